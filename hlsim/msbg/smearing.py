@@ -1,0 +1,108 @@
+"""Spectral smearing (Baer and Moore 1993): each 5.8 ms frame's power spectrum is spread over wider auditory filters."""
+
+import math
+from functools import lru_cache
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn import functional
+
+from hlsim.msbg.ear import RATE
+
+FRAME, HOP, FFT = 256, 64, 512
+
+SMEARING_DELAY = 3 * HOP
+"""Samples by which smearing delays: its frames are read three hops late."""
+
+BROADENING = {"mild": (1.6, 1.1), "moderate": (2.4, 1.6), "severe": (4.0, 2.0)}
+"""Widening of the lower and the upper side of the auditory filters; with no loss nothing is smeared (pyclarity 0.9.0)."""
+
+_TINY = 1e-30
+
+
+def auditory_filters(lower: float, upper: float) -> NDArray[np.float64]:
+    """Roex filters (1 + g) exp(-g) of each bin of the 512-point spectrum, divided by their bandwidth.
+
+    Returns: (256, 256), a row a filter.
+    """
+    bins = np.arange(FFT // 2, dtype=float)
+    hz = bins * RATE / FFT
+    bandwidth = 24.7 * (0.00437 * hz + 1.0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        distance = np.abs(bins[:, None] - bins) / bins[:, None] * 4.0 * hz[:, None] / bandwidth[:, None]
+    g = distance / np.where(bins < bins[:, None], lower, upper)
+    filters = (1.0 + g) * np.exp(-g) / (bandwidth * (lower + upper) / (2.0 * 24.7))[:, None]
+    filters[0] = 0.0
+    filters[0, 0] = 2.0 / (lower + upper)
+    return filters
+
+
+@lru_cache(maxsize=4)
+def smearing_matrix(lower: float, upper: float) -> NDArray[np.float64]:
+    """The wide filters with the normal ones divided out: what, seen through normal filters, looks like the wide ones.
+
+    Returns: (256, 256), to be multiplied with the power spectrum of a frame.
+    """
+    half, quarter = FFT // 2, FFT // 4
+    normal = auditory_filters(1.0, 1.0)
+    # the filters go on above the Nyquist frequency as mirror images of their lower sides, or the division rings
+    extended = np.concatenate((normal, np.zeros((half, quarter))), axis=1)
+    for i in range(quarter, half):
+        stop = min(2 * i - 1, 3 * quarter)
+        mirrored = normal[i, 2 * i - half : max(1, 2 * i - 3 * quarter) : -1]
+        extended[i, half:stop] = mirrored[: stop - half]
+    matrix: NDArray[np.float64] = np.linalg.lstsq(extended, auditory_filters(lower, upper), rcond=-1)[0][
+        :half
+    ]
+    return matrix
+
+
+def smeared_length(samples: int) -> int:
+    """Length of what ``smear`` returns."""
+    return HOP * (math.ceil(samples / HOP) + 3)
+
+
+def smear(waveform: Tensor, matrix: Tensor) -> Tensor:
+    """Smear a waveform at 44.1 kHz as pyclarity's ``smear3`` does, its delay and its first, irregular frames included.
+
+    Shape: (..., time), (256, 256) -> (..., 64 * (ceil(time / 64) + 3)).
+    """
+    samples = waveform.shape[-1]
+    frames = _frames(functional.pad(waveform, (0, max(FRAME, HOP * math.ceil(samples / HOP)) - samples)))
+    frames = frames[..., : math.ceil(samples / HOP), :]
+    place = 2.0 * math.pi * (torch.arange(FRAME, dtype=torch.float64, device=waveform.device) + 0.5) / FRAME
+    window = ((0.5 - 0.5 * place.cos()) / math.sqrt(1.5)).to(waveform.dtype)
+    spectrum = torch.fft.rfft(frames * window, FFT)[..., : FFT // 2]
+    power = spectrum.real.square() + spectrum.imag.square()
+    smeared = power @ matrix.T
+    # tiny terms keep the gradients of silence finite
+    scale = (smeared.abs() + _TINY).sqrt() * (power + _TINY).rsqrt()
+    turned = torch.complex(-spectrum.imag, spectrum.real)  # the square root of a negative power is imaginary
+    spectrum = torch.where(smeared < 0, turned, spectrum) * scale
+    frames = torch.fft.irfft(functional.pad(spectrum, (0, 1)), FFT)[..., :FRAME] * window
+    return _overlap_add(frames)
+
+
+def _frames(waveform: Tensor) -> Tensor:
+    """Frame k covers samples 64 (k - 3) to 64 (k + 1) from the fifth on; the first four are as ``smear3`` fills them."""
+    hops = waveform.unflatten(-1, (-1, HOP))
+    order = torch.tensor([[0, 1, 2, 3], [1, 2, 3, 1], [2, 3, 1, 2], [3, 1, 2, 3]], device=waveform.device)
+    first = hops[..., order, :].flatten(-2)
+    return torch.cat((first, waveform.unfold(-1, FRAME, HOP)[..., 1:, :]), -2)
+
+
+def _overlap_add(frames: Tensor) -> Tensor:
+    hops = frames.unflatten(-1, (4, HOP))
+    count = hops.shape[-3]
+    parts = [functional.pad(hops[..., j, :], (0, 0, j, 0))[..., :count, :] for j in range(4)]
+    # smear3's last three hops: the newest frames' parts, and in place of the others' those of the fourth last frame
+    old = hops[..., count - 4, :, :] if count >= 4 else torch.zeros_like(hops[..., 0, :, :])
+    last, second = hops[..., -1, :, :], hops[..., max(count - 2, 0), :, :]
+    tail = (
+        old[..., 0, :] + last[..., 1, :] + second[..., 2, :],
+        old[..., 1, :] + last[..., 2, :],
+        old[..., 2, :],
+    )
+    return torch.cat((torch.stack(parts).sum(0), torch.stack(tail, -2)), -2).flatten(-2)
