@@ -1,0 +1,51 @@
+"""What every test starts from: seeded random numbers, few threads, and the embedded speech."""
+
+import random
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from hlsim.audio import read_audio
+
+SPEECH_DIR = Path(__file__).parents[1] / "hlsim" / "data" / "speech"
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Take at most two threads, so that a test costs about the same on a small machine and a large one."""
+    torch.set_num_threads(min(2, torch.get_num_threads()))
+
+
+def pytest_report_header(config: pytest.Config) -> str | None:
+    """Say what a plain run leaves out."""
+    if config.option.markexpr == "not install":
+        return "left out: tests that install hlsim into an environment of their own (pytest -m install)"
+    return None
+
+
+@pytest.fixture(autouse=True)
+def seeded() -> None:
+    """Seed every generator before each test; numpy's global one too, for pyclarity's HASPI draws from it."""
+    random.seed(0)
+    np.random.seed(0)
+    torch.manual_seed(0)
+
+
+@pytest.fixture(scope="session")
+def speech_dir() -> Path:
+    """The folder of embedded speech, with ``train`` and ``valid`` in it."""
+    return SPEECH_DIR
+
+
+@pytest.fixture
+def speech(speech_dir: Path) -> list[tuple[Tensor, int]]:
+    """Four utterances of as many voices, two at 16 kHz and two at 22.05 kHz: waveform and rate in Hz.
+
+    The level is 68 dB SPL where RMS 1.0 is 94 dB SPL.
+
+    Shape: (1, time) each.
+    """
+    names = ("train/flite-slt-01", "train/espeak-nyc-m4-01", "valid/flite-rms-01", "valid/espeak-us-annie-01")
+    return [read_audio(speech_dir / f"{name}.flac") for name in names]
