@@ -1,0 +1,103 @@
+"""Is after better than before? Paired tests of scores of the same items."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass
+
+import numpy as np
+from scipy import stats
+
+_ROUNDING = (
+    1e-12  # differences that vary by less than this part of the largest score are equal but for rounding
+)
+
+
+@dataclass(frozen=True)
+class PairedComparison:
+    """Scores of the same items before and after, compared.
+
+    Differences are after minus before throughout, so that a gain is positive where higher scores are better. What the
+    data do not define is None, never NaN: with one pair everything that needs a spread (deviations, t, d, both tests);
+    with differences that are all equal t, p_t and d (a spread of zero); with no difference other than zero w and p_w.
+
+    Attributes:
+        n: pairs.
+        zeros: pairs whose difference is exactly zero; the Wilcoxon test leaves them out.
+        before_mean, after_mean: means of the scores.
+        before_std, after_std: standard deviations with n - 1.
+        delta: mean difference.
+        t, p_t: paired t-test, n - 1 degrees of freedom, two-sided.
+        w, p_w: Wilcoxon signed-rank test, two-sided; zero differences dropped (``zero_method="wilcox"`` of scipy, as
+            Wilcoxon proposed); w is the smaller of the two rank sums.
+        cohens_d: mean difference over the standard deviation (n - 1) of the differences, which is t / sqrt(n).
+    """
+
+    n: int
+    zeros: int
+    before_mean: float
+    before_std: float | None
+    after_mean: float
+    after_std: float | None
+    delta: float
+    t: float | None
+    p_t: float | None
+    w: float | None
+    p_w: float | None
+    cohens_d: float | None
+
+    def to_dict(self) -> dict[str, float | int | None]:
+        """A plain dictionary that JSON can hold."""
+        return asdict(self)
+
+
+def paired_comparison(before: Iterable[float], after: Iterable[float]) -> PairedComparison:
+    """Compare scores of the same items, in the same order, before and after.
+
+    The tests take the pairs as independent. Where several come from one talker or listener they are not, and the p
+    values are too small.
+
+    Raises:
+        ValueError: no pairs, unequal counts, or a score that is NaN or infinite.
+    """
+    first, second = _scores(before, "before"), _scores(after, "after")
+    if len(first) != len(second):
+        raise ValueError(
+            f"{len(first)} scores before and {len(second)} after; a paired comparison needs one each an item"
+        )
+    difference = second - first
+    n = len(first)
+    many = n > 1
+    zeros = int(np.count_nonzero(difference == 0.0))
+    deviation = float(difference.std(ddof=1)) if many else 0.0
+    t = p_t = w = p_w = d = None
+    if deviation > _ROUNDING * max(float(np.abs(first).max()), float(np.abs(second).max())):
+        t, p_t = (float(value) for value in stats.ttest_rel(second, first))
+        d = float(difference.mean()) / deviation
+    if many and zeros < n:
+        w, p_w = (float(value) for value in stats.wilcoxon(second, first, zero_method="wilcox"))
+    return PairedComparison(
+        n=n,
+        zeros=zeros,
+        before_mean=float(first.mean()),
+        before_std=float(first.std(ddof=1)) if many else None,
+        after_mean=float(second.mean()),
+        after_std=float(second.std(ddof=1)) if many else None,
+        delta=float(difference.mean()),
+        t=t,
+        p_t=p_t,
+        w=w,
+        p_w=p_w,
+        cohens_d=d,
+    )
+
+
+def _scores(values: Iterable[float], name: str) -> np.ndarray:
+    scores = np.array([float(value) for value in values], dtype=np.float64)
+    if not len(scores):
+        raise ValueError(f"no scores {name}; a paired comparison needs at least one pair")
+    for index, score in enumerate(scores):
+        if not math.isfinite(score):
+            raise ValueError(f"score {index} {name} is {score}; allowed: finite numbers")
+    return scores

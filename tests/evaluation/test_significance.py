@@ -1,0 +1,126 @@
+"""Paired tests against scipy, against hand-made cases, and against the paper's last table."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from hlsim.evaluation import paired_comparison
+
+
+def draw(n: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    before = rng.uniform(0.0, 0.8, n)
+    return before, np.clip(before + rng.normal(0.1, 0.15, n), 0.0, 1.0)
+
+
+@pytest.mark.parametrize("n", [2, 3, 12, 49, 51, 400])
+def test_equals_scipy(n: int) -> None:
+    before, after = draw(n)
+    c = paired_comparison(before, after)
+    t = stats.ttest_rel(after, before)
+    w = stats.wilcoxon(after, before, zero_method="wilcox")
+    assert (c.n, c.zeros) == (n, 0)
+    assert (c.t, c.p_t) == (t.statistic, t.pvalue)
+    assert (c.w, c.p_w) == (w.statistic, w.pvalue)
+    assert c.before_mean == pytest.approx(before.mean(), abs=1e-15)
+    assert c.after_std == pytest.approx(math.sqrt(((after - after.mean()) ** 2).sum() / (n - 1)), rel=1e-12)
+    assert c.delta == pytest.approx(c.after_mean - c.before_mean, abs=1e-15)
+    assert c.cohens_d == pytest.approx(c.t / math.sqrt(n), rel=1e-12)
+
+
+def test_by_hand() -> None:
+    c = paired_comparison([0.0, 0.25, 0.75, 0.125], [0.25, 0.75, 0.5, 0.875])
+    # differences 0.25, 0.5, -0.25, 0.75: mean 0.3125, squares about it sum to 0.546875; ranks 1.5, 3, -1.5, 4
+    deviation = math.sqrt(0.546875 / 3)
+    assert c.delta == 0.3125
+    assert c.cohens_d == pytest.approx(0.3125 / deviation, rel=1e-14)
+    assert c.t == pytest.approx(2 * 0.3125 / deviation, rel=1e-14)
+    assert c.w == 1.5
+    assert c.before_std == pytest.approx(math.sqrt(0.32421875 / 3), rel=1e-12)
+
+
+def test_the_papers_row() -> None:
+    """HASPI 0.428 to 0.616, |t| = 24.113, n = 1648, d = 0.594: d is t / sqrt(n)."""
+    n, t = 1648, 24.113
+    rng = np.random.default_rng(0)
+    noise = rng.normal(size=n)
+    noise = (noise - noise.mean()) / noise.std(ddof=1)
+    before = rng.uniform(size=n)
+    c = paired_comparison(before, before + 0.187 * (1.0 + noise * math.sqrt(n) / t))
+    assert c.delta == pytest.approx(0.187, abs=1e-12)
+    assert c.t == pytest.approx(t, rel=1e-9)
+    assert c.cohens_d is not None and round(c.cohens_d, 3) == 0.594
+    assert c.p_t is not None and c.p_t < 1e-5 and c.p_w is not None and c.p_w < 1e-5
+
+
+def test_signs_turn_with_the_order() -> None:
+    before, after = draw(30)
+    c, turned = paired_comparison(before, after), paired_comparison(after, before)
+    assert c.t is not None and c.t > 0 and c.delta > 0
+    assert (turned.t, turned.delta, turned.cohens_d) == (-c.t, -c.delta, -c.cohens_d)
+    assert (turned.p_t, turned.w, turned.p_w) == (c.p_t, c.w, c.p_w)
+
+
+def test_zero_differences_are_dropped_and_counted() -> None:
+    before, after = draw(20)
+    more = paired_comparison([*before, 0.5, 0.25, 1.0], [*after, 0.5, 0.25, 1.0])
+    c = paired_comparison(before, after)
+    assert (more.n, more.zeros) == (23, 3)
+    assert more.w == c.w
+    # with zeros scipy leaves its exact distribution, so that p differs a little
+    reference = stats.wilcoxon([*after, 0.5], [*before, 0.5], zero_method="wilcox")
+    assert paired_comparison([*before, 0.5], [*after, 0.5]).p_w == reference.pvalue
+
+
+@pytest.mark.parametrize("shift", [0.1, 0.3])
+def test_equal_differences_leave_t_and_d_undefined(shift: float) -> None:
+    """0.1 apart but for rounding: a spread of 1e-17 must not become a t of 1e16."""
+    before = np.linspace(0.0, 0.6, 12)
+    c = paired_comparison(before, before + shift)
+    assert (c.t, c.p_t, c.cohens_d) == (None, None, None)
+    assert c.delta == pytest.approx(shift)
+    assert c.w == 0.0 and c.p_w is not None and c.p_w < 0.05
+
+
+def test_no_difference() -> None:
+    c = paired_comparison([0.3, 0.5, 0.9], [0.3, 0.5, 0.9])
+    assert (c.delta, c.zeros) == (0.0, 3)
+    assert (c.t, c.p_t, c.w, c.p_w, c.cohens_d) == (None,) * 5
+    assert c.before_std == c.after_std and c.before_std is not None
+
+
+def test_one_pair() -> None:
+    c = paired_comparison([0.25], [0.75])
+    assert (c.n, c.before_mean, c.after_mean, c.delta) == (1, 0.25, 0.75, 0.5)
+    assert (c.before_std, c.after_std, c.t, c.p_t, c.w, c.p_w, c.cohens_d) == (None,) * 7
+
+
+@pytest.mark.parametrize(
+    "pairs", [([0.1], [0.2]), ([0.1, 0.2], [0.1, 0.2]), ([0.0, 0.0], [0.5, 0.5]), draw(30)]
+)
+def test_json_holds_it_without_nan(pairs: tuple[list[float], list[float]]) -> None:
+    c = paired_comparison(*pairs)
+    assert json.loads(json.dumps(c.to_dict(), allow_nan=False)) == c.to_dict()
+
+
+@pytest.mark.filterwarnings("error")
+def test_undefined_cases_do_not_warn() -> None:
+    for pairs in (([0.1], [0.2]), ([0.1, 0.2], [0.1, 0.2]), ([0.0, 0.5], [0.5, 1.0])):
+        paired_comparison(*pairs)
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "message"),
+    [
+        ([0.1, 0.2], [0.1], "2 scores before and 1 after"),
+        ([], [], "no scores before"),
+        ([0.1, math.nan], [0.1, 0.2], "score 1 before is nan"),
+        ([0.1, 0.2], [math.inf, 0.2], "score 0 after is inf"),
+    ],
+)
+def test_bad_input(before: list[float], after: list[float], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        paired_comparison(before, after)
