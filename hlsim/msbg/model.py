@@ -15,7 +15,7 @@ from hlsim.calibration import PASCAL_SPL, check_full_scale, gain_to_pascals
 from hlsim.msbg.ear import EAR_DELAY, RATE, ear_filter, lowpass_filter
 from hlsim.msbg.filterbank import BANKS, gammatone_response
 from hlsim.msbg.recruitment import STEP, envelope, envelope_lowpass, expand, expansion_ratios
-from hlsim.msbg.smearing import BROADENING, SMEARING_DELAY, smear, smeared_length, smearing_matrix
+from hlsim.msbg.smearing import BROADENING, SMEARING_DELAY, smear, smearing_matrix
 
 STRUCTURAL_DELAY = 1047
 """Delay in samples at 44.1 kHz of the model without smearing, by which ``aligned`` advances the output.

@@ -22,13 +22,18 @@ BROADENING = {"mild": (1.6, 1.1), "moderate": (2.4, 1.6), "severe": (4.0, 2.0)}
 _TINY = 1e-30
 
 
-def auditory_filters(lower: float, upper: float) -> NDArray[np.float64]:
-    """Roex filters (1 + g) exp(-g) of each bin of the 512-point spectrum, divided by their bandwidth.
+def roex_filters(lower: float, upper: float, count: int, spacing: float) -> NDArray[np.float64]:
+    """Auditory filters (1 + g) exp(-g), divided by their bandwidth, at equally spaced frequencies.
 
-    Returns: (256, 256), a row a filter.
+    Args:
+        lower, upper: widening of the lower and the upper side.
+        count: filters, and frequencies of each.
+        spacing: Hz between frequencies, which begin at 0.
+
+    Returns: (count, count), a row a filter.
     """
-    bins = np.arange(FFT // 2, dtype=float)
-    hz = bins * RATE / FFT
+    bins = np.arange(count, dtype=float)
+    hz = bins * spacing
     bandwidth = 24.7 * (0.00437 * hz + 1.0)
     with np.errstate(divide="ignore", invalid="ignore"):
         distance = np.abs(bins[:, None] - bins) / bins[:, None] * 4.0 * hz[:, None] / bandwidth[:, None]
@@ -39,24 +44,28 @@ def auditory_filters(lower: float, upper: float) -> NDArray[np.float64]:
     return filters
 
 
-@lru_cache(maxsize=4)
-def smearing_matrix(lower: float, upper: float) -> NDArray[np.float64]:
+def smearing_from_filters(normal: NDArray[np.float64], wide: NDArray[np.float64]) -> NDArray[np.float64]:
     """The wide filters with the normal ones divided out: what, seen through normal filters, looks like the wide ones.
 
-    Returns: (256, 256), to be multiplied with the power spectrum of a frame.
+    Shape: (count, count) twice -> (count, count), to be multiplied with a power spectrum.
     """
-    half, quarter = FFT // 2, FFT // 4
-    normal = auditory_filters(1.0, 1.0)
-    # the filters go on above the Nyquist frequency as mirror images of their lower sides, or the division rings
-    extended = np.concatenate((normal, np.zeros((half, quarter))), axis=1)
-    for i in range(quarter, half):
-        stop = min(2 * i - 1, 3 * quarter)
-        mirrored = normal[i, 2 * i - half : max(1, 2 * i - 3 * quarter) : -1]
-        extended[i, half:stop] = mirrored[: stop - half]
-    matrix: NDArray[np.float64] = np.linalg.lstsq(extended, auditory_filters(lower, upper), rcond=-1)[0][
-        :half
-    ]
+    count = len(normal)
+    half = count // 2
+    # the filters go on above the highest frequency as mirror images of their lower sides, or the division rings
+    extended = np.concatenate((normal, np.zeros((count, half))), axis=1)
+    for i in range(half, count):
+        stop = min(2 * i - 1, 3 * half)
+        mirrored = normal[i, 2 * i - count : max(1, 2 * i - 3 * half) : -1]
+        extended[i, count:stop] = mirrored[: stop - count]
+    matrix: NDArray[np.float64] = np.linalg.lstsq(extended, wide, rcond=-1)[0][:count]
     return matrix
+
+
+@lru_cache(maxsize=4)
+def smearing_matrix(lower: float, upper: float) -> NDArray[np.float64]:
+    """The matrix for MSBG's 512-point spectra. Returns (256, 256)."""
+    normal, wide = (roex_filters(*sides, FFT // 2, RATE / FFT) for sides in ((1.0, 1.0), (lower, upper)))
+    return smearing_from_filters(normal, wide)
 
 
 def smeared_length(samples: int) -> int:

@@ -1,0 +1,111 @@
+"""The training criteria: the paper's (Equations 2 to 9), and those that see how far a simulator is from the truth."""
+
+import math
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from hlsim.spectrum import STFT
+
+PAPER_STFT = STFT(400, 400, 100)
+"""The paper's transform at 16 kHz: 201 frequencies."""
+
+PARTS = ("magnitude", "phase", "complex", "time")
+
+DEFAULT_WEIGHTS = {"magnitude": 0.9, "phase": 0.3, "complex": 0.1, "time": 0.2}
+"""The paper leaves its weights open; these are those of MP-SENet (Lu, Ai and Ling 2023), on which it builds."""
+
+_TINY = 1e-12
+
+
+def magnitude_loss(estimate: Tensor, truth: Tensor) -> Tensor:
+    """Mean square of the difference of magnitudes (Equation 2). Shape: complex (items, frames, bins) -> (items,)."""
+    return (_magnitude(estimate) - _magnitude(truth)).square().mean((-2, -1))
+
+
+def phase_loss(estimate: Tensor, truth: Tensor) -> Tensor:
+    """Anti-wrapped phase error: instantaneous phase + group delay + instantaneous frequency (Equations 3 to 6).
+
+    Shape: complex (items, frames, bins) -> (items,).
+    """
+    difference = _phase(truth) - _phase(estimate)
+    instantaneous = anti_wrap(difference).mean((-2, -1))
+    group_delay = anti_wrap(difference.diff(dim=-1)).mean((-2, -1))
+    if difference.shape[-2] < 2:
+        return instantaneous + group_delay
+    return instantaneous + group_delay + anti_wrap(difference.diff(dim=-2)).mean((-2, -1))
+
+
+def complex_loss(estimate: Tensor, truth: Tensor) -> Tensor:
+    """Twice the mean square of real and imaginary differences (Equation 7). Shape: (items, frames, bins) -> (items,)."""
+    difference = torch.view_as_real(estimate - truth)
+    return 2.0 * difference.square().mean((-3, -2, -1))
+
+
+def time_loss(estimate: Tensor, truth: Tensor) -> Tensor:
+    """Mean absolute difference of waveforms (Equation 8). Shape: (items, time) -> (items,)."""
+    return (estimate - truth).abs().mean(-1)
+
+
+def anti_wrap(angle: Tensor) -> Tensor:
+    """Distance of an angle to the nearest multiple of 2 pi (Ai and Ling 2023). Any shape, radians."""
+    return (angle - 2.0 * math.pi * (angle / (2.0 * math.pi)).round()).abs()
+
+
+def paper_parts(estimate: Tensor, truth: Tensor, stft: STFT = PAPER_STFT) -> dict[str, Tensor]:
+    """The paper's four losses by name, of each item. Shape: (items, time) twice -> (items,) each."""
+    spectra = stft.analyse(estimate), stft.analyse(truth)
+    return {
+        "magnitude": magnitude_loss(*spectra),
+        "phase": phase_loss(*spectra),
+        "complex": complex_loss(*spectra),
+        "time": time_loss(estimate, truth),
+    }
+
+
+def weighted_sum(parts: Mapping[str, Tensor], weights: Mapping[str, float]) -> Tensor:
+    """Sum of parts times weights (Equation 9); parts without a weight do not count."""
+    total = torch.zeros_like(next(iter(parts.values())))
+    for name, weight in weights.items():
+        if weight:
+            total = total + weight * parts[name]
+    return total
+
+
+def noise_to_signal_db(estimate: Tensor, truth: Tensor) -> Tensor:
+    """Power of the error over that of the truth in dB: the negative SNR. Shape: (items, time) twice -> (items,).
+
+    It falls no further than -60 dB, so that the silent and the perfect do not outweigh the rest.
+    """
+    signal = truth.square().mean(-1)
+    error = (estimate - truth).square().mean(-1)
+    return 10.0 * torch.log10((error + 1e-6 * signal + _TINY) / (signal + _TINY))
+
+
+def log_spectral_distance_db(
+    estimate: Tensor, truth: Tensor, stft: STFT = PAPER_STFT, depth: float = 60.0
+) -> Tensor:
+    """Mean absolute difference of log magnitudes in dB, from ``depth`` dB under each item's loudest bin up.
+
+    Shape: (items, time) twice -> (items,).
+    """
+    powers = [
+        spectrum.real.square() + spectrum.imag.square()
+        for spectrum in (stft.analyse(estimate), stft.analyse(truth))
+    ]
+    floor = powers[1].amax((-2, -1), keepdim=True) * 10.0 ** (-depth / 10.0) + _TINY
+    first, second = (10.0 * torch.log10(power + floor) for power in powers)
+    return (first - second).abs().mean((-2, -1))
+
+
+def _magnitude(spectrum: Tensor) -> Tensor:
+    return (spectrum.real.square() + spectrum.imag.square() + _TINY).sqrt()
+
+
+def _phase(spectrum: Tensor) -> Tensor:
+    """Angle with a bounded gradient at zero, where ``torch.angle`` has none."""
+    real = torch.where(
+        spectrum.real.abs() + spectrum.imag.abs() < 1e-7, torch.full_like(spectrum.real, 1e-7), spectrum.real
+    )
+    return torch.atan2(spectrum.imag, real)

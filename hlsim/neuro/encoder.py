@@ -1,0 +1,55 @@
+"""The dense encoder that turns the input channels into feature maps."""
+
+import torch
+from torch import Tensor, nn
+
+
+class Unit(nn.Sequential):
+    """Convolution, instance normalisation where the level may go, PReLU. Shape: (items, channels, time, frequency)."""
+
+    def __init__(self, conv: nn.Module, channels: int, normalise: bool) -> None:
+        norm = [nn.InstanceNorm2d(channels, affine=True)] if normalise else []
+        super().__init__(conv, *norm, nn.PReLU(channels))
+
+
+class DenseBlock(nn.Module):
+    """Convolutions over time and frequency, dilated 1, 2, 4, ... in time, each fed with all before it.
+
+    Shape: (items, channels, time, frequency) -> the same. A depth of 0 changes nothing.
+    """
+
+    def __init__(self, channels: int, depth: int, normalise: bool) -> None:
+        super().__init__()
+        self.units = nn.ModuleList(
+            Unit(
+                nn.Conv2d(channels * (i + 1), channels, 3, padding=(2**i, 1), dilation=(2**i, 1)),
+                channels,
+                normalise,
+            )
+            for i in range(depth)
+        )
+
+    def forward(self, features: Tensor) -> Tensor:
+        outputs = [features]
+        for unit in self.units:
+            outputs.insert(0, unit(torch.cat(outputs, 1)))
+        return outputs[0]
+
+
+class DenseEncoder(nn.Module):
+    """Input channels to feature maps on a coarser grid (Lu, Ai and Ling 2023).
+
+    Shape: (items, inputs, time, frequency) -> (items, channels, time / stride, frequency / stride), rounded up.
+    """
+
+    def __init__(
+        self, inputs: int, channels: int, depth: int, stride: tuple[int, int], normalise: bool
+    ) -> None:
+        super().__init__()
+        kernel = (2 * stride[0] + 1, 2 * stride[1] + 1)
+        self.enter = Unit(nn.Conv2d(inputs, channels, kernel, stride, padding=stride), channels, normalise)
+        self.dense = DenseBlock(channels, depth, normalise)
+
+    def forward(self, features: Tensor) -> Tensor:
+        encoded: Tensor = self.dense(self.enter(features))
+        return encoded

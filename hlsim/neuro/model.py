@@ -1,0 +1,128 @@
+"""Neuro-MSBG: the network that learned MSBG."""
+
+import torch
+from torch import Tensor, nn
+
+from hlsim.audio import check_rate, check_waveform, resample
+from hlsim.audiogram import FREQUENCIES, SEVERITIES, AudiogramLike, severity_index
+from hlsim.calibration import PASCAL_SPL, check_full_scale, gain_to_pascals
+from hlsim.msbg.model import resolve_thresholds
+from hlsim.msbg.recruitment import CATCH_UP_SPL
+from hlsim.neuro.audiogram_encoder import AudiogramEncoder
+from hlsim.neuro.blocks import DualPathBlock
+from hlsim.neuro.config import NEURO_RATE, NeuroConfig
+from hlsim.neuro.decoders import MaskDecoder, PhaseDecoder
+from hlsim.neuro.encoder import DenseEncoder
+from hlsim.neuro.prior import Prior
+
+_TINY = 1e-11
+
+
+class NeuroMSBG(nn.Module):
+    """Waveform and audiogram to what the impaired ear hears, time-aligned.
+
+    Magnitude, phase and encoded audiogram (Equation 1) enter as three channels, a dense encoder and dual-path blocks
+    follow, and two decoders give a mask for the magnitude and a phase; the inverse transform makes a waveform. With
+    ``config.prior``, MSBG's known gains come first and enter as a fourth channel, and the decoders correct them.
+
+    Args:
+        config: sizes and choices.
+        sample_rate: of inputs and outputs in Hz, 16000 to 48000; inside it is 16000, so that only the band under 8 kHz
+            of faster input comes back.
+        full_scale_spl: level in dB SPL of RMS 1.0.
+
+    Raises:
+        ValueError: a rate or level out of range.
+    """
+
+    def __init__(
+        self,
+        config: NeuroConfig | None = None,
+        *,
+        sample_rate: int = NEURO_RATE,
+        full_scale_spl: float = PASCAL_SPL,
+    ) -> None:
+        super().__init__()
+        self.config = config = config or NeuroConfig()
+        self.sample_rate = check_rate(sample_rate)
+        self.full_scale_spl = check_full_scale(full_scale_spl)
+        self.stft = config.stft
+        normalise = not config.level_aware
+        inputs = 4 if config.prior else 3
+        self.audiogram_encoder = AudiogramEncoder(self.stft.frequencies)
+        self.severity = nn.Embedding(len(SEVERITIES), config.channels)
+        nn.init.zeros_(self.severity.weight)
+        self.encoder = DenseEncoder(inputs, config.channels, config.dense_depth, config.stride, normalise)
+        self.blocks = nn.ModuleList(
+            DualPathBlock(config.channels, config.kernel, config.expansion) for _ in range(config.blocks)
+        )
+        self.mask_decoder = MaskDecoder(config.channels, config.dense_depth, config.stride, normalise)
+        self.phase_decoder = PhaseDecoder(
+            config.channels, config.dense_depth, config.stride, normalise, residual=config.level_aware
+        )
+        self.prior = Prior(self.stft) if config.prior else None
+
+    def forward(self, waveform: Tensor, audiogram: AudiogramLike) -> Tensor:
+        """What the ear hears.
+
+        Shape: (..., time) and one audiogram or (..., 8) that broadcasts over the leading dimensions -> (..., time).
+
+        Raises:
+            ValueError: levels outside -10 to 100 dB HL, or shapes that do not fit.
+        """
+        check_waveform(waveform)
+        thresholds = resolve_thresholds(None, audiogram, waveform)
+        with torch.autocast(waveform.device.type, enabled=False):
+            dtype = next(self.parameters()).dtype
+            batch = torch.broadcast_shapes(waveform.shape[:-1], thresholds.shape[:-1])
+            signals = waveform.to(dtype).expand(*batch, -1).reshape(-1, waveform.shape[-1])
+            ears = thresholds.to(dtype).expand(*batch, -1).reshape(-1, len(FREQUENCIES))
+            gain = gain_to_pascals(self.full_scale_spl)
+            heard = self._simulate(resample(signals * gain, self.sample_rate, NEURO_RATE), ears)
+            heard = resample(heard, NEURO_RATE, self.sample_rate)[..., : waveform.shape[-1]] / gain
+            return heard.reshape(*batch, -1).to(waveform.dtype)
+
+    def _simulate(self, signals: Tensor, ears: Tensor) -> Tensor:
+        """Shape: (items, time) pascals at 16 kHz, (items, 8) -> (items, time)."""
+        severity = severity_index(ears)
+        if self.prior is not None:
+            signals = self.prior.filter(signals, severity)
+        spectrum = self.stft.analyse(signals)
+        factor = self.prior(spectrum, ears, severity) if self.prior is not None else None
+        features = self._features(spectrum, ears, factor)
+        features = self.encoder(features.contiguous(memory_format=torch.channels_last))
+        features = features.permute(0, 2, 3, 1) + self.severity(severity)[:, None, None]
+        for block in self.blocks:
+            features = block(features)
+        features = features.permute(0, 3, 1, 2)
+        size = (spectrum.shape[-2], spectrum.shape[-1])
+        log_mask = self.mask_decoder.log_mask(features, size, self._exponents(ears, size[1]))
+        phasor = self.phase_decoder.phasor(features, size)
+        mask = log_mask.clamp(-12.0, 4.0).exp()
+        if factor is not None:
+            spectrum = spectrum * factor
+        if not self.phase_decoder.residual:
+            spectrum = spectrum.abs().to(spectrum.dtype)
+        return self.stft.synthesise(spectrum * phasor * mask, signals.shape[-1])
+
+    def _features(self, spectrum: Tensor, ears: Tensor, factor: Tensor | None) -> Tensor:
+        """Input channels. Shape: complex (items, frames, frequencies), (items, 8) -> (items, 3 or 4, frames, frequencies)."""
+        power = spectrum.real.square() + spectrum.imag.square()
+        encoded = self.audiogram_encoder(ears).unsqueeze(1).expand(power.shape)
+        if self.config.level_aware:
+            # the sine of the phase, faded out near silence: its gradient stays finite and it has no jump at pi
+            channels = [(power + _TINY).log() / 4.0, spectrum.imag * (power + 1e-6).rsqrt(), encoded]
+        else:
+            channels = [(power + _TINY).sqrt(), torch.angle(spectrum), encoded]
+        if factor is not None:
+            channels.append((factor.real.square() + factor.imag.square() + 1e-12).log() / 4.0)
+        return torch.stack(channels, 1)
+
+    def _exponents(self, ears: Tensor, frequencies: int) -> Tensor:
+        """Recruitment exponents, ratio - 1, at the transform's frequencies. Shape: (items, 8) -> (items, frequencies)."""
+        hz = torch.arange(frequencies, device=ears.device, dtype=ears.dtype) * NEURO_RATE / self.config.fft
+        points = torch.tensor(FREQUENCIES, device=ears.device, dtype=ears.dtype)
+        right = torch.bucketize(hz, points).clamp(1, len(FREQUENCIES) - 1)
+        place = ((hz - points[right - 1]) / (points[right] - points[right - 1])).clamp(0.0, 1.0)
+        levels = ears[:, right - 1] * (1.0 - place) + ears[:, right] * place
+        return CATCH_UP_SPL / (CATCH_UP_SPL - levels) - 1.0

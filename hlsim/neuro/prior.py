@@ -1,0 +1,181 @@
+"""What is known of MSBG, as the starting point of a network: smearing, band envelopes and gains on its own frames.
+
+One set of weights a severity, computed from MSBG's formulae; what is trained is a correction to them.
+"""
+
+import math
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.signal import ellip, freqz
+from torch import Tensor, nn
+from torch.nn import functional
+
+from hlsim.audiogram import SEVERITIES
+from hlsim.calibration import PASCAL_SPL
+from hlsim.msbg.ear import RATE, ear_filter, lowpass_filter
+from hlsim.msbg.filterbank import BANKS, FilterBank, erb, gammatone_response
+from hlsim.msbg.model import STRUCTURAL_DELAY
+from hlsim.msbg.recruitment import CATCH_UP_SPL, expansion_ratios
+from hlsim.msbg.smearing import BROADENING, roex_filters, smearing_from_filters
+from hlsim.neuro.config import NEURO_RATE
+from hlsim.spectrum import STFT
+
+RESPONSE_REACH = 1024
+"""Samples at 16 kHz by which the fixed responses reach to either side."""
+
+_CHANNELS = max(bank.channels for bank in BANKS.values())
+_ENVELOPE_REACH = 20  # frames
+_TINY = 1e-12
+
+
+class Prior(nn.Module):
+    """MSBG's gains, estimated on the frames of a short transform.
+
+    Power is smeared by a matrix, summed into the bank's channels, its root smoothed over time, and expanded; the gains
+    weigh the channels' complex responses relative to their sum, which is a fixed filter and applied beforehand.
+
+    Args:
+        stft: the transform; its window should be about as short as MSBG's smearing frame, 5.8 ms.
+    """
+
+    response: Tensor
+    ear_power: Tensor
+
+    def __init__(self, stft: STFT) -> None:
+        super().__init__()
+        points = 160 * stft.fft  # a fine grid that 44.1 kHz shares
+        coarse = slice(None, points // 2 + 1, 160)
+        banks = [BANKS[severity] for severity in SEVERITIES]
+        ear = np.abs(_at_neuro_rate(ear_filter(), points)[coarse]) ** 2
+        self.register_buffer("ear_power", torch.tensor(ear, dtype=torch.float32), persistent=False)
+        responses = [_sum_response(bank) for bank in banks]
+        self.register_buffer(
+            "response", torch.tensor(np.stack(responses), dtype=torch.float32), persistent=False
+        )
+
+        excitation, relative, smoothing = [], [], []
+        for bank in banks:
+            channels = gammatone_response(bank, points * 441 // 160)[:, : points // 2 + 1][:, coarse]
+            scale = (2.0 / (stft.window / 2.0)) ** 2 / 1.5 * (stft.window / stft.fft) * (2.0 / math.pi) ** 2
+            excitation.append(_padded(np.abs(channels) ** 2 * scale))
+            relative.append(_padded(channels / channels.sum(0)))
+            smoothing.append(_padded(_smoothing(bank, stft.hop)))
+        parts = np.stack(relative)
+        self._known("excitation", np.stack(excitation))
+        self._known("relative", np.stack((parts.real, parts.imag)))
+        self._known("smoothing", np.stack(smoothing))
+        self._known("smearing", np.stack([_smearing(severity, stft) for severity in SEVERITIES[1:]]))
+
+    def _known(self, name: str, values: NDArray[np.float64]) -> None:
+        """What a formula gives, and a trained correction that starts at 0 and is relative to it.
+
+        Relative, because the spectrum of speech spans 60 dB: a small absolute change would let the loud leak everywhere.
+        """
+        self.register_buffer(f"{name}_known", torch.tensor(values, dtype=torch.float32), persistent=False)
+        self.register_parameter(f"{name}_learned", nn.Parameter(torch.zeros(values.shape)))
+
+    def _corrected(self, name: str) -> Tensor:
+        known, learned = getattr(self, f"{name}_known"), getattr(self, f"{name}_learned")
+        if name == "relative":  # a complex factor 1 + learned
+            real, imaginary = (
+                known[0] * learned[0] - known[1] * learned[1],
+                known[0] * learned[1] + known[1] * learned[0],
+            )
+            return known + torch.stack((real, imaginary))
+        return known * learned.exp()
+
+    def filter(self, waveform: Tensor, severity: Tensor) -> Tensor:
+        """Apply the fixed response of each item's bank. Shape: (items, time), (items,) -> (items, time)."""
+        time = waveform.shape[-1]
+        points = _even_length(time + 2 * RESPONSE_REACH)
+        response = torch.fft.rfft(self.response.to(waveform), points)[severity]
+        filtered = torch.fft.irfft(torch.fft.rfft(waveform, points) * response, points)
+        return filtered[..., RESPONSE_REACH : RESPONSE_REACH + time]
+
+    def forward(self, spectrum: Tensor, thresholds: Tensor, severity: Tensor) -> Tensor:
+        """Complex factor on the filtered signal's spectrum.
+
+        Shape: complex (items, frames, frequencies), (items, 8), (items,) -> complex (items, frames, frequencies).
+        """
+        power = (spectrum.real.square() + spectrum.imag.square()) * self.ear_power
+        identity = torch.eye(power.shape[-1], device=power.device, dtype=power.dtype).unsqueeze(0)
+        smeared = power @ torch.cat((identity, self._corrected("smearing")))[severity].mT
+        widened = ((smeared.abs() + _TINY) / (power + _TINY)).sqrt()
+
+        level = ((smeared.relu() @ self._corrected("excitation")[severity].mT) + _TINY).sqrt().mT
+        items, channels, frames = level.shape
+        kernels = self._corrected("smoothing")[severity].reshape(items * channels, 1, -1)
+        level = functional.pad(level, (_ENVELOPE_REACH, _ENVELOPE_REACH), mode="replicate")
+        level = functional.conv1d(level.reshape(1, items * channels, -1), kernels, groups=items * channels)
+        level = level.reshape(items, channels, frames).clamp_min(1e-7)
+
+        catch_up = 10.0 ** ((CATCH_UP_SPL - PASCAL_SPL) / 20.0)
+        exponents = self._exponents(thresholds, severity).unsqueeze(-1)
+        gain = ((level / catch_up).log().clamp_max(0.0) * exponents).exp().mT
+        relative = self._corrected("relative")[:, severity]
+        real, imaginary = gain @ relative[0] * widened, gain @ relative[1] * widened
+        # a negative smeared power turns the phase by 90 degrees, as in MSBG
+        turned = smeared < 0
+        return torch.complex(torch.where(turned, -imaginary, real), torch.where(turned, real, imaginary))
+
+    def _exponents(self, thresholds: Tensor, severity: Tensor) -> Tensor:
+        ratios = [
+            functional.pad(expansion_ratios(thresholds, BANKS[name]), (0, _CHANNELS)) for name in SEVERITIES
+        ]
+        rows = torch.stack([ratio[..., :_CHANNELS] for ratio in ratios], 1)
+        chosen = rows[torch.arange(len(severity), device=severity.device), severity]
+        return (chosen - 1.0).clamp_min(-1.0)
+
+
+def _even_length(least: int) -> int:
+    """A length of small primes, at least ``least``."""
+    power = 2 ** max(1, math.ceil(math.log2(least)))
+    return next(size for size in (power * 5 // 8, power * 3 // 4, power * 15 // 16, power) if size >= least)
+
+
+def _at_neuro_rate(filter_taps: NDArray[np.float64], points: int) -> NDArray[np.complex128]:
+    """Response of a 44.1 kHz filter on the grid of ``points`` at 16 kHz; ``points`` is a multiple of 160."""
+    response: NDArray[np.complex128] = np.fft.rfft(filter_taps, points * 441 // 160)[: points // 2 + 1]
+    return response
+
+
+def _sum_response(bank: FilterBank) -> NDArray[np.float64]:
+    """Impulse response of all of MSBG at 16 kHz with every gain at 1, aligned. Returns (2 reach,), its zero at reach."""
+    points = 160 * 160
+    omega = 2.0 * np.pi * np.arange(points // 2 + 1) / (points * RATE / NEURO_RATE)
+    total = gammatone_response(bank, points * 441 // 160)[:, : points // 2 + 1].sum(0)
+    for taps in (ear_filter(), ear_filter(backward=True), lowpass_filter()):
+        total = total * _at_neuro_rate(taps, points)
+    impulse = np.fft.irfft(total * np.exp(1j * omega * STRUCTURAL_DELAY), points) * 10.0 ** (
+        -bank.recombination_db / 20.0
+    )
+    return np.roll(impulse, RESPONSE_REACH)[: 2 * RESPONSE_REACH]
+
+
+def _smoothing(bank: FilterBank, hop: int) -> NDArray[np.float64]:
+    """The envelope's low-pass at the frame rate. Returns (channels, 2 reach + 1)."""
+    points = 4096
+    omega = 2.0 * np.pi * np.fft.rfftfreq(points) * (NEURO_RATE / hop) / RATE
+    rows = []
+    for bandwidth in erb(np.array(bank.centre_frequencies)):
+        numerator, denominator = ellip(2, 0.25, 35, 0.75 * min(100.0, bandwidth) / (RATE / 2.0))
+        impulse = np.fft.irfft(np.abs(freqz(numerator, denominator, omega)[1]) ** 2, points)
+        row = np.roll(impulse, _ENVELOPE_REACH)[: 2 * _ENVELOPE_REACH + 1]
+        rows.append(row / row.sum())
+    return np.array(rows)
+
+
+def _smearing(severity: str, stft: STFT) -> NDArray[np.float64]:
+    """MSBG's smearing matrix on the transform's own frequencies."""
+    spacing = NEURO_RATE / stft.fft
+    count = round(20000.0 / spacing / 4.0) * 4
+    matrix = smearing_from_filters(
+        *(roex_filters(*sides, count, spacing) for sides in ((1.0, 1.0), BROADENING[severity]))
+    )
+    return matrix[: stft.frequencies, : stft.frequencies]
+
+
+def _padded(rows: NDArray[np.generic]) -> NDArray[np.generic]:
+    return np.pad(rows, ((0, _CHANNELS - len(rows)), (0, 0)))

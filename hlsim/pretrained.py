@@ -1,0 +1,143 @@
+"""Checkpoints: a folder of safetensors, a JSON configuration with its hash, and a model card. No pickle."""
+
+import hashlib
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+import safetensors
+import safetensors.torch
+from torch import Tensor, nn
+
+from hlsim.calibration import PASCAL_SPL
+from hlsim.neuro.config import NEURO_RATE, NeuroConfig
+from hlsim.neuro.model import NeuroMSBG
+
+Model = TypeVar("Model", bound=nn.Module)
+
+WEIGHTS, CONFIG, CARD = "model.safetensors", "config.json", "README.md"
+
+
+def load_pretrained(
+    name: str | Path, *, sample_rate: int = NEURO_RATE, full_scale_spl: float = PASCAL_SPL
+) -> NeuroMSBG:
+    """A trained Neuro-MSBG, frozen and in eval mode. Nothing is downloaded.
+
+    Args:
+        name: of a checkpoint that ships with hlsim, e.g. ``"neuro-msbg"``, or a checkpoint folder.
+        sample_rate: of its inputs and outputs in Hz, 16000 to 48000.
+        full_scale_spl: level in dB SPL of RMS 1.0.
+
+    Raises:
+        ValueError: no such checkpoint, one of another kind, or one whose weights are not those that its hash tells.
+    """
+
+    def build(config: Mapping[str, Any]) -> NeuroMSBG:
+        return NeuroMSBG(
+            NeuroConfig.from_dict(config), sample_rate=sample_rate, full_scale_spl=full_scale_spl
+        )
+
+    model = read_checkpoint(name, "neuro-msbg", build)
+    return model.eval().requires_grad_(False)
+
+
+def read_checkpoint(name: str | Path, kind: str, build: Callable[[Mapping[str, Any]], Model]) -> Model:
+    """Build a model from a checkpoint's configuration and load its weights.
+
+    Raises:
+        ValueError: as ``load_pretrained``.
+    """
+    folder = find_checkpoint(name)
+    try:
+        record = json.loads((folder / CONFIG).read_text(encoding="utf-8"))
+        weights = (folder / WEIGHTS).read_bytes()
+    except (OSError, ValueError) as error:
+        raise ValueError(f"{folder}: not readable as a checkpoint ({error})") from error
+    if not isinstance(record, dict) or record.get("kind") != kind:
+        found = record.get("kind") if isinstance(record, dict) else None
+        raise ValueError(f"{folder}: a checkpoint of kind {found!r}; needed here: {kind!r}")
+    if hashlib.sha256(weights).hexdigest() != record.get("sha256"):
+        raise ValueError(
+            f"{folder / WEIGHTS}: changed since it was saved, its SHA-256 differs from {CONFIG}'s; get it anew"
+        )
+    try:
+        model = build(record["config"])
+        model.load_state_dict(safetensors.torch.load(weights))
+    except (KeyError, TypeError, RuntimeError, safetensors.SafetensorError) as error:
+        raise ValueError(
+            f"{folder}: weights and configuration do not fit ({str(error).splitlines()[0]})"
+        ) from error
+    return model
+
+
+def find_checkpoint(name: str | Path) -> Path:
+    """The folder of a checkpoint that ships with hlsim, or of one's own.
+
+    Raises:
+        ValueError: there is none; the message lists those that ship.
+    """
+    shipped = checkpoints_folder()
+    plain = str(name)
+    for folder in (Path(name), shipped / plain if plain and Path(plain).name == plain else None):
+        if folder is not None and (folder / CONFIG).is_file():
+            return folder
+    known = sorted(path.parent.name for path in shipped.glob(f"*/{CONFIG}"))
+    raise ValueError(
+        f"no checkpoint {plain!r}; allowed: {', '.join(known) or 'none ships'}, or a folder with {CONFIG}"
+    )
+
+
+def checkpoints_folder() -> Path:
+    """Where the checkpoints that ship lie: in the installed package, or beside it in a source tree."""
+    package = Path(__file__).parent
+    installed = package / "checkpoints"
+    return installed if installed.is_dir() else package.parent / "checkpoints"
+
+
+def save_checkpoint(
+    folder: str | Path,
+    kind: str,
+    model: nn.Module,
+    config: Mapping[str, Any],
+    about: Mapping[str, Any],
+    card: str = "",
+) -> None:
+    """Write a checkpoint folder, whole or not at all; an older one of the same name is replaced.
+
+    Args:
+        about: how it was trained: data, seed, command, time, metrics, version. Stored beside the configuration.
+        card: text of its README.md; an existing card is kept where this is empty.
+    """
+    target = Path(folder)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    state: dict[str, Tensor] = {
+        name: tensor.detach().cpu().contiguous() for name, tensor in model.state_dict().items()
+    }
+    weights = safetensors.torch.save(state)
+    record = {
+        "kind": kind,
+        "config": dict(config),
+        "sha256": hashlib.sha256(weights).hexdigest(),
+        "about": dict(about),
+    }
+    staging = Path(tempfile.mkdtemp(prefix=f".{target.name}.", dir=target.parent))
+    try:
+        (staging / WEIGHTS).write_bytes(weights)
+        (staging / CONFIG).write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
+        if card:
+            (staging / CARD).write_text(card, encoding="utf-8")
+        elif (target / CARD).is_file():
+            shutil.copy(target / CARD, staging / CARD)
+        staging.chmod(0o755)
+        old = target.with_name(f".{target.name}.old")
+        shutil.rmtree(old, ignore_errors=True)
+        if target.exists():
+            os.replace(target, old)
+        os.replace(staging, target)
+        shutil.rmtree(old, ignore_errors=True)
+    finally:
+        shutil.rmtree(staging, ignore_errors=True)

@@ -1,0 +1,55 @@
+"""Short-time Fourier transform and its inverse, for models and criteria alike."""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class STFT:
+    """A short-time Fourier transform with a Hann window, centred frames and zeros beyond the ends.
+
+    Args:
+        fft: points of the transform; fft // 2 + 1 frequencies.
+        window: samples of the Hann window, at most ``fft``.
+        hop: samples from frame to frame, at most half of ``window``.
+
+    Raises:
+        ValueError: lengths that do not fit together.
+    """
+
+    fft: int = 400
+    window: int = 400
+    hop: int = 100
+
+    def __post_init__(self) -> None:
+        if not 0 < 2 * self.hop <= self.window <= self.fft or self.fft % 2:
+            raise ValueError(
+                f"STFT of fft {self.fft}, window {self.window}, hop {self.hop}; allowed: 2 hop <= window <= fft, fft even"
+            )
+
+    @property
+    def frequencies(self) -> int:
+        return self.fft // 2 + 1
+
+    def analyse(self, waveform: Tensor) -> Tensor:
+        """Spectrum. Shape: (items, time) -> complex (items, frames, frequencies), frames = time // hop + 1."""
+        return torch.stft(
+            waveform,
+            self.fft,
+            self.hop,
+            self.window,
+            self._hann(waveform),
+            center=True,
+            pad_mode="constant",
+            return_complex=True,
+        ).mT
+
+    def synthesise(self, spectrum: Tensor, length: int) -> Tensor:
+        """Waveform by overlap-add. Shape: complex (items, frames, frequencies) -> (items, length)."""
+        window = self._hann(spectrum.real)
+        return torch.istft(spectrum.mT, self.fft, self.hop, self.window, window, center=True, length=length)
+
+    def _hann(self, like: Tensor) -> Tensor:
+        return torch.hann_window(self.window, dtype=like.dtype, device=like.device)

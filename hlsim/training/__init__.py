@@ -1,0 +1,1 @@
+"""Lightning recipes that train simulators and compensators (extra ``train``)."""

@@ -1,0 +1,216 @@
+"""One way to run a training: time-boxed, resumable, with progress, TensorBoard and the best checkpoint kept."""
+
+import hashlib
+import json
+import logging
+import math
+import time
+import warnings
+from collections.abc import Callable, Mapping
+from datetime import timedelta
+from pathlib import Path
+from typing import Any
+
+import lightning as L
+import torch
+from lightning.pytorch.callbacks import Callback, ModelCheckpoint, Timer, TQDMProgressBar
+from lightning.pytorch.loggers import TensorBoardLogger
+from torch import Tensor
+from torch.utils.data import DataLoader, Dataset
+
+LAST = "last.ckpt"
+"""Name of the state that a killed training goes on from."""
+
+
+class Counter(Dataset[int]):
+    """Numbers its items: the modules here make their own batches from a seed and the step."""
+
+    def __init__(self, length: int) -> None:
+        self.length = length
+
+    def __len__(self) -> int:
+        return self.length
+
+    def __getitem__(self, index: int) -> int:
+        return index
+
+
+class TimedModule(L.LightningModule):
+    """A module whose learning rate falls with the time spent, as half a cosine after a short rise.
+
+    Subclasses give ``training_loss`` and ``validate``, and log whatever they like.
+
+    Args:
+        learning_rate: at its highest.
+        max_minutes: of training, all resumed parts together.
+        seed: of every random draw.
+    """
+
+    timer: Timer
+
+    def __init__(self, learning_rate: float, max_minutes: float, seed: int) -> None:
+        super().__init__()
+        self.learning_rate = learning_rate
+        self.max_minutes = max_minutes
+        self.seed = seed
+
+    def training_loss(self, generator: torch.Generator) -> Tensor:
+        """Loss of a new random batch."""
+        raise NotImplementedError
+
+    def validate(self) -> dict[str, float]:
+        """Figures by name; ``score`` is what the best checkpoint has most of."""
+        raise NotImplementedError
+
+    def trained_parameters(self) -> list[torch.nn.Parameter]:
+        return [parameter for parameter in self.parameters() if parameter.requires_grad]
+
+    def training_step(self, batch: Tensor, index: int) -> Tensor:
+        generator = torch.Generator().manual_seed(
+            (self.seed * 1_000_003 + self.global_step) * 64 + self.global_rank
+        )
+        loss = self.training_loss(generator)
+        if not bool(torch.isfinite(loss)):
+            raise RuntimeError(
+                f"the loss is {float(loss)} at step {self.global_step}; a lower learning rate may help"
+            )
+        self.log("loss", loss, prog_bar=True)
+        return loss
+
+    def on_train_batch_start(self, batch: Tensor, index: int) -> None:
+        share = min(1.0, self.timer.time_elapsed("train") / (60.0 * self.max_minutes))
+        rise = min(1.0, (self.global_step + 1) / 50.0)
+        for group in self.optimizers().param_groups:  # type: ignore[union-attr]
+            group["lr"] = self.learning_rate * rise * max(0.01, 0.5 * (1.0 + math.cos(math.pi * share)))
+
+    def validation_step(self, batch: Tensor, index: int) -> None:
+        figures = self.validate()
+        self.log_dict(figures, prog_bar=True, batch_size=1, sync_dist=True)
+
+    def configure_optimizers(self) -> torch.optim.Optimizer:
+        return torch.optim.AdamW(self.trained_parameters(), lr=self.learning_rate, weight_decay=1e-4)
+
+
+class KeepBest(Callback):
+    """Writes the released form of the model whenever the validation score is the best so far."""
+
+    def __init__(self, write: Callable[[dict[str, Any]], None]) -> None:
+        self.write = write
+        self.best = -math.inf
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"best": self.best}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        self.best = float(state_dict["best"])
+
+    def on_validation_end(self, trainer: L.Trainer, module: L.LightningModule) -> None:
+        figures = {name: float(value) for name, value in trainer.callback_metrics.items() if name != "loss"}
+        score = figures.pop("score", -math.inf)
+        if trainer.is_global_zero and score > self.best:
+            self.best = score
+            assert isinstance(module, TimedModule)
+            minutes = module.timer.time_elapsed("train") / 60.0 if not trainer.sanity_checking else 0.0
+            self.write({"steps": trainer.global_step, "minutes": round(minutes, 1), "validation": figures})
+
+
+class History(Callback):
+    """Prints a line a validation."""
+
+    def __init__(self, report: Callable[[str], None]) -> None:
+        self.report = report
+        self.started = time.monotonic()
+
+    def on_validation_end(self, trainer: L.Trainer, module: L.LightningModule) -> None:
+        figures = ", ".join(
+            f"{name} {float(value):.3f}"
+            for name, value in trainer.callback_metrics.items()
+            if name != "score"
+        )
+        minutes = (time.monotonic() - self.started) / 60.0
+        self.report(f"step {trainer.global_step}, {minutes:.1f} min: {figures}")
+
+
+def run(
+    module: TimedModule,
+    *,
+    out: str | Path,
+    recipe: Mapping[str, Any],
+    write: Callable[[dict[str, Any]], None],
+    validate_every: int,
+    max_steps: int = -1,
+    accelerator: str = "auto",
+    devices: int | str = 1,
+    report: Callable[[str], None] = print,
+    progress: bool = True,
+) -> None:
+    """Train until the time is up; go on from ``out`` where a run of the same recipe lies there.
+
+    Args:
+        out: folder for ``last.ckpt``, TensorBoard's events and what ``write`` puts there.
+        recipe: what makes this run this run; it is kept in ``recipe.json``.
+        write: stores the released form of the model, given the figures of its validation.
+        validate_every: steps from validation to validation; a kill loses no more than these.
+        max_steps: stop earlier, -1 for no such limit.
+
+    Raises:
+        ValueError: ``out`` holds a run of another recipe.
+    """
+    folder = Path(out)
+    folder.mkdir(parents=True, exist_ok=True)
+    _claim(folder, recipe)
+    last = folder / LAST
+    module.timer = Timer(timedelta(minutes=module.max_minutes), interval="step", verbose=False)
+    states = ModelCheckpoint(
+        dirpath=folder,
+        filename="last",
+        save_top_k=1,
+        enable_version_counter=False,
+        every_n_train_steps=validate_every,
+        save_on_train_epoch_end=False,
+    )
+    callbacks: list[Callback] = [module.timer, KeepBest(write), History(report), states]
+    if progress:
+        callbacks.append(TQDMProgressBar(refresh_rate=10))
+    logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
+    with warnings.catch_warnings():
+        warnings.filterwarnings(
+            "ignore", ".*(does not have many workers|Checkpoint directory|GPU available|mid-epoch).*"
+        )
+        trainer = L.Trainer(
+            accelerator=accelerator,
+            devices=devices,
+            max_epochs=1,
+            max_steps=max_steps,
+            gradient_clip_val=1.0,
+            callbacks=callbacks,
+            logger=TensorBoardLogger(str(folder), name="", version="events"),
+            val_check_interval=validate_every,
+            num_sanity_val_steps=0,
+            log_every_n_steps=10,
+            enable_progress_bar=progress,
+            enable_model_summary=False,
+        )
+        trainer.fit(
+            module,
+            DataLoader(Counter(10_000_000), batch_size=None),
+            DataLoader(Counter(1), batch_size=None),
+            ckpt_path=str(last) if last.is_file() else None,
+            weights_only=True,
+        )
+        if trainer.interrupted:
+            raise KeyboardInterrupt
+        trainer.validate(module, DataLoader(Counter(1), batch_size=None), verbose=False)
+    trainer.save_checkpoint(last)
+
+
+def _claim(folder: Path, recipe: Mapping[str, Any]) -> None:
+    text = json.dumps(recipe, indent=2, sort_keys=True, default=str)
+    note = folder / "recipe.json"
+    if note.is_file() and (folder / LAST).is_file():
+        kept = hashlib.sha256(note.read_bytes()).hexdigest()
+        if kept != hashlib.sha256(text.encode()).hexdigest():
+            raise ValueError(
+                f"{folder}: holds a training of another recipe (see {note.name}); choose another --out"
+            )
+    note.write_text(text, encoding="utf-8")

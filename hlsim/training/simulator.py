@@ -1,0 +1,208 @@
+"""Training a Neuro-MSBG on targets that the exact MSBG makes as it goes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from hlsim.audiogram import Audiogram, draw_thresholds, read_audiograms
+from hlsim.calibration import set_level
+from hlsim.criteria import log_spectral_distance_db, noise_to_signal_db, paper_parts, weighted_sum
+from hlsim.data.clips import Clips
+from hlsim.data.variation import mix, vary
+from hlsim.msbg import MSBG
+from hlsim.neuro import NeuroConfig, NeuroMSBG
+from hlsim.neuro.config import NEURO_RATE
+from hlsim.pretrained import save_checkpoint
+from hlsim.training.loop import TimedModule, run
+
+MILDER = ("NH", "N1", "N2", "S1")
+"""Standard ears that join the validation, since measured ones are mostly moderate and severe."""
+
+
+@dataclass(frozen=True)
+class SimulatorRecipe:
+    """What a training of a simulator is made of; a YAML file holds the same names.
+
+    Attributes:
+        model: settings of ``NeuroConfig``.
+        batch: clips a step.
+        seconds: length of a clip.
+        learning_rate: of AdamW at its highest.
+        weights: of the criteria: ``snr`` (dB / 10), ``log_spectrum`` (dB / 10) and the paper's ``magnitude``, ``phase``,
+            ``complex``, ``time`` (on signals scaled to unit power of the truth).
+        validate_every: steps.
+        validation_items: how many.
+        seed: of every random draw.
+    """
+
+    model: dict[str, Any] = field(default_factory=dict)
+    batch: int = 6
+    seconds: float = 1.3
+    learning_rate: float = 1e-3
+    weights: dict[str, float] = field(default_factory=lambda: {"snr": 1.0, "log_spectrum": 0.5})
+    validate_every: int = 250
+    validation_items: int = 48
+    seed: int = 0
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> SimulatorRecipe:
+        """Raises ValueError where a name is unknown."""
+        names = [entry.name for entry in fields(cls)]
+        if unknown := sorted(set(data) - set(names)):
+            raise ValueError(
+                f"unknown settings {', '.join(unknown)} in the recipe; allowed: {', '.join(names)}"
+            )
+        known = {"snr", "log_spectrum", "magnitude", "phase", "complex", "time"}
+        if unknown := sorted(set(data.get("weights", {})) - known):
+            raise ValueError(
+                f"unknown criteria {', '.join(unknown)} in the recipe; allowed: {', '.join(sorted(known))}"
+            )
+        return cls(**data)
+
+
+@dataclass(frozen=True)
+class SimulatorData:
+    """Folders and files to train and validate on. Speech is all that is needed.
+
+    Without ``valid_speech`` validation is on the training speech, and says nothing of other speakers.
+    """
+
+    speech: Path
+    noise: Path | None = None
+    audiograms: Path | None = None
+    valid_speech: Path | None = None
+    valid_noise: Path | None = None
+    valid_audiograms: Path | None = None
+
+
+class SimulatorTraining(TimedModule):
+    """Draws speech, noise, ears and levels, asks the exact MSBG what is heard, and teaches it to the network."""
+
+    def __init__(self, recipe: SimulatorRecipe, data: SimulatorData, max_minutes: float) -> None:
+        super().__init__(recipe.learning_rate, max_minutes, recipe.seed)
+        torch.manual_seed(recipe.seed)
+        self.recipe = recipe
+        self.student = NeuroMSBG(NeuroConfig.from_dict(recipe.model))
+        self.teacher = MSBG(sample_rate=NEURO_RATE)
+        options: dict[str, Any] = {"sample_rate": NEURO_RATE, "seconds": recipe.seconds}
+        self.speech = Clips(data.speech, **options)
+        self.noise = Clips(data.noise, repeat=True, **options) if data.noise else None
+        self.ears = _thresholds(data.audiograms)
+        self.valid = validation_set(data, recipe)
+        self.truths: list[Tensor] = []
+
+    def training_loss(self, generator: torch.Generator) -> Tensor:
+        count = self.recipe.batch
+        ears = draw_thresholds(count, generator)
+        if self.ears is not None:
+            measured = self.ears[torch.randint(len(self.ears), (count,), generator=generator)]
+            measured = measured + 10.0 * torch.rand(count, 1, generator=generator) - 5.0
+            keep = torch.rand(count, 1, generator=generator) < 0.4
+            ears = torch.where(keep, measured.clamp(-10.0, 100.0), ears)
+        noise = self.noise.draw(count, generator) if self.noise is not None else None
+        signal = vary(self.speech.draw(count, generator), noise, ears, NEURO_RATE, generator).to(self.device)
+        ears = ears.to(self.device)
+        with torch.no_grad():
+            truth = self.teacher(signal, ears)
+        heard = self.student(signal, ears)
+        scale = truth.square().mean(-1, keepdim=True).add(1e-12).rsqrt()
+        truth, heard = truth * scale, heard * scale
+        weights = self.recipe.weights
+        parts = {"snr": noise_to_signal_db(heard, truth) / 10.0}
+        self.log("snr", -10.0 * parts["snr"].mean(), prog_bar=True)
+        if weights.get("log_spectrum"):
+            parts["log_spectrum"] = log_spectral_distance_db(heard, truth) / 10.0
+        if set(weights) - {"snr", "log_spectrum"}:
+            parts |= paper_parts(heard, truth)
+        return weighted_sum(parts, weights).mean()
+
+    def validate(self) -> dict[str, float]:
+        """Median and worst tenth of the SNR over the validation items, in dB."""
+        values = []
+        with torch.no_grad():
+            for number, (signal, ears) in enumerate(self.valid):
+                signal, ears = signal.to(self.device), ears.to(self.device)
+                if number == len(self.truths):
+                    self.truths.append(self.teacher(signal, ears))
+                values.append(-noise_to_signal_db(self.student(signal, ears), self.truths[number]))
+        snr = torch.cat(values)
+        median, low = float(snr.median()), float(snr.quantile(0.1))
+        return {"score": median + 0.5 * low, "valid_snr_median": median, "valid_snr_worst_tenth": low}
+
+    def trained_parameters(self) -> list[torch.nn.Parameter]:
+        return list(self.student.parameters())
+
+
+def validation_set(data: SimulatorData, recipe: SimulatorRecipe) -> list[tuple[Tensor, Tensor]]:
+    """Fixed items: every second one noisy (0 to 20 dB), 50 to 80 dB SPL, measured, standard and drawn ears in turn."""
+    generator = torch.Generator().manual_seed(1_000 + recipe.seed)
+    options: dict[str, Any] = {"sample_rate": NEURO_RATE, "seconds": 2.0}
+    speech = Clips(data.valid_speech or data.speech, **options)
+    noise_folder = data.valid_noise or data.noise
+    noise = Clips(noise_folder, repeat=True, **options) if noise_folder else None
+    measured = _thresholds(data.valid_audiograms or data.audiograms)
+    standard = torch.tensor([Audiogram.standard(name).thresholds for name in MILDER])
+    batches = []
+    for _ in range(0, recipe.validation_items, 8):
+        signal = speech.draw(8, generator)
+        if noise is not None:
+            noisy = mix(signal, noise.draw(8, generator), 20.0 * torch.rand(8, generator=generator))
+            signal = torch.where((torch.arange(8) % 2 == 1).unsqueeze(-1), noisy, signal)
+        signal = set_level(signal, 50.0 + 30.0 * torch.rand(8, generator=generator))
+        ears = draw_thresholds(8, generator)
+        ears[0:8:4] = standard[torch.randint(len(standard), (2,), generator=generator)]
+        if measured is not None:
+            ears[1:8:2] = measured[torch.randint(len(measured), (4,), generator=generator)]
+        batches.append((signal, ears))
+    return batches
+
+
+def train_simulator(
+    data: SimulatorData,
+    recipe: SimulatorRecipe,
+    *,
+    out: str | Path,
+    max_minutes: float,
+    max_steps: int = -1,
+    accelerator: str = "auto",
+    report: Callable[[str], None] = print,
+    progress: bool = True,
+) -> Path:
+    """Train, resume, and keep the best checkpoint.
+
+    Returns: the folder that ``load_pretrained`` takes, ``out/checkpoint``.
+
+    Raises:
+        ValueError: data or recipe that cannot be used; the message names them.
+    """
+    module = SimulatorTraining(recipe, data, max_minutes)
+    folder = Path(out) / "checkpoint"
+
+    def write(figures: dict[str, Any]) -> None:
+        from hlsim import __version__
+
+        about = {"hlsim": __version__, "recipe": asdict(recipe), **figures}
+        save_checkpoint(folder, "neuro-msbg", module.student, module.student.config.to_dict(), about)
+
+    run(
+        module,
+        out=out,
+        recipe=asdict(recipe) | {"max_minutes": max_minutes} | {k: str(v) for k, v in asdict(data).items()},
+        write=write,
+        validate_every=recipe.validate_every,
+        max_steps=max_steps,
+        accelerator=accelerator,
+        report=report,
+        progress=progress,
+    )
+    return folder
+
+
+def _thresholds(path: Path | None) -> Tensor | None:
+    return torch.tensor([ear.thresholds for _, ear in read_audiograms(path)]) if path else None
