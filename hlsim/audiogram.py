@@ -6,6 +6,7 @@ import csv
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -73,7 +74,7 @@ class Audiogram:
             raise ValueError(
                 f"audiogram levels {_listed(levels)} dB HL; allowed: {LOWEST_LEVEL:g} to {HIGHEST_LEVEL:g}"
             )
-        if frequencies[0] <= 0 or any(b <= a for a, b in zip(frequencies, frequencies[1:], strict=False)):
+        if frequencies[0] <= 0 or any(b <= a for a, b in pairwise(frequencies)):
             raise ValueError(
                 f"audiogram frequencies {_listed(frequencies)} Hz; allowed: positive and ascending"
             )

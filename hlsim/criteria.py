@@ -18,6 +18,9 @@ DEFAULT_WEIGHTS = {"magnitude": 0.9, "phase": 0.3, "complex": 0.1, "time": 0.2}
 
 _TINY = 1e-12
 
+_FAINT = 8e-4  # squared magnitude of a tone of 20 dB SPL in the paper's transform
+_SILENT = 1e-20
+
 
 def magnitude_loss(estimate: Tensor, truth: Tensor) -> Tensor:
     """Mean square of the difference of magnitudes (Equation 2). Shape: complex (items, frames, bins) -> (items,)."""
@@ -27,9 +30,13 @@ def magnitude_loss(estimate: Tensor, truth: Tensor) -> Tensor:
 def phase_loss(estimate: Tensor, truth: Tensor) -> Tensor:
     """Anti-wrapped phase error: instantaneous phase + group delay + instantaneous frequency (Equations 3 to 6).
 
+    The value is the paper's. Its gradient is 1 / magnitude, so that all of it would come from the bins that nobody hears;
+    it is faded out where estimate or truth is fainter than a tone of 20 dB SPL.
+
     Shape: complex (items, frames, bins) -> (items,).
     """
     difference = _phase(truth) - _phase(estimate)
+    difference = difference.detach() + (difference - difference.detach()) * _heard(estimate) * _heard(truth)
     instantaneous = anti_wrap(difference).mean((-2, -1))
     group_delay = anti_wrap(difference.diff(dim=-1)).mean((-2, -1))
     if difference.shape[-2] < 2:
@@ -53,13 +60,27 @@ def anti_wrap(angle: Tensor) -> Tensor:
     return (angle - 2.0 * math.pi * (angle / (2.0 * math.pi)).round()).abs()
 
 
-def paper_parts(estimate: Tensor, truth: Tensor, stft: STFT = PAPER_STFT) -> dict[str, Tensor]:
-    """The paper's four losses by name, of each item. Shape: (items, time) twice -> (items,) each."""
-    spectra = stft.analyse(estimate), stft.analyse(truth)
+def paper_stft(sample_rate: int) -> STFT:
+    """The paper's transform at another rate: windows of 25 ms every 6.25 ms, to the nearest sample."""
+    hop = round(sample_rate * PAPER_STFT.hop / 16000)
+    return STFT(4 * hop, 4 * hop, hop)
+
+
+def paper_parts(
+    estimate: Tensor, truth: Tensor, stft: STFT = PAPER_STFT, frequencies: int | None = None
+) -> dict[str, Tensor]:
+    """The paper's four losses by name, of each item. Shape: (items, time) twice -> (items,) each.
+
+    Args:
+        stft: spectra are scaled to the magnitudes of the paper's transform, so that a rate changes no level.
+        frequencies: how many of the transform's to compare, from 0 Hz up; all if None.
+    """
+    scale = PAPER_STFT.window / stft.window
+    first, second = (stft.analyse(waveform)[..., :frequencies] * scale for waveform in (estimate, truth))
     return {
-        "magnitude": magnitude_loss(*spectra),
-        "phase": phase_loss(*spectra),
-        "complex": complex_loss(*spectra),
+        "magnitude": magnitude_loss(first, second),
+        "phase": phase_loss(first, second),
+        "complex": complex_loss(first, second),
         "time": time_loss(estimate, truth),
     }
 
@@ -80,7 +101,7 @@ def noise_to_signal_db(estimate: Tensor, truth: Tensor) -> Tensor:
     """
     signal = truth.square().mean(-1)
     error = (estimate - truth).square().mean(-1)
-    return 10.0 * torch.log10((error + 1e-6 * signal + _TINY) / (signal + _TINY))
+    return 10.0 * torch.log10((error + 1e-6 * signal + _SILENT) / (signal + _SILENT))
 
 
 def log_spectral_distance_db(
@@ -101,6 +122,12 @@ def log_spectral_distance_db(
 
 def _magnitude(spectrum: Tensor) -> Tensor:
     return (spectrum.real.square() + spectrum.imag.square() + _TINY).sqrt()
+
+
+def _heard(spectrum: Tensor) -> Tensor:
+    """From 0 for silence to 1 for what is well above 20 dB SPL, without gradient."""
+    power = (spectrum.real.square() + spectrum.imag.square()).detach()
+    return power / (power + _FAINT)
 
 
 def _phase(spectrum: Tensor) -> Tensor:

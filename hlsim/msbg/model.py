@@ -171,7 +171,7 @@ def active_rescaling(signals: Tensor) -> Tensor:
 
 
 def _to_cochlea(signals: Tensor, rate: int, length: int, rescale: bool) -> Tensor:
-    """Resample to 44.1 kHz and pass outer and middle ear, in one pair of FFTs. Shape: (items, time) -> (items, length)."""
+    """Resample to 44.1 kHz and pass outer and middle ear by one pair of FFTs. Shape: (items, time) -> (items, length)."""
     up, down = _ratio(rate)
     if rescale:
         at_rate = (
@@ -191,7 +191,7 @@ def _to_cochlea(signals: Tensor, rate: int, length: int, rescale: bool) -> Tenso
 
 
 def _from_cochlea(heard: Tensor, rate: int, delay: int, inner: int, out: int) -> Tensor:
-    """The way back, low-pass, advance by ``delay`` samples and return to ``rate``. Shape: (items, time) -> (items, out)."""
+    """Back out of the ear, low-pass, advance by ``delay``, return to ``rate``. Shape: (items, time) -> (items, out)."""
     up, down = _ratio(rate)
     longest = max(heard.shape[-1], inner + delay) + _FIR_TAIL
     own, points = _grid(math.ceil(longest * down / up), rate)

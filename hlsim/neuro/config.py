@@ -29,12 +29,12 @@ class NeuroConfig:
         level_aware: log magnitude and no normalisation. Otherwise instance normalisation, as in MP-SENet.
     """
 
-    fft: int = 192
+    fft: int = 256
     window: int = 96
     hop: int = 24
     channels: int = 32
     dense_depth: int = 0
-    stride: tuple[int, int] = (4, 2)
+    stride: tuple[int, int] = (4, 3)
     blocks: int = 3
     kernel: tuple[int, int] = (7, 7)
     expansion: int = 2

@@ -106,7 +106,7 @@ class NeuroMSBG(nn.Module):
         return self.stft.synthesise(spectrum * phasor * mask, signals.shape[-1])
 
     def _features(self, spectrum: Tensor, ears: Tensor, factor: Tensor | None) -> Tensor:
-        """Input channels. Shape: complex (items, frames, frequencies), (items, 8) -> (items, 3 or 4, frames, frequencies)."""
+        """The input channels. Shape: (items, frames, frequencies), (items, 8) -> (items, 3 or 4, frames, frequencies)."""
         power = spectrum.real.square() + spectrum.imag.square()
         encoded = self.audiogram_encoder(ears).unsqueeze(1).expand(power.shape)
         if self.config.level_aware:

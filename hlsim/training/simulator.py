@@ -46,7 +46,7 @@ class SimulatorRecipe:
     seconds: float = 1.3
     learning_rate: float = 1e-3
     weights: dict[str, float] = field(default_factory=lambda: {"snr": 1.0, "log_spectrum": 0.5})
-    validate_every: int = 250
+    validate_every: int = 200
     validation_items: int = 48
     seed: int = 0
 
@@ -111,7 +111,7 @@ class SimulatorTraining(TimedModule):
         with torch.no_grad():
             truth = self.teacher(signal, ears)
         heard = self.student(signal, ears)
-        scale = truth.square().mean(-1, keepdim=True).add(1e-12).rsqrt()
+        scale = truth.square().mean(-1, keepdim=True).add(1e-18).rsqrt()
         truth, heard = truth * scale, heard * scale
         weights = self.recipe.weights
         parts = {"snr": noise_to_signal_db(heard, truth) / 10.0}
