@@ -200,7 +200,8 @@ def read_audiograms(path: str | Path) -> list[tuple[dict[str, str], Audiogram]]:
         ValueError: the file is missing, empty, or a row is no audiogram; the message names file and row.
     """
     try:
-        with open(path, newline="", encoding="utf-8") as file:
+        # spreadsheets put a byte order mark first, which would hide the first column
+        with open(path, newline="", encoding="utf-8-sig") as file:
             rows = list(csv.DictReader(file))
     except (OSError, UnicodeDecodeError) as error:
         raise ValueError(f"{path}: cannot read audiograms: {error}") from error
@@ -220,8 +221,8 @@ def draw_thresholds(count: int, generator: torch.Generator | None = None) -> Ten
 
     Each lies between two neighbours of one of Bisgaard's series (NH, N1 ... N6 or NH, S1 ... S3), is tilted by up to
     20 dB at 250 Hz, and moved by noise of up to 8 dB that is alike at neighbouring frequencies (correlation 0.8, as
-    among measured ears). Three of four are rounded to 5 dB, as audiologists do. Of 20000, 27 % have no loss in MSBG's
-    sense, 20 % a mild, 20 % a moderate and 34 % a severe one.
+    among measured ears). Three of four are rounded to 5 dB, as audiologists do. In MSBG's sense 27 % have no loss,
+    18 % a mild, 19 % a moderate and 36 % a severe one.
 
     Returns: (count, 8) dB HL, -10 to 100.
     """
