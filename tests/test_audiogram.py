@@ -1,0 +1,286 @@
+"""Audiograms against Bisgaard's tables and pyclarity's class; validation, interpolation, files and random ears."""
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from hlsim.audiogram import (
+    FREQUENCIES,
+    SEVERITIES,
+    Audiogram,
+    as_thresholds,
+    draw_thresholds,
+    read_audiograms,
+    severity_index,
+)
+
+# Bisgaard, Vlaming and Dahlquist 2010, Tables 1 and 2, all ten frequencies
+BISGAARD_HZ = (250, 375, 500, 750, 1000, 1500, 2000, 3000, 4000, 6000)
+BISGAARD = {
+    "N1": (10, 10, 10, 10, 10, 10, 15, 20, 30, 40),
+    "N2": (20, 20, 20, 22.5, 25, 30, 35, 40, 45, 50),
+    "N3": (35, 35, 35, 35, 40, 45, 50, 55, 60, 65),
+    "N4": (55, 55, 55, 55, 55, 60, 65, 70, 75, 80),
+    "N5": (65, 67.5, 70, 72.5, 75, 80, 80, 80, 80, 80),
+    "N6": (75, 77.5, 80, 82.5, 85, 90, 90, 95, 100, 100),
+    "N7": (90, 92.5, 95, 100, 105, 105, 105, 105, 105, 105),
+    "S1": (10, 10, 10, 10, 10, 10, 15, 30, 55, 70),
+    "S2": (20, 20, 20, 22.5, 25, 35, 55, 75, 95, 95),
+    "S3": (30, 30, 35, 47.5, 60, 70, 75, 80, 80, 85),
+}
+
+CLARITY_SEVERITIES = {"NOTHING": "none", "MILD": "mild", "MODERATE": "moderate", "SEVERE": "severe"}
+
+
+def flat(level: float) -> Audiogram:
+    return Audiogram((level,) * 8)
+
+
+@pytest.mark.parametrize("name", BISGAARD)
+def test_standard_ears_are_bisgaards_and_flat_above_6_khz(name: str) -> None:
+    ear = Audiogram.standard(name)
+    published = dict(zip(BISGAARD_HZ, BISGAARD[name], strict=True))
+    assert ear.frequencies == FREQUENCIES == (250, 500, 1000, 2000, 3000, 4000, 6000, 8000)
+    assert ear.levels[:7] == tuple(published[int(hz)] for hz in FREQUENCIES[:7])
+    assert ear.levels[7] == ear.levels[6]
+
+
+def test_normal_hearing_is_0_throughout() -> None:
+    assert Audiogram.standard("NH").levels == (0.0,) * 8
+
+
+def test_an_unknown_standard_names_those_there_are() -> None:
+    with pytest.raises(ValueError, match=r"'N9'; allowed: NH, N1, .*, S3$"):
+        Audiogram.standard("N9")
+
+
+def test_is_frozen_hashable_and_holds_floats() -> None:
+    ear = Audiogram(np.arange(8))  # type: ignore[arg-type]
+    assert ear == Audiogram(tuple(range(8)))
+    assert hash(ear) == hash(Audiogram(tuple(range(8))))
+    assert all(type(value) is float for value in ear.levels + ear.frequencies)
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        ear.levels = (0.0,) * 8  # type: ignore[misc]
+
+
+@pytest.mark.parametrize("edge", [-10.0, 120.0])
+def test_the_ends_of_the_range_are_allowed(edge: float) -> None:
+    assert flat(edge).thresholds == (edge,) * 8
+
+
+@pytest.mark.parametrize(
+    ("levels", "frequencies", "said"),
+    [
+        ((0.0,) * 7, FREQUENCIES, "got 7 levels and 8 frequencies .*250, 500, 1000"),
+        ((), (), "one level a frequency, got 0 levels"),
+        ((0.0,) * 7 + (120.5,), FREQUENCIES, r"120\.5 dB HL; allowed: -10 to 120"),
+        ((-10.5,) + (0.0,) * 7, FREQUENCIES, r"-10\.5.*; allowed: -10 to 120"),
+        ((float("nan"),) + (0.0,) * 7, FREQUENCIES, "levels nan, .*; allowed: finite numbers"),
+        ((float("inf"),) + (0.0,) * 7, FREQUENCIES, "levels inf, .*; allowed: finite numbers"),
+        ((0.0, 0.0), (250.0, float("nan")), "frequencies 250, nan; allowed: finite numbers"),
+        ((0.0, 0.0), (500.0, 250.0), "frequencies 500, 250 Hz; allowed: positive and ascending"),
+        ((0.0, 0.0), (500.0, 500.0), "allowed: positive and ascending"),
+        ((0.0, 0.0), (0.0, 500.0), "allowed: positive and ascending"),
+        (("loud",) + (0.0,) * 7, FREQUENCIES, "levels .*loud.*; allowed: numbers"),
+        ((None,) + (0.0,) * 7, FREQUENCIES, "levels .*None.*; allowed: numbers"),
+        (30.0, FREQUENCIES, r"levels 30\.0; allowed: numbers"),
+    ],
+)
+def test_bad_ears_say_what_is_allowed_in_one_line(levels: Any, frequencies: Any, said: str) -> None:
+    with pytest.raises(ValueError, match=said) as caught:
+        Audiogram(levels, frequencies)
+    assert "\n" not in str(caught.value)
+
+
+def test_other_grids_are_interpolated_linearly_over_log_frequency_and_flat_beyond() -> None:
+    ear = Audiogram((10.0, 50.0, 30.0), (500.0, 2000.0, 4000.0))
+    half = float(np.log2(3000 / 2000))  # of the octave from 2 to 4 kHz
+    assert ear.thresholds == pytest.approx((10, 10, 30, 50, 50 - 20 * half, 30, 30, 30))
+    assert ear.levels == (10.0, 50.0, 30.0)  # kept as given
+
+
+def test_a_point_between_changes_nothing_where_it_lies_on_the_line() -> None:
+    coarse = Audiogram((20.0, 60.0), (250.0, 8000.0))
+    fine = Audiogram((20.0, 20 + 40 * np.log(4) / np.log(32), 60.0), (250.0, 1000.0, 8000.0))
+    assert fine.thresholds == pytest.approx(coarse.thresholds)
+
+
+def test_severity_is_pyclaritys_at_random_and_at_the_limits() -> None:
+    clarity = pytest.importorskip("clarity.utils.audiogram")
+    rng = np.random.default_rng(1)
+    ears = [rng.uniform(-10, 100) + rng.uniform(-20, 20, 8) for _ in range(1500)]
+    ears += [5.0 * rng.integers(-2, 20, 8) for _ in range(1500)]  # means often lie on a limit
+    for limit in (15.0, 35.0, 56.0):
+        for spread in (0.0, 5.0, 7.5):
+            for excess in (-1e-3, 0.0, 1e-3):
+                tail = np.array(
+                    [limit - spread, limit + spread, limit, limit - spread, limit + spread + excess]
+                )
+                ears.append(np.concatenate(([0.0, 90.0, 45.0], tail)))
+    ears_in_range = [np.clip(ear, -10, 100) for ear in ears]
+    expected = [CLARITY_SEVERITIES[clarity.Audiogram(levels=ear).severity] for ear in ears_in_range]
+    assert [Audiogram(tuple(ear)).severity for ear in ears_in_range] == expected
+    assert set(expected) == set(SEVERITIES)
+    index = severity_index(torch.tensor(np.array(ears_in_range)))
+    assert [SEVERITIES[i] for i in index.tolist()] == expected
+
+
+def test_severity_of_many_ears_keeps_leading_dimensions() -> None:
+    levels = torch.tensor([0.0, 15.0, 35.0, 56.0, 57.0, 20.0]).reshape(2, 3, 1).expand(2, 3, 8)
+    assert severity_index(levels).tolist() == [[0, 0, 1], [2, 3, 1]]
+
+
+def test_dictionary_round_trip_through_json() -> None:
+    ear = Audiogram((10.5, 30.0, 61.25), (300.0, 1500.0, 7000.0))
+    assert Audiogram.from_dict(json.loads(json.dumps(ear.to_dict()))) == ear
+    assert Audiogram.from_dict({"levels": range(8)}) == Audiogram(tuple(range(8)))
+    with pytest.raises(ValueError, match="needs 'levels', got .*frequencies"):
+        Audiogram.from_dict({"frequencies": FREQUENCIES})
+
+
+@pytest.mark.parametrize("frequencies", [FREQUENCIES, (125.0, 750.0, 1500.5)])
+def test_row_round_trip(frequencies: tuple[float, ...]) -> None:
+    ear = Audiogram(tuple(2.5 * i for i in range(len(frequencies))), frequencies)
+    row = ear.to_row()
+    assert list(row)[0] == f"hl_{frequencies[0]:g}"
+    assert Audiogram.from_row({"file": "a.wav"} | row | {"hl_best": "left"}) == ear
+
+
+def test_a_row_without_levels_or_with_a_bad_one() -> None:
+    with pytest.raises(ValueError, match=r"needs columns hl_250, hl_500, \.\.\., got \['file'\]"):
+        Audiogram.from_row({"file": "a.wav"})
+    for value in ("", "loud", None):
+        with pytest.raises(ValueError, match="column hl_500 holds .*; allowed: a level in dB HL"):
+            Audiogram.from_row({"hl_250": "10", "hl_500": value})  # type: ignore[dict-item]
+
+
+def test_csv_round_trip(tmp_path: Path) -> None:
+    ears = [Audiogram.standard(name) for name in ("N1", "S3")]
+    lines = [",".join(("file", *ears[0].to_row()))]
+    lines += [",".join((name, *ear.to_row().values())) for name, ear in zip("ab", ears, strict=True)]
+    (tmp_path / "ears.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    read = read_audiograms(tmp_path / "ears.csv")
+    assert [ear for _, ear in read] == ears
+    assert [row["file"] for row, _ in read] == ["a", "b"]
+
+
+def test_csv_of_a_spreadsheet_keeps_its_first_column(tmp_path: Path) -> None:
+    (tmp_path / "ears.csv").write_bytes(b"\xef\xbb\xbfhl_250,hl_500\r\n10,20\r\n")
+    ((_, ear),) = read_audiograms(tmp_path / "ears.csv")
+    assert ear == Audiogram((10.0, 20.0), (250.0, 500.0))
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        ("", "no audiograms"),
+        ("hl_250,hl_500\n", "no audiograms"),
+        ("hl_250,hl_500\n10,20\n10,x\n", "line 3: .*hl_500 holds 'x'"),
+        ("hl_250,hl_500\n10\n", "line 2: .*hl_500"),
+        ("hl_250,hl_500\n10,20\n10,200\n", "line 3: .*200 dB HL; allowed: -10 to 120"),
+        ("hl_500,hl_250\n10,20\n", "line 2: .*ascending"),
+        ("left,right\n10,20\n", "line 2: .*needs columns hl_250"),
+    ],
+)
+def test_csv_errors_begin_with_the_file_and_name_the_line(tmp_path: Path, content: str, said: str) -> None:
+    path = tmp_path / "ears.csv"
+    path.write_text(content, encoding="utf-8")
+    with pytest.raises(ValueError, match=said) as caught:
+        read_audiograms(path)
+    assert str(caught.value).startswith(str(path))
+
+
+def test_csv_errors_of_files_that_are_none(tmp_path: Path) -> None:
+    binary = tmp_path / "binary.csv"
+    binary.write_bytes(b"hl_250\n\xff\xfe\x80\n")
+    for path in (tmp_path / "missing.csv", tmp_path, binary):
+        with pytest.raises(ValueError, match="cannot read audiograms") as caught:
+            read_audiograms(path)
+        assert str(caught.value).startswith(str(path))
+
+
+def test_pyclarity_round_trip() -> None:
+    clarity = pytest.importorskip("clarity.utils.audiogram")
+    ear = Audiogram.standard("S2")
+    theirs = ear.to_clarity()
+    assert isinstance(theirs, clarity.Audiogram)
+    assert theirs.levels.tolist() == list(ear.levels)
+    assert theirs.frequencies.tolist() == list(ear.frequencies)
+    assert Audiogram.from_clarity(theirs) == ear
+    mild = Audiogram.from_clarity(clarity.AUDIOGRAM_MILD)
+    assert (mild.frequencies[0], mild.levels[0], mild.levels[-1]) == (125.0, 5.0, 50.0)
+    assert mild.thresholds == (10, 15, 19, 25, 28, 31, 35, 38)
+
+
+def test_thresholds_for_a_simulator() -> None:
+    n1, s1 = Audiogram.standard("N1"), Audiogram.standard("S1")
+    assert as_thresholds(n1).tolist() == list(n1.levels)
+    assert as_thresholds([n1, s1]).tolist() == [list(n1.levels), list(s1.levels)]
+    assert as_thresholds((Audiogram((7.0,), (1000.0,)),)).tolist() == [[7.0] * 8]
+    given = torch.zeros(2, 3, 8, dtype=torch.float64)
+    assert as_thresholds(given) is given
+    assert as_thresholds(torch.full((8,), 100)).dtype == torch.float32
+
+
+@pytest.mark.parametrize(
+    ("audiogram", "said"),
+    [
+        (torch.zeros(7), r"shape \(7,\); allowed: \(\.\.\., 8\)"),
+        (torch.tensor(3.0), r"shape \(\); allowed"),
+        (torch.tensor([0.0] * 7 + [float("nan")]), "takes -10 to 100"),
+        (torch.tensor([0.0] * 7 + [100.1]), "takes -10 to 100"),
+        (torch.tensor([[0.0] * 8, [-10.1] * 8]), "takes -10 to 100"),
+        (Audiogram.standard("N7"), "takes -10 to 100"),
+        ([0.0] * 8, "is list; allowed: an Audiogram, a sequence of them, or a .* tensor"),
+        ([], "is list; allowed"),
+        ("N3", "is str; allowed"),
+        (None, "is NoneType; allowed"),
+        (np.zeros(8), "is ndarray; allowed"),
+    ],
+)
+def test_what_is_no_ear_for_a_simulator(audiogram: Any, said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        as_thresholds(audiogram)
+
+
+def test_thresholds_keep_their_gradient() -> None:
+    levels = torch.full((2, 8), 40.0, requires_grad=True)
+    as_thresholds(levels).sum().backward()
+    assert levels.grad is not None and bool((levels.grad == 1).all())
+
+
+def test_drawn_ears_look_like_measured_ones() -> None:
+    ears = draw_thresholds(20000, torch.Generator().manual_seed(3))
+    assert ears.shape == (20000, 8)
+    assert float(ears.min()) >= -10.0 and float(ears.max()) <= 100.0
+    shares = torch.bincount(severity_index(ears), minlength=4) / len(ears)
+    # the docstring's: 27, 18, 19 and 36 %
+    torch.testing.assert_close(shares, torch.tensor([0.27, 0.18, 0.19, 0.36]), atol=0.015, rtol=0)
+    rounded = (ears % 5.0 == 0.0).all(-1).float().mean()
+    assert 0.73 < float(rounded) < 0.77
+    # high-frequency losses are the rule
+    assert float((ears[:, -2] > ears[:, 0]).float().mean()) > 0.7
+
+
+def test_drawn_ears_are_alike_at_neighbouring_frequencies() -> None:
+    ears = draw_thresholds(5000, torch.Generator().manual_seed(4))
+    correlation = torch.corrcoef(ears.T)
+    neighbours = correlation.diagonal(1)
+    assert float(neighbours.min()) > 0.85
+    assert float(correlation[0, -1]) < float(neighbours.min()) - 0.1
+    # even about a series' own shape: the jump from 3 to 4 kHz is small and its sign varies
+    jump = ears[:, 5] - ears[:, 4]
+    assert float(jump.abs().median()) < 10.0
+
+
+def test_drawing_depends_on_the_generator_alone() -> None:
+    first = draw_thresholds(64, torch.Generator().manual_seed(5))
+    torch.rand(7)
+    assert torch.equal(first, draw_thresholds(64, torch.Generator().manual_seed(5)))
+    assert not torch.equal(first, draw_thresholds(64, torch.Generator().manual_seed(6)))
+    as_thresholds(first)  # every one is fit for a simulator
