@@ -1,0 +1,66 @@
+"""Levels in dB SPL, dB FS and pascals."""
+
+import math
+
+import pytest
+import torch
+
+from hlsim.calibration import check_full_scale, dbfs, gain_to_pascals, level_spl, set_level
+
+
+def test_rms_1_is_94_db_spl_and_20_db_are_a_factor_of_10() -> None:
+    wave = torch.tensor([1.0, -1.0, 1.0, -1.0])
+    assert float(level_spl(wave)) == pytest.approx(94.0)
+    assert float(level_spl(0.1 * wave)) == pytest.approx(74.0)
+    assert float(level_spl(wave, 120.0)) == pytest.approx(120.0)
+
+
+def test_a_full_scale_sine_is_3_db_below_full_scale() -> None:
+    sine = torch.sin(2 * math.pi * 100 * torch.arange(16000, dtype=torch.float64) / 16000)
+    assert float(dbfs(sine)) == pytest.approx(10 * math.log10(0.5))
+    assert float(level_spl(sine, 110.0)) == pytest.approx(110 + 10 * math.log10(0.5))
+
+
+def test_gain_to_pascals_is_pyclaritys_full_scale() -> None:
+    # pyclarity: 100 + 20 dB SPL at RMS 1.0
+    assert gain_to_pascals(120.0) == pytest.approx(10 ** (26 / 20))
+    assert gain_to_pascals(94.0) == 1.0
+    wave = torch.randn(3, 500)
+    torch.testing.assert_close(level_spl(wave * gain_to_pascals(107.0)), level_spl(wave, 107.0))
+
+
+@pytest.mark.parametrize("value", [-0.1, 200.1, math.nan, math.inf, -math.inf])
+def test_full_scales_that_are_none(value: float) -> None:
+    with pytest.raises(ValueError, match=r"full_scale_spl is .*; allowed: 0 to 200 dB SPL"):
+        check_full_scale(value)
+
+
+def test_ends_of_full_scale_are_allowed() -> None:
+    assert (check_full_scale(0), check_full_scale(200)) == (0.0, 200.0)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_set_level_gives_each_item_its_own(dtype: torch.dtype) -> None:
+    wave = torch.randn(2, 3, 400, dtype=dtype) * 10 ** torch.linspace(-3, 2, 6, dtype=dtype).reshape(2, 3, 1)
+    wanted = torch.tensor([[40.0, 55.0, 60.0], [75.0, 90.0, 115.0]])
+    out = set_level(wave, wanted, 107.0)
+    assert out.dtype == dtype
+    torch.testing.assert_close(level_spl(out, 107.0), wanted.to(dtype), atol=1e-3, rtol=0)
+    # only the level changes
+    torch.testing.assert_close(out / out.norm(dim=-1, keepdim=True), wave / wave.norm(dim=-1, keepdim=True))
+    assert float(level_spl(set_level(wave, 65), 94.0).sub(65).abs().max()) < 1e-3
+
+
+def test_silence_has_a_finite_level_and_stays_silent() -> None:
+    silence = torch.zeros(2, 100, requires_grad=True)
+    assert level_spl(silence).tolist() == pytest.approx([-106.0, -106.0])
+    louder = set_level(silence, 80.0)
+    assert not bool(louder.any())
+    (louder.sum() + level_spl(silence).sum()).backward()
+    assert silence.grad is not None and bool(torch.isfinite(silence.grad).all())
+
+
+def test_level_and_gain_are_differentiable() -> None:
+    wave = torch.randn(2, 50, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda w: level_spl(w, 100.0), wave)
+    assert torch.autograd.gradcheck(lambda w: set_level(w, 70.0), wave)
