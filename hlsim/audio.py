@@ -35,8 +35,11 @@ def check_waveform(waveform: Tensor, name: str = "waveform") -> Tensor:
     return waveform
 
 
-def read_audio(path: str | Path, *, allow_silent: bool = False) -> tuple[Tensor, int]:
+def read_audio(path: str | Path, *, any_rate: bool = False) -> tuple[Tensor, int]:
     """Read a wav, flac or ogg file.
+
+    Args:
+        any_rate: let rates above 48 kHz through.
 
     Returns: float32 samples as they are in the file, (channels, time), and the rate in Hz.
 
@@ -55,12 +58,13 @@ def read_audio(path: str | Path, *, allow_silent: bool = False) -> tuple[Tensor,
     waveform = torch.from_numpy(samples.T.copy())
     if not bool(torch.isfinite(waveform).all()):
         raise ValueError(f"{path}: holds samples that are NaN or infinite")
-    if not allow_silent and not bool(waveform.any()):
+    if not bool(waveform.any()):
         raise ValueError(f"{path}: silent, every sample is zero")
     try:
-        return waveform, check_rate(rate)
+        check_rate(min(rate, HIGHEST_RATE) if any_rate else rate)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
+    return waveform, int(rate)
 
 
 def write_audio(path: str | Path, waveform: Tensor, sample_rate: int) -> None:
@@ -85,7 +89,12 @@ def write_audio(path: str | Path, waveform: Tensor, sample_rate: int) -> None:
         )
     partial = target.with_name(f".{target.name}.{os.getpid()}.part{suffix}")
     try:
-        soundfile.write(str(partial), samples.T.numpy(), sample_rate, subtype=_SUBTYPES[suffix])
+        soundfile.write(
+            str(partial),
+            samples.mT.numpy() if samples.ndim == 2 else samples.numpy(),
+            sample_rate,
+            subtype=_SUBTYPES[suffix],
+        )
         os.replace(partial, target)
     except (OSError, soundfile.LibsndfileError) as error:
         raise ValueError(f"{path}: cannot be written ({error})") from error
