@@ -1,0 +1,295 @@
+"""Audio files, whole or not at all; bad ones named; resampling against scipy, tones and finite differences."""
+
+import math
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import scipy.signal
+import soundfile
+import torch
+from torch import Tensor
+
+from hlsim.audio import (
+    EXTENSIONS,
+    check_rate,
+    check_waveform,
+    find_audio,
+    read_audio,
+    resample,
+    write_audio,
+)
+
+RATES = [(16000, 44100), (44100, 16000), (48000, 16000), (16000, 48000), (22050, 44100), (32000, 44100)]
+
+
+def tone(hz: float, rate: int, seconds: float = 0.5) -> Tensor:
+    time = torch.arange(round(rate * seconds), dtype=torch.float64) / rate
+    return torch.sin(2 * math.pi * hz * time + 0.3)
+
+
+@pytest.mark.parametrize(("suffix", "step"), [(".wav", 0.0), (".flac", 2.0**-24)])
+@pytest.mark.parametrize("channels", [1, 2])
+def test_wav_and_flac_come_back_to_the_sample(
+    tmp_path: Path, suffix: str, step: float, channels: int
+) -> None:
+    wave = torch.empty(channels, 3000).uniform_(-0.99, 0.99)
+    write_audio(tmp_path / f"a{suffix}", wave, 22050)
+    back, rate = read_audio(tmp_path / f"a{suffix}")
+    assert rate == 22050
+    assert back.shape == wave.shape and back.dtype == torch.float32
+    assert float((back - wave).abs().max()) <= step
+
+
+def test_wav_holds_more_than_full_scale(tmp_path: Path) -> None:
+    wave = torch.tensor([[3.5, -20.0, 0.25]])
+    write_audio(tmp_path / "a.wav", wave, 48000)
+    assert torch.equal(read_audio(tmp_path / "a.wav")[0], wave)
+
+
+def test_ogg_comes_back_aligned_and_close(tmp_path: Path, speech: list[tuple[Tensor, int]]) -> None:
+    wave, rate = speech[0]
+    write_audio(tmp_path / "a.ogg", wave, rate)
+    back, read_rate = read_audio(tmp_path / "a.ogg")
+    assert (back.shape, read_rate) == (wave.shape, rate)
+    assert float((back - wave).square().sum() / wave.square().sum()) < 0.02
+
+
+def test_one_dimension_is_one_channel_and_upper_case_is_an_extension(tmp_path: Path) -> None:
+    wave = torch.rand(500)
+    write_audio(tmp_path / "a.WAV", wave.double().requires_grad_(), 16000)
+    assert torch.equal(read_audio(tmp_path / "a.WAV")[0], wave.unsqueeze(0))
+
+
+def test_writing_over_a_file_replaces_it_and_leaves_nothing_else(tmp_path: Path) -> None:
+    for level in (0.1, 0.2):
+        write_audio(tmp_path / "a.flac", torch.full((100,), level), 16000)
+    assert os.listdir(tmp_path) == ["a.flac"]
+    assert float(read_audio(tmp_path / "a.flac")[0].mean()) == pytest.approx(0.2, abs=1e-6)
+
+
+@pytest.mark.parametrize("failure", [OSError("disk full"), KeyboardInterrupt()])
+@pytest.mark.parametrize("before", [True, False])
+def test_a_failing_write_leaves_what_was_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, failure: BaseException, before: bool
+) -> None:
+    path = tmp_path / "a.wav"
+    old = torch.full((1, 10), 0.5)
+    if before:
+        write_audio(path, old, 16000)
+
+    def half_written(file: str, *args: Any, **kwargs: Any) -> None:
+        Path(file).write_bytes(b"RIFF")
+        raise failure
+
+    monkeypatch.setattr(soundfile, "write", half_written)
+    with pytest.raises((ValueError, KeyboardInterrupt)) as caught:
+        write_audio(path, torch.rand(1, 10), 16000)
+    if isinstance(failure, OSError):
+        assert str(caught.value) == f"{path}: cannot be written (disk full)"
+    assert os.listdir(tmp_path) == (["a.wav"] if before else [])
+    if before:
+        assert torch.equal(read_audio(path)[0], old)
+
+
+@pytest.mark.parametrize(
+    ("name", "wave", "said"),
+    [
+        ("a.mp3", torch.zeros(10), r"cannot write \.mp3; allowed: \.wav, \.flac, \.ogg"),
+        ("a", torch.zeros(10), "cannot write a file without extension"),
+        ("a.wav", torch.tensor([0.0, float("nan")]), "NaN or infinite"),
+        ("a.wav", torch.tensor([0.0, float("inf")]), "NaN or infinite"),
+        ("a.flac", torch.tensor([0.0, -1.5]), r"samples reach 1\.5, \.flac holds 1\.0; write \.wav"),
+        ("a.ogg", torch.tensor([0.0, 1.5]), r"samples reach 1\.5, \.ogg holds 1\.0; write \.wav"),
+        ("a.flac", torch.zeros(9, 10), "cannot be written"),
+        ("a.wav", torch.zeros(2, 3, 10), r"shape \(2, 3, 10\); allowed: \(channels, time\) or \(time,\)"),
+        ("nowhere/a.wav", torch.zeros(10), "cannot be written"),
+    ],
+)
+def test_what_cannot_be_written(tmp_path: Path, name: str, wave: Tensor, said: str) -> None:
+    with pytest.raises(ValueError, match=said) as caught:
+        write_audio(tmp_path / name, wave, 16000)
+    assert str(caught.value).startswith(str(tmp_path / name))
+    assert "\n" not in str(caught.value)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("rate", [8000, 0])
+@pytest.mark.parametrize("suffix", EXTENSIONS)
+def test_rates_that_could_not_be_read_again_are_not_written(tmp_path: Path, suffix: str, rate: int) -> None:
+    with pytest.raises(ValueError, match=rf"sample rate {rate} Hz; allowed: 16000 to 48000") as caught:
+        write_audio(tmp_path / f"a{suffix}", torch.zeros(10), rate)
+    assert str(caught.value).startswith(str(tmp_path))
+    assert not list(tmp_path.iterdir())
+
+
+def bad_file(kind: str, path: Path) -> None:
+    noise = np.random.default_rng(0).uniform(-0.5, 0.5, 100).astype(np.float32)
+    match kind:
+        case "text":
+            path.write_text("This is no recording.\n" * 20)
+        case "no bytes":
+            path.write_bytes(b"")
+        case "cut":
+            whole = path.with_name("whole.flac")
+            soundfile.write(whole, noise, 16000)
+            path.write_bytes(whole.read_bytes()[:30])
+        case "no samples":
+            soundfile.write(path, noise[:0], 16000)
+        case "silent":
+            soundfile.write(path, 0 * noise, 16000)
+        case "NaN":
+            noise[50] = np.nan
+            soundfile.write(path, noise, 16000, subtype="FLOAT")
+        case "infinite":
+            noise[50] = -np.inf
+            soundfile.write(path, noise, 16000, subtype="FLOAT")
+        case "slow":
+            soundfile.write(path, noise, 8000)
+        case "fast":
+            soundfile.write(path, noise, 96000)
+        case "folder":
+            path.mkdir()
+
+
+@pytest.mark.parametrize(
+    ("kind", "said"),
+    [
+        ("missing", "no such file"),
+        ("folder", "no such file"),
+        ("text", "not readable as audio .*; allowed: wav, flac, ogg"),
+        ("no bytes", "not readable as audio"),
+        ("cut", "not readable as audio"),
+        ("no samples", "empty, no samples"),
+        ("silent", "silent, every sample is zero"),
+        ("NaN", "NaN or infinite"),
+        ("infinite", "NaN or infinite"),
+        ("slow", "sample rate 8000 Hz; allowed: 16000 to 48000"),
+        ("fast", "sample rate 96000 Hz; allowed: 16000 to 48000"),
+    ],
+)
+def test_a_bad_file_is_named_first(tmp_path: Path, kind: str, said: str) -> None:
+    path = tmp_path / "bad.wav"
+    bad_file(kind, path)
+    with pytest.raises(ValueError, match=said) as caught:
+        read_audio(path)
+    assert str(caught.value).startswith(f"{path}: ")
+    assert "\n" not in str(caught.value)
+
+
+def test_faster_files_can_be_let_through(tmp_path: Path) -> None:
+    wave = torch.rand(1, 50)
+    write_audio(tmp_path / "a.wav", wave, 96000)
+    back, rate = read_audio(tmp_path / "a.wav", any_rate=True)
+    assert rate == 96000 and torch.equal(back, wave)
+    bad_file("slow", tmp_path / "b.wav")
+    with pytest.raises(ValueError, match="sample rate 8000 Hz"):
+        read_audio(tmp_path / "b.wav", any_rate=True)
+
+
+def test_find_audio_looks_into_folders_and_sorts(tmp_path: Path) -> None:
+    for name in ("b/2.FLAC", "b/1.ogg", "a.wav", ".hidden.wav", "b/notes.txt"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+    assert [p.relative_to(tmp_path).as_posix() for p in find_audio(tmp_path)] == [
+        "a.wav",
+        "b/1.ogg",
+        "b/2.FLAC",
+    ]
+
+
+def test_find_audio_says_what_is_missing(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"no audio in it; looked for \.wav, \.flac, \.ogg"):
+        find_audio(tmp_path)
+    for path in (tmp_path / "none", Path(__file__)):
+        with pytest.raises(ValueError, match="no such folder") as caught:
+            find_audio(path)
+        assert str(caught.value).startswith(str(path))
+
+
+@pytest.mark.parametrize("rate", [15999, 48001, 16000.5, -16000, 0, math.nan, math.inf])
+def test_rates_out_of_range(rate: float) -> None:
+    with pytest.raises(ValueError, match=r"sample rate .* Hz; allowed: 16000 to 48000"):
+        check_rate(rate)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("rate", [16000, 44100.0, 48000])
+def test_rates_in_range_come_back_whole(rate: int) -> None:
+    assert check_rate(rate) == rate and type(check_rate(rate)) is int
+
+
+@pytest.mark.parametrize(
+    "wave", [torch.zeros(10, dtype=torch.int16), np.zeros(10), None, torch.tensor(1.0), torch.zeros(2, 0)]
+)
+def test_what_is_no_waveform(wave: Any) -> None:
+    with pytest.raises(ValueError, match=r"heard (is|has shape) .*; allowed: .*\(\.\.\., time\)"):
+        check_waveform(wave, "heard")
+
+
+@pytest.mark.parametrize(("source", "target"), RATES)
+def test_tones_keep_their_phase_and_amplitude(source: int, target: int) -> None:
+    for hz in (100.0, 1000.0, 0.45 * 0.88 * min(source, target)):
+        ours = resample(tone(hz, source), source, target)
+        middle = slice(len(ours) // 8, -len(ours) // 8)
+        assert float((ours - tone(hz, target))[middle].abs().max()) < 2e-4
+
+
+@pytest.mark.parametrize(("source", "target"), RATES)
+def test_stops_what_the_lower_rate_cannot_hold(source: int, target: int) -> None:
+    nyquist = min(source, target) / 2
+    # a click holds all frequencies alike
+    click = torch.zeros(source, dtype=torch.float64)
+    click[source // 2] = 1.0
+    response = torch.fft.rfft(resample(click, source, target)).abs() * max(source / target, 1.0)
+    response = response / response[100]
+    hz = torch.arange(len(response), dtype=torch.float64)
+    gain_db = 20 * torch.log10(response + 1e-12)
+    assert float(gain_db[hz < 0.9 * nyquist].abs().max()) < 0.1
+    if target > source:
+        assert float(gain_db[hz >= nyquist].max()) < -55.0
+        assert float(gain_db[hz > 1.01 * nyquist].max()) < -80.0
+    else:
+        # what folds back is at most what leaks from just above
+        above = resample(tone(1.01 * nyquist, source), source, target)
+        assert float(20 * above[len(above) // 4 : -len(above) // 4].abs().max().log10()) < -80.0
+
+
+@pytest.mark.parametrize(("source", "target"), RATES)
+def test_equals_scipys_polyphase_filter_on_band_limited_noise(source: int, target: int) -> None:
+    low = scipy.signal.firwin(1001, 0.35 * min(source, target), fs=source)
+    noise = scipy.signal.lfilter(low, 1.0, np.random.default_rng(0).standard_normal(source // 2))
+    common = math.gcd(source, target)
+    up, down = target // common, source // common
+    taps = scipy.signal.firwin(2 * 80 * max(up, down) + 1, 0.95 / max(up, down), window=("kaiser", 12.0))
+    theirs = scipy.signal.resample_poly(noise, up, down, window=taps)
+    ours = resample(torch.from_numpy(noise), source, target).numpy()
+    assert ours.shape == theirs.shape
+    middle = slice(1000, -1000)
+    error = np.sqrt(np.mean((ours - theirs)[middle] ** 2) / np.mean(theirs[middle] ** 2))
+    assert error < 1e-4
+
+
+@pytest.mark.parametrize(("source", "target"), RATES)
+@pytest.mark.parametrize("time", [1, 2, 159, 1601])
+def test_length_is_rounded_up_and_leading_dimensions_stay(source: int, target: int, time: int) -> None:
+    ours = resample(torch.randn(2, 3, time), source, target)
+    assert ours.shape == (2, 3, math.ceil(time * target / source))
+
+
+def test_there_and_back_is_the_same_up_to_the_band_edge() -> None:
+    wave = tone(440.0, 16000) + tone(3000.0, 16000) + tone(6500.0, 16000)
+    back = resample(resample(wave, 16000, 44100), 44100, 16000)
+    assert float((back - wave)[500:-500].abs().max()) < 1e-4
+
+
+def test_equal_rates_change_nothing_at_all() -> None:
+    wave = torch.randn(7)
+    assert resample(wave, 44100, 44100) is wave
+
+
+def test_resampling_is_differentiable() -> None:
+    wave = torch.randn(2, 40, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda w: resample(w, 16000, 24000), wave)
+    assert torch.autograd.gradcheck(lambda w: resample(w, 48000, 16000), wave)
