@@ -1,4 +1,4 @@
-"""Random clips of a folder of recordings, decoded once and kept."""
+"""Random clips of recordings, decoded once and kept."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,7 +15,7 @@ class Clips:
     Recordings are decoded when first drawn and kept as 16-bit samples (115 MB an hour at 16 kHz).
 
     Args:
-        folder: searched for wav, flac and ogg files, subfolders too.
+        source: a folder, searched for wav, flac and ogg files, subfolders too; or the files.
         sample_rate: Hz.
         seconds: length of a clip; shorter recordings are repeated where ``repeat``, else followed by silence.
         repeat: for noises.
@@ -24,8 +24,10 @@ class Clips:
         ValueError: no such folder, or no audio in it; and when a clip is drawn, a file that cannot be used.
     """
 
-    def __init__(self, folder: str | Path, *, sample_rate: int, seconds: float, repeat: bool = False) -> None:
-        self.files: Sequence[Path] = find_audio(folder)
+    def __init__(
+        self, source: str | Path | Sequence[Path], *, sample_rate: int, seconds: float, repeat: bool = False
+    ) -> None:
+        self.files = find_audio(source) if isinstance(source, str | Path) else list(source)
         self.sample_rate = sample_rate
         self.samples = round(seconds * sample_rate)
         self.repeat = repeat

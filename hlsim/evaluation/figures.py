@@ -1,11 +1,16 @@
-"""Pictures of a HASPI report."""
+"""Pictures: a HASPI report, and spectrograms."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import torch
+from torch import Tensor
+
 from hlsim.audiogram import SEVERITIES
+from hlsim.calibration import PASCAL_SPL
 from hlsim.extras import require
 
 if TYPE_CHECKING:
@@ -48,3 +53,35 @@ def draw_report(report: HaspiReport, path: str | Path) -> None:
         axes.legend(fontsize="small")
     figure.suptitle(f"{c.n} items before and after")
     figure.savefig(path, dpi=150, format="png")
+
+
+def draw_spectrograms(signals: Mapping[str, Tensor], sample_rate: int, path: str | Path) -> None:
+    """Write a PNG of log-magnitude spectrograms, one a signal, on one scale of dB SPL.
+
+    Shape: (time,) each, in pascals.
+
+    Raises:
+        MissingExtraError: matplotlib is not installed.
+    """
+    figure = require("matplotlib.figure", "eval").Figure(
+        figsize=(9.0, 2.2 * len(signals)), layout="constrained"
+    )
+    require("matplotlib.backends.backend_agg", "eval").FigureCanvasAgg(figure)
+    points = 2 * (sample_rate // 100)  # 20 ms
+    window = torch.hann_window(points)
+    panels = figure.subplots(len(signals), 1, sharex=True, sharey=True, squeeze=False)[:, 0]
+    for axes, (name, signal) in zip(panels, signals.items(), strict=True):
+        spectrum = torch.stft(signal.float().cpu(), points, points // 4, window=window, return_complex=True)
+        level = 20.0 * torch.log10(spectrum.abs() * 2.0**0.5 / window.sum() + 1e-7) + PASCAL_SPL
+        image = axes.imshow(
+            level.numpy(),
+            origin="lower",
+            aspect="auto",
+            vmin=-20.0,
+            vmax=70.0,
+            extent=(0.0, len(signal) / sample_rate, 0.0, sample_rate / 2000.0),
+        )
+        axes.set(title=name, ylabel="kHz")
+    panels[-1].set(xlabel="s")
+    figure.colorbar(image, ax=list(panels), label="dB SPL in a bin")
+    figure.savefig(path, dpi=110, format="png")

@@ -119,7 +119,7 @@ def gammatone_response(bank: FilterBank, points: int) -> NDArray[np.complex128]:
     radius = np.exp(-2.0 * np.pi * bank.broadening * erb(centre) / RATE)
     cosine = np.cos(2.0 * np.pi * centre / RATE)
 
-    def stage(w: NDArray[np.float64]) -> NDArray[np.complex128]:
+    def stage(w: NDArray[np.floating]) -> NDArray[np.complex128]:
         z = np.exp(-1j * w)
         return (1.0 - radius * cosine * z) / (1.0 - 2.0 * radius * cosine * z + radius**2 * z**2)
 
@@ -132,7 +132,7 @@ def gammatone_response(bank: FilterBank, points: int) -> NDArray[np.complex128]:
     return response
 
 
-def _bessel_highpass(corner: NDArray[np.float64], omega: NDArray[np.float64]) -> NDArray[np.complex128]:
+def _bessel_highpass(corner: NDArray[np.float64], omega: NDArray[np.floating]) -> NDArray[np.complex128]:
     """s^2 / (s^2 + 3 s + 3) of the corner in Hz, by the bilinear transform with the corner kept in place."""
     s = 1j * np.tan(omega / 2.0) / np.tan(np.pi * corner / RATE)
     return s**2 / (s**2 + 3.0 * s + 3.0)

@@ -48,6 +48,8 @@ class MSBG(nn.Module):
         ValueError: a rate, level or audiogram out of range.
     """
 
+    thresholds: Tensor | None
+
     def __init__(
         self,
         audiogram: AudiogramLike | None = None,

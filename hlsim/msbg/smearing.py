@@ -57,7 +57,7 @@ def smearing_from_filters(normal: NDArray[np.float64], wide: NDArray[np.float64]
         stop = min(2 * i - 1, 3 * half)
         mirrored = normal[i, 2 * i - count : max(1, 2 * i - 3 * half) : -1]
         extended[i, count:stop] = mirrored[: stop - count]
-    matrix: NDArray[np.float64] = np.linalg.lstsq(extended, wide, rcond=-1)[0][:count]
+    matrix = np.asarray(np.linalg.lstsq(extended, wide, rcond=-1)[0][:count], dtype=np.float64)
     return matrix
 
 

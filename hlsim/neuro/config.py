@@ -71,4 +71,4 @@ class NeuroConfig:
         names = [field.name for field in fields(cls)]
         if unknown := sorted(set(data) - set(names)):
             raise ValueError(f"unknown network settings {', '.join(unknown)}; allowed: {', '.join(names)}")
-        return cls(**{name: tuple(v) if isinstance(v, list) else v for name, v in data.items()})
+        return cls(**dict(data))
