@@ -1,0 +1,58 @@
+"""The linear stages against pyclarity's filters."""
+
+import numpy as np
+import pytest
+import scipy.signal
+
+from hlsim.fir import frequency_sampling_fir
+from hlsim.msbg.ear import EAR_DELAY, RATE, ear_filter, lowpass_filter
+
+msbg = pytest.importorskip("clarity.evaluator.msbg.msbg")
+msbg_utils = pytest.importorskip("clarity.evaluator.msbg.msbg_utils")
+
+
+@pytest.mark.parametrize("backward", [False, True])
+def test_outer_and_middle_ear_are_pyclaritys(backward: bool) -> None:
+    noise = np.random.default_rng(0).standard_normal(5000)
+    correction = msbg.Ear.get_src_correction("ff")
+    theirs = msbg.Ear.src_to_cochlea_filt(noise, correction, 44100.0, backward)
+    ours = scipy.signal.lfilter(ear_filter(backward), 1.0, noise)
+    np.testing.assert_allclose(ours, theirs, atol=1e-12 * np.abs(theirs).max())
+
+
+@pytest.mark.parametrize("backward", [False, True])
+def test_delay_is_half_the_length(backward: bool) -> None:
+    taps = ear_filter(backward)
+    assert len(taps) == 2 * EAR_DELAY + 1
+    np.testing.assert_allclose(taps, taps[::-1], atol=1e-12 * np.abs(taps).max())
+
+
+def test_there_and_back_is_nothing_but_delay_where_the_filter_is_long_enough() -> None:
+    hz = np.geomspace(150, 5000, 400)
+    both = [scipy.signal.freqz(ear_filter(way), 1.0, hz, fs=RATE)[1] for way in (False, True)]
+    assert np.abs(20 * np.log10(np.abs(both[0] * both[1]))).max() < 0.5
+    # 1 kHz is where the tables are 0 dB
+    at_1_khz = np.abs(scipy.signal.freqz(ear_filter(), 1.0, [1000.0], fs=RATE)[1])
+    assert abs(20 * np.log10(at_1_khz[0])) < 0.1
+
+
+def test_lowpass_is_the_reference() -> None:
+    # as in pyclarity's Ear.process
+    length = 2 * int(np.floor(0.0015 * 44100)) + 1
+    theirs = scipy.signal.firwin(length, 18000 / int(44100 / 2), window=("kaiser", 8))
+    np.testing.assert_allclose(lowpass_filter(), theirs, atol=1e-15)
+
+
+def test_lowpass_is_flat_in_the_band_of_speech_and_shut_at_20_khz() -> None:
+    response = np.abs(scipy.signal.freqz(lowpass_filter(), 1.0, [100, 8000, 15000, 20000], fs=RATE)[1])
+    np.testing.assert_allclose(response[:3], 1.0, atol=1e-3)
+    assert response[3] < 1e-4
+
+
+@pytest.mark.parametrize("taps", [141, 1015])
+def test_frequency_sampling_is_pyclaritys_firwin2(taps: int) -> None:
+    frequencies = np.array([0.0, 0.02, 0.1, 0.101, 0.3, 0.55, 1.0])
+    gains = np.array([0.1, 1.0, 3.0, 2.5, 0.2, 1.7, 0.05])
+    ours = frequency_sampling_fir(taps, frequencies, gains, scipy.signal.windows.kaiser(taps, 4.0))
+    theirs = msbg_utils.firwin2(taps, frequencies.copy(), gains.copy(), window=("kaiser", 4))
+    np.testing.assert_allclose(ours, theirs, atol=1e-14)
