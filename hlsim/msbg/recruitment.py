@@ -64,7 +64,13 @@ def expand(channels: Tensor, envelopes: Tensor, ratios: Tensor) -> Tensor:
     ends = _TAPS // 2
     around = torch.cat((gain[..., -(ends - 1) :], gain, gain[..., :ends]), -1).unfold(-1, _TAPS, 1)
     full = around @ torch.from_numpy(_interpolation_kernel()).to(channels)
-    return (channels * full.flatten(-2)).sum(-2)
+    full = full.flatten(-2)
+    if torch.is_grad_enabled() and (channels.requires_grad or full.requires_grad):
+        return (channels * full).sum(-2)
+    total = torch.zeros_like(channels[..., 0, :])
+    for channel in range(channels.shape[-2]):  # in place, a channel at a time: it stays in the processor's cache
+        total.addcmul_(channels[..., channel, :], full[..., channel, :])
+    return total
 
 
 @lru_cache(maxsize=16)
