@@ -1,0 +1,159 @@
+"""The paper's compensator: Neuro-MSBG's family, with a magnitude path that maps instead of masking."""
+
+import math
+from functools import lru_cache
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from compensators.config import MappingConfig
+from compensators.limiter import soft_limit
+from compensators.nalr import interpolate_gains, nalr_gains_db
+from hlsim.audio import check_rate, check_waveform, resample
+from hlsim.audiogram import FREQUENCIES, AudiogramLike
+from hlsim.calibration import PASCAL_SPL, check_full_scale, gain_to_pascals
+from hlsim.msbg.model import resolve_thresholds
+from hlsim.neuro.audiogram_encoder import AudiogramEncoder
+from hlsim.neuro.blocks import DualPathBlock
+from hlsim.neuro.config import NEURO_RATE
+from hlsim.neuro.decoders import Decoder, PhaseDecoder
+from hlsim.neuro.encoder import DenseEncoder
+
+_TINY = 1e-11
+_NEPER_DB = 20.0 / math.log(10.0)
+
+
+class MappingCompensator(nn.Module):
+    """Waveform and audiogram to what the impaired ear is to be given, time-aligned and limited.
+
+    Log magnitude, phase, encoded audiogram (Equation 1) and the prescribed gain enter as four channels; a dense encoder
+    and dual-path blocks follow; one decoder gives the log magnitude of the output, the other its phase. The log magnitude
+    is the input's plus the prescription ``config.start`` plus the network's correction, which is smooth over frequency
+    and 0 before training. Started from no gain and free at every frequency, training ends below NAL-R: a band that is not
+    heard has almost no gradient.
+
+    The level counts, in pascals, and nothing is normalised. The output is softly limited at ``config.limit_spl``.
+
+    Args:
+        config: sizes and choices.
+        sample_rate: of inputs and outputs in Hz, 16000 to 48000; inside it is 16000, so that only the band under 8 kHz
+            of faster input comes back.
+        full_scale_spl: level in dB SPL of RMS 1.0.
+
+    Raises:
+        ValueError: a rate or level out of range.
+    """
+
+    def __init__(
+        self,
+        config: MappingConfig | None = None,
+        *,
+        sample_rate: int = NEURO_RATE,
+        full_scale_spl: float = PASCAL_SPL,
+    ) -> None:
+        super().__init__()
+        self.config = config = config or MappingConfig()
+        self.sample_rate = check_rate(sample_rate)
+        self.full_scale_spl = check_full_scale(full_scale_spl)
+        self.stft = config.stft
+        size, depth, stride = config.channels, config.dense_depth, config.stride
+        self.audiogram_encoder = AudiogramEncoder(self.stft.frequencies)
+        self.encoder = DenseEncoder(4, size, depth, stride, normalise=False)
+        self.blocks = nn.ModuleList(
+            DualPathBlock(size, config.kernel, config.expansion) for _ in range(config.blocks)
+        )
+        self.magnitude_decoder = Decoder(size, 1, depth, stride, normalise=False, from_zero=True)
+        self.phase_decoder = PhaseDecoder(size, depth, stride, normalise=False, residual=True)
+
+    def forward(self, waveform: Tensor, audiogram: AudiogramLike) -> Tensor:
+        """The compensated waveform.
+
+        Shape: (..., time) and one audiogram or (..., 8) that broadcasts over the leading dimensions -> (..., time).
+
+        Raises:
+            ValueError: levels outside -10 to 100 dB HL, or shapes that do not fit.
+        """
+        check_waveform(waveform)
+        thresholds = resolve_thresholds(None, audiogram, waveform)
+        with torch.autocast(waveform.device.type, enabled=False):
+            dtype = next(self.parameters()).dtype
+            batch = torch.broadcast_shapes(waveform.shape[:-1], thresholds.shape[:-1])
+            signals = waveform.to(dtype).expand(*batch, -1).reshape(-1, waveform.shape[-1])
+            ears = thresholds.to(dtype).expand(*batch, -1).reshape(-1, len(FREQUENCIES))
+            gain = gain_to_pascals(self.full_scale_spl)
+            aided = self._compensate(resample(signals * gain, self.sample_rate, NEURO_RATE), ears)
+            aided = resample(aided, NEURO_RATE, self.sample_rate)[..., : waveform.shape[-1]]
+            # last of all, for resampling can overshoot
+            aided = soft_limit(aided, 10.0 ** ((self.config.limit_spl - PASCAL_SPL) / 20.0)) / gain
+            return aided.reshape(*batch, -1).to(waveform.dtype)
+
+    def start_gains_db(self, thresholds: Tensor) -> Tensor:
+        """Gain before training at the transform's frequencies. Shape: (items, 8) dB HL -> (items, frequencies) dB."""
+        start = self.config.start
+        gains = nalr_gains_db(thresholds) if start == "nalr" else float(start) * thresholds.clamp_min(0.0)
+        return interpolate_gains(gains, self._hz(thresholds))
+
+    def extra_repr(self) -> str:
+        return f"sample_rate={self.sample_rate}, full_scale_spl={self.full_scale_spl:g}, start={self.config.start!r}"
+
+    def _compensate(self, signals: Tensor, ears: Tensor) -> Tensor:
+        """Shape: (items, time) pascals at 16 kHz, (items, 8) -> (items, time)."""
+        spectrum = self.stft.analyse(signals)
+        start = self.start_gains_db(ears) / _NEPER_DB
+        features = self._features(spectrum, ears, start)
+        features = self.encoder(features.contiguous(memory_format=torch.channels_last)).permute(0, 2, 3, 1)
+        for block in self.blocks:
+            features = block(features)
+        features = features.permute(0, 3, 1, 2)
+        size = (spectrum.shape[-2], spectrum.shape[-1])
+        # log magnitude out = log magnitude in + gain, so that silence stays silent and needs no logarithm
+        gain = start.unsqueeze(1) + self._correction(features, size)
+        return self.stft.synthesise(
+            spectrum * self.phase_decoder.phasor(features, size) * gain.exp(), signals.shape[-1]
+        )
+
+    def _correction(self, features: Tensor, size: tuple[int, int]) -> Tensor:
+        """Correction in nepers, smooth over frequency. Shape: (items, channels, ...) -> (items, frames, frequencies)."""
+        into, out_of = (
+            torch.from_numpy(matrix).to(features) for matrix in _bands(self.config.bands, self.config.fft)
+        )
+        levels = self.magnitude_decoder(features, size).squeeze(1) @ into
+        return torch.tanh(levels) @ out_of * (self.config.reach_db / _NEPER_DB)
+
+    def _features(self, spectrum: Tensor, ears: Tensor, start: Tensor) -> Tensor:
+        """The input channels. Shape: (items, frames, frequencies), ... -> (items, 4, frames, frequencies)."""
+        power = spectrum.real.square() + spectrum.imag.square()
+        encoded = self.audiogram_encoder(ears).unsqueeze(1).expand(power.shape)
+        # the sine of the phase, faded out near silence: its gradient stays finite and it has no jump at pi
+        sine = spectrum.imag * (power + 1e-6).rsqrt()
+        return torch.stack(
+            ((power + _TINY).log() / 4.0, sine, encoded, start.unsqueeze(1).expand(power.shape)), 1
+        )
+
+    def _hz(self, like: Tensor) -> Tensor:
+        return (
+            torch.arange(self.stft.frequencies, device=like.device, dtype=like.dtype)
+            * NEURO_RATE
+            / self.config.fft
+        )
+
+
+@lru_cache(maxsize=8)
+def _bands(count: int, fft: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Weights from frequencies to bands, a mean of each, and back, by straight lines between the bands' centres.
+
+    The centres lie evenly on the ERB-number scale of Glasberg and Moore (1990) from 100 Hz to 8 kHz.
+
+    Returns: (frequencies, count) and (count, frequencies).
+    """
+
+    def number(hz: NDArray[np.float64]) -> NDArray[np.float64]:
+        return 21.4 * np.log10(1.0 + 0.00437 * hz)
+
+    places = number(np.arange(fft // 2 + 1) * NEURO_RATE / fft)
+    lowest, highest = number(np.array([100.0, NEURO_RATE / 2.0]))
+    centres = np.linspace(lowest, highest, count)
+    out_of = np.stack([np.interp(places, centres, row) for row in np.eye(count)])
+    return (out_of / out_of.sum(1, keepdims=True).clip(1e-6)).T.copy(), out_of

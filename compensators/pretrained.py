@@ -1,0 +1,40 @@
+"""A name or a folder to a compensator that is ready to use."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from compensators.config import MappingConfig
+from compensators.mapping import MappingCompensator
+from compensators.nalr import NALR
+from hlsim.calibration import PASCAL_SPL
+from hlsim.neuro.config import NEURO_RATE
+from hlsim.pretrained import read_checkpoint
+
+KIND = "mapping-compensator"
+"""What ``config.json`` of a checkpoint of such a compensator calls it."""
+
+
+def load_compensator(
+    name: str | Path, *, sample_rate: int = NEURO_RATE, full_scale_spl: float = PASCAL_SPL
+) -> MappingCompensator | NALR:
+    """A compensator, frozen and in eval mode. Nothing is downloaded.
+
+    Args:
+        name: ``"nalr"``, the prescription; a checkpoint that ships with hlsim; or a checkpoint folder. One that was
+            trained for one ear names it in its ``config.json``, under ``about``, and is meant for no other.
+        sample_rate: of its inputs and outputs in Hz, 16000 to 48000.
+        full_scale_spl: level in dB SPL of RMS 1.0.
+
+    Raises:
+        ValueError: no such checkpoint, one of another kind, or one whose weights are not those that its hash tells.
+    """
+    if name == "nalr":
+        return NALR(sample_rate=sample_rate, full_scale_spl=full_scale_spl).eval()
+
+    def build(config: Mapping[str, Any]) -> MappingCompensator:
+        return MappingCompensator(
+            MappingConfig.from_dict(config), sample_rate=sample_rate, full_scale_spl=full_scale_spl
+        )
+
+    return read_checkpoint(name, KIND, build).eval().requires_grad_(False)

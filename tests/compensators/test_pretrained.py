@@ -1,0 +1,34 @@
+"""Compensators by name and folder."""
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from compensators import NALR, MappingCompensator, MappingConfig, load_compensator
+from hlsim import Audiogram
+from hlsim.pretrained import save_checkpoint
+
+
+def test_saved_and_loaded_is_the_same_to_the_bit(tmp_path: Path) -> None:
+    model = MappingCompensator(MappingConfig(channels=8, blocks=1, start=0.3))
+    torch.nn.init.normal_(model.magnitude_decoder.leave.weight, std=0.1)
+    save_checkpoint(tmp_path / "mine", "mapping-compensator", model, model.config.to_dict(), {})
+    loaded = load_compensator(tmp_path / "mine")
+    assert isinstance(loaded, MappingCompensator) and loaded.config == model.config
+    assert not loaded.training and not any(parameter.requires_grad for parameter in loaded.parameters())
+    waveform, ear = 0.05 * torch.randn(2, 4000), Audiogram.standard("N4")
+    assert torch.equal(loaded(waveform, ear), model.eval()(waveform, ear))
+
+
+def test_nalr_by_name() -> None:
+    nalr = load_compensator("nalr", sample_rate=44100)
+    assert isinstance(nalr, NALR) and nalr.sample_rate == 44100 and not nalr.training
+
+
+def test_unknown_name_and_other_kind(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="no checkpoint 'nobody'"):
+        load_compensator("nobody")
+    save_checkpoint(tmp_path / "other", "neuro-msbg", torch.nn.Linear(2, 2), {}, {})
+    with pytest.raises(ValueError, match="'neuro-msbg'; needed here: 'mapping-compensator'"):
+        load_compensator(tmp_path / "other")
