@@ -175,7 +175,8 @@ def run(
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
     with warnings.catch_warnings():
         warnings.filterwarnings(
-            "ignore", ".*(does not have many workers|Checkpoint directory|GPU available|mid-epoch).*"
+            "ignore",
+            ".*(does not have many workers|Checkpoint directory|GPU available|before the epoch ended).*",
         )
         trainer = L.Trainer(
             accelerator=accelerator,

@@ -1,0 +1,271 @@
+"""Training a compensator through ``HearingLossLoss``, for one ear or for all."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from compensators.config import MappingConfig
+from compensators.mapping import MappingCompensator
+from compensators.pretrained import KIND
+from hlsim.audiogram import Audiogram, draw_thresholds, read_audiograms
+from hlsim.calibration import set_level
+from hlsim.data.clips import Clips
+from hlsim.data.variation import mix
+from hlsim.loss import HearingLossLoss
+from hlsim.neuro.config import NEURO_RATE
+from hlsim.pretrained import save_checkpoint
+from hlsim.training.loop import TimedModule, run
+
+CRITERIA = ("bands", "paper")
+
+
+@dataclass(frozen=True)
+class CompensatorRecipe:
+    """What a training of a compensator is made of; a YAML file holds the same names.
+
+    Attributes:
+        model: settings of ``MappingConfig``.
+        batch: clips a step.
+        seconds: length of a clip.
+        learning_rate: of AdamW at its highest.
+        weights: of ``HearingLossLoss``'s criteria: ``bands`` (dB) and ``paper``.
+        reference: what the paper's criterion compares with, ``clean`` or ``normal-hearing``.
+        levels: lowest and highest level of the speech in dB SPL.
+        noisy: share of noisy clips, where there is noise.
+        snr: lowest and highest signal-to-noise ratio in dB.
+        validate_every: steps.
+        validation_items: how many.
+        seed: of every random draw.
+    """
+
+    model: dict[str, Any] = field(default_factory=dict)
+    batch: int = 3
+    seconds: float = 0.8
+    learning_rate: float = 2e-3
+    weights: dict[str, float] = field(default_factory=lambda: {"bands": 1.0})
+    reference: str = "clean"
+    levels: tuple[float, float] = (50.0, 80.0)
+    noisy: float = 0.5
+    snr: tuple[float, float] = (0.0, 20.0)
+    validate_every: int = 50
+    validation_items: int = 8
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name in ("levels", "snr"):
+            pair = tuple(getattr(self, name))
+            if len(pair) != 2 or pair[0] > pair[1]:
+                raise ValueError(f"{name} {pair} in the recipe; allowed: a lowest and a highest, in dB")
+            object.__setattr__(self, name, pair)
+        counts = (self.batch, self.validate_every, self.validation_items)
+        if min(counts) < 1 or self.seconds <= 0.0 or not 0.0 <= self.noisy <= 1.0:
+            raise ValueError(
+                f"batch {self.batch}, validate_every {self.validate_every}, validation_items {self.validation_items}, "
+                f"seconds {self.seconds}, noisy {self.noisy} in the recipe; allowed: counts from 1 up, seconds above 0, "
+                "noisy 0 to 1"
+            )
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> CompensatorRecipe:
+        """Raises ValueError where a name is unknown."""
+        names = [entry.name for entry in fields(cls)]
+        if unknown := sorted(set(data) - set(names)):
+            raise ValueError(
+                f"unknown settings {', '.join(unknown)} in the recipe; allowed: {', '.join(names)}"
+            )
+        if unknown := sorted(set(data.get("weights", {})) - set(CRITERIA)):
+            raise ValueError(
+                f"unknown criteria {', '.join(unknown)} in the recipe; allowed: {', '.join(CRITERIA)}"
+            )
+        return cls(**data)
+
+
+@dataclass(frozen=True)
+class CompensatorData:
+    """Folders and files to train and validate on. Speech is all that is needed, a folder or a list of files.
+
+    Without ``valid_speech`` validation is on the training speech, and says nothing of other speakers. The audiograms are
+    for a general compensator, and join the drawn ears.
+    """
+
+    speech: Path | Sequence[Path]
+    noise: Path | None = None
+    audiograms: Path | None = None
+    valid_speech: Path | Sequence[Path] | None = None
+    valid_noise: Path | None = None
+    valid_audiograms: Path | None = None
+
+
+class CompensatorTraining(TimedModule):
+    """Draws speech, noise, levels and ears, and hears the compensator's output through the frozen simulator.
+
+    Args:
+        audiogram: the ear of a personal compensator; None trains a general one on drawn ears.
+        simulator: as ``HearingLossLoss`` takes it.
+    """
+
+    def __init__(
+        self,
+        recipe: CompensatorRecipe,
+        data: CompensatorData,
+        max_minutes: float,
+        *,
+        audiogram: Audiogram | None = None,
+        simulator: str | Path | torch.nn.Module = "neuro-msbg",
+    ) -> None:
+        super().__init__(recipe.learning_rate, max_minutes, recipe.seed)
+        torch.manual_seed(recipe.seed)
+        self.recipe = recipe
+        self.compensator = MappingCompensator(MappingConfig.from_dict(recipe.model))
+        self.criteria = torch.nn.ModuleDict()
+        for name, weight in recipe.weights.items():
+            if weight > 0.0:
+                loss = HearingLossLoss(simulator=simulator, reference=recipe.reference, criterion=name)
+                simulator = loss.simulator  # the next criterion shares it
+                self.criteria[name] = loss
+        if not self.criteria:
+            raise ValueError(f"criteria {recipe.weights} in the recipe; allowed: one or more above 0")
+        self.ear = None if audiogram is None else torch.tensor(audiogram.thresholds)
+        self.training_items = Items(recipe, data.speech, data.noise, data.audiograms, recipe.seconds)
+        valid = Items(
+            recipe,
+            data.valid_speech or data.speech,
+            data.valid_noise or data.noise,
+            data.valid_audiograms or data.audiograms,
+            seconds=2.0,
+        )
+        generator = torch.Generator().manual_seed(2_000 + recipe.seed)
+        self.valid = [valid.draw(4, generator, self.ear) for _ in range(0, recipe.validation_items, 4)]
+
+    def training_loss(self, generator: torch.Generator) -> Tensor:
+        return self._loss(*self.training_items.draw(self.recipe.batch, generator, self.ear))
+
+    def validate(self) -> dict[str, float]:
+        """Mean of the loss over the validation items."""
+        with torch.no_grad():
+            losses = [float(self._loss(*batch)) for batch in self.valid]
+        mean = sum(losses) / len(losses)
+        return {"score": -mean, "valid_loss": mean}
+
+    def trained_parameters(self) -> list[torch.nn.Parameter]:
+        return list(self.compensator.parameters())
+
+    def _loss(self, speech: Tensor, clean: Tensor, ears: Tensor) -> Tensor:
+        speech, clean, ears = (tensor.to(self.device) for tensor in (speech, clean, ears))
+        aided = self.compensator(speech, ears)
+        parts = [
+            self.recipe.weights[name] * criterion(aided, clean, ears)
+            for name, criterion in self.criteria.items()
+        ]
+        return torch.stack(parts).sum()
+
+
+class Items:
+    """Random speech, clean or noisy, and the ears that it is for."""
+
+    def __init__(
+        self,
+        recipe: CompensatorRecipe,
+        speech: Path | Sequence[Path],
+        noise: Path | None,
+        audiograms: Path | None,
+        seconds: float,
+    ) -> None:
+        self.recipe = recipe
+        self.speech = Clips(speech, sample_rate=NEURO_RATE, seconds=seconds)
+        self.noise = Clips(noise, sample_rate=NEURO_RATE, seconds=seconds, repeat=True) if noise else None
+        self.ears = (
+            torch.tensor([ear.thresholds for _, ear in read_audiograms(audiograms)]) if audiograms else None
+        )
+
+    def draw(
+        self, count: int, generator: torch.Generator, ear: Tensor | None
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """The compensator's input, the same without its noise, and the ears: ``ear`` or drawn ones.
+
+        Shape: -> (count, time) in pascals twice, (count, 8) dB HL.
+        """
+
+        def uniform(low: float, high: float) -> Tensor:
+            return low + (high - low) * torch.rand(count, generator=generator)
+
+        clean = set_level(self.speech.draw(count, generator), uniform(*self.recipe.levels))
+        speech = clean
+        if self.noise is not None:
+            noisy = mix(clean, self.noise.draw(count, generator), uniform(*self.recipe.snr))
+            speech = torch.where((uniform(0.0, 1.0) < self.recipe.noisy).unsqueeze(-1), noisy, clean)
+        if ear is not None:
+            return speech, clean, ear.expand(count, -1)
+        ears = draw_thresholds(count, generator)
+        if self.ears is not None:
+            measured = self.ears[torch.randint(len(self.ears), (count,), generator=generator)]
+            ears = torch.where((uniform(0.0, 1.0) < 0.5).unsqueeze(-1), measured.clamp(-10.0, 100.0), ears)
+        return speech, clean, ears
+
+
+def train_compensator(
+    data: CompensatorData,
+    recipe: CompensatorRecipe,
+    *,
+    out: str | Path,
+    audiogram: Audiogram | None = None,
+    simulator: str | Path | torch.nn.Module = "neuro-msbg",
+    max_minutes: float,
+    max_steps: int = -1,
+    accelerator: str = "auto",
+    report: Callable[[str], None] = print,
+    progress: bool = True,
+) -> Path:
+    """Train, resume, and keep the best checkpoint.
+
+    Args:
+        audiogram: the ear of a personal compensator; None trains a general one on drawn ears.
+        simulator: ``"neuro-msbg"``, another checkpoint's name or folder, ``"msbg"``, or a module.
+
+    Returns: the folder that ``load_compensator`` takes, ``out/checkpoint``.
+
+    Raises:
+        ValueError: data, recipe or simulator that cannot be used; the message names them.
+    """
+    module = CompensatorTraining(recipe, data, max_minutes, audiogram=audiogram, simulator=simulator)
+    folder = Path(out) / "checkpoint"
+    start = module.validate()["valid_loss"]
+    report(f"start: valid_loss {start:.3f}")
+    trained = {
+        "audiogram": audiogram.to_dict() if audiogram else None,
+        "simulator": type(simulator).__name__ if isinstance(simulator, torch.nn.Module) else str(simulator),
+    }
+
+    def write(figures: dict[str, Any]) -> None:
+        from hlsim import __version__
+
+        about = {
+            "hlsim": __version__,
+            "recipe": asdict(recipe),
+            **trained,
+            "start_valid_loss": start,
+            **figures,
+        }
+        save_checkpoint(folder, KIND, module.compensator, module.compensator.config.to_dict(), about)
+
+    run(
+        module,
+        out=out,
+        recipe=asdict(recipe)
+        | {"max_minutes": max_minutes}
+        | {name: str(path) for name, path in asdict(data).items()}
+        | trained,
+        write=write,
+        validate_every=recipe.validate_every,
+        max_steps=max_steps,
+        accelerator=accelerator,
+        report=report,
+        progress=progress,
+    )
+    return folder

@@ -1,0 +1,136 @@
+"""Training a compensator: it learns, it goes on where it was stopped, and it says what it cannot use."""
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+from compensators import MappingCompensator, load_compensator
+from hlsim import Audiogram
+from hlsim.pretrained import CONFIG
+from hlsim.training.compensator import (
+    CompensatorData,
+    CompensatorRecipe,
+    CompensatorTraining,
+    train_compensator,
+)
+
+SMALL = {
+    "model": {"channels": 8, "blocks": 1, "stride": [4, 3]},
+    "batch": 2,
+    "seconds": 0.4,
+    "validate_every": 10,
+    "validation_items": 4,
+}
+EVER = 1e6  # minutes, so that the learning rate does not fall within a test
+
+
+@pytest.fixture
+def data(speech_dir: Path) -> CompensatorData:
+    return CompensatorData(speech_dir / "train", valid_speech=speech_dir / "valid")
+
+
+def train(data: CompensatorData, out: Path, **options: object) -> tuple[Path, list[str]]:
+    """A few steps through the exact MSBG."""
+    lines: list[str] = []
+    settings = {"max_minutes": EVER, "simulator": "msbg", "accelerator": "cpu", "progress": False} | options
+    recipe = CompensatorRecipe.from_dict(SMALL | settings.pop("recipe", {}))  # type: ignore[operator]
+    folder = train_compensator(data, recipe, out=out, report=lines.append, **settings)  # type: ignore[arg-type]
+    return folder, lines
+
+
+def test_twenty_steps_lower_the_loss(data: CompensatorData, tmp_path: Path) -> None:
+    ear = Audiogram.standard("N3")
+    folder, lines = train(data, tmp_path, audiogram=ear, max_steps=20, recipe={"learning_rate": 1e-2})
+    about = json.loads((folder / CONFIG).read_text())["about"]
+    assert lines[0].startswith("start: valid_loss")
+    assert about["validation"]["valid_loss"] < 0.8 * about["start_valid_loss"]
+    assert about["audiogram"] == ear.to_dict() and about["simulator"] == "msbg"
+
+    module = CompensatorTraining(
+        CompensatorRecipe.from_dict(SMALL), data, EVER, audiogram=ear, simulator="msbg"
+    )
+    assert module.validate()["valid_loss"] == pytest.approx(about["start_valid_loss"])
+    loaded = load_compensator(folder)
+    assert isinstance(loaded, MappingCompensator)
+    module.compensator = loaded
+    assert module.validate()["valid_loss"] == pytest.approx(about["validation"]["valid_loss"])
+
+
+def test_goes_on_where_it_was_stopped(data: CompensatorData, tmp_path: Path) -> None:
+    options = {"recipe": {"validate_every": 2, "seconds": 0.2}}
+    whole, _ = train(data, tmp_path / "whole", max_steps=6, **options)
+
+    def stop(line: str) -> None:
+        if line.startswith("step 4"):
+            raise KeyboardInterrupt
+
+    recipe = CompensatorRecipe.from_dict(SMALL | options["recipe"])
+    with pytest.raises((KeyboardInterrupt, SystemExit)):
+        train_compensator(
+            data,
+            recipe,
+            out=tmp_path / "stopped",
+            simulator="msbg",
+            max_minutes=EVER,
+            accelerator="cpu",
+            report=stop,
+            progress=False,
+        )
+    assert (tmp_path / "stopped" / "last.ckpt").is_file()
+    resumed, lines = train(data, tmp_path / "stopped", max_steps=6, **options)
+    assert not any(line.startswith("step 2") for line in lines) and any("step 6" in line for line in lines)
+    first, second = (
+        torch.load(tmp_path / name / "last.ckpt", weights_only=True)["state_dict"]
+        for name in ("whole", "stopped")
+    )
+    assert set(first) == set(second)
+    for name, values in first.items():
+        torch.testing.assert_close(second[name], values, rtol=1e-5, atol=1e-7)
+    assert whole.name == resumed.name == "checkpoint"
+
+
+def test_another_recipe_does_not_go_on(data: CompensatorData, tmp_path: Path) -> None:
+    options = {"recipe": {"seconds": 0.2}, "max_steps": 1}
+    train(data, tmp_path, audiogram=Audiogram.standard("N3"), **options)
+    with pytest.raises(ValueError, match="another recipe"):
+        train(data, tmp_path, audiogram=Audiogram.standard("N4"), **options)
+
+
+def test_general_one_draws_ears_and_noise(data: CompensatorData, tmp_path: Path) -> None:
+    rows = ["name," + ",".join(f"hl_{hz}" for hz in (250, 500, 1000, 2000, 3000, 4000, 6000, 8000))]
+    rows += [f"ear{i}," + ",".join(str(60 + i) for _ in range(8)) for i in range(3)]
+    ears = tmp_path / "ears.csv"
+    ears.write_text("\n".join(rows) + "\n")
+    noise = data.speech
+    module = CompensatorTraining(
+        CompensatorRecipe.from_dict(SMALL | {"weights": {"bands": 1.0, "paper": 0.5}}),
+        CompensatorData(data.speech, noise=noise, audiograms=ears),
+        EVER,
+        simulator="msbg",
+    )
+    speech, clean, drawn = module.training_items.draw(64, torch.Generator().manual_seed(0), None)
+    noisy = (speech != clean).any(-1).float().mean()
+    measured = (drawn.std(-1) < 1e-6).float().mean()
+    assert 0.25 < noisy < 0.75 and 0.25 < measured < 0.75 and len(drawn.unique(dim=0)) > 20
+    loss = module.training_loss(torch.Generator().manual_seed(0))
+    loss.backward()
+    assert all(p.grad is not None and bool(p.grad.isfinite().all()) for p in module.trained_parameters())
+    assert all(name.startswith("compensator.") for name in module.state_dict())
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"lr": 0.1}, "unknown settings lr"),
+        ({"weights": {"haspi": 1.0}}, "unknown criteria haspi"),
+        ({"levels": [80.0, 50.0]}, "a lowest and a highest"),
+        ({"batch": 0}, "counts from 1 up"),
+        ({"weights": {"bands": 0.0}}, "above 0"),
+        ({"model": {"layers": 2}}, "unknown compensator settings layers"),
+    ],
+)
+def test_bad_recipes(data: CompensatorData, settings: dict[str, object], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        CompensatorTraining(CompensatorRecipe.from_dict(settings), data, EVER, simulator="msbg")
