@@ -1,7 +1,7 @@
 """Loudness recruitment: each channel is expanded by a gain that follows its envelope.
 
 The envelope is low-passed at 75 Hz or less, so that it and the gain are computed at a sixteenth of the rate and the gain
-is interpolated.
+is interpolated, or, where the envelope is near zero, the envelope.
 """
 
 from functools import lru_cache
@@ -28,6 +28,7 @@ _LOWEST_ENVELOPE = 1e-9 * 10.0 ** ((120.0 - PASCAL_SPL) / 20.0)
 _HIGHEST_ENVELOPE = 10.0 ** ((CATCH_UP_SPL - PASCAL_SPL) / 20.0)
 _BOXES = 3  # three running means of 16 samples put zeros of third order where decimation would alias to 0 Hz
 _TAPS = 6
+_SLIGHT = 1.3  # expansion ratio at 24 dB HL
 
 
 def expansion_ratios(thresholds: Tensor, bank: FilterBank) -> Tensor:
@@ -59,18 +60,39 @@ def expand(channels: Tensor, envelopes: Tensor, ratios: Tensor) -> Tensor:
 
     Shape: (..., channels, time), (..., channels, time // 16), (..., channels) -> (..., time).
     """
-    level = envelopes.clamp(_LOWEST_ENVELOPE, _HIGHEST_ENVELOPE).div(_HIGHEST_ENVELOPE).log()
-    gain = (level * (ratios - 1.0).unsqueeze(-1)).exp()
-    ends = _TAPS // 2
-    around = torch.cat((gain[..., -(ends - 1) :], gain, gain[..., :ends]), -1).unfold(-1, _TAPS, 1)
-    full = around @ torch.from_numpy(_interpolation_kernel()).to(channels)
-    full = full.flatten(-2)
+    kernel = torch.from_numpy(_interpolation_kernel()).to(channels)
+    gain = _around(_gain(envelopes, ratios.unsqueeze(-1))) @ kernel
+    # The low-pass overshoots, and where the envelope goes through zero the gain has kinks. A small loss does not bury
+    # them, and the way out of the ear lifts their upper end by 40 dB, so that there the envelope is interpolated instead.
+    slight = (ratios != 1.0) & (ratios < _SLIGHT)
+    if bool(slight.any()):
+        floored = envelopes.detach().clamp_min(_LOWEST_ENVELOPE)
+        low = torch.minimum(floored, floored.roll(-1, -1))
+        high = torch.maximum(floored, floored.roll(-1, -1))
+        steep = low < 0.3 * torch.maximum(high.roll(1, -1), high.roll(-1, -1))
+        steep = steep & slight.unsqueeze(-1)
+        own = ratios.unsqueeze(-1).expand(steep.shape)[steep].unsqueeze(-1)
+        gain = gain.index_put((steep,), _gain(_around(envelopes)[steep] @ kernel, own))
+    full = gain.flatten(-2)
     if torch.is_grad_enabled() and (channels.requires_grad or full.requires_grad):
         return (channels * full).sum(-2)
     total = torch.zeros_like(channels[..., 0, :])
-    for channel in range(channels.shape[-2]):  # in place, a channel at a time: it stays in the processor's cache
+    for channel in range(
+        channels.shape[-2]
+    ):  # in place, a channel at a time: it stays in the processor's cache
         total.addcmul_(channels[..., channel, :], full[..., channel, :])
     return total
+
+
+def _gain(envelopes: Tensor, ratios: Tensor) -> Tensor:
+    level = envelopes.clamp(_LOWEST_ENVELOPE, _HIGHEST_ENVELOPE).div(_HIGHEST_ENVELOPE).log()
+    return (level * (ratios - 1.0)).exp()
+
+
+def _around(values: Tensor) -> Tensor:
+    """The six values about each step. Shape: (..., steps) -> (..., steps, 6)."""
+    ends = _TAPS // 2
+    return torch.cat((values[..., -(ends - 1) :], values, values[..., :ends]), -1).unfold(-1, _TAPS, 1)
 
 
 @lru_cache(maxsize=16)
