@@ -71,7 +71,7 @@ def test_channels_have_unit_gain_at_their_frequency_and_the_sum_is_what_the_tabl
         for channel, hz in zip(response, bank.centre_frequencies, strict=True):
             assert np.interp(hz, np.arange(len(channel)), np.abs(channel)) == pytest.approx(1.0, abs=1e-3)
         level = 20 * np.log10(np.abs(response.sum(0)[300:8000])) - bank.recombination_db
-        assert abs(level.mean()) < 0.5 and np.abs(level).max() < 2.0
+        assert abs(level.mean()) < 0.5 and np.abs(level).max() < 3.0
 
 
 def test_none_and_mild_share_a_bank_and_the_others_do_not() -> None:
