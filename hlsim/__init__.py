@@ -1,10 +1,11 @@
 """Hear through an impaired ear, and backpropagate through it."""
 
 from hlsim.audiogram import Audiogram
+from hlsim.loss import HearingLossLoss
 from hlsim.msbg import MSBG
 from hlsim.neuro import NeuroMSBG
 from hlsim.pretrained import load_pretrained
 
 __version__ = "0.1.0"
 
-__all__ = ["MSBG", "Audiogram", "NeuroMSBG", "load_pretrained"]
+__all__ = ["MSBG", "Audiogram", "HearingLossLoss", "NeuroMSBG", "load_pretrained"]

@@ -1,0 +1,193 @@
+"""A training loss that hears through an impaired ear."""
+
+import math
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+
+from hlsim import criteria
+from hlsim.audio import check_rate, check_waveform, resample
+from hlsim.audiogram import FREQUENCIES, AudiogramLike, as_thresholds
+from hlsim.band_levels import HIGHEST, band_level_loss
+from hlsim.calibration import PASCAL_SPL, check_full_scale, gain_to_pascals
+from hlsim.msbg import MSBG
+from hlsim.neuro import NeuroMSBG
+from hlsim.neuro.config import NEURO_RATE
+from hlsim.pretrained import load_pretrained
+
+CRITERIA: dict[str, Mapping[str, float]] = {"paper": criteria.DEFAULT_WEIGHTS, "bands": {"band_levels": 1.0}}
+"""Criteria by name: their parts and the default weight of each."""
+
+REFERENCES = ("clean", "normal-hearing")
+
+
+class HearingLossLoss(nn.Module):
+    """How far what an impaired ear hears of compensated speech is from the clean speech.
+
+    The simulator is frozen: it stays in eval mode, has no trainable parameter, and is not registered, so that neither the
+    parameters nor the checkpoint of a module that holds this loss know of it. It moves with ``.to()`` all the same, and
+    gradients pass through it to the compensated speech.
+
+    Levels matter, nothing is normalised: 65 dB SPL is RMS 0.035 at the default ``full_scale_spl``.
+
+    Args:
+        audiogram: the ear or ears; may be given with each call instead.
+        simulator: ``"neuro-msbg"`` or another checkpoint's name or folder; ``"msbg"``, the exact model; or a module
+            called as they are, which is frozen as it stands (give a copy of one that still trains).
+        sample_rate: of the speech in Hz, 16000 to 48000. Neuro-MSBG judges the band under 7.5 kHz at any of them.
+        full_scale_spl: level in dB SPL of RMS 1.0.
+        reference: what is heard is compared with ``"clean"``, the clean speech itself, or ``"normal-hearing"``, what the
+            same simulator makes of it at 0 dB HL.
+        criterion: ``"paper"``, magnitude, phase, complex and time losses (Equations 2 to 9), or ``"bands"``, levels in
+            ERB-wide bands, always against what a normal ear hears.
+        weights: of the parts by name; a part left out does not count.
+
+    Raises:
+        ValueError: an unknown name, a value out of range, or a simulator made for another rate or level.
+    """
+
+    def __init__(
+        self,
+        audiogram: AudiogramLike | None = None,
+        *,
+        simulator: str | Path | nn.Module = "neuro-msbg",
+        sample_rate: int = NEURO_RATE,
+        full_scale_spl: float = PASCAL_SPL,
+        reference: str = "clean",
+        criterion: str = "paper",
+        weights: Mapping[str, float] | None = None,
+    ) -> None:
+        super().__init__()
+        self.sample_rate = check_rate(sample_rate)
+        self.full_scale_spl = check_full_scale(full_scale_spl)
+        if reference not in REFERENCES:
+            raise ValueError(f"reference is {reference!r}; allowed: {', '.join(REFERENCES)}")
+        if criterion not in CRITERIA:
+            raise ValueError(f"criterion is {criterion!r}; allowed: {', '.join(CRITERIA)}")
+        self.reference, self.criterion = reference, criterion
+        self.weights = _check_weights(CRITERIA[criterion] if weights is None else weights, criterion)
+        self.thresholds = None if audiogram is None else as_thresholds(audiogram).detach()
+        built = _build(simulator, self.sample_rate, self.full_scale_spl)
+        self._unregistered = (built.eval().requires_grad_(False),)  # in a tuple, nn.Module does not see it
+
+    @property
+    def simulator(self) -> nn.Module:
+        """The simulator, frozen."""
+        return self._unregistered[0]
+
+    @torch.compiler.disable  # a compiled caller calls it as it is
+    def forward(self, compensated: Tensor, clean: Tensor, audiogram: AudiogramLike | None = None) -> Tensor:
+        """The loss: mean over the items.
+
+        Shape: (..., time) twice, and one audiogram or (..., 8) that broadcasts over the leading dimensions -> ().
+
+        Raises:
+            ValueError: shapes that do not fit, no audiogram, or levels outside -10 to 100 dB HL.
+        """
+        return criteria.weighted_sum(self.parts(compensated, clean, audiogram), self.weights)
+
+    @torch.compiler.disable
+    def parts(
+        self, compensated: Tensor, clean: Tensor, audiogram: AudiogramLike | None = None
+    ) -> dict[str, Tensor]:
+        """The parts of the loss by name, before their weights: magnitude, phase, complex and time, or band_levels (dB).
+
+        Shape and errors: as ``forward``.
+        """
+        check_waveform(compensated, "compensated")
+        check_waveform(clean, "clean")
+        if compensated.shape != clean.shape:
+            raise ValueError(
+                f"compensated has shape {tuple(compensated.shape)}, clean {tuple(clean.shape)}; allowed: the same shape"
+            )
+        ears = self.thresholds if audiogram is None else as_thresholds(audiogram)
+        if ears is None:
+            raise ValueError("no audiogram: give one when building the loss or with the call")
+        with torch.autocast(compensated.device.type, enabled=False):
+            dtype = torch.promote_types(torch.promote_types(compensated.dtype, clean.dtype), torch.float32)
+            heard = self._hear(compensated.to(dtype), ears.to(compensated.device))
+            aim = self._aim(clean.to(dtype)).expand_as(heard)
+            gain, time = gain_to_pascals(self.full_scale_spl), heard.shape[-1]
+            heard, aim = heard.reshape(-1, time) * gain, aim.reshape(-1, time) * gain
+            if self.criterion == "bands":
+                items = {"band_levels": band_level_loss(heard, aim, self.sample_rate)}
+            else:
+                stft = criteria.paper_stft(self.sample_rate)
+                items = criteria.paper_parts(heard, aim, stft, self._frequencies(stft.fft))
+        return {name: part.mean() for name, part in items.items()}
+
+    def extra_repr(self) -> str:
+        return (
+            f"simulator={type(self.simulator).__name__}, sample_rate={self.sample_rate}, "
+            f"full_scale_spl={self.full_scale_spl:g}, reference={self.reference!r}, criterion={self.criterion!r}"
+        )
+
+    def _hear(self, waveform: Tensor, thresholds: Tensor) -> Tensor:
+        heard: Tensor = self.simulator(waveform, thresholds)
+        if heard.shape[-1] != waveform.shape[-1]:
+            raise ValueError(
+                f"the simulator made {heard.shape[-1]} samples of {waveform.shape[-1]}; allowed: one that keeps the "
+                "length, as MSBG(aligned=True)"
+            )
+        return heard
+
+    def _aim(self, clean: Tensor) -> Tensor:
+        """What the heard is compared with."""
+        if self.reference == "normal-hearing" or self.criterion == "bands":
+            with torch.set_grad_enabled(torch.is_grad_enabled() and clean.requires_grad):
+                return self._hear(clean, clean.new_zeros(len(FREQUENCIES)))
+        if self._narrow:  # the same band as what is heard
+            return resample(resample(clean, self.sample_rate, NEURO_RATE), NEURO_RATE, self.sample_rate)[
+                ..., : clean.shape[-1]
+            ]
+        return clean
+
+    @property
+    def _narrow(self) -> bool:
+        """Whether the simulator leaves part of the band out."""
+        return isinstance(self.simulator, NeuroMSBG) and self.sample_rate > NEURO_RATE
+
+    def _frequencies(self, fft: int) -> int | None:
+        """Number of the transform's frequencies to compare: those that the simulator gives back."""
+        return int(HIGHEST * fft / self.sample_rate) + 1 if self._narrow else None
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> "HearingLossLoss":
+        super()._apply(fn, recurse)
+        self.simulator._apply(lambda tensor: _moved(fn, tensor))
+        if self.thresholds is not None:
+            self.thresholds = _moved(fn, self.thresholds)
+        return self
+
+
+def _moved(fn: Callable[[Tensor], Tensor], tensor: Tensor) -> Tensor:
+    """Move a tensor of the simulator with its host, but never to half precision, which it does not work in."""
+    moved = fn(tensor)
+    halved = moved.is_floating_point() and moved.dtype not in (torch.float32, torch.float64)
+    return tensor.to(moved.device) if halved else moved
+
+
+def _build(simulator: str | Path | nn.Module, sample_rate: int, full_scale_spl: float) -> nn.Module:
+    if isinstance(simulator, nn.Module):
+        for name, own in (("sample_rate", sample_rate), ("full_scale_spl", full_scale_spl)):
+            if getattr(simulator, name, own) != own:
+                raise ValueError(
+                    f"the simulator has {name} {getattr(simulator, name):g} and the loss {own:g}; allowed: the same"
+                )
+        return simulator
+    if simulator == "msbg":
+        return MSBG(sample_rate=sample_rate, full_scale_spl=full_scale_spl)
+    return load_pretrained(simulator, sample_rate=sample_rate, full_scale_spl=full_scale_spl)
+
+
+def _check_weights(weights: Mapping[str, float], criterion: str) -> dict[str, float]:
+    allowed = CRITERIA[criterion]
+    if unknown := sorted(set(weights) - set(allowed)):
+        raise ValueError(
+            f"unknown weights {', '.join(unknown)} for criterion {criterion!r}; allowed: {', '.join(allowed)}"
+        )
+    checked = {name: float(weight) for name, weight in weights.items()}
+    if not all(math.isfinite(weight) and weight >= 0.0 for weight in checked.values()):
+        raise ValueError(f"weights {checked}; allowed: finite numbers, 0 or more")
+    return checked
