@@ -1,0 +1,189 @@
+"""The program: what it writes, and that bad input ends with status 2, one line and nothing half-written."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import soundfile
+import torch
+from hlsim import MSBG, Audiogram
+from hlsim.cli import main
+
+
+@pytest.fixture
+def utterance(speech_dir: Path) -> Path:
+    return sorted(speech_dir.glob("valid/*.flac"))[0]
+
+
+def fails(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
+    """The one line of a failing call."""
+    assert main([str(argument) for argument in arguments]) == 2
+    error = capsys.readouterr().err.strip()
+    assert len(error.splitlines()) == 1 and error.startswith("hlsim: error: ")
+    return error
+
+
+@pytest.mark.parametrize("simulator", ["msbg", "neuro-msbg"])
+@pytest.mark.parametrize(("rate", "channels"), [(16000, 1), (44100, 2), (96000, 1)])
+def test_simulate_keeps_rate_channels_and_length(
+    tmp_path: Path, simulator: str, rate: int, channels: int
+) -> None:
+    samples = np.random.default_rng(0).standard_normal((rate // 2, channels)) * 0.02
+    soundfile.write(tmp_path / "in.wav", samples, rate, subtype="FLOAT")
+    arguments = ["simulate", str(tmp_path / "in.wav"), str(tmp_path / "out.wav")]
+    assert main([*arguments, "--audiogram", "N3", "--simulator", simulator]) == 0
+    heard, heard_rate = soundfile.read(tmp_path / "out.wav", always_2d=True)
+    assert (heard_rate, heard.shape) == (rate, samples.shape)
+    assert 0 < np.std(heard) < np.std(samples)
+
+
+def test_simulate_is_the_model(tmp_path: Path, utterance: Path) -> None:
+    out = tmp_path / "out.wav"
+    levels = "30,35,40,50,55,60,65,70"
+    options = ["--audiogram", levels, "--simulator", "msbg", "--full-scale-spl", "100"]
+    assert main(["simulate", str(utterance), str(out), *options]) == 0
+    samples, rate = soundfile.read(utterance, dtype="float32")
+    ear = Audiogram(tuple(map(float, levels.split(","))))
+    expected = MSBG(ear, sample_rate=rate, full_scale_spl=100.0)(torch.from_numpy(samples))
+    heard, _ = soundfile.read(out, dtype="float32")
+    np.testing.assert_allclose(heard, expected.numpy(), atol=1e-7)
+
+
+def _bad_files(folder: Path) -> dict[str, tuple[Path, str]]:
+    tone = np.sin(np.arange(8000) / 10.0) * 0.1
+    soundfile.write(folder / "slow.wav", tone, 8000)
+    soundfile.write(folder / "empty.wav", np.zeros(0), 16000)
+    soundfile.write(folder / "silent.wav", np.zeros(8000), 16000)
+    soundfile.write(folder / "nan.wav", np.append(tone, np.nan), 16000, subtype="FLOAT")
+    (folder / "broken.wav").write_text("this is no audio")
+    return {
+        "missing": (folder / "missing.wav", "no such file"),
+        "broken": (folder / "broken.wav", "not readable as audio"),
+        "empty": (folder / "empty.wav", "empty"),
+        "silent": (folder / "silent.wav", "silent"),
+        "nan": (folder / "nan.wav", "NaN"),
+        "slow": (folder / "slow.wav", "16000 to 48000"),
+    }
+
+
+@pytest.mark.parametrize("kind", ["missing", "broken", "empty", "silent", "nan", "slow"])
+def test_bad_audio(tmp_path: Path, capsys: pytest.CaptureFixture[str], kind: str) -> None:
+    path, reason = _bad_files(tmp_path)[kind]
+    before = set(tmp_path.iterdir())
+    error = fails(capsys, "simulate", path, tmp_path / "out.wav", "--audiogram", "N3")
+    assert str(path) in error and reason in error
+    assert set(tmp_path.iterdir()) == before
+
+
+@pytest.mark.parametrize(
+    ("audiogram", "reason"),
+    [
+        ("10,20,30,40,50,60,70", "7 levels and 8 frequencies"),
+        ("10,20,30,40,50,60,70,130", "-10 to 120"),
+        ("N7", "-10 to 100"),
+        ("N9", "N1, N2, N3"),
+        ("10,20,30,x,50,60,70,80", "x"),
+    ],
+)
+def test_bad_audiogram(
+    tmp_path: Path, utterance: Path, capsys: pytest.CaptureFixture[str], audiogram: str, reason: str
+) -> None:
+    error = fails(capsys, "simulate", utterance, tmp_path / "out.wav", "--audiogram", audiogram)
+    assert reason in error and not list(tmp_path.iterdir())
+
+
+def test_audiograms_that_do_not_ascend(tmp_path: Path, capsys: pytest.CaptureFixture[str], speech_dir: Path) -> None:
+    table = tmp_path / "ears.csv"
+    table.write_text("hl_500,hl_250,hl_1000\n10,20,30\n")
+    out = tmp_path / "out"
+    speech = speech_dir / "valid"
+    error = fails(capsys, "evaluate-simulator", "msbg", "--speech", speech, "--audiograms", table, "--out", out)
+    assert f"{table}, line 2" in error and "ascending" in error
+
+
+def test_unknown_and_changed_checkpoints(
+    tmp_path: Path, utterance: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from hlsim.pretrained import find_checkpoint
+
+    call = ("simulate", utterance, tmp_path / "out.wav", "--audiogram", "N3", "--simulator")
+    assert "neuro-msbg" in fails(capsys, *call, "no-such-model")
+    changed = tmp_path / "changed"
+    changed.mkdir()
+    for file in find_checkpoint("neuro-msbg").iterdir():
+        (changed / file.name).write_bytes(file.read_bytes())
+    weights = bytearray((changed / "model.safetensors").read_bytes())
+    weights[-1] ^= 1
+    (changed / "model.safetensors").write_bytes(weights)
+    assert "SHA-256" in fails(capsys, *call, changed)
+    assert not (tmp_path / "out.wav").exists()
+
+
+def test_unequal_file_lists(tmp_path: Path, utterance: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for name in ("clean", "before", "after"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "a.flac").write_bytes(utterance.read_bytes())
+    (tmp_path / "clean" / "b.flac").write_bytes(utterance.read_bytes())
+    folders = [part for name in ("clean", "before", "after") for part in (f"--{name}", tmp_path / name)]
+    error = fails(capsys, "haspi-report", *folders, "--audiogram", "N4", "--out", tmp_path / "out")
+    assert "b" in error and not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("command", "module"),
+    [
+        (["train-simulator", "--config", "c", "--speech", "s", "--out", "o"], "lightning"),
+        (["haspi-report", "--clean", "c", "--before", "b", "--after", "a", "--audiogram", "N4", "--out", "o"], "clarity"),
+        (["evaluate-simulator", "msbg", "--speech", "s", "--audiograms", "a", "--out", "o"], "pesq"),
+        (["demo", "--out", "o"], "matplotlib"),
+    ],
+)
+def test_missing_extra_names_the_install_command(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    command: list[str],
+    module: str,
+) -> None:
+    import sys
+
+    monkeypatch.chdir(tmp_path)
+    for name in [name for name in sys.modules if name.split(".")[0] == module]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, module, None)
+    error = fails(capsys, *command)
+    assert module in error and "pip install 'hlsim[" in error
+    assert not list(tmp_path.iterdir())
+
+
+def test_bad_recipe(tmp_path: Path, speech_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    recipe = tmp_path / "recipe.yaml"
+    recipe.write_text("learning_rat: 1\n")
+    out = tmp_path / "out"
+    call = ("train-simulator", "--config", recipe, "--speech", speech_dir / "train", "--out", out)
+    assert "learning_rat" in fails(capsys, *call) and not out.exists()
+    recipe.write_text("batch: 2\n")
+    assert "no such folder" in fails(capsys, *call[:3], "--speech", tmp_path / "nowhere", "--out", out)
+
+
+def test_evaluate_simulator_writes_both_files(tmp_path: Path, speech_dir: Path) -> None:
+    ears = tmp_path / "ears.csv"
+    ears.write_text(",".join(Audiogram.standard("N3").to_row()) + "\n35,35,40,50,55,60,65,65\n")
+    arguments = ["evaluate-simulator", "msbg", "neuro-msbg", "--speech", str(speech_dir / "valid")]
+    arguments += ["--audiograms", str(ears), "--items", "4", "--seconds", "2", "--out", str(tmp_path / "out")]
+    assert main(arguments) == 0
+    result = json.loads((tmp_path / "out" / "fidelity.json").read_text())
+    assert list(result["simulators"]) == ["msbg", "neuro-msbg"]
+    exact = [row["snr"] for row in result["simulators"]["msbg"]["items"]]
+    assert len(exact) == 4 and min(exact) > 40.0
+    assert "neuro-msbg" in (tmp_path / "out" / "fidelity.md").read_text()
+
+
+def test_benchmark(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "speed.json"
+    assert main(["benchmark", "--repeats", "1", "--seconds", "0.3", "--json", str(path)]) == 0
+    rows = json.loads(path.read_text())["rows"]
+    assert {row["sample_rate"] for row in rows} == {16000, 44100}
+    assert all(row["forward_ms"]["median"] > 0 for row in rows)
+    assert "pyclarity" in capsys.readouterr().out
