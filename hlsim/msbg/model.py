@@ -13,6 +13,7 @@ from hlsim.audio import check_rate, check_waveform
 from hlsim.audiogram import SEVERITIES, AudiogramLike, as_thresholds, severity_index
 from hlsim.calibration import PASCAL_SPL, check_full_scale, gain_to_pascals
 from hlsim.msbg.ear import EAR_DELAY, RATE, ear_filter, lowpass_filter
+from hlsim.msbg.ending import ending, ending_response, ending_weights
 from hlsim.msbg.filterbank import BANKS, gammatone_response
 from hlsim.msbg.recruitment import STEP, envelope, envelope_lowpass, expand, expansion_ratios
 from hlsim.msbg.smearing import BROADENING, SMEARING_DELAY, smear, smearing_matrix
@@ -124,6 +125,10 @@ class MSBG(nn.Module):
         spectrum = torch.fft.rfft(heard, points).unsqueeze(-2) * _tensor("bank", severity, points, heard)
         channels = torch.fft.irfft(spectrum, points) * _tensor("kept", severity, (points, length), heard)
         envelopes = envelope(channels, _tensor("lowpass", severity, points, heard))
+        if not self.aligned:
+            weights = _tensor("ending weights", severity, 0, heard)
+            response = _tensor("ending response", severity, (length - 1) % STEP + 1, heard)
+            envelopes = envelopes + ending(channels, weights, response, length)
         heard = expand(channels, envelopes, expansion_ratios(ears, bank))[..., :length]
 
         inner_out = inner if self.aligned else length
@@ -257,6 +262,10 @@ def _cached(kind: str, key: Any, points: Any, dtype: torch.dtype, device: torch.
             array = gammatone_response(BANKS[key], points)
         case "lowpass":
             array = envelope_lowpass(BANKS[key], points)
+        case "ending weights":
+            array = ending_weights(BANKS[key])
+        case "ending response":
+            array = ending_response(BANKS[key], points)
         case "kept":
             # the advance has nothing to bring in at the end, where the reference puts zeros
             length = points[1] - np.array(BANKS[key].advances)[:, None]

@@ -28,6 +28,10 @@ _LOWEST_ENVELOPE = 1e-9 * 10.0 ** ((120.0 - PASCAL_SPL) / 20.0)
 _HIGHEST_ENVELOPE = 10.0 ** ((CATCH_UP_SPL - PASCAL_SPL) / 20.0)
 _BOXES = 3  # three running means of 16 samples put zeros of third order where decimation would alias to 0 Hz
 _TAPS = 6
+
+AHEAD = _TAPS // 2
+"""Steps ahead of a sample that its gain is interpolated from."""
+
 _SLIGHT = 1.3  # expansion ratio at 24 dB HL
 
 
@@ -91,8 +95,7 @@ def _gain(envelopes: Tensor, ratios: Tensor) -> Tensor:
 
 def _around(values: Tensor) -> Tensor:
     """The six values about each step. Shape: (..., steps) -> (..., steps, 6)."""
-    ends = _TAPS // 2
-    return torch.cat((values[..., -(ends - 1) :], values, values[..., :ends]), -1).unfold(-1, _TAPS, 1)
+    return torch.cat((values[..., 1 - AHEAD :], values, values[..., :AHEAD]), -1).unfold(-1, _TAPS, 1)
 
 
 @lru_cache(maxsize=16)
@@ -100,19 +103,22 @@ def envelope_lowpass(bank: FilterBank, points: int) -> NDArray[np.complex128]:
     """Response that turns the rfft of the block means into that of the envelope at samples 0, 16, ...
 
     The low-pass is ``ellip(2, 0.25, 35)`` at 3/4 of 100 Hz or of the channel's ERB if less, run forwards and backwards
-    as pyclarity does with ``filtfilt``, whose treatment of the ends is left out.
+    as pyclarity does with ``filtfilt``; what that does at the end is in ``hlsim.msbg.ending``.
 
     Returns: (channels, points // 32 + 1).
     """
     omega = 2.0 * np.pi * np.arange(points // STEP // 2 + 1) / points
-    rows = []
-    for bandwidth in erb(np.array(bank.centre_frequencies)):
-        numerator, denominator = ellip(2, 0.25, 35, 0.75 * min(100.0, bandwidth) / (RATE / 2.0))
-        rows.append(np.abs(freqz(numerator, denominator, omega)[1]) ** 2)
+    rows = [np.abs(freqz(*coefficients, omega)[1]) ** 2 for coefficients in envelope_filters(bank)]
     with np.errstate(invalid="ignore"):
         box = np.sin(STEP * omega / 2.0) / (STEP * np.sin(omega / 2.0))
     box[0] = 1.0
     return np.array(rows) / box**_BOXES * np.exp(-7.5j * omega)
+
+
+def envelope_filters(bank: FilterBank) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
+    """Numerator and denominator of each channel's low-pass."""
+    widths = erb(np.array(bank.centre_frequencies))
+    return [ellip(2, 0.25, 35, 0.75 * min(100.0, width) / (RATE / 2.0)) for width in widths]
 
 
 @lru_cache(maxsize=8)
