@@ -1,0 +1,391 @@
+"""The whole model against pyclarity's ``Ear``, and the laws it keeps."""
+
+import copy
+import logging
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import scipy.signal
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from hlsim.audio import find_audio, read_audio
+from hlsim.audiogram import STANDARD, Audiogram, draw_thresholds
+from hlsim.calibration import gain_to_pascals, level_spl, set_level
+from hlsim.msbg import MSBG
+from hlsim.msbg.model import STRUCTURAL_DELAY, active_rescaling
+from hlsim.msbg.smearing import smeared_length
+
+EARS = {"none": "NH", "mild": "N1", "moderate": "N2", "severe": "N4"}  # one a severity
+RATE = 44100
+
+Wave = NDArray[np.float64]
+
+
+@pytest.fixture(scope="module")
+def recordings(speech_dir: Path) -> list[tuple[Wave, int]]:
+    """All embedded speech: waveform and rate."""
+    pairs = [read_audio(path) for path in find_audio(speech_dir)]
+    return [(wave[0].double().numpy(), rate) for wave, rate in pairs]
+
+
+@pytest.fixture(scope="module")
+def ears() -> list[Audiogram]:
+    """48: the standard ones that simulators take, and drawn ones of all severities."""
+    standard = [Audiogram.standard(name) for name in STANDARD if name != "N7"]
+    drawn = draw_thresholds(48 - len(standard), torch.Generator().manual_seed(1)).tolist()
+    return standard + [Audiogram(tuple(levels)) for levels in drawn]
+
+
+def clip(
+    recordings: list[tuple[Wave, int]], rng: np.random.Generator, seconds: float, rate: int = RATE
+) -> Wave:
+    """Random piece of speech of 50 to 80 dB SPL where RMS 1.0 is 120 dB SPL, at ``rate``."""
+    wave, own = recordings[rng.integers(len(recordings))]
+    common = math.gcd(rate, own)
+    wave = scipy.signal.resample_poly(wave, rate // common, own // common)
+    start = rng.integers(len(wave) - round(seconds * rate))
+    wave = wave[start : start + round(seconds * rate)]
+    return wave / np.sqrt(np.mean(wave**2)) * 10 ** ((rng.uniform(50, 80) - 120) / 20)
+
+
+def reference(ear: Audiogram, wave: Wave) -> Wave:
+    module = pytest.importorskip("clarity.evaluator.msbg.msbg")
+    logging.disable(logging.WARNING)  # it warns of levels above 80 dB HL
+    try:
+        model = module.Ear()
+        model.set_audiogram(ear.to_clarity())
+        return np.asarray(model.process(wave)[0])
+    finally:
+        logging.disable(logging.NOTSET)
+
+
+def relative(ours: Wave, theirs: Wave) -> float:
+    return float(np.sqrt(np.sum((ours - theirs) ** 2) / np.sum(theirs**2)))
+
+
+def speech_at(speech: list[tuple[Tensor, int]], spl: float = 65.0, seconds: float = 0.5) -> Tensor:
+    """Speech of an utterance at 44.1 kHz in pascals. Shape: (time,)."""
+    wave, rate = speech[0]
+    start = round(0.5 * rate)
+    piece = wave[0, start : start + round(seconds * rate)].double().numpy()
+    return set_level(torch.from_numpy(scipy.signal.resample(piece, round(seconds * RATE))).float(), spl)
+
+
+def test_equals_pyclarity_sample_for_sample(
+    recordings: list[tuple[Wave, int]], ears: list[Audiogram]
+) -> None:
+    rng = np.random.default_rng(0)
+    errors = []
+    for ear in ears:
+        wave = clip(recordings, rng, rng.uniform(0.7, 0.9))
+        theirs = reference(ear, wave)
+        model = MSBG(ear, full_scale_spl=120.0, aligned=False, rescale_active=True)
+        ours = model(torch.tensor(wave, dtype=torch.float32))
+        assert ours.shape == theirs.shape and ours.dtype == torch.float32
+        errors.append(relative(ours.numpy(), theirs))
+    assert len(errors) >= 40
+    # measured: 4e-5 and 7e-4
+    assert np.median(errors) < 5e-4
+    assert max(errors) < 3e-3
+
+
+def through_reference(ear: Audiogram, wave: Wave, rate: int) -> Wave:
+    """Resample to 44.1 kHz by a Fourier transform, process, take the delay off, and resample back."""
+    fast = scipy.signal.resample(wave, len(wave) * RATE // rate)
+    theirs = reference(ear, fast)
+    delay = 1047 + (192 if ear.severity != "none" else 0)
+    theirs = theirs[delay : delay + len(fast)]
+    return scipy.signal.resample(np.pad(theirs, (0, len(fast) - len(theirs))), len(wave))
+
+
+def band_error(ours: Wave, theirs: Wave, rate: int, highest: float) -> float:
+    first, second = (
+        np.fft.rfft(wave)[np.fft.rfftfreq(len(wave), 1 / rate) < highest] for wave in (ours, theirs)
+    )
+    return float(np.sqrt(np.sum(np.abs(first - second) ** 2) / np.sum(np.abs(second) ** 2)))
+
+
+@pytest.mark.parametrize(
+    ("rate", "count", "highest"),
+    [(16000, 12, 7000.0), (22050, 3, 9500.0), (24000, 3, 10000.0), (32000, 3, 14000.0), (48000, 3, 16000.0)],
+)
+def test_other_rates_equal_pyclarity_on_the_resampled_input(
+    recordings: list[tuple[Wave, int]], ears: list[Audiogram], rate: int, count: int, highest: float
+) -> None:
+    rng = np.random.default_rng(rate)
+    errors = []
+    for number in range(count):
+        ear = ears[(7 * number + 3) % len(ears)]
+        wave = clip(recordings, rng, 0.6, rate)
+        wave[:200] *= np.linspace(0, 1, 200)
+        wave[-200:] *= np.linspace(1, 0, 200)
+        wave = np.pad(wave, (rate // 20, rate // 5 - len(wave) % (rate // 50)))
+        theirs = through_reference(ear, wave, rate)
+        model = MSBG(ear, sample_rate=rate, full_scale_spl=120.0, rescale_active=True)
+        ours = model(torch.tensor(wave, dtype=torch.float32)).numpy()
+        assert ours.shape == wave.shape
+        errors.append(band_error(ours, theirs, rate, highest))
+    assert np.median(errors) < 5e-4
+    assert max(errors) < 5e-3
+
+
+@pytest.mark.parametrize("severity", EARS)
+def test_aligned_is_the_reference_without_its_delay(speech: list[tuple[Tensor, int]], severity: str) -> None:
+    ear = Audiogram.standard(EARS[severity])
+    assert ear.severity == severity
+    wave = speech_at(speech)
+    aligned = MSBG(ear)
+    delay = STRUCTURAL_DELAY + (0 if severity == "none" else 192)
+    assert (STRUCTURAL_DELAY, aligned.delay(severity)) == (1047, delay)
+    heard = aligned(wave)
+    late = MSBG(ear, aligned=False)(torch.cat((wave, torch.zeros(9000))))
+    late = late[delay : delay + len(wave)]
+    assert heard.shape == wave.shape
+    # where it ends, the aligned one has nothing to move channels ahead from
+    assert relative(heard[:-500].numpy(), late[:-500].numpy()) < 3e-5
+    assert relative(heard.numpy(), late.numpy()) < 5e-4
+
+
+@pytest.mark.parametrize("time", [1, 63, 64, 441, 1000, 4410])
+@pytest.mark.parametrize("severity", EARS)
+def test_lengths(severity: str, time: int) -> None:
+    ear = Audiogram.standard(EARS[severity])
+    wave = 0.01 * torch.randn(time)
+    for rescale in (False, True):
+        heard = MSBG(ear, rescale_active=rescale)(wave)
+        assert heard.shape == wave.shape and bool(torch.isfinite(heard).all())
+    late = MSBG(ear, aligned=False)(wave)
+    assert len(late) == (time if severity == "none" else smeared_length(time))
+    slow = MSBG(ear, sample_rate=16000)(wave)
+    assert slow.shape == wave.shape and bool(torch.isfinite(slow).all())
+
+
+@pytest.mark.parametrize("spl", [38.0, 50.0, 65.0, 100.0])
+def test_rescaling_is_measure_rms(recordings: list[tuple[Wave, int]], spl: float) -> None:
+    measure_rms = pytest.importorskip("clarity.evaluator.msbg.msbg_utils").measure_rms
+    rng = np.random.default_rng(5)
+    for _ in range(6):
+        wave = clip(recordings, rng, rng.uniform(0.3, 1.0))
+        wave *= 10 ** ((spl - 120) / 20) / np.sqrt(np.mean(wave**2))
+        expected = np.sqrt(np.mean(wave**2)) / measure_rms(wave, RATE, -12)[0]
+        ours = active_rescaling(torch.from_numpy(wave * gain_to_pascals(120.0)))
+        assert ours.shape == (1,)
+        assert float(ours) == pytest.approx(expected, rel=1e-9)
+
+
+def test_rescaling_leaves_silence_and_very_short_clips_alone() -> None:
+    assert active_rescaling(torch.zeros(2, 3, 1000)).eq(1.0).all()
+    # under 40 dB SPL no frame counts as active, of which the reference makes NaN
+    faint = set_level(torch.randn(1000), 20.0)
+    assert active_rescaling(faint).eq(1.0).all()
+    assert active_rescaling(torch.ones(2, 10)).eq(1.0).all()
+
+
+def mixed(count: int) -> Tensor:
+    """Ears of all severities in turn. Shape: (count, 8)."""
+    names = list(EARS.values())
+    return torch.tensor([STANDARD[names[i % 4]] for i in range(count)], dtype=torch.float32)
+
+
+@pytest.mark.parametrize(
+    "options", [{}, {"aligned": False}, {"sample_rate": 16000}, {"rescale_active": True}]
+)
+def test_a_mixed_batch_equals_its_items(speech: list[tuple[Tensor, int]], options: dict[str, Any]) -> None:
+    ears = mixed(6).reshape(2, 3, 8)
+    waves = torch.stack(
+        [set_level(speech_at(speech, seconds=0.3).roll(500 * i), 50.0 + 6 * i) for i in range(6)]
+    )
+    waves = waves.reshape(2, 3, -1)
+    model = MSBG(**options)
+    together = model(waves, ears)
+    assert together.shape[:2] == (2, 3)
+    if options.get("aligned", True):
+        assert together.shape == waves.shape
+    for i in range(2):
+        for j in range(3):
+            alone = model(waves[i, j], Audiogram(tuple(ears[i, j].tolist())))
+            assert relative(together[i, j, : len(alone)].numpy(), alone.numpy()) < 1e-5
+            assert not bool(together[i, j, len(alone) :].any())
+
+
+def test_ears_and_waveforms_broadcast(speech: list[tuple[Tensor, int]]) -> None:
+    wave = speech_at(speech, seconds=0.1)
+    ears = mixed(4)
+    model = MSBG()
+    each = model(wave, ears)
+    assert each.shape == (4, len(wave))
+    sequence = [Audiogram(tuple(levels)) for levels in ears.tolist()]
+    torch.testing.assert_close(model(wave.expand(4, -1), sequence), each)
+    grid = model(wave.expand(2, 4, -1), ears)
+    torch.testing.assert_close(grid, each.expand(2, 4, -1))
+    one = model(wave.expand(3, 2, -1), sequence[2])
+    torch.testing.assert_close(one, each[2].expand(3, 2, -1))
+    torch.testing.assert_close(model(wave.expand(2, 4, -1), ears.expand(2, 4, 8)), grid)
+
+
+def test_the_ear_of_the_call_comes_before_the_stored_one(speech: list[tuple[Tensor, int]]) -> None:
+    wave = speech_at(speech, seconds=0.1)
+    n3, s1 = Audiogram.standard("N3"), Audiogram.standard("S1")
+    torch.testing.assert_close(MSBG(n3)(wave, s1), MSBG(s1)(wave), atol=0, rtol=0)
+
+
+@pytest.mark.parametrize("severity", EARS)
+@pytest.mark.parametrize(
+    "options", [{}, {"aligned": False}, {"sample_rate": 16000}, {"rescale_active": True}]
+)
+def test_gradcheck(severity: str, options: dict[str, Any]) -> None:
+    model = MSBG(Audiogram.standard(EARS[severity]), **options)
+    wave = 0.3 * torch.randn(1, 600, dtype=torch.float64)
+    # what a severe loss leaves is faint: measured in its own unit, or nothing would be checked
+    scale = 1.0 / float(model(wave).abs().max())
+    assert torch.autograd.gradcheck(
+        lambda w: scale * model(w), wave.requires_grad_(), eps=1e-7, atol=1e-3, rtol=1e-3, fast_mode=True
+    )
+
+
+@pytest.mark.parametrize("severity", ["mild", "moderate", "severe"])
+def test_a_loss_expands(speech: list[tuple[Tensor, int]], severity: str) -> None:
+    """More gain in, more level out, and 1 dB in is more than 1 dB out."""
+    model = MSBG(Audiogram.standard(EARS[severity]))
+    wave = speech_at(speech)
+    levels = torch.arange(45.0, 91.0, 5.0)
+    heard = level_spl(model(torch.stack([set_level(wave, level) for level in levels])))
+    steps = heard.diff()
+    assert bool((steps > 5.0).all())
+    assert bool((heard < levels).all())
+    worse = level_spl(MSBG(Audiogram.standard("N6"))(wave))
+    assert float(worse) < float(level_spl(model(wave)))
+
+
+def test_no_loss_is_linear_and_close_to_the_input(speech: list[tuple[Tensor, int]]) -> None:
+    model = MSBG(Audiogram.standard("NH"))
+    wave = speech_at(speech).double()
+    torch.testing.assert_close(model(10.0 * wave), 10.0 * model(wave))
+    torch.testing.assert_close(model(wave + wave.flip(-1)), model(wave) + model(wave.flip(-1)))
+    # not the input itself: the filter bank's ripple remains
+    assert abs(float(level_spl(model(wave)) - level_spl(wave))) < 2.0
+
+
+def test_full_scale_changes_the_unit_and_nothing_else(speech: list[tuple[Tensor, int]]) -> None:
+    wave = speech_at(speech, seconds=0.2)
+    ear = Audiogram.standard("N3")
+    gain = gain_to_pascals(110.0)
+    torch.testing.assert_close(MSBG(ear, full_scale_spl=110.0)(wave / gain) * gain, MSBG(ear)(wave))
+
+
+@pytest.mark.parametrize("severity", EARS)
+@pytest.mark.parametrize("hops", [1, 7])
+def test_a_later_signal_is_heard_later(speech: list[tuple[Tensor, int]], severity: str, hops: int) -> None:
+    """By whole hops of the smearing, 64 samples; its first frames are irregular, so that some silence comes first."""
+    wave = torch.cat((torch.zeros(512), speech_at(speech, seconds=0.3), torch.zeros(3000)))
+    model = MSBG(Audiogram.standard(EARS[severity]))
+    shift = 64 * hops
+    heard = model(torch.stack((wave, wave.roll(shift))))
+    assert relative(heard[1].roll(-shift)[1000:-shift].numpy(), heard[0][1000:-shift].numpy()) < 1e-4
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("rate", [16000, 44100])
+def test_silence_is_heard_as_silence_with_finite_gradients(rate: int, dtype: torch.dtype) -> None:
+    for rescale in (False, True):
+        waves = torch.zeros(4, 3000, dtype=dtype, requires_grad=True)
+        heard = MSBG(sample_rate=rate, rescale_active=rescale)(waves, mixed(4))
+        assert not bool(heard.any())
+        heard.sum().backward()
+        assert waves.grad is not None and bool(torch.isfinite(waves.grad).all())
+
+
+def test_gradients_are_finite_from_faint_to_clipped(speech: list[tuple[Tensor, int]]) -> None:
+    wave = speech_at(speech, seconds=0.2)
+    levels = torch.tensor([-20.0, 20.0, 60.0, 100.0, 120.0])
+    waves = torch.stack([set_level(wave, level) for level in levels])
+    waves = torch.cat((waves, (1e3 * waves[-1:]).clamp(-1, 1)))
+    waves = waves.unsqueeze(1).expand(-1, 4, -1).clone()
+    waves[:, :, 2000:4000] = 0.0
+    waves.requires_grad_()
+    heard = MSBG()(waves, mixed(4))
+    assert bool(torch.isfinite(heard).all())
+    heard.square().sum().backward()
+    assert waves.grad is not None and bool(torch.isfinite(waves.grad).all())
+    assert bool((waves.grad.abs().amax(-1) > 0).all())
+
+
+@pytest.mark.parametrize("severity", EARS)
+def test_float32_is_float64_to_rounding(speech: list[tuple[Tensor, int]], severity: str) -> None:
+    model = MSBG(Audiogram.standard(EARS[severity]))
+    wave = speech_at(speech)
+    wide = model(wave.double())
+    assert wide.dtype == torch.float64
+    assert relative(model(wave).double().numpy(), wide.numpy()) < 2e-5
+
+
+def test_autocast_is_left(speech: list[tuple[Tensor, int]]) -> None:
+    wave = speech_at(speech, seconds=0.2)
+    model = MSBG(Audiogram.standard("N3"))
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        heard = model(wave)
+        half = model(wave.bfloat16())
+    assert heard.dtype == torch.float32
+    assert torch.equal(heard, model(wave))
+    assert half.dtype == torch.bfloat16
+    torch.testing.assert_close(half, model(wave.bfloat16().float()).bfloat16())
+
+
+def test_nothing_is_trained_or_stored_and_copies_are_alike(speech: list[tuple[Tensor, int]]) -> None:
+    model = MSBG(Audiogram.standard("N3"))
+    assert not model.state_dict() and not list(model.parameters())
+    wave = speech_at(speech, seconds=0.1)
+    assert torch.equal(copy.deepcopy(model)(wave), model(wave))
+    assert "sample_rate=44100" in repr(model)
+
+
+N3 = Audiogram.standard("N3")
+
+
+@pytest.mark.parametrize(
+    ("wave", "audiogram", "said"),
+    [
+        (torch.zeros(100), None, "no audiogram"),
+        (torch.zeros(100), torch.full((8,), 100.5), r"100\.5.*-10 to 100"),
+        (torch.zeros(100), torch.full((8,), -11.0), "-10 to 100"),
+        (torch.zeros(100), Audiogram.standard("N7"), "-10 to 100"),
+        (torch.zeros(100), torch.full((8,), math.nan), "-10 to 100"),
+        (torch.zeros(100), torch.zeros(7), r"\(7,\); allowed: \(\.\.\., 8\)"),
+        (torch.zeros(100), [20.0] * 8, "allowed: an Audiogram, a sequence of them, or a"),
+        (torch.zeros(100, dtype=torch.int16), N3, "int16; allowed: a floating-point tensor"),
+        (np.zeros(100), N3, "ndarray; allowed: a floating-point tensor"),
+        (torch.zeros(2, 0), N3, "at least one sample"),
+        (torch.tensor(1.0), N3, "at least one sample"),
+        (
+            torch.zeros(3, 100),
+            torch.zeros(2, 8),
+            r"\(2, 8\) .*\(3, 100\); allowed: one audiogram, or leading",
+        ),
+        (torch.zeros(3, 100), [N3, N3], "leading dimensions that broadcast"),
+    ],
+)
+def test_bad_calls_say_what_is_allowed(wave: Any, audiogram: Any, said: str) -> None:
+    with pytest.raises(ValueError, match=said) as caught:
+        MSBG()(wave, audiogram)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"sample_rate": 8000}, "8000 Hz; allowed: 16000 to 48000"),
+        ({"sample_rate": 96000}, "96000 Hz; allowed: 16000 to 48000"),
+        ({"full_scale_spl": -1.0}, r"full_scale_spl is -1\.0; allowed: 0 to 200"),
+        ({"full_scale_spl": math.nan}, "full_scale_spl is nan; allowed: 0 to 200"),
+        ({"audiogram": Audiogram.standard("N7")}, "-10 to 100"),
+        ({"audiogram": torch.zeros(7)}, r"\(7,\)"),
+    ],
+)
+def test_bad_settings_say_what_is_allowed(options: dict[str, Any], said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        MSBG(**options)
