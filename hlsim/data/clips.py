@@ -42,6 +42,8 @@ class Clips:
             waveform, rate = read_audio(self.files[index])
             waveform = resample(waveform[:1], rate, self.sample_rate).squeeze(0)
             peak = float(waveform.abs().max())
+            if peak == 0.0:
+                raise ValueError(f"{self.files[index]}: its first channel is silent")
             self._kept[index] = (waveform / peak * 32767.0).round().to(torch.int16)
         return self._kept[index].float() / 32767.0
 

@@ -44,7 +44,7 @@ def compress(waveform: Tensor, ratio: Tensor, sample_rate: int) -> Tensor:
     ).squeeze(1)
     mean = power.mean(-1, keepdim=True)
     exponent = ((1.0 / ratio - 1.0) / 2.0).unsqueeze(-1)
-    return waveform * ((power + 1e-3 * mean) / (mean + 1e-20)) ** exponent
+    return waveform * ((power + 1e-3 * mean + 1e-20) / (mean + 1e-20)) ** exponent
 
 
 def vary(
