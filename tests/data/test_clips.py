@@ -1,0 +1,100 @@
+"""Random clips of recordings: length, place, repetition, rate, and what is refused."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from hlsim.audio import read_audio, write_audio
+from hlsim.data.clips import Clips
+
+
+def folder_with(tmp_path: Path, **waves: Tensor) -> Path:
+    for name, wave in waves.items():
+        write_audio(tmp_path / f"{name}.wav", wave, 16000)
+    return tmp_path
+
+
+def ramp(samples: int) -> Tensor:
+    """From just above 0 to 1."""
+    return torch.arange(1, samples + 1, dtype=torch.float32) / samples
+
+
+def test_clips_are_pieces_of_the_recordings(tmp_path: Path) -> None:
+    clips = Clips(folder_with(tmp_path, a=ramp(4000), b=-0.5 * ramp(3000)), sample_rate=16000, seconds=0.1)
+    assert (len(clips), clips.samples) == (2, 1600)
+    step = 1.0 / 32767  # kept as 16-bit samples, peak at 1
+    for index, whole in enumerate((ramp(4000), -ramp(3000))):
+        torch.testing.assert_close(clips.recording(index), whole, atol=step, rtol=0)
+        torch.testing.assert_close(clips.clip(index, 0.0), whole[:1600], atol=step, rtol=0)
+        torch.testing.assert_close(clips.clip(index, 1.0), whole[-1600:], atol=step, rtol=0)
+        middle = (len(whole) - 1600) // 2
+        torch.testing.assert_close(clips.clip(index, 0.5), whole[middle : middle + 1600], atol=step, rtol=0)
+
+
+def test_short_recordings_end_in_silence_or_are_repeated(tmp_path: Path) -> None:
+    folder = folder_with(tmp_path, a=ramp(700))
+    silent = Clips(folder, sample_rate=16000, seconds=0.1).clip(0, 0.7)
+    torch.testing.assert_close(silent[:700], ramp(700), atol=1e-4, rtol=0)
+    assert silent.shape == (1600,) and not bool(silent[700:].any())
+    repeated = Clips(folder, sample_rate=16000, seconds=0.1, repeat=True).clip(0, 0.0)
+    torch.testing.assert_close(repeated, ramp(700).repeat(3)[:1600], atol=1e-4, rtol=0)
+
+
+def test_other_rates_are_resampled_and_the_first_channel_is_taken(tmp_path: Path) -> None:
+    time = torch.arange(24000) / 48000
+    stereo = torch.stack((torch.sin(2 * torch.pi * 500 * time), torch.randn(24000)))
+    write_audio(tmp_path / "a.wav", 0.3 * stereo, 48000)
+    clip = Clips(tmp_path, sample_rate=16000, seconds=0.5).clip(0, 0.0)
+    expected = torch.sin(2 * torch.pi * 500 * torch.arange(8000) / 16000)
+    assert clip.shape == (8000,)
+    torch.testing.assert_close(clip[200:-200], expected[200:-200], atol=3e-2, rtol=0)
+
+
+def test_drawing_depends_on_the_generator_and_reaches_all(speech_dir: Path) -> None:
+    clips = Clips(speech_dir / "train", sample_rate=16000, seconds=0.25)
+    first = clips.draw(40, torch.Generator().manual_seed(1))
+    assert first.shape == (40, 4000)
+    again = Clips(speech_dir / "train", sample_rate=16000, seconds=0.25)
+    assert torch.equal(first, again.draw(40, torch.Generator().manual_seed(1)))
+    assert not torch.equal(first, clips.draw(40, torch.Generator().manual_seed(2)))
+    assert float(first.abs().max()) <= 1.0
+    assert len({index for index in clips._kept}) > 10  # of the 14 recordings
+
+
+def test_no_drawn_clip_is_silent(tmp_path: Path) -> None:
+    """Of a recording that is mostly silence, only what is not."""
+    wave = torch.zeros(40000)
+    wave[20000:24000] = torch.randn(4000).clamp(-1, 1)
+    clips = Clips(folder_with(tmp_path, a=wave), sample_rate=16000, seconds=0.1)
+    drawn = clips.draw(20, torch.Generator().manual_seed(0))
+    assert float(drawn.square().mean(-1).min()) > 1e-7
+
+
+def test_recordings_are_decoded_once(tmp_path: Path) -> None:
+    clips = Clips(folder_with(tmp_path, a=ramp(2000)), sample_rate=16000, seconds=0.1)
+    before = clips.clip(0, 0.0)
+    (tmp_path / "a.wav").unlink()
+    assert torch.equal(clips.clip(0, 0.0), before)
+
+
+def test_what_is_refused_names_the_path(tmp_path: Path) -> None:
+    for folder in (tmp_path, tmp_path / "missing"):
+        with pytest.raises(ValueError, match=r"no audio in it|no such folder") as caught:
+            Clips(folder, sample_rate=16000, seconds=1.0)
+        assert str(caught.value).startswith(str(folder))
+    bad = tmp_path / "bad.wav"
+    bad.write_text("no recording")
+    with pytest.raises(ValueError, match="not readable as audio") as caught:
+        Clips(tmp_path, sample_rate=16000, seconds=1.0).draw(1, torch.Generator())
+    assert str(caught.value).startswith(str(bad))
+
+
+def test_a_silent_first_channel_is_refused(tmp_path: Path) -> None:
+    """It would be drawn again and again for ever, since none of its clips is loud."""
+    write_audio(tmp_path / "a.wav", torch.stack((torch.zeros(4000), torch.rand(4000))), 16000)
+    assert read_audio(tmp_path / "a.wav")[0].shape == (2, 4000)
+    with pytest.raises(ValueError, match="first channel is silent") as caught:
+        Clips(tmp_path, sample_rate=16000, seconds=0.1).draw(1, torch.Generator())
+    assert str(caught.value).startswith(str(tmp_path / "a.wav"))
