@@ -181,7 +181,7 @@ def run(
         trainer = L.Trainer(
             accelerator=accelerator,
             devices=devices,
-            max_epochs=1,
+            max_epochs=-1,  # steps and time limit it; an epoch that is over would not be resumed
             max_steps=max_steps,
             gradient_clip_val=1.0,
             callbacks=callbacks,
