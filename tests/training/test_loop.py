@@ -1,0 +1,185 @@
+"""The training loop on a module of one number: time, steps, resuming, what is kept, what is refused."""
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+pytest.importorskip("lightning")
+
+from hlsim.training.loop import LAST, TimedModule, run
+
+EVER = 1e6  # minutes
+
+
+class Toy(TimedModule):
+    """Fits a vector to noisy draws of another; ``scores`` says what the validations tell, by step."""
+
+    def __init__(
+        self, *, max_minutes: float = EVER, learning_rate: float = 0.1, scores: dict[int, float] | None = None
+    ) -> None:
+        super().__init__(learning_rate, max_minutes, seed=3)
+        self.vector = torch.nn.Parameter(torch.zeros(4))
+        self.scores = scores
+        self.seen: list[int] = []
+        self.rates: list[float] = []
+
+    def training_loss(self, generator: torch.Generator) -> Tensor:
+        self.seen.append(self.global_step)
+        self.rates.append(self.optimizers().param_groups[0]["lr"])  # type: ignore[union-attr]
+        target = torch.arange(4.0) + 0.5 * torch.randn(4, generator=generator)
+        return (self.vector - target).square().mean()
+
+    def validate(self) -> dict[str, float]:
+        score = self.scores[self.global_step] if self.scores else -float(self.vector.detach().sum())
+        return {"score": score, "sum": float(self.vector.detach().sum())}
+
+
+def go(module: Toy, out: Path, max_steps: int = 6, **options: Any) -> tuple[list[dict[str, Any]], list[str]]:
+    """Run; what was written and reported."""
+    written: list[dict[str, Any]] = []
+    lines: list[str] = []
+    settings: dict[str, Any] = {
+        "recipe": {"a": 1},
+        "write": written.append,
+        "validate_every": 2,
+        "accelerator": "cpu",
+        "report": lines.append,
+        "progress": False,
+    }
+    run(module, out=out, max_steps=max_steps, **(settings | options))
+    return written, lines
+
+
+def test_runs_the_steps_asked_for_and_leaves_state_recipe_and_events(tmp_path: Path) -> None:
+    module = Toy()
+    _, lines = go(module, tmp_path / "new" / "folder")
+    assert module.seen == [0, 1, 2, 3, 4, 5]
+    folder = tmp_path / "new" / "folder"
+    assert json.loads((folder / "recipe.json").read_text()) == {"a": 1}
+    state = torch.load(folder / LAST, weights_only=True)
+    assert state["global_step"] == 6
+    assert list((folder / "events").glob("events.out.tfevents.*"))
+    assert [line.split(",")[0] for line in lines] == ["step 2", "step 4", "step 6", "step 6"]
+    assert "sum " in lines[0] and "score" not in lines[0]
+
+
+def test_a_resumed_run_ends_where_an_uninterrupted_one_does(tmp_path: Path) -> None:
+    whole, first, second = Toy(), Toy(), Toy()
+    go(whole, tmp_path / "whole", max_steps=9)
+    go(first, tmp_path / "parts", max_steps=4)
+    go(second, tmp_path / "parts", max_steps=9)
+    assert first.seen + second.seen == whole.seen == list(range(9))
+    torch.testing.assert_close(second.vector, whole.vector)
+    torch.testing.assert_close(first.rates + second.rates, whole.rates)
+
+
+def test_steps_draw_by_seed_and_step_and_not_by_history(tmp_path: Path) -> None:
+    one, other = Toy(learning_rate=0.0), Toy(learning_rate=0.0)
+    draws: list[list[float]] = [[], []]
+    for module, out, kept in ((one, "a", draws[0]), (other, "b", draws[1])):
+        loss = module.training_loss
+
+        def keep(generator: torch.Generator, loss: Any = loss, kept: list[float] = kept) -> Tensor:
+            value: Tensor = loss(generator)
+            kept.append(float(value.detach()))
+            return value
+
+        module.training_loss = keep  # type: ignore[method-assign]
+        torch.rand(len(out))
+        go(module, tmp_path / out, max_steps=3)
+    assert draws[0] == draws[1]
+    assert len(set(draws[0])) == 3
+
+
+def test_interruption_goes_on_from_the_last_state(tmp_path: Path) -> None:
+    def stop(line: str) -> None:
+        if line.startswith("step 4"):
+            raise KeyboardInterrupt
+
+    first = Toy()
+    with pytest.raises((KeyboardInterrupt, SystemExit)):
+        go(first, tmp_path, max_steps=20, report=stop)
+    assert first.seen == [0, 1, 2, 3]
+    second = Toy()
+    go(second, tmp_path, max_steps=7)
+    assert second.seen[0] in (2, 4) and second.seen[-1] == 6
+    whole = Toy()
+    go(whole, tmp_path / "whole", max_steps=7)
+    torch.testing.assert_close(second.vector, whole.vector)
+
+
+def test_another_recipe_in_the_same_folder_is_refused_and_changes_nothing(tmp_path: Path) -> None:
+    go(Toy(), tmp_path, max_steps=2)
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir() if path.is_file()}
+    module = Toy()
+    with pytest.raises(
+        ValueError, match=r"holds a training of another recipe .*choose another --out"
+    ) as caught:
+        go(module, tmp_path, max_steps=4, recipe={"a": 2})
+    assert str(caught.value).startswith(str(tmp_path))
+    assert not module.seen
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir() if path.is_file()} == before
+
+
+def test_a_recipe_without_a_state_may_be_replaced(tmp_path: Path) -> None:
+    (tmp_path / "recipe.json").write_text("{}")
+    go(Toy(), tmp_path, max_steps=2)
+    assert json.loads((tmp_path / "recipe.json").read_text()) == {"a": 1}
+
+
+def test_time_is_limited_and_counted_over_all_parts(tmp_path: Path) -> None:
+    minutes = 0.6 / 60.0
+    first = Toy(max_minutes=minutes)
+    go(first, tmp_path, max_steps=-1, validate_every=1000)
+    assert len(first.seen) > 5
+    assert (tmp_path / LAST).is_file()
+    second = Toy(max_minutes=minutes)
+    go(second, tmp_path, max_steps=-1, validate_every=1000)
+    assert len(second.seen) <= 1
+    torch.testing.assert_close(second.vector, first.vector, atol=0.05, rtol=0)
+
+
+def test_learning_rate_rises_over_fifty_steps_and_falls_with_time(tmp_path: Path) -> None:
+    rising = Toy(learning_rate=0.5)
+    go(rising, tmp_path / "a", max_steps=60, validate_every=30)
+    assert rising.rates[:50] == pytest.approx([0.5 * (step + 1) / 50 for step in range(50)], rel=1e-3)
+    assert rising.rates[50:] == pytest.approx([0.5] * 10, rel=1e-3)
+    falling = Toy(max_minutes=1.0 / 60.0, learning_rate=0.5)
+    go(falling, tmp_path / "b", max_steps=-1, validate_every=10_000)
+    after = falling.rates[60:]
+    assert all(math.isfinite(rate) and 0.0 < rate <= 0.5 for rate in after)
+    assert after[-1] < 0.1 * max(after)
+
+
+def test_the_best_validation_is_what_is_written(tmp_path: Path) -> None:
+    scores = {2: 1.0, 4: 3.0, 6: 2.0}
+    written, _ = go(Toy(scores=scores), tmp_path, max_steps=6)
+    assert [(note["steps"], set(note["validation"])) for note in written] == [(2, {"sum"}), (4, {"sum"})]
+    assert all(note["minutes"] >= 0.0 for note in written)
+    # resumed: what was best stays best
+    written, _ = go(Toy(scores=scores | {8: 2.9, 10: 3.5}), tmp_path, max_steps=10)
+    assert [note["steps"] for note in written] == [10]
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_a_loss_that_is_not_finite_stops_the_run_and_says_so(tmp_path: Path, value: float) -> None:
+    class Broken(Toy):
+        def training_loss(self, generator: torch.Generator) -> Tensor:
+            loss = super().training_loss(generator)
+            return loss * value if self.global_step == 3 else loss
+
+    with pytest.raises(RuntimeError, match=rf"the loss is {value} at step 3; a lower learning rate"):
+        go(Broken(), tmp_path)
+    assert torch.load(tmp_path / LAST, weights_only=True)["global_step"] == 2
+
+
+def test_other_modules_say_that_they_are_unfinished() -> None:
+    module = TimedModule(0.1, 1.0, 0)
+    for method in (lambda: module.training_loss(torch.Generator()), module.validate):
+        with pytest.raises(NotImplementedError):
+            method()
