@@ -1,0 +1,235 @@
+"""Training a Neuro-MSBG: recipes, what a run leaves, resuming after any end, and data that cannot be used."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from hlsim.audio import write_audio
+from hlsim.audiogram import Audiogram
+from hlsim.calibration import level_spl
+from hlsim.pretrained import load_pretrained
+
+pytest.importorskip("lightning")
+
+from hlsim.training.simulator import (
+    MILDER,
+    SimulatorData,
+    SimulatorRecipe,
+    SimulatorTraining,
+    train_simulator,
+    validation_set,
+)
+
+TINY = {
+    "model": {"channels": 4, "blocks": 1, "stride": [4, 3], "kernel": [3, 3]},
+    "batch": 2,
+    "seconds": 0.25,
+    "validate_every": 4,
+    "validation_items": 8,
+}
+EVER = 1e6  # minutes, so that the learning rate does not fall within a test
+
+
+@pytest.fixture
+def data(speech_dir: Path) -> SimulatorData:
+    return SimulatorData(speech_dir / "train")
+
+
+def train(data: SimulatorData, out: Path, recipe: dict[str, Any] | None = None, **options: Any) -> list[str]:
+    """A few steps; the lines reported."""
+    lines: list[str] = []
+    settings = {
+        "max_minutes": EVER,
+        "accelerator": "cpu",
+        "progress": False,
+        "report": lines.append,
+    } | options
+    folder = train_simulator(data, SimulatorRecipe.from_dict(TINY | (recipe or {})), out=out, **settings)
+    assert folder == out / "checkpoint"
+    return lines
+
+
+def state(out: Path) -> dict[str, Any]:
+    loaded: dict[str, Any] = torch.load(out / "last.ckpt", weights_only=True)
+    return loaded
+
+
+def test_eight_steps_leave_a_checkpoint_that_loads_and_a_state(data: SimulatorData, tmp_path: Path) -> None:
+    lines = train(data, tmp_path / "out", max_steps=8)
+    assert [line.split(",")[0] for line in lines] == ["step 4", "step 8", "step 8"]
+    assert "valid_snr_median" in lines[0] and "valid_snr_worst_tenth" in lines[0]
+    assert state(tmp_path / "out")["global_step"] == 8
+
+    model = load_pretrained(tmp_path / "out" / "checkpoint")
+    assert model.config.channels == 4
+    assert model(0.02 * torch.randn(800), Audiogram.standard("N2")).shape == (800,)
+    about = json.loads((tmp_path / "out" / "checkpoint" / "config.json").read_text())["about"]
+    assert about["recipe"]["batch"] == 2 and about["steps"] in (4, 8)
+    assert set(about["validation"]) >= {"valid_snr_median", "valid_snr_worst_tenth"}
+    # what was written is what was validated
+    module = SimulatorTraining(SimulatorRecipe.from_dict(TINY), data, EVER)
+    module.student = model
+    assert module.validate()["valid_snr_median"] == pytest.approx(
+        about["validation"]["valid_snr_median"], abs=1e-3
+    )
+
+
+def test_stopped_and_resumed_is_as_good_as_uninterrupted(data: SimulatorData, tmp_path: Path) -> None:
+    train(data, tmp_path / "whole", max_steps=8)
+    train(data, tmp_path / "parts", max_steps=4)
+    assert state(tmp_path / "parts")["global_step"] == 4
+    lines = train(data, tmp_path / "parts", max_steps=8)
+    assert [line.split(",")[0] for line in lines] == ["step 8", "step 8"]
+    first, second = (state(tmp_path / name)["state_dict"] for name in ("whole", "parts"))
+    assert set(first) == set(second)
+    for name, values in first.items():
+        torch.testing.assert_close(second[name], values, rtol=1e-4, atol=1e-6)
+
+
+KILLED = """
+import sys
+from pathlib import Path
+import torch
+from hlsim.training.simulator import SimulatorData, SimulatorRecipe, train_simulator
+
+torch.set_num_threads(1)
+train_simulator(
+    SimulatorData(Path(sys.argv[1])), SimulatorRecipe.from_dict({recipe}), out=sys.argv[2], max_minutes={minutes},
+    accelerator="cpu", progress=False,
+)
+"""
+
+
+@pytest.mark.slow
+def test_a_killed_run_goes_on(data: SimulatorData, tmp_path: Path) -> None:
+    recipe = TINY | {"validate_every": 2}
+    out = tmp_path / "out"
+    root = str(Path(__file__).parents[2])
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join((root, os.environ.get("PYTHONPATH", "")))}
+    code = KILLED.format(recipe=recipe, minutes=EVER)
+    child = subprocess.Popen(
+        [sys.executable, "-c", code, str(data.speech), str(out)],
+        env=environment,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+    )
+    try:
+        deadline = time.monotonic() + 120.0
+        while not ((out / "last.ckpt").is_file() and (out / "checkpoint" / "config.json").is_file()):
+            assert child.poll() is None, child.stderr.read().decode() if child.stderr else ""
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
+        child.send_signal(signal.SIGKILL)
+    finally:
+        child.kill()
+        child.communicate()
+    assert child.returncode == -signal.SIGKILL
+
+    reached = state(out)["global_step"]
+    assert reached >= 2
+    load_pretrained(out / "checkpoint")
+    lines = train(data, out, {"validate_every": 2}, max_steps=reached + 2)
+    assert {line.split(",")[0] for line in lines} == {f"step {reached + 2}"}
+    assert state(out)["global_step"] == reached + 2
+
+
+def test_another_recipe_or_other_data_need_another_folder(data: SimulatorData, tmp_path: Path) -> None:
+    train(data, tmp_path, max_steps=4)
+    before = (tmp_path / "last.ckpt").read_bytes()
+    other = SimulatorData(data.speech.parent / "valid")
+    for changed, recipe, options in (
+        (data, {"seed": 1}, {}),
+        (data, {"model": TINY["model"] | {"channels": 5}}, {}),  # type: ignore[operator]
+        (data, {}, {"max_minutes": 2 * EVER}),
+        (other, {}, {}),
+    ):
+        with pytest.raises(ValueError, match=r"another recipe .*choose another --out"):
+            train(changed, tmp_path, recipe, max_steps=8, **options)
+    assert (tmp_path / "last.ckpt").read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("recipe", "said"),
+    [
+        ({"epochs": 3}, "unknown settings epochs in the recipe; allowed: model, batch, seconds"),
+        (
+            {"weights": {"loudness": 1.0}},
+            "unknown criteria loudness in the recipe; allowed: complex, log_spectrum",
+        ),
+    ],
+)
+def test_unknown_names_in_a_recipe(recipe: dict[str, Any], said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        SimulatorRecipe.from_dict(recipe)
+
+
+def test_unknown_settings_of_the_network(data: SimulatorData, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="unknown network settings layers; allowed: fft, window"):
+        train(data, tmp_path / "out", {"model": {"layers": 3}})
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("missing", ["speech", "noise", "audiograms", "valid_speech"])
+def test_missing_data_is_named_before_anything_is_written(
+    speech_dir: Path, tmp_path: Path, missing: str
+) -> None:
+    nowhere = tmp_path / "nowhere"
+    given = {"speech": speech_dir / "train"} | {missing: nowhere}
+    with pytest.raises(ValueError, match=r"no such folder|cannot read audiograms") as caught:
+        train(SimulatorData(**given), tmp_path / "out", max_steps=1)
+    assert str(caught.value).startswith(str(nowhere))
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.fixture
+def rich(speech_dir: Path, tmp_path: Path) -> SimulatorData:
+    """Speech, noise and measured ears."""
+    write_audio(tmp_path / "noise" / "a.wav", torch.randn(1, 20000), 16000) if (
+        tmp_path / "noise"
+    ).mkdir() else None
+    write_audio(tmp_path / "noise" / "a.wav", 0.1 * torch.randn(1, 20000), 16000)
+    row = Audiogram.standard("N5").to_row()
+    (tmp_path / "ears.csv").write_text(",".join(row) + "\n" + ",".join(row.values()) + "\n")
+    return SimulatorData(
+        speech_dir / "train", tmp_path / "noise", tmp_path / "ears.csv", valid_speech=speech_dir / "valid"
+    )
+
+
+def test_noise_ears_and_all_criteria_train(rich: SimulatorData) -> None:
+    weights = {"snr": 1.0, "log_spectrum": 0.5, "magnitude": 0.9, "phase": 0.3, "complex": 0.1, "time": 0.2}
+    module = SimulatorTraining(SimulatorRecipe.from_dict(TINY | {"weights": weights}), rich, EVER)
+    loss = module.training_loss(torch.Generator().manual_seed(0))
+    assert bool(torch.isfinite(loss))
+    loss.backward()
+    assert all(p.grad is not None and bool(torch.isfinite(p.grad).all()) for p in module.trained_parameters())
+    assert {id(p) for p in module.trained_parameters()} == {id(p) for p in module.parameters()}
+    first, again = (module.training_loss(torch.Generator().manual_seed(1)) for _ in range(2))
+    assert torch.equal(first, again)
+
+
+def test_the_validation_set_is_fixed_and_as_described(rich: SimulatorData) -> None:
+    recipe = SimulatorRecipe.from_dict(TINY | {"validation_items": 24})
+    batches = validation_set(rich, recipe)
+    torch.rand(3)
+    for one, same in zip(batches, validation_set(rich, recipe), strict=True):
+        assert torch.equal(one[0], same[0]) and torch.equal(one[1], same[1])
+    signals = torch.cat([waves for waves, _ in batches])
+    ears = torch.cat([ears for _, ears in batches])
+    assert signals.shape == (24, 32000) and ears.shape == (24, 8)
+    levels = level_spl(signals)
+    assert float(levels.min()) >= 50.0 and float(levels.max()) <= 80.0 and float(levels.std()) > 5.0
+    milder = [Audiogram.standard(name).thresholds for name in MILDER]
+    assert all(tuple(ear) in milder for ear in ears[0::4].tolist())
+    assert all(tuple(ear) == Audiogram.standard("N5").thresholds for ear in ears[1::2].tolist())
+    other = torch.cat(
+        [waves for waves, _ in validation_set(rich, SimulatorRecipe(validation_items=24, seed=1))]
+    )
+    assert not torch.equal(other, signals)
