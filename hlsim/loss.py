@@ -156,8 +156,6 @@ class HearingLossLoss(nn.Module):
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> "HearingLossLoss":
         super()._apply(fn, recurse)
         self.simulator._apply(lambda tensor: _moved(fn, tensor))
-        if self.thresholds is not None:
-            self.thresholds = _moved(fn, self.thresholds)
         return self
 
 

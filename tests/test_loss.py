@@ -1,0 +1,484 @@
+"""HearingLossLoss: frozen, unregistered, per-item, finite, in float32 under autocast, and its value."""
+
+import copy
+import pickle
+from collections.abc import Callable
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from hlsim import MSBG, Audiogram, HearingLossLoss, NeuroMSBG, load_pretrained
+from hlsim.audio import resample
+from hlsim.band_levels import band_level_loss
+from hlsim.calibration import set_level
+from hlsim.criteria import DEFAULT_WEIGHTS, PARTS, paper_parts
+from hlsim.pretrained import find_checkpoint
+
+SIMULATORS = ("neuro-msbg", "msbg")
+CRITERIA = ("paper", "bands")
+N3, N4, S2 = (Audiogram.standard(name) for name in ("N3", "N4", "S2"))
+
+both = pytest.mark.parametrize("simulator", SIMULATORS)
+each_criterion = pytest.mark.parametrize("criterion", CRITERIA)
+
+
+@pytest.fixture
+def clean(speech: list[tuple[Tensor, int]]) -> Tensor:
+    """0.3 s of two voices at 65 dB SPL. Shape: (2, time)."""
+    return set_level(torch.cat([waveform[:, 10000:14800] for waveform, _ in speech[:2]]), 65.0)
+
+
+class Host(nn.Module):
+    """Somebody's compensator, with or without the loss inside."""
+
+    def __init__(self, loss: nn.Module | None = None) -> None:
+        super().__init__()
+        self.filter = nn.Conv1d(1, 1, 9, padding=4)
+        if loss is not None:
+            self.loss = loss
+
+    def forward(self, waveform: Tensor) -> Tensor:
+        heard: Tensor = waveform + self.filter(waveform.unsqueeze(1)).squeeze(1)
+        return heard
+
+
+def gradient(
+    loss: HearingLossLoss, compensated: Tensor, clean: Tensor, *rest: Tensor
+) -> tuple[Tensor, Tensor]:
+    given = compensated.detach().clone().requires_grad_()
+    value = loss(given, clean, *rest)
+    return value.detach(), torch.autograd.grad(value, given)[0]
+
+
+def same(first: tuple[Tensor, Tensor], second: tuple[Tensor, Tensor]) -> None:
+    """Value and gradient of the same computation."""
+    torch.testing.assert_close(second[0], first[0], rtol=1e-5, atol=1e-7)
+    torch.testing.assert_close(second[1], first[1], rtol=1e-4, atol=1e-4 * float(first[1].abs().max()))
+
+
+def alike(first: tuple[Tensor, Tensor], second: tuple[Tensor, Tensor]) -> None:
+    """Value and direction of the gradient, in another precision: what is nearly silent moves with every rounding."""
+    assert float(second[0]) == pytest.approx(float(first[0]), rel=1e-3)
+    one, other = first[1].double().cpu().flatten(), second[1].double().cpu().flatten()
+    assert float(torch.cosine_similarity(one, other, dim=0)) > 0.95
+
+
+# Frozen
+
+
+@both
+def test_train_leaves_the_simulator_frozen(simulator: str) -> None:
+    host = Host(HearingLossLoss(N3, simulator=simulator)).train().requires_grad_(True)
+    assert host.loss.training
+    assert not any(module.training for module in host.loss.simulator.modules())
+    assert not any(parameter.requires_grad for parameter in host.loss.simulator.parameters())
+    assert isinstance(host.loss.simulator, {"msbg": MSBG, "neuro-msbg": NeuroMSBG}[simulator])
+
+
+@both
+def test_host_does_not_know_the_simulator(simulator: str) -> None:
+    loss = HearingLossLoss(N3, simulator=simulator)
+    host, bare = Host(loss), Host()
+    assert list(loss.parameters()) == [] and list(loss.buffers()) == [] and loss.state_dict() == {}
+    for names in ("named_parameters", "named_buffers"):
+        assert [n for n, _ in getattr(host, names)()] == [n for n, _ in getattr(bare, names)()]
+    assert not any(isinstance(module, (MSBG, NeuroMSBG)) for module in host.modules())
+    # a checkpoint made with the loss loads without it, and the other way round
+    bare.load_state_dict(host.state_dict(), strict=True)
+    host.load_state_dict(bare.state_dict(), strict=True)
+
+
+def test_initialising_the_host_leaves_the_weights_of_the_simulator() -> None:
+    host = Host(HearingLossLoss(N3))
+    before = copy.deepcopy(host.loss.simulator.state_dict())
+    host.apply(lambda module: [nn.init.zeros_(p) for p in module.parameters()] and None)
+    after = host.loss.simulator.state_dict()
+    assert before and all(torch.equal(before[name], after[name]) for name in before)
+
+
+@both
+@each_criterion
+def test_a_step_trains_the_compensator_alone(simulator: str, criterion: str, clean: Tensor) -> None:
+    host = Host(HearingLossLoss(N3, simulator=simulator, criterion=criterion)).train()
+    before = copy.deepcopy(host.loss.simulator.state_dict())
+    optimiser = torch.optim.SGD(host.parameters(), lr=1e-3)
+    value = host.loss(host(clean), clean)
+    assert value.shape == ()
+    value.backward()
+    gradients = [parameter.grad for parameter in host.filter.parameters()]
+    assert all(grad is not None and bool(grad.isfinite().all()) and bool(grad.any()) for grad in gradients)
+    optimiser.step()
+    assert all(parameter.grad is None for parameter in host.loss.simulator.parameters())
+    after = host.loss.simulator.state_dict()
+    assert all(torch.equal(before[name], after[name]) for name in before)
+
+
+@pytest.mark.parametrize(("criterion", "gain"), [("paper", 8.0), ("bands", 1.0)])
+def test_gradient_is_that_of_the_value(criterion: str, gain: float, clean: Tensor) -> None:
+    """Along a gain, by central differences in float64."""
+    # the phase's gradient is faded where it is faint; the weights of bands have none, but do not change while everything
+    # is heard too softly
+    loss = HearingLossLoss(N3, simulator="msbg", criterion=criterion)
+    signal = clean.double()
+    factor = torch.tensor(gain, dtype=torch.float64, requires_grad=True)
+    (slope,) = torch.autograd.grad(loss(signal * factor, signal), factor)
+    ahead, behind = (float(loss(signal * g, signal)) for g in (gain + 1e-3, gain - 1e-3))
+    assert float(slope) == pytest.approx((ahead - behind) / 2e-3, rel=0.02)
+
+
+# Moving, copying, compiling
+
+
+@both
+def test_moves_with_its_host_but_never_to_half(simulator: str, clean: Tensor) -> None:
+    host = Host(HearingLossLoss(N3, simulator=simulator, criterion="bands"))
+    kinds = {tensor.dtype for tensor in host.loss.simulator.state_dict().values()}
+    host.to(torch.bfloat16)
+    assert host.filter.weight.dtype == torch.bfloat16
+    assert {tensor.dtype for tensor in host.loss.simulator.state_dict().values()} == kinds
+    before = gradient(host.loss, 3.0 * clean, clean)
+    host.double()
+    floating = [t for t in host.loss.simulator.state_dict().values() if t.is_floating_point()]
+    assert {tensor.dtype for tensor in floating} <= {torch.float64}
+    value, slope = gradient(host.loss, 3.0 * clean.double(), clean.double())
+    assert value.dtype == slope.dtype == torch.float64
+    alike(before, (value, slope))
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+@both
+@each_criterion
+def test_cuda_is_like_the_cpu(simulator: str, criterion: str, clean: Tensor) -> None:
+    loss = HearingLossLoss(N3, simulator=simulator, criterion=criterion)
+    before = gradient(loss, 3.0 * clean, clean)
+    Host(loss).cuda()
+    value, slope = gradient(loss, 3.0 * clean.cuda(), clean.cuda())
+    assert value.is_cuda
+    alike(before, (value, slope))
+    ears = torch.tensor([N3.thresholds, N4.thresholds])  # on the CPU, as a data loader gives them
+    assert bool(loss(clean.cuda(), clean.cuda(), ears).isfinite())
+    loss.cpu()
+    same(before, gradient(loss, 3.0 * clean, clean))
+
+
+@both
+@pytest.mark.parametrize("how", [copy.deepcopy, lambda loss: pickle.loads(pickle.dumps(loss))])
+def test_copies_are_their_own(simulator: str, how: Callable[[nn.Module], Host], clean: Tensor) -> None:
+    host = Host(HearingLossLoss(N3, simulator=simulator))
+    twin = how(host)
+    assert twin.loss.simulator is not host.loss.simulator and list(twin.loss.parameters()) == []
+    same(gradient(host.loss, 3.0 * clean, clean), gradient(twin.loss, 3.0 * clean, clean))
+    twin.double()
+    assert all(t.dtype != torch.float64 for t in host.loss.simulator.parameters())
+
+
+@both
+def test_caller_can_be_compiled(simulator: str, clean: Tensor) -> None:
+    loss = HearingLossLoss(N3, simulator=simulator, criterion="bands")
+
+    def step(gain: Tensor, signal: Tensor) -> Tensor:
+        value: Tensor = loss((1.0 + gain).square() * signal, signal) * 0.5
+        return value
+
+    slopes = []
+    for function in (step, torch.compile(step, backend="aot_eager")):
+        gain = torch.tensor(0.5, requires_grad=True)
+        value = function(gain, clean)
+        slopes.append((value.detach(), torch.autograd.grad(value, gain)[0]))
+    same(slopes[0], slopes[1])
+
+
+# Audiograms
+
+
+@both
+def test_audiogram_in_every_form(simulator: str, clean: Tensor) -> None:
+    stored, bare = HearingLossLoss(N3, simulator=simulator), HearingLossLoss(simulator=simulator)
+    expected = stored(clean, clean)
+    for ear in (N3, [N3, N3], torch.tensor(N3.thresholds), torch.tensor([N3.thresholds])):
+        torch.testing.assert_close(bare(clean, clean, ear), expected)
+        torch.testing.assert_close(HearingLossLoss(ear, simulator=simulator)(clean, clean), expected)
+    # the call's comes before the stored one
+    torch.testing.assert_close(stored(clean, clean, S2), bare(clean, clean, S2))
+    assert float(stored(clean, clean, S2)) != pytest.approx(float(expected), rel=1e-3)
+
+
+@both
+@each_criterion
+def test_batch_is_the_mean_of_its_items(simulator: str, criterion: str, clean: Tensor) -> None:
+    loss = HearingLossLoss(simulator=simulator, criterion=criterion)
+    signals = torch.cat((clean, 4.0 * clean.flip(-1)))
+    aided = 3.0 * signals + 1e-4 * torch.randn(signals.shape)
+    if criterion == "paper":  # the phase of what is far from audible is rounding in float32
+        loss, signals, aided = loss.double(), signals.double(), aided.double()
+    ears = torch.tensor([ear.thresholds for ear in (N3, S2, N4, Audiogram.standard("NH"))])
+    items = [loss(aided[i], signals[i], ears[i]) for i in range(4)]
+    assert float(loss(aided, signals, ears)) == pytest.approx(float(torch.stack(items).mean()), rel=1e-5)
+    # any leading dimensions
+    shape = (2, 2, -1)
+    folded = loss(aided.reshape(shape), signals.reshape(shape), ears.reshape(shape))
+    assert float(folded) == pytest.approx(float(torch.stack(items).mean()), rel=1e-5)
+
+
+def test_one_clip_in_several_ears(clean: Tensor) -> None:
+    loss = HearingLossLoss([N3, N4], criterion="bands")
+    alone = [loss(clean[0], clean[0], ear) for ear in (N3, N4)]
+    assert float(loss(clean[0], clean[0])) == pytest.approx(float(sum(alone)) / 2.0, rel=1e-5)
+
+
+# Criteria
+
+
+@both
+@each_criterion
+@pytest.mark.parametrize("reference", ["clean", "normal-hearing"])
+def test_parts_and_weights_make_the_value(
+    simulator: str, criterion: str, reference: str, clean: Tensor
+) -> None:
+    loss = HearingLossLoss(N3, simulator=simulator, criterion=criterion, reference=reference)
+    parts = loss.parts(2.0 * clean, clean)
+    assert tuple(parts) == (PARTS if criterion == "paper" else ("band_levels",))
+    assert all(part.shape == () and float(part) > 0.0 for part in parts.values())
+    default = DEFAULT_WEIGHTS if criterion == "paper" else {"band_levels": 1.0}
+    total = sum(default[name] * part for name, part in parts.items())
+    torch.testing.assert_close(loss(2.0 * clean, clean), total)
+    name = next(iter(parts))
+    alone = HearingLossLoss(
+        N3, simulator=loss.simulator, criterion=criterion, reference=reference, weights={name: 3.0}
+    )
+    torch.testing.assert_close(alone(2.0 * clean, clean), 3.0 * parts[name])
+
+
+def test_parts_can_be_trained_on(clean: Tensor) -> None:
+    loss = HearingLossLoss(N3)
+    given = (2.0 * clean).requires_grad_()
+    for name, part in loss.parts(given, clean).items():
+        (slope,) = torch.autograd.grad(part, given, retain_graph=True)
+        assert bool(slope.any()), name
+
+
+@both
+def test_what_is_heard_is_compared_with_the_reference(simulator: str, clean: Tensor) -> None:
+    """In pascals, by the criteria themselves; band levels always with what a normal ear hears."""
+    for reference in ("clean", "normal-hearing"):
+        loss = HearingLossLoss(N3, simulator=simulator, reference=reference)
+        heard = loss.simulator(2.0 * clean, N3)
+        aim = clean if reference == "clean" else loss.simulator(clean, Audiogram.standard("NH"))
+        for name, part in paper_parts(heard, aim).items():
+            torch.testing.assert_close(loss.parts(2.0 * clean, clean)[name], part.mean(), msg=name)
+        loss = HearingLossLoss(N3, simulator=simulator, criterion="bands", reference=reference)
+        normal = loss.simulator(clean, Audiogram.standard("NH"))
+        expected = band_level_loss(heard, normal, 16000).mean()
+        torch.testing.assert_close(loss(2.0 * clean, clean), expected)
+        assert float(expected) != float(band_level_loss(heard, clean, 16000).mean())
+
+
+@both
+@each_criterion
+def test_a_normal_ear_loses_nothing(simulator: str, criterion: str, clean: Tensor) -> None:
+    normal = Audiogram.standard("NH")
+    loss = HearingLossLoss(normal, simulator=simulator, criterion=criterion, reference="normal-hearing")
+    assert float(loss(clean, clean)) < 1e-5
+    # 0 dB HL is where MSBG is linear: a gain is heard as it is
+    if criterion == "bands":
+        assert float(loss(clean * 10.0**0.5, clean)) == pytest.approx(10.0, abs=0.1)
+
+
+@both
+@each_criterion
+def test_a_prescribed_gain_is_better_than_none(simulator: str, criterion: str, clean: Tensor) -> None:
+    loss = HearingLossLoss(N4, simulator=simulator, criterion=criterion, reference="normal-hearing")
+    assert float(loss(20.0 * clean, clean)) < float(loss(clean, clean))
+    _, slope = gradient(loss, clean, clean)
+    assert float((slope * clean).sum()) < 0.0  # more gain, less loss
+
+
+def test_gradient_reaches_the_clean_speech_only_where_asked(clean: Tensor) -> None:
+    loss = HearingLossLoss(N3, reference="normal-hearing")
+    reference = clean.clone().requires_grad_()
+    (slope,) = torch.autograd.grad(loss(2.0 * clean, reference), reference)
+    assert bool(slope.any()) and bool(slope.isfinite().all())
+    with torch.no_grad():
+        assert not loss(2.0 * clean, reference).requires_grad
+
+
+# Levels and rates
+
+
+@both
+@each_criterion
+def test_full_scale_is_a_unit(simulator: str, criterion: str, clean: Tensor) -> None:
+    pascals = HearingLossLoss(N3, simulator=simulator, criterion=criterion)
+    other = HearingLossLoss(N3, simulator=simulator, criterion=criterion, full_scale_spl=114.0)
+    assert float(other(0.2 * clean, 0.1 * clean)) == pytest.approx(
+        float(pascals(2.0 * clean, clean)), rel=1e-4
+    )
+    # levels matter: nothing is normalised
+    assert float(pascals(0.2 * clean, 0.1 * clean)) != pytest.approx(
+        float(pascals(2.0 * clean, clean)), rel=0.05
+    )
+
+
+@both
+@each_criterion
+def test_other_rates_judge_alike(simulator: str, criterion: str, clean: Tensor) -> None:
+    low = HearingLossLoss(N3, simulator=simulator, criterion=criterion)
+    high = HearingLossLoss(N3, simulator=simulator, criterion=criterion, sample_rate=44100)
+    faster = resample(clean, 16000, 44100)
+    first, second = low.parts(3.0 * clean, clean), high.parts(3.0 * faster, faster)
+    # the mean is over 201 frequencies at 16 kHz, at 44.1 kHz over 188 (Neuro-MSBG), or 553 of which 352 are empty
+    scale = {"neuro-msbg": 188 / 201, "msbg": 553 / 201}[simulator]
+    for name in set(first) - {"phase"}:
+        factor = scale if name in ("magnitude", "complex") else 1.0
+        assert float(second[name]) * factor == pytest.approx(float(first[name]), rel=0.1), name
+    value, slope = gradient(high, 3.0 * faster, faster)
+    assert bool(value.isfinite()) and bool(slope.isfinite().all())
+
+
+def test_above_8_khz_neuro_msbg_judges_nothing(clean: Tensor) -> None:
+    """So that what the network cannot give back is no error of the compensator's."""
+    loss = HearingLossLoss(N3, sample_rate=44100)
+    low = resample(clean, 16000, 44100)
+    time = torch.arange(low.shape[-1]) / 44100.0
+    whistle = 0.05 * torch.sin(2.0 * torch.pi * 12000.0 * time)
+    before, after = loss.parts(low, low), loss.parts(low, low + whistle)
+    for name in ("magnitude", "complex", "time"):
+        assert float(after[name]) == pytest.approx(float(before[name]), rel=1e-3), name
+
+
+# Hard inputs
+
+
+HARD = {
+    "silence": (0.0, 0.0),
+    "zero gain": (0.0, 1.0),
+    "silent clean": (1.0, 0.0),
+    "faint": (1e-9, 1.0),
+    "square wave": (1.0, 1.0),
+    "130 dB SPL": (63.0, 63.0),
+}
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@both
+@each_criterion
+def test_hard_inputs_give_finite_values_and_gradients(
+    simulator: str, criterion: str, dtype: torch.dtype, clean: Tensor
+) -> None:
+    loss = HearingLossLoss(simulator=simulator, criterion=criterion, reference="normal-hearing")
+    ears = torch.tensor([ear.thresholds for ear in (Audiogram.standard("NH"), N3, S2)])
+    square = torch.sign(torch.sin(torch.arange(1600) * 0.3 + 0.1))
+    for name, (given, truth) in HARD.items():
+        shape = clean[0, :1600] if name in ("zero gain", "faint", "silent clean") else square
+        inputs = (given * shape).to(dtype).expand(3, -1), (truth * shape).to(dtype).expand(3, -1)
+        value, slope = gradient(loss, *inputs, ears)
+        assert bool(value.isfinite()) and bool(slope.isfinite().all()), name
+        assert slope.dtype == dtype
+
+
+@pytest.mark.parametrize("pause_spl", [None, -20.0, 10.0])
+@both
+@each_criterion
+def test_pauses_do_not_take_the_gradient_over(
+    simulator: str, criterion: str, pause_spl: float | None, clean: Tensor
+) -> None:
+    """Logarithm and phase have steep gradients near silence, where nobody hears anything."""
+    signal = torch.cat((clean, torch.zeros(2, 8000)), -1)
+    if pause_spl is not None:
+        signal = signal + 10.0 ** ((pause_spl - 94.0) / 20.0) * torch.randn(signal.shape)
+    loss = HearingLossLoss([N3, S2], simulator=simulator, criterion=criterion)
+    _, slope = gradient(loss, 5.0 * signal, signal)
+    speech, pause = slope[:, :4800].norm(), slope[:, 6400:].norm()
+    assert float(speech) > 0.0 and float(pause) < 0.1 * float(speech)
+
+
+@both
+@each_criterion
+def test_autocast_does_not_reach_inside(simulator: str, criterion: str, clean: Tensor) -> None:
+    loss = HearingLossLoss(N3, simulator=simulator, criterion=criterion)
+    results = []
+    for autocast in (False, True):
+        for given in (3.0 * clean, (3.0 * clean).bfloat16()):
+            given.requires_grad_()
+            with torch.autocast("cpu", dtype=torch.bfloat16, enabled=autocast):
+                value = loss(given, clean)
+            (slope,) = torch.autograd.grad(value, given)
+            assert value.dtype == torch.float32 and slope.dtype == given.dtype
+            results.append((value.detach(), slope))
+    same(results[0], results[2])
+    same(results[1], results[3])
+    assert float(results[3][0]) == pytest.approx(float(results[0][0]), rel=0.02)
+
+
+# Simulators and errors
+
+
+def test_simulator_by_folder_and_as_a_module(clean: Tensor) -> None:
+    expected = HearingLossLoss(N3)(2.0 * clean, clean)
+    folder = find_checkpoint("neuro-msbg")
+    model = load_pretrained("neuro-msbg").train().requires_grad_(True)
+    for simulator in (folder, str(folder), model):
+        loss = HearingLossLoss(N3, simulator=simulator)
+        torch.testing.assert_close(loss(2.0 * clean, clean), expected)
+    assert loss.simulator is model and not model.training
+    assert not any(parameter.requires_grad for parameter in model.parameters())
+
+    class Halved(nn.Module):
+        def forward(self, waveform: Tensor, audiogram: Tensor) -> Tensor:
+            return 0.5 * waveform
+
+    own = HearingLossLoss(N3, simulator=Halved(), weights={"time": 1.0})
+    torch.testing.assert_close(own(2.0 * clean, clean), torch.tensor(0.0))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"simulator": "ear"}, "no checkpoint 'ear'; allowed: .*neuro-msbg"),
+        ({"sample_rate": 8000}, "sample rate 8000 Hz; allowed: 16000 to 48000"),
+        ({"full_scale_spl": 300}, "allowed: 0 to 200"),
+        ({"reference": "noisy"}, "reference is 'noisy'; allowed: clean, normal-hearing"),
+        ({"criterion": "l1"}, "criterion is 'l1'; allowed: paper, bands"),
+        ({"weights": {"pitch": 1.0}}, "pitch .*'paper'; allowed: magnitude, phase, complex, time"),
+        ({"criterion": "bands", "weights": {"phase": 1.0}}, "phase .*'bands'; allowed: band_levels"),
+        ({"weights": {"time": -1.0}}, "allowed: finite numbers, 0 or more"),
+        ({"weights": {"time": float("nan")}}, "allowed: finite numbers, 0 or more"),
+        ({"audiogram": Audiogram.standard("N7")}, "takes -10 to 100"),
+        ({"audiogram": torch.zeros(7)}, "allowed: .*8"),
+        ({"simulator": MSBG()}, "simulator has sample_rate 44100 and the loss 16000; allowed: the same"),
+        ({"simulator": MSBG(sample_rate=16000, full_scale_spl=120)}, "simulator has full_scale_spl 120"),
+    ],
+)
+def test_what_cannot_be_built(options: dict[str, object], message: str) -> None:
+    with pytest.raises(ValueError, match=message) as error:
+        HearingLossLoss(**options)  # type: ignore[arg-type]
+    assert "\n" not in str(error.value)
+
+
+@both
+def test_what_cannot_be_compared(simulator: str) -> None:
+    loss = HearingLossLoss(simulator=simulator)
+    signal = torch.randn(2, 1600)
+    for arguments, message in (
+        ((signal, signal), "no audiogram: give one when building the loss or with the call"),
+        (
+            (signal, signal[:, 1:], N3),
+            r"compensated has shape \(2, 1600\), clean \(2, 1599\); allowed: the same",
+        ),
+        ((signal, signal[0], N3), r"\(2, 1600\), clean \(1600,\)"),
+        ((signal.long(), signal, N3), "compensated is torch.int64; allowed"),
+        ((signal[:, :0], signal[:, :0], N3), "at least one sample"),
+        ((signal, signal, [N3, N3, N3]), r"audiograms of shape \(3, 8\)"),
+        ((signal, signal, Audiogram.standard("N7")), "takes -10 to 100"),
+        ((signal, signal, "N3"), "audiogram is str; allowed"),
+    ):
+        with pytest.raises(ValueError, match=message) as error:
+            loss(*arguments)
+        assert "\n" not in str(error.value)
+
+
+def test_simulator_must_keep_the_length() -> None:
+    loss = HearingLossLoss(N3, simulator=MSBG(sample_rate=44100, aligned=False), sample_rate=44100)
+    with pytest.raises(ValueError, match=r"made \d+ samples of 4000; allowed: .*aligned=True"):
+        loss(torch.randn(4000), torch.randn(4000))
