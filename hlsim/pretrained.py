@@ -80,14 +80,13 @@ def find_checkpoint(name: str | Path) -> Path:
     Raises:
         ValueError: there is none; the message lists those that ship.
     """
-    shipped = checkpoints_folder()
-    plain = str(name)
-    for folder in (Path(name), shipped / plain if plain and Path(plain).name == plain else None):
-        if folder is not None and (folder / CONFIG).is_file():
-            return folder
-    known = sorted(path.parent.name for path in shipped.glob(f"*/{CONFIG}"))
+    if (Path(name) / CONFIG).is_file():
+        return Path(name)
+    shipped = {path.parent.name: path.parent for path in sorted(checkpoints_folder().glob(f"*/{CONFIG}"))}
+    if str(name) in shipped:
+        return shipped[str(name)]
     raise ValueError(
-        f"no checkpoint {plain!r}; allowed: {', '.join(known) or 'none ships'}, or a folder with {CONFIG}"
+        f"no checkpoint {str(name)!r}; allowed: {', '.join(shipped) or 'none ships'}, or a folder with {CONFIG}"
     )
 
 
@@ -125,6 +124,7 @@ def save_checkpoint(
         "about": dict(about),
     }
     staging = Path(tempfile.mkdtemp(prefix=f".{target.name}.", dir=target.parent))
+    old = target.with_name(f".{target.name}.old")
     try:
         (staging / WEIGHTS).write_bytes(weights)
         (staging / CONFIG).write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
@@ -133,7 +133,6 @@ def save_checkpoint(
         elif (target / CARD).is_file():
             shutil.copy(target / CARD, staging / CARD)
         staging.chmod(0o755)
-        old = target.with_name(f".{target.name}.old")
         shutil.rmtree(old, ignore_errors=True)
         if target.exists():
             os.replace(target, old)
@@ -141,3 +140,5 @@ def save_checkpoint(
         shutil.rmtree(old, ignore_errors=True)
     finally:
         shutil.rmtree(staging, ignore_errors=True)
+        if old.exists() and not target.exists():
+            os.replace(old, target)
