@@ -36,7 +36,7 @@ class Toy(TimedModule):
 
     def validate(self) -> dict[str, float]:
         score = self.scores[self.global_step] if self.scores else -float(self.vector.detach().sum())
-        return {"score": score, "sum": float(self.vector.detach().sum())}
+        return {"score": score, "valid_sum": float(self.vector.detach().sum())}
 
 
 def go(module: Toy, out: Path, max_steps: int = 6, **options: Any) -> tuple[list[dict[str, Any]], list[str]]:
@@ -65,7 +65,7 @@ def test_runs_the_steps_asked_for_and_leaves_state_recipe_and_events(tmp_path: P
     assert state["global_step"] == 6
     assert list((folder / "events").glob("events.out.tfevents.*"))
     assert [line.split(",")[0] for line in lines] == ["step 2", "step 4", "step 6", "step 6"]
-    assert "sum " in lines[0] and "score" not in lines[0]
+    assert "valid_sum " in lines[0] and "score" not in lines[0]
 
 
 def test_a_resumed_run_ends_where_an_uninterrupted_one_does(tmp_path: Path) -> None:
@@ -159,7 +159,10 @@ def test_learning_rate_rises_over_fifty_steps_and_falls_with_time(tmp_path: Path
 def test_the_best_validation_is_what_is_written(tmp_path: Path) -> None:
     scores = {2: 1.0, 4: 3.0, 6: 2.0}
     written, _ = go(Toy(scores=scores), tmp_path, max_steps=6)
-    assert [(note["steps"], set(note["validation"])) for note in written] == [(2, {"sum"}), (4, {"sum"})]
+    assert [(note["steps"], set(note["validation"])) for note in written] == [
+        (2, {"valid_sum"}),
+        (4, {"valid_sum"}),
+    ]
     assert all(note["minutes"] >= 0.0 for note in written)
     # resumed: what was best stays best
     written, _ = go(Toy(scores=scores | {8: 2.9, 10: 3.5}), tmp_path, max_steps=10)
