@@ -105,7 +105,8 @@ class KeepBest(Callback):
         self.best = float(state_dict["best"])
 
     def on_validation_end(self, trainer: L.Trainer, module: L.LightningModule) -> None:
-        figures = {name: float(value) for name, value in trainer.callback_metrics.items() if name != "loss"}
+        kept = ("score", "valid_")
+        figures = {name: float(v) for name, v in trainer.callback_metrics.items() if name.startswith(kept)}
         score = figures.pop("score", -math.inf)
         if trainer.is_global_zero and score > self.best:
             self.best = score

@@ -1,0 +1,153 @@
+"""Neuro-MSBG: shapes, laws, and how near it is to MSBG."""
+
+import pytest
+import torch
+from hlsim import MSBG, Audiogram, NeuroMSBG, load_pretrained
+from hlsim.audio import resample
+from hlsim.audiogram import draw_thresholds
+from hlsim.calibration import set_level
+from hlsim.criteria import noise_to_signal_db
+from hlsim.neuro import NeuroConfig
+from torch import Tensor
+
+PAPER = NeuroConfig(
+    fft=400, window=400, hop=100, channels=8, dense_depth=2, stride=(1, 2), blocks=1, prior=False, level_aware=False
+)
+
+
+@pytest.fixture(scope="module")
+def trained() -> NeuroMSBG:
+    return load_pretrained("neuro-msbg")
+
+
+@pytest.fixture
+def clips(speech: list[tuple[Tensor, int]]) -> Tensor:
+    cut = [resample(waveform, rate, 16000)[0, 4000:28000] for waveform, rate in speech]
+    return set_level(torch.stack(cut), 65.0)
+
+
+@pytest.mark.parametrize("rate", [16000, 22050, 44100, 48000])
+@pytest.mark.parametrize("shape", [(1600,), (2, 4801), (2, 3, 2000)])
+def test_keeps_the_shape_at_any_rate(rate: int, shape: tuple[int, ...]) -> None:
+    model = NeuroMSBG(NeuroConfig(channels=4, blocks=1), sample_rate=rate)
+    assert model(0.02 * torch.randn(shape), Audiogram.standard("N2")).shape == shape
+
+
+def test_waveform_broadcasts_over_ears(trained: NeuroMSBG) -> None:
+    waveform, ears = 0.02 * torch.randn(8000), draw_thresholds(3)
+    heard = trained(waveform, ears)
+    assert heard.shape == (3, 8000)
+    torch.testing.assert_close(heard[1], trained(waveform, ears[1]), atol=1e-7, rtol=1e-4)
+
+
+def test_batch_of_mixed_severities_equals_its_items(trained: NeuroMSBG, clips: Tensor) -> None:
+    ears = torch.tensor([Audiogram.standard(name).thresholds for name in ("NH", "N1", "N2", "N4")])
+    together = trained(clips, ears)
+    for i in range(4):
+        alone = trained(clips[i], ears[i])
+        assert float((together[i] - alone).norm() / alone.norm()) < 1e-5
+
+
+def test_is_deterministic_under_a_seed() -> None:
+    waveform, ear = 0.02 * torch.randn(4000), Audiogram.standard("N3")
+    models = []
+    for _ in range(2):
+        torch.manual_seed(1)
+        models.append(NeuroMSBG())
+    assert torch.equal(models[0](waveform, ear), models[1](waveform, ear))
+
+
+@pytest.mark.parametrize("config", [NeuroConfig(), PAPER], ids=["default", "paper"])
+def test_configuration_survives_json(config: NeuroConfig) -> None:
+    import json
+
+    assert NeuroConfig.from_dict(json.loads(json.dumps(config.to_dict()))) == config
+
+
+@pytest.mark.parametrize(
+    "change", [{"channel": 3}, {"channels": 0}, {"kernel": [4, 7]}, {"hop": 60}, {"window": 300}, {"blocks": 1.5}]
+)
+def test_bad_configuration(change: dict[str, object]) -> None:
+    with pytest.raises(ValueError, match="allowed"):
+        NeuroConfig.from_dict(change)
+
+
+def test_paper_like_network_trains_a_step() -> None:
+    model = NeuroMSBG(PAPER)
+    heard = model(0.02 * torch.randn(2, 4000), draw_thresholds(2))
+    heard.square().sum().backward()
+    for name, parameter in model.named_parameters():
+        assert parameter.grad is not None and bool(torch.isfinite(parameter.grad).all()), name
+
+
+@pytest.mark.parametrize("level", [-20.0, 20.0, 65.0, 100.0, 120.0])
+def test_gradients_are_finite_at_all_levels(trained: NeuroMSBG, level: float) -> None:
+    waveform = set_level(torch.randn(2, 4000), level).requires_grad_()
+    heard = trained(waveform, torch.tensor([[0.0] * 8, [70.0] * 8]))
+    heard.square().sum().backward()
+    assert bool(torch.isfinite(heard).all()) and bool(torch.isfinite(waveform.grad).all())
+
+
+def test_silence_stays_silent(trained: NeuroMSBG) -> None:
+    waveform = torch.zeros(1600, requires_grad=True)
+    heard = trained(waveform, Audiogram.standard("N4"))
+    heard.sum().backward()
+    assert float(heard.abs().max()) == 0.0 and bool(torch.isfinite(waveform.grad).all())
+
+
+def test_full_scale_is_a_change_of_units(trained: NeuroMSBG, clips: Tensor) -> None:
+    other = load_pretrained("neuro-msbg", full_scale_spl=120.0)
+    scale = 10.0 ** ((94.0 - 120.0) / 20.0)
+    ear = Audiogram.standard("N3")
+    heard = other(clips * scale, ear) / scale
+    assert float((heard - trained(clips, ear)).norm() / heard.norm()) < 1e-4
+
+
+def test_an_impaired_ear_expands(trained: NeuroMSBG, clips: Tensor) -> None:
+    """Recruitment: 10 dB more in is more than 10 dB more out where there is a loss, and 10 dB where there is none."""
+    for name, least, most in (("NH", 9.9, 10.1), ("N3", 14.0, 25.0)):
+        soft, loud = (trained(clips * gain, Audiogram.standard(name)).square().mean() for gain in (1.0, 10**0.5))
+        growth = 10.0 * float(torch.log10(loud / soft))
+        assert least < growth < most
+
+
+@pytest.mark.parametrize(("name", "least"), [("NH", 30.0), ("N1", 26.0), ("N2", 22.0), ("S1", 22.0), ("N3", 16.0)])
+def test_trained_is_near_msbg(trained: NeuroMSBG, clips: Tensor, name: str, least: float) -> None:
+    ear = Audiogram.standard(name)
+    with torch.no_grad():
+        truth = MSBG(ear, sample_rate=16000)(clips)
+        snr = -noise_to_signal_db(trained(clips, ear), truth)
+    assert float(snr.median()) > least
+
+
+def test_untrained_default_starts_near_msbg(clips: Tensor) -> None:
+    model = NeuroMSBG()
+    for name in ("NH", "N1", "N2", "S1"):
+        ear = Audiogram.standard(name)
+        with torch.no_grad():
+            truth = MSBG(ear, sample_rate=16000)(clips)
+            assert float(-noise_to_signal_db(model(clips, ear), truth).median()) > 15.0
+
+
+def test_faster_input_gives_the_band_under_8_khz(trained: NeuroMSBG, clips: Tensor) -> None:
+    ear = Audiogram.standard("N2")
+    fast = load_pretrained("neuro-msbg", sample_rate=48000)(resample(clips, 16000, 48000), ear)
+    back = resample(fast, 48000, 16000)
+    slow = trained(clips, ear)
+    assert float((back - slow).norm() / slow.norm()) < 0.02
+    spectrum = torch.fft.rfft(fast).abs().square().mean(0)
+    assert float(spectrum[spectrum.shape[0] * 2 // 5 :].sum() / spectrum.sum()) < 1e-6
+
+
+def test_bad_input(trained: NeuroMSBG) -> None:
+    for waveform, ear, text in (
+        (torch.zeros(0), torch.zeros(8), "at least one sample"),
+        (torch.zeros(10, dtype=torch.int16), torch.zeros(8), "floating-point"),
+        (torch.zeros(100), torch.full((8,), 101.0), "-10 to 100"),
+        (torch.zeros(100), torch.zeros(7), r"\(..., 8\)"),
+        (torch.zeros(2, 100), torch.zeros(3, 8), "broadcast"),
+    ):
+        with pytest.raises(ValueError, match=text):
+            trained(waveform, ear)
+    with pytest.raises(ValueError, match="16000 to 48000"):
+        NeuroMSBG(sample_rate=8000)

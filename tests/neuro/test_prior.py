@@ -1,0 +1,43 @@
+"""What the network starts from is MSBG's."""
+
+import numpy as np
+import torch
+from hlsim import MSBG, Audiogram
+from hlsim.audiogram import SEVERITIES
+from hlsim.msbg.filterbank import BANKS
+from hlsim.neuro.config import NeuroConfig
+from hlsim.neuro.prior import RESPONSE_REACH, Prior
+
+
+def test_fixed_response_is_msbg_without_a_loss() -> None:
+    prior = Prior(NeuroConfig().stft)
+    impulse = torch.zeros(1, 8000)
+    impulse[0, 4000] = 1.0
+    filtered = prior.filter(impulse, torch.tensor([0]))
+    exact = MSBG(Audiogram.standard("NH"), sample_rate=16000)(impulse)
+    assert float((filtered - exact).norm() / exact.norm()) < 2e-3
+    kernel = prior.response[0].numpy()
+    np.testing.assert_allclose(filtered[0, 4000 - RESPONSE_REACH : 4000 + RESPONSE_REACH], kernel, atol=1e-6)
+
+
+def test_no_loss_means_no_gain_and_no_smearing() -> None:
+    prior = Prior(NeuroConfig().stft)
+    spectrum = torch.randn(2, 50, 129, dtype=torch.complex64)
+    factor = prior(spectrum, torch.zeros(2, 8), torch.zeros(2, dtype=torch.long))
+    torch.testing.assert_close(factor, torch.ones_like(factor), atol=1e-4, rtol=0.0)
+
+
+def test_padding_of_the_smaller_banks_is_silent() -> None:
+    prior = Prior(NeuroConfig().stft)
+    for number, severity in enumerate(SEVERITIES):
+        channels = BANKS[severity].channels
+        assert not bool(prior.excitation_known[number, channels:].any())
+        assert not bool(prior.relative_known[:, number, channels:].any())
+        np.testing.assert_allclose(prior.relative_known[0, number].sum(0), 1.0, atol=1e-4)
+
+
+def test_envelope_smoothing_keeps_the_mean() -> None:
+    prior = Prior(NeuroConfig().stft)
+    for number, severity in enumerate(SEVERITIES):
+        rows = prior.smoothing_known[number, : BANKS[severity].channels]
+        np.testing.assert_allclose(rows.sum(-1), 1.0, atol=1e-5)

@@ -1,0 +1,52 @@
+"""The demo, cut short: everything it promises lies there, and agrees with itself."""
+
+import json
+from pathlib import Path
+
+import pytest
+import soundfile
+from hlsim import Audiogram
+
+pytest.importorskip("lightning")
+pytest.importorskip("clarity")
+
+from hlsim.demo import demo  # noqa: E402
+
+
+@pytest.fixture
+def short_speech(tmp_path: Path, speech_dir: Path) -> Path:
+    """24 utterances of a second, so that eight are scored."""
+    folder = tmp_path / "speech"
+    folder.mkdir()
+    for path in sorted(speech_dir.rglob("*.flac")):
+        samples, rate = soundfile.read(path)
+        soundfile.write(folder / path.name, samples[rate // 2 : rate // 2 + rate], rate)
+    return folder
+
+
+def test_demo_writes_report_audio_and_pictures(tmp_path: Path, short_speech: Path) -> None:
+    out = tmp_path / "out"
+    lines: list[str] = []
+    text = demo(out, Audiogram.standard("N4"), speech=short_speech, minutes=0.1, report=lines.append)
+    report = json.loads((out / "report.json").read_text())
+    assert report["n"] == len(report["items"]) == 8
+    for name in ("unaided", "nalr", "initial", "compensated"):
+        assert 0.0 <= report[f"{name}_mean"] <= 1.0
+        assert f"| {name} | {report[f'{name}_mean']:.3f} |" in text
+    assert report["before_mean"] == pytest.approx(report["unaided_mean"])
+    assert report["after_mean"] == pytest.approx(report["compensated_mean"])
+    # NAL-R and what starts from it make speech louder and easier to understand for this ear
+    assert report["nalr_mean"] > report["unaided_mean"]
+    assert report["compensated_mean"] > report["unaided_mean"]
+    assert report["nalr_level_mean"] > report["unaided_level_mean"] + 10.0
+    assert report["unaided_heard_difference_db"] < -20.0
+    for name in ("report.md", "before-after.png", "spectrograms.png", "training/checkpoint/model.safetensors"):
+        assert (out / name).stat().st_size > 0
+    assert len(list((out / "audio").glob("*.wav"))) == 3 * 8
+    assert any(line.startswith("step") for line in lines)
+
+
+def test_too_little_speech(tmp_path: Path, speech_dir: Path) -> None:
+    with pytest.raises(ValueError, match="allowed: 22 or more"):
+        demo(tmp_path / "out", Audiogram.standard("N4"), speech=speech_dir / "valid")
+    assert not (tmp_path / "out").exists()

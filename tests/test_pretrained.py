@@ -1,0 +1,150 @@
+"""Checkpoints: whole, hashed, without pickle."""
+
+import json
+import os
+from pathlib import Path
+
+import pytest
+import torch
+from hlsim import NeuroMSBG, load_pretrained
+from hlsim.neuro import NeuroConfig
+from hlsim.pretrained import checkpoints_folder, find_checkpoint, save_checkpoint
+
+SMALL = NeuroConfig(channels=4, blocks=1)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    model = NeuroMSBG(SMALL)
+    with torch.no_grad():
+        for parameter in model.parameters():
+            parameter.add_(0.01 * torch.randn_like(parameter))
+    save_checkpoint(tmp_path / "small", "neuro-msbg", model, SMALL.to_dict(), {"seed": 0}, card="# small\n")
+    return tmp_path / "small"
+
+
+def test_save_and_load_are_bit_equal(tmp_path: Path, folder: Path) -> None:
+    first = load_pretrained(folder)
+    save_checkpoint(tmp_path / "again", "neuro-msbg", first, first.config.to_dict(), {})
+    second = load_pretrained(tmp_path / "again")
+    assert first.config == second.config == SMALL
+    for (name, a), (other, b) in zip(first.state_dict().items(), second.state_dict().items(), strict=True):
+        assert name == other and torch.equal(a, b)
+    waveform, ear = 0.02 * torch.randn(2, 4000), torch.full((8,), 40.0)
+    assert torch.equal(first(waveform, ear), second(waveform, ear))
+
+
+def test_loaded_model_is_frozen(folder: Path) -> None:
+    model = load_pretrained(folder, sample_rate=44100, full_scale_spl=100.0)
+    assert not model.training and not any(p.requires_grad for p in model.parameters())
+    assert (model.sample_rate, model.full_scale_spl) == (44100, 100.0)
+
+
+def test_folder_holds_three_files_and_no_pickle(folder: Path) -> None:
+    assert {path.name for path in folder.iterdir()} == {"model.safetensors", "config.json", "README.md"}
+    assert not list(folder.parent.glob(".*"))
+    header = (folder / "model.safetensors").read_bytes()[8:200]
+    assert header.startswith(b"{")  # safetensors: a length, then JSON
+
+
+def test_saving_again_keeps_the_card_and_replaces_the_rest(folder: Path) -> None:
+    save_checkpoint(folder, "neuro-msbg", NeuroMSBG(SMALL), SMALL.to_dict(), {"seed": 1})
+    assert (folder / "README.md").read_text() == "# small\n"
+    assert json.loads((folder / "config.json").read_text())["about"] == {"seed": 1}
+    load_pretrained(folder)
+
+
+def test_failing_save_leaves_the_old_checkpoint(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+
+    def fail(*_: object) -> None:
+        raise OSError("disk full")
+
+    monkeypatch.setattr(os, "replace", fail)
+    with pytest.raises(OSError, match="disk full"):
+        save_checkpoint(folder, "neuro-msbg", NeuroMSBG(SMALL), SMALL.to_dict(), {})
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+    assert [path.name for path in folder.parent.iterdir()] == ["small"]
+
+
+@pytest.mark.parametrize("place", [0, 100, -1])
+def test_changed_weights(folder: Path, place: int) -> None:
+    weights = bytearray((folder / "model.safetensors").read_bytes())
+    weights[place] ^= 1
+    (folder / "model.safetensors").write_bytes(weights)
+    with pytest.raises(ValueError, match="SHA-256"):
+        load_pretrained(folder)
+
+
+def test_another_kind(folder: Path) -> None:
+    record = json.loads((folder / "config.json").read_text())
+    (folder / "config.json").write_text(json.dumps(record | {"kind": "mapping-compensator"}))
+    with pytest.raises(ValueError, match="kind 'mapping-compensator'; needed here: 'neuro-msbg'"):
+        load_pretrained(folder)
+
+
+def test_configuration_that_does_not_fit(folder: Path) -> None:
+    record = json.loads((folder / "config.json").read_text())
+    record["config"]["channels"] = 5
+    (folder / "config.json").write_text(json.dumps(record))
+    with pytest.raises(ValueError, match="do not fit"):
+        load_pretrained(folder)
+    (folder / "config.json").write_text("no JSON")
+    with pytest.raises(ValueError, match="not readable as a checkpoint"):
+        load_pretrained(folder)
+
+
+def test_missing_weights(folder: Path) -> None:
+    (folder / "model.safetensors").unlink()
+    with pytest.raises(ValueError, match="not readable as a checkpoint"):
+        load_pretrained(folder)
+
+
+@pytest.mark.parametrize("name", ["no-such", "../checkpoints/neuro-msbg/../neuro-msbg2", "", "."])
+def test_unknown_names(name: str) -> None:
+    with pytest.raises(ValueError, match="allowed: .*neuro-msbg"):
+        load_pretrained(name)
+
+
+def test_shipped_checkpoint() -> None:
+    assert find_checkpoint("neuro-msbg") == checkpoints_folder() / "neuro-msbg"
+    model = load_pretrained("neuro-msbg")
+    record = json.loads((checkpoints_folder() / "neuro-msbg" / "config.json").read_text())
+    assert record["about"]["validation"]["valid_snr_median"] > 15.0
+    card = (checkpoints_folder() / "neuro-msbg" / "README.md").read_text()
+    assert "CC BY 4.0" in card and "evaluate-simulator" in card
+    assert model.config.prior
+
+
+def test_failing_rename_gives_the_old_checkpoint_its_name_back(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    replace, calls = os.replace, []
+
+    def fail_second(source: Path, target: Path) -> None:
+        calls.append(source)
+        if len(calls) == 2:
+            raise OSError("disk full")
+        replace(source, target)
+
+    monkeypatch.setattr(os, "replace", fail_second)
+    with pytest.raises(OSError, match="disk full"):
+        save_checkpoint(folder, "neuro-msbg", NeuroMSBG(SMALL), SMALL.to_dict(), {})
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+    assert [path.name for path in folder.parent.iterdir()] == ["small"]
+
+
+def test_names_do_not_lead_out_of_the_folder_that_ships(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shipped = tmp_path / "package" / "checkpoints"
+    for place in (shipped / "good", shipped / "deep" / "er", shipped.parent, shipped.parent / "beside"):
+        place.mkdir(parents=True, exist_ok=True)
+        (place / "config.json").write_text("{}")
+    monkeypatch.setattr("hlsim.pretrained.checkpoints_folder", lambda: shipped)
+    monkeypatch.chdir(tmp_path)
+    assert find_checkpoint("good") == shipped / "good"
+    for name in ("..", "../beside", "deep/er", "deep", ".", "", str(shipped / "none")):
+        with pytest.raises(ValueError, match="allowed: good, or a folder with config.json"):
+            find_checkpoint(name)

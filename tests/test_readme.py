@@ -1,0 +1,53 @@
+"""The README's example runs as it stands there, and its commands exist."""
+
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+from hlsim.cli import _parser
+
+README = Path(__file__).parent.parent / "README.md"
+
+
+def _block(marker: str) -> str:
+    found = re.search(rf"<!-- {marker} -->\n```\w+\n(.*?)```", README.read_text(encoding="utf-8"), re.DOTALL)
+    assert found is not None
+    return found[1]
+
+
+def test_example_trains() -> None:
+    names: dict[str, object] = {}
+    exec(compile(_block("example"), str(README), "exec"), names)
+    assert float(names["value"]) > 0  # type: ignore[arg-type]
+    gradients = [parameter.grad for parameter in names["compensator"].parameters()]  # type: ignore[attr-defined]
+    assert any(gradient is not None and bool(gradient.abs().sum() > 0) for gradient in gradients)
+
+
+def test_example_is_about_ten_lines() -> None:
+    assert len([line for line in _block("example").splitlines() if line.strip()]) <= 13
+
+
+def test_commands_parse() -> None:
+    text = re.sub(r"\\\n\s*", "", README.read_text(encoding="utf-8"))
+    commands = re.findall(r"^hlsim (.*)$", text, re.MULTILINE)
+    assert len(commands) >= 3
+    for command in commands:
+        _parser().parse_args(shlex.split(command))
+
+
+@pytest.mark.parametrize("path", re.findall(r"\]\(([\w/.-]+)\)", README.read_text(encoding="utf-8")))
+def test_linked_files_exist(path: str) -> None:
+    assert (README.parent / path).is_file()
+
+
+def test_recipes_are_readable() -> None:
+    yaml = pytest.importorskip("yaml")
+    pytest.importorskip("lightning")
+    from hlsim.neuro import NeuroConfig
+    from hlsim.training.simulator import SimulatorRecipe
+
+    for path in (README.parent / "examples").glob("*.yaml"):
+        if "compensator" not in path.name:
+            recipe = SimulatorRecipe.from_dict(yaml.safe_load(path.read_text(encoding="utf-8")))
+            NeuroConfig.from_dict(recipe.model)
