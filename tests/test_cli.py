@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import soundfile
 import torch
+
 from hlsim import MSBG, Audiogram
 from hlsim.cli import main
 
@@ -93,12 +94,16 @@ def test_bad_audiogram(
     assert reason in error and not list(tmp_path.iterdir())
 
 
-def test_audiograms_that_do_not_ascend(tmp_path: Path, capsys: pytest.CaptureFixture[str], speech_dir: Path) -> None:
+def test_audiograms_that_do_not_ascend(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], speech_dir: Path
+) -> None:
     table = tmp_path / "ears.csv"
     table.write_text("hl_500,hl_250,hl_1000\n10,20,30\n")
     out = tmp_path / "out"
     speech = speech_dir / "valid"
-    error = fails(capsys, "evaluate-simulator", "msbg", "--speech", speech, "--audiograms", table, "--out", out)
+    error = fails(
+        capsys, "evaluate-simulator", "msbg", "--speech", speech, "--audiograms", table, "--out", out
+    )
     assert f"{table}, line 2" in error and "ascending" in error
 
 
@@ -134,7 +139,22 @@ def test_unequal_file_lists(tmp_path: Path, utterance: Path, capsys: pytest.Capt
     ("command", "module"),
     [
         (["train-simulator", "--config", "c", "--speech", "s", "--out", "o"], "lightning"),
-        (["haspi-report", "--clean", "c", "--before", "b", "--after", "a", "--audiogram", "N4", "--out", "o"], "clarity"),
+        (
+            [
+                "haspi-report",
+                "--clean",
+                "c",
+                "--before",
+                "b",
+                "--after",
+                "a",
+                "--audiogram",
+                "N4",
+                "--out",
+                "o",
+            ],
+            "clarity",
+        ),
         (["evaluate-simulator", "msbg", "--speech", "s", "--audiograms", "a", "--out", "o"], "pesq"),
         (["demo", "--out", "o"], "matplotlib"),
     ],

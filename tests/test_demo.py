@@ -5,12 +5,13 @@ from pathlib import Path
 
 import pytest
 import soundfile
+
 from hlsim import Audiogram
 
 pytest.importorskip("lightning")
 pytest.importorskip("clarity")
 
-from hlsim.demo import demo  # noqa: E402
+from hlsim.demo import demo
 
 
 @pytest.fixture
@@ -40,7 +41,12 @@ def test_demo_writes_report_audio_and_pictures(tmp_path: Path, short_speech: Pat
     assert report["compensated_mean"] > report["unaided_mean"]
     assert report["nalr_level_mean"] > report["unaided_level_mean"] + 10.0
     assert report["unaided_heard_difference_db"] < -20.0
-    for name in ("report.md", "before-after.png", "spectrograms.png", "training/checkpoint/model.safetensors"):
+    for name in (
+        "report.md",
+        "before-after.png",
+        "spectrograms.png",
+        "training/checkpoint/model.safetensors",
+    ):
         assert (out / name).stat().st_size > 0
     assert len(list((out / "audio").glob("*.wav"))) == 3 * 8
     assert any(line.startswith("step") for line in lines)

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
+
 from hlsim import NeuroMSBG, load_pretrained
 from hlsim.neuro import NeuroConfig
 from hlsim.pretrained import checkpoints_folder, find_checkpoint, save_checkpoint
@@ -102,7 +103,7 @@ def test_missing_weights(folder: Path) -> None:
 
 @pytest.mark.parametrize("name", ["no-such", "../checkpoints/neuro-msbg/../neuro-msbg2", "", "."])
 def test_unknown_names(name: str) -> None:
-    with pytest.raises(ValueError, match="allowed: .*neuro-msbg"):
+    with pytest.raises(ValueError, match=r"allowed: .*neuro-msbg"):
         load_pretrained(name)
 
 
@@ -146,5 +147,5 @@ def test_names_do_not_lead_out_of_the_folder_that_ships(
     monkeypatch.chdir(tmp_path)
     assert find_checkpoint("good") == shipped / "good"
     for name in ("..", "../beside", "deep/er", "deep", ".", "", str(shipped / "none")):
-        with pytest.raises(ValueError, match="allowed: good, or a folder with config.json"):
+        with pytest.raises(ValueError, match=r"allowed: good, or a folder with config\.json"):
             find_checkpoint(name)

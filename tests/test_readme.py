@@ -5,6 +5,7 @@ import shlex
 from pathlib import Path
 
 import pytest
+
 from hlsim.cli import _parser
 
 README = Path(__file__).parent.parent / "README.md"
@@ -29,8 +30,9 @@ def test_example_is_about_ten_lines() -> None:
 
 
 def test_commands_parse() -> None:
-    text = re.sub(r"\\\n\s*", "", README.read_text(encoding="utf-8"))
-    commands = re.findall(r"^hlsim (.*)$", text, re.MULTILINE)
+    blocks = re.findall(r"```sh\n(.*?)```", README.read_text(encoding="utf-8"), re.DOTALL)
+    text = re.sub(r"\\\n\s*", "", "".join(blocks))
+    commands = re.findall(r"^(?:\.venv/bin/)?hlsim (.*)$", text, re.MULTILINE)
     assert len(commands) >= 3
     for command in commands:
         _parser().parse_args(shlex.split(command))

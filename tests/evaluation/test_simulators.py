@@ -5,12 +5,13 @@ from pathlib import Path
 
 import pytest
 import torch
+from torch import Tensor
+
 from hlsim import MSBG, Audiogram
 from hlsim.calibration import level_spl, set_level
 from hlsim.evaluation.fidelity import snr_db
 from hlsim.evaluation.simulators import LEVELS, _items, evaluate_simulators
 from hlsim.evaluation.truth import pyclarity_msbg
-from torch import Tensor
 
 pytest.importorskip("clarity")
 pytest.importorskip("pesq")

@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+
 from hlsim import MSBG, Audiogram
 from hlsim.msbg import estimate_delay
 
