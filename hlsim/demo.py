@@ -60,14 +60,19 @@ def demo(
     utterances = [_read(path) for path in scored]
     recipe = CompensatorRecipe(seed=seed)
     report(f"training on {len(training)} utterances for {minutes:g} minutes, ear {_name(audiogram)}")
-    checkpoint = train_compensator(
-        CompensatorData(speech=training),
-        recipe,
-        out=folder / "training",
-        audiogram=audiogram,
-        max_minutes=minutes,
-        report=report,
-    )
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)  # the steps are small: on a busy machine two threads wait for each other
+    try:
+        checkpoint = train_compensator(
+            CompensatorData(speech=training),
+            recipe,
+            out=folder / "training",
+            audiogram=audiogram,
+            max_minutes=minutes,
+            report=report,
+        )
+    finally:
+        torch.set_num_threads(threads)
     torch.manual_seed(seed)
     conditions: dict[str, nn.Module] = {
         "unaided": nn.Identity(),

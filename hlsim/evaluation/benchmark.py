@@ -36,7 +36,7 @@ def benchmark(
     """Time one clip at batch 1 through pyclarity's MSBG, the exact MSBG and a Neuro-MSBG, in turn.
 
     The clip is noise at 65 dB SPL with the rhythm of syllables, the ears N1, N2 and N3. Rows take turns, so that all see
-    the same machine; the first round does not count.
+    the same machine; the first round does not count, and each timing follows an uncounted call of the same.
 
     Args:
         device: ``"cpu"`` or ``"cuda"``; pyclarity always runs on the CPU.
@@ -155,6 +155,7 @@ def _time(
     device: str,
     call: Callable[[], Any],
 ) -> None:
+    call()  # the one before left its own data in the caches
     if device.startswith("cuda"):
         torch.cuda.synchronize()
     start = time.perf_counter()

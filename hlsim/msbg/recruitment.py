@@ -76,14 +76,13 @@ def expand(channels: Tensor, envelopes: Tensor, ratios: Tensor) -> Tensor:
         steep = low < 0.3 * torch.maximum(high.roll(1, -1), high.roll(-1, -1))
         steep = steep & slight.unsqueeze(-1)
         own = ratios.unsqueeze(-1).expand(steep.shape)[steep].unsqueeze(-1)
-        gain = gain.index_put((steep,), _gain(_around(envelopes)[steep] @ kernel, own))
+        gain[steep] = _gain(_around(envelopes)[steep] @ kernel, own)
     full = gain.flatten(-2)
     if torch.is_grad_enabled() and (channels.requires_grad or full.requires_grad):
         return (channels * full).sum(-2)
     total = torch.zeros_like(channels[..., 0, :])
-    for channel in range(
-        channels.shape[-2]
-    ):  # in place, a channel at a time: it stays in the processor's cache
+    # in place, a channel at a time: it stays in the processor's cache
+    for channel in range(channels.shape[-2]):
         total.addcmul_(channels[..., channel, :], full[..., channel, :])
     return total
 

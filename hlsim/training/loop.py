@@ -4,6 +4,7 @@ import hashlib
 import json
 import logging
 import math
+import sys
 import time
 import warnings
 from collections.abc import Callable, Mapping
@@ -13,7 +14,7 @@ from typing import Any
 
 import lightning as L
 import torch
-from lightning.pytorch.callbacks import Callback, ModelCheckpoint, Timer, TQDMProgressBar
+from lightning.pytorch.callbacks import Callback, ModelCheckpoint, Timer
 from lightning.pytorch.loggers import TensorBoardLogger
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
@@ -132,6 +133,30 @@ class History(Callback):
         self.report(f"step {trainer.global_step}, {minutes:.1f} min: {figures}")
 
 
+class TimeProgress(Callback):
+    """A line that shows the share of the time spent, every two seconds: the number of steps is not known beforehand."""
+
+    def __init__(self) -> None:
+        self.shown = 0.0
+
+    def on_train_batch_end(
+        self, trainer: L.Trainer, module: L.LightningModule, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        assert isinstance(module, TimedModule)
+        if not trainer.is_global_zero or time.monotonic() - self.shown < 2.0:
+            return
+        self.shown = time.monotonic()
+        spent = module.timer.time_elapsed("train") / 60.0
+        share = min(100.0, 100.0 * spent / module.max_minutes)
+        loss = float(trainer.callback_metrics.get("loss", math.nan))
+        line = f"{share:3.0f} % of {module.max_minutes:g} min, step {trainer.global_step}, loss {loss:.3f}"
+        print(f"\r{line:<60}", end="", file=sys.stderr, flush=True)
+
+    def on_validation_start(self, trainer: L.Trainer, module: L.LightningModule) -> None:
+        if trainer.is_global_zero:
+            print(f"\r{'':<60}\r", end="", file=sys.stderr, flush=True)
+
+
 def run(
     module: TimedModule,
     *,
@@ -172,7 +197,7 @@ def run(
     )
     callbacks: list[Callback] = [module.timer, KeepBest(write), History(report), states]
     if progress:
-        callbacks.append(TQDMProgressBar(refresh_rate=10))
+        callbacks.append(TimeProgress())
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
     with warnings.catch_warnings():
         warnings.filterwarnings(
@@ -190,7 +215,7 @@ def run(
             val_check_interval=validate_every,
             num_sanity_val_steps=0,
             log_every_n_steps=10,
-            enable_progress_bar=progress,
+            enable_progress_bar=False,
             enable_model_summary=False,
         )
         trainer.fit(
