@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from typing import Any
 
+from hlsim.settings import refuse_unknown
 from hlsim.spectrum import STFT
 
 
@@ -76,9 +77,5 @@ class MappingConfig:
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> MappingConfig:
         """Read what ``to_dict`` wrote. Raises ValueError where a name is unknown."""
-        names = [field.name for field in fields(cls)]
-        if unknown := sorted(set(data) - set(names)):
-            raise ValueError(
-                f"unknown compensator settings {', '.join(unknown)}; allowed: {', '.join(names)}"
-            )
+        refuse_unknown(data, (field.name for field in fields(cls)), "compensator settings")
         return cls(**data)

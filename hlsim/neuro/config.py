@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from typing import Any
 
+from hlsim.settings import refuse_unknown
 from hlsim.spectrum import STFT
 
 NEURO_RATE = 16000
@@ -68,7 +69,5 @@ class NeuroConfig:
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> NeuroConfig:
         """Read what ``to_dict`` wrote. Raises ValueError where a name is unknown."""
-        names = [field.name for field in fields(cls)]
-        if unknown := sorted(set(data) - set(names)):
-            raise ValueError(f"unknown network settings {', '.join(unknown)}; allowed: {', '.join(names)}")
+        refuse_unknown(data, (field.name for field in fields(cls)), "network settings")
         return cls(**dict(data))

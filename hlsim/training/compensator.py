@@ -20,6 +20,7 @@ from hlsim.data.variation import equalise, mix
 from hlsim.loss import HearingLossLoss
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.pretrained import save_checkpoint
+from hlsim.settings import refuse_unknown
 from hlsim.training.loop import TimedModule, run
 
 CRITERIA = ("bands", "paper")
@@ -82,15 +83,8 @@ class CompensatorRecipe:
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> CompensatorRecipe:
         """Raises ValueError where a name is unknown."""
-        names = [entry.name for entry in fields(cls)]
-        if unknown := sorted(set(data) - set(names)):
-            raise ValueError(
-                f"unknown settings {', '.join(unknown)} in the recipe; allowed: {', '.join(names)}"
-            )
-        if unknown := sorted(set(data.get("weights", {})) - set(CRITERIA)):
-            raise ValueError(
-                f"unknown criteria {', '.join(unknown)} in the recipe; allowed: {', '.join(CRITERIA)}"
-            )
+        refuse_unknown(data, (entry.name for entry in fields(cls)), "settings", "in the recipe")
+        refuse_unknown(data.get("weights", ()), CRITERIA, "criteria", "in the recipe")
         return cls(**data)
 
 

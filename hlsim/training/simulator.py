@@ -19,7 +19,10 @@ from hlsim.msbg import MSBG
 from hlsim.neuro import NeuroConfig, NeuroMSBG
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.pretrained import save_checkpoint
+from hlsim.settings import refuse_unknown
 from hlsim.training.loop import TimedModule, run
+
+CRITERIA = ("complex", "log_spectrum", "magnitude", "phase", "snr", "time")
 
 MILDER = ("NH", "N1", "N2", "S1")
 """Standard ears that join the validation, since measured ones are mostly moderate and severe."""
@@ -53,17 +56,18 @@ class SimulatorRecipe:
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> SimulatorRecipe:
         """Raises ValueError where a name is unknown."""
-        names = [entry.name for entry in fields(cls)]
-        if unknown := sorted(set(data) - set(names)):
-            raise ValueError(
-                f"unknown settings {', '.join(unknown)} in the recipe; allowed: {', '.join(names)}"
-            )
-        known = {"snr", "log_spectrum", "magnitude", "phase", "complex", "time"}
-        if unknown := sorted(set(data.get("weights", {})) - known):
-            raise ValueError(
-                f"unknown criteria {', '.join(unknown)} in the recipe; allowed: {', '.join(sorted(known))}"
-            )
+        refuse_unknown(data, (entry.name for entry in fields(cls)), "settings", "in the recipe")
+        refuse_unknown(data.get("weights", ()), CRITERIA, "criteria", "in the recipe")
         return cls(**data)
+
+    def __post_init__(self) -> None:
+        counts = (self.batch, self.validate_every, self.validation_items)
+        if min(counts) < 1 or self.seconds <= 0.0 or self.learning_rate <= 0.0:
+            raise ValueError(
+                f"batch {self.batch}, validate_every {self.validate_every}, validation_items {self.validation_items}, "
+                f"seconds {self.seconds}, learning_rate {self.learning_rate} in the recipe; allowed: counts from 1 up, "
+                "seconds and learning_rate above 0"
+            )
 
 
 @dataclass(frozen=True)
