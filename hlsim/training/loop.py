@@ -202,7 +202,7 @@ def run(
     with warnings.catch_warnings():
         warnings.filterwarnings(
             "ignore",
-            ".*(does not have many workers|Checkpoint directory|GPU available|before the epoch ended).*",
+            ".*(does not have many workers|Checkpoint directory|GPU available|before the epoch ended|LeafSpec).*",
         )
         trainer = L.Trainer(
             accelerator=accelerator,
