@@ -33,7 +33,8 @@ class MSBG(nn.Module):
     """The Moore, Stone, Baer and Glasberg model of an impaired ear, as pyclarity's ``Ear.process`` computes it.
 
     Outer and middle ear, spectral smearing, gammatone filter bank, recruitment, the way back, low-pass (Baer and
-    Moore 1993; Moore and Glasberg 1993; Nejime and Moore 1997; pyclarity 0.9.0). The recursive filters are evaluated on an FFT grid.
+    Moore 1993; Moore and Glasberg 1993; Nejime and Moore 1997; pyclarity 0.9.0). The recursive filters are
+    evaluated on an FFT grid.
 
     Args:
         audiogram: the ear; may be given with each call instead.
