@@ -45,6 +45,9 @@ STANDARD = {
     "S3": (30, 35, 60, 75, 80, 80, 85, 85),
 }
 
+MILDER = ("NH", "N1", "N2", "S1")
+"""Standard ears that join measured ones in validation, since those are mostly moderate and severe."""
+
 
 @dataclass(frozen=True)
 class Audiogram:

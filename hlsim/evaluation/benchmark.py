@@ -15,9 +15,9 @@ from torch import Tensor
 
 from hlsim.audiogram import Audiogram
 from hlsim.calibration import set_level
-from hlsim.evaluation.truth import RATE as MSBG_RATE
 from hlsim.extras import MissingExtraError, require
 from hlsim.msbg import MSBG
+from hlsim.msbg.ear import RATE as MSBG_RATE
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.pretrained import load_pretrained
 

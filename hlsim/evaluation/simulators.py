@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from hlsim.audiogram import Audiogram, draw_thresholds, read_audiograms
+from hlsim.audiogram import MILDER, Audiogram, draw_thresholds, read_audiograms
 from hlsim.calibration import level_spl
 from hlsim.data.clips import Clips
 from hlsim.data.variation import mix
@@ -26,12 +26,12 @@ from hlsim.evaluation.fidelity import (
 )
 from hlsim.evaluation.truth import pyclarity_msbg
 from hlsim.msbg import MSBG
+from hlsim.neuro.config import NEURO_RATE
 
-RATE = 16000
+RATE = NEURO_RATE
 LEVELS = (50.0, 60.0, 65.0, 70.0, 80.0)
 """Levels in dB SPL that the items take in turn."""
 
-MILDER = ("NH", "N1", "N2", "S1")
 SNRS_DB = (2.5, 7.5, 12.5, 17.5)
 """Signal-to-noise ratios of the noisy items, the paper's test set."""
 

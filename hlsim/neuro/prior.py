@@ -8,16 +8,16 @@ import math
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.signal import ellip, freqz
+from scipy.signal import freqz
 from torch import Tensor, nn
 from torch.nn import functional
 
 from hlsim.audiogram import SEVERITIES
 from hlsim.calibration import PASCAL_SPL
 from hlsim.msbg.ear import RATE, ear_filter, lowpass_filter
-from hlsim.msbg.filterbank import BANKS, FilterBank, erb, gammatone_response
+from hlsim.msbg.filterbank import BANKS, FilterBank, gammatone_response
 from hlsim.msbg.model import STRUCTURAL_DELAY
-from hlsim.msbg.recruitment import CATCH_UP_SPL, expansion_ratios
+from hlsim.msbg.recruitment import CATCH_UP_SPL, envelope_filters, expansion_ratios
 from hlsim.msbg.smearing import BROADENING, roex_filters, smearing_from_filters
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.spectrum import STFT
@@ -162,8 +162,7 @@ def _smoothing(bank: FilterBank, hop: int) -> NDArray[np.float64]:
     points = 4096
     omega = 2.0 * np.pi * np.fft.rfftfreq(points) * (NEURO_RATE / hop) / RATE
     rows = []
-    for bandwidth in erb(np.array(bank.centre_frequencies)):
-        numerator, denominator = ellip(2, 0.25, 35, 0.75 * min(100.0, bandwidth) / (RATE / 2.0))
+    for numerator, denominator in envelope_filters(bank):
         impulse = np.fft.irfft(np.abs(freqz(numerator, denominator, omega)[1]) ** 2, points)
         row = np.roll(impulse, _ENVELOPE_REACH)[: 2 * _ENVELOPE_REACH + 1]
         rows.append(row / row.sum())

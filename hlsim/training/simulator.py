@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from hlsim.audiogram import Audiogram, draw_thresholds, read_audiograms
+from hlsim.audiogram import MILDER, Audiogram, draw_thresholds, read_audiograms
 from hlsim.calibration import set_level
 from hlsim.criteria import log_spectral_distance_db, noise_to_signal_db, paper_parts, weighted_sum
 from hlsim.data.clips import Clips
@@ -23,9 +23,6 @@ from hlsim.settings import refuse_unknown
 from hlsim.training.loop import TimedModule, run
 
 CRITERIA = ("complex", "log_spectrum", "magnitude", "phase", "snr", "time")
-
-MILDER = ("NH", "N1", "N2", "S1")
-"""Standard ears that join the validation, since measured ones are mostly moderate and severe."""
 
 
 @dataclass(frozen=True)
