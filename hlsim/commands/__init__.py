@@ -1,0 +1,1 @@
+"""The program's commands, a module each or a pair that belongs together."""

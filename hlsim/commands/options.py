@@ -1,0 +1,106 @@
+"""Options that several commands share, and how their values are read."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from hlsim.audiogram import Audiogram
+from hlsim.extras import require
+from hlsim.msbg import MSBG
+from hlsim.pretrained import load_pretrained
+
+Commands = Any
+"""What ``argparse.ArgumentParser.add_subparsers`` returns; its type has no public name."""
+
+
+def add_command(
+    commands: Commands, name: str, run: Callable[[argparse.Namespace], None], text: str
+) -> argparse.ArgumentParser:
+    """A command ``name`` of the program, which ``run`` carries out."""
+    parser: argparse.ArgumentParser = commands.add_parser(
+        name, help=text, description=text, formatter_class=argparse.ArgumentDefaultsHelpFormatter
+    )
+    parser.set_defaults(run=run)
+    return parser
+
+
+def audiogram_option(
+    parser: argparse.ArgumentParser, *, default: str | None = None, required: bool = False, text: str = ""
+) -> None:
+    parser.add_argument(
+        "--audiogram",
+        default=default,
+        required=required,
+        help="NH, N1 to N7, S1 to S3, or eight levels in dB HL at 250, 500, 1000, 2000, 3000, 4000, 6000, 8000 Hz, "
+        f"separated by commas{text}",
+    )
+
+
+def out_option(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--out", type=Path, required=True, help="folder for the results")
+
+
+def seed_option(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--seed", type=int, default=0, help="of every random draw")
+
+
+def full_scale_option(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--full-scale-spl", type=float, default=94.0, help="level in dB SPL of a file whose RMS is 1.0"
+    )
+
+
+def positive(text: str) -> float:
+    value = float(text)
+    if not (math.isfinite(value) and value > 0):
+        raise argparse.ArgumentTypeError(f"{text}; allowed: more than 0")
+    return value
+
+
+def count(text: str) -> int:
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"{text}; allowed: 1 or more")
+    return value
+
+
+def read_ear(text: str) -> Audiogram:
+    """An ear from what ``--audiogram`` holds."""
+    if "," not in text:
+        return Audiogram.standard(text)
+    try:
+        return Audiogram(tuple(float(part) for part in text.split(",")))
+    except ValueError as error:
+        raise ValueError(f"--audiogram {text}: {error}") from error
+
+
+def read_simulator(name: str, sample_rate: int, full_scale_spl: float = 94.0) -> torch.nn.Module:
+    options: dict[str, Any] = {"sample_rate": sample_rate, "full_scale_spl": full_scale_spl}
+    return MSBG(**options) if name == "msbg" else load_pretrained(name, **options)
+
+
+def read_recipe(path: Path | None) -> dict[str, Any]:
+    if path is None:
+        return {}
+    yaml = require("yaml", "train")
+    try:
+        data = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise ValueError(f"{path}: not readable as YAML ({error})") from error
+    if not isinstance(data, dict):
+        raise ValueError(f"{path}: holds no settings; allowed: 'name: value' lines")
+    return data
+
+
+def show_progress(what: str) -> Callable[[int, int], None]:
+    def show(done: int, total: int) -> None:
+        print(f"\r{done} of {total} {what}", end="\n" if done == total else "", file=sys.stderr, flush=True)
+
+    return show

@@ -1,0 +1,97 @@
+"""The commands ``train-simulator`` and ``train-compensator``."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from hlsim.commands.options import (
+    Commands,
+    add_command,
+    audiogram_option,
+    out_option,
+    positive,
+    read_ear,
+    read_recipe,
+)
+from hlsim.extras import require
+
+
+def add(commands: Commands) -> None:
+    sub = add_command(
+        commands, "train-simulator", _train_simulator, "train a Neuro-MSBG on targets from the exact MSBG"
+    )
+    sub.add_argument(
+        "--config", type=Path, required=True, help="recipe, a YAML file (examples/neuro-msbg.yaml)"
+    )
+    sub.add_argument("--noise", type=Path, help="folder of noises to mix in")
+    sub.add_argument("--audiograms", type=Path, help="CSV of measured ears to join the drawn ones")
+    sub.add_argument("--valid-noise", type=Path, help="folder of noises to validate with")
+    sub.add_argument("--valid-audiograms", type=Path, help="CSV of ears to validate with")
+    training_options(sub, minutes=60.0)
+
+    sub = add_command(
+        commands, "train-compensator", _train_compensator, "train a compensator through a frozen simulator"
+    )
+    sub.add_argument("--config", type=Path, help="recipe, a YAML file (examples/compensator.yaml)")
+    audiogram_option(sub, default=None, text="; without it one compensator for all ears is trained")
+    sub.add_argument(
+        "--simulator", default="neuro-msbg", help="msbg (exact), or a checkpoint's name or folder"
+    )
+    sub.add_argument("--noise", type=Path, help="folder of noises to mix in")
+    training_options(sub, minutes=10.0)
+
+
+def _train_simulator(options: argparse.Namespace) -> None:
+    require("lightning", "train")
+    from hlsim.training.simulator import SimulatorData, SimulatorRecipe, train_simulator
+
+    data = SimulatorData(
+        options.speech,
+        options.noise,
+        options.audiograms,
+        options.valid_speech,
+        options.valid_noise,
+        options.valid_audiograms,
+    )
+    folder = train_simulator(
+        data, SimulatorRecipe.from_dict(read_recipe(options.config)), **training_arguments(options)
+    )
+    print(f"the best checkpoint is in {folder}")
+
+
+def _train_compensator(options: argparse.Namespace) -> None:
+    require("lightning", "train")
+    from hlsim.training.compensator import CompensatorData, CompensatorRecipe, train_compensator
+
+    folder = train_compensator(
+        CompensatorData(speech=options.speech, noise=options.noise, valid_speech=options.valid_speech),
+        CompensatorRecipe.from_dict(read_recipe(options.config)),
+        audiogram=read_ear(options.audiogram) if options.audiogram else None,
+        simulator=options.simulator,
+        **training_arguments(options),
+    )
+    print(f"the best checkpoint is in {folder}")
+
+
+def training_options(parser: argparse.ArgumentParser, *, minutes: float) -> None:
+    parser.add_argument("--speech", type=Path, required=True, help="folder of clean speech to train on")
+    parser.add_argument("--valid-speech", type=Path, help="folder of other speakers to validate on")
+    parser.add_argument(
+        "--max-minutes", type=positive, default=minutes, help="of training, resumed parts included"
+    )
+    parser.add_argument("--max-steps", type=int, default=-1, help="stop earlier; -1 for no such limit")
+    parser.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto", help="where to train")
+    parser.add_argument("--quiet", action="store_true", help="no progress bar, only a line a validation")
+    out_option(parser)
+
+
+def training_arguments(options: argparse.Namespace) -> dict[str, Any]:
+    return {
+        "out": options.out,
+        "max_minutes": options.max_minutes,
+        "max_steps": options.max_steps,
+        "accelerator": "gpu" if options.device == "cuda" else options.device,
+        "progress": not options.quiet,
+    }
