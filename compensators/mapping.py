@@ -61,11 +61,9 @@ class MappingCompensator(nn.Module):
         size, depth, stride = config.channels, config.dense_depth, config.stride
         self.audiogram_encoder = AudiogramEncoder(self.stft.frequencies)
         self.encoder = DenseEncoder(4, size, depth, stride, normalise=False)
-        self.blocks = nn.ModuleList(
-            DualPathBlock(size, config.kernel, config.expansion) for _ in range(config.blocks)
-        )
-        self.magnitude_decoder = Decoder(size, 1, depth, stride, normalise=False, from_zero=True)
-        self.phase_decoder = PhaseDecoder(size, depth, stride, normalise=False, residual=True)
+        self.blocks = nn.ModuleList(DualPathBlock(config) for _ in range(config.blocks))
+        self.magnitude_decoder = Decoder(size, 1, depth, stride, normalise=False)
+        self.phase_decoder = PhaseDecoder(size, depth, stride, normalise=False)
 
     def forward(self, waveform: Tensor, audiogram: AudiogramLike) -> Tensor:
         """The compensated waveform.

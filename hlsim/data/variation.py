@@ -48,14 +48,25 @@ def compress(waveform: Tensor, ratio: Tensor, sample_rate: int) -> Tensor:
 
 
 def vary(
-    speech: Tensor, noise: Tensor | None, ears: Tensor, sample_rate: int, generator: torch.Generator
+    speech: Tensor,
+    noise: Tensor | None,
+    ears: Tensor,
+    sample_rate: int,
+    generator: torch.Generator,
+    *,
+    levels: tuple[float, float] = (40.0, 95.0),
+    treated: bool = True,
 ) -> Tensor:
     """Random training signals in pascals.
 
     Two in five items are noisy (-5 to 20 dB), two in five equalised by up to 15 dB, two in five amplified by 0.2 to 0.8
-    of the ear's loss, one in five compressed by 1.5 to 4; levels before amplification are 40 to 95 dB SPL.
+    of the ear's loss, one in five compressed by 1.5 to 4.
 
     Shape: (items, time), (items, time) or None, (items, 8) dB HL -> (items, time).
+
+    Args:
+        levels: lowest and highest level in dB SPL before amplification.
+        treated: equalise, amplify and compress at all.
     """
     items = len(speech)
     chance = torch.rand(items, 5, generator=generator)
@@ -70,8 +81,10 @@ def vary(
     snr_db, ratio = uniform(-5.0, 20.0), uniform(1.5, 4.0)
     if noise is not None:
         signal = some(0, 0.4, mix(signal, noise, snr_db), signal)
-    signal = some(1, 0.2, compress(signal, ratio, sample_rate), signal)
-    signal = set_level(signal, uniform(40.0, 95.0))
+    loud = uniform(*levels)
+    if not treated:
+        return set_level(signal, loud)
+    signal = set_level(some(1, 0.2, compress(signal, ratio, sample_rate), signal), loud)
     knots = torch.tensor([100.0, 250.0, 600.0, 1500.0, 3500.0, 7000.0])
     gains = uniform(-15.0, 15.0, len(knots))
     signal = some(2, 0.4, equalise(signal, gains, knots, sample_rate), signal)

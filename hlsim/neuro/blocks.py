@@ -1,10 +1,16 @@
-"""Dual-path blocks: first along time, then along frequency.
+"""Dual-path blocks: first along time, then along frequency, by convolution, Mamba, LSTM or Transformer.
 
 Feature maps lie (items, time, frequency, channels): the pointwise layers are then plain matrix products.
 """
 
+from collections.abc import Callable
+
+import torch
 from torch import Tensor, nn
 from torch.nn import functional
+
+from hlsim.neuro.config import NetworkConfig
+from hlsim.neuro.mamba import Mamba
 
 
 class ConvPath(nn.Module):
@@ -30,18 +36,112 @@ class ConvPath(nn.Module):
     def forward(self, features: Tensor) -> Tensor:
         hidden = self.local(features.permute(0, 3, 1, 2)).permute(0, 2, 3, 1)
         hidden = functional.relu(self.expand(hidden))
-        # a ConvTranspose1d of length 1 is a matrix product, and faster as one
-        return features + functional.linear(hidden, self.restore.weight.squeeze(-1).T, self.restore.bias)
+        return features + _restore(self.restore, hidden)
+
+
+class SequencePath(nn.Module):
+    """A layer for sequences along one axis: normalise, run, back by ConvTranspose1d, residual.
+
+    Shape: (items, time, frequency, channels) -> the same.
+
+    Args:
+        axis: 0 for time, 1 for frequency; each row along it is a sequence of its own.
+        core: (sequences, length, channels) -> (sequences, length, width).
+    """
+
+    def __init__(self, channels: int, axis: int, core: nn.Module, width: int) -> None:
+        super().__init__()
+        self.axis = axis
+        # over channels, not time: the level of a sound stays visible in how they lie to each other
+        self.norm = nn.LayerNorm(channels)
+        self.core = core
+        self.restore = nn.ConvTranspose1d(width, channels, 1)
+
+    def forward(self, features: Tensor) -> Tensor:
+        rows = features.transpose(1, 2) if self.axis == 0 else features
+        hidden = self.core(self.norm(rows).flatten(0, 1)).unflatten(0, rows.shape[:2])
+        hidden = hidden.transpose(1, 2) if self.axis == 0 else hidden
+        return features + _restore(self.restore, hidden)
+
+
+class BidirectionalMamba(nn.Module):
+    """Two Mambas, one of them backwards. Shape: (sequences, length, channels) -> (..., 2 channels)."""
+
+    def __init__(self, channels: int, states: int, expansion: int) -> None:
+        super().__init__()
+        self.onward = Mamba(channels, states, expand=expansion)
+        self.reverse = Mamba(channels, states, expand=expansion)
+
+    def forward(self, sequence: Tensor) -> Tensor:
+        return torch.cat((self.onward(sequence), self.reverse(sequence.flip(1)).flip(1)), -1)
+
+
+class BidirectionalLSTM(nn.Module):
+    """An LSTM in both directions. Shape: (sequences, length, channels) -> (..., 2 hidden)."""
+
+    def __init__(self, channels: int, hidden: int) -> None:
+        super().__init__()
+        self.lstm = nn.LSTM(channels, hidden, batch_first=True, bidirectional=True)
+
+    def forward(self, sequence: Tensor) -> Tensor:
+        output: Tensor = self.lstm(sequence)[0]
+        return output
+
+
+def _path(config: NetworkConfig, axis: int) -> nn.Module:
+    """The path that ``config.block`` names, along time (0) or frequency (1)."""
+    channels, expansion = config.channels, config.expansion
+    kinds: dict[str, Callable[[], nn.Module]] = {
+        "cnn": lambda: ConvPath(channels, axis, config.kernel[axis], expansion),
+        "mamba": lambda: SequencePath(
+            channels, axis, BidirectionalMamba(channels, config.states, expansion), 2 * channels
+        ),
+        "lstm": lambda: SequencePath(
+            channels, axis, BidirectionalLSTM(channels, expansion * channels), 2 * expansion * channels
+        ),
+        "transformer": lambda: SequencePath(
+            channels,
+            axis,
+            nn.TransformerEncoderLayer(
+                channels,
+                config.heads,
+                expansion * channels,
+                dropout=0.0,
+                activation="gelu",
+                batch_first=True,
+                norm_first=True,
+            ),
+            channels,
+        ),
+    }
+    return kinds[config.block]()
 
 
 class DualPathBlock(nn.Module):
     """A path over time, then one over frequency. Shape: (items, time, frequency, channels) -> the same."""
 
-    def __init__(self, channels: int, kernel: tuple[int, int], expansion: int) -> None:
+    def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
-        self.time = ConvPath(channels, 0, kernel[0], expansion)
-        self.frequency = ConvPath(channels, 1, kernel[1], expansion)
+        self.time = _path(config, 0)
+        self.frequency = _path(config, 1)
 
     def forward(self, features: Tensor) -> Tensor:
         output: Tensor = self.frequency(self.time(features))
         return output
+
+
+class TimeBlock(nn.Module):
+    """A path over time alone, for the monolithic baselines. Shape: as ``DualPathBlock``."""
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__()
+        self.time = _path(config, 0)
+
+    def forward(self, features: Tensor) -> Tensor:
+        output: Tensor = self.time(features)
+        return output
+
+
+def _restore(layer: nn.ConvTranspose1d, hidden: Tensor) -> Tensor:
+    # a ConvTranspose1d of length 1 is a matrix product, and faster as one
+    return functional.linear(hidden, layer.weight.squeeze(-1).T, layer.bias)

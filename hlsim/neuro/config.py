@@ -1,10 +1,10 @@
-"""What a Neuro-MSBG is made of, as JSON can hold it."""
+"""What a network of this family is made of, as JSON can hold it."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
-from typing import Any
+from typing import Any, Self
 
 from hlsim.settings import refuse_unknown
 from hlsim.spectrum import STFT
@@ -12,35 +12,44 @@ from hlsim.spectrum import STFT
 NEURO_RATE = 16000
 """The sample rate in Hz at which the networks work."""
 
+CHOICES = {
+    "block": ("cnn", "mamba", "lstm", "transformer"),
+    "structure": ("dual-path", "monolithic"),
+    "audiogram": ("channel", "concatenated"),
+    "phase": ("predicted", "input"),
+}
+
 
 @dataclass(frozen=True)
-class NeuroConfig:
-    """Sizes and choices of a network of this family.
+class NetworkConfig:
+    """Sizes that simulators and compensators share.
 
     Attributes:
         fft, window, hop: of the transform at 16 kHz, in samples.
         channels: feature maps of the network.
         dense_depth: dilated convolutions of the encoder and of each decoder, 0 for none.
         stride: (time, frequency) steps of the encoder; the decoders undo them.
-        blocks: dual-path blocks.
-        kernel: (time, frequency) lengths of a block's one-dimensional convolutions, odd.
-        expansion: channels inside a block over ``channels``.
-        prior: start from what is known of MSBG (``hlsim.neuro.prior``) and let the network correct it. Without it the
-            network is on its own, as in the paper.
-        level_aware: log magnitude and no normalisation. Otherwise instance normalisation, as in MP-SENet.
+        block: what runs along each axis: ``cnn``, ``mamba``, ``lstm`` or ``transformer``.
+        blocks: how many of them.
+        kernel: (time, frequency) lengths of a cnn block's convolutions, odd.
+        expansion: width inside a block over ``channels``: of the pointwise layers (cnn), of the scan (mamba), of an
+            LSTM's state in each direction, of a transformer's feed-forward layer.
+        states: a channel of mamba's scan.
+        heads: of a transformer's attention; they divide ``channels``.
     """
 
-    fft: int = 256
-    window: int = 96
-    hop: int = 24
-    channels: int = 32
+    fft: int = 400
+    window: int = 400
+    hop: int = 100
+    channels: int = 24
     dense_depth: int = 0
-    stride: tuple[int, int] = (4, 3)
-    blocks: int = 3
+    stride: tuple[int, int] = (2, 3)
+    block: str = "cnn"
+    blocks: int = 2
     kernel: tuple[int, int] = (7, 7)
     expansion: int = 2
-    prior: bool = True
-    level_aware: bool = True
+    states: int = 16
+    heads: int = 4
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "stride", tuple(self.stride))
@@ -51,13 +60,22 @@ class NeuroConfig:
             self.dense_depth + 1,
             self.blocks,
             self.expansion,
+            self.states,
+            self.heads,
             *self.stride,
             *self.kernel,
         )
-        if any(not isinstance(count, int) or count < 1 for count in counts) or any(
-            k % 2 == 0 for k in self.kernel
+        if (
+            any(not isinstance(count, int) or count < 1 for count in counts)
+            or any(k % 2 == 0 for k in self.kernel)
+            or (self.block == "transformer" and self.channels % self.heads)
         ):
-            raise ValueError(f"{self}; allowed: whole numbers of 1 or more, kernels odd")
+            raise ValueError(
+                f"{self}; allowed: whole numbers of 1 or more, kernels odd, heads that divide the channels"
+            )
+        for name, allowed in CHOICES.items():
+            if getattr(self, name, allowed[0]) not in allowed:
+                raise ValueError(f"{name} {getattr(self, name)!r}; allowed: {', '.join(allowed)}")
 
     @property
     def stft(self) -> STFT:
@@ -67,7 +85,36 @@ class NeuroConfig:
         return asdict(self)
 
     @classmethod
-    def from_dict(cls, data: Mapping[str, Any]) -> NeuroConfig:
+    def from_dict(cls, data: Mapping[str, Any]) -> Self:
         """Read what ``to_dict`` wrote. Raises ValueError where a name is unknown."""
         refuse_unknown(data, (field.name for field in fields(cls)), "network settings")
         return cls(**dict(data))
+
+
+@dataclass(frozen=True)
+class NeuroConfig(NetworkConfig):
+    """Sizes and choices of a Neuro-MSBG.
+
+    Attributes:
+        structure: ``dual-path``, or ``monolithic``: no encoder and no frequency axis, each frame one vector of
+            ``channels``, blocks along time only (the paper's baselines).
+        audiogram: encoded as an input ``channel`` (Equation 1), or its eight levels ``concatenated`` to magnitude and
+            phase along frequency (the paper's Table IV).
+        phase: ``predicted``, or the ``input``'s reused: magnitude only (the paper's Table III).
+        prior: start from what is known of MSBG (``hlsim.neuro.prior``) and let the network correct it. Without it the
+            network is on its own, as in the paper.
+        level_aware: log magnitude and no normalisation. Otherwise each utterance is scaled to unit RMS and back, and
+            instance normalisation follows the convolutions, as in MP-SENet: a level is then invisible.
+    """
+
+    fft: int = 256
+    window: int = 96
+    hop: int = 24
+    channels: int = 32
+    stride: tuple[int, int] = (4, 3)
+    blocks: int = 3
+    structure: str = "dual-path"
+    audiogram: str = "channel"
+    phase: str = "predicted"
+    prior: bool = True
+    level_aware: bool = True

@@ -7,12 +7,9 @@ from hlsim.neuro.encoder import DenseBlock
 
 
 class Decoder(nn.Module):
-    """Feature maps back to the transform's grid, each point to a patch of ``stride``.
+    """Feature maps back to the transform's grid, each point to a patch of ``stride``; zero before training.
 
     Shape: (items, channels, time / stride, frequency / stride) -> (items, outputs, time, frequency).
-
-    Args:
-        from_zero: start with an output of zero.
     """
 
     def __init__(
@@ -22,15 +19,13 @@ class Decoder(nn.Module):
         depth: int,
         stride: tuple[int, int],
         normalise: bool,
-        from_zero: bool,
     ) -> None:
         super().__init__()
         self.stride = stride
         self.dense = DenseBlock(channels, depth, normalise)
         self.leave = nn.Linear(channels, outputs * stride[0] * stride[1])
-        if from_zero:
-            nn.init.zeros_(self.leave.weight)
-            nn.init.zeros_(self.leave.bias)
+        nn.init.zeros_(self.leave.weight)
+        nn.init.zeros_(self.leave.bias)
 
     def forward(self, features: Tensor, size: tuple[int, int]) -> Tensor:
         patches = self.leave(self.dense(features).permute(0, 2, 3, 1))
@@ -42,33 +37,33 @@ class Decoder(nn.Module):
 class MaskDecoder(Decoder):
     """Logarithm of the factor on the magnitude, starting at 0.
 
-    Two maps a, b: the factor is exp(a x + b) with x the recruitment exponent of the ear at each frequency, since errors
-    of an envelope grow with it.
+    Args:
+        recruiting: two maps a, b: the factor is exp(a x + b) with x the recruitment exponent of the ear at each
+            frequency, since errors of an envelope grow with it. Otherwise one map.
     """
 
-    def __init__(self, channels: int, depth: int, stride: tuple[int, int], normalise: bool) -> None:
-        super().__init__(channels, 2, depth, stride, normalise, from_zero=True)
+    def __init__(
+        self, channels: int, depth: int, stride: tuple[int, int], normalise: bool, recruiting: bool
+    ) -> None:
+        super().__init__(channels, 2 if recruiting else 1, depth, stride, normalise)
+        self.recruiting = recruiting
 
     def log_mask(self, features: Tensor, size: tuple[int, int], exponents: Tensor) -> Tensor:
         """Shape: as ``Decoder``, and (items, frequency) -> (items, time, frequency)."""
-        scaled, plain = self(features, size).unbind(1)
-        mask: Tensor = scaled * exponents.unsqueeze(1) + plain
-        return mask
+        maps = self(features, size).to(exponents.dtype)
+        return maps[:, 0] * exponents.unsqueeze(1) + maps[:, 1] if self.recruiting else maps[:, 0]
 
 
 class PhaseDecoder(Decoder):
-    """A phase as the angle of two maps; with ``residual`` it starts at 0 and is added to the input's."""
+    """A phase shift, as the angle of two maps, starting at 0. The paper's decoder predicts shifts too."""
 
-    def __init__(
-        self, channels: int, depth: int, stride: tuple[int, int], normalise: bool, residual: bool
-    ) -> None:
-        super().__init__(channels, 2, depth, stride, normalise, from_zero=residual)
-        self.residual = residual
+    def __init__(self, channels: int, depth: int, stride: tuple[int, int], normalise: bool) -> None:
+        super().__init__(channels, 2, depth, stride, normalise)
 
     def phasor(self, features: Tensor, size: tuple[int, int]) -> Tensor:
-        """exp(j phase). Shape: as ``Decoder`` -> complex (items, time, frequency)."""
-        real, imaginary = self(features, size).unbind(1)
-        if self.residual:
-            real = real + 1.0
+        """exp(j shift). Shape: as ``Decoder`` -> complex (items, time, frequency)."""
+        dtype = next(self.parameters()).dtype  # of the weights, whatever autocast makes of the maps
+        real, imaginary = self(features, size).to(dtype).unbind(1)
+        real = real + 1.0
         scale = (real.square() + imaginary.square() + 1e-8).rsqrt()
         return torch.complex(real * scale, imaginary * scale)

@@ -53,3 +53,18 @@ class DenseEncoder(nn.Module):
     def forward(self, features: Tensor) -> Tensor:
         encoded: Tensor = self.dense(self.enter(features))
         return encoded
+
+
+class FrameEncoder(nn.Module):
+    """A linear map of each frame, all of its frequencies and input channels together: the monolithic baselines' entry.
+
+    Shape: (items, inputs, time, frequency) -> (items, channels, time, 1).
+    """
+
+    def __init__(self, inputs: int, frequencies: int, channels: int) -> None:
+        super().__init__()
+        self.enter = nn.Linear(inputs * frequencies, channels)
+
+    def forward(self, features: Tensor) -> Tensor:
+        vectors: Tensor = self.enter(features.transpose(1, 2).flatten(2))
+        return vectors.mT.unsqueeze(-1)

@@ -9,10 +9,10 @@ from hlsim.calibration import PASCAL_SPL, check_full_scale, gain_to_pascals
 from hlsim.msbg.model import resolve_thresholds
 from hlsim.msbg.recruitment import CATCH_UP_SPL
 from hlsim.neuro.audiogram_encoder import AudiogramEncoder
-from hlsim.neuro.blocks import DualPathBlock
+from hlsim.neuro.blocks import DualPathBlock, TimeBlock
 from hlsim.neuro.config import NEURO_RATE, NeuroConfig
 from hlsim.neuro.decoders import MaskDecoder, PhaseDecoder
-from hlsim.neuro.encoder import DenseEncoder
+from hlsim.neuro.encoder import DenseEncoder, FrameEncoder
 from hlsim.neuro.prior import Prior
 
 _TINY = 1e-11
@@ -47,20 +47,31 @@ class NeuroMSBG(nn.Module):
         self.sample_rate = check_rate(sample_rate)
         self.full_scale_spl = check_full_scale(full_scale_spl)
         self.stft = config.stft
-        normalise = not config.level_aware
-        inputs = 4 if config.prior else 3
-        self.audiogram_encoder = AudiogramEncoder(self.stft.frequencies)
-        self.severity = nn.Embedding(len(SEVERITIES), config.channels)
-        nn.init.zeros_(self.severity.weight)
-        self.encoder = DenseEncoder(inputs, config.channels, config.dense_depth, config.stride, normalise)
-        self.blocks = nn.ModuleList(
-            DualPathBlock(config.channels, config.kernel, config.expansion) for _ in range(config.blocks)
+        frequencies, channels = self.stft.frequencies, config.channels
+        monolithic, normalise = config.structure == "monolithic", not config.level_aware
+        encoded = config.audiogram == "channel"
+        rows = frequencies + (0 if encoded else len(FREQUENCIES))
+        inputs = 2 + encoded + config.prior
+        depth = 0 if monolithic else config.dense_depth
+        stride = (1, rows) if monolithic else config.stride
+        self.audiogram_encoder = AudiogramEncoder(frequencies) if encoded else None
+        self.encoder: nn.Module = (
+            FrameEncoder(inputs, rows, channels)
+            if monolithic
+            else DenseEncoder(inputs, channels, depth, stride, normalise)
         )
-        self.mask_decoder = MaskDecoder(config.channels, config.dense_depth, config.stride, normalise)
-        self.phase_decoder = PhaseDecoder(
-            config.channels, config.dense_depth, config.stride, normalise, residual=config.level_aware
+        block = TimeBlock if monolithic else DualPathBlock
+        self.blocks = nn.ModuleList(block(config) for _ in range(config.blocks))
+        self.mask_decoder = MaskDecoder(channels, depth, stride, normalise, config.prior)
+        self.phase_decoder = (
+            PhaseDecoder(channels, depth, stride, normalise) if config.phase == "predicted" else None
         )
         self.prior = Prior(self.stft) if config.prior else None
+        self.severity = nn.Embedding(len(SEVERITIES), channels) if config.prior else None
+        if self.severity is not None:
+            nn.init.zeros_(self.severity.weight)
+        # training may run the network, not the physics around it, in bfloat16
+        self.autocast_dtype: torch.dtype | None = None
 
     def forward(self, waveform: Tensor, audiogram: AudiogramLike) -> Tensor:
         """What the ear hears.
@@ -84,39 +95,56 @@ class NeuroMSBG(nn.Module):
 
     def _simulate(self, signals: Tensor, ears: Tensor) -> Tensor:
         """Shape: (items, time) pascals at 16 kHz, (items, 8) -> (items, time)."""
+        scale = None
+        if not self.config.level_aware:
+            scale = signals.square().mean(-1, keepdim=True).add(_TINY).sqrt()
+            signals = signals / scale
         severity = severity_index(ears)
         if self.prior is not None:
             signals = self.prior.filter(signals, severity)
         spectrum = self.stft.analyse(signals)
         factor = self.prior(spectrum, ears, severity) if self.prior is not None else None
         features = self._features(spectrum, ears, factor)
-        features = self.encoder(features.contiguous(memory_format=torch.channels_last))
-        features = features.permute(0, 2, 3, 1) + self.severity(severity)[:, None, None]
-        for block in self.blocks:
-            features = block(features)
-        features = features.permute(0, 3, 1, 2)
         size = (spectrum.shape[-2], spectrum.shape[-1])
-        log_mask = self.mask_decoder.log_mask(features, size, self._exponents(ears, size[1]))
-        phasor = self.phase_decoder.phasor(features, size)
-        mask = log_mask.clamp(-12.0, 4.0).exp()
+        exponents = self._exponents(ears, size[1])
+        lower = self.autocast_dtype
+        with torch.autocast(signals.device.type, lower or torch.bfloat16, enabled=lower is not None):
+            features = self._network(features, severity)
+            log_mask = self.mask_decoder.log_mask(features, size, exponents)
+            phasor = None if self.phase_decoder is None else self.phase_decoder.phasor(features, size)
         if factor is not None:
             spectrum = spectrum * factor
-        if not self.phase_decoder.residual:
-            spectrum = spectrum.abs().to(spectrum.dtype)
-        return self.stft.synthesise(spectrum * phasor * mask, signals.shape[-1])
+        if phasor is not None:
+            spectrum = spectrum * phasor
+        heard = self.stft.synthesise(spectrum * log_mask.clamp(-12.0, 4.0).exp(), signals.shape[-1])
+        return heard if scale is None else heard * scale
+
+    def _network(self, features: Tensor, severity: Tensor) -> Tensor:
+        """Shape: (items, inputs, frames, rows), (items,) -> (items, channels, frames / stride, rows / stride)."""
+        features = self.encoder(features.contiguous(memory_format=torch.channels_last)).permute(0, 2, 3, 1)
+        if self.severity is not None:
+            features = features + self.severity(severity)[:, None, None]
+        for block in self.blocks:
+            features = block(features)
+        return features.permute(0, 3, 1, 2)
 
     def _features(self, spectrum: Tensor, ears: Tensor, factor: Tensor | None) -> Tensor:
-        """The input channels. Shape: (items, frames, frequencies), (items, 8) -> (items, 3 or 4, frames, frequencies)."""
+        """The input channels. Shape: (items, frames, frequencies), (items, 8) -> (items, 2 to 4, frames, rows)."""
         power = spectrum.real.square() + spectrum.imag.square()
-        encoded = self.audiogram_encoder(ears).unsqueeze(1).expand(power.shape)
         if self.config.level_aware:
             # the sine of the phase, faded out near silence: its gradient stays finite and it has no jump at pi
-            channels = [(power + _TINY).log() / 4.0, spectrum.imag * (power + 1e-6).rsqrt(), encoded]
+            channels = [(power + _TINY).log() / 4.0, spectrum.imag * (power + 1e-6).rsqrt()]
         else:
-            channels = [(power + _TINY).sqrt(), torch.angle(spectrum), encoded]
+            channels = [(power + _TINY).sqrt(), torch.angle(spectrum)]
+        if self.audiogram_encoder is not None:
+            channels.append(self.audiogram_encoder(ears).unsqueeze(1).expand(power.shape))
         if factor is not None:
             channels.append((factor.real.square() + factor.imag.square() + 1e-12).log() / 4.0)
-        return torch.stack(channels, 1)
+        features = torch.stack(channels, 1)
+        if self.audiogram_encoder is not None:
+            return features
+        levels = (ears / 100.0)[:, None, None].expand(*features.shape[:3], -1)
+        return torch.cat((features, levels), -1)
 
     def _exponents(self, ears: Tensor, frequencies: int) -> Tensor:
         """Recruitment exponents, ratio - 1, at the transform's frequencies. Shape: (items, 8) -> (items, frequencies)."""

@@ -20,7 +20,10 @@ from hlsim.neuro import NeuroConfig, NeuroMSBG
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.pretrained import save_checkpoint
 from hlsim.settings import refuse_unknown
+from hlsim.training.averaging import average_of
 from hlsim.training.loop import TimedModule, run
+
+PRECISIONS = {"float32": None, "bfloat16": torch.bfloat16}
 
 CRITERIA = ("complex", "log_spectrum", "magnitude", "phase", "snr", "time")
 
@@ -35,7 +38,16 @@ class SimulatorRecipe:
         seconds: length of a clip.
         learning_rate: of AdamW at its highest.
         weights: of the criteria: ``snr`` (dB / 10), ``log_spectrum`` (dB / 10) and the paper's ``magnitude``, ``phase``,
-            ``complex``, ``time`` (on signals scaled to unit power of the truth).
+            ``complex``, ``time``.
+        unit_power: the signal that is scaled to unit power before the criteria, and all others with it: ``truth``, so
+            that quiet items count as much as loud ones, or ``input``, as in MP-SENet. The paper's criteria on a network
+            without a prior want the latter: a severe ear's first errors are 50 dB above its truth, and the network learns
+            to be silent.
+        levels: lowest and highest level in dB SPL, before amplification.
+        treated: whether clips are equalised, amplified and compressed at random, as compensators do.
+        precision: ``float32``, or ``bfloat16`` for the network's own layers: several times faster where the hardware has
+            matrix units for it. Transforms, physics, scans and criteria stay in float32.
+        average: weight of the past in the running average of the weights; the average is validated and kept. 0 for none.
         validate_every: steps.
         validation_items: how many.
         seed: of every random draw.
@@ -46,6 +58,11 @@ class SimulatorRecipe:
     seconds: float = 1.3
     learning_rate: float = 1e-3
     weights: dict[str, float] = field(default_factory=lambda: {"snr": 1.0, "log_spectrum": 0.5})
+    unit_power: str = "truth"
+    levels: tuple[float, float] = (40.0, 95.0)
+    treated: bool = True
+    precision: str = "float32"
+    average: float = 0.99
     validate_every: int = 200
     validation_items: int = 48
     seed: int = 0
@@ -58,12 +75,24 @@ class SimulatorRecipe:
         return cls(**data)
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "levels", tuple(self.levels))
+        if len(self.levels) != 2 or self.levels[0] > self.levels[1]:
+            raise ValueError(
+                f"levels {self.levels} in the recipe; allowed: a lowest and a highest, in dB SPL"
+            )
         counts = (self.batch, self.validate_every, self.validation_items)
         if min(counts) < 1 or self.seconds <= 0.0 or self.learning_rate <= 0.0:
             raise ValueError(
                 f"batch {self.batch}, validate_every {self.validate_every}, validation_items {self.validation_items}, "
                 f"seconds {self.seconds}, learning_rate {self.learning_rate} in the recipe; allowed: counts from 1 up, "
                 "seconds and learning_rate above 0"
+            )
+        if self.unit_power not in ("truth", "input"):
+            raise ValueError(f"unit_power {self.unit_power!r} in the recipe; allowed: truth or input")
+        if self.precision not in PRECISIONS or not 0.0 <= self.average < 1.0:
+            raise ValueError(
+                f"precision {self.precision!r}, average {self.average} in the recipe; allowed: "
+                f"{' or '.join(PRECISIONS)}, and from 0 to below 1"
             )
 
 
@@ -90,6 +119,8 @@ class SimulatorTraining(TimedModule):
         torch.manual_seed(recipe.seed)
         self.recipe = recipe
         self.student = NeuroMSBG(NeuroConfig.from_dict(recipe.model))
+        self.student.autocast_dtype = PRECISIONS[recipe.precision]
+        self.kept = average_of(self.student, recipe.average)
         self.teacher = MSBG(sample_rate=NEURO_RATE)
         options: dict[str, Any] = {"sample_rate": NEURO_RATE, "seconds": recipe.seconds}
         self.speech = Clips(data.speech, **options)
@@ -107,12 +138,21 @@ class SimulatorTraining(TimedModule):
             keep = torch.rand(count, 1, generator=generator) < 0.4
             ears = torch.where(keep, measured.clamp(-10.0, 100.0), ears)
         noise = self.noise.draw(count, generator) if self.noise is not None else None
-        signal = vary(self.speech.draw(count, generator), noise, ears, NEURO_RATE, generator).to(self.device)
+        signal = vary(
+            self.speech.draw(count, generator),
+            noise,
+            ears,
+            NEURO_RATE,
+            generator,
+            levels=self.recipe.levels,
+            treated=self.recipe.treated,
+        ).to(self.device)
         ears = ears.to(self.device)
         with torch.no_grad():
             truth = self.teacher(signal, ears)
         heard = self.student(signal, ears)
-        scale = truth.square().mean(-1, keepdim=True).add(1e-18).rsqrt()
+        unit = truth if self.recipe.unit_power == "truth" else signal
+        scale = unit.square().mean(-1, keepdim=True).add(1e-18).rsqrt()
         truth, heard = truth * scale, heard * scale
         weights = self.recipe.weights
         parts = {"snr": noise_to_signal_db(heard, truth) / 10.0}
@@ -131,7 +171,7 @@ class SimulatorTraining(TimedModule):
                 signal, ears = signal.to(self.device), ears.to(self.device)
                 if number == len(self.truths):
                     self.truths.append(self.teacher(signal, ears))
-                values.append(-noise_to_signal_db(self.student(signal, ears), self.truths[number]))
+                values.append(-noise_to_signal_db(self.kept.module(signal, ears), self.truths[number]))
         snr = torch.cat(values)
         median, low = float(snr.median()), float(snr.quantile(0.1))
         return {"score": median + 0.5 * low, "valid_snr_median": median, "valid_snr_worst_tenth": low}
@@ -139,9 +179,15 @@ class SimulatorTraining(TimedModule):
     def trained_parameters(self) -> list[torch.nn.Parameter]:
         return list(self.student.parameters())
 
+    def on_train_batch_end(self, *arguments: Any) -> None:
+        self.kept.update_parameters(self.student)
+
 
 def validation_set(data: SimulatorData, recipe: SimulatorRecipe) -> list[tuple[Tensor, Tensor]]:
-    """Fixed items: every second one noisy (0 to 20 dB), 50 to 80 dB SPL, measured, standard and drawn ears in turn."""
+    """Fixed items: every second one noisy (0 to 20 dB); measured, standard and drawn ears in turn.
+
+    50 to 80 dB SPL, or the recipe's levels where it treats no clip.
+    """
     generator = torch.Generator().manual_seed(1_000 + recipe.seed)
     options: dict[str, Any] = {"sample_rate": NEURO_RATE, "seconds": 2.0}
     speech = Clips(data.valid_speech or data.speech, **options)
@@ -155,7 +201,8 @@ def validation_set(data: SimulatorData, recipe: SimulatorRecipe) -> list[tuple[T
         if noise is not None:
             noisy = mix(signal, noise.draw(8, generator), 20.0 * torch.rand(8, generator=generator))
             signal = torch.where((torch.arange(8) % 2 == 1).unsqueeze(-1), noisy, signal)
-        signal = set_level(signal, 50.0 + 30.0 * torch.rand(8, generator=generator))
+        low, high = (50.0, 80.0) if recipe.treated else recipe.levels
+        signal = set_level(signal, low + (high - low) * torch.rand(8, generator=generator))
         ears = draw_thresholds(8, generator)
         ears[0:8:4] = standard[torch.randint(len(standard), (2,), generator=generator)]
         if measured is not None:
@@ -189,7 +236,7 @@ def train_simulator(
         from hlsim import __version__
 
         about = {"hlsim": __version__, "recipe": asdict(recipe), **figures}
-        save_checkpoint(folder, "neuro-msbg", module.student, module.student.config.to_dict(), about)
+        save_checkpoint(folder, "neuro-msbg", module.kept.module, module.student.config.to_dict(), about)
 
     run(
         module,

@@ -150,7 +150,7 @@ def test_config_survives_json_and_refuses_nonsense() -> None:
 
     config = MappingConfig(start=0.4, stride=(1, 2))
     assert MappingConfig.from_dict(json.loads(json.dumps(config.to_dict()))) == config
-    with pytest.raises(ValueError, match="unknown compensator settings layers"):
+    with pytest.raises(ValueError, match="unknown network settings layers"):
         MappingConfig.from_dict({"layers": 3})
     for nonsense in ({"start": "none"}, {"start": 2.0}, {"bands": 2}, {"limit_spl": 200.0}, {"channels": 0}):
         with pytest.raises(ValueError, match="allowed"):

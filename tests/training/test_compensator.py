@@ -128,7 +128,7 @@ def test_general_one_draws_ears_and_noise(data: CompensatorData, tmp_path: Path)
         ({"levels": [80.0, 50.0]}, "a lowest and a highest"),
         ({"batch": 0}, "counts from 1 up"),
         ({"weights": {"bands": 0.0}}, "above 0"),
-        ({"model": {"layers": 2}}, "unknown compensator settings layers"),
+        ({"model": {"layers": 2}}, "unknown network settings layers"),
     ],
 )
 def test_bad_recipes(data: CompensatorData, settings: dict[str, object], message: str) -> None:

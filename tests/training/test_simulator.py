@@ -76,7 +76,7 @@ def test_eight_steps_leave_a_checkpoint_that_loads_and_a_state(data: SimulatorDa
     assert set(about["validation"]) >= {"valid_snr_median", "valid_snr_worst_tenth"}
     # what was written is what was validated
     module = SimulatorTraining(SimulatorRecipe.from_dict(TINY), data, EVER)
-    module.student = model
+    module.kept.module = model
     assert module.validate()["valid_snr_median"] == pytest.approx(
         about["validation"]["valid_snr_median"], abs=1e-3
     )
