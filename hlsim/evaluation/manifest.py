@@ -151,7 +151,7 @@ def _audiogram(
     known = ears.get((listener, ear)) or ears.get((listener, "")) or default
     if known is None:
         raise ValueError(
-            f"no audiogram of listener {listener!r}, ear {ear!r}: neither in the columns hl_250, hl_500, ... or audiogram "
+            f"no audiogram of listener {listener!r}, ear {ear!r}: neither in columns hl_250, hl_500, ... or audiogram "
             "nor in a file of audiograms"
         )
     return known

@@ -63,8 +63,8 @@ def mixed_model(differences: Sequence[float], listeners: Sequence[str]) -> Mixed
         warnings.simplefilter("always")
         try:
             fit = models.MixedLM(values, ones, groups=np.asarray(listeners)).fit(reml=True)
-        except (np.linalg.LinAlgError, ValueError) as error:
-            return f"the fit failed ({error})"
+        except (np.linalg.LinAlgError, ValueError) as failure:
+            return f"the fit failed ({failure})"
     error, z, p = (float(x[0]) for x in (fit.bse_fe, fit.tvalues, fit.pvalues))
     low, high = (float(x) for x in fit.conf_int()[0])
     figures = (float(fit.fe_params[0]), error, z, p, low, high)

@@ -24,7 +24,9 @@ def check_parallel(jobs: int | None, backend: str, scheduler: str | None) -> Non
     if backend not in BACKENDS:
         raise ValueError(f"no backend {backend!r}; allowed: {', '.join(BACKENDS)}")
     if (backend == "dask") != (scheduler is not None):
-        raise ValueError("backend dask needs the scheduler's address, such as tcp://host:8786, and no other does")
+        raise ValueError(
+            "backend dask needs the scheduler's address, such as tcp://host:8786, and no other does"
+        )
     require("joblib", "eval")
     if backend == "dask":
         require("distributed", "cluster")

@@ -138,7 +138,9 @@ def score_items(
     made = run_parallel(score_task, tasks.values(), jobs=jobs, backend=backend, scheduler=scheduler)
     for task, result in made if tasks else ():
         if result is None:
-            result = Result(None, "the process that scored it died (a crash in the measure, or memory ran out)")
+            result = Result(
+                None, "the process that scored it died (a crash in the measure, or memory ran out)"
+            )
         elif result.score is not None:
             facts = {"file": task.item.name, "condition": task.condition, "measure": task.measure}
             store.append(task.key, facts | result._asdict())
@@ -157,7 +159,9 @@ def score_task(task: Task) -> Result:
         clean, rate = read_channel(item.clean, item.ear)
         heard, own_rate = read_channel(processed, item.ear)
         if own_rate != rate:
-            raise ValueError(f"{processed} has {own_rate} Hz and {item.clean} {rate} Hz; allowed: equal rates")
+            raise ValueError(
+                f"{processed} has {own_rate} Hz and {item.clean} {rate} Hz; allowed: equal rates"
+            )
         if len(clean) != len(heard):
             raise ValueError(
                 f"{item.clean} has {len(clean)} samples and {processed} {len(heard)}; allowed: equal lengths"
