@@ -76,15 +76,17 @@ class Comparison:
 
     def in_words(self) -> str:
         """What the figures show, and what they do not, in plain sentences."""
-        return " ".join((self._change(), self._chance(), self._level(), self._nesting(), self._reach()))
+        return " ".join((self.in_short(), self._level(), self._nesting(), self._reach()))
+
+    def in_short(self) -> str:
+        """The change, and whether chance explains it."""
+        return f"{self._change()} {self._chance()}"
 
     def _change(self) -> str:
         c = self.overall
-        verb = (
-            "did not change"
-            if c.delta == 0.0
-            else f"{'rose' if c.delta > 0 else 'fell'} by {abs(c.delta):.3f}"
-        )
+        verb = f"{'rose' if c.delta > 0 else 'fell'} by {abs(c.delta):.3f}"
+        if abs(c.delta) < 0.0005:
+            verb = "did not change" if c.delta == 0.0 else "changed by less than 0.001"
         facts = "one item" if c.n == 1 else f"{c.n} items"
         if c.ci_low is not None:
             facts += f", 95 % bootstrap interval of the change {c.ci_low:+.3f} to {c.ci_high:+.3f}"
@@ -128,7 +130,8 @@ class Comparison:
         c = self.listeners
         if c.p_t is None:
             return f"Over the means of {c.n} listeners no t-test is defined."
-        return f"Over the means of {c.n} listeners, which are independent, the t-test has {p_text(c.p_t)}."
+        adjusted = ", not adjusted" if self.comparisons > 1 else ""
+        return f"Over the means of {c.n} listeners, which are independent, the t-test has {p_text(c.p_t)}{adjusted}."
 
     def _reach(self) -> str:
         return f"{self.title} is a model's prediction: no listener was asked, and other speech and ears may differ."

@@ -104,5 +104,5 @@ def draw_spectrograms(
         )
         axes.set(title=name, ylabel="kHz")
     panels[-1].set(xlabel="s")
-    figure.colorbar(image, ax=list(panels), label="dB SPL in a bin")
+    figure.colorbar(image, ax=list(panels), label="dB SPL in a bin", aspect=40)
     figure.savefig(path, dpi=110, format="png")

@@ -41,6 +41,11 @@ figure img { display: block; width: 100%; max-width: 42rem; height: auto; }
 figcaption { color: var(--soft); font-size: .9rem; }
 .players { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 18rem), 1fr)); gap: .8rem; }
 audio { display: block; width: 100%; }
+@media (max-width: 30rem) {
+  table { font-size: .85rem; }
+  th, td { padding: .25rem .4rem; }
+  td { white-space: normal; }
+}
 @media print { nav, .skip { display: none; } }
 """
 

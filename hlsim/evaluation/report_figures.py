@@ -13,6 +13,7 @@ from hlsim.evaluation.comparison import Comparison
 from hlsim.evaluation.figures import score_range
 from hlsim.evaluation.measures import MEASURES
 from hlsim.evaluation.page import Picture
+from hlsim.evaluation.significance import bootstrap_interval
 from hlsim.extras import require
 
 if TYPE_CHECKING:
@@ -103,6 +104,7 @@ def _levels(report: HaspiReport, c: Comparison) -> Picture:
     def draw(axes: Any) -> None:
         axes.axhline(0.0, color="0.5", linewidth=1.0, linestyle="--")
         axes.scatter(x, y, s=14, alpha=0.7, rasterized=len(points) > _MANY)
+        axes.set_xlim(min(x.min(), 0.0) - 1.0, max(x.max(), 0.0) + 1.0)
         axes.set(xlabel="change of level (dB)", ylabel=f"change of {title}")
 
     alt = f"Change of {title} over the change of level; the level changed by {x.min():+.1f} to {x.max():+.1f} dB."
@@ -144,9 +146,12 @@ def _by_severity(report: HaspiReport) -> Picture:
     def draw(axes: Any) -> None:
         width = 0.8 / len(report.conditions)
         for k, condition in enumerate(report.conditions):
-            means = [_mean(_scores(group, measure, condition)) for group in groups]
             at = np.arange(len(groups)) + (k - (len(report.conditions) - 1) / 2) * width
-            axes.bar(at, means, width * 0.9, label=condition)
+            scores = [_scores(group, measure, condition) for group in groups]
+            axes.bar(at, [_mean(own) for own in scores], width * 0.9, label=condition)
+            for place, own in zip(at, scores, strict=True):
+                if len(own) > 1:
+                    axes.plot((place, place), bootstrap_interval(own), color="black", linewidth=1.0)
         axes.set_xticks(
             range(len(groups)), [f"{s} ({len(g)})" for s, g in zip(severities, groups, strict=True)]
         )
@@ -163,7 +168,9 @@ def _by_severity(report: HaspiReport) -> Picture:
         for severity, group in zip(severities, groups, strict=True)
     )
     return Picture(
-        draw_svg(draw), f"Mean {MEASURES[measure].title} by degree of loss: {what}.", "By degree of loss."
+        draw_svg(draw),
+        f"Mean {MEASURES[measure].title} by degree of loss: {what}.",
+        "By degree of loss, with 95 % bootstrap intervals of the means.",
     )
 
 

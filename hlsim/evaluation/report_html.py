@@ -36,7 +36,7 @@ def html(report: HaspiReport, listen: int = 3) -> str:
     further = [listener_table(headline)]
     if len(report.comparisons) > 1:
         further.append(comparisons_table(report))
-    others = [c.in_words() for c in report.comparisons if c is not headline]
+    others = [c.in_short() for c in report.comparisons if c is not headline]
     sections = [
         Section("Result", paragraphs=[headline.in_words(), GAIN_SENTENCE], tables=[paper_table(headline)]),
         Section("Pictures", pictures=report_pictures(report)),

@@ -187,7 +187,7 @@ def markdown(report: HaspiReport) -> str:
         tables.append(failure_table(report))
     blocks += [f"**{table.caption}**\n\n{_markdown(table)}" for table in tables if table is not None]
     if len(report.comparisons) > 1:
-        blocks.append("\n".join(f"- {c.in_words()}" for c in report.comparisons if c is not headline))
+        blocks.append("\n".join(f"- {c.in_short()}" for c in report.comparisons if c is not headline))
     lines = [f"- {note}" for note in notes(report)]
     lines += [
         f"- {name}: {value}" for name, value in report.extra.items() if isinstance(value, str | int | float)
