@@ -63,10 +63,10 @@ def mixed_model(differences: Sequence[float], listeners: Sequence[str]) -> Mixed
         warnings.simplefilter("always")
         try:
             fit = models.MixedLM(values, ones, groups=np.asarray(listeners)).fit(reml=True)
+            error, z, p = (float(x[0]) for x in (fit.bse_fe, fit.tvalues, fit.pvalues))
+            low, high = (float(x) for x in fit.conf_int()[0])
         except (np.linalg.LinAlgError, ValueError) as failure:
             return f"the fit failed ({failure})"
-    error, z, p = (float(x[0]) for x in (fit.bse_fe, fit.tvalues, fit.pvalues))
-    low, high = (float(x) for x in fit.conf_int()[0])
     figures = (float(fit.fe_params[0]), error, z, p, low, high)
     if not np.isfinite(figures).all():
         return "the fit has no standard error"

@@ -24,7 +24,8 @@ h3 { font-size: 1.05rem; margin: 1.4rem 0 .3rem; overflow-wrap: anywhere; }
 p, li { max-width: 44rem; overflow-wrap: anywhere; }
 a { color: var(--link); }
 nav ul { display: flex; flex-wrap: wrap; gap: .2rem 1.2rem; list-style: none; padding: 0; margin: .5rem 0; }
-nav a, summary { display: inline-block; padding: .35rem 0; }
+nav a { display: inline-block; padding: .35rem 0; }
+summary { padding: .35rem 0; cursor: pointer; }
 :focus-visible { outline: 3px solid var(--link); outline-offset: 2px; }
 .skip { position: absolute; left: -100vw; background: #fff; padding: .5rem 1rem; }
 .skip:focus { left: 0; z-index: 1; }

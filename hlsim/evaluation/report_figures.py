@@ -167,11 +167,8 @@ def _by_severity(report: HaspiReport) -> Picture:
         + ", ".join(f"{name} {_mean(_scores(group, measure, name)):.3f}" for name in report.conditions)
         for severity, group in zip(severities, groups, strict=True)
     )
-    return Picture(
-        draw_svg(draw),
-        f"Mean {MEASURES[measure].title} by degree of loss: {what}.",
-        "By degree of loss, with 95 % bootstrap intervals of the means.",
-    )
+    caption = "By degree of loss, with 95 % bootstrap intervals of the means."
+    return Picture(draw_svg(draw), f"Mean {MEASURES[measure].title} by degree of loss: {what}.", caption)
 
 
 def _by_snr(report: HaspiReport) -> Picture:

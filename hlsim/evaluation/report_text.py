@@ -166,7 +166,7 @@ def notes(report: HaspiReport) -> list[str]:
             + (f" ({report.headline.mixed.note})." if report.headline.mixed.note else ".")
         )
     versions = ", ".join(f"{name} {version}" for name, version in report.versions.items())
-    lines.append(f"Seed {report.seed}; each item's own is in report.json. {versions}.")
+    lines.append(f"Numpy's seed {report.seed}; each item's own is in report.json. {versions}.")
     return lines
 
 
