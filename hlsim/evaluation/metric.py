@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from hlsim.audio import check_rate
 from hlsim.audiogram import FREQUENCIES, Audiogram, AudiogramLike
 from hlsim.calibration import check_full_scale, level_spl
 from hlsim.evaluation.haspi import HaspiItem, check_pair, check_seed, haspi_many
@@ -64,7 +65,7 @@ class HASPI(_Metric):
         require("clarity", "eval")
         if limit is not None and limit < 1:
             raise ValueError(f"limit is {limit}; allowed: 1 or more, or None")
-        self.sample_rate = sample_rate
+        self.sample_rate = check_rate(sample_rate)
         self.full_scale_spl = check_full_scale(full_scale_spl)
         self.seed, self.limit, self.jobs = check_seed(seed), limit, jobs
         for name in ("total", "total_level"):

@@ -43,8 +43,8 @@ figcaption { color: var(--soft); font-size: .9rem; }
 .players { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 18rem), 1fr)); gap: .8rem; }
 audio { display: block; width: 100%; }
 @media (max-width: 30rem) {
-  table { font-size: .85rem; }
-  th, td { padding: .25rem .4rem; }
+  table { font-size: .82rem; }
+  th, td { padding: .25rem .3rem; }
   td { white-space: normal; }
 }
 @media print { nav, .skip { display: none; } }
@@ -137,17 +137,19 @@ def _section(section: Section, name: str, depth: int) -> str:
 
 def _table(table: Table) -> str:
     head = "".join(f'<th scope="col">{escape(cell)}</th>' for cell in table.header)
-    rows = "\n".join(
-        f'<tr><th scope="row">{escape(row[0])}</th>'
-        + "".join(f"<td>{escape(c)}</td>" for c in row[1:])
-        + "</tr>"
-        for row in table.rows
-    )
+    rows = "\n".join(f'<tr><th scope="row">{escape(row[0])}</th>{_cells(row[1:])}</tr>' for row in table.rows)
     # a region that scrolls must take the focus, or the keyboard cannot scroll it
     return (
         f'<div class="scroll" role="region" tabindex="0" aria-label="{escape(table.caption)}"><table>'
         f"<caption>{escape(table.caption)}</caption>\n<thead><tr>{head}</tr></thead>\n<tbody>{rows}</tbody></table></div>"
     )
+
+
+def _cells(cells: Sequence[str]) -> str:
+    if len(cells) > 1 and cells[-1] and not any(cells[:-1]):
+        # a figure of the whole row: on a phone it has no room at the end of it
+        return f'<td colspan="{len(cells)}">{escape(cells[-1])}</td>'
+    return "".join(f"<td>{escape(cell)}</td>" for cell in cells)
 
 
 def _picture(picture: Picture) -> str:
