@@ -1,5 +1,6 @@
 """Reading, writing and resampling audio. The only file that imports torchaudio and soundfile."""
 
+import io
 import os
 from pathlib import Path
 
@@ -106,6 +107,22 @@ def write_audio(path: str | Path, waveform: Tensor, sample_rate: int) -> None:
         raise ValueError(f"{path}: cannot be written ({error})") from error
     finally:
         partial.unlink(missing_ok=True)
+
+
+def encode_flac(waveform: Tensor, sample_rate: int) -> bytes:
+    """The contents of a 16-bit flac file of samples up to 1.0, for a page to play.
+
+    Shape: (time,).
+
+    Raises:
+        ValueError: another shape, or samples that are NaN, infinite or beyond 1.0.
+    """
+    samples = check_waveform(waveform).detach().to("cpu", torch.float32)
+    if samples.ndim != 1 or not bool((samples.abs() <= 1.0).all()):
+        raise ValueError(f"shape {tuple(samples.shape)}; allowed: (time,), samples from -1.0 to 1.0")
+    data = io.BytesIO()
+    soundfile.write(data, samples.numpy(), sample_rate, format="FLAC", subtype="PCM_16")
+    return data.getvalue()
 
 
 def find_audio(folder: str | Path) -> list[Path]:

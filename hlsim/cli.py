@@ -7,7 +7,7 @@ import sys
 from collections.abc import Sequence
 
 from hlsim import __version__
-from hlsim.commands import benchmark, demo, evaluation, simulate, training
+from hlsim.commands import benchmark, demo, evaluation, haspi_report, simulate, training
 from hlsim.extras import MissingExtraError
 
 
@@ -21,7 +21,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 2
     except KeyboardInterrupt:
         print(
-            "hlsim: stopped; what was finished is kept, and training goes on from there with the same command",
+            "hlsim: stopped; what was finished is kept, and training and reports go on from there with the same command",
             file=sys.stderr,
         )
         return 130
@@ -34,7 +34,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"hlsim {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    for module in (demo, simulate, training, evaluation, benchmark):
+    for module in (demo, simulate, training, evaluation, haspi_report, benchmark):
         module.add(commands)
     return parser
 

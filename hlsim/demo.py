@@ -16,7 +16,8 @@ from hlsim.audiogram import Audiogram
 from hlsim.calibration import level_spl, set_level
 from hlsim.evaluation.figures import draw_spectrograms
 from hlsim.evaluation.haspi import HaspiItem, haspi_many
-from hlsim.evaluation.report import HaspiReport, ItemScore, write_report
+from hlsim.evaluation.report import HaspiReport, ItemScore
+from hlsim.evaluation.report_files import write_report
 from hlsim.msbg import MSBG
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.training.compensator import CompensatorData, CompensatorRecipe, train_compensator
@@ -95,14 +96,13 @@ def demo(
         haspi[name] = haspi_many(items)
         report(f"  {name}: mean HASPI {_mean(haspi[name]):.3f}")
 
+    ends = {"before": "unaided", "after": "compensated"}
     scores = [
         ItemScore(
             file=path.stem,
-            before=haspi["unaided"][i],
-            after=haspi["compensated"][i],
+            scores={"haspi": {end: haspi[name][i] for end, name in ends.items()}},
             clean_level=float(level_spl(utterances[i])),
-            before_level=float(level_spl(given["unaided"][i])),
-            after_level=float(level_spl(given["compensated"][i])),
+            levels={end: float(level_spl(given[name][i])) for end, name in ends.items()},
             audiogram=audiogram,
             sample_rate=NEURO_RATE,
             seconds=len(utterances[i]) / NEURO_RATE,
@@ -128,7 +128,7 @@ def demo(
         table.append(
             f"| {name} | {_mean(haspi[name]):.3f} | {_mean(levels):.1f} | {_mean(differences):+.1f} |"
         )
-    result = replace(HaspiReport(items=scores, full_scale_spl=94.0, seed=seed), extra=extra)
+    result = replace(HaspiReport(items=scores, seed=seed), extra=extra)
     write_report(result, folder)
     text = f"# {_name(audiogram)}\n\n{result.to_markdown()}\n" + "\n".join(table) + "\n"
     (folder / "report.md").write_text(text, encoding="utf-8")

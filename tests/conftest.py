@@ -20,8 +20,8 @@ def pytest_configure(config: pytest.Config) -> None:
 
 def pytest_report_header(config: pytest.Config) -> str | None:
     """Say what a plain run leaves out."""
-    if config.option.markexpr == "not install":
-        return "left out: tests that install hlsim into an environment of their own (pytest -m install)"
+    if config.option.markexpr == "not install and not browser":
+        return "left out: tests of an installation (pytest -m install) and of a browser (pytest -m browser)"
     return None
 
 

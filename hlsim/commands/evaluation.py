@@ -1,4 +1,4 @@
-"""The commands ``evaluate-simulator`` and ``haspi-report``."""
+"""The command ``evaluate-simulator``."""
 
 from __future__ import annotations
 
@@ -8,12 +8,9 @@ from pathlib import Path
 from hlsim.commands.options import (
     Commands,
     add_command,
-    audiogram_option,
     count,
-    full_scale_option,
     out_option,
     positive,
-    read_ear,
     read_simulator,
     seed_option,
     show_progress,
@@ -44,26 +41,6 @@ def add(commands: Commands) -> None:
     seed_option(sub)
     out_option(sub)
 
-    sub = add_command(
-        commands, "haspi-report", _haspi_report, "HASPI before and after a treatment, with paired tests"
-    )
-    for name, text in (
-        ("clean", "clean speech"),
-        ("before", "what the ear was given"),
-        ("after", "what it is given now"),
-    ):
-        sub.add_argument(
-            f"--{name}", type=Path, required=True, help=f"folder of {text}; the file names are the same"
-        )
-    audiogram_option(sub, default=None, text=", for all files")
-    sub.add_argument(
-        "--audiograms", type=Path, help="CSV with columns file, hl_250, hl_500, ...: one row a file"
-    )
-    full_scale_option(sub)
-    sub.add_argument("--jobs", type=count, help="processes; all cores by default")
-    seed_option(sub)
-    out_option(sub)
-
 
 def _evaluate_simulator(options: argparse.Namespace) -> None:
     for module in ("clarity", "pystoi", "pesq"):
@@ -83,21 +60,3 @@ def _evaluate_simulator(options: argparse.Namespace) -> None:
         progress=show_progress("items"),
     )
     print((options.out / "fidelity.md").read_text(encoding="utf-8"))
-
-
-def _haspi_report(options: argparse.Namespace) -> None:
-    from hlsim.evaluation import haspi_report
-
-    report = haspi_report(
-        options.clean,
-        options.before,
-        options.after,
-        read_ear(options.audiogram) if options.audiogram else None,
-        audiograms=options.audiograms,
-        out=options.out,
-        full_scale_spl=options.full_scale_spl,
-        seed=options.seed,
-        jobs=options.jobs,
-        progress=show_progress("scores"),
-    )
-    print(report.to_markdown())

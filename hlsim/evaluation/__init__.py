@@ -1,20 +1,43 @@
 """Scores of what an ear is given and of how true a simulator is; most need the extra ``eval``."""
 
+from typing import Any
+
+from hlsim.evaluation.comparison import Comparison
 from hlsim.evaluation.fidelity import fidelity_markdown, summarise
-from hlsim.evaluation.folders import haspi_report
 from hlsim.evaluation.haspi import HaspiItem, haspi_many
-from hlsim.evaluation.report import HaspiReport, ItemScore, write_report
-from hlsim.evaluation.significance import PairedComparison, paired_comparison
+from hlsim.evaluation.report import Failure, HaspiReport, ItemScore
+from hlsim.evaluation.report_files import write_report
+from hlsim.evaluation.scoring import Item, score_items
+from hlsim.evaluation.significance import PairedComparison, bootstrap_interval, holm, paired_comparison
+from hlsim.evaluation.store import ScoreStore
+from hlsim.evaluation.study import haspi_report
 
 __all__ = [
+    "Comparison",
+    "Failure",
+    "HASPI",
     "HaspiItem",
     "HaspiReport",
+    "Item",
     "ItemScore",
     "PairedComparison",
+    "ScoreStore",
+    "bootstrap_interval",
     "fidelity_markdown",
     "haspi_many",
     "haspi_report",
+    "holm",
     "paired_comparison",
+    "score_items",
     "summarise",
     "write_report",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    # needs torchmetrics, which the rest does not
+    if name == "HASPI":
+        from hlsim.evaluation.metric import HASPI
+
+        return HASPI
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

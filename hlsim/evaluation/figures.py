@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, BinaryIO
 
 import torch
 from torch import Tensor
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 def draw_report(report: HaspiReport, path: str | Path) -> None:
-    """Write a PNG of HASPI and of the level, after over before, with the diagonal of no change and a colour a severity.
+    """Write a PNG of score and level of the headline, after over before: a dashed line of no change, a colour a severity.
 
     Raises:
         MissingExtraError: matplotlib is not installed.
@@ -26,12 +26,22 @@ def draw_report(report: HaspiReport, path: str | Path) -> None:
     # the figure by itself, drawn by Agg: without pyplot there is no window and no global state
     figure = require("matplotlib.figure", "eval").Figure(figsize=(9.0, 4.8), layout="constrained")
     require("matplotlib.backends.backend_agg", "eval").FigureCanvasAgg(figure)
-    scores = [(item.before, item.after) for item in report.items]
-    levels = [(item.before_level, item.after_level) for item in report.items]
+    first, last = report.headline.before, report.headline.after
+    items = [
+        item for item in report.items if {first, last} <= item.scores.get(report.headline.measure, {}).keys()
+    ]
+    name = report.headline.title
+    scores = [tuple(item.scores[report.headline.measure][end] for end in (first, last)) for item in items]
+    levels = [tuple(float(item.levels[end] or 0.0) for end in (first, last)) for item in items]
     lowest, highest = min(map(min, levels)) - 3.0, max(map(max, levels)) + 3.0
     c = report.comparison
     panels = (
-        (scores, (-0.03, 1.03), "HASPI", f"mean {c.before_mean:.3f} to {c.after_mean:.3f}"),
+        (
+            scores,
+            score_range(report.headline.measure),
+            name,
+            f"mean {c.before_mean:.3f} to {c.after_mean:.3f}",
+        ),
         (
             levels,
             (lowest, highest),
@@ -39,7 +49,7 @@ def draw_report(report: HaspiReport, path: str | Path) -> None:
             f"mean {report.before_level_mean:.1f} to {report.after_level_mean:.1f} dB SPL",
         ),
     )
-    severities = [item.audiogram.severity for item in report.items]
+    severities = [item.audiogram.severity for item in items]
     for axes, (points, limits, what, title) in zip(figure.subplots(1, 2), panels, strict=True):
         axes.plot(limits, limits, color="0.5", linewidth=1.0, linestyle="--", label="no change")
         for number, severity in enumerate(SEVERITIES):
@@ -49,14 +59,25 @@ def draw_report(report: HaspiReport, path: str | Path) -> None:
                 label = "no loss" if severity == "none" else f"{severity} loss"
                 axes.scatter(before, after, s=18, alpha=0.7, color=f"C{number}", label=label)
         axes.set(xlim=limits, ylim=limits, aspect="equal", title=title)
-        axes.set(xlabel=f"{what}, before", ylabel=f"{what}, after")
+        axes.set(xlabel=f"{what}, {first}", ylabel=f"{what}, {last}")
         axes.legend(fontsize="small")
-    figure.suptitle(f"{c.n} items before and after")
+    figure.suptitle(f"{c.n} items, {first} and {last}")
     figure.savefig(path, dpi=150, format="png")
 
 
-def draw_spectrograms(signals: Mapping[str, Tensor], sample_rate: int, path: str | Path) -> None:
+def score_range(measure: str) -> tuple[float, float]:
+    """The axis of a measure."""
+    return (0.9, 4.7) if measure == "pesq" else (-0.03, 1.03)
+
+
+def draw_spectrograms(
+    signals: Mapping[str, Tensor], sample_rate: int, path: str | Path | BinaryIO, *, width: float = 9.0
+) -> None:
     """Write a PNG of log-magnitude spectrograms, one a signal, on one scale of dB SPL.
+
+    Args:
+        path: or an open binary file.
+        width: inches.
 
     Shape: (time,) each, in pascals.
 
@@ -64,7 +85,7 @@ def draw_spectrograms(signals: Mapping[str, Tensor], sample_rate: int, path: str
         MissingExtraError: matplotlib is not installed.
     """
     figure = require("matplotlib.figure", "eval").Figure(
-        figsize=(9.0, 2.2 * len(signals)), layout="constrained"
+        figsize=(width, 2.2 * len(signals)), layout="constrained"
     )
     require("matplotlib.backends.backend_agg", "eval").FigureCanvasAgg(figure)
     points = 2 * (sample_rate // 100)  # 20 ms
@@ -83,5 +104,5 @@ def draw_spectrograms(signals: Mapping[str, Tensor], sample_rate: int, path: str
         )
         axes.set(title=name, ylabel="kHz")
     panels[-1].set(xlabel="s")
-    figure.colorbar(image, ax=list(panels), label="dB SPL in a bin")
+    figure.colorbar(image, ax=list(panels), label="dB SPL in a bin", aspect=40)
     figure.savefig(path, dpi=110, format="png")

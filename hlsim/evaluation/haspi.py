@@ -17,6 +17,7 @@ clean speech in a normal one. What to know of pyclarity 0.9.0, measured on read 
 from __future__ import annotations
 
 import math
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -28,6 +29,7 @@ from torch import Tensor
 from hlsim.audio import check_rate, read_audio
 from hlsim.audiogram import Audiogram
 from hlsim.calibration import check_full_scale
+from hlsim.evaluation.parallel import check_parallel, run_parallel
 from hlsim.extras import require
 
 SHORTEST_SECONDS = 0.7
@@ -95,7 +97,7 @@ def haspi(
     # at the eight frequencies: the same ear to HASPI, which would log a warning of grids that lack one of its six
     ear = Audiogram(audiogram.thresholds).to_clarity()
     level = check_full_scale(full_scale_spl)
-    with _numpy_seed(seed):
+    with numpy_seed(seed):
         score, _ = model.haspi_v2(clean, sample_rate, heard, sample_rate, ear, level1=level)
     return float(score)
 
@@ -124,22 +126,16 @@ def haspi_many(
             1, or the seed is none that numpy takes.
         MissingExtraError: pyclarity or joblib is not installed.
     """
-    if jobs is not None and jobs < 1:
-        raise ValueError(f"jobs is {jobs}; allowed: 1 or more")
+    check_parallel(jobs, "loky", None)
     check_seed(seed)
-    joblib = require("joblib", "eval")
-    processes = min(jobs or joblib.cpu_count(), len(items))
     seeds = [(seed + i) % 2**32 if item.seed is None else item.seed for i, item in enumerate(items)]
-    work = ((i, item, full_scale_spl, seeds[i]) for i, item in enumerate(items))
+    tasks = [(i, item, full_scale_spl, seeds[i]) for i, item in enumerate(items)]
     scores = [math.nan] * len(items)
-    if processes > 1:
-        with joblib.parallel_config(backend="loky", inner_max_num_threads=1):
-            parallel = joblib.Parallel(n_jobs=processes, return_as="generator_unordered")
-            results = parallel(joblib.delayed(_score)(*task) for task in work)
-    else:
-        results = (_score(*task) for task in work)
-    for done, (index, score) in enumerate(results, start=1):
-        scores[index] = score
+    made = run_parallel(_score, tasks, jobs=1 if len(items) < 2 else jobs)
+    for done, (task, score) in enumerate(made, start=1):
+        if score is None:
+            raise ValueError(f"item {task[0]}: the process that scored it died")
+        scores[task[0]] = score
         if progress is not None:
             progress(done, len(items))
     return scores
@@ -207,17 +203,17 @@ def _samples(signal: Signal, name: str) -> np.ndarray:
     return values.astype(np.float64)
 
 
-def _score(index: int, item: HaspiItem, full_scale_spl: float, seed: int) -> tuple[int, float]:
+def _score(task: tuple[int, HaspiItem, float, int]) -> float:
+    index, item, full_scale_spl, seed = task
     name = str(item.processed) if isinstance(item.processed, str | Path) else f"item {index}"
     try:
         reference, reference_rate = _load(item.reference, item.sample_rate)
         processed, rate = _load(item.processed, item.sample_rate)
         if rate != reference_rate:
             raise ValueError(f"rate {rate} Hz, its reference has {reference_rate}; allowed: equal rates")
-        score = haspi(reference, processed, item.audiogram, rate, full_scale_spl=full_scale_spl, seed=seed)
+        return haspi(reference, processed, item.audiogram, rate, full_scale_spl=full_scale_spl, seed=seed)
     except ValueError as error:
         raise ValueError(f"{name}: {error}") from error
-    return index, score
 
 
 def _load(signal: Signal | str | Path, sample_rate: int | None) -> tuple[Signal, int]:
@@ -228,11 +224,16 @@ def _load(signal: Signal | str | Path, sample_rate: int | None) -> tuple[Signal,
     return signal, sample_rate
 
 
+_GLOBAL_GENERATOR = threading.Lock()
+
+
 @contextmanager
-def _numpy_seed(seed: int) -> Iterator[None]:
-    state = np.random.get_state()
-    np.random.seed(check_seed(seed))
-    try:
-        yield
-    finally:
-        np.random.set_state(state)
+def numpy_seed(seed: int) -> Iterator[None]:
+    """Numpy's global generator with this seed, and afterwards as it was; one thread at a time, others wait."""
+    with _GLOBAL_GENERATOR:
+        state = np.random.get_state()
+        np.random.seed(check_seed(seed))
+        try:
+            yield
+        finally:
+            np.random.set_state(state)

@@ -1,147 +1,252 @@
-"""What a comparison of HASPI before and after comes to, written as JSON, as the paper's last table and as a picture."""
+"""What a comparison of conditions comes to: scores and levels of every item, and what the statistics make of them."""
 
 from __future__ import annotations
 
-import json
 import math
-import os
-import shutil
-import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
-from importlib import metadata
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from hlsim.audiogram import SEVERITIES, Audiogram
-from hlsim.evaluation.figures import draw_report
-from hlsim.evaluation.significance import PairedComparison, paired_comparison
+from hlsim.audiogram import Audiogram
+from hlsim.evaluation.comparison import Comparison, compare_conditions
+from hlsim.evaluation.measures import version_of, versions_of
+from hlsim.evaluation.report_text import GAIN_SENTENCE, markdown
+from hlsim.evaluation.significance import RESAMPLES, PairedComparison
+from hlsim.extras import require
 
-REPORT_FILES = ("report.json", "report.md", "before-after.png")
-
-GAIN_SENTENCE = (
-    "HASPI rewards any gain, however loud, so the output level stands beside it: a higher score at a much higher level "
-    "may be no more than amplification."
-)
+if TYPE_CHECKING:
+    import pandas
 
 
 @dataclass(frozen=True)
 class ItemScore:
-    """HASPI of one item before and after, with the levels (dB SPL) of what was scored."""
+    """Scores of one utterance in one ear, with the levels (dB SPL) of what was scored.
+
+    Args:
+        file: what it is called.
+        levels: of what the ear was given, by condition, in their order; None where a file could not be read.
+        scores: by measure and condition; what could not be scored is not in it.
+        clean_level: of the clean speech.
+        full_scale_spl: level in dB SPL that a file of RMS 1.0 was taken to have.
+        seed: of the noise that HASPI and HASQI add, the same under every condition.
+        listener, ear: whose ear and which; empty where unknown.
+        snr: of the speech in noise in dB, where known.
+        clean, processed: files, for players and spectrograms; not part of ``report.json``.
+    """
 
     file: str
-    before: float
-    after: float
-    clean_level: float
-    before_level: float
-    after_level: float
     audiogram: Audiogram
+    clean_level: float
+    levels: Mapping[str, float | None]
+    scores: Mapping[str, Mapping[str, float]]
     sample_rate: int
     seconds: float
     seed: int
+    full_scale_spl: float = 94.0
+    listener: str = ""
+    ear: str = ""
+    snr: float | None = None
+    clean: Path | None = None
+    processed: Mapping[str, Path] = field(default_factory=dict)
+
+    @property
+    def before(self) -> float | None:
+        """The first measure's score under the first condition; None where there is none."""
+        return self._first_measure.get(next(iter(self.levels)))
+
+    @property
+    def after(self) -> float | None:
+        """The first measure's score under the last condition; None where there is none."""
+        return self._first_measure.get(list(self.levels)[-1])
+
+    @property
+    def before_level(self) -> float | None:
+        """Level of the first condition in dB SPL; None where its file could not be read."""
+        return next(iter(self.levels.values()))
+
+    @property
+    def after_level(self) -> float | None:
+        """Level of the last condition in dB SPL; None where its file could not be read."""
+        return list(self.levels.values())[-1]
+
+    @property
+    def _first_measure(self) -> Mapping[str, float]:
+        return next(iter(self.scores.values()), {})
 
     def to_dict(self) -> dict[str, Any]:
         """A plain dictionary that JSON can hold."""
-        return {**asdict(self), "audiogram": self.audiogram.to_dict(), "severity": self.audiogram.severity}
+        return {
+            "file": self.file,
+            "listener": self.listener,
+            "ear": self.ear,
+            "snr": self.snr,
+            "before": self.before,
+            "after": self.after,
+            "clean_level": self.clean_level,
+            "before_level": self.before_level,
+            "after_level": self.after_level,
+            "scores": {measure: dict(own) for measure, own in self.scores.items()},
+            "levels": dict(self.levels),
+            "full_scale_spl": self.full_scale_spl,
+            "audiogram": self.audiogram.to_dict(),
+            "severity": self.audiogram.severity,
+            "sample_rate": self.sample_rate,
+            "seconds": self.seconds,
+            "seed": self.seed,
+        }
+
+
+@dataclass(frozen=True)
+class Failure:
+    """A score that could not be made, and why."""
+
+    file: str
+    condition: str
+    measure: str
+    reason: str
 
 
 @dataclass(frozen=True)
 class HaspiReport:
-    """HASPI of the same items before and after.
+    """Scores of the same items under two conditions or more.
 
     Args:
-        items: a score each.
-        full_scale_spl: level in dB SPL that a signal of RMS 1.0 was taken to have.
-        seed: that of item 0; item i has ``seed`` + i, before and after alike.
+        items: at least one with scores; the headline compares the last condition with the first.
+        measures: names of the measures, the headline's first; by default those of the first item's scores.
+        seed: of the whole; each item has its own.
+        failures: scores that could not be made.
+        baseline: the first condition, where all others are to be compared with it alone; by default every later one is
+            with every earlier one.
         extra: further keys for ``report.json`` beside the others, such as ``nalr_mean``; what JSON can hold.
 
     Attributes:
-        comparison: means, deviations and tests.
-        clean_level_mean, before_level_mean, after_level_mean: means of the items' levels in dB SPL.
+        conditions: their names, in order, from the items' levels.
+        comparisons: every pair of conditions by every measure, the headline among them.
+        headline: the last condition against the first, by the first measure.
+        comparison: the headline's figures over all items.
+        clean_level_mean, before_level_mean, after_level_mean: means in dB SPL, before and after of the headline.
 
     Raises:
-        ValueError: no items, a score that is not finite, or an extra key that the report has itself.
+        ValueError: no items, or of unlike conditions, or fewer than two; a baseline that is not the first; a score
+            that is not finite, no item with both of the headline's scores, or an extra key that the report has itself.
     """
 
     items: Sequence[ItemScore]
-    full_scale_spl: float = 94.0
+    measures: Sequence[str] = ()
     seed: int = 0
+    failures: Sequence[Failure] = ()
+    baseline: str | None = None
     extra: Mapping[str, Any] = field(default_factory=dict)
-    comparison: PairedComparison = field(init=False)
-    clean_level_mean: float = field(init=False)
-    before_level_mean: float = field(init=False)
-    after_level_mean: float = field(init=False)
+    conditions: Sequence[str] = field(init=False)
+    comparisons: Sequence[Comparison] = field(init=False)
+    headline: Comparison = field(init=False)
 
     def __post_init__(self) -> None:
-        comparison = paired_comparison(
-            [item.before for item in self.items], [item.after for item in self.items]
-        )
-        object.__setattr__(self, "comparison", comparison)
-        for name in ("clean_level", "before_level", "after_level"):
-            levels = [float(getattr(item, name)) for item in self.items]
-            object.__setattr__(self, f"{name}_mean", math.fsum(levels) / len(levels))
+        if not self.items:
+            raise ValueError("no items; a report needs at least one that has scores")
+        conditions = tuple(self.items[0].levels)
+        measures = tuple(self.measures) or tuple(self.items[0].scores)
+        if len(conditions) < 2 or any(tuple(item.levels) != conditions for item in self.items):
+            raise ValueError(
+                f"conditions {', '.join(conditions)}; allowed: two or more, the same of every item"
+            )
+        if self.baseline not in (None, conditions[0]):
+            raise ValueError(
+                f"baseline is {self.baseline!r}; allowed: the first condition, {conditions[0]!r}"
+            )
+        comparisons = compare_conditions(self.items, measures, conditions, self.baseline)
+        ends = (measures[0], conditions[0], conditions[-1])
+        headline = next((c for c in comparisons if (c.measure, c.before, c.after) == ends), None)
+        if headline is None:
+            why = f" ({self.failures[0].reason})" if self.failures else ""
+            raise ValueError(f"no item has {measures[0]} under both {ends[1]} and {ends[2]}{why}")
+        for name, value in (
+            ("conditions", conditions),
+            ("measures", measures),
+            ("comparisons", comparisons),
+            ("headline", headline),
+        ):
+            object.__setattr__(self, name, value)
         taken = sorted(set(self._own()) & set(self.extra))
         if taken:
             raise ValueError(f"extra keys {', '.join(taken)} are the report's own; allowed: other names")
 
     @property
+    def comparison(self) -> PairedComparison:
+        """The headline's figures over all items."""
+        return self.headline.overall
+
+    @property
+    def clean_level_mean(self) -> float:
+        """Mean level of the clean speech in dB SPL."""
+        return math.fsum(item.clean_level for item in self.items) / len(self.items)
+
+    @property
+    def before_level_mean(self) -> float:
+        """Mean level of the headline's first condition in dB SPL."""
+        return self.headline.level_before_mean
+
+    @property
+    def after_level_mean(self) -> float:
+        """Mean level of the headline's second condition in dB SPL."""
+        return self.headline.level_after_mean
+
+    @property
+    def full_scale_spl(self) -> float | None:
+        """Level in dB SPL that RMS 1.0 was taken as; None where the items differ, as where ``spl`` was given."""
+        levels = {item.full_scale_spl for item in self.items}
+        return levels.pop() if len(levels) == 1 else None
+
+    @property
     def versions(self) -> dict[str, str]:
         """Of the packages that the scores depend on."""
-        return {name: _version(name) for name in ("hlsim", "pyclarity", "numpy", "scipy")}
+        return {"hlsim": version_of("hlsim"), **versions_of(self.measures), "scipy": version_of("scipy")}
+
+    @property
+    def table(self) -> pandas.DataFrame:
+        """A row an item and condition, with its level (dB SPL) and a column a measure; NaN where there is no score.
+
+        Raises:
+            MissingExtraError: pandas is not installed.
+        """
+        rows = [
+            {
+                "file": item.file,
+                "listener": item.listener,
+                "ear": item.ear,
+                "condition": condition,
+                "severity": item.audiogram.severity,
+                "snr": math.nan if item.snr is None else item.snr,
+                "clean_level": item.clean_level,
+                "level": math.nan if item.levels[condition] is None else item.levels[condition],
+                "full_scale_spl": item.full_scale_spl,
+                "seconds": item.seconds,
+                "seed": item.seed,
+                **{name: item.scores.get(name, {}).get(condition, math.nan) for name in self.measures},
+            }
+            for item in self.items
+            for condition in self.conditions
+        ]
+        frame: pandas.DataFrame = require("pandas", "eval").DataFrame(rows)
+        return frame
 
     def to_dict(self) -> dict[str, Any]:
         """A plain dictionary that JSON can hold: what ``report.json`` says."""
         return {**self._own(), **self.extra}
 
     def to_markdown(self) -> str:
-        """The paper's last table, with the levels, the conditions and what the figures show."""
-        c = self.comparison
-        before, after = _spread(c.before_mean, c.before_std), _spread(c.after_mean, c.after_std)
-        louder = self.after_level_mean - self.before_level_mean
-        effect = "not defined" if c.cohens_d is None else f"d = {c.cohens_d:+.3f}"
-        rows = [
-            ("HASPI (mean ± std)", before, after, f"{c.delta:+.3f}"),
-            ("*t-test (paired)*", "", "", _test("t", c.t, c.p_t, "+.3f")),
-            ("*Wilcoxon signed-rank*", "", "", _test("W", c.w, c.p_w, ".1f")),
-            ("*Cohen's d (paired)*", "", "", effect),
-            (
-                "Level (dB SPL, mean)",
-                f"{self.before_level_mean:.1f}",
-                f"{self.after_level_mean:.1f}",
-                f"{louder:+.1f}",
-            ),
-        ]
-        degrees = [item.audiogram.severity for item in self.items]
-        ears = ", ".join(f"{name} {degrees.count(name)}" for name in SEVERITIES if name in degrees)
-        versions = ", ".join(f"{name} {version}" for name, version in self.versions.items())
-        lines = [
-            "# HASPI before and after",
-            "",
-            f"{c.n} items. {GAIN_SENTENCE}",
-            "",
-            "| Metric | Before | After | Change (Δ) |",
-            "|---|---|---|---|",
-            *("| " + " | ".join(row) + " |" for row in rows),
-            "",
-            "![HASPI and level, before against after](before-after.png)",
-            "",
-            f"- Degrees of hearing loss: {ears}. Clean speech at {self.clean_level_mean:.1f} dB SPL on average. "
-            f"A signal of RMS 1.0 is taken as {self.full_scale_spl:g} dB SPL.",
-            "- Changes are after minus before, so a gain is positive. Deviations with n - 1; tests two-sided; "
-            "d is the mean difference over the deviation of the differences, t / sqrt(n).",
-            f"- Wilcoxon: zero differences dropped ({c.zeros} of {c.n}); W is the smaller rank sum.",
-            "- The tests take the items as independent; where several share a talker or a listener, p is too small.",
-            f"- HASPI v2, numpy's seed {self.seed} + the item's number from 0. {versions}.",
-        ]
-        lines += [
-            f"- {name}: {value}" for name, value in self.extra.items() if isinstance(value, str | int | float)
-        ]
-        return "\n".join(lines) + "\n"
+        """What ``report.md`` says."""
+        return markdown(self)
 
     def _own(self) -> dict[str, Any]:
         return {
             **self.comparison.to_dict(),
+            "in_words": self.headline.in_words(),
+            "conditions": list(self.conditions),
+            "measures": list(self.measures),
             "wilcoxon_zero_method": "wilcox",
+            "bootstrap": {"resamples": RESAMPLES, "method": "percentile", "seed": 0},
             "full_scale_spl": self.full_scale_spl,
             "clean_level_mean": self.clean_level_mean,
             "before_level_mean": self.before_level_mean,
@@ -149,69 +254,7 @@ class HaspiReport:
             "seed": self.seed,
             "versions": self.versions,
             "note": GAIN_SENTENCE,
+            "comparisons": [c.to_dict() for c in self.comparisons],
+            "failures": [vars(failure).copy() for failure in self.failures],
             "items": [item.to_dict() for item in self.items],
         }
-
-
-def write_report(report: HaspiReport, out_dir: str | Path) -> Path:
-    """Write ``report.json``, ``report.md`` and ``before-after.png`` into a folder, made where it is missing.
-
-    All are written beside it first and then moved in, so that no file is ever half there. Reports of an earlier run are
-    replaced, other files stay.
-
-    Returns: the folder.
-
-    Raises:
-        ValueError: the path is no folder or cannot be written, or an extra value is nothing that JSON can hold, such
-            as NaN.
-        MissingExtraError: matplotlib is not installed.
-    """
-    out = check_out(out_dir)
-    try:
-        text = json.dumps(report.to_dict(), indent=2, ensure_ascii=False, allow_nan=False)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"report cannot be written as JSON: {error}") from error
-    partial = None
-    try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        partial = Path(tempfile.mkdtemp(prefix=f".{out.name}.", suffix=".part", dir=out.parent))
-        (partial / "report.json").write_text(text + "\n", encoding="utf-8")
-        (partial / "report.md").write_text(report.to_markdown(), encoding="utf-8")
-        draw_report(report, partial / "before-after.png")
-        out.mkdir(exist_ok=True)
-        for name in REPORT_FILES:
-            (partial / name).replace(out / name)
-    except OSError as error:
-        raise ValueError(f"{out}: report cannot be written ({error})") from error
-    finally:
-        if partial is not None:
-            shutil.rmtree(partial, ignore_errors=True)
-    return out
-
-
-def check_out(out_dir: str | Path) -> Path:
-    """The folder that a report goes to, or ValueError where it cannot be: to be known before hours of scoring."""
-    out = Path(out_dir).absolute()
-    there = next(path for path in (out, *out.parents) if path.exists())
-    if not there.is_dir():
-        raise ValueError(f"{there}: not a folder; a report needs a folder, there or not")
-    if not os.access(there, os.W_OK | os.X_OK):
-        raise ValueError(f"{there}: no permission to write a report there")
-    return out
-
-
-def _spread(mean: float, deviation: float | None) -> str:
-    return f"{mean:.3f}" if deviation is None else f"{mean:.3f} ± {deviation:.3f}"
-
-
-def _test(name: str, statistic: float | None, p: float | None, form: str) -> str:
-    if statistic is None or p is None:
-        return "not defined"
-    return f"{name} = {statistic:{form}}, " + ("p < 0.00001" if p < 1e-5 else f"p = {p:.5f}")
-
-
-def _version(package: str) -> str:
-    try:
-        return metadata.version(package)
-    except metadata.PackageNotFoundError:
-        return "not installed"

@@ -1,27 +1,22 @@
-"""The report's figures, its three files, and what folders it takes and refuses."""
+"""The report's figures, its tables and its files."""
 
 import json
 import math
-import shutil
 import struct
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from scipy import stats
-from torch import Tensor
 
-from hlsim.audio import read_audio, write_audio
 from hlsim.audiogram import Audiogram
-from hlsim.evaluation import HaspiReport, ItemScore, folders, haspi_report, write_report
-from hlsim.evaluation.haspi import haspi
+from hlsim.evaluation import Failure, HaspiReport, ItemScore, bootstrap_interval, write_report
+from hlsim.evaluation.report_files import REPORT_FILES
 
 for module in ("clarity", "joblib", "matplotlib"):
     pytest.importorskip(module)
 
-N4 = Audiogram.standard("N4")
 STATED = {
     "n",
     "before_mean",
@@ -43,11 +38,9 @@ def make_report(n: int = 12, **options: object) -> HaspiReport:
     items = [
         ItemScore(
             file=f"p1/{i:02}",
-            before=float(low),
-            after=float(min(1.0, low + high)),
+            scores={"haspi": {"before": float(low), "after": float(min(1.0, low + high))}},
             clean_level=65.0,
-            before_level=64.0 + i,
-            after_level=74.0 + i,
+            levels={"before": 64.0 + i, "after": 74.0 + i},
             audiogram=Audiogram.standard(names[i % 4]),
             sample_rate=16000,
             seconds=2.5,
@@ -72,6 +65,7 @@ def test_figures_are_scipys(tmp_path: Path) -> None:
     assert (data["before_level_mean"], data["after_level_mean"], data["full_scale_spl"]) == (69.5, 79.5, 94.0)
     assert data["wilcoxon_zero_method"] == "wilcox"
     assert set(data["versions"]) == {"hlsim", "pyclarity", "numpy", "scipy"}
+    assert (data["ci_low"], data["ci_high"]) == bootstrap_interval(np.subtract(after, before))
     assert data["versions"]["numpy"] == np.__version__
     assert data["items"][2]["severity"] == "severe" and data["items"][2]["file"] == "p1/02"
 
@@ -87,13 +81,13 @@ def test_markdown_is_the_papers_table() -> None:
     assert "none 3, mild 3, severe 6" in text
     assert "seed 3" in text and "nalr_mean: 0.5125" in text
     large = make_report(400)
-    assert large.to_markdown().count("p < 0.00001") == 2
+    assert large.to_markdown().count("p < 0.00001") >= 2
 
 
 def test_undefined_tests_are_said_and_never_nan(tmp_path: Path) -> None:
     report = make_report(1)
     write_report(report, tmp_path)
-    assert (tmp_path / "report.md").read_text(encoding="utf-8").count("not defined") == 3
+    assert (tmp_path / "report.md").read_text(encoding="utf-8").count("| not defined |") == 4
     text = (tmp_path / "report.json").read_text()
     assert "NaN" not in text and json.loads(text)["t"] is None
 
@@ -107,12 +101,12 @@ def test_extra_keys_stand_beside_the_others() -> None:
     )
     with pytest.raises(ValueError, match="extra keys items, t are the report's own"):
         make_report(extra={"t": 1.0, "items": [], "other": 2})
-    with pytest.raises(ValueError, match="no scores before"):
+    with pytest.raises(ValueError, match="no items"):
         HaspiReport([])
 
 
 def test_picture_is_a_png(tmp_path: Path) -> None:
-    write_report(make_report(), tmp_path / "a" / "b")
+    write_report(make_report(), tmp_path / "a" / "b", listen=0)
     data = (tmp_path / "a" / "b" / "before-after.png").read_bytes()
     width, height = struct.unpack(">II", data[16:24])
     assert data.startswith(b"\x89PNG\r\n\x1a\n") and data.endswith(b"IEND\xaeB`\x82")
@@ -125,12 +119,7 @@ def test_files_are_replaced_and_others_stay(tmp_path: Path) -> None:
     (out / "heard.wav").write_text("audio")
     write_report(make_report(5), out)
     assert json.loads((out / "report.json").read_text())["n"] == 5
-    assert sorted(p.name for p in out.iterdir()) == [
-        "before-after.png",
-        "heard.wav",
-        "report.json",
-        "report.md",
-    ]
+    assert sorted(p.name for p in out.iterdir()) == sorted([*REPORT_FILES, "heard.wav"])
     assert [p.name for p in tmp_path.iterdir()] == ["out"]
 
 
@@ -147,7 +136,7 @@ def test_a_failure_leaves_the_earlier_report_whole(
         def fail(*_: object) -> None:
             raise OSError("disk full")
 
-        monkeypatch.setattr("hlsim.evaluation.report.draw_report", fail)
+        monkeypatch.setattr("hlsim.evaluation.report_files.draw_report", fail)
     else:
         report = make_report(5, extra={"nalr_mean": math.nan})
     for target in (out, tmp_path / "new"):
@@ -164,188 +153,87 @@ def test_out_must_be_a_folder(tmp_path: Path) -> None:
             write_report(make_report(), out)
 
 
-@pytest.fixture
-def corpus(tmp_path: Path, speech_dir: Path) -> Path:
-    """clean, before and after with two files of 0.8 s each, one in a subfolder, at two rates."""
-    for name, source in (("a.b", "train/flite-slt-01"), ("p2/c", "valid/espeak-us-annie-01")):
-        waveform, rate = read_audio(speech_dir / f"{source}.flac")
-        clean = waveform[:, rate : rate + 8 * rate // 10]
-        noise = 0.002 * torch.randn(clean.shape, generator=torch.Generator().manual_seed(3))
-        for folder, suffix, signal in (
-            ("clean", ".flac", clean),
-            ("before", ".wav", clean + noise),
-            ("after", ".wav", 8.0 * (clean + noise)),
-        ):
-            path = tmp_path / folder / f"{name}{suffix}"
-            path.parent.mkdir(parents=True, exist_ok=True)
-            write_audio(path, signal, rate)
-    return tmp_path
-
-
-def run(corpus: Path, audiogram: Audiogram | None = N4, **options: object) -> HaspiReport:
-    return haspi_report(corpus / "clean", corpus / "before", corpus / "after", audiogram, jobs=1, **options)
-
-
-def signal(path: Path) -> Tensor:
-    return read_audio(path)[0][0]
-
-
-def test_folders_are_scored_one_by_one(corpus: Path) -> None:
-    seen: list[tuple[int, int]] = []
-    report = run(
-        corpus,
-        out=corpus / "out",
-        seed=4,
-        full_scale_spl=90.0,
-        progress=lambda done, total: seen.append((done, total)),
-    )
-    assert [(item.file, item.seed, item.sample_rate) for item in report.items] == [
-        ("a.b", 4, 16000),
-        ("p2/c", 5, 22050),
-    ]
-    for item in report.items:
-        clean = signal(corpus / "clean" / f"{item.file}.flac")
-        for folder, score, level in (
-            ("before", item.before, item.before_level),
-            ("after", item.after, item.after_level),
-        ):
-            heard = signal(corpus / folder / f"{item.file}.wav")
-            ours = haspi(clean, heard, N4, item.sample_rate, full_scale_spl=90.0, seed=item.seed)
-            assert score == pytest.approx(ours, abs=1e-12)
-            assert level == pytest.approx(
-                90.0 + 10 * math.log10(float(heard.double().square().mean())), abs=1e-6
+def three_conditions() -> HaspiReport:
+    """Nine items of three listeners, by two measures; one score is missing."""
+    rng = np.random.default_rng(1)
+    items = []
+    for i in range(9):
+        low = rng.uniform(0.1, 0.5)
+        scores = {
+            "haspi": {"unaided": low, "NAL-R": low + 0.3, "new_one": low + 0.35 + 0.01 * rng.normal()},
+            "stoi": {"unaided": 0.7, "NAL-R": 0.7 + 0.01 * rng.normal(), "new_one": 0.7},
+        }
+        if i == 4:
+            del scores["stoi"]["new_one"]
+        items.append(
+            ItemScore(
+                file=f"s{i}",
+                audiogram=Audiogram.standard(("N1", "N3")[i % 2]),
+                clean_level=65.0,
+                levels={"unaided": 65.0, "NAL-R": 80.0, "new_one": 80.5},
+                scores=scores,
+                sample_rate=16000,
+                seconds=2.0,
+                seed=i,
+                full_scale_spl=90.0 + i,
+                listener=f"L{i % 3}",
+                ear="left",
+                snr=(0.0, 5.0, 10.0)[i % 3],
             )
-        assert item.after_level - item.before_level == pytest.approx(20 * math.log10(8), abs=1e-4)
-        assert item.seconds == 0.8
-    assert report.comparison.delta > 0.2
-    assert seen == [(done, 4) for done in range(1, 5)]
-    assert json.loads((corpus / "out" / "report.json").read_text()) == report.to_dict()
+        )
+    failures = [Failure("s4", "new_one", "stoi", "a|b & 100 %")]
+    return HaspiReport(items, measures=("haspi", "stoi"), failures=failures)
 
 
-def test_audiograms_of_a_csv(corpus: Path) -> None:
-    header = "file," + ",".join(N4.to_row())
-    rows = {"a.b.wav": Audiogram.standard("S3"), "p2/c": N4, "not/here.flac": N4}
-    table = [header, *(",".join([name, *ear.to_row().values()]) for name, ear in rows.items())]
-    (corpus / "ears.csv").write_text("\n".join(table))
-    report = run(corpus, None, audiograms=corpus / "ears.csv")
-    assert [item.audiogram for item in report.items] == [Audiogram.standard("S3"), N4]
-    clean = signal(corpus / "clean" / "a.b.flac")
-    ours = haspi(clean, signal(corpus / "after" / "a.b.wav"), Audiogram.standard("S3"), 16000, seed=0)
-    assert report.items[0].after == pytest.approx(ours, abs=1e-12)
+def test_every_pair_of_conditions_by_every_measure() -> None:
+    report = three_conditions()
+    assert [(c.measure, c.before, c.after) for c in report.comparisons] == [
+        (measure, *pair)
+        for measure in ("haspi", "stoi")
+        for pair in (("unaided", "NAL-R"), ("unaided", "new_one"), ("NAL-R", "new_one"))
+    ]
+    assert report.headline is report.comparisons[1] and report.comparison.n == 9
+    assert [c.overall.n for c in report.comparisons[3:]] == [9, 8, 8]
+    one = replace(report, baseline="unaided")
+    assert [(c.before, c.after) for c in one.comparisons[:2]] == [
+        ("unaided", "NAL-R"),
+        ("unaided", "new_one"),
+    ]
+    assert len(one.comparisons) == 4
+    with pytest.raises(ValueError, match="baseline is 'NAL-R'; allowed: the first condition, 'unaided'"):
+        replace(report, baseline="NAL-R")
 
 
-def stereo(corpus: Path) -> None:
-    write_audio(
-        corpus / "after" / "p2" / "c.wav", signal(corpus / "after" / "p2" / "c.wav").expand(2, -1), 22050
+def test_table_is_pandas_with_a_row_an_item_and_condition() -> None:
+    table = three_conditions().table
+    assert len(table) == 27 and list(table.condition[:3]) == ["unaided", "NAL-R", "new_one"]
+    assert table.groupby("condition").haspi.mean()["NAL-R"] == pytest.approx(
+        table[table.condition == "unaided"].haspi.mean() + 0.3
     )
+    assert table.stoi.isna().sum() == 1 and set(table.severity) == {"mild", "severe"}
+    assert list(table.level[:3]) == [65.0, 80.0, 80.5] and table.full_scale_spl.max() == 98.0
 
 
-def shorter(corpus: Path) -> None:
-    write_audio(
-        corpus / "before" / "p2" / "c.wav", signal(corpus / "before" / "p2" / "c.wav")[None, 1:], 22050
-    )
-
-
-def faster(corpus: Path) -> None:
-    write_audio(corpus / "after" / "a.b.wav", signal(corpus / "after" / "a.b.wav")[None], 24000)
-
-
-def silent(corpus: Path) -> None:
-    write_audio(corpus / "after" / "a.b.wav", torch.zeros(1, 12800), 16000)
-
-
-def short(corpus: Path) -> None:
-    for path in (corpus / "clean" / "a.b.flac", corpus / "before" / "a.b.wav", corpus / "after" / "a.b.wav"):
-        write_audio(path, signal(path)[None, :8000], 16000)
-
-
-def quiet(corpus: Path) -> None:
-    (corpus / "clean" / "p2" / "c.flac").unlink()
-    write_audio(
-        corpus / "clean" / "p2" / "c.wav", signal(corpus / "before" / "p2" / "c.wav")[None] * 1e-4, 22050
-    )
-
-
-def broken(corpus: Path) -> None:
-    (corpus / "before" / "p2" / "c.wav").write_bytes(b"RIFF and nothing more")
-
-
-def missing(corpus: Path) -> None:
-    (corpus / "after" / "a.b.wav").unlink()
-
-
-def surplus(corpus: Path) -> None:
-    shutil.copytree(corpus / "before" / "p2", corpus / "before" / "p3")
-
-
-def twice(corpus: Path) -> None:
-    shutil.copy(corpus / "clean" / "a.b.flac", corpus / "before" / "a.b.flac")
-
-
-def empty(corpus: Path) -> None:
-    shutil.rmtree(corpus / "clean")
-
-
-@pytest.mark.parametrize(
-    ("damage", "message"),
-    [
-        (stereo, r"after/p2/c.wav: 2 channels; allowed: 1, for one file is what one ear is given"),
-        (shorter, r"clean/p2/c.flac has 17640 samples and .*before/p2/c.wav 17639"),
-        (faster, r"after/a.b.wav has 24000 Hz and .*clean/a.b.flac 16000 Hz"),
-        (silent, r"after/a.b.wav: silent"),
-        (short, r"clean/a.b.flac lasts 0.5 s"),
-        (quiet, r"clean/p2/c.wav is at -\d+.\d dB SPL with full_scale_spl 94"),
-        (broken, r"before/p2/c.wav: not readable as audio"),
-        (missing, r"after: 1 of 2 files missing, a.b; clean, before and after need the same names"),
-        (surplus, r"clean: 1 of 3 files missing, p3/c;"),
-        (twice, r"before/a.b.flac and .*before/a.b.wav: one name twice"),
-        (empty, r"clean: no such folder"),
-    ],
-)
-def test_bad_folders_are_refused_before_the_first_score(
-    corpus: Path, monkeypatch: pytest.MonkeyPatch, damage: object, message: str
-) -> None:
-    def score(*_: object, **__: object) -> list[float]:
-        raise AssertionError("scored before all files were checked")
-
-    monkeypatch.setattr(folders, "haspi_many", score)
-    assert callable(damage)
-    damage(corpus)
-    with pytest.raises(ValueError, match=message) as error:
-        run(corpus, out=corpus / "out")
-    assert "\n" not in str(error.value)
-    assert not (corpus / "out").exists()
-
-
-HEADER = "file," + ",".join(N4.to_row())
-LEVELS = ",".join(N4.to_row().values())
-
-
-@pytest.mark.parametrize(
-    ("table", "message"),
-    [
-        (f"{HEADER}\na.b,{LEVELS}\n", "ears.csv: no audiogram of 1 of 2 files, p2/c"),
-        (f"{HEADER}\na.b,{LEVELS}\na.b.wav,{LEVELS}\n", "ears.csv, line 3: a second row of a.b.wav"),
-        (f"{HEADER[5:]}\n{LEVELS}\n", "ears.csv, line 2: no file named"),
-        (f"{HEADER}\na.b,{LEVELS.replace('55', '555')}\n", "ears.csv, line 2: audiogram levels 555"),
-    ],
-)
-def test_bad_csv(corpus: Path, table: str, message: str) -> None:
-    (corpus / "ears.csv").write_text(table)
-    with pytest.raises(ValueError, match=message):
-        run(corpus, None, audiograms=corpus / "ears.csv")
-
-
-def test_bad_arguments(corpus: Path) -> None:
-    with pytest.raises(ValueError, match="either audiogram"):
-        run(corpus, None)
-    with pytest.raises(ValueError, match="either audiogram"):
-        run(corpus, N4, audiograms=corpus / "ears.csv")
-    with pytest.raises(ValueError, match="audiogram is str"):
-        run(corpus, "N4")
-    with pytest.raises(ValueError, match="jobs is 0"):
-        haspi_report(corpus / "clean", corpus / "before", corpus / "after", N4, jobs=0)
-    with pytest.raises(ValueError, match="seed is -1"):
-        run(corpus, seed=-1)
-    with pytest.raises(ValueError, match="not a folder"):
-        run(corpus, out=corpus / "clean" / "a.b.flac")
+def test_texts_of_three_conditions(tmp_path: Path) -> None:
+    report = three_conditions()
+    write_report(report, tmp_path)
+    text = (tmp_path / "report.md").read_text(encoding="utf-8")
+    assert text.startswith("# HASPI, STOI: unaided, NAL-R, new_one\n")
+    assert "| Metric | Unaided | New_one | Change (Δ) |" in text
+    assert "| s4 | new_one | STOI | a\\|b & 100 % |" in text
+    assert "| listener means | 3 |" in text and "| HASPI: NAL-R to new_one | 9 |" in text
+    assert "RMS 1.0 is taken as 90.0 to 98.0 dB SPL, by item" in text
+    data = json.loads((tmp_path / "report.json").read_text(encoding="utf-8"))
+    assert data == report.to_dict() and data["full_scale_spl"] is None
+    assert data["failures"] == [
+        {"file": "s4", "condition": "new_one", "measure": "stoi", "reason": "a|b & 100 %"}
+    ]
+    tex = (tmp_path / "report.tex").read_text(encoding="utf-8")
+    assert tex.count("\\begin{table}") == tex.count("\\end{table}") == 4
+    body = "\n".join(line for line in tex.splitlines() if not line.startswith("%"))
+    assert "new\\_one" in body and "new_one" not in body and "$\\pm$" in body and "95 \\%" in body
+    assert not set(body) - set(map(chr, range(128)))
+    for row in body.split("\\begin{tabular}")[1:]:
+        columns = row.split("}")[0].count("r") + 1
+        lines = [line for line in row.splitlines() if line.endswith("\\\\")]
+        assert lines and all(line.count("&") == columns - 1 for line in lines)

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from hlsim.evaluation import paired_comparison
+from hlsim.evaluation import bootstrap_interval, holm, paired_comparison
+from hlsim.evaluation.significance import group_means
 
 
 def draw(n: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
@@ -25,6 +26,7 @@ def test_equals_scipy(n: int) -> None:
     assert (c.n, c.zeros) == (n, 0)
     assert (c.t, c.p_t) == (t.statistic, t.pvalue)
     assert (c.w, c.p_w) == (w.statistic, w.pvalue)
+    assert c.ci_low is not None and c.ci_high is not None and c.ci_low <= c.delta <= c.ci_high
     assert c.before_mean == pytest.approx(before.mean(), abs=1e-15)
     assert c.after_std == pytest.approx(math.sqrt(((after - after.mean()) ** 2).sum() / (n - 1)), rel=1e-12)
     assert c.delta == pytest.approx(c.after_mean - c.before_mean, abs=1e-15)
@@ -54,6 +56,48 @@ def test_the_papers_row() -> None:
     assert c.t == pytest.approx(t, rel=1e-9)
     assert c.cohens_d is not None and round(c.cohens_d, 3) == 0.594
     assert c.p_t is not None and c.p_t < 1e-5 and c.p_w is not None and c.p_w < 1e-5
+    # the paper's sign: before minus after
+    turned = paired_comparison(before + 0.187 * (1.0 + noise * math.sqrt(n) / t), before)
+    assert turned.t == pytest.approx(-24.113, rel=1e-9)
+    assert abs(-24.113) / math.sqrt(1648) == pytest.approx(0.594, abs=5e-4)
+
+
+@pytest.mark.parametrize("n", [2, 12, 100])
+def test_interval_is_scipys(n: int) -> None:
+    before, after = draw(n)
+    c = paired_comparison(before, after)
+    # scipy draws as we do where all resamples are drawn at once
+    options = {"random_state": np.random.default_rng(0), "n_resamples": 9999, "method": "percentile"}
+    scipys = stats.bootstrap((after - before,), np.mean, **options).confidence_interval
+    assert (c.ci_low, c.ci_high) == pytest.approx((scipys.low, scipys.high), abs=1e-12)
+
+
+def test_interval_of_many_is_the_normal_one() -> None:
+    values = np.random.default_rng(4).normal(0.2, 1.0, 4000)
+    low, high = bootstrap_interval(values)
+    half = 1.96 * values.std(ddof=1) / math.sqrt(4000)
+    assert (low, high) == pytest.approx((values.mean() - half, values.mean() + half), abs=0.03 * half)
+    narrow = bootstrap_interval(values, confidence=0.5)
+    assert low < narrow[0] < values.mean() < narrow[1] < high
+    assert bootstrap_interval(values, seed=1) != (low, high) == bootstrap_interval(values)
+    with pytest.raises(ValueError, match="1 values; an interval needs two or more"):
+        bootstrap_interval([0.5])
+
+
+def test_holm_by_hand_and_by_statsmodels() -> None:
+    # 0.01 * 4, 0.02 * 3, 0.03 * 2, then not below its forerunner
+    assert holm([0.03, 0.01, 0.04, 0.02]) == pytest.approx([0.06, 0.04, 0.06, 0.06])
+    assert holm([0.9, 0.8, None]) == [1.0, 1.0, None]
+    assert holm([]) == [] and holm([None]) == [None] and holm([0.04]) == [0.04]
+    multitest = pytest.importorskip("statsmodels.stats.multitest")
+    p = np.random.default_rng(5).uniform(0, 0.2, 30)
+    assert holm(p) == pytest.approx(list(multitest.multipletests(p, method="holm")[1]), abs=1e-15)
+
+
+def test_group_means() -> None:
+    assert group_means([1.0, 2.0, 5.0], ["b", "a", "b"]) == {"b": 3.0, "a": 2.0}
+    with pytest.raises(ValueError):
+        group_means([1.0], ["a", "b"])
 
 
 def test_signs_turn_with_the_order() -> None:

@@ -1,0 +1,207 @@
+"""Two conditions compared by one measure: overall, by degree of loss, by listener, and in words."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+from typing import TYPE_CHECKING, Any
+
+from hlsim.audiogram import SEVERITIES
+from hlsim.evaluation.measures import MEASURES
+from hlsim.evaluation.mixed import MixedModel, mixed_model
+from hlsim.evaluation.significance import PairedComparison, group_means, holm, paired_comparison
+
+if TYPE_CHECKING:
+    from hlsim.evaluation.report import ItemScore
+
+ALPHA = 0.05
+"""Below which a p value is said to speak against chance."""
+
+_AUDIBLE = 1.0  # dB: a smaller change of level is not held to explain a score
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """A measure under two conditions, of the items that have both.
+
+    Attributes:
+        measure, before, after: names of the measure and of the conditions.
+        overall: over all items.
+        level_before_mean, level_after_mean: dB SPL of what the ear was given, of the same items.
+        by_severity: by degree of loss, those that occur.
+        listeners: the same tests of the means of each listener; None unless two or more are named.
+        mixed: a mixed model with listeners as a random intercept, or the reason why there is none.
+        p_t_holm, p_w_holm: p values adjusted by Holm over the comparisons of this measure.
+        comparisons: how many those are.
+    """
+
+    measure: str
+    before: str
+    after: str
+    overall: PairedComparison
+    level_before_mean: float
+    level_after_mean: float
+    by_severity: Mapping[str, PairedComparison]
+    listeners: PairedComparison | None
+    mixed: MixedModel | str
+    p_t_holm: float | None
+    p_w_holm: float | None
+    comparisons: int = 1
+
+    @property
+    def title(self) -> str:
+        """The measure's name as a table writes it."""
+        return MEASURES[self.measure].title
+
+    def to_dict(self) -> dict[str, Any]:
+        """A plain dictionary that JSON can hold."""
+        mixed = self.mixed.to_dict() if isinstance(self.mixed, MixedModel) else {"none": self.mixed}
+        return {
+            "measure": self.measure,
+            "before": self.before,
+            "after": self.after,
+            **self.overall.to_dict(),
+            "p_t_holm": self.p_t_holm,
+            "p_w_holm": self.p_w_holm,
+            "comparisons": self.comparisons,
+            "level_before_mean": self.level_before_mean,
+            "level_after_mean": self.level_after_mean,
+            "by_severity": {name: own.to_dict() for name, own in self.by_severity.items()},
+            "listener_means": None if self.listeners is None else self.listeners.to_dict(),
+            "mixed_model": mixed,
+            "in_words": self.in_words(),
+        }
+
+    def in_words(self) -> str:
+        """What the figures show, and what they do not, in plain sentences."""
+        return " ".join((self.in_short(), self._level(), self._nesting(), self._reach()))
+
+    def in_short(self) -> str:
+        """The change, and whether chance explains it."""
+        return f"{self._change()} {self._chance()}"
+
+    def _change(self) -> str:
+        c = self.overall
+        verb = f"{'rose' if c.delta > 0 else 'fell'} by {abs(c.delta):.3f}"
+        if abs(c.delta) < 0.0005:
+            verb = "did not change" if c.delta == 0.0 else "changed by less than 0.001"
+        facts = "one item" if c.n == 1 else f"{c.n} items"
+        if c.ci_low is not None:
+            facts += f", 95 % bootstrap interval of the change {c.ci_low:+.3f} to {c.ci_high:+.3f}"
+        return f"From {self.before} to {self.after}, {self.title} {verb} on average ({facts})."
+
+    def _chance(self) -> str:
+        defined = [
+            (n, p) for n, p in (("t-test", self.p_t_holm), ("Wilcoxon", self.p_w_holm)) if p is not None
+        ]
+        if not defined:
+            return "Neither test is defined for these figures, so they do not tell a change from chance."
+        named = ", ".join(f"{name} {p_text(p)}" for name, p in defined)
+        if self.comparisons > 1:
+            named += f", Holm-adjusted for {self.comparisons} comparisons"
+        against = [p < ALPHA for _, p in defined]
+        if all(against):
+            return f"Chance alone hardly explains it ({named})."
+        if any(against):
+            return f"The tests disagree on whether chance explains it ({named})."
+        return f"It cannot be told from chance ({named}), which does not show that there is no change."
+
+    def _level(self) -> str:
+        title = self.title
+        if not MEASURES[self.measure].of_an_ear:
+            return f"{title} knows neither loss nor level: it rates the signal at the ear, not what is heard."
+        louder = self.level_after_mean - self.level_before_mean
+        if louder >= _AUDIBLE:
+            return (
+                f"The level rose by {louder:.1f} dB, and {title} rewards gain: the figures do not show how much of the "
+                "change amplification alone would have brought."
+            )
+        if louder <= -_AUDIBLE:
+            return f"The level fell by {-louder:.1f} dB, so that gain does not explain a rise."
+        return f"The mean level changed by {louder:+.1f} dB only, so that gain overall does not explain it."
+
+    def _nesting(self) -> str:
+        if self.listeners is None:
+            return (
+                "Items are taken as independent: where several share a talker or a listener, p is too small."
+            )
+        c = self.listeners
+        if c.p_t is None:
+            return f"Over the means of {c.n} listeners no t-test is defined."
+        adjusted = ", not adjusted" if self.comparisons > 1 else ""
+        return f"Over the means of {c.n} listeners, which are independent, the t-test has {p_text(c.p_t)}{adjusted}."
+
+    def _reach(self) -> str:
+        return f"{self.title} is a model's prediction: no listener was asked, and other speech and ears may differ."
+
+
+def compare_conditions(
+    items: Sequence[ItemScore],
+    measures: Sequence[str],
+    conditions: Sequence[str],
+    baseline: str | None = None,
+) -> list[Comparison]:
+    """Every later condition against every earlier one (or against ``baseline`` only) by every measure.
+
+    P values are adjusted by Holm over the comparisons of a measure. A pair that no item has scores of is left out.
+    """
+    pairs = list(combinations(conditions, 2))
+    if baseline is not None:
+        pairs = [(baseline, other) for other in conditions if other != baseline]
+    out = []
+    for measure in measures:
+        own = [c for pair in pairs if (c := _compare(items, measure, *pair)) is not None]
+        p_t, p_w = holm(c.overall.p_t for c in own), holm(c.overall.p_w for c in own)
+        out += [
+            replace(c, p_t_holm=t, p_w_holm=w, comparisons=len(own))
+            for c, t, w in zip(own, p_t, p_w, strict=True)
+        ]
+    return out
+
+
+def p_text(p: float) -> str:
+    """A p value as text, with five places."""
+    return "p < 0.00001" if p < 1e-5 else f"p = {p:.5f}"
+
+
+def _compare(items: Sequence[ItemScore], measure: str, before: str, after: str) -> Comparison | None:
+    both = [item for item in items if {before, after} <= item.scores.get(measure, {}).keys()]
+    if not both:
+        return None
+    first = [item.scores[measure][before] for item in both]
+    second = [item.scores[measure][after] for item in both]
+    severities = [item.audiogram.severity for item in both]
+    by_severity = {
+        name: paired_comparison(
+            [x for x, own in zip(first, severities, strict=True) if own == name],
+            [x for x, own in zip(second, severities, strict=True) if own == name],
+        )
+        for name in SEVERITIES
+        if name in severities
+    }
+    listeners, means = [item.listener for item in both], None
+    mixed: MixedModel | str = "listeners are not named"
+    if all(listeners):
+        mixed = mixed_model([b - a for a, b in zip(first, second, strict=True)], listeners)
+        if len(set(listeners)) > 1:
+            means = paired_comparison(*(group_means(x, listeners).values() for x in (first, second)))
+    return Comparison(
+        measure=measure,
+        before=before,
+        after=after,
+        overall=paired_comparison(first, second),
+        level_before_mean=_mean_level(both, before),
+        level_after_mean=_mean_level(both, after),
+        by_severity=by_severity,
+        listeners=means,
+        mixed=mixed,
+        p_t_holm=None,
+        p_w_holm=None,
+    )
+
+
+def _mean_level(items: Sequence[ItemScore], condition: str) -> float:
+    levels = [level for item in items if (level := item.levels[condition]) is not None]
+    return math.fsum(levels) / len(levels)  # what has a score has a level

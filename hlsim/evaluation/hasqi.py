@@ -1,0 +1,49 @@
+"""HASQI version 2 of one ear, as pyclarity computes it, but the same every time.
+
+HASQI (Kates and Arehart 2014, J. Audio Eng. Soc. 62(3)) is the quality of the processed speech in the impaired ear
+against the clean speech, amplified by NAL-R, in the same ear. pyclarity draws noise for it from numpy's global
+generator, as for HASPI; what ``haspi`` says of rates, short signals and levels holds here too.
+"""
+
+from __future__ import annotations
+
+from hlsim.audiogram import Audiogram
+from hlsim.calibration import check_full_scale
+from hlsim.evaluation.haspi import Signal, check_pair, numpy_seed
+from hlsim.extras import require
+
+
+def hasqi(
+    reference: Signal,
+    processed: Signal,
+    audiogram: Audiogram,
+    sample_rate: int,
+    *,
+    full_scale_spl: float = 94.0,
+    seed: int = 0,
+) -> float:
+    """HASQI v2 of one ear, 0 to 1: pyclarity's ``hasqi_v2``, whose combined score it is, with numpy's seed set.
+
+    Args:
+        reference: clean speech, not amplified; HASQI itself adds NAL-R to it.
+        processed: what the impaired ear is given.
+        audiogram: of that ear.
+        sample_rate: Hz, 16000 to 48000.
+        full_scale_spl: level in dB SPL of a signal with RMS 1.0 (pyclarity's ``level1``).
+        seed: of the noise that HASQI adds.
+
+    Shape: (time,) and (time,), equally long, at least 0.7 s.
+
+    Raises:
+        ValueError: as ``haspi``.
+        MissingExtraError: pyclarity is not installed.
+    """
+    if not isinstance(audiogram, Audiogram):
+        raise ValueError(f"audiogram is {type(audiogram).__name__}; HASQI takes one ear, an Audiogram")
+    clean, heard = check_pair(reference, processed, sample_rate, full_scale_spl)
+    model = require("clarity.evaluator.hasqi", "eval")
+    ear = Audiogram(audiogram.thresholds).to_clarity()
+    level = check_full_scale(full_scale_spl)
+    with numpy_seed(seed):
+        score = model.hasqi_v2(clean, sample_rate, heard, sample_rate, ear, level1=level)[0]
+    return float(score)

@@ -1,0 +1,191 @@
+"""A CSV manifest: which files which ear of which listener is given, under any number of conditions.
+
+A row is one file that one ear is given::
+
+    listener,ear,condition,clean,processed,snr,hl_250,hl_500,...,hl_8000
+    L1,left,unaided,clean/s01.flac,noisy/s01.flac,5,35,35,...,65
+    L1,left,NAL-R,clean/s01.flac,nalr/L1-left/s01.flac,5,35,35,...,65
+
+Columns: ``condition``, ``clean`` and ``processed`` are needed, the paths relative to the root; ``listener``, ``ear``
+(left or right), ``item`` and ``snr`` (dB) may be there. Rows of one listener, ear, clean file, item and SNR are one item
+of the report. The ear's audiogram is in columns ``hl_250`` and so on, or in a column ``audiogram`` by its standard name,
+or in a second CSV file by ``listener`` and ``ear``. The level is in a column ``spl`` (dB SPL of the clean file) or
+``full_scale_spl`` (dB SPL of RMS 1.0), or is given for all.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path, PurePosixPath
+
+from hlsim.audiogram import Audiogram, read_audiograms
+from hlsim.calibration import check_full_scale
+from hlsim.evaluation.scoring import EARS, Item
+
+_EAR_NAMES = {"": "", "l": "left", "left": "left", "r": "right", "right": "right"}
+_NEEDED = ("condition", "clean", "processed")
+
+
+def read_manifest(
+    path: str | Path,
+    root: str | Path | None = None,
+    *,
+    audiogram: Audiogram | None = None,
+    audiograms: str | Path | None = None,
+    full_scale_spl: float = 94.0,
+    spl: float | None = None,
+) -> list[Item]:
+    """The items of a manifest, in the order of their first rows.
+
+    Args:
+        root: the folder that the paths are relative to, and that they may not leave; by default the manifest's own.
+        audiogram: the ear of all rows that bring none; or else
+        audiograms: a CSV file with columns ``listener``, ``ear`` (where left and right differ) and ``hl_250``, ....
+        full_scale_spl, spl: the level, as in ``Item``, of rows that bring none.
+
+    Raises:
+        ValueError: the file cannot be read, lacks a column, or a row is wrong: an ear other than left and right, a path
+            that leaves the root, no audiogram or level, a second row of a condition, or one unlike its item's others.
+    """
+    folder = (Path(path).parent if root is None else Path(root)).resolve()
+    if not folder.is_dir():
+        raise ValueError(f"{folder}: no such folder; the manifest's paths are relative to it")
+    ears = {} if audiograms is None else _ears(audiograms)
+    items: dict[tuple[str, ...], Item] = {}
+    for line, row in enumerate(_rows(path), start=2):
+        try:
+            name, condition, item = _item(row, folder, ears, audiogram, full_scale_spl, spl)
+            known = items.get(name)
+            if known is None:
+                items[name] = item
+                continue
+            if condition in known.processed:
+                raise ValueError(f"a second row of condition {condition!r} of {item.name}")
+            if replace(known, processed={}) != replace(item, processed={}):
+                raise ValueError(f"audiogram or level is not that of the other rows of {item.name}")
+            items[name] = replace(known, processed={**known.processed, **item.processed})
+        except ValueError as error:
+            raise ValueError(f"{path}, line {line}: {error}") from error
+    return list(items.values())
+
+
+def inside(root: Path, name: str, column: str) -> Path:
+    """A path below a root, links followed, or ValueError where it leaves it."""
+    path = (root / name).resolve()
+    if not name or PurePosixPath(name).is_absolute() or Path(name).is_absolute():
+        raise ValueError(f"{column} is {name!r}; allowed: a path relative to {root}")
+    if not path.is_relative_to(root):
+        raise ValueError(f"{column} is {name!r}, which leaves {root}; allowed: paths below it")
+    return path
+
+
+def _rows(path: str | Path) -> list[dict[str, str]]:
+    try:
+        with open(path, newline="", encoding="utf-8-sig") as file:
+            reader = csv.DictReader(file)
+            rows = [
+                {key.strip(): (value or "").strip() for key, value in row.items() if isinstance(key, str)}
+                for row in reader
+            ]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise ValueError(f"{path}: cannot read the manifest: {error}") from error
+    if not rows:
+        raise ValueError(f"{path}: no rows; needs a header with {', '.join(_NEEDED)} and a row a file")
+    missing = [column for column in _NEEDED if column not in rows[0]]
+    if missing:
+        raise ValueError(f"{path}: no column {', '.join(missing)}; needs {', '.join(_NEEDED)}")
+    return rows
+
+
+def _item(
+    row: Mapping[str, str],
+    root: Path,
+    ears: Mapping[tuple[str, str], Audiogram],
+    audiogram: Audiogram | None,
+    full_scale_spl: float,
+    spl: float | None,
+) -> tuple[tuple[str, ...], str, Item]:
+    condition, listener = row["condition"], row.get("listener", "")
+    if not condition:
+        raise ValueError("no condition")
+    ear = _ear(row.get("ear", ""))
+    clean = inside(root, row["clean"], "clean")
+    own = {key: _number(row, key) for key in ("spl", "full_scale_spl", "snr")}
+    if own["spl"] is not None and own["full_scale_spl"] is not None:
+        raise ValueError("both spl and full_scale_spl; allowed: one of them a row")
+    if own["full_scale_spl"] is not None:
+        full_scale_spl, spl = own["full_scale_spl"], None
+    elif own["spl"] is not None:
+        spl = own["spl"]
+    parts = (listener, ear, row.get("item", "") or PurePosixPath(row["clean"]).with_suffix("").as_posix())
+    label = " ".join(part for part in parts if part)
+    item = Item(
+        name=label if own["snr"] is None else f"{label} {own['snr']:g} dB",
+        clean=clean,
+        processed={condition: inside(root, row["processed"], "processed")},
+        audiogram=_audiogram(row, ears, listener, ear, audiogram),
+        listener=listener,
+        ear=ear,
+        snr=own["snr"],
+        full_scale_spl=check_full_scale(full_scale_spl),
+        spl=spl,
+    )
+    return (*parts, str(clean), str(own["snr"])), condition, item
+
+
+def _audiogram(
+    row: Mapping[str, str],
+    ears: Mapping[tuple[str, str], Audiogram],
+    listener: str,
+    ear: str,
+    default: Audiogram | None,
+) -> Audiogram:
+    levels = {key: value for key, value in row.items() if key.startswith("hl_") and value}
+    if levels:
+        return Audiogram.from_row(levels)
+    if row.get("audiogram"):
+        return Audiogram.standard(row["audiogram"])
+    known = ears.get((listener, ear)) or ears.get((listener, "")) or default
+    if known is None:
+        raise ValueError(
+            f"no audiogram of listener {listener!r}, ear {ear!r}: neither in columns hl_250, hl_500, ... or audiogram "
+            "nor in a file of audiograms"
+        )
+    return known
+
+
+def _ears(path: str | Path) -> dict[tuple[str, str], Audiogram]:
+    ears: dict[tuple[str, str], Audiogram] = {}
+    for line, (row, audiogram) in enumerate(read_audiograms(path), start=2):
+        try:
+            name = ((row.get("listener") or "").strip(), _ear((row.get("ear") or "").strip()))
+            if not name[0]:
+                raise ValueError("no listener; needs a column 'listener'")
+            if name in ears:
+                raise ValueError(f"a second row of listener {name[0]}, ear {name[1]!r}")
+        except ValueError as error:
+            raise ValueError(f"{path}, line {line}: {error}") from error
+        ears[name] = audiogram
+    return ears
+
+
+def _ear(text: str) -> str:
+    if text.lower() not in _EAR_NAMES:
+        raise ValueError(f"ear is {text!r}; allowed: {', '.join(EARS)}")
+    return _EAR_NAMES[text.lower()]
+
+
+def _number(row: Mapping[str, str], column: str) -> float | None:
+    text = row.get(column, "")
+    if not text:
+        return None
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise ValueError(f"{column} is {text!r}; allowed: a number of dB")
+    return value

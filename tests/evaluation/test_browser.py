@@ -1,0 +1,152 @@
+"""The report's page in a real Chromium: no error, no request, players that play, a phone's width, the keyboard.
+
+Run with ``pytest -m browser``. Needs playwright and a Chromium: its own (``playwright install chromium``) or a system one,
+found by name or in the environment variable ``CHROMIUM``.
+"""
+
+import os
+import shutil
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from hlsim.audio import read_audio, write_audio
+from hlsim.audiogram import Audiogram
+from hlsim.evaluation import Failure, HaspiReport, ItemScore, write_report
+
+pytestmark = pytest.mark.browser
+
+
+@pytest.fixture(scope="module")
+def page_file(tmp_path_factory: pytest.TempPathFactory, speech_dir: Path) -> Path:
+    """A report of three conditions whose files are there; the scores are made up."""
+    root = tmp_path_factory.mktemp("report")
+    waveform, rate = read_audio(speech_dir / "train" / "flite-slt-01.flac")
+    clean = waveform[:, rate : 2 * rate]
+    gains = {"unaided": 1.0, "NAL-R": 4.0, "compensated": 5.0}
+    for name, gain in {"clean": 1.0, **gains}.items():
+        write_audio(root / f"{name}.wav", clean * gain, rate)
+    generator = torch.Generator().manual_seed(0)
+    items = []
+    for i in range(12):
+        low, rise = torch.rand(2, generator=generator).tolist()
+        scores = {"unaided": low / 2, "NAL-R": low / 2 + rise / 3, "compensated": low / 2 + rise / 2}
+        items.append(
+            ItemScore(
+                file=f"a long name of an utterance/in a folder/{i:02}",
+                audiogram=Audiogram.standard(("N1", "N3", "N4", "S2")[i % 4]),
+                clean_level=65.0,
+                levels={"unaided": 65.0, "NAL-R": 77.0, "compensated": 79.0},
+                scores={"haspi": scores, "stoi": {name: 0.7 + value / 10 for name, value in scores.items()}},
+                sample_rate=rate,
+                seconds=1.0,
+                seed=i,
+                listener=f"L{i % 3}",
+                ear="left",
+                snr=(0.0, 5.0, 10.0)[i % 3],
+                clean=root / "clean.wav",
+                processed={name: root / f"{name}.wav" for name in gains},
+            )
+        )
+    failures = [Failure("x", "NAL-R", "haspi", "silent, every sample is zero")]
+    report = HaspiReport(items, failures=failures)
+    out = write_report(replace(report, extra={"note_of_ours": 1}), root / "out", listen=2)
+    return out / "report.html"
+
+
+@pytest.fixture(scope="module")
+def chromium() -> Iterator[Any]:
+    sync_api = pytest.importorskip("playwright.sync_api")
+    names = ("chromium", "chromium-browser", "google-chrome")
+    path = os.environ.get("CHROMIUM") or next(filter(None, map(shutil.which, names)), None)
+    with sync_api.sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=path, args=["--no-sandbox"])
+        yield browser
+        browser.close()
+
+
+@pytest.fixture(params=[(360, 740), (1280, 900)], ids=["phone", "desk"])
+def page(request: pytest.FixtureRequest, chromium: Any, page_file: Path) -> Iterator[Any]:
+    """The page, opened; fails afterwards where it said anything or asked for anything but itself."""
+    width, height = request.param
+    page = chromium.new_page(viewport={"width": width, "height": height})
+    said: list[str] = []
+    asked: list[str] = []
+    page.on("console", lambda message: said.append(message.text))
+    page.on("pageerror", lambda error: said.append(str(error)))
+    page.on("request", lambda one: asked.append(one.url))
+    page.goto(page_file.as_uri())
+    yield page
+    page.close()
+    assert said == []
+    assert [url for url in asked if not url.startswith("data:")] == [page_file.as_uri()]
+
+
+def test_pictures_are_drawn_and_nothing_is_wider_than_the_screen(page: Any) -> None:
+    widths = page.evaluate("[...document.images].map(i => [i.naturalWidth, i.getBoundingClientRect().width])")
+    assert len(widths) == 6 + 2
+    inner = page.viewport_size["width"]
+    assert all(natural > 0 and 150 < shown <= inner for natural, shown in widths)
+    assert page.evaluate("document.documentElement.scrollWidth") <= inner
+    # the paper's table is whole even on a phone
+    region = page.locator(".scroll").first
+    assert region.evaluate("e => e.scrollWidth <= e.clientWidth")
+    assert page.evaluate("parseFloat(getComputedStyle(document.querySelector('td')).fontSize)") >= 13
+
+
+def test_players_play(page: Any) -> None:
+    played = page.evaluate(
+        """async () => {
+            const out = [];
+            for (const audio of document.querySelectorAll('audio')) {
+                audio.muted = true;
+                await audio.play();
+                await new Promise(done => audio.ontimeupdate = () => audio.currentTime > 0 && done());
+                out.push([audio.duration, audio.error === null, audio.currentTime > 0]);
+                audio.pause();
+            }
+            return out;
+        }"""
+    )
+    assert len(played) == 2 * 4
+    assert all(abs(seconds - 1.0) < 0.02 and fine and moved for seconds, fine, moved in played)
+
+
+def test_the_keyboard_reaches_everything(page: Any) -> None:
+    page.keyboard.press("Tab")
+    focus = "[document.activeElement.className || document.activeElement.tagName, document.activeElement.innerText]"
+    assert page.evaluate(focus) == ["skip", "Skip to the report"]
+    assert page.evaluate("document.activeElement.getBoundingClientRect().left") >= 0
+    page.keyboard.press("Enter")
+    assert page.evaluate("document.activeElement.id") == "main"
+    reached = []
+    for _ in range(80):
+        page.keyboard.press("Tab")
+        kind = page.evaluate("document.activeElement.tagName + '.' + document.activeElement.className")
+        reached.append(kind)
+        if kind.startswith("SUMMARY"):
+            break
+    tables = page.locator("section:not(:has(details)) .scroll").count()
+    assert reached.count("DIV.scroll") == tables >= 5
+    assert sum(kind.startswith("AUDIO") for kind in reached) >= 8
+    hidden = page.locator("details table")
+    assert not hidden.is_visible()
+    page.keyboard.press("Enter")
+    assert hidden.is_visible()
+
+
+def test_the_focus_is_seen_and_scrolls_a_wide_table(page: Any) -> None:
+    wide = page.locator(".scroll").last
+    page.locator("summary").click()
+    wide.focus()
+    page.keyboard.press("Tab")
+    page.keyboard.press("Shift+Tab")
+    assert wide.evaluate("e => getComputedStyle(e).outlineStyle") == "solid"
+    if wide.evaluate("e => e.scrollWidth > e.clientWidth"):
+        for _ in range(3):
+            page.keyboard.press("ArrowRight")
+        page.wait_for_function("e => e.scrollLeft > 0", arg=wide.element_handle())
