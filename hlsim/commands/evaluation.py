@@ -36,6 +36,17 @@ def add(commands: Commands) -> None:
     sub.add_argument(
         "--teacher", choices=("pyclarity", "msbg"), default="pyclarity", help="what counts as the truth"
     )
+    sub.add_argument(
+        "--levels", type=float, nargs="+", default=[50, 60, 65, 70, 80], help="dB SPL that items take in turn"
+    )
+    sub.add_argument(
+        "--inputs",
+        nargs="+",
+        default=["as-is"],
+        metavar="INPUT",
+        help="what the ear is given: as-is, louder (20 dB), nal-r, compressed (3:1), compensated",
+    )
+    sub.add_argument("--compensator", help="its name or folder, for the input compensated")
     sub.add_argument("--items", type=count, default=240, help="how many")
     sub.add_argument("--seconds", type=positive, default=3.0, help="length of an item")
     seed_option(sub)
@@ -45,7 +56,9 @@ def add(commands: Commands) -> None:
 def _evaluate_simulator(options: argparse.Namespace) -> None:
     for module in ("clarity", "pystoi", "pesq"):
         require(module, "eval")
-    from hlsim.evaluation.simulators import RATE, evaluate_simulators
+    from compensators import load_compensator
+    from hlsim.evaluation.fidelity_items import RATE
+    from hlsim.evaluation.simulators import evaluate_simulators
 
     evaluate_simulators(
         {name: read_simulator(name, RATE) for name in options.names},
@@ -56,6 +69,9 @@ def _evaluate_simulator(options: argparse.Namespace) -> None:
         teacher=options.teacher,
         items=options.items,
         seconds=options.seconds,
+        levels=options.levels,
+        inputs=options.inputs,
+        compensator=load_compensator(options.compensator) if options.compensator else None,
         seed=options.seed,
         progress=show_progress("items"),
     )

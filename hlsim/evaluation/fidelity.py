@@ -24,7 +24,7 @@ _BAND_RANGE_DB = 50.0
 _FLOOR = 1e-20  # of the truth's power: keeps an exact estimate at 200 dB SNR, which JSON can hold
 
 
-_COLUMNS = {
+COLUMNS = {
     "n": ("n", "d"),
     "SNR median (dB)": ("snr_median", ".1f"),
     "SNR worst tenth (dB)": ("snr_worst_tenth", ".1f"),
@@ -37,6 +37,9 @@ _COLUMNS = {
     "RAW MSE": ("raw_mse", ".4f"),
     "Band error median (dB)": ("band_error_median", ".2f"),
 }
+"""Titles of a table's columns, with the figure and its format."""
+
+GROUPS = {"severity": "By degree of loss", "level": "By level (dB SPL)", "condition": "By condition"}
 
 
 class Score(NamedTuple):
@@ -224,9 +227,8 @@ def summarise(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 def fidelity_markdown(summary: Mapping[str, Any]) -> str:
     """What ``summarise`` returned as Markdown tables: the whole first, then each grouping."""
-    titles = {"severity": "By degree of loss", "level": "By level (dB SPL)", "condition": "By condition"}
     sections = [_table("Items", {"all": summary["overall"]})]
-    sections += [f"**{titles[key]}**\n\n" + _table(key, summary[key]) for key in titles if summary.get(key)]
+    sections += [f"**{GROUPS[key]}**\n\n" + _table(key, summary[key]) for key in GROUPS if summary.get(key)]
     return "\n\n".join(sections) + "\n"
 
 
@@ -263,10 +265,12 @@ def _figures(rows: Sequence[Mapping[str, Any]]) -> dict[str, float | int | None]
 
 
 def _table(what: str, groups: Mapping[str, Mapping[str, float | int | None]]) -> str:
-    lines = [f"| {what.capitalize()} | " + " | ".join(_COLUMNS) + " |", "|---" * (len(_COLUMNS) + 1) + "|"]
+    lines = [f"| {what.capitalize()} | " + " | ".join(COLUMNS) + " |", "|---" * (len(COLUMNS) + 1) + "|"]
     for name, figures in groups.items():
-        cells = [
-            "n/a" if figures[key] is None else f"{figures[key]:{form}}" for key, form in _COLUMNS.values()
-        ]
-        lines.append(f"| {name} | " + " | ".join(cells) + " |")
+        lines.append(f"| {name} | " + " | ".join(column_cells(figures)) + " |")
     return "\n".join(lines)
+
+
+def column_cells(figures: Mapping[str, float | int | None]) -> list[str]:
+    """The figures of ``summarise`` under ``COLUMNS``, ``n/a`` where there is none."""
+    return ["n/a" if figures[key] is None else f"{figures[key]:{form}}" for key, form in COLUMNS.values()]

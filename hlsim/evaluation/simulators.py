@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import json
-import os
+import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -11,29 +10,14 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from hlsim.audiogram import MILDER, Audiogram, draw_thresholds, read_audiograms
-from hlsim.calibration import level_spl
-from hlsim.data.clips import Clips
-from hlsim.data.variation import mix
-from hlsim.evaluation.fidelity import (
-    fidelity_markdown,
-    pesq_wb,
-    raw_mse,
-    snr_db,
-    stoi,
-    summarise,
-    third_octave_error_db,
-)
+from hlsim.evaluation.fidelity import pesq_wb, raw_mse, snr_db, stoi, third_octave_error_db
+from hlsim.evaluation.fidelity_items import LEVELS, RATE, Item, draw_items, treat
+from hlsim.evaluation.fidelity_report import fidelity_result, write_fidelity
+from hlsim.evaluation.store import ScoreStore, key_of
 from hlsim.evaluation.truth import pyclarity_msbg
 from hlsim.msbg import MSBG
-from hlsim.neuro.config import NEURO_RATE
 
-RATE = NEURO_RATE
-LEVELS = (50.0, 60.0, 65.0, 70.0, 80.0)
-"""Levels in dB SPL that the items take in turn."""
-
-SNRS_DB = (2.5, 7.5, 12.5, 17.5)
-"""Signal-to-noise ratios of the noisy items, the paper's test set."""
+STORE = "scores.jsonl"
 
 Report = Callable[[int, int], None]
 
@@ -48,64 +32,89 @@ def evaluate_simulators(
     teacher: str = "pyclarity",
     items: int = 240,
     seconds: float = 3.0,
+    levels: Sequence[float] = LEVELS,
+    inputs: Sequence[str] = ("as-is",),
+    compensator: nn.Module | None = None,
     seed: int = 0,
     progress: Report | None = None,
 ) -> dict[str, Any]:
-    """Compare simulators with MSBG and write ``fidelity.json`` and ``fidelity.md``.
+    """Compare simulators with MSBG, side by side, and write ``fidelity.json``, ``.md``, ``.html`` and spectrograms.
 
-    Half of the ears are those of the file, a quarter the milder standard ones (NH, N1, N2, S1), a quarter drawn; levels
-    are 50 to 80 dB SPL; with ``noise`` every second item is noisy. All is drawn from the seed.
+    Scores are stored in ``scores.jsonl`` as they are made, by the samples, the ear and the weights that they are of: a
+    run that was stopped goes on where it was, and one with a simulator more scores that one alone.
 
     Args:
         simulators: by name, at 16 kHz and 94 dB SPL full scale.
-        speech, noise: folders of recordings.
-        audiograms: CSV file of ears.
-        out: folder for the two files.
+        speech, noise: folders of recordings; with ``noise`` every second item is noisy.
+        audiograms: CSV file of ears, half of those used; the milder standard ones (NH, N1, N2, S1) and drawn ones are
+            a quarter each.
+        out: folder for the files.
         teacher: ``"pyclarity"``, the reference itself, or ``"msbg"``, hlsim's own.
-        items: how many.
+        items: how many; each is scored under each of ``inputs``.
         seconds: length of an item; PESQ and STOI want 2 or more.
-        progress: called with the items done and all.
+        levels: dB SPL that the items take in turn.
+        inputs: what is done to the signal before the ear gets it, of ``INPUTS`` and, with a compensator, ``compensated``.
+        compensator: called with a waveform and an ear.
+        progress: called with what is done and all.
 
     Returns: what ``fidelity.json`` holds.
 
     Raises:
-        ValueError: data that cannot be used, or an unknown teacher.
-        MissingExtraError: pyclarity, pystoi or pesq is not installed.
+        ValueError: data that cannot be used, or an unknown teacher or input.
+        MissingExtraError: pyclarity, pystoi, pesq or matplotlib is not installed.
     """
     if teacher not in ("pyclarity", "msbg"):
         raise ValueError(f"teacher {teacher!r}; allowed: pyclarity, msbg")
-    if items < 1:
-        raise ValueError(f"{items} items; allowed: 1 or more")
-    folder = Path(out)
-    folder.mkdir(parents=True, exist_ok=True)
-    exact = MSBG(sample_rate=RATE)
+    if items < 1 or not simulators or not inputs or not levels:
+        raise ValueError(
+            f"{items} items of {len(inputs)} inputs at {len(levels)} levels for {len(simulators)} simulators; allowed: "
+            "1 or more of each"
+        )
+    drawn = draw_items(speech, noise, audiograms, items=items, seconds=seconds, seed=seed, levels=levels)
+    store = ScoreStore(Path(out) / STORE)
+    weights = {name: _weights_hash(simulator) for name, simulator in simulators.items()}
     rows: dict[str, list[dict[str, Any]]] = {name: [] for name in simulators}
-    for number, (clean, signal, ear, about) in enumerate(
-        _items(speech, noise, audiograms, items, seconds, seed)
-    ):
-        with torch.no_grad():
-            truth = pyclarity_msbg(signal, ear, RATE) if teacher == "pyclarity" else exact(signal, ear)
+    total = items * len(inputs)
+    for number, item in enumerate(treat(drawn, inputs, compensator)):
+        about = {
+            "signal": _hash(item.clean, item.signal),
+            "ear": list(item.ear.thresholds),
+            "teacher": teacher,
+        }
+        keys = {name: key_of({**about, "weights": weights[name]}) for name in simulators}
+        missing = [name for name in simulators if store.get(keys[name]) is None]
+        if missing:
+            truth = _truth(item, teacher)
             true = {
-                "stoi_true": stoi(clean, truth, RATE).value,
-                "pesq_true": pesq_wb(clean, truth, RATE).value,
+                "stoi_true": stoi(item.clean, truth, RATE).value,
+                "pesq_true": pesq_wb(item.clean, truth, RATE).value,
             }
-            for name, simulator in simulators.items():
-                heard = simulator(signal, ear).double()
-                rows[name].append(about | true | _scores(clean, truth, heard))
+            for name in missing:
+                with torch.no_grad():
+                    heard = simulators[name](item.signal, item.ear).double()
+                store.append(keys[name], true | _scores(item.clean, truth, heard))
+        for name in simulators:
+            rows[name].append({**item.about, **(store.get(keys[name]) or {})})
         if progress is not None:
-            progress(number + 1, items)
-    result = {
-        "teacher": teacher,
-        "items": items,
-        "seconds": seconds,
-        "seed": seed,
-        "simulators": {name: {"summary": summarise(table), "items": table} for name, table in rows.items()},
-    }
-    for name, text in (("fidelity.json", json.dumps(result, indent=1)), ("fidelity.md", _markdown(result))):
-        partial = folder / f".{name}.part"
-        partial.write_text(text, encoding="utf-8")
-        os.replace(partial, folder / name)
+            progress(number + 1, total)
+    result = fidelity_result(
+        rows, teacher=teacher, items=items, seconds=seconds, seed=seed, levels=[*levels], inputs=[*inputs]
+    )
+    shown = _shown(drawn)
+    with torch.no_grad():
+        panels = {"truth": _truth(shown, teacher)} | {
+            name: simulator(shown.signal, shown.ear) for name, simulator in simulators.items()
+        }
+    write_fidelity(result, panels, shown, out)
     return result
+
+
+def _truth(item: Item, teacher: str) -> Tensor:
+    if teacher == "pyclarity":
+        return pyclarity_msbg(item.signal, item.ear, RATE)
+    with torch.no_grad():
+        heard: Tensor = MSBG(sample_rate=RATE)(item.signal, item.ear)
+    return heard
 
 
 def _scores(clean: Tensor, truth: Tensor, heard: Tensor) -> dict[str, float | None]:
@@ -118,52 +127,19 @@ def _scores(clean: Tensor, truth: Tensor, heard: Tensor) -> dict[str, float | No
     }
 
 
-def _items(
-    speech: str | Path,
-    noise: str | Path | None,
-    audiograms: str | Path,
-    items: int,
-    seconds: float,
-    seed: int,
-) -> Sequence[tuple[Tensor, Tensor, Audiogram, dict[str, Any]]]:
-    """Clean and presented signal in pascals, ear, and the item's description."""
-    generator = torch.Generator().manual_seed(seed)
-    clips = Clips(speech, sample_rate=RATE, seconds=seconds)
-    noises = Clips(noise, sample_rate=RATE, seconds=seconds, repeat=True) if noise is not None else None
-    measured = [ear for _, ear in read_audiograms(audiograms)]
-    chosen = []
-    for i in range(items):
-        clean = clips.draw(1, generator)
-        condition = "noisy" if noises is not None and i % 2 else "clean"
-        signal = clean
-        if noises is not None and condition == "noisy":
-            ratio = torch.tensor([SNRS_DB[(i // 2) % len(SNRS_DB)]])
-            signal = mix(clean, noises.draw(1, generator), ratio)
-        # counters of different periods, so that every ear meets every level and condition
-        level = LEVELS[(i // 2) % len(LEVELS)]
-        turn = (i // 2) % 4
-        if turn < 2:
-            ear = measured[int(torch.randint(len(measured), (), generator=generator))]
-        elif turn == 2:
-            ear = Audiogram.standard(MILDER[(i // 8) % len(MILDER)])
-        else:
-            ear = Audiogram(tuple(draw_thresholds(1, generator).squeeze(0).tolist()))
-        gain = 10.0 ** ((level - float(level_spl(signal))) / 20.0)
-        about = {
-            "severity": ear.severity,
-            "level": level,
-            "condition": condition,
-            "audiogram": list(ear.thresholds),
-        }
-        chosen.append(((clean * gain).squeeze(0), (signal * gain).squeeze(0), ear, about))
-    return chosen
+def _shown(items: Sequence[Item]) -> Item:
+    """The item of the spectrograms: the first of moderate loss, or the first of all."""
+    return next((item for item in items if item.about["severity"] == "moderate"), items[0])
 
 
-def _markdown(result: Mapping[str, Any]) -> str:
-    lines = [
-        f"Against {'pyclarity' if result['teacher'] == 'pyclarity' else 'the exact MSBG'}: {result['items']} items of "
-        f"{result['seconds']:g} s, seed {result['seed']}.",
-    ]
-    for name, entry in result["simulators"].items():
-        lines += [f"\n## {name}\n", fidelity_markdown(entry["summary"])]
-    return "\n".join(lines) + "\n"
+def _weights_hash(simulator: nn.Module) -> str:
+    """What makes a simulator this one: its class and settings, and its weights."""
+    state = hashlib.sha256(f"{type(simulator).__qualname__} {getattr(simulator, 'config', '')}".encode())
+    for name, tensor in simulator.state_dict().items():
+        state.update(name.encode())
+        state.update(tensor.detach().cpu().contiguous().numpy().tobytes())
+    return state.hexdigest()
+
+
+def _hash(*signals: Tensor) -> str:
+    return hashlib.sha256(b"".join(signal.contiguous().numpy().tobytes() for signal in signals)).hexdigest()

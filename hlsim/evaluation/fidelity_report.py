@@ -1,0 +1,172 @@
+"""A comparison of simulators as JSON, Markdown, one HTML page, and a picture of spectrograms."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor
+
+from hlsim.audiogram import SEVERITIES
+from hlsim.evaluation.fidelity import COLUMNS, GROUPS, column_cells, fidelity_markdown, summarise
+from hlsim.evaluation.fidelity_items import RATE, Item
+from hlsim.evaluation.figures import draw_spectrograms
+from hlsim.evaluation.page import Picture, Section, Table, render_page
+from hlsim.evaluation.report_figures import draw_svg
+
+FILES = ("fidelity.json", "fidelity.md", "fidelity.html", "spectrograms.png")
+
+_INPUT_TITLES = {
+    "as-is": "Speech as it is",
+    "louder": "20 dB louder",
+    "nal-r": "Amplified by NAL-R for the ear",
+    "compressed": "Compressed 3:1",
+    "compensated": "The output of a compensator",
+}
+
+
+def fidelity_result(rows: Mapping[str, Sequence[Mapping[str, Any]]], **settings: Any) -> dict[str, Any]:
+    """Summaries by simulator and input, and the items themselves.
+
+    Returns: ``{**settings, "simulators": {name: {"inputs": {input: summary}, "items": rows}}}``, for JSON.
+    """
+    simulators = {}
+    for name, table in rows.items():
+        inputs = {
+            given: summarise([row for row in table if row["input"] == given]) for given in settings["inputs"]
+        }
+        simulators[name] = {"inputs": inputs, "items": [*table]}
+    return {**settings, "simulators": simulators}
+
+
+def side_by_side(result: Mapping[str, Any], given: str) -> Table:
+    """The paper's Table I and our columns: a row a simulator, over all items of one input."""
+    rows = [
+        [name, *column_cells(entry["inputs"][given]["overall"])]
+        for name, entry in result["simulators"].items()
+    ]
+    return Table(_INPUT_TITLES[given], ["Simulator", *COLUMNS], rows)
+
+
+def fidelity_text(result: Mapping[str, Any]) -> str:
+    """The comparison in Markdown: simulators side by side for each input, then each by itself."""
+    parts = ["# Fidelity to MSBG", _what(result)]
+    for given in result["inputs"]:
+        table = side_by_side(result, given)
+        lines = [f"## {table.caption}", ""]
+        lines += ["| " + " | ".join(table.header) + " |", "|---" * len(table.header) + "|"]
+        lines += ["| " + " | ".join(row) + " |" for row in table.rows]
+        parts.append("\n".join(lines))
+    for name, entry in result["simulators"].items():
+        for given, summary in entry["inputs"].items():
+            parts.append(
+                f"## {name}: {_INPUT_TITLES[given].lower()}\n\n{fidelity_markdown(summary).rstrip()}"
+            )
+    return "\n\n".join(parts) + "\n"
+
+
+def write_fidelity(
+    result: Mapping[str, Any], panels: Mapping[str, Tensor], shown: Item, out: str | Path
+) -> None:
+    """Write the files into a folder, each whole or not at all.
+
+    Args:
+        panels: what is heard of ``shown`` by name, in pascals at 16 kHz.
+
+    Raises:
+        MissingExtraError: matplotlib is not installed.
+    """
+    folder = Path(out)
+    folder.mkdir(parents=True, exist_ok=True)
+    picture = io.BytesIO()
+    draw_spectrograms(panels, RATE, picture)
+    contents = {
+        "fidelity.json": json.dumps(result, indent=1).encode(),
+        "fidelity.md": fidelity_text(result).encode(),
+        "fidelity.html": _page(result, picture.getvalue(), shown).encode(),
+        "spectrograms.png": picture.getvalue(),
+    }
+    for name in FILES:
+        partial = folder / f".{name}.part"
+        partial.write_bytes(contents[name])
+        os.replace(partial, folder / name)
+
+
+def _what(result: Mapping[str, Any]) -> str:
+    truth = "pyclarity's MSBG" if result["teacher"] == "pyclarity" else "hlsim's exact MSBG"
+    levels = ", ".join(f"{level:g}" for level in result["levels"])
+    return (
+        f"Against {truth}: {result['items']} items of {result['seconds']:g} s at {levels} dB SPL in turn, seed "
+        f"{result['seed']}. RAW MSE is on waveforms scaled to unit power of the truth. STOI and PESQ are of what is "
+        "heard against the clean speech, of the truth and of the simulator: correlations (LCC, SRCC) and mean squared "
+        "difference. PESQ says little where both signals are nearly inaudible."
+    )
+
+
+def _page(result: Mapping[str, Any], spectrograms: bytes, shown: Item) -> str:
+    sections = [
+        Section("Side by side", [_what(result)], [side_by_side(result, given) for given in result["inputs"]])
+    ]
+    about = f"{shown.about['condition']}, {shown.about['level']:g} dB SPL, {shown.about['severity']} loss"
+    panel = Picture(spectrograms, "Log-magnitude spectrograms of the truth and each simulator", about)
+    sections.append(Section("Spectrograms", pictures=[panel]))
+    for name, entry in result["simulators"].items():
+        given = result["inputs"][0]
+        rows = [row for row in entry["items"] if row["input"] == given]
+        tables = [
+            Table(
+                title,
+                [key.capitalize(), *COLUMNS],
+                [
+                    [group, *column_cells(figures)]
+                    for group, figures in entry["inputs"][given].get(key, {}).items()
+                ],
+            )
+            for key, title in GROUPS.items()
+        ]
+        sections.append(Section(f"{name}: {_INPUT_TITLES[given].lower()}", (), tables, _pictures(rows)))
+    return render_page("Fidelity to MSBG", sections, f"{', '.join(result['simulators'])}.")
+
+
+def _pictures(rows: Sequence[Mapping[str, Any]]) -> list[Picture]:
+    pictures = []
+    for measure, title in (("stoi", "STOI"), ("pesq", "PESQ (wide band)")):
+        data = draw_svg(_scatter(rows, measure, title))
+        pictures.append(Picture(data, f"{title} of the simulated against that of the true, a point an item"))
+    for key, title in (("snr", "Waveform SNR (dB)"), ("band_error", "Band level error (dB)")):
+        data = draw_svg(_boxes(rows, key, title))
+        pictures.append(
+            Picture(data, f"{title} by degree of loss: quartiles, and the range within 1.5 of them")
+        )
+    return pictures
+
+
+def _scatter(rows: Sequence[Mapping[str, Any]], measure: str, title: str) -> Callable[[Any], None]:
+    def draw(axes: Any) -> None:
+        for number, severity in enumerate(SEVERITIES):
+            pairs = [
+                (row[f"{measure}_true"], row[f"{measure}_sim"])
+                for row in rows
+                if row["severity"] == severity and None not in (row[f"{measure}_true"], row[f"{measure}_sim"])
+            ]
+            if pairs:
+                axes.scatter(*zip(*pairs, strict=True), s=12, alpha=0.7, color=f"C{number}", label=severity)
+        axes.axline((1.0, 1.0), slope=1.0, color="0.5", linewidth=1.0, linestyle="--")
+        axes.set(xlabel=f"{title}, true", ylabel=f"{title}, simulated")
+        axes.legend(fontsize="small")
+
+    return draw
+
+
+def _boxes(rows: Sequence[Mapping[str, Any]], key: str, title: str) -> Callable[[Any], None]:
+    def draw(axes: Any) -> None:
+        groups = {s: [row[key] for row in rows if row["severity"] == s] for s in SEVERITIES}
+        there = {severity: values for severity, values in groups.items() if values}
+        axes.boxplot([*there.values()], tick_labels=[*there])
+        axes.set(ylabel=title)
+
+    return draw
