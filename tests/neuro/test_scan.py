@@ -1,0 +1,105 @@
+"""The selective scan against the recurrence, step by step, in float64."""
+
+import pytest
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from hlsim.neuro import scan
+from hlsim.neuro.scan import linear_scan, selective_scan
+
+LENGTHS = (1, 2, 3, 4, 5, 31, 64, 101)
+
+
+def by_steps(u: Tensor, delta: Tensor, A: Tensor, B: Tensor, C: Tensor) -> Tensor:
+    state, outputs = torch.zeros(*u.shape[:2], A.shape[1], dtype=u.dtype), []
+    for t in range(u.shape[2]):
+        step = delta[:, :, t, None]
+        state = torch.exp(step * A) * state + step * B[:, None, :, t] * u[:, :, t, None]
+        outputs.append((state * C[:, None, :, t]).sum(-1))
+    return torch.stack(outputs, -1)
+
+
+def arguments(time: int, items: int = 3, channels: int = 5, states: int = 4) -> list[Tensor]:
+    generator = torch.Generator().manual_seed(time)
+
+    def draw(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+    return [
+        draw(items, channels, time),
+        draw(items, channels, time).abs(),
+        -3.0 * draw(channels, states).abs(),
+        draw(items, states, time),
+        draw(items, states, time),
+    ]
+
+
+@pytest.mark.parametrize("time", LENGTHS)
+@pytest.mark.parametrize("block", [1, 2**19], ids=["item by item", "at once"])
+def test_equals_the_recurrence_and_so_do_its_gradients(
+    time: int, block: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(scan, "_BLOCK_CPU", block)
+    given = [tensor.requires_grad_() for tensor in arguments(time)]
+    found, true = selective_scan(*given), by_steps(*given)
+    torch.testing.assert_close(found, true, rtol=1e-10, atol=1e-10)
+    weight = torch.randn(true.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    # at one step the decay multiplies nothing
+    for a, b in zip(
+        torch.autograd.grad((found * weight).sum(), given),
+        torch.autograd.grad((true * weight).sum(), given),
+        strict=True,
+    ):
+        torch.testing.assert_close(a, b, rtol=1e-10, atol=1e-10)
+
+
+def test_gradcheck() -> None:
+    given = [tensor.requires_grad_() for tensor in arguments(7, 2, 2, 3)]
+    assert torch.autograd.gradcheck(selective_scan, given)
+
+
+def test_skip_gate_bias_and_softplus() -> None:
+    u, delta, A, B, C = arguments(9)
+    D, bias, z = torch.randn(5).double(), torch.randn(5).double(), torch.randn_like(u)
+    found = selective_scan(u, delta, A, B, C, D, z, bias, delta_softplus=True)
+    step = functional.softplus(delta + bias[:, None])
+    true = (by_steps(u, step, A, B, C) + D[:, None] * u) * functional.silu(z)
+    torch.testing.assert_close(found, true, rtol=1e-10, atol=1e-10)
+
+
+def test_is_causal_and_remembers() -> None:
+    u, delta, A, B, C = arguments(40)
+    changed = u.clone()
+    changed[..., 20] += 1.0
+    difference = selective_scan(changed, delta, A, B, C) - selective_scan(u, delta, A, B, C)
+    assert not bool(difference[..., :20].any()) and bool(difference[..., 20:23].abs().min() > 0.0)
+
+
+def test_does_not_overflow_where_decays_vanish() -> None:
+    decay, drive = torch.full((1000, 2), 1e-30), torch.ones(1000, 2)
+    assert torch.equal(linear_scan(decay, drive), drive)
+    decay = torch.ones(4096, 1)
+    torch.testing.assert_close(linear_scan(decay, torch.ones(4096, 1)).squeeze(1), torch.arange(1.0, 4097.0))
+
+
+def test_float32_is_near_float64() -> None:
+    given = arguments(101)
+    single = selective_scan(*(tensor.float() for tensor in given)).double()
+    true = selective_scan(*given)
+    assert float((single - true).norm() / true.norm()) < 1e-5
+
+
+def test_shapes_that_do_not_fit() -> None:
+    u, delta, A, B, C = arguments(6)
+    with pytest.raises(ValueError, match=r"allowed: u and delta \(items, channels, time\)"):
+        selective_scan(u, delta, A, B[..., :5], C)
+    with pytest.raises(ValueError, match="allowed"):
+        selective_scan(u, delta[:, :2], A, B, C)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+def test_on_a_gpu_and_by_the_kernel_where_it_is() -> None:
+    given = [tensor.float().cuda() for tensor in arguments(101)]
+    true = selective_scan(*arguments(101)).float()
+    torch.testing.assert_close(selective_scan(*given).cpu(), true, rtol=1e-4, atol=1e-4)
