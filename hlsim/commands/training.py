@@ -10,6 +10,7 @@ from hlsim.commands.options import (
     Commands,
     add_command,
     audiogram_option,
+    count,
     out_option,
     positive,
     read_ear,
@@ -83,6 +84,9 @@ def training_options(parser: argparse.ArgumentParser, *, minutes: float) -> None
     )
     parser.add_argument("--max-steps", type=int, default=-1, help="stop earlier; -1 for no such limit")
     parser.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto", help="where to train")
+    parser.add_argument("--devices", type=count, default=1, help="GPUs or processes a machine")
+    parser.add_argument("--nodes", type=count, default=1, help="machines")
+    parser.add_argument("--strategy", default="auto", help="Lightning's, e.g. ddp")
     parser.add_argument("--quiet", action="store_true", help="no progress bar, only a line a validation")
     out_option(parser)
 
@@ -93,5 +97,8 @@ def training_arguments(options: argparse.Namespace) -> dict[str, Any]:
         "max_minutes": options.max_minutes,
         "max_steps": options.max_steps,
         "accelerator": "gpu" if options.device == "cuda" else options.device,
+        "devices": options.devices,
+        "nodes": options.nodes,
+        "strategy": options.strategy,
         "progress": not options.quiet,
     }

@@ -20,4 +20,6 @@ def average_of(model: nn.Module, decay: float) -> AveragedModel:
         for old, now in zip(kept, new, strict=True):
             old.lerp_(now.to(old), 1.0 - weight)
 
-    return AveragedModel(model, multi_avg_fn=follow)
+    average = AveragedModel(model, multi_avg_fn=follow)
+    average.requires_grad_(False)  # several processes would wait for its gradients
+    return average

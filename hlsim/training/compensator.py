@@ -155,6 +155,13 @@ class CompensatorTraining(TimedModule):
         mean = sum(losses) / len(losses)
         return {"score": -mean, "valid_loss": mean}
 
+    def examples(self) -> dict[str, Tensor]:
+        speech, _, ears = (tensor[:1].to(self.device) for tensor in self.valid[0])
+        aided = self.compensator(speech, ears)
+        loss = next(iter(self.criteria.values()))
+        assert isinstance(loss, HearingLossLoss)
+        return {"given": speech[0], "aided": aided[0], "heard": loss.simulator(aided, ears)[0]}
+
     def trained_parameters(self) -> list[torch.nn.Parameter]:
         return list(self.compensator.parameters())
 
@@ -225,6 +232,9 @@ def train_compensator(
     max_minutes: float,
     max_steps: int = -1,
     accelerator: str = "auto",
+    devices: int = 1,
+    nodes: int = 1,
+    strategy: str = "auto",
     report: Callable[[str], None] = print,
     progress: bool = True,
 ) -> Path:
@@ -271,6 +281,9 @@ def train_compensator(
         validate_every=recipe.validate_every,
         max_steps=max_steps,
         accelerator=accelerator,
+        devices=devices,
+        nodes=nodes,
+        strategy=strategy,
         report=report,
         progress=progress,
     )

@@ -19,6 +19,8 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
+from hlsim.training.examples import ShowExamples
+
 LAST = "last.ckpt"
 """Name of the state that a killed training goes on from."""
 
@@ -63,6 +65,10 @@ class TimedModule(L.LightningModule):
         """Figures by name; ``score`` is what the best checkpoint has most of."""
         raise NotImplementedError
 
+    def examples(self) -> dict[str, Tensor]:
+        """Signals for TensorBoard by name, (time,) in pascals at 16 kHz."""
+        return {}
+
     def trained_parameters(self) -> list[torch.nn.Parameter]:
         return [parameter for parameter in self.parameters() if parameter.requires_grad]
 
@@ -73,7 +79,7 @@ class TimedModule(L.LightningModule):
         loss = self.training_loss(generator)
         if not bool(torch.isfinite(loss)):
             raise RuntimeError(
-                f"the loss is {float(loss)} at step {self.global_step}; a lower learning rate may help"
+                f"the loss is {float(loss.detach())} at step {self.global_step}; a lower learning rate may help"
             )
         self.log("loss", loss, prog_bar=True)
         return loss
@@ -117,13 +123,15 @@ class KeepBest(Callback):
 
 
 class History(Callback):
-    """Prints a line a validation."""
+    """Prints a line a validation, in one of the processes."""
 
     def __init__(self, report: Callable[[str], None]) -> None:
         self.report = report
         self.started = time.monotonic()
 
     def on_validation_end(self, trainer: L.Trainer, module: L.LightningModule) -> None:
+        if not trainer.is_global_zero:
+            return
         figures = ", ".join(
             f"{name} {float(value):.3f}"
             for name, value in trainer.callback_metrics.items()
@@ -166,7 +174,9 @@ def run(
     validate_every: int,
     max_steps: int = -1,
     accelerator: str = "auto",
-    devices: int | str = 1,
+    devices: int = 1,
+    nodes: int = 1,
+    strategy: str = "auto",
     report: Callable[[str], None] = print,
     progress: bool = True,
 ) -> None:
@@ -178,6 +188,8 @@ def run(
         write: stores the released form of the model, given the figures of its validation.
         validate_every: steps from validation to validation; a kill loses no more than these.
         max_steps: stop earlier, -1 for no such limit.
+        accelerator, devices, nodes, strategy: as Lightning's Trainer takes them; each process draws batches of its own,
+            so that the batch grows with their number.
 
     Raises:
         ValueError: ``out`` holds a run of another recipe.
@@ -195,7 +207,7 @@ def run(
         every_n_train_steps=validate_every,
         save_on_train_epoch_end=False,
     )
-    callbacks: list[Callback] = [module.timer, KeepBest(write), History(report), states]
+    callbacks: list[Callback] = [module.timer, KeepBest(write), History(report), ShowExamples(), states]
     if progress:
         callbacks.append(TimeProgress())
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
@@ -207,6 +219,8 @@ def run(
         trainer = L.Trainer(
             accelerator=accelerator,
             devices=devices,
+            num_nodes=nodes,
+            strategy=strategy,
             max_epochs=-1,  # steps and time limit it; an epoch that is over would not be resumed
             max_steps=max_steps,
             gradient_clip_val=1.0,

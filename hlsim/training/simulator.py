@@ -176,6 +176,11 @@ class SimulatorTraining(TimedModule):
         median, low = float(snr.median()), float(snr.quantile(0.1))
         return {"score": median + 0.5 * low, "valid_snr_median": median, "valid_snr_worst_tenth": low}
 
+    def examples(self) -> dict[str, Tensor]:
+        signal, ears = (tensor[1:2].to(self.device) for tensor in self.valid[0])
+        heard = self.kept.module(signal, ears)
+        return {"given": signal[0], "heard/truth": self.teacher(signal, ears)[0], "heard/network": heard[0]}
+
     def trained_parameters(self) -> list[torch.nn.Parameter]:
         return list(self.student.parameters())
 
@@ -219,6 +224,9 @@ def train_simulator(
     max_minutes: float,
     max_steps: int = -1,
     accelerator: str = "auto",
+    devices: int = 1,
+    nodes: int = 1,
+    strategy: str = "auto",
     report: Callable[[str], None] = print,
     progress: bool = True,
 ) -> Path:
@@ -246,6 +254,9 @@ def train_simulator(
         validate_every=recipe.validate_every,
         max_steps=max_steps,
         accelerator=accelerator,
+        devices=devices,
+        nodes=nodes,
+        strategy=strategy,
         report=report,
         progress=progress,
     )

@@ -82,6 +82,60 @@ def test_eight_steps_leave_a_checkpoint_that_loads_and_a_state(data: SimulatorDa
     )
 
 
+@pytest.mark.slow
+def test_a_short_training_on_synthetic_speech_beats_the_untrained_network(
+    speech_dir: Path, tmp_path: Path
+) -> None:
+    data = SimulatorData(speech_dir / "train", valid_speech=speech_dir / "valid")
+    recipe = {
+        "model": {"channels": 16, "blocks": 1},
+        "batch": 3,
+        "seconds": 0.6,
+        "learning_rate": 3e-3,
+        "average": 0.9,
+        "validate_every": 60,
+        "validation_items": 16,
+    }
+    module = SimulatorTraining(SimulatorRecipe.from_dict(TINY | recipe), data, EVER)
+    untrained = module.validate()["valid_snr_median"]
+    train(data, tmp_path / "out", recipe, max_steps=60)
+    module.kept.module = load_pretrained(tmp_path / "out" / "checkpoint")
+    assert module.validate()["valid_snr_median"] > untrained + 0.5
+
+
+def test_averaged_weights_are_what_is_validated_and_kept(data: SimulatorData, tmp_path: Path) -> None:
+    train(data, tmp_path / "out", {"average": 0.9}, max_steps=4)
+    kept = load_pretrained(tmp_path / "out" / "checkpoint").state_dict()
+    states = state(tmp_path / "out")["state_dict"]
+    assert all(torch.equal(kept[name], states[f"kept.module.{name}"]) for name in kept)
+    assert any(not torch.equal(kept[name], states[f"student.{name}"]) for name in kept)
+
+
+def test_lower_precision_is_near_and_leaves_the_physics_alone(data: SimulatorData) -> None:
+    losses = []
+    for precision in ("float32", "bfloat16"):
+        module = SimulatorTraining(SimulatorRecipe.from_dict(TINY | {"precision": precision}), data, EVER)
+        loss = module.training_loss(torch.Generator().manual_seed(0))
+        loss.backward()
+        assert all(p.grad is not None and p.grad.dtype == torch.float32 for p in module.trained_parameters())
+        losses.append(float(loss.detach()))
+    assert losses[1] == pytest.approx(losses[0], abs=0.02)
+
+
+@pytest.mark.parametrize(
+    ("setting", "said"),
+    [
+        ({"precision": "float16"}, "float32 or bfloat16"),
+        ({"average": 1.0}, "from 0 to below 1"),
+        ({"unit_power": "both"}, "truth or input"),
+        ({"levels": [80, 60]}, "a lowest and a highest"),
+    ],
+)
+def test_values_of_a_recipe_that_are_not_allowed(setting: dict[str, Any], said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        SimulatorRecipe.from_dict(TINY | setting)
+
+
 def test_stopped_and_resumed_is_as_good_as_uninterrupted(data: SimulatorData, tmp_path: Path) -> None:
     train(data, tmp_path / "whole", max_steps=8)
     train(data, tmp_path / "parts", max_steps=4)
@@ -212,7 +266,9 @@ def test_noise_ears_and_all_criteria_train(rich: SimulatorData) -> None:
     assert bool(torch.isfinite(loss))
     loss.backward()
     assert all(p.grad is not None and bool(torch.isfinite(p.grad).all()) for p in module.trained_parameters())
-    assert {id(p) for p in module.trained_parameters()} == {id(p) for p in module.parameters()}
+    assert {id(p) for p in module.trained_parameters()} == {
+        id(p) for p in module.parameters() if p.requires_grad
+    }
     first, again = (module.training_loss(torch.Generator().manual_seed(1)) for _ in range(2))
     assert torch.equal(first, again)
 
