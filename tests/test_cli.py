@@ -8,6 +8,7 @@ import pytest
 import soundfile
 import torch
 
+from compensators import NALR
 from hlsim import MSBG, Audiogram
 from hlsim.cli import main
 
@@ -49,6 +50,16 @@ def test_simulate_is_the_model(tmp_path: Path, utterance: Path) -> None:
     expected = MSBG(ear, sample_rate=rate, full_scale_spl=100.0)(torch.from_numpy(samples))
     heard, _ = soundfile.read(out, dtype="float32")
     np.testing.assert_allclose(heard, expected.numpy(), atol=1e-7)
+
+
+def test_compensate_is_the_compensator(tmp_path: Path, utterance: Path) -> None:
+    out = tmp_path / "out.wav"
+    assert main(["compensate", str(utterance), str(out), "--audiogram", "N3", "--full-scale-spl", "100"]) == 0
+    samples, rate = soundfile.read(utterance, dtype="float32")
+    expected = NALR(Audiogram.standard("N3"), sample_rate=rate)(torch.from_numpy(samples))
+    aided, _ = soundfile.read(out, dtype="float32")
+    np.testing.assert_allclose(aided, expected.numpy(), atol=1e-7)
+    assert np.std(aided) > 1.5 * np.std(samples)
 
 
 def _bad_files(folder: Path) -> dict[str, tuple[Path, str]]:
