@@ -13,7 +13,7 @@ from hlsim.training.simulator import SimulatorRecipe
 yaml = pytest.importorskip("yaml")
 
 RECIPES = sorted((Path(__file__).parents[2] / "examples").glob("**/*.yaml"))
-SIMULATORS = {path.stem: path for path in RECIPES if "compensator" not in path.stem}
+SIMULATORS = {path.stem: path for path in RECIPES if not path.stem.startswith("compensator")}
 MILLIONS = {
     "mamba": 1.45,
     "transformer": 1.45,
