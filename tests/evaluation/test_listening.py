@@ -32,16 +32,17 @@ def item(tmp_path: Path, clean: Tensor) -> ItemScore:
         file="a",
         audiogram=Audiogram.standard("N3"),
         clean_level=70.0,
-        levels={"unaided": 70.0, "aided": 82.0, "lost": None},
-        scores={"haspi": {"unaided": 0.2, "aided": 0.6, "lost": 0.7}},
+        levels={"unaided": 70.0, "lost": None, "aided": 82.0},
+        scores={"haspi": {"unaided": 0.2, "aided": 0.6}},
         sample_rate=16000,
         seconds=0.5,
         seed=0,
         full_scale_spl=100.0,
         clean=tmp_path / "clean.wav",
         processed={
-            name: tmp_path / f"{'clean' if name == 'unaided' else name}.wav"
-            for name in ("unaided", "aided", "lost")
+            "unaided": tmp_path / "clean.wav",
+            "aided": tmp_path / "aided.wav",
+            "lost": tmp_path / "lost.wav",
         },
     )
 
@@ -59,9 +60,7 @@ def test_heard_is_msbg_in_pascals(item: ItemScore, clean: Tensor) -> None:
 def test_items_are_spread_from_rise_to_fall(item: ItemScore) -> None:
     changes = [0.1, -0.3, 0.5, 0.2, 0.0]
     items = [
-        replace(
-            item, file=str(change), scores={"haspi": {"unaided": 0.4, "aided": 0.4, "lost": 0.4 + change}}
-        )
+        replace(item, file=str(change), scores={"haspi": {"unaided": 0.4, "aided": 0.4 + change}})
         for change in changes
     ]
     report = HaspiReport(items)
