@@ -16,6 +16,7 @@ from hlsim.audio import (
     EXTENSIONS,
     check_rate,
     check_waveform,
+    encode_flac,
     find_audio,
     read_audio,
     resample,
@@ -293,3 +294,15 @@ def test_resampling_is_differentiable() -> None:
     wave = torch.randn(2, 40, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(lambda w: resample(w, 16000, 24000), wave)
     assert torch.autograd.gradcheck(lambda w: resample(w, 48000, 16000), wave)
+
+
+def test_encoded_flac_is_the_signal_to_16_bits(tmp_path: Path) -> None:
+    signal = torch.linspace(-1.0, 0.99, 16000)
+    data = encode_flac(signal, 16000)
+    assert data.startswith(b"fLaC")
+    (tmp_path / "x.flac").write_bytes(data)
+    back, rate = read_audio(tmp_path / "x.flac")
+    assert rate == 16000 and float((back[0] - signal).abs().max()) <= 2**-15
+    for bad in (signal * 2, torch.zeros(2, 10), signal / 0):
+        with pytest.raises(ValueError, match=r"allowed: \(time,\), samples from -1\.0 to 1\.0"):
+            encode_flac(bad, 16000)

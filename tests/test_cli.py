@@ -218,3 +218,41 @@ def test_benchmark(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert {row["sample_rate"] for row in rows} == {16000, 44100}
     assert all(row["forward_ms"]["median"] > 0 for row in rows)
     assert "pyclarity" in capsys.readouterr().out
+
+
+def test_haspi_report_of_a_manifest(
+    tmp_path: Path, utterance: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for module in ("clarity", "joblib", "matplotlib", "pystoi"):
+        pytest.importorskip(module)
+    samples, rate = soundfile.read(utterance)
+    for name, gain in (("clean", 1.0), ("aided", 4.0)):
+        soundfile.write(tmp_path / f"{name}.wav", gain * samples[rate : 2 * rate], rate, subtype="FLOAT")
+    (tmp_path / "broken.wav").write_text("this is no audio")
+    lines = ["listener,ear,condition,clean,processed,audiogram"]
+    lines += [f"L1,l,{c},clean.wav,{f}.wav,N4" for c, f in (("unaided", "clean"), ("aided", "aided"))]
+    lines += [f"L2,r,{c},clean.wav,{f}.wav,N2" for c, f in (("unaided", "clean"), ("aided", "broken"))]
+    (tmp_path / "study.csv").write_text("\n".join(lines))
+    call = ["haspi-report", "--manifest", tmp_path / "study.csv", "--out", tmp_path / "out", "--jobs", "1"]
+    call += ["--measures", "stoi", "--spl", "65", "--listen", "1"]
+    assert main([str(part) for part in call]) == 0
+    printed = capsys.readouterr()
+    assert "| L2 right clean | aided | STOI | " in printed.out and "broken.wav" in printed.out
+    assert "1 of 4 scores could not be made" in printed.err and "3 of 4 scores" in printed.err
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert report["conditions"] == ["unaided", "aided"] and report["n"] == 1
+    assert report["before_level_mean"] == pytest.approx(65.0)
+    stored = (tmp_path / "out" / "scores.jsonl").read_text()
+    # what failed is not stored
+    assert stored.count("\n") == 3
+    assert main([str(part) for part in call]) == 0
+    assert (tmp_path / "out" / "scores.jsonl").read_text() == stored
+    capsys.readouterr()
+    for extra, says in (
+        (["--measures", "loud"], "unknown measures loud; allowed: haspi, hasqi, stoi, pesq"),
+        (["--backend", "dask"], "needs the scheduler's address"),
+        (["--root", tmp_path / "none"], "none: no such folder"),
+        (["--baseline", "x"], "no condition 'x'; allowed: unaided, aided"),
+        (["--clean", tmp_path], "either the folders clean, before and after, or a manifest"),
+    ):
+        assert says in fails(capsys, *call, *extra)

@@ -92,7 +92,9 @@ def _haspi_report(options: argparse.Namespace) -> None:
     )
     print(report.to_markdown())
     if report.failures:
+        made = sum(len(own) for item in report.items for own in item.scores.values())
         print(
-            f"hlsim: {len(report.failures)} scores could not be made; the reasons are in {options.out / 'report.md'}",
+            f"hlsim: {len(report.failures)} of {made + len(report.failures)} scores could not be made; "
+            f"the reasons are in {options.out / 'report.md'}",
             file=sys.stderr,
         )

@@ -102,7 +102,8 @@ def draw_spectrograms(
             vmax=70.0,
             extent=(0.0, len(signal) / sample_rate, 0.0, sample_rate / 2000.0),
         )
-        axes.set(title=name, ylabel="kHz")
+        # MSBG and HASPI end at 8 kHz
+        axes.set(title=name, ylabel="kHz", ylim=(0.0, min(10.0, sample_rate / 2000.0)))
     panels[-1].set(xlabel="s")
     figure.colorbar(image, ax=list(panels), label="dB SPL in a bin", aspect=40)
     figure.savefig(path, dpi=110, format="png")

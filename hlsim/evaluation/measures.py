@@ -45,7 +45,11 @@ def measure_stoi(
 def measure_pesq(
     clean: np.ndarray, processed: np.ndarray, ear: Audiogram, rate: int, full_scale_spl: float, seed: int
 ) -> float:
-    """Wide-band PESQ of the signal at the ear, at 16 kHz; see ``fidelity.pesq_wb``."""
+    """Wide-band PESQ of the signal at the ear, at 16 kHz; see ``fidelity.pesq_wb``.
+
+    The library (pesq 0.0.4) crashed on 90 s of noise in 90 bursts: score minutes of speech with two processes or more,
+    which outlive it.
+    """
     return _known(fidelity.pesq_wb(clean, processed, rate))
 
 

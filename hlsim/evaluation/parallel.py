@@ -47,7 +47,8 @@ def run_parallel(
 
     Args:
         function: importable by name; raises nothing that the caller would rather live with.
-        jobs: processes of this machine; None takes all cores, 1 runs in this process. A cluster takes all its workers.
+        jobs: processes of this machine; None takes all cores. 1 runs in this process, which a crash then ends. A cluster
+            takes all its workers.
         backend, scheduler: ``"loky"``, processes of this machine, or ``"dask"`` with the scheduler's address; its
             workers import hlsim and see the same files.
 

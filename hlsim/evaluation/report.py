@@ -33,6 +33,9 @@ class ItemScore:
         listener, ear: whose ear and which; empty where unknown.
         snr: of the speech in noise in dB, where known.
         clean, processed: files, for players and spectrograms; not part of ``report.json``.
+
+    Raises:
+        ValueError: a score under a condition without a level.
     """
 
     file: str
@@ -49,6 +52,13 @@ class ItemScore:
     snr: float | None = None
     clean: Path | None = None
     processed: Mapping[str, Path] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for condition in {name for own in self.scores.values() for name in own}:
+            if self.levels.get(condition) is None:
+                raise ValueError(
+                    f"{self.file}: a score under {condition!r} without its level; a score needs one"
+                )
 
     @property
     def before(self) -> float | None:

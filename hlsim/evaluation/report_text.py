@@ -57,7 +57,7 @@ def paper_table(comparison: Comparison) -> Table:
             _spread(c.after_mean, c.after_std),
             f"{c.delta:+.3f}",
         ),
-        ("95 % interval of Δ (bootstrap)", "", "", _interval(c) or "not defined"),
+        ("95 % interval of Δ", "", "", _interval(c) or "not defined"),
         ("t-test (paired)", "", "", _test("t", c.t, c.p_t, "+.3f") or "not defined"),
         ("Wilcoxon signed-rank", "", "", _test("W", c.w, c.p_w, ".1f") or "not defined"),
         ("Cohen's d (paired)", "", "", "not defined" if c.cohens_d is None else f"d = {c.cohens_d:+.3f}"),

@@ -1,7 +1,7 @@
 """The report's page in a real Chromium: no error, no request, players that play, a phone's width, the keyboard.
 
-Run with ``pytest -m browser``. Needs playwright and a Chromium: its own (``playwright install chromium``) or a system one,
-found by name or in the environment variable ``CHROMIUM``.
+Run with ``pytest -m browser``. Needs playwright and a Chromium: its own (``playwright install chromium``), or one of the
+system, found by name or in the environment variable ``CHROMIUM``.
 """
 
 import os

@@ -29,12 +29,17 @@ def raise_at_three(number: int) -> int:
     return number
 
 
-@pytest.mark.parametrize("jobs", [1, 2])
+# processes take seconds to start, for they import hlsim
+JOBS = pytest.mark.parametrize("jobs", [1, pytest.param(2, marks=pytest.mark.slow)])
+
+
+@JOBS
 def test_every_task_comes_back_with_its_result(jobs: int) -> None:
     assert sorted(run_parallel(square, range(9), jobs=jobs)) == [(n, n * n) for n in range(9)]
     assert list(run_parallel(square, [], jobs=jobs)) == []
 
 
+@pytest.mark.slow
 def test_tasks_are_drawn_as_they_are_needed() -> None:
     drawn = []
 
@@ -50,7 +55,7 @@ def test_tasks_are_drawn_as_they_are_needed() -> None:
         results.close()
 
 
-@pytest.mark.parametrize("jobs", [1, 2])
+@JOBS
 def test_what_the_function_raises_is_the_callers(jobs: int) -> None:
     with pytest.raises(RuntimeError, match="three"):
         list(run_parallel(raise_at_three, range(8), jobs=jobs))

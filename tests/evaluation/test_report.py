@@ -103,6 +103,12 @@ def test_extra_keys_stand_beside_the_others() -> None:
         make_report(extra={"t": 1.0, "items": [], "other": 2})
     with pytest.raises(ValueError, match="no items"):
         HaspiReport([])
+    item = make_report(1).items[0]
+    with pytest.raises(ValueError, match="p1/00: a score under 'after' without its level"):
+        replace(item, levels={"before": 65.0, "after": None})
+    unlike = replace(item, levels={"before": 65.0, "after": 65.0, "later": 65.0})
+    with pytest.raises(ValueError, match="two or more, the same of every item"):
+        HaspiReport([item, unlike])
 
 
 def test_picture_is_a_png(tmp_path: Path) -> None:

@@ -87,6 +87,7 @@ def test_equal_the_libraries_called_one_by_one(items: list[Item]) -> None:
         assert results["stoi", condition].seconds == 0.8
 
 
+@pytest.mark.slow
 def test_two_processes_give_the_same(items: list[Item]) -> None:
     given = [replace(item, processed={"noisy": item.processed["noisy"]}) for item in items]
     assert scores(score_items(given, ALL[::2], jobs=2)) == scores(score_items(given, ALL[::2], jobs=1))
@@ -250,6 +251,7 @@ score_items(items, ["stoi"], store=ScoreStore(root / "scores.jsonl"), jobs=1)
 """
 
 
+@pytest.mark.slow
 def test_a_killed_run_goes_on_where_it_was(items: list[Item], tmp_path: Path) -> None:
     (tmp_path / "many").mkdir()
     clean = torch.from_numpy(samples(items[0].clean))
