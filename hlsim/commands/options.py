@@ -5,7 +5,9 @@ from __future__ import annotations
 import argparse
 import math
 import sys
+import time
 from collections.abc import Callable
+from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -100,7 +102,21 @@ def read_recipe(path: Path | None) -> dict[str, Any]:
 
 
 def show_progress(what: str) -> Callable[[int, int], None]:
+    """A line on standard error, at most ten a second, with the share done and when the work will end."""
+    began = time.monotonic()
+    shown = 0.0
+
     def show(done: int, total: int) -> None:
-        print(f"\r{done} of {total} {what}", end="\n" if done == total else "", file=sys.stderr, flush=True)
+        nonlocal shown
+        now = time.monotonic()
+        if now - shown < 0.1 and done < total:
+            return
+        shown = now
+        left = (now - began) * (total - done) / done
+        end = (datetime.now() + timedelta(seconds=left)).strftime(
+            "%H:%M:%S" if left < 86400 else "%d %b %H:%M"
+        )
+        line = f"{done} of {total} {what}" + (f", ends at {end}" if done < total else "")
+        print(f"\r{line:<60}", end="\n" if done == total else "", file=sys.stderr, flush=True)
 
     return show
