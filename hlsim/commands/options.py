@@ -7,7 +7,6 @@ import math
 import sys
 import time
 from collections.abc import Callable
-from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -73,6 +72,13 @@ def count(text: str) -> int:
     return value
 
 
+def natural(text: str) -> int:
+    value = int(text)
+    if value < 0:
+        raise argparse.ArgumentTypeError(f"{text}; allowed: 0 or more")
+    return value
+
+
 def read_ear(text: str) -> Audiogram:
     """An ear from what ``--audiogram`` holds."""
     if "," not in text:
@@ -102,21 +108,21 @@ def read_recipe(path: Path | None) -> dict[str, Any]:
 
 
 def show_progress(what: str) -> Callable[[int, int], None]:
-    """A line on standard error, at most ten a second, with the share done and when the work will end."""
-    began = time.monotonic()
-    shown = 0.0
+    """Print how many are done and when the rest will be, on one line of stderr.
+
+    The end is told from the pace since the first call, so that what was done by an earlier run does not count.
+    """
+    first: tuple[int, float] | None = None
 
     def show(done: int, total: int) -> None:
-        nonlocal shown
-        now = time.monotonic()
-        if now - shown < 0.1 and done < total:
-            return
-        shown = now
-        left = (now - began) * (total - done) / done
-        end = (datetime.now() + timedelta(seconds=left)).strftime(
-            "%H:%M:%S" if left < 86400 else "%d %b %H:%M"
-        )
-        line = f"{done} of {total} {what}" + (f", ends at {end}" if done < total else "")
-        print(f"\r{line:<60}", end="\n" if done == total else "", file=sys.stderr, flush=True)
+        nonlocal first
+        now = time.time()
+        first = first or (done, now)
+        text = f"{done} of {total} {what}"
+        if first[0] < done < total:
+            left = (now - first[1]) / (done - first[0]) * (total - done)
+            clock = time.strftime("%a %H:%M:%S", time.localtime(now + left))
+            text += f", ends about {clock} (in {left / 60:.1f} min)"
+        print(f"\r{text:<70}", end="\n" if done == total else "", file=sys.stderr, flush=True)
 
     return show

@@ -20,8 +20,8 @@ from hlsim.commands.options import (
 )
 from hlsim.data.corpora import LAYOUTS
 from hlsim.data.noises import TEST_SNRS_DB, TEST_TYPES, TRAIN_SNRS_DB, TRAIN_TYPES
-from hlsim.data.parallel import BACKENDS
 from hlsim.data.teacher import ALIGNMENTS, TEACHERS, Reference
+from hlsim.parallel import BACKENDS
 
 
 def add(commands: Commands) -> None:
@@ -88,8 +88,8 @@ def add(commands: Commands) -> None:
         help="impulse is the paper's, with --write",
     )
     sub.add_argument("--jobs", type=count, help="processes; all cores by default")
-    sub.add_argument("--backend", choices=BACKENDS, default="local", help="where the work is done")
-    sub.add_argument("--scheduler", help="address of Dask's scheduler, as tcp://host:8786")
+    sub.add_argument("--backend", choices=BACKENDS, default="loky", help="this machine, or a cluster")
+    sub.add_argument("--scheduler", help="of --backend dask: its address, such as tcp://host:8786")
     seed_option(sub)
     out_option(sub)
 

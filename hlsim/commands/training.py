@@ -10,6 +10,7 @@ from hlsim.commands.options import (
     Commands,
     add_command,
     audiogram_option,
+    natural,
     out_option,
     positive,
     read_ear,
@@ -25,11 +26,17 @@ def add(commands: Commands) -> None:
     sub.add_argument(
         "--config", type=Path, required=True, help="recipe, a YAML file (examples/neuro-msbg.yaml)"
     )
+    sub.add_argument(
+        "--manifest", type=Path, help="manifest.csv that 'hlsim prepare' wrote, instead of folders and files"
+    )
+    sub.add_argument("--root", type=Path, help="folder of the manifest's paths, if not where it was prepared")
+    sub.add_argument("--prepared", action="store_true", help="train on what 'hlsim prepare --write' wrote")
+    sub.add_argument("--workers", type=natural, default=1, help="processes that read the manifest's files")
     sub.add_argument("--noise", type=Path, help="folder of noises to mix in")
     sub.add_argument("--audiograms", type=Path, help="CSV of measured ears to join the drawn ones")
     sub.add_argument("--valid-noise", type=Path, help="folder of noises to validate with")
     sub.add_argument("--valid-audiograms", type=Path, help="CSV of ears to validate with")
-    training_options(sub, minutes=60.0)
+    training_options(sub, minutes=60.0, speech_required=False)
 
     sub = add_command(
         commands, "train-compensator", _train_compensator, "train a compensator through a frozen simulator"
@@ -47,6 +54,13 @@ def _train_simulator(options: argparse.Namespace) -> None:
     require("lightning", "train")
     from hlsim.training.simulator import SimulatorData, SimulatorRecipe, train_simulator
 
+    if options.manifest is not None:
+        _train_planned(options)
+        return
+    if options.speech is None:
+        raise ValueError(
+            "nothing to train on; allowed: --speech, a folder, or --manifest, of 'hlsim prepare'"
+        )
     data = SimulatorData(
         options.speech,
         options.noise,
@@ -57,6 +71,24 @@ def _train_simulator(options: argparse.Namespace) -> None:
     )
     folder = train_simulator(
         data, SimulatorRecipe.from_dict(read_recipe(options.config)), **training_arguments(options)
+    )
+    print(f"the best checkpoint is in {folder}")
+
+
+def _train_planned(options: argparse.Namespace) -> None:
+    from hlsim.training.planned import PlannedSource, PlannedTraining
+    from hlsim.training.simulator import SimulatorRecipe, train_simulator
+
+    folders = ("speech", "noise", "audiograms", "valid_speech", "valid_noise", "valid_audiograms")
+    if given := [f"--{name.replace('_', '-')}" for name in folders if getattr(options, name) is not None]:
+        raise ValueError(
+            f"--manifest with {', '.join(given)}; allowed: one or the other, for a manifest has it all"
+        )
+    folder = train_simulator(
+        PlannedSource(options.manifest, options.root, options.prepared, options.workers),
+        SimulatorRecipe.from_dict(read_recipe(options.config)),
+        kind=PlannedTraining,
+        **training_arguments(options),
     )
     print(f"the best checkpoint is in {folder}")
 
@@ -75,8 +107,12 @@ def _train_compensator(options: argparse.Namespace) -> None:
     print(f"the best checkpoint is in {folder}")
 
 
-def training_options(parser: argparse.ArgumentParser, *, minutes: float) -> None:
-    parser.add_argument("--speech", type=Path, required=True, help="folder of clean speech to train on")
+def training_options(
+    parser: argparse.ArgumentParser, *, minutes: float, speech_required: bool = True
+) -> None:
+    parser.add_argument(
+        "--speech", type=Path, required=speech_required, help="folder of clean speech to train on"
+    )
     parser.add_argument("--valid-speech", type=Path, help="folder of other speakers to validate on")
     parser.add_argument(
         "--max-minutes", type=positive, default=minutes, help="of training, resumed parts included"

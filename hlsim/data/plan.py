@@ -6,7 +6,7 @@ import hashlib
 import json
 import os
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -29,8 +29,8 @@ from hlsim.data.ears import Ears, plan_ears
 from hlsim.data.files import Whole
 from hlsim.data.manifest import SPLITS, UTTERANCE_COLUMNS, Rows, Utterance, csv_line, inside
 from hlsim.data.noises import TEST_SNRS_DB, TRAIN_SNRS_DB, Noises, find_noises
-from hlsim.data.parallel import over_all
 from hlsim.data.samples import INSTANCE_COLUMNS, INSTANCES, MANIFEST, SETTINGS
+from hlsim.parallel import run_parallel
 from hlsim.settings import refuse_unknown
 
 FAULTS = "faults.csv"
@@ -150,7 +150,7 @@ def prepare(
     *,
     strict: bool = False,
     jobs: int | None = None,
-    backend: str = "local",
+    backend: str = "loky",
     scheduler: str | None = None,
     progress: Progress | None = None,
 ) -> Prepared:
@@ -162,7 +162,7 @@ def prepare(
 
     Args:
         strict: a fault is an error; nothing but the report is written then.
-        jobs, backend, scheduler: see ``over_all``.
+        jobs, backend, scheduler: see ``run_parallel``.
         progress: called with the utterances checked and all.
 
     Raises:
@@ -209,8 +209,10 @@ def prepare(
             tell(fault)
         check = partial(examine, root, shortest=settings.shortest, pairs=listing.paired > 0)
         items = (below(found, corpus) for found in find_utterances(root / corpus, layout, settings.table))
-        examined = over_all(check, items, jobs=jobs, backend=backend, scheduler=scheduler)
-        for number, found in enumerate(examined, start=1):
+        examined = run_parallel(
+            partial(_numbered, check), enumerate(items), jobs=jobs, backend=backend, scheduler=scheduler
+        )
+        for number, found in enumerate(_in_order(examined), start=1):
             if isinstance(found, Fault):
                 tell(found)
             else:
@@ -272,6 +274,26 @@ def examine(root: Path, found: Utterance | Fault, *, shortest: float, pairs: boo
         return Fault(path, str(error).removeprefix(f"{root / path}: "))
     level = active_level_db(clean[0], rate)
     return replace(found, rate=rate, seconds=seconds, active_level=level)
+
+
+def _numbered(
+    check: Callable[[Utterance | Fault], Utterance | Fault], task: tuple[int, Utterance | Fault]
+) -> Utterance | Fault:
+    return check(task[1])
+
+
+def _in_order(
+    examined: Iterable[tuple[tuple[int, Utterance | Fault], Utterance | Fault | None]],
+) -> Iterator[Utterance | Fault]:
+    """Results in the order of the corpus, however they come; a process that died is a fault of its file."""
+    waiting: dict[int, Utterance | Fault] = {}
+    wanted = 0
+    for (number, item), found in examined:
+        path = item.path if isinstance(item, Fault) else item.clean
+        waiting[number] = found or Fault(path, "the process that read it died")
+        while wanted in waiting:
+            yield waiting.pop(wanted)
+            wanted += 1
 
 
 def _noises(

@@ -7,12 +7,14 @@ from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from pathlib import Path
 
+import torch
+
 from hlsim.data.corpora import Fault
 from hlsim.data.files import PARTIAL, Whole
 from hlsim.data.manifest import csv_line
-from hlsim.data.parallel import over_all
 from hlsim.data.samples import Plan, is_whole
 from hlsim.data.teacher import Reference, Teacher
+from hlsim.parallel import run_parallel
 
 CLAIM = "instances/made-of.txt"
 WRITE_FAULTS = "write-faults.csv"
@@ -36,7 +38,7 @@ def write_instances(
     *,
     root: str | Path | None = None,
     jobs: int | None = None,
-    backend: str = "local",
+    backend: str = "loky",
     scheduler: str | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> int:
@@ -61,12 +63,21 @@ def write_instances(
         leftover.unlink(missing_ok=True)
     task = partial(make, str(plan.folder), str(plan.root), recipe)
     faults: list[Fault] = []
-    written = over_all(task, range(len(plan.utterances)), jobs=jobs, backend=backend, scheduler=scheduler)
-    for number, fault in enumerate(written, start=1):
-        if fault is not None:
-            faults.append(fault)
-        if progress is not None:
-            progress(number * plan.each, len(plan))
+    threads = torch.get_num_threads()
+    numbers = range(len(plan.utterances))
+    written = run_parallel(task, numbers, jobs=jobs, backend=backend, scheduler=scheduler)
+    try:
+        for done, (number, found) in enumerate(written, start=1):
+            if found is None:  # its process ended
+                faults.append(
+                    Fault(plan.utterance(number * plan.each).clean, "the process that made it died")
+                )
+            else:
+                faults.extend(found)
+            if progress is not None:
+                progress(done * plan.each, len(plan))
+    finally:
+        torch.set_num_threads(threads)
     report = plan.folder / WRITE_FAULTS
     if faults:
         with Whole(report) as file:
@@ -81,11 +92,12 @@ def write_instances(
     return len(plan)
 
 
-def make(folder: str, root: str, recipe: Recipe, number: int) -> Fault | None:
+def make(folder: str, root: str, recipe: Recipe, number: int) -> list[Fault]:
     """Write the instances of one utterance that are missing; what is at fault with its audio, if anything.
 
     One at a time, for the last bits of a batch depend on what else is in it.
     """
+    torch.set_num_threads(1)  # which sums in one order
     plan, teacher = _opened(folder, root, recipe)
     for index in range(number * plan.each, (number + 1) * plan.each):
         if is_whole(plan.path(index)):
@@ -93,12 +105,12 @@ def make(folder: str, root: str, recipe: Recipe, number: int) -> Fault | None:
         try:
             instance = plan.instance(index)
         except ValueError as error:
-            return Fault(plan.utterance(index).clean, str(error))
+            return [Fault(plan.utterance(index).clean, str(error))]
         heard = teacher(instance.signal[None], instance.thresholds[None])[0]
         with Whole(plan.path(index)) as file:
             file.write(replace(instance, impaired=heard).to_bytes())
             file.keep()
-    return None
+    return []
 
 
 @lru_cache(maxsize=2)

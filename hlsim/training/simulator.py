@@ -91,12 +91,17 @@ class SimulatorTraining(TimedModule):
         self.recipe = recipe
         self.student = NeuroMSBG(NeuroConfig.from_dict(recipe.model))
         self.teacher = MSBG(sample_rate=NEURO_RATE)
+        self.truths: list[Tensor] = []
+        self.take(data)
+
+    def take(self, data: SimulatorData) -> None:
+        """Open what there is to train and validate on."""
+        recipe = self.recipe
         options: dict[str, Any] = {"sample_rate": NEURO_RATE, "seconds": recipe.seconds}
         self.speech = Clips(data.speech, **options)
         self.noise = Clips(data.noise, repeat=True, **options) if data.noise else None
         self.ears = _thresholds(data.audiograms)
         self.valid = validation_set(data, recipe)
-        self.truths: list[Tensor] = []
 
     def training_loss(self, generator: torch.Generator) -> Tensor:
         count = self.recipe.batch
@@ -111,6 +116,10 @@ class SimulatorTraining(TimedModule):
         ears = ears.to(self.device)
         with torch.no_grad():
             truth = self.teacher(signal, ears)
+        return self.loss_on(signal, ears, truth)
+
+    def loss_on(self, signal: Tensor, ears: Tensor, truth: Tensor) -> Tensor:
+        """Of the network on signals, given what is heard. Shape: (items, time), (items, 8), (items, time) -> ()."""
         heard = self.student(signal, ears)
         scale = truth.square().mean(-1, keepdim=True).add(1e-18).rsqrt()
         truth, heard = truth * scale, heard * scale
@@ -165,7 +174,7 @@ def validation_set(data: SimulatorData, recipe: SimulatorRecipe) -> list[tuple[T
 
 
 def train_simulator(
-    data: SimulatorData,
+    data: Any,
     recipe: SimulatorRecipe,
     *,
     out: str | Path,
@@ -174,15 +183,19 @@ def train_simulator(
     accelerator: str = "auto",
     report: Callable[[str], None] = print,
     progress: bool = True,
+    kind: type[SimulatorTraining] = SimulatorTraining,
 ) -> Path:
     """Train, resume, and keep the best checkpoint.
+
+    Args:
+        data: a ``SimulatorData``, or what another ``kind`` of training takes.
 
     Returns: the folder that ``load_pretrained`` takes, ``out/checkpoint``.
 
     Raises:
         ValueError: data or recipe that cannot be used; the message names them.
     """
-    module = SimulatorTraining(recipe, data, max_minutes)
+    module = kind(recipe, data, max_minutes)
     folder = Path(out) / "checkpoint"
 
     def write(figures: dict[str, Any]) -> None:
