@@ -18,7 +18,7 @@ from torch.utils.data import DataLoader, Dataset
 from hlsim.audiogram import HIGHEST_SIMULATED, LOWEST_LEVEL
 from hlsim.calibration import level_spl, set_level
 from hlsim.data.samples import Instance, Plan
-from hlsim.data.teacher import Teacher
+from hlsim.data.teacher import Teacher, grid_of
 from hlsim.data.variation import vary
 from hlsim.data.writing import Recipe, claimed
 
@@ -71,6 +71,7 @@ class TrainingItems(Dataset[Instance]):
         self.items = items
         self.samples = round(seconds * items.plan.rate)
         self.augment = augment and not items.prepared
+        self.grid = grid_of(items.plan.rate)
         self.seed = seed
         self.start = start
         self.length = length
@@ -98,7 +99,8 @@ class TrainingItems(Dataset[Instance]):
         generator = torch.Generator().manual_seed(self._mixed(position))
         instance = self.items[number]
         spare = max(0, instance.signal.shape[-1] - self.samples)
-        first = int(torch.randint(spare + 1, (), generator=generator))
+        step = 1 if self.augment else self.grid
+        first = step * int(torch.randint(spare // step + 1, (), generator=generator))
         heard = instance.impaired
         clip = Instance(
             self._cut(instance.clean, first),
@@ -132,8 +134,8 @@ class PlanData(L.LightningDataModule):
 
     Training batches are clips; validation and test batches are whole utterances, padded with silence. Without ``augment``
     item k is the plan's instance k however it is made: whole, the same as ``hlsim prepare --write`` puts on disk (to the
-    rounding of a batch); as a clip, the target on the fly is MSBG's of the clip, that from disk is cut from the whole
-    utterance's, and they differ where MSBG remembers, in the clip's first 50 ms.
+    rounding of a batch). Clips that are not varied start where frames of MSBG's smearing do (every 0.64 s at 16 kHz), so
+    that they too are the same both ways, but for 50 ms at either end, where the target from disk knows what lies beyond.
 
     Args:
         folder: what ``hlsim prepare`` wrote.

@@ -50,7 +50,7 @@ class Teacher(nn.Module):
         self.alignment = alignment
         self.reference = reference
         self.msbg = MSBG(sample_rate=sample_rate, aligned=alignment == "structural" or reference is not None)
-        self.grid = _FRAME * sample_rate // math.gcd(_FRAME * sample_rate, RATE)
+        self.grid = grid_of(sample_rate)
         if self.grid > 4 * sample_rate:
             raise ValueError(
                 f"sample rate {sample_rate} Hz for a teacher; allowed: 16000, 22050, 24000, 32000, 44100, 48000"
@@ -111,3 +111,8 @@ class Teacher(nn.Module):
         heard = self.reference(signal.cpu(), ear, self.sample_rate).to(signal)
         delay = self.delay(thresholds)
         return functional.pad(heard, (-delay, delay))
+
+
+def grid_of(sample_rate: int) -> int:
+    """Samples from one place where a frame of MSBG's smearing starts to the next that falls on a sample."""
+    return _FRAME * sample_rate // math.gcd(_FRAME * sample_rate, RATE)
