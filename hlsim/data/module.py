@@ -60,8 +60,8 @@ class TrainingItems(Dataset[Instance]):
     Args:
         items: where they come from.
         seconds: length of the clips; shorter utterances are followed by silence.
-        augment: vary what is not prepared: another ear of the split, moved by up to 5 dB, another SNR of the noise, and
-            level, equalisation, amplification and compression as ``vary``.
+        augment: vary what is not prepared: another ear of the split, moved by up to 5 dB, another noise of the split
+            where noise is mixed in, and SNR, level, equalisation, amplification and compression as ``vary``.
         start: first p, so that a training goes on where it was.
     """
 
@@ -117,8 +117,11 @@ class TrainingItems(Dataset[Instance]):
     def _varied(self, clip: Instance, number: int, first: int, generator: torch.Generator) -> Instance:
         plan = self.items.plan
         clean, noisy = (self._cut(x, first) for x in plan.pair(int(self.items.indices[number])))
-        noise = noisy - clean
-        other = int(self.items.indices[torch.randint(len(self.items), (), generator=generator)])
+        other, another = self.items.indices[
+            torch.randint(len(self.items), (2,), generator=generator)
+        ].tolist()
+        mixed = plan.utterance(another).mixed
+        noise = plan.noise(another, self.samples) if mixed else noisy - clean
         ears = plan.thresholds(other) + 10.0 * torch.rand((), generator=generator) - 5.0
         ears = ears.clamp(LOWEST_LEVEL, HIGHEST_SIMULATED)
         noises = noise[None] if bool(noise.any()) else None

@@ -23,22 +23,24 @@ TRAIN_TYPES, TEST_TYPES = 8, 2
 
 _SPLIT_FOLDERS = {"train": "train", "valid": "valid", "dev": "valid", "test": "test"}
 _QUIET_DB = 30.0  # a stretch this far below its recording's level counts as a pause of the noise
+_STEP, _STRETCH = 0.1, 5  # s from one possible start to the next, and how many of these are no pause
 
 
 @dataclass(frozen=True)
 class Noises:
-    """Files of noise by split and type, paths below the root, with their seconds, and the SNRs in dB by split."""
+    """Files of noise by split and type, paths below the root, with the places where one may start, in seconds; and the
+    SNRs in dB by split."""
 
-    files: Mapping[str, Mapping[str, Sequence[tuple[str, float]]]]
+    files: Mapping[str, Mapping[str, Sequence[tuple[str, Sequence[float]]]]]
     snrs: Mapping[str, Sequence[float]]
 
     def choose(self, utterance: Utterance, seed: int) -> Utterance:
         """The utterance with one type, file, start and SNR, drawn from the seed and its id."""
         draw = Random(f"{seed}:noise:{utterance.id}")
         types = self.files[utterance.split]
-        path, seconds = draw.choice(types[draw.choice(sorted(types))])
+        path, starts = draw.choice(types[draw.choice(sorted(types))])
         snr = draw.choice(self.snrs[utterance.split])
-        return replace(utterance, noise=path, snr=snr, noise_start=draw.random() * seconds)
+        return replace(utterance, noise=path, snr=snr, noise_start=draw.choice(starts))
 
 
 def find_noises(
@@ -65,7 +67,7 @@ def find_noises(
         raise ValueError(
             f"SNRs {', '.join(f'{snr:g}' for snr in shared)} dB for training and test; allowed: disjoint sets"
         )
-    kinds: dict[str, dict[str, list[tuple[str, float]]]] = {}
+    kinds: dict[str, dict[str, list[tuple[str, Sequence[float]]]]] = {}
     faults = []
     for path in walk_audio(root / folder):
         parts = path.split("/")
@@ -81,7 +83,7 @@ def find_noises(
         if not bool(waveform[0].any()):
             faults.append(Fault(name, "silent first channel"))
             continue
-        kinds.setdefault(split, {}).setdefault(kind, []).append((name, waveform.shape[-1] / rate))
+        kinds.setdefault(split, {}).setdefault(kind, []).append((name, _starts(waveform[0], rate)))
     if not kinds:
         raise ValueError(f"{root / folder}: no noise in it that can be used")
     files = dict(kinds) if set(kinds) - {""} else _drawn(kinds[""], train_types, test_types, seed)
@@ -99,8 +101,8 @@ def find_noises(
 
 
 def _drawn(
-    types: Mapping[str, list[tuple[str, float]]], train: int, test: int, seed: int
-) -> dict[str, dict[str, list[tuple[str, float]]]]:
+    types: Mapping[str, list[tuple[str, Sequence[float]]]], train: int, test: int, seed: int
+) -> dict[str, dict[str, list[tuple[str, Sequence[float]]]]]:
     names = sorted(types)
     Random(f"{seed}:noise types").shuffle(names)
     if len(names) < train + test:
@@ -110,28 +112,24 @@ def _drawn(
     return {split: {name: types[name] for name in own} for split, own in chosen.items() if own}
 
 
-def mix_at(speech: Tensor, noise: Tensor, snr: float, start: float, rate: int, active_db: float) -> Tensor:
-    """Speech with noise at an SNR by active speech level.
+def _starts(noise: Tensor, rate: int) -> tuple[float, ...]:
+    """Seconds at which half a second begins that is no pause; the file counts as repeated where it ends."""
+    step = round(_STEP * rate)
+    if len(noise) < step:
+        return (0.0,)
+    powers = noise[: len(noise) // step * step].square().unflatten(0, (-1, step)).mean(-1).double()
+    ahead = torch.stack([powers.roll(-k) for k in range(_STRETCH)]).mean(0)
+    loud = ahead >= powers.mean() * 10.0 ** (-_QUIET_DB / 10.0)
+    return tuple(round(_STEP * k, 1) for k in loud.nonzero().squeeze(-1).tolist())
 
-    The noise starts ``start`` seconds in and is repeated where it ends; a start in a pause of the noise, 30 dB below the
-    recording's level, moves on by a length of the speech.
+
+def mix_at(speech: Tensor, noise: Tensor, snr: float, active_db: float) -> Tensor:
+    """Speech with noise at an SNR by active speech level.
 
     Args:
         snr: dB, of the active speech level over the noise's RMS level.
         active_db: active level of the speech in dB relative to RMS 1.0.
 
-    Shape: (time,), (samples,) at one rate -> (time,).
+    Shape: (time,) twice -> (time,).
     """
-    samples = speech.shape[-1]
-    quiet = float(dbfs(noise)) - _QUIET_DB
-    place = int(start * rate) % len(noise)
-    best = None
-    for _ in range(-(-len(noise) // samples) + 1):
-        cut = noise[torch.arange(place, place + samples) % len(noise)]
-        if best is None or float(dbfs(cut)) > float(dbfs(best)):
-            best = cut
-        if float(dbfs(best)) >= quiet:
-            break
-        place += samples
-    assert best is not None
-    return speech + best * 10.0 ** ((active_db - snr - float(dbfs(best))) / 20.0)
+    return speech + noise * 10.0 ** ((active_db - snr - float(dbfs(noise))) / 20.0)

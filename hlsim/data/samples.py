@@ -12,7 +12,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save
 from torch import Tensor
 
-from hlsim.audio import read_audio, resample
+from hlsim.audio import read_audio, read_stretch, resample
 from hlsim.audiogram import FREQUENCIES, Audiogram
 from hlsim.calibration import PASCAL_SPL
 from hlsim.data.manifest import UTTERANCE_COLUMNS, Rows, Utterance, inside
@@ -144,15 +144,28 @@ class Plan:
         if utterance.noisy:
             noisy = read_audio(inside(self.root, utterance.noisy))[0][0]
         elif utterance.mixed:
-            assert utterance.snr is not None and utterance.noise_start is not None
-            noise, noise_rate = read_audio(inside(self.root, utterance.noise), any_rate=True)
-            noise = resample(noise[0], noise_rate, rate)
-            noisy = mix_at(clean, noise, utterance.snr, utterance.noise_start, rate, utterance.active_level)
+            assert utterance.snr is not None
+            noisy = mix_at(
+                clean, self._noise(utterance, len(clean), rate), utterance.snr, utterance.active_level
+            )
         else:
             noisy = clean
         if noisy.shape != clean.shape or rate != utterance.rate:
             raise ValueError(f"{inside(self.root, utterance.clean)}: has changed since it was prepared")
         return resample(torch.stack((clean, noisy)), rate, self.rate)
+
+    def noise(self, index: int, samples: int) -> Tensor:
+        """As long a piece as asked of the noise that an instance's utterance is mixed with, at the plan's rate.
+
+        Shape: -> (samples,).
+        """
+        return self._noise(self.utterance(index), samples, self.rate)
+
+    def _noise(self, utterance: Utterance, samples: int, rate: int) -> Tensor:
+        start = utterance.noise_start or 0.0
+        # a little more, for resampling rounds
+        noise, own_rate = read_stretch(inside(self.root, utterance.noise), start, samples / rate + 0.01)
+        return resample(noise[0], own_rate, rate)[:samples]
 
     def instance(self, index: int) -> Instance:
         """Without ``impaired``. Raises ValueError as ``pair``."""
