@@ -76,12 +76,12 @@ def assign_splits(
         ValueError: a speaker is in two splits.
     """
     for speaker, splits in sorted(speakers.items()):
-        if len(splits) > 1:
+        if len(splits - {""}) > 1:
             raise ValueError(
-                f"speaker {speaker} is in {' and '.join(sorted(splits))}; allowed: one split a speaker "
+                f"speaker {speaker} is in {' and '.join(sorted(splits - {''}))}; allowed: one split a speaker "
                 "(a --table with a column speaker or split says otherwise)"
             )
-    assigned = {speaker: min(splits) or "train" for speaker, splits in speakers.items()}
+    assigned = {speaker: max(splits) or "train" for speaker, splits in speakers.items()}
     given = any(splits != {""} for splits in speakers.values())
     for split, share in (("test", 0.0 if given else test_share), ("valid", valid_share)):
         training = sorted(speaker for speaker, own in assigned.items() if own == "train")
@@ -229,8 +229,18 @@ def _listed(corpus: Path, table: Path) -> Iterator[Found]:
         raise ValueError(f"{table}: cannot be read as CSV ({error})") from error
 
 
-def below(found: Found, prefix: str) -> Found:
-    """The same with paths that start with ``prefix``, which is how the corpus lies below the root."""
+def find_below(
+    root: Path, corpus: str, layout: str, table: Path | None = None, noise: str | None = None
+) -> Iterator[Found]:
+    """As ``find_utterances`` of ``root / corpus``, with paths below the root, and without what is in the folder noise."""
+    for found in find_utterances(root / corpus, layout, table):
+        placed = _below(found, corpus)
+        path = placed.path if isinstance(placed, Fault) else placed.clean
+        if noise is None or not path.startswith(f"{noise}/"):
+            yield placed
+
+
+def _below(found: Found, prefix: str) -> Found:
     if not prefix:
         return found
     if isinstance(found, Fault):

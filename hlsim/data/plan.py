@@ -20,9 +20,8 @@ from hlsim.data.corpora import (
     LAYOUTS,
     Fault,
     assign_splits,
-    below,
     detect_layout,
-    find_utterances,
+    find_below,
     walk_audio,
 )
 from hlsim.data.ears import Ears, plan_ears
@@ -173,8 +172,9 @@ def prepare(
     folder = Path(out)
     layout = detect_layout(root / corpus) if settings.layout == "auto" else settings.layout
     listing = _Listing()
-    for found in find_utterances(root / corpus, layout, settings.table):
-        listing.add(root / corpus, found)
+    find = partial(find_below, root, corpus, layout, settings.table, noise if settings.noise else None)
+    for found in find():
+        listing.add(root, found)
     if not listing.total:
         raise ValueError(f"{root / corpus}: no audio in it that the layout {layout} knows")
     about: dict[str, Any] = {
@@ -208,9 +208,8 @@ def prepare(
         for fault in faults:
             tell(fault)
         check = partial(examine, root, shortest=settings.shortest, pairs=listing.paired > 0)
-        items = (below(found, corpus) for found in find_utterances(root / corpus, layout, settings.table))
         examined = run_parallel(
-            partial(_numbered, check), enumerate(items), jobs=jobs, backend=backend, scheduler=scheduler
+            partial(_numbered, check), enumerate(find()), jobs=jobs, backend=backend, scheduler=scheduler
         )
         for number, found in enumerate(_in_order(examined), start=1):
             if isinstance(found, Fault):
@@ -326,16 +325,14 @@ class _Listing:
         self.paired = self.total = 0
         self._digest = hashlib.sha256()
 
-    def add(self, corpus: Path, found: Utterance | Fault) -> None:
+    def add(self, root: Path, found: Utterance | Fault) -> None:
         self.total += 1
         if isinstance(found, Fault):
             self._digest.update(f"{found}\n".encode())
             return
         self.speakers.setdefault(found.speaker, set()).add(found.split)
         self.paired += bool(found.noisy)
-        self._digest.update(
-            f"{found} {_state(corpus / found.clean)} {_state(corpus / found.noisy)}\n".encode()
-        )
+        self._digest.update(f"{found} {_state(root / found.clean)} {_state(root / found.noisy)}\n".encode())
 
     def digest(self, noise: Path | None, settings: PlanSettings) -> str:
         for path in walk_audio(noise) if noise is not None else ():

@@ -69,12 +69,15 @@ class PlannedTraining(SimulatorTraining):
     def training_step(self, batch: Any, index: int) -> Tensor:
         self.batch = batch
         assert self.batches.loader is not None
-        # the first step waits for the workers to start; validations count as training
+        # from the second step on, for the first one waits until the workers have started
         self._marks = [*self._marks[-_WINDOW:], (time.perf_counter(), self.batches.loader.waited)]
         (began, before), (now, waited) = self._marks[0], self._marks[-1]
         if now > began:
             self.log("data_wait", (waited - before) / (now - began))
         return super().training_step(batch, index)
+
+    def on_validation_end(self) -> None:
+        self._marks = []  # that was no step
 
     def training_loss(self, generator: torch.Generator) -> Tensor:
         return self.loss_on(self.batch["signal"], self.batch["thresholds"], self.batch["impaired"])

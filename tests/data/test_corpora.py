@@ -141,6 +141,8 @@ def test_speakers_are_in_one_split() -> None:
     assert splits != assign_splits(speakers, **options | {"seed": 1})
     assert assign_splits({"a": {""}}, **options) == {"a": "train"}
     given = assign_splits({"a": {"train"}, "b": {"test"}, "c": {"train"}, "d": {"train"}}, **options)
+    mixed = assign_splits({"a": {"", "test"}, "b": {""}}, **options | {"valid_share": 0.0})
+    assert mixed == {"a": "test", "b": "train"}
     assert given["b"] == "test" and sorted(given.values()) == ["test", "train", "train", "valid"]
     with pytest.raises(ValueError, match=r"speaker a is in test and train; allowed: one split"):
         assign_splits({"a": {"train", "test"}}, **options)

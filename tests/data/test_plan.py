@@ -100,6 +100,10 @@ def test_noise_is_mixed_in_by_the_plan(tmp_path: Path, pieces: list[Tensor], noi
     assert sum(map(len, speakers.values())) == len(set().union(*speakers.values()))
     assert all(row["clean"].startswith("speech/") and row["noise"].startswith("noise/") for row in manifest)
     assert json.loads((tmp_path / "out" / "plan.json").read_text())["root"] == str(tmp_path)
+    # the folder of noise is no speech, wherever it lies
+    noise_folder.rename(tmp_path / "speech" / "noise")
+    inside = run(tmp_path / "speech", tmp_path / "in", noise=tmp_path / "speech" / "noise")
+    assert sum(inside.utterances.values()) == 10
 
 
 def test_the_same_corpus_gives_the_same_bytes_and_is_not_read_twice(
