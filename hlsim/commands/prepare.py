@@ -118,7 +118,8 @@ def shares(text: str) -> dict[str, float]:
 
 
 def _prepare(options: argparse.Namespace) -> None:
-    from hlsim.data.plan import FAULTS, PlanSettings, prepare
+    from hlsim.data.plan import FAULTS, prepare
+    from hlsim.data.plan_settings import PlanSettings
     from hlsim.data.writing import Recipe, write_instances
 
     if len(options.level) > 2:

@@ -4,109 +4,27 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from random import Random
 from typing import Any
 
-from hlsim.audio import check_rate, read_audio
 from hlsim.audiogram import SEVERITIES
-from hlsim.data.active_level import active_level_db
-from hlsim.data.corpora import (
-    LAYOUTS,
-    Fault,
-    assign_splits,
-    detect_layout,
-    find_below,
-    walk_audio,
-)
+from hlsim.data.checking import Listing, examine_all
+from hlsim.data.corpora import Fault, assign_splits, detect_layout, find_below
 from hlsim.data.ears import Ears, plan_ears
-from hlsim.data.files import Whole
-from hlsim.data.manifest import SPLITS, UTTERANCE_COLUMNS, Rows, Utterance, csv_line, inside
-from hlsim.data.noises import TEST_SNRS_DB, TRAIN_SNRS_DB, Noises, find_noises
+from hlsim.data.files import PARTIAL, Whole
+from hlsim.data.manifest import SPLITS, UTTERANCE_COLUMNS, Rows, csv_line
+from hlsim.data.noises import Noises, find_noises
+from hlsim.data.plan_settings import PlanSettings
 from hlsim.data.samples import INSTANCE_COLUMNS, INSTANCES, MANIFEST, SETTINGS
-from hlsim.parallel import run_parallel
-from hlsim.settings import refuse_unknown
 
 FAULTS = "faults.csv"
 
 Progress = Callable[[int, int], None]
-
-
-@dataclass(frozen=True)
-class PlanSettings:
-    """What a plan is made of.
-
-    Attributes:
-        corpus, noise: folders; the noises are mixed into clean speech.
-        root: folder that holds both; by default the corpus, or with noise their common parent.
-        layout: ``auto``, or one of ``LAYOUTS``.
-        table: CSV file that lists the corpus.
-        train_snrs, test_snrs: dB by active speech level.
-        train_types, test_types: how many types of noise.
-        audiograms, test_audiograms: CSV files of ears; without any they are drawn.
-        ears: an utterance.
-        severities: proportions; None for equal ones of mild, moderate and severe, or as in the file.
-        level: lowest and highest active speech level at which ears are given the speech, dB SPL.
-        rate: of the instances, Hz.
-        test_share, valid_share: of speakers, see ``assign_splits``.
-        shortest: seconds; what is shorter is left out.
-        seed: of every draw.
-    """
-
-    corpus: Path
-    noise: Path | None = None
-    root: Path | None = None
-    layout: str = "auto"
-    table: Path | None = None
-    train_snrs: Sequence[float] = TRAIN_SNRS_DB
-    test_snrs: Sequence[float] = TEST_SNRS_DB
-    train_types: int = 8
-    test_types: int = 2
-    audiograms: Path | None = None
-    test_audiograms: Path | None = None
-    ears: int = 2
-    severities: Mapping[str, float] | None = None
-    level: tuple[float, float] = (65.0, 65.0)
-    rate: int = 16000
-    test_share: float = 0.1
-    valid_share: float = 0.0
-    shortest: float = 0.5
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        refuse_unknown([self.layout], ("auto", *LAYOUTS), "layouts")
-        check_rate(self.rate)
-        for name, share in (("test_share", self.test_share), ("valid_share", self.valid_share)):
-            if not 0.0 <= share < 1.0:
-                raise ValueError(f"{name} {share}; allowed: 0 to less than 1")
-        if min(self.ears, self.train_types, self.test_types) < 1 or self.shortest < 0.1:
-            raise ValueError(
-                f"ears {self.ears}, train_types {self.train_types}, test_types {self.test_types}, shortest "
-                f"{self.shortest} s; allowed: counts from 1 up, 0.1 s or more"
-            )
-        low, high = self.level
-        if not 20.0 <= low <= high <= 110.0:
-            raise ValueError(f"level {low:g} to {high:g} dB SPL; allowed: ascending, 20 to 110")
-
-    def places(self) -> tuple[Path, str, str]:
-        """Root, and corpus and noise below it. Raises ValueError where the root does not hold them."""
-        folders = [folder.resolve() for folder in (self.corpus, self.noise) if folder is not None]
-        for folder in folders:
-            if not folder.is_dir():
-                raise ValueError(f"{folder}: no such folder")
-        root = self.root.resolve() if self.root else Path(os.path.commonpath(folders))
-        if root == Path(root.anchor):
-            raise ValueError(f"{folders[0]} and {folders[-1]} have only {root} in common; allowed: a --root")
-        for folder in folders:
-            if not folder.is_relative_to(root):
-                raise ValueError(f"{folder}: not in the root {root}; allowed: folders below it")
-        names = ["" if folder == root else folder.relative_to(root).as_posix() for folder in folders]
-        return root, names[0], names[-1]
 
 
 @dataclass
@@ -165,13 +83,12 @@ def prepare(
         progress: called with the utterances checked and all.
 
     Raises:
-        ValueError: settings or folders that cannot be used, nothing left to use, faults with ``strict``, or instances of
-            another plan in ``out``.
+        ValueError: settings or folders that cannot be used, nothing left to use, or faults with ``strict``.
     """
     root, corpus, noise = settings.places()
     folder = Path(out)
     layout = detect_layout(root / corpus) if settings.layout == "auto" else settings.layout
-    listing = _Listing()
+    listing = Listing()
     find = partial(find_below, root, corpus, layout, settings.table, noise if settings.noise else None)
     for found in find():
         listing.add(root, found)
@@ -181,7 +98,9 @@ def prepare(
         "root": str(root),
         "layout": layout,
         "settings": {name: _plain(value) for name, value in asdict(settings).items()},
-        "files_sha256": listing.digest(root / noise if settings.noise else None, settings),
+        "files_sha256": listing.digest(
+            root / noise if settings.noise else None, settings.audiograms, settings.test_audiograms
+        ),
     }
     if prepared := _unchanged(folder, about, strict):
         return prepared
@@ -194,6 +113,8 @@ def prepare(
     noises, faults = _noises(settings, root, noise, used, listing.paired)
 
     folder.mkdir(parents=True, exist_ok=True)
+    for leftover in folder.glob(f".*{PARTIAL}"):  # of a run that was killed
+        leftover.unlink(missing_ok=True)
     (folder / SETTINGS).unlink(missing_ok=True)  # it is written last: without it the folder is not prepared
     prepared = Prepared()
     with Whole(folder / FAULTS) as report, Whole(folder / MANIFEST) as manifest:
@@ -207,11 +128,16 @@ def prepare(
 
         for fault in faults:
             tell(fault)
-        check = partial(examine, root, shortest=settings.shortest, pairs=listing.paired > 0)
-        examined = run_parallel(
-            partial(_numbered, check), enumerate(find()), jobs=jobs, backend=backend, scheduler=scheduler
+        examined = examine_all(
+            find(),
+            root,
+            shortest=settings.shortest,
+            pairs=listing.paired > 0,
+            jobs=jobs,
+            backend=backend,
+            scheduler=scheduler,
         )
-        for number, found in enumerate(_in_order(examined), start=1):
+        for number, found in enumerate(examined, start=1):
             if isinstance(found, Fault):
                 tell(found)
             else:
@@ -243,58 +169,6 @@ def prepare(
     return prepared
 
 
-def examine(root: Path, found: Utterance | Fault, *, shortest: float, pairs: bool) -> Utterance | Fault:
-    """The utterance with rate, seconds and active level, or what is at fault with its files, which are read whole."""
-    if isinstance(found, Fault):
-        return found
-    path = found.clean
-    try:
-        clean, rate = read_audio(inside(root, path))
-        seconds = clean.shape[-1] / rate
-        if seconds < shortest:
-            return Fault(path, f"{seconds:.3g} s; {shortest:g} s or more are asked for")
-        if not bool(clean[0].any()):
-            return Fault(path, "silent first channel")
-        if pairs and not found.noisy:
-            return Fault(path, "no noisy counterpart, and others have one")
-        if found.noisy:
-            path = found.noisy
-            noisy, noisy_rate = read_audio(inside(root, path))
-            if not bool(noisy[0].any()):
-                return Fault(path, "silent first channel")
-            if noisy_rate != rate:
-                return Fault(path, f"{noisy_rate} Hz, its clean speech has {rate} Hz")
-            if noisy.shape[-1] != clean.shape[-1]:
-                return Fault(
-                    path,
-                    f"{noisy.shape[-1]} samples, its clean speech has {clean.shape[-1]}: unequal lengths",
-                )
-    except ValueError as error:
-        return Fault(path, str(error).removeprefix(f"{root / path}: "))
-    level = active_level_db(clean[0], rate)
-    return replace(found, rate=rate, seconds=seconds, active_level=level)
-
-
-def _numbered(
-    check: Callable[[Utterance | Fault], Utterance | Fault], task: tuple[int, Utterance | Fault]
-) -> Utterance | Fault:
-    return check(task[1])
-
-
-def _in_order(
-    examined: Iterable[tuple[tuple[int, Utterance | Fault], Utterance | Fault | None]],
-) -> Iterator[Utterance | Fault]:
-    """Results in the order of the corpus, however they come; a process that died is a fault of its file."""
-    waiting: dict[int, Utterance | Fault] = {}
-    wanted = 0
-    for (number, item), found in examined:
-        path = item.path if isinstance(item, Fault) else item.clean
-        waiting[number] = found or Fault(path, "the process that read it died")
-        while wanted in waiting:
-            yield waiting.pop(wanted)
-            wanted += 1
-
-
 def _noises(
     settings: PlanSettings, root: Path, noise: str, splits: set[str], paired: int
 ) -> tuple[Noises | None, list[Fault]]:
@@ -315,39 +189,6 @@ def _noises(
         test_types=settings.test_types,
         seed=settings.seed,
     )
-
-
-class _Listing:
-    """What a first look at the corpus tells: its speakers, and a digest of names, sizes and times of change."""
-
-    def __init__(self) -> None:
-        self.speakers: dict[str, set[str]] = {}
-        self.paired = self.total = 0
-        self._digest = hashlib.sha256()
-
-    def add(self, root: Path, found: Utterance | Fault) -> None:
-        self.total += 1
-        if isinstance(found, Fault):
-            self._digest.update(f"{found}\n".encode())
-            return
-        self.speakers.setdefault(found.speaker, set()).add(found.split)
-        self.paired += bool(found.noisy)
-        self._digest.update(f"{found} {_state(root / found.clean)} {_state(root / found.noisy)}\n".encode())
-
-    def digest(self, noise: Path | None, settings: PlanSettings) -> str:
-        for path in walk_audio(noise) if noise is not None else ():
-            self._digest.update(f"{path} {_state(noise / path)}\n".encode())  # type: ignore[operator]
-        for table in (settings.audiograms, settings.test_audiograms):
-            self._digest.update(f"{table and _state(table)}\n".encode())
-        return self._digest.hexdigest()
-
-
-def _state(path: Path) -> tuple[int, int] | None:
-    try:
-        about = path.stat()
-    except OSError:
-        return None
-    return about.st_size, about.st_mtime_ns
 
 
 def _unchanged(folder: Path, about: Mapping[str, Any], strict: bool) -> Prepared | None:

@@ -7,7 +7,8 @@ import torch
 from torch import Tensor
 
 from hlsim.audio import read_audio, resample, write_audio
-from hlsim.data.plan import PlanSettings, prepare
+from hlsim.data.plan import prepare
+from hlsim.data.plan_settings import PlanSettings
 
 RATE = 16000
 

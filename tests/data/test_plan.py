@@ -11,7 +11,8 @@ import torch
 from torch import Tensor
 
 from hlsim.audio import write_audio
-from hlsim.data.plan import PlanSettings, Prepared, prepare
+from hlsim.data.plan import Prepared, prepare
+from hlsim.data.plan_settings import PlanSettings
 from hlsim.data.samples import Plan
 
 OUTPUTS = ("manifest.csv", "instances.csv", "faults.csv", "plan.json")
@@ -113,7 +114,7 @@ def test_the_same_corpus_gives_the_same_bytes_and_is_not_read_twice(
     run(voicebank, tmp_path / "b")
     for name in OUTPUTS:
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
-    monkeypatch.setattr("hlsim.data.plan.examine", None)
+    monkeypatch.setattr("hlsim.data.checking.examine", None)
     assert run(voicebank, tmp_path / "a") == first
     monkeypatch.undo()
     assert run(voicebank, tmp_path / "a", seed=1) == first  # counts; the ears are others
@@ -184,7 +185,7 @@ def test_strict_makes_a_fault_an_error(voicebank: Path, tmp_path: Path) -> None:
 def test_what_is_refused_before_a_file_is_read(
     voicebank: Path, tmp_path: Path, noise_folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("hlsim.data.plan.examine", None)
+    monkeypatch.setattr("hlsim.data.checking.examine", None)
     out = tmp_path / "out"
     elsewhere = tmp_path / "empty"
     elsewhere.mkdir()

@@ -10,7 +10,8 @@ from hlsim.audio import read_audio, resample, write_audio
 from hlsim.audiogram import Audiogram
 from hlsim.calibration import dbfs
 from hlsim.data.active_level import active_level_db
-from hlsim.data.plan import PlanSettings, prepare
+from hlsim.data.plan import prepare
+from hlsim.data.plan_settings import PlanSettings
 from hlsim.data.samples import Instance, Plan, is_whole
 
 

@@ -16,7 +16,8 @@ from torch import Tensor
 
 from hlsim.audio import write_audio
 from hlsim.data import files
-from hlsim.data.plan import PlanSettings, prepare
+from hlsim.data.plan import prepare
+from hlsim.data.plan_settings import PlanSettings
 from hlsim.data.samples import Instance, Plan
 from hlsim.data.writing import Recipe, write_instances
 
@@ -204,7 +205,8 @@ PEAK = """
 import resource, sys
 from pathlib import Path
 import torch
-from hlsim.data.plan import PlanSettings, prepare
+from hlsim.data.plan import prepare
+from hlsim.data.plan_settings import PlanSettings
 from hlsim.data.writing import Recipe, write_instances
 
 prepare(PlanSettings(Path(sys.argv[1]), ears=1), sys.argv[2], jobs=1)

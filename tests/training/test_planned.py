@@ -11,7 +11,8 @@ from hlsim.audio import write_audio
 pytest.importorskip("lightning")
 
 from hlsim.cli import main
-from hlsim.data.plan import PlanSettings, prepare
+from hlsim.data.plan import prepare
+from hlsim.data.plan_settings import PlanSettings
 from hlsim.data.writing import Recipe, write_instances
 from hlsim.pretrained import load_pretrained
 from hlsim.training.planned import PlannedSource, PlannedTraining
