@@ -68,6 +68,34 @@ def read_audio(path: str | Path, *, any_rate: bool = False) -> tuple[Tensor, int
     return waveform, int(rate)
 
 
+def read_stretch(path: str | Path, start: float, seconds: float) -> tuple[Tensor, int]:
+    """Read a piece of a recording, which begins again where it ends.
+
+    Args:
+        start, seconds: where the piece begins and how long it is.
+
+    Returns: float32 samples (channels, time) and the rate in Hz; silence and any rate are let through.
+
+    Raises:
+        ValueError: the file is missing, broken or empty.
+    """
+    try:
+        with soundfile.SoundFile(str(path)) as file:
+            rate, left = int(file.samplerate), max(1, round(seconds * file.samplerate))
+            file.seek(int(start * rate) % max(1, file.frames))
+            pieces = []
+            while left > 0:
+                piece = file.read(left, dtype="float32", always_2d=True)
+                if not len(piece) and file.tell() == 0:
+                    raise ValueError(f"{path}: empty, no samples")
+                pieces.append(torch.from_numpy(piece.T.copy()))
+                left -= len(piece)
+                file.seek(0)
+    except (soundfile.LibsndfileError, RuntimeError) as error:
+        raise ValueError(f"{path}: not readable as audio ({error}); allowed: wav, flac, ogg") from error
+    return torch.cat(pieces, -1), rate
+
+
 def write_audio(path: str | Path, waveform: Tensor, sample_rate: int) -> None:
     """Write (channels, time) or (time,) samples as wav (32-bit float), flac (24-bit) or ogg, whole or not at all.
 

@@ -20,7 +20,8 @@ from hlsim.evaluation.report import HaspiReport, ItemScore
 from hlsim.evaluation.report_files import write_report
 from hlsim.msbg import MSBG
 from hlsim.neuro.config import NEURO_RATE
-from hlsim.training.compensator import CompensatorData, CompensatorRecipe, train_compensator
+from hlsim.training.compensator import CompensatorRecipe, train_compensator
+from hlsim.training.sources import TrainingData
 
 SPEECH_LEVEL = 65.0
 """Level in dB SPL at which the utterances are given to the unaided ear and to the compensators."""
@@ -65,7 +66,7 @@ def demo(
     torch.set_num_threads(1)  # the steps are small: on a busy machine two threads wait for each other
     try:
         checkpoint = train_compensator(
-            CompensatorData(speech=training),
+            TrainingData(speech=training),
             recipe,
             out=folder / "training",
             audiogram=audiogram,

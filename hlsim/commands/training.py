@@ -11,12 +11,15 @@ from hlsim.commands.options import (
     add_command,
     audiogram_option,
     count,
+    natural,
     out_option,
     positive,
     read_ear,
     read_recipe,
 )
 from hlsim.extras import require
+
+FOLDERS = ("speech", "noise", "audiograms", "valid_speech", "valid_noise", "valid_audiograms")
 
 
 def add(commands: Commands) -> None:
@@ -26,11 +29,13 @@ def add(commands: Commands) -> None:
     sub.add_argument(
         "--config", type=Path, required=True, help="recipe, a YAML file (examples/neuro-msbg.yaml)"
     )
-    sub.add_argument("--noise", type=Path, help="folder of noises to mix in")
-    sub.add_argument("--audiograms", type=Path, help="CSV of measured ears to join the drawn ones")
-    sub.add_argument("--valid-noise", type=Path, help="folder of noises to validate with")
-    sub.add_argument("--valid-audiograms", type=Path, help="CSV of ears to validate with")
-    training_options(sub, minutes=60.0)
+    sub.add_argument(
+        "--manifest", type=Path, help="manifest.csv that 'hlsim prepare' wrote, instead of folders and files"
+    )
+    sub.add_argument("--root", type=Path, help="folder of the manifest's paths, if not where it was prepared")
+    sub.add_argument("--prepared", action="store_true", help="train on what 'hlsim prepare --write' wrote")
+    sub.add_argument("--workers", type=natural, default=1, help="processes that read the manifest's files")
+    training_options(sub, minutes=60.0, speech_required=False)
 
     sub = add_command(
         commands, "train-compensator", _train_compensator, "train a compensator through a frozen simulator"
@@ -40,34 +45,48 @@ def add(commands: Commands) -> None:
     sub.add_argument(
         "--simulator", default="neuro-msbg", help="msbg (exact), or a checkpoint's name or folder"
     )
-    sub.add_argument("--noise", type=Path, help="folder of noises to mix in")
     training_options(sub, minutes=10.0)
 
 
 def _train_simulator(options: argparse.Namespace) -> None:
     require("lightning", "train")
-    from hlsim.training.simulator import SimulatorData, SimulatorRecipe, train_simulator
+    from hlsim.training.simulator import SimulatorRecipe, train_simulator
 
-    data = SimulatorData(
-        options.speech,
-        options.noise,
-        options.audiograms,
-        options.valid_speech,
-        options.valid_noise,
-        options.valid_audiograms,
-    )
+    if options.manifest is not None:
+        _train_planned(options)
+        return
+    if options.speech is None:
+        raise ValueError(
+            "nothing to train on; allowed: --speech, a folder, or --manifest, of 'hlsim prepare'"
+        )
+    recipe = SimulatorRecipe.from_dict(read_recipe(options.config))
+    folder = train_simulator(training_data(options), recipe, **training_arguments(options))
+    print(f"the best checkpoint is in {folder}")
+
+
+def _train_planned(options: argparse.Namespace) -> None:
+    from hlsim.training.planned import PlannedSource, PlannedTraining
+    from hlsim.training.simulator import SimulatorRecipe, train_simulator
+
+    if given := [f"--{name.replace('_', '-')}" for name in FOLDERS if getattr(options, name) is not None]:
+        raise ValueError(
+            f"--manifest with {', '.join(given)}; allowed: one or the other, for a manifest has it all"
+        )
     folder = train_simulator(
-        data, SimulatorRecipe.from_dict(read_recipe(options.config)), **training_arguments(options)
+        PlannedSource(options.manifest, options.root, options.prepared, options.workers),
+        SimulatorRecipe.from_dict(read_recipe(options.config)),
+        kind=PlannedTraining,
+        **training_arguments(options),
     )
     print(f"the best checkpoint is in {folder}")
 
 
 def _train_compensator(options: argparse.Namespace) -> None:
     require("lightning", "train")
-    from hlsim.training.compensator import CompensatorData, CompensatorRecipe, train_compensator
+    from hlsim.training.compensator import CompensatorRecipe, train_compensator
 
     folder = train_compensator(
-        CompensatorData(speech=options.speech, noise=options.noise, valid_speech=options.valid_speech),
+        training_data(options),
         CompensatorRecipe.from_dict(read_recipe(options.config)),
         audiogram=read_ear(options.audiogram) if options.audiogram else None,
         simulator=options.simulator,
@@ -76,9 +95,17 @@ def _train_compensator(options: argparse.Namespace) -> None:
     print(f"the best checkpoint is in {folder}")
 
 
-def training_options(parser: argparse.ArgumentParser, *, minutes: float) -> None:
-    parser.add_argument("--speech", type=Path, required=True, help="folder of clean speech to train on")
+def training_options(
+    parser: argparse.ArgumentParser, *, minutes: float, speech_required: bool = True
+) -> None:
+    parser.add_argument(
+        "--speech", type=Path, required=speech_required, help="folder of clean speech to train on"
+    )
+    parser.add_argument("--noise", type=Path, help="folder of noises to mix in")
+    parser.add_argument("--audiograms", type=Path, help="CSV of measured ears to join the drawn ones")
     parser.add_argument("--valid-speech", type=Path, help="folder of other speakers to validate on")
+    parser.add_argument("--valid-noise", type=Path, help="folder of noises to validate with")
+    parser.add_argument("--valid-audiograms", type=Path, help="CSV of ears to validate with")
     parser.add_argument(
         "--max-minutes", type=positive, default=minutes, help="of training, resumed parts included"
     )
@@ -89,6 +116,12 @@ def training_options(parser: argparse.ArgumentParser, *, minutes: float) -> None
     parser.add_argument("--strategy", default="auto", help="Lightning's, e.g. ddp")
     parser.add_argument("--quiet", action="store_true", help="no progress bar, only a line a validation")
     out_option(parser)
+
+
+def training_data(options: argparse.Namespace) -> Any:
+    from hlsim.training.sources import TrainingData
+
+    return TrainingData(**{name: getattr(options, name) for name in FOLDERS})
 
 
 def training_arguments(options: argparse.Namespace) -> dict[str, Any]:

@@ -29,8 +29,8 @@ from torch import Tensor
 from hlsim.audio import check_rate, read_audio
 from hlsim.audiogram import Audiogram
 from hlsim.calibration import check_full_scale
-from hlsim.evaluation.parallel import check_parallel, run_parallel
 from hlsim.extras import require
+from hlsim.parallel import check_parallel, run_parallel
 
 SHORTEST_SECONDS = 0.7
 """Shortest signal, in seconds, that a score can be trusted of."""

@@ -19,8 +19,8 @@ from hlsim.audiogram import Audiogram
 from hlsim.calibration import check_full_scale, dbfs
 from hlsim.evaluation.haspi import Progress, check_seed
 from hlsim.evaluation.measures import MEASURES, check_measures, versions_of
-from hlsim.evaluation.parallel import check_parallel, run_parallel
 from hlsim.evaluation.store import ScoreStore, content_hash, key_of
+from hlsim.parallel import check_parallel, run_parallel
 
 EARS = ("left", "right")
 

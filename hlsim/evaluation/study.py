@@ -11,12 +11,12 @@ from hlsim.evaluation.folders import read_folders
 from hlsim.evaluation.haspi import Progress, check_seed
 from hlsim.evaluation.manifest import read_manifest
 from hlsim.evaluation.measures import check_measures
-from hlsim.evaluation.parallel import check_parallel
 from hlsim.evaluation.report import Failure, HaspiReport, ItemScore
 from hlsim.evaluation.report_files import check_out, write_report
 from hlsim.evaluation.scoring import Item, Result, score_items
 from hlsim.evaluation.store import ScoreStore
 from hlsim.extras import require
+from hlsim.parallel import check_parallel
 
 SCORES_FILE = "scores.jsonl"
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ from torch import Tensor
 from compensators.config import MappingConfig
 from compensators.mapping import MappingCompensator
 from compensators.pretrained import KIND
-from hlsim.audiogram import Audiogram, draw_thresholds, read_audiograms
+from hlsim.audiogram import Audiogram, draw_thresholds
 from hlsim.calibration import set_level
 from hlsim.data.clips import Clips
 from hlsim.data.variation import equalise, mix
@@ -22,6 +22,7 @@ from hlsim.neuro.config import NEURO_RATE
 from hlsim.pretrained import save_checkpoint
 from hlsim.settings import refuse_unknown
 from hlsim.training.loop import TimedModule, run
+from hlsim.training.sources import TrainingData, read_thresholds
 
 CRITERIA = ("bands", "paper")
 
@@ -88,22 +89,6 @@ class CompensatorRecipe:
         return cls(**data)
 
 
-@dataclass(frozen=True)
-class CompensatorData:
-    """Folders and files to train and validate on. Speech is all that is needed, a folder or a list of files.
-
-    Without ``valid_speech`` validation is on the training speech, and says nothing of other speakers. The audiograms are
-    for a general compensator, and join the drawn ears.
-    """
-
-    speech: Path | Sequence[Path]
-    noise: Path | None = None
-    audiograms: Path | None = None
-    valid_speech: Path | Sequence[Path] | None = None
-    valid_noise: Path | None = None
-    valid_audiograms: Path | None = None
-
-
 class CompensatorTraining(TimedModule):
     """Draws speech, noise, levels and ears, and hears the compensator's output through the frozen simulator.
 
@@ -115,7 +100,7 @@ class CompensatorTraining(TimedModule):
     def __init__(
         self,
         recipe: CompensatorRecipe,
-        data: CompensatorData,
+        data: TrainingData,
         max_minutes: float,
         *,
         audiogram: Audiogram | None = None,
@@ -134,14 +119,8 @@ class CompensatorTraining(TimedModule):
         if not self.criteria:
             raise ValueError(f"criteria {recipe.weights} in the recipe; allowed: one or more above 0")
         self.ear = None if audiogram is None else torch.tensor(audiogram.thresholds)
-        self.training_items = Items(recipe, data.speech, data.noise, data.audiograms, recipe.seconds)
-        valid = Items(
-            replace(recipe, equalised=0.0),
-            data.valid_speech or data.speech,
-            data.valid_noise or data.noise,
-            data.valid_audiograms or data.audiograms,
-            seconds=2.0,
-        )
+        self.training_items = Items(recipe, data, recipe.seconds)
+        valid = Items(replace(recipe, equalised=0.0), data.validation(), seconds=2.0)
         generator = torch.Generator().manual_seed(2_000 + recipe.seed)
         self.valid = [valid.draw(4, generator, self.ear) for _ in range(0, recipe.validation_items, 4)]
 
@@ -178,20 +157,12 @@ class CompensatorTraining(TimedModule):
 class Items:
     """Random speech, clean or noisy, and the ears that it is for."""
 
-    def __init__(
-        self,
-        recipe: CompensatorRecipe,
-        speech: Path | Sequence[Path],
-        noise: Path | None,
-        audiograms: Path | None,
-        seconds: float,
-    ) -> None:
+    def __init__(self, recipe: CompensatorRecipe, data: TrainingData, seconds: float) -> None:
         self.recipe = recipe
-        self.speech = Clips(speech, sample_rate=NEURO_RATE, seconds=seconds)
-        self.noise = Clips(noise, sample_rate=NEURO_RATE, seconds=seconds, repeat=True) if noise else None
-        self.ears = (
-            torch.tensor([ear.thresholds for _, ear in read_audiograms(audiograms)]) if audiograms else None
-        )
+        options: dict[str, Any] = {"sample_rate": NEURO_RATE, "seconds": seconds}
+        self.speech = Clips(data.speech, **options)
+        self.noise = Clips(data.noise, repeat=True, **options) if data.noise else None
+        self.ears = read_thresholds(data.audiograms)
 
     def draw(
         self, count: int, generator: torch.Generator, ear: Tensor | None
@@ -223,7 +194,7 @@ class Items:
 
 
 def train_compensator(
-    data: CompensatorData,
+    data: TrainingData,
     recipe: CompensatorRecipe,
     *,
     out: str | Path,

@@ -50,6 +50,8 @@ class TimedModule(L.LightningModule):
     """
 
     timer: Timer
+    datamodule: L.LightningDataModule | None = None
+    """Where batches come from, in a module that does not make its own."""
 
     def __init__(self, learning_rate: float, max_minutes: float, seed: int) -> None:
         super().__init__()
@@ -232,10 +234,12 @@ def run(
             enable_progress_bar=False,
             enable_model_summary=False,
         )
+        own = module.datamodule is None
         trainer.fit(
             module,
-            DataLoader(Counter(10_000_000), batch_size=None),
-            DataLoader(Counter(1), batch_size=None),
+            DataLoader(Counter(10_000_000), batch_size=None) if own else None,
+            DataLoader(Counter(1), batch_size=None) if own else None,
+            datamodule=module.datamodule,
             ckpt_path=str(last) if last.is_file() else None,
             weights_only=True,
         )

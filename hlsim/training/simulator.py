@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from hlsim.audiogram import MILDER, Audiogram, draw_thresholds, read_audiograms
+from hlsim.audiogram import MILDER, Audiogram, draw_thresholds
 from hlsim.calibration import set_level
 from hlsim.criteria import log_spectral_distance_db, noise_to_signal_db, paper_parts, weighted_sum
 from hlsim.data.clips import Clips
@@ -22,6 +22,7 @@ from hlsim.pretrained import save_checkpoint
 from hlsim.settings import refuse_unknown
 from hlsim.training.averaging import average_of
 from hlsim.training.loop import TimedModule, run
+from hlsim.training.sources import TrainingData, read_thresholds
 
 PRECISIONS = {"float32": None, "bfloat16": torch.bfloat16}
 
@@ -96,25 +97,10 @@ class SimulatorRecipe:
             )
 
 
-@dataclass(frozen=True)
-class SimulatorData:
-    """Folders and files to train and validate on. Speech is all that is needed.
-
-    Without ``valid_speech`` validation is on the training speech, and says nothing of other speakers.
-    """
-
-    speech: Path
-    noise: Path | None = None
-    audiograms: Path | None = None
-    valid_speech: Path | None = None
-    valid_noise: Path | None = None
-    valid_audiograms: Path | None = None
-
-
 class SimulatorTraining(TimedModule):
     """Draws speech, noise, ears and levels, asks the exact MSBG what is heard, and teaches it to the network."""
 
-    def __init__(self, recipe: SimulatorRecipe, data: SimulatorData, max_minutes: float) -> None:
+    def __init__(self, recipe: SimulatorRecipe, data: TrainingData, max_minutes: float) -> None:
         super().__init__(recipe.learning_rate, max_minutes, recipe.seed)
         torch.manual_seed(recipe.seed)
         self.recipe = recipe
@@ -122,12 +108,17 @@ class SimulatorTraining(TimedModule):
         self.student.autocast_dtype = PRECISIONS[recipe.precision]
         self.kept = average_of(self.student, recipe.average)
         self.teacher = MSBG(sample_rate=NEURO_RATE)
+        self.truths: list[Tensor] = []
+        self.take(data)
+
+    def take(self, data: TrainingData) -> None:
+        """Open what there is to train and validate on."""
+        recipe = self.recipe
         options: dict[str, Any] = {"sample_rate": NEURO_RATE, "seconds": recipe.seconds}
         self.speech = Clips(data.speech, **options)
         self.noise = Clips(data.noise, repeat=True, **options) if data.noise else None
-        self.ears = _thresholds(data.audiograms)
+        self.ears = read_thresholds(data.audiograms)
         self.valid = validation_set(data, recipe)
-        self.truths: list[Tensor] = []
 
     def training_loss(self, generator: torch.Generator) -> Tensor:
         count = self.recipe.batch
@@ -150,6 +141,10 @@ class SimulatorTraining(TimedModule):
         ears = ears.to(self.device)
         with torch.no_grad():
             truth = self.teacher(signal, ears)
+        return self.loss_on(signal, ears, truth)
+
+    def loss_on(self, signal: Tensor, ears: Tensor, truth: Tensor) -> Tensor:
+        """Of the network on signals, given what is heard. Shape: (items, time), (items, 8), (items, time) -> ()."""
         heard = self.student(signal, ears)
         unit = truth if self.recipe.unit_power == "truth" else signal
         scale = unit.square().mean(-1, keepdim=True).add(1e-18).rsqrt()
@@ -177,7 +172,7 @@ class SimulatorTraining(TimedModule):
         return {"score": median + 0.5 * low, "valid_snr_median": median, "valid_snr_worst_tenth": low}
 
     def examples(self) -> dict[str, Tensor]:
-        signal, ears = (tensor[1:2].to(self.device) for tensor in self.valid[0])
+        signal, ears = (tensor[-1:].to(self.device) for tensor in self.valid[0])
         heard = self.kept.module(signal, ears)
         return {"given": signal[0], "heard/truth": self.teacher(signal, ears)[0], "heard/network": heard[0]}
 
@@ -188,17 +183,17 @@ class SimulatorTraining(TimedModule):
         self.kept.update_parameters(self.student)
 
 
-def validation_set(data: SimulatorData, recipe: SimulatorRecipe) -> list[tuple[Tensor, Tensor]]:
+def validation_set(data: TrainingData, recipe: SimulatorRecipe) -> list[tuple[Tensor, Tensor]]:
     """Fixed items: every second one noisy (0 to 20 dB); measured, standard and drawn ears in turn.
 
     50 to 80 dB SPL, or the recipe's levels where it treats no clip.
     """
     generator = torch.Generator().manual_seed(1_000 + recipe.seed)
     options: dict[str, Any] = {"sample_rate": NEURO_RATE, "seconds": 2.0}
-    speech = Clips(data.valid_speech or data.speech, **options)
-    noise_folder = data.valid_noise or data.noise
-    noise = Clips(noise_folder, repeat=True, **options) if noise_folder else None
-    measured = _thresholds(data.valid_audiograms or data.audiograms)
+    valid = data.validation()
+    speech = Clips(valid.speech, **options)
+    noise = Clips(valid.noise, repeat=True, **options) if valid.noise else None
+    measured = read_thresholds(valid.audiograms)
     standard = torch.tensor([Audiogram.standard(name).thresholds for name in MILDER])
     batches = []
     for _ in range(0, recipe.validation_items, 8):
@@ -217,7 +212,7 @@ def validation_set(data: SimulatorData, recipe: SimulatorRecipe) -> list[tuple[T
 
 
 def train_simulator(
-    data: SimulatorData,
+    data: Any,
     recipe: SimulatorRecipe,
     *,
     out: str | Path,
@@ -229,15 +224,19 @@ def train_simulator(
     strategy: str = "auto",
     report: Callable[[str], None] = print,
     progress: bool = True,
+    kind: type[SimulatorTraining] = SimulatorTraining,
 ) -> Path:
     """Train, resume, and keep the best checkpoint.
+
+    Args:
+        data: a ``TrainingData``, or what another ``kind`` of training takes.
 
     Returns: the folder that ``load_pretrained`` takes, ``out/checkpoint``.
 
     Raises:
         ValueError: data or recipe that cannot be used; the message names them.
     """
-    module = SimulatorTraining(recipe, data, max_minutes)
+    module = kind(recipe, data, max_minutes)
     folder = Path(out) / "checkpoint"
 
     def write(figures: dict[str, Any]) -> None:
@@ -261,7 +260,3 @@ def train_simulator(
         progress=progress,
     )
     return folder
-
-
-def _thresholds(path: Path | None) -> Tensor | None:
-    return torch.tensor([ear.thresholds for _, ear in read_audiograms(path)]) if path else None

@@ -10,11 +10,11 @@ from compensators import MappingCompensator, load_compensator
 from hlsim import Audiogram
 from hlsim.pretrained import CONFIG
 from hlsim.training.compensator import (
-    CompensatorData,
     CompensatorRecipe,
     CompensatorTraining,
     train_compensator,
 )
+from hlsim.training.sources import TrainingData
 
 SMALL = {
     "model": {"channels": 8, "blocks": 1, "stride": [4, 3]},
@@ -27,11 +27,11 @@ EVER = 1e6  # minutes, so that the learning rate does not fall within a test
 
 
 @pytest.fixture
-def data(speech_dir: Path) -> CompensatorData:
-    return CompensatorData(speech_dir / "train", valid_speech=speech_dir / "valid")
+def data(speech_dir: Path) -> TrainingData:
+    return TrainingData(speech_dir / "train", valid_speech=speech_dir / "valid")
 
 
-def train(data: CompensatorData, out: Path, **options: object) -> tuple[Path, list[str]]:
+def train(data: TrainingData, out: Path, **options: object) -> tuple[Path, list[str]]:
     """A few steps through the exact MSBG."""
     lines: list[str] = []
     settings = {"max_minutes": EVER, "simulator": "msbg", "accelerator": "cpu", "progress": False} | options
@@ -40,7 +40,7 @@ def train(data: CompensatorData, out: Path, **options: object) -> tuple[Path, li
     return folder, lines
 
 
-def test_twenty_steps_lower_the_loss(data: CompensatorData, tmp_path: Path) -> None:
+def test_twenty_steps_lower_the_loss(data: TrainingData, tmp_path: Path) -> None:
     ear = Audiogram.standard("N3")
     folder, lines = train(data, tmp_path, audiogram=ear, max_steps=20, recipe={"learning_rate": 1e-2})
     about = json.loads((folder / CONFIG).read_text())["about"]
@@ -58,7 +58,7 @@ def test_twenty_steps_lower_the_loss(data: CompensatorData, tmp_path: Path) -> N
     assert module.validate()["valid_loss"] == pytest.approx(about["validation"]["valid_loss"])
 
 
-def test_goes_on_where_it_was_stopped(data: CompensatorData, tmp_path: Path) -> None:
+def test_goes_on_where_it_was_stopped(data: TrainingData, tmp_path: Path) -> None:
     options = {"recipe": {"validate_every": 2, "seconds": 0.2}}
     whole, _ = train(data, tmp_path / "whole", max_steps=6, **options)
 
@@ -91,14 +91,14 @@ def test_goes_on_where_it_was_stopped(data: CompensatorData, tmp_path: Path) -> 
     assert whole.name == resumed.name == "checkpoint"
 
 
-def test_another_recipe_does_not_go_on(data: CompensatorData, tmp_path: Path) -> None:
+def test_another_recipe_does_not_go_on(data: TrainingData, tmp_path: Path) -> None:
     options = {"recipe": {"seconds": 0.2}, "max_steps": 1}
     train(data, tmp_path, audiogram=Audiogram.standard("N3"), **options)
     with pytest.raises(ValueError, match="another recipe"):
         train(data, tmp_path, audiogram=Audiogram.standard("N4"), **options)
 
 
-def test_general_one_draws_ears_and_noise(data: CompensatorData, tmp_path: Path) -> None:
+def test_general_one_draws_ears_and_noise(data: TrainingData, tmp_path: Path) -> None:
     rows = ["name," + ",".join(f"hl_{hz}" for hz in (250, 500, 1000, 2000, 3000, 4000, 6000, 8000))]
     rows += [f"ear{i}," + ",".join(str(60 + i) for _ in range(8)) for i in range(3)]
     ears = tmp_path / "ears.csv"
@@ -106,7 +106,7 @@ def test_general_one_draws_ears_and_noise(data: CompensatorData, tmp_path: Path)
     noise = data.speech
     module = CompensatorTraining(
         CompensatorRecipe.from_dict(SMALL | {"weights": {"bands": 1.0, "paper": 0.5}}),
-        CompensatorData(data.speech, noise=noise, audiograms=ears),
+        TrainingData(data.speech, noise=noise, audiograms=ears),
         EVER,
         simulator="msbg",
     )
@@ -131,6 +131,6 @@ def test_general_one_draws_ears_and_noise(data: CompensatorData, tmp_path: Path)
         ({"model": {"layers": 2}}, "unknown network settings layers"),
     ],
 )
-def test_bad_recipes(data: CompensatorData, settings: dict[str, object], message: str) -> None:
+def test_bad_recipes(data: TrainingData, settings: dict[str, object], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         CompensatorTraining(CompensatorRecipe.from_dict(settings), data, EVER, simulator="msbg")

@@ -13,7 +13,8 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from hlsim.calibration import set_level
 from hlsim.training.examples import spectrogram_image
-from hlsim.training.simulator import SimulatorData, SimulatorRecipe, train_simulator
+from hlsim.training.simulator import SimulatorRecipe, train_simulator
+from hlsim.training.sources import TrainingData
 
 
 def test_a_tone_is_a_line_at_its_frequency_and_silence_is_black() -> None:
@@ -35,7 +36,7 @@ def test_a_training_shows_what_was_given_and_heard(tmp_path: Path, speech_dir: P
         "validation_items": 8,
     }
     train_simulator(
-        SimulatorData(speech_dir / "train"),
+        TrainingData(speech_dir / "train"),
         SimulatorRecipe.from_dict(recipe),
         out=tmp_path,
         max_minutes=5.0,

@@ -21,12 +21,12 @@ pytest.importorskip("lightning")
 
 from hlsim.training.simulator import (
     MILDER,
-    SimulatorData,
     SimulatorRecipe,
     SimulatorTraining,
     train_simulator,
     validation_set,
 )
+from hlsim.training.sources import TrainingData
 
 TINY = {
     "model": {"channels": 4, "blocks": 1, "stride": [4, 3], "kernel": [3, 3]},
@@ -39,11 +39,11 @@ EVER = 1e6  # minutes, so that the learning rate does not fall within a test
 
 
 @pytest.fixture
-def data(speech_dir: Path) -> SimulatorData:
-    return SimulatorData(speech_dir / "train")
+def data(speech_dir: Path) -> TrainingData:
+    return TrainingData(speech_dir / "train")
 
 
-def train(data: SimulatorData, out: Path, recipe: dict[str, Any] | None = None, **options: Any) -> list[str]:
+def train(data: TrainingData, out: Path, recipe: dict[str, Any] | None = None, **options: Any) -> list[str]:
     """A few steps; the lines reported."""
     lines: list[str] = []
     settings = {
@@ -62,7 +62,7 @@ def state(out: Path) -> dict[str, Any]:
     return loaded
 
 
-def test_eight_steps_leave_a_checkpoint_that_loads_and_a_state(data: SimulatorData, tmp_path: Path) -> None:
+def test_eight_steps_leave_a_checkpoint_that_loads_and_a_state(data: TrainingData, tmp_path: Path) -> None:
     lines = train(data, tmp_path / "out", max_steps=8)
     assert [line.split(",")[0] for line in lines] == ["step 4", "step 8", "step 8"]
     assert "valid_snr_median" in lines[0] and "valid_snr_worst_tenth" in lines[0]
@@ -86,7 +86,7 @@ def test_eight_steps_leave_a_checkpoint_that_loads_and_a_state(data: SimulatorDa
 def test_a_short_training_on_synthetic_speech_beats_the_untrained_network(
     speech_dir: Path, tmp_path: Path
 ) -> None:
-    data = SimulatorData(speech_dir / "train", valid_speech=speech_dir / "valid")
+    data = TrainingData(speech_dir / "train", valid_speech=speech_dir / "valid")
     recipe = {
         "model": {"channels": 16, "blocks": 1},
         "batch": 3,
@@ -103,7 +103,7 @@ def test_a_short_training_on_synthetic_speech_beats_the_untrained_network(
     assert module.validate()["valid_snr_median"] > untrained + 0.5
 
 
-def test_averaged_weights_are_what_is_validated_and_kept(data: SimulatorData, tmp_path: Path) -> None:
+def test_averaged_weights_are_what_is_validated_and_kept(data: TrainingData, tmp_path: Path) -> None:
     train(data, tmp_path / "out", {"average": 0.9}, max_steps=4)
     kept = load_pretrained(tmp_path / "out" / "checkpoint").state_dict()
     states = state(tmp_path / "out")["state_dict"]
@@ -111,7 +111,7 @@ def test_averaged_weights_are_what_is_validated_and_kept(data: SimulatorData, tm
     assert any(not torch.equal(kept[name], states[f"student.{name}"]) for name in kept)
 
 
-def test_lower_precision_is_near_and_leaves_the_physics_alone(data: SimulatorData) -> None:
+def test_lower_precision_is_near_and_leaves_the_physics_alone(data: TrainingData) -> None:
     losses = []
     for precision in ("float32", "bfloat16"):
         module = SimulatorTraining(SimulatorRecipe.from_dict(TINY | {"precision": precision}), data, EVER)
@@ -136,7 +136,7 @@ def test_values_of_a_recipe_that_are_not_allowed(setting: dict[str, Any], said: 
         SimulatorRecipe.from_dict(TINY | setting)
 
 
-def test_stopped_and_resumed_is_as_good_as_uninterrupted(data: SimulatorData, tmp_path: Path) -> None:
+def test_stopped_and_resumed_is_as_good_as_uninterrupted(data: TrainingData, tmp_path: Path) -> None:
     train(data, tmp_path / "whole", max_steps=8)
     train(data, tmp_path / "parts", max_steps=4)
     assert state(tmp_path / "parts")["global_step"] == 4
@@ -152,18 +152,19 @@ KILLED = """
 import sys
 from pathlib import Path
 import torch
-from hlsim.training.simulator import SimulatorData, SimulatorRecipe, train_simulator
+from hlsim.training.simulator import SimulatorRecipe, train_simulator
+from hlsim.training.sources import TrainingData
 
 torch.set_num_threads(1)
 train_simulator(
-    SimulatorData(Path(sys.argv[1])), SimulatorRecipe.from_dict({recipe}), out=sys.argv[2], max_minutes={minutes},
+    TrainingData(Path(sys.argv[1])), SimulatorRecipe.from_dict({recipe}), out=sys.argv[2], max_minutes={minutes},
     accelerator="cpu", progress=False,
 )
 """
 
 
 @pytest.mark.slow
-def test_a_killed_run_goes_on(data: SimulatorData, tmp_path: Path) -> None:
+def test_a_killed_run_goes_on(data: TrainingData, tmp_path: Path) -> None:
     recipe = TINY | {"validate_every": 2}
     out = tmp_path / "out"
     root = str(Path(__file__).parents[2])
@@ -195,10 +196,10 @@ def test_a_killed_run_goes_on(data: SimulatorData, tmp_path: Path) -> None:
     assert state(out)["global_step"] == reached + 2
 
 
-def test_another_recipe_or_other_data_need_another_folder(data: SimulatorData, tmp_path: Path) -> None:
+def test_another_recipe_or_other_data_need_another_folder(data: TrainingData, tmp_path: Path) -> None:
     train(data, tmp_path, max_steps=4)
     before = (tmp_path / "last.ckpt").read_bytes()
-    other = SimulatorData(data.speech.parent / "valid")
+    other = TrainingData(data.speech.parent / "valid")
     for changed, recipe, options in (
         (data, {"seed": 1}, {}),
         (data, {"model": TINY["model"] | {"channels": 5}}, {}),  # type: ignore[operator]
@@ -227,7 +228,7 @@ def test_unknown_names_in_a_recipe(recipe: dict[str, Any], said: str) -> None:
         SimulatorRecipe.from_dict(recipe)
 
 
-def test_unknown_settings_of_the_network(data: SimulatorData, tmp_path: Path) -> None:
+def test_unknown_settings_of_the_network(data: TrainingData, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="unknown network settings layers; allowed: fft, window"):
         train(data, tmp_path / "out", {"model": {"layers": 3}})
     assert not (tmp_path / "out").exists()
@@ -240,13 +241,13 @@ def test_missing_data_is_named_before_anything_is_written(
     nowhere = tmp_path / "nowhere"
     given = {"speech": speech_dir / "train"} | {missing: nowhere}
     with pytest.raises(ValueError, match=r"no such folder|cannot read audiograms") as caught:
-        train(SimulatorData(**given), tmp_path / "out", max_steps=1)
+        train(TrainingData(**given), tmp_path / "out", max_steps=1)
     assert str(caught.value).startswith(str(nowhere))
     assert not (tmp_path / "out").exists()
 
 
 @pytest.fixture
-def rich(speech_dir: Path, tmp_path: Path) -> SimulatorData:
+def rich(speech_dir: Path, tmp_path: Path) -> TrainingData:
     """Speech, noise and measured ears."""
     write_audio(tmp_path / "noise" / "a.wav", torch.randn(1, 20000), 16000) if (
         tmp_path / "noise"
@@ -254,12 +255,12 @@ def rich(speech_dir: Path, tmp_path: Path) -> SimulatorData:
     write_audio(tmp_path / "noise" / "a.wav", 0.1 * torch.randn(1, 20000), 16000)
     row = Audiogram.standard("N5").to_row()
     (tmp_path / "ears.csv").write_text(",".join(row) + "\n" + ",".join(row.values()) + "\n")
-    return SimulatorData(
+    return TrainingData(
         speech_dir / "train", tmp_path / "noise", tmp_path / "ears.csv", valid_speech=speech_dir / "valid"
     )
 
 
-def test_noise_ears_and_all_criteria_train(rich: SimulatorData) -> None:
+def test_noise_ears_and_all_criteria_train(rich: TrainingData) -> None:
     weights = {"snr": 1.0, "log_spectrum": 0.5, "magnitude": 0.9, "phase": 0.3, "complex": 0.1, "time": 0.2}
     module = SimulatorTraining(SimulatorRecipe.from_dict(TINY | {"weights": weights}), rich, EVER)
     loss = module.training_loss(torch.Generator().manual_seed(0))
@@ -273,7 +274,7 @@ def test_noise_ears_and_all_criteria_train(rich: SimulatorData) -> None:
     assert torch.equal(first, again)
 
 
-def test_the_validation_set_is_fixed_and_as_described(rich: SimulatorData) -> None:
+def test_the_validation_set_is_fixed_and_as_described(rich: TrainingData) -> None:
     recipe = SimulatorRecipe.from_dict(TINY | {"validation_items": 24})
     batches = validation_set(rich, recipe)
     torch.rand(3)

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from hlsim.evaluation.parallel import run_parallel
+from hlsim.parallel import run_parallel
 
 pytest.importorskip("joblib")
 
@@ -93,7 +93,7 @@ def test_bad_settings() -> None:
 
 def test_no_scheduler(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("distributed")
-    monkeypatch.setattr("hlsim.evaluation.parallel._PATIENCE", 0.5)
+    monkeypatch.setattr("hlsim.parallel._PATIENCE", 0.5)
     with pytest.raises(ValueError, match=r"no Dask scheduler answers at tcp://127\.0\.0\.1:9"):
         list(run_parallel(square, [1], backend="dask", scheduler="tcp://127.0.0.1:9"))
 

@@ -1,0 +1,113 @@
+"""Checking a corpus: what there is, and every file of it read."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+from hlsim.audio import read_audio
+from hlsim.data.active_level import active_level_db
+from hlsim.data.corpora import Fault, Found, walk_audio
+from hlsim.data.manifest import inside
+from hlsim.parallel import run_parallel
+
+
+class Listing:
+    """What a first look at the corpus tells: its speakers, and a digest of names, sizes and times of change."""
+
+    def __init__(self) -> None:
+        self.speakers: dict[str, set[str]] = {}
+        self.paired = self.total = 0
+        self._digest = hashlib.sha256()
+
+    def add(self, root: Path, found: Found) -> None:
+        self.total += 1
+        if isinstance(found, Fault):
+            self._digest.update(f"{found}\n".encode())
+            return
+        self.speakers.setdefault(found.speaker, set()).add(found.split)
+        self.paired += bool(found.noisy)
+        self._digest.update(f"{found} {_state(root / found.clean)} {_state(root / found.noisy)}\n".encode())
+
+    def digest(self, noise: Path | None, *tables: Path | None) -> str:
+        if noise is not None:
+            for path in walk_audio(noise):
+                self._digest.update(f"{path} {_state(noise / path)}\n".encode())
+        for table in tables:
+            self._digest.update(f"{table and _state(table)}\n".encode())
+        return self._digest.hexdigest()
+
+
+def _state(path: Path) -> tuple[int, int] | None:
+    try:
+        about = path.stat()
+    except OSError:
+        return None
+    return about.st_size, about.st_mtime_ns
+
+
+def examine(root: Path, found: Found, *, shortest: float, pairs: bool) -> Found:
+    """The utterance with rate, seconds and active level, or what is at fault with its files, which are read whole."""
+    if isinstance(found, Fault):
+        return found
+    path = found.clean
+    try:
+        clean, rate = read_audio(inside(root, path))
+        seconds = clean.shape[-1] / rate
+        if seconds < shortest:
+            return Fault(path, f"{seconds:.3g} s; {shortest:g} s or more are asked for")
+        if not bool(clean[0].any()):
+            return Fault(path, "silent first channel")
+        if pairs and not found.noisy:
+            return Fault(path, "no noisy counterpart, and others have one")
+        if found.noisy:
+            path = found.noisy
+            noisy, noisy_rate = read_audio(inside(root, path))
+            if not bool(noisy[0].any()):
+                return Fault(path, "silent first channel")
+            if noisy_rate != rate:
+                return Fault(path, f"{noisy_rate} Hz, its clean speech has {rate} Hz")
+            if noisy.shape[-1] != clean.shape[-1]:
+                return Fault(
+                    path,
+                    f"{noisy.shape[-1]} samples, its clean speech has {clean.shape[-1]}: unequal lengths",
+                )
+    except ValueError as error:
+        return Fault(path, str(error).removeprefix(f"{root / path}: "))
+    level = active_level_db(clean[0], rate)
+    return replace(found, rate=rate, seconds=seconds, active_level=level)
+
+
+def examine_all(
+    items: Iterable[Found],
+    root: Path,
+    *,
+    shortest: float,
+    pairs: bool,
+    jobs: int | None = None,
+    backend: str = "loky",
+    scheduler: str | None = None,
+) -> Iterator[Found]:
+    """``examine`` of each item, in order; a process that dies is a fault of its file.
+
+    Args:
+        jobs, backend, scheduler: see ``run_parallel``.
+    """
+    task = partial(_numbered, root, shortest, pairs)
+    waiting: dict[int, Found] = {}
+    wanted = 0
+    for (number, item), found in run_parallel(
+        task, enumerate(items), jobs=jobs, backend=backend, scheduler=scheduler
+    ):
+        path = item.path if isinstance(item, Fault) else item.clean
+        waiting[number] = found or Fault(path, "the process that read it died")
+        while wanted in waiting:
+            yield waiting.pop(wanted)
+            wanted += 1
+
+
+def _numbered(root: Path, shortest: float, pairs: bool, task: tuple[int, Found]) -> Found:
+    return examine(root, task[1], shortest=shortest, pairs=pairs)

@@ -1,0 +1,249 @@
+"""Utterances of a corpus: VoiceBank-DEMAND's published layout, LibriSpeech's, or any folder with an optional CSV file.
+
+Each layout is a generator that never holds the whole corpus.
+"""
+
+from __future__ import annotations
+
+import csv
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from random import Random
+
+from hlsim.audio import EXTENSIONS
+from hlsim.data.manifest import SPLITS, Utterance, inside
+
+LAYOUTS = ("voicebank-demand", "librispeech", "folder")
+
+_VOICEBANK = (("trainset_28spk", "train"), ("trainset_56spk", "train"), ("testset", "test"))
+_LIBRISPEECH = {"train": "train", "dev": "valid", "test": "test"}
+_SPLIT_FOLDERS = {"train": "train", "valid": "valid", "dev": "valid", "test": "test"}
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """A file that is left out, and why."""
+
+    path: str
+    reason: str
+
+
+Found = Utterance | Fault
+
+
+def detect_layout(corpus: Path) -> str:
+    """Which layout a folder has. Raises ValueError where there is no such folder."""
+    if not corpus.is_dir():
+        raise ValueError(f"{corpus}: no such folder")
+    if any((corpus / f"clean_{name}_wav").is_dir() for name, _ in _VOICEBANK):
+        return "voicebank-demand"
+    return "librispeech" if _librispeech_parts(corpus) else "folder"
+
+
+def find_utterances(corpus: Path, layout: str, table: Path | None = None) -> Iterator[Found]:
+    """Utterances with paths below ``corpus``, and what is at fault; split is empty where the corpus does not say.
+
+    Args:
+        layout: one of ``LAYOUTS``.
+        table: CSV file with a column ``file`` (path below the corpus) and any of ``id``, ``speaker``, ``split``,
+            ``noisy``, ``noise``, ``snr``; then only what it lists is taken.
+
+    Raises:
+        ValueError: the table cannot be read or holds what it cannot.
+    """
+    if table is not None:
+        return _listed(corpus, table)
+    if layout == "voicebank-demand":
+        return _voicebank(corpus)
+    return _librispeech(corpus) if layout == "librispeech" else _folder(corpus)
+
+
+def assign_splits(
+    speakers: dict[str, set[str]], *, test_share: float, valid_share: float, seed: int
+) -> dict[str, str]:
+    """The split of every speaker.
+
+    Where the corpus gives no split at all, ``test_share`` of the speakers are for test; ``valid_share`` of those to
+    train with are for validation. Both are drawn from the seed; at least one speaker each, where the share is not 0 and
+    another remains to train with.
+
+    Args:
+        speakers: the splits in which the corpus has each; "" where it does not say.
+
+    Raises:
+        ValueError: a speaker is in two splits.
+    """
+    for speaker, splits in sorted(speakers.items()):
+        if len(splits - {""}) > 1:
+            raise ValueError(
+                f"speaker {speaker} is in {' and '.join(sorted(splits - {''}))}; allowed: one split a speaker "
+                "(a --table with a column speaker or split says otherwise)"
+            )
+    assigned = {speaker: max(splits) or "train" for speaker, splits in speakers.items()}
+    given = any(splits != {""} for splits in speakers.values())
+    for split, share in (("test", 0.0 if given else test_share), ("valid", valid_share)):
+        training = sorted(speaker for speaker, own in assigned.items() if own == "train")
+        count = min(max(1, round(share * len(training))), len(training) - 1) if share else 0
+        for speaker in Random(f"{seed}:{split}").sample(training, count):
+            assigned[speaker] = split
+    return assigned
+
+
+def walk_audio(folder: Path) -> Iterator[str]:
+    """Paths of wav, flac and ogg files below a folder in POSIX form, folder by folder in order of names."""
+    for place, folders, names in os.walk(folder):
+        folders[:] = sorted(name for name in folders if not name.startswith("."))
+        below = Path(place).relative_to(folder)
+        for name in sorted(names):
+            if Path(name).suffix.lower() in EXTENSIONS and not name.startswith("."):
+                yield (below / name).as_posix()
+
+
+def _stem(path: str) -> str:
+    return path.removesuffix(Path(path).suffix)
+
+
+def _voicebank(corpus: Path) -> Iterator[Found]:
+    """``clean_trainset_28spk_wav/p226_001.wav`` and so on; ``log_trainset_28spk.txt`` tells noise and SNR."""
+    for name, split in _VOICEBANK:
+        clean, noisy = f"clean_{name}_wav", f"noisy_{name}_wav"
+        if not (corpus / clean).is_dir():
+            continue
+        noises = _voicebank_log(corpus, name)
+        for path in walk_audio(corpus / clean):
+            if not (corpus / noisy / path).is_file():
+                yield Fault(f"{clean}/{path}", f"no noisy counterpart {noisy}/{path}")
+                continue
+            key = Path(path).stem
+            noise, snr = noises.get(key, ("", None))
+            speaker = key.split("_")[0]
+            yield Utterance(key, speaker, split, f"{clean}/{path}", f"{noisy}/{path}", noise, snr)
+        for path in walk_audio(corpus / noisy):
+            if not (corpus / clean / path).is_file():
+                yield Fault(f"{noisy}/{path}", f"no clean counterpart {clean}/{path}")
+
+
+def _voicebank_log(corpus: Path, name: str) -> dict[str, tuple[str, float | None]]:
+    """Noise and SNR by utterance: lines such as ``p226_001 office 15``."""
+    noises: dict[str, tuple[str, float | None]] = {}
+    for place in (corpus / f"log_{name}.txt", corpus / "logfiles" / f"log_{name}.txt"):
+        if place.is_file():
+            for line in place.read_text(encoding="utf-8", errors="replace").splitlines():
+                parts = line.split()
+                if len(parts) == 3:
+                    try:
+                        noises[parts[0]] = (parts[1], float(parts[2]))
+                    except ValueError:
+                        noises[parts[0]] = (parts[1], None)
+    return noises
+
+
+def _librispeech_parts(corpus: Path) -> list[tuple[str, str]]:
+    """Folders such as ``train-clean-100`` with the split of each."""
+    inner = "LibriSpeech/" if (corpus / "LibriSpeech").is_dir() else ""
+    parts = []
+    for place in sorted((corpus / inner).iterdir()):
+        head, dash, _ = place.name.partition("-")
+        if dash and head in _LIBRISPEECH and place.is_dir():
+            parts.append((inner + place.name, _LIBRISPEECH[head]))
+    return parts
+
+
+def _librispeech(corpus: Path) -> Iterator[Found]:
+    """``train-clean-100/<speaker>/<chapter>/<speaker>-<chapter>-<number>.flac`` and so on."""
+    for part, split in _librispeech_parts(corpus):
+        for path in walk_audio(corpus / part):
+            key = Path(path).stem
+            yield Utterance(key, key.split("-")[0], split, f"{part}/{path}")
+
+
+def _folder(corpus: Path) -> Iterator[Found]:
+    """Any folder: the speaker is the folder that holds a file; a folder train, valid, dev or test on top is the split.
+
+    Where a folder ``clean`` has a neighbour ``noisy``, files of equal names in them are pairs.
+    """
+    here: list[str] = []
+    seen: set[str] = set()
+    for path in walk_audio(corpus):
+        parts = path.split("/")
+        split = _SPLIT_FOLDERS.get(parts[0], "") if len(parts) > 1 else ""
+        for side, other in (("clean", "noisy"), ("noisy", "clean")):
+            if side in parts[:-1] and (corpus / path.split(f"{side}/")[0] / other).is_dir():
+                place = parts.index(side)
+                counterpart = "/".join([*parts[:place], other, *parts[place + 1 :]])
+                break
+        else:
+            side, counterpart, place = "", "", -1
+        if counterpart and not (corpus / counterpart).is_file():
+            yield Fault(path, f"no {other} counterpart {counterpart}")
+        elif side != "noisy":
+            key = _stem(path)
+            if parts[:-1] != here:
+                here, seen = parts[:-1], set()
+            if key in seen:
+                yield Fault(path, f"a second file of the name {key}")
+                continue
+            seen.add(key)
+            speaker = "/".join(
+                part for i, part in enumerate(parts[:-1]) if i != place and not (i == 0 and split)
+            )
+            yield Utterance(key, speaker or "unknown", split, path, counterpart)
+
+
+def _listed(corpus: Path, table: Path) -> Iterator[Found]:
+    """What a CSV file lists."""
+    seen: set[str] = set()
+    try:
+        with open(table, newline="", encoding="utf-8-sig") as file:
+            for number, row in enumerate(csv.DictReader(file), start=2):
+                row = {name: (value or "").strip() for name, value in row.items() if name}
+                path, where = row.get("file", ""), f"{table}, line {number}"
+                if not path:
+                    raise ValueError(f"{where}: no file named; needs a column 'file' with a path a row")
+                if row.get("split", "") not in ("", *SPLITS):
+                    raise ValueError(
+                        f"{where}: split {row['split']!r}; allowed: {', '.join(SPLITS)}, or none"
+                    )
+                key = row.get("id") or _stem(path)
+                try:
+                    snr = float(row["snr"]) if row.get("snr") else None
+                except ValueError:
+                    raise ValueError(f"{where}: snr {row['snr']!r}; allowed: a number of dB") from None
+                if key in seen:
+                    raise ValueError(f"{where}: a second row of {key}; allowed: one row an utterance")
+                seen.add(key)
+                for name in filter(None, (path, row.get("noisy"))):
+                    inside(corpus, name)
+                yield Utterance(
+                    key,
+                    row.get("speaker") or "/".join(path.split("/")[:-1]) or "unknown",
+                    row.get("split", ""),
+                    path,
+                    row.get("noisy", ""),
+                    row.get("noise", "") if row.get("noisy") else "",
+                    snr if row.get("noisy") else None,
+                )
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise ValueError(f"{table}: cannot be read as CSV ({error})") from error
+
+
+def find_below(
+    root: Path, corpus: str, layout: str, table: Path | None = None, noise: str | None = None
+) -> Iterator[Found]:
+    """As ``find_utterances`` of ``root / corpus``, with paths below the root, and without what is in the folder noise."""
+    for found in find_utterances(root / corpus, layout, table):
+        placed = _below(found, corpus)
+        path = placed.path if isinstance(placed, Fault) else placed.clean
+        if noise is None or not path.startswith(f"{noise}/"):
+            yield placed
+
+
+def _below(found: Found, prefix: str) -> Found:
+    if not prefix:
+        return found
+    if isinstance(found, Fault):
+        return replace(found, path=f"{prefix}/{found.path}")
+    noisy = f"{prefix}/{found.noisy}" if found.noisy else ""
+    return replace(found, clean=f"{prefix}/{found.clean}", noisy=noisy)

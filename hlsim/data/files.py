@@ -1,0 +1,68 @@
+"""Files that are written whole or not at all."""
+
+from __future__ import annotations
+
+import errno
+import os
+from pathlib import Path
+from types import TracebackType
+from typing import IO, Self
+
+PARTIAL = ".part"
+"""Ending of a file that is not yet whole."""
+
+
+class Whole:
+    """A file under a temporary name, until ``keep`` gives it its own; left without that, it is removed.
+
+    Raises:
+        ValueError: it cannot be written; the message says so where the disk is full.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        self._partial = self.path.with_name(f".{self.path.name}.{os.getpid()}{PARTIAL}")
+        self._file: IO[bytes] | None = None
+
+    def __enter__(self) -> Self:
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            self._file = open(self._partial, "wb")
+        except OSError as error:
+            raise self._refusal(error) from error
+        return self
+
+    def write(self, data: str | bytes) -> None:
+        assert self._file is not None
+        try:
+            self._file.write(data.encode() if isinstance(data, str) else data)
+        except OSError as error:
+            raise self._refusal(error) from error
+
+    def keep(self) -> None:
+        """End the file and give it its name, over what had it."""
+        assert self._file is not None
+        try:
+            self._file.close()
+            os.replace(self._partial, self.path)
+        except OSError as error:
+            raise self._refusal(error) from error
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        try:
+            if self._file is not None:
+                self._file.close()
+        except OSError:
+            pass  # what could not be flushed is thrown away
+        finally:
+            self._partial.unlink(missing_ok=True)
+
+    def _refusal(self, error: OSError) -> ValueError:
+        if error.errno in (errno.ENOSPC, errno.EDQUOT):
+            return ValueError(
+                f"{self.path}: the disk is full; what was finished is kept, and with more space the same command goes on "
+                "from there"
+            )
+        return ValueError(f"{self.path}: cannot be written ({error.strerror})")

@@ -1,0 +1,166 @@
+"""The manifest: a CSV row an utterance, with paths that never lead out of the root."""
+
+from __future__ import annotations
+
+import csv
+import io
+import os
+from array import array
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields
+from functools import lru_cache
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+SPLITS = ("train", "valid", "test")
+
+
+@dataclass(frozen=True, slots=True)
+class Utterance:
+    """One row of a manifest.
+
+    Attributes:
+        id: unique in the manifest.
+        speaker: one that is in no other split.
+        split: train, valid or test.
+        clean: path of the clean speech below the root.
+        noisy: path of its recorded or published noisy counterpart; empty where there is none.
+        noise: its type; or, without ``noisy``, the path below the root of the noise to mix in; or empty.
+        snr: signal-to-noise ratio in dB by active speech level; None where unknown or without noise.
+        noise_start: second of the noise at which mixing starts.
+        rate: of the files, Hz.
+        seconds: length.
+        active_level: active speech level of the clean speech (ITU-T P.56) in dB relative to RMS 1.0.
+    """
+
+    id: str
+    speaker: str
+    split: str
+    clean: str
+    noisy: str = ""
+    noise: str = ""
+    snr: float | None = None
+    noise_start: float | None = None
+    rate: int = 0
+    seconds: float = 0.0
+    active_level: float = 0.0
+
+    def to_row(self) -> dict[str, str]:
+        row = {name: getattr(self, name) for name in UTTERANCE_COLUMNS}
+        return {name: _text(value) for name, value in row.items()}
+
+    @classmethod
+    def from_row(cls, row: Mapping[str, str]) -> Utterance:
+        """Raises ValueError where a column is missing or holds what it cannot."""
+        try:
+            utterance = cls(
+                id=row["id"],
+                speaker=row["speaker"],
+                split=row["split"],
+                clean=row["clean"],
+                noisy=row["noisy"],
+                noise=row["noise"],
+                snr=float(row["snr"]) if row["snr"] else None,
+                noise_start=float(row["noise_start"]) if row["noise_start"] else None,
+                rate=int(row["rate"]),
+                seconds=float(row["seconds"]),
+                active_level=float(row["active_level"]),
+            )
+        except (KeyError, TypeError, ValueError) as error:
+            raise ValueError(
+                f"no row of a manifest ({error!r}); allowed: {', '.join(UTTERANCE_COLUMNS)}"
+            ) from None
+        if utterance.split not in SPLITS:
+            raise ValueError(f"split {utterance.split!r}; allowed: {', '.join(SPLITS)}")
+        return utterance
+
+    @property
+    def mixed(self) -> bool:
+        """Whether the noisy counterpart is made from ``clean`` and ``noise``."""
+        return not self.noisy and bool(self.noise)
+
+
+UTTERANCE_COLUMNS = tuple(entry.name for entry in fields(Utterance))
+
+
+def inside(root: str | Path, relative: str) -> Path:
+    """The path ``root / relative``, or ValueError where it leads out of the root, be it through .. or a link."""
+    path = PurePosixPath(relative)
+    full = Path(root) / path
+    if path.is_absolute() or ".." in path.parts or not full.resolve().is_relative_to(_resolved(str(root))):
+        raise ValueError(
+            f"{relative}: leads out of {root}; allowed: paths below it, without .. and links out"
+        )
+    return full
+
+
+class Rows(Sequence[dict[str, str]]):
+    """Rows of a CSV file, read when asked for: only their places are kept, 8 bytes a row.
+
+    Raises:
+        ValueError: the file cannot be read, or lacks a column.
+    """
+
+    def __init__(self, path: str | Path, columns: Iterable[str]) -> None:
+        self.path = Path(path)
+        self._places = array("Q", [0])
+        try:
+            with open(self.path, "rb") as file:
+                for line in file:
+                    self._places.append(self._places[-1] + len(line))
+        except OSError as error:
+            raise ValueError(f"{path}: cannot be read ({error.strerror})") from error
+        self._open()
+        self.columns = self._parse(0) if len(self._places) > 1 else []
+        if missing := [name for name in columns if name not in self.columns]:
+            raise ValueError(
+                f"{path}: no column {', '.join(missing)}; allowed: a CSV file of 'hlsim prepare'"
+            )
+
+    def __len__(self) -> int:
+        return len(self._places) - 2
+
+    def __getitem__(self, index: Any) -> Any:
+        if isinstance(index, slice):
+            return [self[i] for i in range(*index.indices(len(self)))]
+        if not -len(self) <= index < len(self):
+            raise IndexError(index)
+        cells = self._parse(index % len(self) + 1)
+        if len(cells) != len(self.columns):
+            raise ValueError(
+                f"{self.path}, line {index % len(self) + 2}: {len(cells)} cells; allowed: {len(self.columns)}"
+            )
+        return dict(zip(self.columns, cells, strict=True))
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in self.__dict__.items() if name != "_file"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._open()
+
+    def _open(self) -> None:
+        self._file = open(self.path, "rb")  # noqa: SIM115 - kept open for as long as the rows are wanted
+
+    def _parse(self, line: int) -> list[str]:
+        start, end = self._places[line], self._places[line + 1]
+        text = os.pread(self._file.fileno(), end - start, start).decode("utf-8-sig")  # safe after a fork
+        return next(csv.reader([text]), [])
+
+
+def csv_line(cells: Iterable[object]) -> str:
+    """One line of a CSV file; line breaks within cells become spaces."""
+    line = io.StringIO()
+    csv.writer(line, lineterminator="\n").writerow([" ".join(str(cell).splitlines()) for cell in cells])
+    return line.getvalue()
+
+
+@lru_cache(maxsize=16)
+def _resolved(root: str) -> Path:
+    return Path(root).resolve()
+
+
+def _text(value: object) -> str:
+    if value is None:
+        return ""
+    return f"{value:.6g}" if isinstance(value, float) else str(value)

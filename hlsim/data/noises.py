@@ -1,0 +1,135 @@
+"""Noises for training and test: disjoint types, one of them and one SNR an utterance, and how they are mixed in."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from random import Random
+
+import torch
+from torch import Tensor
+
+from hlsim.audio import read_audio
+from hlsim.calibration import dbfs
+from hlsim.data.corpora import Fault, walk_audio
+from hlsim.data.manifest import Utterance, inside
+
+TRAIN_SNRS_DB, TEST_SNRS_DB = (0.0, 5.0, 10.0, 15.0), (2.5, 7.5, 12.5, 17.5)
+"""Signal-to-noise ratios in dB by active speech level: VoiceBank-DEMAND's, and the paper's."""
+
+TRAIN_TYPES, TEST_TYPES = 8, 2
+"""Types of noise, where there are as many."""
+
+_SPLIT_FOLDERS = {"train": "train", "valid": "valid", "dev": "valid", "test": "test"}
+_QUIET_DB = 30.0  # a stretch this far below its recording's level counts as a pause of the noise
+_STEP, _STRETCH = 0.1, 5  # s from one possible start to the next, and how many of these are no pause
+
+
+@dataclass(frozen=True)
+class Noises:
+    """Files of noise by split and type, paths below the root, with the places where one may start, in seconds; and the
+    SNRs in dB by split."""
+
+    files: Mapping[str, Mapping[str, Sequence[tuple[str, Sequence[float]]]]]
+    snrs: Mapping[str, Sequence[float]]
+
+    def choose(self, utterance: Utterance, seed: int) -> Utterance:
+        """The utterance with one type, file, start and SNR, drawn from the seed and its id."""
+        draw = Random(f"{seed}:noise:{utterance.id}")
+        types = self.files[utterance.split]
+        path, starts = draw.choice(types[draw.choice(sorted(types))])
+        snr = draw.choice(self.snrs[utterance.split])
+        return replace(utterance, noise=path, snr=snr, noise_start=draw.choice(starts))
+
+
+def find_noises(
+    root: Path,
+    folder: str,
+    splits: Iterable[str],
+    *,
+    train_snrs: Sequence[float] = TRAIN_SNRS_DB,
+    test_snrs: Sequence[float] = TEST_SNRS_DB,
+    train_types: int = TRAIN_TYPES,
+    test_types: int = TEST_TYPES,
+    seed: int = 0,
+) -> tuple[Noises, list[Fault]]:
+    """Noises below ``root / folder``, and what is at fault there.
+
+    A type is the folder that holds a file, or the file's own name on top. Folders train, valid and test on top give the
+    splits their types; otherwise they are drawn from the seed, ``train_types`` and ``test_types`` of them, or of fewer
+    all, a fifth of them for test. Validation takes training's types and SNRs unless it has a folder.
+
+    Raises:
+        ValueError: no noise that can be used, too few types, or types or SNRs that are not disjoint.
+    """
+    if shared := sorted(set(train_snrs) & set(test_snrs)):
+        raise ValueError(
+            f"SNRs {', '.join(f'{snr:g}' for snr in shared)} dB for training and test; allowed: disjoint sets"
+        )
+    kinds: dict[str, dict[str, list[tuple[str, Sequence[float]]]]] = {}
+    faults = []
+    for path in walk_audio(root / folder):
+        parts = path.split("/")
+        split = _SPLIT_FOLDERS.get(parts[0], "") if len(parts) > 1 else ""
+        inner = parts[1:] if split else parts
+        kind = "/".join(inner[:-1]) or Path(path).stem
+        name = f"{folder}/{path}" if folder else path
+        try:
+            waveform, rate = read_audio(inside(root, name), any_rate=True)
+        except ValueError as error:
+            faults.append(Fault(name, str(error).removeprefix(f"{root / name}: ")))
+            continue
+        if not bool(waveform[0].any()):
+            faults.append(Fault(name, "silent first channel"))
+            continue
+        kinds.setdefault(split, {}).setdefault(kind, []).append((name, _starts(waveform[0], rate)))
+    if not kinds:
+        raise ValueError(f"{root / folder}: no noise in it that can be used")
+    files = dict(kinds) if set(kinds) - {""} else _drawn(kinds[""], train_types, test_types, seed)
+    if "valid" not in files and "train" in files:
+        files["valid"] = files["train"]
+    for split in splits:
+        if split not in files:
+            raise ValueError(
+                f"{root / folder}: no noise for {split}; allowed: a folder {split} in it, or two types or more and no "
+                "such folders"
+            )
+    if both := sorted(set(files.get("train", ())) & set(files.get("test", ()))):
+        raise ValueError(f"{root / folder}: {', '.join(both)} for training and test; allowed: disjoint types")
+    return Noises(files, {"train": train_snrs, "valid": train_snrs, "test": test_snrs}), faults
+
+
+def _drawn(
+    types: Mapping[str, list[tuple[str, Sequence[float]]]], train: int, test: int, seed: int
+) -> dict[str, dict[str, list[tuple[str, Sequence[float]]]]]:
+    names = sorted(types)
+    Random(f"{seed}:noise types").shuffle(names)
+    if len(names) < train + test:
+        test = min(test, round(len(names) / 5) or 1) if len(names) > 1 else 0
+        train = len(names) - test
+    chosen = {"train": names[:train], "test": names[train : train + test]}
+    return {split: {name: types[name] for name in own} for split, own in chosen.items() if own}
+
+
+def _starts(noise: Tensor, rate: int) -> tuple[float, ...]:
+    """Seconds at which half a second begins that is no pause; the file counts as repeated where it ends."""
+    step = round(_STEP * rate)
+    if len(noise) < step:
+        return (0.0,)
+    powers = noise[: len(noise) // step * step].square().unflatten(0, (-1, step)).mean(-1).double()
+    ahead = torch.stack([powers.roll(-k) for k in range(_STRETCH)]).mean(0)
+    loud = ahead >= powers.mean() * 10.0 ** (-_QUIET_DB / 10.0)
+    return tuple(round(_STEP * k, 1) for k in loud.nonzero().squeeze(-1).tolist())
+
+
+def mix_at(speech: Tensor, noise: Tensor, snr: float, active_db: float) -> Tensor:
+    """Speech with noise at an SNR by active speech level.
+
+    Args:
+        snr: dB, of the active speech level over the noise's RMS level.
+        active_db: active level of the speech in dB relative to RMS 1.0.
+
+    Shape: (time,) twice -> (time,).
+    """
+    return speech + noise * 10.0 ** ((active_db - snr - float(dbfs(noise))) / 20.0)

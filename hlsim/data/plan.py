@@ -1,0 +1,250 @@
+"""Preparing a corpus: every file is checked, and manifest, plan of instances and report of faults are written."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from random import Random
+from typing import Any
+
+from hlsim.audiogram import SEVERITIES
+from hlsim.data.checking import Listing, examine_all
+from hlsim.data.corpora import Fault, assign_splits, detect_layout, find_below
+from hlsim.data.ears import Ears, plan_ears
+from hlsim.data.files import PARTIAL, Whole
+from hlsim.data.manifest import SPLITS, UTTERANCE_COLUMNS, Rows, csv_line
+from hlsim.data.noises import Noises, find_noises
+from hlsim.data.plan_settings import PlanSettings
+from hlsim.data.samples import INSTANCE_COLUMNS, INSTANCES, MANIFEST, SETTINGS
+
+FAULTS = "faults.csv"
+
+Progress = Callable[[int, int], None]
+
+
+@dataclass
+class Prepared:
+    """What ``prepare`` found.
+
+    Attributes:
+        utterances, seconds, instances: by split.
+        severities: instances by split and severity, as "train severe".
+        faults: files left out.
+        first_fault: path and reason of the first.
+    """
+
+    utterances: Counter[str] = field(default_factory=Counter)
+    seconds: dict[str, float] = field(default_factory=dict)
+    instances: Counter[str] = field(default_factory=Counter)
+    severities: Counter[str] = field(default_factory=Counter)
+    faults: int = 0
+    first_fault: str = ""
+
+    def to_text(self) -> str:
+        """A line a split."""
+        lines = []
+        for split in (split for split in SPLITS if self.utterances.get(split)):
+            shares = ", ".join(
+                f"{100.0 * self.severities[key] / self.instances[split]:.0f} % {name}"
+                for name in SEVERITIES
+                if self.severities.get(key := f"{split} {name}")
+            )
+            lines.append(
+                f"{split}: {self.utterances[split]} utterances, {self.seconds[split] / 3600.0:.2f} h, "
+                f"{self.instances[split]} instances; ears {shares}"
+            )
+        return "\n".join(lines)
+
+
+def prepare(
+    settings: PlanSettings,
+    out: str | Path,
+    *,
+    strict: bool = False,
+    jobs: int | None = None,
+    backend: str = "loky",
+    scheduler: str | None = None,
+    progress: Progress | None = None,
+) -> Prepared:
+    """Check a corpus file by file and write the plan of a data set.
+
+    ``out`` gets ``faults.csv`` (path, reason), and if there is anything left to use ``manifest.csv`` (a row an
+    utterance), ``instances.csv`` (a row an instance: utterance, input, ear, level) and ``plan.json`` (settings and root).
+    The same files, settings and seed give the same bytes; what is there already is kept.
+
+    Args:
+        strict: a fault is an error; nothing but the report is written then.
+        jobs, backend, scheduler: see ``run_parallel``.
+        progress: called with the utterances checked and all.
+
+    Raises:
+        ValueError: settings or folders that cannot be used, nothing left to use, or faults with ``strict``.
+    """
+    root, corpus, noise = settings.places()
+    folder = Path(out)
+    layout = detect_layout(root / corpus) if settings.layout == "auto" else settings.layout
+    listing = Listing()
+    find = partial(find_below, root, corpus, layout, settings.table, noise if settings.noise else None)
+    for found in find():
+        listing.add(root, found)
+    if not listing.total:
+        raise ValueError(f"{root / corpus}: no audio in it that the layout {layout} knows")
+    about: dict[str, Any] = {
+        "root": str(root),
+        "layout": layout,
+        "settings": {name: _plain(value) for name, value in asdict(settings).items()},
+        "files_sha256": listing.digest(
+            root / noise if settings.noise else None, settings.audiograms, settings.test_audiograms
+        ),
+    }
+    if prepared := _unchanged(folder, about, strict):
+        return prepared
+    splits = assign_splits(
+        listing.speakers, test_share=settings.test_share, valid_share=settings.valid_share, seed=settings.seed
+    )
+    used = set(splits.values())
+    ears = plan_ears(settings.severities, settings.audiograms, settings.test_audiograms, used, settings.seed)
+    ears.check(used, settings.ears)
+    noises, faults = _noises(settings, root, noise, used, listing.paired)
+
+    folder.mkdir(parents=True, exist_ok=True)
+    for leftover in folder.glob(f".*{PARTIAL}"):  # of a run that was killed
+        leftover.unlink(missing_ok=True)
+    (folder / SETTINGS).unlink(missing_ok=True)  # it is written last: without it the folder is not prepared
+    prepared = Prepared()
+    with Whole(folder / FAULTS) as report, Whole(folder / MANIFEST) as manifest:
+        report.write(csv_line(("path", "reason")))
+        manifest.write(csv_line(UTTERANCE_COLUMNS))
+
+        def tell(fault: Fault) -> None:
+            report.write(csv_line((fault.path, fault.reason)))
+            prepared.faults += 1
+            prepared.first_fault = prepared.first_fault or f"{fault.path}: {fault.reason}"
+
+        for fault in faults:
+            tell(fault)
+        examined = examine_all(
+            find(),
+            root,
+            shortest=settings.shortest,
+            pairs=listing.paired > 0,
+            jobs=jobs,
+            backend=backend,
+            scheduler=scheduler,
+        )
+        for number, found in enumerate(examined, start=1):
+            if isinstance(found, Fault):
+                tell(found)
+            else:
+                utterance = replace(found, split=splits[found.speaker])
+                if noises is not None:
+                    utterance = noises.choose(utterance, settings.seed)
+                manifest.write(csv_line(utterance.to_row().values()))
+                prepared.utterances[utterance.split] += 1
+                sums = prepared.seconds
+                sums[utterance.split] = sums.get(utterance.split, 0.0) + utterance.seconds
+            if progress is not None:
+                progress(number, listing.total)
+        report.keep()
+        _refuse_faults(prepared, strict, folder)
+        if not prepared.utterances:
+            raise ValueError(f"{root / corpus}: nothing in it can be used; {folder / FAULTS} says why")
+        manifest.keep()
+    inputs = ["clean", "noisy"] if listing.paired or noises is not None else ["clean"]
+    _write_instances(settings, folder, prepared, ears, inputs)
+    about |= {
+        "inputs": inputs,
+        "manifest_sha256": _digest(folder / MANIFEST),
+        "instances_sha256": _digest(folder / INSTANCES),
+        "prepared": vars(prepared),
+    }
+    with Whole(folder / SETTINGS) as file:
+        file.write(json.dumps(about, indent=2) + "\n")
+        file.keep()
+    return prepared
+
+
+def _noises(
+    settings: PlanSettings, root: Path, noise: str, splits: set[str], paired: int
+) -> tuple[Noises | None, list[Fault]]:
+    if settings.noise is None:
+        return None, []
+    if paired:
+        raise ValueError(
+            f"{settings.corpus}: has noisy speech of its own; allowed: no folder of noise with it, or only the "
+            "clean speech as the corpus"
+        )
+    return find_noises(
+        root,
+        noise,
+        splits,
+        train_snrs=settings.train_snrs,
+        test_snrs=settings.test_snrs,
+        train_types=settings.train_types,
+        test_types=settings.test_types,
+        seed=settings.seed,
+    )
+
+
+def _unchanged(folder: Path, about: Mapping[str, Any], strict: bool) -> Prepared | None:
+    """What an earlier run found, where it had the same settings and files; None where there is none."""
+    try:
+        kept = json.loads((folder / SETTINGS).read_text(encoding="utf-8"))
+        same = all(kept[name] == json.loads(json.dumps(value)) for name, value in about.items())
+        for name, file in (("manifest_sha256", MANIFEST), ("instances_sha256", INSTANCES)):
+            same = same and kept[name] == _digest(folder / file)
+        prepared = Prepared(**kept["prepared"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    if same:
+        _refuse_faults(prepared, strict, folder)
+    return prepared if same else None
+
+
+def _refuse_faults(prepared: Prepared, strict: bool, folder: Path) -> None:
+    if strict and prepared.faults:
+        raise ValueError(
+            f"{prepared.faults} faults, the first {prepared.first_fault}; all are in {folder / FAULTS}; without --strict "
+            "they are left out"
+        )
+
+
+def _write_instances(
+    settings: PlanSettings, folder: Path, prepared: Prepared, ears: Ears, inputs: Sequence[str]
+) -> None:
+    assigned = {
+        split: ears.assign(split, count, settings.ears) for split, count in prepared.utterances.items()
+    }
+    manifest = Rows(folder / MANIFEST, UTTERANCE_COLUMNS)
+    with Whole(folder / INSTANCES) as file:
+        file.write(csv_line(INSTANCE_COLUMNS))
+        for number, cells in enumerate(_instances(manifest, assigned, inputs, settings)):
+            file.write(csv_line((number, *cells)))
+            prepared.instances[cells[1]] += 1
+            prepared.severities[f"{cells[1]} {cells[4]}"] += 1
+        file.keep()
+
+
+def _instances(
+    manifest: Rows, assigned: Mapping[str, Iterator[list[Any]]], inputs: Sequence[str], settings: PlanSettings
+) -> Iterator[tuple[str, ...]]:
+    for row in manifest:
+        draw = Random(f"{settings.seed}:level:{row['id']}")
+        for ear in next(assigned[row["split"]]):
+            level = f"{draw.uniform(*settings.level):.2f}"
+            for name in inputs:
+                yield (row["id"], row["split"], name, level, ear.severity, *ear.to_row().values())
+
+
+def _digest(path: Path) -> str:
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _plain(value: Any) -> Any:
+    return str(value) if isinstance(value, Path) else value

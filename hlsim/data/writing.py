@@ -1,0 +1,146 @@
+"""Instances on disk: one file each, the same bytes however often the work was interrupted and however many did it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import lru_cache, partial
+from pathlib import Path
+
+import torch
+
+from hlsim.data.corpora import Fault
+from hlsim.data.files import PARTIAL, Whole
+from hlsim.data.manifest import csv_line
+from hlsim.data.samples import Plan, is_whole
+from hlsim.data.teacher import Reference, Teacher
+from hlsim.parallel import run_parallel
+
+CLAIM = "instances/made-of.txt"
+WRITE_FAULTS = "write-faults.csv"
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """How the targets are made."""
+
+    alignment: str = "structural"
+    reference: Reference | None = None
+
+    def __str__(self) -> str:
+        teacher = "msbg" if self.reference is None else getattr(self.reference, "__name__", "reference")
+        return f"teacher {teacher}, alignment {self.alignment}"
+
+
+def write_instances(
+    folder: str | Path,
+    recipe: Recipe,
+    *,
+    root: str | Path | None = None,
+    jobs: int | None = None,
+    backend: str = "loky",
+    scheduler: str | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> int:
+    """Write all instances of a plan that are not there yet.
+
+    Every file is written whole or not at all, and depends on the plan and the recipe alone: stopped in any way and
+    started again, it ends with the same bytes.
+
+    Args:
+        folder: what ``prepare`` wrote.
+        progress: called with the instances made and all; those found count as made.
+
+    Returns: how many are there.
+
+    Raises:
+        ValueError: the folder holds instances of another plan or recipe, the disk is full, or audio cannot be read any
+            more: then what remains is written first, and ``write-faults.csv`` names the files.
+    """
+    plan = Plan(folder, root)
+    _claim(plan, recipe)
+    for leftover in (plan.folder / "instances").rglob(f".*{PARTIAL}"):
+        leftover.unlink(missing_ok=True)
+    task = partial(make, str(plan.folder), str(plan.root), recipe)
+    faults: list[Fault] = []
+    threads = torch.get_num_threads()
+    numbers = range(len(plan.utterances))
+    written = run_parallel(task, numbers, jobs=jobs, backend=backend, scheduler=scheduler)
+    try:
+        for done, (number, found) in enumerate(written, start=1):
+            if found is None:  # its process ended
+                faults.append(
+                    Fault(plan.utterance(number * plan.each).clean, "the process that made it died")
+                )
+            else:
+                faults.extend(found)
+            if progress is not None:
+                progress(done * plan.each, len(plan))
+    finally:
+        torch.set_num_threads(threads)
+    report = plan.folder / WRITE_FAULTS
+    if faults:
+        with Whole(report) as file:
+            for cells in (("path", "reason"), *((fault.path, fault.reason) for fault in faults)):
+                file.write(csv_line(cells))
+            file.keep()
+        raise ValueError(
+            f"{len(faults)} of {len(plan.utterances)} utterances cannot be read any more, the first {faults[0].path}: "
+            f"{faults[0].reason}; all are in {report}; the others are written"
+        )
+    report.unlink(missing_ok=True)
+    return len(plan)
+
+
+def make(folder: str, root: str, recipe: Recipe, number: int) -> list[Fault]:
+    """Write the instances of one utterance that are missing; what is at fault with its audio, if anything.
+
+    One at a time, for the last bits of a batch depend on what else is in it.
+    """
+    torch.set_num_threads(1)  # which sums in one order
+    plan, teacher = _opened(folder, root, recipe)
+    for index in range(number * plan.each, (number + 1) * plan.each):
+        if is_whole(plan.path(index)):
+            continue
+        try:
+            instance = plan.instance(index)
+        except ValueError as error:
+            return [Fault(plan.utterance(index).clean, str(error))]
+        heard = teacher(instance.signal[None], instance.thresholds[None])[0]
+        with Whole(plan.path(index)) as file:
+            file.write(replace(instance, impaired=heard).to_bytes())
+            file.keep()
+    return []
+
+
+@lru_cache(maxsize=2)
+def _opened(folder: str, root: str, recipe: Recipe) -> tuple[Plan, Teacher]:
+    plan = Plan(folder, root)
+    return plan, Teacher(plan.rate, alignment=recipe.alignment, reference=recipe.reference)
+
+
+def _claim(plan: Plan, recipe: Recipe) -> None:
+    path = plan.folder / CLAIM
+    text = f"{plan.digest}\n{recipe}\n"
+    if path.is_file():
+        if path.read_text(encoding="utf-8") != text:
+            raise ValueError(
+                f"{path.parent}: holds instances of another plan, teacher or alignment; choose another --out, or "
+                "remove it"
+            )
+        return
+    with Whole(path) as file:
+        file.write(text)
+        file.keep()
+
+
+def claimed(plan: Plan) -> None:
+    """Raises ValueError unless the instances of this very plan are all on disk."""
+    path = plan.folder / CLAIM
+    if not path.is_file() or path.read_text(encoding="utf-8").splitlines()[:1] != [plan.digest]:
+        raise ValueError(f"{path.parent}: no instances of this plan; 'hlsim prepare --write' makes them")
+    missing = sum(not plan.path(index).is_file() for index in range(len(plan)))
+    if missing:
+        raise ValueError(
+            f"{path.parent}: {missing} of {len(plan)} instances missing; 'hlsim prepare --write' goes on with them"
+        )

@@ -1,0 +1,68 @@
+"""The paper's Figure 2 for any utterance: MSBG's output over its input, before and after alignment."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from hlsim.audiogram import Audiogram
+from hlsim.calibration import dbfs
+from hlsim.data.teacher import Teacher
+from hlsim.extras import require
+from hlsim.msbg.ear import RATE
+from hlsim.settings import refuse_unknown
+
+_SHOWN = 0.12  # s: a delay of 28 ms is plain to see
+
+
+def draw_alignment(
+    signal: Tensor, ear: Audiogram, sample_rate: int, path: str | Path, *, method: str = "impulse"
+) -> float:
+    """Write a PNG of the 0.12 s about the loudest place: A as MSBG gives it, B aligned. Returns the delay in samples.
+
+    What is heard is drawn at the input's level, for it is the time that is to be seen.
+
+    Shape: (time,) in pascals.
+
+    Args:
+        method: ``impulse``, the paper's, or ``structural``.
+
+    Raises:
+        ValueError: an unknown method, or a signal that is silent or shorter than 0.12 s.
+        MissingExtraError: matplotlib is not installed.
+    """
+    refuse_unknown([method], ("impulse", "structural"), "alignments")
+    shown = round(_SHOWN * sample_rate)
+    if signal.shape[-1] < shown or not bool(signal.any()):
+        raise ValueError(f"{signal.shape[-1]} samples to draw; allowed: {shown} or more, not all zero")
+    thresholds = torch.tensor(ear.thresholds)
+    impulse = Teacher(sample_rate, alignment=method)
+    before, after = (
+        teacher(signal[None], thresholds[None])[0]
+        for teacher in (Teacher(sample_rate, alignment="none"), impulse)
+    )
+    if method == "impulse":
+        delay = float(impulse.delay(thresholds))
+    else:
+        delay = impulse.msbg.delay(ear.severity) * sample_rate / RATE
+    first = min(max(0, int(signal.abs().argmax()) - shown // 2), signal.shape[-1] - shown)
+    times = torch.arange(first, first + shown) / sample_rate
+
+    figure = require("matplotlib.figure", "eval").Figure(figsize=(9.0, 5.0), layout="constrained")
+    require("matplotlib.backends.backend_agg", "eval").FigureCanvasAgg(figure)
+    for axes, heard, title in zip(
+        figure.subplots(2, 1, sharex=True),
+        (before, after),
+        (f"A. MSBG as it is, {1000.0 * delay / sample_rate:.1f} ms late", f"B. aligned, {method} method"),
+        strict=True,
+    ):
+        gain = 10.0 ** (float(dbfs(signal) - dbfs(heard)) / 20.0)
+        axes.plot(times, signal[first : first + shown], color="tab:blue", label="input")
+        axes.plot(times, gain * heard[first : first + shown], color="tab:red", label="MSBG", alpha=0.8)
+        axes.set(title=title, ylabel="Pa")
+        axes.legend(fontsize="small", loc="upper right")
+    axes.set(xlabel="s")
+    figure.savefig(path, dpi=110, format="png")
+    return delay

@@ -1,0 +1,47 @@
+"""Why signals are aligned: STOI and PESQ of the aligned pair are higher; and the picture of it."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from hlsim.audio import resample
+from hlsim.audiogram import Audiogram
+from hlsim.calibration import set_level
+from hlsim.data.teacher import Teacher
+from hlsim.evaluation.alignment import draw_alignment
+
+
+@pytest.mark.parametrize("method", ["structural", "impulse"])
+def test_stoi_and_pesq_are_higher_when_aligned(speech: list[tuple[Tensor, int]], method: str) -> None:
+    for package in ("pystoi", "pesq"):
+        pytest.importorskip(package)
+    from hlsim.evaluation.fidelity import pesq_wb, stoi
+
+    waveform, rate = speech[0]
+    clean = set_level(resample(waveform[0], rate, 16000), 65.0)
+    for name in ("NH", "N2", "N4"):
+        ear = torch.tensor(Audiogram.standard(name).thresholds)
+        late, aligned = (
+            Teacher(16000, alignment=alignment)(clean[None], ear[None])[0] for alignment in ("none", method)
+        )
+        better, worse = (stoi(clean, heard, 16000).value for heard in (aligned, late))
+        assert better is not None and worse is not None and better > worse + 0.05
+        better, worse = (pesq_wb(clean, heard, 16000).value for heard in (aligned, late))
+        assert better is not None and worse is not None and better > worse
+
+
+@pytest.mark.parametrize("method", ["structural", "impulse"])
+def test_the_picture(speech: list[tuple[Tensor, int]], tmp_path: Path, method: str) -> None:
+    pytest.importorskip("matplotlib")
+    waveform, rate = speech[0]
+    ear = Audiogram.standard("N3")
+    delay = draw_alignment(waveform[0], ear, rate, tmp_path / "a.png", method=method)
+    assert (tmp_path / "a.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
+    assert delay / rate == pytest.approx(1239 / 44100 if method == "structural" else 1200 / 44100, abs=0.002)
+    with pytest.raises(ValueError, match="samples to draw"):
+        draw_alignment(waveform[0, :100], ear, rate, tmp_path / "b.png")
+    with pytest.raises(ValueError, match="unknown alignments none"):
+        draw_alignment(waveform[0], ear, rate, tmp_path / "b.png", method="none")
+    assert not (tmp_path / "b.png").exists()

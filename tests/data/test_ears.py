@@ -1,0 +1,108 @@
+"""Ears of a plan: proportions, different ears an utterance, and none in two splits."""
+
+from collections import Counter
+from pathlib import Path
+
+import pytest
+
+from hlsim.audiogram import Audiogram
+from hlsim.data.ears import check_shares, plan_ears
+
+SPLITS = ("train", "valid", "test")
+
+
+def table(path: Path, ears: list[tuple[str, tuple[float, ...]]], **columns: list[str]) -> Path:
+    names = [f"hl_{f}" for f in (250, 500, 1000, 2000, 3000, 4000, 6000, 8000)]
+    lines = [",".join(["listener", *columns, *names])]
+    for i, (who, levels) in enumerate(ears):
+        lines.append(",".join([who, *(values[i] for values in columns.values()), *map(str, levels)]))
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def listeners(count: int) -> list[tuple[str, tuple[float, ...]]]:
+    """Two ears each, from mild to severe."""
+    return [
+        (f"L{i:03d}", tuple(float(20 + 2 * i + side + k) for k in range(8)))
+        for i in range(count)
+        for side in (0, 1)
+    ]
+
+
+def test_drawn_ears_meet_the_proportions_and_are_disjoint() -> None:
+    ears = plan_ears(None, None, None, SPLITS, seed=0)
+    drawn = {split: list(ears.assign(split, 150, 2)) for split in SPLITS}
+    for own in drawn.values():
+        counts = Counter(ear.severity for pair in own for ear in pair)
+        assert counts == {"mild": 100, "moderate": 100, "severe": 100}
+        assert all(first.severity != second.severity for first, second in own)
+    sets = {split: {ear.levels for pair in own for ear in pair} for split, own in drawn.items()}
+    assert (
+        not sets["train"] & sets["test"]
+        and not sets["train"] & sets["valid"]
+        and not sets["valid"] & sets["test"]
+    )
+    assert drawn["train"] == list(plan_ears(None, None, None, SPLITS, seed=0).assign("train", 150, 2))
+    assert drawn["train"] != list(plan_ears(None, None, None, SPLITS, seed=1).assign("train", 150, 2))
+
+
+def test_other_proportions_and_counts() -> None:
+    ears = plan_ears({"none": 1.0, "severe": 3.0}, None, None, SPLITS, seed=0)
+    drawn = list(ears.assign("train", 7, 3))
+    assert Counter(ear.severity for own in drawn for ear in own) == {"none": 5, "severe": 16}
+    assert all(len(set(own)) == 3 for own in drawn)
+    with pytest.raises(ValueError, match="unknown severities deaf; allowed: none, mild"):
+        check_shares({"deaf": 1.0})
+    for bad in ({"mild": -1.0, "severe": 2.0}, {"mild": 0.0}, {}):
+        with pytest.raises(ValueError, match="0 or more, not all 0"):
+            check_shares(bad)
+
+
+def test_a_file_without_splits_is_divided_by_listeners(tmp_path: Path) -> None:
+    path = table(tmp_path / "ears.csv", listeners(20))
+    ears = plan_ears(None, path, None, SPLITS, seed=0)
+    assert {split: len(own) for split, own in ears.measured.items()}["test"] >= 6
+    owners = {ear.levels: split for split, own in ears.measured.items() for ear in own}
+    assert sum(map(len, ears.measured.values())) == len(owners)
+    drawn = list(ears.assign("train", 40, 2))
+    assert {ear.levels for own in drawn for ear in own} <= {
+        k for k, split in owners.items() if split == "train"
+    }
+    assert all(first != second for first, second in drawn)
+    alone = plan_ears(None, path, None, ("train",), seed=0)
+    assert not alone.measured["test"] and not alone.measured["valid"]
+
+
+def test_files_and_columns_that_say_the_split(tmp_path: Path) -> None:
+    levels = listeners(6)
+    path = table(tmp_path / "ears.csv", levels[:4], split=["train", "train", "test", "test"])
+    ears = plan_ears(None, path, None, ("train", "test"), seed=0)
+    assert [ear.levels for ear in ears.measured["test"]] == [levels[2][1], levels[3][1]]
+    first, second = table(tmp_path / "1.csv", levels[:8]), table(tmp_path / "2.csv", levels[6:])
+    ears = plan_ears(None, first, second, ("train", "test"), seed=0)
+    assert {ear.levels for ear in ears.measured["test"]} == {own for _, own in levels[6:]}
+    # what both files hold stays with test
+    assert {ear.levels for ear in ears.measured["train"]} == {own for _, own in levels[:6]}
+
+
+def test_what_is_refused(tmp_path: Path) -> None:
+    path = table(tmp_path / "ears.csv", [("a", (60.0,) * 8), ("b", (61.0,) * 8), ("c", (110.0,) * 8)])
+    with pytest.raises(ValueError, match="no mild ears for train"):
+        plan_ears({"mild": 1.0, "severe": 1.0}, path, None, ("train",), seed=0)
+    ears = plan_ears(None, path, None, ("train",), seed=0)
+    assert len(ears.measured["train"]) == 2  # 110 dB HL is more than a simulator takes
+    ears.check(("train",), 2)
+    with pytest.raises(ValueError, match="2 measured ears for train; allowed: 3 or more"):
+        ears.check(("train",), 3)
+    with pytest.raises(ValueError, match="ears for test alone"):
+        plan_ears(None, None, path, ("train",), seed=0)
+    bad = table(tmp_path / "bad.csv", [("a", (60.0,) * 8)], split=["dev"])
+    with pytest.raises(ValueError, match="unknown splits dev"):
+        plan_ears(None, bad, None, ("train",), seed=0)
+
+
+def test_an_ear_is_the_same_after_the_file(tmp_path: Path) -> None:
+    ears = plan_ears(None, None, None, ("train",), seed=3)
+    for own in ears.assign("train", 20, 2):
+        for ear in own:
+            assert Audiogram.from_row(ear.to_row()) == ear

@@ -1,0 +1,135 @@
+"""Batches for Lightning: on the fly and from disk alike, in an order that resumes, varied when training."""
+
+from pathlib import Path
+
+import pytest
+import torch
+
+pytest.importorskip("lightning")
+
+from hlsim import MSBG
+from hlsim.calibration import level_spl
+from hlsim.data.module import PlanData, PlanItems, TrainingItems, collate
+from hlsim.data.samples import Instance, Plan
+from hlsim.data.writing import Recipe, write_instances
+
+
+def close(first: torch.Tensor, second: torch.Tensor) -> float:
+    return float((first - second).norm() / second.norm())
+
+
+@pytest.fixture
+def written(plan: Path) -> Path:
+    write_instances(plan, Recipe(), jobs=1)
+    return plan
+
+
+def test_whole_utterances_are_the_same_both_ways(written: Path) -> None:
+    fly, disk = (PlanData(written, prepared=prepared, workers=0, batch=3) for prepared in (False, True))
+    for made, read in zip(fly.test_dataloader(), disk.test_dataloader(), strict=True):
+        assert "impaired" not in made
+        made = fly.on_after_batch_transfer(made, 0)
+        assert set(made) == set(read) == {"clean", "signal", "impaired", "thresholds", "lengths"}
+        for name in ("clean", "signal", "thresholds", "lengths"):
+            assert torch.equal(made[name], read[name])
+        assert close(made["impaired"], read["impaired"]) < 1e-5
+        assert disk.on_after_batch_transfer(read, 0)["impaired"] is read["impaired"]
+    # there is no validation split: test's serves
+    assert len(list(fly.val_dataloader())) == 3
+
+
+def test_clips_are_the_same_places_both_ways(written: Path) -> None:
+    options = {"seconds": 0.15, "augment": False, "seed": 3, "length": 40}
+    plan = Plan(written)
+    fly, disk = (TrainingItems(PlanItems(plan, "train", prepared=p), **options) for p in (False, True))  # type: ignore[arg-type]
+    teacher = MSBG(sample_rate=16000)
+    speech = [plan.instance(index).clean for index in range(0, 16, 4)]
+    starts: set[int] = set()
+    for place in range(16):
+        made, read = fly[place], disk[place]
+        assert made.impaired is None and read.impaired is not None
+        assert torch.equal(made.signal, read.signal) and torch.equal(made.clean, read.clean)
+        assert made.signal.shape == read.impaired.shape == (2400,)
+        heard = teacher(made.signal, made.thresholds)
+        # at either end the one from disk knows what lies beyond; and what is under 0 dB SPL is no difference
+        target, error = read.impaired[800:-800], (heard - read.impaired)[800:-800]
+        assert float(level_spl(error)) < max(float(level_spl(target)) - 60.0, 0.0)
+        starts |= {s for s in (0, 10240) for x in speech if torch.equal(made.clean, x[s : s + 2400])}
+    assert starts == {0, 10240}
+
+
+def test_every_instance_comes_once_an_epoch_and_the_order_resumes(plan: Path) -> None:
+    items = PlanItems(Plan(plan), "train")
+    options = {"seconds": 0.2, "seed": 1, "length": 100}
+    clips = TrainingItems(items, augment=False, **options)  # type: ignore[arg-type]
+    seen = [tuple(clips[i].signal[:50].tolist() + clips[i].thresholds.tolist()) for i in range(16)]
+    ears = [clips[i].thresholds.tolist() for i in range(32)]
+    assert sorted(ears[:16]) == sorted(ears[16:]) and ears[:16] != ears[16:]
+    assert len(set(seen)) == 16
+    for augment in (False, True):
+        first = TrainingItems(items, augment=augment, **options)  # type: ignore[arg-type]
+        later = TrainingItems(items, augment=augment, start=10, **options)  # type: ignore[arg-type]
+        for i in range(12):
+            assert torch.equal(first[10 + i].signal, later[i].signal)
+    other = TrainingItems(items, augment=False, seconds=0.2, seed=2, length=100)
+    assert [other[i].thresholds.tolist() for i in range(16)] != ears[:16]
+
+
+def test_training_varies_level_ear_noise_and_spectrum(plan: Path) -> None:
+    items = PlanItems(Plan(plan), "train")
+    varied = TrainingItems(items, seconds=0.5, augment=True, seed=0, length=64)
+    drawn = [varied[i] for i in range(64)]
+    levels = torch.stack([level_spl(one.signal) for one in drawn])
+    assert float(levels.min()) < 55.0 and float(levels.max()) > 85.0
+    assert all(
+        float(level_spl(one.clean)) == pytest.approx(float(level_spl(one.signal)), abs=0.1) for one in drawn
+    )
+    planned = {tuple(Plan(plan).thresholds(i).tolist()) for i in range(16)}
+    assert not planned & {tuple(one.thresholds.tolist()) for one in drawn}
+    assert all(float(one.thresholds.min()) >= -10.0 and float(one.thresholds.max()) <= 100.0 for one in drawn)
+    alike = [float(torch.nn.functional.cosine_similarity(one.signal, one.clean, 0)) for one in drawn]
+    assert sum(value > 0.9999 for value in alike) > 5 and sum(value < 0.98 for value in alike) > 15
+    assert all(bool(torch.isfinite(one.signal).all()) for one in drawn)
+
+
+def test_what_cannot_be_read_is_left_out_while_training(plan: Path, voicebank: Path) -> None:
+    bad = voicebank / "clean_trainset_28spk_wav" / "p226_001.wav"
+    bad.unlink()
+    clips = TrainingItems(PlanItems(Plan(plan), "train"), seconds=0.2, augment=True, seed=0, length=16)
+    with pytest.warns(UserWarning, match=r"left out: .*p226_001.wav: no such file"):
+        assert len([clips[i] for i in range(16)]) == 16
+    for path in (voicebank / "clean_trainset_28spk_wav").iterdir():
+        path.unlink()
+    clips = TrainingItems(PlanItems(Plan(plan), "train"), seconds=0.2, augment=True, seed=0, length=16)
+    with pytest.warns(UserWarning), pytest.raises(ValueError, match="8 instances in a row cannot be read"):
+        clips[0]
+
+
+def test_workers_give_the_same_batches_and_the_wait_is_known(plan: Path) -> None:
+    batches = []
+    for workers in (0, 2):
+        data = PlanData(plan, workers=workers, batch=2, seconds=0.3)
+        loader = data.train_dataloader()
+        batches.append([batch for batch, _ in zip(loader, range(4), strict=False)])
+        assert loader is data.loader and data.loader.waited > 0.0
+    for first, second in zip(*batches, strict=True):
+        assert first["signal"].shape == (2, 4800)
+        assert torch.equal(first["signal"], second["signal"]) and torch.equal(first["clean"], second["clean"])
+
+
+def test_collate_pads_with_silence() -> None:
+    batch = collate([Instance(torch.ones(n), torch.ones(n), torch.zeros(8), torch.ones(n)) for n in (3, 5)])
+    assert batch["lengths"].tolist() == [3, 5]
+    assert batch["impaired"].tolist() == [[1, 1, 1, 0, 0], [1, 1, 1, 1, 1]]
+    assert batch["thresholds"].shape == (2, 8)
+
+
+def test_prepared_instances_must_be_there(plan: Path) -> None:
+    with pytest.raises(ValueError, match=r"no instances of this plan; 'hlsim prepare --write' makes them"):
+        PlanData(plan, prepared=True)
+    write_instances(plan, Recipe(), jobs=1)
+    Plan(plan).path(3).unlink()
+    with pytest.raises(ValueError, match="1 of 24 instances missing"):
+        PlanData(plan, prepared=True)
+    with pytest.raises(ValueError, match="has no instances for valid"):
+        PlanItems(Plan(plan), "valid")
