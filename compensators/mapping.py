@@ -11,21 +11,19 @@ from torch import Tensor, nn
 from compensators.config import MappingConfig
 from compensators.limiter import soft_limit
 from compensators.nalr import interpolate_gains, nalr_gains_db
-from hlsim.audio import check_rate, check_waveform, resample
-from hlsim.audiogram import FREQUENCIES, AudiogramLike
-from hlsim.calibration import PASCAL_SPL, check_full_scale, gain_to_pascals
-from hlsim.msbg.model import resolve_thresholds
+from hlsim.calibration import PASCAL_SPL
 from hlsim.neuro.audiogram_encoder import AudiogramEncoder
 from hlsim.neuro.blocks import DualPathBlock
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.neuro.decoders import Decoder, PhaseDecoder
 from hlsim.neuro.encoder import DenseEncoder
+from hlsim.neuro.network import EarNetwork
 
 _TINY = 1e-11
 _NEPER_DB = 20.0 / math.log(10.0)
 
 
-class MappingCompensator(nn.Module):
+class MappingCompensator(EarNetwork):
     """Waveform and audiogram to what the impaired ear is to be given, time-aligned and limited.
 
     Log magnitude, phase, encoded audiogram (Equation 1) and the prescribed gain enter as four channels; a dense encoder
@@ -38,9 +36,7 @@ class MappingCompensator(nn.Module):
 
     Args:
         config: sizes and choices.
-        sample_rate: of inputs and outputs in Hz, 16000 to 48000; inside it is 16000, so that only the band under 8 kHz
-            of faster input comes back.
-        full_scale_spl: level in dB SPL of RMS 1.0.
+        sample_rate, full_scale_spl: as ``EarNetwork``.
 
     Raises:
         ValueError: a rate or level out of range.
@@ -53,10 +49,8 @@ class MappingCompensator(nn.Module):
         sample_rate: int = NEURO_RATE,
         full_scale_spl: float = PASCAL_SPL,
     ) -> None:
-        super().__init__()
+        super().__init__(sample_rate, full_scale_spl)
         self.config = config = config or MappingConfig()
-        self.sample_rate = check_rate(sample_rate)
-        self.full_scale_spl = check_full_scale(full_scale_spl)
         self.stft = config.stft
         size, depth, stride = config.channels, config.dense_depth, config.stride
         self.audiogram_encoder = AudiogramEncoder(self.stft.frequencies)
@@ -64,28 +58,6 @@ class MappingCompensator(nn.Module):
         self.blocks = nn.ModuleList(DualPathBlock(config) for _ in range(config.blocks))
         self.magnitude_decoder = Decoder(size, 1, depth, stride, normalise=False)
         self.phase_decoder = PhaseDecoder(size, depth, stride, normalise=False)
-
-    def forward(self, waveform: Tensor, audiogram: AudiogramLike) -> Tensor:
-        """The compensated waveform.
-
-        Shape: (..., time) and one audiogram or (..., 8) that broadcasts over the leading dimensions -> (..., time).
-
-        Raises:
-            ValueError: levels outside -10 to 100 dB HL, or shapes that do not fit.
-        """
-        check_waveform(waveform)
-        thresholds = resolve_thresholds(None, audiogram, waveform)
-        with torch.autocast(waveform.device.type, enabled=False):
-            dtype = next(self.parameters()).dtype
-            batch = torch.broadcast_shapes(waveform.shape[:-1], thresholds.shape[:-1])
-            signals = waveform.to(dtype).expand(*batch, -1).reshape(-1, waveform.shape[-1])
-            ears = thresholds.to(dtype).expand(*batch, -1).reshape(-1, len(FREQUENCIES))
-            gain = gain_to_pascals(self.full_scale_spl)
-            aided = self._compensate(resample(signals * gain, self.sample_rate, NEURO_RATE), ears)
-            aided = resample(aided, NEURO_RATE, self.sample_rate)[..., : waveform.shape[-1]]
-            # last of all, for resampling can overshoot
-            aided = soft_limit(aided, 10.0 ** ((self.config.limit_spl - PASCAL_SPL) / 20.0)) / gain
-            return aided.reshape(*batch, -1).to(waveform.dtype)
 
     def start_gains_db(self, thresholds: Tensor) -> Tensor:
         """Gain before training at the transform's frequencies. Shape: (items, 8) dB HL -> (items, frequencies) dB."""
@@ -96,8 +68,11 @@ class MappingCompensator(nn.Module):
     def extra_repr(self) -> str:
         return f"sample_rate={self.sample_rate}, full_scale_spl={self.full_scale_spl:g}, start={self.config.start!r}"
 
-    def _compensate(self, signals: Tensor, ears: Tensor) -> Tensor:
-        """Shape: (items, time) pascals at 16 kHz, (items, 8) -> (items, time)."""
+    def _finish(self, result: Tensor) -> Tensor:
+        # last of all, for resampling can overshoot
+        return soft_limit(result, 10.0 ** ((self.config.limit_spl - PASCAL_SPL) / 20.0))
+
+    def _process(self, signals: Tensor, ears: Tensor) -> Tensor:
         spectrum = self.stft.analyse(signals)
         start = self.start_gains_db(ears) / _NEPER_DB
         features = self._features(spectrum, ears, start)

@@ -3,22 +3,21 @@
 import torch
 from torch import Tensor, nn
 
-from hlsim.audio import check_rate, check_waveform, resample
-from hlsim.audiogram import FREQUENCIES, SEVERITIES, AudiogramLike, severity_index
-from hlsim.calibration import PASCAL_SPL, check_full_scale, gain_to_pascals
-from hlsim.msbg.model import resolve_thresholds
+from hlsim.audiogram import FREQUENCIES, SEVERITIES, severity_index
+from hlsim.calibration import PASCAL_SPL
 from hlsim.msbg.recruitment import CATCH_UP_SPL
 from hlsim.neuro.audiogram_encoder import AudiogramEncoder
 from hlsim.neuro.blocks import DualPathBlock, TimeBlock
 from hlsim.neuro.config import NEURO_RATE, NeuroConfig
 from hlsim.neuro.decoders import MaskDecoder, PhaseDecoder
 from hlsim.neuro.encoder import DenseEncoder, FrameEncoder
+from hlsim.neuro.network import EarNetwork
 from hlsim.neuro.prior import Prior
 
 _TINY = 1e-11
 
 
-class NeuroMSBG(nn.Module):
+class NeuroMSBG(EarNetwork):
     """Waveform and audiogram to what the impaired ear hears, time-aligned.
 
     Magnitude, phase and encoded audiogram (Equation 1) enter as three channels, a dense encoder and dual-path blocks
@@ -27,9 +26,7 @@ class NeuroMSBG(nn.Module):
 
     Args:
         config: sizes and choices.
-        sample_rate: of inputs and outputs in Hz, 16000 to 48000; inside it is 16000, so that only the band under 8 kHz
-            of faster input comes back.
-        full_scale_spl: level in dB SPL of RMS 1.0.
+        sample_rate, full_scale_spl: as ``EarNetwork``.
 
     Raises:
         ValueError: a rate or level out of range.
@@ -42,10 +39,8 @@ class NeuroMSBG(nn.Module):
         sample_rate: int = NEURO_RATE,
         full_scale_spl: float = PASCAL_SPL,
     ) -> None:
-        super().__init__()
+        super().__init__(sample_rate, full_scale_spl)
         self.config = config = config or NeuroConfig()
-        self.sample_rate = check_rate(sample_rate)
-        self.full_scale_spl = check_full_scale(full_scale_spl)
         self.stft = config.stft
         frequencies, channels = self.stft.frequencies, config.channels
         monolithic, normalise = config.structure == "monolithic", not config.level_aware
@@ -73,28 +68,7 @@ class NeuroMSBG(nn.Module):
         # training may run the network, not the physics around it, in bfloat16
         self.autocast_dtype: torch.dtype | None = None
 
-    def forward(self, waveform: Tensor, audiogram: AudiogramLike) -> Tensor:
-        """What the ear hears.
-
-        Shape: (..., time) and one audiogram or (..., 8) that broadcasts over the leading dimensions -> (..., time).
-
-        Raises:
-            ValueError: levels outside -10 to 100 dB HL, or shapes that do not fit.
-        """
-        check_waveform(waveform)
-        thresholds = resolve_thresholds(None, audiogram, waveform)
-        with torch.autocast(waveform.device.type, enabled=False):
-            dtype = next(self.parameters()).dtype
-            batch = torch.broadcast_shapes(waveform.shape[:-1], thresholds.shape[:-1])
-            signals = waveform.to(dtype).expand(*batch, -1).reshape(-1, waveform.shape[-1])
-            ears = thresholds.to(dtype).expand(*batch, -1).reshape(-1, len(FREQUENCIES))
-            gain = gain_to_pascals(self.full_scale_spl)
-            heard = self._simulate(resample(signals * gain, self.sample_rate, NEURO_RATE), ears)
-            heard = resample(heard, NEURO_RATE, self.sample_rate)[..., : waveform.shape[-1]] / gain
-            return heard.reshape(*batch, -1).to(waveform.dtype)
-
-    def _simulate(self, signals: Tensor, ears: Tensor) -> Tensor:
-        """Shape: (items, time) pascals at 16 kHz, (items, 8) -> (items, time)."""
+    def _process(self, signals: Tensor, ears: Tensor) -> Tensor:
         scale = None
         if not self.config.level_aware:
             scale = signals.square().mean(-1, keepdim=True).add(_TINY).sqrt()

@@ -1,0 +1,58 @@
+"""What every network here does with a waveform and an ear before and after its own work."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from hlsim.audio import check_rate, check_waveform, resample
+from hlsim.audiogram import FREQUENCIES, AudiogramLike
+from hlsim.calibration import check_full_scale, gain_to_pascals
+from hlsim.msbg.model import resolve_thresholds
+from hlsim.neuro.config import NEURO_RATE
+
+
+class EarNetwork(nn.Module):
+    """Waveform and audiogram to waveform, in pascals at 16 kHz inside. Subclasses give ``_process``.
+
+    Args:
+        sample_rate: of inputs and outputs in Hz, 16000 to 48000; inside it is 16000, so that only the band under 8 kHz
+            of faster input comes back.
+        full_scale_spl: level in dB SPL of RMS 1.0.
+
+    Raises:
+        ValueError: a rate or level out of range.
+    """
+
+    def __init__(self, sample_rate: int, full_scale_spl: float) -> None:
+        super().__init__()
+        self.sample_rate = check_rate(sample_rate)
+        self.full_scale_spl = check_full_scale(full_scale_spl)
+
+    def forward(self, waveform: Tensor, audiogram: AudiogramLike) -> Tensor:
+        """What the ear hears of a waveform, or is to be given.
+
+        Shape: (..., time) and one audiogram or (..., 8) that broadcasts over the leading dimensions -> (..., time).
+
+        Raises:
+            ValueError: levels outside -10 to 100 dB HL, or shapes that do not fit.
+        """
+        check_waveform(waveform)
+        thresholds = resolve_thresholds(None, audiogram, waveform)
+        with torch.autocast(waveform.device.type, enabled=False):
+            dtype = next(self.parameters()).dtype
+            batch = torch.broadcast_shapes(waveform.shape[:-1], thresholds.shape[:-1])
+            signals = waveform.to(dtype).expand(*batch, -1).reshape(-1, waveform.shape[-1])
+            ears = thresholds.to(dtype).expand(*batch, -1).reshape(-1, len(FREQUENCIES))
+            gain = gain_to_pascals(self.full_scale_spl)
+            result = self._process(resample(signals * gain, self.sample_rate, NEURO_RATE), ears)
+            result = resample(result, NEURO_RATE, self.sample_rate)[..., : waveform.shape[-1]]
+            return (self._finish(result) / gain).reshape(*batch, -1).to(waveform.dtype)
+
+    def _process(self, signals: Tensor, ears: Tensor) -> Tensor:
+        """Shape: (items, time) pascals at 16 kHz, (items, 8) dB HL -> (items, time)."""
+        raise NotImplementedError
+
+    def _finish(self, result: Tensor) -> Tensor:
+        """The last step, in pascals at the output's rate. Shape: (items, time) -> the same."""
+        return result
