@@ -51,9 +51,7 @@ def main(folder: str, out: str, ear_name: str = "N3", steps: str = "200") -> Non
         value.backward()
         optimiser.step()
         if step % 20 == 0 or step + 1 == int(steps):
-            print(
-                f"step {step}: bands {float(value.detach()):.2f} dB from what a normal ear hears", flush=True
-            )
+            print(f"step {step}: {float(value.detach()):.2f} dB from what a normal ear hears", flush=True)
     torch.save(network.state_dict(), out)
 
 

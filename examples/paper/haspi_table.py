@@ -1,8 +1,8 @@
 """The paper's last table: python examples/paper/haspi_table.py VOICEBANK OUT --audiograms EARS.csv
 
-HASPI before and after compensation of VoiceBank's 824 test utterances, two ears each, n = 1648, with paired tests. VOICEBANK
-holds clean_testset_wav and noisy_testset_wav. Writes the files and a manifest into OUT, and the report into OUT/report;
-stopped, it goes on with the same command. The paper has 0.428 before and 0.616 after, d = 0.594.
+HASPI before and after compensation of VoiceBank's 824 test utterances, two ears each, n = 1648, with paired tests.
+VOICEBANK holds clean_testset_wav and noisy_testset_wav. Writes the files and a manifest into OUT, and the report into
+OUT/report; stopped, it goes on with the same command. The paper has 0.428 before and 0.616 after, d = 0.594.
 """
 
 import argparse
