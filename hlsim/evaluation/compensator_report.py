@@ -15,8 +15,11 @@ from hlsim.evaluation.page import Section, Table, render_page
 from hlsim.evaluation.report import HaspiReport
 from hlsim.evaluation.report_figures import report_pictures
 from hlsim.evaluation.report_text import GAIN_SENTENCE, markdown_table
+from hlsim.evaluation.significance import PairedComparison
 
 FILES = ("compensators.json", "compensators.md", "compensators.html")
+
+_CHANGES = ("Change", "n", "Δ [95 % interval]", "Paired t", "Wilcoxon", "d")
 
 _GROUPS = {
     "clean": "Clean speech",
@@ -63,7 +66,14 @@ def _sections(result: Mapping[str, Any], reports: Mapping[str, HaspiReport]) -> 
         sections.append(Section(_GROUPS[name], [GAIN_SENTENCE] if name == "clean" else [], tables))
     sections += [
         Section("As loud as a normal ear hears it?", [_LOUDNESS], _each(result, _loudness_table)),
-        Section("By degree of loss", [_HASQI], _each(result, _severity_table)),
+        Section(
+            "By degree of loss",
+            [_HASQI],
+            [
+                *_each(result, _severity_table),
+                *(_severity_tests(reports[group], group) for group in ("clean", "noisy") if group in reports),
+            ],
+        ),
         Section("The surrogate gap", [_GAP.format(**result)], [_gap_table(result)]),
         Section("Does any output pass the limit?", (), [_peak_table(result)]),
         gain_section(result["gain_curves"]),
@@ -111,33 +121,32 @@ def main_table(result: Mapping[str, Any], group: str) -> Table:
 
 def _tests_table(report: HaspiReport) -> Table:
     """Each compensator against no aid and the prescription, and the latter against the former."""
-    rows = []
-    for c in report.comparisons:
-        o = c.overall
-        if c.before not in report.conditions[:2]:
-            continue
-        interval = "" if o.ci_low is None else f" [{o.ci_low:+.3f}, {o.ci_high:+.3f}]"
-        rows.append(
-            (
-                f"{c.title}: {c.before} to {c.after}",
-                str(o.n),
-                f"{o.delta:+.3f}{interval}",
-                _test("t", o.t, c.p_t_holm, "+.2f"),
-                _test("W", o.w, c.p_w_holm, ".1f"),
-                "n/a" if o.cohens_d is None else f"{o.cohens_d:+.2f}",
-                _ears(c),
-            )
-        )
-    header = (
-        "Change",
-        "n",
-        "Δ [95 % interval]",
-        "Paired t, Holm",
-        "Wilcoxon, Holm",
-        "d",
-        "t over means of ears",
-    )
+    rows = [
+        (*_changes(f"{c.title}: {c.before} to {c.after}", c.overall, c.p_t_holm, c.p_w_holm), _ears(c))
+        for c in _told(report)
+    ]
+    header = (*_CHANGES, "t over means of ears")
     return Table("Paired tests, p adjusted by Holm within each measure", header, rows)
+
+
+def _severity_tests(report: HaspiReport, group: str) -> Table:
+    rows = [
+        _changes(f"{severity}, {c.title}: {c.before} to {c.after}", own, own.p_t, own.p_w)
+        for c in _told(report)
+        for severity, own in c.by_severity.items()
+    ]
+    return Table(f"{_GROUPS[group]}: paired tests by degree of loss, p not adjusted", _CHANGES, rows)
+
+
+def _told(report: HaspiReport) -> list[Comparison]:
+    return [c for c in report.comparisons if c.before in report.conditions[:2]]
+
+
+def _changes(name: str, c: PairedComparison, p_t: float | None, p_w: float | None) -> tuple[str, ...]:
+    interval = "" if c.ci_low is None else f" [{c.ci_low:+.3f}, {c.ci_high:+.3f}]"
+    d = "n/a" if c.cohens_d is None else f"{c.cohens_d:+.2f}"
+    tests = (_test("t", c.t, p_t, "+.2f"), _test("W", c.w, p_w, ".1f"))
+    return (name, str(c.n), f"{c.delta:+.3f}{interval}", *tests, d)
 
 
 def _loudness_table(result: Mapping[str, Any], group: str) -> Table:

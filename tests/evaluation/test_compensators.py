@@ -228,6 +228,7 @@ def test_report(tmp_path: Path, speech_dir: Path, ears_csv: Path) -> None:
     assert json.loads((out / "compensators.json").read_text()) == json.loads(json.dumps(result))
     text = (out / "compensators.md").read_text()
     assert f"| loud | 100 | {max(peaks):.2f} | {result['peaks']['loud']['over']} of 10 |" in text
+    assert "| severe, HASQI: NAL-R to loud |" in text and "| HASPI: unaided to broken |" in text
     assert "RuntimeError: no such ear" in text and "| N2, loud, 50 dB SPL | +40.0 |" in text
     page = (out / "compensators.html").read_text()
     assert page.count("data:image/svg+xml") > 2 and "Paired tests" in page and "Gain curves" in page
