@@ -7,7 +7,7 @@ import sys
 from collections.abc import Sequence
 
 from hlsim import __version__
-from hlsim.commands import benchmark, demo, evaluation, files, haspi_report, prepare, training
+from hlsim.commands import benchmark, compensators, demo, evaluation, files, haspi_report, prepare, training
 from hlsim.extras import MissingExtraError
 
 
@@ -34,7 +34,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"hlsim {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    for module in (demo, files, prepare, training, evaluation, haspi_report, benchmark):
+    for module in (demo, files, prepare, training, evaluation, compensators, haspi_report, benchmark):
         module.add(commands)
     return parser
 

@@ -176,7 +176,7 @@ def markdown(report: HaspiReport) -> str:
     blocks = [
         f"# {title(report)}",
         f"{report.comparison.n} items. {GAIN_SENTENCE}",
-        _markdown(paper_table(headline)),
+        markdown_table(paper_table(headline)),
         f"**What the figures show.** {headline.in_words()}",
         "![HASPI and level, before against after](before-after.png)".replace("HASPI", headline.title),
     ]
@@ -185,7 +185,7 @@ def markdown(report: HaspiReport) -> str:
         tables.append(comparisons_table(report))
     if report.failures:
         tables.append(failure_table(report))
-    blocks += [f"**{table.caption}**\n\n{_markdown(table)}" for table in tables if table is not None]
+    blocks += [f"**{table.caption}**\n\n{markdown_table(table)}" for table in tables if table is not None]
     if len(report.comparisons) > 1:
         blocks.append("\n".join(f"- {c.in_short()}" for c in report.comparisons if c is not headline))
     lines = [f"- {note}" for note in notes(report)]
@@ -248,7 +248,8 @@ def _capital(name: str) -> str:
     return name[:1].upper() + name[1:]
 
 
-def _markdown(table: Table) -> str:
+def markdown_table(table: Table) -> str:
+    """A table as Markdown writes it."""
     lines = [table.header, ["---"] * len(table.header), *table.rows]
     return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines)
 

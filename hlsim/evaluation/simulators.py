@@ -72,12 +72,12 @@ def evaluate_simulators(
         )
     drawn = draw_items(speech, noise, audiograms, items=items, seconds=seconds, seed=seed, levels=levels)
     store = ScoreStore(Path(out) / STORE)
-    weights = {name: _weights_hash(simulator) for name, simulator in simulators.items()}
+    weights = {name: weights_hash(simulator) for name, simulator in simulators.items()}
     rows: dict[str, list[dict[str, Any]]] = {name: [] for name in simulators}
     total = items * len(inputs)
     for number, item in enumerate(treat(drawn, inputs, compensator)):
         about = {
-            "signal": _hash(item.clean, item.signal),
+            "signal": samples_hash(item.clean, item.signal),
             "ear": list(item.ear.thresholds),
             "teacher": teacher,
         }
@@ -132,14 +132,15 @@ def _shown(items: Sequence[Item]) -> Item:
     return next((item for item in items if item.about["severity"] == "moderate"), items[0])
 
 
-def _weights_hash(simulator: nn.Module) -> str:
-    """What makes a simulator this one: its class and settings, and its weights."""
-    state = hashlib.sha256(f"{type(simulator).__qualname__} {getattr(simulator, 'config', '')}".encode())
-    for name, tensor in simulator.state_dict().items():
+def weights_hash(module: nn.Module) -> str:
+    """What makes a simulator or compensator this one: its class and settings, and its weights."""
+    state = hashlib.sha256(f"{type(module).__qualname__} {getattr(module, 'config', '')}".encode())
+    for name, tensor in module.state_dict().items():
         state.update(name.encode())
         state.update(tensor.detach().cpu().contiguous().numpy().tobytes())
     return state.hexdigest()
 
 
-def _hash(*signals: Tensor) -> str:
+def samples_hash(*signals: Tensor) -> str:
+    """What makes signals these ones."""
     return hashlib.sha256(b"".join(signal.contiguous().numpy().tobytes() for signal in signals)).hexdigest()

@@ -1,0 +1,167 @@
+"""What a comparison of compensators comes to: summaries of each group of items, and the paired tests."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from hlsim.audiogram import SEVERITIES
+from hlsim.evaluation.fidelity_items import RATE, Item
+from hlsim.evaluation.judging import SIMULATORS, Judged
+from hlsim.evaluation.report import HaspiReport, ItemScore
+
+HARD = 0.6
+"""Unaided HASPI under which an item belongs to those that need help most."""
+
+Rows = Sequence[Mapping[str, Any]]
+
+
+def compensator_result(
+    items: Sequence[Item],
+    judged: Sequence[Mapping[str, Judged]],
+    *,
+    limits: Mapping[str, float | None],
+    settings: Mapping[str, Any],
+) -> tuple[dict[str, Any], dict[str, HaspiReport]]:
+    """Summaries of what ``judge`` made, for JSON, and the reports of the groups that there are.
+
+    An item counts where every condition has figures, so that all rows are of the same items.
+
+    Args:
+        judged: figures of each item by condition.
+        limits: the conditions in order, unaided first, and the peak in dB SPL that each keeps to, or None.
+
+    Raises:
+        ValueError: no item has figures of every condition.
+    """
+    conditions = [*limits]
+    failures, rows = [], []
+    for number, (item, own) in enumerate(zip(items, judged, strict=True)):
+        bad = {name: own[name].reason for name in conditions if own[name].figures is None}
+        failures += [{"item": number, **item.about, "compensator": name, "reason": bad[name]} for name in bad]
+        if not bad:
+            figures = {name: own[name].figures for name in conditions}
+            about = {**item.about, "audiogram": list(item.ear.thresholds)}
+            rows.append({"item": number, **about, "figures": figures})
+    if not rows:
+        raise ValueError(f"none of {len(items)} items could be judged; the first: {failures[0]['reason']}")
+    groups: dict[str, Rows] = {
+        name: [row for row in rows if row["condition"] == name] for name in ("clean", "noisy")
+    }
+    groups["hard"] = [row for row in rows if row["figures"][conditions[0]]["haspi"] < HARD]
+    groups = {name: own for name, own in groups.items() if own}
+    reports = {name: _report(own, items, settings) for name, own in groups.items()}
+    result = {
+        **settings,
+        "limits": dict(limits),
+        "groups": {
+            name: {
+                "n": len(own),
+                "conditions": {condition: _summary(own, condition) for condition in conditions},
+                "comparisons": [c.to_dict() for c in reports[name].comparisons],
+            }
+            for name, own in groups.items()
+        },
+        "gap": {
+            name: {condition: _gap(groups[name], condition) for condition in conditions}
+            for name in ("clean", "noisy")
+            if name in groups
+        },
+        "peaks": {name: _peaks(rows, name, limit) for name, limit in limits.items()},
+        "versions": next(iter(reports.values())).versions,
+        "failures": failures,
+        "rows": rows,
+    }
+    return result, reports
+
+
+def gap(group: Mapping[str, float], one: str, other: str) -> float:
+    """Relative difference of one simulator's loss from another's."""
+    return group[f"loss_{one}"] / group[f"loss_{other}"] - 1.0
+
+
+def _report(rows: Rows, items: Sequence[Item], settings: Mapping[str, Any]) -> HaspiReport:
+    scores = [
+        ItemScore(
+            file=f"item {row['item']}",
+            audiogram=items[row["item"]].ear,
+            clean_level=row["level"],
+            levels={name: own["level"] for name, own in row["figures"].items()},
+            scores={
+                measure: {name: own[measure] for name, own in row["figures"].items()}
+                for measure in ("haspi", "hasqi")
+            },
+            sample_rate=RATE,
+            seconds=settings["seconds"],
+            seed=(settings["seed"] + row["item"]) % 2**32,
+            listener=row["name"],  # utterances are nested in ears
+            snr=row["snr"],
+        )
+        for row in rows
+    ]
+    return HaspiReport(scores, measures=("haspi", "hasqi"), seed=settings["seed"])
+
+
+def _summary(rows: Rows, condition: str) -> dict[str, Any]:
+    """Means over all, by input level and by degree of loss."""
+    levels = sorted({row["level"] for row in rows})
+    return {
+        **_means(rows, condition),
+        "by_level": {
+            f"{level:g}": _means([r for r in rows if r["level"] == level], condition) for level in levels
+        },
+        "by_severity": {
+            severity: _means(own, condition)
+            for severity in SEVERITIES
+            if (own := [row for row in rows if row["severity"] == severity])
+        },
+    }
+
+
+def _means(rows: Rows, condition: str) -> dict[str, Any]:
+    """Means and, of the scores, deviations with n - 1; levels in dB SPL.
+
+    ``heard_off`` is the level heard less a normal ear's of the same input, ``heard_off_clean`` less its of the clean
+    speech; ``_abs`` is the mean of the absolute differences.
+    """
+    figures = [row["figures"][condition] for row in rows]
+    heard, normal, clean = (
+        np.array([own[name] for own in figures]) for name in ("heard", "normal", "normal_clean")
+    )
+    means: dict[str, Any] = {"n": len(rows)}
+    for name in ("haspi", "hasqi"):
+        values = np.array([own[name] for own in figures])
+        means[f"{name}_mean"] = float(values.mean())
+        means[f"{name}_std"] = float(values.std(ddof=1)) if len(values) > 1 else None
+    for name, difference in (("heard_off", heard - normal), ("heard_off_clean", heard - clean)):
+        means |= {name: float(difference.mean()), f"{name}_abs": float(np.abs(difference).mean())}
+    return means | {
+        "level_mean": _mean(figures, "level"),
+        "peak_max": max(own["peak"] for own in figures),
+        "band_error_mean": _mean(figures, "band_error"),
+    }
+
+
+def _gap(rows: Rows, condition: str) -> dict[str, float]:
+    """Mean loss under each simulator, and the median over items of the network's relative distance from pyclarity's."""
+    figures = [row["figures"][condition] for row in rows]
+    losses = {f"loss_{name}": _mean(figures, f"loss_{name}") for name in SIMULATORS}
+    return losses | {
+        "neuro_to_msbg": gap(losses, "neuro", "msbg"),
+        "neuro_to_pyclarity": gap(losses, "neuro", "pyclarity"),
+        "msbg_to_pyclarity": gap(losses, "msbg", "pyclarity"),
+        "item_median": float(np.median([abs(gap(own, "neuro", "pyclarity")) for own in figures])),
+    }
+
+
+def _peaks(rows: Rows, condition: str, limit: float | None) -> dict[str, Any]:
+    peaks = [row["figures"][condition]["peak"] for row in rows]
+    # float32 rounds the limit itself by as little
+    over = None if limit is None else sum(peak > limit + 1e-4 for peak in peaks)
+    return {"n": len(peaks), "limit": limit, "highest": max(peaks), "over": over}
+
+
+def _mean(figures: Sequence[Mapping[str, float]], name: str) -> float:
+    return float(np.mean([own[name] for own in figures]))

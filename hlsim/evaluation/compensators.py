@@ -1,0 +1,195 @@
+"""Compensators judged beside no aid and NAL-R, on the same speech, ears, levels and noise."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from torch import nn
+
+from compensators.nalr import NALR
+from hlsim.audiogram import Audiogram
+from hlsim.evaluation.compensator_report import write_compensators
+from hlsim.evaluation.compensator_result import compensator_result
+from hlsim.evaluation.fidelity_items import RATE, Item
+from hlsim.evaluation.gain_curves import gain_curves
+from hlsim.evaluation.haspi import Progress, check_seed
+from hlsim.evaluation.judging import (
+    INPUT_LEVELS,
+    Judged,
+    Task,
+    Unaided,
+    draw_judged_items,
+    judge,
+    read_ears,
+)
+from hlsim.evaluation.measures import versions_of
+from hlsim.evaluation.report_files import check_out
+from hlsim.evaluation.simulators import samples_hash, weights_hash
+from hlsim.evaluation.store import ScoreStore, key_of
+from hlsim.extras import require
+from hlsim.parallel import check_parallel, run_parallel
+from hlsim.pretrained import load_pretrained
+
+STORE = "scores.jsonl"
+
+UNAIDED, PRESCRIBED = "unaided", "NAL-R"
+"""The conditions that every compensator is compared with."""
+
+_REVISION = 1  # of what ``judge`` measures: raise it where that changes a figure
+
+
+def evaluate_compensators(
+    compensators: Mapping[str, nn.Module],
+    *,
+    speech: str | Path,
+    out: str | Path,
+    audiograms: str | Path | None = None,
+    audiogram: Audiogram | None = None,
+    noise: str | Path | None = None,
+    simulator: str | Path = "neuro-msbg",
+    items: int = 400,
+    seconds: float = 3.0,
+    levels: Sequence[float] = INPUT_LEVELS,
+    gain_ears: Sequence[str] = ("N3", "S2"),
+    seed: int = 0,
+    jobs: int | None = None,
+    progress: Progress | None = None,
+) -> dict[str, Any]:
+    """Judge compensators, and write ``compensators.json``, ``.md`` and ``.html``.
+
+    Figures are stored in ``scores.jsonl`` as they are made, by the samples, the ear and the weights that they are of: a
+    run that was stopped goes on where it was, and one with a compensator more scores that one alone.
+
+    Args:
+        compensators: by name, modules at 16 kHz and 94 dB SPL full scale, called with a waveform and an ear. One with a
+            ``config.limit_spl`` is held to it.
+        speech, noise: folders of recordings; with ``noise`` every second item is noisy, at 2.5 to 17.5 dB.
+        out: folder for the files.
+        audiograms: CSV file of ears that join Bisgaard's N2 to N6 and S1 to S3.
+        audiogram: one ear in place of all, for a compensator that was trained for it.
+        simulator: the Neuro-MSBG of the surrogate gap, by name or folder.
+        items: how many in all. 400 give each main row 200 pairs.
+        seconds: length of an item; HASPI is not to be trusted much under 3.
+        levels: of the clean speech in dB SPL, in turn.
+        gain_ears: standard ears whose gain curves are drawn; with ``audiogram`` that ear's are.
+        jobs: processes; None takes all cores. The figures do not depend on it.
+        progress: called with the number of outputs judged and of all.
+
+    Returns: what ``compensators.json`` holds. Items that failed are listed in it with the reason, under ``failures``.
+
+    Raises:
+        ValueError: data or settings that cannot be used, or no item could be judged.
+        MissingExtraError: pyclarity, joblib or matplotlib is not installed.
+    """
+    for module in ("clarity", "matplotlib"):
+        require(module, "eval")
+    check_parallel(jobs, "loky", None)
+    check_seed(seed)
+    check_out(out)
+    if items < 1 or not compensators or not levels:
+        raise ValueError(
+            f"{items} items at {len(levels)} levels for {len(compensators)} compensators; allowed: 1 or more of each"
+        )
+    if taken := sorted({UNAIDED, PRESCRIBED} & set(compensators)):
+        raise ValueError(f"a compensator named {taken[0]!r}; allowed: other names, that one is there anyway")
+    if (audiograms is None) == (audiogram is None):
+        raise ValueError("give either audiograms, a CSV file of ears, or audiogram, one ear in place of all")
+    if audiogram is None:
+        ears, shown = read_ears(audiograms), {name: Audiogram.standard(name) for name in gain_ears}
+    else:
+        shown = {f"{' '.join(f'{level:g}' for level in audiogram.levels)} dB HL": audiogram}
+        ears = [*shown.items()]
+    conditions = {UNAIDED: Unaided(), PRESCRIBED: NALR(sample_rate=RATE), **compensators}
+    conditions = {name: module.eval() for name, module in conditions.items()}
+    drawn = draw_judged_items(speech, noise, ears, items=items, seconds=seconds, seed=seed, levels=levels)
+    judged = _judge_all(
+        _Panel(drawn, conditions, load_pretrained(simulator), seed),
+        ScoreStore(Path(out) / STORE),
+        jobs,
+        progress,
+    )
+    result, reports = compensator_result(
+        drawn,
+        judged,
+        limits={name: _limit(module) for name, module in conditions.items()},
+        settings={
+            "items": items,
+            "seconds": seconds,
+            "seed": seed,
+            "levels": [*levels],
+            "ears": [name for name, _ in ears],
+            "simulator": Path(simulator).name,
+        },
+    )
+    aided = {name: module for name, module in conditions.items() if name != UNAIDED}
+    result["gain_curves"] = gain_curves(aided, shown, speech, levels, seed)
+    write_compensators(result, reports, out)
+    return result
+
+
+@dataclass(frozen=True)
+class _Panel:
+    """All that is to be judged."""
+
+    items: Sequence[Item]
+    conditions: Mapping[str, nn.Module]
+    simulator: nn.Module
+    seed: int
+
+    def keys(self) -> Iterator[dict[str, str]]:
+        """What each item's figures are stored under, by condition."""
+        weights = {name: weights_hash(module) for name, module in self.conditions.items()}
+        about = {
+            "revision": _REVISION,
+            "versions": versions_of(["haspi", "hasqi"]),
+            "simulator": weights_hash(self.simulator),
+        }
+        for number, item in enumerate(self.items):
+            own = about | {
+                "signal": samples_hash(item.clean, item.signal),
+                "ear": list(item.ear.thresholds),
+                "seed": self.item_seed(number),
+            }
+            yield {name: key_of({**own, "weights": weights[name]}) for name in self.conditions}
+
+    def item_seed(self, number: int) -> int:
+        return (self.seed + number) % 2**32
+
+
+def _judge_all(
+    panel: _Panel, store: ScoreStore, jobs: int | None, progress: Progress | None
+) -> list[dict[str, Judged]]:
+    """Each item's figures by condition, those from the store among them."""
+    keys = list(panel.keys())
+    judged: list[dict[str, Judged]] = []
+    tasks = []
+    for number, (item, own) in enumerate(zip(panel.items, keys, strict=True)):
+        found = {name: record for name, key in own.items() if (record := store.get(key)) is not None}
+        judged.append({name: Judged(record) for name, record in found.items()})
+        missing = {name: module for name, module in panel.conditions.items() if name not in found}
+        if missing:
+            tasks.append(Task(number, item, missing, panel.simulator, panel.item_seed(number)))
+    total = len(panel.items) * len(panel.conditions)
+    done = total - sum(len(task.compensators) for task in tasks)
+    if progress is not None and done and tasks:
+        progress(done, total)
+    for task, result in run_parallel(judge, tasks, jobs=jobs) if tasks else ():
+        if result is None:
+            died = Judged(None, "the process that judged it died (a crash in a measure, or memory ran out)")
+            result = dict.fromkeys(task.compensators, died)
+        for name, own_result in result.items():
+            if own_result.figures is not None:
+                store.append(keys[task.number][name], own_result.figures)
+        judged[task.number].update(result)
+        done += len(result)
+        if progress is not None:
+            progress(done, total)
+    return judged
+
+
+def _limit(compensator: nn.Module) -> float | None:
+    """Peak in dB SPL that a compensator promises not to pass, or None."""
+    return getattr(getattr(compensator, "config", None), "limit_spl", None)

@@ -1,0 +1,209 @@
+"""Compensators judged one utterance at a time: which utterances and ears, and what is measured of each."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from hlsim.audiogram import Audiogram, read_audiograms
+from hlsim.band_levels import audibility, band_level_loss, band_levels, least_audible
+from hlsim.calibration import PASCAL_SPL, level_spl, set_level
+from hlsim.data.clips import Clips
+from hlsim.data.variation import mix
+from hlsim.evaluation.fidelity_items import RATE, SNRS_DB, Item
+from hlsim.evaluation.haspi import haspi
+from hlsim.evaluation.hasqi import hasqi
+from hlsim.evaluation.truth import pyclarity_msbg
+from hlsim.msbg import MSBG
+
+INPUT_LEVELS = (50.0, 65.0, 80.0)
+"""Levels of the clean speech in dB SPL that the items take in turn."""
+
+STANDARD_EARS = ("N2", "N3", "N4", "N5", "N6", "S1", "S2", "S3")
+"""Bisgaard's audiograms that are in every comparison of compensators."""
+
+SIMULATORS = ("neuro", "msbg", "pyclarity")
+"""Under which a compensator's loss is told: the named network, hlsim's exact MSBG, pyclarity's."""
+
+NORMAL = Audiogram.standard("NH")
+
+
+class Unaided(nn.Module):
+    """What an ear without a hearing aid is given: the signal as it is."""
+
+    def forward(self, waveform: Tensor, audiogram: Audiogram) -> Tensor:
+        return waveform
+
+
+@dataclass(frozen=True)
+class Task:
+    """An item, and the compensators that it has no figures of yet.
+
+    Args:
+        number: of the item, for the caller.
+        compensators: by name, at 16 kHz and 94 dB SPL full scale.
+        simulator: the network of ``neuro``, of the same rate and scale.
+        seed: of the noise that HASPI and HASQI add, the same for every compensator.
+    """
+
+    number: int
+    item: Item
+    compensators: Mapping[str, nn.Module]
+    simulator: nn.Module
+    seed: int
+
+
+class Judged(NamedTuple):
+    """Figures by name, or None and the reason."""
+
+    figures: dict[str, float] | None
+    reason: str = ""
+
+
+def read_ears(audiograms: str | Path | None) -> list[tuple[str, Audiogram]]:
+    """The standard ears and those of a CSV file, with names; the latter by listener and ear, or by row."""
+    ears = [(name, Audiogram.standard(name)) for name in STANDARD_EARS]
+    rows = read_audiograms(audiograms) if audiograms is not None else []
+    for number, (row, ear) in enumerate(rows, start=1):
+        named = " ".join(filter(None, (row.get("listener"), row.get("ear"))))
+        ears.append((named or f"row {number}", ear))
+    return ears
+
+
+def draw_judged_items(
+    speech: str | Path,
+    noise: str | Path | None,
+    ears: Sequence[tuple[str, Audiogram]],
+    *,
+    items: int,
+    seconds: float,
+    seed: int,
+    levels: Sequence[float] = INPUT_LEVELS,
+) -> list[Item]:
+    """Random clips for the ears in turn, with noise every second one noisy; all is drawn from the seed.
+
+    An item's speech has one of ``levels``, and its noise comes on top. Every ear meets every level and, of the noisy
+    items, every ratio of 2.5 to 17.5 dB with it.
+
+    Returns: items whose ``about`` has name (of the ear), severity, level, condition, snr (None without noise).
+    """
+    generator = torch.Generator().manual_seed(seed)
+    clips = Clips(speech, sample_rate=RATE, seconds=seconds)
+    noises = Clips(noise, sample_rate=RATE, seconds=seconds, repeat=True) if noise is not None else None
+    chosen = []
+    for i in range(items):
+        turn = i if noises is None else i // 2
+        number, around = turn % len(ears), turn // len(ears)
+        name, ear = ears[number]
+        # counters of different periods, so that no ear keeps to one level
+        level, snr = levels[(number + around) % len(levels)], SNRS_DB[(number + around) % len(SNRS_DB)]
+        clean = set_level(clips.draw(1, generator), level)
+        signal, noisy = clean, noises is not None and i % 2 == 1
+        if noises is not None and noisy:
+            signal = mix(clean, noises.draw(1, generator), torch.tensor([snr]))
+        about = {
+            "name": name,
+            "severity": ear.severity,
+            "level": level,
+            "condition": "noisy" if noisy else "clean",
+            "snr": snr if noisy else None,
+        }
+        chosen.append(Item(clean.squeeze(0), signal.squeeze(0), ear, about))
+    return chosen
+
+
+def judge(task: Task) -> dict[str, Judged]:
+    """Each compensator's figures for an item; what goes wrong is the reason.
+
+    - ``haspi``, ``hasqi``: v2, of the output against the clean speech, in noise too.
+    - ``level``, ``peak``: of the output, RMS and largest sample in dB SPL (a sample of 1.0 is 94).
+    - ``heard``: level in dB SPL after the exact MSBG; ``normal``: what a normal ear hears there of the same input, noise
+      and all; ``normal_clean``: of the speech in it.
+    - ``band_error``: median absolute difference in dB between band levels (24 bands, 32 ms) of what the impaired ear
+      hears and what a normal one hears of the clean speech, both by the exact MSBG, where the latter is audible.
+    - ``loss_neuro``, ``loss_msbg``, ``loss_pyclarity``: what ``HearingLossLoss(criterion="bands")`` is under each.
+    """
+    # small steps: threads would wait for each other, and items are what is parallel
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        with torch.no_grad():
+            return _judge(task)
+    finally:
+        torch.set_num_threads(threads)
+
+
+def _judge(task: Task) -> dict[str, Judged]:
+    item = task.item
+    try:
+        normal = {name: _hear(task, name, item.clean, NORMAL) for name in SIMULATORS}
+        given = float(level_spl(_hear(task, "msbg", item.signal, NORMAL)))
+    except Exception as error:  # whatever it is, it is this item's reason, and the others go on
+        return dict.fromkeys(task.compensators, Judged(None, _reason(error)))
+    judged = {}
+    for name, compensator in task.compensators.items():
+        try:
+            figures = {**_figures(task, compensator(item.signal, item.ear), normal), "normal": given}
+            if unknown := [figure for figure, value in figures.items() if not math.isfinite(value)]:
+                raise ValueError(f"{', '.join(unknown)}: not finite")
+            judged[name] = Judged(figures)
+        except Exception as error:
+            judged[name] = Judged(None, _reason(error))
+    return judged
+
+
+def _figures(task: Task, aided: Tensor, normal: Mapping[str, Tensor]) -> dict[str, float]:
+    item = task.item
+    scores = {
+        name: measure(item.clean, aided, item.ear, RATE, full_scale_spl=PASCAL_SPL, seed=task.seed)
+        for name, measure in (("haspi", haspi), ("hasqi", hasqi))
+    }
+    heard = {name: _hear(task, name, aided, item.ear) for name in SIMULATORS}
+    return {
+        **scores,
+        "level": float(level_spl(aided)),
+        "peak": peak_spl(aided),
+        "heard": float(level_spl(heard["msbg"])),
+        "normal_clean": float(level_spl(normal["msbg"])),
+        "band_error": band_error_db(heard["msbg"], normal["msbg"]),
+        **{f"loss_{name}": float(band_level_loss(heard[name], normal[name], RATE)) for name in SIMULATORS},
+    }
+
+
+def peak_spl(waveform: Tensor) -> float:
+    """The largest sample in dB SPL, where 1.0 is 94. Shape: (time,)."""
+    return float(20.0 * waveform.abs().max().clamp_min(1e-10).log10()) + PASCAL_SPL
+
+
+def band_error_db(heard: Tensor, normal: Tensor) -> float:
+    """Median absolute difference of band levels in dB, over the bands and frames that a normal ear finds audible.
+
+    Shape: (time,) twice, in pascals at 16 kHz.
+
+    Raises:
+        ValueError: it finds none audible.
+    """
+    levels, truth = band_levels(heard, RATE), band_levels(normal, RATE)
+    audible = audibility(truth, least_audible(truth)) > 0.0
+    if not bool(audible.any()):
+        raise ValueError("nothing of the clean speech is audible to a normal ear")
+    return float((levels - truth).abs()[audible].double().quantile(0.5))
+
+
+def _hear(task: Task, simulator: str, signal: Tensor, ear: Audiogram) -> Tensor:
+    if simulator == "pyclarity":
+        return pyclarity_msbg(signal, ear, RATE)
+    model = task.simulator if simulator == "neuro" else MSBG(sample_rate=RATE)
+    heard: Tensor = model(signal, ear)
+    return heard
+
+
+def _reason(error: Exception) -> str:
+    kind = "" if isinstance(error, ValueError) else f"{type(error).__name__}: "
+    return kind + " ".join(str(error).split())

@@ -1,0 +1,301 @@
+"""Judging compensators: the items, what is measured of each, gain curves, and the report."""
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor, nn
+
+from compensators import NALR, MappingCompensator, MappingConfig
+from hlsim import MSBG, Audiogram, HearingLossLoss, load_pretrained
+from hlsim.band_levels import band_edges
+from hlsim.calibration import level_spl, set_level
+from hlsim.cli import main
+from hlsim.evaluation import compensators, judging
+from hlsim.evaluation.compensator_report import FILES
+from hlsim.evaluation.compensators import evaluate_compensators
+from hlsim.evaluation.gain_curves import insertion_gain
+from hlsim.evaluation.haspi import haspi
+from hlsim.evaluation.hasqi import hasqi
+from hlsim.evaluation.judging import (
+    INPUT_LEVELS,
+    Judged,
+    Task,
+    Unaided,
+    band_error_db,
+    draw_judged_items,
+    judge,
+    peak_spl,
+    read_ears,
+)
+from hlsim.evaluation.significance import paired_comparison
+
+pytest.importorskip("clarity")
+pytest.importorskip("matplotlib")
+
+
+class Gain(nn.Module):
+    """So many dB more, whatever the ear."""
+
+    def __init__(self, gain_db: float = 20.0) -> None:
+        super().__init__()
+        self.register_buffer("gain", torch.tensor(10.0 ** (gain_db / 20.0)))
+
+    def forward(self, waveform: Tensor, audiogram: Audiogram) -> Tensor:
+        return waveform * self.gain
+
+
+class Broken(nn.Module):
+    """Fails for S1, and gives NaN for S2."""
+
+    def forward(self, waveform: Tensor, audiogram: Audiogram) -> Tensor:
+        if audiogram == Audiogram.standard("S1"):
+            raise RuntimeError("no\nsuch ear")
+        return waveform * math.nan if audiogram == Audiogram.standard("S2") else waveform
+
+
+@pytest.fixture
+def ears_csv(tmp_path: Path) -> Path:
+    path = tmp_path / "ears.csv"
+    rows = [{"listener": "L1", "ear": side, **Audiogram.standard("N3").to_row()} for side in "lr"]
+    path.write_text("\n".join([",".join(rows[0]), *(",".join(row.values()) for row in rows)]))
+    return path
+
+
+@pytest.fixture
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Scores of no meaning in place of HASPI and HASQI, and the exact MSBG in pyclarity's: seconds instead of minutes."""
+
+    def score(clean: Tensor, aided: Tensor, ear: Audiogram, rate: int, **options: Any) -> float:
+        if not torch.isfinite(aided).all():
+            raise ValueError("processed holds samples that are NaN or infinite")
+        return float(aided.abs().mean() / (aided.abs().mean() + 0.1))
+
+    monkeypatch.setattr(judging, "haspi", score)
+    monkeypatch.setattr(judging, "hasqi", lambda *signals, **options: 0.5 * score(*signals, **options))
+    monkeypatch.setattr(judging, "pyclarity_msbg", lambda x, ear, rate: MSBG(ear, sample_rate=rate)(x))
+
+
+def test_ears_are_the_standard_ones_and_those_of_the_file(ears_csv: Path) -> None:
+    ears = read_ears(ears_csv)
+    assert [name for name, _ in ears] == ["N2", "N3", "N4", "N5", "N6", "S1", "S2", "S3", "L1 l", "L1 r"]
+    assert ears[0][1] == Audiogram.standard("N2") and ears[-1][1] == Audiogram.standard("N3")
+
+
+@pytest.mark.parametrize("count", [8, 9, 10, 11])
+def test_every_ear_meets_every_level_and_ratio(speech_dir: Path, count: int) -> None:
+    ears = [(f"{i}", Audiogram((float(i),) * 8)) for i in range(count)]
+    train, valid = speech_dir / "train", speech_dir / "valid"
+    # short items: only how they are shared out counts
+    drawn = draw_judged_items(valid, train, ears, items=2 * 12 * count, seconds=0.05, seed=0)
+    for condition, combinations in (("clean", 3), ("noisy", 12)):
+        about = [item.about for item in drawn if item.about["condition"] == condition]
+        met = {(entry["name"], entry["level"], entry["snr"]) for entry in about}
+        assert len(about) == 12 * count and len(met) == combinations * count
+
+
+def test_speech_has_its_level_and_noise_comes_on_top(speech_dir: Path) -> None:
+    ears = [("N3", Audiogram.standard("N3"))]
+    drawn, again, other = (
+        draw_judged_items(speech_dir / "valid", speech_dir / "train", ears, items=8, seconds=1.0, seed=seed)
+        for seed in (0, 0, 1)
+    )
+    for item in drawn:
+        assert float(level_spl(item.clean)) == pytest.approx(item.about["level"], abs=0.01)
+        if item.about["snr"] is None:
+            assert torch.equal(item.clean, item.signal)
+        else:
+            snr = float(level_spl(item.clean) - level_spl(item.signal - item.clean))
+            assert snr == pytest.approx(item.about["snr"], abs=0.01)
+    assert all(torch.equal(a.signal, b.signal) for a, b in zip(drawn, again, strict=True))
+    assert not torch.equal(drawn[0].signal, other[0].signal)
+
+
+def test_figures_are_those_of_the_measures_and_the_loss(speech_dir: Path) -> None:
+    ear = Audiogram.standard("N3")
+    (_, item) = draw_judged_items(
+        speech_dir / "valid", speech_dir / "train", [("N3", ear)], items=2, seconds=0.8, seed=0
+    )
+    neuro = load_pretrained("neuro-msbg")
+    judged = judge(Task(0, item, {"NAL-R": NALR()}, neuro, 7))["NAL-R"]
+    figures, aided = judged.figures, NALR()(item.signal, ear)
+    assert figures is not None and judged.reason == ""
+    assert figures["haspi"] == haspi(item.clean, aided, ear, 16000, seed=7)
+    assert figures["hasqi"] == hasqi(item.clean, aided, ear, 16000, seed=7)
+    for name, simulator in (("neuro", neuro), ("msbg", "msbg")):
+        loss = HearingLossLoss(ear, criterion="bands", simulator=simulator)
+        assert figures[f"loss_{name}"] == pytest.approx(float(loss(aided, item.clean)), rel=1e-4)
+    assert figures["loss_pyclarity"] == pytest.approx(figures["loss_msbg"], rel=0.02)
+    assert figures["level"] == pytest.approx(float(level_spl(aided)), abs=1e-3)
+    assert figures["heard"] == pytest.approx(float(level_spl(MSBG(ear, sample_rate=16000)(aided))), abs=1e-3)
+    normal = MSBG(Audiogram.standard("NH"), sample_rate=16000)
+    assert figures["normal"] == pytest.approx(float(level_spl(normal(item.signal))), abs=1e-3)
+    assert figures["normal_clean"] == pytest.approx(float(level_spl(normal(item.clean))), abs=1e-3)
+    assert figures["normal"] > figures["normal_clean"] + 1.0  # 2.5 dB SNR
+
+
+def test_errors_of_bands_and_peaks(speech: list[tuple[Tensor, int]]) -> None:
+    waveform = set_level(speech[0][0][0, :32000], 65.0)
+    assert band_error_db(waveform, waveform) == 0.0
+    assert band_error_db(0.1 * waveform, waveform) == pytest.approx(20.0, abs=0.01)
+    with pytest.raises(ValueError, match="audible"):
+        band_error_db(waveform, 1e-9 * waveform)
+    assert peak_spl(torch.tensor([0.0, -1.0, 0.5])) == pytest.approx(94.0)
+    assert peak_spl(torch.tensor([10.0])) == pytest.approx(114.0)
+
+
+def test_gain_curves(speech: list[tuple[Tensor, int]]) -> None:
+    utterances = torch.stack([speech[i][0][0, :24000] for i in (0, 2)])
+    ear = Audiogram((50.0,) * 8)
+    np.testing.assert_allclose(insertion_gain(Gain(6.0), ear, utterances, INPUT_LEVELS), 6.0, atol=1e-3)
+    # a linear filter has one curve: its own response
+    prescribed = NALR()
+    curves = np.array(insertion_gain(prescribed, ear, utterances, INPUT_LEVELS))
+    np.testing.assert_allclose(curves[1:], curves[:1].repeat(2, 0), atol=0.01)
+    taps = prescribed.taps(torch.tensor(ear.thresholds))
+    hz = np.fft.rfftfreq(4096, 1 / 16000)
+    response = 20.0 * np.log10(np.abs(np.fft.rfft(taps.numpy(), 4096)))
+    edges = band_edges()
+    for gain, low, high in zip(curves[1], edges[:-1], edges[1:], strict=True):
+        inside = response[(hz >= 0.8 * low - 62.5) & (hz <= 1.2 * high + 62.5)]
+        assert inside.min() - 0.1 <= gain <= inside.max() + 0.1
+    # a limit bends the curve of loud speech
+    limited = MappingCompensator(MappingConfig(limit_spl=80.0)).eval()
+    soft, _, loud = (np.mean(curve) for curve in insertion_gain(limited, ear, utterances, INPUT_LEVELS))
+    assert loud < soft - 6.0
+
+
+@pytest.mark.usefixtures("quick")
+def test_report(tmp_path: Path, speech_dir: Path, ears_csv: Path) -> None:
+    out = tmp_path / "out"
+    limited = Gain(40.0)
+    limited.config = MappingConfig(limit_spl=100.0)  # type: ignore[assignment]
+    shown: list[tuple[int, int]] = []
+    result = evaluate_compensators(
+        {"loud": limited, "broken": Broken()},
+        speech=speech_dir / "valid",
+        noise=speech_dir / "train",
+        audiograms=ears_csv,
+        out=out,
+        items=14,
+        seconds=0.3,
+        gain_ears=("N2",),
+        jobs=1,
+        progress=lambda done, total: shown.append((done, total)),
+    )
+    assert shown[-1] == (56, 56)
+    # both items of S1 and of S2 are left out, with the reason
+    reasons = [(failure["name"], failure["reason"]) for failure in result["failures"]]
+    assert reasons[:2] == [("S1", "RuntimeError: no such ear")] * 2
+    assert [name for name, _ in reasons[2:]] == ["S2"] * 2 and "NaN" in reasons[2][1]
+    assert {row["name"] for row in result["rows"]}.isdisjoint({"S1", "S2"})
+    clean = [row for row in result["rows"] if row["condition"] == "clean"]
+    group = result["groups"]["clean"]
+    assert group["n"] == len(clean) == 5 and result["groups"]["noisy"]["n"] == 5
+
+    def column(condition: str, name: str) -> np.ndarray:
+        return np.array([row["figures"][condition][name] for row in clean])
+
+    own = group["conditions"]["loud"]
+    assert own["haspi_mean"] == pytest.approx(column("loud", "haspi").mean())
+    off = column("loud", "heard") - column("loud", "normal")
+    assert (own["heard_off"], own["heard_off_abs"]) == pytest.approx((off.mean(), np.abs(off).mean()))
+    assert set(own["by_level"]) == {"50", "65", "80"} and set(own["by_severity"]) <= {"moderate", "severe"}
+    (against,) = [
+        c
+        for c in group["comparisons"]
+        if (c["measure"], c["before"], c["after"]) == ("haspi", "NAL-R", "loud")
+    ]
+    expected = paired_comparison(column("NAL-R", "haspi"), column("loud", "haspi"))
+    assert (against["t"], against["w"], against["cohens_d"]) == (expected.t, expected.w, expected.cohens_d)
+    assert against["p_t_holm"] >= expected.p_t
+    gap = result["gap"]["clean"]["loud"]
+    assert gap["loss_neuro"] == pytest.approx(column("loud", "loss_neuro").mean())
+    assert gap["neuro_to_msbg"] == pytest.approx(gap["loss_neuro"] / gap["loss_msbg"] - 1.0)
+    # the hard ones are those of low scores unaided
+    low = [row for row in result["rows"] if row["figures"]["unaided"]["haspi"] < 0.6]
+    assert result["groups"]["hard"]["n"] == len(low) > 0
+    # 40 dB more takes 65 dB SPL and up beyond 100
+    peaks = [row["figures"]["loud"]["peak"] for row in result["rows"]]
+    assert result["peaks"]["loud"]["over"] == sum(peak > 100.0 for peak in peaks) > 0
+    assert result["peaks"]["NAL-R"]["over"] is None
+
+    assert {path.name for path in out.iterdir()} == {"scores.jsonl", *FILES}
+    assert json.loads((out / "compensators.json").read_text()) == json.loads(json.dumps(result))
+    text = (out / "compensators.md").read_text()
+    assert f"| loud | 100 | {max(peaks):.2f} | {result['peaks']['loud']['over']} of 10 |" in text
+    assert "| severe, HASQI: NAL-R to loud |" in text and "| HASPI: unaided to broken |" in text
+    assert "RuntimeError: no such ear" in text and "| N2, loud, 50 dB SPL | +40.0 |" in text
+    page = (out / "compensators.html").read_text()
+    assert page.count("data:image/svg+xml") > 2 and "Paired tests" in page and "Gain curves" in page
+
+
+@pytest.mark.usefixtures("quick")
+def test_a_stopped_run_goes_on_and_new_weights_are_judged_anew(
+    tmp_path: Path, speech_dir: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    options: dict[str, Any] = {
+        "speech": speech_dir / "valid",
+        "audiogram": Audiogram.standard("N4"),
+        "items": 3,
+        "seconds": 0.3,
+        "jobs": 1,
+    }
+    whole = evaluate_compensators({"own": Gain()}, **options, out=tmp_path / "whole")
+    original, calls = judging.judge, []
+
+    def counted(task: Task) -> dict[str, Judged]:
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+        calls.append([*task.compensators])
+        return original(task)
+
+    monkeypatch.setattr(compensators, "judge", counted)
+    parts = tmp_path / "parts"
+    with pytest.raises(KeyboardInterrupt):
+        evaluate_compensators({"own": Gain()}, **options, out=parts)
+    assert [path.name for path in parts.iterdir()] == ["scores.jsonl"]
+    calls[:] = [[]]  # one more is left before it stops again
+    assert evaluate_compensators({"own": Gain()}, **options, out=parts) == whole
+    calls.clear()
+    with pytest.raises(KeyboardInterrupt):
+        evaluate_compensators({"own": Gain(10.0)}, **options, out=parts)
+    assert calls == [["own"]] * 2  # of the others all is known
+    assert whole["ears"] == ["55 55 55 65 70 75 80 80 dB HL"] and whole["groups"].keys() <= {"clean", "hard"}
+    assert {curve["ear"] for curve in whole["gain_curves"]} == {*whole["ears"]}
+
+
+def test_nothing_to_judge(tmp_path: Path, speech_dir: Path) -> None:
+    ear, folder = Audiogram.standard("N3"), speech_dir / "valid"
+    options: dict[str, Any] = {"speech": folder, "out": tmp_path / "out", "jobs": 1}
+    with pytest.raises(ValueError, match="named 'NAL-R'; allowed: other names"):
+        evaluate_compensators({"NAL-R": Unaided()}, **options, audiogram=ear)
+    with pytest.raises(ValueError, match="either audiograms, a CSV file of ears, or audiogram"):
+        evaluate_compensators({"own": Unaided()}, **options)
+    with pytest.raises(ValueError, match="0 compensators; allowed: 1 or more"):
+        evaluate_compensators({}, **options, audiogram=ear)
+    # HASPI takes nothing under 0.7 s
+    with pytest.raises(ValueError, match=r"none of 1 items could be judged; the first: .*needs 0.7 s"):
+        evaluate_compensators({"own": Unaided()}, **options, audiogram=ear, items=1, seconds=0.5)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.usefixtures("quick")
+def test_command(tmp_path: Path, speech_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    command = ["evaluate-compensator", "mine=nalr", "--speech", str(speech_dir / "valid"), "--jobs", "1"]
+    command += ["--items", "2", "--seconds", "0.3", "--out", str(tmp_path / "out")]
+    assert main([*command, "--audiogram", "N3"]) == 0
+    said = capsys.readouterr()
+    assert "| mine | 2 |" in said.out and "6 of 6 outputs" in said.err
+    for arguments, line in (
+        (command, "give either audiograms"),
+        ([*command[:2], "mine=nalr", *command[2:], "--audiogram", "N3"], "one a label"),
+        ([command[0], "nobody", *command[2:], "--audiogram", "N3"], "nobody"),
+    ):
+        assert main(arguments) == 2
+        error = capsys.readouterr().err.strip()
+        assert len(error.splitlines()) == 1 and error.startswith("hlsim: error: ") and line in error

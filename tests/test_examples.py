@@ -1,0 +1,59 @@
+"""The examples run as they stand, on little."""
+
+import csv
+import importlib.util
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+import torch
+
+from hlsim import Audiogram
+from hlsim.audio import read_audio, write_audio
+
+EXAMPLES = Path(__file__).parents[1] / "examples"
+
+
+def load(name: str) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(Path(name).stem, EXAMPLES / name)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_own_network_trains(tmp_path: Path, speech_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert len((EXAMPLES / "train_compensator.py").read_text().splitlines()) < 60
+    example, out = load("train_compensator.py"), tmp_path / "network.pt"
+    example.main(str(speech_dir / "train"), str(out), "N4", "2")
+    assert [line.split(":")[0] for line in capsys.readouterr().out.splitlines()] == ["step 0", "step 1"]
+    fresh, trained = example.MyNetwork(), example.MyNetwork()
+    trained.load_state_dict(torch.load(out))
+    ear, noise = Audiogram.standard("N4"), 0.03 * torch.randn(2, 8000)
+    # it starts from the prescription, and two steps have moved it
+    torch.testing.assert_close(fresh(noise, ear), fresh.prescription(noise, ear), atol=1e-4, rtol=1e-3)
+    assert float((trained(noise, ear) - fresh(noise, ear)).abs().max()) > 1e-4
+    assert trained(noise[0], ear).shape == (8000,)
+
+
+def test_the_papers_last_table(tmp_path: Path, speech_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for module in ("clarity", "matplotlib", "joblib"):
+        pytest.importorskip(module)
+    clean, rate = read_audio(speech_dir / "valid" / "flite-rms-01.flac")
+    clean = clean[:, rate // 2 : rate // 2 + rate]
+    corpus = tmp_path / "voicebank"
+    for name, signal in (("clean", clean), ("noisy", clean + 0.01 * torch.randn_like(clean))):
+        (corpus / f"{name}_testset_wav").mkdir(parents=True)
+        write_audio(corpus / f"{name}_testset_wav" / "p232_001.wav", signal, rate)
+    ears = tmp_path / "ears.csv"
+    rows = [{"listener": name, **Audiogram.standard(name).to_row()} for name in ("N2", "N3", "N5")]
+    ears.write_text("\n".join([",".join(rows[0]), *(",".join(row.values()) for row in rows)]))
+    out = tmp_path / "out"
+    options = ["--audiograms", str(ears), "--compensators", "nalr", "--jobs", "1"]
+    load("paper/haspi_table.py").main([str(corpus), str(out), *options])
+    assert "| Metric | Unaided | Nalr | Change (Δ) |" in capsys.readouterr().out
+    with open(out / "table.csv", newline="") as file:
+        table = list(csv.DictReader(file))
+    # one utterance, two different ears of the file, two conditions
+    assert len(table) == 4 and len({row["hl_1000"] for row in table}) == 2
+    assert (out / "report" / "report.json").is_file()
