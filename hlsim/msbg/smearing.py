@@ -73,37 +73,52 @@ def smeared_length(samples: int) -> int:
     return HOP * (math.ceil(samples / HOP) + 3)
 
 
-def smear(waveform: Tensor, matrix: Tensor) -> Tensor:
-    """Smear a waveform at 44.1 kHz as pyclarity's ``smear3`` does, its delay and its first, irregular frames included.
+def smear(waveform: Tensor, matrix: Tensor, step: int = 1) -> Tensor:
+    """Smear a waveform as pyclarity's ``smear3`` does at 44.1 kHz, its delay and its first, irregular frames included.
 
-    Shape: (..., time), (256, 256) -> (..., 64 * (ceil(time / 64) + 3)).
+    Shape: (..., time), (256 // step, 256 // step) -> (..., hop * (ceil(time / hop) + 3)) with hop = 64 // step.
+
+    Args:
+        matrix: ``smearing_matrix``, its lower half in both directions if ``step`` is 2.
+        step: 1 at 44.1 kHz; 2 at 22.05 kHz, where the same frames are taken at every other sample and nothing above
+            11 kHz is known.
     """
+    hop, frame, fft = HOP // step, FRAME // step, FFT // step
     samples = waveform.shape[-1]
-    frames = _frames(functional.pad(waveform, (0, max(FRAME, HOP * math.ceil(samples / HOP)) - samples)))
-    frames = frames[..., : math.ceil(samples / HOP), :]
-    place = 2.0 * math.pi * (torch.arange(FRAME, dtype=torch.float64, device=waveform.device) + 0.5) / FRAME
-    window = ((0.5 - 0.5 * place.cos()) / math.sqrt(1.5)).to(waveform.dtype)
-    spectrum = torch.fft.rfft(frames * window, FFT)[..., : FFT // 2]
+    count = math.ceil(samples / hop)
+    frames = _frames(functional.pad(waveform, (0, max(frame, hop * count) - samples)), hop)[..., :count, :]
+    window = _window(step, waveform.dtype, waveform.device)
+    spectrum = torch.fft.rfft(frames * window, fft)[..., : fft // 2]
     power = spectrum.real.square() + spectrum.imag.square()
     smeared = power @ matrix.T
     # tiny terms keep the gradients of silence finite
-    scale = (smeared.abs() + _TINY).sqrt() * (power + _TINY).rsqrt()
-    turned = torch.complex(-spectrum.imag, spectrum.real)  # the square root of a negative power is imaginary
-    spectrum = torch.where(smeared < 0, turned, spectrum) * scale
-    frames = torch.fft.irfft(functional.pad(spectrum, (0, 1)), FFT)[..., :FRAME] * window
-    return _overlap_add(frames)
+    inverse = (power + _TINY).rsqrt()
+    # the square root of a negative power is imaginary
+    ahead = (smeared.clamp_min(0.0) + _TINY).sqrt() * inverse
+    turned = (smeared.clamp_max(0.0).neg() + _TINY).sqrt() * inverse
+    spectrum = spectrum * torch.complex(ahead, turned)
+    frames = torch.fft.irfft(functional.pad(spectrum, (0, 1)), fft)[..., :frame] * window
+    return _overlap_add(frames, hop)
 
 
-def _frames(waveform: Tensor) -> Tensor:
-    """Frame k covers samples 64 (k - 3) to 64 (k + 1) from the fifth on; the first four are as ``smear3`` fills them."""
-    hops = waveform.unflatten(-1, (-1, HOP))
-    order = torch.tensor([[0, 1, 2, 3], [1, 2, 3, 1], [2, 3, 1, 2], [3, 1, 2, 3]], device=waveform.device)
-    first = hops[..., order, :].flatten(-2)
-    return torch.cat((first, waveform.unfold(-1, FRAME, HOP)[..., 1:, :]), -2)
+@lru_cache(maxsize=16)
+def _window(step: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Of analysis and synthesis: their product adds up to 1 over four frames. Shape: (256 // step,)."""
+    with torch.inference_mode(False):
+        place = 2.0 * math.pi * (torch.arange(0, FRAME, step, dtype=torch.float64) + 0.5) / FRAME
+        return ((0.5 - 0.5 * place.cos()) / math.sqrt(1.5)).to(device=device, dtype=dtype)
 
 
-def _overlap_add(frames: Tensor) -> Tensor:
-    hops = frames.unflatten(-1, (4, HOP))
+def _frames(waveform: Tensor, hop: int) -> Tensor:
+    """Frame k covers hops k - 3 to k from the fifth on; the first four are as ``smear3`` fills them."""
+    hops = waveform.unflatten(-1, (-1, hop))[..., :4, :].unbind(-2)
+    order = (0, 1, 2, 3, 1, 2, 3, 1, 2, 3, 1, 2, 3, 1, 2, 3)
+    first = torch.cat([hops[i] for i in order], -1).unflatten(-1, (4, -1))
+    return torch.cat((first, waveform.unfold(-1, 4 * hop, hop)[..., 1:, :]), -2)
+
+
+def _overlap_add(frames: Tensor, hop: int) -> Tensor:
+    hops = frames.unflatten(-1, (4, hop))
     count = hops.shape[-3]
     parts = [functional.pad(hops[..., j, :], (0, 0, j, 0))[..., :count, :] for j in range(4)]
     # smear3's last three hops: the newest frames' parts, and in place of the others' those of the fourth last frame
