@@ -11,7 +11,7 @@ from torch.utils.checkpoint import checkpoint
 from hlsim.audio import check_rate, check_waveform
 from hlsim.audiogram import SEVERITIES, AudiogramLike, as_thresholds, severity_index
 from hlsim.calibration import PASCAL_SPL, check_full_scale, gain_to_pascals
-from hlsim.msbg.cochlea import Kind, bank_points, hear, hear_ending
+from hlsim.msbg.cochlea import bank_points, hear, hear_ending
 from hlsim.msbg.ear import RATE
 from hlsim.msbg.filterbank import BANKS
 from hlsim.msbg.filters import Filters
@@ -113,13 +113,13 @@ class MSBG(nn.Module):
 
         outputs: list[Tensor] = []
         order: list[int] = []
-        for kind, members in _alike(ears):
+        for severity, none, members in _alike(ears):
             for some in _portions(members, signals.shape[-1], signals.device.type):
                 if len(some) == len(signals):
-                    outputs.append(self._in_blocks(signals, ears, kind))
+                    outputs.append(self._in_blocks(signals, ears, severity, none))
                 else:
                     chosen = slice(some[0], some[-1] + 1, 1) if some[-1] - some[0] == len(some) - 1 else some
-                    outputs.append(self._in_blocks(signals[chosen], ears[chosen], kind))
+                    outputs.append(self._in_blocks(signals[chosen], ears[chosen], severity, none))
                 order += some
         longest = max(output.shape[-1] for output in outputs)
         joined = [functional.pad(output, (0, longest - output.shape[-1])) for output in outputs]
@@ -129,16 +129,16 @@ class MSBG(nn.Module):
         heard = heard / gain_to_pascals(self.full_scale_spl)
         return heard.reshape(*batch, longest).to(waveform.dtype)
 
-    def _in_blocks(self, signals: Tensor, ears: Tensor, kind: Kind) -> Tensor:
+    def _in_blocks(self, signals: Tensor, ears: Tensor, severity: str, none: bool) -> Tensor:
         """Long signals by overlapping blocks, so that memory does not grow. Shapes as ``_simulate_alike``'s."""
         samples = signals.shape[-1]
         bounds = block_bounds(samples, self.sample_rate)
         if len(bounds) == 1:
-            return self._simulate_alike(signals, ears, kind, True)
+            return self._simulate_alike(signals, ears, severity, none, True)
         heard = []
         for begin, start, stop, end in bounds:
             last = end == samples
-            call = partial(self._simulate_alike, kind=kind, last=last)
+            call = partial(self._simulate_alike, severity=severity, none=none, last=last)
             block = signals[:, begin:end]
             if torch.is_grad_enabled() and (block.requires_grad or ears.requires_grad):
                 output = checkpoint(call, block, ears, use_reentrant=False)
@@ -147,13 +147,16 @@ class MSBG(nn.Module):
             heard.append(output[:, start - begin : None if last else stop - begin])
         return torch.cat(heard, -1)
 
-    def _simulate_alike(self, signals: Tensor, ears: Tensor, kind: Kind, last: bool) -> Tensor:
+    def _simulate_alike(
+        self, signals: Tensor, ears: Tensor, severity: str, none: bool, last: bool
+    ) -> Tensor:
         """All items have the same severity. Shape: (items, time), (items, 8) -> (items, time).
 
         Args:
+            none: they hear everything at its level: 0 dB HL throughout.
             last: the signals end where they end, and are not cut from longer ones.
         """
-        severity, samples, rate = kind.severity, signals.shape[-1], self.sample_rate
+        samples, rate = signals.shape[-1], self.sample_rate
         step = 2 if self.aligned and rate <= _HALF_RATE_HZ else 1
         delay = self.delay(severity) if self.aligned else 0
         inner = math.ceil(samples * RATE / rate)
@@ -167,22 +170,23 @@ class MSBG(nn.Module):
         length = heard.shape[-1]
         if self.aligned:
             points = bank_points(length * step, rate)
-            spectrum = hear(rfft(heard, points // step), ratios, filters.get("plan", severity, points, step), kind)
+            plan = filters.get("plan", severity, points, step)
+            spectrum = hear(rfft(heard, points // step), None if none else ratios, plan)
             return scale * from_spectrum(spectrum, points, step, rate, samples, delay, filters)
-        heard = self._late(heard, ratios, kind, last, filters)
+        heard = self._late(heard, ratios, severity, last, filters)
         return scale * from_cochlea(heard, rate, length, round(length * rate / RATE), filters)
 
-    def _late(self, heard: Tensor, ratios: Tensor, kind: Kind, last: bool, filters: Filters) -> Tensor:
+    def _late(self, heard: Tensor, ratios: Tensor, severity: str, last: bool, filters: Filters) -> Tensor:
         """With the delay and, at the end, what the reference makes of it. Shape: (items, time) -> (items, time)."""
         length = heard.shape[-1]
         whole = length <= _ENDING + _ENDING_LEAD
         parts = []
         if not whole or not last:
             points = bank_points(length, RATE)
-            plan = filters.get("plan", kind.severity, points, 1)
-            parts.append(irfft(hear(rfft(heard, points), ratios, plan, kind), points)[..., :length])
+            plan = filters.get("plan", severity, points, 1)
+            parts.append(irfft(hear(rfft(heard, points), ratios, plan), points)[..., :length])
         if last:
-            ending = hear_ending(heard if whole else heard[..., -_ENDING - _ENDING_LEAD :], ratios, kind, filters)
+            ending = hear_ending(heard if whole else heard[..., -_ENDING - _ENDING_LEAD :], ratios, severity, filters)
             parts = [ending] if whole else [parts[0][..., :-_ENDING], ending[..., -_ENDING:]]
         return parts[0] if len(parts) == 1 else torch.cat(parts, -1)
 
@@ -226,18 +230,14 @@ def active_rescaling(signals: Tensor) -> Tensor:
     return ratio.sqrt().unsqueeze(-1)
 
 
-def _alike(ears: Tensor) -> list[tuple[Kind, list[int]]]:
-    """Kinds of ears in a batch, and the indices of each. Shape: (items, 8)."""
+def _alike(ears: Tensor) -> list[tuple[str, bool, list[int]]]:
+    """Severity, whether all is 0 dB HL, and the indices of the items with ears like that. Shape: (items, 8)."""
     known = ears.detach().cpu()  # once a call; the rest asks nothing of the device
+    none = [not any(levels) and not ears.requires_grad for levels in known.tolist()]
     groups: dict[tuple[int, bool], list[int]] = {}
-    for item, (index, none) in enumerate(
-        zip(severity_index(known).tolist(), (known == 0.0).all(-1).tolist(), strict=True)
-    ):
-        groups.setdefault((index, none and not ears.requires_grad), []).append(item)
-    return [
-        (Kind.of(SEVERITIES[index], known[members], none), members)
-        for (index, none), members in groups.items()
-    ]
+    for item, kind in enumerate(zip(severity_index(known).tolist(), none, strict=True)):
+        groups.setdefault(kind, []).append(item)
+    return [(SEVERITIES[index], still, members) for (index, still), members in groups.items()]
 
 
 def _portions(members: list[int], samples: int, device: str) -> list[list[int]]:

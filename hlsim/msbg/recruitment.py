@@ -47,34 +47,36 @@ def expansion_ratios(thresholds: Tensor, bank: FilterBank) -> Tensor:
     return CATCH_UP_SPL / (CATCH_UP_SPL - thresholds @ weights)
 
 
-def rectify(signal: Tensor, quadrature: Tensor, series: Tensor) -> Tensor:
+def rectify(signal: Tensor, quadrature: Tensor, series: tuple[float, float, float]) -> Tensor:
     """What a full-wave rectifier makes of a band, less the harmonics that its rate cannot hold.
 
-    Shape: (..., channels, time) twice, (3, channels, 1) -> (..., channels, time).
+    Shape: (..., time) twice -> (..., time).
 
     Args:
         series: coefficients of 1, cos^2 and cos^4 of the phase in its |cos|.
     """
     square = signal.square()
-    power = square + quadrature.square() + _TINY
+    power = torch.addcmul(square, quadrature, quadrature) + _TINY
     cosine = square / power
-    return power.sqrt() * (series[0] + cosine * (series[1] + cosine * series[2]))
+    if series[2]:
+        factor = (cosine * series[2] + series[1]) * cosine + series[0]
+    else:
+        factor = cosine * series[1] + series[0]
+    return power.sqrt() * factor
 
 
 def decimate(rectified: Tensor, kernel: Tensor) -> Tensor:
-    """Weighted means about each step. Shape: (..., time), (16 // step, 3) -> (..., time * step // 16)."""
-    if kernel.shape[0] == 1:
-        return rectified
-    blocks = rectified.unflatten(-1, (-1, kernel.shape[0])) @ kernel
-    before, here, after = blocks.unbind(-1)
-    return before.roll(1, -1) + here + after.roll(-1, -1)
+    """Weighted sums of each step's samples, for ``smooth``. Shape: (..., time), (16 // step, 3) -> (..., steps, 3)."""
+    return rectified.unflatten(-1, (-1, kernel.shape[0])) @ kernel
 
 
-def smooth(slow: Tensor, lowpass: Tensor) -> Tensor:
-    """Envelopes at samples 0, 16, ... from decimated rectified signals; periodic.
+def smooth(sums: Tensor, lowpass: Tensor) -> Tensor:
+    """Envelopes at samples 0, 16, ... from the sums of ``decimate``; periodic.
 
-    Shape: (..., channels, steps), (channels, steps // 2 + 1) -> (..., channels, steps).
+    Shape: (..., channels, steps, 3), (channels, steps // 2 + 1) -> (..., channels, steps).
     """
+    before, here, after = sums.unbind(-1)
+    slow = before.roll(1, -1) + here + after.roll(-1, -1)
     return torch.fft.irfft(torch.fft.rfft(slow) * lowpass, slow.shape[-1])
 
 
@@ -102,63 +104,31 @@ def around(values: Tensor) -> Tensor:
     return torch.cat((values[..., 1 - AHEAD :], values, values[..., :AHEAD]), -1).unfold(-1, _TAPS, 1)
 
 
-def is_slight(ratios: Tensor) -> Tensor:
-    """Where ``steep_places`` matter: little, but some, expansion. Shape: (...) -> (...)."""
-    return (ratios != 1.0) & (ratios < _SLIGHT)
+def weigh(channels: Tensor, gain: Tensor, kernel: Tensor) -> Tensor:
+    """Interpolate the gains, apply them and sum the channels.
+
+    Shape: (..., channels, time), (..., channels, steps, 6), (6, time // steps) -> (..., time).
+    """
+    return (channels * (gain @ kernel).flatten(-2)).sum(-2)
 
 
-def steep_places(envelopes: Tensor) -> Tensor:
-    """Steps at which the envelope goes through zero. Shape: (..., steps) -> (..., steps).
+def expand(channels: Tensor, envelopes: Tensor, ratios: Tensor) -> Tensor:
+    """Apply the recruitment gain at 44.1 kHz and sum the channels.
 
     The low-pass overshoots, and where the envelope goes through zero the gain has kinks. A small loss does not bury
     them, and the way out of the ear lifts their upper end by 40 dB, so that there the envelope is interpolated instead.
-    """
-    floored = envelopes.detach().clamp_min(_LOWEST_ENVELOPE)
-    low = torch.minimum(floored, floored.roll(-1, -1))
-    high = torch.maximum(floored, floored.roll(-1, -1))
-    return low < 0.3 * torch.maximum(high.roll(1, -1), high.roll(-1, -1))
-
-
-def weigh(
-    channels: Tensor,
-    gain: Tensor,
-    kernel: Tensor,
-    envelopes: Tensor | None = None,
-    ratios: Tensor | None = None,
-) -> Tensor:
-    """Interpolate the gains, apply them and sum the channels.
-
-    Shape: (..., channels, time), (..., channels, steps, 6), (6, time // steps), and for slight losses
-    (..., channels, steps) and (..., channels) -> (..., time).
-    """
-    full = gain @ kernel if kernel.shape[-1] > 1 else gain[..., AHEAD - 1].unsqueeze(-1)
-    if envelopes is not None and ratios is not None and kernel.shape[-1] > 1:
-        places = steep_places(envelopes) & is_slight(ratios).unsqueeze(-1)
-        finely = around(envelopes)
-        if places.device.type == "cpu":
-            own = ratios.unsqueeze(-1).expand(places.shape)[places]
-            full[places] = gains(finely[places] @ kernel, own)
-        else:  # indices would have to come back from the device
-            fine = gains(finely @ kernel, ratios.unsqueeze(-1))
-            full = torch.where(places.unsqueeze(-1), fine, full)
-    full = full.flatten(-2)
-    if torch.is_grad_enabled() and (channels.requires_grad or full.requires_grad):
-        return (channels * full).sum(-2)
-    total = channels[..., 0, :] * full[..., 0, :]
-    # in place, a channel at a time: it stays in the processor's cache
-    for channel in range(1, channels.shape[-2]):
-        total.addcmul_(channels[..., channel, :], full[..., channel, :])
-    return total
-
-
-def expand(channels: Tensor, envelopes: Tensor, ratios: Tensor, slight: bool = True) -> Tensor:
-    """Apply the recruitment gain at 44.1 kHz and sum the channels.
 
     Shape: (..., channels, time), (..., channels, time // 16), (..., channels) -> (..., time).
     """
     kernel = torch.from_numpy(interpolation_kernel()).to(channels)
-    own = (envelopes, ratios) if slight else (None, None)
-    return weigh(channels, around(gains(envelopes, ratios)), kernel, *own)
+    gain = around(gains(envelopes, ratios)) @ kernel
+    floored = envelopes.detach().clamp_min(_LOWEST_ENVELOPE)
+    low = torch.minimum(floored, floored.roll(-1, -1))
+    high = torch.maximum(floored, floored.roll(-1, -1))
+    steep = low < 0.3 * torch.maximum(high.roll(1, -1), high.roll(-1, -1))
+    steep = steep & ((ratios != 1.0) & (ratios < _SLIGHT)).unsqueeze(-1)
+    fine = gains(around(envelopes) @ kernel, ratios.unsqueeze(-1))
+    return (channels * torch.where(steep.unsqueeze(-1), fine, gain).flatten(-2)).sum(-2)
 
 
 @lru_cache(maxsize=16)

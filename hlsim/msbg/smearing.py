@@ -19,7 +19,8 @@ SMEARING_DELAY = 3 * HOP
 BROADENING = {"mild": (1.6, 1.1), "moderate": (2.4, 1.6), "severe": (4.0, 2.0)}
 """Widening of the lower and the upper side of the auditory filters; with no loss nothing is smeared (pyclarity 0.9.0)."""
 
-_TINY = 1e-24  # its power of -1.5, in the gradient of silence, is finite in float32
+_TINY = 1e-24  # Pa^2; in the gradient of silence it stands under 1, twice
+_SLIGHT = 1e-18  # of a power's share; its power of -0.5 is finite
 
 
 def roex_filters(lower: float, upper: float, count: int, spacing: float) -> NDArray[np.float64]:
@@ -83,38 +84,40 @@ def smear(waveform: Tensor, matrix: Tensor, step: int = 1) -> Tensor:
         step: 1 at 44.1 kHz; 2 at 22.05 kHz, where the same frames are taken at every other sample and nothing above
             11 kHz is known.
     """
-    hop, frame, fft = HOP // step, FRAME // step, FFT // step
-    samples = waveform.shape[-1]
-    count = math.ceil(samples / hop)
-    frames = _frames(functional.pad(waveform, (0, max(frame, hop * count) - samples)), hop)[..., :count, :]
+    hop, fft = HOP // step, FFT // step
+    count = math.ceil(waveform.shape[-1] / hop)
     window = _window(step, waveform.dtype, waveform.device)
-    spectrum = torch.fft.rfft(frames * window, fft)[..., : fft // 2]
+    spectrum = torch.fft.rfft(_frames(waveform, count, hop) * window)
     power = spectrum.real.square() + spectrum.imag.square()
-    smeared = power @ matrix.T
-    # tiny terms keep the gradients of silence finite
-    inverse = (power + _TINY).rsqrt()
-    # the square root of a negative power is imaginary
-    ahead = (smeared.clamp_min(0.0) + _TINY).sqrt() * inverse
-    turned = (smeared.clamp_max(0.0).neg() + _TINY).sqrt() * inverse
-    spectrum = spectrum * torch.complex(ahead, turned)
-    frames = torch.fft.irfft(functional.pad(spectrum, (0, 1)), fft)[..., :frame] * window
+    share = (power @ matrix.T) / (power + _TINY)
+    # the square root of a negative power is imaginary; tiny terms keep the gradients of silence finite
+    ahead, turned = share.clamp_min(0.0), share.neg().clamp_min(0.0)
+    spectrum = spectrum * torch.complex((ahead + _SLIGHT).sqrt(), (turned + _SLIGHT).sqrt())
+    frames = torch.fft.irfft(spectrum, fft)[..., : 4 * hop] * window[: 4 * hop]
     return _overlap_add(frames, hop)
 
 
 @lru_cache(maxsize=16)
 def _window(step: int, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """Of analysis and synthesis: their product adds up to 1 over four frames. Shape: (256 // step,)."""
+    """Of analysis and synthesis: their product adds up to 1 over four frames; then zeros. Shape: (512 // step,)."""
     with torch.inference_mode(False):
         place = 2.0 * math.pi * (torch.arange(0, FRAME, step, dtype=torch.float64) + 0.5) / FRAME
-        return ((0.5 - 0.5 * place.cos()) / math.sqrt(1.5)).to(device=device, dtype=dtype)
+        window = (0.5 - 0.5 * place.cos()) / math.sqrt(1.5)
+        return functional.pad(window, (0, (FFT - FRAME) // step)).to(device=device, dtype=dtype)
 
 
-def _frames(waveform: Tensor, hop: int) -> Tensor:
-    """Frame k covers hops k - 3 to k from the fifth on; the first four are as ``smear3`` fills them."""
-    hops = waveform.unflatten(-1, (-1, hop))[..., :4, :].unbind(-2)
-    order = (0, 1, 2, 3, 1, 2, 3, 1, 2, 3, 1, 2, 3, 1, 2, 3)
-    first = torch.cat([hops[i] for i in order], -1).unflatten(-1, (4, -1))
-    return torch.cat((first, waveform.unfold(-1, 4 * hop, hop)[..., 1:, :]), -2)
+def _frames(waveform: Tensor, count: int, hop: int) -> Tensor:
+    """Frame k covers hops k - 3 to k from the fifth on, and what follows, which the window takes away.
+
+    The first four are as ``smear3`` fills them. Shape: (..., time) -> (..., count, 8 * hop).
+    """
+    padded = functional.pad(waveform, (3 * hop, hop * (max(count, 4) + 4) - waveform.shape[-1]))
+    regular = padded.unfold(-1, 8 * hop, hop)[..., :count, :]
+    hops = padded[..., 3 * hop : 7 * hop].unflatten(-1, (4, hop))
+    zero = torch.zeros_like(hops)
+    order = ((0, 1, 2, 3), (1, 2, 3, 1), (2, 3, 1, 2), (3, 1, 2, 3))
+    first = [torch.cat((hops[..., row, :].flatten(-2), zero.flatten(-2)), -1) for row in order[: min(4, count)]]
+    return torch.cat((torch.stack(first, -2), regular[..., 4:, :]), -2)
 
 
 def _overlap_add(frames: Tensor, hop: int) -> Tensor:
