@@ -32,14 +32,12 @@ _SHARED_MULTIPLE = 10000
 
 def bank_points(length: int, rate: int) -> int:
     """FFT length at 44.1 kHz for a signal of ``length``: one that ``rate`` shares, if that costs little."""
-    multiple = shared_multiple(rate) or 2 * STEP
+    multiple = 2 * (shared_multiple(rate) or STEP)  # MKL takes twice as long for odd numbers of steps
     return fft_length(length + BANK_TAIL, multiple)
 
 
 def shared_multiple(rate: int) -> int:
     """Samples at 44.1 kHz, a multiple of 16, that are a whole number of ``rate``'s; 0 if too many."""
-    if rate == RATE:
-        return 2 * STEP
     multiple = math.lcm(STEP, RATE // math.gcd(RATE, rate))
     return multiple if multiple <= _SHARED_MULTIPLE else 0
 

@@ -61,13 +61,14 @@ def block_points() -> int:
 
 @lru_cache(maxsize=256)
 def fft_length(least: int, multiple: int = 1) -> int:
-    """The next length of small primes that is a multiple of ``multiple``."""
-    best = multiple * 2 ** math.ceil(math.log2(max(1, math.ceil(least / multiple))))
-    for threes in (1, 3, 9, 27):
-        for fives in (1, 5, 25):
-            odd = multiple * threes * fives
-            best = min(best, odd * 2 ** math.ceil(math.log2(max(1, math.ceil(least / odd)))))
-    return best
+    """The next length of small primes that is a multiple of ``multiple``.
+
+    No more than 8 twos: MKL takes up to three times as long for a row of 2^10 * 49 as for one of 2^4 * 3125.
+    """
+    spare = multiple & -multiple  # twos that it has already
+    odd = [3**a * 5**b * 7**c for a in range(9) for b in range(6) for c in range(4)]
+    lengths = [multiple * o * 2**twos for o in odd for twos in range(9) if twos == 0 or spare << twos <= 256]
+    return min(length for length in lengths if length >= least)
 
 
 @lru_cache(maxsize=16)

@@ -66,17 +66,17 @@ def rectify(signal: Tensor, quadrature: Tensor, series: tuple[float, float, floa
 
 
 def decimate(rectified: Tensor, kernel: Tensor) -> Tensor:
-    """Weighted sums of each step's samples, for ``smooth``. Shape: (..., time), (16 // step, 3) -> (..., steps, 3)."""
-    return rectified.unflatten(-1, (-1, kernel.shape[0])) @ kernel
+    """Weighted sums of each step's samples, for ``smooth``. Shape: (..., time), (3, 16 // step) -> (..., 3, steps)."""
+    return kernel @ rectified.unflatten(-1, (-1, kernel.shape[-1])).mT
 
 
 def smooth(sums: Tensor, lowpass: Tensor) -> Tensor:
     """Envelopes at samples 0, 16, ... from the sums of ``decimate``; periodic.
 
-    Shape: (..., channels, steps, 3), (channels, steps // 2 + 1) -> (..., channels, steps).
+    Shape: (..., channels, 3, steps), (channels, steps // 2 + 1) -> (..., channels, steps).
     """
-    before, here, after = sums.unbind(-1)
-    slow = before.roll(1, -1) + here + after.roll(-1, -1)
+    before, here, after = sums.unbind(-2)
+    slow = here + before.roll(1, -1) + after.roll(-1, -1)
     return torch.fft.irfft(torch.fft.rfft(slow) * lowpass, slow.shape[-1])
 
 
@@ -109,7 +109,14 @@ def weigh(channels: Tensor, gain: Tensor, kernel: Tensor) -> Tensor:
 
     Shape: (..., channels, time), (..., channels, steps, 6), (6, time // steps) -> (..., time).
     """
-    return (channels * (gain @ kernel).flatten(-2)).sum(-2)
+    full = (gain @ kernel).flatten(-2)
+    if torch.is_grad_enabled() and (channels.requires_grad or full.requires_grad):
+        return (channels * full).sum(-2)
+    total = channels[..., 0, :] * full[..., 0, :]
+    # in place, a channel at a time: it stays in the processor's cache
+    for channel in range(1, channels.shape[-2]):
+        total.addcmul_(channels[..., channel, :], full[..., channel, :])
+    return total
 
 
 def expand(channels: Tensor, envelopes: Tensor, ratios: Tensor) -> Tensor:
@@ -167,12 +174,12 @@ def _interpolation(centre_frequencies: tuple[float, ...]) -> NDArray[np.float64]
 def decimation_kernel(step: int = 1) -> NDArray[np.float64]:
     """Weights of a block's samples in the mean around the block after it, itself and the one before.
 
-    Returns: (16 // step, 3).
+    Returns: (3, 16 // step).
     """
     samples = STEP // step
     box = np.full(samples, 1.0 / samples)
     kernel = np.pad(np.convolve(np.convolve(box, box), box), 1)
-    return np.ascontiguousarray(kernel.reshape(_BOXES, samples).T)
+    return np.ascontiguousarray(kernel.reshape(_BOXES, samples))
 
 
 @lru_cache(maxsize=8)

@@ -20,6 +20,7 @@ BROADENING = {"mild": (1.6, 1.1), "moderate": (2.4, 1.6), "severe": (4.0, 2.0)}
 """Widening of the lower and the upper side of the auditory filters; with no loss nothing is smeared (pyclarity 0.9.0)."""
 
 _TINY = 1e-24  # Pa^2; in the gradient of silence it stands under 1, twice
+_CACHED = 240  # frames
 _SLIGHT = 1e-18  # of a power's share; its power of -0.5 is finite
 
 
@@ -77,24 +78,39 @@ def smeared_length(samples: int) -> int:
 def smear(waveform: Tensor, matrix: Tensor, step: int = 1) -> Tensor:
     """Smear a waveform as pyclarity's ``smear3`` does at 44.1 kHz, its delay and its first, irregular frames included.
 
-    Shape: (..., time), (256 // step, 256 // step) -> (..., hop * (ceil(time / hop) + 3)) with hop = 64 // step.
+    Shape: (..., time), (256 // step + 1, 256 // step + 1) -> (..., hop * (ceil(time / hop) + 3)) with hop = 64 // step.
 
     Args:
-        matrix: ``smearing_matrix``, its lower half in both directions if ``step`` is 2.
+        matrix: ``smearing_matrix``, its lower half in both directions if ``step`` is 2, and zeros for the last bin.
         step: 1 at 44.1 kHz; 2 at 22.05 kHz, where the same frames are taken at every other sample and nothing above
             11 kHz is known.
     """
-    hop, fft = HOP // step, FFT // step
+    hop = HOP // step
     count = math.ceil(waveform.shape[-1] / hop)
     window = _window(step, waveform.dtype, waveform.device)
-    spectrum = torch.fft.rfft(_frames(waveform, count, hop) * window)
+    frames = _frames(waveform, count, hop)
+    # on a CPU a few frames at a time, for the steps from one to the next to find them in its cache
+    size = max(1, _CACHED * step // waveform[..., 0].numel()) if waveform.device.type == "cpu" else count
+    parts = [_widen(part, window, matrix) for part in frames.split(size, -2)]
+    return _overlap_add(parts[0] if len(parts) == 1 else torch.cat(parts, -2), hop)
+
+
+def _widen(frames: Tensor, window: Tensor, matrix: Tensor) -> Tensor:
+    """Smear each frame's power. Shape: (..., frames, 2 n), (2 n,), (n + 1, n + 1) -> (..., frames, n)."""
+    spectrum = torch.fft.rfft(frames * window)
     power = spectrum.real.square() + spectrum.imag.square()
     share = (power @ matrix.T) / (power + _TINY)
-    # the square root of a negative power is imaginary; tiny terms keep the gradients of silence finite
-    ahead, turned = share.clamp_min(0.0), share.neg().clamp_min(0.0)
-    spectrum = spectrum * torch.complex((ahead + _SLIGHT).sqrt(), (turned + _SLIGHT).sqrt())
-    frames = torch.fft.irfft(spectrum, fft)[..., : 4 * hop] * window[: 4 * hop]
-    return _overlap_add(frames, hop)
+    # the square root of a negative power is imaginary
+    spectrum = spectrum * torch.complex(_root(share), _root(-share))
+    half = len(window) // 2
+    return torch.fft.irfft(spectrum, len(window))[..., :half] * window[:half]
+
+
+def _root(share: Tensor) -> Tensor:
+    """Square root, 0 of what is negative; tiny terms keep the gradients of silence finite."""
+    if share.requires_grad and torch.is_grad_enabled():
+        return (share.clamp_min(0.0) + _SLIGHT).sqrt()
+    return share.clamp_min(0.0).sqrt_()
 
 
 @lru_cache(maxsize=16)
@@ -123,13 +139,13 @@ def _frames(waveform: Tensor, count: int, hop: int) -> Tensor:
 def _overlap_add(frames: Tensor, hop: int) -> Tensor:
     hops = frames.unflatten(-1, (4, hop))
     count = hops.shape[-3]
-    parts = [functional.pad(hops[..., j, :], (0, 0, j, 0))[..., :count, :] for j in range(4)]
+    total = frames.new_zeros(*frames.shape[:-2], count + 3, hop)
+    for j in range(4):
+        total[..., j : j + count, :] += hops[..., j, :]
     # smear3's last three hops: the newest frames' parts, and in place of the others' those of the fourth last frame
     old = hops[..., count - 4, :, :] if count >= 4 else torch.zeros_like(hops[..., 0, :, :])
     last, second = hops[..., -1, :, :], hops[..., max(count - 2, 0), :, :]
-    tail = (
-        old[..., 0, :] + last[..., 1, :] + second[..., 2, :],
-        old[..., 1, :] + last[..., 2, :],
-        old[..., 2, :],
-    )
-    return torch.cat((torch.stack(parts).sum(0), torch.stack(tail, -2)), -2).flatten(-2)
+    total[..., count, :] = old[..., 0, :] + last[..., 1, :] + second[..., 2, :]
+    total[..., count + 1, :] = old[..., 1, :] + last[..., 2, :]
+    total[..., count + 2, :] = old[..., 2, :]
+    return total.flatten(-2)

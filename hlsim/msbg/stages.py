@@ -113,5 +113,5 @@ def _between(spectrum: Tensor, source: int, target: int) -> Tensor:
 
 def _grid(samples: int, up: int, down: int) -> tuple[int, int]:
     """FFT lengths at ``down`` and at ``up`` that span the same time, at least ``samples`` at ``down``."""
-    blocks = fft_length(math.ceil(samples / down), 1 if down % 2 == 0 and up % 2 == 0 else 2)
+    blocks = fft_length(math.ceil(samples / down), 4)
     return blocks * down, blocks * up

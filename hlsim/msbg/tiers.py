@@ -23,7 +23,7 @@ REACH = 5.0
 
 _LOW_STEP = 4
 _TRUE_HZ = 350.0  # below, channels are rectified as they are
-_CACHED = 200_000  # samples of a tier on a CPU, for the steps from one to the next to find them in its cache
+_CACHED = 400_000  # samples of a tier on a CPU, for the steps from one to the next to find them in its cache
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class Tier:
         response: of the channels, (channels, points // 2 + 1), or (2, channels, points // 2 + 1) with those of their
             quadrature signals.
         series: coefficients of 1, cos^2 and cos^4 in |cos|; none where a signal is rectified as it is.
-        decimation: weights of a block's samples, (16 // step, 3).
+        decimation: weights of a block's samples, (3, 16 // step).
         interpolation: weights of six gains, (6, 16 // step).
     """
 
