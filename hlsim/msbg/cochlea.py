@@ -42,13 +42,14 @@ def shared_multiple(rate: int) -> int:
     return multiple if multiple <= _SHARED_MULTIPLE else 0
 
 
-def hear(spectrum: Tensor, ratios: Tensor | None, plan: Plan) -> Tensor:
+def hear(spectrum: Tensor, ratios: Tensor | None, plan: Plan, slight: bool) -> Tensor:
     """Filter bank and recruitment of a periodic signal.
 
     Shape: (items, points // (2 step) + 1), (items, channels) -> as the first, where points and step are the plan's.
 
     Args:
         ratios: none for ears that hear everything at its level, 0 dB HL throughout.
+        slight: look after the kinks of slight losses, which a smeared signal buries.
     """
     if ratios is None:
         return spectrum * plan.total
@@ -69,7 +70,9 @@ def hear(spectrum: Tensor, ratios: Tensor | None, plan: Plan) -> Tensor:
 
     heard: dict[int, Tensor] = {}
     for tier, wave in zip(plan.tiers, waves, strict=True):
-        part = weigh(wave, gain[..., tier.channels, :, :], tier.interpolation)
+        own = tier.channels
+        kinks = (envelopes[..., own, :], ratios[..., own]) if slight else None
+        part = weigh(wave, gain[..., own, :, :], tier.interpolation, kinks)
         heard[tier.step] = heard[tier.step] + part if tier.step in heard else part
     bins = plan.points // plan.step // 2 + 1
     parts = [rfft(part, part.shape[-1]) * (step / plan.step) for step, part in heard.items()]

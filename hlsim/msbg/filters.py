@@ -44,7 +44,7 @@ def _array(kind: str, key: tuple[Any, ...]) -> np.ndarray[Any, Any]:
     match kind, *key:
         case "smearing", severity, step:
             half = 256 // step
-            return np.pad(smearing_matrix(*BROADENING[severity])[:half, :half], (0, 1))
+            return smearing_matrix(*BROADENING[severity])[:half, :half]
         case "bank", severity, points:
             return gammatone_response(BANKS[severity], points)
         case "lowpass", severity, points:

@@ -161,9 +161,12 @@ class MSBG(nn.Module):
         delay = self.delay(severity) if self.aligned else 0
         inner = math.ceil(samples * RATE / rate)
         filters = Filters(signals.dtype, signals.device)
-        heard = to_cochlea(signals, rate, math.ceil((inner + delay) / step), step, filters)
+        # a frame that smearing leaves next to nothing hangs on the last bits: where every sample counts, keep more
+        fine = filters if self.aligned else Filters(torch.float64, signals.device)
+        heard = to_cochlea(signals.to(fine.dtype), rate, math.ceil((inner + delay) / step), step, fine)
         if severity in BROADENING:
-            heard = smear(heard, filters.get("smearing", severity, step), step)
+            heard = smear(heard, fine.get("smearing", severity, step), step)
+        heard = heard.to(signals.dtype)
         ratios = expansion_ratios(ears, BANKS[severity])
         scale = 10.0 ** (-BANKS[severity].recombination_db / 20.0)
 
@@ -171,20 +174,25 @@ class MSBG(nn.Module):
         if self.aligned:
             points = bank_points(length * step, rate)
             plan = filters.get("plan", severity, points, step)
-            spectrum = hear(rfft(heard, points // step), None if none else ratios, plan)
-            return scale * from_spectrum(spectrum, points, step, rate, samples, delay, filters)
+            spectrum = hear(rfft(heard, points // step), None if none else ratios, plan, severity not in BROADENING)
+            if severity in BROADENING:
+                return scale * from_spectrum(spectrum, points, step, rate, samples, delay, filters)
+            # without smearing's delay, the way out reaches samples that the advances put before the first one
+            heard = irfft(spectrum, points // step)[..., :length]
+            return scale * from_cochlea(heard, rate, length, samples, filters, step=step, delay=delay)
         heard = self._late(heard, ratios, severity, last, filters)
         return scale * from_cochlea(heard, rate, length, round(length * rate / RATE), filters)
 
     def _late(self, heard: Tensor, ratios: Tensor, severity: str, last: bool, filters: Filters) -> Tensor:
         """With the delay and, at the end, what the reference makes of it. Shape: (items, time) -> (items, time)."""
         length = heard.shape[-1]
-        whole = length <= _ENDING + _ENDING_LEAD
+        # with a slight loss and no smearing, nothing buries what the lower rates change where the envelope is next to 0
+        whole = length <= _ENDING + _ENDING_LEAD or severity not in BROADENING
         parts = []
         if not whole or not last:
             points = bank_points(length, RATE)
             plan = filters.get("plan", severity, points, 1)
-            parts.append(irfft(hear(rfft(heard, points), ratios, plan), points)[..., :length])
+            parts.append(irfft(hear(rfft(heard, points), ratios, plan, severity not in BROADENING), points)[..., :length])
         if last:
             ending = hear_ending(heard if whole else heard[..., -_ENDING - _ENDING_LEAD :], ratios, severity, filters)
             parts = [ending] if whole else [parts[0][..., :-_ENDING], ending[..., -_ENDING:]]

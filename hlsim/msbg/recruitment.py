@@ -104,12 +104,29 @@ def around(values: Tensor) -> Tensor:
     return torch.cat((values[..., 1 - AHEAD :], values, values[..., :AHEAD]), -1).unfold(-1, _TAPS, 1)
 
 
-def weigh(channels: Tensor, gain: Tensor, kernel: Tensor) -> Tensor:
+def weigh(
+    channels: Tensor, gain: Tensor, kernel: Tensor, slight: tuple[Tensor, Tensor] | None = None
+) -> Tensor:
     """Interpolate the gains, apply them and sum the channels.
 
     Shape: (..., channels, time), (..., channels, steps, 6), (6, time // steps) -> (..., time).
+
+    Args:
+        slight: envelopes (..., channels, steps) and ratios (..., channels), where some ratios are slight. The low-pass
+            overshoots, and where the envelope goes through zero the gain has kinks. A small loss does not bury them,
+            and the way out of the ear lifts their upper end by 40 dB, so that there the envelope is interpolated instead.
     """
-    full = (gain @ kernel).flatten(-2)
+    gain = gain @ kernel
+    if slight is not None:
+        envelopes, ratios = slight
+        steep = _steep(envelopes) & ((ratios != 1.0) & (ratios < _SLIGHT)).unsqueeze(-1)
+        if steep.device.type == "cpu":
+            own = ratios.unsqueeze(-1).expand(steep.shape)[steep]
+            gain[steep] = gains(around(envelopes)[steep] @ kernel, own)
+        else:  # indices would have to come back from the device
+            fine = gains(around(envelopes) @ kernel, ratios.unsqueeze(-1))
+            gain = torch.where(steep.unsqueeze(-1), fine, gain)
+    full = gain.flatten(-2)
     if torch.is_grad_enabled() and (channels.requires_grad or full.requires_grad):
         return (channels * full).sum(-2)
     total = channels[..., 0, :] * full[..., 0, :]
@@ -119,23 +136,21 @@ def weigh(channels: Tensor, gain: Tensor, kernel: Tensor) -> Tensor:
     return total
 
 
+def _steep(envelopes: Tensor) -> Tensor:
+    """Where an envelope goes through zero. Shape: (..., steps) -> (..., steps)."""
+    floored = envelopes.detach().clamp_min(_LOWEST_ENVELOPE)
+    low = torch.minimum(floored, floored.roll(-1, -1))
+    high = torch.maximum(floored, floored.roll(-1, -1))
+    return low < 0.3 * torch.maximum(high.roll(1, -1), high.roll(-1, -1))
+
+
 def expand(channels: Tensor, envelopes: Tensor, ratios: Tensor) -> Tensor:
     """Apply the recruitment gain at 44.1 kHz and sum the channels.
-
-    The low-pass overshoots, and where the envelope goes through zero the gain has kinks. A small loss does not bury
-    them, and the way out of the ear lifts their upper end by 40 dB, so that there the envelope is interpolated instead.
 
     Shape: (..., channels, time), (..., channels, time // 16), (..., channels) -> (..., time).
     """
     kernel = torch.from_numpy(interpolation_kernel()).to(channels)
-    gain = around(gains(envelopes, ratios)) @ kernel
-    floored = envelopes.detach().clamp_min(_LOWEST_ENVELOPE)
-    low = torch.minimum(floored, floored.roll(-1, -1))
-    high = torch.maximum(floored, floored.roll(-1, -1))
-    steep = low < 0.3 * torch.maximum(high.roll(1, -1), high.roll(-1, -1))
-    steep = steep & ((ratios != 1.0) & (ratios < _SLIGHT)).unsqueeze(-1)
-    fine = gains(around(envelopes) @ kernel, ratios.unsqueeze(-1))
-    return (channels * torch.where(steep.unsqueeze(-1), fine, gain).flatten(-2)).sum(-2)
+    return weigh(channels, around(gains(envelopes, ratios)), kernel, (envelopes, ratios))
 
 
 @lru_cache(maxsize=16)

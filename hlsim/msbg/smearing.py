@@ -78,14 +78,15 @@ def smeared_length(samples: int) -> int:
 def smear(waveform: Tensor, matrix: Tensor, step: int = 1) -> Tensor:
     """Smear a waveform as pyclarity's ``smear3`` does at 44.1 kHz, its delay and its first, irregular frames included.
 
-    Shape: (..., time), (256 // step + 1, 256 // step + 1) -> (..., hop * (ceil(time / hop) + 3)) with hop = 64 // step.
+    Shape: (..., time), (256 // step, 256 // step) -> (..., hop * (ceil(time / hop) + 3)) with hop = 64 // step.
 
     Args:
-        matrix: ``smearing_matrix``, its lower half in both directions if ``step`` is 2, and zeros for the last bin.
+        matrix: ``smearing_matrix``, its lower half in both directions if ``step`` is 2.
         step: 1 at 44.1 kHz; 2 at 22.05 kHz, where the same frames are taken at every other sample and nothing above
             11 kHz is known.
     """
     hop = HOP // step
+    matrix = functional.pad(matrix, (0, 1, 0, 1))  # the last frequency is left out
     count = math.ceil(waveform.shape[-1] / hop)
     window = _window(step, waveform.dtype, waveform.device)
     frames = _frames(waveform, count, hop)
