@@ -6,7 +6,6 @@ import json
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
@@ -63,7 +62,9 @@ def rows(simulators: list[str] | None = None) -> tuple[list[Row], list[str]]:
         count = sum(p.numel() for p in model.parameters())
         found.append(Row(f"Neuro-MSBG ({name})", both, _neuro(name), parameters=count))
     count = sum(p.numel() for p in ConnearShape().parameters())
-    found.append(Row("CoNNear's shape (random weights, speed only)", (CONNEAR_RATE,), _connear, parameters=count))
+    found.append(
+        Row("CoNNear's shape (random weights, speed only)", (CONNEAR_RATE,), _connear, parameters=count)
+    )
     return found, skipped
 
 

@@ -17,7 +17,9 @@ def benchmark_markdown(result: dict[str, Any]) -> str:
     for title, table in (("A training step", result.get("training")), ("Selective scan", result.get("scan"))):
         if table:
             lines += [f"| {title} | forward | forward + backward |", "|---|---|---|"]
-            lines += [f"| {row['name']} | {_cell(row['forward'])} | {_cell(row['both'])} |" for row in table] + [""]
+            lines += [
+                f"| {row['name']} | {_cell(row['forward'])} | {_cell(row['both'])} |" for row in table
+            ] + [""]
     return "\n".join([*lines, *(f"skipped: {reason}" for reason in result["skipped"])]) + "\n"
 
 
@@ -31,7 +33,9 @@ def _one_second(rows: list[dict[str, Any]]) -> list[str]:
         for forward in (cell for cell in single if cell["direction"] == "forward"):
             rate = forward["sample_rate"]
             both = next((c for c in single if c["direction"] == "both" and c["sample_rate"] == rate), None)
-            peak = [f"{cell['peak_mib']:.0f}" for cell in (forward, both) if cell and cell["peak_mib"] is not None]
+            peak = [
+                f"{cell['peak_mib']:.0f}" for cell in (forward, both) if cell and cell["peak_mib"] is not None
+            ]
             cells = (
                 row["name"],
                 f"{row['parameters']:,}" if row["parameters"] else "-",

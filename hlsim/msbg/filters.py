@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from hlsim.msbg.ear import ear_filter, lowpass_filter
 from hlsim.msbg.ending import ending_response, ending_weights
@@ -59,7 +58,7 @@ def _array(kind: str, key: tuple[Any, ...]) -> np.ndarray[Any, Any]:
             return (np.arange(points) < kept).astype(float)
         case "forward", points:
             return np.fft.rfft(ear_filter(), points)
-        case "forward blocks",:
+        case ("forward blocks",):
             return np.fft.rfft(ear_filter(), block_points())
         case "backward", points, delay, bins:
             response = np.fft.rfft(ear_filter(backward=True), points) * np.fft.rfft(lowpass_filter(), points)

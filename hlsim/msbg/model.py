@@ -147,9 +147,7 @@ class MSBG(nn.Module):
             heard.append(output[:, start - begin : None if last else stop - begin])
         return torch.cat(heard, -1)
 
-    def _simulate_alike(
-        self, signals: Tensor, ears: Tensor, severity: str, none: bool, last: bool
-    ) -> Tensor:
+    def _simulate_alike(self, signals: Tensor, ears: Tensor, severity: str, none: bool, last: bool) -> Tensor:
         """All items have the same severity. Shape: (items, time), (items, 8) -> (items, time).
 
         Args:
@@ -174,7 +172,9 @@ class MSBG(nn.Module):
         if self.aligned:
             points = bank_points(length * step, rate)
             plan = filters.get("plan", severity, points, step)
-            spectrum = hear(rfft(heard, points // step), None if none else ratios, plan, severity not in BROADENING)
+            spectrum = hear(
+                rfft(heard, points // step), None if none else ratios, plan, severity not in BROADENING
+            )
             if severity in BROADENING:
                 return scale * from_spectrum(spectrum, points, step, rate, samples, delay, filters)
             # without smearing's delay, the way out reaches samples that the advances put before the first one
@@ -192,9 +192,15 @@ class MSBG(nn.Module):
         if not whole or not last:
             points = bank_points(length, RATE)
             plan = filters.get("plan", severity, points, 1)
-            parts.append(irfft(hear(rfft(heard, points), ratios, plan, severity not in BROADENING), points)[..., :length])
+            parts.append(
+                irfft(hear(rfft(heard, points), ratios, plan, severity not in BROADENING), points)[
+                    ..., :length
+                ]
+            )
         if last:
-            ending = hear_ending(heard if whole else heard[..., -_ENDING - _ENDING_LEAD :], ratios, severity, filters)
+            ending = hear_ending(
+                heard if whole else heard[..., -_ENDING - _ENDING_LEAD :], ratios, severity, filters
+            )
             parts = [ending] if whole else [parts[0][..., :-_ENDING], ending[..., -_ENDING:]]
         return parts[0] if len(parts) == 1 else torch.cat(parts, -1)
 

@@ -133,7 +133,9 @@ def _frames(waveform: Tensor, count: int, hop: int) -> Tensor:
     hops = padded[..., 3 * hop : 7 * hop].unflatten(-1, (4, hop))
     zero = torch.zeros_like(hops)
     order = ((0, 1, 2, 3), (1, 2, 3, 1), (2, 3, 1, 2), (3, 1, 2, 3))
-    first = [torch.cat((hops[..., row, :].flatten(-2), zero.flatten(-2)), -1) for row in order[: min(4, count)]]
+    first = [
+        torch.cat((hops[..., row, :].flatten(-2), zero.flatten(-2)), -1) for row in order[: min(4, count)]
+    ]
     return torch.cat((torch.stack(first, -2), regular[..., 4:, :]), -2)
 
 

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from hlsim.msbg.ear import RATE
 from hlsim.msbg.filterbank import BANKS, FilterBank, erb, gammatone_response
-from hlsim.msbg.recruitment import STEP, decimation_kernel, envelope_lowpass, interpolation_kernel
+from hlsim.msbg.recruitment import decimation_kernel, envelope_lowpass, interpolation_kernel
 
 REACH = 5.0
 """Bandwidths above its frequency to which a channel is kept."""
@@ -83,9 +83,7 @@ def assign(bank: FilterBank, step: int) -> list[tuple[slice, int, bool]]:
     return [(slice(a, b), *kinds[a]) for a, b in zip(bounds, bounds[1:], strict=False)]
 
 
-def make_plan(
-    severity: str, points: int, step: int, dtype: torch.dtype, device: torch.device
-) -> Plan:
+def make_plan(severity: str, points: int, step: int, dtype: torch.dtype, device: torch.device) -> Plan:
     """The tiers of a severity's bank.
 
     Args:
