@@ -50,13 +50,13 @@ def benchmark(
     Args:
         device: ``"cpu"`` or ``"cuda"``; pyclarity's ``Ear`` always runs on the CPU.
         repeats: counted rounds.
-        limit: seconds that one timing of a longer clip or larger batch may take by what 1 s took; the others are left out.
+        limit: seconds that one timing of a longer clip or larger batch may take by what 1 s took; others are left out.
         lengths: seconds.
         simulators: the Neuro-MSBGs, by name or folder; by default all that ship.
         progress: called with cells done, cells in all, and what comes.
 
     Returns: machine, ``rows`` and ``skipped``. A row has name, parameters and a list of ``cells``, each with sample rate,
-        seconds, batch, direction, the median, least and greatest milliseconds, peak memory in MiB and, at 1 s and batch 1,
+        seconds, batch, direction, median, least and greatest milliseconds, peak memory in MiB and, at 1 s and batch 1,
         ``speedup``: the median of pyclarity's ``Ear``, forward, over the row's. It runs at 44.1 kHz only: the same
         second. ``growth`` is the exponent of the time's growth with length and with batch.
 

@@ -13,7 +13,7 @@ def benchmark_markdown(result: dict[str, Any]) -> str:
         "",
     ]
     if "rows" in result:
-        lines += _one_second(result["rows"]) + [""] + _sizes(result["rows"]) + [""]
+        lines += [*_one_second(result["rows"]), "", *_sizes(result["rows"]), ""]
     for title, table in (("A training step", result.get("training")), ("Selective scan", result.get("scan"))):
         if table:
             lines += [f"| {title} | forward | forward + backward |", "|---|---|---|"]

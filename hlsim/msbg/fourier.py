@@ -14,7 +14,7 @@ _LONG = 8192
 
 
 def rfft(waveform: Tensor, points: int) -> Tensor:
-    """``torch.fft.rfft``; a single long row on a CPU goes as two halves, for MKL takes less than half the time for two rows.
+    """``torch.fft.rfft``; a single long row on a CPU goes as two halves, for MKL takes half the time for two rows.
 
     Shape: (..., time) -> (..., points // 2 + 1).
     """

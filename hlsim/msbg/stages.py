@@ -57,7 +57,7 @@ def from_spectrum(
 def from_cochlea(
     heard: Tensor, rate: int, length: int, samples: int, filters: Filters, *, step: int = 1, delay: int = 0
 ) -> Tensor:
-    """Back out of the ear, low-pass, advance by ``delay``, return to ``rate``. Shape: (items, length) -> (items, samples)."""
+    """``from_spectrum`` of a waveform. Shape: (items, length) -> (items, samples)."""
     up, down = ratio(rate, step)
     own, points = _grid(math.ceil((length + _FIR_TAIL) * down / up), up, down)
     bins = min(own, points) // 2 + 1

@@ -6,6 +6,7 @@ analytic one, |cos| being a short series of even harmonics. The lowest channels,
 are rectified as they are, as the reference does: at 44.1 kHz its own harmonics fold too.
 """
 
+import itertools
 import math
 from dataclasses import dataclass
 
@@ -80,7 +81,7 @@ def assign(bank: FilterBank, step: int) -> list[tuple[slice, int, bool]]:
         own = _LOW_STEP if top <= RATE / _LOW_STEP / 2.0 else step
         kinds.append((own, hz < _TRUE_HZ or own == 1))
     bounds = [0, *(i for i in range(1, len(kinds)) if kinds[i] != kinds[i - 1]), len(kinds)]
-    return [(slice(a, b), *kinds[a]) for a, b in zip(bounds, bounds[1:], strict=False)]
+    return [(slice(a, b), *kinds[a]) for a, b in itertools.pairwise(bounds)]
 
 
 def make_plan(severity: str, points: int, step: int, dtype: torch.dtype, device: torch.device) -> Plan:
@@ -127,7 +128,7 @@ def _parts(
     for channels, step, as_is in tiers:
         size = max(1, _CACHED * step // points)
         cuts = [*range(channels.start, channels.stop, size), channels.stop]
-        parts += [(slice(a, b), step, as_is) for a, b in zip(cuts, cuts[1:], strict=False)]
+        parts += [(slice(a, b), step, as_is) for a, b in itertools.pairwise(cuts)]
     return parts
 
 
