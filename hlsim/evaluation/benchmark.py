@@ -249,7 +249,8 @@ def _peak(
     def resident() -> float:
         return int(statm.read_text(encoding="ascii").split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**20
 
-    before = highest = resident()
+    before = resident()
+    highest = before
     over = threading.Event()
 
     def watch() -> None:

@@ -55,27 +55,27 @@ def scan_rows(*, device: str = "cpu", repeats: int = 5) -> tuple[list[dict[str, 
     items, channels, length, states = SCAN_SHAPE
     torch.manual_seed(0)
     u = torch.randn(items, channels, length, device=place)
-    delta = torch.rand(items, channels, length, device=place) * 0.1
-    B, C = torch.randn(2, items, states, length, device=place).unbind(0)
+    delta = torch.rand(items, channels, length, device=place).mul(0.1)
+    B, C = (torch.randn(items, states, length, device=place) for _ in range(2))
     A = -torch.rand(channels, states, device=place) - 0.5
-    given = [tensor.detach().requires_grad_() for tensor in (u, delta, A, B, C)]
+    for tensor in (u, delta, A, B, C):
+        tensor.requires_grad_()
     parts: list[tuple[str, Callable[[], Tensor]]] = [
-        ("hlsim", lambda: selective_scan(*given).sum()),
-        ("step by step", lambda: scan_loop(*given).sum()),
+        ("hlsim", lambda: selective_scan(u, delta, A, B, C).sum()),
+        ("step by step", lambda: scan_loop(u, delta, A, B, C).sum()),
     ]
     skipped = []
     try:
         kernel = importlib.import_module("mamba_ssm.ops.selective_scan_interface").selective_scan_fn
         if place.type != "cuda":
             raise ImportError("runs on a GPU only")
-        parts.append(("mamba-ssm", lambda: kernel(*given).sum()))
+        parts.append(("mamba-ssm", lambda: kernel(u, delta, A, B, C).sum()))
     except Exception as error:  # a build for another torch or GPU fails with whatever it likes
         skipped.append(f"mamba-ssm: {str(error).splitlines()[0]}")
     try:
         pscan = importlib.import_module("mambapy.pscan").pscan
 
         def mambapy() -> Tensor:
-            u, delta, A, B, C = given
             decay = (delta.mT.unsqueeze(-1) * A).exp()
             drive = (delta * u).mT.unsqueeze(-1) * B.mT.unsqueeze(2)
             return (pscan(decay, drive) @ C.mT.unsqueeze(-1)).sum()
@@ -108,7 +108,7 @@ def _table(
                 with torch.set_grad_enabled(direction == "both"):
                     value = call()
                 if direction == "both":
-                    value.backward()  # type: ignore[no-untyped-call]
+                    value.backward()
                 if device.type == "cuda":
                     torch.cuda.synchronize()
                 if turn:

@@ -74,9 +74,9 @@ def hear(spectrum: Tensor, ratios: Tensor | None, plan: Plan, slight: bool) -> T
         kinks = (envelopes[..., own, :], ratios[..., own]) if slight else None
         part = weigh(wave, gain[..., own, :, :], tier.interpolation, kinks)
         heard[tier.step] = heard[tier.step] + part if tier.step in heard else part
-    bins = plan.points // plan.step // 2 + 1
+    count = plan.points // plan.step // 2 + 1
     parts = [rfft(part, part.shape[-1]) * (step / plan.step) for step, part in heard.items()]
-    return torch.stack([functional.pad(part, (0, bins - part.shape[-1])) for part in parts]).sum(0)
+    return torch.stack([functional.pad(part, (0, count - part.shape[-1])) for part in parts]).sum(0)
 
 
 def hear_ending(heard: Tensor, ratios: Tensor, severity: str, filters: Filters) -> Tensor:

@@ -18,7 +18,7 @@ from hlsim.msbg.filters import Filters
 from hlsim.msbg.fourier import irfft, rfft
 from hlsim.msbg.recruitment import expansion_ratios
 from hlsim.msbg.smearing import BROADENING, SMEARING_DELAY, smear
-from hlsim.msbg.stages import block_bounds, from_cochlea, from_spectrum, to_cochlea, to_inner
+from hlsim.msbg.stages import block_bounds, faded, from_cochlea, from_spectrum, to_cochlea, to_inner
 
 STRUCTURAL_DELAY = 1047
 """Delay in samples at 44.1 kHz of the model without smearing, by which ``aligned`` advances the output.
@@ -139,7 +139,7 @@ class MSBG(nn.Module):
         for begin, start, stop, end in bounds:
             last = end == samples
             call = partial(self._simulate_alike, severity=severity, none=none, last=last)
-            block = signals[:, begin:end]
+            block = faded(signals[:, begin:end], self.sample_rate, begin > 0, not last)
             if torch.is_grad_enabled() and (block.requires_grad or ears.requires_grad):
                 output = checkpoint(call, block, ears, use_reentrant=False)
             else:

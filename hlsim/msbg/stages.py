@@ -15,7 +15,7 @@ _FIR_TAIL = 2 * EAR_DELAY + 132  # with the low-pass on the way out
 
 _BLOCK_SECONDS = 8.0
 # what a block needs around it: filters, delay, and low-passes down to 1e-6
-_LEAD_SECONDS, _LAG_SECONDS = 0.55, 0.35
+_LEAD_SECONDS, _LAG_SECONDS, _FADE_SECONDS = 0.75, 0.55, 0.2
 
 
 def to_cochlea(signals: Tensor, rate: int, length: int, step: int, filters: Filters) -> Tensor:
@@ -92,6 +92,19 @@ def block_bounds(samples: int, rate: int) -> list[tuple[int, int, int, int]]:
         (max(0, start - lead), start, stop, min(samples, stop + lag) if stop < samples else samples)
         for start, stop in zip(starts, stops, strict=True)
     ]
+
+
+def faded(block: Tensor, rate: int, begin: bool, end: bool) -> Tensor:
+    """A block's lead faded in and its lag out over 0.2 s: a sharp cut would ring wherever a band ends sharply.
+
+    Shape: (items, time) -> (items, time).
+    """
+    time = round(_FADE_SECONDS * rate)
+    place = torch.arange(1, time + 1, dtype=torch.float64, device=block.device) * (math.pi / (time + 1))
+    ramp = (0.5 - 0.5 * place.cos()).to(block.dtype)
+    ones = block.new_ones(block.shape[-1] - 2 * time)
+    edge = ramp.new_ones(time)
+    return block * torch.cat((ramp if begin else edge, ones, ramp.flip(-1) if end else edge))
 
 
 def ratio(rate: int, step: int) -> tuple[int, int]:
