@@ -4,37 +4,86 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import sys
+import time
 from pathlib import Path
 
-from hlsim.commands.options import (
-    Commands,
-    add_command,
-    count,
-    positive,
-)
+from hlsim.commands.options import Commands, add_command, count, positive
+
+WHAT = ("simulators", "training", "scan")
 
 
 def add(commands: Commands) -> None:
-    sub = add_command(commands, "benchmark", _benchmark, "time the simulators side by side")
-    sub.add_argument("--device", default="cpu", help="cpu or cuda")
-    sub.add_argument("--seconds", type=positive, default=1.0, help="length of the clip")
-    sub.add_argument("--repeats", type=count, default=9, help="counted rounds")
-    sub.add_argument("--simulator", default="neuro-msbg", help="the Neuro-MSBG, by name or folder")
+    sub = add_command(
+        commands, "benchmark", _benchmark, "time simulators, a training step and the scan side by side"
+    )
+    sub.add_argument("--device", default="cpu", help="cpu or cuda; pyclarity's Ear runs on the CPU always")
+    sub.add_argument(
+        "--what",
+        nargs="+",
+        choices=WHAT,
+        default=["simulators"],
+        help="simulators: all, at 1 s, longer and in batches; training: where the time of a step of a batch of 8 clips "
+        "of 2 s goes; scan: the selective scan against other ways to run it",
+    )
+    sub.add_argument("--repeats", type=count, default=7, help="counted rounds")
+    sub.add_argument(
+        "--limit",
+        type=positive,
+        default=2.0,
+        help="seconds that one timing of a longer clip or larger batch may take; those that would take more are left out",
+    )
+    sub.add_argument(
+        "--simulator", action="append", help="a Neuro-MSBG, by name or folder; by default all that ship"
+    )
     sub.add_argument("--json", type=Path, help="also write the figures to this file")
 
 
 def _benchmark(options: argparse.Namespace) -> None:
-    from hlsim.evaluation.benchmark import benchmark, benchmark_markdown
+    from compensators import MappingCompensator
+    from hlsim.evaluation.benchmark import about, benchmark
+    from hlsim.evaluation.benchmark_report import benchmark_markdown
+    from hlsim.evaluation.benchmark_training import scan_rows, training_step
 
-    result = benchmark(
-        device=options.device,
-        seconds=options.seconds,
-        repeats=options.repeats,
-        simulator=options.simulator,
-        progress=lambda line: print(f"\r{line}", end="", file=sys.stderr, flush=True),
-    )
-    print(file=sys.stderr)
+    result = about(options.device, options.repeats) | {"skipped": []}
+    if "simulators" in options.what:
+        result |= benchmark(
+            device=options.device,
+            repeats=options.repeats,
+            limit=options.limit,
+            simulators=options.simulator,
+            progress=_Progress(),
+        )
+        print(file=sys.stderr)
+    if "training" in options.what:
+        print("a training step ...", file=sys.stderr)
+        result["training"] = training_step(
+            MappingCompensator(), device=options.device, repeats=options.repeats
+        )
+    if "scan" in options.what:
+        print("the selective scan ...", file=sys.stderr)
+        result["scan"], skipped = scan_rows(device=options.device, repeats=options.repeats)
+        result["skipped"] = [*result["skipped"], *skipped]
     print(benchmark_markdown(result))
     if options.json is not None:
-        options.json.write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
+        partial = options.json.with_name(f".{options.json.name}.{os.getpid()}.part")
+        try:
+            partial.write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
+            os.replace(partial, options.json)
+        except OSError as error:
+            raise ValueError(f"{options.json}: cannot be written ({error})") from error
+        finally:
+            partial.unlink(missing_ok=True)
+
+
+class _Progress:
+    """A line on standard error, with the time that is left by how long the cells so far took."""
+
+    def __init__(self) -> None:
+        self.start = time.monotonic()
+
+    def __call__(self, done: int, total: int, text: str) -> None:
+        elapsed = time.monotonic() - self.start
+        left = f", about {elapsed / (done - 1) * (total - done + 1):.0f} s left" if done > 1 else ""
+        print(f"\r{done} of {total}{left}: {text}".ljust(100)[:100], end="", file=sys.stderr, flush=True)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 import os
 import platform
 import statistics
+import threading
 import time
 from collections.abc import Callable
-from functools import partial
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -15,170 +17,250 @@ from torch import Tensor
 
 from hlsim.audiogram import Audiogram
 from hlsim.calibration import set_level
-from hlsim.extras import MissingExtraError, require
-from hlsim.msbg import MSBG
-from hlsim.msbg.ear import RATE as MSBG_RATE
-from hlsim.neuro.config import NEURO_RATE
-from hlsim.pretrained import load_pretrained
+from hlsim.evaluation.benchmark_models import Row, rows
 
 EARS = ("N1", "N2", "N3")
 """One ear of each degree of loss: mild, moderate and severe in MSBG's sense."""
+
+# milliseconds: what takes longer is timed in so many rounds only, with the middle ear and no uncounted call
+_SLOW, _SLOW_ROUNDS = 400.0, 2
+
+LENGTHS = (1.0, 4.0, 16.0, 60.0)
+BATCHES = (1, 8, 64)
+
+Progress = Callable[[int, int, str], None]
 
 
 def benchmark(
     *,
     device: str = "cpu",
-    seconds: float = 1.0,
-    repeats: int = 9,
-    simulator: str = "neuro-msbg",
-    progress: Callable[[str], None] | None = None,
+    repeats: int = 7,
+    limit: float = 2.0,
+    lengths: tuple[float, ...] = LENGTHS,
+    batches: tuple[int, ...] = BATCHES,
+    simulators: list[str] | None = None,
+    progress: Progress | None = None,
 ) -> dict[str, Any]:
-    """Time one clip at batch 1 through pyclarity's MSBG, the exact MSBG and a Neuro-MSBG, in turn.
+    """Time the simulators on noise at 65 dB SPL with the rhythm of syllables.
 
-    The clip is noise at 65 dB SPL with the rhythm of syllables, the ears N1, N2 and N3. Rows take turns, so that all see
-    the same machine; the first round does not count, and each timing follows an uncounted call of the same.
+    One second at batch 1 first, forward and forward plus backward, with the ears N1, N2 and N3: the rows take turns,
+    so that all see the same machine, and each timing follows an uncounted call of the same. Then, forward, at each row's
+    own rate and with the ear N2, longer clips at batch 1 and larger batches of 1 s.
 
     Args:
-        device: ``"cpu"`` or ``"cuda"``; pyclarity always runs on the CPU.
-        seconds: length of the clip.
+        device: ``"cpu"`` or ``"cuda"``; pyclarity's ``Ear`` always runs on the CPU.
         repeats: counted rounds.
-        simulator: name or folder of the Neuro-MSBG.
-        progress: called with a line a round.
+        limit: seconds that one timing of a longer clip or larger batch may take by what 1 s took; others are left out.
+        lengths: seconds.
+        simulators: the Neuro-MSBGs, by name or folder; by default all that ship.
+        progress: called with cells done, cells in all, and what comes.
 
-    Returns: machine, and rows of name, sample rate, median, least and greatest milliseconds forward and forward plus
-    backward, and ``speedup``, the time of pyclarity's MSBG over the row's, both medians over all ears and rounds.
-    pyclarity runs at 44.1 kHz only: the same second.
+    Returns: machine, ``rows`` and ``skipped``. A row has name, parameters and a list of ``cells``, each with sample rate,
+        seconds, batch, direction, median, least and greatest milliseconds, peak memory in MiB and, at 1 s and batch 1,
+        ``speedup``: the median of pyclarity's ``Ear``, forward, over the row's. It runs at 44.1 kHz only: the same
+        second. ``growth`` is the exponent of the time's growth with length and with batch.
+
+    Raises:
+        ValueError: there is no such device.
     """
-    if device.startswith("cuda") and not torch.cuda.is_available():
-        raise ValueError(f"device {device}: there is no GPU that torch can use; allowed: cpu")
-    runs: list[tuple[str, int, Any]] = []
-    for rate in (MSBG_RATE, NEURO_RATE):
-        runs.append(("MSBG (exact)", rate, MSBG(sample_rate=rate).to(device)))
-        runs.append(
-            (f"Neuro-MSBG ({simulator})", rate, load_pretrained(simulator, sample_rate=rate).to(device))
-        )
-    skipped = []
-    try:
-        reference = _reference()
-    except MissingExtraError as error:
-        reference = None
-        skipped.append(f"pyclarity MSBG: {error}")
-    clips = {rate: _clip(rate, seconds) for rate in (MSBG_RATE, NEURO_RATE)}
-    times: dict[tuple[str, int, str], list[float]] = {}
-    for turn in range(repeats + 1):
+    machine = about(device, repeats)
+    place = torch.device(device)
+    found, skipped = rows(simulators)
+    cells: dict[tuple[str, int, float, int, str], list[float]] = {}
+    memory: dict[tuple[str, int, float, int, str], float | None] = {}
+    done, total = 0, _count(found, repeats, lengths, batches)
+
+    def step(text: str) -> None:
+        nonlocal done
+        done += 1
         if progress is not None:
-            progress(f"round {turn} of {repeats}")
-        for ear in map(Audiogram.standard, EARS):
-            if reference is not None:
-                process = partial(reference(ear).process, clips[MSBG_RATE].double().numpy())
-                _time(times, ("MSBG (pyclarity)", MSBG_RATE, "forward"), turn, "cpu", process)
-            for name, rate, model in runs:
-                clip = clips[rate].to(device)
-                _time(times, (name, rate, "forward"), turn, device, partial(_forward, model, clip, ear))
-                _time(times, (name, rate, "both"), turn, device, partial(_both, model, clip, ear))
-    baseline = times.get(("MSBG (pyclarity)", MSBG_RATE, "forward"))
-    rows = []
-    for name, rate in dict.fromkeys((key[0], key[1]) for key in times):
-        forward, both = times[(name, rate, "forward")], times.get((name, rate, "both"))
-        rows.append(
-            {
-                "name": name,
-                "sample_rate": rate,
-                "forward_ms": _spread(forward),
-                "forward_backward_ms": _spread(both) if both else None,
-                "speedup": statistics.median(baseline) / statistics.median(forward) if baseline else None,
-            }
-        )
-    machine = platform.processor() or platform.machine()
-    if device.startswith("cuda"):
-        machine = torch.cuda.get_device_name(device)
-    about = {
-        "device": device,
-        "machine": machine,
-        "cores": os.cpu_count(),
-        "threads": torch.get_num_threads(),
+            progress(done, total, text)
+
+    calls = {
+        (row.name, rate, ear): row.prepare(rate, Audiogram.standard(ear), place)
+        for row in found
+        for rate in row.rates
+        for ear in EARS
     }
-    return about | {
-        "torch": torch.__version__,
-        "seconds": seconds,
-        "repeats": repeats,
-        "rows": rows,
+    probe: dict[tuple[str, int], float] = {}
+    for turn in range(repeats + 1):
+        for row in found:
+            for rate in row.rates:
+                step(f"{row.name}, 1 s")
+                clip = _clip(rate, 1.0, 1, place)
+                slow = probe.get((row.name, rate), math.inf if turn == 0 else 0.0) > _SLOW
+                if slow and turn > _SLOW_ROUNDS:
+                    continue
+                for ear in EARS[1:2] if slow else EARS:
+                    for direction in ("forward", "both") if row.differentiable else ("forward",):
+                        key = (row.name, rate, 1.0, 1, direction)
+                        elapsed = _time(calls[row.name, rate, ear], clip, direction, place, warm=not slow)
+                        if direction == "forward":
+                            probe[row.name, rate] = elapsed
+                        if turn:
+                            cells.setdefault(key, []).append(elapsed)
+                        elif ear == EARS[1]:
+                            memory[key] = _peak(calls[row.name, rate, ear], clip, direction, place)
+    for row in found:
+        rate = row.rates[0]
+        call, first = calls[row.name, rate, "N2"], statistics.median(cells[row.name, rate, 1.0, 1, "forward"])
+        sizes = [(s, 1) for s in lengths if s != 1.0] + [(1.0, b) for b in batches if b != 1]
+        for seconds, batch in sizes:
+            step(f"{row.name}, {seconds:g} s, batch {batch}")
+            if first * seconds * batch > 1000.0 * limit:
+                continue
+            clip = _clip(rate, seconds, batch, place)
+            key = (row.name, rate, seconds, batch, "forward")
+            memory[key] = _peak(call, clip, "forward", place)
+            times = max(1, min(repeats, int(3000.0 * limit / max(1.0, first * seconds * batch))))
+            cells[key] = [_time(call, clip, "forward", place, warm=False) for _ in range(times)]
+    reference = cells.get(("pyclarity Ear", 44100, 1.0, 1, "forward"))
+    return machine | {
+        "rows": [_row(row, cells, memory, reference) for row in found],
         "skipped": skipped,
     }
 
 
-def benchmark_markdown(result: dict[str, Any]) -> str:
-    """The rows as a table."""
-    lines = [
-        f"{result['seconds']:g} s, batch 1, {result['device']} ({result['machine']}, {result['threads']} threads), torch "
-        f"{result['torch']}; median (least to greatest) of {result['repeats']} rounds on {len(EARS)} ears.",
-        "",
-        "| simulator | rate (Hz) | forward (ms) | forward + backward (ms) | times pyclarity's speed |",
-        "|---|---|---|---|---|",
-    ]
-    for row in result["rows"]:
-        both = row["forward_backward_ms"]
-        speedup = f"{row['speedup']:.1f}" if row["speedup"] else "-"
-        cells = (
-            row["name"],
-            row["sample_rate"],
-            _cell(row["forward_ms"]),
-            _cell(both) if both else "-",
-            speedup,
+def _row(
+    row: Row,
+    cells: dict[tuple[str, int, float, int, str], list[float]],
+    memory: dict[tuple[str, int, float, int, str], float | None],
+    reference: list[float] | None,
+) -> dict[str, Any]:
+    out: list[dict[str, Any]] = []
+    for key, times in cells.items():
+        name, rate, seconds, batch, direction = key
+        if name != row.name:
+            continue
+        single = seconds == 1.0 and batch == 1
+        median = statistics.median(times)
+        out.append(
+            {
+                "sample_rate": rate,
+                "seconds": seconds,
+                "batch": batch,
+                "direction": direction,
+                "median_ms": median,
+                "least_ms": min(times),
+                "greatest_ms": max(times),
+                "counted": len(times),
+                "peak_mib": memory.get(key),
+                "speedup": statistics.median(reference) / median if reference and single else None,
+            }
         )
-        lines.append("| " + " | ".join(map(str, cells)) + " |")
-    return "\n".join([*lines, *(f"\nskipped: {reason}" for reason in result["skipped"])]) + "\n"
+    return {
+        "name": row.name,
+        "parameters": row.parameters,
+        "cells": out,
+        "growth": {by: _growth(out, by, row.rates[0]) for by in ("seconds", "batch")},
+    }
 
 
-def _reference() -> Callable[[Audiogram], Any]:
-    module = require("clarity.evaluator.msbg.msbg", "eval")
+def _growth(cells: list[dict[str, Any]], by: str, rate: int) -> float | None:
+    """Exponent of the time over the largest range measured: 1.0 is proportional."""
+    other = "batch" if by == "seconds" else "seconds"
+    line = [
+        (cell[by], cell["median_ms"])
+        for cell in cells
+        if cell[other] == 1 and cell["direction"] == "forward" and cell["sample_rate"] == rate
+    ]
+    (low, first), (high, last) = min(line), max(line)
+    return math.log(last / first) / math.log(high / low) if high > low else None
 
-    def prepare(audiogram: Audiogram) -> Any:
-        ear = module.Ear(equiv_0db_spl=74.0)  # plus 20: RMS 1.0 is 94 dB SPL
-        ear.set_audiogram(audiogram.to_clarity())
-        return ear
 
-    return prepare
+def about(device: str, repeats: int) -> dict[str, Any]:
+    """Machine, versions and date.
+
+    Raises:
+        ValueError: there is no such device.
+    """
+    if device.startswith("cuda") and not torch.cuda.is_available():
+        raise ValueError(f"device {device}: there is no GPU that torch can use; allowed: cpu")
+    machine = _processor()
+    if device.startswith("cuda"):
+        machine = torch.cuda.get_device_name(device)
+    return {
+        "device": device,
+        "machine": machine,
+        "cores": os.cpu_count(),
+        "threads": torch.get_num_threads(),
+        "torch": torch.__version__,
+        "date": time.strftime("%Y-%m-%d"),
+        "repeats": repeats,
+    }
 
 
-def _clip(rate: int, seconds: float) -> Tensor:
+def _processor() -> str:
+    info = Path("/proc/cpuinfo")
+    if info.is_file():
+        for line in info.read_text(encoding="utf-8").splitlines():
+            if line.startswith("model name"):
+                return line.split(":", 1)[1].strip()
+    return platform.processor() or platform.machine()
+
+
+def _count(found: list[Row], repeats: int, lengths: tuple[float, ...], batches: tuple[int, ...]) -> int:
+    sizes = sum(s != 1.0 for s in lengths) + sum(b != 1 for b in batches)
+    return (repeats + 1) * sum(len(row.rates) for row in found) + len(found) * sizes
+
+
+def _clip(rate: int, seconds: float, batch: int, device: torch.device) -> Tensor:
     generator = torch.Generator().manual_seed(0)
     samples = round(rate * seconds)
     syllables = torch.sin(torch.arange(samples) * (2.0 * torch.pi * 4.0 / rate)).clamp_min(0.05)
-    return set_level(torch.randn(samples, generator=generator) * syllables, 65.0)
+    return set_level(torch.randn(batch, samples, generator=generator) * syllables, 65.0).to(device)
+
+
+def _run(call: Callable[[Tensor], Tensor], clip: Tensor, direction: str, device: torch.device) -> None:
+    if direction == "both":
+        call(clip.clone().requires_grad_()).square().sum().backward()
+    else:
+        with torch.no_grad():
+            call(clip)
+    if device.type == "cuda":
+        torch.cuda.synchronize()
 
 
 def _time(
-    times: dict[tuple[str, int, str], list[float]],
-    key: tuple[str, int, str],
-    turn: int,
-    device: str,
-    call: Callable[[], Any],
-) -> None:
-    call()  # the one before left its own data in the caches
-    if device.startswith("cuda"):
-        torch.cuda.synchronize()
+    call: Callable[[Tensor], Tensor], clip: Tensor, direction: str, device: torch.device, warm: bool = True
+) -> float:
+    """Milliseconds of one call."""
+    if warm:
+        _run(call, clip, direction, device)  # the one before left its own data in the caches
     start = time.perf_counter()
-    call()
-    if device.startswith("cuda"):
-        torch.cuda.synchronize()
-    elapsed = 1000.0 * (time.perf_counter() - start)
-    if turn:
-        times.setdefault(key, []).append(elapsed)
+    _run(call, clip, direction, device)
+    return 1000.0 * (time.perf_counter() - start)
 
 
-def _forward(model: torch.nn.Module, clip: Tensor, ear: Audiogram) -> None:
-    with torch.no_grad():
-        model(clip, ear)
+def _peak(
+    call: Callable[[Tensor], Tensor], clip: Tensor, direction: str, device: torch.device
+) -> float | None:
+    """MiB by which memory grows during a call: on a GPU torch's count, on a CPU the process's resident memory."""
+    if device.type == "cuda":
+        torch.cuda.reset_peak_memory_stats()
+        held = torch.cuda.memory_allocated()
+        _run(call, clip, direction, device)
+        return (torch.cuda.max_memory_allocated() - held) / 2**20
+    statm = Path("/proc/self/statm")
+    if not statm.is_file():
+        _run(call, clip, direction, device)
+        return None
 
+    def resident() -> float:
+        return float(statm.read_text(encoding="ascii").split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**20
 
-def _both(model: torch.nn.Module, clip: Tensor, ear: Audiogram) -> None:
-    model(clip.clone().requires_grad_(), ear).square().sum().backward()
+    before = resident()
+    highest = before
+    over = threading.Event()
 
+    def watch() -> None:
+        nonlocal highest
+        while not over.wait(0.002):
+            highest = max(highest, resident())
 
-def _spread(values: list[float]) -> dict[str, float]:
-    return {"median": statistics.median(values), "least": min(values), "greatest": max(values)}
-
-
-def _cell(spread: dict[str, float]) -> str:
-    return f"{spread['median']:.1f} ({spread['least']:.1f} to {spread['greatest']:.1f})"
+    watcher = threading.Thread(target=watch, daemon=True)
+    watcher.start()
+    _run(call, clip, direction, device)
+    over.set()
+    watcher.join()
+    return max(highest, resident()) - before

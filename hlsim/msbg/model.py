@@ -1,22 +1,24 @@
 """The exact MSBG: batched, differentiable, on any device."""
 
 import math
-from functools import lru_cache
-from typing import Any
+from functools import partial
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
+from torch.utils.checkpoint import checkpoint
 
 from hlsim.audio import check_rate, check_waveform
 from hlsim.audiogram import SEVERITIES, AudiogramLike, as_thresholds, severity_index
 from hlsim.calibration import PASCAL_SPL, check_full_scale, gain_to_pascals
-from hlsim.msbg.ear import EAR_DELAY, RATE, ear_filter, lowpass_filter
-from hlsim.msbg.ending import ending, ending_response, ending_weights
-from hlsim.msbg.filterbank import BANKS, gammatone_response
-from hlsim.msbg.recruitment import STEP, envelope, envelope_lowpass, expand, expansion_ratios
-from hlsim.msbg.smearing import BROADENING, SMEARING_DELAY, smear, smearing_matrix
+from hlsim.msbg.cochlea import bank_points, hear, hear_ending
+from hlsim.msbg.ear import RATE
+from hlsim.msbg.filterbank import BANKS
+from hlsim.msbg.filters import Filters
+from hlsim.msbg.fourier import irfft, rfft
+from hlsim.msbg.recruitment import expansion_ratios
+from hlsim.msbg.smearing import BROADENING, SMEARING_DELAY, smear
+from hlsim.msbg.stages import block_bounds, faded, from_cochlea, from_spectrum, to_cochlea, to_inner
 
 STRUCTURAL_DELAY = 1047
 """Delay in samples at 44.1 kHz of the model without smearing, by which ``aligned`` advances the output.
@@ -25,8 +27,16 @@ The three linear-phase filters delay by 507 + 507 + 66 = 1080 samples; the filte
 (200 Hz) of it back, 33 at about 1 kHz.
 """
 
-_FIR_TAIL = 2 * EAR_DELAY
-_BANK_TAIL = 3200  # 73 ms: the longest advance, and what it takes the narrowest channel to decay by 80 dB
+_HALF_RATE_HZ = 20000
+"""Signals of this rate or less run at 22.05 kHz inside."""
+
+# of signals that end in mid-speech, the samples at the end that run at 44.1 kHz throughout, and what these depend on
+_ENDING = 4096
+_ENDING_LEAD = 7296
+
+# samples of all items that run together
+_CPU_SAMPLES = 48000
+_DEVICE_SAMPLES = 12_000_000
 
 
 class MSBG(nn.Module):
@@ -98,45 +108,101 @@ class MSBG(nn.Module):
         signals = waveform.to(dtype).expand(*batch, -1).reshape(-1, waveform.shape[-1])
         ears = thresholds.to(signals).expand(*batch, -1).reshape(-1, thresholds.shape[-1])
         signals = signals * gain_to_pascals(self.full_scale_spl)
+        if self.rescale_active:
+            signals = signals * active_rescaling(to_inner(signals, self.sample_rate))
 
-        indices = severity_index(ears)
         outputs: list[Tensor] = []
-        order: list[Tensor] = []
-        for index in indices.unique().tolist():
-            members = (indices == index).nonzero().squeeze(-1)
-            outputs.append(self._simulate_alike(signals[members], ears[members], SEVERITIES[index]))
-            order.append(members)
+        order: list[int] = []
+        for severity, none, members in _alike(ears):
+            for some in _portions(members, signals.shape[-1], signals.device.type):
+                if len(some) == len(signals):
+                    outputs.append(self._in_blocks(signals, ears, severity, none))
+                else:
+                    chosen = slice(some[0], some[-1] + 1, 1) if some[-1] - some[0] == len(some) - 1 else some
+                    outputs.append(self._in_blocks(signals[chosen], ears[chosen], severity, none))
+                order += some
         longest = max(output.shape[-1] for output in outputs)
-        joined = torch.cat([functional.pad(output, (0, longest - output.shape[-1])) for output in outputs])
-        joined = joined[torch.cat(order).argsort()] / gain_to_pascals(self.full_scale_spl)
-        return joined.reshape(*batch, longest).to(waveform.dtype)
+        joined = [functional.pad(output, (0, longest - output.shape[-1])) for output in outputs]
+        heard = joined[0] if len(joined) == 1 else torch.cat(joined)
+        if order != list(range(len(order))):
+            heard = heard[torch.tensor(order).argsort().to(heard.device)]
+        heard = heard / gain_to_pascals(self.full_scale_spl)
+        return heard.reshape(*batch, longest).to(waveform.dtype)
 
-    def _simulate_alike(self, signals: Tensor, ears: Tensor, severity: str) -> Tensor:
-        """All items have the same severity. Shape: (items, time), (items, 8) -> (items, time)."""
+    def _in_blocks(self, signals: Tensor, ears: Tensor, severity: str, none: bool) -> Tensor:
+        """Long signals by overlapping blocks, so that memory does not grow. Shapes as ``_simulate_alike``'s."""
         samples = signals.shape[-1]
-        bank = BANKS[severity]
+        bounds = block_bounds(samples, self.sample_rate)
+        if len(bounds) == 1:
+            return self._simulate_alike(signals, ears, severity, none, True)
+        heard = []
+        for begin, start, stop, end in bounds:
+            last = end == samples
+            call = partial(self._simulate_alike, severity=severity, none=none, last=last)
+            block = faded(signals[:, begin:end], self.sample_rate, begin > 0, not last)
+            if torch.is_grad_enabled() and (block.requires_grad or ears.requires_grad):
+                output = checkpoint(call, block, ears, use_reentrant=False)
+            else:
+                output = call(block, ears)
+            heard.append(output[:, start - begin : None if last else stop - begin])
+        return torch.cat(heard, -1)
+
+    def _simulate_alike(self, signals: Tensor, ears: Tensor, severity: str, none: bool, last: bool) -> Tensor:
+        """All items have the same severity. Shape: (items, time), (items, 8) -> (items, time).
+
+        Args:
+            none: they hear everything at its level: 0 dB HL throughout.
+            last: the signals end where they end, and are not cut from longer ones.
+        """
+        samples, rate = signals.shape[-1], self.sample_rate
+        step = 2 if self.aligned and rate <= _HALF_RATE_HZ else 1
         delay = self.delay(severity) if self.aligned else 0
-        inner = math.ceil(samples * RATE / self.sample_rate)
-        heard = _to_cochlea(signals, self.sample_rate, inner + delay, self.rescale_active)
+        inner = math.ceil(samples * RATE / rate)
+        filters = Filters(signals.dtype, signals.device)
+        # a frame that smearing leaves next to nothing hangs on the last bits: where every sample counts, keep more
+        fine = filters if self.aligned else Filters(torch.float64, signals.device)
+        heard = to_cochlea(signals.to(fine.dtype), rate, math.ceil((inner + delay) / step), step, fine)
         if severity in BROADENING:
-            heard = smear(heard, _tensor("smearing", BROADENING[severity], 0, heard))
+            heard = smear(heard, fine.get("smearing", severity, step), step)
+        heard = heard.to(signals.dtype)
+        ratios = expansion_ratios(ears, BANKS[severity])
+        scale = 10.0 ** (-BANKS[severity].recombination_db / 20.0)
+
         length = heard.shape[-1]
+        if self.aligned:
+            points = bank_points(length * step, rate)
+            plan = filters.get("plan", severity, points, step)
+            spectrum = hear(
+                rfft(heard, points // step), None if none else ratios, plan, severity not in BROADENING
+            )
+            if severity in BROADENING:
+                return scale * from_spectrum(spectrum, points, step, rate, samples, delay, filters)
+            # without smearing's delay, the way out reaches samples that the advances put before the first one
+            heard = irfft(spectrum, points // step)[..., :length]
+            return scale * from_cochlea(heard, rate, length, samples, filters, step=step, delay=delay)
+        heard = self._late(heard, ratios, severity, last, filters)
+        return scale * from_cochlea(heard, rate, length, round(length * rate / RATE), filters)
 
-        points = _fft_length(length + _BANK_TAIL, 2 * STEP)
-        spectrum = torch.fft.rfft(heard, points).unsqueeze(-2) * _tensor("bank", severity, points, heard)
-        channels = torch.fft.irfft(spectrum, points) * _tensor("kept", severity, (points, length), heard)
-        envelopes = envelope(channels, _tensor("lowpass", severity, points, heard))
-        if not self.aligned:
-            weights = _tensor("ending weights", severity, 0, heard)
-            response = _tensor("ending response", severity, (length - 1) % STEP + 1, heard)
-            envelopes = envelopes + ending(channels, weights, response, length)
-        heard = expand(channels, envelopes, expansion_ratios(ears, bank))[..., :length]
-
-        inner_out = inner if self.aligned else length
-        out = samples if self.aligned else round(length * self.sample_rate / RATE)
-        return _from_cochlea(heard, self.sample_rate, delay, inner_out, out) * 10.0 ** (
-            -bank.recombination_db / 20.0
-        )
+    def _late(self, heard: Tensor, ratios: Tensor, severity: str, last: bool, filters: Filters) -> Tensor:
+        """With the delay and, at the end, what the reference makes of it. Shape: (items, time) -> (items, time)."""
+        length = heard.shape[-1]
+        # with a slight loss and no smearing, nothing buries what the lower rates change where the envelope is next to 0
+        whole = length <= _ENDING + _ENDING_LEAD or severity not in BROADENING
+        parts = []
+        if not whole or not last:
+            points = bank_points(length, RATE)
+            plan = filters.get("plan", severity, points, 1)
+            parts.append(
+                irfft(hear(rfft(heard, points), ratios, plan, severity not in BROADENING), points)[
+                    ..., :length
+                ]
+            )
+        if last:
+            ending = hear_ending(
+                heard if whole else heard[..., -_ENDING - _ENDING_LEAD :], ratios, severity, filters
+            )
+            parts = [ending] if whole else [parts[0][..., :-_ENDING], ending[..., -_ENDING:]]
+        return parts[0] if len(parts) == 1 else torch.cat(parts, -1)
 
 
 def resolve_thresholds(stored: Tensor | None, audiogram: AudiogramLike | None, waveform: Tensor) -> Tensor:
@@ -178,109 +244,17 @@ def active_rescaling(signals: Tensor) -> Tensor:
     return ratio.sqrt().unsqueeze(-1)
 
 
-def _to_cochlea(signals: Tensor, rate: int, length: int, rescale: bool) -> Tensor:
-    """Resample to 44.1 kHz and pass outer and middle ear by one pair of FFTs. Shape: (items, time) -> (items, length)."""
-    up, down = _ratio(rate)
-    if rescale:
-        at_rate = (
-            signals
-            if up == down
-            else _convert(torch.fft.rfft(signals, _grid(signals.shape[-1], rate)[0]), rate, True)
-        )
-        signals = signals * active_rescaling(at_rate[..., : math.ceil(signals.shape[-1] * up / down)])
-    own, points = _grid(
-        max(signals.shape[-1], math.ceil(length * down / up)) + math.ceil(_FIR_TAIL * down / up), rate
-    )
-    bins = min(own, points) // 2 + 1
-    spectrum = torch.fft.rfft(signals, own)[..., :bins] * (
-        _tensor("forward", "", points, signals)[:bins] * (up / down)
-    )
-    return torch.fft.irfft(_without_nyquist(spectrum, own, points), points)[..., :length]
+def _alike(ears: Tensor) -> list[tuple[str, bool, list[int]]]:
+    """Severity, whether all is 0 dB HL, and the indices of the items with ears like that. Shape: (items, 8)."""
+    known = ears.detach().cpu()  # once a call; the rest asks nothing of the device
+    none = [not any(levels) and not ears.requires_grad for levels in known.tolist()]
+    groups: dict[tuple[int, bool], list[int]] = {}
+    for item, kind in enumerate(zip(severity_index(known).tolist(), none, strict=True)):
+        groups.setdefault(kind, []).append(item)
+    return [(SEVERITIES[index], still, members) for (index, still), members in groups.items()]
 
 
-def _from_cochlea(heard: Tensor, rate: int, delay: int, inner: int, out: int) -> Tensor:
-    """Back out of the ear, low-pass, advance by ``delay``, return to ``rate``. Shape: (items, time) -> (items, out)."""
-    up, down = _ratio(rate)
-    longest = max(heard.shape[-1], inner + delay) + _FIR_TAIL
-    own, points = _grid(math.ceil(longest * down / up), rate)
-    bins = min(own, points) // 2 + 1
-    response = _tensor("backward", "", points, heard) * _tensor("advance", "", (points, delay), heard)
-    spectrum = torch.fft.rfft(heard, points)[..., :bins] * (response[:bins] * (down / up))
-    return torch.fft.irfft(_without_nyquist(spectrum, points, own), own)[..., :out]
-
-
-def _convert(spectrum: Tensor, rate: int, inward: bool) -> Tensor:
-    """Resample a spectrum made at ``rate`` to 44.1 kHz."""
-    up, down = _ratio(rate)
-    own = 2 * (spectrum.shape[-1] - 1)
-    points = own * up // down
-    bins = min(own, points) // 2 + 1
-    return torch.fft.irfft(_without_nyquist(spectrum[..., :bins] * (up / down), own, points), points)
-
-
-def _without_nyquist(spectrum: Tensor, source: int, target: int) -> Tensor:
-    """Where rates differ, drop the bin at the lower Nyquist frequency, which the other grid cannot hold as it is."""
-    if source != target:
-        spectrum = spectrum[..., :-1]
-    return spectrum
-
-
-def _ratio(rate: int) -> tuple[int, int]:
-    common = math.gcd(RATE, rate)
-    return RATE // common, rate // common
-
-
-def _grid(samples: int, rate: int) -> tuple[int, int]:
-    """FFT lengths at ``rate`` and at 44.1 kHz that span the same time, at least ``samples`` at ``rate``."""
-    up, down = _ratio(rate)
-    blocks = _fft_length(math.ceil(samples / down), 1 if down % 2 == 0 and up % 2 == 0 else 2)
-    return blocks * down, blocks * up
-
-
-@lru_cache(maxsize=256)
-def _fft_length(least: int, multiple: int) -> int:
-    """The next length of small primes that is a multiple of ``multiple``."""
-    best = multiple * 2 ** math.ceil(math.log2(max(1, math.ceil(least / multiple))))
-    for threes in (1, 3, 9, 27):
-        for fives in (1, 5, 25):
-            odd = multiple * threes * fives
-            best = min(best, odd * 2 ** math.ceil(math.log2(max(1, math.ceil(least / odd)))))
-    return best
-
-
-def _tensor(kind: str, key: Any, points: Any, like: Tensor) -> Tensor:
-    return _cached(kind, key, points, like.dtype, like.device)
-
-
-@lru_cache(maxsize=64)
-def _cached(kind: str, key: Any, points: Any, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """A filter on the FFT grid, held per severity, length, type and device."""
-    array: np.ndarray[Any, Any]
-    match kind:
-        case "smearing":
-            array = smearing_matrix(*key)
-        case "bank":
-            array = gammatone_response(BANKS[key], points)
-        case "lowpass":
-            array = envelope_lowpass(BANKS[key], points)
-        case "ending weights":
-            array = ending_weights(BANKS[key])
-        case "ending response":
-            array = ending_response(BANKS[key], points)
-        case "kept":
-            # the advance has nothing to bring in at the end, where the reference puts zeros
-            length = points[1] - np.array(BANKS[key].advances)[:, None]
-            array = (np.arange(points[0]) < length).astype(float)
-        case "forward":
-            array = np.fft.rfft(ear_filter(), points)
-        case "backward":
-            array = np.fft.rfft(ear_filter(backward=True), points) * np.fft.rfft(lowpass_filter(), points)
-        case "advance":
-            array = np.exp(2j * np.pi * np.arange(points[0] // 2 + 1) * points[1] / points[0])
-        case _:
-            raise AssertionError(kind)
-    wide = torch.complex128 if np.iscomplexobj(array) else torch.float64
-    narrow = {torch.float64: wide, torch.float32: torch.complex64 if wide.is_complex else torch.float32}[
-        dtype
-    ]
-    return torch.from_numpy(array).to(device=device, dtype=narrow)
+def _portions(members: list[int], samples: int, device: str) -> list[list[int]]:
+    """Items that run together: on a CPU few, for their channels to stay in its cache."""
+    size = max(1, (_CPU_SAMPLES if device == "cpu" else _DEVICE_SAMPLES) // samples)
+    return [members[i : i + size] for i in range(0, len(members), size)]

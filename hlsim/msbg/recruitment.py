@@ -33,6 +33,7 @@ AHEAD = _TAPS // 2
 """Steps ahead of a sample that its gain is interpolated from."""
 
 _SLIGHT = 1.3  # expansion ratio at 24 dB HL
+_TINY = 1e-30  # Pa^2, keeps the gradients of silence finite
 
 
 def expansion_ratios(thresholds: Tensor, bank: FilterBank) -> Tensor:
@@ -46,72 +47,131 @@ def expansion_ratios(thresholds: Tensor, bank: FilterBank) -> Tensor:
     return CATCH_UP_SPL / (CATCH_UP_SPL - thresholds @ weights)
 
 
-def envelope(channels: Tensor, lowpass: Tensor) -> Tensor:
-    """Full-wave rectify and low-pass, zero-phase, at a sixteenth of the rate.
+def rectify(signal: Tensor, quadrature: Tensor, series: tuple[float, float, float]) -> Tensor:
+    """What a full-wave rectifier makes of a band, less the harmonics that its rate cannot hold.
 
-    Shape: (..., channels, time), (channels, time // 32 + 1) -> (..., channels, time // 16), the values at samples 0, 16,
-    ...; ``time`` is a multiple of 32 and the signal is taken as periodic.
+    Shape: (..., time) twice -> (..., time).
+
+    Args:
+        series: coefficients of 1, cos^2 and cos^4 of the phase in its |cos|.
     """
-    blocks = channels.abs().unflatten(-1, (-1, STEP))
-    kernel = torch.from_numpy(_decimation_kernel()).to(channels)
-    before, here, after = (blocks @ kernel).unbind(-1)
-    slow = before.roll(1, -1) + here + after.roll(-1, -1)
+    square = signal.square()
+    power = torch.addcmul(square, quadrature, quadrature) + _TINY
+    cosine = square / power
+    if series[2]:
+        factor = (cosine * series[2] + series[1]) * cosine + series[0]
+    else:
+        factor = cosine * series[1] + series[0]
+    return power.sqrt() * factor
+
+
+def decimate(rectified: Tensor, kernel: Tensor) -> Tensor:
+    """Weighted sums of each step's samples, for ``smooth``. Shape: (..., time), (3, 16 // step) -> (..., 3, steps)."""
+    return kernel @ rectified.unflatten(-1, (-1, kernel.shape[-1])).mT
+
+
+def smooth(sums: Tensor, lowpass: Tensor) -> Tensor:
+    """Envelopes at samples 0, 16, ... from the sums of ``decimate``; periodic.
+
+    Shape: (..., channels, 3, steps), (channels, steps // 2 + 1) -> (..., channels, steps).
+    """
+    before, here, after = sums.unbind(-2)
+    slow = here + before.roll(1, -1) + after.roll(-1, -1)
     return torch.fft.irfft(torch.fft.rfft(slow) * lowpass, slow.shape[-1])
 
 
-def expand(channels: Tensor, envelopes: Tensor, ratios: Tensor) -> Tensor:
-    """Apply the recruitment gain (envelope / catch-up level) ** (ratio - 1) and sum the channels.
+def envelope(channels: Tensor, lowpass: Tensor) -> Tensor:
+    """Full-wave rectify at 44.1 kHz and low-pass, zero-phase, at a sixteenth of the rate.
 
-    Shape: (..., channels, time), (..., channels, time // 16), (..., channels) -> (..., time).
+    Shape: (..., channels, time), (channels, time // 32 + 1) -> (..., channels, time // 16), the values at samples 0, 16,
+    ...; ``time`` is a multiple of 16 and the signal is taken as periodic.
     """
-    kernel = torch.from_numpy(_interpolation_kernel()).to(channels)
-    gain = _around(_gain(envelopes, ratios.unsqueeze(-1))) @ kernel
-    # The low-pass overshoots, and where the envelope goes through zero the gain has kinks. A small loss does not bury
-    # them, and the way out of the ear lifts their upper end by 40 dB, so that there the envelope is interpolated instead.
-    slight = (ratios != 1.0) & (ratios < _SLIGHT)
-    if bool(slight.any()):
-        floored = envelopes.detach().clamp_min(_LOWEST_ENVELOPE)
-        low = torch.minimum(floored, floored.roll(-1, -1))
-        high = torch.maximum(floored, floored.roll(-1, -1))
-        steep = low < 0.3 * torch.maximum(high.roll(1, -1), high.roll(-1, -1))
-        steep = steep & slight.unsqueeze(-1)
-        own = ratios.unsqueeze(-1).expand(steep.shape)[steep].unsqueeze(-1)
-        gain[steep] = _gain(_around(envelopes)[steep] @ kernel, own)
-    full = gain.flatten(-2)
-    if torch.is_grad_enabled() and (channels.requires_grad or full.requires_grad):
-        return (channels * full).sum(-2)
-    total = torch.zeros_like(channels[..., 0, :])
-    # in place, a channel at a time: it stays in the processor's cache
-    for channel in range(channels.shape[-2]):
-        total.addcmul_(channels[..., channel, :], full[..., channel, :])
-    return total
+    kernel = torch.from_numpy(decimation_kernel()).to(channels)
+    return smooth(decimate(channels.abs(), kernel), lowpass)
 
 
-def _gain(envelopes: Tensor, ratios: Tensor) -> Tensor:
+def gains(envelopes: Tensor, ratios: Tensor) -> Tensor:
+    """The recruitment gain (envelope / catch-up level) ** (ratio - 1).
+
+    Shape: (..., channels, steps), (..., channels) -> (..., channels, steps).
+    """
     level = envelopes.clamp(_LOWEST_ENVELOPE, _HIGHEST_ENVELOPE).div(_HIGHEST_ENVELOPE).log()
-    return (level * (ratios - 1.0)).exp()
+    return (level * (ratios.unsqueeze(-1) - 1.0)).exp()
 
 
-def _around(values: Tensor) -> Tensor:
+def around(values: Tensor) -> Tensor:
     """The six values about each step. Shape: (..., steps) -> (..., steps, 6)."""
     return torch.cat((values[..., 1 - AHEAD :], values, values[..., :AHEAD]), -1).unfold(-1, _TAPS, 1)
 
 
+def weigh(
+    channels: Tensor, gain: Tensor, kernel: Tensor, slight: tuple[Tensor, Tensor] | None = None
+) -> Tensor:
+    """Interpolate the gains, apply them and sum the channels.
+
+    Shape: (..., channels, time), (..., channels, steps, 6), (6, time // steps) -> (..., time).
+
+    Args:
+        slight: envelopes (..., channels, steps) and ratios (..., channels), where some ratios are slight. The low-pass
+            overshoots, and where the envelope goes through zero the gain has kinks. A small loss does not bury them,
+            and the way out of the ear lifts their upper end by 40 dB, so that there the envelope is interpolated instead.
+    """
+    gain = gain @ kernel
+    if slight is not None:
+        envelopes, ratios = slight
+        steep = _steep(envelopes) & ((ratios != 1.0) & (ratios < _SLIGHT)).unsqueeze(-1)
+        if steep.device.type == "cpu":
+            own = ratios.unsqueeze(-1).expand(steep.shape)[steep]
+            gain[steep] = gains(around(envelopes)[steep] @ kernel, own)
+        else:  # indices would have to come back from the device
+            fine = gains(around(envelopes) @ kernel, ratios.unsqueeze(-1))
+            gain = torch.where(steep.unsqueeze(-1), fine, gain)
+    full = gain.flatten(-2)
+    if torch.is_grad_enabled() and (channels.requires_grad or full.requires_grad):
+        return (channels * full).sum(-2)
+    total = channels[..., 0, :] * full[..., 0, :]
+    # in place, a channel at a time: it stays in the processor's cache
+    for channel in range(1, channels.shape[-2]):
+        total.addcmul_(channels[..., channel, :], full[..., channel, :])
+    return total
+
+
+def _steep(envelopes: Tensor) -> Tensor:
+    """Where an envelope goes through zero. Shape: (..., steps) -> (..., steps)."""
+    floored = envelopes.detach().clamp_min(_LOWEST_ENVELOPE)
+    low = torch.minimum(floored, floored.roll(-1, -1))
+    high = torch.maximum(floored, floored.roll(-1, -1))
+    return low < 0.3 * torch.maximum(high.roll(1, -1), high.roll(-1, -1))
+
+
+def expand(channels: Tensor, envelopes: Tensor, ratios: Tensor) -> Tensor:
+    """Apply the recruitment gain at 44.1 kHz and sum the channels.
+
+    Shape: (..., channels, time), (..., channels, time // 16), (..., channels) -> (..., time).
+    """
+    kernel = torch.from_numpy(interpolation_kernel()).to(channels)
+    return weigh(channels, around(gains(envelopes, ratios)), kernel, (envelopes, ratios))
+
+
 @lru_cache(maxsize=16)
-def envelope_lowpass(bank: FilterBank, points: int) -> NDArray[np.complex128]:
-    """Response that turns the rfft of the block means into that of the envelope at samples 0, 16, ...
+def envelope_lowpass(bank: FilterBank, points: int, step: int = 1) -> NDArray[np.complex128]:
+    """Response that turns the rfft of ``decimate``'s means into that of the envelope at samples 0, 16, ...
 
     The low-pass is ``ellip(2, 0.25, 35)`` at 3/4 of 100 Hz or of the channel's ERB if less, run forwards and backwards
     as pyclarity does with ``filtfilt``; what that does at the end is in ``hlsim.msbg.ending``.
+
+    Args:
+        points: FFT length at 44.1 kHz, a multiple of 16.
+        step: samples at 44.1 kHz from one of the rectified signal's to the next.
 
     Returns: (channels, points // 32 + 1).
     """
     omega = 2.0 * np.pi * np.arange(points // STEP // 2 + 1) / points
     rows = [np.abs(freqz(*coefficients, omega)[1]) ** 2 for coefficients in envelope_filters(bank)]
     with np.errstate(invalid="ignore"):
-        box = np.sin(STEP * omega / 2.0) / (STEP * np.sin(omega / 2.0))
+        box = np.sin(STEP * omega / 2.0) / (STEP // step * np.sin(step * omega / 2.0))
     box[0] = 1.0
-    return np.array(rows) / box**_BOXES * np.exp(-7.5j * omega)
+    return np.array(rows) / box**_BOXES * np.exp(-0.5j * (STEP - step) * omega)
 
 
 def envelope_filters(bank: FilterBank) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
@@ -125,20 +185,24 @@ def _interpolation(centre_frequencies: tuple[float, ...]) -> NDArray[np.float64]
     return np.array([np.interp(centre_frequencies, FREQUENCIES, row) for row in np.eye(len(FREQUENCIES))])
 
 
-@lru_cache(maxsize=1)
-def _decimation_kernel() -> NDArray[np.float64]:
-    """Weights of a block's samples in the mean around the block after it, itself and the one before. Returns (16, 3)."""
-    box = np.full(STEP, 1.0 / STEP)
+@lru_cache(maxsize=8)
+def decimation_kernel(step: int = 1) -> NDArray[np.float64]:
+    """Weights of a block's samples in the mean around the block after it, itself and the one before.
+
+    Returns: (3, 16 // step).
+    """
+    samples = STEP // step
+    box = np.full(samples, 1.0 / samples)
     kernel = np.pad(np.convolve(np.convolve(box, box), box), 1)
-    return np.ascontiguousarray(kernel.reshape(_BOXES, STEP).T)
+    return np.ascontiguousarray(kernel.reshape(_BOXES, samples))
 
 
-@lru_cache(maxsize=1)
-def _interpolation_kernel() -> NDArray[np.float64]:
-    """Lagrange weights of six neighbours for the sixteen samples from the third on. Returns (6, 16)."""
+@lru_cache(maxsize=8)
+def interpolation_kernel(step: int = 1) -> NDArray[np.float64]:
+    """Lagrange weights of six neighbours for the samples from the third on. Returns (6, 16 // step)."""
     nodes = np.arange(_TAPS) - (_TAPS // 2 - 1.0)
-    place = np.arange(STEP) / STEP
-    weights = np.ones((_TAPS, STEP))
+    place = np.arange(0, STEP, step) / STEP
+    weights = np.ones((_TAPS, len(place)))
     for i, node in enumerate(nodes):
         for other in np.delete(nodes, i):
             weights[i] *= (place - other) / (node - other)

@@ -19,7 +19,9 @@ SMEARING_DELAY = 3 * HOP
 BROADENING = {"mild": (1.6, 1.1), "moderate": (2.4, 1.6), "severe": (4.0, 2.0)}
 """Widening of the lower and the upper side of the auditory filters; with no loss nothing is smeared (pyclarity 0.9.0)."""
 
-_TINY = 1e-24  # its power of -1.5, in the gradient of silence, is finite in float32
+_TINY = 1e-24  # Pa^2; in the gradient of silence it stands under 1, twice
+_CACHED = 240  # frames
+_SLIGHT = 1e-18  # of a power's share; its power of -0.5 is finite
 
 
 def roex_filters(lower: float, upper: float, count: int, spacing: float) -> NDArray[np.float64]:
@@ -73,45 +75,80 @@ def smeared_length(samples: int) -> int:
     return HOP * (math.ceil(samples / HOP) + 3)
 
 
-def smear(waveform: Tensor, matrix: Tensor) -> Tensor:
-    """Smear a waveform at 44.1 kHz as pyclarity's ``smear3`` does, its delay and its first, irregular frames included.
+def smear(waveform: Tensor, matrix: Tensor, step: int = 1) -> Tensor:
+    """Smear a waveform as pyclarity's ``smear3`` does at 44.1 kHz, its delay and its first, irregular frames included.
 
-    Shape: (..., time), (256, 256) -> (..., 64 * (ceil(time / 64) + 3)).
+    Shape: (..., time), (256 // step, 256 // step) -> (..., hop * (ceil(time / hop) + 3)) with hop = 64 // step.
+
+    Args:
+        matrix: ``smearing_matrix``, its lower half in both directions if ``step`` is 2.
+        step: 1 at 44.1 kHz; 2 at 22.05 kHz, where the same frames are taken at every other sample and nothing above
+            11 kHz is known.
     """
-    samples = waveform.shape[-1]
-    frames = _frames(functional.pad(waveform, (0, max(FRAME, HOP * math.ceil(samples / HOP)) - samples)))
-    frames = frames[..., : math.ceil(samples / HOP), :]
-    place = 2.0 * math.pi * (torch.arange(FRAME, dtype=torch.float64, device=waveform.device) + 0.5) / FRAME
-    window = ((0.5 - 0.5 * place.cos()) / math.sqrt(1.5)).to(waveform.dtype)
-    spectrum = torch.fft.rfft(frames * window, FFT)[..., : FFT // 2]
+    hop = HOP // step
+    matrix = functional.pad(matrix, (0, 1, 0, 1))  # the last frequency is left out
+    count = math.ceil(waveform.shape[-1] / hop)
+    window = _window(step, waveform.dtype, waveform.device)
+    frames = _frames(waveform, count, hop)
+    # on a CPU a few frames at a time, for the steps from one to the next to find them in its cache
+    size = max(1, _CACHED * step // waveform[..., 0].numel()) if waveform.device.type == "cpu" else count
+    parts = [_widen(part, window, matrix) for part in frames.split(size, -2)]
+    return _overlap_add(parts[0] if len(parts) == 1 else torch.cat(parts, -2), hop)
+
+
+def _widen(frames: Tensor, window: Tensor, matrix: Tensor) -> Tensor:
+    """Smear each frame's power. Shape: (..., frames, 2 n), (2 n,), (n + 1, n + 1) -> (..., frames, n)."""
+    spectrum = torch.fft.rfft(frames * window)
     power = spectrum.real.square() + spectrum.imag.square()
-    smeared = power @ matrix.T
-    # tiny terms keep the gradients of silence finite
-    scale = (smeared.abs() + _TINY).sqrt() * (power + _TINY).rsqrt()
-    turned = torch.complex(-spectrum.imag, spectrum.real)  # the square root of a negative power is imaginary
-    spectrum = torch.where(smeared < 0, turned, spectrum) * scale
-    frames = torch.fft.irfft(functional.pad(spectrum, (0, 1)), FFT)[..., :FRAME] * window
-    return _overlap_add(frames)
+    share = (power @ matrix.T) / (power + _TINY)
+    # the square root of a negative power is imaginary
+    spectrum = spectrum * torch.complex(_root(share), _root(-share))
+    half = len(window) // 2
+    return torch.fft.irfft(spectrum, len(window))[..., :half] * window[:half]
 
 
-def _frames(waveform: Tensor) -> Tensor:
-    """Frame k covers samples 64 (k - 3) to 64 (k + 1) from the fifth on; the first four are as ``smear3`` fills them."""
-    hops = waveform.unflatten(-1, (-1, HOP))
-    order = torch.tensor([[0, 1, 2, 3], [1, 2, 3, 1], [2, 3, 1, 2], [3, 1, 2, 3]], device=waveform.device)
-    first = hops[..., order, :].flatten(-2)
-    return torch.cat((first, waveform.unfold(-1, FRAME, HOP)[..., 1:, :]), -2)
+def _root(share: Tensor) -> Tensor:
+    """Square root, 0 of what is negative; tiny terms keep the gradients of silence finite."""
+    if share.requires_grad and torch.is_grad_enabled():
+        return (share.clamp_min(0.0) + _SLIGHT).sqrt()
+    return share.clamp_min(0.0).sqrt_()
 
 
-def _overlap_add(frames: Tensor) -> Tensor:
-    hops = frames.unflatten(-1, (4, HOP))
+@lru_cache(maxsize=16)
+def _window(step: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Of analysis and synthesis: their product adds up to 1 over four frames; then zeros. Shape: (512 // step,)."""
+    with torch.inference_mode(False):
+        place = 2.0 * math.pi * (torch.arange(0, FRAME, step, dtype=torch.float64) + 0.5) / FRAME
+        window = (0.5 - 0.5 * place.cos()) / math.sqrt(1.5)
+        return functional.pad(window, (0, (FFT - FRAME) // step)).to(device=device, dtype=dtype)
+
+
+def _frames(waveform: Tensor, count: int, hop: int) -> Tensor:
+    """Frame k covers hops k - 3 to k from the fifth on, and what follows, which the window takes away.
+
+    The first four are as ``smear3`` fills them. Shape: (..., time) -> (..., count, 8 * hop).
+    """
+    padded = functional.pad(waveform, (3 * hop, hop * (max(count, 4) + 4) - waveform.shape[-1]))
+    regular = padded.unfold(-1, 8 * hop, hop)[..., :count, :]
+    hops = padded[..., 3 * hop : 7 * hop].unflatten(-1, (4, hop))
+    zero = torch.zeros_like(hops)
+    order = ((0, 1, 2, 3), (1, 2, 3, 1), (2, 3, 1, 2), (3, 1, 2, 3))
+    first = [
+        torch.cat((hops[..., row, :].flatten(-2), zero.flatten(-2)), -1) for row in order[: min(4, count)]
+    ]
+    return torch.cat((torch.stack(first, -2), regular[..., 4:, :]), -2)
+
+
+def _overlap_add(frames: Tensor, hop: int) -> Tensor:
+    hops = frames.unflatten(-1, (4, hop))
     count = hops.shape[-3]
-    parts = [functional.pad(hops[..., j, :], (0, 0, j, 0))[..., :count, :] for j in range(4)]
+    total = frames.new_zeros(*frames.shape[:-2], count + 3, hop)
+    for j in range(4):
+        total[..., j : j + count, :] += hops[..., j, :]
     # smear3's last three hops: the newest frames' parts, and in place of the others' those of the fourth last frame
     old = hops[..., count - 4, :, :] if count >= 4 else torch.zeros_like(hops[..., 0, :, :])
     last, second = hops[..., -1, :, :], hops[..., max(count - 2, 0), :, :]
-    tail = (
-        old[..., 0, :] + last[..., 1, :] + second[..., 2, :],
-        old[..., 1, :] + last[..., 2, :],
-        old[..., 2, :],
-    )
-    return torch.cat((torch.stack(parts).sum(0), torch.stack(tail, -2)), -2).flatten(-2)
+    total[..., count, :] = old[..., 0, :] + last[..., 1, :] + second[..., 2, :]
+    total[..., count + 1, :] = old[..., 1, :] + last[..., 2, :]
+    total[..., count + 2, :] = old[..., 2, :]
+    return total.flatten(-2)

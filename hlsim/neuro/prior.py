@@ -93,7 +93,7 @@ class Prior(nn.Module):
         """Apply the fixed response of each item's bank. Shape: (items, time), (items,) -> (items, time)."""
         time = waveform.shape[-1]
         points = _even_length(time + 2 * RESPONSE_REACH)
-        response = torch.fft.rfft(self.response.to(waveform), points)[severity]
+        response = torch.fft.rfft(self.response[severity].to(waveform), points)
         filtered = torch.fft.irfft(torch.fft.rfft(waveform, points) * response, points)
         return filtered[..., RESPONSE_REACH : RESPONSE_REACH + time]
 

@@ -1,0 +1,97 @@
+"""Simulators as ``torch.export`` programs and ONNX files, for one number of items and one length."""
+
+from __future__ import annotations
+
+import os
+import re
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+
+from hlsim.audiogram import FREQUENCIES
+from hlsim.calibration import gain_to_pascals
+from hlsim.extras import require
+from hlsim.neuro import NeuroMSBG
+from hlsim.neuro.config import NEURO_RATE
+
+
+class _Call(nn.Module):
+    """A simulator as a function of two tensors, without the checks that look at their values."""
+
+    def __init__(self, simulator: NeuroMSBG) -> None:
+        super().__init__()
+        self.simulator = simulator
+        self.gain = gain_to_pascals(simulator.full_scale_spl)
+
+    def forward(self, waveform: Tensor, thresholds: Tensor) -> Tensor:
+        simulator = self.simulator
+        assert isinstance(simulator, NeuroMSBG)
+        return simulator._process(waveform * self.gain, thresholds) / self.gain
+
+
+def export_program(
+    simulator: nn.Module, *, seconds: float = 1.0, items: int = 1
+) -> torch.export.ExportedProgram:
+    """The simulator as a ``torch.export`` program of (items, time) at 16 kHz and (items, 8) dB HL -> (items, time).
+
+    Raises:
+        ValueError: not a Neuro-MSBG at 16 kHz, or a part that cannot be exported.
+    """
+    if not isinstance(simulator, NeuroMSBG) or simulator.sample_rate != NEURO_RATE:
+        raise ValueError(
+            f"{type(simulator).__name__} cannot be exported; allowed: a Neuro-MSBG with sample_rate {NEURO_RATE} (the "
+            "exact model chooses filters by the audiogram's values)"
+        )
+    example = torch.zeros(items, round(NEURO_RATE * seconds)), torch.zeros(items, len(FREQUENCIES))
+    try:
+        with torch.no_grad():
+            return torch.export.export(_Call(simulator).eval(), example)
+    except Exception as error:  # whatever a block that depends on values raises
+        raise ValueError(f"torch.export cannot take the simulator: {_reason(error)}") from error
+
+
+def export_onnx(simulator: nn.Module, path: str | Path, *, seconds: float = 1.0, items: int = 1) -> None:
+    """Write ``export_program``'s program as an ONNX file, whole or not at all.
+
+    Raises:
+        ValueError: as ``export_program``, or an operation that ONNX or its exporter does not have; the message names it.
+        MissingExtraError: onnx or onnxscript is not installed.
+    """
+    for module in ("onnx", "onnxscript"):
+        require(module, "dev")
+    program = export_program(simulator, seconds=seconds, items=items)
+    target = Path(path)
+    partial = target.with_name(f".{target.name}.{os.getpid()}.part")
+    try:
+        converted = torch.onnx.export(program, dynamo=True, verbose=False)
+        assert converted is not None
+        converted.save(str(partial), external_data=False)
+        _check(partial)
+        os.replace(partial, target)
+    except torch.onnx.errors.OnnxExporterError as error:
+        raise ValueError(f"ONNX cannot take the simulator: {_reason(error)}") from error
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def _check(path: Path) -> None:
+    """Raise ValueError where onnxruntime is there and refuses the file: the exporter writes operators of types it lacks."""
+    try:
+        import onnxruntime
+    except ImportError:
+        return
+    try:
+        onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
+    except Exception as error:  # its errors have no common class
+        raise ValueError(f"ONNX cannot take the simulator: onnxruntime says {_reason(error)}") from error
+
+
+def _reason(error: BaseException) -> str:
+    """The operation that an exporter stopped at, or its first line."""
+    text = str(error)
+    found = re.search(r"No ONNX function found for <OpOverload\(op='([\w.]+)'", text)
+    if found:
+        complex_input = " of complex numbers" if "complex" in text else ""
+        return f"it has no {found.group(1)}{complex_input}; allowed: torch.export"
+    return text.strip().splitlines()[0] if text.strip() else type(error).__name__

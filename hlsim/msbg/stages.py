@@ -1,0 +1,130 @@
+"""The way into the cochlea and out of it, with resampling on the same FFT grids; blocks of long signals."""
+
+import math
+
+import torch
+from torch import Tensor
+
+from hlsim.msbg.cochlea import shared_multiple
+from hlsim.msbg.ear import EAR_DELAY, RATE
+from hlsim.msbg.filters import Filters
+from hlsim.msbg.fourier import fft_length, filter_blocks, irfft, rfft
+from hlsim.msbg.smearing import HOP
+
+_FIR_TAIL = 2 * EAR_DELAY + 132  # with the low-pass on the way out
+
+_BLOCK_SECONDS = 8.0
+# what a block needs around it: filters, delay, and low-passes down to 1e-6
+_LEAD_SECONDS, _LAG_SECONDS, _FADE_SECONDS = 0.75, 0.55, 0.2
+
+
+def to_cochlea(signals: Tensor, rate: int, length: int, step: int, filters: Filters) -> Tensor:
+    """Resample to 44.1 kHz / step and pass outer and middle ear. Shape: (items, time) -> (items, length)."""
+    if rate == RATE and step == 1:
+        return filter_blocks(signals, filters.get("forward blocks"), length)
+    up, down = ratio(rate, step)
+    least = max(signals.shape[-1], math.ceil(length * down / up)) + math.ceil(_FIR_TAIL * down / up / step)
+    own, points = _grid(least, up, down)
+    bins = min(own, points) // 2 + 1
+    response = filters.get("forward", points * step)
+    spectrum = rfft(signals, own)[..., :bins] * (response[:bins] * (up / down))
+    return _between(spectrum, own, points)[..., :length]
+
+
+def from_spectrum(
+    spectrum: Tensor, points: int, step: int, rate: int, samples: int, delay: int, filters: Filters
+) -> Tensor:
+    """Back out of the ear, low-pass, advance by ``delay`` and return to ``rate``, from the cochlea's spectrum.
+
+    Shape: (items, points // (2 step) + 1) -> (items, samples).
+
+    Args:
+        points: FFT length at 44.1 kHz of the spectrum.
+        step: the spectrum is of a signal at 44.1 kHz / step.
+        delay: samples at 44.1 kHz.
+    """
+    inner, out = points // step, points * rate // RATE
+    if not shared_multiple(rate):
+        return from_cochlea(
+            irfft(spectrum, inner), rate, points // step, samples, filters, step=step, delay=delay
+        )
+    bins = min(inner, out) // 2 + 1
+    response = filters.get("backward", points, delay, bins)
+    heard = _between(spectrum[..., :bins] * (response * (out / inner)), inner, out)
+    return heard[..., :samples]
+
+
+def from_cochlea(
+    heard: Tensor, rate: int, length: int, samples: int, filters: Filters, *, step: int = 1, delay: int = 0
+) -> Tensor:
+    """``from_spectrum`` of a waveform. Shape: (items, length) -> (items, samples)."""
+    up, down = ratio(rate, step)
+    own, points = _grid(math.ceil((length + _FIR_TAIL) * down / up), up, down)
+    bins = min(own, points) // 2 + 1
+    response = filters.get("backward", points * step, delay, bins)
+    return _between(rfft(heard, points)[..., :bins] * (response * (down / up)), points, own)[..., :samples]
+
+
+def to_inner(signals: Tensor, rate: int) -> Tensor:
+    """Resample to 44.1 kHz. Shape: (items, time) -> (items, ceil(time * 44100 / rate))."""
+    if rate == RATE:
+        return signals
+    up, down = ratio(rate, 1)
+    own, points = _grid(signals.shape[-1], up, down)
+    bins = min(own, points) // 2 + 1
+    fast = _between(rfft(signals, own)[..., :bins] * (up / down), own, points)
+    return fast[..., : math.ceil(signals.shape[-1] * up / down)]
+
+
+def block_bounds(samples: int, rate: int) -> list[tuple[int, int, int, int]]:
+    """Begin, start, stop and end of overlapping blocks: what goes in, and within it what comes out.
+
+    Blocks begin where the smearing's frames and the envelopes' steps do, so that they are those of the whole.
+    """
+    unit = HOP * rate // math.gcd(HOP * rate, RATE)  # samples in a whole number of hops
+    hop = round(_BLOCK_SECONDS * rate) // unit * unit
+    lead, lag = (math.ceil(s * rate / unit) * unit for s in (_LEAD_SECONDS, _LAG_SECONDS))
+    if hop == 0 or samples <= 1.5 * hop:
+        return [(0, 0, samples, samples)]
+    starts = list(range(0, samples - hop // 2, hop))
+    stops = [*starts[1:], samples]
+    return [
+        (max(0, start - lead), start, stop, min(samples, stop + lag) if stop < samples else samples)
+        for start, stop in zip(starts, stops, strict=True)
+    ]
+
+
+def faded(block: Tensor, rate: int, begin: bool, end: bool) -> Tensor:
+    """A block's lead faded in and its lag out over 0.2 s: a sharp cut would ring wherever a band ends sharply.
+
+    Shape: (items, time) -> (items, time).
+    """
+    time = round(_FADE_SECONDS * rate)
+    place = torch.arange(1, time + 1, dtype=torch.float64, device=block.device) * (math.pi / (time + 1))
+    ramp = (0.5 - 0.5 * place.cos()).to(block.dtype)
+    ones = block.new_ones(block.shape[-1] - 2 * time)
+    edge = ramp.new_ones(time)
+    return block * torch.cat((ramp if begin else edge, ones, ramp.flip(-1) if end else edge))
+
+
+def ratio(rate: int, step: int) -> tuple[int, int]:
+    """Smallest whole numbers in proportion to 44.1 kHz / step and ``rate``."""
+    common = math.gcd(RATE // step, rate)
+    return RATE // step // common, rate // common
+
+
+def _between(spectrum: Tensor, source: int, target: int) -> Tensor:
+    """Waveform of ``target`` points; between rates, the lower one's Nyquist bin goes, for the other grid cannot hold it.
+
+    Shape: (..., min(source, target) // 2 + 1) -> (..., target).
+    """
+    if source != target:
+        spectrum = spectrum[..., : (min(source, target) + 1) // 2]
+        spectrum = torch.nn.functional.pad(spectrum, (0, target // 2 + 1 - spectrum.shape[-1]))
+    return irfft(spectrum, target)
+
+
+def _grid(samples: int, up: int, down: int) -> tuple[int, int]:
+    """FFT lengths at ``down`` and at ``up`` that span the same time, at least ``samples`` at ``down``."""
+    blocks = fft_length(math.ceil(samples / down), 4)
+    return blocks * down, blocks * up

@@ -1,0 +1,49 @@
+"""Exported simulators give the simulator's outputs."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from hlsim import MSBG, load_pretrained
+from hlsim.export import export_onnx, export_program
+
+
+def example() -> tuple[Tensor, Tensor]:
+    ears = torch.tensor([[20.0, 30, 40, 50, 60, 60, 60, 60], [0.0, 5, 10, 15, 20, 20, 20, 20]])
+    return 0.03 * torch.randn(2, 8000), ears
+
+
+def test_a_program_gives_the_simulators_outputs() -> None:
+    simulator = load_pretrained("neuro-msbg", full_scale_spl=100.0)
+    program = export_program(simulator, seconds=0.5, items=2).module()
+    wave, ears = example()
+    expected = simulator(wave, ears)
+    assert float((program(wave, ears) - expected).abs().max()) < 1e-4 * float(expected.abs().max())
+
+
+def test_what_cannot_be_exported_is_said(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="MSBG cannot be exported; allowed: a Neuro-MSBG"):
+        export_program(MSBG())
+    with pytest.raises(ValueError, match="sample_rate 16000"):
+        export_program(load_pretrained("neuro-msbg", sample_rate=44100))
+
+
+@pytest.mark.slow
+def test_onnx_gives_the_outputs_or_says_what_it_lacks(tmp_path: Path) -> None:
+    pytest.importorskip("onnxscript")
+    runtime = pytest.importorskip("onnxruntime")
+    simulator, path = load_pretrained("neuro-msbg"), tmp_path / "simulator.onnx"
+    wave, ears = example()
+    try:
+        export_onnx(simulator, path, seconds=0.5, items=2)
+    except ValueError as error:
+        assert "ONNX cannot take the simulator" in str(error) and "\n" not in str(error)
+        assert not list(tmp_path.iterdir())
+        return
+    session = runtime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
+    names = [entry.name for entry in session.get_inputs()]
+    heard = session.run(None, dict(zip(names, (wave.numpy(), ears.numpy()), strict=True)))[0]
+    expected = simulator(wave, ears)
+    assert float((torch.from_numpy(heard) - expected).abs().max()) < 1e-4 * float(expected.abs().max())
