@@ -238,9 +238,9 @@ def _peak(
     """MiB by which memory grows during a call: on a GPU torch's count, on a CPU the process's resident memory."""
     if device.type == "cuda":
         torch.cuda.reset_peak_memory_stats()
-        before = torch.cuda.memory_allocated()
+        held = torch.cuda.memory_allocated()
         _run(call, clip, direction, device)
-        return (torch.cuda.max_memory_allocated() - before) / 2**20
+        return (torch.cuda.max_memory_allocated() - held) / 2**20
     statm = Path("/proc/self/statm")
     if not statm.is_file():
         _run(call, clip, direction, device)
