@@ -19,6 +19,7 @@ from hlsim.calibration import gain_to_pascals, level_spl, set_level
 from hlsim.msbg import MSBG
 from hlsim.msbg.model import STRUCTURAL_DELAY, active_rescaling
 from hlsim.msbg.smearing import smeared_length
+from hlsim.msbg.stages import block_bounds
 
 EARS = {"none": "NH", "mild": "N1", "moderate": "N2", "severe": "N4"}  # one a severity
 RATE = 44100
@@ -389,3 +390,40 @@ def test_bad_calls_say_what_is_allowed(wave: Any, audiogram: Any, said: str) -> 
 def test_bad_settings_say_what_is_allowed(options: dict[str, Any], said: str) -> None:
     with pytest.raises(ValueError, match=said):
         MSBG(**options)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("rate", [16000, 44100])
+@pytest.mark.parametrize("aligned", [True, False])
+def test_long_signals_go_by_blocks_that_equal_the_whole(
+    monkeypatch: pytest.MonkeyPatch, rate: int, aligned: bool
+) -> None:
+    samples = 14 * rate
+    place = torch.arange(samples) / rate
+    # noise with the rhythm of syllables and nothing just under half the rate, the last bin there being left out
+    spectrum = torch.fft.rfft(torch.randn(samples))
+    spectrum[round(0.97 * len(spectrum)) :] = 0.0
+    wave = set_level(
+        torch.fft.irfft(spectrum, samples) * (8.0 * torch.pi * place).sin().clamp_min(0.02), 65.0
+    )
+    model = MSBG(Audiogram.standard("N2"), sample_rate=rate, aligned=aligned)
+    with torch.no_grad():
+        blocks = model(wave)
+        assert len(block_bounds(samples, rate)) == 2
+        monkeypatch.setattr("hlsim.msbg.model.block_bounds", lambda n, _: [(0, 0, n, n)])
+        whole = model(wave)
+    assert blocks.shape == whole.shape
+    assert relative(blocks.numpy(), whole.numpy()) < 1e-5
+
+
+def test_gradients_through_blocks_are_those_of_the_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("hlsim.msbg.stages._BLOCK_SECONDS", 1.0)
+    wave = 0.03 * torch.randn(2 * 44100, dtype=torch.float64)
+    model, gradients = MSBG(Audiogram.standard("N3")), []
+    for _ in range(2):
+        leaf = wave.clone().requires_grad_()
+        model(leaf).square().sum().backward()
+        assert leaf.grad is not None
+        gradients.append(leaf.grad.numpy())
+        monkeypatch.setattr("hlsim.msbg.model.block_bounds", lambda n, _: [(0, 0, n, n)])
+    assert relative(gradients[0], gradients[1]) < 1e-4
