@@ -76,7 +76,7 @@ def export_onnx(simulator: nn.Module, path: str | Path, *, seconds: float = 1.0,
 
 
 def _check(path: Path) -> None:
-    """Raise ValueError where onnxruntime is there and refuses the file: the exporter writes operators of types it lacks."""
+    """Raise ValueError where onnxruntime is there and refuses the file: not every operator has it for every type."""
     try:
         import onnxruntime
     except ImportError:
