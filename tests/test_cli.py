@@ -211,6 +211,7 @@ def test_evaluate_simulator_writes_both_files(tmp_path: Path, speech_dir: Path) 
     assert "neuro-msbg" in (tmp_path / "out" / "fidelity.md").read_text()
 
 
+@pytest.mark.slow
 def test_benchmark(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "speed.json"
     arguments = ["benchmark", "--repeats", "1", "--limit", "0.001", "--what", "simulators", "scan"]

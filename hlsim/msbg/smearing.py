@@ -19,9 +19,8 @@ SMEARING_DELAY = 3 * HOP
 BROADENING = {"mild": (1.6, 1.1), "moderate": (2.4, 1.6), "severe": (4.0, 2.0)}
 """Widening of the lower and the upper side of the auditory filters; with no loss nothing is smeared (pyclarity 0.9.0)."""
 
-_TINY = 1e-24  # Pa^2; in the gradient of silence it stands under 1, twice
+_TINY = 1e-24  # Pa^2; its power of -1.5, in the gradient of silence, is finite in float32
 _CACHED = 240  # frames
-_SLIGHT = 1e-18  # of a power's share; its power of -0.5 is finite
 
 
 def roex_filters(lower: float, upper: float, count: int, spacing: float) -> NDArray[np.float64]:
@@ -100,18 +99,18 @@ def _widen(frames: Tensor, window: Tensor, matrix: Tensor) -> Tensor:
     """Smear each frame's power. Shape: (..., frames, 2 n), (2 n,), (n + 1, n + 1) -> (..., frames, n)."""
     spectrum = torch.fft.rfft(frames * window)
     power = spectrum.real.square() + spectrum.imag.square()
-    share = (power @ matrix.T) / (power + _TINY)
+    smeared, inverse = power @ matrix.T, (power + _TINY).rsqrt()
     # the square root of a negative power is imaginary
-    spectrum = spectrum * torch.complex(_root(share), _root(-share))
+    spectrum = spectrum * torch.complex(_root(smeared) * inverse, _root(-smeared) * inverse)
     half = len(window) // 2
     return torch.fft.irfft(spectrum, len(window))[..., :half] * window[:half]
 
 
-def _root(share: Tensor) -> Tensor:
+def _root(power: Tensor) -> Tensor:
     """Square root, 0 of what is negative; tiny terms keep the gradients of silence finite."""
-    if share.requires_grad and torch.is_grad_enabled():
-        return (share.clamp_min(0.0) + _SLIGHT).sqrt()
-    return share.clamp_min(0.0).sqrt_()
+    if power.requires_grad and torch.is_grad_enabled():
+        return (power.clamp_min(0.0) + _TINY).sqrt()
+    return power.clamp_min(0.0).sqrt_()
 
 
 @lru_cache(maxsize=16)
