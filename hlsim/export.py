@@ -56,9 +56,9 @@ def export_onnx(simulator: nn.Module, path: str | Path, *, seconds: float = 1.0,
 
     Raises:
         ValueError: as ``export_program``, or an operation that ONNX or its exporter does not have; the message names it.
-        MissingExtraError: onnx or onnxscript is not installed.
+        MissingExtraError: onnx, onnxscript or onnxruntime is not installed.
     """
-    for module in ("onnx", "onnxscript"):
+    for module in ("onnx", "onnxscript", "onnxruntime"):
         require(module, "dev")
     program = export_program(simulator, seconds=seconds, items=items)
     target = Path(path)
@@ -76,15 +76,19 @@ def export_onnx(simulator: nn.Module, path: str | Path, *, seconds: float = 1.0,
 
 
 def _check(path: Path) -> None:
-    """Raise ValueError where onnxruntime is there and refuses the file: not every operator has it for every type."""
+    """Load the file as its user will: the exporter also writes what no runtime takes.
+
+    Raises:
+        ValueError: onnxruntime refuses it.
+    """
+    runtime = require("onnxruntime", "dev")
     try:
-        import onnxruntime
-    except ImportError:
-        return
-    try:
-        onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
-    except Exception as error:  # its errors have no common class
-        raise ValueError(f"ONNX cannot take the simulator: onnxruntime says {_reason(error)}") from error
+        runtime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
+    except Exception as error:  # onnxruntime has a class of its own for each kind of refusal
+        reason = str(error).split("failed:", 1)[-1].strip().splitlines()[0]
+        raise ValueError(
+            f"ONNX cannot take the simulator: onnxruntime refuses the file ({reason})"
+        ) from error
 
 
 def _reason(error: BaseException) -> str:

@@ -309,6 +309,8 @@ def test_gradient_reaches_the_clean_speech_only_where_asked(clean: Tensor) -> No
 @both
 @each_criterion
 def test_full_scale_is_a_unit(simulator: str, criterion: str, clean: Tensor) -> None:
+    # in double precision: the phase of what is next to silent hangs on single precision's last bits, up to 3e-4 here
+    clean = clean.double()
     pascals = HearingLossLoss(N3, simulator=simulator, criterion=criterion)
     other = HearingLossLoss(N3, simulator=simulator, criterion=criterion, full_scale_spl=114.0)
     assert float(other(0.2 * clean, 0.1 * clean)) == pytest.approx(
