@@ -28,13 +28,11 @@ compare() { # name of the table, options of evaluate-simulator, --, rows
 }
 
 table1=(monolithic-transformer monolithic-cnn monolithic-lstm transformer cnn lstm mamba)
-for row in "${table1[@]}" mamba-magnitude-only mamba-concatenated level-normalised level-aware; do
-    train "paper/$row"
-done
-for block in mamba lstm transformer cnn; do train "neuro-msbg-$block"; done
+for row in "${table1[@]}" mamba-magnitude-only mamba-concatenated; do train "paper/$row"; done
+for row in mamba lstm transformer cnn cnn-normalised; do train "neuro-msbg-$row"; done
 
 compare table-1 --levels 65 -- "${table1[@]}"
 compare table-3 --levels 65 -- mamba-magnitude-only mamba
 compare table-4 --levels 65 -- mamba-concatenated mamba
-compare levels --levels 40 50 60 70 80 90 100 -- level-normalised level-aware
+compare levels --levels 40 50 60 70 80 90 100 -- neuro-msbg-cnn-normalised neuro-msbg-cnn
 compare family -- neuro-msbg-mamba neuro-msbg-lstm neuro-msbg-transformer neuro-msbg-cnn

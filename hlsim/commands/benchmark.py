@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import sys
 import time
 from pathlib import Path
 
 from hlsim.commands.options import Commands, add_command, count, positive
+from hlsim.data.files import Whole
 
 WHAT = ("simulators", "training", "scan")
 
@@ -67,14 +67,9 @@ def _benchmark(options: argparse.Namespace) -> None:
         result["skipped"] = [*result["skipped"], *skipped]
     print(benchmark_markdown(result))
     if options.json is not None:
-        partial = options.json.with_name(f".{options.json.name}.{os.getpid()}.part")
-        try:
-            partial.write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
-            os.replace(partial, options.json)
-        except OSError as error:
-            raise ValueError(f"{options.json}: cannot be written ({error})") from error
-        finally:
-            partial.unlink(missing_ok=True)
+        with Whole(options.json) as file:
+            file.write(json.dumps(result, indent=2) + "\n")
+            file.keep()
 
 
 class _Progress:

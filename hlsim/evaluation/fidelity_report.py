@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,11 +11,13 @@ from typing import Any
 from torch import Tensor
 
 from hlsim.audiogram import SEVERITIES
+from hlsim.data.files import Whole
 from hlsim.evaluation.fidelity import COLUMNS, GROUPS, column_cells, fidelity_markdown, summarise
 from hlsim.evaluation.fidelity_items import RATE, Item
 from hlsim.evaluation.figures import draw_spectrograms
 from hlsim.evaluation.page import Picture, Section, Table, render_page
 from hlsim.evaluation.report_figures import draw_svg
+from hlsim.evaluation.report_text import markdown_table
 
 FILES = ("fidelity.json", "fidelity.md", "fidelity.html", "spectrograms.png")
 
@@ -57,10 +58,7 @@ def fidelity_text(result: Mapping[str, Any]) -> str:
     parts = ["# Fidelity to MSBG", _what(result)]
     for given in result["inputs"]:
         table = side_by_side(result, given)
-        lines = [f"## {table.caption}", ""]
-        lines += ["| " + " | ".join(table.header) + " |", "|---" * len(table.header) + "|"]
-        lines += ["| " + " | ".join(row) + " |" for row in table.rows]
-        parts.append("\n".join(lines))
+        parts.append(f"## {table.caption}\n\n{markdown_table(table)}")
     for name, entry in result["simulators"].items():
         for given, summary in entry["inputs"].items():
             parts.append(
@@ -78,22 +76,21 @@ def write_fidelity(
         panels: what is heard of ``shown`` by name, in pascals at 16 kHz.
 
     Raises:
+        ValueError: a file cannot be written.
         MissingExtraError: matplotlib is not installed.
     """
-    folder = Path(out)
-    folder.mkdir(parents=True, exist_ok=True)
     picture = io.BytesIO()
     draw_spectrograms(panels, RATE, picture)
-    contents = {
-        "fidelity.json": json.dumps(result, indent=1).encode(),
-        "fidelity.md": fidelity_text(result).encode(),
-        "fidelity.html": _page(result, picture.getvalue(), shown).encode(),
+    contents: dict[str, str | bytes] = {
+        "fidelity.json": json.dumps(result, indent=1),
+        "fidelity.md": fidelity_text(result),
+        "fidelity.html": _page(result, picture.getvalue(), shown),
         "spectrograms.png": picture.getvalue(),
     }
     for name in FILES:
-        partial = folder / f".{name}.part"
-        partial.write_bytes(contents[name])
-        os.replace(partial, folder / name)
+        with Whole(Path(out) / name) as file:
+            file.write(contents[name])
+            file.keep()
 
 
 def _what(result: Mapping[str, Any]) -> str:

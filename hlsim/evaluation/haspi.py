@@ -90,15 +90,29 @@ def haspi(
             below 20 dB SPL; the rate, level or seed is out of range.
         MissingExtraError: pyclarity is not installed.
     """
+    signals = (reference, processed)
+    return pyclarity_score("haspi", signals, audiogram, sample_rate, full_scale_spl, seed)
+
+
+def pyclarity_score(
+    name: str,
+    signals: tuple[Signal, Signal],
+    audiogram: Audiogram,
+    sample_rate: int,
+    full_scale_spl: float,
+    seed: int,
+) -> float:
+    """Version 2 of pyclarity's ``haspi`` or ``hasqi``; arguments and errors as ``haspi``."""
     if not isinstance(audiogram, Audiogram):
-        raise ValueError(f"audiogram is {type(audiogram).__name__}; HASPI takes one ear, an Audiogram")
-    clean, heard = check_pair(reference, processed, sample_rate, full_scale_spl)
-    model = require("clarity.evaluator.haspi", "eval")
-    # at the eight frequencies: the same ear to HASPI, which would log a warning of grids that lack one of its six
+        raise ValueError(
+            f"audiogram is {type(audiogram).__name__}; {name.upper()} takes one ear, an Audiogram"
+        )
+    clean, heard = check_pair(*signals, sample_rate, full_scale_spl)
+    model = getattr(require(f"clarity.evaluator.{name}", "eval"), f"{name}_v2")
+    # at the eight frequencies: the same ear to both, which would log a warning of grids that lack one of their six
     ear = Audiogram(audiogram.thresholds).to_clarity()
-    level = check_full_scale(full_scale_spl)
     with numpy_seed(seed):
-        score, _ = model.haspi_v2(clean, sample_rate, heard, sample_rate, ear, level1=level)
+        score = model(clean, sample_rate, heard, sample_rate, ear, level1=check_full_scale(full_scale_spl))[0]
     return float(score)
 
 

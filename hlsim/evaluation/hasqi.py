@@ -8,9 +8,7 @@ generator, as for HASPI; what ``haspi`` says of rates, short signals and levels 
 from __future__ import annotations
 
 from hlsim.audiogram import Audiogram
-from hlsim.calibration import check_full_scale
-from hlsim.evaluation.haspi import Signal, check_pair, numpy_seed
-from hlsim.extras import require
+from hlsim.evaluation.haspi import Signal, pyclarity_score
 
 
 def hasqi(
@@ -38,12 +36,5 @@ def hasqi(
         ValueError: as ``haspi``.
         MissingExtraError: pyclarity is not installed.
     """
-    if not isinstance(audiogram, Audiogram):
-        raise ValueError(f"audiogram is {type(audiogram).__name__}; HASQI takes one ear, an Audiogram")
-    clean, heard = check_pair(reference, processed, sample_rate, full_scale_spl)
-    model = require("clarity.evaluator.hasqi", "eval")
-    ear = Audiogram(audiogram.thresholds).to_clarity()
-    level = check_full_scale(full_scale_spl)
-    with numpy_seed(seed):
-        score = model.hasqi_v2(clean, sample_rate, heard, sample_rate, ear, level1=level)[0]
-    return float(score)
+    signals = (reference, processed)
+    return pyclarity_score("hasqi", signals, audiogram, sample_rate, full_scale_spl, seed)

@@ -16,6 +16,7 @@ from hlsim.audiogram import SEVERITIES
 from hlsim.calibration import PASCAL_SPL
 from hlsim.msbg.ear import RATE, ear_filter, lowpass_filter
 from hlsim.msbg.filterbank import BANKS, FilterBank, gammatone_response
+from hlsim.msbg.fourier import fft_length, irfft, rfft
 from hlsim.msbg.model import STRUCTURAL_DELAY
 from hlsim.msbg.recruitment import CATCH_UP_SPL, envelope_filters, expansion_ratios
 from hlsim.msbg.smearing import BROADENING, roex_filters, smearing_from_filters
@@ -92,9 +93,9 @@ class Prior(nn.Module):
     def filter(self, waveform: Tensor, severity: Tensor) -> Tensor:
         """Apply the fixed response of each item's bank. Shape: (items, time), (items,) -> (items, time)."""
         time = waveform.shape[-1]
-        points = _even_length(time + 2 * RESPONSE_REACH)
-        response = torch.fft.rfft(self.response[severity].to(waveform), points)
-        filtered = torch.fft.irfft(torch.fft.rfft(waveform, points) * response, points)
+        points = fft_length(time + 2 * RESPONSE_REACH, 4)
+        response = rfft(self.response[severity].to(waveform), points)
+        filtered = irfft(rfft(waveform, points) * response, points)
         return filtered[..., RESPONSE_REACH : RESPONSE_REACH + time]
 
     def forward(self, spectrum: Tensor, thresholds: Tensor, severity: Tensor) -> Tensor:
@@ -130,12 +131,6 @@ class Prior(nn.Module):
         rows = torch.stack([ratio[..., :_CHANNELS] for ratio in ratios], 1)
         chosen = rows[torch.arange(len(severity), device=severity.device), severity]
         return (chosen - 1.0).clamp_min(-1.0)
-
-
-def _even_length(least: int) -> int:
-    """A length of small primes, at least ``least``."""
-    power = 2 ** max(1, math.ceil(math.log2(least)))
-    return next(size for size in (power * 5 // 8, power * 3 // 4, power * 15 // 16, power) if size >= least)
 
 
 def _at_neuro_rate(filter_taps: NDArray[np.float64], points: int) -> NDArray[np.complex128]:
