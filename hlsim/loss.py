@@ -2,7 +2,9 @@
 
 import math
 from collections.abc import Callable, Mapping
+from functools import wraps
 from pathlib import Path
+from typing import ParamSpec, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -21,6 +23,22 @@ CRITERIA: dict[str, Mapping[str, float]] = {"paper": criteria.DEFAULT_WEIGHTS, "
 """Criteria by name: their parts and the default weight of each."""
 
 REFERENCES = ("clean", "normal-hearing")
+
+P = ParamSpec("P")
+Result = TypeVar("Result")
+
+
+def _not_compiled(method: Callable[P, Result]) -> Callable[P, Result]:
+    """``torch.compiler.disable``, but asked for at the first call: it takes longer to import than all of hlsim."""
+    known: list[Callable[P, Result]] = []
+
+    @wraps(method)
+    def call(*args: P.args, **kwargs: P.kwargs) -> Result:
+        if not known:
+            known.append(torch.compiler.disable(method))
+        return known[0](*args, **kwargs)
+
+    return call
 
 
 class HearingLossLoss(nn.Module):
@@ -77,7 +95,7 @@ class HearingLossLoss(nn.Module):
         """The simulator, frozen."""
         return self._unregistered[0]
 
-    @torch.compiler.disable  # a compiled caller calls it as it is
+    @_not_compiled  # a compiled caller calls it as it is
     def forward(self, compensated: Tensor, clean: Tensor, audiogram: AudiogramLike | None = None) -> Tensor:
         """The loss: mean over the items.
 
@@ -88,7 +106,7 @@ class HearingLossLoss(nn.Module):
         """
         return criteria.weighted_sum(self.parts(compensated, clean, audiogram), self.weights)
 
-    @torch.compiler.disable
+    @_not_compiled
     def parts(
         self, compensated: Tensor, clean: Tensor, audiogram: AudiogramLike | None = None
     ) -> dict[str, Tensor]:

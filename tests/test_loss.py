@@ -2,6 +2,8 @@
 
 import copy
 import pickle
+import subprocess
+import sys
 from collections.abc import Callable
 
 import pytest
@@ -484,3 +486,8 @@ def test_simulator_must_keep_the_length() -> None:
     loss = HearingLossLoss(N3, simulator=MSBG(sample_rate=44100, aligned=False), sample_rate=44100)
     with pytest.raises(ValueError, match=r"made \d+ samples of 4000; allowed: .*aligned=True"):
         loss(torch.randn(4000), torch.randn(4000))
+
+
+def test_import_leaves_the_compiler_alone() -> None:
+    code = "import sys, hlsim, hlsim.evaluation; sys.exit('torch._dynamo' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
