@@ -4,6 +4,7 @@ import math
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from hlsim.msbg.cochlea import shared_multiple
 from hlsim.msbg.ear import EAR_DELAY, RATE
@@ -114,13 +115,19 @@ def ratio(rate: int, step: int) -> tuple[int, int]:
 
 
 def _between(spectrum: Tensor, source: int, target: int) -> Tensor:
-    """Waveform of ``target`` points; between rates, the lower one's Nyquist bin goes, for the other grid cannot hold it.
+    """Waveform of ``target`` points of a spectrum of ``source`` points.
+
+    The lower rate's Nyquist bin stands for two frequencies, of which the higher rate has one in each half: left out, it
+    would be missed at every sample by as much as it is of the whole, which hangs on the length.
 
     Shape: (..., min(source, target) // 2 + 1) -> (..., target).
     """
     if source != target:
-        spectrum = spectrum[..., : (min(source, target) + 1) // 2]
-        spectrum = torch.nn.functional.pad(spectrum, (0, target // 2 + 1 - spectrum.shape[-1]))
+        lower = min(source, target)
+        if lower % 2 == 0:
+            nyquist = spectrum[..., -1:] * (0.5 if target > source else 2.0)
+            spectrum = torch.cat((spectrum[..., :-1], nyquist), -1)
+        spectrum = functional.pad(spectrum, (0, target // 2 + 1 - spectrum.shape[-1]))
     return irfft(spectrum, target)
 
 

@@ -19,7 +19,7 @@ from hlsim.calibration import gain_to_pascals, level_spl, set_level
 from hlsim.msbg import MSBG
 from hlsim.msbg.model import STRUCTURAL_DELAY, active_rescaling
 from hlsim.msbg.smearing import smeared_length
-from hlsim.msbg.stages import block_bounds
+from hlsim.msbg.stages import _between, block_bounds
 
 EARS = {"none": "NH", "mild": "N1", "moderate": "N2", "severe": "N4"}  # one a severity
 RATE = 44100
@@ -392,6 +392,14 @@ def test_bad_settings_say_what_is_allowed(options: dict[str, Any], said: str) ->
         MSBG(**options)
 
 
+@pytest.mark.parametrize(("low", "high"), [(320, 882), (882, 960)])
+def test_a_higher_rate_and_back_keeps_all_of_a_signal(low: int, high: int) -> None:
+    signal = torch.randn(low, dtype=torch.float64)
+    moved = _between(torch.fft.rfft(signal) * (high / low), low, high)
+    back = _between(torch.fft.rfft(moved)[: low // 2 + 1] * (low / high), high, low)
+    torch.testing.assert_close(back, signal)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("rate", [16000, 44100])
 @pytest.mark.parametrize("aligned", [True, False])
@@ -400,7 +408,7 @@ def test_long_signals_go_by_blocks_that_equal_the_whole(
 ) -> None:
     samples = 14 * rate
     place = torch.arange(samples) / rate
-    # noise with the rhythm of syllables and nothing just under half the rate, the last bin there being left out
+    # noise with the rhythm of syllables and nothing just under half the rate, where resampling's sharp end rings on
     # in double precision, for single precision rounds by 1e-5 on another FFT grid
     spectrum = torch.fft.rfft(torch.randn(samples, dtype=torch.float64))
     spectrum[round(0.97 * len(spectrum)) :] = 0.0
