@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -100,6 +101,11 @@ def _validation(data: PlanData, count: int) -> list[tuple[Tensor, Tensor]]:
             break
         except ValueError:
             continue
+    if split != "valid":
+        warnings.warn(
+            f"the plan has no split 'valid': the best checkpoint is chosen on {split!r}, whose figures then say too much",
+            stacklevel=2,
+        )
     samples = round(_VALID_SECONDS * data.plan.rate)
     chosen = torch.linspace(0, len(items) - 1, min(count, len(items))).round().int().tolist()
     signals, ears = [], []

@@ -2,7 +2,10 @@
 
 import json
 import math
+import shutil
 import struct
+import subprocess
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -243,3 +246,14 @@ def test_texts_of_three_conditions(tmp_path: Path) -> None:
         columns = row.split("}")[0].count("r") + 1
         lines = [line for line in row.splitlines() if line.endswith("\\\\")]
         assert lines and all(line.count("&") == columns - 1 for line in lines)
+
+
+@pytest.mark.skipif(shutil.which("pdflatex") is None, reason="no pdflatex here")
+@pytest.mark.parametrize("made_by", [make_report, three_conditions])
+def test_latex_compiles(made_by: Callable[[], HaspiReport], tmp_path: Path) -> None:
+    write_report(made_by(), tmp_path)
+    lines = (r"\documentclass{article}", r"\usepackage{booktabs}", r"\begin{document}", r"\input{report.tex}")
+    (tmp_path / "paper.tex").write_text("\n".join([*lines, r"\end{document}"]))
+    call = ["pdflatex", "-interaction=nonstopmode", "-halt-on-error", "paper.tex"]
+    made = subprocess.run(call, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert made.returncode == 0, made.stdout[-1500:]

@@ -90,6 +90,12 @@ def test_the_validation_split_is_used(plan: Path) -> None:
     assert torch.equal(training.valid[0][1], expected)
 
 
+def test_a_plan_without_a_validation_split_says_what_it_is_chosen_on(plan: Path, tmp_path: Path) -> None:
+    prepare(PlanSettings(tmp_path / "speech"), tmp_path / "other", jobs=1)
+    with pytest.warns(UserWarning, match="chosen on 'test'"):
+        PlannedTraining(SimulatorRecipe.from_dict(TINY), PlannedSource(tmp_path / "other", workers=0), 1e6)
+
+
 def test_bad_calls(plan: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     recipe = tmp_path / "recipe.yaml"
     recipe.write_text("batch: 2\n")
