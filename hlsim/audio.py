@@ -1,18 +1,30 @@
 """Reading, writing and resampling audio. The only file that imports torchaudio and soundfile."""
 
 import io
+import math
 import os
+from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import soundfile
 import torch
 import torchaudio.functional
+import torchaudio.transforms
 from torch import Tensor
 
 LOWEST_RATE, HIGHEST_RATE = 16000, 48000
 """Sample rates in Hz that simulators and compensators take."""
 
 EXTENSIONS = (".wav", ".flac", ".ogg")
+
+_SINC: dict[str, Any] = {
+    "lowpass_filter_width": 64,
+    "rolloff": 0.9475937167399596,
+    "resampling_method": "sinc_interp_kaiser",
+    "beta": 14.769656459379492,
+}
+_LARGEST_KERNEL = 1_000_000  # values that are kept: 441 / 160 has 70,560, but 44101 / 16000 has 700 million
 
 _SUBTYPES = {".wav": "FLOAT", ".flac": "PCM_24", ".ogg": "VORBIS"}
 
@@ -179,12 +191,21 @@ def resample(waveform: Tensor, source_rate: int, target_rate: int) -> Tensor:
     """
     if source_rate == target_rate:
         return waveform
-    return torchaudio.functional.resample(
-        waveform,
-        source_rate,
-        target_rate,
-        lowpass_filter_width=64,
-        rolloff=0.9475937167399596,
-        resampling_method="sinc_interp_kaiser",
-        beta=14.769656459379492,
-    )
+    common = math.gcd(source_rate, target_rate)
+    large = source_rate * target_rate // common**2 > _LARGEST_KERNEL
+    if (
+        large or torch.compiler.is_compiling()
+    ):  # what is made while a program is traced is of no use to others
+        resampled: Tensor = torchaudio.functional.resample(waveform, source_rate, target_rate, **_SINC)
+        return resampled
+    resampled = _resampler(source_rate, target_rate, waveform.dtype, waveform.device)(waveform)
+    return resampled
+
+
+@lru_cache(maxsize=32)
+def _resampler(
+    source_rate: int, target_rate: int, dtype: torch.dtype, device: torch.device
+) -> torchaudio.transforms.Resample:
+    """Its kernel takes up to forty times as long to compute as to apply to a second."""
+    with torch.inference_mode(False):
+        return torchaudio.transforms.Resample(source_rate, target_rate, dtype=dtype, **_SINC).to(device)

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from hlsim.audio import (
     EXTENSIONS,
+    _resampler,
     check_rate,
     check_waveform,
     encode_flac,
@@ -294,6 +295,21 @@ def test_resampling_is_differentiable() -> None:
     wave = torch.randn(2, 40, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(lambda w: resample(w, 16000, 24000), wave)
     assert torch.autograd.gradcheck(lambda w: resample(w, 48000, 16000), wave)
+
+
+def test_a_kernel_made_in_inference_mode_serves_gradients_too() -> None:
+    with torch.inference_mode():
+        expected = resample(torch.ones(50), 17000, 16000)
+    wave = torch.ones(50, requires_grad=True)
+    resampled = resample(wave, 17000, 16000)
+    resampled.sum().backward()
+    assert wave.grad is not None and torch.equal(resampled.detach(), expected)
+
+
+def test_a_kernel_of_rates_that_share_little_is_not_kept() -> None:
+    kept = _resampler.cache_info().currsize
+    assert resample(torch.randn(1, 30), 47980, 16000).shape == (1, 11)
+    assert _resampler.cache_info().currsize == kept
 
 
 def test_encoded_flac_is_the_signal_to_16_bits(tmp_path: Path) -> None:

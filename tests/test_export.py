@@ -10,15 +10,17 @@ from hlsim import MSBG, load_pretrained
 from hlsim.export import export_onnx, export_program
 
 
-def example() -> tuple[Tensor, Tensor]:
+def example(items: int = 2, seconds: float = 0.5) -> tuple[Tensor, Tensor]:
     ears = torch.tensor([[20.0, 30, 40, 50, 60, 60, 60, 60], [0.0, 5, 10, 15, 20, 20, 20, 20]])
-    return 0.03 * torch.randn(2, 8000), ears
+    return 0.03 * torch.randn(items, round(16000 * seconds)), ears[:items]
 
 
-def test_a_program_gives_the_simulators_outputs() -> None:
+@pytest.mark.parametrize(("items", "seconds"), [(2, 0.5), (1, 1.1)])
+def test_a_program_gives_the_simulators_outputs(items: int, seconds: float) -> None:
     simulator = load_pretrained("neuro-msbg", full_scale_spl=100.0)
-    program = export_program(simulator, seconds=0.5, items=2).module()
-    wave, ears = example()
+    # first of all at this length, so that nothing made in the export may serve the simulator
+    program = export_program(simulator, seconds=seconds, items=items).module()
+    wave, ears = example(items, seconds)
     expected = simulator(wave, ears)
     assert float((program(wave, ears) - expected).abs().max()) < 1e-4 * float(expected.abs().max())
 

@@ -3,7 +3,9 @@
 import math
 from functools import lru_cache
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
@@ -71,7 +73,12 @@ def fft_length(least: int, multiple: int = 1) -> int:
     return min(length for length in lengths if length >= least)
 
 
-@lru_cache(maxsize=16)
 def _twiddle(points: int, dtype: torch.dtype) -> Tensor:
-    angle = torch.arange(points // 4 + 1, dtype=torch.float64) * (-2.0 * math.pi / points)
-    return torch.polar(torch.ones_like(angle), angle).to(dtype)
+    return torch.from_numpy(_factors(points, dtype == torch.complex128))
+
+
+@lru_cache(maxsize=16)
+def _factors(points: int, double: bool) -> NDArray[np.complexfloating]:
+    """An array, for a tensor made while a program is traced would be none that others could use."""
+    factors = np.exp(np.arange(points // 4 + 1) * (-2j * np.pi / points))
+    return factors if double else factors.astype(np.complex64)
