@@ -31,8 +31,8 @@ table1=(monolithic-transformer monolithic-cnn monolithic-lstm transformer cnn ls
 for row in "${table1[@]}" mamba-magnitude-only mamba-concatenated; do train "paper/$row"; done
 for row in mamba lstm transformer cnn cnn-normalised; do train "neuro-msbg-$row"; done
 
-compare table-1 --levels 65 -- "${table1[@]}"
-compare table-3 --levels 65 -- mamba-magnitude-only mamba
-compare table-4 --levels 65 -- mamba-concatenated mamba
+compare table-1 --levels 65 --seconds 2 -- "${table1[@]}"
+compare table-3 --levels 65 --seconds 2 -- mamba-magnitude-only mamba
+compare table-4 --levels 65 --seconds 2 -- mamba-concatenated mamba
 compare levels --levels 40 50 60 70 80 90 100 -- neuro-msbg-cnn-normalised neuro-msbg-cnn
 compare family -- neuro-msbg-mamba neuro-msbg-lstm neuro-msbg-transformer neuro-msbg-cnn

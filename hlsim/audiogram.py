@@ -196,11 +196,15 @@ def as_thresholds(audiogram: AudiogramLike) -> Tensor:
     return levels
 
 
-def read_audiograms(path: str | Path) -> list[tuple[dict[str, str], Audiogram]]:
+def read_audiograms(path: str | Path, *, simulated: bool = False) -> list[tuple[dict[str, str], Audiogram]]:
     """Rows of a CSV file with columns ``hl_250`` and so on: each row's columns and its audiogram.
 
+    Args:
+        simulated: take only ears that a simulator takes.
+
     Raises:
-        ValueError: the file is missing, empty, or a row is no audiogram; the message names file and row.
+        ValueError: the file is missing, empty, or a row is no audiogram, or, with ``simulated``, beyond 100 dB HL; the
+            message names file and row.
     """
     try:
         # spreadsheets put a byte order mark first, which would hide the first column
@@ -213,7 +217,10 @@ def read_audiograms(path: str | Path) -> list[tuple[dict[str, str], Audiogram]]:
     ears = []
     for number, row in enumerate(rows, start=2):
         try:
-            ears.append((row, Audiogram.from_row(row)))
+            ear = Audiogram.from_row(row)
+            if simulated:
+                as_thresholds(ear)
+            ears.append((row, ear))
         except ValueError as error:
             raise ValueError(f"{path}, line {number}: {error}") from error
     return ears
@@ -223,9 +230,9 @@ def draw_thresholds(count: int, generator: torch.Generator | None = None) -> Ten
     """Random ears that look like measured ones, from no loss to severe.
 
     Each lies between two neighbours of one of Bisgaard's series (NH, N1 ... N6 or NH, S1 ... S3), is tilted by up to
-    20 dB at 250 Hz, and moved by noise of up to 8 dB that is alike at neighbouring frequencies (correlation 0.8, as
-    among measured ears). Three of four are rounded to 5 dB, as audiologists do. In MSBG's sense 27 % have no loss,
-    18 % a mild, 19 % a moderate and 36 % a severe one.
+    20 dB at 250 Hz, and moved by Gaussian noise with a deviation of 2.4 to 8 dB that is alike at neighbouring frequencies
+    (correlation 0.8, as among measured ears). Three of four are rounded to 5 dB, as audiologists do. In MSBG's sense
+    27 % have no loss, 18 % a mild, 19 % a moderate and 36 % a severe one.
 
     Returns: (count, 8) dB HL, -10 to 100.
     """

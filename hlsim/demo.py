@@ -44,8 +44,7 @@ def demo(
     """Train, score, and write report, audio and pictures.
 
     Args:
-        out: folder for ``report.json``, ``report.md``, ``before-after.png``, ``spectrograms.png``, ``audio/`` and
-            ``training/``.
+        out: folder for the report (as ``write_report``), ``spectrograms.png``, ``audio/`` and ``training/``.
         audiogram: the ear.
         speech: folder to use instead of the embedded speech; every third file is scored and not trained on.
         minutes: of training.
@@ -55,7 +54,7 @@ def demo(
     Returns: the report as Markdown.
 
     Raises:
-        ValueError: unusable audio, or fewer than 24 files in ``speech``.
+        ValueError: unusable audio, or fewer than 22 files in ``speech``.
     """
     folder = Path(out)
     training, scored = _split(speech)

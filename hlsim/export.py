@@ -43,7 +43,9 @@ def export_program(
             f"{type(simulator).__name__} cannot be exported; allowed: a Neuro-MSBG with sample_rate {NEURO_RATE} (the "
             "exact model chooses filters by the audiogram's values)"
         )
-    example = torch.zeros(items, round(NEURO_RATE * seconds)), torch.zeros(items, len(FREQUENCIES))
+    device = next(simulator.parameters()).device
+    shapes = ((items, round(NEURO_RATE * seconds)), (items, len(FREQUENCIES)))
+    example = tuple(torch.zeros(shape, device=device) for shape in shapes)
     try:
         with torch.no_grad():
             return torch.export.export(_Call(simulator).eval(), example)

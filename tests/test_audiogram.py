@@ -195,6 +195,14 @@ def test_csv_errors_begin_with_the_file_and_name_the_line(tmp_path: Path, conten
     assert str(caught.value).startswith(str(path))
 
 
+def test_csv_of_an_ear_that_no_simulator_takes(tmp_path: Path) -> None:
+    path = tmp_path / "ears.csv"
+    path.write_text("hl_250,hl_8000\n10,20\n90,105\n", encoding="utf-8")
+    assert len(read_audiograms(path)) == 2
+    with pytest.raises(ValueError, match=r"line 3: .*a simulator takes -10 to 100"):
+        read_audiograms(path, simulated=True)
+
+
 def test_csv_errors_of_files_that_are_none(tmp_path: Path) -> None:
     binary = tmp_path / "binary.csv"
     binary.write_bytes(b"hl_250\n\xff\xfe\x80\n")

@@ -28,7 +28,9 @@ def add(commands: Commands) -> None:
     )
     audiogram_option(sub, default="N4")
     sub.add_argument(
-        "--speech", type=Path, help="folder of speech instead of the embedded; a third of it is scored"
+        "--speech",
+        type=Path,
+        help="folder of 22 files or more instead of the embedded speech; a third is scored",
     )
     sub.add_argument("--minutes", type=positive, default=3.0, help="of training")
     seed_option(sub)

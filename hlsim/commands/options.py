@@ -39,8 +39,8 @@ def audiogram_option(
         "--audiogram",
         default=default,
         required=required,
-        help="NH, N1 to N7, S1 to S3, or eight levels in dB HL at 250, 500, 1000, 2000, 3000, 4000, 6000, 8000 Hz, "
-        f"separated by commas{text}",
+        help="NH, N1 to N7 (simulators take up to N6), S1 to S3, or eight levels in dB HL at 250, 500, 1000, 2000, "
+        f"3000, 4000, 6000, 8000 Hz, separated by commas{text}",
     )
 
 
@@ -59,24 +59,27 @@ def full_scale_option(parser: argparse.ArgumentParser) -> None:
 
 
 def positive(text: str) -> float:
-    value = float(text)
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
     if not (math.isfinite(value) and value > 0):
-        raise argparse.ArgumentTypeError(f"{text}; allowed: more than 0")
+        raise argparse.ArgumentTypeError(f"{text}; allowed: numbers above 0")
     return value
 
 
 def count(text: str) -> int:
-    value = int(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"{text}; allowed: 1 or more")
-    return value
+    return _whole(text, 1)
 
 
 def natural(text: str) -> int:
-    value = int(text)
-    if value < 0:
-        raise argparse.ArgumentTypeError(f"{text}; allowed: 0 or more")
-    return value
+    return _whole(text, 0)
+
+
+def _whole(text: str, least: int) -> int:
+    if not text.strip().isdecimal() or int(text) < least:
+        raise argparse.ArgumentTypeError(f"{text}; allowed: whole numbers from {least} up")
+    return int(text)
 
 
 def read_ear(text: str) -> Audiogram:

@@ -68,7 +68,7 @@ def add(commands: Commands) -> None:
         type=float,
         nargs="+",
         default=[65.0],
-        help="active speech level in dB SPL at which ears are given the speech; two draw one in between an utterance",
+        help="active speech level in dB SPL that ears are given; two draw one in between for each utterance and ear",
     )
     sub.add_argument("--rate", type=int, default=16000, help="of the instances, Hz")
     sub.add_argument(

@@ -170,8 +170,8 @@ def _folder(corpus: Path) -> Iterator[Found]:
         parts = path.split("/")
         split = _SPLIT_FOLDERS.get(parts[0], "") if len(parts) > 1 else ""
         for side, other in (("clean", "noisy"), ("noisy", "clean")):
-            if side in parts[:-1] and (corpus / path.split(f"{side}/")[0] / other).is_dir():
-                place = parts.index(side)
+            place = parts.index(side) if side in parts[:-1] else -1
+            if place >= 0 and corpus.joinpath(*parts[:place], other).is_dir():
                 counterpart = "/".join([*parts[:place], other, *parts[place + 1 :]])
                 break
         else:

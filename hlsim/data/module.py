@@ -62,7 +62,7 @@ class TrainingItems(Dataset[Instance]):
         seconds: length of the clips; shorter utterances are followed by silence.
         augment: vary what is not prepared: another ear of the split, moved by up to 5 dB, another noise of the split
             where noise is mixed in, and SNR, level, equalisation, amplification and compression as ``vary``.
-        start: first p, so that a training goes on where it was.
+        start, stride: first p, so that a training goes on where it was, and step to the next.
         levels, treated: as ``vary`` takes them.
     """
 
@@ -75,6 +75,7 @@ class TrainingItems(Dataset[Instance]):
         seed: int,
         length: int,
         start: int = 0,
+        stride: int = 1,
         levels: tuple[float, float] = (40.0, 95.0),
         treated: bool = True,
     ) -> None:
@@ -83,7 +84,7 @@ class TrainingItems(Dataset[Instance]):
         self.augment = augment and not items.prepared
         self.grid = grid_of(items.plan.rate)
         self.seed = seed
-        self.start = start
+        self.start, self.stride = start, stride
         self.length = length
         self.levels, self.treated = levels, treated
         self._order = (-1, torch.empty(0))
@@ -94,7 +95,7 @@ class TrainingItems(Dataset[Instance]):
     def __getitem__(self, place: int) -> Instance:
         for offset in range(_TRIES):
             try:
-                return self._clip(self.start + place, offset)
+                return self._clip(self.start + place * self.stride, offset)
             except ValueError as error:
                 warnings.warn(f"left out: {error}", stacklevel=2)
                 last = error
@@ -158,6 +159,7 @@ class PlanData(L.LightningDataModule):
     item k is the plan's instance k however it is made: whole, the same as ``hlsim prepare --write`` puts on disk (to the
     rounding of a batch). Clips that are not varied start where frames of MSBG's smearing do (every 0.64 s at 16 kHz), so
     that they too are the same both ways, but for 50 ms at either end, where the target from disk knows what lies beyond.
+    On several devices each takes its own share: give the Trainer ``use_distributed_sampler=False``.
 
     Args:
         folder: what ``hlsim prepare`` wrote.
@@ -207,12 +209,15 @@ class PlanData(L.LightningDataModule):
 
     def train_dataloader(self) -> DataLoader[Any]:
         step = self.trainer.global_step if self.trainer is not None else 0
+        processes = self.trainer.world_size if self.trainer is not None else 1
+        rank = self.trainer.global_rank if self.trainer is not None else 0
         items = TrainingItems(
             PlanItems(self.plan, "train", prepared=self.prepared),
             seconds=self.seconds,
             augment=self.augment,
             seed=self.seed,
-            start=step * self.batch,
+            start=step * self.batch * processes + rank,
+            stride=processes,
             length=_ENDLESS * self.batch,
             levels=self.levels,
             treated=self.treated,

@@ -61,7 +61,7 @@ def write_instances(
     _claim(plan, recipe)
     for leftover in (plan.folder / "instances").rglob(f".*{PARTIAL}"):
         leftover.unlink(missing_ok=True)
-    task = partial(make, str(plan.folder), str(plan.root), recipe)
+    task = partial(make, str(plan.folder), str(plan.root), plan.digest, recipe)
     faults: list[Fault] = []
     threads = torch.get_num_threads()
     numbers = range(len(plan.utterances))
@@ -92,13 +92,13 @@ def write_instances(
     return len(plan)
 
 
-def make(folder: str, root: str, recipe: Recipe, number: int) -> list[Fault]:
+def make(folder: str, root: str, digest: str, recipe: Recipe, number: int) -> list[Fault]:
     """Write the instances of one utterance that are missing; what is at fault with its audio, if anything.
 
     One at a time, for the last bits of a batch depend on what else is in it.
     """
     torch.set_num_threads(1)  # which sums in one order
-    plan, teacher = _opened(folder, root, recipe)
+    plan, teacher = _opened(folder, root, digest, recipe)
     for index in range(number * plan.each, (number + 1) * plan.each):
         if is_whole(plan.path(index)):
             continue
@@ -114,7 +114,8 @@ def make(folder: str, root: str, recipe: Recipe, number: int) -> list[Fault]:
 
 
 @lru_cache(maxsize=2)
-def _opened(folder: str, root: str, recipe: Recipe) -> tuple[Plan, Teacher]:
+def _opened(folder: str, root: str, digest: str, recipe: Recipe) -> tuple[Plan, Teacher]:
+    """What lies in the folder may be another plan than before: the digest says which."""
     plan = Plan(folder, root)
     return plan, Teacher(plan.rate, alignment=recipe.alignment, reference=recipe.reference)
 

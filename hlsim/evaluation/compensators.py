@@ -10,7 +10,7 @@ from typing import Any
 from torch import nn
 
 from compensators.nalr import NALR
-from hlsim.audiogram import Audiogram
+from hlsim.audiogram import Audiogram, as_thresholds
 from hlsim.evaluation.compensator_report import write_compensators
 from hlsim.evaluation.compensator_result import compensator_result
 from hlsim.evaluation.fidelity_items import RATE, Item
@@ -102,6 +102,8 @@ def evaluate_compensators(
     else:
         shown = {f"{' '.join(f'{level:g}' for level in audiogram.levels)} dB HL": audiogram}
         ears = [*shown.items()]
+    for ear in shown.values():
+        as_thresholds(ear)  # to be known before hours of judging
     conditions = {UNAIDED: Unaided(), PRESCRIBED: NALR(sample_rate=RATE), **compensators}
     conditions = {name: module.eval() for name, module in conditions.items()}
     drawn = draw_judged_items(speech, noise, ears, items=items, seconds=seconds, seed=seed, levels=levels)

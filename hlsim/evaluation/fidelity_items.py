@@ -62,7 +62,7 @@ def draw_items(
     generator = torch.Generator().manual_seed(seed)
     clips = Clips(speech, sample_rate=RATE, seconds=seconds)
     noises = Clips(noise, sample_rate=RATE, seconds=seconds, repeat=True) if noise is not None else None
-    measured = [ear for _, ear in read_audiograms(audiograms)]
+    measured = [ear for _, ear in read_audiograms(audiograms, simulated=True)]
     chosen = []
     for i in range(items):
         clean = clips.draw(1, generator)

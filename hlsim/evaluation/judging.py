@@ -69,7 +69,7 @@ class Judged(NamedTuple):
 def read_ears(audiograms: str | Path | None) -> list[tuple[str, Audiogram]]:
     """The standard ears and those of a CSV file, with names; the latter by listener and ear, or by row."""
     ears = [(name, Audiogram.standard(name)) for name in STANDARD_EARS]
-    rows = read_audiograms(audiograms) if audiograms is not None else []
+    rows = read_audiograms(audiograms, simulated=True) if audiograms is not None else []
     for number, (row, ear) in enumerate(rows, start=1):
         named = " ".join(filter(None, (row.get("listener"), row.get("ear"))))
         ears.append((named or f"row {number}", ear))

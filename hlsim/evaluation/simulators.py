@@ -13,11 +13,14 @@ from torch import Tensor, nn
 from hlsim.evaluation.fidelity import pesq_wb, raw_mse, snr_db, stoi, third_octave_error_db
 from hlsim.evaluation.fidelity_items import LEVELS, RATE, Item, draw_items, treat
 from hlsim.evaluation.fidelity_report import fidelity_result, write_fidelity
+from hlsim.evaluation.measures import versions_of
 from hlsim.evaluation.store import ScoreStore, key_of
 from hlsim.evaluation.truth import pyclarity_msbg
 from hlsim.msbg import MSBG
 
 STORE = "scores.jsonl"
+
+_REVISION = 1  # of what is measured: raise it where that changes a figure
 
 Report = Callable[[int, int], None]
 
@@ -72,6 +75,7 @@ def evaluate_simulators(
         )
     drawn = draw_items(speech, noise, audiograms, items=items, seconds=seconds, seed=seed, levels=levels)
     store = ScoreStore(Path(out) / STORE)
+    versions = versions_of(["stoi", "pesq", "haspi"])  # the last for pyclarity's, whose MSBG is the truth
     weights = {name: weights_hash(simulator) for name, simulator in simulators.items()}
     rows: dict[str, list[dict[str, Any]]] = {name: [] for name in simulators}
     total = items * len(inputs)
@@ -80,6 +84,8 @@ def evaluate_simulators(
             "signal": samples_hash(item.clean, item.signal),
             "ear": list(item.ear.thresholds),
             "teacher": teacher,
+            "revision": _REVISION,
+            "versions": versions,
         }
         keys = {name: key_of({**about, "weights": weights[name]}) for name in simulators}
         missing = [name for name in simulators if store.get(keys[name]) is None]
@@ -133,9 +139,16 @@ def _shown(items: Sequence[Item]) -> Item:
 
 
 def weights_hash(module: nn.Module) -> str:
-    """What makes a simulator or compensator this one: its class and settings, and its weights."""
-    state = hashlib.sha256(f"{type(module).__qualname__} {getattr(module, 'config', '')}".encode())
-    for name, tensor in module.state_dict().items():
+    """What makes a simulator or compensator this one: its class, its settings and its weights, kept in it or not."""
+    settings = [
+        (place, name, value)
+        for place, part in module.named_modules()
+        for name, value in sorted(vars(part).items())
+        if isinstance(value, bool | int | float | str | tuple) and name != "training"
+    ]
+    kind = f"{type(module).__module__}.{type(module).__qualname__}"
+    state = hashlib.sha256(f"{kind} {getattr(module, 'config', '')} {settings}".encode())
+    for name, tensor in (*module.named_parameters(), *module.named_buffers()):
         state.update(name.encode())
         state.update(tensor.detach().cpu().contiguous().numpy().tobytes())
     return state.hexdigest()

@@ -49,13 +49,15 @@ class ScoreStore:
                 # one write of whole lines at the end: two runs may share a store
                 handle = os.open(self.path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
                 try:
-                    os.write(handle, ("\n" * self._torn + line).encode())
+                    data = ("\n" * self._torn + line).encode()
+                    self._torn = os.write(handle, data) < len(data)
                     os.fsync(handle)
                 finally:
                     os.close(handle)
             except OSError as error:
                 raise ValueError(f"{self.path}: scores cannot be stored ({error})") from error
-            self._torn = False
+            if self._torn:
+                raise ValueError(f"{self.path}: scores cannot be stored (the disk is full)")
         self._records[key] = dict(record)
 
     def _read(self, path: Path) -> None:

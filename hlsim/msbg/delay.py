@@ -32,7 +32,8 @@ def estimate_delay(
     if audiogram is None and getattr(simulator, "thresholds", None) is None:
         audiogram = Audiogram.standard("NH")
     place = rate // 2
-    impulse = torch.zeros(rate)
+    device = next((weights.device for weights in simulator.parameters()), None)
+    impulse = torch.zeros(rate, device=device)
     impulse[place] = 10.0 ** ((level - float(full_scale)) / 20.0)
     with torch.no_grad():
         heard = simulator(impulse, audiogram)

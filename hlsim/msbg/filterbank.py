@@ -102,7 +102,7 @@ BANKS = {"none": _NARROW, "mild": _NARROW, "moderate": _MIDDLE, "severe": _WIDE}
 """The bank of each severity."""
 
 
-@lru_cache(maxsize=16)
+@lru_cache(maxsize=2)
 def gammatone_response(bank: FilterBank, points: int) -> NDArray[np.complex128]:
     """Frequency responses of all channels, advances and high-passes included.
 

@@ -48,7 +48,8 @@ class MSBG(nn.Module):
 
     Args:
         audiogram: the ear; may be given with each call instead.
-        sample_rate: of inputs and outputs in Hz, 16000 to 48000. The model runs at 44.1 kHz inside.
+        sample_rate: of inputs and outputs in Hz, 16000 to 48000. Inside, the model runs at 44.1 kHz; aligned, and at
+            20000 or less, at 22.05 kHz.
         full_scale_spl: level in dB SPL of RMS 1.0.
         aligned: remove the model's delay and return as many samples as came in. Otherwise the reference's output, sample
             for sample at 44.1 kHz: with its delay, and where it smears 64 * (ceil(time / 64) + 3) samples long (in a
@@ -144,7 +145,7 @@ class MSBG(nn.Module):
                 output = checkpoint(call, block, ears, use_reentrant=False)
             else:
                 output = call(block, ears)
-            heard.append(output[:, start - begin : None if last else stop - begin])
+            heard.append(output[:, start - begin : None if stop == samples else stop - begin])
         return torch.cat(heard, -1)
 
     def _simulate_alike(self, signals: Tensor, ears: Tensor, severity: str, none: bool, last: bool) -> Tensor:

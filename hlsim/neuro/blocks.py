@@ -4,6 +4,7 @@ Feature maps lie (items, time, frequency, channels): the pointwise layers are th
 """
 
 from collections.abc import Callable
+from typing import Self
 
 import torch
 from torch import Tensor, nn
@@ -82,6 +83,12 @@ class BidirectionalLSTM(nn.Module):
     def __init__(self, channels: int, hidden: int) -> None:
         super().__init__()
         self.lstm = nn.LSTM(channels, hidden, batch_first=True, bidirectional=True)
+
+    def train(self, mode: bool = True) -> Self:
+        """The LSTM stays in training mode: cuDNN gives no gradient otherwise, and there is no dropout in it."""
+        super().train(mode)
+        self.lstm.train()
+        return self
 
     def forward(self, sequence: Tensor) -> Tensor:
         output: Tensor = self.lstm(sequence)[0]

@@ -189,7 +189,7 @@ class Items:
         ears = draw_thresholds(count, generator)
         if self.ears is not None:
             measured = self.ears[torch.randint(len(self.ears), (count,), generator=generator)]
-            ears = torch.where((uniform(0.0, 1.0) < 0.5).unsqueeze(-1), measured.clamp(-10.0, 100.0), ears)
+            ears = torch.where((uniform(0.0, 1.0) < 0.5).unsqueeze(-1), measured, ears)
         return speech, clean, ears
 
 

@@ -1,6 +1,5 @@
 """One way to run a training: time-boxed, resumable, with progress, TensorBoard and the best checkpoint kept."""
 
-import hashlib
 import json
 import logging
 import math
@@ -19,10 +18,14 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
+from hlsim.data.files import Whole
 from hlsim.training.examples import ShowExamples
 
 LAST = "last.ckpt"
 """Name of the state that a killed training goes on from."""
+
+BEST = "best.json"
+"""Name of the file with the best score so far."""
 
 
 class Counter(Dataset[int]):
@@ -87,7 +90,9 @@ class TimedModule(L.LightningModule):
         return loss
 
     def on_train_batch_start(self, batch: Tensor, index: int) -> None:
-        share = min(1.0, self.timer.time_elapsed("train") / (60.0 * self.max_minutes))
+        # one clock for all processes, whose weights would drift apart
+        spent = self.trainer.strategy.broadcast(self.timer.time_elapsed("train"))
+        share = min(1.0, spent / (60.0 * self.max_minutes))
         rise = min(1.0, (self.global_step + 1) / 50.0)
         for group in self.optimizers().param_groups:  # type: ignore[union-attr]
             group["lr"] = self.learning_rate * rise * max(0.01, 0.5 * (1.0 + math.cos(math.pi * share)))
@@ -101,10 +106,14 @@ class TimedModule(L.LightningModule):
 
 
 class KeepBest(Callback):
-    """Writes the released form of the model whenever the validation score is the best so far."""
+    """Writes the released form of the model whenever the validation score is the best so far.
 
-    def __init__(self, write: Callable[[dict[str, Any]], None]) -> None:
+    The score is also kept in ``note``: the state that a killed run goes on from is older than its last validation.
+    """
+
+    def __init__(self, write: Callable[[dict[str, Any]], None], note: Path) -> None:
         self.write = write
+        self.note = note
         self.best = -math.inf
 
     def state_dict(self) -> dict[str, Any]:
@@ -112,6 +121,8 @@ class KeepBest(Callback):
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         self.best = float(state_dict["best"])
+        if self.note.is_file():
+            self.best = max(self.best, float(json.loads(self.note.read_text(encoding="utf-8"))["best"]))
 
     def on_validation_end(self, trainer: L.Trainer, module: L.LightningModule) -> None:
         kept = ("score", "valid_")
@@ -122,6 +133,7 @@ class KeepBest(Callback):
             assert isinstance(module, TimedModule)
             minutes = module.timer.time_elapsed("train") / 60.0 if not trainer.sanity_checking else 0.0
             self.write({"steps": trainer.global_step, "minutes": round(minutes, 1), "validation": figures})
+            _put(self.note, json.dumps({"best": score}))
 
 
 class History(Callback):
@@ -209,7 +221,13 @@ def run(
         every_n_train_steps=validate_every,
         save_on_train_epoch_end=False,
     )
-    callbacks: list[Callback] = [module.timer, KeepBest(write), History(report), ShowExamples(), states]
+    callbacks: list[Callback] = [
+        module.timer,
+        KeepBest(write, folder / BEST),
+        History(report),
+        ShowExamples(),
+        states,
+    ]
     if progress:
         callbacks.append(TimeProgress())
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
@@ -223,6 +241,7 @@ def run(
             devices=devices,
             num_nodes=nodes,
             strategy=strategy,
+            use_distributed_sampler=False,  # each process draws by its rank
             max_epochs=-1,  # steps and time limit it; an epoch that is over would not be resumed
             max_steps=max_steps,
             gradient_clip_val=1.0,
@@ -252,10 +271,17 @@ def run(
 def _claim(folder: Path, recipe: Mapping[str, Any]) -> None:
     text = json.dumps(recipe, indent=2, sort_keys=True, default=str)
     note = folder / "recipe.json"
-    if note.is_file() and (folder / LAST).is_file():
-        kept = hashlib.sha256(note.read_bytes()).hexdigest()
-        if kept != hashlib.sha256(text.encode()).hexdigest():
+    if (folder / LAST).is_file():
+        if note.is_file() and note.read_text(encoding="utf-8") != text:
             raise ValueError(
                 f"{folder}: holds a training of another recipe (see {note.name}); choose another --out"
             )
-    note.write_text(text, encoding="utf-8")
+        return
+    (folder / BEST).unlink(missing_ok=True)
+    _put(note, text)
+
+
+def _put(path: Path, text: str) -> None:
+    with Whole(path) as file:
+        file.write(text)
+        file.keep()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +36,7 @@ class PlannedSource:
     manifest: Path
     root: Path | None = None
     prepared: bool = False
-    workers: int = 1
+    workers: int = field(default=1, compare=False)  # a run may go on with others
 
 
 class PlannedTraining(SimulatorTraining):

@@ -248,7 +248,9 @@ def train_simulator(
     run(
         module,
         out=out,
-        recipe=asdict(recipe) | {"max_minutes": max_minutes} | {k: str(v) for k, v in asdict(data).items()},
+        recipe=asdict(recipe)
+        | {"max_minutes": max_minutes}
+        | {entry.name: str(getattr(data, entry.name)) for entry in fields(data) if entry.compare},
         write=write,
         validate_every=recipe.validate_every,
         max_steps=max_steps,

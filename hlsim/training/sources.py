@@ -38,4 +38,6 @@ class TrainingData:
 
 def read_thresholds(path: Path | None) -> Tensor | None:
     """The ears of a CSV file. Shape: -> (ears, 8) dB HL, or None without a file."""
-    return torch.tensor([ear.thresholds for _, ear in read_audiograms(path)]) if path else None
+    if path is None:
+        return None
+    return torch.tensor([ear.thresholds for _, ear in read_audiograms(path, simulated=True)])

@@ -106,6 +106,12 @@ def test_a_folder_with_splits_and_pairs(tmp_path: Path) -> None:
     }
 
 
+def test_a_folder_above_whose_name_ends_in_clean_is_none_of_a_pair(tmp_path: Path) -> None:
+    utterances, faults = found(tree(tmp_path, "vctk-clean/clean/1.wav", "vctk-clean/noisy/1.wav"))
+    assert [(u.clean, u.noisy) for u in utterances] == [("vctk-clean/clean/1.wav", "vctk-clean/noisy/1.wav")]
+    assert list(faults) == []
+
+
 def test_a_table_says_more(tmp_path: Path) -> None:
     corpus = tree(tmp_path / "corpus", "a/1.wav", "a/2.wav", "n/1.wav")
     table = tmp_path / "table.csv"

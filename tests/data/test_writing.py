@@ -2,7 +2,9 @@
 
 import errno
 import hashlib
+import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -49,6 +51,19 @@ def program(*arguments: str) -> subprocess.Popen[bytes]:
     return subprocess.Popen(
         [sys.executable, *arguments], env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE
     )
+
+
+def test_another_plan_in_the_folder_is_another_plan(plan: Path) -> None:
+    write(plan)
+    before = digests(plan / "instances")
+    shutil.rmtree(plan / "instances")
+    settings = json.loads((plan / "plan.json").read_text())
+    prepare(PlanSettings(Path(settings["root"]), seed=5), plan, jobs=1)
+    write(plan)
+    opened = Plan(plan)
+    kept = Instance.read(opened.path(0))
+    assert torch.equal(kept.thresholds, opened.thresholds(0))
+    assert digests(plan / "instances") != before
 
 
 def test_on_the_fly_and_on_disk_are_the_same(plan: Path) -> None:

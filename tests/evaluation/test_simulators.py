@@ -13,7 +13,7 @@ from hlsim.calibration import level_spl, set_level
 from hlsim.evaluation import simulators
 from hlsim.evaluation.fidelity import snr_db
 from hlsim.evaluation.fidelity_items import LEVELS, draw_items, treat
-from hlsim.evaluation.simulators import evaluate_simulators
+from hlsim.evaluation.simulators import evaluate_simulators, weights_hash
 from hlsim.evaluation.truth import pyclarity_msbg
 
 pytest.importorskip("clarity")
@@ -135,6 +135,18 @@ def test_a_stopped_comparison_goes_on_and_a_new_simulator_is_scored_alone(
     result = evaluate_simulators(both, **options, items=3, out=tmp_path / "parts")
     assert result["simulators"]["a"] == whole["simulators"]["a"]
     assert len((tmp_path / "parts" / "scores.jsonl").read_text().splitlines()) == 6
+
+
+def test_modules_that_differ_in_a_setting_differ_in_their_scores_name() -> None:
+    modules = [
+        MSBG(sample_rate=16000),
+        MSBG(sample_rate=16000, rescale_active=True),
+        MSBG(Audiogram.standard("N3"), sample_rate=16000),
+        NALR(sample_rate=16000),
+        NALR(Audiogram.standard("N3"), sample_rate=16000),
+    ]
+    assert len({weights_hash(module) for module in modules}) == len(modules)
+    assert weights_hash(MSBG(sample_rate=16000)) == weights_hash(modules[0])
 
 
 def test_unknown_teacher(tmp_path: Path, speech_dir: Path, ears: Path) -> None:

@@ -425,6 +425,13 @@ def test_long_signals_go_by_blocks_that_equal_the_whole(
     assert relative(blocks.numpy(), whole.numpy()) < 1e-5
 
 
+@pytest.mark.slow
+def test_blocks_of_a_rate_that_shares_little_keep_the_length() -> None:
+    wave = 0.03 * torch.randn(10 * 16026)
+    with torch.no_grad():
+        assert MSBG(Audiogram.standard("N6"), sample_rate=16026)(wave).shape == wave.shape
+
+
 def test_gradients_through_blocks_are_those_of_the_whole(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("hlsim.msbg.stages._BLOCK_SECONDS", 1.0)
     wave = 0.03 * torch.randn(2 * 44100, dtype=torch.float64)

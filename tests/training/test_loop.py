@@ -169,6 +169,23 @@ def test_the_best_validation_is_what_is_written(tmp_path: Path) -> None:
     assert [note["steps"] for note in written] == [10]
 
 
+def test_the_best_of_a_killed_run_is_not_replaced_by_a_worse_one(tmp_path: Path) -> None:
+    def killed(line: str) -> None:
+        if line.startswith("step 4"):
+            raise KeyboardInterrupt
+
+    with pytest.raises((KeyboardInterrupt, SystemExit)):
+        go(Toy(scores={2: 1.0, 4: 3.0}), tmp_path, max_steps=20, report=killed)
+    # as after a kill during that validation: the last state is from before its score
+    state = torch.load(tmp_path / LAST, weights_only=True)
+    for name, kept in state["callbacks"].items():
+        if name.startswith("KeepBest"):
+            kept["best"] = 1.0
+    torch.save(state, tmp_path / LAST)
+    written, _ = go(Toy(scores=dict.fromkeys(range(2, 12, 2), 2.0)), tmp_path, max_steps=8)
+    assert written == []
+
+
 @pytest.mark.parametrize("value", [math.nan, math.inf])
 def test_a_loss_that_is_not_finite_stops_the_run_and_says_so(tmp_path: Path, value: float) -> None:
     class Broken(Toy):
