@@ -191,14 +191,11 @@ def resample(waveform: Tensor, source_rate: int, target_rate: int) -> Tensor:
     """
     if source_rate == target_rate:
         return waveform
-    common = math.gcd(source_rate, target_rate)
-    large = source_rate * target_rate // common**2 > _LARGEST_KERNEL
-    if (
-        large or torch.compiler.is_compiling()
-    ):  # what is made while a program is traced is of no use to others
-        resampled: Tensor = torchaudio.functional.resample(waveform, source_rate, target_rate, **_SINC)
-        return resampled
-    resampled = _resampler(source_rate, target_rate, waveform.dtype, waveform.device)(waveform)
+    size = source_rate * target_rate // math.gcd(source_rate, target_rate) ** 2
+    # a kernel made while a program is traced is of no use to others
+    if size > _LARGEST_KERNEL or torch.compiler.is_compiling():
+        return torchaudio.functional.resample(waveform, source_rate, target_rate, **_SINC)
+    resampled: Tensor = _resampler(source_rate, target_rate, waveform.dtype, waveform.device)(waveform)
     return resampled
 
 
