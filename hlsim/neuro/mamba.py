@@ -38,19 +38,19 @@ class Mamba(nn.Module):
 
     def forward(self, sequence: Tensor) -> Tensor:
         time = sequence.shape[1]
-        signal, gate = self.in_proj(sequence).mT.chunk(2, 1)
-        signal = functional.silu(self.conv1d(signal)[..., :time])
-        step, entry, leave = self.x_proj(signal.mT).split(self.sizes, -1)
+        signal, gate = self.in_proj(sequence).chunk(2, -1)
+        signal = functional.silu(self.conv1d(signal.mT)[..., :time].mT.contiguous())
+        step, entry, leave = self.x_proj(signal).split(self.sizes, -1)
         with torch.autocast(sequence.device.type, enabled=False):  # powers of decays want their precision
             dtype = self.A_log.dtype
             y = selective_scan(
-                signal.to(dtype),
+                signal.to(dtype).mT,
                 functional.linear(step.to(dtype), self.dt_proj.weight).mT,
                 -self.A_log.exp(),
                 entry.to(dtype).mT,
                 leave.to(dtype).mT,
                 self.D,
-                z=gate.to(dtype),
+                z=gate.to(dtype).mT,
                 delta_bias=self.dt_proj.bias,
                 delta_softplus=True,
             )

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import cache
+import math
+from collections.abc import Callable, Iterator
+from functools import cache, cached_property, partial
 from typing import Any
 
 import torch
@@ -11,8 +12,13 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 from torch.nn import functional
 
-# States held at a time: what fits a core's cache, or keeps a GPU busy. Items are taken in blocks of so many.
-_BLOCK_CPU, _BLOCK_GPU = 2**19, 2**27
+# States held at a time: what fits a core's cache, or keeps a GPU busy. Items and channels are taken in blocks of so many.
+_BLOCK_CPU, _BLOCK_GPU = 2**18, 2**27
+
+# Channels of a block at least: rows of fewer cost more than the cache gives.
+_NARROWEST = 8
+
+_Step = Callable[[], Any]
 
 
 def selective_scan(
@@ -59,96 +65,143 @@ def selective_scan(
         delta = delta + delta_bias.unsqueeze(-1)
     if delta_softplus:
         delta = functional.softplus(delta)
-    # time first: a step of the tree then works on whole rows
-    first = [tensor.permute(2, 0, 1) for tensor in (delta, u, B, C)]
-    y = _SelectiveScan.apply(*first, A).permute(1, 2, 0)
+    y = _SelectiveScan.apply(delta.mT, u.mT, B.mT, C.mT, A.mT.contiguous()).mT
     if D is not None:
-        y = y + D.unsqueeze(-1) * u
+        y = torch.addcmul(y, u, D.unsqueeze(-1))
     return y if z is None else y * functional.silu(z)
 
 
 def linear_scan(decay: Tensor, drive: Tensor) -> Tensor:
-    """h with h[t] = decay[t] h[t-1] + drive[t] and h[-1] = 0. Shape: (time, ...) twice -> (time, ...).
+    """h with h[t] = decay[t] h[t-1] + drive[t] and h[-1] = 0. Shape: (items, time, ...) twice -> the same.
 
     Neighbours are joined in pairs, their scan is one of half the length, and the times between follow from it: about
     three operations a time, log2(time) deep, and only products of decays, so that nothing overflows.
     """
-    if len(drive) == 1:
-        return drive
-    pairs = 2 * (len(drive) // 2)
-    odd = decay[1::2]
-    joined = linear_scan(decay[:pairs:2] * odd, torch.addcmul(drive[1::2], odd, drive[:pairs:2]))
-    states = torch.empty_like(drive)
-    states[0] = drive[0]
-    states[1::2] = joined
-    torch.addcmul(drive[2::2], decay[2::2], joined[: (len(drive) - 1) // 2], out=states[2::2])
+    states = drive.clone()
+    _take(_onward(decay, states, torch.empty_like(decay)))
     return states
 
 
-def _linear_scan_back(decay: Tensor, drive: Tensor) -> Tensor:
-    """h with h[t] = decay[t] h[t+1] + drive[t] and h[time] = 0. Shape: (time - 1, ...), (time, ...) -> (time, ...)."""
-    time = len(drive)
-    if time == 1:
-        return drive
+def _onward(decay: Tensor, states: Tensor, spare: Tensor) -> list[_Step]:
+    """The steps of ``linear_scan`` over its own drive; ``spare``, as long as decay, takes the products of decays."""
+    time, half = states.shape[1], states.shape[1] // 2
+    if not half:
+        return []
+    odd, later = states[:, 1::2], decay[:, 1::2]
+    steps: list[_Step] = [partial(odd.addcmul_, later, states[:, : time - 1 : 2])]
+    if half > 1:
+        joined = spare[:, :half]
+        steps.append(partial(torch.mul, later, decay[:, : time - 1 : 2], out=joined))
+        steps += _onward(joined, odd, spare[:, half:])
+    if time > 2:
+        steps.append(partial(states[:, 2::2].addcmul_, decay[:, 2::2], odd[:, : (time - 1) // 2]))
+    return steps
+
+
+def _back(decay: Tensor, states: Tensor, spare: Tensor) -> list[_Step]:
+    """As ``_onward``, of h[t] = decay[t] h[t+1] + drive[t] with h[time] = 0. Shape: (items, time - 1, ...) for decay."""
+    time, half = states.shape[1], states.shape[1] // 2
+    if not half:
+        return []
     odd = time % 2  # pairs are counted from the end
-    first = decay[odd::2]
-    joined = _linear_scan_back(
-        first[:-1] * decay[odd + 1 :: 2] if time > 3 else first[:0],
-        torch.addcmul(drive[odd::2], first, drive[odd + 1 :: 2]),
-    )
-    states = torch.empty_like(drive)
-    states[odd::2] = joined
-    states[-1] = drive[-1]
-    torch.addcmul(drive[odd + 1 : -1 : 2], decay[odd + 1 :: 2], joined[1:], out=states[odd + 1 : -1 : 2])
-    if odd:
-        torch.addcmul(drive[:1], decay[:1], joined[:1], out=states[:1])
-    return states
+    first, earlier = states[:, odd::2], decay[:, odd::2]
+    steps: list[_Step] = [partial(first.addcmul_, earlier, states[:, odd + 1 :: 2])]
+    if half > 1:
+        joined = spare[:, : half - 1]
+        steps.append(partial(torch.mul, earlier[:, :-1], decay[:, odd + 1 :: 2], out=joined))
+        steps += _back(joined, first, spare[:, half:])
+    if time > 2:
+        between = states[:, 1 - odd : -1 : 2]
+        steps.append(partial(between.addcmul_, decay[:, 1 - odd :: 2], first[:, 1 - odd :]))
+    return steps
+
+
+def _take(steps: list[_Step]) -> None:
+    for step in steps:
+        step()
 
 
 class _SelectiveScan(torch.autograd.Function):
-    """Shape: delta, u (time, items, channels); B, C (time, items, states); A (channels, states) -> as u."""
+    """Shape: delta, u (items, time, channels); B, C (items, time, states); A (states, channels) -> as u.
+
+    Inside, channels lie last and times before states: every step then works on whole rows.
+    """
 
     @staticmethod
     def forward(ctx: Any, delta: Tensor, u: Tensor, B: Tensor, C: Tensor, A: Tensor) -> Tensor:
         ctx.save_for_backward(delta, u, B, C, A)
-        outputs = []
-        for part in _blocks(u, A):
-            d, v, b, c = (tensor[:, part].contiguous() for tensor in (delta, u, B, C))
-            outputs.append((_states(d, v, b, A)[1] @ c.unsqueeze(-1)).squeeze(-1))
-        return torch.cat(outputs, 1)
+        y = u.new_empty(u.shape)
+        for rows, columns, work in _blocks(u, A):
+            d, v = (tensor[rows, :, columns].contiguous() for tensor in (delta, u))
+            b, c = (tensor[rows].contiguous() for tensor in (B, C))
+            work.run(d, v, b, A[:, columns])
+            y[rows, :, columns] = (c.unsqueeze(-2) @ work.states).squeeze(-2)
+        return y
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, ...]:
         delta, u, B, C, A = ctx.saved_tensors
-        rows: list[tuple[Tensor, ...]] = []
-        grad_A = torch.zeros_like(A)
-        for part in _blocks(u, A):
-            d, v, b, c, g = (tensor[:, part].contiguous() for tensor in (delta, u, B, C, grad))
-            decay, states = _states(d, v, b, A)
-            grad_c = (g.unsqueeze(-2) @ states).squeeze(-2)
-            # the gradient of the states obeys the same recurrence, backwards, with the next time's decay
-            slope = _linear_scan_back(decay[1:], g.unsqueeze(-1) * c.unsqueeze(-2))
-            driven = (slope @ b.unsqueeze(-1)).squeeze(-1)
-            grad_b = ((d * v).unsqueeze(-2) @ slope).squeeze(-2)
-            exponent = slope[1:] * states[:-1] * decay[1:]
-            grad_d = driven * v
-            grad_d[1:] += (exponent * A).sum(-1)
-            grad_A += (exponent * d[1:].unsqueeze(-1)).sum((0, 1))
-            rows.append((grad_d, driven * d, grad_b, grad_c))
-        return (*(torch.cat(parts, 1) for parts in zip(*rows, strict=True)), grad_A)
+        grad_delta, grad_u = u.new_empty(u.shape), u.new_empty(u.shape)
+        grad_A, grad_B, grad_C = torch.zeros_like(A), torch.zeros_like(B), torch.zeros_like(C)
+        for rows, columns, work in _blocks(u, A):
+            d, v, g = (tensor[rows, :, columns].contiguous() for tensor in (delta, u, grad))
+            b, c = (tensor[rows].contiguous() for tensor in (B, C))
+            a = A[:, columns]
+            work.run(d, v, b, a)
+            grad_C[rows] += (work.states @ g.unsqueeze(-1)).squeeze(-1)
+            slope = work.run_back(g, c)
+            driven = (b.unsqueeze(-2) @ slope).squeeze(-2)
+            grad_u[rows, :, columns] = driven * d
+            grad_B[rows] += (slope @ (d * v).unsqueeze(-1)).squeeze(-1)
+            exponent = work.states[:, :-1].mul_(work.decay[:, 1:]).mul_(slope[:, 1:])
+            driven.mul_(v)[:, 1:] += torch.mul(exponent, a, out=work.spare[:, 1:]).sum(-2)
+            grad_delta[rows, :, columns] = driven
+            grad_A[:, columns] += exponent.mul_(d[:, 1:].unsqueeze(-2)).sum((0, 1))
+        return grad_delta, grad_u, grad_B, grad_C, grad_A
 
 
-def _states(delta: Tensor, u: Tensor, B: Tensor, A: Tensor) -> tuple[Tensor, Tensor]:
-    """Decays and states. Shape: -> (time, items, channels, states) twice."""
-    decay = (delta.unsqueeze(-1) * A).exp_()
-    return decay, linear_scan(decay, (delta * u).unsqueeze(-1) * B.unsqueeze(-2))
+class _Workspace:
+    """Decays and states of a block, in memory that the next block uses again. Shape: (items, time, states, channels)."""
+
+    def __init__(self, shape: tuple[int, ...], like: Tensor) -> None:
+        self.decay, self.states, self.spare = (like.new_empty(shape) for _ in range(3))
+        self.onward = _onward(self.decay, self.states, self.spare)
+
+    def run(self, delta: Tensor, u: Tensor, B: Tensor, A: Tensor) -> None:
+        """Fill ``decay`` and ``states``."""
+        torch.mul(delta.unsqueeze(-2), A, out=self.decay).exp_()
+        torch.mul((delta * u).unsqueeze(-2), B.unsqueeze(-1), out=self.states)
+        _take(self.onward)
+
+    @cached_property
+    def slope(self) -> Tensor:
+        return torch.empty_like(self.states)
+
+    @cached_property
+    def back(self) -> list[_Step]:
+        return _back(self.decay[:, 1:], self.slope, self.spare)
+
+    def run_back(self, grad: Tensor, C: Tensor) -> Tensor:
+        """The gradient of the states: the same recurrence, backwards, with the next time's decay."""
+        torch.mul(C.unsqueeze(-1), grad.unsqueeze(-2), out=self.slope)
+        _take(self.back)
+        return self.slope
 
 
-def _blocks(u: Tensor, A: Tensor) -> list[slice]:
-    time, items = u.shape[:2]
-    size = max(1, (_BLOCK_GPU if u.is_cuda else _BLOCK_CPU) // max(1, time * A.numel()))
-    return [slice(start, start + size) for start in range(0, max(1, items), size)]
+def _blocks(u: Tensor, A: Tensor) -> Iterator[tuple[slice, slice, _Workspace]]:
+    """Items, channels and the memory to work in. Blocks are of all channels, or of one item."""
+    items, time, channels = u.shape
+    room = max(_NARROWEST, (_BLOCK_GPU if u.is_cuda else _BLOCK_CPU) // max(1, time * len(A)))
+    width = math.ceil(channels / math.ceil(channels / room))  # blocks of about the same size
+    height = max(1, room // channels)
+    spaces: dict[tuple[int, ...], _Workspace] = {}
+    for top in range(0, items, height):
+        for left in range(0, channels, width):
+            shape = (min(height, items - top), time, len(A), min(width, channels - left))
+            if shape not in spaces:
+                spaces[shape] = _Workspace(shape, u)
+            yield slice(top, top + height), slice(left, left + width), spaces[shape]
 
 
 @cache

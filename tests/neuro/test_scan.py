@@ -36,12 +36,12 @@ def arguments(time: int, items: int = 3, channels: int = 5, states: int = 4) -> 
 
 
 @pytest.mark.parametrize("time", LENGTHS)
-@pytest.mark.parametrize("block", [1, 2**19], ids=["item by item", "at once"])
+@pytest.mark.parametrize("block", [1, 2**19], ids=["in parts", "at once"])
 def test_equals_the_recurrence_and_so_do_its_gradients(
     time: int, block: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(scan, "_BLOCK_CPU", block)
-    given = [tensor.requires_grad_() for tensor in arguments(time)]
+    given = [tensor.requires_grad_() for tensor in arguments(time, channels=20)]
     found, true = selective_scan(*given), by_steps(*given)
     torch.testing.assert_close(found, true, rtol=1e-10, atol=1e-10)
     weight = torch.randn(true.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
@@ -77,10 +77,10 @@ def test_is_causal_and_remembers() -> None:
 
 
 def test_does_not_overflow_where_decays_vanish() -> None:
-    decay, drive = torch.full((1000, 2), 1e-30), torch.ones(1000, 2)
+    decay, drive = torch.full((2, 1000), 1e-30), torch.ones(2, 1000)
     assert torch.equal(linear_scan(decay, drive), drive)
-    decay = torch.ones(4096, 1)
-    torch.testing.assert_close(linear_scan(decay, torch.ones(4096, 1)).squeeze(1), torch.arange(1.0, 4097.0))
+    ones = torch.ones(1, 4096)
+    torch.testing.assert_close(linear_scan(ones, ones).squeeze(0), torch.arange(1.0, 4097.0))
 
 
 def test_float32_is_near_float64() -> None:
