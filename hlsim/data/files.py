@@ -4,12 +4,39 @@ from __future__ import annotations
 
 import errno
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
 from typing import IO, Self
 
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
+
 PARTIAL = ".part"
 """Ending of a file that is not yet whole."""
+
+
+@contextmanager
+def alone(path: Path) -> Iterator[None]:
+    """Be the only process that holds this file, which exists; it ends with the process, however that ends.
+
+    Raises:
+        ValueError: another process holds it. Systems without such locks (Windows, some network drives) do not tell.
+    """
+    with path.open("rb") as file:
+        try:
+            if fcntl is not None:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise ValueError(
+                f"{path.parent}: another process is writing there; wait until it is done"
+            ) from None
+        except OSError:
+            pass  # no locks on this drive
+        yield
 
 
 class Whole:

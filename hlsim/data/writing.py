@@ -6,13 +6,14 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from pathlib import Path
+from typing import Any
 
 import torch
 
 from hlsim.data.corpora import Fault
-from hlsim.data.files import PARTIAL, Whole
+from hlsim.data.files import PARTIAL, Whole, alone
 from hlsim.data.manifest import csv_line
-from hlsim.data.samples import Plan, is_whole
+from hlsim.data.samples import MANIFEST, Plan, is_whole
 from hlsim.data.teacher import Reference, Teacher
 from hlsim.parallel import run_parallel
 
@@ -54,10 +55,18 @@ def write_instances(
     Returns: how many are there.
 
     Raises:
-        ValueError: the folder holds instances of another plan or recipe, the disk is full, or audio cannot be read any
-            more: then what remains is written first, and ``write-faults.csv`` names the files.
+        ValueError: another process writes there, the folder holds instances of another plan or recipe, the disk is
+            full, or audio cannot be read any more: then what remains is written first, and ``write-faults.csv`` names
+            the files.
     """
     plan = Plan(folder, root)
+    with alone(plan.folder / MANIFEST):  # what others have begun would look like leftovers
+        return _write(plan, recipe, jobs=jobs, backend=backend, scheduler=scheduler, progress=progress)
+
+
+def _write(
+    plan: Plan, recipe: Recipe, *, progress: Callable[[int, int], None] | None, **parallel: Any
+) -> int:
     _claim(plan, recipe)
     for leftover in (plan.folder / "instances").rglob(f".*{PARTIAL}"):
         leftover.unlink(missing_ok=True)
@@ -65,7 +74,7 @@ def write_instances(
     faults: list[Fault] = []
     threads = torch.get_num_threads()
     numbers = range(len(plan.utterances))
-    written = run_parallel(task, numbers, jobs=jobs, backend=backend, scheduler=scheduler)
+    written = run_parallel(task, numbers, **parallel)
     try:
         for done, (number, found) in enumerate(written, start=1):
             if found is None:  # its process ended

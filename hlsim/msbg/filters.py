@@ -1,10 +1,13 @@
 """MSBG's filters as tensors, computed once per severity, length, type and device and held in a small cache."""
 
-from functools import lru_cache
+from collections import OrderedDict
+from collections.abc import Callable
+from threading import RLock
 from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from hlsim.msbg.ear import ear_filter, lowpass_filter
 from hlsim.msbg.ending import ending_response, ending_weights
@@ -12,7 +15,7 @@ from hlsim.msbg.filterbank import BANKS, gammatone_response
 from hlsim.msbg.fourier import block_points
 from hlsim.msbg.recruitment import envelope_lowpass
 from hlsim.msbg.smearing import BROADENING, smearing_matrix
-from hlsim.msbg.tiers import make_plan
+from hlsim.msbg.tiers import Plan, make_plan
 
 
 class Filters:
@@ -23,11 +26,48 @@ class Filters:
 
     def get(self, kind: str, *key: Any) -> Any:
         """A filter by name and what it depends on: FFT lengths, severity."""
-        return _cached(kind, key, self.dtype, self.device)
+        whole = (kind, key, self.dtype, self.device)
+        return _KNOWN.get(whole, lambda: _made(*whole))
 
 
-@lru_cache(maxsize=48)
-def _cached(kind: str, key: tuple[Any, ...], dtype: torch.dtype, device: torch.device) -> Any:
+class _Cache:
+    """The filters asked for last, up to ``limit`` bytes of them: those of long signals take 5 MiB a second of signal."""
+
+    def __init__(self, limit: int) -> None:
+        self.limit = limit
+        self._known: OrderedDict[Any, tuple[Any, int]] = OrderedDict()
+        self._lock = RLock()  # modules may run in threads
+
+    def get(self, key: Any, make: Callable[[], Any]) -> Any:
+        with self._lock:
+            if key in self._known:
+                self._known.move_to_end(key)
+            else:
+                made = make()
+                self._known[key] = made, _bytes(made)
+                while len(self._known) > 1 and self.held > self.limit:
+                    self._known.popitem(last=False)
+            return self._known[key][0]
+
+    @property
+    def held(self) -> int:
+        """Bytes of all."""
+        return sum(size for _, size in self._known.values())
+
+
+_KNOWN = _Cache(2**28)
+
+
+def _bytes(made: Any) -> int:
+    if isinstance(made, Tensor):
+        return made.nbytes
+    if isinstance(made, Plan):
+        tensors = [made.lowpass, made.total, *(tier.response for tier in made.tiers)]
+        return sum(tensor.nbytes for tensor in tensors)
+    raise AssertionError(type(made))
+
+
+def _made(kind: str, key: tuple[Any, ...], dtype: torch.dtype, device: torch.device) -> Any:
     with torch.inference_mode(False):
         if kind == "plan":
             severity, points, step = key

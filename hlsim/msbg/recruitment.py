@@ -153,7 +153,7 @@ def expand(channels: Tensor, envelopes: Tensor, ratios: Tensor) -> Tensor:
     return weigh(channels, around(gains(envelopes, ratios)), kernel, (envelopes, ratios))
 
 
-@lru_cache(maxsize=16)
+@lru_cache(maxsize=4)
 def envelope_lowpass(bank: FilterBank, points: int, step: int = 1) -> NDArray[np.complex128]:
     """Response that turns the rfft of ``decimate``'s means into that of the envelope at samples 0, 16, ...
 

@@ -18,9 +18,10 @@ from torch import Tensor
 
 from hlsim.audio import write_audio
 from hlsim.data import files
+from hlsim.data.files import alone
 from hlsim.data.plan import prepare
 from hlsim.data.plan_settings import PlanSettings
-from hlsim.data.samples import Instance, Plan
+from hlsim.data.samples import MANIFEST, Instance, Plan
 from hlsim.data.writing import Recipe, write_instances
 
 ROOT = Path(__file__).parents[2]
@@ -92,6 +93,13 @@ def test_what_is_there_is_kept_and_the_rest_made(plan: Path) -> None:
     (opened.path(7).parent / ".00000007.safetensors.1.part").write_bytes(b"half")
     write(plan)
     assert digests(plan) == whole and opened.path(3).stat().st_mtime_ns == untouched
+
+
+def test_two_do_not_write_at_once(plan: Path) -> None:
+    pytest.importorskip("fcntl")
+    with alone(plan / MANIFEST), pytest.raises(ValueError, match="another process is writing there"):
+        write(plan)
+    write(plan)
 
 
 @pytest.mark.slow

@@ -1,0 +1,41 @@
+"""The cache of filters: one a key, the same again, and no more memory than it may take."""
+
+import pytest
+import torch
+
+from hlsim import MSBG, Audiogram
+from hlsim.msbg import filters
+from hlsim.msbg.filters import Filters, _Cache
+
+
+@pytest.fixture
+def small(monkeypatch: pytest.MonkeyPatch) -> _Cache:
+    cache = _Cache(4 * 2**20)
+    monkeypatch.setattr(filters, "_KNOWN", cache)
+    return cache
+
+
+def test_the_same_filter_is_made_once() -> None:
+    own = Filters(torch.float32, torch.device("cpu"))
+    assert own.get("forward", 4410) is own.get("forward", 4410)
+    assert own.get("forward", 4410) is not own.get("forward", 8820)
+    double = Filters(torch.float64, torch.device("cpu")).get("forward", 4410)
+    assert double.dtype == torch.complex128 and own.get("forward", 4410).dtype == torch.complex64
+
+
+def test_memory_does_not_grow_with_the_number_of_lengths(small: _Cache) -> None:
+    model = MSBG(Audiogram.standard("N3"), sample_rate=16000)
+    signals = [0.01 * torch.ones(1, 3000 + 2000 * n) for n in range(8)]
+    first = [model(signal) for signal in signals]
+    assert small.held <= small.limit
+    for signal, expected in zip(signals, first, strict=True):  # the early ones are made again
+        assert torch.equal(model(signal), expected)
+    assert small.held <= small.limit
+
+
+def test_one_filter_that_is_too_long_is_held_all_the_same(small: _Cache) -> None:
+    own = Filters(torch.float32, torch.device("cpu"))
+    plan = own.get("plan", "severe", 16 * 6000, 1)
+    assert own.get("plan", "severe", 16 * 6000, 1) is plan and small.held > small.limit
+    own.get("forward", 4410)
+    assert small.held <= small.limit
