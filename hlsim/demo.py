@@ -15,7 +15,7 @@ from hlsim.audio import find_audio, read_audio, resample, write_audio
 from hlsim.audiogram import Audiogram
 from hlsim.calibration import level_spl, set_level
 from hlsim.evaluation.figures import draw_spectrograms
-from hlsim.evaluation.haspi import HaspiItem, haspi_many
+from hlsim.evaluation.haspi import HaspiItem, check_pair, haspi_many
 from hlsim.evaluation.report import HaspiReport, ItemScore
 from hlsim.evaluation.report_files import write_report
 from hlsim.msbg import MSBG
@@ -54,11 +54,14 @@ def demo(
     Returns: the report as Markdown.
 
     Raises:
-        ValueError: unusable audio, or fewer than 22 files in ``speech``.
+        ValueError: unusable audio, one of under 0.7 s among the scored, or fewer than 22 files in ``speech``.
     """
     folder = Path(out)
     training, scored = _split(speech)
     utterances = [_read(path) for path in scored]
+    for path, utterance in zip(scored, utterances, strict=True):  # not after minutes of training
+        check_pair(utterance, utterance, NEURO_RATE, names=(str(path), str(path)))
+    names = _names(scored, speech)
     recipe = CompensatorRecipe(seed=seed)
     report(f"training on {len(training)} utterances for {minutes:g} minutes, ear {_name(audiogram)}")
     threads = torch.get_num_threads()
@@ -99,7 +102,7 @@ def demo(
     ends = {"before": "unaided", "after": "compensated"}
     scores = [
         ItemScore(
-            file=path.stem,
+            file=names[i],
             scores={"haspi": {end: haspi[name][i] for end, name in ends.items()}},
             clean_level=float(level_spl(utterances[i])),
             levels={end: float(level_spl(given[name][i])) for end, name in ends.items()},
@@ -108,7 +111,7 @@ def demo(
             seconds=len(utterances[i]) / NEURO_RATE,
             seed=seed + i,
         )
-        for i, path in enumerate(scored)
+        for i in range(len(scored))
     ]
     heard = _heard(given, utterances, audiogram)
     normal = [float(level_spl(signal)) for signal in heard["normal ear"]]
@@ -132,7 +135,7 @@ def demo(
     write_report(result, folder)
     text = f"# {_name(audiogram)}\n\n{result.to_markdown()}\n" + "\n".join(table) + "\n"
     (folder / "report.md").write_text(text, encoding="utf-8")
-    _write_audio(folder / "audio", scored, utterances, heard)
+    _write_audio(folder / "audio", names, utterances, heard)
     panel = {"original": utterances[0]} | {
         f"heard, {name}": heard[name][0] for name in ("unaided", "nalr", "compensated")
     }
@@ -159,6 +162,12 @@ def _read(path: Path) -> Tensor:
     return set_level(clip, SPEECH_LEVEL)
 
 
+def _names(files: list[Path], speech: str | Path | None) -> list[str]:
+    """What each is called: its path below the folder, for several speakers may have a 001.wav."""
+    root = _EMBEDDED / "valid" if speech is None else Path(speech)
+    return ["-".join(path.relative_to(root).with_suffix("").parts) for path in files]
+
+
 def _give(model: nn.Module, utterance: Tensor, audiogram: Audiogram) -> Tensor:
     given: Tensor = model(utterance) if isinstance(model, nn.Identity) else model(utterance, audiogram)
     return given
@@ -174,20 +183,18 @@ def _heard(
         return heard | {"normal ear": [normal(signal) for signal in clean]}
 
 
-def _write_audio(
-    folder: Path, files: list[Path], clean: list[Tensor], heard: dict[str, list[Tensor]]
-) -> None:
+def _write_audio(folder: Path, names: list[str], clean: list[Tensor], heard: dict[str, list[Tensor]]) -> None:
     """Three files an utterance, all by one gain, so that their loudness can be compared."""
     folder.mkdir(parents=True, exist_ok=True)
-    for i, path in enumerate(files):
+    for i, name in enumerate(names):
         signals = {
             "original": clean[i],
             "heard-unaided": heard["unaided"][i],
             "heard-compensated": heard["compensated"][i],
         }
         peak = max(float(signal.abs().max()) for signal in signals.values())
-        for name, signal in signals.items():
-            write_audio(folder / f"{path.stem}-{name}.wav", 0.9 * signal / peak, NEURO_RATE)
+        for kind, signal in signals.items():
+            write_audio(folder / f"{name}-{kind}.wav", 0.9 * signal / peak, NEURO_RATE)
 
 
 def _name(audiogram: Audiogram) -> str:

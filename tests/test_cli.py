@@ -211,6 +211,12 @@ def test_evaluate_simulator_writes_both_files(tmp_path: Path, speech_dir: Path) 
     assert "neuro-msbg" in (tmp_path / "out" / "fidelity.md").read_text()
 
 
+@pytest.mark.parametrize("device", ["gpu", "cuda:99", "cpu:3"])
+def test_benchmark_on_no_device(device: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["benchmark", "--device", device]) == 2
+    assert f"device '{device}': there is none that torch can use; allowed: cpu" in capsys.readouterr().err
+
+
 @pytest.mark.slow
 def test_benchmark(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "speed.json"

@@ -11,7 +11,7 @@ from hlsim import Audiogram
 pytest.importorskip("lightning")
 pytest.importorskip("clarity")
 
-from hlsim.demo import demo
+from hlsim.demo import _names, demo
 
 
 @pytest.fixture
@@ -50,6 +50,22 @@ def test_demo_writes_report_audio_and_pictures(tmp_path: Path, short_speech: Pat
         assert (out / name).stat().st_size > 0
     assert len(list((out / "audio").glob("*.wav"))) == 3 * 8
     assert any(line.startswith("step") for line in lines)
+
+
+def test_speech_that_cannot_be_scored_is_named_before_the_training(
+    tmp_path: Path, short_speech: Path
+) -> None:
+    first = sorted(short_speech.iterdir())[0]
+    samples, rate = soundfile.read(first)
+    soundfile.write(first, samples[: rate // 2], rate)
+    with pytest.raises(ValueError, match=rf"{first.name} lasts 0.5 s; HASPI needs 0.7 s"):
+        demo(tmp_path / "out", Audiogram.standard("N4"), speech=short_speech)
+    assert not (tmp_path / "out").exists()
+
+
+def test_names_tell_speakers_apart(tmp_path: Path) -> None:
+    files = [tmp_path / "p225" / "001.wav", tmp_path / "p226" / "001.wav"]
+    assert _names(files, tmp_path) == ["p225-001", "p226-001"]
 
 
 def test_too_little_speech(tmp_path: Path, speech_dir: Path) -> None:

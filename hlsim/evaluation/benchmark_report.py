@@ -9,7 +9,8 @@ def benchmark_markdown(result: dict[str, Any]) -> str:
     """One second at batch 1; longer clips and larger batches; the training step and the scan where they were timed."""
     lines = [
         f"{result['device']} ({result['machine']}, {result['cores']} cores, {result['threads']} threads), torch "
-        f"{result['torch']}, {result['date']}; milliseconds, median (least to greatest) of {result['repeats']} rounds.",
+        f"{result['torch']}, {result['date']}; milliseconds, median (least to greatest) of {result['repeats']} rounds "
+        "of three ears, of slow rows of fewer calls.",
         "",
     ]
     if "rows" in result:
@@ -36,8 +37,10 @@ def _one_second(rows: list[dict[str, Any]]) -> list[str]:
             peak = [
                 f"{cell['peak_mib']:.0f}" for cell in (forward, both) if cell and cell["peak_mib"] is not None
             ]
+            most = max(cell["counted"] for other in rows for cell in other["cells"])
+            slow = f" ({forward['counted']} calls)" if forward["counted"] < most else ""
             cells = (
-                row["name"],
+                row["name"] + slow,
                 f"{row['parameters']:,}" if row["parameters"] else "-",
                 rate,
                 _cell(forward),

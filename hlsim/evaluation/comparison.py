@@ -11,7 +11,13 @@ from typing import TYPE_CHECKING, Any
 from hlsim.audiogram import SEVERITIES
 from hlsim.evaluation.measures import MEASURES
 from hlsim.evaluation.mixed import MixedModel, mixed_model
-from hlsim.evaluation.significance import PairedComparison, group_means, holm, paired_comparison
+from hlsim.evaluation.significance import (
+    PairedComparison,
+    differences,
+    group_means,
+    holm,
+    paired_comparison,
+)
 
 if TYPE_CHECKING:
     from hlsim.evaluation.report import ItemScore
@@ -35,6 +41,7 @@ class Comparison:
         mixed: a mixed model with listeners as a random intercept, or the reason why there is none.
         p_t_holm, p_w_holm: p values adjusted by Holm over the comparisons of this measure.
         comparisons: how many those are.
+        unit: what ``listeners`` are called.
     """
 
     measure: str
@@ -49,6 +56,7 @@ class Comparison:
     p_t_holm: float | None
     p_w_holm: float | None
     comparisons: int = 1
+    unit: str = "listeners"
 
     @property
     def title(self) -> str:
@@ -101,37 +109,53 @@ class Comparison:
         named = ", ".join(f"{name} {p_text(p)}" for name, p in defined)
         if self.comparisons > 1:
             named += f", Holm-adjusted for {self.comparisons} comparisons"
-        against = [p < ALPHA for _, p in defined]
-        if all(against):
-            return f"Chance alone hardly explains it ({named})."
+        against = [p < ALPHA for name, p in defined if name == "t-test" or self._wilcoxon_can()]
+        few = "" if self._wilcoxon_can() else f"; with so few Wilcoxon's cannot fall below {ALPHA:g}"
+        if against and all(against):
+            return f"Chance alone hardly explains it ({named}{few})."
         if any(against):
             return f"The tests disagree on whether chance explains it ({named})."
-        return f"It cannot be told from chance ({named}), which does not show that there is no change."
+        return f"It cannot be told from chance ({named}{few}), which does not show that there is no change."
+
+    def _wilcoxon_can(self) -> bool:
+        """Whether its adjusted p would fall below ``ALPHA`` if all pairs changed the same way."""
+        c = self.overall
+        return c.p_w is None or self.comparisons * 2.0 ** (1 - (c.n - c.zeros)) < ALPHA
 
     def _level(self) -> str:
-        title = self.title
-        if not MEASURES[self.measure].of_an_ear:
-            return f"{title} knows neither loss nor level: it rates the signal at the ear, not what is heard."
+        measure, change = MEASURES[self.measure], self.overall.delta
+        if not measure.of_an_ear:
+            return f"{self.title} knows neither loss nor level: it rates the signal at the ear, not what is heard."
         louder = self.level_after_mean - self.level_before_mean
-        if louder >= _AUDIBLE:
+        if abs(louder) < _AUDIBLE:
             return (
-                f"The level rose by {louder:.1f} dB, and {title} rewards gain: the figures do not show how much of the "
-                "change amplification alone would have brought."
+                f"The mean level changed by {louder:+.1f} dB only, so that gain overall does not explain it."
             )
-        if louder <= -_AUDIBLE:
-            return f"The level fell by {-louder:.1f} dB, so that gain does not explain a rise."
-        return f"The mean level changed by {louder:+.1f} dB only, so that gain overall does not explain it."
+        moved = f"The level {'rose' if louder > 0 else 'fell'} by {abs(louder):.1f} dB"
+        if not measure.rewards_gain:
+            return f"{moved}, on which {self.title} depends too: the figures do not tell gain from the rest."
+        if change and (change > 0) != (louder > 0):
+            return f"{moved}, so that gain does not explain a {'rise' if change > 0 else 'fall'}."
+        alone = "amplification" if louder > 0 else "attenuation"
+        return (
+            f"{moved}, and {self.title} rewards gain: the figures do not show how much of the change {alone} alone "
+            "would have brought."
+        )
 
     def _nesting(self) -> str:
         if self.listeners is None:
             return (
-                "Items are taken as independent: where several share a talker or a listener, p is too small."
+                "Items are taken as independent: where several share a talker or a listener, p is too small and the "
+                "interval too narrow."
             )
         c = self.listeners
         if c.p_t is None:
-            return f"Over the means of {c.n} listeners no t-test is defined."
+            return f"Over the means of {c.n} {self.unit} no t-test is defined."
         adjusted = ", not adjusted" if self.comparisons > 1 else ""
-        return f"Over the means of {c.n} listeners, which are independent, the t-test has {p_text(c.p_t)}{adjusted}."
+        return (
+            f"The interval and p take items as independent; over the means of the {c.n} {self.unit} the t-test has "
+            f"{p_text(c.p_t)}{adjusted}."
+        )
 
     def _reach(self) -> str:
         return f"{self.title} is a model's prediction: no listener was asked, and other speech and ears may differ."
@@ -142,6 +166,7 @@ def compare_conditions(
     measures: Sequence[str],
     conditions: Sequence[str],
     baseline: str | None = None,
+    unit: str = "listeners",
 ) -> list[Comparison]:
     """Every later condition against every earlier one (or against ``baseline`` only) by every measure.
 
@@ -155,7 +180,7 @@ def compare_conditions(
         own = [c for pair in pairs if (c := _compare(items, measure, *pair)) is not None]
         p_t, p_w = holm(c.overall.p_t for c in own), holm(c.overall.p_w for c in own)
         out += [
-            replace(c, p_t_holm=t, p_w_holm=w, comparisons=len(own))
+            replace(c, p_t_holm=t, p_w_holm=w, comparisons=len(own), unit=unit)
             for c, t, w in zip(own, p_t, p_w, strict=True)
         ]
     return out
@@ -184,7 +209,7 @@ def _compare(items: Sequence[ItemScore], measure: str, before: str, after: str) 
     listeners, means = [item.listener for item in both], None
     mixed: MixedModel | str = "listeners are not named"
     if all(listeners):
-        mixed = mixed_model([b - a for a, b in zip(first, second, strict=True)], listeners)
+        mixed = mixed_model(differences(first, second).tolist(), listeners)
         if len(set(listeners)) > 1:
             means = paired_comparison(*(group_means(x, listeners).values() for x in (first, second)))
     return Comparison(

@@ -106,8 +106,9 @@ _NOTES = (
     "ear hears and what a normal ear hears of the clean speech, both by the exact MSBG, where the latter is audible; "
     "mean over items.",
     "Holm's family is every pair of conditions by one measure in one group. d is the mean difference over the deviation "
-    "of the differences. Intervals are percentiles of 9999 bootstrap resamples of the items. Several items share an ear: "
-    "the last column of the tests is a t-test of the means of each ear, p not adjusted.",
+    "of the differences. Intervals are percentiles of 9999 bootstrap resamples of the items, expanded for few "
+    "(Hesterberg 2015). Several items share an ear, which makes p too small and intervals too narrow: the last column of "
+    "the tests is a t-test of the means of each ear, p not adjusted. Both ears of a person count as two.",
 )
 
 

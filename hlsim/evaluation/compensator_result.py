@@ -77,9 +77,13 @@ def compensator_result(
     return result, reports
 
 
-def gap(group: Mapping[str, float], one: str, other: str) -> float:
-    """Relative difference of one simulator's loss from another's."""
-    return group[f"loss_{one}"] / group[f"loss_{other}"] - 1.0
+def gap(group: Mapping[str, float], one: str, other: str) -> float | None:
+    """Relative difference of one simulator's loss from another's; None where the other's is 0.
+
+    It is where nothing is lost: clean speech as it is, in an ear without a loss.
+    """
+    least = group[f"loss_{other}"]
+    return group[f"loss_{one}"] / least - 1.0 if least else None
 
 
 def _report(rows: Rows, items: Sequence[Item], settings: Mapping[str, Any]) -> HaspiReport:
@@ -101,7 +105,7 @@ def _report(rows: Rows, items: Sequence[Item], settings: Mapping[str, Any]) -> H
         )
         for row in rows
     ]
-    return HaspiReport(scores, measures=("haspi", "hasqi"), seed=settings["seed"])
+    return HaspiReport(scores, measures=("haspi", "hasqi"), seed=settings["seed"], unit="ears")
 
 
 def _summary(rows: Rows, condition: str) -> dict[str, Any]:
@@ -144,15 +148,17 @@ def _means(rows: Rows, condition: str) -> dict[str, Any]:
     }
 
 
-def _gap(rows: Rows, condition: str) -> dict[str, float]:
+def _gap(rows: Rows, condition: str) -> dict[str, float | None]:
     """Mean loss under each simulator, and the median over items of the network's relative distance from pyclarity's."""
     figures = [row["figures"][condition] for row in rows]
     losses = {f"loss_{name}": _mean(figures, f"loss_{name}") for name in SIMULATORS}
-    return losses | {
+    apart = [abs(own_gap) for own in figures if (own_gap := gap(own, "neuro", "pyclarity")) is not None]
+    return {
+        **losses,
         "neuro_to_msbg": gap(losses, "neuro", "msbg"),
         "neuro_to_pyclarity": gap(losses, "neuro", "pyclarity"),
         "msbg_to_pyclarity": gap(losses, "msbg", "pyclarity"),
-        "item_median": float(np.median([abs(gap(own, "neuro", "pyclarity")) for own in figures])),
+        "item_median": float(np.median(apart)) if apart else None,
     }
 
 

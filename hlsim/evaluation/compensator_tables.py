@@ -130,6 +130,10 @@ def severity_table(result: Mapping[str, Any], group: str) -> Table:
     return Table(f"{GROUPS[group]}, by degree of loss", header, rows)
 
 
+def _share(value: float | None, form: str) -> str:
+    return "n/a" if value is None else f"{100 * value:{form}} %"
+
+
 def gap_table(result: Mapping[str, Any]) -> Table:
     """The loss under the three simulators."""
     rows = []
@@ -137,8 +141,8 @@ def gap_table(result: Mapping[str, Any]) -> Table:
         for name, own in conditions.items():
             losses = [f"{own[f'loss_{simulator}']:.2f}" for simulator in ("neuro", "msbg", "pyclarity")]
             gaps = [own["neuro_to_msbg"], own["neuro_to_pyclarity"], own["msbg_to_pyclarity"]]
-            row = (f"{group}, {name}", *losses, *(f"{100 * part:+.1f} %" for part in gaps))
-            rows.append((*row, f"{100 * own['item_median']:.1f} %"))
+            row = (f"{group}, {name}", *losses, *(_share(part, "+.1f") for part in gaps))
+            rows.append((*row, _share(own["item_median"], ".1f")))
     header = (
         "What the ear is given",
         "Neuro-MSBG",

@@ -25,7 +25,7 @@ from hlsim.evaluation.judging import (
     judge,
     read_ears,
 )
-from hlsim.evaluation.measures import versions_of
+from hlsim.evaluation.measures import version_of, versions_of
 from hlsim.evaluation.report_files import check_out
 from hlsim.evaluation.simulators import samples_hash, weights_hash
 from hlsim.evaluation.store import ScoreStore, key_of
@@ -107,6 +107,8 @@ def evaluate_compensators(
     conditions = {UNAIDED: Unaided(), PRESCRIBED: NALR(sample_rate=RATE), **compensators}
     conditions = {name: module.eval() for name, module in conditions.items()}
     drawn = draw_judged_items(speech, noise, ears, items=items, seconds=seconds, seed=seed, levels=levels)
+    aided = {name: module for name, module in conditions.items() if name != UNAIDED}
+    curves = gain_curves(aided, shown, speech, levels, seed)  # first: what cannot be used shows at once
     judged = _judge_all(
         _Panel(drawn, conditions, load_pretrained(simulator), seed),
         ScoreStore(Path(out) / STORE),
@@ -126,8 +128,7 @@ def evaluate_compensators(
             "simulator": Path(simulator).name,
         },
     )
-    aided = {name: module for name, module in conditions.items() if name != UNAIDED}
-    result["gain_curves"] = gain_curves(aided, shown, speech, levels, seed)
+    result["gain_curves"] = curves
     write_compensators(result, reports, out)
     return result
 
@@ -146,7 +147,7 @@ class _Panel:
         weights = {name: weights_hash(module) for name, module in self.conditions.items()}
         about = {
             "revision": _REVISION,
-            "versions": versions_of(["haspi", "hasqi"]),
+            "versions": {**versions_of(["haspi", "hasqi"]), "hlsim": version_of("hlsim")},
             "simulator": weights_hash(self.simulator),
         }
         for number, item in enumerate(self.items):

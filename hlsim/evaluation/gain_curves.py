@@ -41,7 +41,8 @@ def insertion_gain(
     with torch.no_grad():
         for level in levels:
             given = set_level(speech, level)
-            taken, made = (_powers(signal) for signal in (given, compensator(given, ear)))
+            aided = torch.stack([compensator(utterance, ear) for utterance in given])
+            taken, made = (_powers(signal) for signal in (given, aided))
             curves.append((10.0 * (made / taken).log10()).tolist())
     return curves
 

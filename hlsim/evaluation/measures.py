@@ -25,6 +25,7 @@ class Measure(NamedTuple):
         packages: those whose versions its scores depend on.
         of_an_ear: whether audiogram, level and seed change the score. STOI and PESQ know none of them: they compare the
             signal at the ear with the clean speech, and do not say what is heard.
+        rewards_gain: whether more level alone brings a higher score.
         score: of (clean, processed, audiogram, rate in Hz, full_scale_spl, seed); raises ValueError where there is none.
     """
 
@@ -32,6 +33,7 @@ class Measure(NamedTuple):
     module: str
     packages: tuple[str, ...]
     of_an_ear: bool
+    rewards_gain: bool
     score: Callable[[np.ndarray, np.ndarray, Audiogram, int, float, int], float]
 
 
@@ -68,10 +70,10 @@ def measure_hasqi(
 
 
 MEASURES = {
-    "haspi": Measure("HASPI", "clarity", ("pyclarity", "numpy", "scipy"), True, measure_haspi),
-    "hasqi": Measure("HASQI", "clarity", ("pyclarity", "numpy", "scipy"), True, measure_hasqi),
-    "stoi": Measure("STOI", "pystoi", ("pystoi", "numpy", "scipy"), False, measure_stoi),
-    "pesq": Measure("PESQ", "pesq", ("pesq", "numpy", "torchaudio"), False, measure_pesq),
+    "haspi": Measure("HASPI", "clarity", ("pyclarity", "numpy", "scipy"), True, True, measure_haspi),
+    "hasqi": Measure("HASQI", "clarity", ("pyclarity", "numpy", "scipy"), True, False, measure_hasqi),
+    "stoi": Measure("STOI", "pystoi", ("pystoi", "numpy", "scipy"), False, False, measure_stoi),
+    "pesq": Measure("PESQ", "pesq", ("pesq", "numpy", "torchaudio"), False, False, measure_pesq),
 }
 """By the names that options and files use. Higher is better in all: HASPI, HASQI and STOI end at 1, PESQ at 4.64."""
 

@@ -129,6 +129,7 @@ class HaspiReport:
         baseline: the first condition, where all others are to be compared with it alone; by default every later one is
             with every earlier one.
         extra: further keys for ``report.json`` beside the others, such as ``nalr_mean``; what JSON can hold.
+        unit: what the items' listeners are called in sentences, such as ``ears``.
 
     Attributes:
         conditions: their names, in order, from the items' levels.
@@ -148,6 +149,7 @@ class HaspiReport:
     failures: Sequence[Failure] = ()
     baseline: str | None = None
     extra: Mapping[str, Any] = field(default_factory=dict)
+    unit: str = "listeners"
     conditions: Sequence[str] = field(init=False)
     comparisons: Sequence[Comparison] = field(init=False)
     headline: Comparison = field(init=False)
@@ -165,7 +167,7 @@ class HaspiReport:
             raise ValueError(
                 f"baseline is {self.baseline!r}; allowed: the first condition, {conditions[0]!r}"
             )
-        comparisons = compare_conditions(self.items, measures, conditions, self.baseline)
+        comparisons = compare_conditions(self.items, measures, conditions, self.baseline, self.unit)
         ends = (measures[0], conditions[0], conditions[-1])
         headline = next((c for c in comparisons if (c.measure, c.before, c.after) == ends), None)
         if headline is None:
@@ -256,7 +258,7 @@ class HaspiReport:
             "conditions": list(self.conditions),
             "measures": list(self.measures),
             "wilcoxon_zero_method": "wilcox",
-            "bootstrap": {"resamples": RESAMPLES, "method": "percentile", "seed": 0},
+            "bootstrap": {"resamples": RESAMPLES, "method": "expanded percentile", "seed": 0},
             "full_scale_spl": self.full_scale_spl,
             "clean_level_mean": self.clean_level_mean,
             "before_level_mean": self.before_level_mean,

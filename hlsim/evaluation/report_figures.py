@@ -13,7 +13,7 @@ from hlsim.evaluation.comparison import Comparison
 from hlsim.evaluation.figures import score_range
 from hlsim.evaluation.measures import MEASURES
 from hlsim.evaluation.page import Picture
-from hlsim.evaluation.significance import bootstrap_interval
+from hlsim.evaluation.significance import FEWEST, bootstrap_interval
 from hlsim.extras import require
 
 if TYPE_CHECKING:
@@ -150,7 +150,7 @@ def _by_severity(report: HaspiReport) -> Picture:
             scores = [_scores(group, measure, condition) for group in groups]
             axes.bar(at, [_mean(own) for own in scores], width * 0.9, label=condition)
             for place, own in zip(at, scores, strict=True):
-                if len(own) > 1:
+                if len(own) >= FEWEST:
                     axes.plot((place, place), bootstrap_interval(own), color="black", linewidth=1.0)
         axes.set_xticks(
             range(len(groups)), [f"{s} ({len(g)})" for s, g in zip(severities, groups, strict=True)]
@@ -163,11 +163,12 @@ def _by_severity(report: HaspiReport) -> Picture:
         axes.legend(fontsize="small")
 
     what = "; ".join(
-        f"{severity}: "
-        + ", ".join(f"{name} {_mean(_scores(group, measure, name)):.3f}" for name in report.conditions)
-        for severity, group in zip(severities, groups, strict=True)
+        f"{severity}: " + _means(report, group) for severity, group in zip(severities, groups, strict=True)
     )
-    caption = "By degree of loss, with 95 % bootstrap intervals of the means."
+    caption = (
+        "By degree of loss, of the items that have each score, with 95 % bootstrap intervals of the means from "
+        f"{FEWEST} items on."
+    )
     return Picture(draw_svg(draw), f"Mean {MEASURES[measure].title} by degree of loss: {what}.", caption)
 
 
@@ -183,7 +184,18 @@ def _by_snr(report: HaspiReport) -> Picture:
         axes.set(xlabel="SNR (dB)", ylabel=f"mean {MEASURES[measure].title}", ylim=score_range(measure))
         axes.legend(fontsize="small")
 
-    return Picture(draw_svg(draw), f"Mean {MEASURES[measure].title} by SNR, {len(snrs)} SNRs.", "By SNR.")
+    what = "; ".join(f"{snr:g} dB: " + _means(report, group) for snr, group in zip(snrs, groups, strict=True))
+    caption = "By SNR, of the items that have each score."
+    return Picture(draw_svg(draw), f"Mean {MEASURES[measure].title} by SNR: {what}.", caption)
+
+
+def _means(report: HaspiReport, items: Sequence[ItemScore]) -> str:
+    """Each condition's mean in words."""
+    told = []
+    for name in report.conditions:
+        scores = _scores(items, report.measures[0], name)
+        told.append(f"{name} " + (f"{_mean(scores):.3f}" if len(scores) else "n/a"))
+    return ", ".join(told)
 
 
 def _audiograms(report: HaspiReport) -> Picture:

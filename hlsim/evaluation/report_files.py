@@ -19,8 +19,8 @@ REPORT_FILES = ("report.json", "report.md", "report.tex", "report.html", "before
 def write_report(report: HaspiReport, out_dir: str | Path, *, listen: int = 3) -> Path:
     """Write ``report.json``, ``.md``, ``.tex``, ``.html`` and ``before-after.png`` into a folder, there or not.
 
-    All are written beside it first and then moved in, so that no file is ever half there. Reports of an earlier run are
-    replaced, other files stay.
+    All are written into a hidden folder in it first and then moved, so that no file is ever half there. Reports of an
+    earlier run are replaced, other files stay.
 
     Args:
         listen: how many items the page shows with spectrograms and players, where their files are known.
@@ -43,14 +43,14 @@ def write_report(report: HaspiReport, out_dir: str | Path, *, listen: int = 3) -
         "report.tex": latex(report),
         "report.html": html(report, listen),
     }
-    partial = None
+    partial, there = None, out.exists()
     try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        partial = Path(tempfile.mkdtemp(prefix=f".{out.name}.", suffix=".part", dir=out.parent))
+        out.mkdir(parents=True, exist_ok=True)
+        # in it, not beside it: it may be the root of a drive
+        partial = Path(tempfile.mkdtemp(prefix=".report.", suffix=".part", dir=out))
         for name, content in texts.items():
             (partial / name).write_text(content, encoding="utf-8")
         draw_report(report, partial / "before-after.png")
-        out.mkdir(exist_ok=True)
         for name in REPORT_FILES:
             (partial / name).replace(out / name)
     except OSError as error:
@@ -58,6 +58,8 @@ def write_report(report: HaspiReport, out_dir: str | Path, *, listen: int = 3) -
     finally:
         if partial is not None:
             shutil.rmtree(partial, ignore_errors=True)
+        if not there and out.is_dir() and not any(out.iterdir()):
+            out.rmdir()
     return out
 
 

@@ -154,9 +154,11 @@ def notes(report: HaspiReport) -> list[str]:
         + f"Clean speech at {report.clean_level_mean:.1f} dB SPL on average. {_full_scale(report)}",
         "Changes are after minus before, so a gain is positive. Deviations with n - 1; tests two-sided; "
         "d is the mean difference over the deviation of the differences, t / sqrt(n). "
-        "Intervals are percentiles of 9999 bootstrap resamples.",
+        "Intervals are percentiles of 9999 bootstrap resamples, expanded for few items (Hesterberg 2015); under six "
+        "there is none.",
         f'Wilcoxon: zero differences dropped ({zeros} of {n}; scipy\'s zero_method "wilcox"); W is the smaller rank sum.',
-        "The tests take the items as independent; where several share a talker or a listener, p is too small.",
+        "Tests and intervals take the items as independent; where several share a talker or a listener, p is too small "
+        "and the interval too narrow.",
     ]
     if isinstance(report.headline.mixed, str):
         lines.append(f"No mixed model: {report.headline.mixed}.")

@@ -127,7 +127,7 @@ def score_items(
             results[index][place[1:]] = Result(None, task.reason)
             continue
         if stored := store.get(task.key):
-            results[index][place[1:]] = _stored(stored)
+            results[index][place[1:]] = _stored(stored)._replace(seed=task.seed)  # some measures know none
             continue
         wanted.setdefault(task.key, []).append(place)
         tasks.setdefault(task.key, task)

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import hashlib
+import inspect
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
 from hlsim.evaluation.fidelity import pesq_wb, raw_mse, snr_db, stoi, third_octave_error_db
 from hlsim.evaluation.fidelity_items import LEVELS, RATE, Item, draw_items, treat
 from hlsim.evaluation.fidelity_report import fidelity_result, write_fidelity
-from hlsim.evaluation.measures import versions_of
+from hlsim.evaluation.measures import version_of, versions_of
 from hlsim.evaluation.store import ScoreStore, key_of
 from hlsim.evaluation.truth import pyclarity_msbg
 from hlsim.msbg import MSBG
@@ -75,7 +77,8 @@ def evaluate_simulators(
         )
     drawn = draw_items(speech, noise, audiograms, items=items, seconds=seconds, seed=seed, levels=levels)
     store = ScoreStore(Path(out) / STORE)
-    versions = versions_of(["stoi", "pesq", "haspi"])  # the last for pyclarity's, whose MSBG is the truth
+    # haspi's for pyclarity's, whose MSBG is the truth
+    versions = {**versions_of(["stoi", "pesq", "haspi"]), "hlsim": version_of("hlsim")}
     weights = {name: weights_hash(simulator) for name, simulator in simulators.items()}
     rows: dict[str, list[dict[str, Any]]] = {name: [] for name in simulators}
     total = items * len(inputs)
@@ -139,19 +142,55 @@ def _shown(items: Sequence[Item]) -> Item:
 
 
 def weights_hash(module: nn.Module) -> str:
-    """What makes a simulator or compensator this one: its class, its settings and its weights, kept in it or not."""
+    """What makes a simulator or compensator this one: its class, its settings and its weights, kept in it or not.
+
+    Of a class of your own the source counts too, where it can be had; not that of what it calls.
+    """
+    torchs = vars(nn.Module()).keys()  # what every module has
     settings = [
-        (place, name, value)
+        (place, name, _setting(value))
         for place, part in module.named_modules()
         for name, value in sorted(vars(part).items())
-        if isinstance(value, bool | int | float | str | tuple) and name != "training"
+        if name not in torchs
     ]
-    kind = f"{type(module).__module__}.{type(module).__qualname__}"
-    state = hashlib.sha256(f"{kind} {getattr(module, 'config', '')} {settings}".encode())
+    kinds = {type(part): None for part in module.modules()}
+    about = [f"{kind.__module__}.{kind.__qualname__} {_source(kind)}" for kind in kinds]
+    state = hashlib.sha256(f"{about} {getattr(module, 'config', '')} {settings}".encode())
     for name, tensor in (*module.named_parameters(), *module.named_buffers()):
         state.update(name.encode())
         state.update(tensor.detach().cpu().contiguous().numpy().tobytes())
     return state.hexdigest()
+
+
+def _setting(value: Any) -> Any:
+    """What tells one value from another, the same in every process; of other objects their class."""
+    if isinstance(value, bool | int | float | complex | str | bytes | None):
+        return value
+    if isinstance(value, list | tuple):
+        return [_setting(own) for own in value]
+    if isinstance(value, Mapping):
+        return sorted((repr(name), _setting(own)) for name, own in value.items())
+    if isinstance(value, np.ndarray):
+        return (
+            value.shape,
+            str(value.dtype),
+            hashlib.sha256(np.ascontiguousarray(value).tobytes()).hexdigest(),
+        )
+    if isinstance(value, Tensor):
+        return _setting(value.detach().cpu().numpy())
+    if isinstance(value, torch.dtype | torch.device):
+        return str(value)
+    return type(value).__qualname__
+
+
+def _source(kind: type) -> str:
+    """Of classes outside hlsim and torch: those have a version, which is in the keys."""
+    if kind.__module__.split(".")[0] in ("hlsim", "compensators", "torch", "torchaudio"):
+        return ""
+    try:
+        return inspect.getsource(kind)
+    except (OSError, TypeError):  # typed in, or compiled
+        return ""
 
 
 def samples_hash(*signals: Tensor) -> str:

@@ -88,16 +88,26 @@ def test_items_without_both_scores_are_left_out() -> None:
             draw(30, 0.2),
             ["HASPI rose by 0.2", "30 items", "Chance alone hardly explains it", "taken as independent"],
         ),
-        (draw(30, -0.2, louder=-6.0), ["HASPI fell by", "The level fell by 6.0 dB"]),
+        (
+            draw(30, -0.2, louder=-6.0),
+            ["HASPI fell by", "The level fell by 6.0 dB, and HASPI rewards gain", "attenuation"],
+        ),
+        (draw(30, 0.2, louder=-6.0), ["The level fell by 6.0 dB, so that gain does not explain a rise"]),
+        (draw(30, -0.2, louder=6.0), ["The level rose by 6.0 dB, so that gain does not explain a fall"]),
         (draw(10, 0.0), ["cannot be told from chance", "does not show that there is no change"]),
         (draw(30, 0.2, louder=20.0), ["The level rose by 20.0 dB, and HASPI rewards gain"]),
-        (draw(30, 0.2, listeners=6), ["Over the means of 6 listeners, which are independent"]),
+        (draw(30, 0.2, listeners=6), ["over the means of the 6 listeners the t-test has p"]),
         (draw(1, 0.2), ["one item", "Neither test is defined"]),
         (
             [item(i, {"a": 0.5, "b": 0.5}) for i in range(3)],
             ["HASPI did not change", "Neither test is defined"],
         ),
         ([item(i, {"a": 0.5, "b": 0.5001}) for i in range(3)], ["HASPI changed by less than 0.001"]),
+        # five rises: the least that Wilcoxon's p can be is 0.0625
+        (
+            [item(i, {"a": 0.5, "b": 0.7 + i / 1e3}) for i in range(5)],
+            ["Chance alone hardly explains it", "with so few Wilcoxon's cannot fall below 0.05"],
+        ),
         # nine small rises and a large fall: the ranks and the means disagree
         (
             [item(i, {"a": 0.5, "b": 0.51 + i / 1e3 if i < 14 else 0.1}) for i in range(15)],
@@ -115,6 +125,12 @@ def test_words_of_stoi_do_not_speak_of_gain() -> None:
     items = [replace(i, scores={"stoi": i.scores["haspi"]}) for i in draw(10, 0.1, louder=20.0)]
     (found,) = compare_conditions(items, ["stoi"], ["a", "b"])
     assert "STOI knows neither loss nor level" in found.in_words() and "rewards" not in found.in_words()
+
+
+def test_words_of_hasqi_do_not_say_that_it_rewards_gain() -> None:
+    items = [replace(i, scores={"hasqi": i.scores["haspi"]}) for i in draw(10, -0.1, louder=20.0)]
+    (found,) = compare_conditions(items, ["hasqi"], ["a", "b"], unit="ears")
+    assert "on which HASQI depends too" in found.in_words() and "rewards" not in found.in_words()
 
 
 def test_p_as_text() -> None:

@@ -269,6 +269,24 @@ def test_a_stopped_run_goes_on_and_new_weights_are_judged_anew(
     assert {curve["ear"] for curve in whole["gain_curves"]} == {*whole["ears"]}
 
 
+class OneAtATime(Gain):
+    def forward(self, waveform: Tensor, ear: Audiogram) -> Tensor:
+        assert waveform.dim() == 1
+        return super().forward(waveform, ear)
+
+
+@pytest.mark.usefixtures("quick")
+def test_an_ear_without_a_loss_and_a_module_for_one_signal(tmp_path: Path, speech_dir: Path) -> None:
+    options: dict[str, Any] = {"speech": speech_dir / "valid", "items": 2, "seconds": 0.3, "jobs": 1}
+    result = evaluate_compensators(
+        {"own": OneAtATime()}, **options, audiogram=Audiogram.standard("NH"), out=tmp_path
+    )
+    # nothing is lost of clean speech as it is: no loss to be relative to
+    unaided = result["gap"]["clean"]["unaided"]
+    assert unaided["loss_msbg"] == 0.0 and unaided["neuro_to_msbg"] is None and unaided["item_median"] is None
+    assert "n/a" in (tmp_path / "compensators.md").read_text()
+
+
 def test_nothing_to_judge(tmp_path: Path, speech_dir: Path) -> None:
     ear, folder = Audiogram.standard("N3"), speech_dir / "valid"
     options: dict[str, Any] = {"speech": folder, "out": tmp_path / "out", "jobs": 1}

@@ -14,7 +14,7 @@ import pytest
 from scipy import stats
 
 from hlsim.audiogram import Audiogram
-from hlsim.evaluation import Failure, HaspiReport, ItemScore, bootstrap_interval, write_report
+from hlsim.evaluation import Failure, HaspiReport, ItemScore, bootstrap_interval, report_files, write_report
 from hlsim.evaluation.report_files import REPORT_FILES
 
 for module in ("clarity", "joblib", "matplotlib"):
@@ -130,6 +130,19 @@ def test_files_are_replaced_and_others_stay(tmp_path: Path) -> None:
     assert json.loads((out / "report.json").read_text())["n"] == 5
     assert sorted(p.name for p in out.iterdir()) == sorted([*REPORT_FILES, "heard.wav"])
     assert [p.name for p in tmp_path.iterdir()] == ["out"]
+
+
+def test_nothing_is_written_beside_the_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It may be the root of a drive."""
+    original, seen = report_files.draw_report, []
+
+    def look(report: HaspiReport, path: Path) -> None:
+        seen.extend(own.name for own in tmp_path.iterdir())
+        original(report, path)
+
+    monkeypatch.setattr(report_files, "draw_report", look)
+    write_report(make_report(5), tmp_path / "out")
+    assert seen == ["out"] and sorted(p.name for p in (tmp_path / "out").iterdir()) == sorted(REPORT_FILES)
 
 
 @pytest.mark.parametrize("broken", ["picture", "nan"])

@@ -87,6 +87,16 @@ def test_equal_the_libraries_called_one_by_one(items: list[Item]) -> None:
         assert results["stoi", condition].seconds == 0.8
 
 
+def test_a_stored_score_has_the_seed_of_this_run(items: list[Item], tmp_path: Path) -> None:
+    """STOI knows no seed, so that a score of another run serves."""
+    store = tmp_path / "scores.jsonl"
+    first, second = (
+        score_items(items[:1], ("stoi",), store=ScoreStore(store), seed=seed, jobs=1)[0]["stoi", "noisy"]
+        for seed in (0, 7)
+    )
+    assert second == first._replace(seed=first.seed + 7)
+
+
 @pytest.mark.slow
 def test_two_processes_give_the_same(items: list[Item]) -> None:
     given = [replace(item, processed={"noisy": item.processed["noisy"]}) for item in items]

@@ -8,7 +8,7 @@ import pytest
 from scipy import stats
 
 from hlsim.evaluation import bootstrap_interval, holm, paired_comparison
-from hlsim.evaluation.significance import group_means
+from hlsim.evaluation.significance import FEWEST, group_means
 
 
 def draw(n: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
@@ -26,7 +26,10 @@ def test_equals_scipy(n: int) -> None:
     assert (c.n, c.zeros) == (n, 0)
     assert (c.t, c.p_t) == (t.statistic, t.pvalue)
     assert (c.w, c.p_w) == (w.statistic, w.pvalue)
-    assert c.ci_low is not None and c.ci_high is not None and c.ci_low <= c.delta <= c.ci_high
+    if n < FEWEST:
+        assert c.ci_low is None and c.ci_high is None
+    else:
+        assert c.ci_low is not None and c.ci_high is not None and c.ci_low <= c.delta <= c.ci_high
     assert c.before_mean == pytest.approx(before.mean(), abs=1e-15)
     assert c.after_std == pytest.approx(math.sqrt(((after - after.mean()) ** 2).sum() / (n - 1)), rel=1e-12)
     assert c.delta == pytest.approx(c.after_mean - c.before_mean, abs=1e-15)
@@ -62,13 +65,17 @@ def test_the_papers_row() -> None:
     assert abs(-24.113) / math.sqrt(1648) == pytest.approx(0.594, abs=5e-4)
 
 
-@pytest.mark.parametrize("n", [2, 12, 100])
-def test_interval_is_scipys(n: int) -> None:
+@pytest.mark.parametrize("n", [6, 12, 100])
+def test_interval_is_scipys_expanded(n: int) -> None:
     before, after = draw(n)
     c = paired_comparison(before, after)
+    wider = 1.0 - 2.0 * stats.norm.cdf(-stats.t.ppf(0.975, n - 1) * math.sqrt(n / (n - 1)))
+    assert wider > 0.95
     # scipy draws as we do where all resamples are drawn at once
     options = {"random_state": np.random.default_rng(0), "n_resamples": 9999, "method": "percentile"}
-    scipys = stats.bootstrap((after - before,), np.mean, **options).confidence_interval
+    scipys = stats.bootstrap(
+        (after - before,), np.mean, confidence_level=wider, **options
+    ).confidence_interval
     assert (c.ci_low, c.ci_high) == pytest.approx((scipys.low, scipys.high), abs=1e-12)
 
 
@@ -80,14 +87,33 @@ def test_interval_of_many_is_the_normal_one() -> None:
     narrow = bootstrap_interval(values, confidence=0.5)
     assert low < narrow[0] < values.mean() < narrow[1] < high
     assert bootstrap_interval(values, seed=1) != (low, high) == bootstrap_interval(values)
-    with pytest.raises(ValueError, match="1 values; an interval needs two or more"):
-        bootstrap_interval([0.5])
+    with pytest.raises(ValueError, match="5 values; an interval needs 6 or more"):
+        bootstrap_interval([0.5, 0.1, 0.2, 0.3, 0.4])
+
+
+def test_intervals_of_few_hold_the_mean_as_often_as_they_say() -> None:
+    rng = np.random.default_rng(6)
+    held = 0
+    for _ in range(400):
+        low, high = bootstrap_interval(rng.normal(size=8), resamples=999)
+        held += low <= 0.0 <= high
+    assert 0.91 < held / 400 < 0.98  # plain percentiles: 0.88
+
+
+def test_rounding_is_no_difference() -> None:
+    before, _ = draw(12)
+    rounded = before * (1.0 + 1e-9 * np.arange(-6, 6))
+    c = paired_comparison(before, rounded)
+    assert (c.zeros, c.t, c.p_t, c.w, c.p_w, c.cohens_d) == (12, None, None, None, None, None)
+    c = paired_comparison(before, before + 0.1)
+    assert (c.zeros, c.t, c.cohens_d) == (0, None, None) and c.delta == pytest.approx(0.1)
 
 
 def test_holm_by_hand_and_by_statsmodels() -> None:
     # 0.01 * 4, 0.02 * 3, 0.03 * 2, then not below its forerunner
     assert holm([0.03, 0.01, 0.04, 0.02]) == pytest.approx([0.06, 0.04, 0.06, 0.06])
     assert holm([0.9, 0.8, None]) == [1.0, 1.0, None]
+    assert holm([0.01, None, 0.02]) == pytest.approx([0.03, None, 0.04])  # as many as are named
     assert holm([]) == [] and holm([None]) == [None] and holm([0.04]) == [0.04]
     multitest = pytest.importorskip("statsmodels.stats.multitest")
     p = np.random.default_rng(5).uniform(0, 0.2, 30)

@@ -2,7 +2,9 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -147,6 +149,34 @@ def test_modules_that_differ_in_a_setting_differ_in_their_scores_name() -> None:
     ]
     assert len({weights_hash(module) for module in modules}) == len(modules)
     assert weights_hash(MSBG(sample_rate=16000)) == weights_hash(modules[0])
+
+
+class Own(torch.nn.Module):
+    """A module whose settings are no numbers."""
+
+    def __init__(self, gains: Any) -> None:
+        super().__init__()
+        self._gains = gains
+
+
+def test_settings_of_any_kind_tell_modules_apart(monkeypatch: pytest.MonkeyPatch) -> None:
+    kinds = (
+        [1.0],
+        [2.0],
+        {"a": 1.0},
+        {"a": 2.0},
+        None,
+        np.ones(2),
+        np.zeros(2),
+        torch.ones(3),
+        torch.float32,
+    )
+    hashes = [weights_hash(Own(gains)) for gains in kinds]
+    assert len(set(hashes)) == len(hashes)
+    assert hashes == [weights_hash(Own(gains)) for gains in kinds]
+    # what a class of one's own does counts too
+    monkeypatch.setattr("inspect.getsource", lambda kind: "changed")
+    assert weights_hash(Own([1.0])) != hashes[0]
 
 
 def test_unknown_teacher(tmp_path: Path, speech_dir: Path, ears: Path) -> None:
