@@ -42,17 +42,14 @@ def shared_multiple(rate: int) -> int:
     return multiple if multiple <= _SHARED_MULTIPLE else 0
 
 
-def hear(spectrum: Tensor, ratios: Tensor | None, plan: Plan, slight: bool) -> Tensor:
+def hear(spectrum: Tensor, ratios: Tensor, plan: Plan, slight: bool) -> Tensor:
     """Filter bank and recruitment of a periodic signal.
 
     Shape: (items, points // (2 step) + 1), (items, channels) -> as the first, where points and step are the plan's.
 
     Args:
-        ratios: none for ears that hear everything at its level, 0 dB HL throughout.
         slight: look after the kinks of slight losses, which a smeared signal buries.
     """
-    if ratios is None:
-        return spectrum * plan.total
     waves, sums = [], []
     for tier in plan.tiers:
         bins = spectrum[..., None, : tier.points // 2 + 1]

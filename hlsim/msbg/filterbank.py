@@ -1,7 +1,6 @@
 """MSBG's gammatone filter banks: one a degree of loss, evaluated on an FFT grid."""
 
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -102,33 +101,43 @@ BANKS = {"none": _NARROW, "mild": _NARROW, "moderate": _MIDDLE, "severe": _WIDE}
 """The bank of each severity."""
 
 
-@lru_cache(maxsize=2)
-def gammatone_response(bank: FilterBank, points: int) -> NDArray[np.complex128]:
-    """Frequency responses of all channels, advances and high-passes included.
+def gammatone_response(
+    bank: FilterBank, points: int, channels: slice = slice(None), bins: int | None = None
+) -> NDArray[np.complex128]:
+    """Frequency responses of channels, advances and high-passes included.
 
     Each channel is four times the one-zero, two-pole gammatone stage g (1 - r cos(w) / z) / (1 - 2 r cos(w) / z + r^2 /
     z^2) with r = exp(-2 pi broadening ERB / fs), w = 2 pi f / fs and unit gain at its frequency f.
 
     Args:
         points: FFT length; the grid is that of ``rfft`` at 44.1 kHz.
+        channels: which of the bank's; all by default.
+        bins: how many, from 0 Hz up; all by default.
 
-    Returns: (channels, points // 2 + 1).
+    Returns: (channels, points // 2 + 1), or as many channels and bins as were asked for.
     """
-    centre = np.array(bank.centre_frequencies)[:, None]
-    omega = 2.0 * np.pi * np.fft.rfftfreq(points)[None]
+    chosen = range(bank.channels)[channels]
+    centre = np.array(bank.centre_frequencies)[chosen, None]
+    omega = 2.0 * np.pi * np.arange(points // 2 + 1 if bins is None else bins)[None] / points
+    own = 2.0 * np.pi * centre / RATE
     radius = np.exp(-2.0 * np.pi * bank.broadening * erb(centre) / RATE)
-    cosine = np.cos(2.0 * np.pi * centre / RATE)
 
     def stage(w: NDArray[np.floating]) -> NDArray[np.complex128]:
-        z = np.exp(-1j * w)
-        return (1.0 - radius * cosine * z) / (1.0 - 2.0 * radius * cosine * z + radius**2 * z**2)
+        delayed = radius * np.exp(-1j * w)
+        out = 1.0 - np.cos(own) * delayed
+        out /= out - np.cos(own) * delayed + delayed**2
+        return out
 
-    response = (stage(omega) / np.abs(stage(2.0 * np.pi * centre / RATE))) ** ORDER
-    response *= np.exp(1j * omega * np.array(bank.advances)[:, None])
-    corners = _CORNER_STEP * np.array(bank.highpass_corners)[:, None]
-    upper = slice(bank.first_highpass, None)
-    unity = np.abs(_bessel_highpass(corners, 2.0 * np.pi * centre[upper] / RATE))
-    response[upper] *= _bessel_highpass(corners, omega) / unity
+    response = stage(omega) / np.abs(stage(own))
+    for _ in range(2):  # to the fourth
+        response *= response
+    response *= np.exp(1j * omega * np.array(bank.advances)[chosen, None])
+    first = bank.first_highpass
+    upper = [place for place, channel in enumerate(chosen) if channel >= first]
+    if upper:
+        corners = _CORNER_STEP * np.array(bank.highpass_corners)[[chosen[i] - first for i in upper], None]
+        unity = np.abs(_bessel_highpass(corners, own[upper]))
+        response[upper] *= _bessel_highpass(corners, omega) / unity
     return response
 
 

@@ -15,7 +15,7 @@ from hlsim.msbg.filterbank import BANKS, gammatone_response
 from hlsim.msbg.fourier import block_points
 from hlsim.msbg.recruitment import envelope_lowpass
 from hlsim.msbg.smearing import BROADENING, smearing_matrix
-from hlsim.msbg.tiers import Plan, make_plan
+from hlsim.msbg.tiers import Plan, make_plan, total_response
 
 
 class Filters:
@@ -62,8 +62,7 @@ def _bytes(made: Any) -> int:
     if isinstance(made, Tensor):
         return made.nbytes
     if isinstance(made, Plan):
-        tensors = [made.lowpass, made.total, *(tier.response for tier in made.tiers)]
-        return sum(tensor.nbytes for tensor in tensors)
+        return made.lowpass.nbytes + sum(tier.response.nbytes for tier in made.tiers)
     raise AssertionError(type(made))
 
 
@@ -84,6 +83,8 @@ def _array(kind: str, key: tuple[Any, ...]) -> np.ndarray[Any, Any]:
         case "smearing", severity, step:
             half = 256 // step
             return smearing_matrix(*BROADENING[severity])[:half, :half]
+        case "total", severity, points, step:
+            return total_response(severity, points, step)
         case "bank", severity, points:
             return gammatone_response(BANKS[severity], points)
         case "lowpass", severity, points:

@@ -172,10 +172,12 @@ class MSBG(nn.Module):
         length = heard.shape[-1]
         if self.aligned:
             points = bank_points(length * step, rate)
-            plan = filters.get("plan", severity, points, step)
-            spectrum = hear(
-                rfft(heard, points // step), None if none else ratios, plan, severity not in BROADENING
-            )
+            spectrum = rfft(heard, points // step)
+            if none:
+                spectrum = spectrum * filters.get("total", severity, points, step)
+            else:
+                plan = filters.get("plan", severity, points, step)
+                spectrum = hear(spectrum, ratios, plan, severity not in BROADENING)
             if severity in BROADENING:
                 return scale * from_spectrum(spectrum, points, step, rate, samples, delay, filters)
             # without smearing's delay, the way out reaches samples that the advances put before the first one

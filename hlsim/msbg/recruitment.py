@@ -9,7 +9,7 @@ from functools import lru_cache
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.signal import ellip, freqz
+from scipy.signal import ellip
 from torch import Tensor
 
 from hlsim.audiogram import FREQUENCIES
@@ -153,8 +153,9 @@ def expand(channels: Tensor, envelopes: Tensor, ratios: Tensor) -> Tensor:
     return weigh(channels, around(gains(envelopes, ratios)), kernel, (envelopes, ratios))
 
 
-@lru_cache(maxsize=4)
-def envelope_lowpass(bank: FilterBank, points: int, step: int = 1) -> NDArray[np.complex128]:
+def envelope_lowpass(
+    bank: FilterBank, points: int, step: int = 1, channels: slice = slice(None)
+) -> NDArray[np.complex128]:
     """Response that turns the rfft of ``decimate``'s means into that of the envelope at samples 0, 16, ...
 
     The low-pass is ``ellip(2, 0.25, 35)`` at 3/4 of 100 Hz or of the channel's ERB if less, run forwards and backwards
@@ -163,17 +164,21 @@ def envelope_lowpass(bank: FilterBank, points: int, step: int = 1) -> NDArray[np
     Args:
         points: FFT length at 44.1 kHz, a multiple of 16.
         step: samples at 44.1 kHz from one of the rectified signal's to the next.
+        channels: which of the bank's; all by default.
 
     Returns: (channels, points // 32 + 1).
     """
     omega = 2.0 * np.pi * np.arange(points // STEP // 2 + 1) / points
-    rows = [np.abs(freqz(*coefficients, omega)[1]) ** 2 for coefficients in envelope_filters(bank)]
+    powers = np.exp(-1j * omega) ** np.arange(3)[:, None]
+    numerators, denominators = np.array(envelope_filters(bank)[channels]).swapaxes(0, 1)
+    rows = np.abs((numerators @ powers) / (denominators @ powers)) ** 2
     with np.errstate(invalid="ignore"):
         box = np.sin(STEP * omega / 2.0) / (STEP // step * np.sin(step * omega / 2.0))
     box[0] = 1.0
-    return np.array(rows) / box**_BOXES * np.exp(-0.5j * (STEP - step) * omega)
+    return rows / box**_BOXES * np.exp(-0.5j * (STEP - step) * omega)
 
 
+@lru_cache(maxsize=4)
 def envelope_filters(bank: FilterBank) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
     """Numerator and denominator of each channel's low-pass."""
     widths = erb(np.array(bank.centre_frequencies))

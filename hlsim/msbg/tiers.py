@@ -56,7 +56,6 @@ class Plan:
     """A bank on the FFT grid of a length: ``tiers`` from the lowest channels up, and the envelopes' ``lowpass``.
 
     Attributes:
-        total: the sum of the channels' responses, (points // step // 2 + 1,), for ears with no loss at all.
         lowpass: (channels, points // 32 + 1).
         step: that of the widest channels, 1 or 2.
         points: FFT length at 44.1 kHz, a multiple of 16.
@@ -66,7 +65,6 @@ class Plan:
     step: int
     tiers: tuple[Tier, ...]
     lowpass: Tensor
-    total: Tensor
 
 
 def assign(bank: FilterBank, step: int) -> list[tuple[slice, int, bool]]:
@@ -98,12 +96,11 @@ def make_plan(severity: str, points: int, step: int, dtype: torch.dtype, device:
         return torch.from_numpy(np.ascontiguousarray(values)).to(device=device, dtype=kind)
 
     bank = BANKS[severity]
-    full = gammatone_response(bank, points)
     tiers, lowpass = [], []
     with torch.inference_mode(False):
         for channels, own, as_is in _parts(assign(bank, step), points, device):
             count = points // own
-            response = full[channels, : count // 2 + 1] * (step / own)
+            response = gammatone_response(bank, points, channels, count // 2 + 1) * (step / own)
             if own > 1 and count % 2 == 0:
                 response[:, -1] = 0.0
             if not as_is:
@@ -111,11 +108,16 @@ def make_plan(severity: str, points: int, step: int, dtype: torch.dtype, device:
             kernels = tensor(decimation_kernel(own)), tensor(interpolation_kernel(own))
             series = None if as_is else _series(own)
             tiers.append(Tier(channels, own, count, tensor(response), series, *kernels))
-            lowpass.append(envelope_lowpass(bank, points, own)[channels])
-        total = full[:, : points // step // 2 + 1].sum(0)
-        if step > 1 and (points // step) % 2 == 0:
-            total[-1] = 0.0
-        return Plan(points, step, tuple(tiers), tensor(np.concatenate(lowpass)), tensor(total))
+            lowpass.append(envelope_lowpass(bank, points, own, channels))
+        return Plan(points, step, tuple(tiers), tensor(np.concatenate(lowpass)))
+
+
+def total_response(severity: str, points: int, step: int) -> NDArray[np.complex128]:
+    """The sum of all channels, for ears with no loss at all. Returns (points // step // 2 + 1,)."""
+    total = gammatone_response(BANKS[severity], points, bins=points // step // 2 + 1).sum(0)
+    if step > 1 and (points // step) % 2 == 0:
+        total[-1] = 0.0
+    return total
 
 
 def _parts(
