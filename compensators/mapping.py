@@ -68,6 +68,10 @@ class MappingCompensator(EarNetwork):
     def extra_repr(self) -> str:
         return f"sample_rate={self.sample_rate}, full_scale_spl={self.full_scale_spl:g}, start={self.config.start!r}"
 
+    @property
+    def _dtype(self) -> torch.dtype:
+        return self.magnitude_decoder.leave.weight.dtype
+
     def _finish(self, result: Tensor) -> Tensor:
         # last of all, for resampling can overshoot
         return soft_limit(result, 10.0 ** ((self.config.limit_spl - PASCAL_SPL) / 20.0))

@@ -10,7 +10,7 @@ from scipy.signal.windows import hamming
 from torch import Tensor, nn
 
 from hlsim.audio import check_rate, check_waveform
-from hlsim.audiogram import FREQUENCIES, AudiogramLike, as_thresholds
+from hlsim.audiogram import FREQUENCIES, AudiogramLike, own_thresholds
 from hlsim.calibration import PASCAL_SPL, check_full_scale
 from hlsim.fir import frequency_sampling_fir
 from hlsim.msbg.model import resolve_thresholds
@@ -52,8 +52,7 @@ class NALR(nn.Module):
         if order % 2 or not 2 <= order <= 1022:
             raise ValueError(f"order of the NAL-R filter is {order}; allowed: even numbers from 2 to 1022")
         self.order = order
-        stored = None if audiogram is None else as_thresholds(audiogram)
-        self.register_buffer("thresholds", stored, persistent=False)
+        self.register_buffer("thresholds", own_thresholds(audiogram), persistent=False)
 
     def forward(self, waveform: Tensor, audiogram: AudiogramLike | None = None) -> Tensor:
         """The amplified waveform.

@@ -113,7 +113,7 @@ class Audiogram:
         """Read what ``to_dict`` wrote. Raises ValueError where ``levels`` is missing."""
         if "levels" not in data:
             raise ValueError(f"an audiogram dictionary needs 'levels', got {sorted(data)}")
-        return cls(tuple(data["levels"]), tuple(data.get("frequencies", FREQUENCIES)))
+        return cls(data["levels"], data.get("frequencies", FREQUENCIES))
 
     def to_row(self) -> dict[str, str]:
         """Columns ``hl_250`` and so on for a CSV file."""
@@ -183,17 +183,26 @@ def as_thresholds(audiogram: AudiogramLike) -> Tensor:
         raise ValueError(
             f"audiogram is {type(audiogram).__name__}; allowed: an Audiogram, a sequence of them, or a (..., 8) tensor"
         )
-    if levels.ndim == 0 or levels.shape[-1] != len(FREQUENCIES):
+    if levels.ndim == 0 or levels.shape[-1] != len(FREQUENCIES) or not levels.numel():
         raise ValueError(
             f"audiogram tensor of shape {tuple(levels.shape)}; allowed: (..., 8), dB HL at {_listed(FREQUENCIES)} Hz"
         )
     with torch.no_grad():
-        if not bool(((levels >= LOWEST_LEVEL) & (levels <= HIGHEST_SIMULATED)).all()):
+        good = ((levels >= LOWEST_LEVEL) & (levels <= HIGHEST_SIMULATED)).all(-1)
+        if not bool(good.all()):
             raise ValueError(
-                f"audiogram levels {_listed(levels.reshape(-1, 8)[0].tolist())} dB HL ...; a simulator takes "
+                f"audiogram levels {_listed(levels[~good][0].tolist())} dB HL; a simulator takes "
                 f"{LOWEST_LEVEL:g} to {HIGHEST_SIMULATED:g} (MSBG is singular at 105)"
             )
     return levels
+
+
+def own_thresholds(audiogram: AudiogramLike | None) -> Tensor | None:
+    """``as_thresholds`` to keep: a copy, for the caller may write into its tensor; one that is trained stays itself."""
+    if audiogram is None:
+        return None
+    levels = as_thresholds(audiogram)
+    return levels if levels.requires_grad else levels.clone()
 
 
 def read_audiograms(path: str | Path, *, simulated: bool = False) -> list[tuple[dict[str, str], Audiogram]]:
@@ -257,6 +266,8 @@ def draw_thresholds(count: int, generator: torch.Generator | None = None) -> Ten
 
 def _numbers(values: Iterable[float], what: str) -> tuple[float, ...]:
     try:
+        if isinstance(values, str):  # whose characters are no levels
+            raise TypeError
         numbers = tuple(float(value) for value in values)
     except (TypeError, ValueError):
         raise ValueError(f"audiogram {what} {values!r}; allowed: numbers") from None

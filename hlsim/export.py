@@ -35,6 +35,8 @@ def export_program(
 ) -> torch.export.ExportedProgram:
     """The simulator as a ``torch.export`` program of (items, time) at 16 kHz and (items, 8) dB HL -> (items, time).
 
+    It is for inference: a program of Mamba blocks gives no gradient.
+
     Raises:
         ValueError: not a Neuro-MSBG at 16 kHz, or a part that cannot be exported.
     """

@@ -46,7 +46,8 @@ class HearingLossLoss(nn.Module):
 
     The simulator is frozen: it stays in eval mode, has no trainable parameter, and is not registered, so that neither the
     parameters nor the checkpoint of a module that holds this loss know of it. It moves with ``.to()`` all the same, and
-    gradients pass through it to the compensated speech.
+    gradients pass through it to the compensated speech. Being one for all, it is not for ``nn.DataParallel``; use
+    ``DistributedDataParallel``.
 
     Levels matter, nothing is normalised: 65 dB SPL is RMS 0.035 at the default ``full_scale_spl``.
 
@@ -54,7 +55,8 @@ class HearingLossLoss(nn.Module):
         audiogram: the ear or ears; may be given with each call instead.
         simulator: ``"neuro-msbg"`` or another checkpoint's name or folder; ``"msbg"``, the exact model; or a module
             called as they are, which is frozen as it stands (give a copy of one that still trains).
-        sample_rate: of the speech in Hz, 16000 to 48000. Neuro-MSBG judges the band under 7.5 kHz at any of them.
+        sample_rate: of the speech in Hz, 16000 to 48000. Neuro-MSBG judges the band under 8 kHz, above 16000 that under
+            7.5 kHz.
         full_scale_spl: level in dB SPL of RMS 1.0.
         reference: what is heard is compared with ``"clean"``, the clean speech itself, or ``"normal-hearing"``, what the
             same simulator makes of it at 0 dB HL.
@@ -63,7 +65,7 @@ class HearingLossLoss(nn.Module):
         weights: of the parts by name; a part left out does not count.
 
     Raises:
-        ValueError: an unknown name, a value out of range, or a simulator made for another rate or level.
+        ValueError: an unknown name, a value out of range, a simulator made for another rate or level, or one that delays.
     """
 
     def __init__(
@@ -86,7 +88,7 @@ class HearingLossLoss(nn.Module):
             raise ValueError(f"criterion is {criterion!r}; allowed: {', '.join(CRITERIA)}")
         self.reference, self.criterion = reference, criterion
         self.weights = _check_weights(CRITERIA[criterion] if weights is None else weights, criterion)
-        self.thresholds = None if audiogram is None else as_thresholds(audiogram).detach()
+        self.thresholds = None if audiogram is None else as_thresholds(audiogram).detach().clone()
         built = _build(simulator, self.sample_rate, self.full_scale_spl)
         self._unregistered = (built.eval().requires_grad_(False),)  # in a tuple, nn.Module does not see it
 
@@ -143,6 +145,11 @@ class HearingLossLoss(nn.Module):
         )
 
     def _hear(self, waveform: Tensor, thresholds: Tensor) -> Tensor:
+        weight = next(self.simulator.parameters(), None)
+        if weight is not None and weight.device != waveform.device:
+            raise ValueError(
+                f"the speech is on {waveform.device} and the simulator on {weight.device}; move the loss with .to()"
+            )
         heard: Tensor = self.simulator(waveform, thresholds)
         if heard.shape[-1] != waveform.shape[-1]:
             raise ValueError(
@@ -191,6 +198,10 @@ def _build(simulator: str | Path | nn.Module, sample_rate: int, full_scale_spl: 
                 raise ValueError(
                     f"the simulator has {name} {getattr(simulator, name):g} and the loss {own:g}; allowed: the same"
                 )
+        if getattr(simulator, "aligned", True) is False:
+            raise ValueError(
+                "the simulator delays what it hears; allowed: one that does not, as MSBG(aligned=True)"
+            )
         return simulator
     if simulator == "msbg":
         return MSBG(sample_rate=sample_rate, full_scale_spl=full_scale_spl)
@@ -206,4 +217,8 @@ def _check_weights(weights: Mapping[str, float], criterion: str) -> dict[str, fl
     checked = {name: float(weight) for name, weight in weights.items()}
     if not all(math.isfinite(weight) and weight >= 0.0 for weight in checked.values()):
         raise ValueError(f"weights {checked}; allowed: finite numbers, 0 or more")
+    if not any(checked.values()):
+        raise ValueError(
+            f"weights {checked} count nothing; allowed: one above 0 at least, of {', '.join(allowed)}"
+        )
     return checked

@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 import torch
 
+from compensators import NALR
+from hlsim import MSBG
 from hlsim.audiogram import (
     FREQUENCIES,
     SEVERITIES,
@@ -242,7 +244,8 @@ def test_thresholds_for_a_simulator() -> None:
         (torch.tensor(3.0), r"shape \(\); allowed"),
         (torch.tensor([0.0] * 7 + [float("nan")]), "takes -10 to 100"),
         (torch.tensor([0.0] * 7 + [100.1]), "takes -10 to 100"),
-        (torch.tensor([[0.0] * 8, [-10.1] * 8]), "takes -10 to 100"),
+        (torch.tensor([[0.0] * 8, [-10.1] * 8]), "levels -10.1, -10.1, .*takes -10 to 100"),
+        (torch.zeros(0, 8), r"shape \(0, 8\); allowed"),
         (Audiogram.standard("N7"), "takes -10 to 100"),
         ([0.0] * 8, "is list; allowed: an Audiogram, a sequence of them, or a .* tensor"),
         ([], "is list; allowed"),
@@ -254,6 +257,21 @@ def test_thresholds_for_a_simulator() -> None:
 def test_what_is_no_ear_for_a_simulator(audiogram: Any, said: str) -> None:
     with pytest.raises(ValueError, match=said):
         as_thresholds(audiogram)
+
+
+@pytest.mark.parametrize("levels", ["12345678", 3])
+def test_what_holds_no_numbers(levels: Any) -> None:
+    for make in (Audiogram, lambda own: Audiogram.from_dict({"levels": own})):
+        with pytest.raises(ValueError, match="allowed: numbers"):
+            make(levels)
+
+
+@pytest.mark.parametrize("make", [MSBG, NALR])
+def test_a_stored_ear_is_its_own(make: Any) -> None:
+    given = torch.full((8,), 40.0)
+    module = make(given)
+    given.fill_(105.0)
+    assert torch.equal(module.thresholds, torch.full((8,), 40.0))
 
 
 def test_thresholds_keep_their_gradient() -> None:

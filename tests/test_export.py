@@ -15,9 +15,12 @@ def example(items: int = 2, seconds: float = 0.5) -> tuple[Tensor, Tensor]:
     return 0.03 * torch.randn(items, round(16000 * seconds)), ears[:items]
 
 
-@pytest.mark.parametrize(("items", "seconds"), [(2, 0.5), (1, 1.1)])
-def test_a_program_gives_the_simulators_outputs(items: int, seconds: float) -> None:
-    simulator = load_pretrained("neuro-msbg", full_scale_spl=100.0)
+@pytest.mark.parametrize(
+    ("name", "items", "seconds"),
+    [("neuro-msbg", 2, 0.5), ("neuro-msbg", 1, 1.1), ("neuro-msbg-mamba", 2, 0.5)],
+)
+def test_a_program_gives_the_simulators_outputs(name: str, items: int, seconds: float) -> None:
+    simulator = load_pretrained(name, full_scale_spl=100.0)
     # first of all at this length, so that nothing made in the export may serve the simulator
     program = export_program(simulator, seconds=seconds, items=items).module()
     wave, ears = example(items, seconds)

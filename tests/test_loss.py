@@ -447,6 +447,11 @@ def test_simulator_by_folder_and_as_a_module(clean: Tensor) -> None:
         ({"criterion": "bands", "weights": {"phase": 1.0}}, "phase .*'bands'; allowed: band_levels"),
         ({"weights": {"time": -1.0}}, "allowed: finite numbers, 0 or more"),
         ({"weights": {"time": float("nan")}}, "allowed: finite numbers, 0 or more"),
+        ({"weights": {}}, "count nothing; allowed: one above 0 at least, of magnitude"),
+        (
+            {"simulator": MSBG(sample_rate=16000, aligned=False)},
+            r"allowed: one that does not, as MSBG\(aligned=True\)",
+        ),
         ({"audiogram": Audiogram.standard("N7")}, "takes -10 to 100"),
         ({"audiogram": torch.zeros(7)}, "allowed: .*8"),
         ({"simulator": MSBG()}, "simulator has sample_rate 44100 and the loss 16000; allowed: the same"),
@@ -482,9 +487,29 @@ def test_what_cannot_be_compared(simulator: str) -> None:
 
 
 def test_simulator_must_keep_the_length() -> None:
-    loss = HearingLossLoss(N3, simulator=MSBG(sample_rate=44100, aligned=False), sample_rate=44100)
-    with pytest.raises(ValueError, match=r"made \d+ samples of 4000; allowed: .*aligned=True"):
+    class Longer(nn.Module):
+        def forward(self, waveform: Tensor, audiogram: Tensor) -> Tensor:
+            return nn.functional.pad(waveform, (0, 100))
+
+    loss = HearingLossLoss(N3, simulator=Longer())
+    with pytest.raises(ValueError, match=r"made 4100 samples of 4000; allowed: .*aligned=True"):
         loss(torch.randn(4000), torch.randn(4000))
+
+
+def test_another_device_is_named() -> None:
+    loss = HearingLossLoss(N3).to("meta")
+    with pytest.raises(
+        ValueError, match=r"speech is on cpu and the simulator on meta; move the loss with \.to\(\)"
+    ):
+        loss(torch.randn(4000), torch.randn(4000))
+
+
+def test_a_stored_ear_is_its_own(clean: Tensor) -> None:
+    given = torch.full((8,), 40.0)
+    loss = HearingLossLoss(given)
+    before = loss(2.0 * clean, clean)
+    given.fill_(0.0)
+    assert torch.equal(loss(2.0 * clean, clean), before)
 
 
 def test_import_leaves_the_compiler_alone() -> None:

@@ -12,7 +12,7 @@ def estimate_delay(
     """Delay in samples by a unit impulse: where the output's largest magnitude lies after the impulse.
 
     The impulse stands in the middle of a second of silence (Section III-A of the paper). What comes back depends on ear
-    and level, for the sum of MSBG's channels is dispersive: 1078 with no loss and 1170 to 1271 with one at 44.1 kHz. To
+    and level, for the sum of MSBG's channels is dispersive: 1078 with no loss and 1237 to 1271 with one at 44.1 kHz. To
     align signals use ``MSBG.delay``, which does not.
 
     Args:

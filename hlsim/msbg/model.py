@@ -9,7 +9,7 @@ from torch.nn import functional
 from torch.utils.checkpoint import checkpoint
 
 from hlsim.audio import check_rate, check_waveform
-from hlsim.audiogram import SEVERITIES, AudiogramLike, as_thresholds, severity_index
+from hlsim.audiogram import SEVERITIES, AudiogramLike, as_thresholds, own_thresholds, severity_index
 from hlsim.calibration import PASCAL_SPL, check_full_scale, gain_to_pascals
 from hlsim.msbg.cochlea import bank_points, hear, hear_ending
 from hlsim.msbg.ear import RATE
@@ -77,9 +77,7 @@ class MSBG(nn.Module):
         self.full_scale_spl = check_full_scale(full_scale_spl)
         self.aligned = aligned
         self.rescale_active = rescale_active
-        self.register_buffer(
-            "thresholds", None if audiogram is None else as_thresholds(audiogram), persistent=False
-        )
+        self.register_buffer("thresholds", own_thresholds(audiogram), persistent=False)
 
     def forward(self, waveform: Tensor, audiogram: AudiogramLike | None = None) -> Tensor:
         """What the ear hears.

@@ -20,6 +20,9 @@ CHOICES = {
 }
 
 
+_COUNTS = ("fft", "window", "hop", "channels", "dense_depth", "blocks", "expansion", "states", "heads")
+
+
 @dataclass(frozen=True)
 class NetworkConfig:
     """Sizes that simulators and compensators share.
@@ -52,27 +55,25 @@ class NetworkConfig:
     heads: int = 4
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "stride", tuple(self.stride))
-        object.__setattr__(self, "kernel", tuple(self.kernel))
-        _ = self.stft
-        counts = (
-            self.channels,
-            self.dense_depth + 1,
-            self.blocks,
-            self.expansion,
-            self.states,
-            self.heads,
-            *self.stride,
-            *self.kernel,
-        )
-        if (
-            any(not isinstance(count, int) or count < 1 for count in counts)
-            or any(k % 2 == 0 for k in self.kernel)
-            or (self.block == "transformer" and self.channels % self.heads)
+        for name in ("stride", "kernel"):
+            pair = getattr(self, name)
+            if not isinstance(pair, list | tuple) or len(pair) != 2:
+                raise ValueError(f"{name} {pair!r}; allowed: two whole numbers, of time and of frequency")
+            object.__setattr__(self, name, tuple(pair))
+        counts = {name: getattr(self, name) for name in _COUNTS}
+        for name, values in {**counts, "stride": self.stride, "kernel": self.kernel}.items():
+            least = 0 if name == "dense_depth" else 1
+            for value in values if isinstance(values, tuple) else (values,):
+                if not isinstance(value, int) or isinstance(value, bool) or value < least:
+                    raise ValueError(f"{name} {values!r}; allowed: whole numbers of {least} or more")
+        if any(k % 2 == 0 for k in self.kernel) or (
+            self.block == "transformer" and self.channels % self.heads
         ):
             raise ValueError(
-                f"{self}; allowed: whole numbers of 1 or more, kernels odd, heads that divide the channels"
+                f"kernel {self.kernel}, {self.heads} heads of {self.channels} channels; allowed: odd kernels, heads that "
+                "divide the channels"
             )
+        _ = self.stft
         for name, allowed in CHOICES.items():
             if getattr(self, name, allowed[0]) not in allowed:
                 raise ValueError(f"{name} {getattr(self, name)!r}; allowed: {', '.join(allowed)}")
@@ -86,7 +87,9 @@ class NetworkConfig:
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Self:
-        """Read what ``to_dict`` wrote. Raises ValueError where a name is unknown."""
+        """Read what ``to_dict`` wrote. Raises ValueError where a name is unknown, or a value none that is allowed."""
+        if not isinstance(data, Mapping):
+            raise ValueError(f"network settings {data!r}; allowed: names with values")
         refuse_unknown(data, (field.name for field in fields(cls)), "network settings")
         return cls(**dict(data))
 

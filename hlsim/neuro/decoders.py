@@ -62,7 +62,7 @@ class PhaseDecoder(Decoder):
 
     def phasor(self, features: Tensor, size: tuple[int, int]) -> Tensor:
         """exp(j shift). Shape: as ``Decoder`` -> complex (items, time, frequency)."""
-        dtype = next(self.parameters()).dtype  # of the weights, whatever autocast makes of the maps
+        dtype = self.leave.weight.dtype  # of the weights, whatever autocast makes of the maps
         real, imaginary = self(features, size).to(dtype).unbind(1)
         real = real + 1.0
         scale = (real.square() + imaginary.square() + 1e-8).rsqrt()

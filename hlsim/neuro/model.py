@@ -68,6 +68,10 @@ class NeuroMSBG(EarNetwork):
         # training may run the network, not the physics around it, in bfloat16
         self.autocast_dtype: torch.dtype | None = None
 
+    @property
+    def _dtype(self) -> torch.dtype:
+        return self.mask_decoder.leave.weight.dtype
+
     def _process(self, signals: Tensor, ears: Tensor) -> Tensor:
         scale = None
         if not self.config.level_aware:

@@ -40,7 +40,7 @@ class EarNetwork(nn.Module):
         check_waveform(waveform)
         thresholds = resolve_thresholds(None, audiogram, waveform)
         with torch.autocast(waveform.device.type, enabled=False):
-            dtype = next(self.parameters()).dtype
+            dtype = self._dtype
             batch = torch.broadcast_shapes(waveform.shape[:-1], thresholds.shape[:-1])
             signals = waveform.to(dtype).expand(*batch, -1).reshape(-1, waveform.shape[-1])
             ears = thresholds.to(dtype).expand(*batch, -1).reshape(-1, len(FREQUENCIES))
@@ -48,6 +48,11 @@ class EarNetwork(nn.Module):
             result = self._process(resample(signals * gain, self.sample_rate, NEURO_RATE), ears)
             result = resample(result, NEURO_RATE, self.sample_rate)[..., : waveform.shape[-1]]
             return (self._finish(result) / gain).reshape(*batch, -1).to(waveform.dtype)
+
+    @property
+    def _dtype(self) -> torch.dtype:
+        """Of the weights, by one that has a name: replicas of ``nn.DataParallel`` list none."""
+        raise NotImplementedError
 
     def _process(self, signals: Tensor, ears: Tensor) -> Tensor:
         """Shape: (items, time) pascals at 16 kHz, (items, 8) dB HL -> (items, time)."""

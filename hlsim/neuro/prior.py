@@ -60,7 +60,7 @@ class Prior(nn.Module):
 
         excitation, relative, smoothing = [], [], []
         for severity, bank in zip(SEVERITIES, banks, strict=True):
-            channels = gammatone_response(bank, points * 441 // 160)[:, : points // 2 + 1][:, coarse]
+            channels = gammatone_response(bank, points * 441 // 160, bins=points // 2 + 1)[:, coarse]
             scale = 32.0 / (3.0 * stft.window * stft.fft) * (2.0 / math.pi) ** 2
             scale *= 10.0 ** (-_FLUCTUATION_DB[severity] / 10.0)
             excitation.append(_padded(np.abs(channels) ** 2 * scale))
@@ -143,7 +143,7 @@ def _sum_response(bank: FilterBank) -> NDArray[np.float64]:
     """Impulse response of all of MSBG at 16 kHz with every gain at 1, aligned. Returns (2 reach,), its zero at reach."""
     points = 160 * 160
     omega = 2.0 * np.pi * np.arange(points // 2 + 1) / (points * RATE / NEURO_RATE)
-    total = gammatone_response(bank, points * 441 // 160)[:, : points // 2 + 1].sum(0)
+    total = gammatone_response(bank, points * 441 // 160, bins=points // 2 + 1).sum(0)
     for taps in (ear_filter(), ear_filter(backward=True), lowpass_filter()):
         total = total * _at_neuro_rate(taps, points)
     impulse = np.fft.irfft(total * np.exp(1j * omega * STRUCTURAL_DELAY), points) * 10.0 ** (

@@ -61,29 +61,29 @@ def selective_scan(
             u, delta, A, B, C, D=D, z=z, delta_bias=delta_bias, delta_softplus=delta_softplus
         )
         return output
+    given, whole = (
+        u.dtype,
+        torch.promote_types(u.dtype, torch.float32),
+    )  # powers of decays want their precision
+    u, delta, A, B, C = (tensor.to(whole) for tensor in (u, delta, A, B, C))
     if delta_bias is not None:
         delta = delta + delta_bias.unsqueeze(-1)
     if delta_softplus:
         delta = functional.softplus(delta)
     y = _SelectiveScan.apply(delta.mT, u.mT, B.mT, C.mT, A.mT.contiguous()).mT
     if D is not None:
-        y = torch.addcmul(y, u, D.unsqueeze(-1))
-    return y if z is None else y * functional.silu(z)
-
-
-def linear_scan(decay: Tensor, drive: Tensor) -> Tensor:
-    """h with h[t] = decay[t] h[t-1] + drive[t] and h[-1] = 0. Shape: (items, time, ...) twice -> the same.
-
-    Neighbours are joined in pairs, their scan is one of half the length, and the times between follow from it: about
-    three operations a time, log2(time) deep, and only products of decays, so that nothing overflows.
-    """
-    states = drive.clone()
-    _take(_onward(decay, states, torch.empty_like(decay)))
-    return states
+        y = torch.addcmul(y, u, D.to(whole).unsqueeze(-1))
+    return (y if z is None else y * functional.silu(z)).to(given)
 
 
 def _onward(decay: Tensor, states: Tensor, spare: Tensor) -> list[_Step]:
-    """The steps of ``linear_scan`` over its own drive; ``spare``, as long as decay, takes the products of decays."""
+    """The steps of h[t] = decay[t] h[t-1] + drive[t] with h[-1] = 0, over its own drive.
+
+    Neighbours are joined in pairs, their scan is one of half the length, and the times between follow from it: about
+    three operations a time, log2(time) deep, and only products of decays, so that nothing overflows.
+
+    Shape: (items, time, ...) each; ``spare`` takes the products of decays.
+    """
     time, half = states.shape[1], states.shape[1] // 2
     if not half:
         return []
@@ -131,11 +131,12 @@ class _SelectiveScan(torch.autograd.Function):
     def forward(ctx: Any, delta: Tensor, u: Tensor, B: Tensor, C: Tensor, A: Tensor) -> Tensor:
         ctx.save_for_backward(delta, u, B, C, A)
         y = u.new_empty(u.shape)
-        for rows, columns, work in _blocks(u, A):
-            d, v = (tensor[rows, :, columns].contiguous() for tensor in (delta, u))
-            b, c = (tensor[rows].contiguous() for tensor in (B, C))
-            work.run(d, v, b, A[:, columns])
-            y[rows, :, columns] = (c.unsqueeze(-2) @ work.states).squeeze(-2)
+        with torch.autocast(u.device.type, enabled=False):
+            for rows, columns, work in _blocks(u, A, back=False):
+                d, v = (tensor[rows, :, columns].contiguous() for tensor in (delta, u))
+                b, c = (tensor[rows].contiguous() for tensor in (B, C))
+                work.run(d, v, b, A[:, columns])
+                y[rows, :, columns] = (c.unsqueeze(-2) @ work.states).squeeze(-2)
         return y
 
     @staticmethod
@@ -144,28 +145,31 @@ class _SelectiveScan(torch.autograd.Function):
         delta, u, B, C, A = ctx.saved_tensors
         grad_delta, grad_u = u.new_empty(u.shape), u.new_empty(u.shape)
         grad_A, grad_B, grad_C = torch.zeros_like(A), torch.zeros_like(B), torch.zeros_like(C)
-        for rows, columns, work in _blocks(u, A):
-            d, v, g = (tensor[rows, :, columns].contiguous() for tensor in (delta, u, grad))
-            b, c = (tensor[rows].contiguous() for tensor in (B, C))
-            a = A[:, columns]
-            work.run(d, v, b, a)
-            grad_C[rows] += (work.states @ g.unsqueeze(-1)).squeeze(-1)
-            slope = work.run_back(g, c)
-            driven = (b.unsqueeze(-2) @ slope).squeeze(-2)
-            grad_u[rows, :, columns] = driven * d
-            grad_B[rows] += (slope @ (d * v).unsqueeze(-1)).squeeze(-1)
-            exponent = work.states[:, :-1].mul_(work.decay[:, 1:]).mul_(slope[:, 1:])
-            driven.mul_(v)[:, 1:] += torch.mul(exponent, a, out=work.spare[:, 1:]).sum(-2)
-            grad_delta[rows, :, columns] = driven
-            grad_A[:, columns] += exponent.mul_(d[:, 1:].unsqueeze(-2)).sum((0, 1))
+        with torch.autocast(u.device.type, enabled=False):  # backward may be called in an autocast region
+            for rows, columns, work in _blocks(u, A, back=True):
+                d, v, g = (tensor[rows, :, columns].contiguous() for tensor in (delta, u, grad))
+                b, c = (tensor[rows].contiguous() for tensor in (B, C))
+                a = A[:, columns]
+                work.run(d, v, b, a)
+                grad_C[rows] += (work.states @ g.unsqueeze(-1)).squeeze(-1)
+                slope = work.run_back(g, c)
+                driven = (b.unsqueeze(-2) @ slope).squeeze(-2)
+                grad_u[rows, :, columns] = driven * d
+                grad_B[rows] += (slope @ (d * v).unsqueeze(-1)).squeeze(-1)
+                exponent = work.states[:, :-1].mul_(work.decay[:, 1:]).mul_(slope[:, 1:])
+                driven.mul_(v)[:, 1:] += torch.mul(exponent, a, out=work.spare[:, 1:]).sum(-2)
+                grad_delta[rows, :, columns] = driven
+                grad_A[:, columns] += exponent.mul_(d[:, 1:].unsqueeze(-2)).sum((0, 1))
         return grad_delta, grad_u, grad_B, grad_C, grad_A
 
 
 class _Workspace:
     """Decays and states of a block, in memory that the next block uses again. Shape: (items, time, states, channels)."""
 
-    def __init__(self, shape: tuple[int, ...], like: Tensor) -> None:
-        self.decay, self.states, self.spare = (like.new_empty(shape) for _ in range(3))
+    def __init__(self, shape: tuple[int, ...], memory: list[Tensor]) -> None:
+        views = [own[: math.prod(shape)].view(shape) for own in memory]
+        self.decay, self.states, self.spare = views[:3]
+        self.slope = views[-1]  # a fourth, where there is a way back
         self.onward = _onward(self.decay, self.states, self.spare)
 
     def run(self, delta: Tensor, u: Tensor, B: Tensor, A: Tensor) -> None:
@@ -173,10 +177,6 @@ class _Workspace:
         torch.mul(delta.unsqueeze(-2), A, out=self.decay).exp_()
         torch.mul((delta * u).unsqueeze(-2), B.unsqueeze(-1), out=self.states)
         _take(self.onward)
-
-    @cached_property
-    def slope(self) -> Tensor:
-        return torch.empty_like(self.states)
 
     @cached_property
     def back(self) -> list[_Step]:
@@ -189,18 +189,19 @@ class _Workspace:
         return self.slope
 
 
-def _blocks(u: Tensor, A: Tensor) -> Iterator[tuple[slice, slice, _Workspace]]:
+def _blocks(u: Tensor, A: Tensor, back: bool) -> Iterator[tuple[slice, slice, _Workspace]]:
     """Items, channels and the memory to work in. Blocks are of all channels, or of one item."""
     items, time, channels = u.shape
     room = max(_NARROWEST, (_BLOCK_GPU if u.is_cuda else _BLOCK_CPU) // max(1, time * len(A)))
     width = math.ceil(channels / math.ceil(channels / room))  # blocks of about the same size
-    height = max(1, room // channels)
+    height = max(1, min(items, room // channels))
+    memory = [u.new_empty(height * time * len(A) * width) for _ in range(4 if back else 3)]
     spaces: dict[tuple[int, ...], _Workspace] = {}
     for top in range(0, items, height):
         for left in range(0, channels, width):
             shape = (min(height, items - top), time, len(A), min(width, channels - left))
             if shape not in spaces:
-                spaces[shape] = _Workspace(shape, u)
+                spaces[shape] = _Workspace(shape, memory)
             yield slice(top, top + height), slice(left, left + width), spaces[shape]
 
 

@@ -1,9 +1,12 @@
 """Neuro-MSBG: shapes, laws, and how near it is to MSBG."""
 
+from typing import Any
+
 import pytest
 import torch
 from torch import Tensor
 
+from compensators import MappingCompensator
 from hlsim import MSBG, Audiogram, NeuroMSBG, load_pretrained
 from hlsim.audio import resample
 from hlsim.audiogram import draw_thresholds
@@ -75,11 +78,40 @@ def test_configuration_survives_json(config: NeuroConfig) -> None:
 
 @pytest.mark.parametrize(
     "change",
-    [{"channel": 3}, {"channels": 0}, {"kernel": [4, 7]}, {"hop": 60}, {"window": 300}, {"blocks": 1.5}],
+    [
+        {"channel": 3},
+        {"channels": 0},
+        {"channels": True},
+        {"kernel": [4, 7]},
+        {"kernel": [7]},
+        {"stride": 4},
+        {"stride": [4, 3, 2]},
+        {"hop": 60},
+        {"hop": 24.0},
+        {"fft": "400"},
+        {"window": 300},
+        {"blocks": 1.5},
+        3,
+    ],
 )
-def test_bad_configuration(change: dict[str, object]) -> None:
+def test_bad_configuration(change: Any) -> None:
     with pytest.raises(ValueError, match="allowed"):
         NeuroConfig.from_dict(change)
+
+
+def test_replicas_of_data_parallel_list_no_parameters(clips: Tensor) -> None:
+    """As ``torch.nn.parallel.replicate`` makes them, which needs GPUs itself."""
+    for module in (NeuroMSBG().eval(), MappingCompensator().eval()):
+        replicas = {own: own._replicate_for_data_parallel() for own in module.modules()}
+        for own, replica in replicas.items():
+            for name, child in own._modules.items():
+                replica._modules[name] = None if child is None else replicas[child]
+            for name, weight in own._parameters.items():
+                setattr(replica, name, None if weight is None else weight.clone())
+        replica = replicas[module]
+        assert not list(replica.parameters())
+        ear = Audiogram.standard("N3")
+        torch.testing.assert_close(replica(clips, ear), module(clips, ear))
 
 
 def test_paper_like_network_trains_a_step() -> None:

@@ -6,7 +6,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from hlsim.neuro import scan
-from hlsim.neuro.scan import linear_scan, selective_scan
+from hlsim.neuro.scan import selective_scan
 
 LENGTHS = (1, 2, 3, 4, 5, 31, 64, 101)
 
@@ -76,11 +76,29 @@ def test_is_causal_and_remembers() -> None:
     assert not bool(difference[..., :20].any()) and bool(difference[..., 20:23].abs().min() > 0.0)
 
 
-def test_does_not_overflow_where_decays_vanish() -> None:
-    decay, drive = torch.full((2, 1000), 1e-30), torch.ones(2, 1000)
-    assert torch.equal(linear_scan(decay, drive), drive)
-    ones = torch.ones(1, 4096)
-    torch.testing.assert_close(linear_scan(ones, ones).squeeze(0), torch.arange(1.0, 4097.0))
+def test_does_not_overflow_where_decays_vanish_and_sums_where_there_are_none() -> None:
+    ones, drive = torch.ones(2, 1, 4096), torch.full((2, 1, 4096), 1 / 69.0)
+    vanishing = selective_scan(drive, 69.0 * ones, -torch.ones(1, 1), ones, ones)  # decays of 1e-30
+    torch.testing.assert_close(vanishing, ones)
+    kept = selective_scan(ones, ones, torch.zeros(1, 1), ones, ones)
+    torch.testing.assert_close(kept, torch.arange(1.0, 4097.0).expand(2, 1, -1))
+
+
+def test_autocast_does_not_reach_it() -> None:
+    given = [tensor.float().requires_grad_() for tensor in arguments(33)]
+    true = selective_scan(*given)
+    gradients = torch.autograd.grad(true.square().sum(), given)
+    with torch.autocast("cpu", torch.bfloat16):
+        found = selective_scan(*given)
+        inside = torch.autograd.grad(found.square().sum(), given)
+    assert torch.equal(found, true)
+    assert all(torch.equal(a, b) for a, b in zip(inside, gradients, strict=True))
+    # mamba_ssm's convention: A in float32, the rest as the network has it
+    u, delta, A, B, C = (tensor.float() for tensor in arguments(33))
+    lower = [tensor.bfloat16() for tensor in (u, delta, B, C)]
+    coarse = selective_scan(lower[0], lower[1], A, *lower[2:])
+    fine = selective_scan(lower[0].float(), lower[1].float(), A, *(tensor.float() for tensor in lower[2:]))
+    assert coarse.dtype == torch.bfloat16 and torch.equal(coarse, fine.bfloat16())
 
 
 def test_float32_is_near_float64() -> None:
