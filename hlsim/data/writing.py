@@ -70,7 +70,9 @@ def _write(
     _claim(plan, recipe)
     for leftover in (plan.folder / "instances").rglob(f".*{PARTIAL}"):
         leftover.unlink(missing_ok=True)
-    task = partial(make, str(plan.folder), str(plan.root), plan.digest, recipe)
+    # a worker on another machine has another working folder
+    folder, root = str(plan.folder.absolute()), str(plan.root.absolute())
+    task = partial(make, folder, root, plan.digest, recipe)
     faults: list[Fault] = []
     threads = torch.get_num_threads()
     numbers = range(len(plan.utterances))
