@@ -196,8 +196,7 @@ class PlanData(L.LightningDataModule):
         self.levels, self.treated = levels, treated
         self.plan = Plan(folder, root)
         self.prepared = prepared
-        if prepared:
-            claimed(self.plan)
+        self.made_of = claimed(self.plan) if prepared else self.plan.digest
         recipe = recipe or Recipe()
         self.teacher = Teacher(self.plan.rate, alignment=recipe.alignment, reference=recipe.reference)
         self.batch = batch

@@ -146,13 +146,18 @@ def _claim(plan: Plan, recipe: Recipe) -> None:
         file.keep()
 
 
-def claimed(plan: Plan) -> None:
-    """Raises ValueError unless the instances of this very plan are all on disk."""
+def claimed(plan: Plan) -> str:
+    """What the instances on disk are made of: plan, teacher and alignment.
+
+    Raises ValueError unless those of this very plan are all there.
+    """
     path = plan.folder / CLAIM
-    if not path.is_file() or path.read_text(encoding="utf-8").splitlines()[:1] != [plan.digest]:
+    found = path.read_text(encoding="utf-8") if path.is_file() else ""
+    if found.splitlines()[:1] != [plan.digest]:
         raise ValueError(f"{path.parent}: no instances of this plan; 'hlsim prepare --write' makes them")
     missing = sum(not plan.path(index).is_file() for index in range(len(plan)))
     if missing:
         raise ValueError(
             f"{path.parent}: {missing} of {len(plan)} instances missing; 'hlsim prepare --write' goes on with them"
         )
+    return found.strip()

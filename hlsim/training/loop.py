@@ -272,13 +272,25 @@ def _claim(folder: Path, recipe: Mapping[str, Any]) -> None:
     text = json.dumps(recipe, indent=2, sort_keys=True, default=str)
     note = folder / "recipe.json"
     if (folder / LAST).is_file():
-        if note.is_file() and note.read_text(encoding="utf-8") != text:
+        if note.is_file() and (found := note.read_text(encoding="utf-8")) != text:
             raise ValueError(
-                f"{folder}: holds a training of another recipe (see {note.name}); choose another --out"
+                f"{folder}: holds a training of another recipe (other {_differing(found, text)}; see {note.name}); "
+                "choose another --out"
             )
         return
     (folder / BEST).unlink(missing_ok=True)
     _put(note, text)
+
+
+def _differing(one: str, other: str) -> str:
+    """Names of the settings that differ."""
+    try:
+        first, second = json.loads(one), json.loads(other)
+        return ", ".join(
+            name for name in sorted(first | second) if first.get(name, ...) != second.get(name, ...)
+        )
+    except (ValueError, TypeError):
+        return "settings"  # the file is broken
 
 
 def _put(path: Path, text: str) -> None:

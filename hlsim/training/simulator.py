@@ -164,9 +164,7 @@ class SimulatorTraining(TimedModule):
         with torch.no_grad():
             for number, (signal, ears) in enumerate(self.valid):
                 signal, ears = signal.to(self.device), ears.to(self.device)
-                if number == len(self.truths):
-                    self.truths.append(self.teacher(signal, ears))
-                values.append(-noise_to_signal_db(self.kept.module(signal, ears), self.truths[number]))
+                values.append(-noise_to_signal_db(self.kept.module(signal, ears), self.truth(number)))
         snr = torch.cat(values)
         median, low = float(snr.median()), float(snr.quantile(0.1))
         return {"score": median + 0.5 * low, "valid_snr_median": median, "valid_snr_worst_tenth": low}
@@ -174,7 +172,19 @@ class SimulatorTraining(TimedModule):
     def examples(self) -> dict[str, Tensor]:
         signal, ears = (tensor[-1:].to(self.device) for tensor in self.valid[0])
         heard = self.kept.module(signal, ears)
-        return {"given": signal[0], "heard/truth": self.teacher(signal, ears)[0], "heard/network": heard[0]}
+        return {"given": signal[0], "heard/truth": self.truth(0)[-1], "heard/network": heard[0]}
+
+    def truth(self, number: int) -> Tensor:
+        """What is heard of a batch of validation items, asked for once and in order. Shape: -> (items, time)."""
+        if number == len(self.truths):
+            signal, ears = (tensor.to(self.device) for tensor in self.valid[number])
+            with torch.no_grad():
+                self.truths.append(self.teacher(signal, ears))
+        return self.truths[number].to(self.device)
+
+    def identity(self, data: Any) -> dict[str, str]:
+        """What the training is on, by name: with anything else it is another one."""
+        return {entry.name: str(getattr(data, entry.name)) for entry in fields(data) if entry.compare}
 
     def trained_parameters(self) -> list[torch.nn.Parameter]:
         return list(self.student.parameters())
@@ -248,9 +258,7 @@ def train_simulator(
     run(
         module,
         out=out,
-        recipe=asdict(recipe)
-        | {"max_minutes": max_minutes}
-        | {entry.name: str(getattr(data, entry.name)) for entry in fields(data) if entry.compare},
+        recipe=asdict(recipe) | {"max_minutes": max_minutes} | module.identity(data),
         write=write,
         validate_every=recipe.validate_every,
         max_steps=max_steps,

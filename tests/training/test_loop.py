@@ -118,9 +118,9 @@ def test_another_recipe_in_the_same_folder_is_refused_and_changes_nothing(tmp_pa
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir() if path.is_file()}
     module = Toy()
     with pytest.raises(
-        ValueError, match=r"holds a training of another recipe .*choose another --out"
+        ValueError, match=r"holds a training of another recipe \(other a, b; see .*choose another --out"
     ) as caught:
-        go(module, tmp_path, max_steps=4, recipe={"a": 2})
+        go(module, tmp_path, max_steps=4, recipe={"a": 2, "b": None})
     assert str(caught.value).startswith(str(tmp_path))
     assert not module.seen
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir() if path.is_file()} == before
