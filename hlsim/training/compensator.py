@@ -21,7 +21,7 @@ from hlsim.loss import HearingLossLoss
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.pretrained import save_checkpoint
 from hlsim.settings import refuse_unknown
-from hlsim.training.loop import TimedModule, run
+from hlsim.training.loop import CHECKPOINT, TimedModule, run
 from hlsim.training.sources import TrainingData, read_thresholds
 
 CRITERIA = ("bands", "paper")
@@ -221,7 +221,7 @@ def train_compensator(
         ValueError: data, recipe or simulator that cannot be used; the message names them.
     """
     module = CompensatorTraining(recipe, data, max_minutes, audiogram=audiogram, simulator=simulator)
-    folder = Path(out) / "checkpoint"
+    folder = Path(out) / CHECKPOINT
     start = module.validate()["valid_loss"]
     report(f"start: valid_loss {start:.3f}")
     trained = {

@@ -21,7 +21,7 @@ from hlsim.neuro.config import NEURO_RATE
 from hlsim.pretrained import save_checkpoint
 from hlsim.settings import refuse_unknown
 from hlsim.training.averaging import average_of
-from hlsim.training.loop import TimedModule, run
+from hlsim.training.loop import CHECKPOINT, TimedModule, run
 from hlsim.training.sources import TrainingData, read_thresholds
 
 PRECISIONS = {"float32": None, "bfloat16": torch.bfloat16}
@@ -247,7 +247,7 @@ def train_simulator(
         ValueError: data or recipe that cannot be used; the message names them.
     """
     module = kind(recipe, data, max_minutes)
-    folder = Path(out) / "checkpoint"
+    folder = Path(out) / CHECKPOINT
 
     def write(figures: dict[str, Any]) -> None:
         from hlsim import __version__
