@@ -19,7 +19,7 @@ from hlsim.msbg import MSBG
 from hlsim.neuro import NeuroConfig, NeuroMSBG
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.pretrained import save_checkpoint
-from hlsim.settings import refuse_unknown
+from hlsim.settings import refuse_other_kinds, refuse_unknown, refuse_weights
 from hlsim.training.averaging import average_of
 from hlsim.training.loop import CHECKPOINT, TimedModule, run
 from hlsim.training.sources import TrainingData, read_thresholds
@@ -70,17 +70,14 @@ class SimulatorRecipe:
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> SimulatorRecipe:
-        """Raises ValueError where a name is unknown."""
+        """Raises ValueError where a name is unknown or a value is not allowed."""
         refuse_unknown(data, (entry.name for entry in fields(cls)), "settings", "in the recipe")
-        refuse_unknown(data.get("weights", ()), CRITERIA, "criteria", "in the recipe")
         return cls(**data)
 
     def __post_init__(self) -> None:
+        refuse_other_kinds(self, "in the recipe")
+        refuse_weights(self.weights, CRITERIA, "in the recipe")
         object.__setattr__(self, "levels", tuple(self.levels))
-        if len(self.levels) != 2 or self.levels[0] > self.levels[1]:
-            raise ValueError(
-                f"levels {self.levels} in the recipe; allowed: a lowest and a highest, in dB SPL"
-            )
         counts = (self.batch, self.validate_every, self.validation_items)
         if min(counts) < 1 or self.seconds <= 0.0 or self.learning_rate <= 0.0:
             raise ValueError(
