@@ -139,6 +139,8 @@ def test_bad_calls(plan: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str
     call = ["train-simulator", "--config", str(recipe), "--out", str(tmp_path / "out")]
     for options, said in (
         ([], "nothing to train on; allowed: --speech, a folder, or --manifest"),
+        (["--speech", "s", "--root", "r", "--workers", "0"], "--root, --workers without --manifest"),
+        (["--speech", "s", "--prepared"], "--prepared without --manifest; allowed: with it alone"),
         (["--manifest", str(plan), "--noise", "n"], "--manifest with --noise"),
         (["--manifest", str(tmp_path / "manifest.csv")], "not prepared"),
     ):
