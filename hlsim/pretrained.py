@@ -92,6 +92,12 @@ def find_checkpoint(name: str | Path) -> Path:
     )
 
 
+def checkpoint_digest(name: str | Path) -> str:
+    """The SHA-256 of a checkpoint's weights, as it tells it. Raises ValueError where there is no such checkpoint."""
+    record = json.loads((find_checkpoint(name) / CONFIG).read_text(encoding="utf-8"))
+    return str(record["sha256"])
+
+
 def checkpoints_folder() -> Path:
     """Where the checkpoints that ship lie: in the installed package, or beside it in a source tree."""
     package = Path(__file__).parent

@@ -264,6 +264,8 @@ class TimedLoader(DataLoader[Any]):
                 batch = next(batches)
             except StopIteration:
                 return
+            except ValueError as error:  # a worker's has its traceback in its message
+                raise ValueError(str(error).rpartition("ValueError: ")[2].strip()) from error
             self.waited += time.perf_counter() - began
             yield batch
 

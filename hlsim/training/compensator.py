@@ -19,7 +19,7 @@ from hlsim.data.clips import Clips
 from hlsim.data.variation import equalise, mix
 from hlsim.loss import HearingLossLoss
 from hlsim.neuro.config import NEURO_RATE
-from hlsim.pretrained import save_checkpoint
+from hlsim.pretrained import checkpoint_digest, save_checkpoint
 from hlsim.settings import refuse_other_kinds, refuse_unknown, refuse_weights
 from hlsim.training.loop import CHECKPOINT, TimedModule, run
 from hlsim.training.sources import TrainingData, read_thresholds
@@ -225,6 +225,8 @@ def train_compensator(
         "audiogram": audiogram.to_dict() if audiogram else None,
         "simulator": type(simulator).__name__ if isinstance(simulator, torch.nn.Module) else str(simulator),
     }
+    if isinstance(simulator, str | Path) and str(simulator) != "msbg":
+        trained["simulator_sha256"] = checkpoint_digest(simulator)  # a folder may hold another one next time
 
     def write(figures: dict[str, Any]) -> None:
         from hlsim import __version__
