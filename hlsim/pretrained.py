@@ -1,8 +1,10 @@
 """Checkpoints: a folder of safetensors, a JSON configuration with its hash, and a model card. No pickle."""
 
+import contextlib
 import hashlib
 import json
 import os
+import re
 import shutil
 import tempfile
 from collections.abc import Callable, Mapping
@@ -90,6 +92,12 @@ def find_checkpoint(name: str | Path) -> Path:
     )
 
 
+def checkpoint_digest(name: str | Path) -> str:
+    """The SHA-256 of a checkpoint's weights, as it tells it. Raises ValueError where there is no such checkpoint."""
+    record = json.loads((find_checkpoint(name) / CONFIG).read_text(encoding="utf-8"))
+    return str(record["sha256"])
+
+
 def checkpoints_folder() -> Path:
     """Where the checkpoints that ship lie: in the installed package, or beside it in a source tree."""
     package = Path(__file__).parent
@@ -113,6 +121,7 @@ def save_checkpoint(
     """
     target = Path(folder)
     target.parent.mkdir(parents=True, exist_ok=True)
+    repair_checkpoint(target)
     state: dict[str, Tensor] = {
         name: tensor.detach().cpu().contiguous() for name, tensor in model.state_dict().items()
     }
@@ -124,7 +133,7 @@ def save_checkpoint(
         "about": dict(about),
     }
     staging = Path(tempfile.mkdtemp(prefix=f".{target.name}.", dir=target.parent))
-    old = target.with_name(f".{target.name}.old")
+    old = _old(target)
     try:
         (staging / WEIGHTS).write_bytes(weights)
         (staging / CONFIG).write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
@@ -142,3 +151,20 @@ def save_checkpoint(
         shutil.rmtree(staging, ignore_errors=True)
         if old.exists() and not target.exists():
             os.replace(old, target)
+
+
+def repair_checkpoint(folder: str | Path) -> None:
+    """Undo what a kill within ``save_checkpoint`` left: the older checkpoint gets its name back, and the rest goes."""
+    target = Path(folder)
+    old = _old(target)
+    if old.exists() and not target.exists():
+        with contextlib.suppress(FileNotFoundError):  # another process of the training was first
+            os.replace(old, target)
+    staged = re.compile(rf"\.{re.escape(target.name)}\.[a-z0-9_]{{8}}")  # as mkdtemp names it
+    for path in target.parent.glob(f".{target.name}.*"):
+        if path.is_dir() and staged.fullmatch(path.name):
+            shutil.rmtree(path, ignore_errors=True)
+
+
+def _old(target: Path) -> Path:
+    return target.with_name(f".{target.name}.old")

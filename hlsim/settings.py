@@ -1,9 +1,17 @@
-"""Names in configurations and recipes: the unknown ones are refused, with those that are allowed."""
+"""Settings in configurations and recipes: unknown names and values of another kind are refused, with what is allowed."""
 
-from collections.abc import Iterable
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import fields
+from decimal import Decimal, InvalidOperation
+from typing import Any, get_type_hints
+
+_KINDS = {int: "a whole number", float: "a number", bool: "true or false", str: "text"}
 
 
-def refuse_unknown(found: Iterable[str], allowed: Iterable[str], what: str, where: str = "") -> None:
+def refuse_unknown(found: Iterable[Any], allowed: Iterable[str], what: str, where: str = "") -> None:
     """Raise ValueError unless every name is allowed.
 
     Args:
@@ -11,6 +19,69 @@ def refuse_unknown(found: Iterable[str], allowed: Iterable[str], what: str, wher
         where: where they stand: "in the recipe".
     """
     allowed = list(allowed)
-    if unknown := sorted(set(found) - set(allowed)):
+    if unknown := sorted({str(name) for name in found} - set(allowed)):
         place = f" {where}" if where else ""
         raise ValueError(f"unknown {what} {', '.join(unknown)}{place}; allowed: {', '.join(allowed)}")
+
+
+def refuse_other_kinds(settings: Any, where: str) -> None:
+    """Raise ValueError unless every field of a dataclass holds what it is annotated with.
+
+    Args:
+        settings: with fields that are an int, a float, a bool, a str, a pair of floats (ascending) or a dict of them.
+        where: where they stand: "in the recipe".
+    """
+    kinds = get_type_hints(type(settings))
+    for name in (entry.name for entry in fields(settings)):
+        kind, value = kinds[name], getattr(settings, name)
+        origin = getattr(kind, "__origin__", None)
+        if origin is tuple:
+            if not isinstance(value, tuple | list) or len(value) != 2:
+                raise ValueError(f"{name} {value!r} {where}; allowed: a lowest and a highest, as [0, 20]")
+            for one in value:
+                _refuse(one, float, name, where)
+            if value[0] > value[1]:
+                raise ValueError(f"{name} {list(value)} {where}; allowed: a lowest and a highest, ascending")
+        elif origin is dict:
+            if not isinstance(value, Mapping):
+                raise ValueError(f"{name} {value!r} {where}; allowed: 'name: value' lines below it")
+            if float in kind.__args__:
+                for key, one in value.items():
+                    _refuse(one, float, f"{name}: {key}", where)
+        else:
+            _refuse(value, kind, name, where)
+
+
+def refuse_weights(weights: Mapping[str, float], allowed: Iterable[str], where: str) -> None:
+    """Raise ValueError unless all are of known criteria, none is negative and one or more is above 0."""
+    refuse_unknown(weights, allowed, "criteria", where)
+    if min(weights.values(), default=0.0) < 0.0 or not any(weights.values()):
+        raise ValueError(f"weights {dict(weights)} {where}; allowed: 0 or more, one or more above 0")
+
+
+def _refuse(value: Any, kind: type, name: str, where: str) -> None:
+    if kind is float:
+        fits = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    else:
+        fits = type(value) is kind
+    if fits:
+        return
+    wanted = f"allowed: {_KINDS[kind]}"
+    if kind in (int, float) and isinstance(value, str) and (written := _as_number(value)):
+        wanted = f"that is text in YAML; write {written}"
+    raise ValueError(f"{name} {value!r} {where}; {wanted}")
+
+
+def _as_number(text: str) -> str | None:
+    """How YAML reads what the text means; None where it is no number."""
+    try:
+        number = Decimal(text)
+    except InvalidOperation:
+        return None
+    if not number.is_finite() or abs(number.adjusted()) > 15:
+        return None
+    plain = f"{number:f}"
+    if "e" not in text.lower():
+        return plain
+    mantissa, _, exponent = f"{number:e}".partition("e")
+    return f"{plain} or {mantissa if '.' in mantissa else mantissa + '.0'}e{exponent}"

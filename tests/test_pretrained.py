@@ -9,7 +9,7 @@ import torch
 
 from hlsim import NeuroMSBG, load_pretrained
 from hlsim.neuro import NeuroConfig
-from hlsim.pretrained import checkpoints_folder, find_checkpoint, save_checkpoint
+from hlsim.pretrained import checkpoints_folder, find_checkpoint, repair_checkpoint, save_checkpoint
 
 SMALL = NeuroConfig(channels=4, blocks=1)
 
@@ -134,6 +134,21 @@ def test_failing_rename_gives_the_old_checkpoint_its_name_back(
         save_checkpoint(folder, "neuro-msbg", NeuroMSBG(SMALL), SMALL.to_dict(), {})
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
     assert [path.name for path in folder.parent.iterdir()] == ["small"]
+
+
+@pytest.mark.parametrize("again", [False, True])
+def test_a_kill_between_the_renames_loses_nothing(folder: Path, again: bool) -> None:
+    parent = folder.parent
+    folder.rename(parent / ".small.old")
+    (parent / ".small.abcd_123").mkdir()
+    (parent / ".small.er.abcd_123").mkdir()  # of another name
+    if again:
+        save_checkpoint(folder, "neuro-msbg", NeuroMSBG(SMALL), SMALL.to_dict(), {})
+    else:
+        repair_checkpoint(folder)
+    assert {path.name for path in parent.iterdir()} == {"small", ".small.er.abcd_123"}
+    assert (folder / "README.md").read_text() == "# small\n"
+    load_pretrained(folder)
 
 
 def test_names_do_not_lead_out_of_the_folder_that_ships(

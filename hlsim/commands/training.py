@@ -34,7 +34,7 @@ def add(commands: Commands) -> None:
     )
     sub.add_argument("--root", type=Path, help="folder of the manifest's paths, if not where it was prepared")
     sub.add_argument("--prepared", action="store_true", help="train on what 'hlsim prepare --write' wrote")
-    sub.add_argument("--workers", type=natural, default=1, help="processes that read the manifest's files")
+    sub.add_argument("--workers", type=natural, help="processes that read the manifest's files; 1 by default")
     training_options(sub, minutes=60.0, speech_required=False)
 
     sub = add_command(
@@ -55,6 +55,9 @@ def _train_simulator(options: argparse.Namespace) -> None:
     if options.manifest is not None:
         _train_planned(options)
         return
+    planned = {"--root": options.root, "--prepared": options.prepared or None, "--workers": options.workers}
+    if given := [name for name, value in planned.items() if value is not None]:
+        raise ValueError(f"{', '.join(given)} without --manifest; allowed: with it alone")
     if options.speech is None:
         raise ValueError(
             "nothing to train on; allowed: --speech, a folder, or --manifest, of 'hlsim prepare'"
@@ -73,7 +76,12 @@ def _train_planned(options: argparse.Namespace) -> None:
             f"--manifest with {', '.join(given)}; allowed: one or the other, for a manifest has it all"
         )
     folder = train_simulator(
-        PlannedSource(options.manifest, options.root, options.prepared, options.workers),
+        PlannedSource(
+            options.manifest,
+            options.root,
+            options.prepared,
+            workers=1 if options.workers is None else options.workers,
+        ),
         SimulatorRecipe.from_dict(read_recipe(options.config)),
         kind=PlannedTraining,
         **training_arguments(options),

@@ -30,7 +30,8 @@ class Listing:
             return
         self.speakers.setdefault(found.speaker, set()).add(found.split)
         self.paired += bool(found.noisy)
-        self._digest.update(f"{found} {_state(root / found.clean)} {_state(root / found.noisy)}\n".encode())
+        noisy = _state(root / found.noisy) if found.noisy else None
+        self._digest.update(f"{found} {_state(root / found.clean)} {noisy}\n".encode())
 
     def digest(self, noise: Path | None, *tables: Path | None) -> str:
         if noise is not None:

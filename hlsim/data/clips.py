@@ -1,5 +1,6 @@
 """Random clips of recordings, decoded once and kept."""
 
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -8,11 +9,14 @@ from torch import Tensor
 
 from hlsim.audio import find_audio, read_audio, resample
 
+_TRIES = 100  # draws of files that cannot be used, one after the other, before it ends
+
 
 class Clips:
     """Clips of equal length from the recordings under a folder, first channel, resampled to one rate.
 
-    Recordings are decoded when first drawn and kept as 16-bit samples (115 MB an hour at 16 kHz).
+    Recordings are decoded when first drawn and kept as 16-bit samples (115 MB an hour at 16 kHz). A file that cannot be
+    used (broken, silent, of another rate) is told of once, and wherever it is drawn another is drawn instead.
 
     Args:
         source: a folder, searched for wav, flac and ogg files, subfolders too; or the files.
@@ -21,7 +25,8 @@ class Clips:
         repeat: for noises.
 
     Raises:
-        ValueError: no such folder, or no audio in it; and when a clip is drawn, a file that cannot be used.
+        ValueError: no such folder, or no audio in it; when clips are drawn, too many files that cannot be used; when one
+            recording is asked for, that it cannot be used.
     """
 
     def __init__(
@@ -32,6 +37,7 @@ class Clips:
         self.samples = round(seconds * sample_rate)
         self.repeat = repeat
         self._kept: dict[int, Tensor] = {}
+        self._bad: dict[int, str] = {}
 
     def __len__(self) -> int:
         return len(self.files)
@@ -59,9 +65,28 @@ class Clips:
     def draw(self, count: int, generator: torch.Generator) -> Tensor:
         """Random clips, none silent. Shape: -> (count, samples)."""
         clips: list[Tensor] = []
+        failed = 0
         while len(clips) < count:
             index = int(torch.randint(len(self), (), generator=generator))
-            clip = self.clip(index, float(torch.rand((), generator=generator)))
+            # drawn for a bad file too: what follows does not depend on when it was found bad
+            place = float(torch.rand((), generator=generator))
+            if not self._usable(index):
+                failed += 1
+                if failed == _TRIES:
+                    raise ValueError(f"{self._bad[index]}; {_TRIES} files like it were drawn in a row")
+                continue
+            failed = 0
+            clip = self.clip(index, place)
             if float(clip.square().mean()) > 1e-7:
                 clips.append(clip)
         return torch.stack(clips)
+
+    def _usable(self, index: int) -> bool:
+        if index not in self._bad:
+            try:
+                self.recording(index)
+                return True
+            except ValueError as error:
+                self._bad[index] = str(error)
+                warnings.warn(f"left out: {error}", stacklevel=3)
+        return False

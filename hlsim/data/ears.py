@@ -114,7 +114,8 @@ def plan_ears(
     owner = dict.fromkeys(listeners, "train")
     for split in _SHARES:
         if split in splits and not groups[split]:
-            for _ in range(math.ceil(_SHARES[split] * len(owner) / 10)):
+            # of one or two listeners a split gets none, and check says so
+            for _ in range(min(len(listeners), math.ceil(_SHARES[split] * len(owner) / 10))):
                 owner[listeners.pop()] = split
     for who, ear in groups.pop(""):
         groups[owner[who]].append((who, ear))

@@ -196,8 +196,7 @@ class PlanData(L.LightningDataModule):
         self.levels, self.treated = levels, treated
         self.plan = Plan(folder, root)
         self.prepared = prepared
-        if prepared:
-            claimed(self.plan)
+        self.made_of = claimed(self.plan) if prepared else self.plan.digest
         recipe = recipe or Recipe()
         self.teacher = Teacher(self.plan.rate, alignment=recipe.alignment, reference=recipe.reference)
         self.batch = batch
@@ -265,6 +264,8 @@ class TimedLoader(DataLoader[Any]):
                 batch = next(batches)
             except StopIteration:
                 return
+            except ValueError as error:  # a worker's has its traceback in its message
+                raise ValueError(str(error).rpartition("ValueError: ")[2].strip()) from error
             self.waited += time.perf_counter() - began
             yield batch
 

@@ -82,7 +82,8 @@ class Plan:
             self.rate = int(about["settings"]["rate"])
             self.inputs: list[str] = about["inputs"]
             self.ears = int(about["settings"]["ears"])
-            self.digest: str = about["manifest_sha256"] + about["instances_sha256"]
+            # neither table has the rate
+            self.digest: str = f"{about['manifest_sha256']}{about['instances_sha256']} at {self.rate} Hz"
         except (OSError, KeyError, TypeError, ValueError) as error:
             raise ValueError(f"{self.folder}: not prepared ({error}); 'hlsim prepare' makes it") from error
         self.utterances = Rows(self.folder / MANIFEST, UTTERANCE_COLUMNS)

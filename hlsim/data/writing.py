@@ -70,7 +70,9 @@ def _write(
     _claim(plan, recipe)
     for leftover in (plan.folder / "instances").rglob(f".*{PARTIAL}"):
         leftover.unlink(missing_ok=True)
-    task = partial(make, str(plan.folder), str(plan.root), plan.digest, recipe)
+    # a worker on another machine has another working folder
+    folder, root = str(plan.folder.absolute()), str(plan.root.absolute())
+    task = partial(make, folder, root, plan.digest, recipe)
     faults: list[Fault] = []
     threads = torch.get_num_threads()
     numbers = range(len(plan.utterances))
@@ -144,13 +146,18 @@ def _claim(plan: Plan, recipe: Recipe) -> None:
         file.keep()
 
 
-def claimed(plan: Plan) -> None:
-    """Raises ValueError unless the instances of this very plan are all on disk."""
+def claimed(plan: Plan) -> str:
+    """What the instances on disk are made of: plan, teacher and alignment.
+
+    Raises ValueError unless those of this very plan are all there.
+    """
     path = plan.folder / CLAIM
-    if not path.is_file() or path.read_text(encoding="utf-8").splitlines()[:1] != [plan.digest]:
+    found = path.read_text(encoding="utf-8") if path.is_file() else ""
+    if found.splitlines()[:1] != [plan.digest]:
         raise ValueError(f"{path.parent}: no instances of this plan; 'hlsim prepare --write' makes them")
     missing = sum(not plan.path(index).is_file() for index in range(len(plan)))
     if missing:
         raise ValueError(
             f"{path.parent}: {missing} of {len(plan)} instances missing; 'hlsim prepare --write' goes on with them"
         )
+    return found.strip()

@@ -19,9 +19,9 @@ from hlsim.data.clips import Clips
 from hlsim.data.variation import equalise, mix
 from hlsim.loss import HearingLossLoss
 from hlsim.neuro.config import NEURO_RATE
-from hlsim.pretrained import save_checkpoint
-from hlsim.settings import refuse_unknown
-from hlsim.training.loop import TimedModule, run
+from hlsim.pretrained import checkpoint_digest, save_checkpoint
+from hlsim.settings import refuse_other_kinds, refuse_unknown, refuse_weights
+from hlsim.training.loop import CHECKPOINT, TimedModule, run
 from hlsim.training.sources import TrainingData, read_thresholds
 
 CRITERIA = ("bands", "paper")
@@ -67,25 +67,24 @@ class CompensatorRecipe:
     seed: int = 0
 
     def __post_init__(self) -> None:
+        refuse_other_kinds(self, "in the recipe")
+        refuse_weights(self.weights, CRITERIA, "in the recipe")
         for name in ("levels", "snr"):
-            pair = tuple(getattr(self, name))
-            if len(pair) != 2 or pair[0] > pair[1]:
-                raise ValueError(f"{name} {pair} in the recipe; allowed: a lowest and a highest, in dB")
-            object.__setattr__(self, name, pair)
+            object.__setattr__(self, name, tuple(getattr(self, name)))
         counts = (self.batch, self.validate_every, self.validation_items)
-        if min(counts) < 1 or self.seconds <= 0.0:
+        if min(counts) < 1 or self.seconds <= 0.0 or self.learning_rate <= 0.0:
             raise ValueError(
                 f"batch {self.batch}, validate_every {self.validate_every}, validation_items {self.validation_items}, "
-                f"seconds {self.seconds} in the recipe; allowed: counts from 1 up, seconds above 0"
+                f"seconds {self.seconds}, learning_rate {self.learning_rate} in the recipe; allowed: counts from 1 up, "
+                "seconds and learning_rate above 0"
             )
         if not (0.0 <= self.noisy <= 1.0 and 0.0 <= self.equalised <= 1.0):
             raise ValueError(f"noisy {self.noisy}, equalised {self.equalised} in the recipe; allowed: 0 to 1")
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> CompensatorRecipe:
-        """Raises ValueError where a name is unknown."""
+        """Raises ValueError where a name is unknown or a value is not allowed."""
         refuse_unknown(data, (entry.name for entry in fields(cls)), "settings", "in the recipe")
-        refuse_unknown(data.get("weights", ()), CRITERIA, "criteria", "in the recipe")
         return cls(**data)
 
 
@@ -116,8 +115,6 @@ class CompensatorTraining(TimedModule):
                 loss = HearingLossLoss(simulator=simulator, reference=recipe.reference, criterion=name)
                 simulator = loss.simulator  # the next criterion shares it
                 self.criteria[name] = loss
-        if not self.criteria:
-            raise ValueError(f"criteria {recipe.weights} in the recipe; allowed: one or more above 0")
         self.ear = None if audiogram is None else torch.tensor(audiogram.thresholds)
         self.training_items = Items(recipe, data, recipe.seconds)
         valid = Items(replace(recipe, equalised=0.0), data.validation(), seconds=2.0)
@@ -221,13 +218,15 @@ def train_compensator(
         ValueError: data, recipe or simulator that cannot be used; the message names them.
     """
     module = CompensatorTraining(recipe, data, max_minutes, audiogram=audiogram, simulator=simulator)
-    folder = Path(out) / "checkpoint"
+    folder = Path(out) / CHECKPOINT
     start = module.validate()["valid_loss"]
     report(f"start: valid_loss {start:.3f}")
     trained = {
         "audiogram": audiogram.to_dict() if audiogram else None,
         "simulator": type(simulator).__name__ if isinstance(simulator, torch.nn.Module) else str(simulator),
     }
+    if isinstance(simulator, str | Path) and str(simulator) != "msbg":
+        trained["simulator_sha256"] = checkpoint_digest(simulator)  # a folder may hold another one next time
 
     def write(figures: dict[str, Any]) -> None:
         from hlsim import __version__

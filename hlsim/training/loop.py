@@ -15,17 +15,16 @@ import lightning as L
 import torch
 from lightning.pytorch.callbacks import Callback, ModelCheckpoint, Timer
 from lightning.pytorch.loggers import TensorBoardLogger
+from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
-from hlsim.data.files import Whole
+from hlsim.pretrained import repair_checkpoint
 from hlsim.training.examples import ShowExamples
+from hlsim.training.state import BEST, LAST, WholeStates, claim, put
 
-LAST = "last.ckpt"
-"""Name of the state that a killed training goes on from."""
-
-BEST = "best.json"
-"""Name of the file with the best score so far."""
+CHECKPOINT = "checkpoint"
+"""Name of the folder with the best model, in its released form."""
 
 
 class Counter(Dataset[int]):
@@ -83,7 +82,7 @@ class TimedModule(L.LightningModule):
         )
         loss = self.training_loss(generator)
         if not bool(torch.isfinite(loss)):
-            raise RuntimeError(
+            raise ValueError(
                 f"the loss is {float(loss.detach())} at step {self.global_step}; a lower learning rate may help"
             )
         self.log("loss", loss, prog_bar=True)
@@ -133,7 +132,7 @@ class KeepBest(Callback):
             assert isinstance(module, TimedModule)
             minutes = module.timer.time_elapsed("train") / 60.0 if not trainer.sanity_checking else 0.0
             self.write({"steps": trainer.global_step, "minutes": round(minutes, 1), "validation": figures})
-            _put(self.note, json.dumps({"best": score}))
+            put(self.note, json.dumps({"best": score}))
 
 
 class History(Callback):
@@ -206,11 +205,13 @@ def run(
             so that the batch grows with their number.
 
     Raises:
-        ValueError: ``out`` holds a run of another recipe.
+        ValueError: ``out`` holds a run of another recipe or a broken state, there is no such device, the loss is not
+            finite, or the disk is full.
+        KeyboardInterrupt: it was stopped; the state is that of the last validation.
     """
+    if max_steps < -1:
+        raise ValueError(f"max_steps {max_steps}; allowed: whole numbers from 0 up, or -1 for no such limit")
     folder = Path(out)
-    folder.mkdir(parents=True, exist_ok=True)
-    _claim(folder, recipe)
     last = folder / LAST
     module.timer = Timer(timedelta(minutes=module.max_minutes), interval="step", verbose=False)
     states = ModelCheckpoint(
@@ -236,52 +237,46 @@ def run(
             "ignore",
             ".*(does not have many workers|Checkpoint directory|GPU available|before the epoch ended|LeafSpec).*",
         )
-        trainer = L.Trainer(
-            accelerator=accelerator,
-            devices=devices,
-            num_nodes=nodes,
-            strategy=strategy,
-            use_distributed_sampler=False,  # each process draws by its rank
-            max_epochs=-1,  # steps and time limit it; an epoch that is over would not be resumed
-            max_steps=max_steps,
-            gradient_clip_val=1.0,
-            callbacks=callbacks,
-            logger=TensorBoardLogger(str(folder), name="", version="events"),
-            val_check_interval=validate_every,
-            num_sanity_val_steps=0,
-            log_every_n_steps=10,
-            enable_progress_bar=False,
-            enable_model_summary=False,
-        )
-        own = module.datamodule is None
-        trainer.fit(
-            module,
-            DataLoader(Counter(10_000_000), batch_size=None) if own else None,
-            DataLoader(Counter(1), batch_size=None) if own else None,
-            datamodule=module.datamodule,
-            ckpt_path=str(last) if last.is_file() else None,
-            weights_only=True,
-        )
-        if trainer.interrupted:
-            raise KeyboardInterrupt
-        trainer.validate(module, DataLoader(Counter(1), batch_size=None), verbose=False)
-    trainer.save_checkpoint(last)
-
-
-def _claim(folder: Path, recipe: Mapping[str, Any]) -> None:
-    text = json.dumps(recipe, indent=2, sort_keys=True, default=str)
-    note = folder / "recipe.json"
-    if (folder / LAST).is_file():
-        if note.is_file() and note.read_text(encoding="utf-8") != text:
-            raise ValueError(
-                f"{folder}: holds a training of another recipe (see {note.name}); choose another --out"
+        try:
+            trainer = L.Trainer(
+                accelerator=accelerator,
+                devices=devices,
+                num_nodes=nodes,
+                strategy=strategy,
+                plugins=[WholeStates()],
+                use_distributed_sampler=False,  # each process draws by its rank
+                max_epochs=-1,  # steps and time limit it; an epoch that is over would not be resumed
+                max_steps=max_steps,
+                gradient_clip_val=1.0,
+                callbacks=callbacks,
+                default_root_dir=str(folder),  # for what SLURM's end of a job makes Lightning store
+                logger=TensorBoardLogger(str(folder), name="", version="events"),
+                val_check_interval=validate_every,
+                num_sanity_val_steps=0,
+                log_every_n_steps=10,
+                enable_progress_bar=False,
+                enable_model_summary=False,
             )
-        return
-    (folder / BEST).unlink(missing_ok=True)
-    _put(note, text)
-
-
-def _put(path: Path, text: str) -> None:
-    with Whole(path) as file:
-        file.write(text)
-        file.keep()
+        except MisconfigurationException as error:
+            raise ValueError(
+                f"cannot train with device {accelerator}, devices {devices}, nodes {nodes}, strategy {strategy}: {error}"
+            ) from error
+        claim(folder, recipe)  # now that the training can begin
+        repair_checkpoint(folder / CHECKPOINT)
+        own = module.datamodule is None
+        try:
+            trainer.fit(
+                module,
+                DataLoader(Counter(10_000_000), batch_size=None) if own else None,
+                DataLoader(Counter(1), batch_size=None) if own else None,
+                datamodule=module.datamodule,
+                ckpt_path=str(last) if last.is_file() else None,
+                weights_only=True,
+            )
+            trainer.validate(module, DataLoader(Counter(1), batch_size=None), verbose=False)
+        except SystemExit as end:
+            # Lightning's answer to Ctrl-C; to SIGTERM it is a kind of its own
+            if trainer.interrupted and type(end) is SystemExit:
+                raise KeyboardInterrupt from None
+            raise
+    trainer.save_checkpoint(last)

@@ -42,6 +42,8 @@ class PlannedSource:
 class PlannedTraining(SimulatorTraining):
     """Batches from a plan's training split; validation on its validation split, or else on test's, or training's.
 
+    What is prepared is heard as it lies on disk, in validation too, and needs no corpus.
+
     Logs ``data_wait``, the share of a step's time that is spent waiting for data.
     """
 
@@ -66,8 +68,11 @@ class PlannedTraining(SimulatorTraining):
             raise ValueError(
                 f"{data.manifest}: prepared at {self.batches.plan.rate} Hz; allowed: {NEURO_RATE}"
             )
-        self.valid = _validation(self.batches, self.recipe.validation_items)
+        self.valid, self.truths = _validation(self.batches, self.recipe.validation_items)
         self._marks: list[tuple[float, float]] = []
+
+    def identity(self, data: Any) -> dict[str, str]:
+        return super().identity(data) | {"instances": self.batches.made_of}
 
     def training_step(self, batch: Any, index: int) -> Tensor:
         self.batch = batch
@@ -93,11 +98,14 @@ class _Batches(PlanData):
         return DataLoader(Counter(1), batch_size=None)
 
 
-def _validation(data: PlanData, count: int) -> list[tuple[Tensor, Tensor]]:
-    """The middle 2 s of instances evenly spread over the split. Shape: [((8, time), (8, 8))]."""
+def _validation(data: PlanData, count: int) -> tuple[list[tuple[Tensor, Tensor]], list[Tensor]]:
+    """The middle 2 s of instances evenly spread over the split, and what is heard of them where that is prepared.
+
+    Shape: [((8, time), (8, 8))], [(8, time)].
+    """
     for split in ("valid", "test", "train"):
         try:
-            items = PlanItems(data.plan, split)
+            items = PlanItems(data.plan, split, prepared=data.prepared)
             break
         except ValueError:
             continue
@@ -108,11 +116,20 @@ def _validation(data: PlanData, count: int) -> list[tuple[Tensor, Tensor]]:
         )
     samples = round(_VALID_SECONDS * data.plan.rate)
     chosen = torch.linspace(0, len(items) - 1, min(count, len(items))).round().int().tolist()
-    signals, ears = [], []
+    signals, ears, heard = [], [], []
     for place in chosen:
         instance = items[place]
-        first = max(0, (instance.signal.shape[-1] - samples) // 2)
-        cut = instance.signal[first : first + samples]
-        signals.append(torch.nn.functional.pad(cut, (0, samples - cut.shape[-1])))
+        signals.append(_middle(instance.signal, samples))
         ears.append(instance.thresholds)
-    return [(torch.stack(signals[i : i + 8]), torch.stack(ears[i : i + 8])) for i in range(0, len(chosen), 8)]
+        if instance.impaired is not None:
+            heard.append(_middle(instance.impaired, samples))
+    pairs = [
+        (torch.stack(signals[i : i + 8]), torch.stack(ears[i : i + 8])) for i in range(0, len(chosen), 8)
+    ]
+    return pairs, [torch.stack(heard[i : i + 8]) for i in range(0, len(heard), 8)]
+
+
+def _middle(value: Tensor, samples: int) -> Tensor:
+    first = max(0, (value.shape[-1] - samples) // 2)
+    cut = value[first : first + samples]
+    return torch.nn.functional.pad(cut, (0, samples - cut.shape[-1]))

@@ -19,9 +19,9 @@ from hlsim.msbg import MSBG
 from hlsim.neuro import NeuroConfig, NeuroMSBG
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.pretrained import save_checkpoint
-from hlsim.settings import refuse_unknown
+from hlsim.settings import refuse_other_kinds, refuse_unknown, refuse_weights
 from hlsim.training.averaging import average_of
-from hlsim.training.loop import TimedModule, run
+from hlsim.training.loop import CHECKPOINT, TimedModule, run
 from hlsim.training.sources import TrainingData, read_thresholds
 
 PRECISIONS = {"float32": None, "bfloat16": torch.bfloat16}
@@ -70,17 +70,14 @@ class SimulatorRecipe:
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> SimulatorRecipe:
-        """Raises ValueError where a name is unknown."""
+        """Raises ValueError where a name is unknown or a value is not allowed."""
         refuse_unknown(data, (entry.name for entry in fields(cls)), "settings", "in the recipe")
-        refuse_unknown(data.get("weights", ()), CRITERIA, "criteria", "in the recipe")
         return cls(**data)
 
     def __post_init__(self) -> None:
+        refuse_other_kinds(self, "in the recipe")
+        refuse_weights(self.weights, CRITERIA, "in the recipe")
         object.__setattr__(self, "levels", tuple(self.levels))
-        if len(self.levels) != 2 or self.levels[0] > self.levels[1]:
-            raise ValueError(
-                f"levels {self.levels} in the recipe; allowed: a lowest and a highest, in dB SPL"
-            )
         counts = (self.batch, self.validate_every, self.validation_items)
         if min(counts) < 1 or self.seconds <= 0.0 or self.learning_rate <= 0.0:
             raise ValueError(
@@ -164,9 +161,7 @@ class SimulatorTraining(TimedModule):
         with torch.no_grad():
             for number, (signal, ears) in enumerate(self.valid):
                 signal, ears = signal.to(self.device), ears.to(self.device)
-                if number == len(self.truths):
-                    self.truths.append(self.teacher(signal, ears))
-                values.append(-noise_to_signal_db(self.kept.module(signal, ears), self.truths[number]))
+                values.append(-noise_to_signal_db(self.kept.module(signal, ears), self.truth(number)))
         snr = torch.cat(values)
         median, low = float(snr.median()), float(snr.quantile(0.1))
         return {"score": median + 0.5 * low, "valid_snr_median": median, "valid_snr_worst_tenth": low}
@@ -174,7 +169,19 @@ class SimulatorTraining(TimedModule):
     def examples(self) -> dict[str, Tensor]:
         signal, ears = (tensor[-1:].to(self.device) for tensor in self.valid[0])
         heard = self.kept.module(signal, ears)
-        return {"given": signal[0], "heard/truth": self.teacher(signal, ears)[0], "heard/network": heard[0]}
+        return {"given": signal[0], "heard/truth": self.truth(0)[-1], "heard/network": heard[0]}
+
+    def truth(self, number: int) -> Tensor:
+        """What is heard of a batch of validation items, asked for once and in order. Shape: -> (items, time)."""
+        if number == len(self.truths):
+            signal, ears = (tensor.to(self.device) for tensor in self.valid[number])
+            with torch.no_grad():
+                self.truths.append(self.teacher(signal, ears))
+        return self.truths[number].to(self.device)
+
+    def identity(self, data: Any) -> dict[str, str]:
+        """What the training is on, by name: with anything else it is another one."""
+        return {entry.name: str(getattr(data, entry.name)) for entry in fields(data) if entry.compare}
 
     def trained_parameters(self) -> list[torch.nn.Parameter]:
         return list(self.student.parameters())
@@ -237,7 +244,7 @@ def train_simulator(
         ValueError: data or recipe that cannot be used; the message names them.
     """
     module = kind(recipe, data, max_minutes)
-    folder = Path(out) / "checkpoint"
+    folder = Path(out) / CHECKPOINT
 
     def write(figures: dict[str, Any]) -> None:
         from hlsim import __version__
@@ -248,9 +255,7 @@ def train_simulator(
     run(
         module,
         out=out,
-        recipe=asdict(recipe)
-        | {"max_minutes": max_minutes}
-        | {entry.name: str(getattr(data, entry.name)) for entry in fields(data) if entry.compare},
+        recipe=asdict(recipe) | {"max_minutes": max_minutes} | module.identity(data),
         write=write,
         validate_every=recipe.validate_every,
         max_steps=max_steps,

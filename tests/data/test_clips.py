@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import pytest
+import soundfile
 import torch
 from torch import Tensor
 
@@ -86,15 +87,37 @@ def test_what_is_refused_names_the_path(tmp_path: Path) -> None:
         assert str(caught.value).startswith(str(folder))
     bad = tmp_path / "bad.wav"
     bad.write_text("no recording")
-    with pytest.raises(ValueError, match="not readable as audio") as caught:
+    with (
+        pytest.warns(UserWarning, match="left out: .*bad.wav"),
+        pytest.raises(ValueError, match=r"not readable as audio.*; 100 files like it were drawn") as caught,
+    ):
         Clips(tmp_path, sample_rate=16000, seconds=1.0).draw(1, torch.Generator())
     assert str(caught.value).startswith(str(bad))
+
+
+def test_files_that_cannot_be_used_are_told_of_once_and_passed_over(tmp_path: Path) -> None:
+    folder = folder_with(tmp_path, a=ramp(4000), b=torch.zeros(4000), d=-ramp(4000))
+    (tmp_path / "c.wav").write_text("no recording")
+    soundfile.write(tmp_path / "e.wav", ramp(4000).numpy(), 8000)
+    clips = Clips(folder, sample_rate=16000, seconds=0.1)
+    with pytest.warns(UserWarning) as warned:
+        first = clips.draw(30, torch.Generator().manual_seed(2))
+    told = sorted(str(one.message) for one in warned)
+    assert len(told) == 3
+    for one, name in zip(told, "bce", strict=True):
+        assert one.startswith(f"left out: {tmp_path / name}.wav: ")
+    assert first.shape == (30, 1600) and bool((first > 0.5).any()) and bool((first < -0.5).any())
+    # the same after a resume, where they are met anew, and where they are known
+    assert torch.equal(first, clips.draw(30, torch.Generator().manual_seed(2)))
 
 
 def test_a_silent_first_channel_is_refused(tmp_path: Path) -> None:
     """It would be drawn again and again for ever, since none of its clips is loud."""
     write_audio(tmp_path / "a.wav", torch.stack((torch.zeros(4000), torch.rand(4000))), 16000)
     assert read_audio(tmp_path / "a.wav")[0].shape == (2, 4000)
-    with pytest.raises(ValueError, match="first channel is silent") as caught:
+    with (
+        pytest.warns(UserWarning, match="left out"),
+        pytest.raises(ValueError, match="first channel is silent") as caught,
+    ):
         Clips(tmp_path, sample_rate=16000, seconds=0.1).draw(1, torch.Generator())
     assert str(caught.value).startswith(str(tmp_path / "a.wav"))

@@ -73,6 +73,13 @@ def test_a_file_without_splits_is_divided_by_listeners(tmp_path: Path) -> None:
     assert not alone.measured["test"] and not alone.measured["valid"]
 
 
+def test_a_file_of_fewer_listeners_than_splits_is_too_few(tmp_path: Path) -> None:
+    path = table(tmp_path / "ears.csv", listeners(1))
+    ears = plan_ears(None, path, None, SPLITS, seed=0)
+    with pytest.raises(ValueError, match="0 measured ears for train; allowed: 2 or more"):
+        ears.check(SPLITS, 2)
+
+
 def test_files_and_columns_that_say_the_split(tmp_path: Path) -> None:
     levels = listeners(6)
     path = table(tmp_path / "ears.csv", levels[:4], split=["train", "train", "test", "test"])

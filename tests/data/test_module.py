@@ -133,3 +133,13 @@ def test_prepared_instances_must_be_there(plan: Path) -> None:
         PlanData(plan, prepared=True)
     with pytest.raises(ValueError, match="has no instances for valid"):
         PlanItems(Plan(plan), "valid")
+
+
+def test_what_a_worker_cannot_read_is_said_in_a_line(plan: Path, voicebank: Path) -> None:
+    for path in voicebank.rglob("*.wav"):
+        path.write_bytes(b"gone")
+    with pytest.raises(
+        ValueError, match=r"^8 instances in a row cannot be read, the last: .*wav: not readable"
+    ) as caught:
+        next(iter(PlanData(plan, workers=1).train_dataloader()))
+    assert len(str(caught.value).splitlines()) == 1

@@ -123,6 +123,19 @@ def test_the_same_corpus_gives_the_same_bytes_and_is_not_read_twice(
     assert run(voicebank, tmp_path / "a", seed=1).utterances == {"train": 4, "test": 1}
 
 
+def test_another_file_in_the_root_changes_nothing(
+    tmp_path: Path, pieces: list[Tensor], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for i, piece in enumerate(pieces[:4]):
+        folder = tmp_path / "speech" / f"speaker{i}"
+        folder.mkdir(parents=True)
+        write_audio(folder / f"{i}.wav", piece, 16000)
+    first = run(tmp_path / "speech", tmp_path / "out", root=tmp_path)
+    (tmp_path / "notes.txt").write_text("x")
+    monkeypatch.setattr("hlsim.data.checking.examine", None)
+    assert run(tmp_path / "speech", tmp_path / "out", root=tmp_path) == first
+
+
 def faulty(corpus: Path) -> dict[str, str]:
     """One file of each fault in an otherwise good corpus; the reasons by path."""
     clean, noisy = corpus / "clean_trainset_28spk_wav", corpus / "noisy_trainset_28spk_wav"

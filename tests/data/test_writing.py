@@ -67,6 +67,26 @@ def test_another_plan_in_the_folder_is_another_plan(plan: Path) -> None:
     assert digests(plan / "instances") != before
 
 
+def test_another_rate_in_the_folder_is_another_plan(plan: Path, voicebank: Path) -> None:
+    write(plan)
+    prepare(PlanSettings(voicebank, level=(55.0, 75.0), rate=22050), plan, jobs=1)
+    with pytest.raises(ValueError, match="another plan"):
+        write(plan)
+
+
+def test_workers_elsewhere_are_told_whole_paths(plan: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(plan.parent)
+    told: list[Any] = []
+
+    def keep(task: Any, numbers: Any, **_: Any) -> Any:
+        told.extend(task.args[:2])
+        return iter(())
+
+    monkeypatch.setattr("hlsim.data.writing.run_parallel", keep)
+    write_instances(plan.name, Recipe(), root="vbd")
+    assert told == [str(plan), str(plan.parent / "vbd")]
+
+
 def test_on_the_fly_and_on_disk_are_the_same(plan: Path) -> None:
     from hlsim.data.teacher import Teacher
 

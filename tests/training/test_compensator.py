@@ -8,7 +8,8 @@ import torch
 
 from compensators import MappingCompensator, load_compensator
 from hlsim import Audiogram
-from hlsim.pretrained import CONFIG
+from hlsim.neuro import NeuroConfig, NeuroMSBG
+from hlsim.pretrained import CONFIG, save_checkpoint
 from hlsim.training.compensator import (
     CompensatorRecipe,
     CompensatorTraining,
@@ -67,7 +68,7 @@ def test_goes_on_where_it_was_stopped(data: TrainingData, tmp_path: Path) -> Non
             raise KeyboardInterrupt
 
     recipe = CompensatorRecipe.from_dict(SMALL | options["recipe"])
-    with pytest.raises((KeyboardInterrupt, SystemExit)):
+    with pytest.raises(KeyboardInterrupt):
         train_compensator(
             data,
             recipe,
@@ -96,6 +97,17 @@ def test_another_recipe_does_not_go_on(data: TrainingData, tmp_path: Path) -> No
     train(data, tmp_path, audiogram=Audiogram.standard("N3"), **options)
     with pytest.raises(ValueError, match="another recipe"):
         train(data, tmp_path, audiogram=Audiogram.standard("N4"), **options)
+
+
+def test_another_simulator_in_the_same_folder_does_not_go_on(data: TrainingData, tmp_path: Path) -> None:
+    config = NeuroConfig(channels=4, blocks=1)
+    options = {"recipe": {"seconds": 0.2}, "max_steps": 1, "simulator": tmp_path / "simulator"}
+    for again in (False, True):
+        save_checkpoint(tmp_path / "simulator", "neuro-msbg", NeuroMSBG(config), config.to_dict(), {})
+        if not again:
+            train(data, tmp_path / "out", **options)
+    with pytest.raises(ValueError, match=r"another recipe \(other simulator_sha256; "):
+        train(data, tmp_path / "out", **options)
 
 
 def test_general_one_draws_ears_and_noise(data: TrainingData, tmp_path: Path) -> None:

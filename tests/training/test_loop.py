@@ -2,6 +2,8 @@
 
 import json
 import math
+import os
+import signal
 from pathlib import Path
 from typing import Any
 
@@ -102,7 +104,7 @@ def test_interruption_goes_on_from_the_last_state(tmp_path: Path) -> None:
             raise KeyboardInterrupt
 
     first = Toy()
-    with pytest.raises((KeyboardInterrupt, SystemExit)):
+    with pytest.raises(KeyboardInterrupt):
         go(first, tmp_path, max_steps=20, report=stop)
     assert first.seen == [0, 1, 2, 3]
     second = Toy()
@@ -113,17 +115,100 @@ def test_interruption_goes_on_from_the_last_state(tmp_path: Path) -> None:
     torch.testing.assert_close(second.vector, whole.vector)
 
 
+def test_being_told_to_end_is_no_interruption(tmp_path: Path) -> None:
+    def end(line: str) -> None:
+        if line.startswith("step 4"):
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    with pytest.raises(SystemExit):
+        go(Toy(), tmp_path, max_steps=20, report=end)
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
 def test_another_recipe_in_the_same_folder_is_refused_and_changes_nothing(tmp_path: Path) -> None:
     go(Toy(), tmp_path, max_steps=2)
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir() if path.is_file()}
     module = Toy()
     with pytest.raises(
-        ValueError, match=r"holds a training of another recipe .*choose another --out"
+        ValueError, match=r"holds a training of another recipe \(other a, b; see .*choose another --out"
     ) as caught:
-        go(module, tmp_path, max_steps=4, recipe={"a": 2})
+        go(module, tmp_path, max_steps=4, recipe={"a": 2, "b": None})
     assert str(caught.value).startswith(str(tmp_path))
     assert not module.seen
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir() if path.is_file()} == before
+
+
+def test_a_state_is_written_beside_its_place_whole_or_not_at_all(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    go(Toy(), tmp_path, max_steps=2)
+    before = (tmp_path / LAST).read_bytes()
+    replace, made = os.replace, []
+
+    def killed(source: Path, target: Path) -> None:
+        if Path(target).name == LAST:
+            made.append(Path(source))
+            raise OSError(28, "No space left on device")
+        replace(source, target)
+
+    monkeypatch.setattr(os, "replace", killed)
+    with pytest.raises(ValueError, match=r"last\.ckpt: the disk is full"):
+        go(Toy(), tmp_path, max_steps=4)
+    assert made[0].parent == tmp_path and (tmp_path / LAST).read_bytes() == before
+    assert not list(tmp_path.glob("*.part"))
+
+
+def test_leftovers_of_a_killed_run_go(tmp_path: Path) -> None:
+    (tmp_path / f".{LAST}.99.part").write_bytes(b"half")
+    (tmp_path / ".checkpoint.old").mkdir()
+    (tmp_path / ".checkpoint.abcd1234").mkdir()
+    go(Toy(), tmp_path, max_steps=1)
+    assert not list(tmp_path.glob(".*")) and (tmp_path / "checkpoint").is_dir()
+
+
+@pytest.mark.parametrize("broken", [b"", b"no state", None])
+def test_a_broken_state_is_named(tmp_path: Path, broken: bytes | None) -> None:
+    go(Toy(), tmp_path, max_steps=2)
+    last = tmp_path / LAST
+    if broken is None:
+        torch.save({}, last)
+    else:
+        last.write_bytes(broken)
+    with pytest.raises(ValueError, match="not readable as a state; remove it to start anew") as caught:
+        go(Toy(), tmp_path, max_steps=4)
+    assert str(caught.value).startswith(str(last))
+    last.unlink()
+    go(Toy(), tmp_path, max_steps=2)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"max_steps": -7}, "max_steps -7; allowed: whole numbers from 0 up, or -1"),
+        ({"devices": 0}, "cannot train with device cpu, devices 0"),
+        ({"strategy": "none"}, "strategy"),
+        pytest.param(
+            {"accelerator": "gpu"},
+            "cannot train with device gpu, .*gpu",
+            marks=pytest.mark.skipif(torch.cuda.is_available(), reason="has a GPU"),
+        ),
+    ],
+)
+def test_where_it_cannot_train_nothing_is_written(tmp_path: Path, options: dict[str, Any], said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        go(Toy(), tmp_path / "out", **options)
+    assert not (tmp_path / "out").exists()
+
+
+def test_what_slurm_makes_it_store_belongs_to_the_folder_and_its_recipe(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    module = Toy()
+    go(module, tmp_path, max_steps=1)
+    assert module.trainer.default_root_dir == str(tmp_path)
+    (tmp_path / LAST).rename(tmp_path / "hpc_ckpt_1.ckpt")
+    with pytest.raises(ValueError, match="another recipe"):
+        go(Toy(), tmp_path, recipe={"a": 2})
 
 
 def test_a_recipe_without_a_state_may_be_replaced(tmp_path: Path) -> None:
@@ -174,7 +259,7 @@ def test_the_best_of_a_killed_run_is_not_replaced_by_a_worse_one(tmp_path: Path)
         if line.startswith("step 4"):
             raise KeyboardInterrupt
 
-    with pytest.raises((KeyboardInterrupt, SystemExit)):
+    with pytest.raises(KeyboardInterrupt):
         go(Toy(scores={2: 1.0, 4: 3.0}), tmp_path, max_steps=20, report=killed)
     # as after a kill during that validation: the last state is from before its score
     state = torch.load(tmp_path / LAST, weights_only=True)
@@ -193,7 +278,7 @@ def test_a_loss_that_is_not_finite_stops_the_run_and_says_so(tmp_path: Path, val
             loss = super().training_loss(generator)
             return loss * value if self.global_step == 3 else loss
 
-    with pytest.raises(RuntimeError, match=rf"the loss is {value} at step 3; a lower learning rate"):
+    with pytest.raises(ValueError, match=rf"the loss is {value} at step 3; a lower learning rate"):
         go(Broken(), tmp_path)
     assert torch.load(tmp_path / LAST, weights_only=True)["global_step"] == 2
 

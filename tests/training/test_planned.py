@@ -1,5 +1,6 @@
 """Training from a manifest: on the fly, prepared and resumed, with the wait for data in the log."""
 
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ pytest.importorskip("lightning")
 from hlsim.cli import main
 from hlsim.data.plan import prepare
 from hlsim.data.plan_settings import PlanSettings
+from hlsim.data.samples import Instance
 from hlsim.data.writing import Recipe, write_instances
 from hlsim.pretrained import load_pretrained
 from hlsim.training.planned import PlannedSource, PlannedTraining
@@ -82,6 +84,41 @@ def test_prepared_instances_train_too(plan: Path, tmp_path: Path) -> None:
     assert len(train(PlannedSource(plan, prepared=True, workers=0), tmp_path / "out", 4)) == 2
 
 
+def test_prepared_validation_is_on_what_lies_on_disk_and_needs_no_corpus(plan: Path, tmp_path: Path) -> None:
+    write_instances(plan, Recipe(alignment="impulse"), jobs=1)
+    (tmp_path / "speech").rename(tmp_path / "gone")
+    source = PlannedSource(plan, prepared=True, workers=0)
+    training = PlannedTraining(SimulatorRecipe.from_dict(TINY), source, 1e6)
+    opened = training.batches.plan
+    for place, index in enumerate(opened.indices("valid").tolist()):
+        stored = Instance.read(opened.path(index))
+        assert stored.impaired is not None
+        for cut, whole in (
+            (training.valid[0][0][place], stored.signal),
+            (training.truth(0)[place], stored.impaired),
+        ):
+            assert torch.equal(cut[:9600], whole) and not bool(cut[9600:].any())  # shorter than 2 s
+    assert len(training.truths) == len(training.valid)
+    assert torch.equal(training.examples()["heard/truth"], training.truth(0)[-1])
+    train(source, tmp_path / "out", 1)
+
+
+def test_another_plan_in_the_same_folder_is_another_training(plan: Path, tmp_path: Path) -> None:
+    source = PlannedSource(plan, workers=0)
+    train(source, tmp_path / "out", 1)
+    prepare(PlanSettings(tmp_path / "speech", valid_share=0.2, seed=1), plan, jobs=1)
+    with pytest.raises(ValueError, match=r"another recipe \(other instances; see recipe.json\)"):
+        train(source, tmp_path / "out", 2)
+    for name in ("structural", "impulse"):
+        shutil.rmtree(plan / "instances", ignore_errors=True)
+        write_instances(plan, Recipe(name), jobs=1)
+        prepared = PlannedSource(plan, prepared=True, workers=0)
+        if name == "structural":
+            train(prepared, tmp_path / "prepared", 1)
+    with pytest.raises(ValueError, match=r"another recipe \(other instances; see recipe.json\)"):
+        train(prepared, tmp_path / "prepared", 2)
+
+
 def test_the_validation_split_is_used(plan: Path) -> None:
     training = PlannedTraining(SimulatorRecipe.from_dict(TINY), PlannedSource(plan, workers=0), 1e6)
     assert [(len(signals), ears.shape) for signals, ears in training.valid] == [(4, (4, 8))]
@@ -102,6 +139,8 @@ def test_bad_calls(plan: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str
     call = ["train-simulator", "--config", str(recipe), "--out", str(tmp_path / "out")]
     for options, said in (
         ([], "nothing to train on; allowed: --speech, a folder, or --manifest"),
+        (["--speech", "s", "--root", "r", "--workers", "0"], "--root, --workers without --manifest"),
+        (["--speech", "s", "--prepared"], "--prepared without --manifest; allowed: with it alone"),
         (["--manifest", str(plan), "--noise", "n"], "--manifest with --noise"),
         (["--manifest", str(tmp_path / "manifest.csv")], "not prepared"),
     ):

@@ -1,0 +1,84 @@
+"""What a training's folder holds of its state, and whose state that is."""
+
+import io
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from lightning.pytorch.plugins.io import TorchCheckpointIO
+
+from hlsim.data.files import PARTIAL, Whole
+
+LAST = "last.ckpt"
+"""Name of the state that a killed training goes on from."""
+
+BEST = "best.json"
+"""Name of the file with the best score so far."""
+
+RECIPE = "recipe.json"
+"""Name of the file that says what the training is made of."""
+
+
+class WholeStates(TorchCheckpointIO):
+    """Writes states whole or not at all: Lightning's own may copy one from another disk, and a kill then halves it."""
+
+    def save_checkpoint(
+        self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any = None
+    ) -> None:
+        buffer = io.BytesIO()
+        torch.save(checkpoint, buffer)
+        with Whole(path) as file:
+            file.write(buffer.getvalue())
+            file.keep()
+
+    def load_checkpoint(self, path: str | Path, *options: Any, **others: Any) -> dict[str, Any]:
+        """Raises ValueError where the file is broken."""
+        try:
+            state: dict[str, Any] = super().load_checkpoint(path, *options, **others)
+            state["state_dict"]
+        except Exception as error:  # zip, pickle and torch have their own each
+            raise ValueError(f"{path}: not readable as a state; remove it to start anew") from error
+        return state
+
+
+def claim(folder: Path, recipe: Mapping[str, Any]) -> None:
+    """Make a folder this training's, with its recipe in it.
+
+    Raises:
+        ValueError: it holds the state of a training of another recipe.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    for leftover in folder.glob(f".{LAST}.*{PARTIAL}"):  # of a run that was killed
+        leftover.unlink(missing_ok=True)
+    text = json.dumps(recipe, indent=2, sort_keys=True, default=str)
+    note = folder / RECIPE
+    # the second is what Lightning leaves where SLURM ends a job
+    if (folder / LAST).is_file() or any(folder.glob("hpc_ckpt_*")):
+        if note.is_file() and (found := note.read_text(encoding="utf-8")) != text:
+            raise ValueError(
+                f"{folder}: holds a training of another recipe (other {_differing(found, text)}; see {note.name}); "
+                "choose another --out"
+            )
+        return
+    (folder / BEST).unlink(missing_ok=True)
+    put(note, text)
+
+
+def put(path: Path, text: str) -> None:
+    """Write a small file."""
+    with Whole(path) as file:
+        file.write(text)
+        file.keep()
+
+
+def _differing(one: str, other: str) -> str:
+    """Names of the settings that differ."""
+    try:
+        first, second = json.loads(one), json.loads(other)
+        return ", ".join(
+            name for name in sorted(first | second) if first.get(name, ...) != second.get(name, ...)
+        )
+    except (ValueError, TypeError):
+        return "settings"  # the file is broken

@@ -1,0 +1,67 @@
+"""Settings: values of another kind are refused in both recipes, and the message says what to write."""
+
+from typing import Any
+
+import pytest
+
+pytest.importorskip("lightning")
+
+import yaml
+
+from hlsim.training.compensator import CompensatorRecipe
+from hlsim.training.simulator import SimulatorRecipe
+
+
+@pytest.mark.parametrize("recipe", [SimulatorRecipe, CompensatorRecipe])
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (
+            "learning_rate: 1e-3",
+            "learning_rate '1e-3' in the recipe; that is text in YAML; write 0.001 or 1.0e-3",
+        ),
+        ("learning_rate: 25e-6", "write 0.000025 or 2.5e-5"),
+        ("learning_rate: -1.0", "learning_rate -1.0 in the recipe; allowed: .* above 0"),
+        ("learning_rate: .nan", "learning_rate nan in the recipe; allowed: a number"),
+        ("learning_rate: true", "learning_rate True in the recipe; allowed: a number"),
+        ("batch: two", "batch 'two' in the recipe; allowed: a whole number"),
+        ("batch: '4'", "write 4$"),
+        ("batch: 2.5", "batch 2.5 in the recipe; allowed: a whole number"),
+        ("batch:", "batch None in the recipe; allowed: a whole number"),
+        ("seconds: .inf", "seconds inf"),
+        ("levels: 65", r"levels 65 in the recipe; allowed: a lowest and a highest, as \[0, 20\]"),
+        ("levels: [50, loud]", "levels 'loud' in the recipe; allowed: a number"),
+        ("levels: [80, 50]", r"levels \[80, 50\] in the recipe; allowed: a lowest and a highest, ascending"),
+        ("weights:", "weights None in the recipe; allowed: 'name: value' lines below it"),
+        ("weights: 1.0", "weights 1.0 in the recipe; allowed: 'name: value' lines"),
+        ("weights: {}", r"weights \{\} in the recipe; allowed: 0 or more, one or more above 0"),
+        ("model: small", "model 'small' in the recipe; allowed: 'name: value' lines"),
+        ("1: 2", "unknown settings 1 in the recipe"),
+        ("seed: x", "seed 'x'"),
+    ],
+)
+def test_values_that_are_not_allowed(recipe: Any, text: str, said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        recipe.from_dict(yaml.safe_load(text))
+
+
+@pytest.mark.parametrize(("recipe", "criterion"), [(SimulatorRecipe, "snr"), (CompensatorRecipe, "bands")])
+def test_weights(recipe: Any, criterion: str) -> None:
+    for value in (-1.0, 0.0, 0):
+        with pytest.raises(ValueError, match="allowed: 0 or more, one or more above 0"):
+            recipe(weights={criterion: value})
+    for value in ("1", None, float("inf")):
+        with pytest.raises(ValueError, match=f"weights: {criterion} .* in the recipe; "):
+            recipe(weights={criterion: value})
+    with pytest.raises(ValueError, match="unknown criteria loudness in the recipe; allowed: "):
+        recipe(weights={"loudness": 1.0})
+    assert recipe(weights={criterion: 2}, learning_rate=1, levels=[50, 60]).levels == (50, 60)
+
+
+def test_other_names() -> None:
+    with pytest.raises(ValueError, match=r"snr 5 in the recipe; allowed: a lowest and a highest"):
+        CompensatorRecipe.from_dict({"snr": 5})
+    with pytest.raises(ValueError, match=r"treated 'no way' in the recipe; allowed: true or false"):
+        SimulatorRecipe.from_dict({"treated": "no way"})
+    with pytest.raises(ValueError, match=r"precision 16 in the recipe; allowed: text"):
+        SimulatorRecipe.from_dict({"precision": 16})
