@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+import hlsim
 from hlsim.audiogram import Audiogram
 from hlsim.evaluation import fidelity
 from hlsim.evaluation.haspi import haspi
@@ -96,7 +97,9 @@ def versions_of(names: Iterable[str]) -> dict[str, str]:
 
 
 def version_of(package: str) -> str:
-    """An installed package's version, or that it is not installed."""
+    """An installed package's version, or that it is not installed; hlsim's own also where it runs from its sources."""
+    if package == "hlsim":
+        return hlsim.__version__
     try:
         return metadata.version(package)
     except metadata.PackageNotFoundError:
