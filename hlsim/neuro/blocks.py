@@ -95,6 +95,16 @@ class BidirectionalLSTM(nn.Module):
         return output
 
 
+class EncoderLayer(nn.TransformerEncoderLayer):
+    """Torch's, without dropout. Shape: (sequences, length, channels) -> the same.
+
+    It stays in training mode: in evaluation torch's shortcut holds every pair of times, 64 GiB for a minute of signal.
+    """
+
+    def train(self, mode: bool = True) -> Self:
+        return super().train(True)
+
+
 def _path(config: NetworkConfig, axis: int) -> nn.Module:
     """The path that ``config.block`` names, along time (0) or frequency (1)."""
     channels, expansion = config.channels, config.expansion
@@ -109,7 +119,7 @@ def _path(config: NetworkConfig, axis: int) -> nn.Module:
         "transformer": lambda: SequencePath(
             channels,
             axis,
-            nn.TransformerEncoderLayer(
+            EncoderLayer(
                 channels,
                 config.heads,
                 expansion * channels,

@@ -91,6 +91,20 @@ def test_keeps_shapes_and_gives_items_what_they_would_get_alone(kind: str) -> No
             assert float((together[i] - alone).norm() / alone.norm()) < 1e-4
 
 
+def test_attention_takes_no_shortcut_that_holds_every_pair_of_times(monkeypatch: pytest.MonkeyPatch) -> None:
+    model = network("transformer").eval()
+    waveform, ear = 0.02 * torch.randn(1, 1600), Audiogram.standard("N3")
+    expected = model(waveform, ear).detach()
+
+    def refuse(*arguments: object) -> None:
+        raise AssertionError("torch's shortcut")
+
+    for name in ("_transformer_encoder_layer_fwd", "_native_multi_head_attention"):
+        monkeypatch.setattr(torch, name, refuse)
+    with torch.no_grad():
+        torch.testing.assert_close(model(waveform, ear), expected)
+
+
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("level", [-20.0, 65.0, 120.0])
 def test_gradients_are_finite_and_reach_every_parameter(kind: str, level: float) -> None:
