@@ -50,7 +50,8 @@ def benchmark(
     Args:
         device: ``"cpu"`` or ``"cuda"``; pyclarity's ``Ear`` always runs on the CPU.
         repeats: counted rounds.
-        limit: seconds that one timing of a longer clip or larger batch may take by what 1 s took; others are left out.
+        limit: seconds that one timing of a longer clip or larger batch may take by what shorter ones took; others are
+            left out.
         lengths: seconds.
         simulators: the Neuro-MSBGs, by name or folder; by default all that ship.
         progress: called with cells done, cells in all, and what comes.
@@ -105,9 +106,11 @@ def benchmark(
         rate = row.rates[0]
         call, first = calls[row.name, rate, "N2"], statistics.median(cells[row.name, rate, 1.0, 1, "forward"])
         sizes = [(s, 1) for s in lengths if s != 1.0] + [(1.0, b) for b in batches if b != 1]
+        line = [(1.0, first)]
         for seconds, batch in sizes:
             step(f"{row.name}, {seconds:g} s, batch {batch}")
-            if first * seconds * batch > 1000.0 * limit:
+            expected = first * batch if batch > 1 else _expected(line, seconds)
+            if expected > 1000.0 * limit:
                 continue
             clip = _clip(rate, seconds, batch, place)
             key = (row.name, rate, seconds, batch, "forward")
@@ -118,8 +121,10 @@ def benchmark(
                     raise
                 skipped.append(f"{row.name}, {seconds:g} s, batch {batch}: memory ran out")
                 continue
-            times = max(1, min(repeats, int(3000.0 * limit / max(1.0, first * seconds * batch))))
+            times = max(1, min(repeats, int(3000.0 * limit / max(1.0, expected))))
             cells[key] = [_time(call, clip, "forward", place, warm=False) for _ in range(times)]
+            if batch == 1:
+                line.append((seconds, statistics.median(cells[key])))
     reference = cells.get(("pyclarity Ear", 44100, 1.0, 1, "forward"))
     return machine | {
         "rows": [_row(row, cells, memory, reference) for row in found],
@@ -160,6 +165,15 @@ def _row(
         "cells": out,
         "growth": {by: _growth(out, by, row.rates[0]) for by in ("seconds", "batch")},
     }
+
+
+def _expected(line: list[tuple[float, float]], seconds: float) -> float:
+    """Milliseconds of a longer clip, by how the time grew so far: attention's grows with the square of the length."""
+    power = 1.0
+    if len(line) > 1:
+        (low, first), (high, last) = line[-2:]
+        power = max(1.0, math.log(last / first) / math.log(high / low))
+    return line[-1][1] * (seconds / line[-1][0]) ** power
 
 
 def _growth(cells: list[dict[str, Any]], by: str, rate: int) -> float | None:

@@ -1,5 +1,7 @@
 """What the benchmark does where a call fails."""
 
+import time
+
 import pytest
 import torch
 from torch import Tensor
@@ -31,6 +33,20 @@ def test_a_row_that_runs_out_of_memory_is_left_out_there_alone(monkeypatch: pyte
     sizes = {row["name"]: {(c["seconds"], c["batch"]) for c in row["cells"]} for row in result["rows"]}
     assert sizes == {"greedy": {(1.0, 1), (1.0, 2)}, "modest": {(1.0, 1), (4.0, 1), (1.0, 2)}}
     assert "skipped: greedy, 4 s" in benchmark_markdown(result)
+
+
+def test_time_that_grows_with_the_square_is_seen_coming(monkeypatch: pytest.MonkeyPatch) -> None:
+    def call(waveform: Tensor) -> Tensor:
+        seconds = waveform.shape[-1] / 16000
+        assert seconds < 10.0
+        time.sleep(0.005 * seconds**2)
+        return 0.5 * waveform
+
+    square = Row("square", (16000,), lambda rate, ear, device: call)
+    monkeypatch.setattr(benchmark_module, "rows", lambda simulators: ([square, identity()], []))
+    result = benchmark(repeats=1, limit=0.5, lengths=(1.0, 4.0, 16.0), batches=(1,))
+    lengths = [sorted({cell["seconds"] for cell in row["cells"]}) for row in result["rows"]]
+    assert lengths == [[1.0, 4.0], [1.0, 4.0, 16.0]]  # by the first second alone 80 ms would be expected
 
 
 def test_another_error_is_not_hidden(monkeypatch: pytest.MonkeyPatch) -> None:
