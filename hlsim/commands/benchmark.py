@@ -9,7 +9,7 @@ import time
 from pathlib import Path
 
 from hlsim.commands.options import Commands, add_command, count, positive
-from hlsim.data.files import Whole
+from hlsim.data.files import write_whole
 
 WHAT = ("simulators", "training", "scan")
 
@@ -67,9 +67,7 @@ def _benchmark(options: argparse.Namespace) -> None:
         result["skipped"] = [*result["skipped"], *skipped]
     print(benchmark_markdown(result))
     if options.json is not None:
-        with Whole(options.json) as file:
-            file.write(json.dumps(result, indent=2) + "\n")
-            file.keep()
+        write_whole(options.json, json.dumps(result, indent=2) + "\n")
 
 
 class _Progress:

@@ -93,3 +93,10 @@ class Whole:
                 "from there"
             )
         return ValueError(f"{self.path}: cannot be written ({error.strerror})")
+
+
+def write_whole(path: str | Path, data: str | bytes) -> None:
+    """A file of these contents, whole or not at all. Raises ValueError as ``Whole``."""
+    with Whole(path) as file:
+        file.write(data)
+        file.keep()

@@ -16,7 +16,7 @@ from hlsim.audiogram import SEVERITIES
 from hlsim.data.checking import Listing, examine_all
 from hlsim.data.corpora import Fault, assign_splits, detect_layout, find_below
 from hlsim.data.ears import Ears, plan_ears
-from hlsim.data.files import PARTIAL, Whole
+from hlsim.data.files import PARTIAL, Whole, write_whole
 from hlsim.data.manifest import SPLITS, UTTERANCE_COLUMNS, Rows, csv_line
 from hlsim.data.noises import Noises, find_noises
 from hlsim.data.plan_settings import PlanSettings
@@ -163,9 +163,7 @@ def prepare(
         "instances_sha256": _digest(folder / INSTANCES),
         "prepared": vars(prepared),
     }
-    with Whole(folder / SETTINGS) as file:
-        file.write(json.dumps(about, indent=2) + "\n")
-        file.keep()
+    write_whole(folder / SETTINGS, json.dumps(about, indent=2) + "\n")
     return prepared
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 
 from hlsim.data.corpora import Fault
-from hlsim.data.files import PARTIAL, Whole, alone
+from hlsim.data.files import PARTIAL, alone, write_whole
 from hlsim.data.manifest import csv_line
 from hlsim.data.samples import MANIFEST, Plan, is_whole
 from hlsim.data.teacher import Reference, Teacher
@@ -91,10 +91,8 @@ def _write(
         torch.set_num_threads(threads)
     report = plan.folder / WRITE_FAULTS
     if faults:
-        with Whole(report) as file:
-            for cells in (("path", "reason"), *((fault.path, fault.reason) for fault in faults)):
-                file.write(csv_line(cells))
-            file.keep()
+        cells = (("path", "reason"), *((fault.path, fault.reason) for fault in faults))
+        write_whole(report, "".join(map(csv_line, cells)))
         raise ValueError(
             f"{len(faults)} of {len(plan.utterances)} utterances cannot be read any more, the first {faults[0].path}: "
             f"{faults[0].reason}; all are in {report}; the others are written"
@@ -118,9 +116,7 @@ def make(folder: str, root: str, digest: str, recipe: Recipe, number: int) -> li
         except ValueError as error:
             return [Fault(plan.utterance(index).clean, str(error))]
         heard = teacher(instance.signal[None], instance.thresholds[None])[0]
-        with Whole(plan.path(index)) as file:
-            file.write(replace(instance, impaired=heard).to_bytes())
-            file.keep()
+        write_whole(plan.path(index), replace(instance, impaired=heard).to_bytes())
     return []
 
 
@@ -141,9 +137,7 @@ def _claim(plan: Plan, recipe: Recipe) -> None:
                 "remove it"
             )
         return
-    with Whole(path) as file:
-        file.write(text)
-        file.keep()
+    write_whole(path, text)
 
 
 def claimed(plan: Plan) -> str:

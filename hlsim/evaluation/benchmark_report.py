@@ -9,8 +9,8 @@ def benchmark_markdown(result: dict[str, Any]) -> str:
     """One second at batch 1; longer clips and larger batches; the training step and the scan where they were timed."""
     lines = [
         f"{result['device']} ({result['machine']}, {result['cores']} cores, {result['threads']} threads), torch "
-        f"{result['torch']}, {result['date']}; milliseconds, median (least to greatest) of {result['repeats']} rounds "
-        "of three ears, of slow rows of fewer calls.",
+        f"{result['torch']}, {result['date']}; milliseconds, median (least to greatest) of {result['repeats']} rounds"
+        + (" of three ears, of slow rows of fewer calls." if "rows" in result else "."),
         "",
     ]
     if "rows" in result:
@@ -29,6 +29,7 @@ def _one_second(rows: list[dict[str, Any]]) -> list[str]:
         "| 1 s, batch 1 | parameters | rate (Hz) | forward | forward + backward | peak memory (MiB) | times pyclarity |",
         "|---|---|---|---|---|---|---|",
     ]
+    most = max(cell["counted"] for row in rows for cell in row["cells"])
     for row in rows:
         single = [cell for cell in row["cells"] if cell["seconds"] == 1.0 and cell["batch"] == 1]
         for forward in (cell for cell in single if cell["direction"] == "forward"):
@@ -37,7 +38,6 @@ def _one_second(rows: list[dict[str, Any]]) -> list[str]:
             peak = [
                 f"{cell['peak_mib']:.0f}" for cell in (forward, both) if cell and cell["peak_mib"] is not None
             ]
-            most = max(cell["counted"] for other in rows for cell in other["cells"])
             slow = f" ({forward['counted']} calls)" if forward["counted"] < most else ""
             cells = (
                 row["name"] + slow,

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from hlsim.data.files import Whole
+from hlsim.data.files import write_whole
 from hlsim.evaluation.compensator_tables import (
     GROUPS,
     failure_table,
@@ -45,9 +45,7 @@ def write_compensators(
         "compensators.html": render_page(title, sections, lead),
     }
     for name in FILES:
-        with Whole(Path(out) / name) as file:
-            file.write(contents[name])
-            file.keep()
+        write_whole(Path(out) / name, contents[name])
 
 
 def _lead(result: Mapping[str, Any]) -> str:

@@ -11,7 +11,7 @@ from typing import Any
 from torch import Tensor
 
 from hlsim.audiogram import SEVERITIES
-from hlsim.data.files import Whole
+from hlsim.data.files import write_whole
 from hlsim.evaluation.fidelity import COLUMNS, GROUPS, column_cells, fidelity_markdown, summarise
 from hlsim.evaluation.fidelity_items import RATE, Item
 from hlsim.evaluation.figures import draw_spectrograms
@@ -88,9 +88,7 @@ def write_fidelity(
         "spectrograms.png": picture.getvalue(),
     }
     for name in FILES:
-        with Whole(Path(out) / name) as file:
-            file.write(contents[name])
-            file.keep()
+        write_whole(Path(out) / name, contents[name])
 
 
 def _what(result: Mapping[str, Any]) -> str:

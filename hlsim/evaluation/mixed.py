@@ -10,6 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from hlsim.evaluation.significance import ROUNDING
+
 
 @dataclass(frozen=True)
 class MixedModel:
@@ -51,7 +53,7 @@ def mixed_model(differences: Sequence[float], listeners: Sequence[str]) -> Mixed
     if groups < 2 or len(differences) <= groups:
         return "needs two listeners or more, and more items than listeners"
     values = np.asarray(differences, dtype=np.float64)
-    if np.ptp(values) <= 1e-7 * np.abs(values).max():  # what varies is rounding
+    if np.ptp(values) <= ROUNDING * np.abs(values).max():
         return "the differences do not vary"
     try:
         # no extra brings statsmodels: the report is whole without it

@@ -17,8 +17,8 @@ _DRAWS = 1_000_000  # indices drawn at a time: keeps the bootstrap's memory at s
 FEWEST = 6
 """Values from which on an interval is given, and Wilcoxon's p can fall below 0.05."""
 
-# what is less than this part of the largest score is rounding: scores of files hang on float32
-_ROUNDING = 1e-7
+ROUNDING = 1e-7
+"""What is less than this part of the largest score is rounding: scores of files hang on float32."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ def paired_comparison(before: Iterable[float], after: Iterable[float]) -> Paired
     zeros = int(np.count_nonzero(difference == 0.0))
     deviation = float(difference.std(ddof=1)) if many else 0.0
     t = p_t = w = p_w = d = None
-    if deviation > _ROUNDING * _largest(first, second):
+    if deviation > ROUNDING * _largest(first, second):
         t, p_t = (float(value) for value in stats.ttest_1samp(difference, 0.0))
         d = float(difference.mean()) / deviation
     if many and zeros < n:
@@ -111,7 +111,7 @@ def differences(before: Iterable[float], after: Iterable[float]) -> np.ndarray:
     """After minus before, 0 where that is rounding."""
     first, second = (np.asarray(list(values), dtype=np.float64) for values in (before, after))
     difference = second - first
-    return np.where(np.abs(difference) <= _ROUNDING * _largest(first, second), 0.0, difference)
+    return np.where(np.abs(difference) <= ROUNDING * _largest(first, second), 0.0, difference)
 
 
 def bootstrap_interval(

@@ -61,10 +61,8 @@ def selective_scan(
             u, delta, A, B, C, D=D, z=z, delta_bias=delta_bias, delta_softplus=delta_softplus
         )
         return output
-    given, whole = (
-        u.dtype,
-        torch.promote_types(u.dtype, torch.float32),
-    )  # powers of decays want their precision
+    # powers of decays want their precision
+    given, whole = u.dtype, torch.promote_types(u.dtype, torch.float32)
     u, delta, A, B, C = (tensor.to(whole) for tensor in (u, delta, A, B, C))
     if delta_bias is not None:
         delta = delta + delta_bias.unsqueeze(-1)

@@ -19,9 +19,10 @@ from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
+from hlsim.data.files import write_whole
 from hlsim.pretrained import repair_checkpoint
 from hlsim.training.examples import ShowExamples
-from hlsim.training.state import BEST, LAST, WholeStates, claim, put
+from hlsim.training.state import BEST, LAST, WholeStates, claim
 
 CHECKPOINT = "checkpoint"
 """Name of the folder with the best model, in its released form."""
@@ -132,7 +133,7 @@ class KeepBest(Callback):
             assert isinstance(module, TimedModule)
             minutes = module.timer.time_elapsed("train") / 60.0 if not trainer.sanity_checking else 0.0
             self.write({"steps": trainer.global_step, "minutes": round(minutes, 1), "validation": figures})
-            put(self.note, json.dumps({"best": score}))
+            write_whole(self.note, json.dumps({"best": score}))
 
 
 class History(Callback):

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 
-from hlsim.data.files import PARTIAL, Whole
+from hlsim.data.files import PARTIAL, write_whole
 
 LAST = "last.ckpt"
 """Name of the state that a killed training goes on from."""
@@ -29,9 +29,7 @@ class WholeStates(TorchCheckpointIO):
     ) -> None:
         buffer = io.BytesIO()
         torch.save(checkpoint, buffer)
-        with Whole(path) as file:
-            file.write(buffer.getvalue())
-            file.keep()
+        write_whole(path, buffer.getvalue())
 
     def load_checkpoint(self, path: str | Path, *options: Any, **others: Any) -> dict[str, Any]:
         """Raises ValueError where the file is broken."""
@@ -63,14 +61,7 @@ def claim(folder: Path, recipe: Mapping[str, Any]) -> None:
             )
         return
     (folder / BEST).unlink(missing_ok=True)
-    put(note, text)
-
-
-def put(path: Path, text: str) -> None:
-    """Write a small file."""
-    with Whole(path) as file:
-        file.write(text)
-        file.keep()
+    write_whole(note, text)
 
 
 def _differing(one: str, other: str) -> str:
