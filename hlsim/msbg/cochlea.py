@@ -12,12 +12,11 @@ from hlsim.msbg.filters import Filters
 from hlsim.msbg.fourier import fft_length, irfft, rfft
 from hlsim.msbg.recruitment import (
     STEP,
-    around,
     decimate,
+    detect,
     envelope,
     expand,
     gains,
-    rectify,
     smooth,
     weigh,
 )
@@ -32,8 +31,10 @@ _SHARED_MULTIPLE = 10000
 
 def bank_points(length: int, rate: int) -> int:
     """FFT length at 44.1 kHz for a signal of ``length``: one that ``rate`` shares, if that costs little."""
-    multiple = 2 * (shared_multiple(rate) or STEP)  # MKL takes twice as long for odd numbers of steps
-    return fft_length(length + BANK_TAIL, multiple)
+    multiple = shared_multiple(rate) or STEP
+    odd, even = (fft_length(length + BANK_TAIL, some) for some in (multiple, 2 * multiple))
+    # MKL takes twice as long for odd numbers of steps, but few of its transforms are of steps
+    return odd if 1.1 * odd < even else even
 
 
 def shared_multiple(rate: int) -> int:
@@ -52,28 +53,33 @@ def hear(spectrum: Tensor, ratios: Tensor, plan: Plan, slight: bool) -> Tensor:
     """
     waves, sums = [], []
     for tier in plan.tiers:
-        bins = spectrum[..., None, : tier.points // 2 + 1]
-        if tier.series is None:
-            wave = torch.fft.irfft(bins * tier.response, tier.points)
+        bins = spectrum[..., None, : tier.response.shape[-1]] * tier.response
+        if tier.detector == "itself":
+            wave = torch.fft.irfft(bins, tier.points)
             rectified = wave.abs()
         else:
-            both = torch.fft.irfft(bins.unsqueeze(-3) * tier.response, tier.points)
-            wave, quadrature = both.unbind(-3)
-            rectified = rectify(wave, quadrature, tier.series)
+            both = torch.view_as_real(torch.fft.ifft(bins, tier.points))
+            rectified = detect(both, harmonics=tier.detector == "harmonics")
+            wave = both.flatten(-2) if tier.detector == "modulus" else both[..., 0]
         waves.append(wave)
         sums.append(decimate(rectified, tier.decimation))
     envelopes = smooth(torch.cat(sums, -3), plan.lowpass)
-    gain = around(gains(envelopes, ratios))
+    gain = gains(envelopes, ratios)
 
-    heard: dict[int, Tensor] = {}
+    heard: dict[tuple[int, bool], Tensor] = {}
     for tier, wave in zip(plan.tiers, waves, strict=True):
-        own = tier.channels
+        own, kind = tier.channels, (tier.step, tier.detector == "modulus")
         kinks = (envelopes[..., own, :], ratios[..., own]) if slight else None
-        part = weigh(wave, gain[..., own, :, :], tier.interpolation, kinks)
-        heard[tier.step] = heard[tier.step] + part if tier.step in heard else part
-    count = plan.points // plan.step // 2 + 1
-    parts = [rfft(part, part.shape[-1]) * (step / plan.step) for step, part in heard.items()]
-    return torch.stack([functional.pad(part, (0, count - part.shape[-1])) for part in parts]).sum(0)
+        part = weigh(wave, gain[..., own, :], tier.interpolation, kinks)
+        heard[kind] = heard[kind] + part if kind in heard else part
+    total = torch.zeros_like(spectrum)
+    for (_, analytic), part in heard.items():
+        if analytic:
+            bins = torch.fft.fft(torch.view_as_complex(part.unflatten(-1, (-1, 2))))
+        else:
+            bins = rfft(part, part.shape[-1])
+        total[..., : bins.shape[-1]] += bins
+    return total
 
 
 def hear_ending(heard: Tensor, ratios: Tensor, severity: str, filters: Filters) -> Tensor:

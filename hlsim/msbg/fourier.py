@@ -16,29 +16,28 @@ _LONG = 8192
 
 
 def rfft(waveform: Tensor, points: int) -> Tensor:
-    """``torch.fft.rfft``; a single long row on a CPU goes as two halves, for MKL takes half the time for two rows.
+    """``torch.fft.rfft``; a single long row on a CPU goes as complex numbers, for which MKL plans in a fifth of the time.
 
     Shape: (..., time) -> (..., points // 2 + 1).
     """
-    rows = waveform.numel() // waveform.shape[-1]
-    if rows > 1 or points < _LONG or points % 4 or waveform.device.type != "cpu":
+    if not _long_row(waveform, points):
         return torch.fft.rfft(waveform, points)
-    padded = functional.pad(waveform[..., :points], (0, max(0, points - waveform.shape[-1])))
-    even, odd = torch.fft.rfft(padded.unflatten(-1, (-1, 2)).mT).unbind(-2)
-    odd = odd * _twiddle(points, odd.dtype)
-    return torch.cat((even + odd, (even - odd)[..., :-1].conj().flip(-1)), -1)
+    padded = functional.pad(waveform, (0, points - waveform.shape[-1]))  # which cuts as well
+    both = torch.fft.fft(torch.view_as_complex(padded.unflatten(-1, (-1, 2))))  # even samples + i odd ones
+    both = torch.cat((both, both[..., :1]), -1)
+    own, mirrored = _untangling(points, both.dtype)
+    return torch.addcmul(both * own, both.flip(-1).conj(), mirrored)
 
 
 def irfft(spectrum: Tensor, points: int) -> Tensor:
     """``torch.fft.irfft``, the inverse of ``rfft``. Shape: (..., points // 2 + 1) -> (..., points)."""
-    rows = spectrum.numel() // spectrum.shape[-1]
-    if rows > 1 or points < _LONG or points % 4 or spectrum.device.type != "cpu":
+    if not _long_row(spectrum, points):
         return torch.fft.irfft(spectrum, points)
-    quarter = points // 4
-    low, high = spectrum[..., : quarter + 1], spectrum[..., quarter:].conj().flip(-1)
-    odd = (low - high) * _twiddle(points, spectrum.dtype).conj()
-    halves = torch.fft.irfft(torch.stack((low + high, odd), -2), points // 2)
-    return halves.mT.flatten(-2) * 0.5
+    own, mirrored = _untangling(points, spectrum.dtype)
+    ends = torch.complex(spectrum.real[..., :: points // 2], torch.zeros_like(spectrum.real[..., :: points // 2]))
+    spectrum = torch.cat((ends[..., :1], spectrum[..., 1:-1], ends[..., 1:]), -1)
+    both = torch.addcmul(spectrum * own.conj(), spectrum.flip(-1).conj(), mirrored.conj())
+    return torch.view_as_real(torch.fft.ifft(both[..., :-1])).flatten(-2)
 
 
 def filter_blocks(waveform: Tensor, response: Tensor, length: int) -> Tensor:
@@ -73,12 +72,20 @@ def fft_length(least: int, multiple: int = 1) -> int:
     return min(length for length in lengths if length >= least)
 
 
-def _twiddle(points: int, dtype: torch.dtype) -> Tensor:
-    return torch.from_numpy(_factors(points, dtype == torch.complex128))
+def _long_row(signal: Tensor, points: int) -> bool:
+    rows = signal.numel() // signal.shape[-1]
+    return rows == 1 and points >= _LONG and points % 2 == 0 and signal.device.type == "cpu"
+
+
+def _untangling(points: int, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+    """What to multiply the spectrum of pairs of samples and its mirror image with for that of the samples."""
+    own, mirrored = _factors(points, dtype == torch.complex128)
+    return torch.from_numpy(own), torch.from_numpy(mirrored)
 
 
 @lru_cache(maxsize=16)
-def _factors(points: int, double: bool) -> NDArray[np.complexfloating]:
-    """An array, for a tensor made while a program is traced would be none that others could use."""
-    factors = np.exp(np.arange(points // 4 + 1) * (-2j * np.pi / points))
-    return factors if double else factors.astype(np.complex64)
+def _factors(points: int, double: bool) -> tuple[NDArray[np.complexfloating], NDArray[np.complexfloating]]:
+    """Arrays, for a tensor made while a program is traced would be none that others could use."""
+    turned = 0.5j * np.exp(np.arange(points // 2 + 1) * (-2j * np.pi / points))
+    factors = 0.5 - turned, 0.5 + turned
+    return factors if double else tuple(factor.astype(np.complex64) for factor in factors)  # type: ignore[return-value]

@@ -103,10 +103,13 @@ class MSBG(nn.Module):
 
     def _simulate(self, waveform: Tensor, thresholds: Tensor) -> Tensor:
         dtype = waveform.dtype if waveform.dtype == torch.float64 else torch.float32
-        batch = torch.broadcast_shapes(waveform.shape[:-1], thresholds.shape[:-1])
+        batch = waveform.shape[:-1]
+        if thresholds.ndim > 1:
+            batch = torch.broadcast_shapes(batch, thresholds.shape[:-1])
         signals = waveform.to(dtype).expand(*batch, -1).reshape(-1, waveform.shape[-1])
         ears = thresholds.to(signals).expand(*batch, -1).reshape(-1, thresholds.shape[-1])
-        signals = signals * gain_to_pascals(self.full_scale_spl)
+        if (gain := gain_to_pascals(self.full_scale_spl)) != 1.0:
+            signals = signals * gain
         if self.rescale_active:
             signals = signals * active_rescaling(to_inner(signals, self.sample_rate))
 
@@ -125,7 +128,8 @@ class MSBG(nn.Module):
         heard = joined[0] if len(joined) == 1 else torch.cat(joined)
         if order != list(range(len(order))):
             heard = heard[torch.tensor(order).argsort().to(heard.device)]
-        heard = heard / gain_to_pascals(self.full_scale_spl)
+        if gain != 1.0:
+            heard = heard / gain
         return heard.reshape(*batch, longest).to(waveform.dtype)
 
     def _in_blocks(self, signals: Tensor, ears: Tensor, severity: str, none: bool) -> Tensor:
@@ -217,7 +221,8 @@ def resolve_thresholds(stored: Tensor | None, audiogram: AudiogramLike | None, w
     thresholds = as_thresholds(audiogram) if audiogram is not None else stored
     assert thresholds is not None
     try:
-        torch.broadcast_shapes(waveform.shape[:-1], thresholds.shape[:-1])
+        if thresholds.ndim > 1:
+            torch.broadcast_shapes(waveform.shape[:-1], thresholds.shape[:-1])
     except RuntimeError:
         raise ValueError(
             f"audiograms of shape {tuple(thresholds.shape)} for a waveform of shape {tuple(waveform.shape)}; allowed: "

@@ -28,6 +28,7 @@ _LOWEST_ENVELOPE = 1e-9 * 10.0 ** ((120.0 - PASCAL_SPL) / 20.0)
 _HIGHEST_ENVELOPE = 10.0 ** ((CATCH_UP_SPL - PASCAL_SPL) / 20.0)
 _BOXES = 3  # three running means of 16 samples put zeros of third order where decimation would alias to 0 Hz
 _TAPS = 6
+_TOGETHER = 8  # steps between which a matrix product interpolates together
 
 AHEAD = _TAPS // 2
 """Steps ahead of a sample that its gain is interpolated from."""
@@ -47,22 +48,22 @@ def expansion_ratios(thresholds: Tensor, bank: FilterBank) -> Tensor:
     return CATCH_UP_SPL / (CATCH_UP_SPL - thresholds @ weights)
 
 
-def rectify(signal: Tensor, quadrature: Tensor, series: tuple[float, float, float]) -> Tensor:
-    """What a full-wave rectifier makes of a band, less the harmonics that its rate cannot hold.
+def detect(parts: Tensor, harmonics: bool) -> Tensor:
+    """What a full-wave rectifier makes of the real part of an analytic signal, times pi / 2, less its harmonics.
 
-    Shape: (..., time) twice -> (..., time).
+    Shape: (..., 2) -> (...).
 
     Args:
-        series: coefficients of 1, cos^2 and cos^4 of the phase in its |cos|.
+        harmonics: with the lower two: |cos a| is 2 / pi (1 + 2/3 cos 2a - 2/15 cos 4a ...); otherwise the modulus.
     """
-    square = signal.square()
-    power = torch.addcmul(square, quadrature, quadrature) + _TINY
-    cosine = square / power
-    if series[2]:
-        factor = (cosine * series[2] + series[1]) * cosine + series[0]
-    else:
-        factor = cosine * series[1] + series[0]
-    return power.sqrt() * factor
+    squares = parts.square()  # torch's own modulus of complex numbers takes four times as long
+    real, imaginary = squares.unbind(-1)
+    power = real + imaginary
+    if not harmonics:
+        return (power + _TINY if power.requires_grad else power).sqrt()
+    power = power + _TINY
+    cosine = real / power  # its square
+    return power.sqrt() * ((cosine * (-16 / 15) + 12 / 5) * cosine + 1 / 5)
 
 
 def decimate(rectified: Tensor, kernel: Tensor) -> Tensor:
@@ -99,9 +100,17 @@ def gains(envelopes: Tensor, ratios: Tensor) -> Tensor:
     return (level * (ratios.unsqueeze(-1) - 1.0)).exp()
 
 
-def around(values: Tensor) -> Tensor:
-    """The six values about each step. Shape: (..., steps) -> (..., steps, 6)."""
-    return torch.cat((values[..., 1 - AHEAD :], values, values[..., :AHEAD]), -1).unfold(-1, _TAPS, 1)
+def interpolate(values: Tensor, kernel: Tensor) -> Tensor:
+    """Values between the steps' ones; periodic. Shape: (..., steps), (13, 8 * each) -> (..., steps * each).
+
+    Args:
+        kernel: ``interpolation_kernel``.
+    """
+    nothing = values.new_zeros(*values.shape[:-1], -values.shape[-1] % _TOGETHER)
+    wrapped = torch.cat((values[..., 1 - AHEAD :], values, values[..., :AHEAD], nothing), -1)
+    windows = wrapped.unfold(-1, len(kernel), _TOGETHER)
+    fine = windows.reshape(-1, len(kernel)) @ kernel  # one product: matmul makes one a channel of it, at twice the cost
+    return fine.view(*windows.shape[:-2], -1)[..., : values.shape[-1] * kernel.shape[-1] // _TOGETHER]
 
 
 def weigh(
@@ -109,24 +118,21 @@ def weigh(
 ) -> Tensor:
     """Interpolate the gains, apply them and sum the channels.
 
-    Shape: (..., channels, time), (..., channels, steps, 6), (6, time // steps) -> (..., time).
+    Shape: (..., channels, time), (..., channels, steps), (13, 8 * time // steps) -> (..., time).
 
     Args:
         slight: envelopes (..., channels, steps) and ratios (..., channels), where some ratios are slight. The low-pass
             overshoots, and where the envelope goes through zero the gain has kinks. A small loss does not bury them,
             and the way out of the ear lifts their upper end by 40 dB, so that there the envelope is interpolated instead.
     """
-    gain = gain @ kernel
+    full = interpolate(gain, kernel)
     if slight is not None:
         envelopes, ratios = slight
         steep = _steep(envelopes) & ((ratios != 1.0) & (ratios < _SLIGHT)).unsqueeze(-1)
-        if steep.device.type == "cpu":
-            own = ratios.unsqueeze(-1).expand(steep.shape)[steep]
-            gain[steep] = gains(around(envelopes)[steep] @ kernel, own)
-        else:  # indices would have to come back from the device
-            fine = gains(around(envelopes) @ kernel, ratios.unsqueeze(-1))
-            gain = torch.where(steep.unsqueeze(-1), fine, gain)
-    full = gain.flatten(-2)
+        if steep.device.type != "cpu" or steep.any():
+            fine = gains(interpolate(envelopes, kernel), ratios)
+            every = full.shape[-1] // steep.shape[-1]
+            full = torch.where(steep.repeat_interleave(every, -1), fine, full)
     if torch.is_grad_enabled() and (channels.requires_grad or full.requires_grad):
         return (channels * full).sum(-2)
     total = channels[..., 0, :] * full[..., 0, :]
@@ -150,7 +156,7 @@ def expand(channels: Tensor, envelopes: Tensor, ratios: Tensor) -> Tensor:
     Shape: (..., channels, time), (..., channels, time // 16), (..., channels) -> (..., time).
     """
     kernel = torch.from_numpy(interpolation_kernel()).to(channels)
-    return weigh(channels, around(gains(envelopes, ratios)), kernel, (envelopes, ratios))
+    return weigh(channels, gains(envelopes, ratios), kernel, (envelopes, ratios))
 
 
 def envelope_lowpass(
@@ -203,12 +209,21 @@ def decimation_kernel(step: int = 1) -> NDArray[np.float64]:
 
 
 @lru_cache(maxsize=8)
-def interpolation_kernel(step: int = 1) -> NDArray[np.float64]:
-    """Lagrange weights of six neighbours for the samples from the third on. Returns (6, 16 // step)."""
+def interpolation_kernel(step: int = 1, parts: int = 1) -> NDArray[np.float64]:
+    """Weights of 13 neighbours for the samples of eight steps from the third on: six count for each, after Lagrange.
+
+    Args:
+        parts: of a sample, one after the other, that weigh alike.
+
+    Returns: (13, 8 * 16 // step * parts).
+    """
     nodes = np.arange(_TAPS) - (_TAPS // 2 - 1.0)
     place = np.arange(0, STEP, step) / STEP
     weights = np.ones((_TAPS, len(place)))
     for i, node in enumerate(nodes):
         for other in np.delete(nodes, i):
             weights[i] *= (place - other) / (node - other)
-    return weights
+    kernel = np.zeros((_TAPS + _TOGETHER - 1, _TOGETHER, len(place)))
+    for i in range(_TOGETHER):
+        kernel[i : i + _TAPS, i] = weights
+    return kernel.reshape(len(kernel), -1).repeat(parts, -1)

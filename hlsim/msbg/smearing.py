@@ -20,7 +20,7 @@ BROADENING = {"mild": (1.6, 1.1), "moderate": (2.4, 1.6), "severe": (4.0, 2.0)}
 """Widening of the lower and the upper side of the auditory filters; with no loss nothing is smeared (pyclarity 0.9.0)."""
 
 _TINY = 1e-24  # Pa^2; its power of -1.5, in the gradient of silence, is finite in float32
-_CACHED = 240  # frames
+_CACHED = 480  # frames
 
 
 def roex_filters(lower: float, upper: float, count: int, spacing: float) -> NDArray[np.float64]:
@@ -88,7 +88,7 @@ def smear(waveform: Tensor, matrix: Tensor, step: int = 1) -> Tensor:
     matrix = functional.pad(matrix, (0, 1, 0, 1))  # the last frequency is left out
     count = math.ceil(waveform.shape[-1] / hop)
     window = _window(step, waveform.dtype, waveform.device)
-    frames = _frames(waveform, count, hop)
+    frames = _frames(waveform, count, hop, window)
     # on a CPU a few frames at a time, for the steps from one to the next to find them in its cache
     size = max(1, _CACHED * step // waveform[..., 0].numel()) if waveform.device.type == "cpu" else count
     parts = [_widen(part, window, matrix) for part in frames.split(size, -2)]
@@ -97,20 +97,15 @@ def smear(waveform: Tensor, matrix: Tensor, step: int = 1) -> Tensor:
 
 def _widen(frames: Tensor, window: Tensor, matrix: Tensor) -> Tensor:
     """Smear each frame's power. Shape: (..., frames, 2 n), (2 n,), (n + 1, n + 1) -> (..., frames, n)."""
-    spectrum = torch.fft.rfft(frames * window)
-    power = spectrum.real.square() + spectrum.imag.square()
+    spectrum = torch.fft.rfft(frames)
+    squares = torch.view_as_real(spectrum).square()
+    power = squares[..., 0] + squares[..., 1]
     smeared, inverse = power @ matrix.T, (power + _TINY).rsqrt()
-    # the square root of a negative power is imaginary
-    spectrum = spectrum * torch.complex(_root(smeared) * inverse, _root(-smeared) * inverse)
+    # the square root of a negative power is imaginary; of 0 it has no gradient, and takes long
+    real, imaginary = smeared.clamp_min(_TINY).sqrt(), (-smeared).clamp_min(_TINY).sqrt()
+    spectrum = spectrum * torch.complex(real * inverse, imaginary * inverse)
     half = len(window) // 2
     return torch.fft.irfft(spectrum, len(window))[..., :half] * window[:half]
-
-
-def _root(power: Tensor) -> Tensor:
-    """Square root, 0 of what is negative; tiny terms keep the gradients of silence finite."""
-    if power.requires_grad and torch.is_grad_enabled():
-        return (power.clamp_min(0.0) + _TINY).sqrt()
-    return power.clamp_min(0.0).sqrt_()
 
 
 @lru_cache(maxsize=16)
@@ -122,32 +117,28 @@ def _window(step: int, dtype: torch.dtype, device: torch.device) -> Tensor:
         return functional.pad(window, (0, (FFT - FRAME) // step)).to(device=device, dtype=dtype)
 
 
-def _frames(waveform: Tensor, count: int, hop: int) -> Tensor:
+def _frames(waveform: Tensor, count: int, hop: int, window: Tensor) -> Tensor:
     """Frame k covers hops k - 3 to k from the fifth on, and what follows, which the window takes away.
 
-    The first four are as ``smear3`` fills them. Shape: (..., time) -> (..., count, 8 * hop).
+    The first four are as ``smear3`` fills them, as if hops 1 to 3 came again after the first four.
+
+    Shape: (..., time), (8 * hop,) -> (..., count, 8 * hop).
     """
-    padded = functional.pad(waveform, (3 * hop, hop * (max(count, 4) + 4) - waveform.shape[-1]))
-    regular = padded.unfold(-1, 8 * hop, hop)[..., :count, :]
-    hops = padded[..., 3 * hop : 7 * hop].unflatten(-1, (4, hop))
-    zero = torch.zeros_like(hops)
-    order = ((0, 1, 2, 3), (1, 2, 3, 1), (2, 3, 1, 2), (3, 1, 2, 3))
-    first = [
-        torch.cat((hops[..., row, :].flatten(-2), zero.flatten(-2)), -1) for row in order[: min(4, count)]
-    ]
-    return torch.cat((torch.stack(first, -2), regular[..., 4:, :]), -2)
+    padded = functional.pad(waveform, (0, hop * (max(count, 4) + 4) - waveform.shape[-1]))
+    again = torch.cat((padded[..., : 4 * hop], padded[..., hop:]), -1)
+    return again.unfold(-1, 8 * hop, hop)[..., :count, :] * window
 
 
 def _overlap_add(frames: Tensor, hop: int) -> Tensor:
     hops = frames.unflatten(-1, (4, hop))
     count = hops.shape[-3]
     total = frames.new_zeros(*frames.shape[:-2], count + 3, hop)
-    for j in range(4):
+    for j in range(3):
         total[..., j : j + count, :] += hops[..., j, :]
-    # smear3's last three hops: the newest frames' parts, and in place of the others' those of the fourth last frame
-    old = hops[..., count - 4, :, :] if count >= 4 else torch.zeros_like(hops[..., 0, :, :])
-    last, second = hops[..., -1, :, :], hops[..., max(count - 2, 0), :, :]
-    total[..., count, :] = old[..., 0, :] + last[..., 1, :] + second[..., 2, :]
-    total[..., count + 1, :] = old[..., 1, :] + last[..., 2, :]
-    total[..., count + 2, :] = old[..., 2, :]
+    if count == 1:
+        total[..., 1, :] += hops[..., 0, 2, :]
+    if count >= 4:
+        total[..., 3:count, :] += hops[..., : count - 3, 3, :]
+        # in smear3's last three hops the fourth last frame's first parts stand for the last parts of the last three
+        total[..., count:, :] += hops[..., count - 4, :3, :]
     return total.flatten(-2)

@@ -9,6 +9,7 @@ are rectified as they are, as the reference does: at 44.1 kHz its own harmonics 
 import itertools
 import math
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import torch
@@ -22,9 +23,13 @@ from hlsim.msbg.recruitment import decimation_kernel, envelope_lowpass, interpol
 REACH = 5.0
 """Bandwidths above its frequency to which a channel is kept."""
 
-_LOW_STEP = 4
-_TRUE_HZ = 350.0  # below, channels are rectified as they are
-_CACHED = 400_000  # samples of a tier on a CPU, for the steps from one to the next to find them in its cache
+_WIDE = 2.5  # broadening above which bands come so near to 0 Hz that a rectifier's harmonics count
+_TRUE_HZ = 400.0  # below, channels are rectified as they are
+_CACHED = 600_000  # samples of a tier on a CPU, for the steps from one to the next to find them in its cache
+
+
+Detector = Literal["itself", "modulus", "harmonics"]
+"""What a channel's envelope is taken from: the rectified signal, or the analytic one, alone or with harmonics."""
 
 
 @dataclass(frozen=True)
@@ -35,18 +40,17 @@ class Tier:
         channels: which of the bank's.
         step: samples at 44.1 kHz from one of its samples to the next; a divisor of 16.
         points: its FFT length.
-        response: of the channels, (channels, points // 2 + 1), or (2, channels, points // 2 + 1) with those of their
-            quadrature signals.
-        series: coefficients of 1, cos^2 and cos^4 in |cos|; none where a signal is rectified as it is.
+        detector: how they are rectified.
+        response: of the channels, (channels, points // 2 + 1), or of their analytic signals, (channels, points).
         decimation: weights of a block's samples, (3, 16 // step).
-        interpolation: weights of six gains, (6, 16 // step).
+        interpolation: ``interpolation_kernel``, each weight twice for analytic signals' two parts.
     """
 
     channels: slice
     step: int
     points: int
+    detector: Detector
     response: Tensor
-    series: tuple[float, float, float] | None
     decimation: Tensor
     interpolation: Tensor
 
@@ -67,17 +71,23 @@ class Plan:
     lowpass: Tensor
 
 
-def assign(bank: FilterBank, step: int) -> list[tuple[slice, int, bool]]:
-    """Channels, step and whether rectified as they are, from the lowest channels up.
+def assign(bank: FilterBank, step: int) -> list[tuple[slice, int, Detector]]:
+    """Channels, step and how they are rectified, from the lowest channels up.
 
     Args:
         step: of the widest channels: 1, or 2 where nothing above 11 kHz is of interest.
     """
-    kinds: list[tuple[int, bool]] = []
+    kinds: list[tuple[int, Detector]] = []
     for hz, width in zip(bank.centre_frequencies, erb(np.array(bank.centre_frequencies)), strict=True):
         top = hz + REACH * bank.broadening * float(width)
-        own = _LOW_STEP if top <= RATE / _LOW_STEP / 2.0 else step
-        kinds.append((own, hz < _TRUE_HZ or own == 1))
+        if hz < _TRUE_HZ:
+            kinds.append((4, "itself"))
+        elif top <= RATE / 8:
+            kinds.append((4, "harmonics") if bank.broadening > _WIDE else (8, "modulus"))
+        elif step == 2 or (top <= RATE / 4 and bank.broadening <= _WIDE):
+            kinds.append((4, "modulus"))
+        else:
+            kinds.append((1, "itself"))
     bounds = [0, *(i for i in range(1, len(kinds)) if kinds[i] != kinds[i - 1]), len(kinds)]
     return [(slice(a, b), *kinds[a]) for a, b in itertools.pairwise(bounds)]
 
@@ -98,16 +108,24 @@ def make_plan(severity: str, points: int, step: int, dtype: torch.dtype, device:
     bank = BANKS[severity]
     tiers, lowpass = [], []
     with torch.inference_mode(False):
-        for channels, own, as_is in _parts(assign(bank, step), points, device):
-            count = points // own
-            response = gammatone_response(bank, points, channels, count // 2 + 1) * (step / own)
-            if own > 1 and count % 2 == 0:
+        for channels, own, detector in _parts(assign(bank, step), points, device):
+            count, analytic = points // own, detector != "itself"
+            bins = count if analytic else count // 2 + 1
+            # signals are own / step times too loud, as their sum's spectrum is to be; those that are to be transformed as
+            # analytic ones half of it, the other half being in negative frequencies
+            response = gammatone_response(bank, points, channels, bins)
+            decimation = decimation_kernel(own) * (step / own)
+            interpolation = interpolation_kernel(own, 2 if detector == "modulus" else 1)
+            if detector == "modulus":
+                response[:, 0] *= 0.5
+                decimation = decimation * (4.0 / math.pi)
+            elif detector == "harmonics":
+                response[:, 1:] *= 2.0
+                decimation = decimation * (2.0 / math.pi)
+            elif own > 1 and count % 2 == 0:
                 response[:, -1] = 0.0
-            if not as_is:
-                response = np.stack((response, -1j * response))
-            kernels = tensor(decimation_kernel(own)), tensor(interpolation_kernel(own))
-            series = None if as_is else _series(own)
-            tiers.append(Tier(channels, own, count, tensor(response), series, *kernels))
+            kernels = tensor(decimation), tensor(interpolation)
+            tiers.append(Tier(channels, own, count, detector, tensor(response), *kernels))
             lowpass.append(envelope_lowpass(bank, points, own, channels))
         return Plan(points, step, tuple(tiers), tensor(np.concatenate(lowpass)))
 
@@ -121,20 +139,15 @@ def total_response(severity: str, points: int, step: int) -> NDArray[np.complex1
 
 
 def _parts(
-    tiers: list[tuple[slice, int, bool]], points: int, device: torch.device
-) -> list[tuple[slice, int, bool]]:
+    tiers: list[tuple[slice, int, Detector]], points: int, device: torch.device
+) -> list[tuple[slice, int, Detector]]:
     """The tiers, on a CPU cut to what its cache holds."""
     if device.type != "cpu":
         return tiers
     parts = []
-    for channels, step, as_is in tiers:
-        size = max(1, _CACHED * step // points)
-        cuts = [*range(channels.start, channels.stop, size), channels.stop]
-        parts += [(slice(a, b), step, as_is) for a, b in itertools.pairwise(cuts)]
+    for channels, step, detector in tiers:
+        count = channels.stop - channels.start
+        pieces = min(count, math.ceil(count * (1 if detector == "itself" else 2) * points / (_CACHED * step)))
+        cuts = [channels.start + count * piece // pieces for piece in range(pieces + 1)]
+        parts += [(slice(a, b), step, detector) for a, b in itertools.pairwise(cuts)]
     return parts
-
-
-def _series(step: int) -> tuple[float, float, float]:
-    """2 / pi (1 + 2/3 cos 2a - 2/15 cos 4a) in powers of cos^2 a, without the last term where 4a would fold."""
-    powers = (1 / 5, 12 / 5, -16 / 15) if step == _LOW_STEP else (1 / 3, 4 / 3, 0.0)
-    return tuple(2.0 / math.pi * power for power in powers)  # type: ignore[return-value]
