@@ -14,6 +14,7 @@ from hlsim.commands.options import (
     seed_option,
 )
 from hlsim.extras import require
+from hlsim.memory import keep_freed_memory
 
 
 def add(commands: Commands) -> None:
@@ -39,6 +40,7 @@ def add(commands: Commands) -> None:
 def _demo(options: argparse.Namespace) -> None:
     for module, extra in (("lightning", "train"), ("clarity", "eval"), ("matplotlib", "eval")):
         require(module, extra)
+    keep_freed_memory()
     from hlsim.demo import demo
 
     report = demo(

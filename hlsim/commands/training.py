@@ -18,6 +18,7 @@ from hlsim.commands.options import (
     read_recipe,
 )
 from hlsim.extras import require
+from hlsim.memory import keep_freed_memory
 
 FOLDERS = ("speech", "noise", "audiograms", "valid_speech", "valid_noise", "valid_audiograms")
 
@@ -50,6 +51,7 @@ def add(commands: Commands) -> None:
 
 def _train_simulator(options: argparse.Namespace) -> None:
     require("lightning", "train")
+    keep_freed_memory()
     from hlsim.training.simulator import SimulatorRecipe, train_simulator
 
     if options.manifest is not None:
@@ -91,6 +93,7 @@ def _train_planned(options: argparse.Namespace) -> None:
 
 def _train_compensator(options: argparse.Namespace) -> None:
     require("lightning", "train")
+    keep_freed_memory()
     from hlsim.training.compensator import CompensatorRecipe, train_compensator
 
     folder = train_compensator(

@@ -4,7 +4,6 @@ import math
 
 import torch
 from torch import Tensor
-from torch.nn import functional
 
 from hlsim.msbg.ear import RATE
 from hlsim.msbg.ending import ending
@@ -58,9 +57,9 @@ def hear(spectrum: Tensor, ratios: Tensor, plan: Plan, slight: bool) -> Tensor:
             wave = torch.fft.irfft(bins, tier.points)
             rectified = wave.abs()
         else:
-            both = torch.view_as_real(torch.fft.ifft(bins, tier.points))
+            both = torch.fft.ifft(bins, tier.points)
             rectified = detect(both, harmonics=tier.detector == "harmonics")
-            wave = both.flatten(-2) if tier.detector == "modulus" else both[..., 0]
+            wave = torch.view_as_real(both).flatten(-2) if tier.detector == "modulus" else both.real
         waves.append(wave)
         sums.append(decimate(rectified, tier.decimation))
     envelopes = smooth(torch.cat(sums, -3), plan.lowpass)

@@ -34,7 +34,9 @@ def irfft(spectrum: Tensor, points: int) -> Tensor:
     if not _long_row(spectrum, points):
         return torch.fft.irfft(spectrum, points)
     own, mirrored = _untangling(points, spectrum.dtype)
-    ends = torch.complex(spectrum.real[..., :: points // 2], torch.zeros_like(spectrum.real[..., :: points // 2]))
+    ends = spectrum.real[..., :: points // 2].to(
+        spectrum.dtype
+    )  # as torch does, without their imaginary parts
     spectrum = torch.cat((ends[..., :1], spectrum[..., 1:-1], ends[..., 1:]), -1)
     both = torch.addcmul(spectrum * own.conj(), spectrum.flip(-1).conj(), mirrored.conj())
     return torch.view_as_real(torch.fft.ifft(both[..., :-1])).flatten(-2)
@@ -88,4 +90,4 @@ def _factors(points: int, double: bool) -> tuple[NDArray[np.complexfloating], ND
     """Arrays, for a tensor made while a program is traced would be none that others could use."""
     turned = 0.5j * np.exp(np.arange(points // 2 + 1) * (-2j * np.pi / points))
     factors = 0.5 - turned, 0.5 + turned
-    return factors if double else tuple(factor.astype(np.complex64) for factor in factors)  # type: ignore[return-value]
+    return factors if double else tuple(factor.astype(np.complex64) for factor in factors)

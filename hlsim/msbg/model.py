@@ -35,7 +35,7 @@ _ENDING = 4096
 _ENDING_LEAD = 7296
 
 # samples of all items that run together
-_CPU_SAMPLES = 48000
+_CPU_SAMPLES = 96000
 _DEVICE_SAMPLES = 12_000_000
 
 

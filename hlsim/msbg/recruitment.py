@@ -48,20 +48,19 @@ def expansion_ratios(thresholds: Tensor, bank: FilterBank) -> Tensor:
     return CATCH_UP_SPL / (CATCH_UP_SPL - thresholds @ weights)
 
 
-def detect(parts: Tensor, harmonics: bool) -> Tensor:
-    """What a full-wave rectifier makes of the real part of an analytic signal, times pi / 2, less its harmonics.
+def detect(signals: Tensor, harmonics: bool) -> Tensor:
+    """What a full-wave rectifier makes of the real part of analytic signals, times pi / 2, less its harmonics.
 
-    Shape: (..., 2) -> (...).
+    Shape: complex (...) -> (...).
 
     Args:
         harmonics: with the lower two: |cos a| is 2 / pi (1 + 2/3 cos 2a - 2/15 cos 4a ...); otherwise the modulus.
     """
-    squares = parts.square()  # torch's own modulus of complex numbers takes four times as long
+    squares = torch.view_as_real(signals).square()  # torch's own modulus takes four times as long
     real, imaginary = squares.unbind(-1)
-    power = real + imaginary
+    power = real + imaginary + _TINY
     if not harmonics:
-        return (power + _TINY if power.requires_grad else power).sqrt()
-    power = power + _TINY
+        return power.sqrt()
     cosine = real / power  # its square
     return power.sqrt() * ((cosine * (-16 / 15) + 12 / 5) * cosine + 1 / 5)
 
@@ -109,7 +108,8 @@ def interpolate(values: Tensor, kernel: Tensor) -> Tensor:
     nothing = values.new_zeros(*values.shape[:-1], -values.shape[-1] % _TOGETHER)
     wrapped = torch.cat((values[..., 1 - AHEAD :], values, values[..., :AHEAD], nothing), -1)
     windows = wrapped.unfold(-1, len(kernel), _TOGETHER)
-    fine = windows.reshape(-1, len(kernel)) @ kernel  # one product: matmul makes one a channel of it, at twice the cost
+    # as one product, for matmul makes one a channel of it, at twice the cost
+    fine = windows.reshape(-1, len(kernel)) @ kernel
     return fine.view(*windows.shape[:-2], -1)[..., : values.shape[-1] * kernel.shape[-1] // _TOGETHER]
 
 

@@ -1,9 +1,10 @@
-"""At which rate each channel runs: a gammatone channel is a band, and only the wider ones need 44.1 kHz.
+"""At which rate each channel runs: a gammatone channel is a band, and only the widest need 44.1 kHz.
 
-A channel runs at 11 kHz if that rate holds its band up to five bandwidths above its frequency, where it is 57 dB down.
-Rectified there as it is, its harmonics would fold onto the envelope; instead the rectified signal is taken from the
-analytic one, |cos| being a short series of even harmonics. The lowest channels, whose bands reach 0 Hz, and the widest
-are rectified as they are, as the reference does: at 44.1 kHz its own harmonics fold too.
+A channel is kept up to five bandwidths above its frequency, where it is 57 dB down. Narrow ones run as analytic signals
+at 5.5 or 11 kHz, whose modulus is the envelope: what a rectifier adds, harmonics of the band, lies above its low-pass.
+It does not where bands are so wide for their frequency that they come down to 0 Hz: with severe losses two harmonics
+complete the modulus. The lowest channels, and the widest at 44.1 kHz, are rectified as they are, as the reference does:
+at that rate its own harmonics fold too.
 """
 
 import itertools
@@ -20,8 +21,7 @@ from hlsim.msbg.ear import RATE
 from hlsim.msbg.filterbank import BANKS, FilterBank, erb, gammatone_response
 from hlsim.msbg.recruitment import decimation_kernel, envelope_lowpass, interpolation_kernel
 
-REACH = 5.0
-"""Bandwidths above its frequency to which a channel is kept."""
+_REACH = 5.0  # bandwidths above its frequency to which a channel is kept
 
 _WIDE = 2.5  # broadening above which bands come so near to 0 Hz that a rectifier's harmonics count
 _TRUE_HZ = 400.0  # below, channels are rectified as they are
@@ -79,7 +79,7 @@ def assign(bank: FilterBank, step: int) -> list[tuple[slice, int, Detector]]:
     """
     kinds: list[tuple[int, Detector]] = []
     for hz, width in zip(bank.centre_frequencies, erb(np.array(bank.centre_frequencies)), strict=True):
-        top = hz + REACH * bank.broadening * float(width)
+        top = hz + _REACH * bank.broadening * float(width)
         if hz < _TRUE_HZ:
             kinds.append((4, "itself"))
         elif top <= RATE / 8:
