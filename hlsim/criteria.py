@@ -57,7 +57,8 @@ def time_loss(estimate: Tensor, truth: Tensor) -> Tensor:
 
 def anti_wrap(angle: Tensor) -> Tensor:
     """Distance of an angle to the nearest multiple of 2 pi (Ai and Ling 2023). Any shape, radians."""
-    return (angle - 2.0 * math.pi * (angle / (2.0 * math.pi)).round()).abs()
+    turns = (angle.detach() / (2.0 * math.pi)).round()
+    return torch.sub(angle, turns, alpha=2.0 * math.pi).abs()
 
 
 def paper_stft(sample_rate: int) -> STFT:
@@ -111,28 +112,29 @@ def log_spectral_distance_db(
 
     Shape: (items, time) twice -> (items,).
     """
-    powers = [
-        spectrum.real.square() + spectrum.imag.square()
-        for spectrum in (stft.analyse(estimate), stft.analyse(truth))
-    ]
+    powers = [_power(spectrum) for spectrum in (stft.analyse(estimate), stft.analyse(truth))]
     floor = powers[1].amax((-2, -1), keepdim=True) * 10.0 ** (-depth / 10.0) + _TINY
     first, second = (10.0 * torch.log10(power + floor) for power in powers)
     return (first - second).abs().mean((-2, -1))
 
 
 def _magnitude(spectrum: Tensor) -> Tensor:
-    return (spectrum.real.square() + spectrum.imag.square() + _TINY).sqrt()
+    return (_power(spectrum) + _TINY).sqrt()
+
+
+def _power(spectrum: Tensor) -> Tensor:
+    squares = torch.view_as_real(spectrum).square()
+    return squares[..., 0] + squares[..., 1]
 
 
 def _heard(spectrum: Tensor) -> Tensor:
     """From 0 for silence to 1 for what is well above 20 dB SPL, without gradient."""
-    power = (spectrum.real.square() + spectrum.imag.square()).detach()
+    power = _power(spectrum.detach())
     return power / (power + _FAINT)
 
 
 def _phase(spectrum: Tensor) -> Tensor:
     """Angle with a bounded gradient at zero, where ``torch.angle`` has none."""
-    real = torch.where(
-        spectrum.real.abs() + spectrum.imag.abs() < 1e-7, torch.full_like(spectrum.real, 1e-7), spectrum.real
-    )
-    return torch.atan2(spectrum.imag, real)
+    # of the parts apart, for torch takes twenty times as long where every second number is another's
+    real, imaginary = spectrum.real.contiguous(), spectrum.imag.contiguous()
+    return torch.atan2(imaginary, torch.where(real.abs() + imaginary.abs() < 1e-7, 1e-7, real))

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 
 @dataclass(frozen=True)
@@ -35,16 +36,11 @@ class STFT:
 
     def analyse(self, waveform: Tensor) -> Tensor:
         """Spectrum. Shape: (items, time) -> complex (items, frames, frequencies), frames = time // hop + 1."""
-        return torch.stft(
-            waveform,
-            self.fft,
-            self.hop,
-            self.window,
-            self._hann(waveform),
-            center=True,
-            pad_mode="constant",
-            return_complex=True,
-        ).mT
+        # as torch.stft, whose gradient takes half as long again
+        side, before = self.fft // 2, (self.fft - self.window) // 2
+        frames = functional.pad(waveform, (side, side)).unfold(-1, self.fft, self.hop)
+        windowed = frames[..., before : before + self.window] * self._hann(waveform)
+        return torch.fft.rfft(functional.pad(windowed, (before, self.fft - self.window - before)))
 
     def synthesise(self, spectrum: Tensor, length: int) -> Tensor:
         """Waveform by overlap-add. Shape: complex (items, frames, frequencies) -> (items, length)."""
