@@ -18,6 +18,7 @@ from hlsim.neuro.config import NEURO_RATE
 from hlsim.neuro.decoders import Decoder, PhaseDecoder
 from hlsim.neuro.encoder import DenseEncoder
 from hlsim.neuro.network import EarNetwork
+from hlsim.spectrum import power
 
 _TINY = 1e-11
 _NEPER_DB = 20.0 / math.log(10.0)
@@ -101,12 +102,12 @@ class MappingCompensator(EarNetwork):
 
     def _features(self, spectrum: Tensor, ears: Tensor, start: Tensor) -> Tensor:
         """The input channels. Shape: (items, frames, frequencies), ... -> (items, 4, frames, frequencies)."""
-        power = spectrum.real.square() + spectrum.imag.square()
-        encoded = self.audiogram_encoder(ears).unsqueeze(1).expand(power.shape)
+        squared = power(spectrum)
+        encoded = self.audiogram_encoder(ears).unsqueeze(1).expand(squared.shape)
         # the sine of the phase, faded out near silence: its gradient stays finite and it has no jump at pi
-        sine = spectrum.imag * (power + 1e-6).rsqrt()
+        sine = spectrum.imag * (squared + 1e-6).rsqrt()
         return torch.stack(
-            ((power + _TINY).log() / 4.0, sine, encoded, start.unsqueeze(1).expand(power.shape)), 1
+            ((squared + _TINY).log() / 4.0, sine, encoded, start.unsqueeze(1).expand(squared.shape)), 1
         )
 
     def _hz(self, like: Tensor) -> Tensor:

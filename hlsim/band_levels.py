@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from hlsim.calibration import PASCAL_SPL
-from hlsim.spectrum import STFT
+from hlsim.spectrum import STFT, power
 
 BANDS = 24
 
@@ -40,11 +40,10 @@ def band_levels(waveform: Tensor, sample_rate: int) -> Tensor:
     hop = round(FRAME_SECONDS / 2.0 * sample_rate)
     stft = STFT(2 * hop, 2 * hop, hop)
     spectrum = stft.analyse(waveform.reshape(-1, waveform.shape[-1]))
-    power = spectrum.real.square() + spectrum.imag.square()
     # both halves of the spectrum; the squares of a Hann window of n samples sum to 3 n / 8
-    power = power * (2.0 / (stft.fft * 0.375 * stft.window))
-    power = power @ torch.from_numpy(_bands(stft.fft, sample_rate)).to(power)
-    levels = 10.0 * torch.log10(power + LOWEST_POWER) + PASCAL_SPL
+    powers = power(spectrum) * (2.0 / (stft.fft * 0.375 * stft.window))
+    powers = powers @ torch.from_numpy(_bands(stft.fft, sample_rate)).to(powers)
+    levels = 10.0 * torch.log10(powers + LOWEST_POWER) + PASCAL_SPL
     return levels.reshape(*waveform.shape[:-1], *levels.shape[-2:])
 
 

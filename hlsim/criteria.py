@@ -6,7 +6,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from hlsim.spectrum import STFT
+from hlsim.spectrum import STFT, power
 
 PAPER_STFT = STFT(400, 400, 100)
 """The paper's transform at 16 kHz: 201 frequencies."""
@@ -112,25 +112,20 @@ def log_spectral_distance_db(
 
     Shape: (items, time) twice -> (items,).
     """
-    powers = [_power(spectrum) for spectrum in (stft.analyse(estimate), stft.analyse(truth))]
+    powers = [power(spectrum) for spectrum in (stft.analyse(estimate), stft.analyse(truth))]
     floor = powers[1].amax((-2, -1), keepdim=True) * 10.0 ** (-depth / 10.0) + _TINY
-    first, second = (10.0 * torch.log10(power + floor) for power in powers)
+    first, second = (10.0 * torch.log10(own + floor) for own in powers)
     return (first - second).abs().mean((-2, -1))
 
 
 def _magnitude(spectrum: Tensor) -> Tensor:
-    return (_power(spectrum) + _TINY).sqrt()
-
-
-def _power(spectrum: Tensor) -> Tensor:
-    squares = torch.view_as_real(spectrum).square()
-    return squares[..., 0] + squares[..., 1]
+    return (power(spectrum) + _TINY).sqrt()
 
 
 def _heard(spectrum: Tensor) -> Tensor:
     """From 0 for silence to 1 for what is well above 20 dB SPL, without gradient."""
-    power = _power(spectrum.detach())
-    return power / (power + _FAINT)
+    level = power(spectrum.detach())
+    return level / (level + _FAINT)
 
 
 def _phase(spectrum: Tensor) -> Tensor:

@@ -1,6 +1,7 @@
-"""Short-time Fourier transform and its inverse, for models and criteria alike."""
+"""Short-time Fourier transform and its inverse, and the power of a spectrum, for models and criteria alike."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -49,3 +50,35 @@ class STFT:
 
     def _hann(self, like: Tensor) -> Tensor:
         return torch.hann_window(self.window, dtype=like.dtype, device=like.device)
+
+
+def power(spectrum: Tensor) -> Tensor:
+    """Squared modulus. Shape: complex (...) -> (...)."""
+    if spectrum.requires_grad and torch.is_grad_enabled():
+        result: Tensor = _Power.apply(spectrum)
+        return result
+    return _power(spectrum)
+
+
+class _Power(torch.autograd.Function):
+    """With a gradient of one step, where that of real and imaginary part apart takes six."""
+
+    generate_vmap_rule = True
+
+    @staticmethod
+    def forward(spectrum: Tensor) -> Tensor:
+        return _power(spectrum)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor], output: Tensor) -> None:
+        ctx.save_for_backward(*inputs)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> Tensor:
+        (spectrum,) = ctx.saved_tensors
+        return spectrum * (2.0 * gradient)
+
+
+def _power(spectrum: Tensor) -> Tensor:
+    squares = torch.view_as_real(spectrum).square()
+    return squares[..., 0] + squares[..., 1]

@@ -5,7 +5,7 @@ import torch
 from scipy.signal import ShortTimeFFT
 from scipy.signal.windows import hann
 
-from hlsim.spectrum import STFT
+from hlsim.spectrum import STFT, power
 
 SIZES = [(400, 400, 100), (256, 96, 24), (256, 256, 128)]
 
@@ -56,3 +56,14 @@ def test_both_ways_are_differentiable() -> None:
 def test_lengths_that_do_not_fit(sizes: tuple[int, int, int]) -> None:
     with pytest.raises(ValueError, match=r"STFT of fft .*; allowed: 2 hop <= window <= fft, fft even"):
         STFT(*sizes)
+
+
+def test_power_is_the_squared_modulus() -> None:
+    spectrum = torch.randn(3, 5, dtype=torch.complex128)
+    torch.testing.assert_close(power(spectrum), spectrum.abs().square())
+    spectrum.requires_grad_()
+    torch.testing.assert_close(power(spectrum), spectrum.abs().square())
+    assert torch.autograd.gradcheck(power, (spectrum,))
+    assert torch.autograd.gradgradcheck(power, (spectrum,))
+    (gradient,) = torch.autograd.grad(power(spectrum * 0.0).sum(), spectrum)
+    assert torch.equal(gradient, torch.zeros_like(gradient))

@@ -16,6 +16,7 @@ from hlsim.audiogram import FREQUENCIES
 from hlsim.calibration import PASCAL_SPL
 from hlsim.msbg.ear import RATE
 from hlsim.msbg.filterbank import FilterBank, erb
+from hlsim.spectrum import power
 
 CATCH_UP_SPL = 105.0
 """Level in dB SPL at which the impaired ear hears as loud as a normal one."""
@@ -56,13 +57,12 @@ def detect(signals: Tensor, harmonics: bool) -> Tensor:
     Args:
         harmonics: with the lower two: |cos a| is 2 / pi (1 + 2/3 cos 2a - 2/15 cos 4a ...); otherwise the modulus.
     """
-    squares = torch.view_as_real(signals).square()  # torch's own modulus takes four times as long
-    real, imaginary = squares.unbind(-1)
-    power = real + imaginary + _TINY
+    squared = power(signals) + _TINY
+    modulus = squared.sqrt()  # torch's own takes four times as long
     if not harmonics:
-        return power.sqrt()
-    cosine = real / power  # its square
-    return power.sqrt() * ((cosine * (-16 / 15) + 12 / 5) * cosine + 1 / 5)
+        return modulus
+    cosine = signals.real.square() / squared  # its square
+    return modulus * ((cosine * (-16 / 15) + 12 / 5) * cosine + 1 / 5)
 
 
 def decimate(rectified: Tensor, kernel: Tensor) -> Tensor:

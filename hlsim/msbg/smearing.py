@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from hlsim.msbg.ear import RATE
+from hlsim.spectrum import power
 
 FRAME, HOP, FFT = 256, 64, 512
 
@@ -98,9 +99,8 @@ def smear(waveform: Tensor, matrix: Tensor, step: int = 1) -> Tensor:
 def _widen(frames: Tensor, window: Tensor, matrix: Tensor) -> Tensor:
     """Smear each frame's power. Shape: (..., frames, 2 n), (2 n,), (n + 1, n + 1) -> (..., frames, n)."""
     spectrum = torch.fft.rfft(frames)
-    squares = torch.view_as_real(spectrum).square()
-    power = squares[..., 0] + squares[..., 1]
-    smeared, inverse = power @ matrix.T, (power + _TINY).rsqrt()
+    given = power(spectrum)
+    smeared, inverse = given @ matrix.T, (given + _TINY).rsqrt()
     # the square root of a negative power is imaginary; of 0 it has no gradient, and takes long
     real, imaginary = smeared.clamp_min(_TINY).sqrt(), (-smeared).clamp_min(_TINY).sqrt()
     spectrum = spectrum * torch.complex(real * inverse, imaginary * inverse)

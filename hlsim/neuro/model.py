@@ -13,6 +13,7 @@ from hlsim.neuro.decoders import MaskDecoder, PhaseDecoder
 from hlsim.neuro.encoder import DenseEncoder, FrameEncoder
 from hlsim.neuro.network import EarNetwork
 from hlsim.neuro.prior import Prior
+from hlsim.spectrum import power
 
 _TINY = 1e-11
 
@@ -108,16 +109,16 @@ class NeuroMSBG(EarNetwork):
 
     def _features(self, spectrum: Tensor, ears: Tensor, factor: Tensor | None) -> Tensor:
         """The input channels. Shape: (items, frames, frequencies), (items, 8) -> (items, 2 to 4, frames, rows)."""
-        power = spectrum.real.square() + spectrum.imag.square()
+        squared = power(spectrum)
         if self.config.level_aware:
             # the sine of the phase, faded out near silence: its gradient stays finite and it has no jump at pi
-            channels = [(power + _TINY).log() / 4.0, spectrum.imag * (power + 1e-6).rsqrt()]
+            channels = [(squared + _TINY).log() / 4.0, spectrum.imag * (squared + 1e-6).rsqrt()]
         else:
-            channels = [(power + _TINY).sqrt(), torch.angle(spectrum)]
+            channels = [(squared + _TINY).sqrt(), torch.angle(spectrum)]
         if self.audiogram_encoder is not None:
-            channels.append(self.audiogram_encoder(ears).unsqueeze(1).expand(power.shape))
+            channels.append(self.audiogram_encoder(ears).unsqueeze(1).expand(squared.shape))
         if factor is not None:
-            channels.append((factor.real.square() + factor.imag.square() + 1e-12).log() / 4.0)
+            channels.append((power(factor) + 1e-12).log() / 4.0)
         features = torch.stack(channels, 1)
         if self.audiogram_encoder is not None:
             return features

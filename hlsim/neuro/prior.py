@@ -21,7 +21,7 @@ from hlsim.msbg.model import STRUCTURAL_DELAY
 from hlsim.msbg.recruitment import CATCH_UP_SPL, envelope_filters, expansion_ratios
 from hlsim.msbg.smearing import BROADENING, roex_filters, smearing_from_filters
 from hlsim.neuro.config import NEURO_RATE
-from hlsim.spectrum import STFT
+from hlsim.spectrum import STFT, power
 
 RESPONSE_REACH = 1024
 """Samples at 16 kHz by which the fixed responses reach to either side."""
@@ -103,10 +103,10 @@ class Prior(nn.Module):
 
         Shape: complex (items, frames, frequencies), (items, 8), (items,) -> complex (items, frames, frequencies).
         """
-        power = (spectrum.real.square() + spectrum.imag.square()) * self.ear_power
-        identity = torch.eye(power.shape[-1], device=power.device, dtype=power.dtype).unsqueeze(0)
-        smeared = power @ torch.cat((identity, self._corrected("smearing")))[severity].mT
-        widened = ((smeared.abs() + _TINY) / (power + _TINY)).sqrt()
+        given = power(spectrum) * self.ear_power
+        identity = torch.eye(given.shape[-1], device=given.device, dtype=given.dtype).unsqueeze(0)
+        smeared = given @ torch.cat((identity, self._corrected("smearing")))[severity].mT
+        widened = ((smeared.abs() + _TINY) / (given + _TINY)).sqrt()
 
         level = ((smeared.relu() @ self._corrected("excitation")[severity].mT) + _TINY).sqrt().mT
         items, channels, frames = level.shape
