@@ -63,13 +63,14 @@ def hear(spectrum: Tensor, ratios: Tensor, plan: Plan, slight: bool) -> Tensor:
         waves.append(wave)
         sums.append(decimate(rectified, tier.decimation))
     envelopes = smooth(torch.cat(sums, -3), plan.lowpass)
-    gain = gains(envelopes, ratios)
+    sizes = [tier.channels.stop - tier.channels.start for tier in plan.tiers]
+    own_gains = gains(envelopes, ratios).split(sizes, -2)
 
     heard: dict[tuple[int, bool], Tensor] = {}
-    for tier, wave in zip(plan.tiers, waves, strict=True):
+    for tier, wave, gain in zip(plan.tiers, waves, own_gains, strict=True):
         own, kind = tier.channels, (tier.step, tier.detector == "modulus")
         kinks = (envelopes[..., own, :], ratios[..., own]) if slight else None
-        part = weigh(wave, gain[..., own, :], tier.interpolation, kinks)
+        part = weigh(wave, gain, tier.interpolation, kinks)
         heard[kind] = heard[kind] + part if kind in heard else part
     total = torch.zeros_like(spectrum)
     for (_, analytic), part in heard.items():

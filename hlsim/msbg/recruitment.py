@@ -29,7 +29,6 @@ _LOWEST_ENVELOPE = 1e-9 * 10.0 ** ((120.0 - PASCAL_SPL) / 20.0)
 _HIGHEST_ENVELOPE = 10.0 ** ((CATCH_UP_SPL - PASCAL_SPL) / 20.0)
 _BOXES = 3  # three running means of 16 samples put zeros of third order where decimation would alias to 0 Hz
 _TAPS = 6
-_TOGETHER = 8  # steps between which a matrix product interpolates together
 
 AHEAD = _TAPS // 2
 """Steps ahead of a sample that its gain is interpolated from."""
@@ -100,17 +99,16 @@ def gains(envelopes: Tensor, ratios: Tensor) -> Tensor:
 
 
 def interpolate(values: Tensor, kernel: Tensor) -> Tensor:
-    """Values between the steps' ones; periodic. Shape: (..., steps), (13, 8 * each) -> (..., steps * each).
-
-    Args:
-        kernel: ``interpolation_kernel``.
-    """
-    nothing = values.new_zeros(*values.shape[:-1], -values.shape[-1] % _TOGETHER)
+    """Values between the steps' ones; periodic. Shape: (..., steps), ``interpolation_kernel`` -> (..., time)."""
+    reach, columns = kernel.shape
+    together = reach - _TAPS + 1
+    steps = values.shape[-1]
+    nothing = values.new_zeros(*values.shape[:-1], -steps % together)
     wrapped = torch.cat((values[..., 1 - AHEAD :], values, values[..., :AHEAD], nothing), -1)
-    windows = wrapped.unfold(-1, len(kernel), _TOGETHER)
+    windows = wrapped.unfold(-1, reach, together)
     # as one product, for matmul makes one a channel of it, at twice the cost
-    fine = windows.reshape(-1, len(kernel)) @ kernel
-    return fine.view(*windows.shape[:-2], -1)[..., : values.shape[-1] * kernel.shape[-1] // _TOGETHER]
+    fine = (windows.reshape(-1, reach) @ kernel).view(*windows.shape[:-2], -1)
+    return fine if steps % together == 0 else fine[..., : steps * columns // together]
 
 
 def weigh(
@@ -118,7 +116,7 @@ def weigh(
 ) -> Tensor:
     """Interpolate the gains, apply them and sum the channels.
 
-    Shape: (..., channels, time), (..., channels, steps), (13, 8 * time // steps) -> (..., time).
+    Shape: (..., channels, time), (..., channels, steps), ``interpolation_kernel`` -> (..., time).
 
     Args:
         slight: envelopes (..., channels, steps) and ratios (..., channels), where some ratios are slight. The low-pass
@@ -208,14 +206,15 @@ def decimation_kernel(step: int = 1) -> NDArray[np.float64]:
     return np.ascontiguousarray(kernel.reshape(_BOXES, samples))
 
 
-@lru_cache(maxsize=8)
-def interpolation_kernel(step: int = 1, parts: int = 1) -> NDArray[np.float64]:
-    """Weights of 13 neighbours for the samples of eight steps from the third on: six count for each, after Lagrange.
+@lru_cache(maxsize=16)
+def interpolation_kernel(step: int = 1, parts: int = 1, together: int = 8) -> NDArray[np.float64]:
+    """Weights of the values about some steps for the samples of these: six count for each, after Lagrange.
 
     Args:
         parts: of a sample, one after the other, that weigh alike.
+        together: steps that a matrix product interpolates at once; best a divisor of their number.
 
-    Returns: (13, 8 * 16 // step * parts).
+    Returns: (together + 5, together * 16 // step * parts).
     """
     nodes = np.arange(_TAPS) - (_TAPS // 2 - 1.0)
     place = np.arange(0, STEP, step) / STEP
@@ -223,7 +222,7 @@ def interpolation_kernel(step: int = 1, parts: int = 1) -> NDArray[np.float64]:
     for i, node in enumerate(nodes):
         for other in np.delete(nodes, i):
             weights[i] *= (place - other) / (node - other)
-    kernel = np.zeros((_TAPS + _TOGETHER - 1, _TOGETHER, len(place)))
-    for i in range(_TOGETHER):
+    kernel = np.zeros((_TAPS + together - 1, together, len(place)))
+    for i in range(together):
         kernel[i : i + _TAPS, i] = weights
     return kernel.reshape(len(kernel), -1).repeat(parts, -1)

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from hlsim.msbg.ear import RATE
 from hlsim.msbg.filterbank import BANKS, FilterBank, erb, gammatone_response
-from hlsim.msbg.recruitment import decimation_kernel, envelope_lowpass, interpolation_kernel
+from hlsim.msbg.recruitment import STEP, decimation_kernel, envelope_lowpass, interpolation_kernel
 
 _REACH = 5.0  # bandwidths above its frequency to which a channel is kept
 
@@ -106,6 +106,7 @@ def make_plan(severity: str, points: int, step: int, dtype: torch.dtype, device:
         return torch.from_numpy(np.ascontiguousarray(values)).to(device=device, dtype=kind)
 
     bank = BANKS[severity]
+    together = next((count for count in (8, 9, 7, 10, 6, 5) if points // STEP % count == 0), 8)
     tiers, lowpass = [], []
     with torch.inference_mode(False):
         for channels, own, detector in _parts(assign(bank, step), points, device):
@@ -115,7 +116,7 @@ def make_plan(severity: str, points: int, step: int, dtype: torch.dtype, device:
             # analytic ones half of it, the other half being in negative frequencies
             response = gammatone_response(bank, points, channels, bins)
             decimation = decimation_kernel(own) * (step / own)
-            interpolation = interpolation_kernel(own, 2 if detector == "modulus" else 1)
+            interpolation = interpolation_kernel(own, 2 if detector == "modulus" else 1, together)
             if detector == "modulus":
                 response[:, 0] *= 0.5
                 decimation = decimation * (4.0 / math.pi)

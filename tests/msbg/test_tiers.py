@@ -72,7 +72,8 @@ def test_detection_of_silence_has_a_gradient() -> None:
 
 @pytest.mark.parametrize("steps", [16, 21, 40])
 @pytest.mark.parametrize("step", [1, 2, 4, 8])
-def test_interpolation_is_exact_for_polynomials_of_fifth_order(steps: int, step: int) -> None:
+@pytest.mark.parametrize("together", [5, 8])
+def test_interpolation_is_exact_for_polynomials_of_fifth_order(steps: int, step: int, together: int) -> None:
     powers = torch.randn(6, dtype=torch.float64)
 
     def polynomial(place: torch.Tensor) -> torch.Tensor:
@@ -80,7 +81,7 @@ def test_interpolation_is_exact_for_polynomials_of_fifth_order(steps: int, step:
 
     each = 16 // step
     places = torch.arange(steps * each, dtype=torch.float64) / each
-    kernel = torch.from_numpy(interpolation_kernel(step))
+    kernel = torch.from_numpy(interpolation_kernel(step, together=together))
     fine = interpolate(polynomial(torch.arange(steps, dtype=torch.float64))[None], kernel)[0]
     inside = slice(2 * each, (steps - 3) * each)  # it is taken as periodic
     torch.testing.assert_close(fine[inside], polynomial(places)[inside])
