@@ -56,12 +56,11 @@ def detect(signals: Tensor, harmonics: bool) -> Tensor:
     Args:
         harmonics: with the lower two: |cos a| is 2 / pi (1 + 2/3 cos 2a - 2/15 cos 4a ...); otherwise the modulus.
     """
-    squared = power(signals) + _TINY
-    modulus = squared.sqrt()  # torch's own takes four times as long
+    squared = power(signals).add_(_TINY)  # in place, here and below, where no gradient needs what was there
     if not harmonics:
-        return modulus
+        return squared.sqrt_()  # torch's own modulus takes four times as long
     cosine = signals.real.square() / squared  # its square
-    return modulus * ((cosine * (-16 / 15) + 12 / 5) * cosine + 1 / 5)
+    return squared.sqrt() * ((cosine * (-16 / 15) + 12 / 5) * cosine + 1 / 5)
 
 
 def decimate(rectified: Tensor, kernel: Tensor) -> Tensor:
@@ -75,8 +74,8 @@ def smooth(sums: Tensor, lowpass: Tensor) -> Tensor:
     Shape: (..., channels, 3, steps), (channels, steps // 2 + 1) -> (..., channels, steps).
     """
     before, here, after = sums.unbind(-2)
-    slow = here + before.roll(1, -1) + after.roll(-1, -1)
-    return torch.fft.irfft(torch.fft.rfft(slow) * lowpass, slow.shape[-1])
+    slow = (here + before.roll(1, -1)).add_(after.roll(-1, -1))
+    return torch.fft.irfft(torch.fft.rfft(slow).mul_(lowpass), slow.shape[-1])
 
 
 def envelope(channels: Tensor, lowpass: Tensor) -> Tensor:
@@ -94,8 +93,8 @@ def gains(envelopes: Tensor, ratios: Tensor) -> Tensor:
 
     Shape: (..., channels, steps), (..., channels) -> (..., channels, steps).
     """
-    level = envelopes.clamp(_LOWEST_ENVELOPE, _HIGHEST_ENVELOPE).div(_HIGHEST_ENVELOPE).log()
-    return (level * (ratios.unsqueeze(-1) - 1.0)).exp()
+    level = envelopes.clamp(_LOWEST_ENVELOPE, _HIGHEST_ENVELOPE).div_(_HIGHEST_ENVELOPE).log()
+    return (level * (ratios.unsqueeze(-1) - 1.0)).exp_()
 
 
 def interpolate(values: Tensor, kernel: Tensor) -> Tensor:

@@ -100,9 +100,9 @@ def _widen(frames: Tensor, window: Tensor, matrix: Tensor) -> Tensor:
     """Smear each frame's power. Shape: (..., frames, 2 n), (2 n,), (n + 1, n + 1) -> (..., frames, n)."""
     spectrum = torch.fft.rfft(frames)
     given = power(spectrum)
-    smeared, inverse = given @ matrix.T, (given + _TINY).rsqrt()
+    smeared, inverse = given @ matrix.T, (given + _TINY).rsqrt_()
     # the square root of a negative power is imaginary; of 0 it has no gradient, and takes long
-    real, imaginary = smeared.clamp_min(_TINY).sqrt(), (-smeared).clamp_min(_TINY).sqrt()
+    real, imaginary = smeared.clamp_min(_TINY).sqrt_(), (-smeared).clamp_min(_TINY).sqrt_()
     spectrum = spectrum * torch.complex(real * inverse, imaginary * inverse)
     half = len(window) // 2
     return torch.fft.irfft(spectrum, len(window))[..., :half] * window[:half]
