@@ -45,6 +45,7 @@ def training_step(
         ("HearingLossLoss (msbg)", lambda: exact(leaf, clean)),
         ("- its simulator", lambda: exact.simulator(leaf, ear).square().sum()),
         ("whole step (neuro-msbg)", lambda: loss(compensator(clean, ear), clean)),
+        ("whole step (msbg)", lambda: exact(compensator(clean, ear), clean)),
     ]
     return _table(parts, place, repeats)
 
