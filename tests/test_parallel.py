@@ -51,7 +51,8 @@ def test_tasks_are_drawn_as_they_are_needed() -> None:
     results = run_parallel(square, tasks(), jobs=2)
     next(results)
     assert len(drawn) < 100
-    with pytest.warns(UserWarning, match="not used"):  # joblib's word on what was under way
+    # joblib's word on what was under way, one or the other by how far it was
+    with pytest.warns(UserWarning, match="not used|cancelled"):
         results.close()
 
 
