@@ -172,7 +172,8 @@ def _expected(line: list[tuple[float, float]], seconds: float) -> float:
     power = 1.0
     if len(line) > 1:
         (low, first), (high, last) = line[-2:]
-        power = max(1.0, math.log(last / first) / math.log(high / low))
+        # no more than that, for what takes microseconds may look as if, where the machine was busy once
+        power = min(2.0, max(1.0, math.log(last / first) / math.log(high / low)))
     return line[-1][1] * (seconds / line[-1][0]) ** power
 
 
