@@ -102,9 +102,7 @@ def interpolate(values: Tensor, kernel: Tensor) -> Tensor:
     reach, columns = kernel.shape
     together = reach - _TAPS + 1
     steps = values.shape[-1]
-    nothing = values.new_zeros(*values.shape[:-1], -steps % together)
-    wrapped = torch.cat((values[..., 1 - AHEAD :], values, values[..., :AHEAD], nothing), -1)
-    windows = wrapped.unfold(-1, reach, together)
+    windows = _around(values, -steps % together).unfold(-1, reach, together)
     # as one product, for matmul makes one a channel of it, at twice the cost
     fine = (windows.reshape(-1, reach) @ kernel).view(*windows.shape[:-2], -1)
     return fine if steps % together == 0 else fine[..., : steps * columns // together]
@@ -126,9 +124,13 @@ def weigh(
     if slight is not None:
         envelopes, ratios = slight
         steep = _steep(envelopes) & ((ratios != 1.0) & (ratios < _SLIGHT)).unsqueeze(-1)
-        if steep.device.type != "cpu" or steep.any():
+        every = full.shape[-1] // steep.shape[-1]
+        if steep.device.type == "cpu":
+            own = ratios.unsqueeze(-1).expand(steep.shape)[steep]
+            about = _around(envelopes).unfold(-1, _TAPS, 1)[steep]
+            full.unflatten(-1, (-1, every))[steep] = gains(about @ kernel[:_TAPS, :every], own)
+        else:  # indices would have to come back from the device
             fine = gains(interpolate(envelopes, kernel), ratios)
-            every = full.shape[-1] // steep.shape[-1]
             full = torch.where(steep.repeat_interleave(every, -1), fine, full)
     if torch.is_grad_enabled() and (channels.requires_grad or full.requires_grad):
         return (channels * full).sum(-2)
@@ -137,6 +139,12 @@ def weigh(
     for channel in range(1, channels.shape[-2]):
         total.addcmul_(channels[..., channel, :], full[..., channel, :])
     return total
+
+
+def _around(values: Tensor, more: int = 0) -> Tensor:
+    """With those that the interpolation at the ends needs, and zeros. Shape: (..., steps) -> (..., steps + 5 + more)."""
+    zeros = values.new_zeros(*values.shape[:-1], more)
+    return torch.cat((values[..., 1 - AHEAD :], values, values[..., :AHEAD], zeros), -1)
 
 
 def _steep(envelopes: Tensor) -> Tensor:
