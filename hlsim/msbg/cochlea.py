@@ -37,7 +37,7 @@ def bank_points(length: int, rate: int) -> int:
 
 
 def shared_multiple(rate: int) -> int:
-    """Samples at 44.1 kHz, a multiple of 16, that are a whole number of ``rate``'s; 0 if too many."""
+    """Samples at 44.1 kHz, a multiple of 24, that are a whole number of ``rate``'s; 0 if too many."""
     multiple = math.lcm(STEP, RATE // math.gcd(RATE, rate))
     return multiple if multiple <= _SHARED_MULTIPLE else 0
 

@@ -27,7 +27,7 @@ Array = NDArray[np.float64]
 def ending(channels: Tensor, weights: Tensor, response: Tensor, length: int) -> Tensor:
     """What the end adds to the envelopes of ``hlsim.msbg.recruitment.envelope``.
 
-    Shape: (..., channels, time), (channels, 2, reach), (channels, reach // 16, 2) -> (..., channels, time // 16).
+    Shape: (..., channels, time), (channels, 2, reach), (channels, reach // 24, 2) -> (..., channels, time // 24).
 
     Args:
         channels: zero from sample ``length`` on.
@@ -47,7 +47,7 @@ def ending_weights(bank: FilterBank) -> Array:
 
 
 def ending_response(bank: FilterBank, length: int) -> Array:
-    """The oscillation at the steps up to ``AHEAD`` behind the end. Returns (channels, reach // 16, 2)."""
+    """The oscillation at the steps up to ``AHEAD`` behind the end. Returns (channels, reach // 24, 2)."""
     first = (length - 1) % STEP
     return np.stack([response[first::STEP][: REACH // STEP][::-1] for _, response in _oscillations(bank)])
 

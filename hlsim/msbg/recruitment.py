@@ -1,6 +1,6 @@
 """Loudness recruitment: each channel is expanded by a gain that follows its envelope.
 
-The envelope is low-passed at 75 Hz or less, so that it and the gain are computed at a sixteenth of the rate and the gain
+The envelope is low-passed at 75 Hz or less, so that it and the gain are computed at a 24th of the rate and the gain
 is interpolated, or, where the envelope is near zero, the envelope.
 """
 
@@ -21,13 +21,13 @@ from hlsim.spectrum import power
 CATCH_UP_SPL = 105.0
 """Level in dB SPL at which the impaired ear hears as loud as a normal one."""
 
-STEP = 16
+STEP = 24
 """Samples from one value of the gain to the next."""
 
 # pyclarity limits the envelope to 1e-9 of its full scale of 120 dB SPL
 _LOWEST_ENVELOPE = 1e-9 * 10.0 ** ((120.0 - PASCAL_SPL) / 20.0)
 _HIGHEST_ENVELOPE = 10.0 ** ((CATCH_UP_SPL - PASCAL_SPL) / 20.0)
-_BOXES = 3  # three running means of 16 samples put zeros of third order where decimation would alias to 0 Hz
+_BOXES = 3  # three running means of 24 samples put zeros of third order where decimation would alias to 0 Hz
 _TAPS = 6
 
 AHEAD = _TAPS // 2
@@ -64,12 +64,12 @@ def detect(signals: Tensor, harmonics: bool) -> Tensor:
 
 
 def decimate(rectified: Tensor, kernel: Tensor) -> Tensor:
-    """Weighted sums of each step's samples, for ``smooth``. Shape: (..., time), (3, 16 // step) -> (..., 3, steps)."""
+    """Weighted sums of each step's samples, for ``smooth``. Shape: (..., time), (3, 24 // step) -> (..., 3, steps)."""
     return kernel @ rectified.unflatten(-1, (-1, kernel.shape[-1])).mT
 
 
 def smooth(sums: Tensor, lowpass: Tensor) -> Tensor:
-    """Envelopes at samples 0, 16, ... from the sums of ``decimate``; periodic.
+    """Envelopes at samples 0, 24, ... from the sums of ``decimate``; periodic.
 
     Shape: (..., channels, 3, steps), (channels, steps // 2 + 1) -> (..., channels, steps).
     """
@@ -79,10 +79,10 @@ def smooth(sums: Tensor, lowpass: Tensor) -> Tensor:
 
 
 def envelope(channels: Tensor, lowpass: Tensor) -> Tensor:
-    """Full-wave rectify at 44.1 kHz and low-pass, zero-phase, at a sixteenth of the rate.
+    """Full-wave rectify at 44.1 kHz and low-pass, zero-phase, at a 24th of the rate.
 
-    Shape: (..., channels, time), (channels, time // 32 + 1) -> (..., channels, time // 16), the values at samples 0, 16,
-    ...; ``time`` is a multiple of 16 and the signal is taken as periodic.
+    Shape: (..., channels, time), (channels, time // 48 + 1) -> (..., channels, time // 24), the values at samples 0, 24,
+    ...; ``time`` is a multiple of 24 and the signal is taken as periodic.
     """
     kernel = torch.from_numpy(decimation_kernel()).to(channels)
     return smooth(decimate(channels.abs(), kernel), lowpass)
@@ -158,7 +158,7 @@ def _steep(envelopes: Tensor) -> Tensor:
 def expand(channels: Tensor, envelopes: Tensor, ratios: Tensor) -> Tensor:
     """Apply the recruitment gain at 44.1 kHz and sum the channels.
 
-    Shape: (..., channels, time), (..., channels, time // 16), (..., channels) -> (..., time).
+    Shape: (..., channels, time), (..., channels, time // 24), (..., channels) -> (..., time).
     """
     kernel = torch.from_numpy(interpolation_kernel()).to(channels)
     return weigh(channels, gains(envelopes, ratios), kernel, (envelopes, ratios))
@@ -167,17 +167,17 @@ def expand(channels: Tensor, envelopes: Tensor, ratios: Tensor) -> Tensor:
 def envelope_lowpass(
     bank: FilterBank, points: int, step: int = 1, channels: slice = slice(None)
 ) -> NDArray[np.complex128]:
-    """Response that turns the rfft of ``decimate``'s means into that of the envelope at samples 0, 16, ...
+    """Response that turns the rfft of ``decimate``'s means into that of the envelope at samples 0, 24, ...
 
     The low-pass is ``ellip(2, 0.25, 35)`` at 3/4 of 100 Hz or of the channel's ERB if less, run forwards and backwards
     as pyclarity does with ``filtfilt``; what that does at the end is in ``hlsim.msbg.ending``.
 
     Args:
-        points: FFT length at 44.1 kHz, a multiple of 16.
+        points: FFT length at 44.1 kHz, a multiple of 24.
         step: samples at 44.1 kHz from one of the rectified signal's to the next.
         channels: which of the bank's; all by default.
 
-    Returns: (channels, points // 32 + 1).
+    Returns: (channels, points // 48 + 1).
     """
     omega = 2.0 * np.pi * np.arange(points // STEP // 2 + 1) / points
     powers = np.exp(-1j * omega) ** np.arange(3)[:, None]
@@ -205,7 +205,7 @@ def _interpolation(centre_frequencies: tuple[float, ...]) -> NDArray[np.float64]
 def decimation_kernel(step: int = 1) -> NDArray[np.float64]:
     """Weights of a block's samples in the mean around the block after it, itself and the one before.
 
-    Returns: (3, 16 // step).
+    Returns: (3, 24 // step).
     """
     samples = STEP // step
     box = np.full(samples, 1.0 / samples)
@@ -221,7 +221,7 @@ def interpolation_kernel(step: int = 1, parts: int = 1, together: int = 8) -> ND
         parts: of a sample, one after the other, that weigh alike.
         together: steps that a matrix product interpolates at once; best a divisor of their number.
 
-    Returns: (together + 5, together * 16 // step * parts).
+    Returns: (together + 5, together * 24 // step * parts).
     """
     nodes = np.arange(_TAPS) - (_TAPS // 2 - 1.0)
     place = np.arange(0, STEP, step) / STEP

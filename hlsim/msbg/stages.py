@@ -10,6 +10,7 @@ from hlsim.msbg.cochlea import shared_multiple
 from hlsim.msbg.ear import EAR_DELAY, RATE
 from hlsim.msbg.filters import Filters
 from hlsim.msbg.fourier import fft_length, filter_blocks, irfft, rfft
+from hlsim.msbg.recruitment import STEP
 from hlsim.msbg.smearing import HOP
 
 _FIR_TAIL = 2 * EAR_DELAY + 132  # with the low-pass on the way out
@@ -82,7 +83,8 @@ def block_bounds(samples: int, rate: int) -> list[tuple[int, int, int, int]]:
 
     Blocks begin where the smearing's frames and the envelopes' steps do, so that they are those of the whole.
     """
-    unit = HOP * rate // math.gcd(HOP * rate, RATE)  # samples in a whole number of hops
+    common = math.lcm(HOP, STEP)
+    unit = common * rate // math.gcd(common * rate, RATE)  # samples in a whole number of hops and of steps
     hop = round(_BLOCK_SECONDS * rate) // unit * unit
     lead, lag = (math.ceil(s * rate / unit) * unit for s in (_LEAD_SECONDS, _LAG_SECONDS))
     if hop == 0 or samples <= 1.5 * hop:

@@ -38,11 +38,11 @@ class Tier:
 
     Attributes:
         channels: which of the bank's.
-        step: samples at 44.1 kHz from one of its samples to the next; a divisor of 16.
+        step: samples at 44.1 kHz from one of its samples to the next; a divisor of 24.
         points: its FFT length.
         detector: how they are rectified.
         response: of the channels, (channels, points // 2 + 1), or of their analytic signals, (channels, points).
-        decimation: weights of a block's samples, (3, 16 // step).
+        decimation: weights of a block's samples, (3, 24 // step).
         interpolation: ``interpolation_kernel``, each weight twice for analytic signals' two parts.
     """
 
@@ -60,9 +60,9 @@ class Plan:
     """A bank on the FFT grid of a length: ``tiers`` from the lowest channels up, and the envelopes' ``lowpass``.
 
     Attributes:
-        lowpass: (channels, points // 32 + 1).
+        lowpass: (channels, points // 48 + 1).
         step: that of the widest channels, 1 or 2.
-        points: FFT length at 44.1 kHz, a multiple of 16.
+        points: FFT length at 44.1 kHz, a multiple of 24.
     """
 
     points: int
@@ -96,7 +96,7 @@ def make_plan(severity: str, points: int, step: int, dtype: torch.dtype, device:
     """The tiers of a severity's bank.
 
     Args:
-        points: FFT length at 44.1 kHz, a multiple of 16.
+        points: FFT length at 44.1 kHz, a multiple of 24.
         step: 1 or 2, as in ``assign``.
     """
 

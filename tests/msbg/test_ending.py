@@ -32,7 +32,7 @@ def tones(bank: FilterBank, length: int, points: int) -> np.ndarray:
 @pytest.mark.parametrize("length", [8000, 8001, 8011, 8015])
 def test_envelopes_of_what_ends_abruptly(name: str, length: int) -> None:
     bank = BANKS[name]
-    channels = tones(bank, length, 32 * 512)
+    channels = tones(bank, length, 2 * STEP * 342)
     theirs = cochlea.compute_envelope(channels[:, :length], erb(np.array(bank.centre_frequencies)), RATE)
     ours = torch.from_numpy(channels)
     silent = envelope(ours, torch.from_numpy(envelope_lowpass(bank, channels.shape[-1])))
@@ -45,15 +45,15 @@ def test_envelopes_of_what_ends_abruptly(name: str, length: int) -> None:
 
 def test_single_precision_is_enough() -> None:
     bank = BANKS["mild"]
-    channels = torch.from_numpy(tones(bank, 8000, 32 * 512))
+    channels = torch.from_numpy(tones(bank, 8000, 2 * STEP * 342))
     wide = added(channels, bank, 8000)
     assert float((added(channels.float(), bank, 8000) - wide).abs().max()) < 1e-5
 
 
-@pytest.mark.parametrize("length", [1, 5, 16, 17, 100, REACH - 1, REACH + 1])
+@pytest.mark.parametrize("length", [1, 5, STEP, STEP + 1, 100, REACH - 1, REACH + 1])
 def test_short_signals_and_leading_dimensions(length: int) -> None:
     bank = BANKS["severe"]
-    points = 32 * (length // 32 + 100)
+    points = 2 * STEP * (length // 32 + 100)
     channels = torch.from_numpy(tones(bank, length, points)).expand(2, 3, -1, -1)
     extra = added(channels, bank, length)
     assert extra.shape == (2, 3, bank.channels, points // STEP)

@@ -7,6 +7,7 @@ import torch
 from hlsim.msbg.cochlea import hear
 from hlsim.msbg.filterbank import BANKS, erb, gammatone_response
 from hlsim.msbg.recruitment import (
+    STEP,
     detect,
     envelope,
     envelope_lowpass,
@@ -79,7 +80,7 @@ def test_interpolation_is_exact_for_polynomials_of_fifth_order(steps: int, step:
     def polynomial(place: torch.Tensor) -> torch.Tensor:
         return (powers * ((place - steps / 2) / steps).unsqueeze(-1) ** torch.arange(6)).sum(-1)
 
-    each = 16 // step
+    each = STEP // step
     places = torch.arange(steps * each, dtype=torch.float64) / each
     kernel = torch.from_numpy(interpolation_kernel(step, together=together))
     fine = interpolate(polynomial(torch.arange(steps, dtype=torch.float64))[None], kernel)[0]
