@@ -1,4 +1,4 @@
-"""Short-time Fourier transform and its inverse, and the power of a spectrum, for models and criteria alike."""
+"""Fourier transforms, short-time ones and their inverse, and the power of a spectrum, for models and criteria alike."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -41,7 +41,7 @@ class STFT:
         side, before = self.fft // 2, (self.fft - self.window) // 2
         frames = functional.pad(waveform, (side, side)).unfold(-1, self.fft, self.hop)
         windowed = frames[..., before : before + self.window] * self._hann(waveform)
-        return torch.fft.rfft(functional.pad(windowed, (before, self.fft - self.window - before)))
+        return rfft(functional.pad(windowed, (before, self.fft - self.window - before)))
 
     def synthesise(self, spectrum: Tensor, length: int) -> Tensor:
         """Waveform by overlap-add. Shape: complex (items, frames, frequencies) -> (items, length)."""
@@ -50,6 +50,35 @@ class STFT:
 
     def _hann(self, like: Tensor) -> Tensor:
         return torch.hann_window(self.window, dtype=like.dtype, device=like.device)
+
+
+def rfft(signals: Tensor) -> Tensor:
+    """``torch.fft.rfft``. Shape: (..., time) -> complex (..., time // 2 + 1)."""
+    if signals.requires_grad and torch.is_grad_enabled():
+        result: Tensor = _RFFT.apply(signals)
+        return result
+    return torch.fft.rfft(signals)
+
+
+class _RFFT(torch.autograd.Function):
+    """With a real transform as gradient, where torch's is a complex one of twice the length."""
+
+    generate_vmap_rule = True
+
+    @staticmethod
+    def forward(signals: Tensor) -> Tensor:
+        return torch.fft.rfft(signals)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor], output: Tensor) -> None:
+        ctx.time = inputs[0].shape[-1]
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> Tensor:
+        # the inverse adds each frequency twice but 0 Hz and, of even lengths, the last
+        once = gradient.real.new_full(gradient.shape[-1:], 0.5)
+        once[:: max(1, ctx.time // 2) if ctx.time % 2 == 0 else ctx.time] = 1.0
+        return torch.fft.irfft(gradient * once, ctx.time, norm="forward")
 
 
 def power(spectrum: Tensor) -> Tensor:

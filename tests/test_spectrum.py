@@ -5,7 +5,7 @@ import torch
 from scipy.signal import ShortTimeFFT
 from scipy.signal.windows import hann
 
-from hlsim.spectrum import STFT, power
+from hlsim.spectrum import STFT, power, rfft
 
 SIZES = [(400, 400, 100), (256, 96, 24), (256, 256, 128)]
 
@@ -56,6 +56,18 @@ def test_both_ways_are_differentiable() -> None:
 def test_lengths_that_do_not_fit(sizes: tuple[int, int, int]) -> None:
     with pytest.raises(ValueError, match=r"STFT of fft .*; allowed: 2 hop <= window <= fft, fft even"):
         STFT(*sizes)
+
+
+@pytest.mark.parametrize("time", [1, 2, 7, 8])
+def test_rfft_and_its_gradients_are_torchs(time: int) -> None:
+    signals = torch.randn(3, time, dtype=torch.float64, requires_grad=True)
+    ours, theirs = rfft(signals), torch.fft.rfft(signals)
+    assert torch.equal(ours, theirs) and torch.equal(rfft(signals.detach()), theirs)
+    weights = torch.randn_like(theirs)
+    torch.testing.assert_close(
+        *(torch.autograd.grad(spectrum, signals, weights)[0] for spectrum in (ours, theirs))
+    )
+    assert torch.autograd.gradgradcheck(rfft, signals)
 
 
 def test_power_is_the_squared_modulus() -> None:

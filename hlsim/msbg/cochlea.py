@@ -78,7 +78,7 @@ def hear(spectrum: Tensor, ratios: Tensor, plan: Plan, slight: bool) -> Tensor:
             bins = torch.fft.fft(torch.view_as_complex(part.unflatten(-1, (-1, 2))))
         else:
             bins = rfft(part, part.shape[-1])
-        total[..., : bins.shape[-1]] += bins
+        total[..., : bins.shape[-1]].add_(bins)
     return total
 
 

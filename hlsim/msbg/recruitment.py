@@ -5,6 +5,7 @@ is interpolated, or, where the envelope is near zero, the envelope.
 """
 
 from functools import lru_cache
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -16,7 +17,7 @@ from hlsim.audiogram import FREQUENCIES
 from hlsim.calibration import PASCAL_SPL
 from hlsim.msbg.ear import RATE
 from hlsim.msbg.filterbank import FilterBank, erb
-from hlsim.spectrum import power
+from hlsim.spectrum import power, rfft
 
 CATCH_UP_SPL = 105.0
 """Level in dB SPL at which the impaired ear hears as loud as a normal one."""
@@ -56,11 +57,46 @@ def detect(signals: Tensor, harmonics: bool) -> Tensor:
     Args:
         harmonics: with the lower two: |cos a| is 2 / pi (1 + 2/3 cos 2a - 2/15 cos 4a ...); otherwise the modulus.
     """
-    squared = power(signals).add_(_TINY)  # in place, here and below, where no gradient needs what was there
+    if signals.requires_grad and torch.is_grad_enabled():
+        return cast(Tensor, _Detect.apply(signals, harmonics)[0])
+    return _detect(signals, harmonics)[0]
+
+
+def _detect(signals: Tensor, harmonics: bool) -> tuple[Tensor, ...]:
+    """What is detected; with harmonics also the modulus, and the squared cosine of the angle."""
+    squared = power(signals).add_(_TINY)
     if not harmonics:
-        return squared.sqrt_()  # torch's own modulus takes four times as long
-    cosine = signals.real.square() / squared  # its square
-    return squared.sqrt() * ((cosine * (-16 / 15) + 12 / 5) * cosine + 1 / 5)
+        return (squared.sqrt_(),)  # torch's own modulus takes four times as long
+    cosine, modulus = signals.real.square() / squared, squared.sqrt()
+    return modulus * ((cosine * (-16 / 15) + 12 / 5) * cosine + 1 / 5), modulus, cosine
+
+
+class _Detect(torch.autograd.Function):
+    """``_detect`` with a gradient of half the steps."""
+
+    generate_vmap_rule = True
+
+    @staticmethod
+    def forward(signals: Tensor, harmonics: bool) -> tuple[Tensor, ...]:
+        return _detect(signals, harmonics)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor, bool], output: tuple[Tensor, ...]) -> None:
+        ctx.harmonics = inputs[1]
+        ctx.mark_non_differentiable(*output[1:])
+        ctx.save_for_backward(inputs[0], *output)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor, *_: Tensor) -> tuple[Tensor, None]:
+        signals, *detected = ctx.saved_tensors
+        if not ctx.harmonics:
+            return signals * (gradient / detected[0]), None
+        # with a gradient of its own, what is constant here comes from the signals anew
+        _, modulus, cosine = _detect(signals, True) if torch.is_grad_enabled() else detected
+        share = gradient / modulus
+        along = share * ((cosine * (16 / 5) - 20 / 3) * cosine + 5)
+        across = share * ((cosine * (16 / 5) - 12 / 5) * cosine + 1 / 5)
+        return torch.complex(signals.real * along, signals.imag * across), None
 
 
 def decimate(rectified: Tensor, kernel: Tensor) -> Tensor:
@@ -75,7 +111,7 @@ def smooth(sums: Tensor, lowpass: Tensor) -> Tensor:
     """
     before, here, after = sums.unbind(-2)
     slow = (here + before.roll(1, -1)).add_(after.roll(-1, -1))
-    return torch.fft.irfft(torch.fft.rfft(slow).mul_(lowpass), slow.shape[-1])
+    return torch.fft.irfft(rfft(slow).mul_(lowpass), slow.shape[-1])
 
 
 def envelope(channels: Tensor, lowpass: Tensor) -> Tensor:

@@ -2,6 +2,7 @@
 
 import math
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 import torch
@@ -10,7 +11,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from hlsim.msbg.ear import RATE
-from hlsim.spectrum import power
+from hlsim.spectrum import power, rfft
 
 FRAME, HOP, FFT = 256, 64, 512
 
@@ -98,15 +99,51 @@ def smear(waveform: Tensor, matrix: Tensor, step: int = 1) -> Tensor:
 
 def _widen(frames: Tensor, window: Tensor, matrix: Tensor) -> Tensor:
     """Smear each frame's power. Shape: (..., frames, 2 n), (2 n,), (n + 1, n + 1) -> (..., frames, n)."""
-    spectrum = torch.fft.rfft(frames)
-    given = power(spectrum)
-    smeared, inverse = given @ matrix.T, (given + _TINY).rsqrt_()
-    # the square root of a negative power is imaginary; of 0 it has no gradient, and takes long
-    real, imaginary = smeared.clamp_min(_TINY).sqrt_(), (-smeared).clamp_min(_TINY).sqrt_()
-    spectrum = spectrum * torch.complex(real * inverse, imaginary * inverse)
+    spectrum = rfft(frames)
+    if spectrum.requires_grad and torch.is_grad_enabled():
+        spectrum = _Spread.apply(spectrum, matrix)[0]
+    else:
+        spectrum = _spread(spectrum, matrix)[0]
     half = len(window) // 2
     return torch.fft.irfft(spectrum, len(window))[..., :half] * window[:half]
 
+
+def _spread(spectrum: Tensor, matrix: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """The spectrum with its power smeared and its phase kept, the power, and what was made of it."""
+    given = power(spectrum)
+    smeared, inverse = given @ matrix.T, (given + _TINY).rsqrt_()
+    # the square root of a negative power is imaginary; of 0 it takes long
+    real, imaginary = smeared.clamp_min(_TINY).sqrt_(), (-smeared).clamp_min(_TINY).sqrt_()
+    return spectrum * torch.complex(real * inverse, imaginary * inverse), given, smeared
+
+
+class _Spread(torch.autograd.Function):
+    """``_spread`` with a gradient of a third of the steps.
+
+    Of z = x sqrt(s) / |x| with s = A |x|^2, and w the conjugate of z times the gradient at z, it is x (A^T Re w / s + i Im
+    w / |x|^2): along x the power changes, across it the phase.
+    """
+
+    generate_vmap_rule = True
+
+    @staticmethod
+    def forward(spectrum: Tensor, matrix: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        return _spread(spectrum, matrix)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor], output: tuple[Tensor, Tensor, Tensor]) -> None:
+        ctx.mark_non_differentiable(*output[1:])
+        ctx.save_for_backward(*inputs, *output)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor, *_: Tensor) -> tuple[Tensor, None]:
+        spectrum, matrix, *made = ctx.saved_tensors
+        # with a gradient of its own, what is constant here comes from the spectrum anew
+        spread, given, smeared = _spread(spectrum, matrix) if torch.is_grad_enabled() else made
+        turned = spread.conj() * gradient
+        least = smeared.new_tensor(_TINY)
+        along = (turned.real / (smeared + torch.copysign(least, smeared))) @ matrix
+        return spectrum * torch.complex(along, turned.imag / (given + _TINY)), None
 
 @lru_cache(maxsize=16)
 def _window(step: int, dtype: torch.dtype, device: torch.device) -> Tensor:
@@ -130,15 +167,16 @@ def _frames(waveform: Tensor, count: int, hop: int, window: Tensor) -> Tensor:
 
 
 def _overlap_add(frames: Tensor, hop: int) -> Tensor:
-    hops = frames.unflatten(-1, (4, hop))
-    count = hops.shape[-3]
+    hops = frames.unflatten(-1, (4, hop)).unbind(-2)
+    count = frames.shape[-2]
     total = frames.new_zeros(*frames.shape[:-2], count + 3, hop)
     for j in range(3):
-        total[..., j : j + count, :] += hops[..., j, :]
+        total[..., j : j + count, :].add_(hops[j])
     if count == 1:
-        total[..., 1, :] += hops[..., 0, 2, :]
+        total[..., 1, :].add_(hops[2][..., 0, :])
     if count >= 4:
-        total[..., 3:count, :] += hops[..., : count - 3, 3, :]
+        total[..., 3:count, :].add_(hops[3][..., : count - 3, :])
         # in smear3's last three hops the fourth last frame's first parts stand for the last parts of the last three
-        total[..., count:, :] += hops[..., count - 4, :3, :]
+        for j in range(3):
+            total[..., count + j, :].add_(hops[j][..., count - 4, :])
     return total.flatten(-2)

@@ -89,6 +89,7 @@ def test_gradients(severity: str) -> None:
     wave = torch.randn(1, 320, dtype=torch.float64, requires_grad=True)
     matrix = torch.from_numpy(smearing_matrix(*BROADENING[severity]))
     assert torch.autograd.gradcheck(lambda w: smear(w, matrix), wave, fast_mode=True)
+    assert torch.autograd.gradgradcheck(lambda w: smear(w, matrix), wave, fast_mode=True)
 
 
 def test_gradients_of_silence_are_finite() -> None:

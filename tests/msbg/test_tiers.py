@@ -64,6 +64,14 @@ def test_what_a_rectifier_makes_of_an_analytic_signal() -> None:
     torch.testing.assert_close(fine, torch.fft.rfft(signal.real.abs())[:5], atol=1e-4, rtol=1e-5)
 
 
+@pytest.mark.parametrize("harmonics", [False, True])
+def test_gradients_of_detection(harmonics: bool) -> None:
+    signals = torch.randn(2, 5, dtype=torch.complex128, requires_grad=True)
+    assert torch.equal(detect(signals, harmonics), detect(signals.detach(), harmonics))
+    assert torch.autograd.gradcheck(lambda z: detect(z, harmonics), signals)
+    assert torch.autograd.gradgradcheck(lambda z: detect(z, harmonics), signals)
+
+
 def test_detection_of_silence_has_a_gradient() -> None:
     silence = torch.zeros(16, dtype=torch.complex64, requires_grad=True)
     for harmonics in (False, True):
