@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -20,6 +21,7 @@ _TINY = 1e-12
 
 _FAINT = 8e-4  # squared magnitude of a tone of 20 dB SPL in the paper's transform
 _SILENT = 1e-20
+_NEXT_TO_NOTHING = 1e-12
 
 
 def magnitude_loss(estimate: Tensor, truth: Tensor) -> Tensor:
@@ -35,8 +37,7 @@ def phase_loss(estimate: Tensor, truth: Tensor) -> Tensor:
 
     Shape: complex (items, frames, bins) -> (items,).
     """
-    difference = _phase(truth) - _phase(estimate)
-    difference = difference.detach() + (difference - difference.detach()) * _heard(estimate) * _heard(truth)
+    difference = _phase(truth, estimate) - _phase(estimate, truth)
     instantaneous = anti_wrap(difference).mean((-2, -1))
     group_delay = anti_wrap(difference.diff(dim=-1)).mean((-2, -1))
     if difference.shape[-2] < 2:
@@ -57,7 +58,7 @@ def time_loss(estimate: Tensor, truth: Tensor) -> Tensor:
 
 def anti_wrap(angle: Tensor) -> Tensor:
     """Distance of an angle to the nearest multiple of 2 pi (Ai and Ling 2023). Any shape, radians."""
-    turns = (angle.detach() / (2.0 * math.pi)).round()
+    turns = (angle.detach() / (2.0 * math.pi)).round_()
     return torch.sub(angle, turns, alpha=2.0 * math.pi).abs()
 
 
@@ -76,8 +77,9 @@ def paper_parts(
         stft: spectra are scaled to the magnitudes of the paper's transform, so that a rate changes no level.
         frequencies: how many of the transform's to compare, from 0 Hz up; all if None.
     """
-    scale = PAPER_STFT.window / stft.window
-    first, second = (stft.analyse(waveform)[..., :frequencies] * scale for waveform in (estimate, truth))
+    first, second = (stft.analyse(waveform)[..., :frequencies] for waveform in (estimate, truth))
+    if (scale := PAPER_STFT.window / stft.window) != 1.0:
+        first, second = first * scale, second * scale
     return {
         "magnitude": magnitude_loss(first, second),
         "phase": phase_loss(first, second),
@@ -122,14 +124,36 @@ def _magnitude(spectrum: Tensor) -> Tensor:
     return (power(spectrum) + _TINY).sqrt()
 
 
-def _heard(spectrum: Tensor) -> Tensor:
-    """From 0 for silence to 1 for what is well above 20 dB SPL, without gradient."""
-    level = power(spectrum.detach())
-    return level / (level + _FAINT)
+def _phase(spectrum: Tensor, other: Tensor) -> Tensor:
+    """Angle, with a gradient that fades out where it or the other spectrum is faint."""
+    if spectrum.requires_grad and torch.is_grad_enabled():
+        result: Tensor = _FadedPhase.apply(spectrum, other)
+        return result
+    return _angle(spectrum)
 
 
-def _phase(spectrum: Tensor) -> Tensor:
-    """Angle with a bounded gradient at zero, where ``torch.angle`` has none."""
+def _angle(spectrum: Tensor) -> Tensor:
+    """That of silence, which may be -0, is 0."""
     # of the parts apart, for torch takes twenty times as long where every second number is another's
-    real, imaginary = spectrum.real.contiguous(), spectrum.imag.contiguous()
-    return torch.atan2(imaginary, torch.where(real.abs() + imaginary.abs() < 1e-7, 1e-7, real))
+    return torch.atan2(spectrum.imag.contiguous(), spectrum.real + _NEXT_TO_NOTHING)
+
+
+class _FadedPhase(torch.autograd.Function):
+    """The gradient of an angle, i z / |z|^2, times |z|^2 / (|z|^2 + faint), and the same of the other's."""
+
+    generate_vmap_rule = True
+
+    @staticmethod
+    def forward(spectrum: Tensor, other: Tensor) -> Tensor:
+        return _angle(spectrum)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor], output: Tensor) -> None:
+        ctx.save_for_backward(*inputs)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
+        spectrum, other = ctx.saved_tensors
+        level = power(other)
+        share = gradient * (level / ((level + _FAINT) * (power(spectrum) + _FAINT)))
+        return torch.complex(-spectrum.imag * share, spectrum.real * share), None

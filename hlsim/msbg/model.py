@@ -35,7 +35,7 @@ _ENDING = 4096
 _ENDING_LEAD = 7296
 
 # samples of all items that run together
-_CPU_SAMPLES = 96000
+_CPU_SAMPLES = 384_000
 _DEVICE_SAMPLES = 12_000_000
 
 
@@ -261,6 +261,6 @@ def _alike(ears: Tensor) -> list[tuple[str, bool, list[int]]]:
 
 
 def _portions(members: list[int], samples: int, device: str) -> list[list[int]]:
-    """Items that run together: on a CPU few, for their channels to stay in its cache."""
+    """Items that run together: as many as do not ask for too much memory."""
     size = max(1, (_CPU_SAMPLES if device == "cpu" else _DEVICE_SAMPLES) // samples)
     return [members[i : i + size] for i in range(0, len(members), size)]

@@ -145,6 +145,7 @@ class _Spread(torch.autograd.Function):
         along = (turned.real / (smeared + torch.copysign(least, smeared))) @ matrix
         return spectrum * torch.complex(along, turned.imag / (given + _TINY)), None
 
+
 @lru_cache(maxsize=16)
 def _window(step: int, dtype: torch.dtype, device: torch.device) -> Tensor:
     """Of analysis and synthesis: their product adds up to 1 over four frames; then zeros. Shape: (512 // step,)."""
