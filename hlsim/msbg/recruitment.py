@@ -87,7 +87,7 @@ class _Detect(torch.autograd.Function):
         ctx.save_for_backward(inputs[0], *output)
 
     @staticmethod
-    def backward(ctx: Any, gradient: Tensor, *_: Tensor) -> tuple[Tensor, None]:
+    def backward(ctx: Any, gradient: Tensor, *others: Tensor) -> tuple[Tensor, None]:
         signals, *detected = ctx.saved_tensors
         if not ctx.harmonics:
             return signals * (gradient / detected[0]), None

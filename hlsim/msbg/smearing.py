@@ -120,8 +120,8 @@ def _spread(spectrum: Tensor, matrix: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 class _Spread(torch.autograd.Function):
     """``_spread`` with a gradient of a third of the steps.
 
-    Of z = x sqrt(s) / |x| with s = A |x|^2, and w the conjugate of z times the gradient at z, it is x (A^T Re w / s + i Im
-    w / |x|^2): along x the power changes, across it the phase.
+    Of z = x sqrt(s) / |x| with s = A |x|^2, and w the conjugate of z times the gradient at z, it is
+    x (A^T Re w / s + i Im w / |x|^2): along x the power changes, across it the phase.
     """
 
     generate_vmap_rule = True
@@ -136,7 +136,7 @@ class _Spread(torch.autograd.Function):
         ctx.save_for_backward(*inputs, *output)
 
     @staticmethod
-    def backward(ctx: Any, gradient: Tensor, *_: Tensor) -> tuple[Tensor, None]:
+    def backward(ctx: Any, gradient: Tensor, *others: Tensor) -> tuple[Tensor, None]:
         spectrum, matrix, *made = ctx.saved_tensors
         # with a gradient of its own, what is constant here comes from the spectrum anew
         spread, given, smeared = _spread(spectrum, matrix) if torch.is_grad_enabled() else made
