@@ -111,10 +111,11 @@ def _widen(frames: Tensor, window: Tensor, matrix: Tensor) -> Tensor:
 def _spread(spectrum: Tensor, matrix: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """The spectrum with its power smeared and its phase kept, the power, and what was made of it."""
     given = power(spectrum)
-    smeared, inverse = given @ matrix.T, (given + _TINY).rsqrt_()
+    smeared = given @ matrix.T
+    factor = smeared / (given + _TINY)
     # the square root of a negative power is imaginary; of 0 it takes long
-    real, imaginary = smeared.clamp_min(_TINY).sqrt_(), (-smeared).clamp_min(_TINY).sqrt_()
-    return spectrum * torch.complex(real * inverse, imaginary * inverse), given, smeared
+    real, imaginary = factor.clamp_min(_TINY).sqrt_(), factor.neg().clamp_min_(_TINY).sqrt_()
+    return spectrum * torch.complex(real, imaginary), given, smeared
 
 
 class _Spread(torch.autograd.Function):
