@@ -97,12 +97,12 @@ def _array(kind: str, key: tuple[Any, ...]) -> np.ndarray[Any, Any]:
             # the advance has nothing to bring in at the end, where the reference puts zeros
             kept = length - np.array(BANKS[severity].advances)[:, None]
             return (np.arange(points) < kept).astype(float)
-        case "forward", points:
-            return np.fft.rfft(ear_filter(), points)
+        case "forward", points, bins, gain:
+            return gain * np.fft.rfft(ear_filter(), points)[:bins]
         case ("forward blocks",):
             return np.fft.rfft(ear_filter(), block_points())
-        case "backward", points, delay, bins:
+        case "backward", points, delay, bins, gain:
             response = np.fft.rfft(ear_filter(backward=True), points) * np.fft.rfft(lowpass_filter(), points)
-            advance = np.exp(2j * np.pi * np.arange(points // 2 + 1) * delay / points)
-            return (response * advance)[:bins]
+            advance = np.exp(2j * np.pi * np.arange(bins) * delay / points)
+            return gain * response[:bins] * advance
     raise AssertionError(kind)

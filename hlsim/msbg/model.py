@@ -169,7 +169,7 @@ class MSBG(nn.Module):
             heard = smear(heard, fine.get("smearing", severity, step), step)
         heard = heard.to(signals.dtype)
         ratios = expansion_ratios(ears, BANKS[severity])
-        scale = 10.0 ** (-BANKS[severity].recombination_db / 20.0)
+        gain = 10.0 ** (-BANKS[severity].recombination_db / 20.0)
 
         length = heard.shape[-1]
         if self.aligned:
@@ -181,12 +181,12 @@ class MSBG(nn.Module):
                 plan = filters.get("plan", severity, points, step)
                 spectrum = hear(spectrum, ratios, plan, severity not in BROADENING)
             if severity in BROADENING:
-                return scale * from_spectrum(spectrum, points, step, rate, samples, delay, filters)
+                return from_spectrum(spectrum, points, step, rate, samples, filters, gain=gain, delay=delay)
             # without smearing's delay, the way out reaches samples that the advances put before the first one
             heard = irfft(spectrum, points // step)[..., :length]
-            return scale * from_cochlea(heard, rate, length, samples, filters, step=step, delay=delay)
+            return from_cochlea(heard, rate, length, samples, filters, gain=gain, step=step, delay=delay)
         heard = self._late(heard, ratios, severity, last, filters)
-        return scale * from_cochlea(heard, rate, length, round(length * rate / RATE), filters)
+        return from_cochlea(heard, rate, length, round(length * rate / RATE), filters, gain=gain)
 
     def _late(self, heard: Tensor, ratios: Tensor, severity: str, last: bool, filters: Filters) -> Tensor:
         """With the delay and, at the end, what the reference makes of it. Shape: (items, time) -> (items, time)."""

@@ -28,43 +28,57 @@ def to_cochlea(signals: Tensor, rate: int, length: int, step: int, filters: Filt
     least = max(signals.shape[-1], math.ceil(length * down / up)) + math.ceil(_FIR_TAIL * down / up / step)
     own, points = _grid(least, up, down)
     bins = min(own, points) // 2 + 1
-    response = filters.get("forward", points * step)
-    spectrum = rfft(signals, own)[..., :bins] * (response[:bins] * (up / down))
-    return _between(spectrum, own, points)[..., :length]
+    response = filters.get("forward", points * step, bins, up / down)
+    return _between(rfft(signals, own)[..., :bins] * response, own, points)[..., :length]
 
 
 def from_spectrum(
-    spectrum: Tensor, points: int, step: int, rate: int, samples: int, delay: int, filters: Filters
+    spectrum: Tensor,
+    points: int,
+    step: int,
+    rate: int,
+    samples: int,
+    filters: Filters,
+    *,
+    gain: float,
+    delay: int,
 ) -> Tensor:
     """Back out of the ear, low-pass, advance by ``delay`` and return to ``rate``, from the cochlea's spectrum.
 
     Shape: (items, points // (2 step) + 1) -> (items, samples).
 
     Args:
+        gain: factor on all of it.
         points: FFT length at 44.1 kHz of the spectrum.
         step: the spectrum is of a signal at 44.1 kHz / step.
         delay: samples at 44.1 kHz.
     """
     inner, out = points // step, points * rate // RATE
     if not shared_multiple(rate):
-        return from_cochlea(
-            irfft(spectrum, inner), rate, points // step, samples, filters, step=step, delay=delay
-        )
+        heard = irfft(spectrum, inner)
+        return from_cochlea(heard, rate, inner, samples, filters, gain=gain, step=step, delay=delay)
     bins = min(inner, out) // 2 + 1
-    response = filters.get("backward", points, delay, bins)
-    heard = _between(spectrum[..., :bins] * (response * (out / inner)), inner, out)
-    return heard[..., :samples]
+    response = filters.get("backward", points, delay, bins, gain * out / inner)
+    return _between(spectrum[..., :bins] * response, inner, out)[..., :samples]
 
 
 def from_cochlea(
-    heard: Tensor, rate: int, length: int, samples: int, filters: Filters, *, step: int = 1, delay: int = 0
+    heard: Tensor,
+    rate: int,
+    length: int,
+    samples: int,
+    filters: Filters,
+    *,
+    gain: float,
+    step: int = 1,
+    delay: int = 0,
 ) -> Tensor:
     """``from_spectrum`` of a waveform. Shape: (items, length) -> (items, samples)."""
     up, down = ratio(rate, step)
     own, points = _grid(math.ceil((length + _FIR_TAIL) * down / up), up, down)
     bins = min(own, points) // 2 + 1
-    response = filters.get("backward", points * step, delay, bins)
-    return _between(rfft(heard, points)[..., :bins] * (response * (down / up)), points, own)[..., :samples]
+    response = filters.get("backward", points * step, delay, bins, gain * down / up)
+    return _between(rfft(heard, points)[..., :bins] * response, points, own)[..., :samples]
 
 
 def to_inner(signals: Tensor, rate: int) -> Tensor:
