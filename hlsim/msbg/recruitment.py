@@ -169,12 +169,36 @@ def weigh(
             fine = gains(interpolate(envelopes, kernel), ratios)
             full = torch.where(steep.repeat_interleave(every, -1), fine, full)
     if torch.is_grad_enabled() and (channels.requires_grad or full.requires_grad):
-        return (channels * full).sum(-2)
-    total = channels[..., 0, :] * full[..., 0, :]
-    # in place, a channel at a time: it stays in the processor's cache
-    for channel in range(1, channels.shape[-2]):
-        total.addcmul_(channels[..., channel, :], full[..., channel, :])
+        return cast(Tensor, _SumOfProducts.apply(channels, full))
+    return _sum_of_products(channels, full)
+
+
+def _sum_of_products(channels: Tensor, factors: Tensor) -> Tensor:
+    """Shape: (..., channels, time) twice -> (..., time)."""
+    first, *others = zip(channels.unbind(-2), factors.unbind(-2), strict=True)
+    total = torch.mul(*first)
+    # in place, a channel at a time: it stays in the processor's cache, and torch's sum takes eight times as long
+    for channel, factor in others:
+        total.addcmul_(channel, factor)
     return total
+
+
+class _SumOfProducts(torch.autograd.Function):
+    generate_vmap_rule = True
+
+    @staticmethod
+    def forward(channels: Tensor, factors: Tensor) -> Tensor:
+        return _sum_of_products(channels, factors)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor], output: Tensor) -> None:
+        ctx.save_for_backward(*inputs)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor]:
+        channels, factors = ctx.saved_tensors
+        every = gradient.unsqueeze(-2)
+        return every * factors, every * channels
 
 
 def _around(values: Tensor, more: int = 0) -> Tensor:

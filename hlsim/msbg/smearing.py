@@ -22,7 +22,7 @@ BROADENING = {"mild": (1.6, 1.1), "moderate": (2.4, 1.6), "severe": (4.0, 2.0)}
 """Widening of the lower and the upper side of the auditory filters; with no loss nothing is smeared (pyclarity 0.9.0)."""
 
 _TINY = 1e-24  # Pa^2; its power of -1.5, in the gradient of silence, is finite in float32
-_CACHED = 480  # frames
+_CACHED = 1200  # frames
 
 
 def roex_filters(lower: float, upper: float, count: int, spacing: float) -> NDArray[np.float64]:
