@@ -25,7 +25,7 @@ _REACH = 5.0  # bandwidths above its frequency to which a channel is kept
 
 _WIDE = 2.5  # broadening above which bands come so near to 0 Hz that a rectifier's harmonics count
 _TRUE_HZ = 400.0  # below, channels are rectified as they are
-_CACHED = 2_000_000  # samples of a tier on a CPU, for the steps from one to the next to find them in its cache
+_CACHED = 2_000_000  # samples of a tier on a CPU, for each step to find the last one's in its cache
 
 
 Detector = Literal["itself", "modulus", "harmonics"]
