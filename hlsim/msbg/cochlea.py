@@ -7,18 +7,10 @@ from torch import Tensor
 
 from hlsim.msbg.ear import RATE
 from hlsim.msbg.ending import ending
+from hlsim.msbg.envelope import STEP, decimate, detect, envelope, smooth
 from hlsim.msbg.filters import Filters
 from hlsim.msbg.fourier import fft_length, irfft, rfft
-from hlsim.msbg.recruitment import (
-    STEP,
-    decimate,
-    detect,
-    envelope,
-    expand,
-    gains,
-    smooth,
-    weigh,
-)
+from hlsim.msbg.recruitment import expand, gains, weigh
 from hlsim.msbg.tiers import Plan
 
 BANK_TAIL = 3200

@@ -13,8 +13,9 @@ from scipy.signal import lfilter_zi
 from torch import Tensor
 from torch.nn import functional
 
+from hlsim.msbg.envelope import STEP, envelope_filters
 from hlsim.msbg.filterbank import FilterBank
-from hlsim.msbg.recruitment import AHEAD, STEP, envelope_filters
+from hlsim.msbg.recruitment import AHEAD
 
 REACH = 4096
 """Samples that the slowest low-pass looks back, to 70 dB."""
@@ -25,7 +26,7 @@ Array = NDArray[np.float64]
 
 
 def ending(channels: Tensor, weights: Tensor, response: Tensor, length: int) -> Tensor:
-    """What the end adds to the envelopes of ``hlsim.msbg.recruitment.envelope``.
+    """What the end adds to the envelopes of ``hlsim.msbg.envelope.envelope``.
 
     Shape: (..., channels, time), (channels, 2, reach), (channels, reach // 24, 2) -> (..., channels, time // 24).
 

@@ -11,9 +11,9 @@ from torch import Tensor
 
 from hlsim.msbg.ear import ear_filter, lowpass_filter
 from hlsim.msbg.ending import ending_response, ending_weights
+from hlsim.msbg.envelope import envelope_lowpass
 from hlsim.msbg.filterbank import BANKS, gammatone_response
 from hlsim.msbg.fourier import block_points
-from hlsim.msbg.recruitment import envelope_lowpass
 from hlsim.msbg.smearing import BROADENING, smearing_matrix
 from hlsim.msbg.tiers import Plan, make_plan, total_response
 

@@ -8,9 +8,9 @@ from torch.nn import functional
 
 from hlsim.msbg.cochlea import shared_multiple
 from hlsim.msbg.ear import EAR_DELAY, RATE
+from hlsim.msbg.envelope import STEP
 from hlsim.msbg.filters import Filters
 from hlsim.msbg.fourier import fft_length, filter_blocks, irfft, rfft
-from hlsim.msbg.recruitment import STEP
 from hlsim.msbg.smearing import HOP
 
 _FIR_TAIL = 2 * EAR_DELAY + 132  # with the low-pass on the way out

@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from hlsim.msbg.ear import RATE
+from hlsim.msbg.envelope import STEP, decimation_kernel, envelope_lowpass
 from hlsim.msbg.filterbank import BANKS, FilterBank, erb, gammatone_response
-from hlsim.msbg.recruitment import STEP, decimation_kernel, envelope_lowpass, interpolation_kernel
+from hlsim.msbg.recruitment import interpolation_kernel
 
 _REACH = 5.0  # bandwidths above its frequency to which a channel is kept
 

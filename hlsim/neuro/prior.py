@@ -15,10 +15,11 @@ from torch.nn import functional
 from hlsim.audiogram import SEVERITIES
 from hlsim.calibration import PASCAL_SPL
 from hlsim.msbg.ear import RATE, ear_filter, lowpass_filter
+from hlsim.msbg.envelope import envelope_filters
 from hlsim.msbg.filterbank import BANKS, FilterBank, gammatone_response
 from hlsim.msbg.fourier import fft_length, irfft, rfft
 from hlsim.msbg.model import STRUCTURAL_DELAY
-from hlsim.msbg.recruitment import CATCH_UP_SPL, envelope_filters, expansion_ratios
+from hlsim.msbg.recruitment import CATCH_UP_SPL, expansion_ratios
 from hlsim.msbg.smearing import BROADENING, roex_filters, smearing_from_filters
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.spectrum import STFT, power

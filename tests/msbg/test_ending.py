@@ -7,8 +7,8 @@ from torch import Tensor
 
 from hlsim.msbg.ear import RATE
 from hlsim.msbg.ending import REACH, ending, ending_response, ending_weights
+from hlsim.msbg.envelope import STEP, envelope, envelope_lowpass
 from hlsim.msbg.filterbank import BANKS, FilterBank, erb
-from hlsim.msbg.recruitment import STEP, envelope, envelope_lowpass
 
 cochlea = pytest.importorskip("clarity.evaluator.msbg.cochlea")
 

@@ -1,16 +1,17 @@
-"""Expansion, envelope and gain against pyclarity's functions."""
+"""Expansion and gain against pyclarity's functions."""
+
+from collections.abc import Callable
 
 import numpy as np
 import pytest
-import scipy.signal
 import torch
-from torch import Tensor
 
 from hlsim.audiogram import FREQUENCIES, draw_thresholds
 from hlsim.calibration import gain_to_pascals
 from hlsim.msbg.ear import RATE
+from hlsim.msbg.envelope import STEP, envelope, envelope_lowpass
 from hlsim.msbg.filterbank import BANKS, FilterBank, erb
-from hlsim.msbg.recruitment import CATCH_UP_SPL, STEP, envelope, envelope_lowpass, expand, expansion_ratios
+from hlsim.msbg.recruitment import CATCH_UP_SPL, expand, expansion_ratios, interpolate, interpolation_kernel
 
 cochlea = pytest.importorskip("clarity.evaluator.msbg.cochlea")
 clarity_audiogram = pytest.importorskip("clarity.utils.audiogram")
@@ -20,23 +21,6 @@ EDGE = 3000  # samples from each end that filtfilt treats its own way
 
 BANK_NAMES = ["mild", "moderate", "severe"]
 TO_PASCALS = gain_to_pascals(120.0)
-
-
-def band_noise(bank: FilterBank, time: int = TIME) -> np.ndarray:
-    """Noise in each channel's band, fluctuating as speech does, 90 dB SPL where RMS 1.0 is 120."""
-    rng = np.random.default_rng(1)
-    slow = np.exp(np.cumsum(rng.standard_normal(time)) / 400)
-    rows = []
-    for hz, width in zip(bank.centre_frequencies, erb(np.array(bank.centre_frequencies)), strict=True):
-        edges = [max(20.0, hz - width), min(22000.0, hz + width)]
-        sos = scipy.signal.butter(2, edges, "bandpass", fs=RATE, output="sos")
-        row = scipy.signal.sosfilt(sos, rng.standard_normal(time)) * slow
-        rows.append(row / np.sqrt(np.mean(row**2)))
-    return 10 ** (-30 / 20) * np.array(rows)
-
-
-def lowpass(bank: FilterBank, time: int = TIME) -> Tensor:
-    return torch.from_numpy(envelope_lowpass(bank, time))
 
 
 @pytest.mark.parametrize("name", BANK_NAMES)
@@ -55,24 +39,10 @@ def test_expansion_ratios(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", BANK_NAMES)
-def test_envelope(name: str) -> None:
-    bank = BANKS[name]
-    channels = band_noise(bank)
-    theirs = cochlea.compute_envelope(channels, erb(np.array(bank.centre_frequencies)), RATE)
-    ours = envelope(torch.from_numpy(channels), lowpass(bank)).numpy()
-    assert ours.shape == (bank.channels, TIME // STEP)
-    kept = slice(EDGE // STEP, -(EDGE // STEP))
-    error = (ours - theirs[:, ::STEP])[:, kept]
-    relative = np.sqrt((error**2).mean(-1) / (theirs[:, ::STEP][:, kept] ** 2).mean(-1))
-    # folding at the decimation: 2.2e-4 in wide bands, whose rectified carrier is noise; 1.1e-5 in the narrowest
-    assert relative.max() < 3e-4 and relative[0] < 1.2e-5
-
-
-@pytest.mark.parametrize("name", BANK_NAMES)
-def test_recruitment(name: str) -> None:
+def test_recruitment(name: str, band_noise: Callable[[FilterBank, int], np.ndarray]) -> None:
     """The gain of envelopes that pyclarity computed at the full rate, sampled a step apart."""
     bank = BANKS[name]
-    channels = band_noise(bank)
+    channels = band_noise(bank, TIME)
     theirs = np.maximum(
         cochlea.compute_envelope(channels, erb(np.array(bank.centre_frequencies)), RATE), 1e-7
     )
@@ -114,21 +84,35 @@ def test_one_db_in_is_the_ratio_of_db_out() -> None:
     assert float(gain_db) == pytest.approx(float(ratio), abs=1e-9)
 
 
-@pytest.mark.parametrize("name", BANK_NAMES)
-def test_envelope_of_a_constant_is_the_constant(name: str) -> None:
-    # the elliptic low-pass of even order is 0.25 dB down at 0 Hz, and it is run twice
-    bank = BANKS[name]
-    channels = torch.full((bank.channels, 40 * STEP), -0.7, dtype=torch.float64)
-    expected = torch.full((bank.channels, 40), 0.7 * 10 ** (-0.5 / 20), dtype=torch.float64)
-    torch.testing.assert_close(envelope(channels, lowpass(bank, 40 * STEP)), expected)
-
-
 def test_gradients() -> None:
     bank = BANKS["severe"]
     channels = torch.randn(bank.channels, 4 * STEP, dtype=torch.float64, requires_grad=True)
-    response = lowpass(bank, 4 * STEP)
+    response = torch.from_numpy(envelope_lowpass(bank, 4 * STEP))
     ratios = torch.linspace(1.0, 4.0, bank.channels, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(lambda c: envelope(c, response), channels, fast_mode=True)
     assert torch.autograd.gradcheck(
         lambda c, r: expand(c, envelope(c, response), r), (channels, ratios), fast_mode=True
     )
+
+
+@pytest.mark.parametrize("steps", [16, 21, 40])
+@pytest.mark.parametrize("step", [1, 2, 4, 8])
+@pytest.mark.parametrize("together", [5, 8])
+def test_interpolation_is_exact_for_polynomials_of_fifth_order(steps: int, step: int, together: int) -> None:
+    powers = torch.randn(6, dtype=torch.float64)
+
+    def polynomial(place: torch.Tensor) -> torch.Tensor:
+        return (powers * ((place - steps / 2) / steps).unsqueeze(-1) ** torch.arange(6)).sum(-1)
+
+    each = STEP // step
+    places = torch.arange(steps * each, dtype=torch.float64) / each
+    kernel = torch.from_numpy(interpolation_kernel(step, together=together))
+    fine = interpolate(polynomial(torch.arange(steps, dtype=torch.float64))[None], kernel)[0]
+    inside = slice(2 * each, (steps - 3) * each)  # it is taken as periodic
+    torch.testing.assert_close(fine[inside], polynomial(places)[inside])
+
+
+def test_interpolation_of_two_parts_gives_both_the_same() -> None:
+    values = torch.randn(3, 24, dtype=torch.float64)
+    once, twice = (interpolate(values, torch.from_numpy(interpolation_kernel(4, parts))) for parts in (1, 2))
+    torch.testing.assert_close(twice, once.repeat_interleave(2, -1))

@@ -1,0 +1,139 @@
+"""Envelopes of the channels: rectified, and low-passed at 75 Hz or less, so that every 24th sample tells all."""
+
+from functools import lru_cache
+from typing import Any, cast
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.signal import ellip
+from torch import Tensor
+
+from hlsim.msbg.ear import RATE
+from hlsim.msbg.filterbank import FilterBank, erb
+from hlsim.spectrum import power, rfft
+
+STEP = 24
+"""Samples from one value of an envelope, and of the gain that follows it, to the next."""
+
+_BOXES = 3  # three running means of 24 samples put zeros of third order where decimation would alias to 0 Hz
+_TINY = 1e-30  # Pa^2, keeps the gradients of silence finite
+
+
+def detect(signals: Tensor, harmonics: bool) -> Tensor:
+    """What a full-wave rectifier makes of the real part of analytic signals, times pi / 2, less its harmonics.
+
+    Shape: complex (...) -> (...).
+
+    Args:
+        harmonics: with the lower two: |cos a| is 2 / pi (1 + 2/3 cos 2a - 2/15 cos 4a ...); otherwise the modulus.
+    """
+    if signals.requires_grad and torch.is_grad_enabled():
+        return cast(Tensor, _Detect.apply(signals, harmonics)[0])
+    return _detect(signals, harmonics)[0]
+
+
+def _detect(signals: Tensor, harmonics: bool) -> tuple[Tensor, ...]:
+    """What is detected; with harmonics also the modulus, and the squared cosine of the angle."""
+    squared = power(signals).add_(_TINY)
+    if not harmonics:
+        return (squared.sqrt_(),)  # torch's own modulus takes four times as long
+    cosine, modulus = signals.real.square() / squared, squared.sqrt()
+    return modulus * ((cosine * (-16 / 15) + 12 / 5) * cosine + 1 / 5), modulus, cosine
+
+
+class _Detect(torch.autograd.Function):
+    """``_detect`` with a gradient of half the steps."""
+
+    generate_vmap_rule = True
+
+    @staticmethod
+    def forward(signals: Tensor, harmonics: bool) -> tuple[Tensor, ...]:
+        return _detect(signals, harmonics)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor, bool], output: tuple[Tensor, ...]) -> None:
+        ctx.harmonics = inputs[1]
+        ctx.mark_non_differentiable(*output[1:])
+        ctx.save_for_backward(inputs[0], *output)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor, *others: Tensor) -> tuple[Tensor, None]:
+        signals, *detected = ctx.saved_tensors
+        if not ctx.harmonics:
+            return signals * (gradient / detected[0]), None
+        # with a gradient of its own, what is constant here comes from the signals anew
+        _, modulus, cosine = _detect(signals, True) if torch.is_grad_enabled() else detected
+        share = gradient / modulus
+        along = share * ((cosine * (16 / 5) - 20 / 3) * cosine + 5)
+        across = share * ((cosine * (16 / 5) - 12 / 5) * cosine + 1 / 5)
+        return torch.complex(signals.real * along, signals.imag * across), None
+
+
+def decimate(rectified: Tensor, kernel: Tensor) -> Tensor:
+    """Weighted sums of each step's samples, for ``smooth``. Shape: (..., time), (3, 24 // step) -> (..., 3, steps)."""
+    return kernel @ rectified.unflatten(-1, (-1, kernel.shape[-1])).mT
+
+
+def smooth(sums: Tensor, lowpass: Tensor) -> Tensor:
+    """Envelopes at samples 0, 24, ... from the sums of ``decimate``; periodic.
+
+    Shape: (..., channels, 3, steps), (channels, steps // 2 + 1) -> (..., channels, steps).
+    """
+    before, here, after = sums.unbind(-2)
+    slow = (here + before.roll(1, -1)).add_(after.roll(-1, -1))
+    return torch.fft.irfft(rfft(slow).mul_(lowpass), slow.shape[-1])
+
+
+def envelope(channels: Tensor, lowpass: Tensor) -> Tensor:
+    """Full-wave rectify at 44.1 kHz and low-pass, zero-phase, at a 24th of the rate.
+
+    Shape: (..., channels, time), (channels, time // 48 + 1) -> (..., channels, time // 24), the values at samples 0, 24,
+    ...; ``time`` is a multiple of 24 and the signal is taken as periodic.
+    """
+    kernel = torch.from_numpy(decimation_kernel()).to(channels)
+    return smooth(decimate(channels.abs(), kernel), lowpass)
+
+
+def envelope_lowpass(
+    bank: FilterBank, points: int, step: int = 1, channels: slice = slice(None)
+) -> NDArray[np.complex128]:
+    """Response that turns the rfft of ``decimate``'s means into that of the envelope at samples 0, 24, ...
+
+    The low-pass is ``ellip(2, 0.25, 35)`` at 3/4 of 100 Hz or of the channel's ERB if less, run forwards and backwards
+    as pyclarity does with ``filtfilt``; what that does at the end is in ``hlsim.msbg.ending``.
+
+    Args:
+        points: FFT length at 44.1 kHz, a multiple of 24.
+        step: samples at 44.1 kHz from one of the rectified signal's to the next.
+        channels: which of the bank's; all by default.
+
+    Returns: (channels, points // 48 + 1).
+    """
+    omega = 2.0 * np.pi * np.arange(points // STEP // 2 + 1) / points
+    powers = np.exp(-1j * omega) ** np.arange(3)[:, None]
+    numerators, denominators = np.array(envelope_filters(bank)[channels]).swapaxes(0, 1)
+    rows = np.abs((numerators @ powers) / (denominators @ powers)) ** 2
+    with np.errstate(invalid="ignore"):
+        box = np.sin(STEP * omega / 2.0) / (STEP // step * np.sin(step * omega / 2.0))
+    box[0] = 1.0
+    return rows / box**_BOXES * np.exp(-0.5j * (STEP - step) * omega)
+
+
+@lru_cache(maxsize=4)
+def envelope_filters(bank: FilterBank) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
+    """Numerator and denominator of each channel's low-pass."""
+    widths = erb(np.array(bank.centre_frequencies))
+    return [ellip(2, 0.25, 35, 0.75 * min(100.0, width) / (RATE / 2.0)) for width in widths]
+
+
+@lru_cache(maxsize=8)
+def decimation_kernel(step: int = 1) -> NDArray[np.float64]:
+    """Weights of a block's samples in the mean around the block after it, itself and the one before.
+
+    Returns: (3, 24 // step).
+    """
+    samples = STEP // step
+    box = np.full(samples, 1.0 / samples)
+    kernel = np.pad(np.convolve(np.convolve(box, box), box), 1)
+    return np.ascontiguousarray(kernel.reshape(_BOXES, samples))
