@@ -95,13 +95,16 @@ def benchmark(
                 for ear in EARS[1:2] if slow else EARS:
                     for direction in ("forward", "both") if row.differentiable else ("forward",):
                         key = (row.name, rate, 1.0, 1, direction)
-                        elapsed = _time(calls[row.name, rate, ear], clip, direction, place, warm=not slow)
+                        call = calls[row.name, rate, ear]
+                        elapsed = _time(call, clip, direction, place, warm=not slow)
+                        if turn == 0 and elapsed > _SLOW:  # a row's first call makes what the later ones find
+                            elapsed = _time(call, clip, direction, place, warm=False)
                         if direction == "forward":
                             probe[row.name, rate] = min(probe.get((row.name, rate), math.inf), elapsed)
                         if turn:
                             cells.setdefault(key, []).append(elapsed)
                         elif ear == EARS[1]:
-                            memory[key] = _peak(calls[row.name, rate, ear], clip, direction, place)
+                            memory[key] = _peak(call, clip, direction, place)
     for row in found:
         rate = row.rates[0]
         call, first = calls[row.name, rate, "N2"], statistics.median(cells[row.name, rate, 1.0, 1, "forward"])

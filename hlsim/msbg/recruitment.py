@@ -93,6 +93,8 @@ def weigh(
 
 def _sum_of_products(channels: Tensor, factors: Tensor) -> Tensor:
     """Shape: (..., channels, time) twice -> (..., time)."""
+    if channels.device.type != "cpu":
+        return (channels * factors).sum(-2)
     first, *others = zip(channels.unbind(-2), factors.unbind(-2), strict=True)
     total = torch.mul(*first)
     # in place, a channel at a time: it stays in the processor's cache, and torch's sum takes eight times as long
