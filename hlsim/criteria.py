@@ -21,7 +21,6 @@ _TINY = 1e-12
 
 _FAINT = 8e-4  # squared magnitude of a tone of 20 dB SPL in the paper's transform
 _SILENT = 1e-20
-_NEXT_TO_NOTHING = 1e-12
 
 
 def magnitude_loss(estimate: Tensor, truth: Tensor) -> Tensor:
@@ -126,16 +125,9 @@ def _magnitude(spectrum: Tensor) -> Tensor:
 
 def _phase(spectrum: Tensor, other: Tensor) -> Tensor:
     """Angle, with a gradient that fades out where it or the other spectrum is faint."""
-    if spectrum.requires_grad and torch.is_grad_enabled():
-        result: Tensor = _FadedPhase.apply(spectrum, other)
-        return result
-    return _angle(spectrum)
-
-
-def _angle(spectrum: Tensor) -> Tensor:
-    """That of silence, which may be -0, is 0."""
-    # of the parts apart, for torch takes twenty times as long where every second number is another's
-    return torch.atan2(spectrum.imag.contiguous(), spectrum.real + _NEXT_TO_NOTHING)
+    # always: whether a gradient will be asked for, torch.func and forward mode do not tell
+    phase: Tensor = _FadedPhase.apply(spectrum, other)
+    return phase
 
 
 class _FadedPhase(torch.autograd.Function):
@@ -145,15 +137,29 @@ class _FadedPhase(torch.autograd.Function):
 
     @staticmethod
     def forward(spectrum: Tensor, other: Tensor) -> Tensor:
-        return _angle(spectrum)
+        # of the parts apart, for torch takes twenty times as long where every second number is another's
+        real, imaginary = spectrum.real.contiguous(), spectrum.imag.contiguous()
+        # next to silence the angle is rounding
+        return torch.atan2(imaginary, torch.where(real.abs().add_(imaginary.abs()) < 1e-7, 1e-7, real))
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor], output: Tensor) -> None:
         ctx.save_for_backward(*inputs)
+        ctx.save_for_forward(*inputs)
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
         spectrum, other = ctx.saved_tensors
-        level = power(other)
-        share = gradient * (level / ((level + _FAINT) * (power(spectrum) + _FAINT)))
+        share = gradient * _fading(spectrum, other)
         return torch.complex(-spectrum.imag * share, spectrum.real * share), None
+
+    @staticmethod
+    def jvp(ctx: Any, tangent: Tensor, other_tangent: Tensor | None) -> Tensor:
+        spectrum, other = ctx.saved_tensors
+        across = spectrum.real * tangent.imag - spectrum.imag * tangent.real
+        return across * _fading(spectrum, other)
+
+
+def _fading(spectrum: Tensor, other: Tensor) -> Tensor:
+    level = power(other)
+    return level / ((level + _FAINT) * (power(spectrum) + _FAINT))

@@ -115,10 +115,10 @@ class _SumOfProducts(torch.autograd.Function):
         ctx.save_for_backward(*inputs)
 
     @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor]:
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, Tensor | None]:
         channels, factors = ctx.saved_tensors
-        every = gradient.unsqueeze(-2)
-        return every * factors, every * channels
+        every, (first, second) = gradient.unsqueeze(-2), ctx.needs_input_grad
+        return every * factors if first else None, every * channels if second else None
 
 
 def _around(values: Tensor, more: int = 0) -> Tensor:

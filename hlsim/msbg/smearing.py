@@ -21,7 +21,8 @@ SMEARING_DELAY = 3 * HOP
 BROADENING = {"mild": (1.6, 1.1), "moderate": (2.4, 1.6), "severe": (4.0, 2.0)}
 """Widening of the lower and the upper side of the auditory filters; with no loss nothing is smeared (pyclarity 0.9.0)."""
 
-_TINY = 1e-24  # Pa^2; its power of -1.5, in the gradient of silence, is finite in float32
+_TINY = 1e-24  # Pa^2
+_NEVER = 1e-36  # Pa^2, keeps a division from one by 0
 _CACHED = 1200  # frames
 
 
@@ -108,43 +109,49 @@ def _widen(frames: Tensor, window: Tensor, matrix: Tensor) -> Tensor:
     return torch.fft.irfft(spectrum, len(window))[..., :half] * window[:half]
 
 
-def _spread(spectrum: Tensor, matrix: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """The spectrum with its power smeared and its phase kept, the power, and what was made of it."""
+def _spread(spectrum: Tensor, matrix: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """The spectrum with its power smeared and its phase kept; the factor on it, the power, and what was made of it.
+
+    Silence counts as a power of 1e-24 Pa^2, and stays as it is.
+    """
     given = power(spectrum)
-    smeared = given @ matrix.T
-    factor = smeared / (given + _TINY)
+    smeared, given = (given @ matrix.T).add_(_TINY), given.add_(_TINY)
+    quotient = smeared / given
     # the square root of a negative power is imaginary; of 0 it takes long
-    real, imaginary = factor.clamp_min(_TINY).sqrt_(), factor.neg().clamp_min_(_TINY).sqrt_()
-    return spectrum * torch.complex(real, imaginary), given, smeared
+    real, imaginary = quotient.clamp_min(_TINY).sqrt_(), quotient.neg().clamp_min_(_TINY).sqrt_()
+    factor = torch.complex(real, imaginary)
+    return spectrum * factor, factor, given, smeared
 
 
 class _Spread(torch.autograd.Function):
     """``_spread`` with a gradient of a third of the steps.
 
-    Of z = x sqrt(s) / |x| with s = A |x|^2, and w the conjugate of z times the gradient at z, it is
-    x (A^T Re w / s + i Im w / |x|^2): along x the power changes, across it the phase.
+    Of z = f x with |f|^2 = s / p, s = A p and p = |x|^2, and g the conjugate of f times the gradient at z, it is
+    g + x (A^T e / s - e / p) with e = Re(conj(x) g): with the power of one frequency the factor of others changes.
     """
 
     generate_vmap_rule = True
 
     @staticmethod
-    def forward(spectrum: Tensor, matrix: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def forward(spectrum: Tensor, matrix: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         return _spread(spectrum, matrix)
 
     @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor], output: tuple[Tensor, Tensor, Tensor]) -> None:
+    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor], output: tuple[Tensor, ...]) -> None:
         ctx.mark_non_differentiable(*output[1:])
-        ctx.save_for_backward(*inputs, *output)
+        ctx.save_for_backward(*inputs, *output[1:])
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor, *others: Tensor) -> tuple[Tensor, None]:
         spectrum, matrix, *made = ctx.saved_tensors
         # with a gradient of its own, what is constant here comes from the spectrum anew
-        spread, given, smeared = _spread(spectrum, matrix) if torch.is_grad_enabled() else made
-        turned = spread.conj() * gradient
-        least = smeared.new_tensor(_TINY)
-        along = (turned.real / (smeared + torch.copysign(least, smeared))) @ matrix
-        return spectrum * torch.complex(along, turned.imag / (given + _TINY)), None
+        factor, given, smeared = _spread(spectrum, matrix)[1:] if torch.is_grad_enabled() else made
+        direct = factor.conj() * gradient
+        products = torch.view_as_real(spectrum) * torch.view_as_real(direct)
+        changed = products[..., 0] + products[..., 1]
+        divisor = smeared + torch.copysign(smeared.new_tensor(_NEVER), smeared)
+        along = (changed / divisor) @ matrix - changed / given
+        return torch.addcmul(direct, spectrum, along), None
 
 
 @lru_cache(maxsize=16)
