@@ -20,7 +20,7 @@ from hlsim.data.files import PARTIAL, Whole, write_whole
 from hlsim.data.manifest import SPLITS, UTTERANCE_COLUMNS, Rows, csv_line
 from hlsim.data.noises import Noises, find_noises
 from hlsim.data.plan_settings import PlanSettings
-from hlsim.data.samples import INSTANCE_COLUMNS, INSTANCES, MANIFEST, SETTINGS
+from hlsim.data.samples import CLAIM, INSTANCE_COLUMNS, INSTANCES, MANIFEST, SETTINGS
 
 FAULTS = "faults.csv"
 
@@ -83,7 +83,8 @@ def prepare(
         progress: called with the utterances checked and all.
 
     Raises:
-        ValueError: settings or folders that cannot be used, nothing left to use, or faults with ``strict``.
+        ValueError: settings or folders that cannot be used, nothing left to use, faults with ``strict``, or ``out`` holds
+            instances of another plan.
     """
     root, corpus, noise = settings.places()
     folder = Path(out)
@@ -104,6 +105,11 @@ def prepare(
     }
     if prepared := _unchanged(folder, about, strict):
         return prepared
+    if (folder / SETTINGS).is_file() and (folder / CLAIM).is_file():  # of no use without their plan
+        raise ValueError(
+            f"{(folder / CLAIM).parent}: holds instances of another plan, with other settings or files; choose another "
+            "--out, or remove it"
+        )
     splits = assign_splits(
         listing.speakers, test_share=settings.test_share, valid_share=settings.valid_share, seed=settings.seed
     )

@@ -21,6 +21,9 @@ from hlsim.data.noises import mix_at
 MANIFEST, INSTANCES, SETTINGS = "manifest.csv", "instances.csv", "plan.json"
 """Names in a prepared folder."""
 
+CLAIM = "instances/made-of.txt"
+"""What the instances in a prepared folder are made of: the plan's digest, and how."""
+
 INSTANCE_COLUMNS = (
     "number",
     "id",

@@ -13,11 +13,10 @@ import torch
 from hlsim.data.corpora import Fault
 from hlsim.data.files import PARTIAL, alone, write_whole
 from hlsim.data.manifest import csv_line
-from hlsim.data.samples import MANIFEST, Plan, is_whole
+from hlsim.data.samples import CLAIM, MANIFEST, Plan, is_whole
 from hlsim.data.teacher import Reference, Teacher
 from hlsim.parallel import run_parallel
 
-CLAIM = "instances/made-of.txt"
 WRITE_FAULTS = "write-faults.csv"
 
 

@@ -69,9 +69,9 @@ def test_another_plan_in_the_folder_is_another_plan(plan: Path) -> None:
 
 def test_another_rate_in_the_folder_is_another_plan(plan: Path, voicebank: Path) -> None:
     write(plan)
-    prepare(PlanSettings(voicebank, level=(55.0, 75.0), rate=22050), plan, jobs=1)
-    with pytest.raises(ValueError, match="another plan"):
-        write(plan)
+    with pytest.raises(ValueError, match="another plan, with other settings or files; choose another --out"):
+        prepare(PlanSettings(voicebank, level=(55.0, 75.0), rate=22050), plan, jobs=1)
+    write(plan)  # the plan that is there is still its own
 
 
 def test_workers_elsewhere_are_told_whole_paths(plan: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -206,9 +206,8 @@ def test_another_plan_or_recipe_needs_another_folder(plan: Path, voicebank: Path
     before = digests(plan / "instances")
     with pytest.raises(ValueError, match="another plan, teacher or alignment; choose another --out"):
         write_instances(plan, Recipe(alignment="impulse"), jobs=1)
-    prepare(PlanSettings(voicebank, seed=1), plan, jobs=1)
     with pytest.raises(ValueError, match="another plan"):
-        write(plan)
+        prepare(PlanSettings(voicebank, seed=1), plan, jobs=1)
     assert digests(plan / "instances") == before
 
 
