@@ -26,6 +26,49 @@ def fails(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
     return error
 
 
+def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
+    """The one line of a call whose options cannot be read."""
+    with pytest.raises(SystemExit) as end:
+        main([str(argument) for argument in arguments])
+    assert end.value.code == 2
+    error = capsys.readouterr().err.strip()
+    assert len(error.splitlines()) == 1 and error.startswith("hlsim")
+    return error
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["simulate"], "hlsim simulate: error: the following arguments are required: IN"),
+        (["simulate", "a", "b", "--audiogram", "N3", "--loud"], "hlsim simulate: error: unrecognized"),
+        (["nothing"], "hlsim: error: argument COMMAND: invalid choice"),
+        ([], "hlsim: error: the following arguments are required: COMMAND"),
+    ],
+)
+def test_unreadable_options_are_one_line_without_the_usage(
+    capsys: pytest.CaptureFixture[str], arguments: list[str], said: str
+) -> None:
+    error = refused(capsys, *arguments)
+    assert error.startswith(said) and error.endswith(f"; see {said.split(':')[0]} --help")
+
+
+@pytest.mark.parametrize(
+    ("command", "option", "said"),
+    [
+        ("prepare", ["--severities", "mild=x"], "mild=x; allowed: severities with a number each"),
+        ("prepare", ["--severities", "mild"], "mild; allowed: severities with a number each"),
+        ("prepare", ["--train-snr", "0,x"], "0,x; allowed: numbers separated by commas"),
+        ("prepare", ["--seed", "a"], "a; allowed: whole numbers"),
+        ("draw-alignment", ["--full-scale-spl", "abc"], "abc; allowed: numbers such as"),
+        ("draw-alignment", ["--full-scale-spl", "nan"], "nan; allowed: numbers such as"),
+    ],
+)
+def test_values_of_another_kind(
+    capsys: pytest.CaptureFixture[str], command: str, option: list[str], said: str
+) -> None:
+    assert f"argument {option[0]}: {said}" in refused(capsys, command, *option)
+
+
 @pytest.mark.parametrize("simulator", ["msbg", "neuro-msbg"])
 @pytest.mark.parametrize(("rate", "channels"), [(16000, 1), (44100, 2), (96000, 1)])
 def test_simulate_keeps_rate_channels_and_length(
@@ -95,7 +138,7 @@ def test_bad_audio(tmp_path: Path, capsys: pytest.CaptureFixture[str], kind: str
         ("10,20,30,40,50,60,70,130", "-10 to 120"),
         ("N7", "-10 to 100"),
         ("N9", "N1, N2, N3"),
-        ("10,20,30,x,50,60,70,80", "x"),
+        ("10,20,30,x,50,60,70,80", "allowed: a standard ear such as N3, or eight numbers"),
     ],
 )
 def test_bad_audiogram(
@@ -103,6 +146,62 @@ def test_bad_audiogram(
 ) -> None:
     error = fails(capsys, "simulate", utterance, tmp_path / "out.wav", "--audiogram", audiogram)
     assert reason in error and not list(tmp_path.iterdir())
+
+
+def test_levels_below_zero_need_no_sign_of_equality(tmp_path: Path, utterance: Path) -> None:
+    out = tmp_path / "out.wav"
+    call = ["simulate", str(utterance), str(out), "--simulator", "msbg", "--audiogram"]
+    assert main([*call, "-10,-5,0,0,0,0,0,0"]) == 0 and out.is_file()
+
+
+@pytest.mark.parametrize("command", ["simulate", "compensate"])
+def test_files_that_cannot_be_in_and_out(
+    tmp_path: Path, utterance: Path, capsys: pytest.CaptureFixture[str], command: str
+) -> None:
+    given, plain, out = tmp_path / "in.flac", tmp_path / "plain", tmp_path / "out.wav"
+    given.write_bytes(utterance.read_bytes())
+    plain.touch()
+    for source, target, said in (
+        (given, plain / "o.wav", f"{plain}: not a folder; allowed"),
+        (given, tmp_path / "none" / "o.wav", f"{tmp_path / 'none'}: no such folder; allowed"),
+        (given, given, f"{given}: OUT is IN itself"),
+        (tmp_path, out, f"{tmp_path}: a folder; allowed: one file"),
+        (tmp_path / "missing.wav", tmp_path / "missing.wav", "missing.wav: no such file"),
+    ):
+        assert said in fails(capsys, command, source, target, "--audiogram", "N3")
+    assert given.read_bytes() == utterance.read_bytes()
+    assert {path.name for path in tmp_path.iterdir()} == {"in.flac", "plain"}
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ["train-compensator", "--speech", "s"],
+        ["train-simulator", "--speech", "s", "--config", "c"],
+        ["prepare", "s"],
+        ["demo"],
+    ],
+)
+def test_a_file_in_the_place_of_the_folder_for_results(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], command: list[str]
+) -> None:
+    plain = tmp_path / "plain"
+    plain.touch()
+    for out in (plain, plain / "below"):
+        error = refused(capsys, *command, "--out", out)
+        assert f"argument --out: {plain}: not a folder; allowed: a folder, there or not" in error
+
+
+def test_options_that_contradict_each_other(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = ["--out", tmp_path / "out"]
+    error = refused(capsys, "haspi-report", "--spl", "65", "--full-scale-spl", "94", *out)
+    assert "argument --full-scale-spl: not allowed with argument --spl" in error
+    call = ["evaluate-simulator", "msbg", "msbg", "--speech", "s", "--audiograms", "a", *out]
+    assert "simulators msbg, msbg; allowed: each once" in fails(capsys, *call)
+    pytest.importorskip("lightning")
+    call = ["train-compensator", "--speech", "s", "--audiogram", "N4", "--audiograms", "a", *out]
+    assert "--audiogram with --audiograms; allowed: one ear, or a CSV" in fails(capsys, *call)
+    assert not list(tmp_path.iterdir())
 
 
 def test_audiograms_that_do_not_ascend(
@@ -150,6 +249,9 @@ def test_unequal_file_lists(tmp_path: Path, utterance: Path, capsys: pytest.Capt
     ("command", "module"),
     [
         (["train-simulator", "--config", "c", "--speech", "s", "--out", "o"], "lightning"),
+        (["train-simulator", "--config", "c", "--speech", "s", "--out", "o"], "tensorboard"),
+        (["train-compensator", "--speech", "s", "--out", "o"], "tensorboard"),
+        (["demo", "--out", "o"], "tensorboard"),
         (
             [
                 "haspi-report",

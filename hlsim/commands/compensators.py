@@ -11,6 +11,7 @@ from hlsim.commands.options import (
     add_command,
     audiogram_option,
     count,
+    number,
     out_option,
     positive,
     read_ear,
@@ -47,7 +48,7 @@ def add(commands: Commands) -> None:
         "--simulator", default="neuro-msbg", help="Neuro-MSBG of the surrogate gap, by name or folder"
     )
     sub.add_argument(
-        "--levels", type=float, nargs="+", default=[50, 65, 80], help="of the speech in dB SPL, in turn"
+        "--levels", type=number, nargs="+", default=[50, 65, 80], help="of the speech in dB SPL, in turn"
     )
     sub.add_argument("--items", type=count, default=400, help="how many in all")
     sub.add_argument("--seconds", type=positive, default=3.0, help="length of an item")

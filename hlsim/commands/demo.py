@@ -9,6 +9,7 @@ from hlsim.commands.options import (
     Commands,
     add_command,
     audiogram_option,
+    folder,
     positive,
     read_ear,
     seed_option,
@@ -25,7 +26,7 @@ def add(commands: Commands) -> None:
         "train a compensator for one ear on the embedded speech and score it by HASPI",
     )
     sub.add_argument(
-        "--out", type=Path, default=Path("hlsim-demo"), help="folder for report, audio and pictures"
+        "--out", type=folder, default=Path("hlsim-demo"), help="folder for report, audio and pictures"
     )
     audiogram_option(sub, default="N4")
     sub.add_argument(
@@ -38,7 +39,12 @@ def add(commands: Commands) -> None:
 
 
 def _demo(options: argparse.Namespace) -> None:
-    for module, extra in (("lightning", "train"), ("clarity", "eval"), ("matplotlib", "eval")):
+    for module, extra in (
+        ("lightning", "train"),
+        ("tensorboard", "train"),
+        ("clarity", "eval"),
+        ("matplotlib", "eval"),
+    ):
         require(module, extra)
     keep_freed_memory()
     from hlsim.demo import demo

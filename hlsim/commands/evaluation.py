@@ -9,6 +9,7 @@ from hlsim.commands.options import (
     Commands,
     add_command,
     count,
+    number,
     out_option,
     positive,
     read_simulator,
@@ -37,7 +38,11 @@ def add(commands: Commands) -> None:
         "--teacher", choices=("pyclarity", "msbg"), default="pyclarity", help="what counts as the truth"
     )
     sub.add_argument(
-        "--levels", type=float, nargs="+", default=[50, 60, 65, 70, 80], help="dB SPL that items take in turn"
+        "--levels",
+        type=number,
+        nargs="+",
+        default=[50, 60, 65, 70, 80],
+        help="dB SPL that items take in turn",
     )
     sub.add_argument(
         "--inputs",
@@ -54,6 +59,8 @@ def add(commands: Commands) -> None:
 
 
 def _evaluate_simulator(options: argparse.Namespace) -> None:
+    if len(set(options.names)) < len(options.names):
+        raise ValueError(f"simulators {', '.join(options.names)}; allowed: each once")
     for module in ("clarity", "pystoi", "pesq"):
         require(module, "eval")
     from compensators import load_compensator

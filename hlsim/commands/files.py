@@ -14,6 +14,7 @@ from hlsim.commands.options import (
     Commands,
     add_command,
     audiogram_option,
+    check_files,
     full_scale_option,
     read_ear,
     read_simulator,
@@ -59,6 +60,7 @@ def _compensate(options: argparse.Namespace) -> None:
 
 def _pass_through(options: argparse.Namespace, build: Callable[[int], torch.nn.Module]) -> None:
     """Read, run what ``build`` makes for a sample rate, and write at the file's own rate."""
+    check_files(options.input, options.output)
     ear = read_ear(options.audiogram)
     waveform, rate = read_audio(options.input, any_rate=True)
     inner = min(rate, HIGHEST_RATE)

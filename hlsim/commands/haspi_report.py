@@ -53,8 +53,9 @@ def add(commands: Commands) -> None:
         help="of haspi, hasqi, stoi, pesq, separated by commas; the first leads",
     )
     sub.add_argument("--baseline", help="condition that all others are compared with; all pairs by default")
-    full_scale_option(sub)
-    sub.add_argument(
+    level = sub.add_mutually_exclusive_group()
+    full_scale_option(level)
+    level.add_argument(
         "--spl", type=positive, help="level of each clean file in dB SPL, in place of --full-scale-spl"
     )
     sub.add_argument("--scores", type=Path, help="file of scores made so far; OUT/scores.jsonl by default")

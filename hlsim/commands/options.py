@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import os
 import sys
 import time
 from collections.abc import Callable
@@ -45,27 +46,70 @@ def audiogram_option(
 
 
 def out_option(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--out", type=Path, required=True, help="folder for the results")
+    parser.add_argument("--out", type=folder, required=True, help="folder for the results")
 
 
 def seed_option(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--seed", type=int, default=0, help="of every random draw")
+    parser.add_argument("--seed", type=integer, default=0, help="of every random draw")
 
 
-def full_scale_option(parser: argparse.ArgumentParser) -> None:
+def full_scale_option(parser: argparse._ActionsContainer) -> None:
     parser.add_argument(
-        "--full-scale-spl", type=float, default=94.0, help="level in dB SPL of a file whose RMS is 1.0"
+        "--full-scale-spl", type=number, default=94.0, help="level in dB SPL of a file whose RMS is 1.0"
     )
 
 
+def folder(text: str) -> Path:
+    """Where results go, there or not: one that cannot be is to be known before hours of work."""
+    path = Path(text)
+    there = next(part for part in (path.absolute(), *path.absolute().parents) if part.exists())
+    if not there.is_dir():
+        raise argparse.ArgumentTypeError(f"{there}: not a folder; allowed: a folder, there or not")
+    if not os.access(there, os.W_OK | os.X_OK):
+        raise argparse.ArgumentTypeError(
+            f"{there}: no permission to write there; allowed: a folder of one's own"
+        )
+    return path
+
+
+def check_files(source: Path, target: Path) -> None:
+    """Refuse an IN and OUT that would end in nothing after the work, or in the loss of IN."""
+    if source.is_dir():
+        raise ValueError(f"{source}: a folder; allowed: one file, wav, flac or ogg")
+    if not target.parent.is_dir():
+        found = "not a folder" if target.parent.exists() else "no such folder"
+        raise ValueError(f"{target.parent}: {found}; allowed: an OUT in a folder that is there")
+    if source.exists() and target.exists() and target.samefile(source):
+        raise ValueError(f"{target}: OUT is IN itself; allowed: another file, for IN would be lost")
+
+
+def number(text: str) -> float:
+    value = _float(text)
+    if not math.isfinite(value):
+        raise argparse.ArgumentTypeError(f"{text}; allowed: numbers such as 65 or 2.5")
+    return value
+
+
 def positive(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
+    value = _float(text)
     if not (math.isfinite(value) and value > 0):
         raise argparse.ArgumentTypeError(f"{text}; allowed: numbers above 0")
     return value
+
+
+def _float(text: str) -> float:
+    """NaN where it is no number."""
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
+
+
+def integer(text: str) -> int:
+    try:
+        return int(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text}; allowed: whole numbers") from None
 
 
 def count(text: str) -> int:
@@ -87,7 +131,13 @@ def read_ear(text: str) -> Audiogram:
     if "," not in text:
         return Audiogram.standard(text)
     try:
-        return Audiogram(tuple(float(part) for part in text.split(",")))
+        levels = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        raise ValueError(
+            f"--audiogram {text}; allowed: a standard ear such as N3, or eight numbers in dB HL separated by commas"
+        ) from None
+    try:
+        return Audiogram(levels)
     except ValueError as error:
         raise ValueError(f"--audiogram {text}: {error}") from error
 

@@ -10,8 +10,11 @@ from hlsim.commands.options import (
     Commands,
     add_command,
     audiogram_option,
+    check_files,
     count,
     full_scale_option,
+    integer,
+    number,
     out_option,
     positive,
     read_ear,
@@ -65,16 +68,19 @@ def add(commands: Commands) -> None:
     )
     sub.add_argument(
         "--level",
-        type=float,
+        type=number,
         nargs="+",
         default=[65.0],
         help="active speech level in dB SPL that ears are given; two draw one in between for each utterance and ear",
     )
-    sub.add_argument("--rate", type=int, default=16000, help="of the instances, Hz")
+    sub.add_argument("--rate", type=integer, default=16000, help="of the instances, Hz")
     sub.add_argument(
-        "--test-share", type=float, default=0.1, help="of speakers, where the corpus has no splits of its own"
+        "--test-share",
+        type=number,
+        default=0.1,
+        help="of speakers, where the corpus has no splits of its own",
     )
-    sub.add_argument("--valid-share", type=float, default=0.0, help="of the speakers to train with")
+    sub.add_argument("--valid-share", type=number, default=0.0, help="of the speakers to train with")
     sub.add_argument("--shortest", type=positive, default=0.5, help="seconds; shorter files are left out")
     sub.add_argument("--strict", action="store_true", help="make a fault an error")
     sub.add_argument("--write", action="store_true", help="make the instances too, 12 bytes a sample")
@@ -109,12 +115,22 @@ def add(commands: Commands) -> None:
 
 
 def numbers(text: str) -> tuple[float, ...]:
-    return tuple(float(part) for part in text.split(","))
+    try:
+        return tuple(number(part) for part in text.split(","))
+    except argparse.ArgumentTypeError:
+        raise argparse.ArgumentTypeError(
+            f"{text}; allowed: numbers separated by commas, such as 0,2.5,5"
+        ) from None
 
 
 def shares(text: str) -> dict[str, float]:
     pairs = [part.partition("=") for part in text.split(",")]
-    return {name.strip(): float(value) for name, _, value in pairs}
+    try:
+        return {name.strip(): number(value) for name, _, value in pairs}
+    except argparse.ArgumentTypeError:
+        raise argparse.ArgumentTypeError(
+            f"{text}; allowed: severities with a number each, such as mild=1,severe=2"
+        ) from None
 
 
 def _prepare(options: argparse.Namespace) -> None:
@@ -124,6 +140,7 @@ def _prepare(options: argparse.Namespace) -> None:
 
     if len(options.level) > 2:
         raise ValueError(f"--level {options.level}; allowed: one level, or lowest and highest")
+    _refuse_what_has_no_use(options)
     settings = PlanSettings(
         corpus=options.corpus,
         noise=options.noise,
@@ -158,6 +175,27 @@ def _prepare(options: argparse.Namespace) -> None:
         print(f"{count_made} instances are in {options.out / 'instances'}")
 
 
+def _refuse_what_has_no_use(options: argparse.Namespace) -> None:
+    """Options that another one has to be given with. A value that is the default's equal passes: it changes nothing."""
+    mixing = {
+        "--train-snr": options.train_snr != TRAIN_SNRS_DB,
+        "--test-snr": options.test_snr != TEST_SNRS_DB,
+        "--train-types": options.train_types != TRAIN_TYPES,
+        "--test-types": options.test_types != TEST_TYPES,
+    }
+    making = {
+        "--teacher": options.teacher != TEACHERS[0],
+        "--alignment": options.alignment != ALIGNMENTS[0],
+    }
+    for needed, there, given in (
+        ("--noise", options.noise is not None, mixing),
+        ("--write", options.write, making),
+    ):
+        if not there and any(given.values()):
+            names = ", ".join(name for name, other in given.items() if other)
+            raise ValueError(f"{names} without {needed}; allowed: only with it")
+
+
 def _reference(teacher: str) -> Reference | None:
     if teacher == "msbg":
         return None
@@ -173,6 +211,7 @@ def _draw_alignment(options: argparse.Namespace) -> None:
     from hlsim.calibration import gain_to_pascals
     from hlsim.evaluation.alignment import draw_alignment
 
+    check_files(options.input, options.output)
     waveform, rate = read_audio(options.input)
     signal = waveform[0] * gain_to_pascals(options.full_scale_spl)
     delay = draw_alignment(

@@ -11,6 +11,7 @@ from hlsim.commands.options import (
     add_command,
     audiogram_option,
     count,
+    integer,
     natural,
     out_option,
     positive,
@@ -50,7 +51,7 @@ def add(commands: Commands) -> None:
 
 
 def _train_simulator(options: argparse.Namespace) -> None:
-    require("lightning", "train")
+    _require_extras()
     keep_freed_memory()
     from hlsim.training.simulator import SimulatorRecipe, train_simulator
 
@@ -73,7 +74,7 @@ def _train_planned(options: argparse.Namespace) -> None:
     from hlsim.training.planned import PlannedSource, PlannedTraining
     from hlsim.training.simulator import SimulatorRecipe, train_simulator
 
-    if given := [f"--{name.replace('_', '-')}" for name in FOLDERS if getattr(options, name) is not None]:
+    if given := [_flag(name) for name in FOLDERS if getattr(options, name) is not None]:
         raise ValueError(
             f"--manifest with {', '.join(given)}; allowed: one or the other, for a manifest has it all"
         )
@@ -92,7 +93,12 @@ def _train_planned(options: argparse.Namespace) -> None:
 
 
 def _train_compensator(options: argparse.Namespace) -> None:
-    require("lightning", "train")
+    _require_extras()
+    measured = ("audiograms", "valid_audiograms")
+    if options.audiogram and (given := [name for name in measured if getattr(options, name) is not None]):
+        raise ValueError(
+            f"--audiogram with {', '.join(map(_flag, given))}; allowed: one ear, or a CSV of ears, not both"
+        )
     keep_freed_memory()
     from hlsim.training.compensator import CompensatorRecipe, train_compensator
 
@@ -104,6 +110,15 @@ def _train_compensator(options: argparse.Namespace) -> None:
         **training_arguments(options),
     )
     print(f"the best checkpoint is in {folder}")
+
+
+def _require_extras() -> None:
+    for module in ("lightning", "tensorboard"):
+        require(module, "train")
+
+
+def _flag(name: str) -> str:
+    return f"--{name.replace('_', '-')}"
 
 
 def training_options(
@@ -120,7 +135,7 @@ def training_options(
     parser.add_argument(
         "--max-minutes", type=positive, default=minutes, help="of training, resumed parts included"
     )
-    parser.add_argument("--max-steps", type=int, default=-1, help="stop earlier; -1 for no such limit")
+    parser.add_argument("--max-steps", type=integer, default=-1, help="stop earlier; -1 for no such limit")
     parser.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto", help="where to train")
     parser.add_argument("--devices", type=count, default=1, help="GPUs or processes a machine")
     parser.add_argument("--nodes", type=count, default=1, help="machines")

@@ -30,9 +30,12 @@ def draw_alignment(
         method: ``impulse``, the paper's, or ``structural``.
 
     Raises:
-        ValueError: an unknown method, or a signal that is silent or shorter than 0.12 s.
+        ValueError: an unknown method, a path that does not end in .png, or a signal that is silent or shorter than
+            0.12 s.
         MissingExtraError: matplotlib is not installed.
     """
+    if Path(path).suffix.lower() != ".png":
+        raise ValueError(f"{path}: what is drawn is a PNG; allowed: a name that ends in .png")
     refuse_unknown([method], ("impulse", "structural"), "alignments")
     shown = round(_SHOWN * sample_rate)
     if signal.shape[-1] < shown or not bool(signal.any()):

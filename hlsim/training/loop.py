@@ -137,11 +137,10 @@ class KeepBest(Callback):
 
 
 class History(Callback):
-    """Prints a line a validation, in one of the processes."""
+    """Prints a line a validation, in one of the processes, with the minutes of all resumed parts."""
 
     def __init__(self, report: Callable[[str], None]) -> None:
         self.report = report
-        self.started = time.monotonic()
 
     def on_validation_end(self, trainer: L.Trainer, module: L.LightningModule) -> None:
         if not trainer.is_global_zero:
@@ -151,7 +150,8 @@ class History(Callback):
             for name, value in trainer.callback_metrics.items()
             if name != "score"
         )
-        minutes = (time.monotonic() - self.started) / 60.0
+        assert isinstance(module, TimedModule)
+        minutes = module.timer.time_elapsed("train") / 60.0
         self.report(f"step {trainer.global_step}, {minutes:.1f} min: {figures}")
 
 

@@ -73,6 +73,9 @@ def test_options_reach_the_plan(corpus: Path, tmp_path: Path, capsys: pytest.Cap
         (["--backend", "dask", "--scheduler", "tcp://127.0.0.1:1"], "no Dask scheduler answers"),
         (["--root", "."], "not in the root"),
         (["--train-snr", "5,10", "--test-snr", "5", "--noise", "NOISE"], "SNRs 5 dB for training and test"),
+        (["--train-snr", "5", "--test-types", "1"], "--train-snr, --test-types without --noise; allowed"),
+        (["--teacher", "pyclarity"], "--teacher without --write; allowed: only with it"),
+        (["--alignment", "impulse"], "--alignment without --write; allowed: only with it"),
     ],
 )
 def test_bad_input_is_one_line(
@@ -94,3 +97,14 @@ def test_draw_alignment(corpus: Path, tmp_path: Path, capsys: pytest.CaptureFixt
     assert main(["draw-alignment", str(corpus / "ann" / "1.wav"), str(picture), "--audiogram", "N3"]) == 0
     assert "samples at 16000 Hz" in capsys.readouterr().out and picture.stat().st_size > 1000
     assert main(["draw-alignment", str(corpus / "bob" / "2.wav"), str(picture)]) == 2
+
+
+def test_bad_pictures_are_refused_before_the_work(
+    corpus: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for picture, said in (
+        (tmp_path / "a.jpg", "a.jpg: what is drawn is a PNG; allowed: a name that ends in .png"),
+        (tmp_path / "none" / "a.png", "none: no such folder"),
+    ):
+        assert main(["draw-alignment", str(corpus / "ann" / "1.wav"), str(picture)]) == 2
+        assert said in capsys.readouterr().err and not picture.exists()

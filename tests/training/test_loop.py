@@ -230,6 +230,15 @@ def test_time_is_limited_and_counted_over_all_parts(tmp_path: Path) -> None:
     torch.testing.assert_close(second.vector, first.vector, atol=0.05, rtol=0)
 
 
+def test_the_minutes_told_are_of_all_parts(tmp_path: Path) -> None:
+    go(Toy(), tmp_path, max_steps=2)
+    state = torch.load(tmp_path / LAST, weights_only=True)
+    state["callbacks"]["Timer"]["time_elapsed"]["train"] = 720.0
+    torch.save(state, tmp_path / LAST)
+    _, lines = go(Toy(), tmp_path, max_steps=4)
+    assert {line.split(":")[0] for line in lines} == {"step 4, 12.0 min"}
+
+
 def test_learning_rate_rises_over_fifty_steps_and_falls_with_time(tmp_path: Path) -> None:
     rising = Toy(learning_rate=0.5)
     go(rising, tmp_path / "a", max_steps=60, validate_every=30)
