@@ -40,7 +40,7 @@ class MappingCompensator(EarNetwork):
         sample_rate, full_scale_spl: as ``EarNetwork``.
 
     Raises:
-        ValueError: a rate or level out of range.
+        ValueError: a rate or level out of range, or a configuration of another kind.
     """
 
     def __init__(
@@ -51,6 +51,8 @@ class MappingCompensator(EarNetwork):
         full_scale_spl: float = PASCAL_SPL,
     ) -> None:
         super().__init__(sample_rate, full_scale_spl)
+        if config is not None and not isinstance(config, MappingConfig):
+            raise ValueError(f"config is {type(config).__name__}; allowed: a MappingConfig")
         self.config = config = config or MappingConfig()
         self.stft = config.stft
         size, depth, stride = config.channels, config.dense_depth, config.stride

@@ -1,6 +1,7 @@
 """NAL-R, the closed-form prescription that a trained compensator has to beat."""
 
 from functools import lru_cache
+from numbers import Integral
 
 import numpy as np
 import torch
@@ -49,9 +50,11 @@ class NALR(nn.Module):
         super().__init__()
         self.sample_rate = check_rate(sample_rate)
         self.full_scale_spl = check_full_scale(full_scale_spl)
-        if order % 2 or not 2 <= order <= 1022:
-            raise ValueError(f"order of the NAL-R filter is {order}; allowed: even numbers from 2 to 1022")
-        self.order = order
+        if not isinstance(order, Integral) or order % 2 or not 2 <= order <= 1022:
+            raise ValueError(
+                f"order of the NAL-R filter is {order!r}; allowed: even whole numbers from 2 to 1022"
+            )
+        self.order: int = int(order)
         self.register_buffer("thresholds", own_thresholds(audiogram), persistent=False)
 
     def forward(self, waveform: Tensor, audiogram: AudiogramLike | None = None) -> Tensor:

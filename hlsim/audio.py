@@ -13,6 +13,8 @@ import torchaudio.functional
 import torchaudio.transforms
 from torch import Tensor
 
+from hlsim.calibration import is_finite
+
 LOWEST_RATE, HIGHEST_RATE = 16000, 48000
 """Sample rates in Hz that simulators and compensators take."""
 
@@ -26,13 +28,16 @@ _SINC: dict[str, Any] = {
 }
 _LARGEST_KERNEL = 1_000_000  # values that are kept: 441 / 160 has 70,560, but 44101 / 16000 has 700 million
 
+_STREAMED = 0x7FFF0000  # sizes from here on were written before the length was known: 0x7FFFF000, 0xFFFFFFFF
+
 _SUBTYPES = {".wav": "FLOAT", ".flac": "PCM_24", ".ogg": "VORBIS"}
 
 
 def check_rate(sample_rate: int) -> int:
     """Return the rate, or raise ValueError unless it is a whole number of Hz from 16000 to 48000."""
-    if not LOWEST_RATE <= sample_rate <= HIGHEST_RATE or int(sample_rate) != sample_rate:
-        raise ValueError(f"sample rate {sample_rate} Hz; allowed: {LOWEST_RATE} to {HIGHEST_RATE}")
+    inside = is_finite(sample_rate) and LOWEST_RATE <= sample_rate <= HIGHEST_RATE
+    if not inside or int(sample_rate) != sample_rate:
+        raise ValueError(f"sample rate {sample_rate!r} Hz; allowed: {LOWEST_RATE} to {HIGHEST_RATE}")
     return int(sample_rate)
 
 
@@ -57,14 +62,15 @@ def read_audio(path: str | Path, *, any_rate: bool = False) -> tuple[Tensor, int
     Returns: float32 samples as they are in the file, (channels, time), and the rate in Hz.
 
     Raises:
-        ValueError: the file is missing, broken, empty, silent or holds NaN or infinity, or its rate is below 16 kHz or
-            above 48 kHz. The message starts with the path.
+        ValueError: the file is missing, broken, cut off (wav), empty, silent or holds NaN or infinity, or its rate is
+            below 16 kHz or above 48 kHz. The message starts with the path.
     """
     if not Path(path).is_file():
         raise ValueError(f"{path}: no such file")
     try:
+        _refuse_cut(path)
         samples, rate = soundfile.read(str(path), dtype="float32", always_2d=True)
-    except (soundfile.LibsndfileError, RuntimeError) as error:
+    except (OSError, soundfile.LibsndfileError, RuntimeError) as error:
         raise ValueError(f"{path}: not readable as audio ({error}); allowed: wav, flac, ogg") from error
     if samples.shape[0] == 0:
         raise ValueError(f"{path}: empty, no samples")
@@ -89,9 +95,10 @@ def read_stretch(path: str | Path, start: float, seconds: float) -> tuple[Tensor
     Returns: float32 samples (channels, time) and the rate in Hz; silence and any rate are let through.
 
     Raises:
-        ValueError: the file is missing, broken or empty.
+        ValueError: the file is missing, broken, cut off (wav) or empty.
     """
     try:
+        _refuse_cut(path)
         with soundfile.SoundFile(str(path)) as file:
             rate, left = int(file.samplerate), max(1, round(seconds * file.samplerate))
             file.seek(int(start * rate) % max(1, file.frames))
@@ -103,9 +110,27 @@ def read_stretch(path: str | Path, start: float, seconds: float) -> tuple[Tensor
                 pieces.append(torch.from_numpy(piece.T.copy()))
                 left -= len(piece)
                 file.seek(0)
-    except (soundfile.LibsndfileError, RuntimeError) as error:
+    except (OSError, soundfile.LibsndfileError, RuntimeError) as error:
         raise ValueError(f"{path}: not readable as audio ({error}); allowed: wav, flac, ogg") from error
     return torch.cat(pieces, -1), rate
+
+
+def _refuse_cut(path: str | Path) -> None:
+    """Raise ValueError where a wav file holds less than its header tells; libsndfile would read what there is."""
+    with open(path, "rb") as file:
+        start = file.read(12)
+        if start[:4] != b"RIFF" or start[8:] != b"WAVE":
+            return
+        while len(chunk := file.read(8)) == 8:
+            size = int.from_bytes(chunk[4:], "little")
+            if chunk[:4] == b"data":
+                held = os.fstat(file.fileno()).st_size - file.tell()
+                if held < size < _STREAMED:
+                    raise ValueError(
+                        f"{path}: cut off, its header tells of {size} bytes of samples, {held} are there"
+                    )
+                return
+            file.seek(size + size % 2, os.SEEK_CUR)
 
 
 def write_audio(path: str | Path, waveform: Tensor, sample_rate: int) -> None:

@@ -86,8 +86,12 @@ class Audiogram:
 
     @classmethod
     def standard(cls, name: str) -> Audiogram:
-        """A standard audiogram by name: N1 to N7, S1 to S3 (Bisgaard 2010) or NH, 0 dB HL throughout."""
-        if name not in STANDARD:
+        """A standard audiogram by name: N1 to N7, S1 to S3 (Bisgaard 2010) or NH, 0 dB HL throughout.
+
+        Raises:
+            ValueError: no such name.
+        """
+        if not isinstance(name, str) or name not in STANDARD:
             raise ValueError(f"no standard audiogram {name!r}; allowed: {', '.join(STANDARD)}")
         return cls(tuple(float(level) for level in STANDARD[name]))
 
@@ -110,9 +114,10 @@ class Audiogram:
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Audiogram:
-        """Read what ``to_dict`` wrote. Raises ValueError where ``levels`` is missing."""
-        if "levels" not in data:
-            raise ValueError(f"an audiogram dictionary needs 'levels', got {sorted(data)}")
+        """Read what ``to_dict`` wrote. Raises ValueError where it is no mapping or ``levels`` is missing."""
+        if not isinstance(data, Mapping) or "levels" not in data:
+            got = list(data) if isinstance(data, Mapping) else type(data).__name__
+            raise ValueError(f"an audiogram dictionary needs 'levels', got {got}")
         return cls(data["levels"], data.get("frequencies", FREQUENCIES))
 
     def to_row(self) -> dict[str, str]:
@@ -169,11 +174,16 @@ def as_thresholds(audiogram: AudiogramLike) -> Tensor:
     Returns: (8,) for one ear, (batch, 8) for a sequence, the tensor itself otherwise; dB HL.
 
     Raises:
-        ValueError: not an audiogram, a last dimension other than 8, NaN, or levels outside -10 to 100 dB HL.
+        ValueError: not an audiogram, a complex or bool tensor, a last dimension other than 8, NaN, or levels outside -10
+            to 100 dB HL.
     """
     if isinstance(audiogram, Audiogram):
         levels = torch.tensor(audiogram.thresholds)
     elif isinstance(audiogram, Tensor):
+        if audiogram.is_complex() or audiogram.dtype == torch.bool:
+            raise ValueError(
+                f"audiogram tensor of {audiogram.dtype}; allowed: floating-point or integer dB HL"
+            )
         levels = audiogram if audiogram.is_floating_point() else audiogram.float()
     elif (
         isinstance(audiogram, Sequence) and audiogram and all(isinstance(ear, Audiogram) for ear in audiogram)

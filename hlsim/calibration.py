@@ -5,6 +5,8 @@ as 94): RMS 1.0 is 94 dB SPL. ``full_scale_spl`` says what RMS 1.0 is in somebod
 """
 
 import math
+from numbers import Real
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -15,12 +17,21 @@ PASCAL_SPL = 94.0
 _LOWEST_POWER = 1e-20  # -106 dB SPL: keeps the level of silence finite
 
 
+def is_finite(value: Any) -> bool:
+    """Whether it is a finite number, Python's or numpy's; a bool is none."""
+    if not isinstance(value, Real) or isinstance(value, bool):
+        return False
+    try:
+        return math.isfinite(value)
+    except OverflowError:  # a whole number that no float holds
+        return False
+
+
 def check_full_scale(full_scale_spl: float) -> float:
     """Return ``full_scale_spl`` as a float, or raise ValueError where it cannot be a level in dB SPL (0 to 200)."""
-    value = float(full_scale_spl)
-    if not (math.isfinite(value) and 0.0 <= value <= 200.0):
-        raise ValueError(f"full_scale_spl is {full_scale_spl}; allowed: 0 to 200 dB SPL at RMS 1.0")
-    return value
+    if not (is_finite(full_scale_spl) and 0.0 <= full_scale_spl <= 200.0):
+        raise ValueError(f"full_scale_spl is {full_scale_spl!r}; allowed: 0 to 200 dB SPL at RMS 1.0")
+    return float(full_scale_spl)
 
 
 def gain_to_pascals(full_scale_spl: float) -> float:

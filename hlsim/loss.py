@@ -1,6 +1,8 @@
 """A training loss that hears through an impaired ear."""
 
+import contextlib
 import math
+import os
 from collections.abc import Callable, Mapping
 from functools import wraps
 from pathlib import Path
@@ -13,11 +15,11 @@ from hlsim import criteria
 from hlsim.audio import check_rate, check_waveform, resample
 from hlsim.audiogram import FREQUENCIES, AudiogramLike, as_thresholds
 from hlsim.band_levels import HIGHEST, band_level_loss
-from hlsim.calibration import PASCAL_SPL, check_full_scale, gain_to_pascals
+from hlsim.calibration import PASCAL_SPL, check_full_scale, gain_to_pascals, is_finite
 from hlsim.msbg import MSBG
 from hlsim.neuro import NeuroMSBG
 from hlsim.neuro.config import NEURO_RATE
-from hlsim.pretrained import load_pretrained
+from hlsim.pretrained import SIMULATOR, find_checkpoint, load_pretrained
 
 CRITERIA: dict[str, Mapping[str, float]] = {"paper": criteria.DEFAULT_WEIGHTS, "bands": {"band_levels": 1.0}}
 """Criteria by name: their parts and the default weight of each."""
@@ -65,7 +67,8 @@ class HearingLossLoss(nn.Module):
         weights: of the parts by name; a part left out does not count.
 
     Raises:
-        ValueError: an unknown name, a value out of range, a simulator made for another rate or level, or one that delays.
+        ValueError: an unknown name, a value of another kind or out of range, a simulator made for another rate or level,
+            or one that delays.
     """
 
     def __init__(
@@ -82,9 +85,9 @@ class HearingLossLoss(nn.Module):
         super().__init__()
         self.sample_rate = check_rate(sample_rate)
         self.full_scale_spl = check_full_scale(full_scale_spl)
-        if reference not in REFERENCES:
+        if not isinstance(reference, str) or reference not in REFERENCES:
             raise ValueError(f"reference is {reference!r}; allowed: {', '.join(REFERENCES)}")
-        if criterion not in CRITERIA:
+        if not isinstance(criterion, str) or criterion not in CRITERIA:
             raise ValueError(f"criterion is {criterion!r}; allowed: {', '.join(CRITERIA)}")
         self.reference, self.criterion = reference, criterion
         self.weights = _check_weights(CRITERIA[criterion] if weights is None else weights, criterion)
@@ -104,7 +107,8 @@ class HearingLossLoss(nn.Module):
         Shape: (..., time) twice, and one audiogram or (..., 8) that broadcasts over the leading dimensions -> ().
 
         Raises:
-            ValueError: shapes that do not fit, no audiogram, or levels outside -10 to 100 dB HL.
+            ValueError: shapes that do not fit, no audiogram, levels outside -10 to 100 dB HL, or a simulator that does
+                not return a waveform of the shape it was given.
         """
         return criteria.weighted_sum(self.parts(compensated, clean, audiogram), self.weights)
 
@@ -125,6 +129,7 @@ class HearingLossLoss(nn.Module):
         ears = self.thresholds if audiogram is None else as_thresholds(audiogram)
         if ears is None:
             raise ValueError("no audiogram: give one when building the loss or with the call")
+        _refuse_pairs(compensated.shape[:-1], ears.shape[:-1])
         with torch.autocast(compensated.device.type, enabled=False):
             dtype = torch.promote_types(torch.promote_types(compensated.dtype, clean.dtype), torch.float32)
             heard = self._hear(compensated.to(dtype), ears.to(compensated.device))
@@ -150,7 +155,15 @@ class HearingLossLoss(nn.Module):
             raise ValueError(
                 f"the speech is on {waveform.device} and the simulator on {weight.device}; move the loss with .to()"
             )
-        heard: Tensor = self.simulator(waveform, thresholds)
+        heard = check_waveform(self.simulator(waveform, thresholds), "what the simulator returned")
+        batches = [waveform.shape[:-1]]
+        with contextlib.suppress(RuntimeError):  # ears that do not broadcast are the simulator's to refuse
+            batches.append(torch.broadcast_shapes(waveform.shape[:-1], thresholds.shape[:-1]))
+        if heard.shape[:-1] not in batches:
+            raise ValueError(
+                f"the simulator made shape {tuple(heard.shape)} of {tuple(waveform.shape)}; allowed: one that keeps the "
+                "shape, or broadcasts it with the audiograms'"
+            )
         if heard.shape[-1] != waveform.shape[-1]:
             raise ValueError(
                 f"the simulator made {heard.shape[-1]} samples of {waveform.shape[-1]}; allowed: one that keeps the "
@@ -184,6 +197,16 @@ class HearingLossLoss(nn.Module):
         return self
 
 
+def _refuse_pairs(items: torch.Size, ears: torch.Size) -> None:
+    """Raise ValueError where ears broadcast so that each item is heard with each ear: (batch, 1) items, (batch,) ears."""
+    with contextlib.suppress(RuntimeError):  # ears that do not broadcast are the simulator's to refuse
+        if math.prod(torch.broadcast_shapes(items, ears)) > max(math.prod(items), math.prod(ears)):
+            raise ValueError(
+                f"audiograms of shape {(*ears, len(FREQUENCIES))} would pair each item of {tuple(items)} with each ear; "
+                f"allowed: one audiogram, or one an item: {(*items, len(FREQUENCIES))}"
+            )
+
+
 def _moved(fn: Callable[[Tensor], Tensor], tensor: Tensor) -> Tensor:
     """Move a tensor of the simulator with its host, but never to half precision, which it does not work in."""
     moved = fn(tensor)
@@ -203,20 +226,27 @@ def _build(simulator: str | Path | nn.Module, sample_rate: int, full_scale_spl: 
                 "the simulator delays what it hears; allowed: one that does not, as MSBG(aligned=True)"
             )
         return simulator
+    if not isinstance(simulator, str | os.PathLike):
+        raise ValueError(
+            f"simulator is {type(simulator).__name__}; allowed: a name, a folder or a module (not its class)"
+        )
     if simulator == "msbg":
         return MSBG(sample_rate=sample_rate, full_scale_spl=full_scale_spl)
-    return load_pretrained(simulator, sample_rate=sample_rate, full_scale_spl=full_scale_spl)
+    folder = find_checkpoint(simulator, SIMULATOR, ("msbg",))
+    return load_pretrained(folder, sample_rate=sample_rate, full_scale_spl=full_scale_spl)
 
 
 def _check_weights(weights: Mapping[str, float], criterion: str) -> dict[str, float]:
     allowed = CRITERIA[criterion]
-    if unknown := sorted(set(weights) - set(allowed)):
+    if not isinstance(weights, Mapping):
+        raise ValueError(f"weights is {type(weights).__name__}; allowed: numbers by name, as {dict(allowed)}")
+    if unknown := sorted(map(str, set(weights) - set(allowed))):
         raise ValueError(
             f"unknown weights {', '.join(unknown)} for criterion {criterion!r}; allowed: {', '.join(allowed)}"
         )
+    if not all(is_finite(weight) and weight >= 0.0 for weight in weights.values()):
+        raise ValueError(f"weights {dict(weights)}; allowed: finite numbers, 0 or more")
     checked = {name: float(weight) for name, weight in weights.items()}
-    if not all(math.isfinite(weight) and weight >= 0.0 for weight in checked.values()):
-        raise ValueError(f"weights {checked}; allowed: finite numbers, 0 or more")
     if not any(checked.values()):
         raise ValueError(
             f"weights {checked} count nothing; allowed: one above 0 at least, of {', '.join(allowed)}"

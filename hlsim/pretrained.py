@@ -7,7 +7,7 @@ import os
 import re
 import shutil
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -22,6 +22,9 @@ from hlsim.neuro.model import NeuroMSBG
 Model = TypeVar("Model", bound=nn.Module)
 
 WEIGHTS, CONFIG, CARD = "model.safetensors", "config.json", "README.md"
+
+SIMULATOR = "neuro-msbg"
+"""What ``config.json`` of a checkpoint of a simulator calls it."""
 
 
 def load_pretrained(
@@ -43,7 +46,7 @@ def load_pretrained(
             NeuroConfig.from_dict(config), sample_rate=sample_rate, full_scale_spl=full_scale_spl
         )
 
-    model = read_checkpoint(name, "neuro-msbg", build)
+    model = read_checkpoint(name, SIMULATOR, build)
     return model.eval().requires_grad_(False)
 
 
@@ -53,7 +56,7 @@ def read_checkpoint(name: str | Path, kind: str, build: Callable[[Mapping[str, A
     Raises:
         ValueError: as ``load_pretrained``.
     """
-    folder = find_checkpoint(name)
+    folder = find_checkpoint(name, kind)
     try:
         record = json.loads((folder / CONFIG).read_text(encoding="utf-8"))
         weights = (folder / WEIGHTS).read_bytes()
@@ -76,19 +79,28 @@ def read_checkpoint(name: str | Path, kind: str, build: Callable[[Mapping[str, A
     return model
 
 
-def find_checkpoint(name: str | Path) -> Path:
+def find_checkpoint(name: str | Path, kind: str | None = None, also: Sequence[str] = ()) -> Path:
     """The folder of a checkpoint that ships with hlsim, or of one's own.
 
+    Args:
+        kind: of those that the message lists; None lists all.
+        also: other names that the caller takes, for the message.
+
     Raises:
-        ValueError: there is none; the message lists those that ship.
+        ValueError: there is none, or it is neither a name nor a path; the message lists those that ship.
     """
+    if not isinstance(name, str | os.PathLike):
+        raise ValueError(f"checkpoint is {type(name).__name__}; allowed: a name or a folder")
     if (Path(name) / CONFIG).is_file():
         return Path(name)
     shipped = {path.parent.name: path.parent for path in sorted(checkpoints_folder().glob(f"*/{CONFIG}"))}
     if str(name) in shipped:
         return shipped[str(name)]
+    names = [*also, *(own for own, folder in shipped.items() if kind in (None, _kind(folder)))]
+    inner = Path(name) / "checkpoint"  # as a training leaves it
+    hint = f", but {str(inner)!r} is one" if (inner / CONFIG).is_file() else ""
     raise ValueError(
-        f"no checkpoint {str(name)!r}; allowed: {', '.join(shipped) or 'none ships'}, or a folder with {CONFIG}"
+        f"no checkpoint {str(name)!r}{hint}; allowed: {', '.join(names) or 'none ships'}, or a folder with {CONFIG}"
     )
 
 
@@ -164,6 +176,11 @@ def repair_checkpoint(folder: str | Path) -> None:
     for path in target.parent.glob(f".{target.name}.*"):
         if path.is_dir() and staged.fullmatch(path.name):
             shutil.rmtree(path, ignore_errors=True)
+
+
+def _kind(folder: Path) -> str | None:
+    kind: str | None = json.loads((folder / CONFIG).read_text(encoding="utf-8")).get("kind")
+    return kind
 
 
 def _old(target: Path) -> Path:

@@ -20,6 +20,7 @@ from hlsim.audio import (
     encode_flac,
     find_audio,
     read_audio,
+    read_stretch,
     resample,
     write_audio,
 )
@@ -211,13 +212,59 @@ def test_find_audio_says_what_is_missing(tmp_path: Path) -> None:
         assert str(caught.value).startswith(str(path))
 
 
-@pytest.mark.parametrize("rate", [15999, 48001, 16000.5, -16000, 0, math.nan, math.inf])
-def test_rates_out_of_range(rate: float) -> None:
+@pytest.mark.parametrize("header", ["plain", "chunk before", "odd"])
+def test_a_wav_cut_off_is_named(tmp_path: Path, header: str) -> None:
+    path = tmp_path / "cut.wav"
+    soundfile.write(path, np.full(101, 0.25), 16000, subtype="PCM_U8" if header == "odd" else "PCM_16")
+    whole = path.read_bytes()
+    place = whole.index(b"data")
+    if header == "chunk before":
+        whole = whole[:place] + b"LIST\x03\0\0\0abc\0" + whole[place:]
+    size = {"odd": 101}.get(header, 202)
+    end = whole.index(b"data") + 8 + size
+    for held in (size, size - 1, 2):
+        path.write_bytes(whole[: end - size + held])
+        for read in (read_audio, lambda name: read_stretch(name, 0.0, 0.001)):
+            if held == size:  # the odd one without its byte of padding
+                assert bool((read(path)[0] == 0.25).all())
+                continue
+            with pytest.raises(ValueError, match=f"{size} bytes of samples, {held} are there") as caught:
+                read(path)
+            assert str(caught.value).startswith(f"{path}: cut off") and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("size", [0, 0x7FFFF000, 0xFFFFFFFF])
+def test_a_streamed_wav_does_not_know_its_length(tmp_path: Path, size: int) -> None:
+    path = tmp_path / "streamed.wav"
+    soundfile.write(path, np.full(100, 0.25), 16000)
+    data = bytearray(path.read_bytes())
+    place = data.index(b"data") + 4
+    data[4:8] = data[place : place + 4] = size.to_bytes(4, "little")
+    path.write_bytes(data)
+    if size:
+        assert bool((read_audio(path)[0] == 0.25).all())
+    else:  # libsndfile's own answer
+        with pytest.raises(ValueError, match="empty"):
+            read_audio(path)
+
+
+@pytest.mark.parametrize("format", ["RF64", "W64", "FLAC", "OGG"])
+def test_other_formats_are_left_to_libsndfile(tmp_path: Path, format: str) -> None:
+    path = tmp_path / "a.wav"
+    soundfile.write(path, np.full(1000, 0.25), 16000, format=format)
+    assert read_audio(path)[0].shape == (1, 1000)
+
+
+@pytest.mark.parametrize(
+    "rate",
+    [15999, 48001, 16000.5, -16000, 0, math.nan, math.inf, 10**400, None, "16k", "16000", True, [16000]],
+)
+def test_rates_out_of_range(rate: Any) -> None:
     with pytest.raises(ValueError, match=r"sample rate .* Hz; allowed: 16000 to 48000"):
-        check_rate(rate)  # type: ignore[arg-type]
+        check_rate(rate)
 
 
-@pytest.mark.parametrize("rate", [16000, 44100.0, 48000])
+@pytest.mark.parametrize("rate", [16000, 44100.0, 48000, np.int64(16000), np.float32(16000)])
 def test_rates_in_range_come_back_whole(rate: int) -> None:
     assert check_rate(rate) == rate and type(check_rate(rate)) is int
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -56,9 +57,10 @@ def test_normal_hearing_is_0_throughout() -> None:
     assert Audiogram.standard("NH").levels == (0.0,) * 8
 
 
-def test_an_unknown_standard_names_those_there_are() -> None:
-    with pytest.raises(ValueError, match=r"'N9'; allowed: NH, N1, .*, S3$"):
-        Audiogram.standard("N9")
+@pytest.mark.parametrize("name", ["N9", ["N3"], None])
+def test_an_unknown_standard_names_those_there_are(name: Any) -> None:
+    with pytest.raises(ValueError, match=rf"{re.escape(repr(name))}; allowed: NH, N1, .*, S3$"):
+        Audiogram.standard(name)
 
 
 def test_is_frozen_hashable_and_holds_floats() -> None:
@@ -143,6 +145,12 @@ def test_dictionary_round_trip_through_json() -> None:
     assert Audiogram.from_dict({"levels": range(8)}) == Audiogram(tuple(range(8)))
     with pytest.raises(ValueError, match=r"needs 'levels', got .*frequencies"):
         Audiogram.from_dict({"frequencies": FREQUENCIES})
+
+
+@pytest.mark.parametrize(("data", "got"), [(3, "int"), (["levels"], "list"), ({1: 2, "a": 3}, r"\[1, 'a'\]")])
+def test_what_is_no_dictionary_of_an_ear(data: Any, got: str) -> None:
+    with pytest.raises(ValueError, match=f"needs 'levels', got {got}"):
+        Audiogram.from_dict(data)
 
 
 @pytest.mark.parametrize("frequencies", [FREQUENCIES, (125.0, 750.0, 1500.5)])
@@ -246,6 +254,8 @@ def test_thresholds_for_a_simulator() -> None:
         (torch.tensor([0.0] * 7 + [100.1]), "takes -10 to 100"),
         (torch.tensor([[0.0] * 8, [-10.1] * 8]), "levels -10.1, -10.1, .*takes -10 to 100"),
         (torch.zeros(0, 8), r"shape \(0, 8\); allowed"),
+        (torch.zeros(8, dtype=torch.bool), "of torch.bool; allowed: floating-point or integer"),
+        (torch.zeros(8, dtype=torch.complex64), "of torch.complex64; allowed: floating-point or integer"),
         (Audiogram.standard("N7"), "takes -10 to 100"),
         ([0.0] * 8, "is list; allowed: an Audiogram, a sequence of them, or a .* tensor"),
         ([], "is list; allowed"),

@@ -1,7 +1,9 @@
 """Levels in dB SPL, dB FS and pascals."""
 
 import math
+from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
@@ -29,14 +31,21 @@ def test_gain_to_pascals_is_pyclaritys_full_scale() -> None:
     torch.testing.assert_close(level_spl(wave * gain_to_pascals(107.0)), level_spl(wave, 107.0))
 
 
-@pytest.mark.parametrize("value", [-0.1, 200.1, math.nan, math.inf, -math.inf])
-def test_full_scales_that_are_none(value: float) -> None:
+@pytest.mark.parametrize(
+    "value", [-0.1, 200.1, math.nan, math.inf, -math.inf, 10**400, None, "a", "94", True, [94.0], 94 + 0j]
+)
+def test_full_scales_that_are_none(value: Any) -> None:
     with pytest.raises(ValueError, match=r"full_scale_spl is .*; allowed: 0 to 200 dB SPL"):
         check_full_scale(value)
 
 
 def test_ends_of_full_scale_are_allowed() -> None:
     assert (check_full_scale(0), check_full_scale(200)) == (0.0, 200.0)
+
+
+@pytest.mark.parametrize("value", [94, np.float32(94), np.int64(94)])
+def test_numbers_of_numpy_are_full_scales(value: Any) -> None:
+    assert check_full_scale(value) == 94.0 and type(check_full_scale(value)) is float
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

@@ -438,9 +438,22 @@ def test_simulator_by_folder_and_as_a_module(clean: Tensor) -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"simulator": "ear"}, "no checkpoint 'ear'; allowed: .*neuro-msbg"),
+        ({"simulator": "ear"}, "no checkpoint 'ear'; allowed: msbg, neuro-msbg"),
+        ({"simulator": 3}, "simulator is int; allowed: a name, a folder or a module"),
+        ({"simulator": None}, "simulator is NoneType; allowed: a name, a folder or a module"),
+        ({"simulator": nn.ReLU}, r"simulator is type; allowed: .* a module \(not its class\)"),
         ({"sample_rate": 8000}, "sample rate 8000 Hz; allowed: 16000 to 48000"),
+        ({"sample_rate": "16k"}, "sample rate '16k' Hz; allowed: 16000 to 48000"),
         ({"full_scale_spl": 300}, "allowed: 0 to 200"),
+        ({"full_scale_spl": None}, "full_scale_spl is None; allowed: 0 to 200"),
+        ({"reference": ["clean"]}, r"reference is \['clean'\]; allowed: clean, normal-hearing"),
+        ({"criterion": ["paper"]}, r"criterion is \['paper'\]; allowed: paper, bands"),
+        ({"weights": 1.0}, "weights is float; allowed: numbers by name"),
+        ({"weights": [1, 2]}, "weights is list; allowed: numbers by name"),
+        ({"weights": {3: 1.0, "pitch": 1.0}}, "unknown weights 3, pitch"),
+        ({"weights": {"magnitude": None}}, "'magnitude': None.*allowed: finite numbers, 0 or more"),
+        ({"weights": {"magnitude": "a"}}, "'magnitude': 'a'.*allowed: finite numbers, 0 or more"),
+        ({"weights": {"magnitude": True}}, "allowed: finite numbers, 0 or more"),
         ({"reference": "noisy"}, "reference is 'noisy'; allowed: clean, normal-hearing"),
         ({"criterion": "l1"}, "criterion is 'l1'; allowed: paper, bands"),
         ({"weights": {"pitch": 1.0}}, "pitch .*'paper'; allowed: magnitude, phase, complex, time"),
@@ -496,6 +509,43 @@ def test_simulator_must_keep_the_length() -> None:
         loss(torch.randn(4000), torch.randn(4000))
 
 
+@pytest.mark.parametrize(
+    ("returned", "message"),
+    [
+        (lambda wave: (wave, wave), r"returned is tuple; allowed: a floating-point tensor \(\.\.\., time\)"),
+        (lambda wave: None, "returned is NoneType; allowed"),
+        (lambda wave: wave.cfloat(), "returned is torch.complex64; allowed"),
+        (lambda wave: wave.mean(), r"returned has shape \(\); allowed"),
+        (
+            lambda wave: wave.mean(0),
+            r"made shape \(4000,\) of \(2, 4000\); allowed: one that keeps the shape",
+        ),
+        (lambda wave: wave.mean(-1), r"made shape \(2,\) of \(2, 4000\); allowed: one that keeps the shape"),
+        (lambda wave: wave.expand(2, 2, -1), r"made shape \(2, 2, 4000\) of \(2, 4000\); allowed"),
+    ],
+)
+def test_simulator_must_keep_the_shape(returned: Callable[[Tensor], object], message: str) -> None:
+    class Own(nn.Module):
+        def forward(self, waveform: Tensor, audiogram: Tensor) -> object:
+            return returned(waveform)
+
+    loss = HearingLossLoss(N3, simulator=Own())
+    with pytest.raises(ValueError, match=message) as error:
+        loss(torch.randn(2, 4000), torch.randn(2, 4000))
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("heard", [(4000,), (3, 4000)])
+def test_own_simulator_may_broadcast_with_the_ears(heard: tuple[int, ...]) -> None:
+    class Own(nn.Module):
+        def forward(self, waveform: Tensor, audiogram: Tensor) -> Tensor:
+            return waveform.expand(heard)
+
+    wave = torch.randn(4000)
+    loss = HearingLossLoss([N3, N4, S2], simulator=Own(), weights={"time": 1.0})
+    assert float(loss(wave, wave)) == 0.0
+
+
 def test_another_device_is_named() -> None:
     loss = HearingLossLoss(N3).to("meta")
     with pytest.raises(
@@ -515,3 +565,16 @@ def test_a_stored_ear_is_its_own(clean: Tensor) -> None:
 def test_import_leaves_the_compiler_alone() -> None:
     code = "import sys, hlsim, hlsim.evaluation; sys.exit('torch._dynamo' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_one_ear_an_item_never_becomes_every_ear_for_every_item() -> None:
+    loss, ears = HearingLossLoss(simulator="msbg"), [Audiogram.standard("N2"), Audiogram.standard("N4")]
+    speech = 0.03 * torch.randn(2, 1, 2000)
+    with pytest.raises(
+        ValueError, match=r"pair each item of .* with each ear; allowed: .*one an item: \(2, 1, 8\)"
+    ):
+        loss(speech, speech, ears)
+    levels = torch.tensor([ear.thresholds for ear in ears])
+    expected = loss(speech[:, 0], speech[:, 0], ears)
+    torch.testing.assert_close(loss(speech, speech, levels[:, None]), expected)
+    assert bool(loss(speech[0, 0], speech[0, 0], ears).isfinite())  # one item and several ears

@@ -3,6 +3,7 @@
 import json
 import os
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -105,6 +106,28 @@ def test_missing_weights(folder: Path) -> None:
 def test_unknown_names(name: str) -> None:
     with pytest.raises(ValueError, match=r"allowed: .*neuro-msbg"):
         load_pretrained(name)
+
+
+@pytest.mark.parametrize("name", [3, None, torch.nn.ReLU, ["neuro-msbg"]])
+def test_what_is_no_name(name: Any) -> None:
+    with pytest.raises(
+        ValueError, match=rf"checkpoint is {type(name).__name__}; allowed: a name or a folder"
+    ):
+        load_pretrained(name)
+
+
+def test_only_those_of_the_kind_are_listed() -> None:
+    with pytest.raises(ValueError, match="allowed: neuro-msbg, ") as caught:
+        load_pretrained("no-such")
+    assert "compensator" not in str(caught.value)
+    with pytest.raises(ValueError, match=r"allowed: compensator-general, .*neuro-msbg"):
+        find_checkpoint("no-such")
+
+
+def test_folder_of_a_training_names_the_checkpoint_in_it(folder: Path) -> None:
+    folder.rename(folder.with_name("checkpoint"))
+    with pytest.raises(ValueError, match=r"no checkpoint '.*', but '.*checkpoint' is one; allowed: "):
+        load_pretrained(folder.parent)
 
 
 def test_shipped_checkpoint() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -89,7 +90,7 @@ class HASPI(_Metric):
         Shape: (batch, time) or (time,), the same for both; ``lengths`` (batch,).
 
         Raises:
-            ValueError: shapes differ, or the audiograms are not one or one an item.
+            ValueError: shapes differ, or the audiograms are none, or not one or one an item.
         """
         if processed.shape != clean.shape or processed.ndim not in (1, 2):
             raise ValueError(
@@ -140,7 +141,13 @@ def _ears(audiogram: AudiogramLike, batch: int) -> list[Audiogram]:
             )
         rows = torch.atleast_2d(audiogram.detach()).expand(batch, -1)
         return [Audiogram(tuple(row.tolist())) for row in rows.double().cpu()]
-    ears = list(audiogram)
-    if len(ears) != batch or not all(isinstance(ear, Audiogram) for ear in ears):
-        raise ValueError(f"{len(ears)} audiograms of {batch} items; allowed: one Audiogram, or one an item")
-    return ears
+    if not isinstance(audiogram, Sequence) or not all(isinstance(ear, Audiogram) for ear in audiogram):
+        raise ValueError(
+            f"audiogram is {type(audiogram).__name__}; allowed: an Audiogram, one an item, or an (8,) or ({batch}, 8) "
+            "tensor"
+        )
+    if len(audiogram) != batch:
+        raise ValueError(
+            f"{len(audiogram)} audiograms of {batch} items; allowed: one Audiogram, or one an item"
+        )
+    return list(audiogram)

@@ -1,6 +1,7 @@
 """The mapping compensator: its start, its limit, and what every module of signals must do."""
 
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
@@ -12,6 +13,7 @@ from hlsim.audio import resample
 from hlsim.audiogram import draw_thresholds
 from hlsim.band_levels import band_levels
 from hlsim.calibration import level_spl, set_level
+from hlsim.neuro import NeuroConfig
 
 SMALL = MappingConfig(channels=8, blocks=1)
 
@@ -155,3 +157,9 @@ def test_config_survives_json_and_refuses_nonsense() -> None:
     for nonsense in ({"start": "none"}, {"start": 2.0}, {"bands": 2}, {"limit_spl": 200.0}, {"channels": 0}):
         with pytest.raises(ValueError, match="allowed"):
             MappingConfig.from_dict(nonsense)
+
+
+@pytest.mark.parametrize("config", [5, 0, {}, "small", MappingConfig, NeuroConfig()])
+def test_what_is_no_configuration(config: Any) -> None:
+    with pytest.raises(ValueError, match=r"config is .*; allowed: a MappingConfig"):
+        MappingCompensator(config)

@@ -1,5 +1,7 @@
 """NAL-R against pyclarity's, and what holds for any linear filter."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
@@ -112,5 +114,9 @@ def test_refuses_what_it_cannot_use() -> None:
         nalr(torch.randn(3, 100), torch.zeros(2, 8))
     with pytest.raises(ValueError, match="16000 to 48000"):
         NALR(sample_rate=8000)
-    with pytest.raises(ValueError, match="even numbers"):
-        NALR(order=221)
+
+
+@pytest.mark.parametrize("order", [221, 2.0, "220", None, True, 0, 1024])
+def test_order_is_an_even_whole_number(order: Any) -> None:
+    with pytest.raises(ValueError, match="allowed: even whole numbers from 2 to 1022"):
+        NALR(order=order)

@@ -1,6 +1,7 @@
 """Compensators by name and folder."""
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -27,8 +28,17 @@ def test_nalr_by_name() -> None:
 
 
 def test_unknown_name_and_other_kind(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="no checkpoint 'nobody'"):
+    with pytest.raises(
+        ValueError, match="no checkpoint 'nobody'; allowed: nalr, compensator-general, "
+    ) as caught:
         load_compensator("nobody")
+    assert "neuro-msbg" not in str(caught.value)
     save_checkpoint(tmp_path / "other", "neuro-msbg", torch.nn.Linear(2, 2), {}, {})
     with pytest.raises(ValueError, match="'neuro-msbg'; needed here: 'mapping-compensator'"):
         load_compensator(tmp_path / "other")
+
+
+@pytest.mark.parametrize("name", [3, None, NALR])
+def test_what_is_no_name(name: Any) -> None:
+    with pytest.raises(ValueError, match="allowed: a name or a folder"):
+        load_compensator(name)

@@ -73,6 +73,9 @@ def test_bad_input(clean: Tensor) -> None:
     for call, message in (
         ((clean, clean[:1], N3), r"processed \(2, 12800\) and clean \(1, 12800\)"),
         ((clean, clean, [N3]), "1 audiograms of 2 items"),
+        ((clean, clean, "N3"), "audiogram is str; allowed: an Audiogram, one an item, or"),
+        ((clean, clean, 3), "audiogram is int; allowed"),
+        ((clean, clean, [N3, "N3"]), "audiogram is list; allowed"),
         ((clean, clean, torch.zeros(3, 8)), r"audiogram of shape \(3, 8\); allowed: \(8,\) or \(2, 8\)"),
     ):
         with pytest.raises(ValueError, match=message):
