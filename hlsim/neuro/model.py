@@ -30,7 +30,7 @@ class NeuroMSBG(EarNetwork):
         sample_rate, full_scale_spl: as ``EarNetwork``.
 
     Raises:
-        ValueError: a rate or level out of range.
+        ValueError: a rate or level out of range, or a configuration of another kind.
     """
 
     def __init__(
@@ -41,6 +41,8 @@ class NeuroMSBG(EarNetwork):
         full_scale_spl: float = PASCAL_SPL,
     ) -> None:
         super().__init__(sample_rate, full_scale_spl)
+        if config is not None and not isinstance(config, NeuroConfig):
+            raise ValueError(f"config is {type(config).__name__}; allowed: a NeuroConfig")
         self.config = config = config or NeuroConfig()
         self.stft = config.stft
         frequencies, channels = self.stft.frequencies, config.channels

@@ -195,5 +195,7 @@ def test_bad_input(trained: NeuroMSBG) -> None:
     ):
         with pytest.raises(ValueError, match=text):
             trained(waveform, ear)
+    with pytest.raises(ValueError, match="config is int; allowed: a NeuroConfig"):
+        NeuroMSBG(5)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="16000 to 48000"):
         NeuroMSBG(sample_rate=8000)
