@@ -51,9 +51,7 @@ class MappingCompensator(EarNetwork):
         full_scale_spl: float = PASCAL_SPL,
     ) -> None:
         super().__init__(sample_rate, full_scale_spl)
-        if config is not None and not isinstance(config, MappingConfig):
-            raise ValueError(f"config is {type(config).__name__}; allowed: a MappingConfig")
-        self.config = config = config or MappingConfig()
+        self.config = config = MappingConfig.given(config)
         self.stft = config.stft
         size, depth, stride = config.channels, config.dense_depth, config.stride
         self.audiogram_encoder = AudiogramEncoder(self.stft.frequencies)

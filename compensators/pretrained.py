@@ -9,7 +9,7 @@ from compensators.mapping import MappingCompensator
 from compensators.nalr import NALR
 from hlsim.calibration import PASCAL_SPL
 from hlsim.neuro.config import NEURO_RATE
-from hlsim.pretrained import find_checkpoint, read_checkpoint
+from hlsim.pretrained import read_checkpoint
 
 KIND = "mapping-compensator"
 """What ``config.json`` of a checkpoint of such a compensator calls it."""
@@ -37,4 +37,4 @@ def load_compensator(
             MappingConfig.from_dict(config), sample_rate=sample_rate, full_scale_spl=full_scale_spl
         )
 
-    return read_checkpoint(find_checkpoint(name, KIND, ("nalr",)), KIND, build).eval().requires_grad_(False)
+    return read_checkpoint(name, KIND, build, also=("nalr",)).eval().requires_grad_(False)

@@ -1,6 +1,5 @@
 """A training loss that hears through an impaired ear."""
 
-import contextlib
 import math
 import os
 from collections.abc import Callable, Mapping
@@ -129,7 +128,6 @@ class HearingLossLoss(nn.Module):
         ears = self.thresholds if audiogram is None else as_thresholds(audiogram)
         if ears is None:
             raise ValueError("no audiogram: give one when building the loss or with the call")
-        _refuse_pairs(compensated.shape[:-1], ears.shape[:-1])
         with torch.autocast(compensated.device.type, enabled=False):
             dtype = torch.promote_types(torch.promote_types(compensated.dtype, clean.dtype), torch.float32)
             heard = self._hear(compensated.to(dtype), ears.to(compensated.device))
@@ -155,11 +153,9 @@ class HearingLossLoss(nn.Module):
             raise ValueError(
                 f"the speech is on {waveform.device} and the simulator on {weight.device}; move the loss with .to()"
             )
+        allowed = _batches(waveform.shape[:-1], thresholds.shape[:-1])
         heard = check_waveform(self.simulator(waveform, thresholds), "what the simulator returned")
-        batches = [waveform.shape[:-1]]
-        with contextlib.suppress(RuntimeError):  # ears that do not broadcast are the simulator's to refuse
-            batches.append(torch.broadcast_shapes(waveform.shape[:-1], thresholds.shape[:-1]))
-        if heard.shape[:-1] not in batches:
+        if heard.shape[:-1] not in allowed:
             raise ValueError(
                 f"the simulator made shape {tuple(heard.shape)} of {tuple(waveform.shape)}; allowed: one that keeps the "
                 "shape, or broadcasts it with the audiograms'"
@@ -197,14 +193,22 @@ class HearingLossLoss(nn.Module):
         return self
 
 
-def _refuse_pairs(items: torch.Size, ears: torch.Size) -> None:
-    """Raise ValueError where ears broadcast so that each item is heard with each ear: (batch, 1) items, (batch,) ears."""
-    with contextlib.suppress(RuntimeError):  # ears that do not broadcast are the simulator's to refuse
-        if math.prod(torch.broadcast_shapes(items, ears)) > max(math.prod(items), math.prod(ears)):
-            raise ValueError(
-                f"audiograms of shape {(*ears, len(FREQUENCIES))} would pair each item of {tuple(items)} with each ear; "
-                f"allowed: one audiogram, or one an item: {(*items, len(FREQUENCIES))}"
-            )
+def _batches(items: torch.Size, ears: torch.Size) -> list[torch.Size]:
+    """Leading dimensions that what is heard may have.
+
+    Raises:
+        ValueError: ears broadcast so that each item is heard with each ear: (batch, 1) items, (batch,) ears.
+    """
+    try:
+        together = torch.broadcast_shapes(items, ears)
+    except RuntimeError:  # the simulator's to refuse
+        return [items]
+    if math.prod(together) > max(math.prod(items), math.prod(ears)):
+        raise ValueError(
+            f"audiograms of shape {(*ears, len(FREQUENCIES))} would pair each item of {tuple(items)} with each ear; "
+            f"allowed: one audiogram, or one an item: {(*items, len(FREQUENCIES))}"
+        )
+    return [items, together]
 
 
 def _moved(fn: Callable[[Tensor], Tensor], tensor: Tensor) -> Tensor:

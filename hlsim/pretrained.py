@@ -50,13 +50,15 @@ def load_pretrained(
     return model.eval().requires_grad_(False)
 
 
-def read_checkpoint(name: str | Path, kind: str, build: Callable[[Mapping[str, Any]], Model]) -> Model:
+def read_checkpoint(
+    name: str | Path, kind: str, build: Callable[[Mapping[str, Any]], Model], also: Sequence[str] = ()
+) -> Model:
     """Build a model from a checkpoint's configuration and load its weights.
 
     Raises:
         ValueError: as ``load_pretrained``.
     """
-    folder = find_checkpoint(name, kind)
+    folder = find_checkpoint(name, kind, also)
     try:
         record = json.loads((folder / CONFIG).read_text(encoding="utf-8"))
         weights = (folder / WEIGHTS).read_bytes()
@@ -93,10 +95,9 @@ def find_checkpoint(name: str | Path, kind: str | None = None, also: Sequence[st
         raise ValueError(f"checkpoint is {type(name).__name__}; allowed: a name or a folder")
     if (Path(name) / CONFIG).is_file():
         return Path(name)
-    shipped = {path.parent.name: path.parent for path in sorted(checkpoints_folder().glob(f"*/{CONFIG}"))}
-    if str(name) in shipped:
-        return shipped[str(name)]
-    names = [*also, *(own for own, folder in shipped.items() if kind in (None, _kind(folder)))]
+    if str(name) in (own := shipped()):
+        return own[str(name)]
+    names = [*also, *shipped(kind)]
     inner = Path(name) / "checkpoint"  # as a training leaves it
     hint = f", but {str(inner)!r} is one" if (inner / CONFIG).is_file() else ""
     raise ValueError(
@@ -108,6 +109,16 @@ def checkpoint_digest(name: str | Path) -> str:
     """The SHA-256 of a checkpoint's weights, as it tells it. Raises ValueError where there is no such checkpoint."""
     record = json.loads((find_checkpoint(name) / CONFIG).read_text(encoding="utf-8"))
     return str(record["sha256"])
+
+
+def shipped(kind: str | None = None) -> dict[str, Path]:
+    """The checkpoints that ship with hlsim, name and folder; all kinds by default."""
+    records = sorted(checkpoints_folder().glob(f"*/{CONFIG}"))
+    if kind is not None:
+        records = [
+            path for path in records if json.loads(path.read_text(encoding="utf-8")).get("kind") == kind
+        ]
+    return {path.parent.name: path.parent for path in records}
 
 
 def checkpoints_folder() -> Path:
@@ -176,11 +187,6 @@ def repair_checkpoint(folder: str | Path) -> None:
     for path in target.parent.glob(f".{target.name}.*"):
         if path.is_dir() and staged.fullmatch(path.name):
             shutil.rmtree(path, ignore_errors=True)
-
-
-def _kind(folder: Path) -> str | None:
-    kind: str | None = json.loads((folder / CONFIG).read_text(encoding="utf-8")).get("kind")
-    return kind
 
 
 def _old(target: Path) -> Path:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -74,7 +75,7 @@ def _train_planned(options: argparse.Namespace) -> None:
     from hlsim.training.planned import PlannedSource, PlannedTraining
     from hlsim.training.simulator import SimulatorRecipe, train_simulator
 
-    if given := [_flag(name) for name in FOLDERS if getattr(options, name) is not None]:
+    if given := _given(options, FOLDERS):
         raise ValueError(
             f"--manifest with {', '.join(given)}; allowed: one or the other, for a manifest has it all"
         )
@@ -94,11 +95,8 @@ def _train_planned(options: argparse.Namespace) -> None:
 
 def _train_compensator(options: argparse.Namespace) -> None:
     _require_extras()
-    measured = ("audiograms", "valid_audiograms")
-    if options.audiogram and (given := [name for name in measured if getattr(options, name) is not None]):
-        raise ValueError(
-            f"--audiogram with {', '.join(map(_flag, given))}; allowed: one ear, or a CSV of ears, not both"
-        )
+    if options.audiogram and (given := _given(options, ("audiograms", "valid_audiograms"))):
+        raise ValueError(f"--audiogram with {', '.join(given)}; allowed: one ear, or a CSV of ears, not both")
     keep_freed_memory()
     from hlsim.training.compensator import CompensatorRecipe, train_compensator
 
@@ -117,8 +115,9 @@ def _require_extras() -> None:
         require(module, "train")
 
 
-def _flag(name: str) -> str:
-    return f"--{name.replace('_', '-')}"
+def _given(options: argparse.Namespace, names: Iterable[str]) -> list[str]:
+    """Those of the options that were given, as they are written."""
+    return [f"--{name.replace('_', '-')}" for name in names if getattr(options, name) is not None]
 
 
 def training_options(

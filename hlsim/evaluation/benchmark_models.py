@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -16,7 +15,7 @@ from hlsim.extras import MissingExtraError, require
 from hlsim.msbg import MSBG
 from hlsim.msbg.ear import RATE as MSBG_RATE
 from hlsim.neuro.config import NEURO_RATE
-from hlsim.pretrained import CONFIG, checkpoints_folder, load_pretrained
+from hlsim.pretrained import SIMULATOR, load_pretrained, shipped
 
 CONNEAR_RATE = 20000
 
@@ -57,7 +56,7 @@ def rows(simulators: list[str] | None = None) -> tuple[list[Row], list[str]]:
         except MissingExtraError as error:
             skipped.append(f"{name}: {error}")
     found.append(Row("MSBG (exact)", both, _exact))
-    for name in shipped() if simulators is None else simulators:
+    for name in shipped(SIMULATOR) if simulators is None else simulators:
         model = load_pretrained(name)
         count = sum(p.numel() for p in model.parameters())
         found.append(Row(f"Neuro-MSBG ({name})", both, _neuro(name), parameters=count))
@@ -66,13 +65,6 @@ def rows(simulators: list[str] | None = None) -> tuple[list[Row], list[str]]:
         Row("CoNNear's shape (random weights, speed only)", (CONNEAR_RATE,), _connear, parameters=count)
     )
     return found, skipped
-
-
-def shipped() -> list[str]:
-    """Names of the Neuro-MSBGs that ship."""
-    records = sorted(checkpoints_folder().glob(f"*/{CONFIG}"))
-    kinds = {path.parent.name: json.loads(path.read_text(encoding="utf-8")).get("kind") for path in records}
-    return [name for name, kind in kinds.items() if kind == "neuro-msbg"]
 
 
 class ConnearShape(nn.Module):

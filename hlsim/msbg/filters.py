@@ -15,7 +15,7 @@ from hlsim.msbg.envelope import envelope_lowpass
 from hlsim.msbg.filterbank import BANKS, gammatone_response
 from hlsim.msbg.fourier import block_points
 from hlsim.msbg.smearing import BROADENING, smearing_matrix
-from hlsim.msbg.tiers import Plan, make_plan, total_response
+from hlsim.msbg.tiers import Plan, as_tensor, make_plan, total_response
 
 
 class Filters:
@@ -71,11 +71,7 @@ def _made(kind: str, key: tuple[Any, ...], dtype: torch.dtype, device: torch.dev
         if kind == "plan":
             severity, points, step = key
             return make_plan(severity, points, step, dtype, device)
-        array = _array(kind, key)
-        wide = torch.complex128 if np.iscomplexobj(array) else torch.float64
-        single = torch.complex64 if wide.is_complex else torch.float32
-        narrow = wide if dtype == torch.float64 else single
-        return torch.from_numpy(np.ascontiguousarray(array)).to(device=device, dtype=narrow)
+        return as_tensor(_array(kind, key), dtype, device)
 
 
 def _array(kind: str, key: tuple[Any, ...]) -> np.ndarray[Any, Any]:

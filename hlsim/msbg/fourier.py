@@ -22,7 +22,7 @@ def rfft(waveform: Tensor, points: int) -> Tensor:
     """
     if not _long_row(waveform, points):
         return torch.fft.rfft(waveform, points)
-    return torch.fft.fft(waveform.to(_complex(waveform.dtype)), points)[..., : points // 2 + 1]
+    return torch.fft.fft(waveform.to(waveform.dtype.to_complex()), points)[..., : points // 2 + 1]
 
 
 def irfft(spectrum: Tensor, points: int) -> Tensor:
@@ -70,7 +70,3 @@ def _long_row(signal: Tensor, points: int) -> bool:
     rows = signal.numel() // signal.shape[-1]
     long = rows == 1 and points >= _LONG and points % 2 == 0
     return long and signal.device.type == "cpu" and torch.get_num_threads() > 1
-
-
-def _complex(dtype: torch.dtype) -> torch.dtype:
-    return torch.complex128 if dtype == torch.float64 else torch.complex64

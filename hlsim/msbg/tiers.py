@@ -10,6 +10,7 @@ at that rate its own harmonics fold too.
 import itertools
 import math
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -101,11 +102,7 @@ def make_plan(severity: str, points: int, step: int, dtype: torch.dtype, device:
         step: 1 or 2, as in ``assign``.
     """
 
-    def tensor(values: NDArray[np.generic]) -> Tensor:
-        complex_dtype = torch.complex128 if dtype == torch.float64 else torch.complex64
-        kind = complex_dtype if np.iscomplexobj(values) else dtype
-        return torch.from_numpy(np.ascontiguousarray(values)).to(device=device, dtype=kind)
-
+    tensor = partial(as_tensor, dtype=dtype, device=device)
     bank = BANKS[severity]
     together = next((count for count in (8, 9, 7, 10, 6, 5) if points // STEP % count == 0), 8)
     tiers, lowpass = [], []
@@ -130,6 +127,12 @@ def make_plan(severity: str, points: int, step: int, dtype: torch.dtype, device:
             tiers.append(Tier(channels, own, count, detector, tensor(response), *kernels))
             lowpass.append(envelope_lowpass(bank, points, own, channels))
         return Plan(points, step, tuple(tiers), tensor(np.concatenate(lowpass)))
+
+
+def as_tensor(values: NDArray[np.generic], dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Real or complex values as a tensor of ``dtype`` or its complex counterpart."""
+    kind = dtype.to_complex() if np.iscomplexobj(values) else dtype
+    return torch.from_numpy(np.ascontiguousarray(values)).to(device=device, dtype=kind)
 
 
 def total_response(severity: str, points: int, step: int) -> NDArray[np.complex128]:

@@ -82,6 +82,13 @@ class NetworkConfig:
     def stft(self) -> STFT:
         return STFT(self.fft, self.window, self.hop)
 
+    @classmethod
+    def given(cls, config: Self | None) -> Self:
+        """What a network was given, or the default. Raises ValueError where it is of another kind."""
+        if config is not None and not isinstance(config, cls):
+            raise ValueError(f"config is {type(config).__name__}; allowed: a {cls.__name__}")
+        return config or cls()
+
     def to_dict(self) -> dict[str, Any]:
         return asdict(self)
 

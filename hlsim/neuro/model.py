@@ -41,9 +41,7 @@ class NeuroMSBG(EarNetwork):
         full_scale_spl: float = PASCAL_SPL,
     ) -> None:
         super().__init__(sample_rate, full_scale_spl)
-        if config is not None and not isinstance(config, NeuroConfig):
-            raise ValueError(f"config is {type(config).__name__}; allowed: a NeuroConfig")
-        self.config = config = config or NeuroConfig()
+        self.config = config = NeuroConfig.given(config)
         self.stft = config.stft
         frequencies, channels = self.stft.frequencies, config.channels
         monolithic, normalise = config.structure == "monolithic", not config.level_aware

@@ -18,7 +18,7 @@ from hlsim.data.variation import mix, vary
 from hlsim.msbg import MSBG
 from hlsim.neuro import NeuroConfig, NeuroMSBG
 from hlsim.neuro.config import NEURO_RATE
-from hlsim.pretrained import save_checkpoint
+from hlsim.pretrained import SIMULATOR, save_checkpoint
 from hlsim.settings import refuse_other_kinds, refuse_unknown, refuse_weights
 from hlsim.training.averaging import average_of
 from hlsim.training.loop import CHECKPOINT, TimedModule, run
@@ -250,7 +250,7 @@ def train_simulator(
         from hlsim import __version__
 
         about = {"hlsim": __version__, "recipe": asdict(recipe), **figures}
-        save_checkpoint(folder, "neuro-msbg", module.kept.module, module.student.config.to_dict(), about)
+        save_checkpoint(folder, SIMULATOR, module.kept.module, module.student.config.to_dict(), about)
 
     run(
         module,
