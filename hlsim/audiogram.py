@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
+from bisect import bisect_left
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -106,7 +107,7 @@ class Audiogram:
     @property
     def severity(self) -> str:
         """MSBG's degree of loss: none, mild, moderate or severe, by the mean threshold from 2 to 8 kHz."""
-        return SEVERITIES[int(severity_index(torch.tensor(self.thresholds, dtype=torch.float64)))]
+        return severity_of(self.thresholds)
 
     def to_dict(self) -> dict[str, list[float]]:
         """A plain dictionary that JSON can hold."""
@@ -156,6 +157,12 @@ class Audiogram:
     def from_clarity(cls, audiogram: Any) -> Audiogram:
         """From pyclarity's ``Audiogram``."""
         return cls(tuple(map(float, audiogram.levels)), tuple(map(float, audiogram.frequencies)))
+
+
+def severity_of(levels: Sequence[float]) -> str:
+    """``Audiogram.severity`` of eight levels in dB HL."""
+    high = levels[FREQUENCIES.index(2000.0) :]
+    return SEVERITIES[bisect_left(SEVERITY_LIMITS, sum(high) / len(high))]
 
 
 def severity_index(thresholds: Tensor) -> Tensor:

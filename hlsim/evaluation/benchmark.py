@@ -43,9 +43,9 @@ def benchmark(
 ) -> dict[str, Any]:
     """Time the simulators on noise at 65 dB SPL with the rhythm of syllables.
 
-    One second at batch 1 first, forward and forward plus backward, with the ears N1, N2 and N3: the rows take turns,
-    so that all see the same machine, and each timing follows an uncounted call of the same. Then, forward, at each row's
-    own rate and with the ear N2, longer clips at batch 1 and larger batches of 1 s.
+    One second at batch 1 first, forward (in inference mode) and forward plus backward, with the ears N1, N2 and N3: the
+    rows take turns, so that all see the same machine, and each timing follows an uncounted call of the same. Then longer
+    clips at batch 1 and larger batches of 1 s, forward, at each row's own rate and with the ear N2.
 
     Args:
         device: ``"cpu"`` or ``"cuda"``; pyclarity's ``Ear`` always runs on the CPU.
@@ -238,7 +238,7 @@ def _run(call: Callable[[Tensor], Tensor], clip: Tensor, direction: str, device:
     if direction == "both":
         call(clip.clone().requires_grad_()).square().sum().backward()
     else:
-        with torch.no_grad():
+        with torch.inference_mode():
             call(clip)
     if device.type == "cuda":
         torch.cuda.synchronize()

@@ -10,7 +10,7 @@ from hlsim.msbg.ending import ending
 from hlsim.msbg.envelope import STEP, decimate, detect, envelope, smooth
 from hlsim.msbg.filters import Filters
 from hlsim.msbg.fourier import fft_length, irfft, rfft
-from hlsim.msbg.recruitment import expand, gains, weigh
+from hlsim.msbg.recruitment import around, expand, gains, weigh
 from hlsim.msbg.tiers import Plan
 
 BANK_TAIL = 3200
@@ -55,14 +55,14 @@ def hear(spectrum: Tensor, ratios: Tensor, plan: Plan, slight: bool) -> Tensor:
         waves.append(wave)
         sums.append(decimate(rectified, tier.decimation))
     envelopes = smooth(torch.cat(sums, -3), plan.lowpass)
-    sizes = [tier.channels.stop - tier.channels.start for tier in plan.tiers]
-    own_gains = gains(envelopes, ratios).split(sizes, -2)
+    ratios = ratios[..., : len(plan.lowpass)]
+    all_gains = around(gains(envelopes, ratios))
 
     heard: dict[tuple[int, bool], Tensor] = {}
-    for tier, wave, gain in zip(plan.tiers, waves, own_gains, strict=True):
-        own, kind = tier.channels, (tier.step, tier.detector == "modulus")
+    for tier, wave in zip(plan.tiers, waves, strict=True):
+        own, kind = tier.channels, (tier.points, tier.detector == "modulus")
         kinks = (envelopes[..., own, :], ratios[..., own]) if slight else None
-        part = weigh(wave, gain, tier.interpolation, kinks)
+        part = weigh(wave, all_gains[..., own, :], tier.interpolation, kinks)
         heard[kind] = heard[kind] + part if kind in heard else part
     total = torch.zeros_like(spectrum)
     for (_, analytic), part in heard.items():

@@ -71,7 +71,7 @@ class _Detect(torch.autograd.Function):
 
 
 def decimate(rectified: Tensor, kernel: Tensor) -> Tensor:
-    """Weighted sums of each step's samples, for ``smooth``. Shape: (..., time), (3, 24 // step) -> (..., 3, steps)."""
+    """Weighted sums of each step's samples, for ``smooth``. Shape: (..., time), (3, samples) -> (..., 3, steps)."""
     return kernel @ rectified.unflatten(-1, (-1, kernel.shape[-1])).mT
 
 
@@ -96,7 +96,7 @@ def envelope(channels: Tensor, lowpass: Tensor) -> Tensor:
 
 
 def envelope_lowpass(
-    bank: FilterBank, points: int, step: int = 1, channels: slice = slice(None)
+    bank: FilterBank, points: int, samples: int = STEP, channels: slice = slice(None)
 ) -> NDArray[np.complex128]:
     """Response that turns the rfft of ``decimate``'s means into that of the envelope at samples 0, 24, ...
 
@@ -105,7 +105,7 @@ def envelope_lowpass(
 
     Args:
         points: FFT length at 44.1 kHz, a multiple of 24.
-        step: samples at 44.1 kHz from one of the rectified signal's to the next.
+        samples: of the rectified signal in each 24 at 44.1 kHz.
         channels: which of the bank's; all by default.
 
     Returns: (channels, points // 48 + 1).
@@ -115,9 +115,9 @@ def envelope_lowpass(
     numerators, denominators = np.array(envelope_filters(bank)[channels]).swapaxes(0, 1)
     rows = np.abs((numerators @ powers) / (denominators @ powers)) ** 2
     with np.errstate(invalid="ignore"):
-        box = np.sin(STEP * omega / 2.0) / (STEP // step * np.sin(step * omega / 2.0))
+        box = np.sin(STEP * omega / 2.0) / (samples * np.sin(STEP / samples * omega / 2.0))
     box[0] = 1.0
-    return rows / box**_BOXES * np.exp(-0.5j * (STEP - step) * omega)
+    return rows / box**_BOXES * np.exp(-0.5j * (STEP - STEP / samples) * omega)
 
 
 @lru_cache(maxsize=4)
@@ -128,12 +128,11 @@ def envelope_filters(bank: FilterBank) -> list[tuple[NDArray[np.float64], NDArra
 
 
 @lru_cache(maxsize=8)
-def decimation_kernel(step: int = 1) -> NDArray[np.float64]:
-    """Weights of a block's samples in the mean around the block after it, itself and the one before.
+def decimation_kernel(samples: int = STEP) -> NDArray[np.float64]:
+    """Weights of a step's samples in the mean around the step after it, itself and the one before.
 
-    Returns: (3, 24 // step).
+    Returns: (3, samples).
     """
-    samples = STEP // step
     box = np.full(samples, 1.0 / samples)
     kernel = np.pad(np.convolve(np.convolve(box, box), box), 1)
     return np.ascontiguousarray(kernel.reshape(_BOXES, samples))

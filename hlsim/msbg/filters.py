@@ -14,7 +14,8 @@ from hlsim.msbg.ending import ending_response, ending_weights
 from hlsim.msbg.envelope import envelope_lowpass
 from hlsim.msbg.filterbank import BANKS, gammatone_response
 from hlsim.msbg.fourier import block_points
-from hlsim.msbg.smearing import BROADENING, smearing_matrix
+from hlsim.msbg.recruitment import threshold_weights
+from hlsim.msbg.smearing import BROADENING, smeared_bins, smearing_matrix
 from hlsim.msbg.tiers import Plan, as_tensor, make_plan, total_response
 
 
@@ -69,16 +70,18 @@ def _bytes(made: Any) -> int:
 def _made(kind: str, key: tuple[Any, ...], dtype: torch.dtype, device: torch.device) -> Any:
     with torch.inference_mode(False):
         if kind == "plan":
-            severity, points, step = key
-            return make_plan(severity, points, step, dtype, device)
+            severity, points, step, highest = key
+            return make_plan(severity, points, step, highest, dtype, device)
         return as_tensor(_array(kind, key), dtype, device)
 
 
 def _array(kind: str, key: tuple[Any, ...]) -> np.ndarray[Any, Any]:
     match kind, *key:
-        case "smearing", severity, step:
-            half = 256 // step
-            return smearing_matrix(*BROADENING[severity])[:half, :half]
+        case "smearing", severity, step, highest:
+            bins = smeared_bins(step, highest)
+            return smearing_matrix(*BROADENING[severity])[:bins, :bins]
+        case "thresholds", severity:
+            return threshold_weights(BANKS[severity])
         case "total", severity, points, step:
             return total_response(severity, points, step)
         case "bank", severity, points:

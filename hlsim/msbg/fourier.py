@@ -67,6 +67,5 @@ def fft_length(least: int, multiple: int = 1) -> int:
 
 
 def _long_row(signal: Tensor, points: int) -> bool:
-    rows = signal.numel() // signal.shape[-1]
-    long = rows == 1 and points >= _LONG and points % 2 == 0
+    long = points >= _LONG and points % 2 == 0 and signal.numel() == signal.shape[-1]
     return long and signal.device.type == "cpu" and torch.get_num_threads() > 1

@@ -9,7 +9,7 @@ from torch.nn import functional
 from torch.utils.checkpoint import checkpoint
 
 from hlsim.audio import check_rate, check_waveform
-from hlsim.audiogram import SEVERITIES, AudiogramLike, as_thresholds, own_thresholds, severity_index
+from hlsim.audiogram import AudiogramLike, as_thresholds, own_thresholds, severity_of
 from hlsim.calibration import PASCAL_SPL, check_full_scale, gain_to_pascals
 from hlsim.msbg.cochlea import bank_points, hear, hear_ending
 from hlsim.msbg.ear import RATE
@@ -124,8 +124,9 @@ class MSBG(nn.Module):
                     outputs.append(self._in_blocks(signals[chosen], ears[chosen], severity, none))
                 order += some
         longest = max(output.shape[-1] for output in outputs)
-        joined = [functional.pad(output, (0, longest - output.shape[-1])) for output in outputs]
-        heard = joined[0] if len(joined) == 1 else torch.cat(joined)
+        heard = outputs[0]
+        if len(outputs) > 1:
+            heard = torch.cat([functional.pad(output, (0, longest - output.shape[-1])) for output in outputs])
         if order != list(range(len(order))):
             heard = heard[torch.tensor(order).argsort().to(heard.device)]
         if gain != 1.0:
@@ -160,15 +161,16 @@ class MSBG(nn.Module):
         samples, rate = signals.shape[-1], self.sample_rate
         step = 2 if self.aligned and rate <= _HALF_RATE_HZ else 1
         delay = self.delay(severity) if self.aligned else 0
+        highest = rate / 2 if step == 2 else RATE / 2
         inner = math.ceil(samples * RATE / rate)
         filters = Filters(signals.dtype, signals.device)
         # a frame that smearing leaves next to nothing hangs on the last bits: where every sample counts, keep more
         fine = filters if self.aligned else Filters(torch.float64, signals.device)
         heard = to_cochlea(signals.to(fine.dtype), rate, math.ceil((inner + delay) / step), step, fine)
         if severity in BROADENING:
-            heard = smear(heard, fine.get("smearing", severity, step), step)
+            heard = smear(heard, fine.get("smearing", severity, step, highest), step)
         heard = heard.to(signals.dtype)
-        ratios = expansion_ratios(ears, BANKS[severity])
+        ratios = expansion_ratios(ears, filters.get("thresholds", severity))
         gain = 10.0 ** (-BANKS[severity].recombination_db / 20.0)
 
         length = heard.shape[-1]
@@ -178,7 +180,7 @@ class MSBG(nn.Module):
             if none:
                 spectrum = spectrum * filters.get("total", severity, points, step)
             else:
-                plan = filters.get("plan", severity, points, step)
+                plan = filters.get("plan", severity, points, step, highest)
                 spectrum = hear(spectrum, ratios, plan, severity not in BROADENING)
             if severity in BROADENING:
                 return from_spectrum(spectrum, points, step, rate, samples, filters, gain=gain, delay=delay)
@@ -196,7 +198,7 @@ class MSBG(nn.Module):
         parts = []
         if not whole or not last:
             points = bank_points(length, RATE)
-            plan = filters.get("plan", severity, points, 1)
+            plan = filters.get("plan", severity, points, 1, RATE / 2)
             parts.append(
                 irfft(hear(rfft(heard, points), ratios, plan, severity not in BROADENING), points)[
                     ..., :length
@@ -252,12 +254,11 @@ def active_rescaling(signals: Tensor) -> Tensor:
 
 def _alike(ears: Tensor) -> list[tuple[str, bool, list[int]]]:
     """Severity, whether all is 0 dB HL, and the indices of the items with ears like that. Shape: (items, 8)."""
-    known = ears.detach().cpu()  # once a call; the rest asks nothing of the device
-    none = [not any(levels) and not ears.requires_grad for levels in known.tolist()]
-    groups: dict[tuple[int, bool], list[int]] = {}
-    for item, kind in enumerate(zip(severity_index(known).tolist(), none, strict=True)):
-        groups.setdefault(kind, []).append(item)
-    return [(SEVERITIES[index], still, members) for (index, still), members in groups.items()]
+    groups: dict[tuple[str, bool], list[int]] = {}
+    for item, levels in enumerate(ears.tolist()):  # once a call; the rest asks nothing of the device
+        none = not any(levels) and not ears.requires_grad
+        groups.setdefault((severity_of(levels), none), []).append(item)
+    return [(*kind, members) for kind, members in groups.items()]
 
 
 def _portions(members: list[int], samples: int, device: str) -> list[list[int]]:

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+from torch.nn import functional
 
 from hlsim.audiogram import FREQUENCIES
 from hlsim.calibration import PASCAL_SPL
@@ -31,15 +32,23 @@ AHEAD = _TAPS // 2
 _SLIGHT = 1.3  # expansion ratio at 24 dB HL
 
 
-def expansion_ratios(thresholds: Tensor, bank: FilterBank) -> Tensor:
+def expansion_ratios(thresholds: Tensor, weights: Tensor) -> Tensor:
     """Ratio 105 / (105 - threshold) by which each channel's level is expanded.
 
-    Thresholds are interpolated linearly over Hz and extended flat below 250 and above 8000 Hz.
-
-    Shape: (..., 8) dB HL -> (..., channels).
+    Shape: (..., 8) dB HL, ``threshold_weights`` -> (..., channels).
     """
-    weights = torch.from_numpy(_interpolation(bank.centre_frequencies)).to(thresholds)
     return CATCH_UP_SPL / (CATCH_UP_SPL - thresholds @ weights)
+
+
+@lru_cache(maxsize=8)
+def threshold_weights(bank: FilterBank) -> NDArray[np.float64]:
+    """Weights of the eight thresholds in that of each channel: linear in Hz, flat below 250 and above 8000 Hz.
+
+    Returns: (8, channels).
+    """
+    return np.array(
+        [np.interp(bank.centre_frequencies, FREQUENCIES, row) for row in np.eye(len(FREQUENCIES))]
+    )
 
 
 def gains(envelopes: Tensor, ratios: Tensor) -> Tensor:
@@ -52,11 +61,16 @@ def gains(envelopes: Tensor, ratios: Tensor) -> Tensor:
 
 
 def interpolate(values: Tensor, kernel: Tensor) -> Tensor:
-    """Values between the steps' ones; periodic. Shape: (..., steps), ``interpolation_kernel`` -> (..., time)."""
+    """Values between the steps' ones.
+
+    Shape: ``around``'s (..., steps + 5), ``interpolation_kernel`` -> (..., time).
+    """
     reach, columns = kernel.shape
     together = reach - _TAPS + 1
-    steps = values.shape[-1]
-    windows = _around(values, -steps % together).unfold(-1, reach, together)
+    steps = values.shape[-1] - _TAPS + 1
+    if steps % together:
+        values = functional.pad(values, (0, -steps % together))
+    windows = values.unfold(-1, reach, together)
     # as one product, for matmul makes one a channel of it, at twice the cost
     fine = (windows.reshape(-1, reach) @ kernel).view(*windows.shape[:-2], -1)
     return fine if steps % together == 0 else fine[..., : steps * columns // together]
@@ -67,7 +81,7 @@ def weigh(
 ) -> Tensor:
     """Interpolate the gains, apply them and sum the channels.
 
-    Shape: (..., channels, time), (..., channels, steps), ``interpolation_kernel`` -> (..., time).
+    Shape: (..., channels, time), ``around``'s (..., channels, steps + 5), ``interpolation_kernel`` -> (..., time).
 
     Args:
         slight: envelopes (..., channels, steps) and ratios (..., channels), where some ratios are slight. The low-pass
@@ -81,10 +95,10 @@ def weigh(
         every = full.shape[-1] // steep.shape[-1]
         if steep.device.type == "cpu":
             own = ratios.unsqueeze(-1).expand(steep.shape)[steep]
-            about = _around(envelopes).unfold(-1, _TAPS, 1)[steep]
+            about = around(envelopes).unfold(-1, _TAPS, 1)[steep]
             full.unflatten(-1, (-1, every))[steep] = gains(about @ kernel[:_TAPS, :every], own)
         else:  # indices would have to come back from the device
-            fine = gains(interpolate(envelopes, kernel), ratios)
+            fine = gains(interpolate(around(envelopes), kernel), ratios)
             full = torch.where(steep.repeat_interleave(every, -1), fine, full)
     if torch.is_grad_enabled() and (channels.requires_grad or full.requires_grad):
         return cast(Tensor, _SumOfProducts.apply(channels, full))
@@ -123,10 +137,9 @@ class _SumOfProducts(torch.autograd.Function):
         return every * factors if first else None, every * channels if second else None
 
 
-def _around(values: Tensor, more: int = 0) -> Tensor:
-    """With those that the interpolation at the ends needs, and zeros. Shape: (..., steps) -> (..., steps + 5 + more)."""
-    zeros = values.new_zeros(*values.shape[:-1], more)
-    return torch.cat((values[..., 1 - AHEAD :], values, values[..., :AHEAD], zeros), -1)
+def around(values: Tensor) -> Tensor:
+    """With those that the interpolation at the ends needs; periodic. Shape: (..., steps) -> (..., steps + 5)."""
+    return torch.cat((values[..., 1 - AHEAD :], values, values[..., :AHEAD]), -1)
 
 
 def _steep(envelopes: Tensor) -> Tensor:
@@ -143,26 +156,22 @@ def expand(channels: Tensor, envelopes: Tensor, ratios: Tensor) -> Tensor:
     Shape: (..., channels, time), (..., channels, time // 24), (..., channels) -> (..., time).
     """
     kernel = torch.from_numpy(interpolation_kernel()).to(channels)
-    return weigh(channels, gains(envelopes, ratios), kernel, (envelopes, ratios))
-
-
-@lru_cache(maxsize=8)
-def _interpolation(centre_frequencies: tuple[float, ...]) -> NDArray[np.float64]:
-    return np.array([np.interp(centre_frequencies, FREQUENCIES, row) for row in np.eye(len(FREQUENCIES))])
+    return weigh(channels, around(gains(envelopes, ratios)), kernel, (envelopes, ratios))
 
 
 @lru_cache(maxsize=16)
-def interpolation_kernel(step: int = 1, parts: int = 1, together: int = 8) -> NDArray[np.float64]:
+def interpolation_kernel(samples: int = STEP, parts: int = 1, together: int = 8) -> NDArray[np.float64]:
     """Weights of the values about some steps for the samples of these: six count for each, after Lagrange.
 
     Args:
+        samples: in each step.
         parts: of a sample, one after the other, that weigh alike.
         together: steps that a matrix product interpolates at once; best a divisor of their number.
 
-    Returns: (together + 5, together * 24 // step * parts).
+    Returns: (together + 5, together * samples * parts).
     """
     nodes = np.arange(_TAPS) - (_TAPS // 2 - 1.0)
-    place = np.arange(0, STEP, step) / STEP
+    place = np.arange(samples) / samples
     weights = np.ones((_TAPS, len(place)))
     for i, node in enumerate(nodes):
         for other in np.delete(nodes, i):

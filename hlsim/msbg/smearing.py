@@ -21,6 +21,7 @@ SMEARING_DELAY = 3 * HOP
 BROADENING = {"mild": (1.6, 1.1), "moderate": (2.4, 1.6), "severe": (4.0, 2.0)}
 """Widening of the lower and the upper side of the auditory filters; with no loss nothing is smeared (pyclarity 0.9.0)."""
 
+_SKIRT_HZ = 800.0
 _TINY = 1e-24  # Pa^2
 _NEVER = 1e-36  # Pa^2, keeps a division from one by 0
 _CACHED = 1200  # frames
@@ -72,6 +73,11 @@ def smearing_matrix(lower: float, upper: float) -> NDArray[np.float64]:
     return smearing_from_filters(normal, wide)
 
 
+def smeared_bins(step: int, highest: float) -> int:
+    """Frequencies of a frame at 44.1 kHz / step on which what is below ``highest`` Hz depends, by the window's skirts."""
+    return min(FFT // 2 // step, math.ceil((highest + _SKIRT_HZ) * FFT / RATE))
+
+
 def smeared_length(samples: int) -> int:
     """Length of what ``smear`` returns."""
     return HOP * (math.ceil(samples / HOP) + 3)
@@ -80,27 +86,28 @@ def smeared_length(samples: int) -> int:
 def smear(waveform: Tensor, matrix: Tensor, step: int = 1) -> Tensor:
     """Smear a waveform as pyclarity's ``smear3`` does at 44.1 kHz, its delay and its first, irregular frames included.
 
-    Shape: (..., time), (256 // step, 256 // step) -> (..., hop * (ceil(time / hop) + 3)) with hop = 64 // step.
+    Shape: (..., time), (bins, bins) -> (..., hop * (ceil(time / hop) + 3)) with hop = 64 // step.
 
     Args:
-        matrix: ``smearing_matrix``, its lower half in both directions if ``step`` is 2.
+        matrix: ``smearing_matrix``, or the part of it for the lowest frequencies; the others, and the Nyquist frequency,
+            are left out. At most (256 // step, 256 // step).
         step: 1 at 44.1 kHz; 2 at 22.05 kHz, where the same frames are taken at every other sample and nothing above
             11 kHz is known.
     """
     hop = HOP // step
-    matrix = functional.pad(matrix, (0, 1, 0, 1))  # the last frequency is left out
     count = math.ceil(waveform.shape[-1] / hop)
     window = _window(step, waveform.dtype, waveform.device)
     frames = _frames(waveform, count, hop, window)
     # on a CPU a few frames at a time, for the steps from one to the next to find them in its cache
     size = max(1, _CACHED * step // waveform[..., 0].numel()) if waveform.device.type == "cpu" else count
-    parts = [_widen(part, window, matrix) for part in frames.split(size, -2)]
-    return _overlap_add(parts[0] if len(parts) == 1 else torch.cat(parts, -2), hop)
+    if size >= count:
+        return _overlap_add(_widen(frames, window, matrix), hop)
+    return _overlap_add(torch.cat([_widen(part, window, matrix) for part in frames.split(size, -2)], -2), hop)
 
 
 def _widen(frames: Tensor, window: Tensor, matrix: Tensor) -> Tensor:
-    """Smear each frame's power. Shape: (..., frames, 2 n), (2 n,), (n + 1, n + 1) -> (..., frames, n)."""
-    spectrum = rfft(frames)
+    """Smear each frame's power. Shape: (..., frames, 2 n), (2 n,), (bins, bins) -> (..., frames, n)."""
+    spectrum = rfft(frames)[..., : len(matrix)]
     if spectrum.requires_grad and torch.is_grad_enabled():
         spectrum = _Spread.apply(spectrum, matrix)[0]
     else:
@@ -176,8 +183,8 @@ def _frames(waveform: Tensor, count: int, hop: int, window: Tensor) -> Tensor:
 
 
 def _overlap_add(frames: Tensor, hop: int) -> Tensor:
-    hops = frames.unflatten(-1, (4, hop)).unbind(-2)
-    count = frames.shape[-2]
+    parts, count = frames.unflatten(-1, (4, hop)), frames.shape[-2]
+    hops = parts.unbind(-2)
     total = frames.new_zeros(*frames.shape[:-2], count + 3, hop)
     for j in range(3):
         total[..., j : j + count, :].add_(hops[j])
@@ -186,6 +193,5 @@ def _overlap_add(frames: Tensor, hop: int) -> Tensor:
     if count >= 4:
         total[..., 3:count, :].add_(hops[3][..., : count - 3, :])
         # in smear3's last three hops the fourth last frame's first parts stand for the last parts of the last three
-        for j in range(3):
-            total[..., count + j, :].add_(hops[j][..., count - 4, :])
+        total[..., count:, :].add_(parts[..., count - 4, :3, :])
     return total.flatten(-2)

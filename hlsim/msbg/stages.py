@@ -141,8 +141,7 @@ def _between(spectrum: Tensor, source: int, target: int) -> Tensor:
     if source != target:
         lower = min(source, target)
         if lower % 2 == 0:
-            nyquist = spectrum[..., -1:] * (0.5 if target > source else 2.0)
-            spectrum = torch.cat((spectrum[..., :-1], nyquist), -1)
+            spectrum[..., -1] *= 0.5 if target > source else 2.0
         spectrum = functional.pad(spectrum, (0, target // 2 + 1 - spectrum.shape[-1]))
     return irfft(spectrum, target)
 

@@ -1,10 +1,13 @@
 """At which rate each channel runs: a gammatone channel is a band, and only the widest need 44.1 kHz.
 
 A channel is kept up to five bandwidths above its frequency, where it is 57 dB down. Narrow ones run as analytic signals
-at 5.5 or 11 kHz, whose modulus is the envelope: what a rectifier adds, harmonics of the band, lies above its low-pass.
-It does not where bands are so wide for their frequency that they come down to 0 Hz: with severe losses two harmonics
-complete the modulus. The lowest channels, and the widest at 44.1 kHz, are rectified as they are, as the reference does:
-at that rate its own harmonics fold too.
+at 5.5, 9.2 or 11 kHz, whose modulus is the envelope: what a rectifier adds, harmonics of the band, lies above its
+low-pass. It does not where bands are so wide for their frequency that they come down to 0 Hz: with severe losses two
+harmonics complete the modulus. The lowest channels, and the widest at 44.1 kHz, are rectified as they are, as the
+reference does: at that rate its own harmonics fold too.
+
+Channels centred far above the highest frequency of interest all hear what there is next to it, by their skirts, and
+expand it alike, by the threshold at 8 kHz: they run as one, the sum of them.
 """
 
 import itertools
@@ -27,6 +30,9 @@ _REACH = 5.0  # bandwidths above its frequency to which a channel is kept
 
 _WIDE = 2.5  # broadening above which bands come so near to 0 Hz that a rectifier's harmonics count
 _TRUE_HZ = 400.0  # below, channels are rectified as they are
+_FAR = 1.55  # times the highest frequency of interest, above which channels run as one
+_FAR_RATIO = 1.3  # expansion, of a loss of 24 dB, at which their gain is right; with more they are heard less
+_NARROWED_HZ = 9000.0  # highest frequency of interest for which 9.2 kHz do
 _CACHED = 2_000_000  # samples of a tier on a CPU, for each step to find the last one's in its cache
 
 
@@ -40,16 +46,14 @@ class Tier:
 
     Attributes:
         channels: which of the bank's.
-        step: samples at 44.1 kHz from one of its samples to the next; a divisor of 24.
         points: its FFT length.
         detector: how they are rectified.
         response: of the channels, (channels, points // 2 + 1), or of their analytic signals, (channels, points).
-        decimation: weights of a block's samples, (3, 24 // step).
+        decimation: weights of a step's samples, (3, samples).
         interpolation: ``interpolation_kernel``, each weight twice for analytic signals' two parts.
     """
 
     channels: slice
-    step: int
     points: int
     detector: Detector
     response: Tensor
@@ -62,8 +66,8 @@ class Plan:
     """A bank on the FFT grid of a length: ``tiers`` from the lowest channels up, and the envelopes' ``lowpass``.
 
     Attributes:
-        lowpass: (channels, points // 48 + 1).
-        step: that of the widest channels, 1 or 2.
+        lowpass: (channels, points // 48 + 1), as many channels as the tiers have.
+        step: of the signal, 1 or 2.
         points: FFT length at 44.1 kHz, a multiple of 24.
     """
 
@@ -73,60 +77,92 @@ class Plan:
     lowpass: Tensor
 
 
-def assign(bank: FilterBank, step: int) -> list[tuple[slice, int, Detector]]:
-    """Channels, step and how they are rectified, from the lowest channels up.
+def assign(bank: FilterBank, step: int, highest: float = RATE / 2) -> list[tuple[slice, int, Detector]]:
+    """Channels, samples in each 24 at 44.1 kHz and how they are rectified, from the lowest channels up.
+
+    The last one stands for all those above it.
 
     Args:
-        step: of the widest channels: 1, or 2 where nothing above 11 kHz is of interest.
+        step: of the signal: 1, or 2 where nothing above 11 kHz is of interest.
+        highest: frequency of interest in Hz.
     """
+    widest = STEP // 4 if highest > _NARROWED_HZ else STEP * 5 // 24
     kinds: list[tuple[int, Detector]] = []
     for hz, width in zip(bank.centre_frequencies, erb(np.array(bank.centre_frequencies)), strict=True):
         top = hz + _REACH * bank.broadening * float(width)
         if hz < _TRUE_HZ:
-            kinds.append((4, "itself"))
+            kinds.append((STEP // 4, "itself"))
         elif top <= RATE / 8:
-            kinds.append((4, "harmonics") if bank.broadening > _WIDE else (8, "modulus"))
-        elif step == 2 or (top <= RATE / 4 and bank.broadening <= _WIDE):
-            kinds.append((4, "modulus"))
+            kinds.append((STEP // 4, "harmonics") if bank.broadening > _WIDE else (STEP // 8, "modulus"))
+        elif step == 2:
+            kinds.append((widest, "modulus"))
+        elif top <= RATE / 4 and bank.broadening <= _WIDE:
+            kinds.append((STEP // 4, "modulus"))
         else:
-            kinds.append((1, "itself"))
+            kinds.append((STEP, "itself"))
+    kinds = kinds[: _kept(bank, highest)]
     bounds = [0, *(i for i in range(1, len(kinds)) if kinds[i] != kinds[i - 1]), len(kinds)]
     return [(slice(a, b), *kinds[a]) for a, b in itertools.pairwise(bounds)]
 
 
-def make_plan(severity: str, points: int, step: int, dtype: torch.dtype, device: torch.device) -> Plan:
+def make_plan(
+    severity: str, points: int, step: int, highest: float, dtype: torch.dtype, device: torch.device
+) -> Plan:
     """The tiers of a severity's bank.
 
     Args:
         points: FFT length at 44.1 kHz, a multiple of 24.
-        step: 1 or 2, as in ``assign``.
+        step, highest: as in ``assign``.
     """
 
     tensor = partial(as_tensor, dtype=dtype, device=device)
     bank = BANKS[severity]
+    last = _kept(bank, highest)
     together = next((count for count in (8, 9, 7, 10, 6, 5) if points // STEP % count == 0), 8)
     tiers, lowpass = [], []
     with torch.inference_mode(False):
-        for channels, own, detector in _parts(assign(bank, step), points, device):
-            count, analytic = points // own, detector != "itself"
+        for channels, samples, detector in _parts(assign(bank, step, highest), points, device):
+            count, analytic = points // STEP * samples, detector != "itself"
             bins = count if analytic else count // 2 + 1
-            # signals are own / step times too loud, as their sum's spectrum is to be; those that are to be transformed as
-            # analytic ones half of it, the other half being in negative frequencies
+            # signals are too loud by the ratio of the rates, as their sum's spectrum is to be; those that are to be
+            # transformed as analytic ones half of it, the other half being in negative frequencies
             response = gammatone_response(bank, points, channels, bins)
-            decimation = decimation_kernel(own) * (step / own)
-            interpolation = interpolation_kernel(own, 2 if detector == "modulus" else 1, together)
+            smoothing = envelope_lowpass(bank, points, samples, channels)
+            if channels.stop == last < bank.channels:
+                far = gammatone_response(bank, points, slice(last - 1, None), bins)
+                response[-1] = far.sum(0)
+                smoothing[-1] *= _far_level(far[:, round(highest * points / RATE)])
+            decimation = decimation_kernel(samples) * (step * samples / STEP)
+            interpolation = interpolation_kernel(samples, 2 if detector == "modulus" else 1, together)
             if detector == "modulus":
                 response[:, 0] *= 0.5
                 decimation = decimation * (4.0 / math.pi)
             elif detector == "harmonics":
                 response[:, 1:] *= 2.0
                 decimation = decimation * (2.0 / math.pi)
-            elif own > 1 and count % 2 == 0:
+            elif samples < STEP and count % 2 == 0:
                 response[:, -1] = 0.0
             kernels = tensor(decimation), tensor(interpolation)
-            tiers.append(Tier(channels, own, count, detector, tensor(response), *kernels))
-            lowpass.append(envelope_lowpass(bank, points, own, channels))
+            tiers.append(Tier(channels, count, detector, tensor(response), *kernels))
+            lowpass.append(smoothing)
         return Plan(points, step, tuple(tiers), tensor(np.concatenate(lowpass)))
+
+
+def _kept(bank: FilterBank, highest: float) -> int:
+    """Channels, those far above the highest frequency of interest as one."""
+    return min(bank.channels, 1 + sum(hz <= _FAR * highest for hz in bank.centre_frequencies))
+
+
+def _far_level(responses: NDArray[np.complex128]) -> float:
+    """Factor on the envelope of a sum of channels, for it to be expanded as they are.
+
+    Args:
+        responses: of the channels at one frequency.
+    """
+    more = _FAR_RATIO - 1.0
+    total = abs(responses.sum())
+    expanded = abs((responses * np.abs(responses) ** more).sum()) / total
+    return float(expanded ** (1.0 / more) / total)
 
 
 def as_tensor(values: NDArray[np.generic], dtype: torch.dtype, device: torch.device) -> Tensor:
@@ -150,9 +186,10 @@ def _parts(
     if device.type != "cpu":
         return tiers
     parts = []
-    for channels, step, detector in tiers:
+    for channels, samples, detector in tiers:
         count = channels.stop - channels.start
-        pieces = min(count, math.ceil(count * (1 if detector == "itself" else 2) * points / (_CACHED * step)))
+        size = count * (1 if detector == "itself" else 2) * points // STEP * samples
+        pieces = min(count, math.ceil(size / _CACHED))
         cuts = [channels.start + count * piece // pieces for piece in range(pieces + 1)]
-        parts += [(slice(a, b), step, detector) for a, b in itertools.pairwise(cuts)]
+        parts += [(slice(a, b), samples, detector) for a, b in itertools.pairwise(cuts)]
     return parts

@@ -19,7 +19,7 @@ from hlsim.msbg.envelope import envelope_filters
 from hlsim.msbg.filterbank import BANKS, FilterBank, gammatone_response
 from hlsim.msbg.fourier import fft_length, irfft, rfft
 from hlsim.msbg.model import STRUCTURAL_DELAY
-from hlsim.msbg.recruitment import CATCH_UP_SPL, expansion_ratios
+from hlsim.msbg.recruitment import CATCH_UP_SPL, expansion_ratios, threshold_weights
 from hlsim.msbg.smearing import BROADENING, roex_filters, smearing_from_filters
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.spectrum import STFT, power
@@ -126,9 +126,8 @@ class Prior(nn.Module):
         return torch.complex(torch.where(turned, -imaginary, real), torch.where(turned, real, imaginary))
 
     def _exponents(self, thresholds: Tensor, severity: Tensor) -> Tensor:
-        ratios = [
-            functional.pad(expansion_ratios(thresholds, BANKS[name]), (0, _CHANNELS)) for name in SEVERITIES
-        ]
+        weights = [torch.from_numpy(threshold_weights(BANKS[name])).to(thresholds) for name in SEVERITIES]
+        ratios = [functional.pad(expansion_ratios(thresholds, own), (0, _CHANNELS)) for own in weights]
         rows = torch.stack([ratio[..., :_CHANNELS] for ratio in ratios], 1)
         chosen = rows[torch.arange(len(severity), device=severity.device), severity]
         return (chosen - 1.0).clamp_min(-1.0)

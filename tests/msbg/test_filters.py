@@ -35,7 +35,7 @@ def test_memory_does_not_grow_with_the_number_of_lengths(small: _Cache) -> None:
 
 def test_one_filter_that_is_too_long_is_held_all_the_same(small: _Cache) -> None:
     own = Filters(torch.float32, torch.device("cpu"))
-    plan = own.get("plan", "severe", 24 * 4000, 1)
-    assert own.get("plan", "severe", 24 * 4000, 1) is plan and small.held > small.limit
+    plan = own.get("plan", "severe", 24 * 4000, 1, 22050.0)
+    assert own.get("plan", "severe", 24 * 4000, 1, 22050.0) is plan and small.held > small.limit
     own.get("forward", 4410, 2206, 1.0)
     assert small.held <= small.limit

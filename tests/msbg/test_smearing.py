@@ -13,6 +13,7 @@ from hlsim.msbg.smearing import (
     SMEARING_DELAY,
     roex_filters,
     smear,
+    smeared_bins,
     smeared_length,
     smearing_matrix,
 )
@@ -59,6 +60,19 @@ def test_smearing_sample_for_sample(severity: str, length: int) -> None:
         np.testing.assert_allclose(ours[:whole], theirs[:whole], atol=1e-10)
 
 
+@pytest.mark.parametrize("severity", BROADENING)
+@pytest.mark.parametrize("highest", [8000.0, 9000.0])
+def test_frequencies_above_the_highest_of_interest_need_not_be_smeared(severity: str, highest: float) -> None:
+    spectrum = torch.fft.rfft(torch.randn(32 * 400, dtype=torch.float64))
+    spectrum[round(highest / (RATE / 2) * 32 * 400) :] = 0.0
+    noise = torch.fft.irfft(spectrum)
+    matrix, bins = torch.from_numpy(smearing_matrix(*BROADENING[severity])), smeared_bins(2, highest)
+    assert bins < 128
+    whole, part = (torch.fft.rfft(smear(noise, matrix[:n, :n], 2)) for n in (128, bins))
+    below = slice(round(highest / (RATE / 2) * smeared_length(32 * 400)))
+    assert (whole - part)[below].norm() < 1e-3 * whole[below].norm()
+
+
 def test_leading_dimensions_are_items() -> None:
     waves = torch.randn(2, 3, 700, dtype=torch.float64)
     matrix = torch.from_numpy(smearing_matrix(*BROADENING["mild"]))
@@ -98,7 +112,9 @@ def test_gradients_of_silence_are_those_of_no_smearing() -> None:
     wave = torch.zeros(2000, requires_grad=True)
     out = smear(wave, torch.from_numpy(smearing_matrix(*BROADENING["severe"])).float())
     assert not bool(out.any())
-    weights = torch.randn_like(out)
+    spectrum = torch.fft.rfft(torch.randn_like(out))
+    spectrum[len(spectrum) * 98 // 100 :] = 0.0  # frames leave their highest frequency out
+    weights = torch.fft.irfft(spectrum)
     (gradient,) = torch.autograd.grad(out, wave, weights)
     kept = slice(2 * FRAME, 2000 - 2 * FRAME)
     delayed = weights[SMEARING_DELAY : SMEARING_DELAY + 2000]
