@@ -131,7 +131,7 @@ def ratio(rate: int, step: int) -> tuple[int, int]:
 
 
 def _between(spectrum: Tensor, source: int, target: int) -> Tensor:
-    """Waveform of ``target`` points of a spectrum of ``source`` points.
+    """Waveform of ``target`` points of a spectrum of ``source`` points, which is written into.
 
     The lower rate's Nyquist bin stands for two frequencies, of which the higher rate has one in each half: left out, it
     would be missed at every sample by as much as it is of the whole, which hangs on the length.
@@ -141,7 +141,7 @@ def _between(spectrum: Tensor, source: int, target: int) -> Tensor:
     if source != target:
         lower = min(source, target)
         if lower % 2 == 0:
-            spectrum[..., -1] *= 0.5 if target > source else 2.0
+            spectrum[..., -1].mul_(0.5 if target > source else 2.0)
         spectrum = functional.pad(spectrum, (0, target // 2 + 1 - spectrum.shape[-1]))
     return irfft(spectrum, target)
 
