@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from hlsim.calibration import is_finite
 from hlsim.neuro.config import NetworkConfig
 
 
@@ -27,9 +28,9 @@ class MappingConfig(NetworkConfig):
         super().__post_init__()
         if self.start != "nalr" and not (isinstance(self.start, float | int) and 0.0 <= self.start <= 1.0):
             raise ValueError(f"start is {self.start!r}; allowed: 'nalr', or a share of the loss from 0 to 1")
-        if not 4 <= self.bands <= 40:
-            raise ValueError(f"bands is {self.bands}; allowed: 4 to 40")
-        if not 0.0 < self.reach_db <= 60.0:
-            raise ValueError(f"reach_db is {self.reach_db}; allowed: more than 0, to 60 dB")
-        if not 60.0 <= self.limit_spl <= 140.0:
-            raise ValueError(f"limit_spl is {self.limit_spl}; allowed: 60 to 140 dB SPL")
+        if type(self.bands) is not int or not 4 <= self.bands <= 40:
+            raise ValueError(f"bands is {self.bands!r}; allowed: whole numbers from 4 to 40")
+        if not (is_finite(self.reach_db) and 0.0 < self.reach_db <= 60.0):
+            raise ValueError(f"reach_db is {self.reach_db!r}; allowed: more than 0, to 60 dB")
+        if not (is_finite(self.limit_spl) and 60.0 <= self.limit_spl <= 140.0):
+            raise ValueError(f"limit_spl is {self.limit_spl!r}; allowed: 60 to 140 dB SPL")

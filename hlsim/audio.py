@@ -133,6 +133,16 @@ def _refuse_cut(path: str | Path) -> None:
             file.seek(size + size % 2, os.SEEK_CUR)
 
 
+def check_extension(path: str | Path) -> str:
+    """Return the extension in lower case, or raise ValueError unless it is one that ``write_audio`` writes."""
+    suffix = Path(path).suffix.lower()
+    if suffix not in _SUBTYPES:
+        raise ValueError(
+            f"{path}: cannot write {suffix or 'a file without extension'}; allowed: {', '.join(EXTENSIONS)}"
+        )
+    return suffix
+
+
 def write_audio(path: str | Path, waveform: Tensor, sample_rate: int) -> None:
     """Write (channels, time) or (time,) samples as wav (32-bit float), flac (24-bit) or ogg, whole or not at all.
 
@@ -141,15 +151,11 @@ def write_audio(path: str | Path, waveform: Tensor, sample_rate: int) -> None:
             and ogg, beyond full scale (they would be clipped).
     """
     target = Path(path)
-    suffix = target.suffix.lower()
-    if suffix not in _SUBTYPES:
-        raise ValueError(
-            f"{path}: cannot write {suffix or 'a file without extension'}; allowed: {', '.join(EXTENSIONS)}"
-        )
+    suffix = check_extension(path)
     if check_waveform(waveform).ndim > 2:
         raise ValueError(f"{path}: shape {tuple(waveform.shape)}; allowed: (channels, time) or (time,)")
     try:
-        check_rate(min(sample_rate, HIGHEST_RATE))
+        check_rate(min(sample_rate, HIGHEST_RATE) if is_finite(sample_rate) else sample_rate)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
     samples = waveform.detach().to("cpu", torch.float32)

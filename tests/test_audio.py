@@ -119,10 +119,10 @@ def test_what_cannot_be_written(tmp_path: Path, name: str, wave: Tensor, said: s
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("rate", [8000, 0])
+@pytest.mark.parametrize("rate", [8000, 0, "16k", None])
 @pytest.mark.parametrize("suffix", EXTENSIONS)
-def test_rates_that_could_not_be_read_again_are_not_written(tmp_path: Path, suffix: str, rate: int) -> None:
-    with pytest.raises(ValueError, match=rf"sample rate {rate} Hz; allowed: 16000 to 48000") as caught:
+def test_rates_that_could_not_be_read_again_are_not_written(tmp_path: Path, suffix: str, rate: Any) -> None:
+    with pytest.raises(ValueError, match=rf"sample rate {rate!r} Hz; allowed: 16000 to 48000") as caught:
         write_audio(tmp_path / f"a{suffix}", torch.zeros(10), rate)
     assert str(caught.value).startswith(str(tmp_path))
     assert not list(tmp_path.iterdir())

@@ -167,6 +167,7 @@ def test_files_that_cannot_be_in_and_out(
         (given, given, f"{given}: OUT is IN itself"),
         (tmp_path, out, f"{tmp_path}: a folder; allowed: one file"),
         (tmp_path / "missing.wav", tmp_path / "missing.wav", "missing.wav: no such file"),
+        (tmp_path / "missing.wav", tmp_path / "o.mp3", "o.mp3: cannot write .mp3; allowed: .wav"),
     ):
         assert said in fails(capsys, command, source, target, "--audiogram", "N3")
     assert given.read_bytes() == utterance.read_bytes()

@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 
 from compensators import load_compensator
-from hlsim.audio import HIGHEST_RATE, read_audio, resample, write_audio
+from hlsim.audio import HIGHEST_RATE, check_extension, read_audio, resample, write_audio
 from hlsim.commands.options import (
     Commands,
     add_command,
@@ -61,6 +61,7 @@ def _compensate(options: argparse.Namespace) -> None:
 def _pass_through(options: argparse.Namespace, build: Callable[[int], torch.nn.Module]) -> None:
     """Read, run what ``build`` makes for a sample rate, and write at the file's own rate."""
     check_files(options.input, options.output)
+    check_extension(options.output)
     ear = read_ear(options.audiogram)
     waveform, rate = read_audio(options.input, any_rate=True)
     inner = min(rate, HIGHEST_RATE)

@@ -128,3 +128,9 @@ class NeuroConfig(NetworkConfig):
     phase: str = "predicted"
     prior: bool = True
     level_aware: bool = True
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("prior", "level_aware"):
+            if not isinstance(getattr(self, name), bool):
+                raise ValueError(f"{name} {getattr(self, name)!r}; allowed: true or false")

@@ -2,6 +2,7 @@
 
 import io
 import json
+import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -32,8 +33,11 @@ class WholeStates(TorchCheckpointIO):
         write_whole(path, buffer.getvalue())
 
     def load_checkpoint(self, path: str | Path, *options: Any, **others: Any) -> dict[str, Any]:
-        """Raises ValueError where the file is broken."""
+        """Raises ValueError where the file is broken or has changed."""
         try:
+            with zipfile.ZipFile(path) as archive:  # torch does not look at the checksums
+                if changed := archive.testzip():
+                    raise ValueError(f"{changed} is not what was written")
             state: dict[str, Any] = super().load_checkpoint(path, *options, **others)
             state["state_dict"]
         except Exception as error:  # zip, pickle and torch have their own each

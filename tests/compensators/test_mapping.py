@@ -154,7 +154,17 @@ def test_config_survives_json_and_refuses_nonsense() -> None:
     assert MappingConfig.from_dict(json.loads(json.dumps(config.to_dict()))) == config
     with pytest.raises(ValueError, match="unknown network settings layers"):
         MappingConfig.from_dict({"layers": 3})
-    for nonsense in ({"start": "none"}, {"start": 2.0}, {"bands": 2}, {"limit_spl": 200.0}, {"channels": 0}):
+    for nonsense in (
+        {"start": "none"},
+        {"start": 2.0},
+        {"bands": 2},
+        {"bands": "a"},
+        {"bands": 20.0},
+        {"reach_db": None},
+        {"limit_spl": 200.0},
+        {"limit_spl": "loud"},
+        {"channels": 0},
+    ):
         with pytest.raises(ValueError, match="allowed"):
             MappingConfig.from_dict(nonsense)
 

@@ -84,6 +84,7 @@ def test_bad_input(clean: Tensor) -> None:
         ({"limit": 0}, "limit is 0"),
         ({"full_scale_spl": float("inf")}, "full_scale_spl is inf"),
         ({"seed": -1}, "seed is -1"),
+        ({"seed": "a"}, "seed is 'a'; allowed: whole numbers"),
         ({"sample_rate": 8000}, "8000 Hz; allowed: 16000 to 48000"),
     ):
         with pytest.raises(ValueError, match=message):

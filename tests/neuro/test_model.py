@@ -91,6 +91,8 @@ def test_configuration_survives_json(config: NeuroConfig) -> None:
         {"fft": "400"},
         {"window": 300},
         {"blocks": 1.5},
+        {"prior": "no"},
+        {"level_aware": 0},
         3,
     ],
 )

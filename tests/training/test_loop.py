@@ -167,12 +167,18 @@ def test_leftovers_of_a_killed_run_go(tmp_path: Path) -> None:
     assert not list(tmp_path.glob(".*")) and (tmp_path / "checkpoint").is_dir()
 
 
-@pytest.mark.parametrize("broken", [b"", b"no state", None])
-def test_a_broken_state_is_named(tmp_path: Path, broken: bytes | None) -> None:
+@pytest.mark.parametrize("broken", [b"", b"no state", None, "one byte"])
+def test_a_broken_state_is_named(tmp_path: Path, broken: bytes | str | None) -> None:
     go(Toy(), tmp_path, max_steps=2)
     last = tmp_path / LAST
     if broken is None:
         torch.save({}, last)
+    elif broken == "one byte":
+        state = bytearray(last.read_bytes())
+        weight = torch.load(last, weights_only=True)["state_dict"].popitem()[1]
+        place = state.index(weight.numpy().tobytes())
+        state[place] ^= 1
+        last.write_bytes(state)
     else:
         last.write_bytes(broken)
     with pytest.raises(ValueError, match="not readable as a state; remove it to start anew") as caught:
