@@ -5,15 +5,15 @@ import math
 import os
 from functools import lru_cache
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import soundfile
 import torch
-import torchaudio.functional
-import torchaudio.transforms
-from torch import Tensor
+from torch import Tensor, nn
 
 from hlsim.calibration import is_finite
+from hlsim.extras import MissingExtraError
 
 LOWEST_RATE, HIGHEST_RATE = 16000, 48000
 """Sample rates in Hz that simulators and compensators take."""
@@ -219,21 +219,37 @@ def resample(waveform: Tensor, source_rate: int, target_rate: int) -> Tensor:
     Flat within 0.1 dB to 90 % of the lower Nyquist frequency, 55 dB down at it and 80 dB from 101 % of it on.
 
     Shape: (..., time) -> (..., ceil(time * target_rate / source_rate)).
+
+    Raises:
+        MissingExtraError: the rates differ and torchaudio cannot be loaded.
     """
     if source_rate == target_rate:
         return waveform
     size = source_rate * target_rate // math.gcd(source_rate, target_rate) ** 2
     # a kernel made while a program is traced is of no use to others
     if size > _LARGEST_KERNEL or torch.compiler.is_compiling():
-        return torchaudio.functional.resample(waveform, source_rate, target_rate, **_SINC)
+        slow: Tensor = _torchaudio().functional.resample(waveform, source_rate, target_rate, **_SINC)
+        return slow
     resampled: Tensor = _resampler(source_rate, target_rate, waveform.dtype, waveform.device)(waveform)
     return resampled
 
 
 @lru_cache(maxsize=32)
-def _resampler(
-    source_rate: int, target_rate: int, dtype: torch.dtype, device: torch.device
-) -> torchaudio.transforms.Resample:
+def _resampler(source_rate: int, target_rate: int, dtype: torch.dtype, device: torch.device) -> nn.Module:
     """Its kernel takes up to forty times as long to compute as to apply to a second."""
     with torch.inference_mode(False):
-        return torchaudio.transforms.Resample(source_rate, target_rate, dtype=dtype, **_SINC).to(device)
+        made: nn.Module = _torchaudio().transforms.Resample(source_rate, target_rate, dtype=dtype, **_SINC)
+        return made.to(device)
+
+
+def _torchaudio() -> ModuleType:
+    """Imported when a rate is to change: it does not load beside another build of torch, and 16 kHz can do without."""
+    try:
+        import torchaudio.functional
+        import torchaudio.transforms
+    except (ImportError, OSError) as error:
+        raise MissingExtraError(
+            f"torchaudio is needed to change the sample rate and cannot be loaded ({error}): "
+            f"install torchaudio 2.11 from where torch {torch.__version__} came from"
+        ) from error
+    return torchaudio

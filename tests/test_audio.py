@@ -2,6 +2,8 @@
 
 import math
 import os
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -369,3 +371,24 @@ def test_encoded_flac_is_the_signal_to_16_bits(tmp_path: Path) -> None:
     for bad in (signal * 2, torch.zeros(2, 10), signal / 0):
         with pytest.raises(ValueError, match=r"allowed: \(time,\), samples from -1\.0 to 1\.0"):
             encode_flac(bad, 16000)
+
+
+def test_without_torchaudio_all_but_another_rate_works() -> None:
+    """As beside a build of torch that it does not fit."""
+    code = """
+import sys
+sys.modules["torchaudio"] = None
+import torch
+from hlsim import Audiogram, HearingLossLoss
+ear, speech = Audiogram.standard("N3"), 0.01 * torch.randn(1, 4000)
+for simulator in ("msbg", "neuro-msbg"):
+    assert bool(HearingLossLoss(ear, simulator=simulator)(2.0 * speech, speech).isfinite())
+try:
+    HearingLossLoss(ear, sample_rate=44100)(2.0 * speech, speech)
+except ImportError as error:
+    print(error)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    assert "torchaudio is needed to change the sample rate and cannot be loaded" in done.stdout
+    assert f"install torchaudio 2.11 from where torch {torch.__version__} came from" in done.stdout
