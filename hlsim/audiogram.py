@@ -167,7 +167,8 @@ def severity_of(levels: Sequence[float]) -> str:
 
 def severity_index(thresholds: Tensor) -> Tensor:
     """Index into ``SEVERITIES`` of each ear. Shape: (..., 8) dB HL -> (...), int64."""
-    mean = thresholds[..., FREQUENCIES.index(2000.0) :].double().mean(-1)
+    high = thresholds[..., FREQUENCIES.index(2000.0) :].double().unbind(-1)
+    mean = sum(high[1:], start=high[0]) / len(high)  # in the order of ``severity_of``, for the same last bit
     return torch.bucketize(mean, torch.tensor(SEVERITY_LIMITS, dtype=torch.float64, device=mean.device))
 
 

@@ -20,6 +20,7 @@ from hlsim.audiogram import (
     draw_thresholds,
     read_audiograms,
     severity_index,
+    severity_of,
 )
 
 # Bisgaard, Vlaming and Dahlquist 2010, Tables 1 and 2, all ten frequencies
@@ -132,6 +133,19 @@ def test_severity_is_pyclaritys_at_random_and_at_the_limits() -> None:
     assert set(expected) == set(SEVERITIES)
     index = severity_index(torch.tensor(np.array(ears_in_range)))
     assert [SEVERITIES[i] for i in index.tolist()] == expected
+
+
+def test_severity_is_the_same_to_the_last_bit_of_the_mean() -> None:
+    ears = [
+        [0.0, 0.0, 0.0, 21.8, 3.1, 5.1, 7.4, 37.6],  # 15, or a bit more if summed in another order
+        *np.round(np.random.default_rng(0).uniform(0.0, 75.0, (4000, 8)), 1).tolist(),
+    ]
+    for ear in ears[1:]:  # on a limit, as near as a double comes
+        last = (5.0 * limit - sum(ear[3:7]) for limit in (15.0, 35.0, 56.0))
+        ear[7] = next((level for level in last if 0.0 <= level <= 100.0), ear[7])
+    index = severity_index(torch.tensor(ears, dtype=torch.float64)).tolist()
+    assert [SEVERITIES[i] for i in index] == [severity_of(ear) for ear in ears]
+    assert [severity_of(ear) for ear in ears] == [Audiogram(tuple(ear)).severity for ear in ears]
 
 
 def test_severity_of_many_ears_keeps_leading_dimensions() -> None:

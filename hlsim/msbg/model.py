@@ -124,8 +124,9 @@ class MSBG(nn.Module):
                     outputs.append(self._in_blocks(signals[chosen], ears[chosen], severity, none))
                 order += some
         longest = max(output.shape[-1] for output in outputs)
-        heard = outputs[0]
-        if len(outputs) > 1:
+        if len(outputs) == 1:  # a copy, or it would hold all that the last transform made
+            heard = outputs[0].clone(memory_format=torch.contiguous_format)
+        else:
             heard = torch.cat([functional.pad(output, (0, longest - output.shape[-1])) for output in outputs])
         if order != list(range(len(order))):
             heard = heard[torch.tensor(order).argsort().to(heard.device)]

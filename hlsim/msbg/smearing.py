@@ -21,7 +21,9 @@ SMEARING_DELAY = 3 * HOP
 BROADENING = {"mild": (1.6, 1.1), "moderate": (2.4, 1.6), "severe": (4.0, 2.0)}
 """Widening of the lower and the upper side of the auditory filters; with no loss nothing is smeared (pyclarity 0.9.0)."""
 
-_SKIRT_HZ = 800.0
+SKIRT_HZ = 800.0
+"""How far above what it is given smearing reaches, by the skirts of its frames' spectra."""
+
 _TINY = 1e-24  # Pa^2
 _NEVER = 1e-36  # Pa^2, keeps a division from one by 0
 _CACHED = 1200  # frames
@@ -75,7 +77,7 @@ def smearing_matrix(lower: float, upper: float) -> NDArray[np.float64]:
 
 def smeared_bins(step: int, highest: float) -> int:
     """Frequencies of a frame at 44.1 kHz / step on which what is below ``highest`` Hz depends, by the window's skirts."""
-    return min(FFT // 2 // step, math.ceil((highest + _SKIRT_HZ) * FFT / RATE))
+    return min(FFT // 2 // step, math.ceil((highest + SKIRT_HZ) * FFT / RATE))
 
 
 def smeared_length(samples: int) -> int:

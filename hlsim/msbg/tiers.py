@@ -1,10 +1,10 @@
 """At which rate each channel runs: a gammatone channel is a band, and only the widest need 44.1 kHz.
 
-A channel is kept up to five bandwidths above its frequency, where it is 57 dB down. Narrow ones run as analytic signals
-at 5.5, 9.2 or 11 kHz, whose modulus is the envelope: what a rectifier adds, harmonics of the band, lies above its
-low-pass. It does not where bands are so wide for their frequency that they come down to 0 Hz: with severe losses two
-harmonics complete the modulus. The lowest channels, and the widest at 44.1 kHz, are rectified as they are, as the
-reference does: at that rate its own harmonics fold too.
+A channel is kept up to five bandwidths above its frequency, where it is 57 dB down, or to the highest frequency of
+interest. Narrow ones run as analytic signals at 5.5 or 11 kHz, or 9.2 where that is enough, whose modulus is the
+envelope: what a rectifier adds, harmonics of the band, lies above its low-pass. It does not where bands are so wide for
+their frequency that they come down to 0 Hz: with severe losses two harmonics complete the modulus. The lowest channels,
+and the widest at 44.1 kHz, are rectified as they are, as the reference does: at that rate its own harmonics fold too.
 
 Channels centred far above the highest frequency of interest all hear what there is next to it, by their skirts, and
 expand it alike, by the threshold at 8 kHz: they run as one, the sum of them.
@@ -25,14 +25,14 @@ from hlsim.msbg.ear import RATE
 from hlsim.msbg.envelope import STEP, decimation_kernel, envelope_lowpass
 from hlsim.msbg.filterbank import BANKS, FilterBank, erb, gammatone_response
 from hlsim.msbg.recruitment import interpolation_kernel
+from hlsim.msbg.smearing import SKIRT_HZ
 
 _REACH = 5.0  # bandwidths above its frequency to which a channel is kept
 
 _WIDE = 2.5  # broadening above which bands come so near to 0 Hz that a rectifier's harmonics count
 _TRUE_HZ = 400.0  # below, channels are rectified as they are
-_FAR = 1.55  # times the highest frequency of interest, above which channels run as one
+_FAR = 1.75  # times the highest frequency of interest, above which channels run as one
 _FAR_RATIO = 1.3  # expansion, of a loss of 24 dB, at which their gain is right; with more they are heard less
-_NARROWED_HZ = 9000.0  # highest frequency of interest for which 9.2 kHz do
 _CACHED = 2_000_000  # samples of a tier on a CPU, for each step to find the last one's in its cache
 
 
@@ -80,13 +80,13 @@ class Plan:
 def assign(bank: FilterBank, step: int, highest: float = RATE / 2) -> list[tuple[slice, int, Detector]]:
     """Channels, samples in each 24 at 44.1 kHz and how they are rectified, from the lowest channels up.
 
-    The last one stands for all those above it.
+    Where the bank has more, the last one stands for those, too.
 
     Args:
         step: of the signal: 1, or 2 where nothing above 11 kHz is of interest.
         highest: frequency of interest in Hz.
     """
-    widest = STEP // 4 if highest > _NARROWED_HZ else STEP * 5 // 24
+    widest = STEP * 5 // 24 if highest + SKIRT_HZ <= RATE * 5 / 24 else STEP // 4
     kinds: list[tuple[int, Detector]] = []
     for hz, width in zip(bank.centre_frequencies, erb(np.array(bank.centre_frequencies)), strict=True):
         top = hz + _REACH * bank.broadening * float(width)

@@ -443,3 +443,30 @@ def test_gradients_through_blocks_are_those_of_the_whole(monkeypatch: pytest.Mon
         gradients.append(leaf.grad.numpy())
         monkeypatch.setattr("hlsim.msbg.model.block_bounds", lambda n, _: [(0, 0, n, n)])
     assert relative(gradients[0], gradients[1]) < 1e-4
+
+
+@pytest.mark.parametrize("rate", [16000, 17000, 18000, 20000])
+# as slight as each bank is used for, where its skirts count most
+@pytest.mark.parametrize(("level", "error"), [(16.0, 1e-3), (36.0, 2.5e-3), (57.0, 6e-3)])
+def test_half_the_rate_inside_changes_little(
+    monkeypatch: pytest.MonkeyPatch, rate: int, level: float, error: float
+) -> None:
+    noise = 0.02 * torch.randn(1, rate // 2, dtype=torch.float64)
+    spectrum = torch.fft.rfft(noise)
+    spectrum[:, : spectrum.shape[-1] * 88 // 100] = 0.0
+    ear, model = torch.full((8,), level, dtype=torch.float64), MSBG(sample_rate=rate)
+    for signal in (noise, torch.fft.irfft(spectrum, rate // 2))[: 1 if rate == 16000 else 2]:
+        monkeypatch.undo()
+        heard = model(signal, ear)
+        monkeypatch.setattr("hlsim.msbg.model._HALF_RATE_HZ", 0)
+        truth = model(signal, ear)
+        assert 0.0 < float((heard - truth).norm()) < error * float(truth.norm())
+
+
+@pytest.mark.parametrize("rate", [16000, 16001, 44100])
+@pytest.mark.parametrize("ears", [["N3"], ["N1", "N3"], ["NH", "NH"]])
+def test_outputs_hold_no_more_than_themselves(rate: int, ears: list[str]) -> None:
+    model = MSBG([Audiogram.standard(name) for name in ears], sample_rate=rate)
+    heard = model(0.01 * torch.randn(len(ears), 400))
+    assert heard.is_contiguous()
+    assert heard.untyped_storage().nbytes() == heard.nbytes
