@@ -66,8 +66,9 @@ def _train_simulator(options: argparse.Namespace) -> None:
         raise ValueError(
             "nothing to train on; allowed: --speech, a folder, or --manifest, of 'hlsim prepare'"
         )
-    recipe = SimulatorRecipe.from_dict(read_recipe(options.config))
-    folder = train_simulator(training_data(options), recipe, **training_arguments(options))
+    folder = train_simulator(
+        training_data(options), SimulatorRecipe.from_dict(recipe(options)), **training_arguments(options)
+    )
     print(f"the best checkpoint is in {folder}")
 
 
@@ -86,7 +87,7 @@ def _train_planned(options: argparse.Namespace) -> None:
             options.prepared,
             workers=1 if options.workers is None else options.workers,
         ),
-        SimulatorRecipe.from_dict(read_recipe(options.config)),
+        SimulatorRecipe.from_dict(recipe(options)),
         kind=PlannedTraining,
         **training_arguments(options),
     )
@@ -102,7 +103,7 @@ def _train_compensator(options: argparse.Namespace) -> None:
 
     folder = train_compensator(
         training_data(options),
-        CompensatorRecipe.from_dict(read_recipe(options.config)),
+        CompensatorRecipe.from_dict(recipe(options)),
         audiogram=read_ear(options.audiogram) if options.audiogram else None,
         simulator=options.simulator,
         **training_arguments(options),
@@ -132,6 +133,9 @@ def training_options(
     parser.add_argument("--valid-noise", type=Path, help="folder of noises to validate with")
     parser.add_argument("--valid-audiograms", type=Path, help="CSV of ears to validate with")
     parser.add_argument(
+        "--start", metavar="NAME", help="checkpoint whose weights to start from, instead of random ones"
+    )
+    parser.add_argument(
         "--max-minutes", type=positive, default=minutes, help="of training, resumed parts included"
     )
     parser.add_argument("--max-steps", type=integer, default=-1, help="stop earlier; -1 for no such limit")
@@ -141,6 +145,12 @@ def training_options(
     parser.add_argument("--strategy", default="auto", help="Lightning's, e.g. ddp")
     parser.add_argument("--quiet", action="store_true", help="no progress bar, only a line a validation")
     out_option(parser)
+
+
+def recipe(options: argparse.Namespace) -> dict[str, Any]:
+    """What the recipe's file holds, and what options say instead."""
+    start = {} if options.start is None else {"start": options.start}
+    return read_recipe(options.config) | start
 
 
 def training_data(options: argparse.Namespace) -> Any:

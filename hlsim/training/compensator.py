@@ -12,7 +12,7 @@ from torch import Tensor
 
 from compensators.config import MappingConfig
 from compensators.mapping import MappingCompensator
-from compensators.pretrained import KIND
+from compensators.pretrained import KIND, load_compensator
 from hlsim.audiogram import Audiogram, draw_thresholds
 from hlsim.calibration import set_level
 from hlsim.data.clips import Clips
@@ -21,6 +21,7 @@ from hlsim.loss import HearingLossLoss
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.pretrained import checkpoint_digest, save_checkpoint
 from hlsim.settings import refuse_other_kinds, refuse_unknown, refuse_weights
+from hlsim.training.beginning import start_identity, started
 from hlsim.training.loop import CHECKPOINT, TimedModule, run
 from hlsim.training.sources import TrainingData, read_thresholds
 
@@ -37,6 +38,8 @@ class CompensatorRecipe:
 
     Attributes:
         model: settings of ``MappingConfig``.
+        start: checkpoint whose weights to start from, a name or a folder; its settings are the model's. Without it they
+            are random.
         batch: clips a step.
         seconds: length of a clip.
         learning_rate: of AdamW at its highest.
@@ -53,6 +56,7 @@ class CompensatorRecipe:
     """
 
     model: dict[str, Any] = field(default_factory=dict)
+    start: str = ""
     batch: int = 2
     seconds: float = 0.6
     learning_rate: float = 3e-3
@@ -108,7 +112,9 @@ class CompensatorTraining(TimedModule):
         super().__init__(recipe.learning_rate, max_minutes, recipe.seed)
         torch.manual_seed(recipe.seed)
         self.recipe = recipe
-        self.compensator = MappingCompensator(MappingConfig.from_dict(recipe.model))
+        self.compensator = started(
+            recipe.start, recipe.model, MappingConfig, MappingCompensator, load_compensator
+        )
         self.criteria = torch.nn.ModuleDict()
         for name, weight in recipe.weights.items():
             if weight > 0.0:
@@ -227,6 +233,7 @@ def train_compensator(
     }
     if isinstance(simulator, str | Path) and str(simulator) != "msbg":
         trained["simulator_sha256"] = checkpoint_digest(simulator)  # a folder may hold another one next time
+    trained |= start_identity(recipe.start)
 
     def write(figures: dict[str, Any]) -> None:
         from hlsim import __version__

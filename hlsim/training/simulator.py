@@ -18,9 +18,10 @@ from hlsim.data.variation import mix, vary
 from hlsim.msbg import MSBG
 from hlsim.neuro import NeuroConfig, NeuroMSBG
 from hlsim.neuro.config import NEURO_RATE
-from hlsim.pretrained import SIMULATOR, save_checkpoint
+from hlsim.pretrained import SIMULATOR, load_pretrained, save_checkpoint
 from hlsim.settings import refuse_other_kinds, refuse_unknown, refuse_weights
 from hlsim.training.averaging import average_of
+from hlsim.training.beginning import start_identity, started
 from hlsim.training.loop import CHECKPOINT, TimedModule, run
 from hlsim.training.sources import TrainingData, read_thresholds
 
@@ -35,6 +36,8 @@ class SimulatorRecipe:
 
     Attributes:
         model: settings of ``NeuroConfig``.
+        start: checkpoint whose weights to start from, a name or a folder; its settings are the model's. Without it they
+            are random.
         batch: clips a step.
         seconds: length of a clip.
         learning_rate: of AdamW at its highest.
@@ -55,6 +58,7 @@ class SimulatorRecipe:
     """
 
     model: dict[str, Any] = field(default_factory=dict)
+    start: str = ""
     batch: int = 6
     seconds: float = 1.3
     learning_rate: float = 1e-3
@@ -101,7 +105,7 @@ class SimulatorTraining(TimedModule):
         super().__init__(recipe.learning_rate, max_minutes, recipe.seed)
         torch.manual_seed(recipe.seed)
         self.recipe = recipe
-        self.student = NeuroMSBG(NeuroConfig.from_dict(recipe.model))
+        self.student = started(recipe.start, recipe.model, NeuroConfig, NeuroMSBG, load_pretrained)
         self.student.autocast_dtype = PRECISIONS[recipe.precision]
         self.kept = average_of(self.student, recipe.average)
         self.teacher = MSBG(sample_rate=NEURO_RATE)
@@ -181,7 +185,8 @@ class SimulatorTraining(TimedModule):
 
     def identity(self, data: Any) -> dict[str, str]:
         """What the training is on, by name: with anything else it is another one."""
-        return {entry.name: str(getattr(data, entry.name)) for entry in fields(data) if entry.compare}
+        own = {entry.name: str(getattr(data, entry.name)) for entry in fields(data) if entry.compare}
+        return own | start_identity(self.recipe.start)
 
     def trained_parameters(self) -> list[torch.nn.Parameter]:
         return list(self.student.parameters())
@@ -245,11 +250,12 @@ def train_simulator(
     """
     module = kind(recipe, data, max_minutes)
     folder = Path(out) / CHECKPOINT
+    begun = start_identity(recipe.start)
 
     def write(figures: dict[str, Any]) -> None:
         from hlsim import __version__
 
-        about = {"hlsim": __version__, "recipe": asdict(recipe), **figures}
+        about = {"hlsim": __version__, "recipe": asdict(recipe), **begun, **figures}
         save_checkpoint(folder, SIMULATOR, module.kept.module, module.student.config.to_dict(), about)
 
     run(

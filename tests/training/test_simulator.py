@@ -216,7 +216,7 @@ def test_another_recipe_or_other_data_need_another_folder(data: TrainingData, tm
     [
         ({"batch": 0}, "counts from 1 up"),
         ({"learning_rate": -1.0}, "learning_rate above 0"),
-        ({"epochs": 3}, "unknown settings epochs in the recipe; allowed: model, batch, seconds"),
+        ({"epochs": 3}, "unknown settings epochs in the recipe; allowed: model, start, batch, seconds"),
         (
             {"weights": {"loudness": 1.0}},
             "unknown criteria loudness in the recipe; allowed: complex, log_spectrum",
