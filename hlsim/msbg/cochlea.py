@@ -37,7 +37,7 @@ def shared_multiple(rate: int) -> int:
 def hear(spectrum: Tensor, ratios: Tensor, plan: Plan, slight: bool) -> Tensor:
     """Filter bank and recruitment of a periodic signal.
 
-    Shape: (items, points // (2 step) + 1), (items, channels) -> as the first, where points and step are the plan's.
+    Shape: (items, points // (2 step) + 1), (items, channels) -> as the first, where points and step are ``make_plan``'s.
 
     Args:
         slight: look after the kinks of slight losses, which a smeared signal buries.

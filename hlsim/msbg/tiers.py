@@ -67,12 +67,8 @@ class Plan:
 
     Attributes:
         lowpass: (channels, points // 48 + 1), as many channels as the tiers have.
-        step: of the signal, 1 or 2.
-        points: FFT length at 44.1 kHz, a multiple of 24.
     """
 
-    points: int
-    step: int
     tiers: tuple[Tier, ...]
     lowpass: Tensor
 
@@ -86,7 +82,7 @@ def assign(bank: FilterBank, step: int, highest: float = RATE / 2) -> list[tuple
         step: of the signal: 1, or 2 where nothing above 11 kHz is of interest.
         highest: frequency of interest in Hz.
     """
-    widest = STEP * 5 // 24 if highest + SKIRT_HZ <= RATE * 5 / 24 else STEP // 4
+    widest = 5 if highest + SKIRT_HZ <= RATE * 5 / STEP else STEP // 4
     kinds: list[tuple[int, Detector]] = []
     for hz, width in zip(bank.centre_frequencies, erb(np.array(bank.centre_frequencies)), strict=True):
         top = hz + _REACH * bank.broadening * float(width)
@@ -145,7 +141,7 @@ def make_plan(
             kernels = tensor(decimation), tensor(interpolation)
             tiers.append(Tier(channels, count, detector, tensor(response), *kernels))
             lowpass.append(smoothing)
-        return Plan(points, step, tuple(tiers), tensor(np.concatenate(lowpass)))
+        return Plan(tuple(tiers), tensor(np.concatenate(lowpass)))
 
 
 def _kept(bank: FilterBank, highest: float) -> int:
