@@ -3,6 +3,7 @@
 import json
 import logging
 import math
+import signal
 import sys
 import time
 import warnings
@@ -276,8 +277,10 @@ def run(
             )
             trainer.validate(module, DataLoader(Counter(1), batch_size=None), verbose=False)
         except SystemExit as end:
-            # Lightning's answer to Ctrl-C; to SIGTERM it is a kind of its own
-            if trainer.interrupted and type(end) is SystemExit:
+            # Lightning's answer to Ctrl-C, and, as a kind of its own and as if all were done, to SIGTERM
+            if type(end) is not SystemExit:
+                raise SystemExit(128 + signal.SIGTERM) from None
+            if trainer.interrupted:
                 raise KeyboardInterrupt from None
             raise
     trainer.save_checkpoint(last)

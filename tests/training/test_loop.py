@@ -121,8 +121,9 @@ def test_being_told_to_end_is_no_interruption(tmp_path: Path) -> None:
             os.kill(os.getpid(), signal.SIGTERM)
 
     before = signal.getsignal(signal.SIGINT)  # ignored where the tests run in the background
-    with pytest.raises(SystemExit):
+    with pytest.raises(SystemExit) as ended:
         go(Toy(), tmp_path, max_steps=20, report=end)
+    assert ended.value.code == 128 + signal.SIGTERM  # what comes next in a script is not to begin
     assert signal.getsignal(signal.SIGINT) is before
 
 
