@@ -204,9 +204,9 @@ def summarise(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
             ``level`` (dB SPL), ``condition``.
 
     Returns: ``{"overall": figures, "severity": {"mild": figures, ...}, "level": {"65": figures, ...}, "condition":
-        {...}}``, for JSON. Figures are ``n``, ``snr_median``, ``snr_worst_tenth`` (10th percentile), ``raw_mse`` (mean),
-        ``band_error_median`` and, for stoi and pesq, ``_n`` (pairs used), ``_lcc``, ``_srcc``, ``_mse``; None where
-        undefined.
+        {...}}``, for JSON. Figures are ``n``, ``snr_n`` (how many have one), ``snr_median``, ``snr_worst_tenth`` (10th
+        percentile), ``raw_mse`` (mean), ``band_error_median`` and, for stoi and pesq, ``_n`` (pairs used), ``_lcc``,
+        ``_srcc``, ``_mse``; None where undefined.
 
     Raises:
         ValueError: no rows, or a number that is not finite.
@@ -247,6 +247,7 @@ def _figures(rows: Sequence[Mapping[str, Any]]) -> dict[str, float | int | None]
 
     figures: dict[str, float | int | None] = {
         "n": len(rows),
+        "snr_n": len(column("snr")),
         "snr_median": over(np.median, "snr"),
         "snr_worst_tenth": over(lambda v: np.percentile(v, 10), "snr"),
         "raw_mse": over(np.mean, "raw_mse"),
@@ -272,5 +273,12 @@ def _table(what: str, groups: Mapping[str, Mapping[str, float | int | None]]) ->
 
 
 def column_cells(figures: Mapping[str, float | int | None]) -> list[str]:
-    """The figures of ``summarise`` under ``COLUMNS``, ``n/a`` where there is none."""
-    return ["n/a" if figures[key] is None else f"{figures[key]:{form}}" for key, form in COLUMNS.values()]
+    """The figures of ``summarise`` under ``COLUMNS``, ``n/a`` where there is none; with their own n where it is less."""
+    cells = []
+    for key, form in COLUMNS.values():
+        cell = "n/a" if figures[key] is None else f"{figures[key]:{form}}"
+        # raw MSE and band error are there where an SNR is
+        used = figures.get(f"{key.split('_')[0]}_n", figures["snr_n"])
+        fewer = key != "n" and used != figures["n"] and figures[key] is not None
+        cells.append(f"{cell} ({used} of {figures['n']})" if fewer else cell)
+    return cells

@@ -35,7 +35,8 @@ class Item:
 
     Attributes:
         clean, signal: (time,); ``signal`` is what the ear gets, ``clean`` the speech in it, before treatment.
-        about: severity, level (dB SPL before treatment), condition (clean or noisy), input, audiogram.
+        about: severity, level (dB SPL before treatment), condition (clean or noisy), noise_snr (dB; None where clean),
+            input, audiogram.
     """
 
     clean: Tensor
@@ -57,7 +58,8 @@ def draw_items(
     """Items of input ``as-is``. All is drawn from the seed.
 
     Half of the ears are those of the file, a quarter the milder standard ones (NH, N1, N2, S1), a quarter drawn; with
-    noise every second item is noisy.
+    noise every second item is noisy. With four ratios and five levels, each kind of ear meets each of them together
+    once in 160 items.
     """
     generator = torch.Generator().manual_seed(seed)
     clips = Clips(speech, sample_rate=RATE, seconds=seconds)
@@ -67,17 +69,18 @@ def draw_items(
     for i in range(items):
         clean = clips.draw(1, generator)
         condition = "noisy" if noises is not None and i % 2 else "clean"
+        kind, around = (i // 2) % 4, i // 8
+        # moved on, or ratios and levels of an even number would go round together
+        slip = 0 if len(levels) % 2 else around // len(levels)
+        level = levels[(kind + around) % len(levels)]
+        snr = SNRS_DB[(kind + around + slip) % len(SNRS_DB)]
         signal = clean
         if noises is not None and condition == "noisy":
-            ratio = torch.tensor([SNRS_DB[(i // 2) % len(SNRS_DB)]])
-            signal = mix(clean, noises.draw(1, generator), ratio)
-        # counters of different periods, so that every ear meets every level and condition
-        level = levels[(i // 2) % len(levels)]
-        turn = (i // 2) % 4
-        if turn < 2:
+            signal = mix(clean, noises.draw(1, generator), torch.tensor([snr]))
+        if kind < 2:
             ear = measured[int(torch.randint(len(measured), (), generator=generator))]
-        elif turn == 2:
-            ear = Audiogram.standard(MILDER[(i // 8) % len(MILDER)])
+        elif kind == 2:
+            ear = Audiogram.standard(MILDER[(around + around // 4 + slip) % len(MILDER)])
         else:
             ear = Audiogram(tuple(draw_thresholds(1, generator).squeeze(0).tolist()))
         gain = 10.0 ** ((level - float(level_spl(signal))) / 20.0)
@@ -85,6 +88,7 @@ def draw_items(
             "severity": ear.severity,
             "level": level,
             "condition": condition,
+            "noise_snr": snr if condition == "noisy" else None,
             "input": "as-is",
             "audiogram": list(ear.thresholds),
         }

@@ -53,6 +53,18 @@ def side_by_side(result: Mapping[str, Any], given: str) -> Table:
     return Table(_INPUT_TITLES[given], ["Simulator", *COLUMNS], rows)
 
 
+def failure_table(result: Mapping[str, Any]) -> Table | None:
+    """What simulators failed on, and scores that could not be made; None if there is nothing of it."""
+    rows = [
+        (name, str(row["item"]), _INPUT_TITLES[row["input"]], row["severity"], reason)
+        for name, entry in result["simulators"].items()
+        for row in entry["items"]
+        for reason in row.get("reasons", ())
+    ]
+    header = ("Simulator", "Item", "Input", "Degree of loss", "Reason")
+    return Table("Without a score, and in no figure that needs it", header, rows) if rows else None
+
+
 def fidelity_text(result: Mapping[str, Any]) -> str:
     """The comparison in Markdown: simulators side by side for each input, then each by itself."""
     parts = ["# Fidelity to MSBG", _what(result)]
@@ -64,6 +76,8 @@ def fidelity_text(result: Mapping[str, Any]) -> str:
             parts.append(
                 f"## {name}: {_INPUT_TITLES[given].lower()}\n\n{fidelity_markdown(summary).rstrip()}"
             )
+    if (failures := failure_table(result)) is not None:
+        parts.append(f"## Failures\n\n{failures.caption}.\n\n{markdown_table(failures)}")
     return "\n\n".join(parts) + "\n"
 
 
@@ -124,6 +138,8 @@ def _page(result: Mapping[str, Any], spectrograms: bytes, shown: Item) -> str:
             for key, title in GROUPS.items()
         ]
         sections.append(Section(f"{name}: {_INPUT_TITLES[given].lower()}", (), tables, _pictures(rows)))
+    if (failures := failure_table(result)) is not None:
+        sections.append(Section("Failures", tables=[failures]))
     return render_page("Fidelity to MSBG", sections, f"{', '.join(result['simulators'])}.")
 
 
@@ -146,7 +162,8 @@ def _scatter(rows: Sequence[Mapping[str, Any]], measure: str, title: str) -> Cal
             pairs = [
                 (row[f"{measure}_true"], row[f"{measure}_sim"])
                 for row in rows
-                if row["severity"] == severity and None not in (row[f"{measure}_true"], row[f"{measure}_sim"])
+                if row["severity"] == severity
+                and None not in map(row.get, (f"{measure}_true", f"{measure}_sim"))
             ]
             if pairs:
                 axes.scatter(*zip(*pairs, strict=True), s=12, alpha=0.7, color=f"C{number}", label=severity)
@@ -159,7 +176,7 @@ def _scatter(rows: Sequence[Mapping[str, Any]], measure: str, title: str) -> Cal
 
 def _boxes(rows: Sequence[Mapping[str, Any]], key: str, title: str) -> Callable[[Any], None]:
     def draw(axes: Any) -> None:
-        groups = {s: [row[key] for row in rows if row["severity"] == s] for s in SEVERITIES}
+        groups = {s: [row[key] for row in rows if row["severity"] == s and key in row] for s in SEVERITIES}
         there = {severity: values for severity, values in groups.items() if values}
         axes.boxplot([*there.values()], tick_labels=[*there])
         axes.set(ylabel=title)

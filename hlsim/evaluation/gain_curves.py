@@ -36,12 +36,19 @@ def insertion_gain(
         levels: of each utterance in dB SPL.
 
     Shape: (utterances, time) at 16 kHz -> (levels, 24).
+
+    Raises:
+        ValueError: the compensator gives samples that are NaN or infinite.
     """
     curves = []
     with torch.no_grad():
         for level in levels:
             given = set_level(speech, level)
             aided = torch.stack([compensator(utterance, ear) for utterance in given])
+            if not aided.isfinite().all():
+                raise ValueError(
+                    f"the output for speech at {level:g} dB SPL holds samples that are NaN or infinite"
+                )
             taken, made = (_powers(signal) for signal in (given, aided))
             curves.append((10.0 * (made / taken).log10()).tolist())
     return curves
@@ -56,21 +63,23 @@ def gain_curves(
 ) -> list[dict[str, Any]]:
     """The curves of every compensator for every ear, on six clips of 3 s drawn from a folder.
 
+    Raises:
+        ValueError: a compensator gives samples that are NaN or infinite.
+
     Returns: for each ``{"compensator", "ear", "levels", "frequencies", "gain_db": (levels, 24)}``.
     """
     clips = Clips(speech, sample_rate=RATE, seconds=_SECONDS)
     drawn = clips.draw(_UTTERANCES, torch.Generator().manual_seed(seed))
-    return [
-        {
-            "compensator": name,
-            "ear": ear_name,
-            "levels": [*levels],
-            "frequencies": _centres().tolist(),
-            "gain_db": insertion_gain(compensator, ear, drawn, levels),
-        }
-        for ear_name, ear in ears.items()
-        for name, compensator in compensators.items()
-    ]
+    curves = []
+    for ear_name, ear in ears.items():
+        for name, compensator in compensators.items():
+            try:
+                gains = insertion_gain(compensator, ear, drawn, levels)
+            except ValueError as error:
+                raise ValueError(f"{name}, ear {ear_name}: {error}") from error
+            about = {"compensator": name, "ear": ear_name, "levels": [*levels]}
+            curves.append({**about, "frequencies": _centres().tolist(), "gain_db": gains})
+    return curves
 
 
 def gain_table(curves: Sequence[Mapping[str, Any]]) -> Table:

@@ -143,8 +143,8 @@ def _audiogram(
     ear: str,
     default: Audiogram | None,
 ) -> Audiogram:
-    levels = {key: value for key, value in row.items() if key.startswith("hl_") and value}
-    if levels:
+    levels = {key: value for key, value in row.items() if key.startswith("hl_")}
+    if any(levels.values()):  # then all: a blank is no threshold, and not one like its neighbour's either
         return Audiogram.from_row(levels)
     if row.get("audiogram"):
         return Audiogram.standard(row["audiogram"])

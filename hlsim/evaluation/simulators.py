@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import inspect
+import pickle
+import uuid
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -22,7 +25,7 @@ from hlsim.msbg import MSBG
 
 STORE = "scores.jsonl"
 
-_REVISION = 1  # of what is measured: raise it where that changes a figure
+_REVISION = 2  # of what is measured: raise it where that changes a figure
 
 Report = Callable[[int, int], None]
 
@@ -62,7 +65,8 @@ def evaluate_simulators(
         compensator: called with a waveform and an ear.
         progress: called with what is done and all.
 
-    Returns: what ``fidelity.json`` holds.
+    Returns: what ``fidelity.json`` holds. An item that a simulator fails on, or that has no STOI or PESQ, is listed with
+        the ``reasons`` and counts in no figure that it has no value for.
 
     Raises:
         ValueError: data that cannot be used, or an unknown teacher or input.
@@ -92,28 +96,34 @@ def evaluate_simulators(
         }
         keys = {name: key_of({**about, "weights": weights[name]}) for name in simulators}
         missing = [name for name in simulators if store.get(keys[name]) is None]
+        failed: dict[str, str] = {}
         if missing:
             truth = _truth(item, teacher)
-            true = {
-                "stoi_true": stoi(item.clean, truth, RATE).value,
-                "pesq_true": pesq_wb(item.clean, truth, RATE).value,
-            }
+            true = _both(item.clean, truth, "true")
             for name in missing:
-                with torch.no_grad():
-                    heard = simulators[name](item.signal, item.ear).double()
-                store.append(keys[name], true | _scores(item.clean, truth, heard))
+                try:
+                    with torch.no_grad():
+                        heard = simulators[name](item.signal, item.ear).double()
+                    scores = _scores(item.clean, truth, heard)
+                except Exception as error:  # one simulator's, and tried again next time; the others go on
+                    failed[name] = f"{type(error).__name__}: {error}"
+                else:
+                    reasons = true["reasons"] + scores["reasons"]
+                    store.append(keys[name], true | scores | {"reasons": reasons})
         for name in simulators:
-            rows[name].append({**item.about, **(store.get(keys[name]) or {})})
+            scores = store.get(keys[name]) or {"reasons": [failed[name]]}
+            rows[name].append({"item": number // len(inputs), **item.about, **scores})
         if progress is not None:
             progress(number + 1, total)
     result = fidelity_result(
         rows, teacher=teacher, items=items, seconds=seconds, seed=seed, levels=[*levels], inputs=[*inputs]
     )
     shown = _shown(drawn)
-    with torch.no_grad():
-        panels = {"truth": _truth(shown, teacher)} | {
-            name: simulator(shown.signal, shown.ear) for name, simulator in simulators.items()
-        }
+    panels = {"truth": _truth(shown, teacher)}
+    for name, simulator in simulators.items():
+        with contextlib.suppress(Exception), torch.no_grad():  # its failure is in the tables
+            heard = simulator(shown.signal, shown.ear)
+            panels |= {name: heard} if heard.isfinite().all() else {}
     write_fidelity(result, panels, shown, out)
     return result
 
@@ -126,14 +136,20 @@ def _truth(item: Item, teacher: str) -> Tensor:
     return heard
 
 
-def _scores(clean: Tensor, truth: Tensor, heard: Tensor) -> dict[str, float | None]:
+def _scores(clean: Tensor, truth: Tensor, heard: Tensor) -> dict[str, Any]:
     return {
         "snr": snr_db(truth, heard),
         "raw_mse": raw_mse(truth, heard),
         "band_error": third_octave_error_db(truth, heard, RATE),
-        "stoi_sim": stoi(clean, heard, RATE).value,
-        "pesq_sim": pesq_wb(clean, heard, RATE).value,
+        **_both(clean, heard, "sim"),
     }
+
+
+def _both(clean: Tensor, heard: Tensor, whose: str) -> dict[str, Any]:
+    """STOI and PESQ of the truth or the simulator, and the reasons why there is none."""
+    scores = {f"stoi_{whose}": stoi(clean, heard, RATE), f"pesq_{whose}": pesq_wb(clean, heard, RATE)}
+    reasons = [f"no {name}: {score.reason}" for name, score in scores.items() if score.value is None]
+    return {name: score.value for name, score in scores.items()} | {"reasons": reasons}
 
 
 def _shown(items: Sequence[Item]) -> Item:
@@ -163,7 +179,7 @@ def weights_hash(module: nn.Module) -> str:
 
 
 def _setting(value: Any) -> Any:
-    """What tells one value from another, the same in every process; of other objects their class."""
+    """What tells one value from another, the same in every process where it can be had."""
     if isinstance(value, bool | int | float | complex | str | bytes | None):
         return value
     if isinstance(value, list | tuple):
@@ -180,7 +196,10 @@ def _setting(value: Any) -> Any:
         return _setting(value.detach().cpu().numpy())
     if isinstance(value, torch.dtype | torch.device):
         return str(value)
-    return type(value).__qualname__
+    try:
+        return hashlib.sha256(pickle.dumps(value)).hexdigest()
+    except Exception:  # a lambda, an open file: whatever it does may have changed, so it is scored anew
+        return uuid.uuid4().hex
 
 
 def _source(kind: type) -> str:

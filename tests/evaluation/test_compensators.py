@@ -167,6 +167,8 @@ def test_gain_curves(speech: list[tuple[Tensor, int]]) -> None:
     limited = MappingCompensator(MappingConfig(limit_spl=80.0)).eval()
     soft, _, loud = (np.mean(curve) for curve in insertion_gain(limited, ear, utterances, INPUT_LEVELS))
     assert loud < soft - 6.0
+    with pytest.raises(ValueError, match="at 50 dB SPL holds samples that are NaN"):
+        insertion_gain(Gain(math.nan), ear, utterances, INPUT_LEVELS)
 
 
 @pytest.mark.usefixtures("quick")

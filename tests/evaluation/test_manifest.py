@@ -120,6 +120,10 @@ HEADER = "listener,ear,condition,clean,processed,audiogram,spl,full_scale_spl,sn
             (HEADER, "L1,l,u,c.wav,u.wav,N3,,,", "L1,l,v,c.wav,v.wav,N4,,,"),
             "line 3: audiogram or level is not that of the other rows of L1 left c",
         ),
+        (
+            ("condition,clean,processed,hl_250,hl_1000,hl_8000", "u,c.wav,u.wav,20,30,"),
+            "line 2: .*hl_8000",
+        ),
         (("condition,clean", "u,c.wav"), "no column processed; needs condition, clean, processed"),
         ((HEADER,), "no rows; needs a header"),
     ],

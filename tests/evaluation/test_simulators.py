@@ -1,6 +1,8 @@
 """Items, truth and tables of the comparison of simulators."""
 
 import json
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -53,6 +55,20 @@ def test_items_are_the_same_for_a_seed_and_cover_what_they_say(speech_dir: Path,
         assert float(level_spl(item.signal)) == pytest.approx(item.about["level"], abs=0.01)
         assert torch.equal(item.clean, item.signal) == (item.about["condition"] == "clean")
         assert item.ear.severity == item.about["severity"]
+
+
+@pytest.mark.parametrize("count", [2, 4, 5])
+def test_every_kind_of_ear_meets_every_level_at_every_ratio(speech_dir: Path, ears: Path, count: int) -> None:
+    levels, each = [50.0, 55.0, 60.0, 70.0, 80.0][:count], 16 * count
+    drawn = draw_items(
+        speech_dir / "valid", speech_dir / "train", ears, items=2 * each, seconds=0.1, seed=0, levels=levels
+    )
+    noisy = [item.about for item in drawn if item.about["condition"] == "noisy"]
+    met = {(number % 4, about["level"], about["noise_snr"]) for number, about in enumerate(noisy)}
+    assert len(met) == each == len(noisy)
+    standard = {(tuple(about["audiogram"]), about["noise_snr"]) for about in noisy[2::4]}
+    assert len({ear for ear, _ in standard}) == 4 and len(standard) > 4
+    assert {item.about["noise_snr"] for item in drawn if item.about["condition"] == "clean"} == {None}
 
 
 def test_inputs_are_what_their_names_say(speech_dir: Path, ears: Path) -> None:
@@ -112,6 +128,44 @@ def test_files_and_an_identity_is_no_simulator(tmp_path: Path, speech_dir: Path,
     assert "data:image/png" in page and page.count("<svg") + page.count("svg+xml") == 8
 
 
+class FailsOnHardEars(torch.nn.Module):
+    def __init__(self, how: str) -> None:
+        super().__init__()
+        self.how = how
+
+    def forward(self, waveform: Tensor, audiogram: Audiogram) -> Tensor:
+        if audiogram.severity != "severe":
+            return waveform
+        if self.how == "raise":
+            raise RuntimeError("not that ear")
+        return waveform * (0.0 if self.how == "silent" else torch.nan)
+
+
+def test_what_a_simulator_fails_on_is_told(tmp_path: Path, speech_dir: Path, ears: Path) -> None:
+    failing = {how: FailsOnHardEars(how) for how in ("raise", "nan", "silent")}
+    result = evaluate_simulators(
+        {"identity": Unimpaired(), **failing},
+        speech=speech_dir / "valid",
+        audiograms=ears,
+        out=tmp_path,
+        teacher="msbg",
+        items=8,
+        seconds=1.5,
+    )
+    whole = {name: entry["inputs"]["as-is"]["overall"] for name, entry in result["simulators"].items()}
+    hard = sum(row["severity"] == "severe" for row in result["simulators"]["identity"]["items"])
+    assert 0 < hard < 8 and all(figures["n"] == 8 for figures in whole.values())
+    assert [whole[name]["snr_n"] for name in whole] == [8, 8 - hard, 8 - hard, 8]
+    assert [whole[name]["stoi_n"] for name in whole] == [8, 8 - hard, 8 - hard, 8 - hard]
+    text = (tmp_path / "fidelity.md").read_text()
+    failures = text[text.index("## Failures") :]
+    assert failures.count("RuntimeError: not that ear") == failures.count("NaN or infinite") == hard
+    assert failures.count("| silent |") == 2 * hard and "identity" not in failures
+    assert f"({8 - hard} of 8)" in text and "not that ear" in (tmp_path / "fidelity.html").read_text()
+    # what failed is not stored, but tried again
+    assert len((tmp_path / "scores.jsonl").read_text().splitlines()) == 4 * 8 - 2 * hard
+
+
 def test_a_stopped_comparison_goes_on_and_a_new_simulator_is_scored_alone(
     tmp_path: Path, speech_dir: Path, ears: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -151,6 +205,11 @@ def test_modules_that_differ_in_a_setting_differ_in_their_scores_name() -> None:
     assert weights_hash(MSBG(sample_rate=16000)) == weights_hash(modules[0])
 
 
+@dataclass
+class Options:
+    gain: float
+
+
 class Own(torch.nn.Module):
     """A module whose settings are no numbers."""
 
@@ -170,10 +229,17 @@ def test_settings_of_any_kind_tell_modules_apart(monkeypatch: pytest.MonkeyPatch
         np.zeros(2),
         torch.ones(3),
         torch.float32,
+        Options(0.0),
+        Options(20.0),
+        partial(max, 1.0),
+        partial(max, 2.0),
+        [torch.nn.Linear(1, 1)],
     )
     hashes = [weights_hash(Own(gains)) for gains in kinds]
     assert len(set(hashes)) == len(hashes)
     assert hashes == [weights_hash(Own(gains)) for gains in kinds]
+    # of what cannot be told, a function without a name, nothing that was scored counts
+    assert weights_hash(Own(lambda: 1.0)) != weights_hash(Own(lambda: 1.0))
     # what a class of one's own does counts too
     monkeypatch.setattr("inspect.getsource", lambda kind: "changed")
     assert weights_hash(Own([1.0])) != hashes[0]
