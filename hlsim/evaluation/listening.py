@@ -75,11 +75,15 @@ def listening_section(report: HaspiReport, count: int) -> Section | None:
         except ValueError as error:
             sections.append(Section(title, paragraphs=[f"Not to be heard here: {error}"]))
             continue
+        peak = max(float(signal.abs().max()) for signal in signals.values())
+        if peak == 0.0:  # speech that begins later is scored, but cut away here
+            reason = f"the first {LONGEST_SECONDS:g} s are silent"
+            sections.append(Section(title, paragraphs=[f"Not to be heard here: {reason}"]))
+            continue
         levels = {name: float(level_spl(signal)) for name, signal in signals.items()}
         # one gain for all: what is softer in the ear is softer here
-        gain = _PEAK / max(float(signal.abs().max()) for signal in signals.values())
         players = [
-            Player(encode_flac(signal * gain, rate), f"{name} ({levels[name]:.0f} dB SPL)")
+            Player(encode_flac(signal * (_PEAK / peak), rate), f"{name} ({levels[name]:.0f} dB SPL)")
             for name, signal in signals.items()
         ]
         picture = io.BytesIO()

@@ -94,3 +94,12 @@ def test_what_msbg_does_not_take_is_said(item: ItemScore) -> None:
     section = listening_section(HaspiReport([replace(item, audiogram=Audiogram.standard("N7"))]), 1)
     assert section is not None and not section.sections[0].players
     assert "Not to be heard here: " in section.sections[0].paragraphs[0]
+
+
+def test_silence_before_the_speech_is_said(item: ItemScore, clean: Tensor, tmp_path: Path) -> None:
+    late = torch.cat([torch.zeros(131200), clean])
+    for name in ("clean", "aided"):
+        write_audio(tmp_path / f"{name}.wav", late, 16000)
+    section = listening_section(HaspiReport([item]), 1)
+    assert section is not None and not section.sections[0].players
+    assert section.sections[0].paragraphs == ["Not to be heard here: the first 8 s are silent"]
