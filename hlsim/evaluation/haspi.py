@@ -10,7 +10,7 @@ clean speech in a normal one. What to know of pyclarity 0.9.0, measured on read 
 - White noise in place of the processed speech should score 0. It does, to 0.05, on utterances of 3 s and more, but gets
   up to 0.3 on 1.2 s, 0.45 on 0.7 s and 0.99 on 0.2 s. Shorter signals than 0.7 s are refused.
 - With the reference under the threshold of hearing it gives any signal the same score, up to 0.99: references under
-  20 dB SPL are refused.
+  20 dB SPL are refused; a DC offset, which nobody hears, does not count.
 - It rewards gain: 20 dB of it took one utterance from 0.53 to 0.99. Always give the level beside the score.
 """
 
@@ -196,7 +196,7 @@ def check_pair(
         raise ValueError(
             f"{names[0]} lasts {len(clean) / rate:.2g} s; HASPI needs {SHORTEST_SECONDS} s or more to mean anything"
         )
-    level = 10.0 * math.log10(max(float(np.mean(clean**2)), 1e-30)) + full_scale
+    level = 10.0 * math.log10(max(float(np.var(clean)), 1e-30)) + full_scale
     if level < LOWEST_REFERENCE_SPL:
         raise ValueError(
             f"{names[0]} is at {level:.1f} dB SPL with full_scale_spl {full_scale:g}; HASPI needs "

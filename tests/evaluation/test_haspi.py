@@ -132,6 +132,7 @@ SPEECH = torch.sin(torch.arange(16000) * 0.2) * 0.05
         ((SPEECH * 100).long(), SPEECH, {}, "int64"),
         (SPEECH[:11000], SPEECH[:11000], {}, "lasts 0.69 s; HASPI needs 0.7 s"),
         (SPEECH * 1e-3, SPEECH, {}, "reference is at 5.0 dB SPL with full_scale_spl 94"),
+        (SPEECH * 1e-3 + 0.1, SPEECH, {}, "reference is at 5.0 dB SPL"),
         (SPEECH, SPEECH, {"sample_rate": 8000}, "8000 Hz; allowed: 16000 to 48000"),
         (SPEECH, SPEECH, {"full_scale_spl": float("nan")}, "full_scale_spl is nan"),
         (SPEECH, SPEECH, {"seed": -1}, "seed is -1"),
