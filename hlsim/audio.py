@@ -200,7 +200,7 @@ def find_audio(folder: str | Path) -> list[Path]:
     """All wav, flac and ogg files under a folder, sorted by path.
 
     Raises:
-        ValueError: no such folder, or no audio in it.
+        ValueError: no such folder, no audio in it, or a file whose name is not UTF-8.
     """
     root = Path(folder)
     if not root.is_dir():
@@ -210,7 +210,18 @@ def find_audio(folder: str | Path) -> list[Path]:
     )
     if not files:
         raise ValueError(f"{folder}: no audio in it; looked for {', '.join(EXTENSIONS)}")
+    for path in files:
+        check_name(path)
     return files
+
+
+def check_name(path: str | Path) -> None:
+    """Raise ValueError where a path is not UTF-8: neither soundfile nor a report takes it."""
+    try:
+        str(path).encode()
+    except UnicodeEncodeError as error:
+        shown = os.fsencode(path).decode("utf-8", "backslashreplace")
+        raise ValueError(f"{shown}: its name is not UTF-8; rename it") from error
 
 
 def resample(waveform: Tensor, source_rate: int, target_rate: int) -> Tensor:

@@ -26,6 +26,7 @@ from hlsim.audio import (
     resample,
     write_audio,
 )
+from hlsim.data.corpora import walk_audio
 
 RATES = [(16000, 44100), (44100, 16000), (48000, 16000), (16000, 48000), (22050, 44100), (32000, 44100)]
 
@@ -203,6 +204,17 @@ def test_find_audio_looks_into_folders_and_sorts(tmp_path: Path) -> None:
         "b/1.ogg",
         "b/2.FLAC",
     ]
+
+
+def test_a_name_that_is_not_utf_8_is_named_before_the_work(tmp_path: Path) -> None:
+    try:
+        Path(os.fsdecode(os.fsencode(tmp_path) + b"/caf\xe9.wav")).touch()
+    except OSError:
+        pytest.skip("this disk takes no such names")
+    (tmp_path / "good.wav").touch()
+    for find in (find_audio, walk_audio):
+        with pytest.raises(ValueError, match=r"caf\\xe9\.wav: its name is not UTF-8; rename it"):
+            list(find(tmp_path))
 
 
 def test_find_audio_says_what_is_missing(tmp_path: Path) -> None:

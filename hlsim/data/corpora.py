@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from random import Random
 
-from hlsim.audio import EXTENSIONS
+from hlsim.audio import EXTENSIONS, check_name
 from hlsim.data.manifest import SPLITS, Utterance, inside
 
 LAYOUTS = ("voicebank-demand", "librispeech", "folder")
@@ -92,12 +92,17 @@ def assign_splits(
 
 
 def walk_audio(folder: Path) -> Iterator[str]:
-    """Paths of wav, flac and ogg files below a folder in POSIX form, folder by folder in order of names."""
+    """Paths of wav, flac and ogg files below a folder in POSIX form, folder by folder in order of names.
+
+    Raises:
+        ValueError: the name of one is not UTF-8.
+    """
     for place, folders, names in os.walk(folder):
         folders[:] = sorted(name for name in folders if not name.startswith("."))
         below = Path(place).relative_to(folder)
         for name in sorted(names):
             if Path(name).suffix.lower() in EXTENSIONS and not name.startswith("."):
+                check_name(os.path.join(place, name))
                 yield (below / name).as_posix()
 
 
