@@ -90,7 +90,8 @@ class HASPI(_Metric):
         Shape: (batch, time) or (time,), the same for both; ``lengths`` (batch,).
 
         Raises:
-            ValueError: shapes differ, or the audiograms are none, or not one or one an item.
+            ValueError: shapes differ, or the audiograms are none, or not one or one an item; the lengths are not one an
+                item, or beyond the signals.
         """
         if processed.shape != clean.shape or processed.ndim not in (1, 2):
             raise ValueError(
@@ -101,7 +102,7 @@ class HASPI(_Metric):
             torch.atleast_2d(signal.detach()).to("cpu", torch.float64) for signal in (processed, clean)
         )
         ears = _ears(audiogram, len(heard))
-        ends = [heard.shape[-1]] * len(heard) if lengths is None else [int(n) for n in lengths]
+        ends = _ends(lengths, *heard.shape)
         items, levels = [], []
         for i, (signal, target, ear, end) in enumerate(zip(heard, reference, ears, ends, strict=True)):
             number = int(self.seen) + i
@@ -129,6 +130,17 @@ class HASPI(_Metric):
     def level(self) -> Tensor:
         """Mean level in dB SPL of what was scored, of this process; NaN where nothing was."""
         return self.total_level / self.count
+
+
+def _ends(lengths: Tensor | None, batch: int, time: int) -> list[int]:
+    if lengths is None:
+        return [time] * batch
+    ends = [int(n) for n in lengths]
+    if len(ends) != batch:
+        raise ValueError(f"{len(ends)} lengths of {batch} items; allowed: one an item")
+    if wrong := [end for end in ends if not 0 <= end <= time]:
+        raise ValueError(f"a length is {wrong[0]}; allowed: 0 to {time} samples")
+    return ends
 
 
 def _ears(audiogram: AudiogramLike, batch: int) -> list[Audiogram]:

@@ -80,6 +80,13 @@ def test_bad_input(clean: Tensor) -> None:
     ):
         with pytest.raises(ValueError, match=message):
             metric.update(*call)
+    for lengths, message in (
+        ([12800], "1 lengths of 2 items; allowed: one an item"),
+        ([12800, -5], "a length is -5; allowed: 0 to 12800 samples"),
+        ([12801, 12800], "a length is 12801; allowed: 0 to 12800 samples"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            metric.update(clean, clean, N3, lengths=torch.tensor(lengths))
     for options, message in (
         ({"limit": 0}, "limit is 0"),
         ({"full_scale_spl": float("inf")}, "full_scale_spl is inf"),
