@@ -94,7 +94,8 @@ def demo(
     for name, signals in given.items():
         pairs = zip(utterances, signals, strict=True)
         items = [
-            HaspiItem(clean, aided, audiogram, NEURO_RATE, seed + i) for i, (clean, aided) in enumerate(pairs)
+            HaspiItem(clean, aided, audiogram, NEURO_RATE, (seed + i) % 2**32)
+            for i, (clean, aided) in enumerate(pairs)
         ]
         haspi[name] = haspi_many(items)
         report(f"  {name}: mean HASPI {_mean(haspi[name]):.3f}")
@@ -109,7 +110,7 @@ def demo(
             audiogram=audiogram,
             sample_rate=NEURO_RATE,
             seconds=len(utterances[i]) / NEURO_RATE,
-            seed=seed + i,
+            seed=(seed + i) % 2**32,
         )
         for i in range(len(scored))
     ]

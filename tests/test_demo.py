@@ -28,9 +28,12 @@ def short_speech(tmp_path: Path, speech_dir: Path) -> Path:
 def test_demo_writes_report_audio_and_pictures(tmp_path: Path, short_speech: Path) -> None:
     out = tmp_path / "out"
     lines: list[str] = []
-    text = demo(out, Audiogram.standard("N4"), speech=short_speech, minutes=0.1, report=lines.append)
+    ear, seed = Audiogram.standard("N4"), 2**32 - 2
+    text = demo(out, ear, speech=short_speech, minutes=0.1, seed=seed, report=lines.append)
     report = json.loads((out / "report.json").read_text())
     assert report["n"] == len(report["items"]) == 8
+    # after numpy's last seed comes its first
+    assert [item["seed"] for item in report["items"]] == [seed, seed + 1, 0, 1, 2, 3, 4, 5]
     for name in ("unaided", "nalr", "initial", "compensated"):
         assert 0.0 <= report[f"{name}_mean"] <= 1.0
         assert f"| {name} | {report[f'{name}_mean']:.3f} |" in text
