@@ -59,10 +59,16 @@ def draw_report(report: HaspiReport, path: str | Path) -> None:
                 label = "no loss" if severity == "none" else f"{severity} loss"
                 axes.scatter(before, after, s=18, alpha=0.7, color=f"C{number}", label=label)
         axes.set(xlim=limits, ylim=limits, aspect="equal", title=title)
-        axes.set(xlabel=f"{what}, {first}", ylabel=f"{what}, {last}")
+        axes.set(xlabel=plain(f"{what}, {first}"), ylabel=plain(f"{what}, {last}"))
         axes.legend(fontsize="small")
-    figure.suptitle(f"{c.n} items, {first} and {last}")
+    figure.suptitle(plain(f"{c.n} items, {first} and {last}"))
     figure.savefig(path, dpi=150, format="png")
+
+
+def plain(text: str) -> str:
+    """Text as it is, for labels: matplotlib reads ``$`` as mathematics and hides from a legend what begins with _."""
+    text = text.replace("$", r"\$")
+    return f"\u200b{text}" if text.startswith("_") else text
 
 
 def score_range(measure: str) -> tuple[float, float]:
@@ -103,7 +109,7 @@ def draw_spectrograms(
             extent=(0.0, len(signal) / sample_rate, 0.0, sample_rate / 2000.0),
         )
         # MSBG and HASPI end at 8 kHz
-        axes.set(title=name, ylabel="kHz", ylim=(0.0, min(10.0, sample_rate / 2000.0)))
+        axes.set(title=plain(name), ylabel="kHz", ylim=(0.0, min(10.0, sample_rate / 2000.0)))
     panels[-1].set(xlabel="s")
     figure.colorbar(image, ax=list(panels), label="dB SPL in a bin", aspect=40)
     figure.savefig(path, dpi=110, format="png")

@@ -10,7 +10,7 @@ import numpy as np
 
 from hlsim.audiogram import SEVERITIES
 from hlsim.evaluation.comparison import Comparison
-from hlsim.evaluation.figures import score_range
+from hlsim.evaluation.figures import plain, score_range
 from hlsim.evaluation.measures import MEASURES
 from hlsim.evaluation.page import Picture
 from hlsim.evaluation.significance import FEWEST, bootstrap_interval
@@ -81,7 +81,7 @@ def _scatter(report: HaspiReport, c: Comparison) -> Picture:
                     rasterized=len(x) > _MANY,
                 )
         axes.set(xlim=(low, high), ylim=(low, high), aspect="equal")
-        axes.set(xlabel=f"{title}, {c.before}", ylabel=f"{title}, {c.after}")
+        axes.set(xlabel=plain(f"{title}, {c.before}"), ylabel=plain(f"{title}, {c.after}"))
         axes.legend(fontsize="small")
 
     caption = "Each point is an item; above the dashed line the score rose."
@@ -148,7 +148,7 @@ def _by_severity(report: HaspiReport) -> Picture:
         for k, condition in enumerate(report.conditions):
             at = np.arange(len(groups)) + (k - (len(report.conditions) - 1) / 2) * width
             scores = [_scores(group, measure, condition) for group in groups]
-            axes.bar(at, [_mean(own) for own in scores], width * 0.9, label=condition)
+            axes.bar(at, [_mean(own) for own in scores], width * 0.9, label=plain(condition))
             for place, own in zip(at, scores, strict=True):
                 if len(own) >= FEWEST:
                     axes.plot((place, place), bootstrap_interval(own), color="black", linewidth=1.0)
@@ -180,7 +180,7 @@ def _by_snr(report: HaspiReport) -> Picture:
     def draw(axes: Any) -> None:
         for condition in report.conditions:
             means = [_mean(_scores(group, measure, condition)) for group in groups]
-            axes.plot(snrs, means, marker="o", label=condition)
+            axes.plot(snrs, means, marker="o", label=plain(condition))
         axes.set(xlabel="SNR (dB)", ylabel=f"mean {MEASURES[measure].title}", ylim=score_range(measure))
         axes.legend(fontsize="small")
 
@@ -231,4 +231,4 @@ def _loss(severity: str) -> str:
 
 
 def _labels(names: Sequence[str]) -> list[str]:
-    return [name if len(name) < 13 else name[:11] + "…" for name in names]
+    return [plain(name if len(name) < 13 else name[:11] + "…") for name in names]

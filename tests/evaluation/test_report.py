@@ -15,6 +15,7 @@ from scipy import stats
 
 from hlsim.audiogram import Audiogram
 from hlsim.evaluation import Failure, HaspiReport, ItemScore, bootstrap_interval, report_files, write_report
+from hlsim.evaluation.report_figures import report_pictures
 from hlsim.evaluation.report_files import REPORT_FILES
 
 for module in ("clarity", "joblib", "matplotlib"):
@@ -120,6 +121,25 @@ def test_picture_is_a_png(tmp_path: Path) -> None:
     width, height = struct.unpack(">II", data[16:24])
     assert data.startswith(b"\x89PNG\r\n\x1a\n") and data.endswith(b"IEND\xaeB`\x82")
     assert width > 800 and height > 400
+
+
+def test_names_of_conditions_are_no_markup(tmp_path: Path) -> None:
+    first, last = "_a", "c $5_$6"
+    items = [
+        replace(
+            item,
+            levels={first: 65.0, last: 75.0},
+            scores={"haspi": {first: item.before or 0.0, last: item.after or 0.0}},
+        )
+        for item in make_report(4).items
+    ]
+    report = HaspiReport(items)
+    # as matplotlib writes a label's text beside its outlines
+    pictures = [picture.data.decode() for picture in report_pictures(report)]
+    assert f"<!-- HASPI, {last} -->" in pictures[0]
+    for picture in pictures[2:4]:  # the ticks, and the legend by severity
+        assert f"<!-- \u200b{first} -->" in picture and f"<!-- {last} -->" in picture
+    write_report(report, tmp_path)
 
 
 def test_files_are_replaced_and_others_stay(tmp_path: Path) -> None:
