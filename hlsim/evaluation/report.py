@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from hlsim.audiogram import Audiogram
 from hlsim.evaluation.comparison import Comparison, compare_conditions
 from hlsim.evaluation.measures import version_of, versions_of
-from hlsim.evaluation.report_text import GAIN_SENTENCE, markdown
+from hlsim.evaluation.report_text import markdown, opening
 from hlsim.evaluation.significance import RESAMPLES, PairedComparison
 from hlsim.extras import require
 
@@ -265,7 +265,7 @@ class HaspiReport:
             "after_level_mean": self.after_level_mean,
             "seed": self.seed,
             "versions": self.versions,
-            "note": GAIN_SENTENCE,
+            "note": " ".join(opening(self)),
             "comparisons": [c.to_dict() for c in self.comparisons],
             "failures": [vars(failure).copy() for failure in self.failures],
             "items": [item.to_dict() for item in self.items],

@@ -9,11 +9,11 @@ from hlsim.evaluation.measures import MEASURES
 from hlsim.evaluation.page import Section, Table, render_page
 from hlsim.evaluation.report_figures import report_pictures
 from hlsim.evaluation.report_text import (
-    GAIN_SENTENCE,
     comparisons_table,
     failure_table,
     listener_table,
     notes,
+    opening,
     paper_table,
     severity_table,
     title,
@@ -38,7 +38,7 @@ def html(report: HaspiReport, listen: int = 3) -> str:
         further.append(comparisons_table(report))
     others = [c.in_short() for c in report.comparisons if c is not headline]
     sections = [
-        Section("Result", paragraphs=[headline.in_words(), GAIN_SENTENCE], tables=[paper_table(headline)]),
+        Section("Result", paragraphs=[headline.in_words(), *opening(report)], tables=[paper_table(headline)]),
         Section("Pictures", pictures=report_pictures(report)),
         Section("By degree of loss", tables=[severity_table(headline)]),
     ]

@@ -38,6 +38,11 @@ _LATEX = {
 }
 
 
+def opening(report: HaspiReport) -> list[str]:
+    """What is to be known before the figures: that HASPI rewards gain, where it is among the measures."""
+    return [GAIN_SENTENCE] if "haspi" in report.measures else []
+
+
 def title(report: HaspiReport) -> str:
     """The report's title: "HASPI before and after", or the measures and conditions."""
     if list(report.conditions) == ["before", "after"]:
@@ -177,7 +182,7 @@ def markdown(report: HaspiReport) -> str:
     headline = report.headline
     blocks = [
         f"# {title(report)}",
-        f"{report.comparison.n} items. {GAIN_SENTENCE}",
+        " ".join([f"{report.comparison.n} items.", *opening(report)]),
         markdown_table(paper_table(headline)),
         f"**What the figures show.** {headline.in_words()}",
         "![HASPI and level, before against after](before-after.png)".replace("HASPI", headline.title),

@@ -17,6 +17,7 @@ from hlsim.audiogram import Audiogram
 from hlsim.evaluation import Failure, HaspiReport, ItemScore, bootstrap_interval, report_files, write_report
 from hlsim.evaluation.report_figures import report_pictures
 from hlsim.evaluation.report_files import REPORT_FILES
+from hlsim.evaluation.report_html import html
 
 for module in ("clarity", "joblib", "matplotlib"):
     pytest.importorskip(module)
@@ -260,7 +261,7 @@ def test_texts_of_three_conditions(tmp_path: Path) -> None:
     report = three_conditions()
     write_report(report, tmp_path)
     text = (tmp_path / "report.md").read_text(encoding="utf-8")
-    assert text.startswith("# HASPI, STOI: unaided, NAL-R, new_one\n")
+    assert text.startswith("# HASPI, STOI: unaided, NAL-R, new_one\n\n9 items. HASPI rewards any gain")
     assert "| Metric | Unaided | New_one | Change (Δ) |" in text
     assert "| s4 | new_one | STOI | a\\|b & 100 % |" in text
     assert "| listener means | 3 |" in text and "| HASPI: NAL-R to new_one | 9 |" in text
@@ -279,6 +280,15 @@ def test_texts_of_three_conditions(tmp_path: Path) -> None:
         columns = row.split("}")[0].count("r") + 1
         lines = [line for line in row.splitlines() if line.endswith("\\\\")]
         assert lines and all(line.count("&") == columns - 1 for line in lines)
+
+
+def test_of_haspis_gain_only_where_it_is_a_measure() -> None:
+    items = [replace(item, scores={"stoi": dict(item.scores["stoi"])}) for item in three_conditions().items]
+    report = HaspiReport(items)
+    assert report.to_dict()["note"] == "" and "\n\n8 items.\n\n" in report.to_markdown()
+    assert "HASPI rewards" not in report.to_markdown() + html(report, 0)
+    both = three_conditions()
+    assert both.to_dict()["note"].startswith("HASPI rewards") and "HASPI rewards" in html(both, 0)
 
 
 @pytest.mark.skipif(shutil.which("pdflatex") is None, reason="no pdflatex here")
