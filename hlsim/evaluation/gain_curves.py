@@ -16,6 +16,7 @@ from hlsim.band_levels import band_edges, band_levels
 from hlsim.calibration import set_level
 from hlsim.data.clips import Clips
 from hlsim.evaluation.fidelity_items import RATE
+from hlsim.evaluation.figures import plain
 from hlsim.evaluation.page import Picture, Section, Table
 from hlsim.evaluation.report_figures import draw_svg
 
@@ -115,7 +116,7 @@ def _picture(ear: str, curves: Sequence[Mapping[str, Any]]) -> Picture:
         styles = ("-", "--", ":", "-.")
         for number, curve in enumerate(curves):
             for style, level, gains in zip(styles, curve["levels"], curve["gain_db"], strict=False):
-                label = f"{curve['compensator'][:18]}, {level:g}"
+                label = plain(f"{curve['compensator'][:18]}, {level:g}")
                 axes.plot(curve["frequencies"], gains, style, color=f"C{number}", label=label)
         axes.set(xscale="log", xlabel="frequency (kHz)", ylabel="insertion gain (dB)")
         axes.set_xticks(_TICKS, [f"{hz / 1000:g}" for hz in _TICKS])
