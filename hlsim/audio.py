@@ -11,6 +11,7 @@ from typing import Any
 import soundfile
 import torch
 from torch import Tensor, nn
+from torch.nn import functional
 
 from hlsim.calibration import is_finite
 from hlsim.extras import MissingExtraError
@@ -26,7 +27,12 @@ _SINC: dict[str, Any] = {
     "resampling_method": "sinc_interp_kaiser",
     "beta": 14.769656459379492,
 }
-_LARGEST_KERNEL = 1_000_000  # values that are kept: 441 / 160 has 70,560, but 44101 / 16000 has 700 million
+_LARGEST_KERNEL = (
+    1_000_000  # values of torchaudio's: 441 / 160 has 70,560, but 44101 / 16000 would have 700 million
+)
+_TOGETHER = (
+    64  # output samples that share a row of inputs where the rates have too little in common for torchaudio's
+)
 
 _STREAMED = 0x7FFF0000  # sizes from here on were written before the length was known: 0x7FFFF000, 0xFFFFFFFF
 
@@ -232,13 +238,15 @@ def resample(waveform: Tensor, source_rate: int, target_rate: int) -> Tensor:
     Shape: (..., time) -> (..., ceil(time * target_rate / source_rate)).
 
     Raises:
-        MissingExtraError: the rates differ and torchaudio cannot be loaded.
+        MissingExtraError: the rates differ and torchaudio, which all but odd ones need, cannot be loaded.
     """
     if source_rate == target_rate:
         return waveform
-    size = source_rate * target_rate // math.gcd(source_rate, target_rate) ** 2
+    common = math.gcd(source_rate, target_rate)
+    if source_rate * target_rate // common**2 > _LARGEST_KERNEL:
+        return _resample_odd(waveform, source_rate // common, target_rate // common)
     # a kernel made while a program is traced is of no use to others
-    if size > _LARGEST_KERNEL or torch.compiler.is_compiling():
+    if torch.compiler.is_compiling():
         slow: Tensor = _torchaudio().functional.resample(waveform, source_rate, target_rate, **_SINC)
         return slow
     resampled: Tensor = _resampler(source_rate, target_rate, waveform.dtype, waveform.device)(waveform)
@@ -251,6 +259,52 @@ def _resampler(source_rate: int, target_rate: int, dtype: torch.dtype, device: t
     with torch.inference_mode(False):
         made: nn.Module = _torchaudio().transforms.Resample(source_rate, target_rate, dtype=dtype, **_SINC)
         return made.to(device)
+
+
+def _resample_odd(waveform: Tensor, source: int, target: int) -> Tensor:
+    """As torchaudio, between rates without a common factor, whose kernel is nearly all zeros.
+
+    Output sample k lies at k * source / target; it and those after it take one row of inputs, each its own weights.
+    """
+    time = waveform.shape[-1]
+    length = -(-time * target // source)
+    make = _odd_kernel if torch.compiler.is_compiling() else _kept_odd_kernel
+    kernel = make(source, target, waveform.dtype, waveform.device)[: -(-min(length, target) // _TOGETHER)]
+    periods, (rows, _, span) = -(-length // target), kernel.shape
+    first = torch.arange(rows, device=waveform.device) * _TOGETHER * source // target
+    first = first + source * torch.arange(periods, device=waveform.device)[:, None]
+    width = _width(source, target)
+    padded = functional.pad(waveform, (width - 1, source + span))
+    inputs = padded[..., first[..., None] + torch.arange(span, device=waveform.device)]
+    outputs = torch.einsum("...prs,rks->...prk", inputs, kernel).flatten(-2)
+    return outputs[..., :target].flatten(-2)[..., :length]
+
+
+def _width(source: int, target: int) -> int:
+    """Inputs on either side of an output sample."""
+    return math.ceil(_SINC["lowpass_filter_width"] * source / (min(source, target) * _SINC["rolloff"]))
+
+
+def _odd_kernel(source: int, target: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Weights of one period. Shape: (rows, output samples of a row, inputs of a row)."""
+    zeros, beta = _SINC["lowpass_filter_width"], torch.tensor(_SINC["beta"], dtype=torch.float64)
+    width, scale = _width(source, target), min(1.0, target / source) * _SINC["rolloff"]
+    span = 2 * width + -(-(_TOGETHER - 1) * source // target)
+    output = torch.arange(-(-target // _TOGETHER) * _TOGETHER).reshape(-1, _TOGETHER) * source
+    place = (output - output[:, :1] // target * target).double() / target + (width - 1)
+    made = []
+    for part in place.split(32):  # in float64 the whole is large
+        t = ((torch.arange(span) - part[..., None]) * scale).clamp_(-zeros, zeros)
+        window = torch.i0(beta * (1.0 - (t / zeros).square()).sqrt()) / torch.i0(beta)
+        made.append((torch.sinc(t) * window * scale).to(dtype))
+    return torch.cat(made).to(device)
+
+
+@lru_cache(maxsize=4)
+def _kept_odd_kernel(source: int, target: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Some 40 MB in float32."""
+    with torch.inference_mode(False), torch._C._DisableFuncTorch():
+        return _odd_kernel(source, target, dtype, device)
 
 
 def _torchaudio() -> ModuleType:

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from hlsim.audio import (
     EXTENSIONS,
-    _resampler,
+    _kept_odd_kernel,
     check_rate,
     check_waveform,
     encode_flac,
@@ -367,10 +367,34 @@ def test_a_kernel_made_in_inference_mode_serves_gradients_too() -> None:
     assert wave.grad is not None and torch.equal(resampled.detach(), expected)
 
 
-def test_a_kernel_of_rates_that_share_little_is_not_kept() -> None:
-    kept = _resampler.cache_info().currsize
-    assert resample(torch.randn(1, 30), 47980, 16000).shape == (1, 11)
-    assert _resampler.cache_info().currsize == kept
+@pytest.mark.parametrize("time", [1, 700, 50001])
+@pytest.mark.parametrize(("source", "target"), [(44100, 16000), (16000, 44100)])
+def test_odd_rates_are_resampled_by_torchaudios_weights(
+    monkeypatch: pytest.MonkeyPatch, source: int, target: int, time: int
+) -> None:
+    wave = torch.randn(2, 1, time, dtype=torch.float64)
+    expected = resample(wave, source, target)
+    monkeypatch.setattr("hlsim.audio._LARGEST_KERNEL", 0)
+    for dtype, tolerance in ((torch.float64, 1e-7), (torch.float32, 2e-6)):
+        ours = resample(wave.to(dtype), source, target)
+        assert ours.dtype == dtype and ours.shape == expected.shape
+        assert float((ours - expected).abs().max() / expected.abs().max()) < tolerance
+
+
+def test_odd_rates_need_no_kernel_of_all_phases() -> None:
+    """Torchaudio's would hold gigabytes and take minutes."""
+    wave = torch.sin(2 * math.pi * 1000 * torch.arange(66149, dtype=torch.float64) / 44099)
+    ours = resample(wave.float(), 44099, 16000)
+    expected = torch.sin(2 * math.pi * 1000 * torch.arange(len(ours), dtype=torch.float64) / 16000)
+    assert float((ours - expected)[500:-500].abs().max()) < 1e-4
+    kept = _kept_odd_kernel(44099, 16000, torch.float32, wave.device)
+    assert kept.numel() < 10_000_000
+
+
+def test_resampling_odd_rates_is_differentiable() -> None:
+    wave = torch.randn(2, 20, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda w: resample(w, 16001, 16000), wave)
+    assert torch.autograd.gradgradcheck(lambda w: resample(w, 16001, 16000), wave)
 
 
 def test_encoded_flac_is_the_signal_to_16_bits(tmp_path: Path) -> None:
