@@ -256,7 +256,7 @@ def resample(waveform: Tensor, source_rate: int, target_rate: int) -> Tensor:
 @lru_cache(maxsize=32)
 def _resampler(source_rate: int, target_rate: int, dtype: torch.dtype, device: torch.device) -> nn.Module:
     """Its kernel takes up to forty times as long to compute as to apply to a second."""
-    with torch.inference_mode(False):
+    with torch.inference_mode(False), torch._C._DisableFuncTorch():  # what is kept outlives either
         made: nn.Module = _torchaudio().transforms.Resample(source_rate, target_rate, dtype=dtype, **_SINC)
         return made.to(device)
 

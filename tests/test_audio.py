@@ -17,6 +17,7 @@ from torch import Tensor
 from hlsim.audio import (
     EXTENSIONS,
     _kept_odd_kernel,
+    _resampler,
     check_rate,
     check_waveform,
     encode_flac,
@@ -365,6 +366,19 @@ def test_a_kernel_made_in_inference_mode_serves_gradients_too() -> None:
     resampled = resample(wave, 17000, 16000)
     resampled.sum().backward()
     assert wave.grad is not None and torch.equal(resampled.detach(), expected)
+
+
+@pytest.mark.parametrize("source", [17000, 16001])
+def test_a_kernel_made_in_a_transform_serves_others_too(source: int) -> None:
+    def energy(wave: Tensor) -> Tensor:
+        return resample(wave, source, 16000).square().sum()
+
+    _resampler.cache_clear()
+    _kept_odd_kernel.cache_clear()
+    wave = torch.randn(50)
+    torch.func.grad(lambda w: torch.func.grad(energy)(w).sum())(wave)
+    (expected,) = torch.autograd.grad(energy(wave.requires_grad_()), wave)
+    torch.testing.assert_close(torch.func.grad(energy)(wave.detach()), expected)
 
 
 @pytest.mark.parametrize("time", [1, 700, 50001])
