@@ -15,7 +15,8 @@ class STFT:
     Args:
         fft: points of the transform; fft // 2 + 1 frequencies.
         window: samples of the Hann window, at most ``fft``.
-        hop: samples from frame to frame, at most half of ``window``.
+        hop: samples from frame to frame, at most half of ``window``; a quarter where spectra are changed and then
+            synthesised, or the last samples may be divided by almost nothing.
 
     Raises:
         ValueError: lengths that do not fit together.

@@ -28,7 +28,7 @@ class NetworkConfig:
     """Sizes that simulators and compensators share.
 
     Attributes:
-        fft, window, hop: of the transform at 16 kHz, in samples.
+        fft, window, hop: of the transform at 16 kHz, in samples; ``hop`` is at most a quarter of ``window``.
         channels: feature maps of the network.
         dense_depth: dilated convolutions of the encoder and of each decoder, 0 for none.
         stride: (time, frequency) steps of the encoder; the decoders undo them.
@@ -74,6 +74,9 @@ class NetworkConfig:
                 "divide the channels"
             )
         _ = self.stft
+        # with longer hops the last samples may lie where the only window is almost zero, which the inverse divides by
+        if 4 * self.hop > self.window:
+            raise ValueError(f"hop {self.hop}, window {self.window}; allowed: 4 hop <= window")
         for name, allowed in CHOICES.items():
             if getattr(self, name, allowed[0]) not in allowed:
                 raise ValueError(f"{name} {getattr(self, name)!r}; allowed: {', '.join(allowed)}")

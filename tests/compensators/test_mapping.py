@@ -169,6 +169,11 @@ def test_config_survives_json_and_refuses_nonsense() -> None:
             MappingConfig.from_dict(nonsense)
 
 
+def test_hops_that_leave_the_last_samples_to_a_windows_end_are_refused() -> None:
+    with pytest.raises(ValueError, match="hop 200, window 400; allowed: 4 hop <= window"):
+        MappingConfig(fft=400, window=400, hop=200)
+
+
 @pytest.mark.parametrize("config", [5, 0, {}, "small", MappingConfig, NeuroConfig()])
 def test_what_is_no_configuration(config: Any) -> None:
     with pytest.raises(ValueError, match=r"config is .*; allowed: a MappingConfig"):

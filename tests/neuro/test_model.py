@@ -87,6 +87,7 @@ def test_configuration_survives_json(config: NeuroConfig) -> None:
         {"stride": 4},
         {"stride": [4, 3, 2]},
         {"hop": 60},
+        {"hop": 25},
         {"hop": 24.0},
         {"fft": "400"},
         {"window": 300},
