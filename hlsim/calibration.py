@@ -44,8 +44,8 @@ def level_spl(waveform: Tensor, full_scale_spl: float = PASCAL_SPL) -> Tensor:
 
     Shape: (..., time) -> (...). Silence gives -106 dB SPL at the default scale, never infinity.
     """
-    power = waveform.square().mean(-1).clamp_min(_LOWEST_POWER)
-    return 10.0 * torch.log10(power) + check_full_scale(full_scale_spl)
+    power = _whole(waveform).square().mean(-1).clamp_min(_LOWEST_POWER)
+    return (10.0 * torch.log10(power) + check_full_scale(full_scale_spl)).to(waveform.dtype)
 
 
 def set_level(waveform: Tensor, spl: float | Tensor, full_scale_spl: float = PASCAL_SPL) -> Tensor:
@@ -53,10 +53,16 @@ def set_level(waveform: Tensor, spl: float | Tensor, full_scale_spl: float = PAS
 
     Shape: (..., time) -> (..., time); ``spl`` is a number or (...). Silence stays silent.
     """
-    gain_db = torch.as_tensor(spl, device=waveform.device) - level_spl(waveform, full_scale_spl)
-    silent = waveform.square().mean(-1) <= _LOWEST_POWER
+    whole = _whole(waveform)
+    gain_db = torch.as_tensor(spl, device=waveform.device) - level_spl(whole, full_scale_spl)
+    silent = whole.square().mean(-1) <= _LOWEST_POWER
     gain = torch.where(silent, torch.ones_like(gain_db), 10.0 ** (gain_db / 20.0))
-    return waveform * gain.unsqueeze(-1).to(waveform.dtype)
+    return (whole * gain.unsqueeze(-1).to(whole.dtype)).to(waveform.dtype)
+
+
+def _whole(waveform: Tensor) -> Tensor:
+    """In float32 at least: float16 holds neither the power of soft speech nor that of silence."""
+    return waveform.float() if waveform.dtype in (torch.float16, torch.bfloat16) else waveform
 
 
 def dbfs(waveform: Tensor) -> Tensor:

@@ -69,6 +69,17 @@ def test_silence_has_a_finite_level_and_stays_silent() -> None:
     assert silence.grad is not None and bool(torch.isfinite(silence.grad).all())
 
 
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_half_precision_is_levelled_too(dtype: torch.dtype) -> None:
+    wave = 1e-5 * torch.randn(4000).to(dtype)  # its power is less than half precision holds
+    level = level_spl(wave)
+    assert level.dtype == dtype and float(level) == pytest.approx(-6.0, abs=0.5)
+    assert float(level_spl(torch.zeros(10, dtype=dtype))) == -106.0
+    louder = set_level(wave, 65.0)
+    assert louder.dtype == dtype and float(level_spl(louder.float())) == pytest.approx(65.0, abs=0.05)
+    assert not bool(set_level(torch.zeros(10, dtype=dtype), 65.0).any())
+
+
 def test_level_and_gain_are_differentiable() -> None:
     wave = torch.randn(2, 50, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(lambda w: level_spl(w, 100.0), wave)
