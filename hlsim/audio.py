@@ -36,6 +36,7 @@ _TOGETHER = (
 
 _STREAMED = 0x7FFF0000  # sizes from here on were written before the length was known: 0x7FFFF000, 0xFFFFFFFF
 
+_HIGHEST_STORED = {".wav": 2**31 - 1, ".flac": 655_350, ".ogg": 200_000}  # in Hz; libvorbis crashes beyond
 _SUBTYPES = {".wav": "FLOAT", ".flac": "PCM_24", ".ogg": "VORBIS"}
 
 
@@ -149,12 +150,23 @@ def check_extension(path: str | Path) -> str:
     return suffix
 
 
+def _check_stored_rate(sample_rate: int, suffix: str) -> int:
+    """Return the rate, or raise ValueError unless it is a whole number of Hz that such a file holds."""
+    highest = _HIGHEST_STORED[suffix]
+    inside = is_finite(sample_rate) and 1 <= sample_rate <= highest
+    if not inside or int(sample_rate) != sample_rate:
+        raise ValueError(
+            f"sample rate {sample_rate!r} Hz; allowed in {suffix}: whole numbers up to {highest}"
+        )
+    return int(sample_rate)
+
+
 def write_audio(path: str | Path, waveform: Tensor, sample_rate: int) -> None:
     """Write (channels, time) or (time,) samples as wav (32-bit float), flac (24-bit) or ogg, whole or not at all.
 
     Raises:
-        ValueError: unknown extension, another shape, a rate below 16 kHz, samples that are NaN or infinite, or, for flac
-            and ogg, beyond full scale (they would be clipped).
+        ValueError: unknown extension, another shape, a rate below 16 kHz or one that such a file cannot hold, samples
+            that are NaN or infinite, or, for flac and ogg, beyond full scale (they would be clipped).
     """
     target = Path(path)
     suffix = check_extension(path)
@@ -162,6 +174,7 @@ def write_audio(path: str | Path, waveform: Tensor, sample_rate: int) -> None:
         raise ValueError(f"{path}: shape {tuple(waveform.shape)}; allowed: (channels, time) or (time,)")
     try:
         check_rate(min(sample_rate, HIGHEST_RATE) if is_finite(sample_rate) else sample_rate)
+        rate = _check_stored_rate(sample_rate, suffix)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
     samples = waveform.detach().to("cpu", torch.float32)
@@ -176,7 +189,7 @@ def write_audio(path: str | Path, waveform: Tensor, sample_rate: int) -> None:
         soundfile.write(
             str(partial),
             samples.mT.numpy() if samples.ndim == 2 else samples.numpy(),
-            sample_rate,
+            rate,
             subtype=_SUBTYPES[suffix],
         )
         os.replace(partial, target)
@@ -192,13 +205,17 @@ def encode_flac(waveform: Tensor, sample_rate: int) -> bytes:
     Shape: (time,).
 
     Raises:
-        ValueError: another shape, or samples that are NaN, infinite or beyond 1.0.
+        ValueError: another shape, a rate that flac cannot hold, or samples that are NaN, infinite or beyond 1.0.
     """
+    rate = _check_stored_rate(sample_rate, ".flac")
     samples = check_waveform(waveform).detach().to("cpu", torch.float32)
     if samples.ndim != 1 or not bool((samples.abs() <= 1.0).all()):
         raise ValueError(f"shape {tuple(samples.shape)}; allowed: (time,), samples from -1.0 to 1.0")
     data = io.BytesIO()
-    soundfile.write(data, samples.numpy(), sample_rate, format="FLAC", subtype="PCM_16")
+    try:
+        soundfile.write(data, samples.numpy(), rate, format="FLAC", subtype="PCM_16")
+    except soundfile.LibsndfileError as error:  # above 65535 Hz it holds multiples of 10 only
+        raise ValueError(f"sample rate {rate} Hz: cannot be written as flac ({error})") from error
     return data.getvalue()
 
 

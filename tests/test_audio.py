@@ -132,6 +132,27 @@ def test_rates_that_could_not_be_read_again_are_not_written(tmp_path: Path, suff
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize(("suffix", "most"), [(".wav", 2**31 - 1), (".flac", 655350), (".ogg", 200000)])
+def test_rates_that_a_file_cannot_hold_are_not_written(tmp_path: Path, suffix: str, most: int) -> None:
+    wrong: list[Any] = [most + 1, 96000.5, 9_000_000_000]
+    for beyond in wrong:
+        with pytest.raises(ValueError, match=rf"sample rate {beyond} Hz; .* whole numbers up to {most}"):
+            write_audio(tmp_path / f"a{suffix}", torch.zeros(10), beyond)
+    assert not list(tmp_path.iterdir())
+
+
+def test_whole_rates_of_any_type_are_written(tmp_path: Path) -> None:
+    rates: list[Any] = [44100.0, np.int64(44100), np.float32(44100)]
+    for rate in rates:
+        write_audio(tmp_path / "a.wav", torch.ones(10), rate)
+        assert read_audio(tmp_path / "a.wav")[1] == 44100
+        assert encode_flac(torch.ones(10), rate) == encode_flac(torch.ones(10), 44100)
+    wrong: list[Any] = [96000.5, 9_000_000_000, 0, None, 65537]
+    for bad in wrong:
+        with pytest.raises(ValueError, match=f"sample rate {bad} Hz"):
+            encode_flac(torch.ones(10), bad)
+
+
 def bad_file(kind: str, path: Path) -> None:
     noise = np.random.default_rng(0).uniform(-0.5, 0.5, 100).astype(np.float32)
     match kind:
