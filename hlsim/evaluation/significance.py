@@ -38,7 +38,10 @@ class PairedComparison:
         delta: mean difference.
         t, p_t: paired t-test, n - 1 degrees of freedom, two-sided.
         w, p_w: Wilcoxon signed-rank test, two-sided; zero differences dropped before all else, as Wilcoxon proposed; w is
-            the smaller of the two rank sums. p as scipy's ``method="auto"`` takes it of the rest: exact up to 50.
+            the smaller of the two rank sums. Differences of one size but for rounding, to a power of ten that is 1e-7
+            of the largest score or less, share a rank. p as scipy's ``method="auto"`` takes it of the rest: exact up to
+            50, the normal approximation beyond; where sizes are shared exact up to 13, the approximation with its
+            correction for ties beyond (scipy before 1.15: up to 50 as if none were shared).
         cohens_d: mean difference over the standard deviation (n - 1) of the differences, which is t / sqrt(n).
         ci_low, ci_high: 95 % interval of the mean difference by ``bootstrap_interval``, seed 0.
     """
@@ -88,7 +91,10 @@ def paired_comparison(before: Iterable[float], after: Iterable[float]) -> Paired
         d = float(difference.mean()) / deviation
     if many and zeros < n:
         # scipy counts zeros where it chooses between exact and approximate, its versions differently
-        w, p_w = (float(value) for value in stats.wilcoxon(difference[difference != 0.0]))
+        changes = difference[difference != 0.0]
+        # by a power of ten: decimal scores lie on its steps, never between two, where rounding would part them again
+        places = -math.floor(math.log10(ROUNDING * _largest(first, second)))
+        w, p_w = (float(value) for value in stats.wilcoxon(np.round(changes, places)))
     low, high = bootstrap_interval(difference) if n >= FEWEST else (None, None)
     return PairedComparison(
         n=n,

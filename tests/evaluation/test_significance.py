@@ -145,6 +145,18 @@ def test_zero_differences_are_dropped_and_counted() -> None:
     assert (mostly.n, mostly.zeros, mostly.w, mostly.p_w) == (14, 9, 0.0, 0.0625)
 
 
+@pytest.mark.parametrize("scale", [1.0, 0.8, 0.64, 5.0, 1e-3, 1e4])
+def test_changes_of_one_size_share_a_rank(scale: float) -> None:
+    """Eight rises and two falls by 0.1: all have rank 5.5, so that W is 11."""
+    before = np.array([0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.2, 0.3])
+    after = np.array([0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.7, 0.1, 0.4])
+    assert len(set(np.abs(after - before))) > 1  # rounding parts them
+    c = paired_comparison(scale * before, scale * after)
+    assert c.w == 11.0
+    # 56 of 1024 ways have two falls or fewer; scipy before 1.15 takes its table for ranks without ties
+    assert c.p_w == pytest.approx(2 * 56 / 1024, abs=0.005)
+
+
 @pytest.mark.parametrize("shift", [0.1, 0.3])
 def test_equal_differences_leave_t_and_d_undefined(shift: float) -> None:
     """0.1 apart but for rounding: a spread of 1e-17 must not become a t of 1e16."""
