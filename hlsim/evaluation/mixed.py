@@ -61,15 +61,19 @@ def mixed_model(differences: Sequence[float], listeners: Sequence[str]) -> Mixed
     except ImportError:
         return "statsmodels is not installed"
     ones = np.ones((len(values), 1))
+    # statsmodels takes any variance below 0.01 for one at its boundary, whatever the unit
+    scale = float(values.std())
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         try:
-            fit = models.MixedLM(values, ones, groups=np.asarray(listeners)).fit(reml=True)
-            error, z, p = (float(x[0]) for x in (fit.bse_fe, fit.tvalues, fit.pvalues))
-            low, high = (float(x) for x in fit.conf_int()[0])
+            fit = models.MixedLM(values / scale, ones, groups=np.asarray(listeners)).fit(reml=True)
+            z, p = (float(x[0]) for x in (fit.tvalues, fit.pvalues))
+            delta, error, low, high = (
+                scale * float(x) for x in (fit.fe_params[0], fit.bse_fe[0], *fit.conf_int()[0])
+            )
         except (np.linalg.LinAlgError, ValueError) as failure:
             return f"the fit failed ({failure})"
-    figures = (float(fit.fe_params[0]), error, z, p, low, high)
+    figures = (delta, error, z, p, low, high)
     if not np.isfinite(figures).all():
         return "the fit has no standard error"
     complaints = [] if fit.converged else ["no convergence"]
@@ -78,7 +82,7 @@ def mixed_model(differences: Sequence[float], listeners: Sequence[str]) -> Mixed
         len(values),
         groups,
         *figures,
-        listener_variance=float(np.asarray(fit.cov_re)[0, 0]),
-        residual_variance=float(fit.scale),
+        listener_variance=scale**2 * float(np.asarray(fit.cov_re)[0, 0]),
+        residual_variance=scale**2 * float(fit.scale),
         note="; ".join(complaints),
     )

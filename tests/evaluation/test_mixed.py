@@ -45,6 +45,24 @@ def test_no_listener_effect_is_a_note_and_no_warning(recwarn: pytest.WarningsRec
     assert not [w for w in recwarn.list if "statsmodels" in str(w.filename)]
 
 
+@pytest.mark.parametrize("scale", [1.0, 0.1, 1e-4, 100.0])
+def test_the_note_does_not_depend_on_the_unit(scale: float) -> None:
+    """statsmodels takes any variance below 0.01 for one at its boundary: nearly all of scores from 0 to 1."""
+    pytest.importorskip("statsmodels")
+    table, names = balanced(12, 10, 0.15)
+    unscaled, found = (mixed_model((k * table).ravel().tolist(), names) for k in (1.0, scale))
+    assert isinstance(found, MixedModel) and isinstance(unscaled, MixedModel)
+    assert (found.note, found.z, found.p) == ("", pytest.approx(unscaled.z), pytest.approx(unscaled.p))
+    assert found.delta == pytest.approx(scale * table.mean())
+    assert (found.ci_high - found.ci_low) / 2 == pytest.approx(1.959964 * found.standard_error)
+    within = table.var(axis=-1, ddof=1).mean()
+    assert found.residual_variance == pytest.approx(scale**2 * within, rel=1e-3)
+    assert found.listener_variance == pytest.approx(scale**2 * unscaled.listener_variance, rel=1e-3)
+    alike = table - table.mean(-1, keepdims=True) + 0.1  # of which it holds
+    found = mixed_model((scale * alike).ravel().tolist(), names)
+    assert isinstance(found, str) or "boundary" in found.note
+
+
 def test_reasons(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "two listeners or more" in str(mixed_model([0.1, 0.2, 0.3], ["L1"] * 3))
     assert "more items than listeners" in str(mixed_model([0.1, 0.2], ["L1", "L2"]))
