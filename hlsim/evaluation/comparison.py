@@ -118,9 +118,11 @@ class Comparison:
         return f"It cannot be told from chance ({named}{few}), which does not show that there is no change."
 
     def _wilcoxon_can(self) -> bool:
-        """Whether its adjusted p would fall below ``ALPHA`` if all pairs changed the same way."""
+        """Whether its adjusted p is below ``ALPHA``, or would be if all pairs changed the same way."""
         c = self.overall
-        return c.p_w is None or self.comparisons * 2.0 ** (1 - (c.n - c.zeros)) < ALPHA
+        if c.p_w is None or (self.p_w_holm is not None and self.p_w_holm < ALPHA):
+            return True  # the number of comparisons is only the largest of Holm's factors
+        return self.comparisons * 2.0 ** (1 - (c.n - c.zeros)) < ALPHA
 
     def _level(self) -> str:
         measure, change = MEASURES[self.measure], self.overall.delta

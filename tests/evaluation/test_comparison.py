@@ -121,6 +121,18 @@ def test_words(items: list[ItemScore], says: list[str]) -> None:
     assert "no listener was asked" in text and "nan" not in text and "None" not in text
 
 
+def test_a_wilcoxon_below_the_limit_is_not_said_to_be_unable() -> None:
+    """Six rises beside twenty: Holm takes 2 / 64 once, not twice."""
+    items = [
+        item(i, {"a": 0.3, "b": 0.4 + i / 1e3, **({"c": 0.5 + i / 1e3} if i < 6 else {})}) for i in range(20)
+    ]
+    items = [replace(i, levels=dict.fromkeys("abc", 65.0)) for i in items]
+    _, found = compare_conditions(items, ["haspi"], ["a", "b", "c"], baseline="a")
+    assert (found.overall.n, found.comparisons, found.p_w_holm) == (6, 2, 0.03125)
+    assert "Chance alone hardly explains it" in found.in_short()
+    assert "Wilcoxon p = 0.03125" in found.in_short() and "cannot fall" not in found.in_short()
+
+
 def test_words_of_stoi_do_not_speak_of_gain() -> None:
     items = [replace(i, scores={"stoi": i.scores["haspi"]}) for i in draw(10, 0.1, louder=20.0)]
     (found,) = compare_conditions(items, ["stoi"], ["a", "b"])
