@@ -68,7 +68,8 @@ def _bytes(made: Any) -> int:
 
 
 def _made(kind: str, key: tuple[Any, ...], dtype: torch.dtype, device: torch.device) -> Any:
-    with torch.inference_mode(False):
+    # what outlives the call must be none of its transform's wrappers (torch.func)
+    with torch.inference_mode(False), torch._C._DisableFuncTorch():
         if kind == "plan":
             severity, points, step, highest = key
             return make_plan(severity, points, step, highest, dtype, device)

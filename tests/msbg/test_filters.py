@@ -2,10 +2,13 @@
 
 import pytest
 import torch
+from torch import Tensor
+from torch.func import grad
 
 from hlsim import MSBG, Audiogram
 from hlsim.msbg import filters
 from hlsim.msbg.filters import Filters, _Cache
+from hlsim.msbg.smearing import _window
 
 
 @pytest.fixture
@@ -39,3 +42,17 @@ def test_one_filter_that_is_too_long_is_held_all_the_same(small: _Cache) -> None
     assert own.get("plan", "severe", 24 * 4000, 1, 22050.0) is plan and small.held > small.limit
     own.get("forward", 4410, 2206, 1.0)
     assert small.held <= small.limit
+
+
+def test_what_a_transform_makes_serves_after_it(small: _Cache) -> None:
+    _window.cache_clear()
+    model = MSBG(Audiogram.standard("N3"), sample_rate=16000)
+    wave, gain = 0.03 * torch.randn(1, 1200), torch.tensor(1.0)
+
+    def energy(factor: Tensor) -> Tensor:
+        return model(wave * factor).square().sum()
+
+    second = grad(grad(energy))(gain)
+    assert torch.equal(grad(grad(energy))(gain), second)
+    leaf = gain.clone().requires_grad_()
+    torch.testing.assert_close(grad(energy)(gain), torch.autograd.grad(energy(leaf), leaf)[0])
