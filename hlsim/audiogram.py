@@ -30,6 +30,8 @@ SEVERITIES = ("none", "mild", "moderate", "severe")
 SEVERITY_LIMITS = (15.0, 35.0, 56.0)
 """Mean thresholds in dB HL above which the loss is mild, moderate, severe (pyclarity 0.9.0, ``Audiogram.severity``)."""
 
+_FINE = 1e4  # parts of a dB that levels count in for the severity: single precision's 19.7 is to be 19.7 on a limit, too
+
 # Bisgaard, Vlaming, Dahlquist 2010, Trends in Amplification 14(2), doi 10.1177/1084713810379609, Tables 1 and 2, at the
 # frequencies above; they end at 6 kHz, so that 8 kHz is our flat extension.
 STANDARD = {
@@ -161,13 +163,13 @@ class Audiogram:
 
 def severity_of(levels: Sequence[float]) -> str:
     """``Audiogram.severity`` of eight levels in dB HL."""
-    high = levels[FREQUENCIES.index(2000.0) :]
+    high = [round(level * _FINE) / _FINE for level in levels[FREQUENCIES.index(2000.0) :]]
     return SEVERITIES[bisect_left(SEVERITY_LIMITS, sum(high) / len(high))]
 
 
 def severity_index(thresholds: Tensor) -> Tensor:
     """Index into ``SEVERITIES`` of each ear. Shape: (..., 8) dB HL -> (...), int64."""
-    high = thresholds[..., FREQUENCIES.index(2000.0) :].double().unbind(-1)
+    high = ((thresholds[..., FREQUENCIES.index(2000.0) :].double() * _FINE).round() / _FINE).unbind(-1)
     mean = sum(high[1:], start=high[0]) / len(high)  # in the order of ``severity_of``, for the same last bit
     return torch.bucketize(mean, torch.tensor(SEVERITY_LIMITS, dtype=torch.float64, device=mean.device))
 

@@ -148,6 +148,26 @@ def test_severity_is_the_same_to_the_last_bit_of_the_mean() -> None:
     assert [severity_of(ear) for ear in ears] == [Audiogram(tuple(ear)).severity for ear in ears]
 
 
+def test_severity_on_a_limit_is_pyclaritys_in_single_precision_too() -> None:
+    clarity = pytest.importorskip("clarity.utils.audiogram")
+    rng = np.random.default_rng(2)
+    ears = [[10.0, 10.0, 10.0, 19.7, 14.8, 18.7, 12.6, 9.2]]  # 15, which in single precision is a bit more
+    for limit in (15.0, 35.0, 56.0):
+        tenths = rng.integers(round(10.0 * limit) - 80, round(10.0 * limit) + 81, (500, 8))
+        tenths[:, 7] = round(50.0 * limit) - tenths[:, 3:7].sum(-1) + rng.integers(-1, 2, 500)
+        ears += (tenths.clip(-100, 1000) / 10.0).tolist()
+    expected = [CLARITY_SEVERITIES[clarity.Audiogram(levels=np.array(ear)).severity] for ear in ears]
+    assert set(expected) == set(SEVERITIES)
+    assert [Audiogram(tuple(ear)).severity for ear in ears] == expected
+    single = as_thresholds([Audiogram(tuple(ear)) for ear in ears])
+    assert single.dtype == torch.float32
+    assert [severity_of(ear) for ear in single.tolist()] == expected
+    assert [SEVERITIES[i] for i in severity_index(single).tolist()] == expected
+    assert [
+        SEVERITIES[i] for i in severity_index(torch.tensor(ears, dtype=torch.float64)).tolist()
+    ] == expected
+
+
 def test_severity_of_many_ears_keeps_leading_dimensions() -> None:
     levels = torch.tensor([0.0, 15.0, 35.0, 56.0, 57.0, 20.0]).reshape(2, 3, 1).expand(2, 3, 8)
     assert severity_index(levels).tolist() == [[0, 0, 1], [2, 3, 1]]
