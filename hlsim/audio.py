@@ -27,12 +27,9 @@ _SINC: dict[str, Any] = {
     "resampling_method": "sinc_interp_kaiser",
     "beta": 14.769656459379492,
 }
-_LARGEST_KERNEL = (
-    1_000_000  # values of torchaudio's: 441 / 160 has 70,560, but 44101 / 16000 would have 700 million
-)
-_TOGETHER = (
-    64  # output samples that share a row of inputs where the rates have too little in common for torchaudio's
-)
+# values of torchaudio's kernel: 441 / 160 has 70,560, but 44101 / 16000 would have 700 million
+_LARGEST_KERNEL = 1_000_000
+_TOGETHER = 64  # output samples that share a row of inputs between rates with larger ones
 
 _STREAMED = 0x7FFF0000  # sizes from here on were written before the length was known: 0x7FFFF000, 0xFFFFFFFF
 
