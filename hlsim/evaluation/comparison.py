@@ -42,6 +42,7 @@ class Comparison:
         p_t_holm, p_w_holm: p values adjusted by Holm over the comparisons of this measure.
         comparisons: how many those are.
         unit: what ``listeners`` are called.
+        left_out: how many items lack a score under one of the conditions or both.
     """
 
     measure: str
@@ -57,6 +58,7 @@ class Comparison:
     p_w_holm: float | None
     comparisons: int = 1
     unit: str = "listeners"
+    left_out: int = 0
 
     @property
     def title(self) -> str:
@@ -74,6 +76,7 @@ class Comparison:
             "p_t_holm": self.p_t_holm,
             "p_w_holm": self.p_w_holm,
             "comparisons": self.comparisons,
+            "left_out": self.left_out,
             "level_before_mean": self.level_before_mean,
             "level_after_mean": self.level_after_mean,
             "by_severity": {name: own.to_dict() for name, own in self.by_severity.items()},
@@ -98,7 +101,10 @@ class Comparison:
         facts = "one item" if c.n == 1 else f"{c.n} items"
         if c.ci_low is not None:
             facts += f", 95 % bootstrap interval of the change {c.ci_low:+.3f} to {c.ci_high:+.3f}"
-        return f"From {self.before} to {self.after}, {self.title} {verb} on average ({facts})."
+        text = f"From {self.before} to {self.after}, {self.title} {verb} on average ({facts})."
+        if self.left_out:
+            text += f" Items that lack {self.title} under {self.before} or {self.after} do not count: {self.left_out}."
+        return text
 
     def _chance(self) -> str:
         defined = [
@@ -226,6 +232,7 @@ def _compare(items: Sequence[ItemScore], measure: str, before: str, after: str) 
         mixed=mixed,
         p_t_holm=None,
         p_w_holm=None,
+        left_out=len(items) - len(both),
     )
 
 

@@ -133,6 +133,15 @@ def test_a_wilcoxon_below_the_limit_is_not_said_to_be_unable() -> None:
     assert "Wilcoxon p = 0.03125" in found.in_short() and "cannot fall" not in found.in_short()
 
 
+def test_items_without_a_row_under_one_condition_are_counted_in_words() -> None:
+    items = draw(5, 0.1)
+    assert only(items).left_out == 0 and "lack" not in only(items).in_words()
+    lacking = [replace(i, scores={"haspi": {"a": 0.5}}, levels={"a": 65.0, "b": None}) for i in items[3:]]
+    found = only([*items[:3], *lacking])
+    assert (found.overall.n, found.left_out, found.to_dict()["left_out"]) == (3, 2, 2)
+    assert "(3 items). Items that lack HASPI under a or b do not count: 2." in found.in_short()
+
+
 def test_words_of_stoi_do_not_speak_of_gain() -> None:
     items = [replace(i, scores={"stoi": i.scores["haspi"]}) for i in draw(10, 0.1, louder=20.0)]
     (found,) = compare_conditions(items, ["stoi"], ["a", "b"])
