@@ -67,11 +67,13 @@ class Judged(NamedTuple):
 
 
 def read_ears(audiograms: str | Path | None) -> list[tuple[str, Audiogram]]:
-    """The standard ears and those of a CSV file, with names; the latter by listener and ear, or by row."""
+    """The standard ears and those of a CSV file; the latter named by listener and ear, or row, and no two alike."""
     ears = [(name, Audiogram.standard(name)) for name in STANDARD_EARS]
     rows = read_audiograms(audiograms, simulated=True) if audiograms is not None else []
     for number, (row, ear) in enumerate(rows, start=1):
         named = " ".join(filter(None, (row.get("listener"), row.get("ear"))))
+        if named in (name for name, _ in ears):
+            named += f", row {number}"  # items of one name would count as one ear's
         ears.append((named or f"row {number}", ear))
     return ears
 

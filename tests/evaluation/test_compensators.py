@@ -86,6 +86,16 @@ def test_ears_are_the_standard_ones_and_those_of_the_file(ears_csv: Path) -> Non
     assert ears[0][1] == Audiogram.standard("N2") and ears[-1][1] == Audiogram.standard("N3")
 
 
+def test_ears_of_one_name_are_told_apart(tmp_path: Path) -> None:
+    path = tmp_path / "ears.csv"
+    names = ("A", "B", "A", "N3", "", "A")
+    rows = [{"listener": name, **Audiogram((10.0 * i,) * 8).to_row()} for i, name in enumerate(names)]
+    path.write_text("\n".join([",".join(rows[0]), *(",".join(row.values()) for row in rows)]))
+    own = read_ears(path)[8:]
+    assert [name for name, _ in own] == ["A", "B", "A, row 3", "N3, row 4", "row 5", "A, row 6"]
+    assert [ear for _, ear in own] == [Audiogram((10.0 * i,) * 8) for i in range(6)]
+
+
 @pytest.mark.parametrize("count", [8, 9, 10, 11])
 def test_every_ear_meets_every_level_and_ratio(speech_dir: Path, count: int) -> None:
     ears = [(f"{i}", Audiogram((float(i),) * 8)) for i in range(count)]
