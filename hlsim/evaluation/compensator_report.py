@@ -50,8 +50,10 @@ def write_compensators(
 
 def _lead(result: Mapping[str, Any]) -> str:
     levels = ", ".join(f"{level:g}" for level in result["levels"])
+    # few items do not come to every ear
+    ears = len({own["name"] for own in (*result["rows"], *result["failures"])})
     return (
-        f"{result['items']} items of {result['seconds']:g} s, {len(result['ears'])} ears in turn, speech at {levels} "
+        f"{result['items']} items of {result['seconds']:g} s, {ears} ears in turn, speech at {levels} "
         f"dB SPL in turn, seed {result['seed']}: {', '.join(result['limits'])}. HASPI v2 and HASQI v2 are pyclarity's, "
         "against the clean speech, in noise too."
     )

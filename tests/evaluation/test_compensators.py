@@ -239,6 +239,8 @@ def test_report(tmp_path: Path, speech_dir: Path, ears_csv: Path) -> None:
     assert {path.name for path in out.iterdir()} == {"scores.jsonl", *FILES}
     assert json.loads((out / "compensators.json").read_text()) == json.loads(json.dumps(result))
     text = (out / "compensators.md").read_text()
+    # clean and noisy for each ear; those of which all failed were met too, three of the ten were not
+    assert "14 items of 0.3 s, 7 ears in turn" in text
     assert f"| loud | 100 | {max(peaks):.2f} | {result['peaks']['loud']['over']} of 10 |" in text
     assert "| severe, HASQI: NAL-R to loud |" in text and "| HASPI: unaided to broken |" in text
     assert "RuntimeError: no such ear" in text and "| N2, loud, 50 dB SPL | +40.0 |" in text
