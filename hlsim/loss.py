@@ -3,9 +3,7 @@
 import math
 import os
 from collections.abc import Callable, Mapping
-from functools import wraps
 from pathlib import Path
-from typing import ParamSpec, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -15,6 +13,7 @@ from hlsim.audio import check_rate, check_waveform, resample
 from hlsim.audiogram import FREQUENCIES, AudiogramLike, as_thresholds
 from hlsim.band_levels import HIGHEST, band_level_loss
 from hlsim.calibration import PASCAL_SPL, check_full_scale, gain_to_pascals, is_finite
+from hlsim.compiling import not_compiled
 from hlsim.msbg import MSBG
 from hlsim.neuro import NeuroMSBG
 from hlsim.neuro.config import NEURO_RATE
@@ -24,22 +23,6 @@ CRITERIA: dict[str, Mapping[str, float]] = {"paper": criteria.DEFAULT_WEIGHTS, "
 """Criteria by name: their parts and the default weight of each."""
 
 REFERENCES = ("clean", "normal-hearing")
-
-P = ParamSpec("P")
-Result = TypeVar("Result")
-
-
-def _not_compiled(method: Callable[P, Result]) -> Callable[P, Result]:
-    """``torch.compiler.disable``, but asked for at the first call: it takes longer to import than all of hlsim."""
-    known: list[Callable[P, Result]] = []
-
-    @wraps(method)
-    def call(*args: P.args, **kwargs: P.kwargs) -> Result:
-        if not known:
-            known.append(torch.compiler.disable(method))
-        return known[0](*args, **kwargs)
-
-    return call
 
 
 class HearingLossLoss(nn.Module):
@@ -99,7 +82,7 @@ class HearingLossLoss(nn.Module):
         """The simulator, frozen."""
         return self._unregistered[0]
 
-    @_not_compiled  # a compiled caller calls it as it is
+    @not_compiled  # a compiled caller calls it as it is
     def forward(self, compensated: Tensor, clean: Tensor, audiogram: AudiogramLike | None = None) -> Tensor:
         """The loss: mean over the items.
 
@@ -111,7 +94,7 @@ class HearingLossLoss(nn.Module):
         """
         return criteria.weighted_sum(self.parts(compensated, clean, audiogram), self.weights)
 
-    @_not_compiled
+    @not_compiled
     def parts(
         self, compensated: Tensor, clean: Tensor, audiogram: AudiogramLike | None = None
     ) -> dict[str, Tensor]:

@@ -562,8 +562,11 @@ def test_a_stored_ear_is_its_own(clean: Tensor) -> None:
     assert torch.equal(loss(2.0 * clean, clean), before)
 
 
-def test_import_leaves_the_compiler_alone() -> None:
-    code = "import sys, hlsim, hlsim.evaluation; sys.exit('torch._dynamo' in sys.modules)"
+def test_import_and_simulator_leave_the_compiler_alone() -> None:
+    code = (
+        "import sys, torch, hlsim, hlsim.evaluation; hlsim.MSBG(torch.zeros(8))(torch.zeros(99)); "
+        "sys.exit('torch._dynamo' in sys.modules)"
+    )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 

@@ -11,6 +11,7 @@ from torch.utils.checkpoint import checkpoint
 from hlsim.audio import check_rate, check_waveform
 from hlsim.audiogram import AudiogramLike, as_thresholds, own_thresholds, severity_of
 from hlsim.calibration import PASCAL_SPL, check_full_scale, gain_to_pascals
+from hlsim.compiling import not_compiled
 from hlsim.msbg.cochlea import bank_points, hear, hear_ending
 from hlsim.msbg.ear import RATE
 from hlsim.msbg.filterbank import BANKS
@@ -79,6 +80,7 @@ class MSBG(nn.Module):
         self.rescale_active = rescale_active
         self.register_buffer("thresholds", own_thresholds(audiogram), persistent=False)
 
+    @not_compiled  # it depends on the ear's values, and its filters are made by numpy
     def forward(self, waveform: Tensor, audiogram: AudiogramLike | None = None) -> Tensor:
         """What the ear hears.
 

@@ -16,7 +16,7 @@ from torch import Tensor
 from hlsim.audio import find_audio, read_audio
 from hlsim.audiogram import STANDARD, Audiogram, draw_thresholds
 from hlsim.calibration import gain_to_pascals, level_spl, set_level
-from hlsim.msbg import MSBG
+from hlsim.msbg import MSBG, filters
 from hlsim.msbg.model import STRUCTURAL_DELAY, active_rescaling
 from hlsim.msbg.smearing import smeared_length
 from hlsim.msbg.stages import _between, block_bounds
@@ -335,6 +335,13 @@ def test_autocast_is_left(speech: list[tuple[Tensor, int]]) -> None:
     assert torch.equal(heard, model(wave))
     assert half.dtype == torch.bfloat16
     torch.testing.assert_close(half, model(wave.bfloat16().float()).bfloat16())
+
+
+def test_compiled_it_is_called_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(filters, "_KNOWN", filters._Cache(2**28))  # empty: what makes filters is called, too
+    model, wave = MSBG(Audiogram.standard("N3"), sample_rate=16000), 0.03 * torch.randn(1, 1200)
+    heard = torch.compile(model, backend="eager")(wave)
+    assert torch.equal(heard, model(wave))
 
 
 def test_nothing_is_trained_or_stored_and_copies_are_alike(speech: list[tuple[Tensor, int]]) -> None:
