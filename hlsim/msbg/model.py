@@ -143,11 +143,13 @@ class MSBG(nn.Module):
         if len(bounds) == 1:
             return self._simulate_alike(signals, ears, severity, none, True)
         heard = []
+        # torch.func's transforms refuse the hooks by which a block is computed again
+        again = torch.is_grad_enabled() and torch._C._functorch.peek_interpreter_stack() is None
         for begin, start, stop, end in bounds:
             last = end == samples
             call = partial(self._simulate_alike, severity=severity, none=none, last=last)
             block = faded(signals[:, begin:end], self.sample_rate, begin > 0, not last)
-            if torch.is_grad_enabled() and (block.requires_grad or ears.requires_grad):
+            if again and (block.requires_grad or ears.requires_grad):
                 output = checkpoint(call, block, ears, use_reentrant=False)
             else:
                 output = call(block, ears)

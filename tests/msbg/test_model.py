@@ -452,6 +452,16 @@ def test_gradients_through_blocks_are_those_of_the_whole(monkeypatch: pytest.Mon
     assert relative(gradients[0], gradients[1]) < 1e-4
 
 
+def test_gradients_through_blocks_are_the_same_by_a_transform(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("hlsim.msbg.stages._BLOCK_SECONDS", 1.0)
+    model, wave = MSBG(Audiogram.standard("N3"), sample_rate=16000), 0.03 * torch.randn(20000)
+    assert len(block_bounds(20000, 16000)) > 1
+    leaf = wave.clone().requires_grad_()
+    model(leaf).square().sum().backward()
+    slope = torch.func.grad(lambda signal: model(signal).square().sum())(wave)
+    torch.testing.assert_close(slope, leaf.grad)
+
+
 @pytest.mark.parametrize("rate", [16000, 17000, 18000, 20000])
 # as slight as each bank is used for, where its skirts count most
 @pytest.mark.parametrize(("level", "error"), [(16.0, 1e-3), (36.0, 2.5e-3), (57.0, 6e-3)])
