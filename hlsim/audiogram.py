@@ -125,7 +125,7 @@ class Audiogram:
 
     def to_row(self) -> dict[str, str]:
         """Columns ``hl_250`` and so on for a CSV file."""
-        return {f"hl_{f:g}": f"{v:g}" for f, v in zip(self.frequencies, self.levels, strict=True)}
+        return {f"hl_{_exact(f)}": _exact(v) for f, v in zip(self.frequencies, self.levels, strict=True)}
 
     @classmethod
     def from_row(cls, row: Mapping[str, str]) -> Audiogram:
@@ -294,6 +294,12 @@ def _numbers(values: Iterable[float], what: str) -> tuple[float, ...]:
     if not all(math.isfinite(number) for number in numbers):
         raise ValueError(f"audiogram {what} {_listed(numbers)}; allowed: finite numbers")
     return numbers
+
+
+def _exact(value: float) -> str:
+    """The shortest text that is read as the same number."""
+    short = f"{value:g}"
+    return short if float(short) == value else repr(value)
 
 
 def _listed(values: Iterable[float]) -> str:

@@ -195,6 +195,14 @@ def test_row_round_trip(frequencies: tuple[float, ...]) -> None:
     assert Audiogram.from_row({"file": "a.wav"} | row | {"hl_best": "left"}) == ear
 
 
+def test_row_keeps_all_digits_and_adds_none() -> None:
+    ear = Audiogram((35.1234567, -0.1 - 0.2, 61.25, 100.0), (250.0, 707.1067811865476, 1000.0, 11313.7085))
+    row = ear.to_row()
+    assert Audiogram.from_row(row) == ear
+    assert list(row) == ["hl_250", "hl_707.1067811865476", "hl_1000", "hl_11313.7085"]
+    assert list(row.values()) == ["35.1234567", "-0.30000000000000004", "61.25", "100"]
+
+
 def test_a_row_without_levels_or_with_a_bad_one() -> None:
     with pytest.raises(ValueError, match=r"needs columns hl_250, hl_500, \.\.\., got \['file'\]"):
         Audiogram.from_row({"file": "a.wav"})
