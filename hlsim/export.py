@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from hlsim.audiogram import FREQUENCIES
-from hlsim.calibration import gain_to_pascals
+from hlsim.calibration import gain_to_pascals, is_finite
 from hlsim.extras import require
 from hlsim.neuro import NeuroMSBG
 from hlsim.neuro.config import NEURO_RATE
@@ -38,21 +38,29 @@ def export_program(
     It is for inference: a program of Mamba blocks gives no gradient.
 
     Raises:
-        ValueError: not a Neuro-MSBG at 16 kHz, or a part that cannot be exported.
+        ValueError: not a Neuro-MSBG at 16 kHz, no sample or item, or a part that cannot be exported.
     """
     if not isinstance(simulator, NeuroMSBG) or simulator.sample_rate != NEURO_RATE:
         raise ValueError(
             f"{type(simulator).__name__} cannot be exported; allowed: a Neuro-MSBG with sample_rate {NEURO_RATE} (the "
             "exact model chooses filters by the audiogram's values)"
         )
-    device = next(simulator.parameters()).device
-    shapes = ((items, round(NEURO_RATE * seconds)), (items, len(FREQUENCIES)))
-    example = tuple(torch.zeros(shape, device=device) for shape in shapes)
+    time = round(NEURO_RATE * seconds) if is_finite(seconds) else 0
+    if time < 1 or not isinstance(items, int) or items < 1:
+        raise ValueError(
+            f"a program for {seconds!r} seconds of {items!r} items; allowed: more than 0 seconds, 1 item or more"
+        )
+    weight = next(simulator.parameters())
+    example = tuple(weight.new_zeros(items, length) for length in (time, len(FREQUENCIES)))
+    modes = [(module, module.training) for module in simulator.modules()]
     try:
         with torch.no_grad():
             return torch.export.export(_Call(simulator).eval(), example)
     except Exception as error:  # whatever a block that depends on values raises
         raise ValueError(f"torch.export cannot take the simulator: {_reason(error)}") from error
+    finally:
+        for module, training in modes:  # the simulator is the caller's
+            module.training = training
 
 
 def export_onnx(simulator: nn.Module, path: str | Path, *, seconds: float = 1.0, items: int = 1) -> None:

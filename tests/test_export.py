@@ -1,13 +1,15 @@
 """Exported simulators give the simulator's outputs."""
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
 
-from hlsim import MSBG, load_pretrained
+from hlsim import MSBG, NeuroMSBG, load_pretrained
 from hlsim.export import export_onnx, export_program
+from hlsim.neuro import NeuroConfig
 
 
 def example(items: int = 2, seconds: float = 0.5) -> tuple[Tensor, Tensor]:
@@ -26,6 +28,26 @@ def test_a_program_gives_the_simulators_outputs(name: str, items: int, seconds: 
     wave, ears = example(items, seconds)
     expected = simulator(wave, ears)
     assert float((program(wave, ears) - expected).abs().max()) < 1e-4 * float(expected.abs().max())
+
+
+def test_the_simulator_keeps_its_mode_and_its_precision() -> None:
+    simulator = NeuroMSBG(NeuroConfig(channels=4, blocks=1)).double().train()
+    simulator.encoder.eval()
+    before = [module.training for module in simulator.modules()]
+    program = export_program(simulator, seconds=0.1, items=2).module()
+    assert [module.training for module in simulator.modules()] == before
+    wave, ears = (tensor.double() for tensor in example(seconds=0.1))
+    torch.testing.assert_close(program(wave, ears), simulator(wave, ears))
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{"seconds": -1}, {"seconds": 0}, {"seconds": float("nan")}, {"items": 0}, {"items": 1.5}],
+)
+def test_sizes_of_no_program(options: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match="allowed: more than 0 seconds, 1 item or more") as caught:
+        export_program(NeuroMSBG(), **options)
+    assert "\n" not in str(caught.value)
 
 
 def test_what_cannot_be_exported_is_said(tmp_path: Path) -> None:
