@@ -23,6 +23,7 @@ from hlsim.data.plan_settings import PlanSettings
 from hlsim.data.samples import CLAIM, INSTANCE_COLUMNS, INSTANCES, MANIFEST, SETTINGS
 
 FAULTS = "faults.csv"
+FAULT_COLUMNS = ("path", "reason")
 
 Progress = Callable[[int, int], None]
 
@@ -84,10 +85,11 @@ def prepare(
 
     Raises:
         ValueError: settings or folders that cannot be used, nothing left to use, faults with ``strict``, or ``out`` holds
-            instances of another plan.
+            instances of another plan, or tables that are not of ``prepare``.
     """
     root, corpus, noise = settings.places()
     folder = Path(out)
+    _spare_what_is_not_ours(settings, folder)
     layout = detect_layout(root / corpus) if settings.layout == "auto" else settings.layout
     listing = Listing()
     find = partial(find_below, root, corpus, layout, settings.table, noise if settings.noise else None)
@@ -124,7 +126,7 @@ def prepare(
     (folder / SETTINGS).unlink(missing_ok=True)  # it is written last: without it the folder is not prepared
     prepared = Prepared()
     with Whole(folder / FAULTS) as report, Whole(folder / MANIFEST) as manifest:
-        report.write(csv_line(("path", "reason")))
+        report.write(csv_line(FAULT_COLUMNS))
         manifest.write(csv_line(UTTERANCE_COLUMNS))
 
         def tell(fault: Fault) -> None:
@@ -171,6 +173,26 @@ def prepare(
     }
     write_whole(folder / SETTINGS, json.dumps(about, indent=2) + "\n")
     return prepared
+
+
+def _spare_what_is_not_ours(settings: PlanSettings, folder: Path) -> None:
+    """Raises ValueError where a table of the user's would be written over."""
+    tables = (settings.table, settings.audiograms, settings.test_audiograms)
+    for name, columns in (
+        (MANIFEST, UTTERANCE_COLUMNS),
+        (INSTANCES, INSTANCE_COLUMNS),
+        (FAULTS, FAULT_COLUMNS),
+        (SETTINGS, None),
+    ):
+        path = folder / name
+        if not path.exists():
+            continue
+        if any(table.exists() and table.samefile(path) for table in tables if table is not None):
+            raise ValueError(f"{path}: would be written over, and is read from; choose another --out")
+        with open(path, "rb") as file:
+            ours = columns is None or file.readline() == csv_line(columns).encode()
+        if not ours:
+            raise ValueError(f"{path}: not written by 'hlsim prepare'; choose another --out, or move it")
 
 
 def _noises(

@@ -70,11 +70,15 @@ class PlanSettings:
             raise ValueError(f"level {low:g} to {high:g} dB SPL; allowed: ascending, 20 to 110")
 
     def places(self) -> tuple[Path, str, str]:
-        """Root, and corpus and noise below it. Raises ValueError where the root does not hold them."""
+        """Root, and corpus and noise below it. Raises ValueError where they cannot be used."""
         folders = [folder.resolve() for folder in (self.corpus, self.noise) if folder is not None]
         for folder in folders:
             if not folder.is_dir():
                 raise ValueError(f"{folder}: no such folder")
+        if len(folders) > 1 and folders[0].is_relative_to(folders[1]):
+            raise ValueError(
+                f"noise {folders[1]}: holds the corpus, and its speech would be noise; allowed: a folder of noise alone"
+            )
         root = self.root.resolve() if self.root else Path(os.path.commonpath(folders))
         if root == Path(root.anchor):
             raise ValueError(f"{folders[0]} and {folders[-1]} have only {root} in common; allowed: a --root")

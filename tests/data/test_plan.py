@@ -209,10 +209,32 @@ def test_what_is_refused_before_a_file_is_read(
         ({"root": elsewhere}, "not in the root"),
         ({"audiograms": tmp_path / "none.csv"}, "cannot read audiograms"),
         ({"noise": tmp_path / "none"}, "no such folder"),
+        ({"noise": voicebank}, "holds the corpus, and its speech would be noise"),
+        ({"noise": tmp_path}, "holds the corpus, and its speech would be noise"),
     ):
         with pytest.raises(ValueError, match=said):
             prepare(PlanSettings(**{"corpus": voicebank} | options), out, jobs=1)
     assert not out.exists()
+
+
+def test_tables_of_the_users_are_not_written_over(
+    voicebank: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("hlsim.data.checking.examine", None)
+    out = tmp_path / "out"
+    out.mkdir()
+    for name in ("manifest.csv", "instances.csv", "faults.csv"):
+        (out / name).write_text("file\nclean_testset_wav/p232_001.wav\n")
+        with pytest.raises(
+            ValueError, match=rf"{name}: not written by 'hlsim prepare'; choose another --out"
+        ):
+            run(voicebank, out)
+        for option in ("table", "audiograms", "test_audiograms"):
+            with pytest.raises(ValueError, match=rf"{name}: would be written over, and is read from; choose"):
+                run(voicebank, out, **{option: out / name})
+        assert (out / name).read_text().startswith("file\n")
+        (out / name).unlink()
+    assert list(out.iterdir()) == []
 
 
 @pytest.mark.parametrize(
