@@ -36,7 +36,7 @@ class Listing:
     def digest(self, noise: Path | None, *tables: Path | None) -> str:
         if noise is not None:
             for path in walk_audio(noise):
-                self._digest.update(f"{path} {_state(noise / path)}\n".encode())
+                self._digest.update(f"{path} {_state(noise / path)}\n".encode(errors="backslashreplace"))
         for table in tables:
             self._digest.update(f"{table and _state(table)}\n".encode())
         return self._digest.hexdigest()

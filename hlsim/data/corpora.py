@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from random import Random
 
-from hlsim.audio import EXTENSIONS, check_name
-from hlsim.data.manifest import SPLITS, Utterance, inside
+from hlsim.audio import EXTENSIONS
+from hlsim.data.manifest import SPLITS, Utterance, inside, printable, storable
 
 LAYOUTS = ("voicebank-demand", "librispeech", "folder")
 
@@ -31,6 +31,8 @@ class Fault:
 
 
 Found = Utterance | Fault
+
+BAD_NAME = "its name is not UTF-8 or has a line break in it; rename it"
 
 
 def detect_layout(corpus: Path) -> str:
@@ -92,18 +94,23 @@ def assign_splits(
 
 
 def walk_audio(folder: Path) -> Iterator[str]:
-    """Paths of wav, flac and ogg files below a folder in POSIX form, folder by folder in order of names.
-
-    Raises:
-        ValueError: the name of one is not UTF-8.
-    """
+    """Paths of wav, flac and ogg files below a folder in POSIX form, folder by folder in order of names."""
     for place, folders, names in os.walk(folder):
         folders[:] = sorted(name for name in folders if not name.startswith("."))
         below = Path(place).relative_to(folder)
         for name in sorted(names):
             if Path(name).suffix.lower() in EXTENSIONS and not name.startswith("."):
-                check_name(os.path.join(place, name))
                 yield (below / name).as_posix()
+
+
+def linked_folders(folder: Path, prefix: str = "") -> Iterator[Fault]:
+    """The links to folders below a folder, which ``walk_audio`` does not follow."""
+    for place, folders, _ in os.walk(folder):
+        folders[:] = sorted(name for name in folders if not name.startswith("."))
+        for path in (Path(place, name) for name in folders):
+            if path.is_symlink():
+                name = (prefix / path.relative_to(folder)).as_posix()
+                yield Fault(name, "a link to a folder; put the folder itself there")
 
 
 def _stem(path: str) -> str:
@@ -128,6 +135,8 @@ def _voicebank(corpus: Path) -> Iterator[Found]:
         for path in walk_audio(corpus / noisy):
             if not (corpus / clean / path).is_file():
                 yield Fault(f"{noisy}/{path}", f"no clean counterpart {clean}/{path}")
+        for side in (clean, noisy):
+            yield from linked_folders(corpus / side, side)
 
 
 def _voicebank_log(corpus: Path, name: str) -> dict[str, tuple[str, float | None]]:
@@ -162,6 +171,7 @@ def _librispeech(corpus: Path) -> Iterator[Found]:
         for path in walk_audio(corpus / part):
             key = Path(path).stem
             yield Utterance(key, key.split("-")[0], split, f"{part}/{path}")
+        yield from linked_folders(corpus / part, part)
 
 
 def _folder(corpus: Path) -> Iterator[Found]:
@@ -195,6 +205,7 @@ def _folder(corpus: Path) -> Iterator[Found]:
                 part for i, part in enumerate(parts[:-1]) if i != place and not (i == 0 and split)
             )
             yield Utterance(key, speaker or "unknown", split, path, counterpart)
+    yield from linked_folders(corpus)
 
 
 def _listed(corpus: Path, table: Path) -> Iterator[Found]:
@@ -242,7 +253,18 @@ def find_below(
         placed = _below(found, corpus)
         path = placed.path if isinstance(placed, Fault) else placed.clean
         if noise is None or not path.startswith(f"{noise}/"):
-            yield placed
+            yield _named(placed)
+
+
+def _named(found: Found) -> Found:
+    """What is found, or a fault with a name that fits a CSV file."""
+    if isinstance(found, Fault):
+        fits = storable(found.path) and storable(found.reason)
+        return found if fits else Fault(printable(found.path), printable(found.reason))
+    for path in (found.clean, found.noisy):
+        if not storable(path):
+            return Fault(printable(path), BAD_NAME)
+    return found
 
 
 def _below(found: Found, prefix: str) -> Found:

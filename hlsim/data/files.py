@@ -62,7 +62,7 @@ class Whole:
     def write(self, data: str | bytes) -> None:
         assert self._file is not None
         try:
-            self._file.write(data.encode() if isinstance(data, str) else data)
+            self._file.write(data.encode(errors="backslashreplace") if isinstance(data, str) else data)
         except OSError as error:
             raise self._refusal(error) from error
 

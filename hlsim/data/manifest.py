@@ -155,6 +155,16 @@ def csv_line(cells: Iterable[object]) -> str:
     return line.getvalue()
 
 
+def storable(name: str) -> bool:
+    """Whether a name comes back from a CSV file as it was: it is UTF-8 and has no line break."""
+    return " ".join(name.splitlines()).encode(errors="replace").decode() == name
+
+
+def printable(name: str) -> str:
+    """What cannot be printed in a line, as escapes."""
+    return "".join(char if char.isprintable() else char.encode("unicode_escape").decode() for char in name)
+
+
 @lru_cache(maxsize=16)
 def _resolved(root: str) -> Path:
     return Path(root).resolve()

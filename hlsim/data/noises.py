@@ -12,8 +12,8 @@ from torch import Tensor
 
 from hlsim.audio import read_audio
 from hlsim.calibration import dbfs
-from hlsim.data.corpora import Fault, walk_audio
-from hlsim.data.manifest import Utterance, inside
+from hlsim.data.corpora import BAD_NAME, Fault, linked_folders, walk_audio
+from hlsim.data.manifest import Utterance, inside, printable, storable
 
 TRAIN_SNRS_DB, TEST_SNRS_DB = (0.0, 5.0, 10.0, 15.0), (2.5, 7.5, 12.5, 17.5)
 """Signal-to-noise ratios in dB by active speech level: VoiceBank-DEMAND's, and the paper's."""
@@ -68,13 +68,16 @@ def find_noises(
             f"SNRs {', '.join(f'{snr:g}' for snr in shared)} dB for training and test; allowed: disjoint sets"
         )
     kinds: dict[str, dict[str, list[tuple[str, Sequence[float]]]]] = {}
-    faults = []
+    faults = list(linked_folders(root / folder, folder))
     for path in walk_audio(root / folder):
         parts = path.split("/")
         split = _SPLIT_FOLDERS.get(parts[0], "") if len(parts) > 1 else ""
         inner = parts[1:] if split else parts
         kind = "/".join(inner[:-1]) or Path(path).stem
         name = f"{folder}/{path}" if folder else path
+        if not storable(name):
+            faults.append(Fault(printable(name), BAD_NAME))
+            continue
         try:
             waveform, rate = read_audio(inside(root, name), any_rate=True)
         except ValueError as error:

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from hlsim.data.corpora import Fault, assign_splits, detect_layout, find_utterances, walk_audio
+from hlsim.data.corpora import Fault, assign_splits, detect_layout, find_below, find_utterances, walk_audio
 from hlsim.data.manifest import Utterance
 
 
@@ -110,6 +110,22 @@ def test_a_folder_above_whose_name_ends_in_clean_is_none_of_a_pair(tmp_path: Pat
     utterances, faults = found(tree(tmp_path, "vctk-clean/clean/1.wav", "vctk-clean/noisy/1.wav"))
     assert [(u.clean, u.noisy) for u in utterances] == [("vctk-clean/clean/1.wav", "vctk-clean/noisy/1.wav")]
     assert list(faults) == []
+
+
+def test_links_to_folders_are_told_of(tmp_path: Path) -> None:
+    tree(tmp_path / "far", "1.wav")
+    for name, inner in (
+        ("any", "b"),
+        ("libri", "train-clean-100/b"),
+        ("vbd", "clean_testset_wav/b"),
+    ):
+        corpus = tree(tmp_path / name, f"{Path(inner).parent}/a/s-1.wav", "noisy_testset_wav/a/s-1.wav")
+        (corpus / inner).symlink_to(tmp_path / "far")
+        _, faults = found(corpus)
+        assert [(f.path, f.reason.split(";")[0]) for f in faults] == [(inner, "a link to a folder")]
+        assert [
+            f.path for f in find_below(tmp_path, name, detect_layout(corpus)) if isinstance(f, Fault)
+        ] == [f"{name}/{inner}"]
 
 
 def test_a_table_says_more(tmp_path: Path) -> None:

@@ -3,6 +3,8 @@
 import csv
 import json
 import os
+import shutil
+import sys
 from pathlib import Path
 
 import pytest
@@ -180,6 +182,29 @@ def test_faults_are_listed_and_left_out(voicebank: Path, tmp_path: Path) -> None
     for path, reason in expected.items():
         assert reason in listed[path] and "\n" not in listed[path]
     assert not any("p300" in row["id"] for row in rows(tmp_path / "out" / "manifest.csv"))
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems have no such names")
+def test_names_that_fit_no_csv_file_are_faults(
+    voicebank: Path, noise_folder: Path, tmp_path: Path, pieces: list[Tensor]
+) -> None:
+    names = {
+        os.fsdecode(b"caf\xe9.wav"): r"caf\udce9.wav",
+        "a\nb.wav": r"a\nb.wav",
+        "\u2028.wav": r"\u2028.wav",
+    }
+    (tmp_path / "speech").mkdir()
+    write_audio(tmp_path / "good.wav", pieces[0], 16000)
+    shutil.copy(tmp_path / "good.wav", tmp_path / "speech")
+    for name in names:
+        shutil.copy(tmp_path / "good.wav", tmp_path / "speech" / name)
+        shutil.copy(tmp_path / "good.wav", noise_folder / "hum" / name)
+        shutil.copy(tmp_path / "good.wav", voicebank / "clean_testset_wav" / name)
+    assert run(tmp_path / "speech", tmp_path / "out", noise=noise_folder).utterances == {"train": 1}
+    listed = {row["path"]: row["reason"] for row in rows(tmp_path / "out" / "faults.csv")}
+    assert set(listed) == {f"{place}/{name}" for place in ("speech", "noise/hum") for name in names.values()}
+    assert all("rename it" in reason for reason in listed.values())
+    assert run(voicebank, tmp_path / "vbd-out").faults == 3  # here without a noisy counterpart
 
 
 def test_strict_makes_a_fault_an_error(voicebank: Path, tmp_path: Path) -> None:
