@@ -160,8 +160,9 @@ class _Measured:
             if ear in alike:
                 waiting.remove(ear)
                 return ear
-        waiting.extend(self.draw.sample(alike, len(alike)))
-        return waiting.pop(0)
+        fresh = self.draw.sample(alike, len(alike))
+        waiting.extend(fresh[1:])  # behind those that would not do this time
+        return fresh[0]
 
 
 class _Drawn:

@@ -92,6 +92,17 @@ def test_files_and_columns_that_say_the_split(tmp_path: Path) -> None:
     assert {ear.levels for ear in ears.measured["train"]} == {own for _, own in levels[:6]}
 
 
+def test_few_measured_ears_are_still_different_and_of_the_severity(tmp_path: Path) -> None:
+    for levels, shares, count, expected in (
+        ([30.0, 31.0, 32.0, 70.0], {"mild": 1.0, "severe": 1.0}, 3, {"mild": 40, "severe": 20}),
+        ([30.0, 70.0, 71.0], {"mild": 2.0, "severe": 1.0}, 2, {"mild": 20, "severe": 20}),
+    ):
+        path = table(tmp_path / "ears.csv", [(f"L{level}", (level,) * 8) for level in levels])
+        drawn = list(plan_ears(shares, path, None, ("train",), seed=0).assign("train", 20, count))
+        assert all(len(set(own)) == count for own in drawn)
+        assert Counter(ear.severity for own in drawn for ear in own) == expected
+
+
 def test_what_is_refused(tmp_path: Path) -> None:
     path = table(tmp_path / "ears.csv", [("a", (60.0,) * 8), ("b", (61.0,) * 8), ("c", (110.0,) * 8)])
     with pytest.raises(ValueError, match="no mild ears for train"):
