@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import hashlib
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -93,6 +94,12 @@ class Whole:
                 "from there"
             )
         return ValueError(f"{self.path}: cannot be written ({error.strerror})")
+
+
+def sha256(path: str | Path) -> str:
+    """Of what a file holds."""
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def write_whole(path: str | Path, data: str | bytes) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -16,7 +15,7 @@ from hlsim.audiogram import SEVERITIES
 from hlsim.data.checking import Listing, examine_all
 from hlsim.data.corpora import Fault, assign_splits, detect_layout, find_below
 from hlsim.data.ears import Ears, plan_ears
-from hlsim.data.files import PARTIAL, Whole, write_whole
+from hlsim.data.files import PARTIAL, Whole, sha256, write_whole
 from hlsim.data.manifest import SPLITS, UTTERANCE_COLUMNS, Rows, csv_line
 from hlsim.data.noises import Noises, find_noises
 from hlsim.data.plan_settings import PlanSettings
@@ -167,8 +166,8 @@ def prepare(
     _write_instances(settings, folder, prepared, ears, inputs)
     about |= {
         "inputs": inputs,
-        "manifest_sha256": _digest(folder / MANIFEST),
-        "instances_sha256": _digest(folder / INSTANCES),
+        "manifest_sha256": sha256(folder / MANIFEST),
+        "instances_sha256": sha256(folder / INSTANCES),
         "prepared": vars(prepared),
     }
     write_whole(folder / SETTINGS, json.dumps(about, indent=2) + "\n")
@@ -223,7 +222,7 @@ def _unchanged(folder: Path, about: Mapping[str, Any], strict: bool) -> Prepared
         kept = json.loads((folder / SETTINGS).read_text(encoding="utf-8"))
         same = all(kept[name] == json.loads(json.dumps(value)) for name, value in about.items())
         for name, file in (("manifest_sha256", MANIFEST), ("instances_sha256", INSTANCES)):
-            same = same and kept[name] == _digest(folder / file)
+            same = same and kept[name] == sha256(folder / file)
         prepared = Prepared(**kept["prepared"])
     except (OSError, ValueError, KeyError, TypeError):
         return None
@@ -265,11 +264,6 @@ def _instances(
             level = f"{draw.uniform(*settings.level):.2f}"
             for name in inputs:
                 yield (row["id"], row["split"], name, level, ear.severity, *ear.to_row().values())
-
-
-def _digest(path: Path) -> str:
-    with open(path, "rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _plain(value: Any) -> Any:

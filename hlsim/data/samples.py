@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from torch import Tensor
 from hlsim.audio import read_audio, read_stretch, resample
 from hlsim.audiogram import FREQUENCIES, Audiogram
 from hlsim.calibration import PASCAL_SPL
+from hlsim.data.files import sha256
 from hlsim.data.manifest import UTTERANCE_COLUMNS, Rows, Utterance, inside
 from hlsim.data.noises import mix_at
 
@@ -97,6 +99,11 @@ class Plan:
                 f"{self.folder}: {len(self.rows)} instances of {len(self.utterances)} utterances; "
                 f"allowed: {self.each} of each"
             )
+        for name in (MANIFEST, INSTANCES):
+            if sha256(self.folder / name) != about[f"{Path(name).stem}_sha256"]:
+                raise ValueError(
+                    f"{self.folder / name}: has changed since it was prepared; 'hlsim prepare' makes it anew"
+                )
 
     def __len__(self) -> int:
         """How many instances."""
@@ -154,7 +161,9 @@ class Plan:
             )
         else:
             noisy = clean
-        if noisy.shape != clean.shape or rate != utterance.rate:
+        # the manifest has six digits of the seconds
+        same_length = math.isclose(len(clean) / rate, utterance.seconds, rel_tol=1e-5)
+        if noisy.shape != clean.shape or rate != utterance.rate or not same_length:
             raise ValueError(f"{inside(self.root, utterance.clean)}: has changed since it was prepared")
         return resample(torch.stack((clean, noisy)), rate, self.rate)
 

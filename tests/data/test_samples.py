@@ -1,5 +1,6 @@
 """Instances: level, noise and alignment of what is given, and the same samples by every way."""
 
+import json
 from pathlib import Path
 
 import pytest
@@ -10,6 +11,7 @@ from hlsim.audio import read_audio, resample, write_audio
 from hlsim.audiogram import Audiogram
 from hlsim.calibration import dbfs
 from hlsim.data.active_level import active_level_db
+from hlsim.data.files import sha256
 from hlsim.data.plan import prepare
 from hlsim.data.plan_settings import PlanSettings
 from hlsim.data.samples import Instance, Plan, is_whole
@@ -81,6 +83,10 @@ def test_what_has_changed_since(plan: Path, voicebank: Path, tmp_path: Path) -> 
     write_audio(path, torch.ones(5), 16000)
     with pytest.raises(ValueError, match="has changed since it was prepared"):
         opened.instance(0)
+    for part in ("clean", "noisy"):  # both alike, but of another length
+        write_audio(voicebank / f"{part}_testset_wav" / "p232_002.wav", torch.ones(12799), 16000)
+    with pytest.raises(ValueError, match=r"p232_002.wav: has changed since it was prepared"):
+        opened.instance(20)
     with pytest.raises(ValueError, match="no such file"):
         Plan(plan, root=tmp_path).instance(0)
     text = (
@@ -89,6 +95,13 @@ def test_what_has_changed_since(plan: Path, voicebank: Path, tmp_path: Path) -> 
         .replace("clean_testset_wav/p232_001", "../vbd/clean_testset_wav/p232_001")
     )
     (plan / "manifest.csv").write_text(text)
+    with pytest.raises(
+        ValueError, match=r"manifest.csv: has changed since it was prepared; 'hlsim prepare' makes"
+    ):
+        Plan(plan)
+    about = json.loads((plan / "plan.json").read_text())
+    about["manifest_sha256"] = sha256(plan / "manifest.csv")
+    (plan / "plan.json").write_text(json.dumps(about))
     with pytest.raises(ValueError, match="leads out of"):
         Plan(plan).instance(16)
     (plan / "instances.csv").write_text("".join((plan / "instances.csv").read_text().splitlines(True)[:-1]))
