@@ -113,12 +113,30 @@ def linked_folders(folder: Path, prefix: str = "") -> Iterator[Fault]:
                 yield Fault(name, "a link to a folder; put the folder itself there")
 
 
+class _Names:
+    """Names in one folder after the other, without their endings."""
+
+    def __init__(self) -> None:
+        self.folder, self.names = "", set[str]()
+
+    def again(self, path: str) -> bool:
+        """Whether the path's folder has had the name already."""
+        folder = path.rpartition("/")[0]
+        if folder != self.folder:
+            self.folder, self.names = folder, set()
+        name = _stem(path)
+        known = name in self.names
+        self.names.add(name)
+        return known
+
+
 def _stem(path: str) -> str:
     return path.removesuffix(Path(path).suffix)
 
 
 def _voicebank(corpus: Path) -> Iterator[Found]:
     """``clean_trainset_28spk_wav/p226_001.wav`` and so on; ``log_trainset_28spk.txt`` tells noise and SNR."""
+    names = _Names()
     for name, split in _VOICEBANK:
         clean, noisy = f"clean_{name}_wav", f"noisy_{name}_wav"
         if not (corpus / clean).is_dir():
@@ -129,6 +147,9 @@ def _voicebank(corpus: Path) -> Iterator[Found]:
                 yield Fault(f"{clean}/{path}", f"no noisy counterpart {noisy}/{path}")
                 continue
             key = Path(path).stem
+            if names.again(f"{clean}/{path}"):
+                yield Fault(f"{clean}/{path}", f"a second file of the name {key}")
+                continue
             noise, snr = noises.get(key, ("", None))
             speaker = key.split("_")[0]
             yield Utterance(key, speaker, split, f"{clean}/{path}", f"{noisy}/{path}", noise, snr)
@@ -167,9 +188,13 @@ def _librispeech_parts(corpus: Path) -> list[tuple[str, str]]:
 
 def _librispeech(corpus: Path) -> Iterator[Found]:
     """``train-clean-100/<speaker>/<chapter>/<speaker>-<chapter>-<number>.flac`` and so on."""
+    names = _Names()
     for part, split in _librispeech_parts(corpus):
         for path in walk_audio(corpus / part):
             key = Path(path).stem
+            if names.again(f"{part}/{path}"):
+                yield Fault(f"{part}/{path}", f"a second file of the name {key}")
+                continue
             yield Utterance(key, key.split("-")[0], split, f"{part}/{path}")
         yield from linked_folders(corpus / part, part)
 
@@ -179,8 +204,7 @@ def _folder(corpus: Path) -> Iterator[Found]:
 
     Where a folder ``clean`` has a neighbour ``noisy``, files of equal names in them are pairs.
     """
-    here: list[str] = []
-    seen: set[str] = set()
+    names = _Names()
     for path in walk_audio(corpus):
         parts = path.split("/")
         split = _SPLIT_FOLDERS.get(parts[0], "") if len(parts) > 1 else ""
@@ -195,17 +219,19 @@ def _folder(corpus: Path) -> Iterator[Found]:
             yield Fault(path, f"no {other} counterpart {counterpart}")
         elif side != "noisy":
             key = _stem(path)
-            if parts[:-1] != here:
-                here, seen = parts[:-1], set()
-            if key in seen:
+            if names.again(path):
                 yield Fault(path, f"a second file of the name {key}")
                 continue
-            seen.add(key)
             speaker = "/".join(
                 part for i, part in enumerate(parts[:-1]) if i != place and not (i == 0 and split)
             )
-            yield Utterance(key, speaker or "unknown", split, path, counterpart)
+            yield Utterance(key, speaker or _unknown(split), split, path, counterpart)
     yield from linked_folders(corpus)
+
+
+def _unknown(split: str) -> str:
+    """A speaker: what the corpus has in two splits cannot be one."""
+    return f"unknown {split}".rstrip()
 
 
 def _listed(corpus: Path, table: Path) -> Iterator[Found]:
@@ -234,7 +260,7 @@ def _listed(corpus: Path, table: Path) -> Iterator[Found]:
                     inside(corpus, name)
                 yield Utterance(
                     key,
-                    row.get("speaker") or "/".join(path.split("/")[:-1]) or "unknown",
+                    row.get("speaker") or "/".join(path.split("/")[:-1]) or _unknown(row.get("split", "")),
                     row.get("split", ""),
                     path,
                     row.get("noisy", ""),

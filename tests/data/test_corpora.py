@@ -106,6 +106,29 @@ def test_a_folder_with_splits_and_pairs(tmp_path: Path) -> None:
     }
 
 
+def test_files_without_a_speaker_are_one_a_split(tmp_path: Path) -> None:
+    table = tmp_path / "table.csv"
+    table.write_text("file,split\n1.wav,train\n2.wav,test\n3.wav,\n")
+    corpus = tree(tmp_path / "c", "train/1.wav", "valid/1.wav", "test/1.wav", "test/2.wav", "1.wav")
+    for (utterances, _), expected in (
+        (found(corpus), {"unknown", "unknown train", "unknown valid", "unknown test"}),
+        (found(corpus, table), {"unknown", "unknown train", "unknown test"}),
+    ):
+        speakers = {u.speaker: {u.split} for u in utterances}
+        assert set(speakers) == expected
+        splits = assign_splits(speakers, test_share=0.1, valid_share=0.0, seed=0)
+        assert splits["unknown train"] == "train" and splits["unknown test"] == "test"
+
+
+def test_a_second_file_of_a_name_is_a_fault(tmp_path: Path) -> None:
+    for name, place in (("libri", "train-clean-100/1/2"), ("vbd", "clean_testset_wav")):
+        corpus = tree(tmp_path / name, f"{place}/1-2.flac", f"{place}/1-2.wav")
+        tree(corpus, "noisy_testset_wav/1-2.flac", "noisy_testset_wav/1-2.wav")
+        utterances, faults = found(corpus)
+        assert [u.clean for u in utterances] == [f"{place}/1-2.flac"]
+        assert [(f.path, f.reason) for f in faults] == [(f"{place}/1-2.wav", "a second file of the name 1-2")]
+
+
 def test_a_folder_above_whose_name_ends_in_clean_is_none_of_a_pair(tmp_path: Path) -> None:
     utterances, faults = found(tree(tmp_path, "vctk-clean/clean/1.wav", "vctk-clean/noisy/1.wav"))
     assert [(u.clean, u.noisy) for u in utterances] == [("vctk-clean/clean/1.wav", "vctk-clean/noisy/1.wav")]
