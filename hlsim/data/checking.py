@@ -8,11 +8,17 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
+from torch import Tensor
+
 from hlsim.audio import read_audio
 from hlsim.data.active_level import active_level_db
 from hlsim.data.corpora import Fault, Found, walk_audio
 from hlsim.data.manifest import inside
 from hlsim.parallel import run_parallel
+
+_SILENT = 10.0 ** (
+    -150.0 / 20.0
+)  # a peak below the steps of 24 bits; the squares of the smallest numbers are 0
 
 
 class Listing:
@@ -50,6 +56,14 @@ def _state(path: Path) -> tuple[int, int] | None:
     return about.st_size, about.st_mtime_ns
 
 
+def silence(channel: Tensor) -> str:
+    """Why a first channel has nothing to hear; empty where it has. Shape: (time,)."""
+    peak = float(channel.abs().max())
+    if peak == 0.0:
+        return "silent first channel"
+    return "" if peak > _SILENT else f"first channel as good as silent, its peak is {peak:.1g}"
+
+
 def examine(root: Path, found: Found, *, shortest: float, pairs: bool) -> Found:
     """The utterance with rate, seconds and active level, or what is at fault with its files, which are read whole."""
     if isinstance(found, Fault):
@@ -60,15 +74,15 @@ def examine(root: Path, found: Found, *, shortest: float, pairs: bool) -> Found:
         seconds = clean.shape[-1] / rate
         if seconds < shortest:
             return Fault(path, f"{seconds:.3g} s; {shortest:g} s or more are asked for")
-        if not bool(clean[0].any()):
-            return Fault(path, "silent first channel")
+        if reason := silence(clean[0]):
+            return Fault(path, reason)
         if pairs and not found.noisy:
             return Fault(path, "no noisy counterpart, and others have one")
         if found.noisy:
             path = found.noisy
             noisy, noisy_rate = read_audio(inside(root, path))
-            if not bool(noisy[0].any()):
-                return Fault(path, "silent first channel")
+            if reason := silence(noisy[0]):
+                return Fault(path, reason)
             if noisy_rate != rate:
                 return Fault(path, f"{noisy_rate} Hz, its clean speech has {rate} Hz")
             if noisy.shape[-1] != clean.shape[-1]:

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from hlsim.audio import read_audio
 from hlsim.calibration import dbfs
+from hlsim.data.checking import silence
 from hlsim.data.corpora import BAD_NAME, Fault, linked_folders, walk_audio
 from hlsim.data.manifest import Utterance, inside, printable, storable
 
@@ -83,8 +84,8 @@ def find_noises(
         except ValueError as error:
             faults.append(Fault(name, str(error).removeprefix(f"{root / name}: ")))
             continue
-        if not bool(waveform[0].any()):
-            faults.append(Fault(name, "silent first channel"))
+        if reason := silence(waveform[0]):
+            faults.append(Fault(name, reason))
             continue
         kinds.setdefault(split, {}).setdefault(kind, []).append((name, _starts(waveform[0], rate)))
     if not kinds:

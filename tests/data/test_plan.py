@@ -155,6 +155,9 @@ def faulty(corpus: Path) -> dict[str, str]:
     write_audio(noisy / "p300_7.wav", tone, 22050)
     write_audio(clean / "p300_8.wav", torch.stack((torch.zeros(12800), tone)), 16000)
     (clean / "p300_9.wav").unlink()
+    for name in "bc":
+        for folder, peak in ((clean, 1e-39 if name == "b" else 0.1), (noisy, 1e-39 if name == "c" else 0.1)):
+            soundfile.write(folder / f"p300_{name}.wav", (peak * tone).numpy(), 16000, subtype="FLOAT")
     outside = corpus.parent / "outside.wav"
     write_audio(outside, tone, 16000)
     (clean / "p300_a.wav").symlink_to(outside)
@@ -170,6 +173,8 @@ def faulty(corpus: Path) -> dict[str, str]:
         "clean_trainset_28spk_wav/p300_8.wav": "silent first channel",
         "noisy_trainset_28spk_wav/p300_9.wav": "no clean counterpart",
         "clean_trainset_28spk_wav/p300_a.wav": "leads out of",
+        "clean_trainset_28spk_wav/p300_b.wav": "as good as silent",
+        "noisy_trainset_28spk_wav/p300_c.wav": "as good as silent",
     }
 
 
@@ -211,12 +216,12 @@ def test_strict_makes_a_fault_an_error(voicebank: Path, tmp_path: Path) -> None:
     faulty(voicebank)
     for _ in range(2):
         with pytest.raises(
-            ValueError, match=r"10 faults, the first clean_trainset_28spk_wav/p300_1.wav: not readable"
+            ValueError, match=r"12 faults, the first clean_trainset_28spk_wav/p300_1.wav: not readable"
         ):
             prepare(PlanSettings(voicebank), tmp_path / "out", strict=True, jobs=1)
         assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["faults.csv"]
     run(voicebank, tmp_path / "out")
-    with pytest.raises(ValueError, match="10 faults"):
+    with pytest.raises(ValueError, match="12 faults"):
         prepare(PlanSettings(voicebank), tmp_path / "out", strict=True, jobs=1)
 
 
