@@ -109,7 +109,7 @@ class TimedModule(L.LightningModule):
 class KeepBest(Callback):
     """Writes the released form of the model whenever the validation score is the best so far.
 
-    The score is also kept in ``note``: the state that a killed run goes on from is older than its last validation.
+    The score is also kept in ``note``: the state that a killed run goes on from may be older than its last validation.
     """
 
     def __init__(self, write: Callable[[dict[str, Any]], None], note: Path) -> None:
@@ -201,7 +201,7 @@ def run(
         out: folder for ``last.ckpt``, TensorBoard's events and what ``write`` puts there.
         recipe: what makes this run this run; it is kept in ``recipe.json``.
         write: stores the released form of the model, given the figures of its validation.
-        validate_every: steps from validation to validation; a kill loses no more than these.
+        validate_every: steps from validation to validation; a kill loses no more than these and their validation.
         max_steps: stop earlier, -1 for no such limit.
         accelerator, devices, nodes, strategy: as Lightning's Trainer takes them; each process draws batches of its own,
             so that the batch grows with their number.
@@ -221,7 +221,7 @@ def run(
         filename="last",
         save_top_k=1,
         enable_version_counter=False,
-        every_n_train_steps=validate_every,
+        # at the end of each validation, not before it: a run that goes on from a state does not validate it
         save_on_train_epoch_end=False,
     )
     callbacks: list[Callback] = [

@@ -288,6 +288,25 @@ def test_the_best_of_a_killed_run_is_not_replaced_by_a_worse_one(tmp_path: Path)
     assert written == []
 
 
+def test_a_validation_that_was_cut_off_is_made_up_for(tmp_path: Path) -> None:
+    class Stopped(Toy):
+        def validate(self) -> dict[str, float]:
+            if self.global_step == 4:
+                raise KeyboardInterrupt
+            return super().validate()
+
+    scores = {2: 1.0, 4: 9.0, 6: 2.0, 8: 2.0}
+    with pytest.raises(KeyboardInterrupt):
+        go(Stopped(scores=scores), tmp_path, max_steps=20)
+    module = Toy(scores=scores)
+    written, lines = go(module, tmp_path, max_steps=8)
+    assert [note["steps"] for note in written] == [4]
+    assert [line.split(",")[0] for line in lines] == ["step 4", "step 6", "step 8", "step 8"]
+    whole = Toy(scores=scores)
+    go(whole, tmp_path / "whole", max_steps=8)
+    assert torch.equal(module.vector, whole.vector)
+
+
 @pytest.mark.parametrize("value", [math.nan, math.inf])
 def test_a_loss_that_is_not_finite_stops_the_run_and_says_so(tmp_path: Path, value: float) -> None:
     class Broken(Toy):
