@@ -187,6 +187,7 @@ def run(
     recipe: Mapping[str, Any],
     write: Callable[[dict[str, Any]], None],
     validate_every: int,
+    begun: bool = False,
     max_steps: int = -1,
     accelerator: str = "auto",
     devices: int = 1,
@@ -202,6 +203,7 @@ def run(
         recipe: what makes this run this run; it is kept in ``recipe.json``.
         write: stores the released form of the model, given the figures of its validation.
         validate_every: steps from validation to validation; a kill loses no more than these and their validation.
+        begun: with weights that are worth keeping: they are validated too, and the best until others are better.
         max_steps: stop earlier, -1 for no such limit.
         accelerator, devices, nodes, strategy: as Lightning's Trainer takes them; each process draws batches of its own,
             so that the batch grows with their number.
@@ -254,7 +256,7 @@ def run(
                 default_root_dir=str(folder),  # for what SLURM's end of a job makes Lightning store
                 logger=TensorBoardLogger(str(folder), name="", version="events"),
                 val_check_interval=validate_every,
-                num_sanity_val_steps=0,
+                num_sanity_val_steps=int(begun),  # not where a run goes on
                 log_every_n_steps=10,
                 enable_progress_bar=False,
                 enable_model_summary=False,

@@ -36,8 +36,8 @@ class SimulatorRecipe:
 
     Attributes:
         model: settings of ``NeuroConfig``.
-        start: checkpoint whose weights to start from, a name or a folder; its settings are the model's. Without it they
-            are random.
+        start: checkpoint whose weights to start from, a name or a folder; its settings are the model's. It is
+            also what is kept until the training gives a better one. Without it they are random.
         batch: clips a step.
         seconds: length of a clip.
         learning_rate: of AdamW at its highest.
@@ -264,6 +264,7 @@ def train_simulator(
         recipe=asdict(recipe) | {"max_minutes": max_minutes} | module.identity(data),
         write=write,
         validate_every=recipe.validate_every,
+        begun=bool(recipe.start),
         max_steps=max_steps,
         accelerator=accelerator,
         devices=devices,

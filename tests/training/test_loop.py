@@ -271,6 +271,18 @@ def test_the_best_validation_is_what_is_written(tmp_path: Path) -> None:
     assert [note["steps"] for note in written] == [10]
 
 
+def test_weights_begun_with_are_the_best_until_others_are_better(tmp_path: Path) -> None:
+    scores = {0: 2.0, 2: 1.0, 4: 3.0, 6: 2.5}
+    written, lines = go(Toy(scores=scores), tmp_path, max_steps=2, begun=True)
+    assert [(note["steps"], note["minutes"], set(note["validation"])) for note in written] == [
+        (0, 0.0, {"valid_sum"})
+    ]
+    assert [line.split(",")[0] for line in lines] == ["step 0", "step 2", "step 2"]
+    written, lines = go(Toy(scores=scores), tmp_path, max_steps=6, begun=True)
+    assert [note["steps"] for note in written] == [4]
+    assert [line.split(",")[0] for line in lines] == ["step 4", "step 6", "step 6"]
+
+
 def test_the_best_of_a_killed_run_is_not_replaced_by_a_worse_one(tmp_path: Path) -> None:
     def killed(line: str) -> None:
         if line.startswith("step 4"):
