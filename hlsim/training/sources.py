@@ -9,6 +9,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from hlsim.audio import find_audio
 from hlsim.audiogram import read_audiograms
 
 
@@ -28,11 +29,34 @@ class TrainingData:
     valid_audiograms: Path | None = None
 
     def validation(self) -> TrainingData:
-        """The same, with what there is to validate on in the place of what there is to train on."""
+        """The same, with what there is to validate on in the place of what there is to train on.
+
+        Raises:
+            ValueError: speech or noise to validate on is also trained on.
+        """
+        refuse_shared("speech", self.speech, self.valid_speech)
+        refuse_shared("noise", self.noise, self.valid_noise)
         return TrainingData(
             self.valid_speech or self.speech,
             self.valid_noise or self.noise,
             self.valid_audiograms or self.audiograms,
+        )
+
+
+def refuse_shared(
+    name: str, training: Path | Sequence[Path] | None, validation: Path | Sequence[Path] | None
+) -> None:
+    """Raises ValueError where files are both trained and validated on: the best checkpoint would be chosen on them."""
+    if not training or not validation:
+        return
+    trained, validated = (
+        {path.resolve() for path in (find_audio(source) if isinstance(source, str | Path) else source)}
+        for source in (training, validation)
+    )
+    if count := len(trained & validated):
+        raise ValueError(
+            f"{count} of {len(validated)} files of the {name} to validate on are also trained on; give folders that "
+            f"share none, or no {name} to validate on"
         )
 
 

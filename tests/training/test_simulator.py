@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 import torch
 
-from hlsim.audio import write_audio
+from hlsim.audio import find_audio, write_audio
 from hlsim.audiogram import Audiogram
 from hlsim.calibration import level_spl
 from hlsim.pretrained import load_pretrained
@@ -244,6 +244,22 @@ def test_missing_data_is_named_before_anything_is_written(
         train(TrainingData(**given), tmp_path / "out", max_steps=1)
     assert str(caught.value).startswith(str(nowhere))
     assert not (tmp_path / "out").exists()
+
+
+def test_files_trained_on_are_none_to_validate_on(speech_dir: Path, tmp_path: Path) -> None:
+    train_dir, valid = speech_dir / "train", speech_dir / "valid"
+    link = tmp_path / "link"
+    link.symlink_to(train_dir)
+    files = [*find_audio(train_dir), *find_audio(valid)]
+    for name, given in (
+        ("speech", {"speech": speech_dir, "valid_speech": valid}),
+        ("speech", {"speech": train_dir, "valid_speech": link}),
+        ("speech", {"speech": files, "valid_speech": valid}),
+        ("noise", {"speech": train_dir, "noise": speech_dir, "valid_noise": valid}),
+    ):
+        data = TrainingData(**given)  # type: ignore[arg-type]
+        with pytest.raises(ValueError, match=rf"^\d+ of \d+ files of the {name} to validate on are also"):
+            SimulatorTraining(SimulatorRecipe.from_dict(TINY), data, EVER)
 
 
 @pytest.fixture
