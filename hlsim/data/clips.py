@@ -10,6 +10,7 @@ from torch import Tensor
 from hlsim.audio import find_audio, read_audio, resample
 
 _TRIES = 100  # draws of files that cannot be used, one after the other, before it ends
+_SILENT_TRIES = 10_000  # more, for a recording may be loud for one second in an hour
 
 
 class Clips:
@@ -25,8 +26,8 @@ class Clips:
         repeat: for noises.
 
     Raises:
-        ValueError: no such folder, or no audio in it; when clips are drawn, too many files that cannot be used; when one
-            recording is asked for, that it cannot be used.
+        ValueError: no such folder, or no audio in it, or clips of no samples; when clips are drawn, too many files that
+            cannot be used, or too many silent clips; when one recording is asked for, that it cannot be used.
     """
 
     def __init__(
@@ -35,6 +36,8 @@ class Clips:
         self.files = find_audio(source) if isinstance(source, str | Path) else list(source)
         self.sample_rate = sample_rate
         self.samples = round(seconds * sample_rate)
+        if self.samples < 1:
+            raise ValueError(f"clips of {seconds} s; allowed: a sample or more, {1.0 / sample_rate:.2g} s")
         self.repeat = repeat
         self._kept: dict[int, Tensor] = {}
         self._bad: dict[int, str] = {}
@@ -65,7 +68,7 @@ class Clips:
     def draw(self, count: int, generator: torch.Generator) -> Tensor:
         """Random clips, none silent. Shape: -> (count, samples)."""
         clips: list[Tensor] = []
-        failed = 0
+        failed = silent = 0
         while len(clips) < count:
             index = int(torch.randint(len(self), (), generator=generator))
             # drawn for a bad file too: what follows does not depend on when it was found bad
@@ -79,6 +82,14 @@ class Clips:
             clip = self.clip(index, place)
             if float(clip.square().mean()) > 1e-7:
                 clips.append(clip)
+                silent = 0
+                continue
+            silent += 1
+            if silent == _SILENT_TRIES:
+                raise ValueError(
+                    f"{self.files[index]}: {silent} clips in a row were silent, this one the last; leave silent "
+                    "recordings out, or take longer clips"
+                )
         return torch.stack(clips)
 
     def _usable(self, index: int) -> bool:

@@ -73,6 +73,22 @@ def test_no_drawn_clip_is_silent(tmp_path: Path) -> None:
     assert float(drawn.square().mean(-1).min()) > 1e-7
 
 
+def test_drawing_ends_where_all_clips_are_silent_or_empty(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("hlsim.data.clips._SILENT_TRIES", 300)
+    wave = torch.zeros(40000)
+    wave[-1] = 1.0  # of 24,001 places only the last reaches it
+    folder = folder_with(tmp_path, a=wave)
+    with pytest.raises(
+        ValueError, match=r"a.wav: 300 clips in a row were silent, this one the last; leave"
+    ) as caught:
+        Clips(folder, sample_rate=16000, seconds=1.0).draw(1, torch.Generator().manual_seed(0))
+    assert "\n" not in str(caught.value)
+    with pytest.raises(ValueError, match=r"clips of 1e-05 s; allowed: a sample or more, "):
+        Clips(folder, sample_rate=16000, seconds=1e-5)
+
+
 def test_recordings_are_decoded_once(tmp_path: Path) -> None:
     clips = Clips(folder_with(tmp_path, a=ramp(2000)), sample_rate=16000, seconds=0.1)
     before = clips.clip(0, 0.0)
