@@ -23,7 +23,7 @@ from hlsim.commands.options import (
 )
 from hlsim.data.corpora import LAYOUTS
 from hlsim.data.noises import TEST_SNRS_DB, TEST_TYPES, TRAIN_SNRS_DB, TRAIN_TYPES
-from hlsim.data.teacher import ALIGNMENTS, TEACHERS, Reference
+from hlsim.data.teacher import ALIGNMENTS, TEACHERS, Reference, check_grid
 from hlsim.parallel import BACKENDS
 
 
@@ -162,6 +162,8 @@ def _prepare(options: argparse.Namespace) -> None:
         shortest=options.shortest,
         seed=options.seed,
     )
+    if options.write:
+        check_grid(options.rate)  # before hours of checking files
     where: dict[str, Any] = {"jobs": options.jobs, "backend": options.backend, "scheduler": options.scheduler}
     recipe = Recipe(options.alignment, _reference(options.teacher)) if options.write else None
     prepared = prepare(

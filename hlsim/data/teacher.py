@@ -50,11 +50,7 @@ class Teacher(nn.Module):
         self.alignment = alignment
         self.reference = reference
         self.msbg = MSBG(sample_rate=sample_rate, aligned=alignment == "structural" or reference is not None)
-        self.grid = grid_of(sample_rate)
-        if self.grid > 4 * sample_rate:
-            raise ValueError(
-                f"sample rate {sample_rate} Hz for a teacher; allowed: 16000, 22050, 24000, 32000, 44100, 48000"
-            )
+        self.grid = check_grid(sample_rate)
         self.body, self.context = (
             self.grid * math.ceil(s * sample_rate / self.grid) for s in (_BODY, _CONTEXT)
         )
@@ -116,3 +112,13 @@ class Teacher(nn.Module):
 def grid_of(sample_rate: int) -> int:
     """Samples from one place where a frame of MSBG's smearing starts to the next that falls on a sample."""
     return _FRAME * sample_rate // math.gcd(_FRAME * sample_rate, RATE)
+
+
+def check_grid(sample_rate: int) -> int:
+    """``grid_of`` a rate, or ValueError where it is too coarse for a teacher."""
+    grid = grid_of(sample_rate)
+    if grid > 4 * sample_rate:
+        raise ValueError(
+            f"sample rate {sample_rate} Hz for a teacher; allowed: 16000, 22050, 24000, 32000, 44100, 48000"
+        )
+    return grid
