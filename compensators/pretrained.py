@@ -29,7 +29,7 @@ def load_compensator(
     Raises:
         ValueError: no such checkpoint, one of another kind, or one whose weights are not those that its hash tells.
     """
-    if name == "nalr":
+    if str(name) == "nalr":
         return NALR(sample_rate=sample_rate, full_scale_spl=full_scale_spl).eval()
 
     def build(config: Mapping[str, Any]) -> MappingCompensator:

@@ -217,7 +217,7 @@ def _build(simulator: str | Path | nn.Module, sample_rate: int, full_scale_spl: 
         raise ValueError(
             f"simulator is {type(simulator).__name__}; allowed: a name, a folder or a module (not its class)"
         )
-    if simulator == "msbg":
+    if str(simulator) == "msbg":
         return MSBG(sample_rate=sample_rate, full_scale_spl=full_scale_spl)
     folder = find_checkpoint(simulator, SIMULATOR, ("msbg",))
     return load_pretrained(folder, sample_rate=sample_rate, full_scale_spl=full_scale_spl)

@@ -5,6 +5,7 @@ import pickle
 import subprocess
 import sys
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 import torch
@@ -415,6 +416,11 @@ def test_autocast_does_not_reach_inside(simulator: str, criterion: str, clean: T
 
 
 # Simulators and errors
+
+
+def test_names_may_be_paths() -> None:
+    assert isinstance(HearingLossLoss(N3, simulator=Path("msbg")).simulator, MSBG)
+    assert isinstance(HearingLossLoss(N3, simulator=Path("neuro-msbg")).simulator, NeuroMSBG)
 
 
 def test_simulator_by_folder_and_as_a_module(clean: Tensor) -> None:

@@ -37,6 +37,6 @@ def estimate_delay(
     impulse[place] = 10.0 ** ((level - float(full_scale)) / 20.0)
     with torch.no_grad():
         heard = simulator(impulse, audiogram)
-    if heard.ndim != 1:
-        raise ValueError(f"audiograms of {heard.shape[0]} ears; allowed: one")
+    if (ears := heard.shape[:-1].numel()) != 1:
+        raise ValueError(f"audiograms of {ears} ears; allowed: one")
     return int(heard.abs().argmax()) - place

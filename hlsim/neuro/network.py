@@ -35,9 +35,11 @@ class EarNetwork(nn.Module):
         Shape: (..., time) and one audiogram or (..., 8) that broadcasts over the leading dimensions -> (..., time).
 
         Raises:
-            ValueError: levels outside -10 to 100 dB HL, or shapes that do not fit.
+            ValueError: no audiogram, levels outside -10 to 100 dB HL, or shapes that do not fit.
         """
         check_waveform(waveform)
+        if audiogram is None:
+            raise ValueError(f"no audiogram: give one with each call, {type(self).__name__} holds none")
         thresholds = resolve_thresholds(None, audiogram, waveform)
         with torch.autocast(waveform.device.type, enabled=False):
             dtype = self._dtype

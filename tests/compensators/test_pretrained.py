@@ -25,6 +25,7 @@ def test_saved_and_loaded_is_the_same_to_the_bit(tmp_path: Path) -> None:
 def test_nalr_by_name() -> None:
     nalr = load_compensator("nalr", sample_rate=44100)
     assert isinstance(nalr, NALR) and nalr.sample_rate == 44100 and not nalr.training
+    assert isinstance(load_compensator(Path("nalr")), NALR)
 
 
 def test_unknown_name_and_other_kind(tmp_path: Path) -> None:

@@ -45,3 +45,9 @@ def test_what_is_no_simulator() -> None:
         estimate_delay(torch.nn.Identity())
     with pytest.raises(ValueError, match="allowed: one"):
         estimate_delay(MSBG(aligned=False), torch.zeros(2, 8))
+
+
+def test_one_ear_in_any_shape() -> None:
+    ear, simulator = Audiogram.standard("N2"), MSBG(aligned=False, sample_rate=16000)
+    given = ([ear], torch.tensor([[ear.thresholds]]))
+    assert {estimate_delay(simulator, one) for one in given} == {estimate_delay(simulator, ear)}
