@@ -1,8 +1,6 @@
 """A name or a folder to a compensator that is ready to use."""
 
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 from compensators.config import MappingConfig
 from compensators.mapping import MappingCompensator
@@ -27,14 +25,12 @@ def load_compensator(
         full_scale_spl: level in dB SPL of RMS 1.0.
 
     Raises:
-        ValueError: no such checkpoint, one of another kind, or one whose weights are not those that its hash tells.
+        ValueError: no such checkpoint, one of another kind, or one that has changed since it was saved.
     """
     if str(name) == "nalr":
         return NALR(sample_rate=sample_rate, full_scale_spl=full_scale_spl).eval()
 
-    def build(config: Mapping[str, Any]) -> MappingCompensator:
-        return MappingCompensator(
-            MappingConfig.from_dict(config), sample_rate=sample_rate, full_scale_spl=full_scale_spl
-        )
+    def build(config: MappingConfig) -> MappingCompensator:
+        return MappingCompensator(config, sample_rate=sample_rate, full_scale_spl=full_scale_spl)
 
-    return read_checkpoint(name, KIND, build, also=("nalr",)).eval().requires_grad_(False)
+    return read_checkpoint(name, KIND, MappingConfig, build, also=("nalr",)).eval().requires_grad_(False)

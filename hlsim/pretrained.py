@@ -16,10 +16,11 @@ import safetensors.torch
 from torch import Tensor, nn
 
 from hlsim.calibration import PASCAL_SPL
-from hlsim.neuro.config import NEURO_RATE, NeuroConfig
+from hlsim.neuro.config import NEURO_RATE, NetworkConfig, NeuroConfig
 from hlsim.neuro.model import NeuroMSBG
 
 Model = TypeVar("Model", bound=nn.Module)
+Config = TypeVar("Config", bound=NetworkConfig)
 
 WEIGHTS, CONFIG, CARD = "model.safetensors", "config.json", "README.md"
 
@@ -38,22 +39,26 @@ def load_pretrained(
         full_scale_spl: level in dB SPL of RMS 1.0.
 
     Raises:
-        ValueError: no such checkpoint, one of another kind, or one whose weights are not those that its hash tells.
+        ValueError: no such checkpoint, one of another kind, or one that has changed since it was saved.
     """
 
-    def build(config: Mapping[str, Any]) -> NeuroMSBG:
-        return NeuroMSBG(
-            NeuroConfig.from_dict(config), sample_rate=sample_rate, full_scale_spl=full_scale_spl
-        )
+    def build(config: NeuroConfig) -> NeuroMSBG:
+        return NeuroMSBG(config, sample_rate=sample_rate, full_scale_spl=full_scale_spl)
 
-    model = read_checkpoint(name, SIMULATOR, build)
+    model = read_checkpoint(name, SIMULATOR, NeuroConfig, build)
     return model.eval().requires_grad_(False)
 
 
 def read_checkpoint(
-    name: str | Path, kind: str, build: Callable[[Mapping[str, Any]], Model], also: Sequence[str] = ()
+    name: str | Path,
+    kind: str,
+    config_kind: type[Config],
+    build: Callable[[Config], Model],
+    also: Sequence[str] = (),
 ) -> Model:
     """Build a model from a checkpoint's configuration and load its weights.
+
+    A configuration without a hash, as older checkpoints have it, is taken as it is.
 
     Raises:
         ValueError: as ``load_pretrained``.
@@ -71,10 +76,19 @@ def read_checkpoint(
         raise ValueError(
             f"{folder / WEIGHTS}: changed since it was saved, its SHA-256 differs from {CONFIG}'s; get it anew"
         )
+    settings: Any = record.get("config")
+    if record.get("config_sha256", _digest(settings)) != _digest(settings):
+        raise ValueError(
+            f"{folder / CONFIG}: changed since it was saved, the SHA-256 of its 'config' is another; get it anew"
+        )
     try:
-        model = build(record["config"])
+        config = config_kind.from_dict(settings)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{folder / CONFIG}: {error}") from error
+    try:
+        model = build(config)
         model.load_state_dict(safetensors.torch.load(weights))
-    except (KeyError, TypeError, RuntimeError, safetensors.SafetensorError) as error:
+    except (TypeError, RuntimeError, safetensors.SafetensorError) as error:
         raise ValueError(
             f"{folder}: weights and configuration do not fit ({str(error).splitlines()[0]})"
         ) from error
@@ -153,6 +167,7 @@ def save_checkpoint(
         "kind": kind,
         "config": dict(config),
         "sha256": hashlib.sha256(weights).hexdigest(),
+        "config_sha256": _digest(dict(config)),
         "about": dict(about),
     }
     staging = Path(tempfile.mkdtemp(prefix=f".{target.name}.", dir=target.parent))
@@ -187,6 +202,11 @@ def repair_checkpoint(folder: str | Path) -> None:
     for path in target.parent.glob(f".{target.name}.*"):
         if path.is_dir() and staged.fullmatch(path.name):
             shutil.rmtree(path, ignore_errors=True)
+
+
+def _digest(config: Any) -> str:
+    """The SHA-256 of a configuration, whatever the order of its names."""
+    return hashlib.sha256(json.dumps(config, sort_keys=True).encode()).hexdigest()
 
 
 def _old(target: Path) -> Path:

@@ -1,5 +1,6 @@
 """Checkpoints: whole, hashed, without pickle."""
 
+import hashlib
 import json
 import os
 from pathlib import Path
@@ -10,7 +11,7 @@ import torch
 
 from hlsim import NeuroMSBG, load_pretrained
 from hlsim.neuro import NeuroConfig
-from hlsim.pretrained import checkpoints_folder, find_checkpoint, repair_checkpoint, save_checkpoint
+from hlsim.pretrained import checkpoints_folder, find_checkpoint, repair_checkpoint, save_checkpoint, shipped
 
 SMALL = NeuroConfig(channels=4, blocks=1)
 
@@ -88,12 +89,43 @@ def test_another_kind(folder: Path) -> None:
 def test_configuration_that_does_not_fit(folder: Path) -> None:
     record = json.loads((folder / "config.json").read_text())
     record["config"]["channels"] = 5
+    del record["config_sha256"]  # as in older ones
     (folder / "config.json").write_text(json.dumps(record))
     with pytest.raises(ValueError, match="do not fit"):
         load_pretrained(folder)
     (folder / "config.json").write_text("no JSON")
     with pytest.raises(ValueError, match="not readable as a checkpoint"):
         load_pretrained(folder)
+
+
+def test_changed_configuration(folder: Path) -> None:
+    path = folder / "config.json"
+    record = json.loads(path.read_text())
+    assert NeuroConfig.from_dict(record["config"]).window != 64
+    path.write_text(json.dumps(record | {"config": record["config"] | {"window": 64}}))
+    with pytest.raises(ValueError, match="changed since it was saved, the SHA-256 of its 'config'") as caught:
+        load_pretrained(folder)
+    assert str(caught.value).startswith(str(path))
+    path.write_text(json.dumps(record | {"config": dict(reversed(record["config"].items()))}))
+    load_pretrained(folder)
+
+
+@pytest.mark.parametrize("config", [None, [], {"layers": 3}, {"channels": "many"}])
+def test_odd_configuration_is_named(folder: Path, config: Any) -> None:
+    path = folder / "config.json"
+    record = json.loads(path.read_text())
+    del record["config_sha256"]
+    path.write_text(json.dumps(record | {"config": config}))
+    with pytest.raises(ValueError, match="allowed: ") as caught:
+        load_pretrained(folder)
+    assert str(caught.value).startswith(str(path)) and len(str(caught.value).splitlines()) == 1
+
+
+@pytest.mark.parametrize("name", sorted(shipped()))
+def test_shipped_configurations_have_their_hash(name: str) -> None:
+    record = json.loads((checkpoints_folder() / name / "config.json").read_text())
+    text = json.dumps(record["config"], sort_keys=True)
+    assert hashlib.sha256(text.encode()).hexdigest() == record["config_sha256"]
 
 
 def test_missing_weights(folder: Path) -> None:
