@@ -1,5 +1,6 @@
 """One way to run a training: time-boxed, resumable, with progress, TensorBoard and the best checkpoint kept."""
 
+import contextlib
 import json
 import logging
 import math
@@ -121,8 +122,12 @@ class KeepBest(Callback):
         return {"best": self.best}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        if not (self.note.parent / CHECKPOINT).is_dir():
+            return  # the next one is the best there is
         self.best = float(state_dict["best"])
-        if self.note.is_file():
+        with contextlib.suppress(
+            OSError, ValueError, TypeError, LookupError
+        ):  # none, or one that a crash broke
             self.best = max(self.best, float(json.loads(self.note.read_text(encoding="utf-8"))["best"]))
 
     def on_validation_end(self, trainer: L.Trainer, module: L.LightningModule) -> None:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 pytest.importorskip("lightning")
 
-from hlsim.training.loop import LAST, TimedModule, run
+from hlsim.training.loop import BEST, CHECKPOINT, LAST, TimedModule, run
 
 EVER = 1e6  # minutes
 
@@ -45,9 +45,14 @@ def go(module: Toy, out: Path, max_steps: int = 6, **options: Any) -> tuple[list
     """Run; what was written and reported."""
     written: list[dict[str, Any]] = []
     lines: list[str] = []
+
+    def write(figures: dict[str, Any]) -> None:
+        (out / CHECKPOINT).mkdir(exist_ok=True)
+        written.append(figures)
+
     settings: dict[str, Any] = {
         "recipe": {"a": 1},
-        "write": written.append,
+        "write": write,
         "validate_every": 2,
         "accelerator": "cpu",
         "report": lines.append,
@@ -165,7 +170,7 @@ def test_leftovers_of_a_killed_run_go(tmp_path: Path) -> None:
     (tmp_path / ".checkpoint.old").mkdir()
     (tmp_path / ".checkpoint.abcd1234").mkdir()
     go(Toy(), tmp_path, max_steps=1)
-    assert not list(tmp_path.glob(".*")) and (tmp_path / "checkpoint").is_dir()
+    assert not list(tmp_path.glob(".*")) and (tmp_path / CHECKPOINT).is_dir()
 
 
 @pytest.mark.parametrize("broken", [b"", b"no state", None, "one byte"])
@@ -298,6 +303,23 @@ def test_the_best_of_a_killed_run_is_not_replaced_by_a_worse_one(tmp_path: Path)
     torch.save(state, tmp_path / LAST)
     written, _ = go(Toy(scores=dict.fromkeys(range(2, 12, 2), 2.0)), tmp_path, max_steps=8)
     assert written == []
+
+
+@pytest.mark.parametrize("note", ["", "[]", "{}", '{"best": null}', '{"best": "?"}', None])
+def test_without_a_note_of_the_best_the_state_knows_it(tmp_path: Path, note: str | None) -> None:
+    scores = {2: 3.0, 4: 2.0, 6: 2.5}
+    go(Toy(scores=scores), tmp_path, max_steps=2)
+    (tmp_path / BEST).unlink()
+    if note is not None:
+        (tmp_path / BEST).write_text(note)
+    assert go(Toy(scores=scores), tmp_path, max_steps=4)[0] == []
+
+
+def test_a_checkpoint_that_was_removed_is_written_again(tmp_path: Path) -> None:
+    scores = {2: 3.0, 4: 2.0, 6: 1.0}
+    go(Toy(scores=scores), tmp_path, max_steps=2)
+    (tmp_path / CHECKPOINT).rmdir()
+    assert [note["steps"] for note in go(Toy(scores=scores), tmp_path, max_steps=6)[0]] == [4]
 
 
 def test_a_validation_that_was_cut_off_is_made_up_for(tmp_path: Path) -> None:
