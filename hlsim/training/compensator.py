@@ -82,6 +82,10 @@ class CompensatorRecipe:
                 f"seconds {self.seconds}, learning_rate {self.learning_rate} in the recipe; allowed: counts from 1 up, "
                 "seconds and learning_rate above 0"
             )
+        if not -(2**62) < self.seed < 2**62:
+            raise ValueError(
+                f"seed {self.seed} in the recipe; allowed: whole numbers between -2**62 and 2**62"
+            )
         if not (0.0 <= self.noisy <= 1.0 and 0.0 <= self.equalised <= 1.0):
             raise ValueError(f"noisy {self.noisy}, equalised {self.equalised} in the recipe; allowed: 0 to 1")
 

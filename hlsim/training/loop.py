@@ -80,9 +80,8 @@ class TimedModule(L.LightningModule):
         return [parameter for parameter in self.parameters() if parameter.requires_grad]
 
     def training_step(self, batch: Tensor, index: int) -> Tensor:
-        generator = torch.Generator().manual_seed(
-            (self.seed * 1_000_003 + self.global_step) * 64 + self.global_rank
-        )
+        number = (self.seed * 1_000_003 + self.global_step) * 64 + self.global_rank
+        generator = torch.Generator().manual_seed(number % 2**63)  # more are too many for it
         loss = self.training_loss(generator)
         if not bool(torch.isfinite(loss)):
             raise ValueError(
@@ -125,9 +124,8 @@ class KeepBest(Callback):
         if not (self.note.parent / CHECKPOINT).is_dir():
             return  # the next one is the best there is
         self.best = float(state_dict["best"])
-        with contextlib.suppress(
-            OSError, ValueError, TypeError, LookupError
-        ):  # none, or one that a crash broke
+        # there may be none, or one that a crash broke
+        with contextlib.suppress(OSError, ValueError, TypeError, LookupError):
             self.best = max(self.best, float(json.loads(self.note.read_text(encoding="utf-8"))["best"]))
 
     def on_validation_end(self, trainer: L.Trainer, module: L.LightningModule) -> None:
@@ -272,6 +270,9 @@ def run(
             ) from error
         claim(folder, recipe)  # now that the training can begin
         repair_checkpoint(folder / CHECKPOINT)
+        # SLURM's end of a job leaves its own, newer than the last validation's
+        left = [path for path in (last, *folder.glob("hpc_ckpt_*.ckpt")) if path.is_file()]
+        newest = max(left, key=lambda path: path.stat().st_mtime_ns, default=None)
         own = module.datamodule is None
         try:
             trainer.fit(
@@ -279,7 +280,7 @@ def run(
                 DataLoader(Counter(10_000_000), batch_size=None) if own else None,
                 DataLoader(Counter(1), batch_size=None) if own else None,
                 datamodule=module.datamodule,
-                ckpt_path=str(last) if last.is_file() else None,
+                ckpt_path=str(newest) if newest else None,
                 weights_only=True,
             )
             trainer.validate(module, DataLoader(Counter(1), batch_size=None), verbose=False)

@@ -89,6 +89,10 @@ class SimulatorRecipe:
                 f"seconds {self.seconds}, learning_rate {self.learning_rate} in the recipe; allowed: counts from 1 up, "
                 "seconds and learning_rate above 0"
             )
+        if not -(2**62) < self.seed < 2**62:
+            raise ValueError(
+                f"seed {self.seed} in the recipe; allowed: whole numbers between -2**62 and 2**62"
+            )
         if self.unit_power not in ("truth", "input"):
             raise ValueError(f"unit_power {self.unit_power!r} in the recipe; allowed: truth or input")
         if self.precision not in PRECISIONS or not 0.0 <= self.average < 1.0:

@@ -139,6 +139,7 @@ def test_general_one_draws_ears_and_noise(data: TrainingData, tmp_path: Path) ->
         ({"weights": {"haspi": 1.0}}, "unknown criteria haspi"),
         ({"levels": [80.0, 50.0]}, "a lowest and a highest"),
         ({"batch": 0}, "counts from 1 up"),
+        ({"seed": -(2**62)}, "seed -4611686018427387904 in the recipe; allowed: whole numbers between"),
         ({"weights": {"bands": 0.0}}, "above 0"),
         ({"model": {"layers": 2}}, "unknown network settings layers"),
     ],

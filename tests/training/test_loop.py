@@ -22,9 +22,14 @@ class Toy(TimedModule):
     """Fits a vector to noisy draws of another; ``scores`` says what the validations tell, by step."""
 
     def __init__(
-        self, *, max_minutes: float = EVER, learning_rate: float = 0.1, scores: dict[int, float] | None = None
+        self,
+        *,
+        max_minutes: float = EVER,
+        learning_rate: float = 0.1,
+        scores: dict[int, float] | None = None,
+        seed: int = 3,
     ) -> None:
-        super().__init__(learning_rate, max_minutes, seed=3)
+        super().__init__(learning_rate, max_minutes, seed)
         self.vector = torch.nn.Parameter(torch.zeros(4))
         self.scores = scores
         self.seen: list[int] = []
@@ -101,6 +106,13 @@ def test_steps_draw_by_seed_and_step_and_not_by_history(tmp_path: Path) -> None:
         go(module, tmp_path / out, max_steps=3)
     assert draws[0] == draws[1]
     assert len(set(draws[0])) == 3
+
+
+@pytest.mark.parametrize("seed", [2**62 - 1, -(2**62) + 1])
+def test_large_seeds_draw_too(tmp_path: Path, seed: int) -> None:
+    module = Toy(seed=seed)
+    go(module, tmp_path, max_steps=1)
+    assert module.seen == [0]
 
 
 def test_interruption_goes_on_from_the_last_state(tmp_path: Path) -> None:
@@ -222,6 +234,21 @@ def test_what_slurm_makes_it_store_belongs_to_the_folder_and_its_recipe(
     (tmp_path / LAST).rename(tmp_path / "hpc_ckpt_1.ckpt")
     with pytest.raises(ValueError, match="another recipe"):
         go(Toy(), tmp_path, recipe={"a": 2})
+
+
+def test_the_newest_state_is_gone_on_from(tmp_path: Path) -> None:
+    go(Toy(), tmp_path / "whole", max_steps=3)
+    go(Toy(), tmp_path / "parts", max_steps=2)
+    first, last = tmp_path / "whole" / LAST, tmp_path / "parts" / LAST
+    first.rename(last.with_name("hpc_ckpt_1.ckpt"))
+    os.utime(last.with_name("hpc_ckpt_1.ckpt"), (last.stat().st_atime, last.stat().st_mtime + 1.0))
+    module = Toy()
+    go(module, tmp_path / "parts", max_steps=4)
+    assert module.seen == [3]
+    os.utime(last, (last.stat().st_atime, last.stat().st_mtime + 60.0))
+    module = Toy()
+    go(module, tmp_path / "parts", max_steps=6)
+    assert module.seen == [4, 5]
 
 
 def test_a_recipe_without_a_state_may_be_replaced(tmp_path: Path) -> None:

@@ -128,6 +128,7 @@ def test_lower_precision_is_near_and_leaves_the_physics_alone(data: TrainingData
         ({"precision": "float16"}, "float32 or bfloat16"),
         ({"average": 1.0}, "from 0 to below 1"),
         ({"unit_power": "both"}, "truth or input"),
+        ({"seed": 2**62}, "seed 4611686018427387904 in the recipe; allowed: whole numbers between"),
         ({"levels": [80, 60]}, "a lowest and a highest"),
     ],
 )
