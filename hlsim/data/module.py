@@ -85,6 +85,7 @@ class TrainingItems(Dataset[Instance]):
         self.grid = grid_of(items.plan.rate)
         self.seed = seed
         self.start, self.stride = start, stride
+        self.skip = 0  # items, given before
         self.length = length
         self.levels, self.treated = levels, treated
         self._order = (-1, torch.empty(0))
@@ -95,7 +96,7 @@ class TrainingItems(Dataset[Instance]):
     def __getitem__(self, place: int) -> Instance:
         for offset in range(_TRIES):
             try:
-                return self._clip(self.start + place * self.stride, offset)
+                return self._clip(self.start + (self.skip + place) * self.stride, offset)
             except ValueError as error:
                 warnings.warn(f"left out: {error}", stacklevel=2)
                 last = error
@@ -159,7 +160,8 @@ class PlanData(L.LightningDataModule):
     item k is the plan's instance k however it is made: whole, the same as ``hlsim prepare --write`` puts on disk (to the
     rounding of a batch). Clips that are not varied start where frames of MSBG's smearing do (every 0.64 s at 16 kHz), so
     that they too are the same both ways, but for 50 ms at either end, where the target from disk knows what lies beyond.
-    On several devices each takes its own share: give the Trainer ``use_distributed_sampler=False``.
+    On several devices each takes its own share: give the Trainer ``use_distributed_sampler=False``. Each iteration over
+    training batches, and a training that goes on from a Trainer's state, begins after the batches already given.
 
     Args:
         folder: what ``hlsim prepare`` wrote.
@@ -205,9 +207,20 @@ class PlanData(L.LightningDataModule):
         self.workers = workers
         self.seed = seed
         self.loader: TimedLoader | None = None
+        self.given: int | None = None
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"given": self.loader.given if self.loader is not None else self.given}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        self.loader = None
+        self.given = state_dict.get("given")
 
     def train_dataloader(self) -> DataLoader[Any]:
-        step = self.trainer.global_step if self.trainer is not None else 0
+        if self.loader is not None:
+            self.given = self.loader.given
+        elif self.given is None:  # states of old have no count
+            self.given = self.trainer.global_step if self.trainer is not None else 0
         processes = self.trainer.world_size if self.trainer is not None else 1
         rank = self.trainer.global_rank if self.trainer is not None else 0
         items = TrainingItems(
@@ -215,13 +228,14 @@ class PlanData(L.LightningDataModule):
             seconds=self.seconds,
             augment=self.augment,
             seed=self.seed,
-            start=step * self.batch * processes + rank,
+            start=rank,
             stride=processes,
             length=_ENDLESS * self.batch,
             levels=self.levels,
             treated=self.treated,
         )
         self.loader = self._loader(items)
+        self.loader.given = self.given
         return self.loader
 
     def val_dataloader(self) -> DataLoader[Any]:
@@ -252,11 +266,17 @@ class PlanData(L.LightningDataModule):
 
 
 class TimedLoader(DataLoader[Any]):
-    """A loader that knows how long it was waited for: ``waited``, in seconds."""
+    """A loader that knows how long it was waited for, ``waited`` in seconds, and how many batches it has ``given``.
+
+    An iteration over ``TrainingItems``, which are endless, begins after the batches given.
+    """
 
     waited = 0.0
+    given = 0
 
     def __iter__(self) -> Iterator[Any]:  # type: ignore[override]
+        if isinstance(self.dataset, TrainingItems):
+            self.dataset.skip = self.given * (self.batch_size or 1)  # before workers take their copies
         batches = super().__iter__()
         while True:
             began = time.perf_counter()
@@ -267,6 +287,7 @@ class TimedLoader(DataLoader[Any]):
             except ValueError as error:  # a worker's has its traceback in its message
                 raise ValueError(str(error).rpartition("ValueError: ")[2].strip()) from error
             self.waited += time.perf_counter() - began
+            self.given += 1
             yield batch
 
 

@@ -94,6 +94,10 @@ class PlannedTraining(SimulatorTraining):
 class _Batches(PlanData):
     """Training batches; the modules here validate on items of their own."""
 
+    def state_dict(self) -> dict[str, Any]:
+        """Nothing: a batch is a step, and the step is right where SLURM has a state stored in the midst of one."""
+        return {}
+
     def val_dataloader(self) -> DataLoader[Any]:
         return DataLoader(Counter(1), batch_size=None)
 

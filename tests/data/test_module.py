@@ -1,5 +1,6 @@
 """Batches for Lightning: on the fly and from disk alike, in an order that resumes, varied when training."""
 
+import itertools
 from pathlib import Path
 
 import pytest
@@ -7,9 +8,11 @@ import torch
 
 pytest.importorskip("lightning")
 
+import lightning as L
+
 from hlsim import MSBG
 from hlsim.calibration import level_spl
-from hlsim.data.module import PlanData, PlanItems, TrainingItems, collate
+from hlsim.data.module import Batch, PlanData, PlanItems, TrainingItems, collate
 from hlsim.data.samples import Instance, Plan
 from hlsim.data.writing import Recipe, write_instances
 
@@ -115,6 +118,60 @@ def test_workers_give_the_same_batches_and_the_wait_is_known(plan: Path) -> None
     for first, second in zip(*batches, strict=True):
         assert first["signal"].shape == (2, 4800)
         assert torch.equal(first["signal"], second["signal"]) and torch.equal(first["clean"], second["clean"])
+
+
+class Seen(L.LightningModule):
+    """Keeps the sums of its batches, which tell them apart."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.weight = torch.nn.Parameter(torch.ones(()))
+        self.sums: list[float] = []
+
+    def training_step(self, batch: Batch, index: int) -> torch.Tensor:
+        self.sums.append(float(batch["signal"].double().sum()))
+        return self.weight * batch["signal"].mean()
+
+    def configure_optimizers(self) -> torch.optim.Optimizer:
+        return torch.optim.SGD(self.parameters(), lr=0.1)
+
+
+def test_epochs_and_resumed_trainings_go_on_where_the_batches_were(plan: Path, tmp_path: Path) -> None:
+    def fit(epochs: int, state: Path | None = None) -> tuple[list[float], L.Trainer]:
+        module = Seen()
+        data = PlanData(plan, workers=0, batch=2, seconds=0.1, prepared=True)
+        trainer = L.Trainer(
+            accelerator="cpu",
+            max_epochs=epochs,
+            limit_train_batches=4,
+            limit_val_batches=0,
+            accumulate_grad_batches=2,
+            logger=False,
+            enable_checkpointing=False,
+            enable_progress_bar=False,
+            enable_model_summary=False,
+            default_root_dir=str(tmp_path),
+        )
+        trainer.fit(module, datamodule=data, ckpt_path=state, weights_only=True)
+        return module.sums, trainer
+
+    write_instances(plan, Recipe(), jobs=1)
+    whole, _ = fit(3)
+    loader = PlanData(plan, workers=0, batch=2, seconds=0.1, prepared=True).train_dataloader()
+    expected = [float(batch["signal"].double().sum()) for batch, _ in zip(loader, range(12), strict=False)]
+    assert whole == expected and len(set(whole)) == 12
+    first, trainer = fit(2)
+    trainer.save_checkpoint(tmp_path / "state.ckpt")
+    assert first + fit(3, tmp_path / "state.ckpt")[0] == expected
+
+
+def test_workers_go_on_too(plan: Path) -> None:
+    sums: list[list[float]] = []
+    for parts in ((4,), (1, 3)):
+        loader = PlanData(plan, workers=1, batch=2, seconds=0.1).train_dataloader()
+        batches = [b for n in parts for b in itertools.islice(loader, n)]
+        sums.append([float(batch["signal"].double().sum()) for batch in batches])
+    assert sums[0] == sums[1] and len(set(sums[0])) == 4
 
 
 def test_collate_pads_with_silence() -> None:
