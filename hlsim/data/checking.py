@@ -16,9 +16,7 @@ from hlsim.data.corpora import Fault, Found, walk_audio
 from hlsim.data.manifest import inside
 from hlsim.parallel import run_parallel
 
-_SILENT = 10.0 ** (
-    -150.0 / 20.0
-)  # a peak below the steps of 24 bits; the squares of the smallest numbers are 0
+_SILENT = 10.0 ** (-150.0 / 20.0)  # a peak below the steps of 24 bits
 
 
 class Listing:

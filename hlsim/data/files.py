@@ -96,9 +96,9 @@ class Whole:
         return ValueError(f"{self.path}: cannot be written ({error.strerror})")
 
 
-def sha256(path: str | Path) -> str:
+def sha256(path: Path) -> str:
     """Of what a file holds."""
-    with open(path, "rb") as file:
+    with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 

@@ -184,7 +184,7 @@ def _spare_what_is_not_ours(settings: PlanSettings, folder: Path) -> None:
         (SETTINGS, None),
     ):
         path = folder / name
-        if not path.exists():
+        if not path.is_file():
             continue
         if any(table.exists() and table.samefile(path) for table in tables if table is not None):
             raise ValueError(f"{path}: would be written over, and is read from; choose another --out")

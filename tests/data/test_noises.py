@@ -70,10 +70,14 @@ def test_what_is_refused(tmp_path: Path) -> None:
         find_noises(one, "noise", ("train",), test_snrs=(5.0, 7.5))
     (one / "noise" / "broken.wav").write_text("x")
     write_audio(one / "noise" / "stereo.wav", torch.stack((torch.zeros(160), torch.ones(160))), 16000)
+    soundfile.write(one / "noise" / "tiny.wav", torch.full((160,), 1e-39).numpy(), 16000, subtype="FLOAT")
+    (one / "noise" / "linked").symlink_to(both / "noise")
     noises, faults = find_noises(one, "noise", ("train",))
     assert set(noises.files["train"]) == {"a"}
     reasons = {fault.path: fault.reason for fault in faults}
     assert reasons["noise/stereo.wav"] == "silent first channel"
+    assert reasons["noise/tiny.wav"] == "first channel as good as silent, its peak is 1e-39"
+    assert reasons["noise/linked"].startswith("a link to a folder")
     assert reasons["noise/broken.wav"].startswith("not readable as audio")
 
 
