@@ -69,12 +69,14 @@ def read_audio(path: str | Path, *, any_rate: bool = False) -> tuple[Tensor, int
         ValueError: the file is missing, broken, cut off (wav), empty, silent or holds NaN or infinity, or its rate is
             below 16 kHz or above 48 kHz. The message starts with the path.
     """
+    check_name(path)
     if not Path(path).is_file():
         raise ValueError(f"{path}: no such file")
     try:
         _refuse_cut(path)
         samples, rate = soundfile.read(str(path), dtype="float32", always_2d=True)
-    except (OSError, soundfile.LibsndfileError, RuntimeError) as error:
+    except (OSError, soundfile.LibsndfileError, RuntimeError, MemoryError) as error:
+        # no memory is enough for the length that a broken header tells
         raise ValueError(f"{path}: not readable as audio ({error}); allowed: wav, flac, ogg") from error
     if samples.shape[0] == 0:
         raise ValueError(f"{path}: empty, no samples")
@@ -114,7 +116,7 @@ def read_stretch(path: str | Path, start: float, seconds: float) -> tuple[Tensor
                 pieces.append(torch.from_numpy(piece.T.copy()))
                 left -= len(piece)
                 file.seek(0)
-    except (OSError, soundfile.LibsndfileError, RuntimeError) as error:
+    except (OSError, soundfile.LibsndfileError, RuntimeError, MemoryError) as error:
         raise ValueError(f"{path}: not readable as audio ({error}); allowed: wav, flac, ogg") from error
     return torch.cat(pieces, -1), rate
 
@@ -226,7 +228,11 @@ def find_audio(folder: str | Path) -> list[Path]:
     if not root.is_dir():
         raise ValueError(f"{folder}: no such folder")
     files = sorted(
-        p for p in root.rglob("*") if p.suffix.lower() in EXTENSIONS and not p.name.startswith(".")
+        path
+        for path in root.rglob("*")
+        if path.suffix.lower() in EXTENSIONS
+        and not any(part.startswith(".") for part in path.relative_to(root).parts)
+        and not path.is_dir()
     )
     if not files:
         raise ValueError(f"{folder}: no audio in it; looked for {', '.join(EXTENSIONS)}")

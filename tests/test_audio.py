@@ -27,7 +27,6 @@ from hlsim.audio import (
     resample,
     write_audio,
 )
-from hlsim.data.corpora import walk_audio
 
 RATES = [(16000, 44100), (44100, 16000), (48000, 16000), (16000, 48000), (22050, 44100), (32000, 44100)]
 
@@ -218,7 +217,8 @@ def test_faster_files_can_be_let_through(tmp_path: Path) -> None:
 
 
 def test_find_audio_looks_into_folders_and_sorts(tmp_path: Path) -> None:
-    for name in ("b/2.FLAC", "b/1.ogg", "a.wav", ".hidden.wav", "b/notes.txt"):
+    (tmp_path / "folder.wav").mkdir()
+    for name in ("b/2.FLAC", "b/1.ogg", "a.wav", ".hidden.wav", "b/notes.txt", ".cache/c.wav"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).touch()
     assert [p.relative_to(tmp_path).as_posix() for p in find_audio(tmp_path)] == [
@@ -229,14 +229,33 @@ def test_find_audio_looks_into_folders_and_sorts(tmp_path: Path) -> None:
 
 
 def test_a_name_that_is_not_utf_8_is_named_before_the_work(tmp_path: Path) -> None:
+    path = Path(os.fsdecode(os.fsencode(tmp_path) + b"/caf\xe9.wav"))
     try:
-        Path(os.fsdecode(os.fsencode(tmp_path) + b"/caf\xe9.wav")).touch()
+        path.touch()
     except OSError:
         pytest.skip("this disk takes no such names")
     (tmp_path / "good.wav").touch()
-    for find in (find_audio, walk_audio):
+    for read in (lambda: find_audio(tmp_path), lambda: read_audio(path)):
         with pytest.raises(ValueError, match=r"caf\\xe9\.wav: its name is not UTF-8; rename it"):
-            list(find(tmp_path))
+            read()
+
+
+def test_a_header_that_tells_of_more_than_memory_holds(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "long.flac"
+    write_audio(path, torch.rand(100), 16000)
+    data = bytearray(path.read_bytes())
+    data[21:26] = bytes([data[21] | 0x0F, *[0xFF] * 4])  # the number of samples
+    path.write_bytes(data)
+    assert soundfile.info(str(path)).frames == 2**36 - 1
+
+    def refuse(*args: object, **kwargs: object) -> None:  # whether the system would, hangs on its settings
+        raise MemoryError("Unable to allocate 256. GiB")
+
+    monkeypatch.setattr(np, "empty", refuse)
+    with pytest.raises(ValueError, match=r"long\.flac: not readable as audio \(Unable to allocate"):
+        read_audio(path)
 
 
 def test_find_audio_says_what_is_missing(tmp_path: Path) -> None:
