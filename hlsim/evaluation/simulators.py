@@ -7,6 +7,7 @@ import hashlib
 import inspect
 import pickle
 import uuid
+import weakref
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -171,7 +172,7 @@ def weights_hash(module: nn.Module) -> str:
     ]
     kinds = {type(part): None for part in module.modules()}
     about = [f"{kind.__module__}.{kind.__qualname__} {_source(kind)}" for kind in kinds]
-    state = hashlib.sha256(f"{about} {getattr(module, 'config', '')} {settings}".encode())
+    state = hashlib.sha256(f"{about} {settings}".encode())
     for name, tensor in (*module.named_parameters(), *module.named_buffers()):
         state.update(name.encode())
         state.update(tensor.detach().cpu().contiguous().numpy().tobytes())
@@ -196,6 +197,8 @@ def _setting(value: Any) -> Any:
         return _setting(value.detach().cpu().numpy())
     if isinstance(value, torch.dtype | torch.device):
         return str(value)
+    if isinstance(value, weakref.ref):  # an LSTM holds some to its weights
+        return _setting(value())
     try:
         return hashlib.sha256(pickle.dumps(value)).hexdigest()
     except Exception:  # a lambda, an open file: whatever it does may have changed, so it is scored anew

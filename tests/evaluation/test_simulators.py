@@ -19,6 +19,7 @@ from hlsim.evaluation.fidelity import snr_db
 from hlsim.evaluation.fidelity_items import LEVELS, draw_items, treat
 from hlsim.evaluation.simulators import evaluate_simulators, weights_hash
 from hlsim.evaluation.truth import pyclarity_msbg
+from hlsim.pretrained import SIMULATOR, load_pretrained, shipped
 
 pytest.importorskip("clarity")
 pytest.importorskip("pesq")
@@ -208,6 +209,13 @@ def test_modules_that_differ_in_a_setting_differ_in_their_scores_name() -> None:
 @dataclass
 class Options:
     gain: float
+
+
+@pytest.mark.parametrize("name", [*shipped(SIMULATOR)])
+def test_a_checkpoint_is_the_same_whenever_it_is_loaded(name: str) -> None:
+    once, again = load_pretrained(name), load_pretrained(name)
+    again(torch.full((1600,), 0.01), Audiogram.standard("N3"))  # nor does use change it
+    assert weights_hash(once) == weights_hash(again)
 
 
 class Own(torch.nn.Module):
