@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from hlsim.calibration import is_finite
+from hlsim.compiling import lasting
 from hlsim.extras import MissingExtraError
 
 LOWEST_RATE, HIGHEST_RATE = 16000, 48000
@@ -276,7 +277,7 @@ def resample(waveform: Tensor, source_rate: int, target_rate: int) -> Tensor:
 @lru_cache(maxsize=32)
 def _resampler(source_rate: int, target_rate: int, dtype: torch.dtype, device: torch.device) -> nn.Module:
     """Its kernel takes up to forty times as long to compute as to apply to a second."""
-    with torch.inference_mode(False), torch._C._DisableFuncTorch():  # what is kept outlives either
+    with lasting():
         made: nn.Module = _torchaudio().transforms.Resample(source_rate, target_rate, dtype=dtype, **_SINC)
         return made.to(device)
 
@@ -323,7 +324,7 @@ def _odd_kernel(source: int, target: int, dtype: torch.dtype, device: torch.devi
 @lru_cache(maxsize=4)
 def _kept_odd_kernel(source: int, target: int, dtype: torch.dtype, device: torch.device) -> Tensor:
     """Some 40 MB in float32."""
-    with torch.inference_mode(False), torch._C._DisableFuncTorch():
+    with lasting():
         return _odd_kernel(source, target, dtype, device)
 
 

@@ -1,6 +1,7 @@
-"""What ``torch.compile`` is to leave as it is."""
+"""What torch's compiler, modes and transforms are to leave as it is."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import wraps
 from typing import ParamSpec, TypeVar
 
@@ -20,3 +21,10 @@ def not_compiled(method: Callable[P, Result]) -> Callable[P, Result]:
         return method(*args, **kwargs)
 
     return call
+
+
+@contextmanager
+def lasting() -> Iterator[None]:
+    """For what a cache keeps: plain tensors, also where inference mode or a transform of ``torch.func`` asks first."""
+    with torch.inference_mode(False), torch._C._DisableFuncTorch():
+        yield

@@ -59,6 +59,12 @@ def refuse_weights(weights: Mapping[str, float], allowed: Iterable[str], where: 
         raise ValueError(f"weights {dict(weights)} {where}; allowed: 0 or more, one or more above 0")
 
 
+def refuse_seed(seed: int, where: str) -> None:
+    """Raise ValueError for a seed that torch's generators do not take."""
+    if not -(2**62) < seed < 2**62:
+        raise ValueError(f"seed {seed} {where}; allowed: whole numbers between -2**62 and 2**62")
+
+
 def _refuse(value: Any, kind: type, name: str, where: str) -> None:
     if kind is float:
         fits = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)

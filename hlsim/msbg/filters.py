@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from hlsim.compiling import lasting
 from hlsim.msbg.ear import ear_filter, lowpass_filter
 from hlsim.msbg.ending import ending_response, ending_weights
 from hlsim.msbg.envelope import envelope_lowpass
@@ -68,8 +69,7 @@ def _bytes(made: Any) -> int:
 
 
 def _made(kind: str, key: tuple[Any, ...], dtype: torch.dtype, device: torch.device) -> Any:
-    # what outlives the call must be none of its transform's wrappers (torch.func)
-    with torch.inference_mode(False), torch._C._DisableFuncTorch():
+    with lasting():
         if kind == "plan":
             severity, points, step, highest = key
             return make_plan(severity, points, step, highest, dtype, device)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
+from hlsim.compiling import lasting
 from hlsim.msbg.ear import RATE
 from hlsim.spectrum import power, rfft
 
@@ -166,7 +167,7 @@ class _Spread(torch.autograd.Function):
 @lru_cache(maxsize=16)
 def _window(step: int, dtype: torch.dtype, device: torch.device) -> Tensor:
     """Of analysis and synthesis: their product adds up to 1 over four frames; then zeros. Shape: (512 // step,)."""
-    with torch.inference_mode(False), torch._C._DisableFuncTorch():  # as the filters: it outlives the call
+    with lasting():
         place = 2.0 * math.pi * (torch.arange(0, FRAME, step, dtype=torch.float64) + 0.5) / FRAME
         window = (0.5 - 0.5 * place.cos()) / math.sqrt(1.5)
         return functional.pad(window, (0, (FFT - FRAME) // step)).to(device=device, dtype=dtype)

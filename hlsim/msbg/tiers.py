@@ -116,32 +116,31 @@ def make_plan(
     last = _kept(bank, highest)
     together = next((count for count in (8, 9, 7, 10, 6, 5) if points // STEP % count == 0), 8)
     tiers, lowpass = [], []
-    with torch.inference_mode(False):
-        for channels, samples, detector in _parts(assign(bank, step, highest), points, device):
-            count, analytic = points // STEP * samples, detector != "itself"
-            bins = count if analytic else count // 2 + 1
-            # signals are too loud by the ratio of the rates, as their sum's spectrum is to be; those that are to be
-            # transformed as analytic ones half of it, the other half being in negative frequencies
-            response = gammatone_response(bank, points, channels, bins)
-            smoothing = envelope_lowpass(bank, points, samples, channels)
-            if channels.stop == last < bank.channels:
-                far = gammatone_response(bank, points, slice(last - 1, None), bins)
-                response[-1] = far.sum(0)
-                smoothing[-1] *= _far_level(far[:, round(highest * points / RATE)])
-            decimation = decimation_kernel(samples) * (step * samples / STEP)
-            interpolation = interpolation_kernel(samples, 2 if detector == "modulus" else 1, together)
-            if detector == "modulus":
-                response[:, 0] *= 0.5
-                decimation = decimation * (4.0 / math.pi)
-            elif detector == "harmonics":
-                response[:, 1:] *= 2.0
-                decimation = decimation * (2.0 / math.pi)
-            elif samples < STEP and count % 2 == 0:
-                response[:, -1] = 0.0
-            kernels = tensor(decimation), tensor(interpolation)
-            tiers.append(Tier(channels, count, detector, tensor(response), *kernels))
-            lowpass.append(smoothing)
-        return Plan(tuple(tiers), tensor(np.concatenate(lowpass)))
+    for channels, samples, detector in _parts(assign(bank, step, highest), points, device):
+        count, analytic = points // STEP * samples, detector != "itself"
+        bins = count if analytic else count // 2 + 1
+        # signals are too loud by the ratio of the rates, as their sum's spectrum is to be; those that are to be
+        # transformed as analytic ones half of it, the other half being in negative frequencies
+        response = gammatone_response(bank, points, channels, bins)
+        smoothing = envelope_lowpass(bank, points, samples, channels)
+        if channels.stop == last < bank.channels:
+            far = gammatone_response(bank, points, slice(last - 1, None), bins)
+            response[-1] = far.sum(0)
+            smoothing[-1] *= _far_level(far[:, round(highest * points / RATE)])
+        decimation = decimation_kernel(samples) * (step * samples / STEP)
+        interpolation = interpolation_kernel(samples, 2 if detector == "modulus" else 1, together)
+        if detector == "modulus":
+            response[:, 0] *= 0.5
+            decimation = decimation * (4.0 / math.pi)
+        elif detector == "harmonics":
+            response[:, 1:] *= 2.0
+            decimation = decimation * (2.0 / math.pi)
+        elif samples < STEP and count % 2 == 0:
+            response[:, -1] = 0.0
+        kernels = tensor(decimation), tensor(interpolation)
+        tiers.append(Tier(channels, count, detector, tensor(response), *kernels))
+        lowpass.append(smoothing)
+    return Plan(tuple(tiers), tensor(np.concatenate(lowpass)))
 
 
 def _kept(bank: FilterBank, highest: float) -> int:

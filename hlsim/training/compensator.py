@@ -20,7 +20,7 @@ from hlsim.data.variation import equalise, mix
 from hlsim.loss import HearingLossLoss
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.pretrained import checkpoint_digest, save_checkpoint
-from hlsim.settings import refuse_other_kinds, refuse_unknown, refuse_weights
+from hlsim.settings import refuse_other_kinds, refuse_seed, refuse_unknown, refuse_weights
 from hlsim.training.beginning import start_identity, started
 from hlsim.training.loop import CHECKPOINT, TimedModule, run
 from hlsim.training.sources import TrainingData, read_thresholds
@@ -82,10 +82,7 @@ class CompensatorRecipe:
                 f"seconds {self.seconds}, learning_rate {self.learning_rate} in the recipe; allowed: counts from 1 up, "
                 "seconds and learning_rate above 0"
             )
-        if not -(2**62) < self.seed < 2**62:
-            raise ValueError(
-                f"seed {self.seed} in the recipe; allowed: whole numbers between -2**62 and 2**62"
-            )
+        refuse_seed(self.seed, "in the recipe")
         if not (0.0 <= self.noisy <= 1.0 and 0.0 <= self.equalised <= 1.0):
             raise ValueError(f"noisy {self.noisy}, equalised {self.equalised} in the recipe; allowed: 0 to 1")
 

@@ -19,7 +19,7 @@ from hlsim.msbg import MSBG
 from hlsim.neuro import NeuroConfig, NeuroMSBG
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.pretrained import SIMULATOR, load_pretrained, save_checkpoint
-from hlsim.settings import refuse_other_kinds, refuse_unknown, refuse_weights
+from hlsim.settings import refuse_other_kinds, refuse_seed, refuse_unknown, refuse_weights
 from hlsim.training.averaging import average_of
 from hlsim.training.beginning import start_identity, started
 from hlsim.training.loop import CHECKPOINT, TimedModule, run
@@ -89,10 +89,7 @@ class SimulatorRecipe:
                 f"seconds {self.seconds}, learning_rate {self.learning_rate} in the recipe; allowed: counts from 1 up, "
                 "seconds and learning_rate above 0"
             )
-        if not -(2**62) < self.seed < 2**62:
-            raise ValueError(
-                f"seed {self.seed} in the recipe; allowed: whole numbers between -2**62 and 2**62"
-            )
+        refuse_seed(self.seed, "in the recipe")
         if self.unit_power not in ("truth", "input"):
             raise ValueError(f"unit_power {self.unit_power!r} in the recipe; allowed: truth or input")
         if self.precision not in PRECISIONS or not 0.0 <= self.average < 1.0:
