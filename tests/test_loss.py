@@ -204,7 +204,8 @@ def test_audiogram_in_every_form(simulator: str, clean: Tensor) -> None:
         torch.testing.assert_close(HearingLossLoss(ear, simulator=simulator)(clean, clean), expected)
     # the call's comes before the stored one
     torch.testing.assert_close(stored(clean, clean, S2), bare(clean, clean, S2))
-    assert float(stored(clean, clean, S2)) != pytest.approx(float(expected), rel=1e-3)
+    magnitude = float(stored.parts(clean, clean)["magnitude"])
+    assert float(stored.parts(clean, clean, S2)["magnitude"]) != pytest.approx(magnitude, rel=0.05)
 
 
 @both
@@ -311,12 +312,12 @@ def test_gradient_reaches_the_clean_speech_only_where_asked(clean: Tensor) -> No
 @both
 @each_criterion
 def test_full_scale_is_a_unit(simulator: str, criterion: str, clean: Tensor) -> None:
-    # in double precision: the phase of what is next to silent hangs on single precision's last bits, up to 3e-4 here
+    # in double precision, for the phase of what is next to silent hangs on single precision's last bits
     clean = clean.double()
-    pascals = HearingLossLoss(N3, simulator=simulator, criterion=criterion)
-    other = HearingLossLoss(N3, simulator=simulator, criterion=criterion, full_scale_spl=114.0)
+    pascals = HearingLossLoss(N3, simulator=simulator, criterion=criterion).double()
+    other = HearingLossLoss(N3, simulator=simulator, criterion=criterion, full_scale_spl=114.0).double()
     assert float(other(0.2 * clean, 0.1 * clean)) == pytest.approx(
-        float(pascals(2.0 * clean, clean)), rel=1e-4
+        float(pascals(2.0 * clean, clean)), rel=1e-6
     )
     # levels matter: nothing is normalised
     assert float(pascals(0.2 * clean, 0.1 * clean)) != pytest.approx(

@@ -60,6 +60,30 @@ def test_batch_of_mixed_severities_equals_its_items(trained: NeuroMSBG, clips: T
         assert float((together[i] - alone).norm() / alone.norm()) < 1e-5
 
 
+@pytest.mark.parametrize("rate", [16000, 44100])
+def test_items_that_run_one_after_the_other_are_as_together(
+    rate: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = NeuroMSBG(NeuroConfig(channels=4, blocks=1), sample_rate=rate)
+    given, ears = (0.02 * torch.randn(5, 2 * rate)).requires_grad_(), draw_thresholds(5)
+    sizes = []
+    process = model._process
+
+    def counted(signals: Tensor, own: Tensor) -> Tensor:
+        sizes.append(len(signals))
+        return process(signals, own)
+
+    monkeypatch.setattr(model, "_process", counted)
+    apart = model(given, ears)
+    (gradient,) = torch.autograd.grad(apart.square().sum(), given)
+    monkeypatch.setattr("hlsim.neuro.network._CPU_SAMPLES", 10**9)
+    together = model(given, ears)
+    assert sizes == [2, 2, 1, 5]
+    torch.testing.assert_close(apart, together, atol=1e-6, rtol=1e-4)
+    expected = torch.autograd.grad(together.square().sum(), given)[0]
+    assert float((gradient - expected).norm() / expected.norm()) < 1e-4
+
+
 def test_is_deterministic_under_a_seed() -> None:
     waveform, ear = 0.02 * torch.randn(4000), Audiogram.standard("N3")
     models = []
