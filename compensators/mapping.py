@@ -70,6 +70,10 @@ class MappingCompensator(EarNetwork):
         return f"sample_rate={self.sample_rate}, full_scale_spl={self.full_scale_spl:g}, start={self.config.start!r}"
 
     @property
+    def _reach(self) -> tuple[int, int] | None:
+        return None if self.config.reach is None else (self.config.step, self.config.reach)
+
+    @property
     def _dtype(self) -> torch.dtype:
         return self.magnitude_decoder.leave.weight.dtype
 

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from hlsim.blocks import overlapping
 from hlsim.msbg.cochlea import shared_multiple
 from hlsim.msbg.ear import EAR_DELAY, RATE
 from hlsim.msbg.envelope import STEP
@@ -93,22 +94,15 @@ def to_inner(signals: Tensor, rate: int) -> Tensor:
 
 
 def block_bounds(samples: int, rate: int) -> list[tuple[int, int, int, int]]:
-    """Begin, start, stop and end of overlapping blocks: what goes in, and within it what comes out.
+    """``overlapping`` blocks of a signal at ``rate``.
 
-    Blocks begin where the smearing's frames and the envelopes' steps do, so that they are those of the whole.
+    They begin where the smearing's frames and the envelopes' steps do, so that they are those of the whole.
     """
     common = math.lcm(HOP, STEP)
     unit = common * rate // math.gcd(common * rate, RATE)  # samples in a whole number of hops and of steps
     hop = round(_BLOCK_SECONDS * rate) // unit * unit
     lead, lag = (math.ceil(s * rate / unit) * unit for s in (_LEAD_SECONDS, _LAG_SECONDS))
-    if hop == 0 or samples <= 1.5 * hop:
-        return [(0, 0, samples, samples)]
-    starts = list(range(0, samples - hop // 2, hop))
-    stops = [*starts[1:], samples]
-    return [
-        (max(0, start - lead), start, stop, min(samples, stop + lag) if stop < samples else samples)
-        for start, stop in zip(starts, stops, strict=True)
-    ]
+    return overlapping(samples, hop, lead, lag)
 
 
 def faded(block: Tensor, rate: int, begin: bool, end: bool) -> Tensor:

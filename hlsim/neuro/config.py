@@ -85,6 +85,20 @@ class NetworkConfig:
     def stft(self) -> STFT:
         return STFT(self.fft, self.window, self.hop)
 
+    @property
+    def step(self) -> int:
+        """Samples from one place of the feature maps to the next."""
+        return self.hop * self.stride[0]
+
+    @property
+    def reach(self) -> int | None:
+        """Samples to either side on which one depends by transform and network; None where it is all of them."""
+        if self.block != "cnn":
+            return None
+        # by blocks, dense encoder and decoder, and the patches into which the encoder's and the decoders' strides cut
+        steps = self.blocks * (self.kernel[0] // 2) + 2 * (2**self.dense_depth - 1) + 2
+        return self.step * steps + self.window
+
     @classmethod
     def given(cls, config: Self | None) -> Self:
         """What a network was given, or the default. Raises ValueError where it is of another kind."""

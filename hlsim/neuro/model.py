@@ -70,6 +70,13 @@ class NeuroMSBG(EarNetwork):
         self.autocast_dtype: torch.dtype | None = None
 
     @property
+    def _reach(self) -> tuple[int, int] | None:
+        if self.config.reach is None or not self.config.level_aware:
+            return None
+        known = self.prior.reach if self.prior is not None else 0
+        return self.config.step, self.config.reach + known
+
+    @property
     def _dtype(self) -> torch.dtype:
         return self.mask_decoder.leave.weight.dtype
 

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor, nn
 
 from hlsim.audio import check_rate, check_waveform, resample
 from hlsim.audiogram import FREQUENCIES, AudiogramLike
+from hlsim.blocks import overlapping
 from hlsim.calibration import check_full_scale, gain_to_pascals
 from hlsim.msbg.model import resolve_thresholds
 from hlsim.neuro.config import NEURO_RATE
@@ -14,10 +17,15 @@ from hlsim.neuro.config import NEURO_RATE
 # Samples at 16 kHz of all items that run together on a CPU. Feature maps of more are so large that the C library gives
 # them back to the system, and pays for their pages anew with every one: 64 items of 1 s take three times as long.
 _CPU_SAMPLES = 64_000
+# samples of a long item that run together elsewhere
+_DEVICE_SAMPLES = 960_000
 
 
 class EarNetwork(nn.Module):
     """Waveform and audiogram to waveform, in pascals at 16 kHz inside. Subclasses give ``_process``.
+
+    On a CPU a few items run at a time. Long signals go through in overlapping blocks where the network looks no farther
+    than these overlap (``cnn`` blocks): the output is the same, and without gradients memory grows by it alone.
 
     Args:
         sample_rate: of inputs and outputs in Hz, 16000 to 48000; inside it is 16000, so that only the band under 8 kHz
@@ -65,8 +73,27 @@ class EarNetwork(nn.Module):
     def _run(self, signals: Tensor, ears: Tensor) -> Tensor:
         """``_process`` at the waveform's rate and level. Shape: (items, time), (items, 8) -> (items, time)."""
         gain = gain_to_pascals(self.full_scale_spl)
-        result = self._process(resample(signals * gain, self.sample_rate, NEURO_RATE), ears)
+        result = self._in_blocks(resample(signals * gain, self.sample_rate, NEURO_RATE), ears)
         return self._finish(resample(result, NEURO_RATE, self.sample_rate)[..., : signals.shape[-1]]) / gain
+
+    def _in_blocks(self, signals: Tensor, ears: Tensor) -> Tensor:
+        """``_process``, of long signals by blocks where that is the same. Shapes as ``_process``'s."""
+        if self._reach is None or torch.compiler.is_compiling():
+            return self._process(signals, ears)
+        unit, reach = self._reach
+        lead = math.ceil(reach / unit) * unit
+        hop = (_CPU_SAMPLES if signals.device.type == "cpu" else _DEVICE_SAMPLES) // unit * unit
+        bounds = overlapping(signals.shape[-1], hop, lead, lead)
+        blocks = [
+            self._process(signals[:, begin:end], ears)[:, start - begin : stop - begin]
+            for begin, start, stop, end in bounds
+        ]
+        return blocks[0] if len(blocks) == 1 else torch.cat(blocks, -1)
+
+    @property
+    def _reach(self) -> tuple[int, int] | None:
+        """Samples of which blocks begin at multiples, and on how many to either side one depends; None if on all."""
+        raise NotImplementedError
 
     @property
     def _dtype(self) -> torch.dtype:

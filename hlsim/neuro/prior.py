@@ -44,6 +44,9 @@ class Prior(nn.Module):
 
     Args:
         stft: the transform; its window should be about as short as MSBG's smearing frame, 5.8 ms.
+
+    Attributes:
+        reach: samples to either side on which one depends, besides those of the transform.
     """
 
     response: Tensor
@@ -51,6 +54,7 @@ class Prior(nn.Module):
 
     def __init__(self, stft: STFT) -> None:
         super().__init__()
+        self.reach = RESPONSE_REACH + _ENVELOPE_REACH * stft.hop
         points = 160 * stft.fft  # a fine grid that 44.1 kHz shares
         coarse = slice(None, points // 2 + 1, 160)
         banks = [BANKS[severity] for severity in SEVERITIES]

@@ -128,7 +128,11 @@ def test_is_deterministic_and_survives_saving(kind: str, tmp_path: Path) -> None
     with torch.no_grad():
         heard = model(waveform, ear)
         assert torch.equal(heard, again(waveform, ear))
-        assert torch.equal(heard, load_pretrained(tmp_path / "kept")(waveform, ear))
+        loaded = load_pretrained(tmp_path / "kept")
+        # the weights to the bit; what is heard need not be, on processors that mind where in memory they lie
+        for name, value in model.state_dict().items():
+            assert torch.equal(value, loaded.state_dict()[name])
+        torch.testing.assert_close(loaded(waveform, ear), heard, rtol=1e-4, atol=1e-7)
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -14,6 +14,7 @@ from hlsim.calibration import set_level
 from hlsim.criteria import noise_to_signal_db
 from hlsim.neuro import NeuroConfig
 
+N3 = Audiogram.standard("N3")
 PAPER = NeuroConfig(
     fft=400,
     window=400,
@@ -82,6 +83,59 @@ def test_items_that_run_one_after_the_other_are_as_together(
     torch.testing.assert_close(apart, together, atol=1e-6, rtol=1e-4)
     expected = torch.autograd.grad(together.square().sum(), given)[0]
     assert float((gradient - expected).norm() / expected.norm()) < 1e-4
+
+
+LOCAL = {
+    "default": lambda: NeuroMSBG(NeuroConfig(channels=8)),
+    "dense": lambda: NeuroMSBG(
+        NeuroConfig(channels=4, dense_depth=3, stride=(2, 3), blocks=1, kernel=(3, 5))
+    ),
+    "paper's transform": lambda: NeuroMSBG(
+        NeuroConfig(
+            fft=400, window=400, hop=100, stride=(3, 2), kernel=(11, 3), channels=4, blocks=1, prior=False
+        )
+    ),
+    "monolithic": lambda: NeuroMSBG(NeuroConfig(channels=8, structure="monolithic")),
+    "compensator": MappingCompensator,
+}
+
+
+@pytest.mark.parametrize("kind", LOCAL)
+def test_long_signals_by_blocks_are_as_whole(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    model = LOCAL[kind]().double()
+    for parameter in model.parameters():  # so that everything reaches as far as it can
+        parameter.data += 0.05 * torch.randn_like(parameter)
+    time = 40_000
+    given = (0.02 * torch.randn(1, time, dtype=torch.float64)).requires_grad_()
+    whole = model(given, N3)
+    monkeypatch.setattr("hlsim.neuro.network._CPU_SAMPLES", 12_000)
+    calls = []
+    process = model._process
+
+    def counted(signals: Tensor, ears: Tensor) -> Tensor:
+        calls.append(signals.shape[-1])
+        return process(signals, ears)
+
+    monkeypatch.setattr(model, "_process", counted)
+    blocks = model(given, N3)
+    assert len(calls) == 3 and max(calls) < time / 2
+    assert float((blocks - whole).detach().norm() / whole.detach().norm()) < 1e-12
+    first, second = (torch.autograd.grad(heard.square().sum(), given)[0] for heard in (whole, blocks))
+    assert float((second - first).norm() / first.norm()) < 1e-12
+
+
+@pytest.mark.parametrize(
+    "change", [{"block": "lstm"}, {"block": "mamba"}, {"block": "transformer"}, {"level_aware": False}]
+)
+def test_networks_that_look_at_all_of_a_signal_take_it_whole(
+    change: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = NeuroMSBG(NeuroConfig(channels=4, blocks=1, **change))
+    waveform = 0.02 * torch.randn(9600)
+    with torch.no_grad():
+        expected = model(waveform, N3)
+        monkeypatch.setattr("hlsim.neuro.network._CPU_SAMPLES", 2400)
+        assert torch.equal(model(waveform, N3), expected)
 
 
 def test_is_deterministic_under_a_seed() -> None:
