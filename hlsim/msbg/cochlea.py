@@ -7,7 +7,7 @@ from torch import Tensor
 
 from hlsim.msbg.ear import RATE
 from hlsim.msbg.ending import ending
-from hlsim.msbg.envelope import STEP, decimate, detect, envelope, smooth
+from hlsim.msbg.envelope import HALF_RATE_STEP, STEP, decimate, detect, envelope, smooth
 from hlsim.msbg.filters import Filters
 from hlsim.msbg.fourier import fft_length, irfft, rfft
 from hlsim.msbg.recruitment import around, expand, gains, weigh
@@ -20,18 +20,27 @@ _SHARED_MULTIPLE = 10000
 """Samples up to which the lengths that a rate shares with 44.1 kHz may be multiples of."""
 
 
-def bank_points(length: int, rate: int) -> int:
-    """FFT length at 44.1 kHz for a signal of ``length``: one that ``rate`` shares, if that costs little."""
-    multiple = shared_multiple(rate) or STEP
+def bank_points(length: int, rate: int, step: int = 1) -> int:
+    """FFT length at 44.1 kHz for a signal of ``length``: one that ``rate`` shares, if that costs little.
+
+    Args:
+        step: the signal runs at 44.1 kHz / step.
+    """
+    multiple = shared_multiple(rate, step) or _whole_steps(step)
     odd, even = (fft_length(length + BANK_TAIL, some) for some in (multiple, 2 * multiple))
     # MKL takes twice as long for odd numbers of steps, but few of its transforms are of steps
     return odd if 1.1 * odd < even else even
 
 
-def shared_multiple(rate: int) -> int:
-    """Samples at 44.1 kHz, a multiple of 24, that are a whole number of ``rate``'s; 0 if too many."""
-    multiple = math.lcm(STEP, RATE // math.gcd(RATE, rate))
+def shared_multiple(rate: int, step: int = 1) -> int:
+    """Samples at 44.1 kHz, whole steps of the envelopes, that are a whole number of ``rate``'s; 0 if too many."""
+    multiple = math.lcm(_whole_steps(step), RATE // math.gcd(RATE, rate))
     return multiple if multiple <= _SHARED_MULTIPLE else 0
+
+
+def _whole_steps(step: int) -> int:
+    """Samples at 44.1 kHz that are whole steps of the envelopes, and an even number at 44.1 kHz / step."""
+    return STEP if step == 1 else round(8 * HALF_RATE_STEP)
 
 
 def hear(spectrum: Tensor, ratios: Tensor, plan: Plan, slight: bool) -> Tensor:
@@ -70,7 +79,7 @@ def hear(spectrum: Tensor, ratios: Tensor, plan: Plan, slight: bool) -> Tensor:
             bins = torch.fft.fft(torch.view_as_complex(part.unflatten(-1, (-1, 2))))
         else:
             bins = rfft(part, part.shape[-1])
-        total[..., : bins.shape[-1]].add_(bins)
+        total[..., : bins.shape[-1]].add_(bins[..., : total.shape[-1]])
     return total
 
 

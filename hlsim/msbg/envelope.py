@@ -1,4 +1,4 @@
-"""Envelopes of the channels: rectified, and low-passed at 75 Hz or less, so that every 24th sample tells all."""
+"""Envelopes of the channels: rectified, and low-passed at 75 Hz or less, so that every 24th sample or so tells all."""
 
 from functools import lru_cache
 from typing import Any, cast
@@ -14,9 +14,12 @@ from hlsim.msbg.filterbank import FilterBank, erb
 from hlsim.spectrum import power, rfft
 
 STEP = 24
-"""Samples from one value of an envelope, and of the gain that follows it, to the next."""
+"""Samples at 44.1 kHz from one value of an envelope, and of the gain that follows it, to the next."""
 
-_BOXES = 3  # three running means of 24 samples put zeros of third order where decimation would alias to 0 Hz
+HALF_RATE_STEP = 24.5
+"""The same where signals run at 22.05 kHz: 1800 values a second, so that FFTs which 16 kHz shares have fewer sevens."""
+
+_BOXES = 3  # running means of a step's samples put zeros of third order where decimation would alias to 0 Hz
 _TINY = 1e-30  # Pa^2, keeps the gradients of silence finite
 
 
@@ -96,28 +99,33 @@ def envelope(channels: Tensor, lowpass: Tensor) -> Tensor:
 
 
 def envelope_lowpass(
-    bank: FilterBank, points: int, samples: int = STEP, channels: slice = slice(None)
+    bank: FilterBank,
+    points: int,
+    samples: int = STEP,
+    channels: slice = slice(None),
+    step: float = STEP,
 ) -> NDArray[np.complex128]:
-    """Response that turns the rfft of ``decimate``'s means into that of the envelope at samples 0, 24, ...
+    """Response that turns the rfft of ``decimate``'s means into that of the envelope at the steps.
 
     The low-pass is ``ellip(2, 0.25, 35)`` at 3/4 of 100 Hz or of the channel's ERB if less, run forwards and backwards
     as pyclarity does with ``filtfilt``; what that does at the end is in ``hlsim.msbg.ending``.
 
     Args:
-        points: FFT length at 44.1 kHz, a multiple of 24.
-        samples: of the rectified signal in each 24 at 44.1 kHz.
+        points: FFT length at 44.1 kHz, a whole number of steps.
+        samples: of the rectified signal in each step.
         channels: which of the bank's; all by default.
+        step: samples at 44.1 kHz.
 
-    Returns: (channels, points // 48 + 1).
+    Returns: (channels, steps // 2 + 1).
     """
-    omega = 2.0 * np.pi * np.arange(points // STEP // 2 + 1) / points
+    omega = 2.0 * np.pi * np.arange(round(points / step) // 2 + 1) / points
     powers = np.exp(-1j * omega) ** np.arange(3)[:, None]
     numerators, denominators = np.array(envelope_filters(bank)[channels]).swapaxes(0, 1)
     rows = np.abs((numerators @ powers) / (denominators @ powers)) ** 2
     with np.errstate(invalid="ignore"):
-        box = np.sin(STEP * omega / 2.0) / (samples * np.sin(STEP / samples * omega / 2.0))
+        box = np.sin(step * omega / 2.0) / (samples * np.sin(step / samples * omega / 2.0))
     box[0] = 1.0
-    return rows / box**_BOXES * np.exp(-0.5j * (STEP - STEP / samples) * omega)
+    return rows / box**_BOXES * np.exp(-0.5j * (step - step / samples) * omega)
 
 
 @lru_cache(maxsize=4)

@@ -10,11 +10,11 @@ import torch
 from torch import Tensor
 
 from hlsim.compiling import lasting
-from hlsim.msbg.ear import ear_filter, lowpass_filter
+from hlsim.msbg.ear import RATE, ear_filter, lowpass_filter
 from hlsim.msbg.ending import ending_response, ending_weights
 from hlsim.msbg.envelope import envelope_lowpass
 from hlsim.msbg.filterbank import BANKS, gammatone_response
-from hlsim.msbg.fourier import block_points
+from hlsim.msbg.fourier import block_points, edge
 from hlsim.msbg.recruitment import threshold_weights
 from hlsim.msbg.smearing import BROADENING, smeared_bins, smearing_matrix
 from hlsim.msbg.tiers import Plan, as_tensor, make_plan, total_response
@@ -97,12 +97,17 @@ def _array(kind: str, key: tuple[Any, ...]) -> np.ndarray[Any, Any]:
             # the advance has nothing to bring in at the end, where the reference puts zeros
             kept = length - np.array(BANKS[severity].advances)[:, None]
             return (np.arange(points) < kept).astype(float)
-        case "forward", points, bins, gain:
-            return gain * np.fft.rfft(ear_filter(), points)[:bins]
+        case "forward", points, bins, gain, rate:
+            return gain * np.fft.rfft(ear_filter(), points)[:bins] * _end(points, bins, rate)
         case ("forward blocks",):
             return np.fft.rfft(ear_filter(), block_points())
-        case "backward", points, delay, bins, gain:
+        case "backward", points, delay, bins, gain, rate:
             response = np.fft.rfft(ear_filter(backward=True), points) * np.fft.rfft(lowpass_filter(), points)
             advance = np.exp(2j * np.pi * np.arange(bins) * delay / points)
-            return gain * response[:bins] * advance
+            return gain * response[:bins] * advance * _end(points, bins, rate)
     raise AssertionError(kind)
+
+
+def _end(points: int, bins: int, rate: int) -> np.ndarray[Any, Any] | float:
+    """Where a signal's own rate is the lower one and ends its spectrum."""
+    return edge(bins, RATE / points, rate / 2) if rate < RATE else 1.0

@@ -3,7 +3,9 @@
 import math
 from functools import lru_cache
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
@@ -11,6 +13,8 @@ _BLOCK, _HOP = 4096, 3072
 """Blocks of ``filter_blocks``; taps may be 1025 at most."""
 
 _LONG = 12000
+
+_EDGE_HZ = 80.0
 
 
 def rfft(waveform: Tensor, points: int) -> Tensor:
@@ -64,6 +68,23 @@ def fft_length(least: int, multiple: int = 1) -> int:
     odd = [3**a * 5**b * 7**c for a in range(9) for b in range(6) for c in range(4)]
     lengths = [multiple * o * 2**twos for o in odd for twos in range(9) if twos == 0 or spare << twos <= 256]
     return min(length for length in lengths if length >= least)
+
+
+def edge(bins: int, hz: float, end: float) -> NDArray[np.float64]:
+    """Factors on a spectrum that ends where there is more to come: 1, and down to 0 within the last 80 Hz.
+
+    A sharp end would ring on for seconds, and how much of that comes round again hangs on the FFT's length.
+
+    Args:
+        bins: of the spectrum.
+        hz: from one to the next.
+        end: in Hz.
+
+    Returns: (bins,).
+    """
+    left = np.clip((end - hz * np.arange(bins)) / _EDGE_HZ, 0.0, 1.0)
+    factors: NDArray[np.float64] = np.sin(0.5 * np.pi * left) ** 2
+    return factors
 
 
 def _long_row(signal: Tensor, points: int) -> bool:

@@ -50,7 +50,7 @@ class MSBG(nn.Module):
     Args:
         audiogram: the ear; may be given with each call instead.
         sample_rate: of inputs and outputs in Hz, 16000 to 48000. Inside, the model runs at 44.1 kHz; aligned, and at
-            20000 or less, at 22.05 kHz.
+            20000 or less, at 22.05 kHz. Under 44100, the last 80 Hz below half the rate fade out.
         full_scale_spl: level in dB SPL of RMS 1.0.
         aligned: remove the model's delay and return as many samples as came in. Otherwise the reference's output, sample
             for sample at 44.1 kHz: with its delay, and where it smears 64 * (ceil(time / 64) + 3) samples long (in a
@@ -180,7 +180,7 @@ class MSBG(nn.Module):
 
         length = heard.shape[-1]
         if self.aligned:
-            points = bank_points(length * step, rate)
+            points = bank_points(length * step, rate, step)
             spectrum = rfft(heard, points // step)
             if none:
                 spectrum = spectrum * filters.get("total", severity, points, step)

@@ -9,7 +9,7 @@ from torch.nn import functional
 from hlsim.blocks import overlapping
 from hlsim.msbg.cochlea import shared_multiple
 from hlsim.msbg.ear import EAR_DELAY, RATE
-from hlsim.msbg.envelope import STEP
+from hlsim.msbg.envelope import HALF_RATE_STEP, STEP
 from hlsim.msbg.filters import Filters
 from hlsim.msbg.fourier import fft_length, filter_blocks, irfft, rfft
 from hlsim.msbg.smearing import HOP
@@ -29,7 +29,7 @@ def to_cochlea(signals: Tensor, rate: int, length: int, step: int, filters: Filt
     least = max(signals.shape[-1], math.ceil(length * down / up)) + math.ceil(_FIR_TAIL * down / up / step)
     own, points = _grid(least, up, down)
     bins = min(own, points) // 2 + 1
-    response = filters.get("forward", points * step, bins, up / down)
+    response = filters.get("forward", points * step, bins, up / down, rate)
     return _between(rfft(signals, own)[..., :bins] * response, own, points)[..., :length]
 
 
@@ -55,11 +55,11 @@ def from_spectrum(
         delay: samples at 44.1 kHz.
     """
     inner, out = points // step, points * rate // RATE
-    if not shared_multiple(rate):
+    if not shared_multiple(rate, step):
         heard = irfft(spectrum, inner)
         return from_cochlea(heard, rate, inner, samples, filters, gain=gain, step=step, delay=delay)
     bins = min(inner, out) // 2 + 1
-    response = filters.get("backward", points, delay, bins, gain * out / inner)
+    response = filters.get("backward", points, delay, bins, gain * out / inner, rate)
     return _between(spectrum[..., :bins] * response, inner, out)[..., :samples]
 
 
@@ -78,7 +78,7 @@ def from_cochlea(
     up, down = ratio(rate, step)
     own, points = _grid(math.ceil((length + _FIR_TAIL) * down / up), up, down)
     bins = min(own, points) // 2 + 1
-    response = filters.get("backward", points * step, delay, bins, gain * down / up)
+    response = filters.get("backward", points * step, delay, bins, gain * down / up, rate)
     return _between(rfft(heard, points)[..., :bins] * response, points, own)[..., :samples]
 
 
@@ -98,7 +98,7 @@ def block_bounds(samples: int, rate: int) -> list[tuple[int, int, int, int]]:
 
     They begin where the smearing's frames and the envelopes' steps do, so that they are those of the whole.
     """
-    common = math.lcm(HOP, STEP)
+    common = math.lcm(HOP, STEP, round(2 * HALF_RATE_STEP))
     unit = common * rate // math.gcd(common * rate, RATE)  # samples in a whole number of hops and of steps
     hop = round(_BLOCK_SECONDS * rate) // unit * unit
     lead, lag = (math.ceil(s * rate / unit) * unit for s in (_LEAD_SECONDS, _LAG_SECONDS))

@@ -1,7 +1,7 @@
 """At which rate each channel runs: a gammatone channel is a band, and only the widest need 44.1 kHz.
 
 A channel is kept up to five bandwidths above its frequency, where it is 57 dB down, or to the highest frequency of
-interest. Narrow ones run as analytic signals at 5.5 or 11 kHz, or 9.2 where that is enough, whose modulus is the
+interest. Narrow ones run as analytic signals at about 5.5 or 11 kHz, or 9 where that is enough, whose modulus is the
 envelope: what a rectifier adds, harmonics of the band, lies above its low-pass. It does not where bands are so wide for
 their frequency that they come down to 0 Hz: with severe losses two harmonics complete the modulus. The lowest channels,
 and the widest at 44.1 kHz, are rectified as they are, as the reference does: at that rate its own harmonics fold too.
@@ -22,8 +22,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from hlsim.msbg.ear import RATE
-from hlsim.msbg.envelope import STEP, decimation_kernel, envelope_lowpass
+from hlsim.msbg.envelope import HALF_RATE_STEP, STEP, decimation_kernel, envelope_lowpass
 from hlsim.msbg.filterbank import BANKS, FilterBank, erb, gammatone_response
+from hlsim.msbg.fourier import edge
 from hlsim.msbg.recruitment import interpolation_kernel
 from hlsim.msbg.smearing import SKIRT_HZ
 
@@ -66,7 +67,7 @@ class Plan:
     """A bank on the FFT grid of a length: ``tiers`` from the lowest channels up, and the envelopes' ``lowpass``.
 
     Attributes:
-        lowpass: (channels, points // 48 + 1), as many channels as the tiers have.
+        lowpass: (channels, steps // 2 + 1), as many channels as the tiers have.
     """
 
     tiers: tuple[Tier, ...]
@@ -74,7 +75,7 @@ class Plan:
 
 
 def assign(bank: FilterBank, step: int, highest: float = RATE / 2) -> list[tuple[slice, int, Detector]]:
-    """Channels, samples in each 24 at 44.1 kHz and how they are rectified, from the lowest channels up.
+    """Channels, samples in each of an envelope's steps and how they are rectified, from the lowest channels up.
 
     Where the bank has more, the last one stands for those, too.
 
@@ -82,18 +83,20 @@ def assign(bank: FilterBank, step: int, highest: float = RATE / 2) -> list[tuple
         step: of the signal: 1, or 2 where nothing above 11 kHz is of interest.
         highest: frequency of interest in Hz.
     """
-    widest = 5 if highest + SKIRT_HZ <= RATE * 5 / STEP else STEP // 4
+    a_second = RATE / envelope_step(step)
+    slow, fast = 3, 6
+    widest = int((highest + SKIRT_HZ) / a_second) + 1
     kinds: list[tuple[int, Detector]] = []
     for hz, width in zip(bank.centre_frequencies, erb(np.array(bank.centre_frequencies)), strict=True):
         top = hz + _REACH * bank.broadening * float(width)
         if hz < _TRUE_HZ:
-            kinds.append((STEP // 4, "itself"))
-        elif top <= RATE / 8:
-            kinds.append((STEP // 4, "harmonics") if bank.broadening > _WIDE else (STEP // 8, "modulus"))
+            kinds.append((fast, "itself"))
+        elif top <= slow * a_second:
+            kinds.append((fast, "harmonics") if bank.broadening > _WIDE else (slow, "modulus"))
         elif step == 2:
             kinds.append((widest, "modulus"))
-        elif top <= RATE / 4 and bank.broadening <= _WIDE:
-            kinds.append((STEP // 4, "modulus"))
+        elif top <= fast * a_second and bank.broadening <= _WIDE:
+            kinds.append((fast, "modulus"))
         else:
             kinds.append((STEP, "itself"))
     kinds = kinds[: _kept(bank, highest)]
@@ -107,27 +110,29 @@ def make_plan(
     """The tiers of a severity's bank.
 
     Args:
-        points: FFT length at 44.1 kHz, a multiple of 24.
+        points: FFT length at 44.1 kHz, a whole number of the envelopes' steps.
         step, highest: as in ``assign``.
     """
 
     tensor = partial(as_tensor, dtype=dtype, device=device)
     bank = BANKS[severity]
     last = _kept(bank, highest)
-    together = next((count for count in (8, 9, 7, 10, 6, 5) if points // STEP % count == 0), 8)
+    steps = round(points / envelope_step(step))
+    together = next((count for count in (8, 9, 7, 10, 6, 5) if steps % count == 0), 8)
     tiers, lowpass = [], []
-    for channels, samples, detector in _parts(assign(bank, step, highest), points, device):
-        count, analytic = points // STEP * samples, detector != "itself"
-        bins = count if analytic else count // 2 + 1
+    for channels, samples, detector in _parts(assign(bank, step, highest), steps, device):
+        count, analytic = steps * samples, detector != "itself"
+        bins = min(count if analytic else count // 2 + 1, points // step // 2 + 1)
         # signals are too loud by the ratio of the rates, as their sum's spectrum is to be; those that are to be
         # transformed as analytic ones half of it, the other half being in negative frequencies
         response = gammatone_response(bank, points, channels, bins)
-        smoothing = envelope_lowpass(bank, points, samples, channels)
+        smoothing = envelope_lowpass(bank, points, samples, channels, envelope_step(step))
         if channels.stop == last < bank.channels:
             far = gammatone_response(bank, points, slice(last - 1, None), bins)
             response[-1] = far.sum(0)
             smoothing[-1] *= _far_level(far[:, round(highest * points / RATE)])
-        decimation = decimation_kernel(samples) * (step * samples / STEP)
+        # by how much slower than the signal's the channels' rate is
+        decimation = decimation_kernel(samples) * (step * samples / envelope_step(step))
         interpolation = interpolation_kernel(samples, 2 if detector == "modulus" else 1, together)
         if detector == "modulus":
             response[:, 0] *= 0.5
@@ -135,12 +140,17 @@ def make_plan(
         elif detector == "harmonics":
             response[:, 1:] *= 2.0
             decimation = decimation * (2.0 / math.pi)
-        elif samples < STEP and count % 2 == 0:
-            response[:, -1] = 0.0
+        if samples < STEP:
+            response *= edge(bins, RATE / points, count / (1 if analytic else 2) * RATE / points)
         kernels = tensor(decimation), tensor(interpolation)
         tiers.append(Tier(channels, count, detector, tensor(response), *kernels))
         lowpass.append(smoothing)
     return Plan(tuple(tiers), tensor(np.concatenate(lowpass)))
+
+
+def envelope_step(step: int) -> float:
+    """Samples at 44.1 kHz from one value of an envelope to the next, of signals at 44.1 kHz / ``step``."""
+    return STEP if step == 1 else HALF_RATE_STEP
 
 
 def _kept(bank: FilterBank, highest: float) -> int:
@@ -175,7 +185,7 @@ def total_response(severity: str, points: int, step: int) -> NDArray[np.complex1
 
 
 def _parts(
-    tiers: list[tuple[slice, int, Detector]], points: int, device: torch.device
+    tiers: list[tuple[slice, int, Detector]], steps: int, device: torch.device
 ) -> list[tuple[slice, int, Detector]]:
     """The tiers, on a CPU cut to what its cache holds."""
     if device.type != "cpu":
@@ -183,7 +193,7 @@ def _parts(
     parts = []
     for channels, samples, detector in tiers:
         count = channels.stop - channels.start
-        size = count * (1 if detector == "itself" else 2) * points // STEP * samples
+        size = count * (1 if detector == "itself" else 2) * steps * samples
         pieces = min(count, math.ceil(size / _CACHED))
         cuts = [channels.start + count * piece // pieces for piece in range(pieces + 1)]
         parts += [(slice(a, b), samples, detector) for a, b in itertools.pairwise(cuts)]

@@ -20,10 +20,11 @@ def small(monkeypatch: pytest.MonkeyPatch) -> _Cache:
 
 def test_the_same_filter_is_made_once() -> None:
     own = Filters(torch.float32, torch.device("cpu"))
-    assert own.get("forward", 4410, 2206, 1.0) is own.get("forward", 4410, 2206, 1.0)
-    assert own.get("forward", 4410, 2206, 1.0) is not own.get("forward", 8820, 4411, 1.0)
-    double = Filters(torch.float64, torch.device("cpu")).get("forward", 4410, 2206, 1.0)
-    assert double.dtype == torch.complex128 and own.get("forward", 4410, 2206, 1.0).dtype == torch.complex64
+    key = ("forward", 4410, 2206, 1.0, 44100)
+    assert own.get(*key) is own.get(*key)
+    assert own.get(*key) is not own.get("forward", 8820, 4411, 1.0, 44100)
+    double = Filters(torch.float64, torch.device("cpu")).get(*key)
+    assert double.dtype == torch.complex128 and own.get(*key).dtype == torch.complex64
 
 
 def test_memory_does_not_grow_with_the_number_of_lengths(small: _Cache) -> None:
@@ -40,7 +41,7 @@ def test_one_filter_that_is_too_long_is_held_all_the_same(small: _Cache) -> None
     own = Filters(torch.float32, torch.device("cpu"))
     plan = own.get("plan", "severe", 24 * 4000, 1, 22050.0)
     assert own.get("plan", "severe", 24 * 4000, 1, 22050.0) is plan and small.held > small.limit
-    own.get("forward", 4410, 2206, 1.0)
+    own.get("forward", 4410, 2206, 1.0, 44100)
     assert small.held <= small.limit
 
 
