@@ -188,21 +188,16 @@ def as_thresholds(audiogram: AudiogramLike) -> Tensor:
             to 100 dB HL.
     """
     if isinstance(audiogram, Audiogram):
-        levels = torch.tensor(audiogram.thresholds)
-    elif isinstance(audiogram, Tensor):
-        if audiogram.is_complex() or audiogram.dtype == torch.bool:
-            raise ValueError(
-                f"audiogram tensor of {audiogram.dtype}; allowed: floating-point or integer dB HL"
-            )
-        levels = audiogram if audiogram.is_floating_point() else audiogram.float()
-    elif (
-        isinstance(audiogram, Sequence) and audiogram and all(isinstance(ear, Audiogram) for ear in audiogram)
-    ):
-        levels = torch.tensor([ear.thresholds for ear in audiogram])
-    else:
+        return torch.tensor(_simulated(audiogram.thresholds))
+    if isinstance(audiogram, Sequence) and audiogram and all(isinstance(ear, Audiogram) for ear in audiogram):
+        return torch.tensor([_simulated(ear.thresholds) for ear in audiogram])
+    if not isinstance(audiogram, Tensor):
         raise ValueError(
             f"audiogram is {type(audiogram).__name__}; allowed: an Audiogram, a sequence of them, or a (..., 8) tensor"
         )
+    if audiogram.is_complex() or audiogram.dtype == torch.bool:
+        raise ValueError(f"audiogram tensor of {audiogram.dtype}; allowed: floating-point or integer dB HL")
+    levels = audiogram if audiogram.is_floating_point() else audiogram.float()
     if levels.ndim == 0 or levels.shape[-1] != len(FREQUENCIES) or not levels.numel():
         raise ValueError(
             f"audiogram tensor of shape {tuple(levels.shape)}; allowed: (..., 8), dB HL at {_listed(FREQUENCIES)} Hz"
@@ -210,10 +205,17 @@ def as_thresholds(audiogram: AudiogramLike) -> Tensor:
     with torch.no_grad():
         good = ((levels >= LOWEST_LEVEL) & (levels <= HIGHEST_SIMULATED)).all(-1)
         if not bool(good.all()):
-            raise ValueError(
-                f"audiogram levels {_listed(levels[~good][0].tolist())} dB HL; a simulator takes "
-                f"{LOWEST_LEVEL:g} to {HIGHEST_SIMULATED:g} (MSBG is singular at 105)"
-            )
+            _simulated(levels[~good][0].tolist())
+    return levels
+
+
+def _simulated(levels: Sequence[float]) -> Sequence[float]:
+    """The levels, or ValueError where no simulator takes them."""
+    if not all(LOWEST_LEVEL <= level <= HIGHEST_SIMULATED for level in levels):
+        raise ValueError(
+            f"audiogram levels {_listed(levels)} dB HL; a simulator takes "
+            f"{LOWEST_LEVEL:g} to {HIGHEST_SIMULATED:g} (MSBG is singular at 105)"
+        )
     return levels
 
 

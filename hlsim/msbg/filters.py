@@ -109,5 +109,5 @@ def _array(kind: str, key: tuple[Any, ...]) -> np.ndarray[Any, Any]:
 
 
 def _end(points: int, bins: int, rate: int) -> np.ndarray[Any, Any] | float:
-    """Where a signal's own rate is the lower one and ends its spectrum."""
-    return edge(bins, RATE / points, rate / 2) if rate < RATE else 1.0
+    """How the spectrum ends where a signal's rate is not the model's."""
+    return edge(bins, RATE / points, min(rate, RATE) / 2) if rate != RATE else 1.0

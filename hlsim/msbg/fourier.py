@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
+from hlsim.compiling import lasting
+
 _BLOCK, _HOP = 4096, 3072
 """Blocks of ``filter_blocks``; taps may be 1025 at most."""
 
@@ -30,12 +32,23 @@ def rfft(waveform: Tensor, points: int) -> Tensor:
 
 
 def irfft(spectrum: Tensor, points: int) -> Tensor:
-    """``torch.fft.irfft``, the inverse of ``rfft``. Shape: (..., points // 2 + 1) -> (..., points)."""
+    """``torch.fft.irfft``, the inverse of ``rfft``, of a spectrum that may end early: zeros follow.
+
+    Shape: (..., points // 2 + 1 or less) -> (..., points).
+    """
     if not _long_row(spectrum, points):
         return torch.fft.irfft(spectrum, points)
-    both = spectrum.real.new_full((points // 2 + 1,), 2.0)  # what the negative frequencies hold, too
-    both[:: points // 2] = 1.0
-    return torch.fft.ifft(spectrum * both, points).real
+    sides = _sides(spectrum.shape[-1], points, spectrum.real.dtype, spectrum.device)
+    return torch.fft.ifft(spectrum * sides, points).real
+
+
+@lru_cache(maxsize=16)
+def _sides(bins: int, points: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """How often each frequency is in a spectrum, negative ones counted too. Shape: (bins,)."""
+    with lasting():
+        sides = torch.full((bins,), 2.0, dtype=dtype, device=device)
+        sides[:: points // 2] = 1.0
+        return sides
 
 
 def filter_blocks(waveform: Tensor, response: Tensor, length: int) -> Tensor:

@@ -1,17 +1,20 @@
-"""The way into the cochlea and out of it, with resampling on the same FFT grids; blocks of long signals."""
+"""The way into the cochlea and out of it, with resampling on the same FFT grids; blocks of long signals.
+
+Where two rates meet, the lower one's spectrum ends softly, and so with nothing at half that rate, a frequency that the
+higher one has twice.
+"""
 
 import math
 
 import torch
 from torch import Tensor
-from torch.nn import functional
 
 from hlsim.blocks import overlapping
 from hlsim.msbg.cochlea import shared_multiple
 from hlsim.msbg.ear import EAR_DELAY, RATE
 from hlsim.msbg.envelope import HALF_RATE_STEP, STEP
 from hlsim.msbg.filters import Filters
-from hlsim.msbg.fourier import fft_length, filter_blocks, irfft, rfft
+from hlsim.msbg.fourier import edge, fft_length, filter_blocks, irfft, rfft
 from hlsim.msbg.smearing import HOP
 
 _FIR_TAIL = 2 * EAR_DELAY + 132  # with the low-pass on the way out
@@ -30,7 +33,7 @@ def to_cochlea(signals: Tensor, rate: int, length: int, step: int, filters: Filt
     own, points = _grid(least, up, down)
     bins = min(own, points) // 2 + 1
     response = filters.get("forward", points * step, bins, up / down, rate)
-    return _between(rfft(signals, own)[..., :bins] * response, own, points)[..., :length]
+    return irfft(rfft(signals, own)[..., :bins] * response, points)[..., :length]
 
 
 def from_spectrum(
@@ -60,7 +63,7 @@ def from_spectrum(
         return from_cochlea(heard, rate, inner, samples, filters, gain=gain, step=step, delay=delay)
     bins = min(inner, out) // 2 + 1
     response = filters.get("backward", points, delay, bins, gain * out / inner, rate)
-    return _between(spectrum[..., :bins] * response, inner, out)[..., :samples]
+    return irfft(spectrum[..., :bins] * response, out)[..., :samples]
 
 
 def from_cochlea(
@@ -79,7 +82,7 @@ def from_cochlea(
     own, points = _grid(math.ceil((length + _FIR_TAIL) * down / up), up, down)
     bins = min(own, points) // 2 + 1
     response = filters.get("backward", points * step, delay, bins, gain * down / up, rate)
-    return _between(rfft(heard, points)[..., :bins] * response, points, own)[..., :samples]
+    return irfft(rfft(heard, points)[..., :bins] * response, own)[..., :samples]
 
 
 def to_inner(signals: Tensor, rate: int) -> Tensor:
@@ -89,8 +92,10 @@ def to_inner(signals: Tensor, rate: int) -> Tensor:
     up, down = ratio(rate, 1)
     own, points = _grid(signals.shape[-1], up, down)
     bins = min(own, points) // 2 + 1
-    fast = _between(rfft(signals, own)[..., :bins] * (up / down), own, points)
-    return fast[..., : math.ceil(signals.shape[-1] * up / down)]
+    response = torch.from_numpy(up / down * edge(bins, RATE / points, min(rate, RATE) / 2)).to(signals)
+    return irfft(rfft(signals, own)[..., :bins] * response, points)[
+        ..., : math.ceil(signals.shape[-1] * up / down)
+    ]
 
 
 def block_bounds(samples: int, rate: int) -> list[tuple[int, int, int, int]]:
@@ -122,22 +127,6 @@ def ratio(rate: int, step: int) -> tuple[int, int]:
     """Smallest whole numbers in proportion to 44.1 kHz / step and ``rate``."""
     common = math.gcd(RATE // step, rate)
     return RATE // step // common, rate // common
-
-
-def _between(spectrum: Tensor, source: int, target: int) -> Tensor:
-    """Waveform of ``target`` points of a spectrum of ``source`` points, which is written into.
-
-    The lower rate's Nyquist bin stands for two frequencies, of which the higher rate has one in each half: left out, it
-    would be missed at every sample by as much as it is of the whole, which hangs on the length.
-
-    Shape: (..., min(source, target) // 2 + 1) -> (..., target).
-    """
-    if source != target:
-        lower = min(source, target)
-        if lower % 2 == 0:
-            spectrum[..., -1].mul_(0.5 if target > source else 2.0)
-        spectrum = functional.pad(spectrum, (0, target // 2 + 1 - spectrum.shape[-1]))
-    return irfft(spectrum, target)
 
 
 def _grid(samples: int, up: int, down: int) -> tuple[int, int]:
