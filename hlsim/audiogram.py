@@ -7,7 +7,9 @@ import math
 from bisect import bisect_left
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import reduce
 from itertools import pairwise
+from operator import add
 from pathlib import Path
 from typing import Any
 
@@ -164,7 +166,8 @@ class Audiogram:
 def severity_of(levels: Sequence[float]) -> str:
     """``Audiogram.severity`` of eight levels in dB HL."""
     high = [round(level * _FINE) / _FINE for level in levels[FREQUENCIES.index(2000.0) :]]
-    return SEVERITIES[bisect_left(SEVERITY_LIMITS, sum(high) / len(high))]
+    total = reduce(add, high)  # Python's own sum rounds in other ways from 3.12 on
+    return SEVERITIES[bisect_left(SEVERITY_LIMITS, total / len(high))]
 
 
 def severity_index(thresholds: Tensor) -> Tensor:
