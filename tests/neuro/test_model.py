@@ -138,6 +138,16 @@ def test_networks_that_look_at_all_of_a_signal_take_it_whole(
         assert torch.equal(model(waveform, N3), expected)
 
 
+@pytest.mark.parametrize("items", [1, 5])
+def test_compiled_gives_the_same(items: int) -> None:
+    model = NeuroMSBG(NeuroConfig(channels=4, blocks=1))
+    # one long row, which goes as complex numbers otherwise; more items than run together otherwise
+    waveform, ears = 0.02 * torch.randn(items, 20_000), draw_thresholds(items)
+    with torch.no_grad():
+        heard = torch.compile(model, backend="eager")(waveform, ears)
+        torch.testing.assert_close(heard, model(waveform, ears), atol=1e-6, rtol=1e-4)
+
+
 def test_is_deterministic_under_a_seed() -> None:
     waveform, ear = 0.02 * torch.randn(4000), Audiogram.standard("N3")
     models = []
