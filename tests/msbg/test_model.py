@@ -399,6 +399,18 @@ def test_bad_settings_say_what_is_allowed(options: dict[str, Any], said: str) ->
         MSBG(**options)
 
 
+@pytest.mark.parametrize("rate", [16000, 44100])
+def test_more_threads_change_rounding_alone(rate: int) -> None:
+    model, wave = MSBG(Audiogram.standard("N3"), sample_rate=rate), 0.03 * torch.randn(1, rate)
+    one = model(wave)
+    torch.set_num_threads(2)
+    try:
+        two = model(wave)
+    finally:
+        torch.set_num_threads(1)
+    assert relative(two.numpy(), one.numpy()) < 1e-4
+
+
 @pytest.mark.parametrize("rate", [16000, 16001, 22050, 48000])
 def test_resampling_keeps_all_but_the_last_80_hz(rate: int) -> None:
     spectrum = torch.fft.rfft(torch.randn(rate, dtype=torch.float64))
