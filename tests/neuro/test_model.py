@@ -138,6 +138,7 @@ def test_networks_that_look_at_all_of_a_signal_take_it_whole(
         assert torch.equal(model(waveform, N3), expected)
 
 
+@pytest.mark.usefixtures("two_threads")
 @pytest.mark.parametrize("items", [1, 5])
 def test_compiled_gives_the_same(items: int) -> None:
     model = NeuroMSBG(NeuroConfig(channels=4, blocks=1))
