@@ -43,6 +43,8 @@ class MappingCompensator(EarNetwork):
         ValueError: a rate or level out of range, or a configuration of another kind.
     """
 
+    config: MappingConfig
+
     def __init__(
         self,
         config: MappingConfig | None = None,
@@ -93,7 +95,7 @@ class MappingCompensator(EarNetwork):
         # log magnitude out = log magnitude in + gain, so that silence stays silent and needs no logarithm
         gain = start.unsqueeze(1) + self._correction(features, size)
         return self.stft.synthesise(
-            spectrum * self.phase_decoder.phasor(features, size) * gain.exp(), signals.shape[-1]
+            spectrum * self.phase_decoder.factor(features, size, gain), signals.shape[-1]
         )
 
     def _correction(self, features: Tensor, size: tuple[int, int]) -> Tensor:

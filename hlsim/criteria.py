@@ -36,7 +36,8 @@ def phase_loss(estimate: Tensor, truth: Tensor) -> Tensor:
 
     Shape: complex (items, frames, bins) -> (items,).
     """
-    difference = _phase(truth, estimate) - _phase(estimate, truth)
+    # always: whether a gradient will be asked for, torch.func and forward mode do not tell
+    difference: Tensor = _FadedDifference.apply(estimate, truth)
     instantaneous = anti_wrap(difference).mean((-2, -1))
     group_delay = anti_wrap(difference.diff(dim=-1)).mean((-2, -1))
     if difference.shape[-2] < 2:
@@ -123,24 +124,19 @@ def _magnitude(spectrum: Tensor) -> Tensor:
     return (power(spectrum) + _TINY).sqrt()
 
 
-def _phase(spectrum: Tensor, other: Tensor) -> Tensor:
-    """Angle, with a gradient that fades out where it or the other spectrum is faint."""
-    # always: whether a gradient will be asked for, torch.func and forward mode do not tell
-    phase: Tensor = _FadedPhase.apply(spectrum, other)
-    return phase
+class _FadedDifference(torch.autograd.Function):
+    """Angle of the truth's product with the estimate's conjugate: that from the one's phase to the other's.
 
-
-class _FadedPhase(torch.autograd.Function):
-    """The gradient of an angle, i z / |z|^2, times |z|^2 / (|z|^2 + faint), and the same of the other's."""
+    The gradient of an angle is i z / |z|^2; here it is times |z|^2 / (|z|^2 + faint), and the same of the other's.
+    """
 
     generate_vmap_rule = True
 
     @staticmethod
-    def forward(spectrum: Tensor, other: Tensor) -> Tensor:
-        # of the parts apart, for torch takes twenty times as long where every second number is another's
-        real, imaginary = spectrum.real.contiguous(), spectrum.imag.contiguous()
-        # next to silence the angle is rounding
-        return torch.atan2(imaginary, torch.where(real.abs().add_(imaginary.abs()) < 1e-7, 1e-7, real))
+    def forward(estimate: Tensor, truth: Tensor) -> Tensor:
+        (x, y), (u, v) = _apart(estimate), _apart(truth)
+        # one angle, where that of each takes as long again as all the rest
+        return torch.atan2(x * v - y * u, x * u + y * v)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor], output: Tensor) -> None:
@@ -148,16 +144,37 @@ class _FadedPhase(torch.autograd.Function):
         ctx.save_for_forward(*inputs)
 
     @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
-        spectrum, other = ctx.saved_tensors
-        share = gradient * _fading(spectrum, other)
-        return torch.complex(-spectrum.imag * share, spectrum.real * share), None
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, Tensor | None]:
+        estimate, truth = ctx.saved_tensors
+        first, second = ctx.needs_input_grad
+        return (
+            _turned(estimate, -gradient * _fading(estimate, truth)) if first else None,
+            _turned(truth, gradient * _fading(truth, estimate)) if second else None,
+        )
 
     @staticmethod
-    def jvp(ctx: Any, tangent: Tensor, other_tangent: Tensor | None) -> Tensor:
-        spectrum, other = ctx.saved_tensors
-        across = spectrum.real * tangent.imag - spectrum.imag * tangent.real
-        return across * _fading(spectrum, other)
+    def jvp(ctx: Any, *tangents: Tensor | None) -> Tensor:
+        estimate, truth = ctx.saved_tensors
+        along = torch.zeros_like(estimate.real)
+        for sign, spectrum, other, tangent in zip(
+            (-1.0, 1.0), (estimate, truth), (truth, estimate), tangents, strict=True
+        ):
+            if tangent is not None:
+                across = spectrum.real * tangent.imag - spectrum.imag * tangent.real
+                along = along + sign * across * _fading(spectrum, other)
+        return along
+
+
+def _apart(spectrum: Tensor) -> tuple[Tensor, Tensor]:
+    """Real and imaginary parts; next to silence, where the angle is rounding, the real one is small and positive."""
+    # contiguous, for torch takes twenty times as long where every second number is another's
+    real, imaginary = spectrum.real.contiguous(), spectrum.imag.contiguous()
+    return torch.where(real.abs().add_(imaginary.abs()) < 1e-7, 1e-7, real), imaginary
+
+
+def _turned(spectrum: Tensor, share: Tensor) -> Tensor:
+    """i times the spectrum times real numbers."""
+    return torch.complex(-spectrum.imag * share, spectrum.real * share)
 
 
 def _fading(spectrum: Tensor, other: Tensor) -> Tensor:

@@ -37,6 +37,12 @@ def add(commands: Commands) -> None:
     sub.add_argument(
         "--simulator", action="append", help="a Neuro-MSBG, by name or folder; by default all that ship"
     )
+    sub.add_argument(
+        "--only", nargs="+", default=[], metavar="NAME", help="rows whose names hold one of these words"
+    )
+    sub.add_argument(
+        "--brief", action="store_true", help="one second at batch 1 alone: no longer clips, no larger batches"
+    )
     sub.add_argument("--json", type=Path, help="also write the figures to this file")
 
 
@@ -53,6 +59,8 @@ def _benchmark(options: argparse.Namespace) -> None:
             repeats=options.repeats,
             limit=options.limit,
             simulators=options.simulator,
+            only=options.only,
+            **({"lengths": (), "batches": ()} if options.brief else {}),
             progress=_Progress(),
         )
         print(file=sys.stderr)

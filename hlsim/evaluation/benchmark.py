@@ -8,7 +8,7 @@ import platform
 import statistics
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +39,7 @@ def benchmark(
     lengths: tuple[float, ...] = LENGTHS,
     batches: tuple[int, ...] = BATCHES,
     simulators: list[str] | None = None,
+    only: Sequence[str] = (),
     progress: Progress | None = None,
 ) -> dict[str, Any]:
     """Time the simulators on noise at 65 dB SPL with the rhythm of syllables.
@@ -54,6 +55,7 @@ def benchmark(
             left out.
         lengths: seconds.
         simulators: the Neuro-MSBGs, by name or folder; by default all that ship.
+        only: parts of names: rows with none of them are left out.
         progress: called with cells done, cells in all, and what comes.
 
     Returns: machine, ``rows`` and ``skipped``. A row has name, parameters and a list of ``cells``, each with sample rate,
@@ -62,11 +64,16 @@ def benchmark(
         second. ``growth`` is the exponent of the time's growth with length and with batch.
 
     Raises:
-        ValueError: there is no such device.
+        ValueError: there is no such device, or no row of such a name.
     """
     machine = about(device, repeats)
     place = torch.device(device)
     found, skipped = rows(simulators)
+    if only:
+        names = [row.name for row in found]
+        found = [row for row in found if any(part in row.name for part in only)]
+        if not found:
+            raise ValueError(f"only {' '.join(only)}: no such row; there are {', '.join(names)}")
     cells: dict[tuple[str, int, float, int, str], list[float]] = {}
     memory: dict[tuple[str, int, float, int, str], float | None] = {}
     done, total = 0, _count(found, repeats, lengths, batches)

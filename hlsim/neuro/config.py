@@ -91,6 +91,12 @@ class NetworkConfig:
         return self.hop * self.stride[0]
 
     @property
+    def density(self) -> float:
+        """Values of the widest feature map a sample."""
+        rows = -(-self.stft.frequencies // self.stride[1])
+        return self.channels * self.expansion * rows / self.step
+
+    @property
     def reach(self) -> int | None:
         """Samples to either side on which one depends by transform and network; None where it is all of them."""
         if self.block != "cnn":

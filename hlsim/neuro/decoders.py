@@ -1,9 +1,13 @@
 """The decoders: feature maps to a magnitude factor, a magnitude, or a phase on the transform's grid."""
 
+from typing import Any
+
 import torch
 from torch import Tensor, nn
 
 from hlsim.neuro.encoder import DenseBlock
+
+_TINY = 1e-8
 
 
 class Decoder(nn.Module):
@@ -60,10 +64,36 @@ class PhaseDecoder(Decoder):
     def __init__(self, channels: int, depth: int, stride: tuple[int, int], normalise: bool) -> None:
         super().__init__(channels, 2, depth, stride, normalise)
 
-    def phasor(self, features: Tensor, size: tuple[int, int]) -> Tensor:
-        """exp(j shift). Shape: as ``Decoder`` -> complex (items, time, frequency)."""
+    def factor(self, features: Tensor, size: tuple[int, int], log_gain: Tensor) -> Tensor:
+        """exp(log gain + j shift). Shape: as ``Decoder``, (items, time, frequency) -> complex, the same."""
         dtype = self.leave.weight.dtype  # of the weights, whatever autocast makes of the maps
-        real, imaginary = self(features, size).to(dtype).unbind(1)
-        real = real + 1.0
-        scale = (real.square() + imaginary.square() + 1e-8).rsqrt()
-        return torch.complex(real * scale, imaginary * scale)
+        result: Tensor = _Turning.apply(log_gain, *self(features, size).to(dtype).unbind(1))
+        return result
+
+
+class _Turning(torch.autograd.Function):
+    """exp(a) z / |z| of z = 1 + x + j y, with a gradient of a third of the steps.
+
+    With the result f, the gradient g at it, and q = g conj(f), it is Re q for a, and for x and y that of the angle:
+    -y Im q / |z|^2 and (1 + x) Im q / |z|^2.
+    """
+
+    generate_vmap_rule = True
+
+    @staticmethod
+    def forward(log_gain: Tensor, right: Tensor, up: Tensor) -> Tensor:
+        right = right + 1.0
+        scale = torch.addcmul(right.square(), up, up).clamp_min_(_TINY).rsqrt_().mul_(log_gain.exp())
+        return torch.complex(right.mul_(scale), scale.mul_(up))
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor, Tensor], output: Tensor) -> None:
+        ctx.save_for_backward(*inputs[1:], output)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        right, up, factor = ctx.saved_tensors
+        along = gradient * factor.conj()
+        right = right + 1.0
+        turn = along.imag / torch.addcmul(right.square(), up, up).clamp_min(_TINY)
+        return along.real, -up * turn, right * turn

@@ -33,6 +33,8 @@ class NeuroMSBG(EarNetwork):
         ValueError: a rate or level out of range, or a configuration of another kind.
     """
 
+    config: NeuroConfig
+
     def __init__(
         self,
         config: NeuroConfig | None = None,
@@ -89,20 +91,22 @@ class NeuroMSBG(EarNetwork):
         if self.prior is not None:
             signals = self.prior.filter(signals, severity)
         spectrum = self.stft.analyse(signals)
-        factor = self.prior(spectrum, ears, severity) if self.prior is not None else None
-        features = self._features(spectrum, ears, factor)
+        squared = power(spectrum)
+        factor = self.prior(squared, ears, severity) if self.prior is not None else None
+        features = self._features(spectrum, squared, ears, factor)
         size = (spectrum.shape[-2], spectrum.shape[-1])
         exponents = self._exponents(ears, size[1])
         lower = self.autocast_dtype
         with torch.autocast(signals.device.type, lower or torch.bfloat16, enabled=lower is not None):
             features = self._network(features, severity)
-            log_mask = self.mask_decoder.log_mask(features, size, exponents)
-            phasor = None if self.phase_decoder is None else self.phase_decoder.phasor(features, size)
-        if factor is not None:
-            spectrum = spectrum * factor
-        if phasor is not None:
-            spectrum = spectrum * phasor
-        heard = self.stft.synthesise(spectrum * log_mask.clamp(-12.0, 4.0).exp(), signals.shape[-1])
+            log_mask = self.mask_decoder.log_mask(features, size, exponents).clamp(-12.0, 4.0)
+            if self.phase_decoder is None:
+                correction = log_mask.exp()
+            else:
+                correction = self.phase_decoder.factor(features, size, log_mask)
+        heard = self.stft.synthesise(
+            spectrum * (correction if factor is None else factor * correction), signals.shape[-1]
+        )
         return heard if scale is None else heard * scale
 
     def _network(self, features: Tensor, severity: Tensor) -> Tensor:
@@ -114,9 +118,11 @@ class NeuroMSBG(EarNetwork):
             features = block(features)
         return features.permute(0, 3, 1, 2)
 
-    def _features(self, spectrum: Tensor, ears: Tensor, factor: Tensor | None) -> Tensor:
-        """The input channels. Shape: (items, frames, frequencies), (items, 8) -> (items, 2 to 4, frames, rows)."""
-        squared = power(spectrum)
+    def _features(self, spectrum: Tensor, squared: Tensor, ears: Tensor, factor: Tensor | None) -> Tensor:
+        """The input channels.
+
+        Shape: (items, frames, frequencies) twice, (items, 8) -> (items, 2 to 4, frames, rows).
+        """
         if self.config.level_aware:
             # the sine of the phase, faded out near silence: its gradient stays finite and it has no jump at pi
             channels = [(squared + _TINY).log() / 4.0, spectrum.imag * (squared + 1e-6).rsqrt()]

@@ -12,17 +12,19 @@ from hlsim.audiogram import FREQUENCIES, AudiogramLike
 from hlsim.blocks import overlapping
 from hlsim.calibration import check_full_scale, gain_to_pascals
 from hlsim.msbg.model import resolve_thresholds
-from hlsim.neuro.config import NEURO_RATE
+from hlsim.neuro.config import NEURO_RATE, NetworkConfig
 
-# Samples at 16 kHz of all items that run together on a CPU. Feature maps of more are so large that the C library gives
-# them back to the system, and pays for their pages anew with every one: 64 items of 1 s take three times as long.
-_CPU_SAMPLES = 64_000
+# Values of the widest feature map of all items that run together on a CPU, and the samples at 16 kHz that this may be at
+# most. Larger maps the C library gives back to the system, and pays for their pages anew with every one; of smaller ones
+# the steps from one to the next take longer than the sums.
+_CPU_VALUES = 1_800_000
+_CPU_SAMPLES = (16_000, 256_000)
 # samples of a long item that run together elsewhere
 _DEVICE_SAMPLES = 960_000
 
 
 class EarNetwork(nn.Module):
-    """Waveform and audiogram to waveform, in pascals at 16 kHz inside. Subclasses give ``_process``.
+    """Waveform and audiogram to waveform, in pascals at 16 kHz inside. Subclasses give ``config`` and ``_process``.
 
     On a CPU a few items run at a time. Long signals go through in overlapping blocks where the network looks no farther
     than these overlap (``cnn`` blocks): the output is the same, and without gradients memory grows by it alone.
@@ -35,6 +37,8 @@ class EarNetwork(nn.Module):
     Raises:
         ValueError: a rate or level out of range.
     """
+
+    config: NetworkConfig
 
     def __init__(self, sample_rate: int, full_scale_spl: float) -> None:
         super().__init__()
@@ -68,7 +72,7 @@ class EarNetwork(nn.Module):
         items, samples = signals.shape
         if signals.device.type != "cpu" or torch.compiler.is_compiling():
             return items
-        return max(1, _CPU_SAMPLES * self.sample_rate // (NEURO_RATE * samples))
+        return max(1, self._at_once * self.sample_rate // (NEURO_RATE * samples))
 
     def _run(self, signals: Tensor, ears: Tensor) -> Tensor:
         """``_process`` at the waveform's rate and level. Shape: (items, time), (items, 8) -> (items, time)."""
@@ -82,13 +86,19 @@ class EarNetwork(nn.Module):
             return self._process(signals, ears)
         unit, reach = self._reach
         lead = math.ceil(reach / unit) * unit
-        hop = (_CPU_SAMPLES if signals.device.type == "cpu" else _DEVICE_SAMPLES) // unit * unit
+        hop = (self._at_once if signals.device.type == "cpu" else _DEVICE_SAMPLES) // unit * unit
         bounds = overlapping(signals.shape[-1], hop, lead, lead)
         blocks = [
             self._process(signals[:, begin:end], ears)[:, start - begin : stop - begin]
             for begin, start, stop, end in bounds
         ]
         return blocks[0] if len(blocks) == 1 else torch.cat(blocks, -1)
+
+    @property
+    def _at_once(self) -> int:
+        """Samples at 16 kHz that run together on a CPU."""
+        least, most = _CPU_SAMPLES
+        return min(max(int(_CPU_VALUES / self.config.density), least), most)
 
     @property
     def _reach(self) -> tuple[int, int] | None:

@@ -4,6 +4,7 @@ One set of weights a severity, computed from MSBG's formulae; what is trained is
 """
 
 import math
+from typing import Any
 
 import numpy as np
 import torch
@@ -22,7 +23,7 @@ from hlsim.msbg.model import STRUCTURAL_DELAY
 from hlsim.msbg.recruitment import CATCH_UP_SPL, expansion_ratios, threshold_weights
 from hlsim.msbg.smearing import BROADENING, roex_filters, smearing_from_filters
 from hlsim.neuro.config import NEURO_RATE
-from hlsim.spectrum import STFT, power
+from hlsim.spectrum import STFT
 
 RESPONSE_REACH = 1024
 """Samples at 16 kHz by which the fixed responses reach to either side."""
@@ -30,6 +31,7 @@ RESPONSE_REACH = 1024
 _CHANNELS = max(bank.channels for bank in BANKS.values())
 _ENVELOPE_REACH = 20  # frames
 _TINY = 1e-14
+_ALMOST = 1e-20
 
 # By how much MSBG's envelope of speech is lower than a sinusoid's of the same power, since it fluctuates and smeared
 # frames partly cancel where they overlap: dB, read off the channels of 32 clips to about 0.5 dB.
@@ -103,15 +105,15 @@ class Prior(nn.Module):
         filtered = irfft(rfft(waveform, points) * response, points)
         return filtered[..., RESPONSE_REACH : RESPONSE_REACH + time]
 
-    def forward(self, spectrum: Tensor, thresholds: Tensor, severity: Tensor) -> Tensor:
-        """Complex factor on the filtered signal's spectrum.
+    def forward(self, powers: Tensor, thresholds: Tensor, severity: Tensor) -> Tensor:
+        """Complex factor on the filtered signal's spectrum, of its powers.
 
-        Shape: complex (items, frames, frequencies), (items, 8), (items,) -> complex (items, frames, frequencies).
+        Shape: (items, frames, frequencies), (items, 8), (items,) -> complex (items, frames, frequencies).
         """
-        given = power(spectrum) * self.ear_power
+        given = powers * self.ear_power
         identity = torch.eye(given.shape[-1], device=given.device, dtype=given.dtype).unsqueeze(0)
         smeared = given @ torch.cat((identity, self._corrected("smearing")))[severity].mT
-        widened = ((smeared.abs() + _TINY) / (given + _TINY)).sqrt()
+        widened: Tensor = _Widening.apply(smeared, given)
 
         level = ((smeared.relu() @ self._corrected("excitation")[severity].mT) + _TINY).sqrt().mT
         items, channels, frames = level.shape
@@ -124,10 +126,7 @@ class Prior(nn.Module):
         exponents = self._exponents(thresholds, severity).unsqueeze(-1)
         gain = ((level / catch_up).log().clamp_max(0.0) * exponents).exp().mT
         relative = self._corrected("relative")[:, severity]
-        real, imaginary = gain @ relative[0] * widened, gain @ relative[1] * widened
-        # a negative smeared power turns the phase by 90 degrees, as in MSBG
-        turned = smeared < 0
-        return torch.complex(torch.where(turned, -imaginary, real), torch.where(turned, real, imaginary))
+        return torch.complex(gain @ relative[0], gain @ relative[1]) * widened
 
     def _exponents(self, thresholds: Tensor, severity: Tensor) -> Tensor:
         weights = [torch.from_numpy(threshold_weights(BANKS[name])).to(thresholds) for name in SEVERITIES]
@@ -135,6 +134,34 @@ class Prior(nn.Module):
         rows = torch.stack([ratio[..., :_CHANNELS] for ratio in ratios], 1)
         chosen = rows[torch.arange(len(severity), device=severity.device), severity]
         return (chosen - 1.0).clamp_min(-1.0)
+
+
+class _Widening(torch.autograd.Function):
+    """Square root of the quotient of two powers, imaginary where the first is negative, as in MSBG.
+
+    With the result f, the gradient g at it, and q = Re(g conj(f)) / 2, the gradient is q / s for the first, and -q / p
+    for the second.
+    """
+
+    generate_vmap_rule = True
+
+    @staticmethod
+    def forward(smeared: Tensor, given: Tensor) -> Tensor:
+        quotient = torch.copysign(smeared.abs().add_(_TINY), smeared) / (given + _TINY)
+        # of 0 a root takes long
+        return torch.complex(quotient.clamp_min(_ALMOST).sqrt_(), quotient.neg().clamp_min_(_ALMOST).sqrt_())
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor], output: Tensor) -> None:
+        ctx.save_for_backward(*inputs, output)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor]:
+        smeared, given, factor = ctx.saved_tensors
+        products = torch.view_as_real(gradient) * torch.view_as_real(factor)
+        along = (products[..., 0] + products[..., 1]) * 0.5
+        divisor = torch.copysign(smeared.abs() + _TINY, smeared)
+        return along / divisor, -along / (given + _TINY)
 
 
 def _at_neuro_rate(filter_taps: NDArray[np.float64], points: int) -> NDArray[np.complex128]:

@@ -53,3 +53,14 @@ def test_another_error_is_not_hidden(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(benchmark_module, "rows", lambda simulators: ([short_of_memory("shapes")], []))
     with pytest.raises(RuntimeError, match="shapes"):
         benchmark(repeats=1, lengths=(1.0, 4.0), batches=(1,))
+
+
+def test_rows_can_be_chosen_by_part_of_their_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    rows = [identity(), Row("modest too", (16000,), lambda rate, ear, device: torch.clone)]
+    rows.append(Row("other", (16000,), lambda rate, ear, device: torch.clone))
+    monkeypatch.setattr(benchmark_module, "rows", lambda simulators: (rows, []))
+    result = benchmark(repeats=1, lengths=(), batches=(), only=["modest", "none"])
+    assert [row["name"] for row in result["rows"]] == ["modest", "modest too"]
+    assert all(len(row["cells"]) == 2 for row in result["rows"])  # 1 s at batch 1, there and back
+    with pytest.raises(ValueError, match="no such row; there are modest, modest too, other"):
+        benchmark(repeats=1, only=["none"])

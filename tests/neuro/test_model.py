@@ -13,6 +13,7 @@ from hlsim.audiogram import draw_thresholds
 from hlsim.calibration import set_level
 from hlsim.criteria import noise_to_signal_db
 from hlsim.neuro import NeuroConfig
+from hlsim.neuro.network import EarNetwork
 
 N3 = Audiogram.standard("N3")
 PAPER = NeuroConfig(
@@ -75,9 +76,10 @@ def test_items_that_run_one_after_the_other_are_as_together(
         return process(signals, own)
 
     monkeypatch.setattr(model, "_process", counted)
+    monkeypatch.setattr(NeuroMSBG, "_at_once", 64_000)
     apart = model(given, ears)
     (gradient,) = torch.autograd.grad(apart.square().sum(), given)
-    monkeypatch.setattr("hlsim.neuro.network._CPU_SAMPLES", 10**9)
+    monkeypatch.setattr(NeuroMSBG, "_at_once", 10**9)
     together = model(given, ears)
     assert sizes == [2, 2, 1, 5]
     torch.testing.assert_close(apart, together, atol=1e-6, rtol=1e-4)
@@ -108,7 +110,7 @@ def test_long_signals_by_blocks_are_as_whole(kind: str, monkeypatch: pytest.Monk
     time = 40_000
     given = (0.02 * torch.randn(1, time, dtype=torch.float64)).requires_grad_()
     whole = model(given, N3)
-    monkeypatch.setattr("hlsim.neuro.network._CPU_SAMPLES", 12_000)
+    monkeypatch.setattr(EarNetwork, "_at_once", 12_000)
     calls = []
     process = model._process
 
@@ -134,7 +136,7 @@ def test_networks_that_look_at_all_of_a_signal_take_it_whole(
     waveform = 0.02 * torch.randn(9600)
     with torch.no_grad():
         expected = model(waveform, N3)
-        monkeypatch.setattr("hlsim.neuro.network._CPU_SAMPLES", 2400)
+        monkeypatch.setattr(NeuroMSBG, "_at_once", 2400)
         assert torch.equal(model(waveform, N3), expected)
 
 

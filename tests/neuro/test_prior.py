@@ -7,7 +7,8 @@ from hlsim import MSBG, Audiogram
 from hlsim.audiogram import SEVERITIES
 from hlsim.msbg.filterbank import BANKS
 from hlsim.neuro.config import NeuroConfig
-from hlsim.neuro.prior import RESPONSE_REACH, Prior
+from hlsim.neuro.prior import RESPONSE_REACH, Prior, _Widening
+from hlsim.spectrum import power
 
 
 def test_fixed_response_is_msbg_without_a_loss() -> None:
@@ -27,7 +28,7 @@ def test_fixed_response_is_msbg_without_a_loss() -> None:
 def test_no_loss_means_no_gain_and_no_smearing() -> None:
     prior = Prior(NeuroConfig().stft)
     spectrum = torch.randn(2, 50, 129, dtype=torch.complex64)
-    factor = prior(spectrum, torch.zeros(2, 8), torch.zeros(2, dtype=torch.long))
+    factor = prior(power(spectrum), torch.zeros(2, 8), torch.zeros(2, dtype=torch.long))
     torch.testing.assert_close(factor, torch.ones_like(factor), atol=1e-4, rtol=0.0)
 
 
@@ -45,3 +46,20 @@ def test_envelope_smoothing_keeps_the_mean() -> None:
     for number, severity in enumerate(SEVERITIES):
         rows = prior.smoothing_known[number, : BANKS[severity].channels]
         np.testing.assert_allclose(rows.sum(-1), 1.0, atol=1e-5)
+
+
+def test_widening_is_the_complex_root_of_the_quotient_and_so_is_its_gradient() -> None:
+    smeared = torch.randn(3, 40, dtype=torch.float64).requires_grad_()
+    given = (torch.rand(3, 40, dtype=torch.float64) + 0.1).requires_grad_()
+    expected = torch.complex(smeared / given, torch.zeros_like(given)).sqrt()
+    torch.testing.assert_close(_Widening.apply(smeared, given), expected, atol=1e-9, rtol=1e-12)
+    assert torch.autograd.gradcheck(_Widening.apply, (smeared, given))
+    assert torch.autograd.gradgradcheck(_Widening.apply, (smeared, given))
+
+
+def test_widening_of_silence_stays_finite() -> None:
+    smeared, given = (torch.zeros(5, requires_grad=True) for _ in range(2))
+    factor = _Widening.apply(smeared, given)
+    torch.testing.assert_close(factor, torch.ones(5, dtype=torch.complex64))
+    factor.abs().sum().backward()
+    assert smeared.grad is not None and smeared.grad.isfinite().all()
