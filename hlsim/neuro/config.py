@@ -140,10 +140,10 @@ class NeuroConfig(NetworkConfig):
             instance normalisation follows the convolutions, as in MP-SENet: a level is then invisible.
     """
 
-    fft: int = 256
-    window: int = 96
-    hop: int = 24
-    channels: int = 32
+    fft: int = 128
+    window: int = 128
+    hop: int = 32
+    channels: int = 24
     stride: tuple[int, int] = (4, 3)
     blocks: int = 3
     structure: str = "dual-path"

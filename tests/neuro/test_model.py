@@ -87,6 +87,12 @@ def test_items_that_run_one_after_the_other_are_as_together(
     assert float((gradient - expected).norm() / expected.norm()) < 1e-4
 
 
+def test_wider_networks_take_fewer_samples_at_once() -> None:
+    sizes = [NeuroMSBG(NeuroConfig(channels=channels, blocks=1))._at_once for channels in (4, 32, 64, 2048)]
+    assert sizes == sorted(sizes, reverse=True) and sizes[1] > 1.9 * sizes[2]
+    assert sizes[0] == 256_000 and sizes[-1] == 16_000
+
+
 LOCAL = {
     "default": lambda: NeuroMSBG(NeuroConfig(channels=8)),
     "dense": lambda: NeuroMSBG(
@@ -97,7 +103,9 @@ LOCAL = {
             fft=400, window=400, hop=100, stride=(3, 2), kernel=(11, 3), channels=4, blocks=1, prior=False
         )
     ),
-    "monolithic": lambda: NeuroMSBG(NeuroConfig(channels=8, structure="monolithic")),
+    "monolithic": lambda: NeuroMSBG(
+        NeuroConfig(fft=256, window=96, hop=24, channels=8, structure="monolithic")
+    ),
     "compensator": MappingCompensator,
 }
 
@@ -178,7 +186,7 @@ def test_configuration_survives_json(config: NeuroConfig) -> None:
         {"stride": 4},
         {"stride": [4, 3, 2]},
         {"hop": 60},
-        {"hop": 25},
+        {"hop": 33},
         {"hop": 24.0},
         {"fft": "400"},
         {"window": 300},

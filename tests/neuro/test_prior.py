@@ -26,8 +26,9 @@ def test_fixed_response_is_msbg_without_a_loss() -> None:
 
 
 def test_no_loss_means_no_gain_and_no_smearing() -> None:
-    prior = Prior(NeuroConfig().stft)
-    spectrum = torch.randn(2, 50, 129, dtype=torch.complex64)
+    stft = NeuroConfig().stft
+    prior = Prior(stft)
+    spectrum = torch.randn(2, 50, stft.frequencies, dtype=torch.complex64)
     factor = prior(power(spectrum), torch.zeros(2, 8), torch.zeros(2, dtype=torch.long))
     torch.testing.assert_close(factor, torch.ones_like(factor), atol=1e-4, rtol=0.0)
 
