@@ -36,7 +36,7 @@ class ConvPath(nn.Module):
 
     def forward(self, features: Tensor) -> Tensor:
         hidden = self.local(features.permute(0, 3, 1, 2)).permute(0, 2, 3, 1)
-        hidden = functional.relu(self.expand(hidden))
+        hidden = self.expand(hidden).relu_()
         return features + _restore(self.restore, hidden)
 
 
