@@ -31,7 +31,6 @@ RESPONSE_REACH = 1024
 _CHANNELS = max(bank.channels for bank in BANKS.values())
 _ENVELOPE_REACH = 20  # frames
 _TINY = 1e-14
-_ALMOST = 1e-20
 
 # By how much MSBG's envelope of speech is lower than a sinusoid's of the same power, since it fluctuates and smeared
 # frames partly cancel where they overlap: dB, read off the channels of 32 clips to about 0.5 dB.
@@ -147,9 +146,9 @@ class _Widening(torch.autograd.Function):
 
     @staticmethod
     def forward(smeared: Tensor, given: Tensor) -> Tensor:
-        quotient = torch.copysign(smeared.abs().add_(_TINY), smeared) / (given + _TINY)
-        # of 0 a root takes long
-        return torch.complex(quotient.clamp_min(_ALMOST).sqrt_(), quotient.neg().clamp_min_(_ALMOST).sqrt_())
+        root = (smeared.abs().add_(_TINY) / (given + _TINY)).sqrt_()
+        imaginary = root * (smeared < 0.0)
+        return torch.complex(root - imaginary, imaginary)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor], output: Tensor) -> None:
