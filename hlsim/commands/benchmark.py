@@ -48,7 +48,7 @@ def add(commands: Commands) -> None:
 
 def _benchmark(options: argparse.Namespace) -> None:
     from compensators import MappingCompensator
-    from hlsim.evaluation.benchmark import about, benchmark
+    from hlsim.evaluation.benchmark import BATCHES, LENGTHS, about, benchmark
     from hlsim.evaluation.benchmark_report import benchmark_markdown
     from hlsim.evaluation.benchmark_training import scan_rows, training_step
 
@@ -60,7 +60,8 @@ def _benchmark(options: argparse.Namespace) -> None:
             limit=options.limit,
             simulators=options.simulator,
             only=options.only,
-            **({"lengths": (), "batches": ()} if options.brief else {}),
+            lengths=() if options.brief else LENGTHS,
+            batches=() if options.brief else BATCHES,
             progress=_Progress(),
         )
         print(file=sys.stderr)

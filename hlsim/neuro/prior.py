@@ -4,7 +4,6 @@ One set of weights a severity, computed from MSBG's formulae; what is trained is
 """
 
 import math
-from typing import Any
 
 import numpy as np
 import torch
@@ -112,7 +111,7 @@ class Prior(nn.Module):
         given = powers * self.ear_power
         identity = torch.eye(given.shape[-1], device=given.device, dtype=given.dtype).unsqueeze(0)
         smeared = given @ torch.cat((identity, self._corrected("smearing")))[severity].mT
-        widened: Tensor = _Widening.apply(smeared, given)
+        widened = _widening(smeared, given)
 
         level = ((smeared.relu() @ self._corrected("excitation")[severity].mT) + _TINY).sqrt().mT
         items, channels, frames = level.shape
@@ -135,32 +134,11 @@ class Prior(nn.Module):
         return (chosen - 1.0).clamp_min(-1.0)
 
 
-class _Widening(torch.autograd.Function):
-    """Square root of the quotient of two powers, imaginary where the first is negative, as in MSBG.
-
-    With the result f, the gradient g at it, and q = Re(g conj(f)) / 2, the gradient is q / s for the first, and -q / p
-    for the second.
-    """
-
-    generate_vmap_rule = True
-
-    @staticmethod
-    def forward(smeared: Tensor, given: Tensor) -> Tensor:
-        root = (smeared.abs().add_(_TINY) / (given + _TINY)).sqrt_()
-        imaginary = root * (smeared < 0.0)
-        return torch.complex(root - imaginary, imaginary)
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor], output: Tensor) -> None:
-        ctx.save_for_backward(*inputs, output)
-
-    @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor]:
-        smeared, given, factor = ctx.saved_tensors
-        products = torch.view_as_real(gradient) * torch.view_as_real(factor)
-        along = (products[..., 0] + products[..., 1]) * 0.5
-        divisor = torch.copysign(smeared.abs() + _TINY, smeared)
-        return along / divisor, -along / (given + _TINY)
+def _widening(smeared: Tensor, given: Tensor) -> Tensor:
+    """Square root of the quotient of two powers, imaginary where the first is negative, as in MSBG."""
+    root = ((smeared.abs() + _TINY) / (given + _TINY)).sqrt()
+    imaginary = root * (smeared < 0.0)
+    return torch.complex(root - imaginary, imaginary)
 
 
 def _at_neuro_rate(filter_taps: NDArray[np.float64], points: int) -> NDArray[np.complex128]:

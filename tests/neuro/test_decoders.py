@@ -2,13 +2,13 @@
 
 import torch
 
-from hlsim.neuro.decoders import MaskDecoder, PhaseDecoder
+from hlsim.neuro.decoders import PhaseDecoder
 
 SIZE = (9, 17)
 
 
-def decoder(kind: type[PhaseDecoder] | type[MaskDecoder], *options: bool) -> PhaseDecoder | MaskDecoder:
-    model = kind(4, 0, (4, 3), False, *options).double()
+def trained() -> PhaseDecoder:
+    model = PhaseDecoder(4, 0, (4, 3), False).double()
     for parameter in model.parameters():
         parameter.data.normal_(0.0, 0.3)
     return model
@@ -19,7 +19,7 @@ def given() -> tuple[torch.Tensor, torch.Tensor]:
 
 
 def test_factor_is_the_gain_and_the_angle_of_the_two_maps() -> None:
-    model = decoder(PhaseDecoder)
+    model = trained()
     features, log_gain = given()
     right, up = model(features, SIZE).unbind(1)
     expected = torch.polar(log_gain.exp(), torch.atan2(up, 1.0 + right))
@@ -35,7 +35,7 @@ def test_untrained_there_is_no_shift() -> None:
 
 
 def test_gradients_are_those_of_differences() -> None:
-    model = decoder(PhaseDecoder)
+    model = trained()
     inputs = tuple(tensor.requires_grad_() for tensor in given())
 
     def factor(features: torch.Tensor, log_gain: torch.Tensor) -> torch.Tensor:
