@@ -46,8 +46,24 @@ class STFT:
 
     def synthesise(self, spectrum: Tensor, length: int) -> Tensor:
         """Waveform by overlap-add. Shape: complex (items, frames, frequencies) -> (items, length)."""
-        window = self._hann(spectrum.real)
-        return torch.istft(spectrum.mT, self.fft, self.hop, self.window, window, center=True, length=length)
+        # as torch.istft, which takes longer, and of which ONNX gets an index that its runtime refuses
+        window, before = self._hann(spectrum.real), (self.fft - self.window) // 2
+        frames = torch.fft.irfft(spectrum, self.fft)[..., before : before + self.window] * window
+        weights = window.square().expand(1, spectrum.shape[-2], -1)
+        kept = slice(self.fft // 2 - before, self.fft // 2 - before + length)
+        return self._overlap_add(frames)[:, kept] / self._overlap_add(weights)[:, kept]
+
+    def _overlap_add(self, frames: Tensor) -> Tensor:
+        """Shape: (items, frames, window) -> (items, time)."""
+        items, count, window = frames.shape
+        parts = -(-window // self.hop)  # of a frame, each added to the next part of the frame before
+        if window % self.hop:
+            frames = functional.pad(frames, (0, parts * self.hop - window))
+        rows = frames.reshape(items, count, parts, self.hop).transpose(1, 2)
+        # zeros after each row, and rows that are one shorter than that: each begins one place later than the one before
+        places = count + parts - 1
+        late = functional.pad(rows, (0, 0, 0, parts)).flatten(1, 2)[:, : parts * places]
+        return late.reshape(items, parts, places, self.hop).sum(1).flatten(1)
 
     def _hann(self, like: Tensor) -> Tensor:
         return torch.hann_window(self.window, dtype=like.dtype, device=like.device)

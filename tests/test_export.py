@@ -58,19 +58,39 @@ def test_what_cannot_be_exported_is_said(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_onnx_gives_the_outputs_or_says_what_it_lacks(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("items", "seconds"), [(2, 0.5), (1, 1.0)])
+def test_onnx_gives_the_outputs(tmp_path: Path, items: int, seconds: float) -> None:
     pytest.importorskip("onnxscript")
     runtime = pytest.importorskip("onnxruntime")
     simulator, path = load_pretrained("neuro-msbg"), tmp_path / "simulator.onnx"
-    wave, ears = example()
-    try:
-        export_onnx(simulator, path, seconds=0.5, items=2)
-    except ValueError as error:
-        assert "ONNX cannot take the simulator" in str(error) and "\n" not in str(error)
-        assert not list(tmp_path.iterdir())
-        return
+    wave, ears = example(items, seconds)
+    export_onnx(simulator, path, seconds=seconds, items=items)
     session = runtime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
     names = [entry.name for entry in session.get_inputs()]
     heard = session.run(None, dict(zip(names, (wave.numpy(), ears.numpy()), strict=True)))[0]
     expected = simulator(wave, ears)
     assert float((torch.from_numpy(heard) - expected).abs().max()) < 1e-4 * float(expected.abs().max())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("broken", "complaint"),
+    [
+        (lambda session, names, given: [0.999 * heard for heard in session(names, given)], "off by 1e-03"),
+        (lambda session, names, given: 1 / 0, "onnxruntime refuses the file"),
+    ],
+)
+def test_onnx_that_gives_something_else_is_not_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, broken: Any, complaint: str
+) -> None:
+    pytest.importorskip("onnxscript")
+    runtime = pytest.importorskip("onnxruntime")
+    run = runtime.InferenceSession.run
+    monkeypatch.setattr(
+        runtime.InferenceSession,
+        "run",
+        lambda self, names, given: broken(lambda *wanted: run(self, *wanted), names, given),
+    )
+    with pytest.raises(ValueError, match=f"ONNX cannot take the simulator: .*{complaint}") as caught:
+        export_onnx(NeuroMSBG(NeuroConfig(channels=4, blocks=1)), tmp_path / "simulator.onnx", seconds=0.1)
+    assert "\n" not in str(caught.value) and not list(tmp_path.iterdir())
