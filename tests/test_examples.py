@@ -8,8 +8,9 @@ from types import ModuleType
 import pytest
 import torch
 
-from hlsim import Audiogram
+from hlsim import MSBG, Audiogram
 from hlsim.audio import read_audio, write_audio
+from hlsim.calibration import level_spl
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 
@@ -57,3 +58,24 @@ def test_the_papers_last_table(tmp_path: Path, speech_dir: Path, capsys: pytest.
     # one utterance, two different ears of the file, two conditions
     assert len(table) == 4 and len({row["hl_1000"] for row in table}) == 2
     assert (out / "report" / "report.json").is_file()
+
+
+def test_other_sounds(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    example = load("other_sounds.py")
+    # the three levels of each tone, in the order of the tones
+    sound = example.tones((250, 1000))
+    torch.testing.assert_close(level_spl(sound), torch.tensor([50.0, 65.0, 80.0, 50.0, 65.0, 80.0]))
+    assert (torch.fft.rfft(sound).abs().argmax(-1) / 2).tolist() == [250.0] * 3 + [1000.0] * 3
+    monkeypatch.setattr(example, "EARS", ("N3",))
+    monkeypatch.setattr(example.sys, "argv", ["other_sounds.py"])
+    ear = Audiogram.standard("N3")
+    itself = example.cells(MSBG(ear, sample_rate=16000), lambda x, _: MSBG(ear, sample_rate=16000)(x), ear)
+    assert itself[:2] == ["+0.0 to +0.0"] * 2 and itself[3] == itself[5] == "inf, inf, inf"
+    # one that gives 3 dB too much
+    louder = example.cells(
+        MSBG(ear, sample_rate=16000), lambda x, _: 2**0.5 * MSBG(ear, sample_rate=16000)(x), ear
+    )
+    assert louder[0] == "+3.0 to +3.0" and louder[2] == "+3.0, +3.0, +3.0" and louder[3] == "8, 8, 8"
+    example.main()
+    table = capsys.readouterr().out.splitlines()
+    assert len(table) == 3 and all(line.count("|") == 8 for line in table) and table[2].startswith("| N3 |")
