@@ -24,10 +24,7 @@ from torch.utils.data import DataLoader, Dataset
 from hlsim.data.files import write_whole
 from hlsim.pretrained import repair_checkpoint
 from hlsim.training.examples import ShowExamples
-from hlsim.training.state import BEST, LAST, WholeStates, claim
-
-CHECKPOINT = "checkpoint"
-"""Name of the folder with the best model, in its released form."""
+from hlsim.training.state import BEST, CHECKPOINT, LAST, WholeStates, claim
 
 
 class Counter(Dataset[int]):

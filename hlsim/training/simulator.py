@@ -22,8 +22,9 @@ from hlsim.pretrained import SIMULATOR, load_pretrained, save_checkpoint
 from hlsim.settings import refuse_other_kinds, refuse_seed, refuse_unknown, refuse_weights
 from hlsim.training.averaging import average_of
 from hlsim.training.beginning import start_identity, started
-from hlsim.training.loop import CHECKPOINT, TimedModule, run
+from hlsim.training.loop import TimedModule, run
 from hlsim.training.sources import TrainingData, read_thresholds
+from hlsim.training.state import CHECKPOINT
 
 PRECISIONS = {"float32": None, "bfloat16": torch.bfloat16}
 

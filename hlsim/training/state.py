@@ -12,6 +12,9 @@ from lightning.pytorch.plugins.io import TorchCheckpointIO
 
 from hlsim.data.files import PARTIAL, write_whole
 
+CHECKPOINT = "checkpoint"
+"""Name of the folder with the best model, in its released form."""
+
 LAST = "last.ckpt"
 """Name of the state that a killed training goes on from."""
 
@@ -61,7 +64,7 @@ def claim(folder: Path, recipe: Mapping[str, Any]) -> None:
         if note.is_file() and (found := note.read_text(encoding="utf-8")) != text:
             raise ValueError(
                 f"{folder}: holds a training of another recipe (other {_differing(found, text)}; see {note.name}); "
-                "choose another --out"
+                f"choose another --out, from its weights with --start {folder / CHECKPOINT}"
             )
         return
     (folder / BEST).unlink(missing_ok=True)

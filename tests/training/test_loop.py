@@ -13,7 +13,8 @@ from torch import Tensor
 
 pytest.importorskip("lightning")
 
-from hlsim.training.loop import BEST, CHECKPOINT, LAST, TimedModule, run
+from hlsim.training.loop import TimedModule, run
+from hlsim.training.state import BEST, CHECKPOINT, LAST
 
 EVER = 1e6  # minutes
 
@@ -149,7 +150,8 @@ def test_another_recipe_in_the_same_folder_is_refused_and_changes_nothing(tmp_pa
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir() if path.is_file()}
     module = Toy()
     with pytest.raises(
-        ValueError, match=r"holds a training of another recipe \(other a, b; see .*choose another --out"
+        ValueError,
+        match=r"another recipe \(other a, b; see .*another --out, from its weights with --start .*checkpoint",
     ) as caught:
         go(module, tmp_path, max_steps=4, recipe={"a": 2, "b": None})
     assert str(caught.value).startswith(str(tmp_path))
