@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from torch import nn
 
@@ -18,6 +18,7 @@ from hlsim.evaluation.gain_curves import gain_curves
 from hlsim.evaluation.haspi import Progress, check_seed
 from hlsim.evaluation.judging import (
     INPUT_LEVELS,
+    OF_NETWORK,
     Judged,
     Task,
     Unaided,
@@ -38,7 +39,7 @@ STORE = "scores.jsonl"
 UNAIDED, PRESCRIBED = "unaided", "NAL-R"
 """The conditions that every compensator is compared with."""
 
-_REVISION = 1  # of what ``judge`` measures: raise it where that changes a figure
+_REVISION = 2  # of what ``judge`` measures: raise it where that changes a figure
 
 
 def evaluate_compensators(
@@ -61,7 +62,8 @@ def evaluate_compensators(
     """Judge compensators, and write ``compensators.json``, ``.md`` and ``.html``.
 
     Figures are stored in ``scores.jsonl`` as they are made, by the samples, the ear and the weights that they are of: a
-    run that was stopped goes on where it was, and one with a compensator more scores that one alone.
+    run that was stopped goes on where it was, one with a compensator more scores that one alone, and one with another
+    simulator computes the surrogate gap alone.
 
     Args:
         compensators: by name, modules at 16 kHz and 94 dB SPL full scale, called with a waveform and an ear. One with a
@@ -133,6 +135,13 @@ def evaluate_compensators(
     return result
 
 
+class _Keys(NamedTuple):
+    """Under which figures are stored: all but ``OF_NETWORK``, which hangs on more, and that one."""
+
+    most: str
+    of_network: str
+
+
 @dataclass(frozen=True)
 class _Panel:
     """All that is to be judged."""
@@ -142,21 +151,25 @@ class _Panel:
     simulator: nn.Module
     seed: int
 
-    def keys(self) -> Iterator[dict[str, str]]:
+    def keys(self) -> Iterator[dict[str, _Keys]]:
         """What each item's figures are stored under, by condition."""
         weights = {name: weights_hash(module) for name, module in self.conditions.items()}
         about = {
             "revision": _REVISION,
             "versions": {**versions_of(["haspi", "hasqi"]), "hlsim": version_of("hlsim")},
-            "simulator": weights_hash(self.simulator),
         }
+        network = weights_hash(self.simulator)
         for number, item in enumerate(self.items):
             own = about | {
                 "signal": samples_hash(item.clean, item.signal),
                 "ear": list(item.ear.thresholds),
                 "seed": self.item_seed(number),
             }
-            yield {name: key_of({**own, "weights": weights[name]}) for name in self.conditions}
+            of = {name: {**own, "weights": weights[name]} for name in self.conditions}
+            yield {
+                name: _Keys(key_of(settings), key_of({**settings, "simulator": network}))
+                for name, settings in of.items()
+            }
 
     def item_seed(self, number: int) -> int:
         return (self.seed + number) % 2**32
@@ -170,11 +183,17 @@ def _judge_all(
     judged: list[dict[str, Judged]] = []
     tasks = []
     for number, (item, own) in enumerate(zip(panel.items, keys, strict=True)):
-        found = {name: record for name, key in own.items() if (record := store.get(key)) is not None}
+        known = {name: record for name, key in own.items() if (record := store.get(key.most)) is not None}
+        found = {
+            name: known[name] | record
+            for name, key in own.items()
+            if name in known and (record := store.get(key.of_network)) is not None
+        }
         judged.append({name: Judged(record) for name, record in found.items()})
         missing = {name: module for name, module in panel.conditions.items() if name not in found}
         if missing:
-            tasks.append(Task(number, item, missing, panel.simulator, panel.item_seed(number)))
+            left = {name: known[name] for name in missing if name in known}
+            tasks.append(Task(number, item, missing, panel.simulator, panel.item_seed(number), left))
     total = len(panel.items) * len(panel.conditions)
     done = total - sum(len(task.compensators) for task in tasks)
     if progress is not None and done and tasks:
@@ -185,7 +204,10 @@ def _judge_all(
             result = dict.fromkeys(task.compensators, died)
         for name, own_result in result.items():
             if own_result.figures is not None:
-                store.append(keys[task.number][name], own_result.figures)
+                most, key = dict(own_result.figures), keys[task.number][name]
+                store.append(key.of_network, {OF_NETWORK: most.pop(OF_NETWORK)})
+                if name not in task.known:
+                    store.append(key.most, most)
         judged[task.number].update(result)
         done += len(result)
         if progress is not None:

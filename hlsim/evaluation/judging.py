@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
@@ -28,8 +28,12 @@ INPUT_LEVELS = (50.0, 65.0, 80.0)
 STANDARD_EARS = ("N2", "N3", "N4", "N5", "N6", "S1", "S2", "S3")
 """Bisgaard's audiograms that are in every comparison of compensators."""
 
-SIMULATORS = ("neuro", "msbg", "pyclarity")
+EXACT = ("msbg", "pyclarity")
+SIMULATORS = ("neuro", *EXACT)
 """Under which a compensator's loss is told: the named network, hlsim's exact MSBG, pyclarity's."""
+
+OF_NETWORK = "loss_neuro"
+"""The figure that hangs on the named network; no other does."""
 
 NORMAL = Audiogram.standard("NH")
 
@@ -43,11 +47,12 @@ class Unaided(nn.Module):
 
 @dataclass(frozen=True)
 class Task:
-    """An item, and the compensators that it has no figures of yet.
+    """An item, and the compensators that it lacks figures of.
 
     Args:
         number: of the item, for the caller.
         compensators: by name, at 16 kHz and 94 dB SPL full scale.
+        known: figures by name of those that lack ``OF_NETWORK`` alone.
         simulator: the network of ``neuro``, of the same rate and scale.
         seed: of the noise that HASPI and HASQI add, the same for every compensator.
     """
@@ -57,6 +62,7 @@ class Task:
     compensators: Mapping[str, nn.Module]
     simulator: nn.Module
     seed: int
+    known: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
 
 
 class Judged(NamedTuple):
@@ -143,15 +149,19 @@ def judge(task: Task) -> dict[str, Judged]:
 
 def _judge(task: Task) -> dict[str, Judged]:
     item = task.item
+    needed = ("neuro",) if task.compensators.keys() <= task.known.keys() else SIMULATORS
     try:
-        normal = {name: _hear(task, name, item.clean, NORMAL) for name in SIMULATORS}
-        given = float(level_spl(_hear(task, "msbg", item.signal, NORMAL)))
+        normal = {name: _hear(task, name, item.clean, NORMAL) for name in needed}
+        if needed == SIMULATORS:
+            normal["msbg, of the input"] = _hear(task, "msbg", item.signal, NORMAL)
     except Exception as error:  # whatever it is, it is this item's reason, and the others go on
         return dict.fromkeys(task.compensators, Judged(None, _reason(error)))
     judged = {}
     for name, compensator in task.compensators.items():
         try:
-            figures = {**_figures(task, compensator(item.signal, item.ear), normal), "normal": given}
+            aided = compensator(item.signal, item.ear)
+            figures = dict(task.known.get(name) or _figures(task, aided, normal))
+            figures[OF_NETWORK] = _loss(_hear(task, "neuro", aided, item.ear), normal["neuro"])
             if unknown := [figure for figure, value in figures.items() if not math.isfinite(value)]:
                 raise ValueError(f"{', '.join(unknown)}: not finite")
             judged[name] = Judged(figures)
@@ -161,21 +171,27 @@ def _judge(task: Task) -> dict[str, Judged]:
 
 
 def _figures(task: Task, aided: Tensor, normal: Mapping[str, Tensor]) -> dict[str, float]:
+    """All but ``OF_NETWORK``."""
     item = task.item
     scores = {
         name: measure(item.clean, aided, item.ear, RATE, full_scale_spl=PASCAL_SPL, seed=task.seed)
         for name, measure in (("haspi", haspi), ("hasqi", hasqi))
     }
-    heard = {name: _hear(task, name, aided, item.ear) for name in SIMULATORS}
+    heard = {name: _hear(task, name, aided, item.ear) for name in EXACT}
     return {
         **scores,
         "level": float(level_spl(aided)),
         "peak": peak_spl(aided),
         "heard": float(level_spl(heard["msbg"])),
+        "normal": float(level_spl(normal["msbg, of the input"])),
         "normal_clean": float(level_spl(normal["msbg"])),
         "band_error": band_error_db(heard["msbg"], normal["msbg"]),
-        **{f"loss_{name}": float(band_level_loss(heard[name], normal[name], RATE)) for name in SIMULATORS},
+        **{f"loss_{name}": _loss(heard[name], normal[name]) for name in EXACT},
     }
+
+
+def _loss(heard: Tensor, normal: Tensor) -> float:
+    return float(band_level_loss(heard, normal, RATE))
 
 
 def peak_spl(waveform: Tensor) -> float:

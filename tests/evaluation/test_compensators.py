@@ -279,6 +279,19 @@ def test_a_stopped_run_goes_on_and_new_weights_are_judged_anew(
     with pytest.raises(KeyboardInterrupt):
         evaluate_compensators({"own": Gain(10.0)}, **options, out=parts)
     assert calls == [["own"]] * 2  # of the others all is known
+
+    # under another simulator nothing is new but the surrogate gap
+    calls.clear()
+    measured: list[int] = []
+    monkeypatch.setattr(compensators, "judge", original)
+    monkeypatch.setattr(judging, "_figures", lambda *arguments: measured.append(1))
+    other = evaluate_compensators({"own": Gain()}, **options, simulator="neuro-msbg-cnn", out=parts)
+    assert not measured
+    for before, after in zip(whole["rows"], other["rows"], strict=True):
+        for name, figures in before["figures"].items():
+            assert {key for key, value in figures.items() if value != after["figures"][name][key]} == {
+                "loss_neuro"
+            }
     assert whole["ears"] == ["55 55 55 65 70 75 80 80 dB HL"] and whole["groups"].keys() <= {"clean", "hard"}
     assert {curve["ear"] for curve in whole["gain_curves"]} == {*whole["ears"]}
 
