@@ -53,6 +53,8 @@ class PlannedTraining(SimulatorTraining):
     def take(self, data: Any) -> None:
         if not isinstance(data, PlannedSource):
             raise ValueError(f"data is {type(data).__name__}; allowed: PlannedSource")
+        if self.recipe.sounds:
+            raise ValueError(f"sounds {self.recipe.sounds} in the recipe, with a manifest; allowed: 0")
         self.batches = self.datamodule = _Batches(
             data.manifest,
             root=data.root,

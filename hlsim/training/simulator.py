@@ -14,6 +14,7 @@ from hlsim.audiogram import MILDER, Audiogram, draw_thresholds
 from hlsim.calibration import set_level
 from hlsim.criteria import log_spectral_distance_db, noise_to_signal_db, paper_parts, weighted_sum
 from hlsim.data.clips import Clips
+from hlsim.data.sounds import draw_sounds
 from hlsim.data.variation import mix, vary
 from hlsim.msbg import MSBG
 from hlsim.neuro import NeuroConfig, NeuroMSBG
@@ -49,6 +50,7 @@ class SimulatorRecipe:
             without a prior want the latter: a severe ear's first errors are 50 dB above its truth, and the network learns
             to be silent.
         levels: lowest and highest level in dB SPL, before amplification.
+        sounds: share of clips that are tones or clicks instead of speech, 0 to 1; 0 with a manifest.
         treated: whether clips are equalised, amplified and compressed at random, as compensators do.
         precision: ``float32``, or ``bfloat16`` for the network's own layers: several times faster where the hardware has
             matrix units for it. Transforms, physics, scans and criteria stay in float32.
@@ -66,6 +68,7 @@ class SimulatorRecipe:
     weights: dict[str, float] = field(default_factory=lambda: {"snr": 1.0, "log_spectrum": 0.5})
     unit_power: str = "truth"
     levels: tuple[float, float] = (40.0, 95.0)
+    sounds: float = 0.0
     treated: bool = True
     precision: str = "float32"
     average: float = 0.99
@@ -93,6 +96,8 @@ class SimulatorRecipe:
         refuse_seed(self.seed, "in the recipe")
         if self.unit_power not in ("truth", "input"):
             raise ValueError(f"unit_power {self.unit_power!r} in the recipe; allowed: truth or input")
+        if not 0.0 <= self.sounds <= 1.0:
+            raise ValueError(f"sounds {self.sounds} in the recipe; allowed: from 0 to 1")
         if self.precision not in PRECISIONS or not 0.0 <= self.average < 1.0:
             raise ValueError(
                 f"precision {self.precision!r}, average {self.average} in the recipe; allowed: "
@@ -112,6 +117,7 @@ class SimulatorTraining(TimedModule):
         self.kept = average_of(self.student, recipe.average)
         self.teacher = MSBG(sample_rate=NEURO_RATE)
         self.truths: list[Tensor] = []
+        self.sound_batches = 0  # the last of those to validate on
         self.take(data)
 
     def take(self, data: TrainingData) -> None:
@@ -121,7 +127,8 @@ class SimulatorTraining(TimedModule):
         self.speech = Clips(data.speech, **options)
         self.noise = Clips(data.noise, repeat=True, **options) if data.noise else None
         self.ears = read_thresholds(data.audiograms)
-        self.valid = validation_set(data, recipe)
+        sounds = sound_set(recipe) if recipe.sounds else []
+        self.valid, self.sound_batches = [*validation_set(data, recipe), *sounds], len(sounds)
 
     def training_loss(self, generator: torch.Generator) -> Tensor:
         count = self.recipe.batch
@@ -132,8 +139,12 @@ class SimulatorTraining(TimedModule):
             keep = torch.rand(count, 1, generator=generator) < 0.4
             ears = torch.where(keep, measured.clamp(-10.0, 100.0), ears)
         noise = self.noise.draw(count, generator) if self.noise is not None else None
+        clips = self.speech.draw(count, generator)
+        if self.recipe.sounds:
+            others = draw_sounds(count, clips.shape[-1], NEURO_RATE, generator)
+            clips = torch.where(torch.rand(count, 1, generator=generator) < self.recipe.sounds, others, clips)
         signal = vary(
-            self.speech.draw(count, generator),
+            clips,
             noise,
             ears,
             NEURO_RATE,
@@ -162,15 +173,25 @@ class SimulatorTraining(TimedModule):
         return weighted_sum(parts, weights).mean()
 
     def validate(self) -> dict[str, float]:
-        """Median and worst tenth of the SNR over the validation items, in dB."""
+        """Median and worst tenth of the SNR in dB over the validation items, and of sounds where it trains on them.
+
+        They score by their share of the training.
+        """
         values = []
         with torch.no_grad():
             for number, (signal, ears) in enumerate(self.valid):
                 signal, ears = signal.to(self.device), ears.to(self.device)
                 values.append(-noise_to_signal_db(self.kept.module(signal, ears), self.truth(number)))
-        snr = torch.cat(values)
-        median, low = float(snr.median()), float(snr.quantile(0.1))
-        return {"score": median + 0.5 * low, "valid_snr_median": median, "valid_snr_worst_tenth": low}
+        figures: dict[str, float] = {}
+        score = 0.0
+        speech, share = len(values) - self.sound_batches, self.recipe.sounds
+        for name, kind, part in (("", values[:speech], 1.0 - share), ("_sounds", values[speech:], share)):
+            if kind:
+                snr = torch.cat(kind)
+                median, low = float(snr.median()), float(snr.quantile(0.1))
+                figures |= {f"valid{name}_snr_median": median, f"valid{name}_snr_worst_tenth": low}
+                score += part * (median + 0.5 * low)
+        return {"score": score, **figures}
 
     def examples(self) -> dict[str, Tensor]:
         signal, ears = (tensor[-1:].to(self.device) for tensor in self.valid[0])
@@ -222,6 +243,17 @@ def validation_set(data: TrainingData, recipe: SimulatorRecipe) -> list[tuple[Te
         if measured is not None:
             ears[1:8:2] = measured[torch.randint(len(measured), (4,), generator=generator)]
         batches.append((signal, ears))
+    return batches
+
+
+def sound_set(recipe: SimulatorRecipe) -> list[tuple[Tensor, Tensor]]:
+    """Fixed tones and clicks at the levels of ``validation_set``, a third as many items, for drawn ears."""
+    generator = torch.Generator().manual_seed(2_000 + recipe.seed)
+    batches = []
+    for _ in range(0, recipe.validation_items, 24):
+        signal = draw_sounds(8, 2 * NEURO_RATE, NEURO_RATE, generator)
+        levels = 50.0 + 30.0 * torch.rand(8, generator=generator)
+        batches.append((set_level(signal, levels), draw_thresholds(8, generator)))
     return batches
 
 

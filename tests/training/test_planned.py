@@ -127,6 +127,12 @@ def test_the_validation_split_is_used(plan: Path) -> None:
     assert torch.equal(training.valid[0][1], expected)
 
 
+def test_a_plan_has_no_sounds_but_its_own(plan: Path) -> None:
+    recipe = SimulatorRecipe.from_dict(TINY | {"sounds": 0.1})
+    with pytest.raises(ValueError, match=r"sounds 0\.1 in the recipe, with a manifest; allowed: 0"):
+        PlannedTraining(recipe, PlannedSource(plan, workers=0), 1e6)
+
+
 def test_a_plan_without_a_validation_split_says_what_it_is_chosen_on(plan: Path, tmp_path: Path) -> None:
     prepare(PlanSettings(tmp_path / "speech"), tmp_path / "other", jobs=1)
     with pytest.warns(UserWarning, match="chosen on 'test'"):

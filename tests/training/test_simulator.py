@@ -309,3 +309,37 @@ def test_the_validation_set_is_fixed_and_as_described(rich: TrainingData) -> Non
         [waves for waves, _ in validation_set(rich, SimulatorRecipe(validation_items=24, seed=1))]
     )
     assert not torch.equal(other, signals)
+
+
+def test_sounds_take_the_place_of_a_share_of_the_clips(
+    data: TrainingData, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def clips(sounds: float) -> torch.Tensor:
+        recipe = TINY | {"batch": 40, "sounds": sounds, "treated": False}
+        module = SimulatorTraining(SimulatorRecipe.from_dict(recipe), data, EVER)
+        monkeypatch.setattr(module, "loss_on", lambda signal, ears, truth: signal)
+        return module.training_loss(torch.Generator().manual_seed(0))
+
+    def clicks(signals: torch.Tensor) -> int:
+        return int(((signals != 0.0).sum(-1) <= 8).sum())  # half of the sounds
+
+    assert clicks(clips(0.0)) == 0 and clicks(clips(1.0)) == 20 and 4 <= clicks(clips(0.5)) <= 16
+
+
+def test_sounds_are_validated_by_their_share(data: TrainingData) -> None:
+    def figures(sounds: float) -> dict[str, float]:
+        recipe = SimulatorRecipe.from_dict(TINY | {"sounds": sounds})
+        return SimulatorTraining(recipe, data, EVER).validate()
+
+    speech, both = figures(0.0), figures(0.25)
+    median, low = both["valid_sounds_snr_median"], both["valid_sounds_snr_worst_tenth"]
+    assert set(speech) == {"score", "valid_snr_median", "valid_snr_worst_tenth"}
+    assert all(both[name] == speech[name] for name in speech if name != "score")
+    assert both["score"] == pytest.approx(0.75 * speech["score"] + 0.25 * (median + 0.5 * low))
+    assert low < median != speech["valid_snr_median"]
+
+
+@pytest.mark.parametrize("sounds", [-0.1, 1.1])
+def test_shares_that_are_none(sounds: float) -> None:
+    with pytest.raises(ValueError, match=r"sounds .* in the recipe; allowed: from 0 to 1"):
+        SimulatorRecipe(sounds=sounds)

@@ -1,0 +1,39 @@
+"""Tones and clicks: what they are, and that a seed is all they hang on."""
+
+import torch
+
+from hlsim.data.sounds import draw_sounds
+
+
+def draw(items: int, samples: int = 16000, seed: int = 0) -> torch.Tensor:
+    return draw_sounds(items, samples, 16000, torch.Generator().manual_seed(seed))
+
+
+def test_tones_are_steady_and_few() -> None:
+    tones = draw(40)[::2]
+    spectra = (tones[:, 8000:] * torch.hann_window(8000)).T.contiguous()
+    powers = torch.fft.rfft(spectra, dim=0).abs().square()
+    loudest = powers.topk(5 * 4, dim=0).values.sum(0)  # four tones, five bins of the window each
+    assert float((loudest / powers.sum(0)).min()) > 0.999
+    hertz = powers.argmax(0) * 2.0
+    assert (
+        float(hertz.min()) >= 98.0
+        and float(hertz.max()) <= 7502.0
+        and int((hertz % 250.0 == 0.0).sum()) > 5
+        and len(hertz.unique()) > 10
+    )
+    # as loud to the end as from the middle on
+    levels = [part.square().mean(-1).log10() * 10.0 for part in (tones[:, 8000:12000], tones[:, 12000:])]
+    torch.testing.assert_close(*levels, atol=0.5, rtol=0)
+    begins = (tones.abs() > 1e-6 * tones.abs().amax(-1, keepdim=True)).float().argmax(-1)
+    assert 4000 < int(begins.max()) <= 8010
+
+
+def test_clicks_are_single_samples() -> None:
+    counts = (draw(40)[1::2] != 0.0).sum(-1)
+    assert int(counts.min()) >= 1 and int(counts.max()) <= 8 and len(counts.unique()) > 2
+
+
+def test_a_seed_is_all_they_hang_on() -> None:
+    assert torch.equal(draw(6), draw(6)) and not torch.equal(draw(6), draw(6, seed=1))
+    assert draw(3, 1).shape == (3, 1) and bool(torch.isfinite(draw(3, 1)).all())
