@@ -66,7 +66,7 @@ def export_program(
 
 
 def export_onnx(simulator: nn.Module, path: str | Path, *, seconds: float = 1.0, items: int = 1) -> None:
-    """Write ``export_program``'s program as an ONNX file, whole or not at all.
+    """Write ``export_program``'s program as an ONNX file, whole or not at all; with Mamba blocks that takes minutes.
 
     Raises:
         ValueError: as ``export_program``, or an operation that ONNX or its exporter does not have; the message names it;
