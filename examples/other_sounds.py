@@ -20,8 +20,9 @@ RATE = 16000
 
 def tones(hertz: tuple[int, ...]) -> Tensor:
     """Each at each level. Shape: -> (tones * levels, 2 s)."""
-    phases = 2.0 * torch.pi * torch.tensor(hertz).unsqueeze(-1) * torch.arange(2 * RATE) / RATE
-    return set_level(phases.sin().repeat_interleave(len(LEVELS), 0), LEVELS.repeat(len(hertz)))
+    turns = torch.tensor(hertz).unsqueeze(-1) * torch.arange(2 * RATE) % RATE / RATE
+    tone = (2.0 * torch.pi * turns).sin()
+    return set_level(tone.repeat_interleave(len(LEVELS), 0), LEVELS.repeat(len(hertz)))
 
 
 def snr(truth: Tensor, heard: Tensor) -> Tensor:

@@ -26,14 +26,12 @@ def draw_sounds(items: int, samples: int, sample_rate: int, generator: torch.Gen
 
     hertz = uniform(math.log(_LOWEST), math.log(_HIGHEST), _TONES).exp()
     hertz = torch.where(uniform(0.0, 1.0, _TONES) < 0.5, 250.0 * (hertz / 250.0).ceil(), hertz)
-    phases = uniform(0.0, 2.0 * math.pi, _TONES)
     levels_db = uniform(-40.0, 0.0, _TONES)
     levels_db[:, 1:][uniform(0.0, 1.0, _TONES - 1) < 0.5] = -math.inf
     time = torch.arange(samples)
-    turns = hertz.unsqueeze(-1) * time / sample_rate
-    tones = (10.0 ** (levels_db / 20.0)).unsqueeze(-1) * torch.sin(
-        2.0 * math.pi * turns + phases.unsqueeze(-1)
-    )
+    # in double precision: in single, thousands of turns are noise 50 dB below the tone
+    turns = uniform(0.0, 1.0, _TONES).unsqueeze(-1) + hertz.double().unsqueeze(-1) * time / sample_rate
+    tones = (10.0 ** (levels_db / 20.0)).unsqueeze(-1) * torch.sin(2.0 * math.pi * turns).float()
     begins = uniform(0.0, 0.5 * samples, 1)
     rise = ((time - begins) / (0.01 * sample_rate)).clamp(0.0, 1.0)  # 10 ms
 
