@@ -13,7 +13,8 @@ def test_tones_are_steady_and_few() -> None:
     tones = draw(40)[::2]
     spectra = (tones[:, 8000:] * torch.hann_window(8000)).T.contiguous()
     powers = torch.fft.rfft(spectra, dim=0).abs().square()
-    loudest = powers.topk(5 * 4, dim=0).values.sum(0)  # four tones, five bins of the window each
+    # four tones, five bins of the window each: no more than that fluctuates
+    loudest = powers.topk(5 * 4, dim=0).values.sum(0)
     assert float((loudest / powers.sum(0)).min()) > 0.999
     hertz = powers.argmax(0) * 2.0
     assert (
@@ -22,9 +23,6 @@ def test_tones_are_steady_and_few() -> None:
         and int((hertz % 250.0 == 0.0).sum()) > 5
         and len(hertz.unique()) > 10
     )
-    # as loud to the end as from the middle on
-    levels = [part.square().mean(-1).log10() * 10.0 for part in (tones[:, 8000:12000], tones[:, 12000:])]
-    torch.testing.assert_close(*levels, atol=0.5, rtol=0)
     begins = (tones.abs() > 1e-6 * tones.abs().amax(-1, keepdim=True)).float().argmax(-1)
     assert 4000 < int(begins.max()) <= 8010
 
