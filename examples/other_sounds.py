@@ -1,4 +1,4 @@
-"""What Neuro-MSBG, trained on speech, makes of other sounds: python examples/other_sounds.py [NAME OR FOLDER]
+"""What Neuro-MSBG makes of sounds that are not speech: python examples/other_sounds.py [NAME OR FOLDER]
 
 Steady tones, white noise and a click of 50, 65 and 80 dB SPL, compared with the exact MSBG. A tone counts where the exact
 MSBG leaves 0 dB SPL of it or more.

@@ -39,7 +39,7 @@ STORE = "scores.jsonl"
 UNAIDED, PRESCRIBED = "unaided", "NAL-R"
 """The conditions that every compensator is compared with."""
 
-_REVISION = 2  # of what ``judge`` measures: raise it where that changes a figure
+_REVISION = 2  # of what ``judge`` measures and how it is kept: raise it where that changes
 
 
 def evaluate_compensators(

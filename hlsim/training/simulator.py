@@ -236,8 +236,7 @@ def validation_set(data: TrainingData, recipe: SimulatorRecipe) -> list[tuple[Te
         if noise is not None:
             noisy = mix(signal, noise.draw(8, generator), 20.0 * torch.rand(8, generator=generator))
             signal = torch.where((torch.arange(8) % 2 == 1).unsqueeze(-1), noisy, signal)
-        low, high = (50.0, 80.0) if recipe.treated else recipe.levels
-        signal = set_level(signal, low + (high - low) * torch.rand(8, generator=generator))
+        signal = set_level(signal, _valid_levels(recipe, generator))
         ears = draw_thresholds(8, generator)
         ears[0:8:4] = standard[torch.randint(len(standard), (2,), generator=generator)]
         if measured is not None:
@@ -252,9 +251,15 @@ def sound_set(recipe: SimulatorRecipe) -> list[tuple[Tensor, Tensor]]:
     batches = []
     for _ in range(0, recipe.validation_items, 24):
         signal = draw_sounds(8, 2 * NEURO_RATE, NEURO_RATE, generator)
-        levels = 50.0 + 30.0 * torch.rand(8, generator=generator)
-        batches.append((set_level(signal, levels), draw_thresholds(8, generator)))
+        signal = set_level(signal, _valid_levels(recipe, generator))
+        batches.append((signal, draw_thresholds(8, generator)))
     return batches
+
+
+def _valid_levels(recipe: SimulatorRecipe, generator: torch.Generator) -> Tensor:
+    """Levels in dB SPL of a batch to validate on. Shape: -> (8,)."""
+    low, high = (50.0, 80.0) if recipe.treated else recipe.levels
+    return low + (high - low) * torch.rand(8, generator=generator)
 
 
 def train_simulator(

@@ -23,6 +23,7 @@ from hlsim.training.simulator import (
     MILDER,
     SimulatorRecipe,
     SimulatorTraining,
+    sound_set,
     train_simulator,
     validation_set,
 )
@@ -337,6 +338,13 @@ def test_sounds_are_validated_by_their_share(data: TrainingData) -> None:
     assert all(both[name] == speech[name] for name in speech if name != "score")
     assert both["score"] == pytest.approx(0.75 * speech["score"] + 0.25 * (median + 0.5 * low))
     assert low < median != speech["valid_snr_median"]
+
+
+@pytest.mark.parametrize(("treated", "low", "high"), [(True, 50.0, 80.0), (False, 85.0, 90.0)])
+def test_sounds_have_the_levels_of_the_validation_set(treated: bool, low: float, high: float) -> None:
+    recipe = SimulatorRecipe(sounds=0.1, treated=treated, levels=(85.0, 90.0))
+    levels = torch.cat([level_spl(signals) for signals, _ in sound_set(recipe)])
+    assert len(levels) == 16 and low - 0.01 <= float(levels.min()) < float(levels.max()) <= high + 0.01
 
 
 @pytest.mark.parametrize("sounds", [-0.1, 1.1])
