@@ -11,6 +11,7 @@ from torch import Tensor
 
 from hlsim import MSBG, Audiogram, load_pretrained
 from hlsim.calibration import level_spl, set_level
+from hlsim.evaluation.fidelity import snr_db
 
 EARS = ("NH", "N1", "N2", "N3", "N4", "N5", "S1", "S2", "S3")
 LEVELS = torch.tensor([50.0, 65.0, 80.0])
@@ -23,11 +24,6 @@ def tones(hertz: tuple[int, ...]) -> Tensor:
     turns = torch.tensor(hertz).unsqueeze(-1) * torch.arange(2 * RATE) % RATE / RATE
     tone = (2.0 * torch.pi * turns).sin()
     return set_level(tone.repeat_interleave(len(LEVELS), 0), LEVELS.repeat(len(hertz)))
-
-
-def snr(truth: Tensor, heard: Tensor) -> Tensor:
-    """In dB. Shape: (items, time) twice -> (items,)."""
-    return 10.0 * torch.log10(truth.square().sum(-1) / (truth - heard).square().sum(-1))
 
 
 def cells(exact: MSBG, network: torch.nn.Module, ear: Audiogram) -> list[str]:
@@ -46,7 +42,7 @@ def cells(exact: MSBG, network: torch.nn.Module, ear: Audiogram) -> list[str]:
         off = level_spl(heard) - level_spl(truth)
         row += [
             ", ".join(f"{value:+.1f}" for value in off.tolist()),
-            ", ".join(f"{value:.0f}" for value in snr(truth, heard).tolist()),
+            ", ".join(f"{snr_db(*pair):.0f}" for pair in zip(truth.numpy(), heard.numpy(), strict=True)),
         ]
     return row
 
