@@ -74,16 +74,18 @@ def paper_parts(
     """The paper's four losses by name, of each item. Shape: (items, time) twice -> (items,) each.
 
     Args:
-        stft: spectra are scaled to the magnitudes of the paper's transform, so that a rate changes no level.
+        stft: spectra are scaled to the magnitudes of the paper's transform, so that a rate changes no level; magnitude
+            and complex loss to its number of frequencies, so that an empty band does not change them either.
         frequencies: how many of the transform's to compare, from 0 Hz up; all if None.
     """
     first, second = (stft.analyse(waveform)[..., :frequencies] for waveform in (estimate, truth))
     if (scale := PAPER_STFT.window / stft.window) != 1.0:
         first, second = first * scale, second * scale
+    share = first.shape[-1] / PAPER_STFT.frequencies
     return {
-        "magnitude": magnitude_loss(first, second),
+        "magnitude": magnitude_loss(first, second) * share,
         "phase": phase_loss(first, second),
-        "complex": complex_loss(first, second),
+        "complex": complex_loss(first, second) * share,
         "time": time_loss(estimate, truth),
     }
 

@@ -15,6 +15,7 @@ from hlsim.band_levels import HIGHEST, band_level_loss
 from hlsim.calibration import PASCAL_SPL, check_full_scale, gain_to_pascals, is_finite
 from hlsim.compiling import not_compiled
 from hlsim.msbg import MSBG
+from hlsim.msbg.response import with_phase_of_bank
 from hlsim.neuro import NeuroMSBG
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.pretrained import SIMULATOR, find_checkpoint, load_pretrained
@@ -43,7 +44,9 @@ class HearingLossLoss(nn.Module):
             7.5 kHz.
         full_scale_spl: level in dB SPL of RMS 1.0.
         reference: what is heard is compared with ``"clean"``, the clean speech itself, or ``"normal-hearing"``, what the
-            same simulator makes of it at 0 dB HL.
+            same simulator makes of it at 0 dB HL. For the criterion ``"paper"`` either has the phase of MSBG's bank of
+            the ear's severity (``hlsim.msbg.response``), or speech turned over could be nearer than the speech. With a
+            module that neither is nor holds one of hlsim's simulators, it is compared as it is.
         criterion: ``"paper"``, magnitude, phase, complex and time losses (Equations 2 to 9), or ``"bands"``, levels in
             ERB-wide bands, always against what a normal ear hears.
         weights: of the parts by name; a part left out does not count.
@@ -115,11 +118,15 @@ class HearingLossLoss(nn.Module):
             dtype = torch.promote_types(torch.promote_types(compensated.dtype, clean.dtype), torch.float32)
             heard = self._hear(compensated.to(dtype), ears.to(compensated.device))
             aim = self._aim(clean.to(dtype)).expand_as(heard)
-            gain, time = gain_to_pascals(self.full_scale_spl), heard.shape[-1]
+            gain, (*batch, time) = gain_to_pascals(self.full_scale_spl), heard.shape
             heard, aim = heard.reshape(-1, time) * gain, aim.reshape(-1, time) * gain
             if self.criterion == "bands":
                 items = {"band_levels": band_level_loss(heard, aim, self.sample_rate)}
             else:
+                if any(isinstance(module, MSBG | NeuroMSBG) for module in self.simulator.modules()):
+                    each = ears.to(aim.device).expand(*batch, -1).reshape(-1, len(FREQUENCIES))
+                    normal = self.reference == "normal-hearing"
+                    aim = with_phase_of_bank(aim, each, self.sample_rate, normal=normal)
                 stft = criteria.paper_stft(self.sample_rate)
                 items = criteria.paper_parts(heard, aim, stft, self._frequencies(stft.fft))
         return {name: part.mean() for name, part in items.items()}

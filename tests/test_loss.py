@@ -11,11 +11,13 @@ import pytest
 import torch
 from torch import Tensor, nn
 
+from compensators import NALR
 from hlsim import MSBG, Audiogram, HearingLossLoss, NeuroMSBG, load_pretrained
 from hlsim.audio import resample
 from hlsim.band_levels import band_level_loss
 from hlsim.calibration import set_level
 from hlsim.criteria import DEFAULT_WEIGHTS, PARTS, paper_parts
+from hlsim.msbg.response import with_phase_of_bank
 from hlsim.pretrained import find_checkpoint
 
 SIMULATORS = ("neuro-msbg", "msbg")
@@ -117,17 +119,22 @@ def test_a_step_trains_the_compensator_alone(simulator: str, criterion: str, cle
     assert all(torch.equal(before[name], after[name]) for name in before)
 
 
-@pytest.mark.parametrize(("criterion", "gain"), [("paper", 8.0), ("bands", 1.0)])
-def test_gradient_is_that_of_the_value(criterion: str, gain: float, clean: Tensor) -> None:
+@pytest.mark.parametrize(
+    ("criterion", "weights", "gain"),
+    [("paper", {"magnitude": 0.9, "complex": 0.1, "time": 0.2}, 8.0), ("bands", None, 1.0)],
+)
+def test_gradient_is_that_of_the_value(
+    criterion: str, weights: dict[str, float] | None, gain: float, clean: Tensor
+) -> None:
     """Along a gain, by central differences in float64."""
-    # the phase's gradient is faded where it is faint; the weights of bands have none, but do not change while everything
-    # is heard too softly
-    loss = HearingLossLoss(N3, simulator="msbg", criterion=criterion)
+    # without the phase, whose gradient is faded where it is faint; the weights of bands have none, but do not change
+    # while everything is heard too softly
+    loss = HearingLossLoss(N3, simulator="msbg", criterion=criterion, weights=weights)
     signal = clean.double()
     factor = torch.tensor(gain, dtype=torch.float64, requires_grad=True)
     (slope,) = torch.autograd.grad(loss(signal * factor, signal), factor)
     ahead, behind = (float(loss(signal * g, signal)) for g in (gain + 1e-3, gain - 1e-3))
-    assert float(slope) == pytest.approx((ahead - behind) / 2e-3, rel=0.02)
+    assert float(slope) == pytest.approx((ahead - behind) / 2e-3, rel=1e-4)
 
 
 # Moving, copying, compiling
@@ -267,7 +274,9 @@ def test_what_is_heard_is_compared_with_the_reference(simulator: str, clean: Ten
     for reference in ("clean", "normal-hearing"):
         loss = HearingLossLoss(N3, simulator=simulator, reference=reference)
         heard = loss.simulator(2.0 * clean, N3)
-        aim = clean if reference == "clean" else loss.simulator(clean, Audiogram.standard("NH"))
+        normal = reference == "normal-hearing"
+        aim = loss.simulator(clean, Audiogram.standard("NH")) if normal else clean
+        aim = with_phase_of_bank(aim, torch.tensor([N3.thresholds] * 2), 16000, normal=normal)
         for name, part in paper_parts(heard, aim).items():
             torch.testing.assert_close(loss.parts(2.0 * clean, clean)[name], part.mean(), msg=name)
         loss = HearingLossLoss(N3, simulator=simulator, criterion="bands", reference=reference)
@@ -286,6 +295,42 @@ def test_a_normal_ear_loses_nothing(simulator: str, criterion: str, clean: Tenso
     # 0 dB HL is where MSBG is linear: a gain is heard as it is
     if criterion == "bands":
         assert float(loss(clean * 10.0**0.5, clean)) == pytest.approx(10.0, abs=0.1)
+
+
+@both
+@pytest.mark.parametrize("reference", ["clean", "normal-hearing"])
+@pytest.mark.parametrize("ear", ["NH", "N1", "N3", "N4", "S2"])
+def test_speech_is_nearer_than_speech_turned_over(
+    simulator: str, reference: str, ear: str, clean: Tensor
+) -> None:
+    """And than silence, though the banks have no linear phase: amplified by NAL-R, in each part that knows of phase."""
+    audiogram = Audiogram.standard(ear)
+    loss = HearingLossLoss(audiogram, simulator=simulator, reference=reference)
+    given = clean if ear == "NH" else NALR(audiogram)(clean)
+    upright, over, silent = (loss.parts(factor * given, clean) for factor in (1.0, -1.0, 0.0))
+    for name in ("phase", "complex", "time"):
+        assert float(upright[name]) < 0.95 * float(over[name]), name
+        assert float(upright[name]) < float(silent[name]), name
+
+
+def test_a_module_of_ones_own_is_compared_as_it_is(clean: Tensor) -> None:
+    class Own(nn.Module):
+        def forward(self, waveform: Tensor, thresholds: Tensor) -> Tensor:
+            return waveform
+
+    assert float(HearingLossLoss(N3, simulator=Own())(clean, clean)) == 0.0
+
+    class Around(Own):
+        def __init__(self) -> None:
+            super().__init__()
+            self.inner = MSBG(sample_rate=16000)
+
+        def forward(self, waveform: Tensor, thresholds: Tensor) -> Tensor:
+            heard: Tensor = self.inner(waveform, thresholds)
+            return heard
+
+    expected = HearingLossLoss(N3, simulator="msbg")(3.0 * clean, clean)
+    torch.testing.assert_close(HearingLossLoss(N3, simulator=Around())(3.0 * clean, clean), expected)
 
 
 @both
@@ -332,11 +377,8 @@ def test_other_rates_judge_alike(simulator: str, criterion: str, clean: Tensor) 
     high = HearingLossLoss(N3, simulator=simulator, criterion=criterion, sample_rate=44100)
     faster = resample(clean, 16000, 44100)
     first, second = low.parts(3.0 * clean, clean), high.parts(3.0 * faster, faster)
-    # the mean is over 201 frequencies at 16 kHz, at 44.1 kHz over 188 (Neuro-MSBG), or 553 of which 352 are empty
-    scale = {"neuro-msbg": 188 / 201, "msbg": 553 / 201}[simulator]
     for name in set(first) - {"phase"}:
-        factor = scale if name in ("magnitude", "complex") else 1.0
-        assert float(second[name]) * factor == pytest.approx(float(first[name]), rel=0.1), name
+        assert float(second[name]) == pytest.approx(float(first[name]), rel=0.1), name
     value, slope = gradient(high, 3.0 * faster, faster)
     assert bool(value.isfinite()) and bool(slope.isfinite().all())
 
@@ -402,18 +444,21 @@ def test_pauses_do_not_take_the_gradient_over(
 @each_criterion
 def test_autocast_does_not_reach_inside(simulator: str, criterion: str, clean: Tensor) -> None:
     loss = HearingLossLoss(N3, simulator=simulator, criterion=criterion)
-    results = []
+    results, parts = [], []
     for autocast in (False, True):
         for given in (3.0 * clean, (3.0 * clean).bfloat16()):
             given.requires_grad_()
             with torch.autocast("cpu", dtype=torch.bfloat16, enabled=autocast):
                 value = loss(given, clean)
+                parts.append(loss.parts(given, clean))
             (slope,) = torch.autograd.grad(value, given)
             assert value.dtype == torch.float32 and slope.dtype == given.dtype
             results.append((value.detach(), slope))
     same(results[0], results[2])
     same(results[1], results[3])
-    assert float(results[3][0]) == pytest.approx(float(results[0][0]), rel=0.02)
+    # without the phase: that of what is nearly silent is the input's rounding
+    for name in set(parts[0]) - {"phase"}:
+        assert float(parts[3][name]) == pytest.approx(float(parts[0][name]), rel=0.01), name
 
 
 # Simulators and errors

@@ -14,12 +14,12 @@ from torch.nn import functional
 
 from hlsim.audiogram import SEVERITIES
 from hlsim.calibration import PASCAL_SPL
-from hlsim.msbg.ear import RATE, ear_filter, lowpass_filter
+from hlsim.msbg.ear import RATE, ear_filter
 from hlsim.msbg.envelope import envelope_filters
 from hlsim.msbg.filterbank import BANKS, FilterBank, gammatone_response
 from hlsim.msbg.fourier import fft_length, irfft, rfft
-from hlsim.msbg.model import STRUCTURAL_DELAY
 from hlsim.msbg.recruitment import CATCH_UP_SPL, expansion_ratios, threshold_weights
+from hlsim.msbg.response import fixed_response
 from hlsim.msbg.smearing import BROADENING, roex_filters, smearing_from_filters
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.spectrum import STFT
@@ -58,7 +58,7 @@ class Prior(nn.Module):
         points = 160 * stft.fft  # a fine grid that 44.1 kHz shares
         coarse = slice(None, points // 2 + 1, 160)
         banks = [BANKS[severity] for severity in SEVERITIES]
-        ear = np.abs(_at_neuro_rate(ear_filter(), points)[coarse]) ** 2
+        ear = np.abs(np.fft.rfft(ear_filter(), points * 441 // 160)[coarse]) ** 2
         self.register_buffer("ear_power", torch.tensor(ear, dtype=torch.float32))
         responses = [_sum_response(bank) for bank in banks]
         self.register_buffer("response", torch.tensor(np.stack(responses), dtype=torch.float32))
@@ -143,22 +143,10 @@ def _widening(smeared: Tensor, given: Tensor) -> Tensor:
     return torch.complex(root - imaginary, imaginary)
 
 
-def _at_neuro_rate(filter_taps: NDArray[np.float64], points: int) -> NDArray[np.complex128]:
-    """Response of a 44.1 kHz filter on the grid of ``points`` at 16 kHz; ``points`` is a multiple of 160."""
-    response: NDArray[np.complex128] = np.fft.rfft(filter_taps, points * 441 // 160)[: points // 2 + 1]
-    return response
-
-
 def _sum_response(bank: FilterBank) -> NDArray[np.float64]:
     """Impulse response of all of MSBG at 16 kHz with every gain at 1, aligned. Returns (2 reach,), its zero at reach."""
     points = 160 * 160
-    omega = 2.0 * np.pi * np.arange(points // 2 + 1) / (points * RATE / NEURO_RATE)
-    total = gammatone_response(bank, points * 441 // 160, bins=points // 2 + 1).sum(0)
-    for taps in (ear_filter(), ear_filter(backward=True), lowpass_filter()):
-        total = total * _at_neuro_rate(taps, points)
-    impulse = np.fft.irfft(total * np.exp(1j * omega * STRUCTURAL_DELAY), points) * 10.0 ** (
-        -bank.recombination_db / 20.0
-    )
+    impulse = np.fft.irfft(fixed_response(bank, NEURO_RATE, points), points)
     return np.roll(impulse, RESPONSE_REACH)[: 2 * RESPONSE_REACH]
 
 

@@ -1,0 +1,79 @@
+"""The fixed response of MSBG with every gain at 1, and its phase alone: what a filter bank does to any ear's signals.
+
+The bank's channels add up to a level response within a few dB, but not to a linear phase: at 1 to 2 kHz what is heard is
+nearer to the signal turned over than to the signal. Waveforms, phases and complex spectra can only be compared with a
+signal that has the same phase.
+"""
+
+import math
+from functools import lru_cache
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from hlsim.audiogram import SEVERITIES, severity_index
+from hlsim.compiling import lasting
+from hlsim.msbg.ear import RATE, ear_filter, lowpass_filter
+from hlsim.msbg.filterbank import BANKS, FilterBank, gammatone_response
+from hlsim.msbg.fourier import fft_length, irfft, rfft
+from hlsim.msbg.model import STRUCTURAL_DELAY
+
+_REACH_SECONDS = 0.064
+_SPACING = 2.5  # Hz, at most: of the grid, whose period is several times what the responses last
+_FAINT = 0.1
+
+
+def fixed_response(bank: FilterBank, rate: int, points: int) -> NDArray[np.complex128]:
+    """Response of all of MSBG, aligned, with every gain at 1, on the grid of ``rfft`` at a rate.
+
+    Args:
+        points: FFT length at ``rate`` that is a whole number of samples at 44.1 kHz too.
+
+    Returns: (points // 2 + 1,), 0 above 22.05 kHz.
+    """
+    own = points * RATE // rate
+    bins = min(points, own) // 2 + 1
+    omega = 2.0 * np.pi * np.arange(bins) / own
+    total = gammatone_response(bank, own, bins=bins).sum(0)
+    for taps in (ear_filter(), ear_filter(backward=True), lowpass_filter()):
+        total = total * np.fft.rfft(taps, own)[:bins]
+    total = total * np.exp(1j * omega * STRUCTURAL_DELAY) * 10.0 ** (-bank.recombination_db / 20.0)
+    return np.pad(total, (0, points // 2 + 1 - bins))
+
+
+def with_phase_of_bank(waveform: Tensor, thresholds: Tensor, rate: int, *, normal: bool = False) -> Tensor:
+    """A signal with the phase that MSBG's bank of each ear's severity gives it, and its own magnitude.
+
+    Where the response ends, from 20 dB down, the magnitude goes with it.
+
+    Shape: (items, time), (items, 8) dB HL -> (items, time).
+
+    Args:
+        normal: the signal is what a normal ear hears: the phase of that ear's bank is taken off.
+    """
+    time, severity = waveform.shape[-1], severity_index(thresholds)
+    taps = _phases(rate, normal, waveform.dtype, waveform.device)[severity]
+    reach = taps.shape[-1] // 2
+    points = fft_length(time + 2 * reach, 4)
+    moved = irfft(rfft(waveform, points) * rfft(taps, points), points)[..., reach : reach + time]
+    # a normal ear's stays as it is to the bit, for phases of what is nearly silent hang on rounding
+    return torch.where((severity == 0).unsqueeze(-1), waveform, moved) if normal else moved
+
+
+@lru_cache(maxsize=8)
+def _phases(rate: int, normal: bool, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Impulse response of each severity's phase, its zero in the middle. Shape: (severities, 2 reach)."""
+    shared = math.gcd(rate, RATE)
+    points = rate // shared * 2 * math.ceil(shared / (2.0 * _SPACING))
+    responses = np.stack([fixed_response(BANKS[severity], rate, points) for severity in SEVERITIES])
+    if normal:
+        phases = np.exp(1j * (np.angle(responses) - np.angle(responses[0])))
+    else:
+        magnitude = np.abs(responses)
+        phases = responses / np.maximum(magnitude, _FAINT * magnitude.max(-1, keepdims=True))
+    reach = math.ceil(_REACH_SECONDS * rate)
+    impulses = np.roll(np.fft.irfft(phases, points), reach, -1)[:, : 2 * reach]
+    with lasting():
+        return torch.from_numpy(impulses.copy()).to(device=device, dtype=dtype)
