@@ -26,7 +26,7 @@ def add(commands: Commands) -> None:
         commands,
         "evaluate-compensator",
         _evaluate_compensator,
-        "judge compensators beside no aid and NAL-R: HASPI, HASQI, loudness as heard, surrogate gap, gain curves",
+        "judge compensators beside no aid and NAL-R: HASPI, HASQI, loudness as heard, surrogate gap, gain curves, tones",
     )
     sub.add_argument(
         "names",
@@ -53,7 +53,11 @@ def add(commands: Commands) -> None:
     sub.add_argument("--items", type=count, default=400, help="how many in all")
     sub.add_argument("--seconds", type=positive, default=3.0, help="length of an item")
     sub.add_argument(
-        "--gain-ears", nargs="+", default=["N3", "S2"], metavar="EAR", help="standard ears of the gain curves"
+        "--gain-ears",
+        nargs="+",
+        default=["N3", "S2"],
+        metavar="EAR",
+        help="standard ears of the gain curves and tones",
     )
     sub.add_argument("--jobs", type=count, help="processes; all cores by default")
     seed_option(sub)

@@ -24,6 +24,7 @@ from hlsim.evaluation.page import Section, Table, render_page
 from hlsim.evaluation.report import HaspiReport
 from hlsim.evaluation.report_figures import report_pictures
 from hlsim.evaluation.report_text import GAIN_SENTENCE, markdown_table
+from hlsim.evaluation.steadiness import steadiness_sections
 
 FILES = ("compensators.json", "compensators.md", "compensators.html")
 
@@ -31,7 +32,9 @@ FILES = ("compensators.json", "compensators.md", "compensators.html")
 def write_compensators(
     result: Mapping[str, Any], reports: Mapping[str, HaspiReport], out: str | Path
 ) -> None:
-    """Write what ``compensator_result`` made, with ``gain_curves`` in it, into a folder; each file whole or not at all.
+    """Write ``compensator_result`` with ``gain_curves``, ``steady_tones`` and ``shifts`` in it into a folder.
+
+    Each file whole or not at all.
 
     Raises:
         ValueError: a file cannot be written.
@@ -77,6 +80,7 @@ def _sections(result: Mapping[str, Any], reports: Mapping[str, HaspiReport]) -> 
         Section("The surrogate gap", [_GAP.format(**result)], [gap_table(result)]),
         Section("Does any output pass the limit?", (), [peak_table(result)]),
         gain_section(result["gain_curves"]),
+        *steadiness_sections(result["steady_tones"], result["shifts"]),
     ]
     for name in ("clean", "noisy"):
         if name in reports:

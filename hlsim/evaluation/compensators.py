@@ -29,6 +29,7 @@ from hlsim.evaluation.judging import (
 from hlsim.evaluation.measures import version_of, versions_of
 from hlsim.evaluation.report_files import check_out
 from hlsim.evaluation.simulators import samples_hash, weights_hash
+from hlsim.evaluation.steadiness import shift_differences, steady_tones
 from hlsim.evaluation.store import ScoreStore, key_of
 from hlsim.extras import require
 from hlsim.parallel import check_parallel, run_parallel
@@ -38,6 +39,8 @@ STORE = "scores.jsonl"
 
 UNAIDED, PRESCRIBED = "unaided", "NAL-R"
 """The conditions that every compensator is compared with."""
+
+_SHIFTED = 6  # items, of which every condition has figures
 
 _REVISION = 2  # of what ``judge`` measures and how it is kept: raise it where that changes
 
@@ -76,7 +79,7 @@ def evaluate_compensators(
         items: how many in all. 400 give each main row 200 pairs.
         seconds: length of an item; HASPI is not to be trusted much under 3.
         levels: of the clean speech in dB SPL, in turn.
-        gain_ears: standard ears whose gain curves are drawn; with ``audiogram`` that ear's are.
+        gain_ears: standard ears of the gain curves and the steady tones; with ``audiogram``, that ear in their place.
         jobs: processes; None takes all cores. The figures do not depend on it.
         progress: called with the number of outputs judged and of all.
 
@@ -111,6 +114,7 @@ def evaluate_compensators(
     drawn = draw_judged_items(speech, noise, ears, items=items, seconds=seconds, seed=seed, levels=levels)
     aided = {name: module for name, module in conditions.items() if name != UNAIDED}
     curves = gain_curves(aided, shown, speech, levels, seed)  # first: what cannot be used shows at once
+    steady = steady_tones(conditions, shown, levels)
     judged = _judge_all(
         _Panel(drawn, conditions, load_pretrained(simulator), seed),
         ScoreStore(Path(out) / STORE),
@@ -130,7 +134,9 @@ def evaluate_compensators(
             "simulator": Path(simulator).name,
         },
     )
-    result["gain_curves"] = curves
+    shifted = sorted(result["rows"], key=lambda row: row["condition"] != "clean")[:_SHIFTED]
+    shifts = shift_differences(aided, {row["item"]: drawn[row["item"]] for row in shifted})
+    result |= {"gain_curves": curves, "steady_tones": steady, "shifts": shifts}
     write_compensators(result, reports, out)
     return result
 

@@ -15,7 +15,7 @@ from hlsim import MSBG, Audiogram, HearingLossLoss, load_pretrained
 from hlsim.band_levels import band_edges
 from hlsim.calibration import level_spl, set_level
 from hlsim.cli import main
-from hlsim.evaluation import compensators, judging
+from hlsim.evaluation import compensators, judging, steadiness
 from hlsim.evaluation.compensator_report import FILES
 from hlsim.evaluation.compensators import evaluate_compensators
 from hlsim.evaluation.gain_curves import insertion_gain
@@ -68,13 +68,14 @@ def ears_csv(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Scores of no meaning in place of HASPI and HASQI, and the exact MSBG in pyclarity's: seconds instead of minutes."""
+    """Scores of no meaning in place of HASPI and HASQI, the exact MSBG in pyclarity's, one tone: seconds, not minutes."""
 
     def score(clean: Tensor, aided: Tensor, ear: Audiogram, rate: int, **options: Any) -> float:
         if not torch.isfinite(aided).all():
             raise ValueError("processed holds samples that are NaN or infinite")
         return float(aided.abs().mean() / (aided.abs().mean() + 0.1))
 
+    monkeypatch.setattr(steadiness, "TONES", (1000,))
     monkeypatch.setattr(judging, "haspi", score)
     monkeypatch.setattr(judging, "hasqi", lambda *signals, **options: 0.5 * score(*signals, **options))
     monkeypatch.setattr(judging, "pyclarity_msbg", lambda x, ear, rate: MSBG(ear, sample_rate=rate)(x))
@@ -244,7 +245,19 @@ def test_report(tmp_path: Path, speech_dir: Path, ears_csv: Path) -> None:
     assert f"| loud | 100 | {max(peaks):.2f} | {result['peaks']['loud']['over']} of 10 |" in text
     assert "| severe, HASQI: NAL-R to loud |" in text and "| HASPI: unaided to broken |" in text
     assert "RuntimeError: no such ear" in text and "| N2, loud, 50 dB SPL | +40.0 |" in text
+    # the worst of tones and of shifted speech; a gain does nothing else, and the noisy fill up where the clean are few
+    tones = {own["compensator"]: own for own in result["steady_tones"]}
+    assert [*tones] == ["unaided", "NAL-R", "loud", "broken"] and tones["loud"]["levels"] == [50, 65, 80]
+    assert tones["broken"]["heard_off_db"] == tones["unaided"]["heard_off_db"]
+    off = tones["loud"]["heard_off_db"][0][0]
+    assert off > tones["unaided"]["heard_off_db"][0][0] + 40.0  # recruitment
+    rows = [line.split(" | ") for line in text.splitlines() if line.startswith("| N2, loud, 50 dB SPL")]
+    assert len(rows) == 2 and rows[1][1] == f"{off:+.1f}"
+    assert "| loud | 12 | -200 | -200 |" in text and "The clean speech of 6 items is delayed" in text
+    numbers = [row["item"] for row in clean]
+    assert [own["items"][:5] for own in result["shifts"]] == [numbers] * 3
     page = (out / "compensators.html").read_text()
+    assert "Steady tones" in page and "where frames fall" in page
     assert page.count("data:image/svg+xml") > 2 and "Paired tests" in page and "Gain curves" in page
 
 

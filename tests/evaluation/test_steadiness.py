@@ -1,0 +1,126 @@
+"""What a compensator makes of steady tones and of delayed speech: filters pass, and what is at fault is caught."""
+
+import math
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from compensators import NALR
+from hlsim import MSBG, Audiogram
+from hlsim.calibration import level_spl
+from hlsim.evaluation.fidelity_items import Item
+from hlsim.evaluation.judging import NORMAL, Unaided
+from hlsim.evaluation.steadiness import TONES, shift_differences, shift_table, steady_tones, tone_table, tones
+
+N3 = Audiogram.standard("N3")
+
+
+class Modulating(nn.Module):
+    """The waveform times 1 + depth cos(2 pi 80 t), whose phase hangs on where the signal begins."""
+
+    def __init__(self, depth: float) -> None:
+        super().__init__()
+        self.depth = depth
+
+    def forward(self, waveform: Tensor, audiogram: Audiogram) -> Tensor:
+        turns = 80 * torch.arange(waveform.shape[-1]) % 16000 / 16000
+        return waveform * (1.0 + self.depth * (2.0 * torch.pi * turns).cos())
+
+
+class Muting(nn.Module):
+    """40 dB less of a sound whose level stays the same from one 32 ms to the next."""
+
+    def forward(self, waveform: Tensor, audiogram: Audiogram) -> Tensor:
+        levels = level_spl(waveform[: len(waveform) // 512 * 512].unflatten(-1, (-1, 512)))
+        return 0.01 * waveform if float(levels.std()) < 1.0 else waveform
+
+
+class Unable(nn.Module):
+    def forward(self, waveform: Tensor, audiogram: Audiogram) -> Tensor:
+        return waveform * math.nan
+
+
+@pytest.fixture
+def items() -> dict[int, Item]:
+    """Noise that comes and goes, for there all is known of what modulation does."""
+    noise = 0.02 * torch.randn(2, 24000, generator=torch.Generator().manual_seed(0))
+    noise *= 0.1 + (torch.arange(24000) % 8000 < 5000)
+    return {number: Item(own, own, N3, {}) for number, own in zip((3, 8), noise, strict=True)}
+
+
+def test_tones() -> None:
+    # the levels of each tone, in the order of the tones
+    sound = tones((250, 1000), (50.0, 65.0, 80.0))
+    torch.testing.assert_close(level_spl(sound), torch.tensor([50.0, 65.0, 80.0, 50.0, 65.0, 80.0]))
+    assert (torch.fft.rfft(sound).abs().argmax(-1) / 2).tolist() == [250.0] * 3 + [1000.0] * 3
+
+
+def test_unaided_is_what_the_exact_model_gives() -> None:
+    (found,) = steady_tones({"unaided": Unaided()}, {"N3": N3}, (50.0, 65.0))
+    assert (found["compensator"], found["ear"], found["levels"]) == ("unaided", "N3", [50.0, 65.0])
+    time = torch.arange(32000, dtype=torch.float64) / 16000
+    for row, level in enumerate((50.0, 65.0)):
+        tone = 2**0.5 * 10.0 ** ((level - 94.0) / 20.0) * (2.0 * torch.pi * 1000.0 * time).sin()
+        heard, normal = (level_spl(MSBG(ear, sample_rate=16000)(tone)[8000:24000]) for ear in (N3, NORMAL))
+        off = found["heard_off_db"][row][TONES.index(1000)]
+        assert off == pytest.approx(float(heard - normal), abs=0.01) and off < -20.0
+
+
+def test_a_filter_adds_nothing_and_moves_with_the_signal(items: dict[int, Item]) -> None:
+    prescribed = {"NAL-R": NALR()}
+    (found,) = steady_tones(prescribed, {"N3": N3}, (50.0, 80.0))
+    assert max(map(max, found["sidebands_db"])) < -60.0
+    (shifts,) = shift_differences(prescribed, items)
+    assert shifts["items"] == [3, 8] and shifts["delays"] == [7, 30]
+    assert max(map(max, shifts["difference_db"])) < -80.0
+
+
+@pytest.mark.parametrize("depth", [0.1, 1.0])
+def test_modulation_is_caught(depth: float, items: dict[int, Item]) -> None:
+    (found,) = steady_tones({"own": Modulating(depth)}, {"NH": NORMAL}, (65.0,))
+    # two sidebands of depth / 2
+    (sidebands,) = found["sidebands_db"]
+    assert sidebands == pytest.approx([10.0 * math.log10(depth**2 / 2.0)] * len(TONES), abs=0.01)
+    # a linear ear hears them too
+    assert found["heard_off_db"][0][2] == pytest.approx(10.0 * math.log10(1.0 + depth**2 / 2.0), abs=0.1)
+    (shifts,) = shift_differences({"own": Modulating(depth)}, items)
+    for row in shifts["difference_db"]:
+        for delay, difference in zip(shifts["delays"], row, strict=True):
+            change = depth * 2.0 * math.sin(math.pi * 80 * delay / 16000)
+            expected = 10.0 * math.log10(change**2 / 2.0 / (1.0 + depth**2 / 2.0))
+            assert difference == pytest.approx(expected, abs=0.5)
+
+
+def test_muting_of_steady_sounds_is_caught() -> None:
+    # with no loss all is linear: 0 dB off unaided, and what was taken away
+    unaided, muted = steady_tones({"unaided": Unaided(), "own": Muting()}, {"NH": NORMAL}, (50.0, 80.0))
+    for level in range(2):
+        assert unaided["heard_off_db"][level] == pytest.approx([0.0] * len(TONES), abs=1e-3)
+        assert muted["heard_off_db"][level] == pytest.approx([-40.0] * len(TONES), abs=1e-3)
+
+
+def test_silence_has_figures(items: dict[int, Item]) -> None:
+    silent = {"own": lambda waveform, ear: 0.0 * waveform}
+    (found,) = steady_tones(silent, {"NH": NORMAL}, (65.0,))  # type: ignore[arg-type]
+    assert found["sidebands_db"] == [[-200.0] * len(TONES)] and found["heard_off_db"][0][2] < -140.0
+    (shifts,) = shift_differences(silent, items)  # type: ignore[arg-type]
+    assert shifts["difference_db"] == [[-200.0, -200.0]] * 2
+
+
+def test_samples_that_are_not_numbers(items: dict[int, Item]) -> None:
+    with pytest.raises(ValueError, match="own, ear N3, steady tones: the output holds samples that are NaN"):
+        steady_tones({"own": Unable()}, {"N3": N3}, (65.0,))
+    with pytest.raises(ValueError, match="own, delayed speech of item 3: the output holds samples that are"):
+        shift_differences({"own": Unable()}, items)
+
+
+def test_tables() -> None:
+    about = {"compensator": "own", "ear": "N3", "levels": [50.0, 65.0], "frequencies": [*TONES]}
+    offs = [[0.0, 1.0, 2.0, 3.0, 4.0, 5.0], [-1.0] * 6]
+    sidebands = [[-50.0, -40.0, -3.2, -10.0, -60.0, -60.0], [-120.0] * 5 + [6.0]]
+    first, second = tone_table([{**about, "heard_off_db": offs, "sidebands_db": sidebands}]).rows
+    assert first == ["N3, own, 50 dB SPL", "+0.0", "+1.0", "+2.0", "+3.0", "+4.0", "+5.0", "-3 (1000 Hz)"]
+    assert second[0] == "N3, own, 65 dB SPL" and second[-1] == "6 (4000 Hz)"
+    found = {"compensator": "own", "items": [0, 2], "difference_db": [[-30.0, -20.0], [-12.4, -20.0]]}
+    assert [*shift_table([found]).rows] == [["own", "4", "-20", "-12"]]
