@@ -7,29 +7,22 @@ MSBG leaves 0 dB SPL of it or more.
 import sys
 
 import torch
-from torch import Tensor
 
 from hlsim import MSBG, Audiogram, load_pretrained
 from hlsim.calibration import level_spl, set_level
 from hlsim.evaluation.fidelity import snr_db
+from hlsim.evaluation.steadiness import tones
 
 EARS = ("NH", "N1", "N2", "N3", "N4", "N5", "S1", "S2", "S3")
-LEVELS = torch.tensor([50.0, 65.0, 80.0])
+LEVELS = (50.0, 65.0, 80.0)
 LOW, HIGH = (250, 500, 1000, 2000), (3000, 4000, 6000)  # Hz
 RATE = 16000
-
-
-def tones(hertz: tuple[int, ...]) -> Tensor:
-    """Each at each level. Shape: -> (tones * levels, 2 s)."""
-    turns = torch.tensor(hertz).unsqueeze(-1) * torch.arange(2 * RATE) % RATE / RATE
-    tone = (2.0 * torch.pi * turns).sin()
-    return set_level(tone.repeat_interleave(len(LEVELS), 0), LEVELS.repeat(len(hertz)))
 
 
 def cells(exact: MSBG, network: torch.nn.Module, ear: Audiogram) -> list[str]:
     row = []
     for hertz in (LOW, HIGH):
-        sound, middle = tones(hertz), slice(RATE // 2, -RATE // 2)
+        sound, middle = tones(hertz, LEVELS), slice(RATE // 2, -RATE // 2)
         truth, heard = (level_spl(signal[:, middle]) for signal in (exact(sound), network(sound, ear)))
         off = (heard - truth)[truth >= 0.0]
         row.append(f"{float(off.min()):+.1f} to {float(off.max()):+.1f}" if len(off) else "-")
@@ -37,7 +30,7 @@ def cells(exact: MSBG, network: torch.nn.Module, ear: Audiogram) -> list[str]:
     click = torch.zeros(1, 2 * RATE)
     click[:, RATE] = 1.0
     for shape in (noise, click):
-        sound = set_level(shape.expand(len(LEVELS), -1), LEVELS)
+        sound = set_level(shape.expand(len(LEVELS), -1), torch.tensor(LEVELS))
         truth, heard = exact(sound), network(sound, ear)
         off = level_spl(heard) - level_spl(truth)
         row += [

@@ -10,7 +10,6 @@ import torch
 
 from hlsim import MSBG, Audiogram
 from hlsim.audio import read_audio, write_audio
-from hlsim.calibration import level_spl
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 
@@ -62,10 +61,6 @@ def test_the_papers_last_table(tmp_path: Path, speech_dir: Path, capsys: pytest.
 
 def test_other_sounds(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     example = load("other_sounds.py")
-    # the three levels of each tone, in the order of the tones
-    sound = example.tones((250, 1000))
-    torch.testing.assert_close(level_spl(sound), torch.tensor([50.0, 65.0, 80.0, 50.0, 65.0, 80.0]))
-    assert (torch.fft.rfft(sound).abs().argmax(-1) / 2).tolist() == [250.0] * 3 + [1000.0] * 3
     monkeypatch.setattr(example, "EARS", ("N3",))
     monkeypatch.setattr(example.sys, "argv", ["other_sounds.py"])
     ear = Audiogram.standard("N3")
