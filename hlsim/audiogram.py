@@ -172,9 +172,12 @@ def severity_of(levels: Sequence[float]) -> str:
 
 def severity_index(thresholds: Tensor) -> Tensor:
     """Index into ``SEVERITIES`` of each ear. Shape: (..., 8) dB HL -> (...), int64."""
-    high = ((thresholds[..., FREQUENCIES.index(2000.0) :].double() * _FINE).round() / _FINE).unbind(-1)
-    mean = sum(high[1:], start=high[0]) / len(high)  # in the order of ``severity_of``, for the same last bit
-    return torch.bucketize(mean, torch.tensor(SEVERITY_LIMITS, dtype=torch.float64, device=mean.device))
+    high = thresholds[..., FREQUENCIES.index(2000.0) :].double()
+    # by tensors: CUDA multiplies by a number's reciprocal instead of dividing by it, which is off by the last bit
+    fine, count = (high.new_full((), value) for value in (_FINE, high.shape[-1]))
+    levels = ((high * _FINE).round() / fine).unbind(-1)
+    mean = sum(levels[1:], start=levels[0]) / count  # in the order of ``severity_of``, for the same last bit
+    return torch.stack([mean > limit for limit in SEVERITY_LIMITS]).sum(0)
 
 
 AudiogramLike = Audiogram | Sequence[Audiogram] | Tensor

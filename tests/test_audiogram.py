@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from compensators import NALR
 from hlsim import MSBG
@@ -166,6 +168,25 @@ def test_severity_on_a_limit_is_pyclaritys_in_single_precision_too() -> None:
     assert [
         SEVERITIES[i] for i in severity_index(torch.tensor(ears, dtype=torch.float64)).tolist()
     ] == expected
+
+
+class DividesAsCUDA(TorchDispatchMode):
+    """CUDA takes a division by a number for a product with its reciprocal (DivTrueKernel.cu)."""
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        if func is torch.ops.aten.div.Tensor and not isinstance(args[1], Tensor):
+            return args[0] * (1.0 / args[1])
+        return func(*args, **(kwargs or {}))
+
+
+def test_severity_on_a_limit_is_the_same_where_a_division_is_a_product() -> None:
+    tenths = np.random.default_rng(3).integers(0, 750, (4000, 8))
+    tenths[:, 7] = 5 * np.resize((150, 350, 560), 4000) - tenths[:, 3:7].sum(-1)  # on a limit
+    ears = torch.tensor(tenths[(tenths[:, 7] >= -100) & (tenths[:, 7] <= 1000)] / 10.0)
+    assert len(ears) > 1000
+    with DividesAsCUDA():
+        index = severity_index(ears)
+    assert [SEVERITIES[i] for i in index.tolist()] == [severity_of(ear) for ear in ears.tolist()]
 
 
 def test_severity_of_many_ears_keeps_leading_dimensions() -> None:
