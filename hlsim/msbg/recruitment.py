@@ -37,7 +37,8 @@ def expansion_ratios(thresholds: Tensor, weights: Tensor) -> Tensor:
 
     Shape: (..., 8) dB HL, ``threshold_weights`` -> (..., channels).
     """
-    return CATCH_UP_SPL / (CATCH_UP_SPL - thresholds @ weights)
+    # no matrix product, which a GPU may be allowed to round to ten bits: next to 105 dB HL every bit counts
+    return CATCH_UP_SPL / (CATCH_UP_SPL - (thresholds.unsqueeze(-1) * weights).sum(-2))
 
 
 @lru_cache(maxsize=8)

@@ -1,10 +1,13 @@
 """Expansion and gain against pyclarity's functions."""
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from torch import Tensor
+from torch.overrides import TorchFunctionMode
 
 from hlsim.audiogram import FREQUENCIES, draw_thresholds
 from hlsim.calibration import gain_to_pascals
@@ -44,6 +47,23 @@ def test_expansion_ratios(name: str) -> None:
         )
         assert np.all(catch_up == CATCH_UP_SPL)
         np.testing.assert_allclose(ratios.numpy(), theirs, rtol=1e-12)
+
+
+class RoundsProducts(TorchFunctionMode):
+    """Matrix products of what is rounded to ten bits, as TF32 has it."""
+
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        if func in (torch.matmul, Tensor.matmul, Tensor.__matmul__):
+            args = [((factor.view(torch.int32) + 2**12) & -(2**13)).view(torch.float32) for factor in args]
+        return func(*args, **(kwargs or {}))
+
+
+def test_expansion_ratios_are_exact_where_matrix_products_are_rounded() -> None:
+    ears = torch.linspace(93.3, 99.9, 80).reshape(10, 8)
+    weights = torch.from_numpy(threshold_weights(BANKS["severe"])).float()
+    with RoundsProducts():
+        ours = expansion_ratios(ears, weights)
+    assert (ours / expansion_ratios(ears.double(), weights.double()) - 1.0).abs().max() < 1e-5
 
 
 @pytest.mark.parametrize("name", BANK_NAMES)
