@@ -6,7 +6,12 @@ import argparse
 import json
 import sys
 import time
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
+from typing import Any
+
+import torch
 
 from hlsim.commands.options import Commands, add_command, count, positive
 from hlsim.data.files import write_whole
@@ -18,14 +23,16 @@ def add(commands: Commands) -> None:
     sub = add_command(
         commands, "benchmark", _benchmark, "time simulators, a training step and the scan side by side"
     )
-    sub.add_argument("--device", default="cpu", help="cpu or cuda; pyclarity's Ear runs on the CPU always")
+    sub.add_argument(
+        "--device", default="cpu", help="cpu, cuda or cuda:1; pyclarity's Ear runs on the CPU always"
+    )
     sub.add_argument(
         "--what",
         nargs="+",
         choices=WHAT,
         default=["simulators"],
-        help="simulators: all, at 1 s, longer and in batches; training: where the time of a step of a batch of 8 clips "
-        "of 2 s goes; scan: the selective scan against other ways to run it",
+        help="simulators: all, at 1 s, longer and in batches, and the default network on a batch to train on; training: "
+        "where the time of a step on 8 clips of 2 s goes; scan: the selective scan against other ways to run it",
     )
     sub.add_argument("--repeats", type=count, default=7, help="counted rounds")
     sub.add_argument(
@@ -43,40 +50,57 @@ def add(commands: Commands) -> None:
     sub.add_argument(
         "--brief", action="store_true", help="one second at batch 1 alone: no longer clips, no larger batches"
     )
-    sub.add_argument("--json", type=Path, help="also write the figures to this file")
+    sub.add_argument("--json", type=Path, help="also write the figures to this file, as they come")
 
 
 def _benchmark(options: argparse.Namespace) -> None:
     from compensators import MappingCompensator
-    from hlsim.evaluation.benchmark import BATCHES, LENGTHS, about, benchmark
+    from hlsim.evaluation.benchmark import BATCHES, LENGTHS, TRAINING, benchmark
+    from hlsim.evaluation.benchmark_machine import about
     from hlsim.evaluation.benchmark_report import benchmark_markdown
+    from hlsim.evaluation.benchmark_timing import attempt
     from hlsim.evaluation.benchmark_training import scan_rows, training_step
 
-    result = about(options.device, options.repeats) | {"skipped": []}
+    device, repeats = options.device, options.repeats
+    result = about(device, repeats) | {"skipped": []}
+
+    def keep(more: dict[str, Any]) -> None:
+        result.update(more)
+        if options.json is not None:  # what is measured is not to wait for what may yet fail
+            write_whole(options.json, json.dumps(result, indent=2) + "\n")
+
+    def table(name: str, measure: Callable[[], tuple[list[dict[str, Any]], list[str]]]) -> None:
+        rows, skipped = measure()
+        result[name] = rows
+        result["skipped"] += skipped
+
     if "simulators" in options.what:
-        result |= benchmark(
-            device=options.device,
-            repeats=options.repeats,
+        benchmark(
+            device=device,
+            repeats=repeats,
             limit=options.limit,
             simulators=options.simulator,
             only=options.only,
             lengths=() if options.brief else LENGTHS,
             batches=() if options.brief else BATCHES,
+            training=None if options.brief else TRAINING,
             progress=_Progress(),
+            keep=keep,
         )
         print(file=sys.stderr)
-    if "training" in options.what:
-        print("a training step ...", file=sys.stderr)
-        result["training"] = training_step(
-            MappingCompensator(), device=options.device, repeats=options.repeats
-        )
-    if "scan" in options.what:
-        print("the selective scan ...", file=sys.stderr)
-        result["scan"], skipped = scan_rows(device=options.device, repeats=options.repeats)
-        result["skipped"] = [*result["skipped"], *skipped]
+    tables = {
+        "training": (
+            "a training step",
+            lambda: training_step(MappingCompensator(), device=device, repeats=repeats),
+        ),
+        "scan": ("the selective scan", lambda: scan_rows(device=device, repeats=repeats)),
+    }
+    for name, (title, measure) in tables.items():
+        if name in options.what:
+            print(f"{title} ...", file=sys.stderr)
+            attempt(title, partial(table, name, measure), torch.device(device), result["skipped"])
+            keep({})
     print(benchmark_markdown(result))
-    if options.json is not None:
-        write_whole(options.json, json.dumps(result, indent=2) + "\n")
 
 
 class _Progress:

@@ -32,6 +32,7 @@ class Row:
         prepare: rate, ear and device -> a call (batch, time) -> (batch, time).
         differentiable: whether gradients pass.
         parameters: of the network; 0 where nothing is trained.
+        default: whether it is the network that ``HearingLossLoss`` takes.
     """
 
     name: str
@@ -39,6 +40,7 @@ class Row:
     prepare: Prepare
     differentiable: bool = True
     parameters: int = 0
+    default: bool = False
 
 
 def rows(simulators: list[str] | None = None) -> tuple[list[Row], list[str]]:
@@ -59,7 +61,8 @@ def rows(simulators: list[str] | None = None) -> tuple[list[Row], list[str]]:
     for name in shipped(SIMULATOR) if simulators is None else simulators:
         model = load_pretrained(name)
         count = sum(p.numel() for p in model.parameters())
-        found.append(Row(f"Neuro-MSBG ({name})", both, _neuro(name), parameters=count))
+        default = name == "neuro-msbg"
+        found.append(Row(f"Neuro-MSBG ({name})", both, _neuro(name), parameters=count, default=default))
     count = sum(p.numel() for p in ConnearShape().parameters())
     found.append(
         Row("CoNNear's shape (random weights, speed only)", (CONNEAR_RATE,), _connear, parameters=count)

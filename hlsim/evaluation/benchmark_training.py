@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import importlib
 import statistics
-import time
 from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import torch
@@ -13,6 +14,7 @@ from torch import Tensor, nn
 
 from hlsim.audiogram import Audiogram
 from hlsim.calibration import set_level
+from hlsim.evaluation.benchmark_timing import attempt, milliseconds, peak_mib
 from hlsim.loss import HearingLossLoss
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.neuro.scan import selective_scan
@@ -23,13 +25,14 @@ SCAN_SHAPE = (16, 64, 256, 16)
 
 def training_step(
     compensator: nn.Module, *, device: str = "cpu", batch: int = 8, seconds: float = 2.0, repeats: int = 5
-) -> list[dict[str, Any]]:
+) -> tuple[list[dict[str, Any]], list[str]]:
     """Where a step's time goes: the compensator, the loss that judges it, its simulator alone, and the whole step.
 
     Args:
         compensator: called with speech at 16 kHz and an audiogram.
 
-    Returns: rows of name, forward, and forward plus backward: median, least and greatest milliseconds.
+    Returns: rows of name, forward, and forward plus backward: median, least and greatest milliseconds and peak memory in
+        MiB; and what failed, with its reason.
     """
     place, ear = torch.device(device), Audiogram.standard("N3")
     generator = torch.Generator().manual_seed(0)
@@ -84,7 +87,8 @@ def scan_rows(*, device: str = "cpu", repeats: int = 5) -> tuple[list[dict[str, 
         parts.append(("mambapy", mambapy))
     except ImportError as error:
         skipped.append(f"mambapy: {error}")
-    return _table(parts, place, repeats), skipped
+    rows, failed = _table(parts, place, repeats)
+    return rows, skipped + failed
 
 
 def scan_loop(u: Tensor, delta: Tensor, A: Tensor, B: Tensor, C: Tensor) -> Tensor:
@@ -100,25 +104,49 @@ def scan_loop(u: Tensor, delta: Tensor, A: Tensor, B: Tensor, C: Tensor) -> Tens
 
 def _table(
     parts: list[tuple[str, Callable[[], Tensor]]], device: torch.device, repeats: int
-) -> list[dict[str, Any]]:
-    times: list[dict[str, list[float]]] = [{"forward": [], "both": []} for _ in parts]
+) -> tuple[list[dict[str, Any]], list[str]]:
+    cells = [{"forward": _Cell(), "both": _Cell()} for _ in parts]
+    skipped: list[str] = []
     for turn in range(repeats + 1):  # in turns, so that all see the same machine; the first does not count
-        for (_, call), own in zip(parts, times, strict=True):
-            for direction in ("forward", "both"):
-                start = time.perf_counter()
-                with torch.set_grad_enabled(direction == "both"):
-                    value = call()
-                if direction == "both":
-                    value.backward()
-                if device.type == "cuda":
-                    torch.cuda.synchronize()
-                if turn:
-                    own[direction].append(1000.0 * (time.perf_counter() - start))
-    return [
-        {"name": name} | {direction: _spread(values) for direction, values in own.items()}
-        for (name, _), own in zip(parts, times, strict=True)
+        for (name, part), own in zip(parts, cells, strict=True):
+            for direction, cell in own.items():
+                call = partial(cell.take, partial(_run, part, direction), device, turn > 0)
+                what = f"{name}, " + ("forward" if direction == "forward" else "forward and backward")
+                if not cell.failed:
+                    cell.failed = not attempt(what, call, device, skipped)
+    rows = [
+        {"name": name} | {direction: cell.figures() for direction, cell in own.items()}
+        for (name, _), own in zip(parts, cells, strict=True)
     ]
+    return [row for row in rows if row["forward"] or row["both"]], skipped
 
 
-def _spread(values: list[float]) -> dict[str, float]:
-    return {"median_ms": statistics.median(values), "least_ms": min(values), "greatest_ms": max(values)}
+@dataclass
+class _Cell:
+    times: list[float] = field(default_factory=list)
+    peak: float | None = None
+    failed: bool = False
+
+    def take(self, call: Callable[[], None], device: torch.device, counted: bool) -> None:
+        elapsed = milliseconds(call, device)
+        if counted:
+            self.times.append(elapsed)
+        else:
+            self.peak = peak_mib(call, device)
+
+    def figures(self) -> dict[str, float | None] | None:
+        if not self.times:
+            return None
+        return {
+            "median_ms": statistics.median(self.times),
+            "least_ms": min(self.times),
+            "greatest_ms": max(self.times),
+            "peak_mib": self.peak,
+        }
+
+
+def _run(part: Callable[[], Tensor], direction: str) -> None:
+    with torch.set_grad_enabled(direction == "both"):
+        value = part()
+    if direction == "both":
+        value.backward()
