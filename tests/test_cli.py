@@ -333,7 +333,7 @@ def test_benchmark(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert all(0 < cell["least_ms"] <= cell["median_ms"] <= cell["greatest_ms"] for cell in cells)
     connear = next(row for row in result["rows"] if "CoNNear" in row["name"])
     assert round(connear["parameters"] / 1e6, 1) == 11.7
-    assert [row["name"] for row in result["scan"]][:2] == ["hlsim", "step by step"]
+    assert [row["name"] for row in result["scan"]][:2] == ["hlsim (plain torch)", "step by step"]
     printed = capsys.readouterr().out
     assert "pyclarity" in printed and "step by step" in printed
 

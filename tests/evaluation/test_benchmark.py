@@ -21,6 +21,7 @@ from hlsim.evaluation.benchmark_machine import about
 from hlsim.evaluation.benchmark_models import Row
 from hlsim.evaluation.benchmark_report import benchmark_markdown
 from hlsim.evaluation.benchmark_timing import peak_mib
+from hlsim.neuro import scan as scan_module
 
 
 def short_of_memory(message: str) -> Row:
@@ -137,10 +138,25 @@ def test_a_table_without_what_fails(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(benchmark_training, "SCAN_SHAPE", (1, 8, 16, 4))
     scan, skipped = benchmark_training.scan_rows(repeats=1)
     assert "step by step, forward: RuntimeError: too long" in skipped
-    assert next(row["name"] for row in scan).startswith("hlsim") and "step by step" not in str(scan)
-    assert all("peak_mib" in row["both"] for row in scan)
+    assert scan[0]["name"] == "hlsim (plain torch)" and "step by step" not in str(scan)
     table = benchmark_markdown(about("cpu", 1) | {"scan": scan, "skipped": skipped})
     assert "| Selective scan | forward | forward + backward | peak memory (MiB) |" in table
+
+
+def test_the_scan_by_a_kernel_has_a_row_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    calls = []
+
+    def kernel(u: Tensor, *rest: Tensor, **options: Any) -> Tensor:
+        calls.append(len(rest))
+        return 0.5 * u
+
+    monkeypatch.setattr(benchmark_training, "SCAN_SHAPE", (1, 8, 16, 4))
+    for module in (scan_module, benchmark_training):
+        monkeypatch.setattr(module, "kernel_for", lambda u: kernel)
+    table, _ = benchmark_training.scan_rows(repeats=2)
+    names = [row["name"] for row in table]
+    assert names[:2] == ["hlsim (plain torch)", "step by step"] and "hlsim (by mamba-ssm's kernel)" in names
+    assert len(calls) == 2 * 3  # its own row's: forward and back in each round
 
 
 def test_the_default_network_is_timed_on_a_batch_to_train_on(monkeypatch: pytest.MonkeyPatch) -> None:
