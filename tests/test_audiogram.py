@@ -1,6 +1,7 @@
 """Audiograms against Bisgaard's tables and pyclarity's class; validation, interpolation, files and random ears."""
 
 import dataclasses
+import io
 import json
 import re
 from pathlib import Path
@@ -200,6 +201,30 @@ def test_dictionary_round_trip_through_json() -> None:
     assert Audiogram.from_dict({"levels": range(8)}) == Audiogram(tuple(range(8)))
     with pytest.raises(ValueError, match=r"needs 'levels', got .*frequencies"):
         Audiogram.from_dict({"frequencies": FREQUENCIES})
+
+
+def test_ears_in_a_checkpoint_load_without_trust_in_pickles() -> None:
+    ear = Audiogram((10.5, 30.0, 61.25), (300.0, 1500.0, 7000.0))
+    file = io.BytesIO()
+    torch.save({"ear": ear, "ears": [Audiogram.standard("N3")]}, file)
+    file.seek(0)
+    assert torch.load(file, weights_only=True) == {"ear": ear, "ears": [Audiogram.standard("N3")]}
+
+
+def test_an_ear_is_a_hyperparameter_of_lightnings(tmp_path: Path) -> None:
+    lightning = pytest.importorskip("lightning")
+
+    class Module(lightning.LightningModule):  # type: ignore[misc, name-defined]
+        def __init__(self, ear: Audiogram) -> None:
+            super().__init__()
+            self.save_hyperparameters()
+            self.filter = torch.nn.Linear(2, 2)
+
+    trainer = lightning.Trainer(accelerator="cpu", logger=False, enable_progress_bar=False)
+    trainer.strategy.connect(Module(Audiogram.standard("N3")))
+    trainer.save_checkpoint(tmp_path / "kept.ckpt")
+    loaded = Module.load_from_checkpoint(tmp_path / "kept.ckpt", weights_only=True)
+    assert loaded.hparams.ear == Audiogram.standard("N3")
 
 
 @pytest.mark.parametrize(("data", "got"), [(3, "int"), (["levels"], "list"), ({1: 2, "a": 3}, r"\[1, 'a'\]")])
