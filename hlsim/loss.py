@@ -14,6 +14,7 @@ from hlsim.audiogram import FREQUENCIES, AudiogramLike, as_thresholds
 from hlsim.band_levels import HIGHEST, band_level_loss
 from hlsim.calibration import PASCAL_SPL, check_full_scale, gain_to_pascals, is_finite
 from hlsim.compiling import not_compiled
+from hlsim.lengths import Lengths, check_lengths, silent_after
 from hlsim.msbg import MSBG
 from hlsim.msbg.response import with_phase_of_bank
 from hlsim.neuro import NeuroMSBG
@@ -24,6 +25,8 @@ CRITERIA: dict[str, Mapping[str, float]] = {"paper": criteria.DEFAULT_WEIGHTS, "
 """Criteria by name: their parts and the default weight of each."""
 
 REFERENCES = ("clean", "normal-hearing")
+
+REDUCTIONS = ("mean", "none")
 
 
 class HearingLossLoss(nn.Module):
@@ -50,6 +53,7 @@ class HearingLossLoss(nn.Module):
         criterion: ``"paper"``, magnitude, phase, complex and time losses (Equations 2 to 9), or ``"bands"``, levels in
             ERB-wide bands, always against what a normal ear hears.
         weights: of the parts by name; a part left out does not count.
+        reduction: ``"mean"`` over the items, whatever their lengths, or ``"none"``, a value for each.
 
     Raises:
         ValueError: an unknown name, a value of another kind or out of range, a simulator made for another rate or level,
@@ -66,6 +70,7 @@ class HearingLossLoss(nn.Module):
         reference: str = "clean",
         criterion: str = "paper",
         weights: Mapping[str, float] | None = None,
+        reduction: str = "mean",
     ) -> None:
         super().__init__()
         self.sample_rate = check_rate(sample_rate)
@@ -74,7 +79,9 @@ class HearingLossLoss(nn.Module):
             raise ValueError(f"reference is {reference!r}; allowed: {', '.join(REFERENCES)}")
         if not isinstance(criterion, str) or criterion not in CRITERIA:
             raise ValueError(f"criterion is {criterion!r}; allowed: {', '.join(CRITERIA)}")
-        self.reference, self.criterion = reference, criterion
+        if not isinstance(reduction, str) or reduction not in REDUCTIONS:
+            raise ValueError(f"reduction is {reduction!r}; allowed: {', '.join(REDUCTIONS)}")
+        self.reference, self.criterion, self.reduction = reference, criterion, reduction
         self.weights = _check_weights(CRITERIA[criterion] if weights is None else weights, criterion)
         self.thresholds = None if audiogram is None else as_thresholds(audiogram).detach().clone()
         built = _build(simulator, self.sample_rate, self.full_scale_spl)
@@ -86,24 +93,42 @@ class HearingLossLoss(nn.Module):
         return self._unregistered[0]
 
     @not_compiled  # a compiled caller calls it as it is
-    def forward(self, compensated: Tensor, clean: Tensor, audiogram: AudiogramLike | None = None) -> Tensor:
-        """The loss: mean over the items.
+    def forward(
+        self,
+        compensated: Tensor,
+        clean: Tensor,
+        audiogram: AudiogramLike | None = None,
+        lengths: Lengths | None = None,
+    ) -> Tensor:
+        """The loss: mean over the items, or of each.
 
-        Shape: (..., time) twice, and one audiogram or (..., 8) that broadcasts over the leading dimensions -> ().
+        Shape: (..., time) twice, and one audiogram or (..., 8) that broadcasts over the leading dimensions -> (), or with
+            ``reduction="none"`` the leading dimensions.
+
+        Args:
+            lengths: samples of each item of a padded batch, (...). What follows an item's end is heard as silence,
+                whatever is there, and is not compared. With the exact MSBG an item counts much as it does alone; blocks
+                of a network that look at all of a signal (lstm, transformer, mamba) see the silence too.
 
         Raises:
-            ValueError: shapes that do not fit, no audiogram, levels outside -10 to 100 dB HL, or a simulator that does
-                not return a waveform of the shape it was given.
+            ValueError: shapes that do not fit, no audiogram, levels outside -10 to 100 dB HL, lengths outside 1 to time,
+                or a simulator that does not return a waveform of the shape it was given.
         """
-        return criteria.weighted_sum(self.parts(compensated, clean, audiogram), self.weights)
+        return criteria.weighted_sum(self.parts(compensated, clean, audiogram, lengths), self.weights)
 
     @not_compiled
     def parts(
-        self, compensated: Tensor, clean: Tensor, audiogram: AudiogramLike | None = None
+        self,
+        compensated: Tensor,
+        clean: Tensor,
+        audiogram: AudiogramLike | None = None,
+        lengths: Lengths | None = None,
     ) -> dict[str, Tensor]:
         """The parts of the loss by name, before their weights: magnitude, phase, complex and time, or band_levels (dB).
 
-        Shape and errors: as ``forward``.
+        Their sum, ``sum(weight * parts[name] for name, weight in loss.weights.items())``, is what ``forward`` gives.
+
+        Shape, arguments and errors: as ``forward``.
         """
         check_waveform(compensated, "compensated")
         check_waveform(clean, "clean")
@@ -111,24 +136,34 @@ class HearingLossLoss(nn.Module):
             raise ValueError(
                 f"compensated has shape {tuple(compensated.shape)}, clean {tuple(clean.shape)}; allowed: the same shape"
             )
+        ends = None if lengths is None else check_lengths(lengths, compensated.shape)
         ears = self.thresholds if audiogram is None else as_thresholds(audiogram)
         if ears is None:
             raise ValueError("no audiogram: give one when building the loss or with the call")
         with torch.autocast(compensated.device.type, enabled=False):
             dtype = torch.promote_types(torch.promote_types(compensated.dtype, clean.dtype), torch.float32)
-            heard = self._hear(compensated.to(dtype), ears.to(compensated.device))
-            aim = self._aim(clean.to(dtype)).expand_as(heard)
-            gain, (*batch, time) = gain_to_pascals(self.full_scale_spl), heard.shape
+            compensated, clean = compensated.to(dtype), clean.to(dtype)
+            if ends is not None:
+                compensated, clean = silent_after(compensated, ends), silent_after(clean, ends)
+            heard = self._hear(compensated, ears.to(compensated.device))
+            aim = self._aim(clean).expand_as(heard)
+            batch, time = heard.shape[:-1], heard.shape[-1]
+            gain = gain_to_pascals(self.full_scale_spl)
             heard, aim = heard.reshape(-1, time) * gain, aim.reshape(-1, time) * gain
-            if self.criterion == "bands":
-                items = {"band_levels": band_level_loss(heard, aim, self.sample_rate)}
+            if self.criterion == "paper" and self._has_banks:
+                own_ears = ears.to(aim.device).expand(*batch, -1).reshape(-1, len(FREQUENCIES))
+                normal = self.reference == "normal-hearing"
+                aim = with_phase_of_bank(aim, own_ears, self.sample_rate, normal=normal)
+            if ends is None or bool((ends == time).all()):
+                items = self._compare(heard, aim)
             else:
-                if any(isinstance(module, MSBG | NeuroMSBG) for module in self.simulator.modules()):
-                    each = ears.to(aim.device).expand(*batch, -1).reshape(-1, len(FREQUENCIES))
-                    normal = self.reference == "normal-hearing"
-                    aim = with_phase_of_bank(aim, each, self.sample_rate, normal=normal)
-                stft = criteria.paper_stft(self.sample_rate)
-                items = criteria.paper_parts(heard, aim, stft, self._frequencies(stft.fft))
+                each = [
+                    self._compare(heard[item, None, :end], aim[item, None, :end])
+                    for item, end in enumerate(ends.expand(batch).flatten().tolist())
+                ]
+                items = {name: torch.cat([own[name] for own in each]) for name in each[0]}
+        if self.reduction == "none":
+            return {name: part.reshape(batch) for name, part in items.items()}
         return {name: part.mean() for name, part in items.items()}
 
     def extra_repr(self) -> str:
@@ -136,6 +171,13 @@ class HearingLossLoss(nn.Module):
             f"simulator={type(self.simulator).__name__}, sample_rate={self.sample_rate}, "
             f"full_scale_spl={self.full_scale_spl:g}, reference={self.reference!r}, criterion={self.criterion!r}"
         )
+
+    def _compare(self, heard: Tensor, aim: Tensor) -> dict[str, Tensor]:
+        """The parts of each item. Shape: (items, time) twice, in pascals -> (items,) each."""
+        if self.criterion == "bands":
+            return {"band_levels": band_level_loss(heard, aim, self.sample_rate)}
+        stft = criteria.paper_stft(self.sample_rate)
+        return criteria.paper_parts(heard, aim, stft, self._frequencies(stft.fft))
 
     def _hear(self, waveform: Tensor, thresholds: Tensor) -> Tensor:
         weight = next(self.simulator.parameters(), None)
@@ -167,6 +209,11 @@ class HearingLossLoss(nn.Module):
                 ..., : clean.shape[-1]
             ]
         return clean
+
+    @property
+    def _has_banks(self) -> bool:
+        """Whether what is heard has gone through the banks of MSBG."""
+        return any(isinstance(module, MSBG | NeuroMSBG) for module in self.simulator.modules())
 
     @property
     def _narrow(self) -> bool:

@@ -49,7 +49,7 @@ class Host(nn.Module):
 
 
 def gradient(
-    loss: HearingLossLoss, compensated: Tensor, clean: Tensor, *rest: Tensor
+    loss: HearingLossLoss, compensated: Tensor, clean: Tensor, *rest: object
 ) -> tuple[Tensor, Tensor]:
     given = compensated.detach().clone().requires_grad_()
     value = loss(given, clean, *rest)
@@ -235,6 +235,86 @@ def test_one_clip_in_several_ears(clean: Tensor) -> None:
     loss = HearingLossLoss([N3, N4], criterion="bands")
     alone = [loss(clean[0], clean[0], ear) for ear in (N3, N4)]
     assert float(loss(clean[0], clean[0])) == pytest.approx(float(sum(alone)) / 2.0, rel=1e-5)
+
+
+# Padded batches
+
+
+@both
+@each_criterion
+def test_items_that_are_as_long_as_the_batch_need_no_lengths(
+    simulator: str, criterion: str, clean: Tensor
+) -> None:
+    loss = HearingLossLoss([N3, S2], simulator=simulator, criterion=criterion)
+    expected = loss(3.0 * clean, clean)
+    for lengths in ([4800, 4800], torch.tensor([4800, 4800])):
+        assert torch.equal(loss(3.0 * clean, clean, lengths=lengths), expected)
+    one = loss(3.0 * clean[0], clean[0], N3, lengths=torch.tensor(4800))
+    assert torch.equal(one, loss(3.0 * clean[0], clean[0], N3))
+
+
+@each_criterion
+@pytest.mark.parametrize("reference", ["clean", "normal-hearing"])
+def test_a_padded_item_is_as_alone(criterion: str, reference: str, clean: Tensor) -> None:
+    loss = HearingLossLoss(
+        simulator="msbg", criterion=criterion, reference=reference, reduction="none"
+    ).double()
+    signals, ears = clean.double(), torch.tensor([N3.thresholds, S2.thresholds])
+    longer = nn.functional.pad(signals, (0, 3000))
+    together = loss.parts(3.0 * longer, longer, ears, lengths=[4800, 4000])
+    for item, end in enumerate((4800, 4000)):
+        alone = loss.parts(3.0 * signals[item, :end], signals[item, :end], ears[item])
+        for name, part in alone.items():
+            assert float(together[name][item]) == pytest.approx(float(part), rel=2e-3), name
+
+
+@both
+@each_criterion
+def test_what_follows_the_end_counts_for_nothing(simulator: str, criterion: str, clean: Tensor) -> None:
+    loss = HearingLossLoss([N3, S2], simulator=simulator, criterion=criterion)
+    lengths = [4800, 3000]
+    after = torch.zeros_like(clean)
+    after[1, 3000:] = 1.0
+    expected = gradient(loss, 3.0 * clean, clean, None, lengths)
+    noisy = gradient(loss, 3.0 * clean + after, clean - after, None, lengths)
+    assert torch.equal(noisy[0], expected[0]) and torch.equal(noisy[1], expected[1])
+    assert not bool(expected[1][1, 3000:].any()) and bool(expected[1][1, :3000].any())
+    assert float(expected[0]) != float(loss(3.0 * clean, clean))
+
+
+@both
+@each_criterion
+def test_a_value_for_each_item(simulator: str, criterion: str, clean: Tensor) -> None:
+    mean = HearingLossLoss([N3, S2], simulator=simulator, criterion=criterion)
+    each = HearingLossLoss([N3, S2], simulator=mean.simulator, criterion=criterion, reduction="none")
+    for lengths in (None, [1, 4800]):
+        values = each(3.0 * clean, clean, lengths=lengths)
+        assert values.shape == (2,) and values[0] != values[1]
+        torch.testing.assert_close(values.mean(), mean(3.0 * clean, clean, lengths=lengths))
+        parts = each.parts(3.0 * clean, clean, lengths=lengths)
+        torch.testing.assert_close(sum(each.weights[name] * part for name, part in parts.items()), values)
+    # one clip in two ears, and leading dimensions of two
+    assert each(clean[0], clean[0], lengths=4000).shape == (2,)
+    assert each(clean[:, None], clean[:, None], N3, lengths=[[4800], [99]]).shape == (2, 1)
+
+
+@pytest.mark.parametrize(
+    ("lengths", "message"),
+    [
+        ([4800, 0], "lengths from 0 to 4800; allowed: whole numbers from 1 to 4800"),
+        (torch.tensor([4801, 4800]), "lengths from 4800 to 4801; allowed: .* 1 to 4800"),
+        ([4800], r"lengths of shape \(1,\); allowed: .* of shape \(2,\), one an item"),
+        (4800, r"lengths of shape \(\); allowed: .* of shape \(2,\)"),
+        ([1.0, 0.5], r"lengths of torch.float32; allowed: whole numbers .*\(samples\)"),
+        ([True, True], "lengths of torch.bool; allowed: whole numbers"),
+        ("long", "lengths is str; allowed: whole numbers"),
+        ([[1], [2, 3]], "lengths is list; allowed: whole numbers"),
+    ],
+)
+def test_lengths_that_do_not_fit(lengths: object, message: str, clean: Tensor) -> None:
+    with pytest.raises(ValueError, match=message) as error:
+        HearingLossLoss(N3)(clean, clean, lengths=lengths)
+    assert "\n" not in str(error.value)
 
 
 # Criteria
@@ -507,6 +587,8 @@ def test_simulator_by_folder_and_as_a_module(clean: Tensor) -> None:
         ({"weights": {"magnitude": "a"}}, "'magnitude': 'a'.*allowed: finite numbers, 0 or more"),
         ({"weights": {"magnitude": True}}, "allowed: finite numbers, 0 or more"),
         ({"reference": "noisy"}, "reference is 'noisy'; allowed: clean, normal-hearing"),
+        ({"reduction": "sum"}, "reduction is 'sum'; allowed: mean, none"),
+        ({"reduction": None}, "reduction is None; allowed: mean, none"),
         ({"criterion": "l1"}, "criterion is 'l1'; allowed: paper, bands"),
         ({"weights": {"pitch": 1.0}}, "pitch .*'paper'; allowed: magnitude, phase, complex, time"),
         ({"criterion": "bands", "weights": {"phase": 1.0}}, "phase .*'bands'; allowed: band_levels"),
