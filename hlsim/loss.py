@@ -218,7 +218,9 @@ class HearingLossLoss(nn.Module):
     @property
     def _narrow(self) -> bool:
         """Whether the simulator leaves part of the band out."""
-        return isinstance(self.simulator, NeuroMSBG) and self.sample_rate > NEURO_RATE
+        # it may be compiled, or in somebody's module
+        neuro = any(isinstance(module, NeuroMSBG) for module in self.simulator.modules())
+        return neuro and self.sample_rate > NEURO_RATE
 
     def _frequencies(self, fft: int) -> int | None:
         """Number of the transform's frequencies to compare: those that the simulator gives back."""

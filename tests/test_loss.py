@@ -474,6 +474,30 @@ def test_above_8_khz_neuro_msbg_judges_nothing(clean: Tensor) -> None:
         assert float(after[name]) == pytest.approx(float(before[name]), rel=1e-3), name
 
 
+class Wrapped(nn.Module):
+    """Somebody's module round a simulator."""
+
+    def __init__(self, inner: nn.Module) -> None:
+        super().__init__()
+        self.inner = inner
+
+    def forward(self, waveform: Tensor, audiogram: Tensor) -> Tensor:
+        heard: Tensor = self.inner(waveform, audiogram)
+        return heard
+
+
+@pytest.mark.parametrize("wrap", [Wrapped, lambda model: torch.compile(model, backend="eager")])
+def test_a_wrapped_neuro_msbg_judges_the_same_band(
+    wrap: Callable[[nn.Module], nn.Module], clean: Tensor
+) -> None:
+    model = load_pretrained("neuro-msbg", sample_rate=44100)
+    faster = resample(clean, 16000, 44100)
+    expected = HearingLossLoss(N3, simulator=model, sample_rate=44100).parts(3.0 * faster, faster)
+    found = HearingLossLoss(N3, simulator=wrap(model), sample_rate=44100).parts(3.0 * faster, faster)
+    for name, part in expected.items():
+        assert float(found[name]) == pytest.approx(float(part), rel=1e-3), name
+
+
 # Hard inputs
 
 
