@@ -64,7 +64,8 @@ class Audiogram:
             ``thresholds`` (linearly over log frequency, flat beyond the ends).
 
     Raises:
-        ValueError: the counts differ, a value is not finite or out of range, or the frequencies do not ascend.
+        ValueError: the counts differ, a value is not finite or out of range, or the frequencies do not ascend or lie all
+            under 250 or over 8000 Hz.
     """
 
     levels: tuple[float, ...]
@@ -85,6 +86,11 @@ class Audiogram:
         if frequencies[0] <= 0 or any(b <= a for a, b in pairwise(frequencies)):
             raise ValueError(
                 f"audiogram frequencies {_listed(frequencies)} Hz; allowed: positive and ascending"
+            )
+        if frequencies[-1] < FREQUENCIES[0] or frequencies[0] > FREQUENCIES[-1]:  # in kHz, as a rule
+            raise ValueError(
+                f"audiogram frequencies {_listed(frequencies)} Hz; allowed: Hz, not all under {FREQUENCIES[0]:g} or all "
+                f"over {FREQUENCIES[-1]:g}"
             )
         object.__setattr__(self, "levels", levels)
         object.__setattr__(self, "frequencies", frequencies)

@@ -94,6 +94,12 @@ def test_the_ends_of_the_range_are_allowed(edge: float) -> None:
         ((0.0, 0.0), (500.0, 250.0), "frequencies 500, 250 Hz; allowed: positive and ascending"),
         ((0.0, 0.0), (500.0, 500.0), "allowed: positive and ascending"),
         ((0.0, 0.0), (0.0, 500.0), "allowed: positive and ascending"),
+        (
+            (0.0, 0.0),
+            (0.25, 8.0),
+            r"frequencies 0\.25, 8 Hz; allowed: Hz, not all under 250 or all over 8000",
+        ),
+        ((0.0, 0.0), (9000.0, 12000.0), "frequencies 9000, 12000 Hz; allowed: Hz, not all under 250"),
         (("loud",) + (0.0,) * 7, FREQUENCIES, "levels .*loud.*; allowed: numbers"),
         ((None,) + (0.0,) * 7, FREQUENCIES, "levels .*None.*; allowed: numbers"),
         (30.0, FREQUENCIES, r"levels 30\.0; allowed: numbers"),
@@ -110,6 +116,8 @@ def test_other_grids_are_interpolated_linearly_over_log_frequency_and_flat_beyon
     half = float(np.log2(3000 / 2000))  # of the octave from 2 to 4 kHz
     assert ear.thresholds == pytest.approx((10, 10, 30, 50, 50 - 20 * half, 30, 30, 30))
     assert ear.levels == (10.0, 50.0, 30.0)  # kept as given
+    for hz in (250.0, 8000.0):
+        assert Audiogram((7.0,), (hz,)).thresholds == (7.0,) * 8
 
 
 def test_a_point_between_changes_nothing_where_it_lies_on_the_line() -> None:
