@@ -239,8 +239,9 @@ def own_thresholds(audiogram: AudiogramLike | None) -> Tensor | None:
     """``as_thresholds`` to keep: a copy, for the caller may write into its tensor; one that is trained stays itself."""
     if audiogram is None:
         return None
-    levels = as_thresholds(audiogram)
-    return levels if levels.requires_grad else levels.clone()
+    with torch.inference_mode(False):  # it may be trained through later
+        levels = as_thresholds(audiogram)
+        return levels if levels.requires_grad else levels.clone()
 
 
 def read_audiograms(path: str | Path, *, simulated: bool = False) -> list[tuple[dict[str, str], Audiogram]]:

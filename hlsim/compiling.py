@@ -25,6 +25,6 @@ def not_compiled(method: Callable[P, Result]) -> Callable[P, Result]:
 
 @contextmanager
 def lasting() -> Iterator[None]:
-    """For what a cache keeps: plain tensors, also where inference mode or a transform of ``torch.func`` asks first."""
+    """For what is kept: plain tensors, also where inference mode or a transform of ``torch.func`` asks first."""
     with torch.inference_mode(False), torch._C._DisableFuncTorch():
         yield

@@ -16,6 +16,7 @@ import safetensors.torch
 from torch import Tensor, nn
 
 from hlsim.calibration import PASCAL_SPL
+from hlsim.compiling import lasting
 from hlsim.neuro.config import NEURO_RATE, NetworkConfig, NeuroConfig
 from hlsim.neuro.model import NeuroMSBG
 
@@ -86,8 +87,9 @@ def read_checkpoint(
     except (TypeError, ValueError) as error:
         raise ValueError(f"{folder / CONFIG}: {error}") from error
     try:
-        model = build(config)
-        model.load_state_dict(safetensors.torch.load(weights))
+        with lasting():  # it may be trained through later
+            model = build(config)
+            model.load_state_dict(safetensors.torch.load(weights))
     except (TypeError, RuntimeError, safetensors.SafetensorError) as error:
         raise ValueError(
             f"{folder}: weights and configuration do not fit ({str(error).splitlines()[0]})"

@@ -380,6 +380,13 @@ def test_a_stored_ear_is_its_own(make: Any) -> None:
     assert torch.equal(module.thresholds, torch.full((8,), 40.0))
 
 
+@pytest.mark.parametrize("make", [MSBG, NALR])
+def test_an_ear_stored_in_inference_mode_trains_later(make: Any) -> None:
+    with torch.inference_mode():
+        modules = [make(ear) for ear in (Audiogram.standard("N3"), torch.full((8,), 40.0))]
+    assert not any(module.thresholds.is_inference() for module in modules)
+
+
 def test_thresholds_keep_their_gradient() -> None:
     levels = torch.full((2, 8), 40.0, requires_grad=True)
     as_thresholds(levels).sum().backward()

@@ -137,6 +137,16 @@ def test_gradient_is_that_of_the_value(
     assert float(slope) == pytest.approx((ahead - behind) / 2e-3, rel=1e-4)
 
 
+@both
+@each_criterion
+def test_built_in_inference_mode_it_trains_later(simulator: str, criterion: str, clean: Tensor) -> None:
+    expected = HearingLossLoss(N3, simulator=simulator, criterion=criterion)
+    with torch.inference_mode():
+        loss = HearingLossLoss(N3, simulator=simulator, criterion=criterion)
+        loss(3.0 * clean, clean)
+    same(gradient(expected, 3.0 * clean, clean), gradient(loss, 3.0 * clean, clean))
+
+
 # Moving, copying, compiling
 
 

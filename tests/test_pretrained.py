@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 import torch
 
+from compensators import load_compensator
 from hlsim import NeuroMSBG, load_pretrained
 from hlsim.neuro import NeuroConfig
 from hlsim.pretrained import checkpoints_folder, find_checkpoint, repair_checkpoint, save_checkpoint, shipped
@@ -41,6 +42,18 @@ def test_loaded_model_is_frozen(folder: Path) -> None:
     model = load_pretrained(folder, sample_rate=44100, full_scale_spl=100.0)
     assert not model.training and not any(p.requires_grad for p in model.parameters())
     assert (model.sample_rate, model.full_scale_spl) == (44100, 100.0)
+
+
+@pytest.mark.parametrize(
+    ("load", "name"), [(load_pretrained, "neuro-msbg"), (load_compensator, "compensator-general")]
+)
+def test_loaded_in_inference_mode_gives_a_gradient_later(load: Any, name: str) -> None:
+    with torch.inference_mode():
+        model = load(name)
+    assert not any(tensor.is_inference() for tensor in (*model.parameters(), *model.buffers()))
+    given = (0.02 * torch.randn(2000)).requires_grad_()
+    model(given, torch.full((8,), 40.0)).square().sum().backward()
+    assert bool(given.grad.any())
 
 
 def test_folder_holds_three_files_and_no_pickle(folder: Path) -> None:
