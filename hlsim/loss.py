@@ -83,7 +83,8 @@ class HearingLossLoss(nn.Module):
             raise ValueError(f"reduction is {reduction!r}; allowed: {', '.join(REDUCTIONS)}")
         self.reference, self.criterion, self.reduction = reference, criterion, reduction
         self.weights = _check_weights(CRITERIA[criterion] if weights is None else weights, criterion)
-        self.thresholds = None if audiogram is None else as_thresholds(audiogram).detach().clone()
+        with torch.device("cpu"):  # where the host is made on ``meta``, nobody gives the ear its values later
+            self.thresholds = None if audiogram is None else as_thresholds(audiogram).detach().clone()
         built = _build(simulator, self.sample_rate, self.full_scale_spl)
         self._unregistered = (built.eval().requires_grad_(False),)  # in a tuple, nn.Module does not see it
 
@@ -251,10 +252,14 @@ def _batches(items: torch.Size, ears: torch.Size) -> list[torch.Size]:
 
 
 def _moved(fn: Callable[[Tensor], Tensor], tensor: Tensor) -> Tensor:
-    """Move a tensor of the simulator with its host, but never to half precision, which it does not work in."""
+    """Move a tensor of the simulator with its host, but never to half precision, which it does not work in.
+
+    Its values stay: where the host goes to ``meta`` it stays too, and follows when ``to_empty`` calls the host back.
+    """
     moved = fn(tensor)
+    device = tensor.device if moved.is_meta else moved.device
     halved = moved.is_floating_point() and moved.dtype not in (torch.float32, torch.float64)
-    return tensor.to(moved.device) if halved else moved
+    return tensor.to(device) if halved else tensor.to(device, moved.dtype)
 
 
 def _build(simulator: str | Path | nn.Module, sample_rate: int, full_scale_spl: float) -> nn.Module:

@@ -13,6 +13,7 @@ from typing import Any, TypeVar
 
 import safetensors
 import safetensors.torch
+import torch
 from torch import Tensor, nn
 
 from hlsim.calibration import PASCAL_SPL
@@ -61,6 +62,8 @@ def read_checkpoint(
 
     A configuration without a hash, as older checkpoints have it, is taken as it is.
 
+    Returns: the model on torch's default device, or the CPU where that is ``meta``.
+
     Raises:
         ValueError: as ``load_pretrained``.
     """
@@ -87,14 +90,17 @@ def read_checkpoint(
     except (TypeError, ValueError) as error:
         raise ValueError(f"{folder / CONFIG}: {error}") from error
     try:
-        with lasting():  # it may be trained through later
+        device = torch.get_default_device()
+        # it may be trained through later, and torch.device("meta") would keep no weights
+        with lasting(), torch.device("cpu"):
             model = build(config)
             model.load_state_dict(safetensors.torch.load(weights))
     except (TypeError, RuntimeError, safetensors.SafetensorError) as error:
         raise ValueError(
             f"{folder}: weights and configuration do not fit ({str(error).splitlines()[0]})"
         ) from error
-    return model
+    with lasting():
+        return model if device.type == "meta" else model.to(device)
 
 
 def find_checkpoint(name: str | Path, kind: str | None = None, also: Sequence[str] = ()) -> Path:

@@ -182,6 +182,30 @@ def test_cuda_is_like_the_cpu(simulator: str, criterion: str, clean: Tensor) -> 
     same(before, gradient(loss, 3.0 * clean, clean))
 
 
+def to_meta_and_back(loss: HearingLossLoss) -> nn.Module:
+    return Host(loss).to("meta").to_empty(device="cpu")
+
+
+def made_on_meta(loss: HearingLossLoss) -> nn.Module:
+    with torch.device("meta"):
+        host = Host(
+            HearingLossLoss(N3, simulator="msbg" if isinstance(loss.simulator, MSBG) else "neuro-msbg")
+        )
+    return host.to_empty(device="cpu")
+
+
+@both
+@pytest.mark.parametrize(
+    "how", [lambda loss: Host(loss).to_empty(device="cpu"), to_meta_and_back, made_on_meta]
+)
+def test_a_host_without_values_leaves_the_simulator_its_own(
+    simulator: str, how: Callable[[nn.Module], Host], clean: Tensor
+) -> None:
+    loss = HearingLossLoss(N3, simulator=simulator)
+    before = gradient(loss, 3.0 * clean, clean)
+    same(before, gradient(how(loss).loss, 3.0 * clean, clean))
+
+
 @both
 @pytest.mark.parametrize("how", [copy.deepcopy, lambda loss: pickle.loads(pickle.dumps(loss))])
 def test_copies_are_their_own(simulator: str, how: Callable[[nn.Module], Host], clean: Tensor) -> None:
@@ -715,7 +739,8 @@ def test_own_simulator_may_broadcast_with_the_ears(heard: tuple[int, ...]) -> No
 
 
 def test_another_device_is_named() -> None:
-    loss = HearingLossLoss(N3).to("meta")
+    loss = HearingLossLoss(N3)
+    loss.simulator.to("meta")
     with pytest.raises(
         ValueError, match=r"speech is on cpu and the simulator on meta; move the loss with \.to\(\)"
     ):
