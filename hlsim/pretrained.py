@@ -91,8 +91,8 @@ def read_checkpoint(
         raise ValueError(f"{folder / CONFIG}: {error}") from error
     try:
         device = torch.get_default_device()
-        # it may be trained through later, and torch.device("meta") would keep no weights
-        with lasting(), torch.device("cpu"):
+        # it may be trained through later, torch.device("meta") would keep no weights, and the random start is not kept
+        with lasting(), torch.device("cpu"), torch.random.fork_rng(devices=[]):
             model = build(config)
             model.load_state_dict(safetensors.torch.load(weights))
     except (TypeError, RuntimeError, safetensors.SafetensorError) as error:

@@ -16,6 +16,10 @@ from hlsim.pretrained import checkpoints_folder, find_checkpoint, repair_checkpo
 
 SMALL = NeuroConfig(channels=4, blocks=1)
 
+loaders = pytest.mark.parametrize(
+    ("load", "name"), [(load_pretrained, "neuro-msbg"), (load_compensator, "compensator-general")]
+)
+
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
@@ -44,9 +48,14 @@ def test_loaded_model_is_frozen(folder: Path) -> None:
     assert (model.sample_rate, model.full_scale_spl) == (44100, 100.0)
 
 
-@pytest.mark.parametrize(
-    ("load", "name"), [(load_pretrained, "neuro-msbg"), (load_compensator, "compensator-general")]
-)
+@loaders
+def test_loading_draws_no_random_numbers(load: Any, name: str) -> None:
+    before = torch.get_rng_state()
+    load(name)
+    assert torch.equal(torch.get_rng_state(), before)
+
+
+@loaders
 def test_loaded_in_inference_mode_gives_a_gradient_later(load: Any, name: str) -> None:
     with torch.inference_mode():
         model = load(name)
