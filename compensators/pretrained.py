@@ -5,9 +5,10 @@ from pathlib import Path
 from compensators.config import MappingConfig
 from compensators.mapping import MappingCompensator
 from compensators.nalr import NALR
+from hlsim import __version__
 from hlsim.calibration import PASCAL_SPL
 from hlsim.neuro.config import NEURO_RATE
-from hlsim.pretrained import read_checkpoint
+from hlsim.pretrained import CONFIG, read_checkpoint, save_checkpoint
 
 KIND = "mapping-compensator"
 """What ``config.json`` of a checkpoint of such a compensator calls it."""
@@ -34,3 +35,21 @@ def load_compensator(
         return MappingCompensator(config, sample_rate=sample_rate, full_scale_spl=full_scale_spl)
 
     return read_checkpoint(name, KIND, MappingConfig, build, also=("nalr",)).eval().requires_grad_(False)
+
+
+def save_compensator(model: MappingCompensator, folder: str | Path) -> None:
+    """Write a checkpoint that ``load_compensator`` reads, whole or not at all; an older one there is replaced.
+
+    Rate and level are no part of it: ``load_compensator`` is told them.
+
+    Raises:
+        ValueError: another kind of model, or a folder that holds something else.
+    """
+    if not isinstance(model, MappingCompensator):
+        raise ValueError(f"{type(model).__name__} cannot be saved; allowed: a MappingCompensator")
+    target = Path(folder)
+    if target.exists() and not (
+        target.is_dir() and ((target / CONFIG).is_file() or not any(target.iterdir()))
+    ):
+        raise ValueError(f"{target}: holds something else; allowed: a new folder, or that of a checkpoint")
+    save_checkpoint(target, KIND, model, model.config.to_dict(), {"hlsim": __version__})

@@ -210,6 +210,7 @@ def as_thresholds(audiogram: AudiogramLike) -> Tensor:
     if not isinstance(audiogram, Tensor):
         raise ValueError(
             f"audiogram is {type(audiogram).__name__}; allowed: an Audiogram, a sequence of them, or a (..., 8) tensor"
+            + _instead(audiogram)
         )
     if audiogram.is_complex() or audiogram.dtype == torch.bool:
         raise ValueError(f"audiogram tensor of {audiogram.dtype}; allowed: floating-point or integer dB HL")
@@ -233,6 +234,25 @@ def _simulated(levels: Sequence[float]) -> Sequence[float]:
             f"{LOWEST_LEVEL:g} to {HIGHEST_SIMULATED:g} (MSBG is singular at 105)"
         )
     return levels
+
+
+def _instead(given: object) -> str:
+    """What to write in place of something that is no audiogram but holds one."""
+    several = isinstance(given, list | tuple) and len(given) > 0
+    first = given[0] if isinstance(given, list | tuple) and given else given
+    if isinstance(first, str) and first in STANDARD:
+        make = f"Audiogram.standard({first!r})"
+    elif isinstance(first, Mapping):
+        make = "Audiogram.from_dict(...)"
+    elif hasattr(first, "levels") and hasattr(first, "frequencies"):  # pyclarity's, without importing it
+        make = "hlsim.Audiogram.from_clarity(...)"
+    elif several and isinstance(first, Tensor):
+        return "; write torch.stack(...)"
+    elif isinstance(first, np.ndarray) or (several and isinstance(first, float | int | list | tuple)):
+        return "; write torch.tensor(...)"
+    else:
+        return ""
+    return f"; write {f'[{make}, ...]' if several else make}"
 
 
 def own_thresholds(audiogram: AudiogramLike | None) -> Tensor | None:

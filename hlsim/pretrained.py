@@ -29,6 +29,9 @@ WEIGHTS, CONFIG, CARD = "model.safetensors", "config.json", "README.md"
 SIMULATOR = "neuro-msbg"
 """What ``config.json`` of a checkpoint of a simulator calls it."""
 
+_LOADERS = {SIMULATOR: "hlsim.load_pretrained", "mapping-compensator": "compensators.load_compensator"}
+_MODELS = {"msbg": "hlsim.MSBG", "nalr": "compensators.NALR"}  # that need no checkpoint
+
 
 def load_pretrained(
     name: str | Path, *, sample_rate: int = NEURO_RATE, full_scale_spl: float = PASCAL_SPL
@@ -75,7 +78,8 @@ def read_checkpoint(
         raise ValueError(f"{folder}: not readable as a checkpoint ({error})") from error
     if not isinstance(record, dict) or record.get("kind") != kind:
         found = record.get("kind") if isinstance(record, dict) else None
-        raise ValueError(f"{folder}: a checkpoint of kind {found!r}; needed here: {kind!r}")
+        hint = f" ({_LOADERS[found]} loads the former)" if found in _LOADERS else ""
+        raise ValueError(f"{folder}: a checkpoint of kind {found!r}; needed here: {kind!r}{hint}")
     if hashlib.sha256(weights).hexdigest() != record.get("sha256"):
         raise ValueError(
             f"{folder / WEIGHTS}: changed since it was saved, its SHA-256 differs from {CONFIG}'s; get it anew"
@@ -122,6 +126,8 @@ def find_checkpoint(name: str | Path, kind: str | None = None, also: Sequence[st
     names = [*also, *shipped(kind)]
     inner = Path(name) / "checkpoint"  # as a training leaves it
     hint = f", but {str(inner)!r} is one" if (inner / CONFIG).is_file() else ""
+    if str(name) in _MODELS:
+        hint = f": it is {_MODELS[str(name)]}"
     raise ValueError(
         f"no checkpoint {str(name)!r}{hint}; allowed: {', '.join(names) or 'none ships'}, or a folder with {CONFIG}"
     )

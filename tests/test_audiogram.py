@@ -329,6 +329,11 @@ def test_pyclarity_round_trip() -> None:
     mild = Audiogram.from_clarity(clarity.AUDIOGRAM_MILD)
     assert (mild.frequencies[0], mild.levels[0], mild.levels[-1]) == (125.0, 5.0, 50.0)
     assert mild.thresholds == (10, 15, 19, 25, 28, 31, 35, 38)
+    for given in (theirs, [theirs, theirs]):
+        with pytest.raises(
+            ValueError, match=r"allowed: .* tensor; write \[?hlsim\.Audiogram\.from_clarity\("
+        ):
+            as_thresholds(given)
 
 
 def test_thresholds_for_a_simulator() -> None:
@@ -353,11 +358,19 @@ def test_thresholds_for_a_simulator() -> None:
         (torch.zeros(8, dtype=torch.bool), "of torch.bool; allowed: floating-point or integer"),
         (torch.zeros(8, dtype=torch.complex64), "of torch.complex64; allowed: floating-point or integer"),
         (Audiogram.standard("N7"), "takes -10 to 100"),
-        ([0.0] * 8, "is list; allowed: an Audiogram, a sequence of them, or a .* tensor"),
-        ([], "is list; allowed"),
-        ("N3", "is str; allowed"),
-        (None, "is NoneType; allowed"),
-        (np.zeros(8), "is ndarray; allowed"),
+        (
+            [0.0] * 8,
+            r"is list; allowed: an Audiogram, a sequence of them, or a .* tensor; write torch\.tensor\(",
+        ),
+        ([[0.0] * 8], r"is list; allowed: .* tensor; write torch\.tensor\(\.\.\.\)$"),
+        ((torch.zeros(8), torch.zeros(8)), r"is tuple; allowed: .* tensor; write torch\.stack\(\.\.\.\)$"),
+        ([], "is list; allowed: .* tensor$"),
+        ("N3", r"is str; allowed: .* tensor; write Audiogram\.standard\('N3'\)$"),
+        (["N3", "N4"], r"is list; allowed: .* tensor; write \[Audiogram\.standard\('N3'\), \.\.\.\]$"),
+        ("loud", "is str; allowed: .* tensor$"),
+        ({"levels": [0.0] * 8}, r"is dict; allowed: .* tensor; write Audiogram\.from_dict\("),
+        (None, "is NoneType; allowed: .* tensor$"),
+        (np.zeros(8), r"is ndarray; allowed: .* tensor; write torch\.tensor\(\.\.\.\)$"),
     ],
 )
 def test_what_is_no_ear_for_a_simulator(audiogram: Any, said: str) -> None:

@@ -108,6 +108,13 @@ def test_another_kind(folder: Path) -> None:
         load_pretrained(folder)
 
 
+def test_what_is_loaded_or_made_otherwise_is_named() -> None:
+    with pytest.raises(ValueError, match=r"'neuro-msbg' \(compensators\.load_compensator loads the former\)"):
+        load_pretrained("compensator-general")
+    with pytest.raises(ValueError, match=r"no checkpoint 'msbg': it is hlsim\.MSBG; allowed: neuro-msbg"):
+        load_pretrained("msbg")
+
+
 def test_configuration_that_does_not_fit(folder: Path) -> None:
     record = json.loads((folder / "config.json").read_text())
     record["config"]["channels"] = 5

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 import torch
 
-from compensators import NALR, MappingCompensator, MappingConfig, load_compensator
+from compensators import NALR, MappingCompensator, MappingConfig, load_compensator, save_compensator
 from hlsim import Audiogram
 from hlsim.pretrained import save_checkpoint
 
@@ -14,12 +14,26 @@ from hlsim.pretrained import save_checkpoint
 def test_saved_and_loaded_is_the_same_to_the_bit(tmp_path: Path) -> None:
     model = MappingCompensator(MappingConfig(channels=8, blocks=1, start=0.3))
     torch.nn.init.normal_(model.magnitude_decoder.leave.weight, std=0.1)
-    save_checkpoint(tmp_path / "mine", "mapping-compensator", model, model.config.to_dict(), {})
+    save_compensator(MappingCompensator(), tmp_path / "mine")
+    save_compensator(model, tmp_path / "mine")  # in place of the other
     loaded = load_compensator(tmp_path / "mine")
     assert isinstance(loaded, MappingCompensator) and loaded.config == model.config
     assert not loaded.training and not any(parameter.requires_grad for parameter in loaded.parameters())
     waveform, ear = 0.05 * torch.randn(2, 4000), Audiogram.standard("N4")
     assert torch.equal(loaded(waveform, ear), model.eval()(waveform, ear))
+
+
+def test_saving_takes_nothing_else_away(tmp_path: Path) -> None:
+    (tmp_path / "runs").mkdir()
+    (tmp_path / "file").write_text("kept")
+    save_compensator(MappingCompensator(MappingConfig(channels=4, blocks=1)), tmp_path / "runs")
+    (tmp_path / "runs" / "config.json").rename(tmp_path / "runs" / "notes.txt")
+    for name in ("runs", "file", "."):
+        with pytest.raises(ValueError, match="holds something else; allowed: a new folder"):
+            save_compensator(MappingCompensator(), tmp_path / name)
+    assert (tmp_path / "file").read_text() == "kept" and (tmp_path / "runs" / "notes.txt").is_file()
+    with pytest.raises(ValueError, match="NALR cannot be saved; allowed: a MappingCompensator"):
+        save_compensator(NALR(), tmp_path / "nalr")  # type: ignore[arg-type]
 
 
 def test_nalr_by_name() -> None:
@@ -35,7 +49,7 @@ def test_unknown_name_and_other_kind(tmp_path: Path) -> None:
         load_compensator("nobody")
     assert "neuro-msbg" not in str(caught.value)
     save_checkpoint(tmp_path / "other", "neuro-msbg", torch.nn.Linear(2, 2), {}, {})
-    with pytest.raises(ValueError, match="'neuro-msbg'; needed here: 'mapping-compensator'"):
+    with pytest.raises(ValueError, match=r"'neuro-msbg'; needed here: .* \(hlsim.load_pretrained loads"):
         load_compensator(tmp_path / "other")
 
 
