@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
+import re
 from bisect import bisect_left
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -16,6 +17,8 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
+
+from hlsim.tables import read_rows
 
 FREQUENCIES = (250.0, 500.0, 1000.0, 2000.0, 3000.0, 4000.0, 6000.0, 8000.0)
 """The audiometric frequencies in Hz that every simulator uses."""
@@ -49,6 +52,8 @@ STANDARD = {
     "S2": (20, 20, 25, 55, 75, 95, 95, 95),
     "S3": (30, 35, 60, 75, 80, 80, 85, 85),
 }
+
+_COLUMN = re.compile(r"hl_(\d+\.?\d*|\.\d+)(_.+)?")  # the frequency, and the name of a remark on it
 
 MILDER = ("NH", "N1", "N2", "S1")
 """Standard ears that join measured ones in validation, since those are mostly moderate and severe."""
@@ -137,21 +142,30 @@ class Audiogram:
 
     @classmethod
     def from_row(cls, row: Mapping[str, str]) -> Audiogram:
-        """Read the columns ``hl_<frequency in Hz>`` of a CSV row; others are ignored.
+        """Read the columns ``hl_<frequency in Hz>`` of a CSV row.
+
+        Others are ignored, and so are remarks on a frequency, ``hl_8000_extrapolated_flat``: what they hold was not
+        measured.
 
         Raises:
-            ValueError: the row has no such column, or one that holds no number.
+            ValueError: the row has no such column, one that holds no number, two of a frequency, or one that begins with
+                ``hl`` and is neither a threshold nor a remark.
         """
-        points = {}
+        points: dict[float, float] = {}
         for column, value in row.items():
-            hz = str(column).removeprefix("hl_")
-            if hz != column and hz.replace(".", "", 1).isdigit():
-                try:
-                    points[float(hz)] = float(value)
-                except (TypeError, ValueError):
-                    raise ValueError(
-                        f"audiogram column {column} holds {value!r}; allowed: a level in dB HL"
-                    ) from None
+            found = _COLUMN.fullmatch(str(column))
+            if found is None and str(column).lower().startswith("hl"):
+                raise ValueError(f"audiogram column {column!r}; allowed: hl_ and a frequency in Hz, hl_500")
+            if found is None or found[2]:
+                continue
+            if float(found[1]) in points:
+                raise ValueError(f"audiogram column {column}: a second one of {float(found[1]):g} Hz")
+            try:
+                points[float(found[1])] = float(value)
+            except (TypeError, ValueError):
+                raise ValueError(
+                    f"audiogram column {column} holds {value!r}; allowed: a level in dB HL"
+                ) from None
         if not points:
             raise ValueError(f"a row of audiograms needs columns hl_250, hl_500, ..., got {list(row)}")
         return cls(tuple(points.values()), tuple(points))
@@ -267,28 +281,35 @@ def own_thresholds(audiogram: AudiogramLike | None) -> Tensor | None:
 def read_audiograms(path: str | Path, *, simulated: bool = False) -> list[tuple[dict[str, str], Audiogram]]:
     """Rows of a CSV file with columns ``hl_250`` and so on: each row's columns and its audiogram.
 
+    Blanks around names and values do not count. Frequencies other than the eight are interpolated, as in ``Audiogram``.
+
     Args:
         simulated: take only ears that a simulator takes.
 
     Raises:
-        ValueError: the file is missing, empty, or a row is no audiogram, or, with ``simulated``, beyond 100 dB HL; the
-            message names file and row.
+        ValueError: the file is missing, empty, has a column twice, or a row is no audiogram, or, with ``simulated``,
+            beyond 100 dB HL; the message names file and line.
     """
+    return [(row, ear) for _, row, ear in numbered_audiograms(path, simulated=simulated)]
+
+
+def numbered_audiograms(
+    path: str | Path, *, simulated: bool = False
+) -> list[tuple[int, dict[str, str], Audiogram]]:
+    """``read_audiograms`` with the number of each row's line first, for messages that name it."""
     try:
-        # spreadsheets put a byte order mark first, which would hide the first column
-        with open(path, newline="", encoding="utf-8-sig") as file:
-            rows = list(csv.DictReader(file))
-    except (OSError, UnicodeDecodeError) as error:
+        rows = list(read_rows(path))
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise ValueError(f"{path}: cannot read audiograms: {error}") from error
     if not rows:
         raise ValueError(f"{path}: no audiograms; needs a header with hl_250, hl_500, ... and a row an ear")
     ears = []
-    for number, row in enumerate(rows, start=2):
+    for number, row in rows:
         try:
             ear = Audiogram.from_row(row)
             if simulated:
                 as_thresholds(ear)
-            ears.append((row, ear))
+            ears.append((number, row, ear))
         except ValueError as error:
             raise ValueError(f"{path}, line {number}: {error}") from error
     return ears

@@ -246,7 +246,7 @@ def test_row_round_trip(frequencies: tuple[float, ...]) -> None:
     ear = Audiogram(tuple(2.5 * i for i in range(len(frequencies))), frequencies)
     row = ear.to_row()
     assert next(iter(row)) == f"hl_{frequencies[0]:g}"
-    assert Audiogram.from_row({"file": "a.wav"} | row | {"hl_best": "left"}) == ear
+    assert Audiogram.from_row({"file": "a.wav"} | row | {"hl_8000_extrapolated_flat": "40"}) == ear
 
 
 def test_row_keeps_all_digits_and_adds_none() -> None:
@@ -281,6 +281,14 @@ def test_csv_of_a_spreadsheet_keeps_its_first_column(tmp_path: Path) -> None:
     assert ear == Audiogram((10.0, 20.0), (250.0, 500.0))
 
 
+def test_csv_with_blanks_after_its_commas(tmp_path: Path) -> None:
+    path = tmp_path / "ears.csv"
+    path.write_text("file, hl_250 , hl_500, ,\na b.wav , 10, 20 ,,\n", encoding="utf-8")
+    assert read_audiograms(path) == [
+        ({"file": "a b.wav", "hl_250": "10", "hl_500": "20"}, Audiogram((10.0, 20.0), (250.0, 500.0)))
+    ]
+
+
 @pytest.mark.parametrize(
     ("content", "said"),
     [
@@ -291,6 +299,14 @@ def test_csv_of_a_spreadsheet_keeps_its_first_column(tmp_path: Path) -> None:
         ("hl_250,hl_500\n10,20\n10,200\n", "line 3: .*200 dB HL; allowed: -10 to 120"),
         ("hl_500,hl_250\n10,20\n", "line 2: .*ascending"),
         ("left,right\n10,20\n", "line 2: .*needs columns hl_250"),
+        ("hl_250,hl_1k\n10,20\n", "line 2: audiogram column 'hl_1k'; allowed: hl_ and a frequency in Hz"),
+        ("hl_250,HL_500\n10,20\n", "line 2: audiogram column 'HL_500'"),
+        ("hl_250,hl4000\n10,20\n", "line 2: audiogram column 'hl4000'"),
+        ("hl_250,hl_8000dB\n10,20\n", "line 2: audiogram column 'hl_8000dB'"),
+        ("hl_250,hl_500, hl_500\n10,20,30\n", "line 1: column hl_500 twice"),
+        ("hl_500,hl_500.0\n10,20\n", "line 2: .*hl_500.0: a second one of 500 Hz"),
+        ("hl_250,hl_500\n10,2,5\n", "line 2: 3 values; allowed: one for each of the 2 columns"),
+        ("\nhl_250,hl_500\n\n\n10,x\n", "line 5: .*hl_500 holds 'x'"),
     ],
 )
 def test_csv_errors_begin_with_the_file_and_name_the_line(tmp_path: Path, content: str, said: str) -> None:

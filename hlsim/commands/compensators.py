@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 from hlsim.commands.options import (
+    EARS_TABLE,
     Commands,
     add_command,
     audiogram_option,
@@ -38,7 +39,7 @@ def add(commands: Commands) -> None:
     sub.add_argument(
         "--audiograms",
         type=Path,
-        help="CSV with columns hl_250, hl_500, ... in dB HL, whose ears join Bisgaard's N2 to N6 and S1 to S3",
+        help=f"{EARS_TABLE}; its ears join Bisgaard's N2 to N6 and S1 to S3",
     )
     audiogram_option(sub, text="; one ear in place of all, for a compensator trained for it")
     sub.add_argument(

@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 
 from hlsim.commands.options import (
+    EARS_TABLE,
     Commands,
     add_command,
     count,
@@ -30,9 +31,7 @@ def add(commands: Commands) -> None:
         "names", nargs="+", metavar="NAME", help="checkpoints, by name or folder, or msbg (exact)"
     )
     sub.add_argument("--speech", type=Path, required=True, help="folder of clean speech")
-    sub.add_argument(
-        "--audiograms", type=Path, required=True, help="CSV with columns hl_250, hl_500, ... in dB HL"
-    )
+    sub.add_argument("--audiograms", type=Path, required=True, help=EARS_TABLE)
     sub.add_argument("--noise", type=Path, help="folder of noises; every second item is then noisy")
     sub.add_argument(
         "--teacher", choices=("pyclarity", "msbg"), default="pyclarity", help="what counts as the truth"

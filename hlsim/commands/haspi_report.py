@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 from hlsim.commands.options import (
+    EARS_TABLE,
     Commands,
     add_command,
     audiogram_option,
@@ -45,7 +46,7 @@ def add(commands: Commands) -> None:
     sub.add_argument(
         "--audiograms",
         type=Path,
-        help="CSV with columns hl_250, hl_500, ... and file (folders) or listener and ear (manifest)",
+        help=f"{EARS_TABLE}; and a column file (folders) or columns listener and ear (manifest)",
     )
     sub.add_argument(
         "--measures",

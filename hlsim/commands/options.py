@@ -21,6 +21,11 @@ from hlsim.pretrained import load_pretrained
 Commands = Any
 """What ``argparse.ArgumentParser.add_subparsers`` returns; its type has no public name."""
 
+EARS_TABLE = (
+    "CSV with columns hl_250, hl_500, ... hl_8000 in dB HL; where one of the eight is missing its level is interpolated "
+    "over log frequency, flat beyond the ends"
+)
+
 
 def add_command(
     commands: Commands, name: str, run: Callable[[argparse.Namespace], None], text: str

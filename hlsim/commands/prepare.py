@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from hlsim.commands.options import (
+    EARS_TABLE,
     Commands,
     add_command,
     audiogram_option,
@@ -55,9 +56,7 @@ def add(commands: Commands) -> None:
     sub.add_argument("--test-snr", type=numbers, default=TEST_SNRS_DB, help="other ones")
     sub.add_argument("--train-types", type=count, default=TRAIN_TYPES, help="types of noise to train with")
     sub.add_argument("--test-types", type=count, default=TEST_TYPES, help="other ones to test with")
-    sub.add_argument(
-        "--audiograms", type=Path, help="CSV with columns hl_250, hl_500, ... in dB HL; or ears are drawn"
-    )
+    sub.add_argument("--audiograms", type=Path, help=f"{EARS_TABLE}. Without it ears are drawn")
     sub.add_argument("--test-audiograms", type=Path, help="CSV of the ears for test")
     sub.add_argument("--ears", type=count, default=2, help="an utterance")
     sub.add_argument(

@@ -14,6 +14,7 @@ from random import Random
 
 from hlsim.audio import EXTENSIONS
 from hlsim.data.manifest import SPLITS, Utterance, inside, printable, storable
+from hlsim.tables import read_rows
 
 LAYOUTS = ("voicebank-demand", "librispeech", "folder")
 
@@ -238,35 +239,31 @@ def _listed(corpus: Path, table: Path) -> Iterator[Found]:
     """What a CSV file lists."""
     seen: set[str] = set()
     try:
-        with open(table, newline="", encoding="utf-8-sig") as file:
-            for number, row in enumerate(csv.DictReader(file), start=2):
-                row = {name: (value or "").strip() for name, value in row.items() if name}
-                path, where = row.get("file", ""), f"{table}, line {number}"
-                if not path:
-                    raise ValueError(f"{where}: no file named; needs a column 'file' with a path a row")
-                if row.get("split", "") not in ("", *SPLITS):
-                    raise ValueError(
-                        f"{where}: split {row['split']!r}; allowed: {', '.join(SPLITS)}, or none"
-                    )
-                key = row.get("id") or _stem(path)
-                try:
-                    snr = float(row["snr"]) if row.get("snr") else None
-                except ValueError:
-                    raise ValueError(f"{where}: snr {row['snr']!r}; allowed: a number of dB") from None
-                if key in seen:
-                    raise ValueError(f"{where}: a second row of {key}; allowed: one row an utterance")
-                seen.add(key)
-                for name in filter(None, (path, row.get("noisy"))):
-                    inside(corpus, name)
-                yield Utterance(
-                    key,
-                    row.get("speaker") or "/".join(path.split("/")[:-1]) or _unknown(row.get("split", "")),
-                    row.get("split", ""),
-                    path,
-                    row.get("noisy", ""),
-                    row.get("noise", "") if row.get("noisy") else "",
-                    snr if row.get("noisy") else None,
-                )
+        for number, row in read_rows(table):
+            path, where = row.get("file", ""), f"{table}, line {number}"
+            if not path:
+                raise ValueError(f"{where}: no file named; needs a column 'file' with a path a row")
+            if row.get("split", "") not in ("", *SPLITS):
+                raise ValueError(f"{where}: split {row['split']!r}; allowed: {', '.join(SPLITS)}, or none")
+            key = row.get("id") or _stem(path)
+            try:
+                snr = float(row["snr"]) if row.get("snr") else None
+            except ValueError:
+                raise ValueError(f"{where}: snr {row['snr']!r}; allowed: a number of dB") from None
+            if key in seen:
+                raise ValueError(f"{where}: a second row of {key}; allowed: one row an utterance")
+            seen.add(key)
+            for name in filter(None, (path, row.get("noisy"))):
+                inside(corpus, name)
+            yield Utterance(
+                key,
+                row.get("speaker") or "/".join(path.split("/")[:-1]) or _unknown(row.get("split", "")),
+                row.get("split", ""),
+                path,
+                row.get("noisy", ""),
+                row.get("noise", "") if row.get("noisy") else "",
+                snr if row.get("noisy") else None,
+            )
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise ValueError(f"{table}: cannot be read as CSV ({error})") from error
 

@@ -7,7 +7,7 @@ from itertools import chain
 from pathlib import Path, PurePath
 
 from hlsim.audio import EXTENSIONS, find_audio
-from hlsim.audiogram import Audiogram, read_audiograms
+from hlsim.audiogram import Audiogram, numbered_audiograms
 from hlsim.evaluation.scoring import Item
 
 _NAMED = 3  # of many missing files a message names the first few
@@ -87,10 +87,10 @@ def _common_names(roots: Iterable[str | Path], folders: list[dict[str, Path]]) -
 
 def _ears(path: str, names: list[str]) -> dict[str, Audiogram]:
     ears: dict[str, Audiogram] = {}
-    for line, (row, ear) in enumerate(read_audiograms(path), start=2):
+    for line, row, ear in numbered_audiograms(path):
         if not row.get("file"):
             raise ValueError(f"{path}, line {line}: no file named; needs a column 'file' with a name a row")
-        name = _name(PurePath(row["file"].strip()))
+        name = _name(PurePath(row["file"]))
         if name in ears:
             raise ValueError(f"{path}, line {line}: a second row of {row['file']}; allowed: one ear a file")
         ears[name] = ear

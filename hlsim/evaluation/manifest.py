@@ -21,9 +21,10 @@ from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
-from hlsim.audiogram import Audiogram, read_audiograms
+from hlsim.audiogram import Audiogram, numbered_audiograms
 from hlsim.calibration import check_full_scale
 from hlsim.evaluation.scoring import EARS, Item
+from hlsim.tables import read_rows
 
 _EAR_NAMES = {"": "", "l": "left", "left": "left", "r": "right", "right": "right"}
 _NEEDED = ("condition", "clean", "processed")
@@ -55,7 +56,7 @@ def read_manifest(
         raise ValueError(f"{folder}: no such folder; the manifest's paths are relative to it")
     ears = {} if audiograms is None else _ears(audiograms)
     items: dict[tuple[str, ...], Item] = {}
-    for line, row in enumerate(_rows(path), start=2):
+    for line, row in _rows(path):
         try:
             name, condition, item = _item(row, folder, ears, audiogram, full_scale_spl, spl)
             known = items.get(name)
@@ -82,19 +83,15 @@ def inside(root: Path, name: str, column: str) -> Path:
     return path
 
 
-def _rows(path: str | Path) -> list[dict[str, str]]:
+def _rows(path: str | Path) -> list[tuple[int, dict[str, str]]]:
+    """With the number of each row's line."""
     try:
-        with open(path, newline="", encoding="utf-8-sig") as file:
-            reader = csv.DictReader(file)
-            rows = [
-                {key.strip(): (value or "").strip() for key, value in row.items() if isinstance(key, str)}
-                for row in reader
-            ]
+        rows = list(read_rows(path))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise ValueError(f"{path}: cannot read the manifest: {error}") from error
     if not rows:
         raise ValueError(f"{path}: no rows; needs a header with {', '.join(_NEEDED)} and a row a file")
-    missing = [column for column in _NEEDED if column not in rows[0]]
+    missing = [column for column in _NEEDED if column not in rows[0][1]]
     if missing:
         raise ValueError(f"{path}: no column {', '.join(missing)}; needs {', '.join(_NEEDED)}")
     return rows
@@ -143,7 +140,7 @@ def _audiogram(
     ear: str,
     default: Audiogram | None,
 ) -> Audiogram:
-    levels = {key: value for key, value in row.items() if key.startswith("hl_")}
+    levels = {key: value for key, value in row.items() if key.lower().startswith("hl")}
     if any(levels.values()):  # then all: a blank is no threshold, and not one like its neighbour's either
         return Audiogram.from_row(levels)
     if row.get("audiogram"):
@@ -159,9 +156,9 @@ def _audiogram(
 
 def _ears(path: str | Path) -> dict[tuple[str, str], Audiogram]:
     ears: dict[tuple[str, str], Audiogram] = {}
-    for line, (row, audiogram) in enumerate(read_audiograms(path), start=2):
+    for line, row, audiogram in numbered_audiograms(path):
         try:
-            name = ((row.get("listener") or "").strip(), _ear((row.get("ear") or "").strip()))
+            name = (row.get("listener", ""), _ear(row.get("ear", "")))
             if not name[0]:
                 raise ValueError("no listener; needs a column 'listener'")
             if name in ears:

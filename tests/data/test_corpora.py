@@ -166,7 +166,7 @@ def test_a_table_says_more(tmp_path: Path) -> None:
         ("id\nx\n", "line 2: no file named"),
         ("file,split\na/1.wav,dev\n", "line 2: split 'dev'"),
         ("file,snr\na/1.wav,loud\n", "line 2: snr 'loud'"),
-        ("file\na/1.wav\na/1.wav\n", "line 3: a second row of a/1"),
+        ("file\na/1.wav\n\na/1.wav\n", "line 4: a second row of a/1"),
         ("file\n../a/1.wav\n", "leads out of"),
     ):
         table.write_text(text)

@@ -124,6 +124,11 @@ HEADER = "listener,ear,condition,clean,processed,audiogram,spl,full_scale_spl,sn
             ("condition,clean,processed,hl_250,hl_1000,hl_8000", "u,c.wav,u.wav,20,30,"),
             "line 2: .*hl_8000",
         ),
+        (("condition,clean,processed,HL_250,hl_8000", "u,c.wav,u.wav,20,30"), "line 2: .*'HL_250'"),
+        (
+            (HEADER, "", "L1,l,u,c.wav,u.wav,N3,,,", "", "L1,both,u,c.wav,u.wav,N3,,,"),
+            "study.csv, line 5: ear is 'both'",
+        ),
         (("condition,clean", "u,c.wav"), "no column processed; needs condition, clean, processed"),
         ((HEADER,), "no rows; needs a header"),
     ],
@@ -139,7 +144,10 @@ def test_bad_files(tmp_path: Path) -> None:
         read_manifest(tmp_path / "none.csv")
     path = write(tmp_path, HEADER, "L1,l,u,c.wav,u.wav,,,,")
     for rows, message in (
-        (("listener,ear,hl_250", "L1,l,10", "L1,left,20"), "ears.csv, line 3: a second row of listener L1"),
+        (
+            ("listener,ear,hl_250", "L1,l,10", "", "L1,left,20"),
+            "ears.csv, line 4: a second row of listener L1",
+        ),
         (("ear,hl_250", "l,10"), "ears.csv, line 2: no listener"),
         (("listener,ear,hl_250", "L1,x,10"), "ears.csv, line 2: ear is 'x'"),
     ):

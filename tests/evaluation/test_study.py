@@ -283,7 +283,7 @@ LEVELS = ",".join(N4.to_row().values())
     ("table", "message"),
     [
         (f"{HEADER}\na.b,{LEVELS}\n", "ears.csv: no audiogram of 1 of 2 files, p2/c"),
-        (f"{HEADER}\na.b,{LEVELS}\na.b.wav,{LEVELS}\n", "ears.csv, line 3: a second row of a.b.wav"),
+        (f"{HEADER}\na.b,{LEVELS}\n\na.b.wav,{LEVELS}\n", "ears.csv, line 4: a second row of a.b.wav"),
         (f"{HEADER[5:]}\n{LEVELS}\n", "ears.csv, line 2: no file named"),
         (f"{HEADER}\na.b,{LEVELS.replace('55', '555')}\n", "ears.csv, line 2: audiogram levels 555"),
     ],
