@@ -150,6 +150,13 @@ def check_extension(path: str | Path) -> str:
     return suffix
 
 
+def check_channels(path: str | Path, channels: int) -> int:
+    """Return the number, or raise ValueError for ogg with more than two: libvorbis takes the sixth for a subwoofer's."""
+    if Path(path).suffix.lower() == ".ogg" and channels > 2:
+        raise ValueError(f"{path}: {channels} channels; allowed: up to 2 in .ogg, more in .wav and .flac")
+    return channels
+
+
 def _check_stored_rate(sample_rate: int, suffix: str) -> int:
     """Return the rate, or raise ValueError unless it is a whole number of Hz that such a file holds."""
     highest = _HIGHEST_STORED[suffix]
@@ -165,13 +172,15 @@ def write_audio(path: str | Path, waveform: Tensor, sample_rate: int) -> None:
     """Write (channels, time) or (time,) samples as wav (32-bit float), flac (24-bit) or ogg, whole or not at all.
 
     Raises:
-        ValueError: unknown extension, another shape, a rate below 16 kHz or one that such a file cannot hold, samples
-            that are NaN or infinite, or, for flac and ogg, beyond full scale (they would be clipped).
+        ValueError: unknown extension, another shape, ogg with more than two channels, a rate below 16 kHz or one that
+            such a file cannot hold, samples that are NaN or infinite, or, for flac and ogg, beyond full scale (they would
+            be clipped).
     """
     target = Path(path)
     suffix = check_extension(path)
     if check_waveform(waveform).ndim > 2:
         raise ValueError(f"{path}: shape {tuple(waveform.shape)}; allowed: (channels, time) or (time,)")
+    check_channels(path, waveform.shape[:-1].numel())
     try:
         check_rate(min(sample_rate, HIGHEST_RATE) if is_finite(sample_rate) else sample_rate)
         rate = _check_stored_rate(sample_rate, suffix)

@@ -110,6 +110,7 @@ def test_a_failing_write_leaves_what_was_there(
         ("a.flac", torch.tensor([0.0, -1.5]), r"samples reach 1\.5, \.flac holds 1\.0; write \.wav"),
         ("a.ogg", torch.tensor([0.0, 1.5]), r"samples reach 1\.5, \.ogg holds 1\.0; write \.wav"),
         ("a.flac", torch.zeros(9, 10), "cannot be written"),
+        ("a.OGG", torch.zeros(3, 10), r"3 channels; allowed: up to 2 in \.ogg, more in \.wav and \.flac"),
         ("a.wav", torch.zeros(2, 3, 10), r"shape \(2, 3, 10\); allowed: \(channels, time\) or \(time,\)"),
         ("nowhere/a.wav", torch.zeros(10), "cannot be written"),
     ],

@@ -174,6 +174,18 @@ def test_files_that_cannot_be_in_and_out(
     assert {path.name for path in tmp_path.iterdir()} == {"in.flac", "plain"}
 
 
+@pytest.mark.parametrize("command", ["simulate", "compensate"])
+def test_ogg_of_many_channels_is_refused_before_anything_is_loaded(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], command: str
+) -> None:
+    soundfile.write(tmp_path / "in.wav", np.full((1600, 6), 0.01), 16000)
+    call = (command, tmp_path / "in.wav", tmp_path / "out.ogg", "--audiogram", "N3")
+    loaded = {"simulate": "--simulator", "compensate": "--compensator"}[command]
+    assert "6 channels; allowed: up to 2 in .ogg, more in .wav and .flac" in fails(
+        capsys, *call, loaded, "no-such-model"
+    )
+
+
 @pytest.mark.parametrize(
     "command",
     [

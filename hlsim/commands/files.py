@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 
 from compensators import load_compensator
-from hlsim.audio import HIGHEST_RATE, check_extension, read_audio, resample, write_audio
+from hlsim.audio import HIGHEST_RATE, check_channels, check_extension, read_audio, resample, write_audio
 from hlsim.commands.options import (
     Commands,
     add_command,
@@ -39,7 +39,9 @@ def _command(
     sub.add_argument(
         "input", type=Path, metavar="IN", help="wav, flac or ogg, 16 kHz or more, any number of channels"
     )
-    sub.add_argument("output", type=Path, metavar="OUT", help="wav (32-bit float), flac or ogg")
+    sub.add_argument(
+        "output", type=Path, metavar="OUT", help="wav (32-bit float), flac, or ogg, which takes two channels"
+    )
     audiogram_option(sub, required=True)
     full_scale_option(sub)
     return sub
@@ -64,6 +66,7 @@ def _pass_through(options: argparse.Namespace, build: Callable[[int], torch.nn.M
     check_extension(options.output)
     ear = read_ear(options.audiogram)
     waveform, rate = read_audio(options.input, any_rate=True)
+    check_channels(options.output, waveform.shape[0])
     inner = min(rate, HIGHEST_RATE)
     module = build(inner)
     with torch.no_grad():
