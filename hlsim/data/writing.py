@@ -55,8 +55,8 @@ def write_instances(
 
     Raises:
         ValueError: another process writes there, the folder holds instances of another plan or recipe, the disk is
-            full, or audio cannot be read any more: then what remains is written first, and ``write-faults.csv`` names
-            the files.
+            full, or audio cannot be read any more or its teacher fails on it: then what remains is written first, and
+            ``write-faults.csv`` names the files.
     """
     plan = Plan(folder, root)
     with alone(plan.folder / MANIFEST):  # what others have begun would look like leftovers
@@ -93,7 +93,7 @@ def _write(
         cells = (("path", "reason"), *((fault.path, fault.reason) for fault in faults))
         write_whole(report, "".join(map(csv_line, cells)))
         raise ValueError(
-            f"{len(faults)} of {len(plan.utterances)} utterances cannot be read any more, the first {faults[0].path}: "
+            f"{len(faults)} of {len(plan.utterances)} utterances have no instances, the first {faults[0].path}: "
             f"{faults[0].reason}; all are in {report}; the others are written"
         )
     report.unlink(missing_ok=True)
@@ -112,9 +112,9 @@ def make(folder: str, root: str, digest: str, recipe: Recipe, number: int) -> li
             continue
         try:
             instance = plan.instance(index)
+            heard = teacher(instance.signal[None], instance.thresholds[None])[0]
         except ValueError as error:
             return [Fault(plan.utterance(index).clean, str(error))]
-        heard = teacher(instance.signal[None], instance.thresholds[None])[0]
         write_whole(plan.path(index), replace(instance, impaired=heard).to_bytes())
     return []
 

@@ -120,7 +120,10 @@ def _page(result: Mapping[str, Any], spectrograms: bytes, shown: Item) -> str:
     sections = [
         Section("Side by side", [_what(result)], [side_by_side(result, given) for given in result["inputs"]])
     ]
-    about = f"{shown.about['condition']}, {shown.about['level']:g} dB SPL, {shown.about['severity']} loss"
+    about = (
+        f"{_INPUT_TITLES[shown.about['input']]}, {shown.about['condition']}, {shown.about['level']:g} dB SPL, "
+        f"{shown.about['severity']} loss"
+    )
     panel = Picture(spectrograms, "Log-magnitude spectrograms of the truth and each simulator", about)
     sections.append(Section("Spectrograms", pictures=[panel]))
     for name, entry in result["simulators"].items():
@@ -169,7 +172,8 @@ def _scatter(rows: Sequence[Mapping[str, Any]], measure: str, title: str) -> Cal
                 axes.scatter(*zip(*pairs, strict=True), s=12, alpha=0.7, color=f"C{number}", label=severity)
         axes.axline((1.0, 1.0), slope=1.0, color="0.5", linewidth=1.0, linestyle="--")
         axes.set(xlabel=f"{title}, true", ylabel=f"{title}, simulated")
-        axes.legend(fontsize="small")
+        if axes.collections:
+            axes.legend(fontsize="small")
 
     return draw
 
@@ -178,7 +182,8 @@ def _boxes(rows: Sequence[Mapping[str, Any]], key: str, title: str) -> Callable[
     def draw(axes: Any) -> None:
         groups = {s: [row[key] for row in rows if row["severity"] == s and key in row] for s in SEVERITIES}
         there = {severity: values for severity, values in groups.items() if values}
-        axes.boxplot([*there.values()], tick_labels=[*there])
+        if there:
+            axes.boxplot([*there.values()], tick_labels=[*there])
         axes.set(ylabel=title)
 
     return draw

@@ -8,7 +8,8 @@ import inspect
 import pickle
 import uuid
 import weakref
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ from hlsim.evaluation.fidelity_report import fidelity_result, write_fidelity
 from hlsim.evaluation.measures import version_of, versions_of
 from hlsim.evaluation.store import ScoreStore, key_of
 from hlsim.evaluation.truth import pyclarity_msbg
+from hlsim.extras import MissingExtraError
 from hlsim.msbg import MSBG
 
 STORE = "scores.jsonl"
@@ -66,11 +68,11 @@ def evaluate_simulators(
         compensator: called with a waveform and an ear.
         progress: called with what is done and all.
 
-    Returns: what ``fidelity.json`` holds. An item that a simulator fails on, or that has no STOI or PESQ, is listed with
-        the ``reasons`` and counts in no figure that it has no value for.
+    Returns: what ``fidelity.json`` holds. An item that a simulator or the truth fails on, or that has no STOI or PESQ, is
+        listed with the ``reasons`` and counts in no figure that it has no value for.
 
     Raises:
-        ValueError: data that cannot be used, or an unknown teacher or input.
+        ValueError: data that cannot be used, an unknown teacher or input, or no item that the truth does not fail on.
         MissingExtraError: pyclarity, pystoi, pesq or matplotlib is not installed.
     """
     if teacher not in ("pyclarity", "msbg"):
@@ -99,8 +101,14 @@ def evaluate_simulators(
         missing = [name for name in simulators if store.get(keys[name]) is None]
         failed: dict[str, str] = {}
         if missing:
-            truth = _truth(item, teacher)
-            true = _both(item.clean, truth, "true")
+            try:
+                truth = _truth(item, teacher)
+                true = _both(item.clean, truth, "true")
+            except MissingExtraError:
+                raise
+            except Exception as error:  # of this item alone: all simulators go without
+                failed = dict.fromkeys(missing, f"no truth: {error}")
+                missing = []
             for name in missing:
                 try:
                     with torch.no_grad():
@@ -119,8 +127,8 @@ def evaluate_simulators(
     result = fidelity_result(
         rows, teacher=teacher, items=items, seconds=seconds, seed=seed, levels=[*levels], inputs=[*inputs]
     )
-    shown = _shown(drawn)
-    panels = {"truth": _truth(shown, teacher)}
+    shown, truth = _shown(drawn, treat(drawn, inputs, compensator), teacher)
+    panels = {"truth": truth}
     for name, simulator in simulators.items():
         with contextlib.suppress(Exception), torch.no_grad():  # its failure is in the tables
             heard = simulator(shown.signal, shown.ear)
@@ -153,9 +161,15 @@ def _both(clean: Tensor, heard: Tensor, whose: str) -> dict[str, Any]:
     return {name: score.value for name, score in scores.items()} | {"reasons": reasons}
 
 
-def _shown(items: Sequence[Item]) -> Item:
-    """The item of the spectrograms: the first of moderate loss, or the first of all."""
-    return next((item for item in items if item.about["severity"] == "moderate"), items[0])
+def _shown(items: Sequence[Item], others: Iterable[Item], teacher: str) -> tuple[Item, Tensor]:
+    """The item of the spectrograms and its truth: the first of moderate loss, or of all, or of the others, with one."""
+    reason: Exception | None = None
+    for item in chain(sorted(items, key=lambda item: item.about["severity"] != "moderate"), others):
+        try:
+            return item, _truth(item, teacher)
+        except Exception as error:
+            reason = reason or error
+    raise ValueError(f"no item has a truth: {reason}")
 
 
 def weights_hash(module: nn.Module) -> str:

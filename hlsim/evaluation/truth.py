@@ -27,6 +27,7 @@ def pyclarity_msbg(waveform: Tensor, audiogram: Audiogram, sample_rate: int) -> 
     Shape: (time,) -> (time,), float64.
 
     Raises:
+        ValueError: the signal is so soft, 30 dB SPL as a rule, that the reference finds no active level in it.
         MissingExtraError: pyclarity is not installed.
     """
     msbg, utils = (require(f"clarity.evaluator.msbg.{name}", "eval") for name in ("msbg", "msbg_utils"))
@@ -56,5 +57,11 @@ def _undo_rescaling(signal: np.ndarray, measure_rms: Callable[..., tuple[float, 
     overall = np.sqrt(np.mean(signal**2))
     factor = 1.0
     for _ in range(5):
-        factor = float(measure_rms(signal * factor, RATE, -12)[0] / (overall * factor))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            factor = float(measure_rms(signal * factor, RATE, -12)[0] / (overall * factor))
+        if not math.isfinite(factor):
+            raise ValueError(
+                "too soft for pyclarity's active level, which starts at 40 dB SPL; allowed: louder signals, or the "
+                "teacher msbg"
+            )
     return factor

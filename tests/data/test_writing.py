@@ -18,6 +18,8 @@ import torch
 from torch import Tensor
 
 from hlsim.audio import write_audio
+from hlsim.audiogram import Audiogram
+from hlsim.calibration import level_spl
 from hlsim.data import files
 from hlsim.data.files import alone
 from hlsim.data.plan import prepare
@@ -225,14 +227,26 @@ def test_audio_that_went_bad_since_is_told_of_after_the_rest(plan: Path, voiceba
     bad = voicebank / "noisy_trainset_28spk_wav" / "p226_002.wav"
     good = bad.read_bytes()
     bad.write_bytes(b"gone")
-    with pytest.raises(
-        ValueError, match=r"1 of 6 utterances cannot be read any more, the first clean_.*p226_002"
-    ):
+    with pytest.raises(ValueError, match=r"1 of 6 utterances have no instances, the first clean_.*p226_002"):
         write(plan)
     assert len(list(plan.rglob("*.safetensors"))) == 20
     assert "not readable as audio" in (plan / "write-faults.csv").read_text()
     bad.write_bytes(good)
     assert write(plan) == 24 and not (plan / "write-faults.csv").exists()
+
+
+def fails_on_soft(signal: Tensor, ear: Audiogram, rate: int) -> Tensor:
+    if float(level_spl(signal)) < 65.0:
+        raise ValueError("too soft")
+    return signal
+
+
+def test_what_the_teacher_fails_on_is_told_by_the_name_of_its_utterance(plan: Path) -> None:
+    with pytest.raises(ValueError, match=r"of 6 utterances have no instances, the first clean_.*: too soft"):
+        write_instances(plan, Recipe(reference=fails_on_soft), jobs=1)
+    named = (plan / "write-faults.csv").read_text().splitlines()[1:]
+    assert named and all(line.startswith("clean_") and line.endswith(".wav,too soft") for line in named)
+    assert 0 < len(list(plan.rglob("*.safetensors"))) < 24
 
 
 @pytest.mark.slow

@@ -167,6 +167,37 @@ def test_what_a_simulator_fails_on_is_told(tmp_path: Path, speech_dir: Path, ear
     assert len((tmp_path / "scores.jsonl").read_text().splitlines()) == 4 * 8 - 2 * hard
 
 
+def test_what_the_truth_fails_on_is_told_and_is_no_picture(
+    tmp_path: Path, speech_dir: Path, ears: Path
+) -> None:
+    result = evaluate_simulators(
+        {"identity": Unimpaired(), "exact": MSBG(sample_rate=16000)},
+        speech=speech_dir / "valid",
+        audiograms=ears,
+        out=tmp_path,
+        items=2,
+        seconds=1.0,
+        levels=(28.0,),
+        inputs=("as-is", "louder"),
+    )
+    for simulator in result["simulators"].values():
+        soft, loud = (simulator["inputs"][given]["overall"] for given in ("as-is", "louder"))
+        assert (soft["n"], soft["snr_n"], loud["n"], loud["snr_n"]) == (2, 0, 2, 2)
+    text = (tmp_path / "fidelity.md").read_text()
+    assert text[text.index("## Failures") :].count("no truth: too soft for pyclarity's active level") == 4
+    assert "20 dB louder, clean, 28 dB SPL" in (tmp_path / "fidelity.html").read_text()
+    with pytest.raises(ValueError, match="no item has a truth: too soft for pyclarity's"):
+        evaluate_simulators(
+            {"identity": Unimpaired()},
+            speech=speech_dir / "valid",
+            audiograms=ears,
+            out=tmp_path,
+            items=1,
+            seconds=1.0,
+            levels=(28.0,),
+        )
+
+
 def test_a_stopped_comparison_goes_on_and_a_new_simulator_is_scored_alone(
     tmp_path: Path, speech_dir: Path, ears: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
