@@ -3,6 +3,13 @@
 from compensators.config import MappingConfig
 from compensators.mapping import MappingCompensator
 from compensators.nalr import NALR
-from compensators.pretrained import load_compensator, save_compensator
+from compensators.pretrained import load_compensator, save_compensator, trained_for
 
-__all__ = ["NALR", "MappingCompensator", "MappingConfig", "load_compensator", "save_compensator"]
+__all__ = [
+    "NALR",
+    "MappingCompensator",
+    "MappingConfig",
+    "load_compensator",
+    "save_compensator",
+    "trained_for",
+]

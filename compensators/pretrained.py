@@ -6,9 +6,10 @@ from compensators.config import MappingConfig
 from compensators.mapping import MappingCompensator
 from compensators.nalr import NALR
 from hlsim import __version__
+from hlsim.audiogram import Audiogram
 from hlsim.calibration import PASCAL_SPL
 from hlsim.neuro.config import NEURO_RATE
-from hlsim.pretrained import CONFIG, read_checkpoint, save_checkpoint
+from hlsim.pretrained import CONFIG, checkpoint_about, read_checkpoint, save_checkpoint
 
 KIND = "mapping-compensator"
 """What ``config.json`` of a checkpoint of such a compensator calls it."""
@@ -21,7 +22,7 @@ def load_compensator(
 
     Args:
         name: ``"nalr"``, the prescription; a checkpoint that ships with hlsim; or a checkpoint folder. One that was
-            trained for one ear names it in its ``config.json``, under ``about``, and is meant for no other.
+            trained for one ear is meant for no other: see ``trained_for``.
         sample_rate: of its inputs and outputs in Hz, 16000 to 48000.
         full_scale_spl: level in dB SPL of RMS 1.0.
 
@@ -53,3 +54,13 @@ def save_compensator(model: MappingCompensator, folder: str | Path) -> None:
     ):
         raise ValueError(f"{target}: holds something else; allowed: a new folder, or that of a checkpoint")
     save_checkpoint(target, KIND, model, model.config.to_dict(), {"hlsim": __version__})
+
+
+def trained_for(name: str | Path) -> Audiogram | None:
+    """The one ear that a compensator was trained for; None for those of all ears.
+
+    Raises:
+        ValueError: no such checkpoint, or what it tells is no ear.
+    """
+    told = None if str(name) == "nalr" else checkpoint_about(name).get("audiogram")
+    return None if told is None else Audiogram.from_dict(told)

@@ -139,6 +139,12 @@ def checkpoint_digest(name: str | Path) -> str:
     return str(record["sha256"])
 
 
+def checkpoint_about(name: str | Path) -> dict[str, Any]:
+    """How a checkpoint was trained, as it tells it. Raises ValueError where there is no such checkpoint."""
+    record = json.loads((find_checkpoint(name) / CONFIG).read_text(encoding="utf-8"))
+    return dict(record.get("about") or {})
+
+
 def shipped(kind: str | None = None) -> dict[str, Path]:
     """The checkpoints that ship with hlsim, name and folder; all kinds by default."""
     records = sorted(checkpoints_folder().glob(f"*/{CONFIG}"))

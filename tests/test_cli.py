@@ -8,9 +8,10 @@ import pytest
 import soundfile
 import torch
 
-from compensators import NALR
+from compensators import NALR, MappingCompensator, MappingConfig
 from hlsim import MSBG, Audiogram
 from hlsim.cli import main
+from hlsim.pretrained import save_checkpoint
 
 
 @pytest.fixture
@@ -103,6 +104,21 @@ def test_compensate_is_the_compensator(tmp_path: Path, utterance: Path) -> None:
     aided, _ = soundfile.read(out, dtype="float32")
     np.testing.assert_allclose(aided, expected.numpy(), atol=1e-7)
     assert np.std(aided) > 1.5 * np.std(samples)
+
+
+@pytest.mark.parametrize(("ear", "warned"), [("N4", False), ("N3", True)])
+def test_a_compensator_of_another_ear_warns(
+    tmp_path: Path, utterance: Path, capsys: pytest.CaptureFixture[str], ear: str, warned: bool
+) -> None:
+    model = MappingCompensator(MappingConfig(channels=8, blocks=1))
+    about = {"audiogram": Audiogram.standard("N4").to_dict()}
+    save_checkpoint(tmp_path / "mine", "mapping-compensator", model, model.config.to_dict(), about)
+    call = ["compensate", str(utterance), str(tmp_path / "out.wav"), "--compensator", str(tmp_path / "mine")]
+    assert main([*call, "--audiogram", ear]) == 0
+    line = (
+        f"hlsim: warning: {tmp_path / 'mine'} was trained for one ear, 55, 55, 55, 65, 70, 75, 80, 80 dB HL"
+    )
+    assert (line in capsys.readouterr().err) == warned
 
 
 def _bad_files(folder: Path) -> dict[str, tuple[Path, str]]:

@@ -13,6 +13,7 @@ from hlsim.commands.options import (
     audiogram_option,
     count,
     number,
+    other_ear,
     out_option,
     positive,
     read_ear,
@@ -74,11 +75,16 @@ def _evaluate_compensator(options: argparse.Namespace) -> None:
     named = dict(map(_labelled, options.names))
     if len(named) < len(options.names):
         raise ValueError(f"compensators {', '.join(options.names)}; allowed: one a label")
+    loaded = {label: load_compensator(name) for label, name in named.items()}
+    ear = read_ear(options.audiogram) if options.audiogram else None
+    notes = [line for label, name in named.items() for line in other_ear(label, name, ear)]
+    for line in notes:
+        print(f"hlsim: warning: {line}", file=sys.stderr)
     result = evaluate_compensators(
-        {label: load_compensator(name) for label, name in named.items()},
+        loaded,
         speech=options.speech,
         audiograms=options.audiograms,
-        audiogram=read_ear(options.audiogram) if options.audiogram else None,
+        audiogram=ear,
         noise=options.noise,
         simulator=options.simulator,
         out=options.out,
@@ -86,6 +92,7 @@ def _evaluate_compensator(options: argparse.Namespace) -> None:
         seconds=options.seconds,
         levels=options.levels,
         gain_ears=options.gain_ears,
+        notes=notes,
         seed=options.seed,
         jobs=options.jobs,
         progress=show_progress("outputs"),

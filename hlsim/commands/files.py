@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from hlsim.commands.options import (
     audiogram_option,
     check_files,
     full_scale_option,
+    other_ear,
     read_ear,
     read_simulator,
 )
@@ -28,7 +30,9 @@ def add(commands: Commands) -> None:
     )
     sub = _command(commands, "compensate", _compensate, "write what an impaired ear is to be given of a file")
     sub.add_argument(
-        "--compensator", default="nalr", help="nalr (the prescription), or a checkpoint's name or folder"
+        "--compensator",
+        default="nalr",
+        help="nalr (the prescription), or a checkpoint's name or folder; one of one ear alone warns of another",
     )
 
 
@@ -52,12 +56,14 @@ def _simulate(options: argparse.Namespace) -> None:
 
 
 def _compensate(options: argparse.Namespace) -> None:
-    _pass_through(
-        options,
-        lambda rate: load_compensator(
-            options.compensator, sample_rate=rate, full_scale_spl=options.full_scale_spl
-        ),
-    )
+    def build(rate: int) -> torch.nn.Module:
+        name = options.compensator
+        compensator = load_compensator(name, sample_rate=rate, full_scale_spl=options.full_scale_spl)
+        for line in other_ear(name, name, read_ear(options.audiogram)):
+            print(f"hlsim: warning: {line}", file=sys.stderr)
+        return compensator
+
+    _pass_through(options, build)
 
 
 def _pass_through(options: argparse.Namespace, build: Callable[[int], torch.nn.Module]) -> None:

@@ -13,6 +13,7 @@ from typing import Any
 
 import torch
 
+from compensators import trained_for
 from hlsim.audiogram import Audiogram
 from hlsim.extras import require
 from hlsim.msbg import MSBG
@@ -145,6 +146,15 @@ def read_ear(text: str) -> Audiogram:
         return Audiogram(levels)
     except ValueError as error:
         raise ValueError(f"--audiogram {text}: {error}") from error
+
+
+def other_ear(label: str, name: str, ear: Audiogram | None) -> list[str]:
+    """What there is to say of a compensator that was trained for one ear and is given another, or several (None)."""
+    own = trained_for(name)
+    if own is None or (ear is not None and own.thresholds == ear.thresholds):
+        return []
+    levels = ", ".join(f"{level:g}" for level in own.thresholds)
+    return [f"{label} was trained for one ear, {levels} dB HL, and is meant for no other."]
 
 
 def read_simulator(name: str, sample_rate: int, full_scale_spl: float = 94.0) -> torch.nn.Module:

@@ -32,7 +32,7 @@ FILES = ("compensators.json", "compensators.md", "compensators.html")
 def write_compensators(
     result: Mapping[str, Any], reports: Mapping[str, HaspiReport], out: str | Path
 ) -> None:
-    """Write ``compensator_result`` with ``gain_curves``, ``steady_tones`` and ``shifts`` in it into a folder.
+    """Write ``compensator_result`` with ``gain_curves``, ``steady_tones``, ``shifts`` and ``notes`` in it into a folder.
 
     Each file whole or not at all.
 
@@ -55,11 +55,12 @@ def _lead(result: Mapping[str, Any]) -> str:
     levels = ", ".join(f"{level:g}" for level in result["levels"])
     # few items do not come to every ear
     ears = len({own["name"] for own in (*result["rows"], *result["failures"])})
-    return (
+    about = (
         f"{result['items']} items of {result['seconds']:g} s, {ears} ears in turn, speech at {levels} "
         f"dB SPL in turn, seed {result['seed']}: {', '.join(result['limits'])}. HASPI v2 and HASQI v2 are pyclarity's, "
         "against the clean speech, in noise too."
     )
+    return " ".join([*result["notes"], about])
 
 
 def _sections(result: Mapping[str, Any], reports: Mapping[str, HaspiReport]) -> list[Section]:

@@ -58,6 +58,7 @@ def evaluate_compensators(
     seconds: float = 3.0,
     levels: Sequence[float] = INPUT_LEVELS,
     gain_ears: Sequence[str] = ("N3", "S2"),
+    notes: Sequence[str] = (),
     seed: int = 0,
     jobs: int | None = None,
     progress: Progress | None = None,
@@ -80,6 +81,7 @@ def evaluate_compensators(
         seconds: length of an item; HASPI is not to be trusted much under 3.
         levels: of the clean speech in dB SPL, in turn.
         gain_ears: standard ears of the gain curves and the steady tones; with ``audiogram``, that ear in their place.
+        notes: sentences that the report begins with.
         jobs: processes; None takes all cores. The figures do not depend on it.
         progress: called with the number of outputs judged and of all.
 
@@ -136,7 +138,7 @@ def evaluate_compensators(
     )
     shifted = sorted(result["rows"], key=lambda row: row["condition"] != "clean")[:_SHIFTED]
     shifts = shift_differences(aided, {row["item"]: drawn[row["item"]] for row in shifted})
-    result |= {"gain_curves": curves, "steady_tones": steady, "shifts": shifts}
+    result |= {"gain_curves": curves, "steady_tones": steady, "shifts": shifts, "notes": [*notes]}
     write_compensators(result, reports, out)
     return result
 

@@ -6,7 +6,14 @@ from typing import Any
 import pytest
 import torch
 
-from compensators import NALR, MappingCompensator, MappingConfig, load_compensator, save_compensator
+from compensators import (
+    NALR,
+    MappingCompensator,
+    MappingConfig,
+    load_compensator,
+    save_compensator,
+    trained_for,
+)
 from hlsim import Audiogram
 from hlsim.pretrained import save_checkpoint
 
@@ -40,6 +47,16 @@ def test_nalr_by_name() -> None:
     nalr = load_compensator("nalr", sample_rate=44100)
     assert isinstance(nalr, NALR) and nalr.sample_rate == 44100 and not nalr.training
     assert isinstance(load_compensator(Path("nalr")), NALR)
+
+
+def test_the_ear_that_a_compensator_was_trained_for(tmp_path: Path) -> None:
+    model, ear = MappingCompensator(MappingConfig(channels=8, blocks=1)), Audiogram.standard("N4")
+    for name, about in (("one", {"audiogram": ear.to_dict()}), ("all", {"audiogram": None}), ("old", {})):
+        save_checkpoint(tmp_path / name, "mapping-compensator", model, model.config.to_dict(), about)
+    assert [trained_for(tmp_path / name) for name in ("one", "all", "old")] == [ear, None, None]
+    assert trained_for("nalr") is trained_for("compensator-general") is None
+    with pytest.raises(ValueError, match="no checkpoint 'nobody'"):
+        trained_for("nobody")
 
 
 def test_unknown_name_and_other_kind(tmp_path: Path) -> None:

@@ -33,6 +33,7 @@ from hlsim.evaluation.judging import (
     read_ears,
 )
 from hlsim.evaluation.significance import paired_comparison
+from hlsim.pretrained import save_checkpoint
 
 pytest.importorskip("clarity")
 pytest.importorskip("matplotlib")
@@ -349,6 +350,14 @@ def test_command(tmp_path: Path, speech_dir: Path, capsys: pytest.CaptureFixture
     assert main([*command, "--audiogram", "N3"]) == 0
     said = capsys.readouterr()
     assert "| mine | 2 |" in said.out and "6 of 6 outputs" in said.err
+    assert "trained for one ear" not in said.out + said.err
+    model = MappingCompensator(MappingConfig(channels=8, blocks=1))
+    about = {"audiogram": Audiogram.standard("N4").to_dict()}
+    save_checkpoint(tmp_path / "n4", "mapping-compensator", model, model.config.to_dict(), about)
+    assert main([command[0], f"mine={tmp_path / 'n4'}", *command[2:], "--audiogram", "N3"]) == 0
+    said = capsys.readouterr()
+    note = "mine was trained for one ear, 55, 55, 55, 65, 70, 75, 80, 80 dB HL, and is meant for no other."
+    assert f"hlsim: warning: {note}" in said.err and note in said.out
     for arguments, line in (
         (command, "give either audiograms"),
         ([*command[:2], "mine=nalr", *command[2:], "--audiogram", "N3"], "one a label"),
