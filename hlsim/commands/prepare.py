@@ -102,7 +102,7 @@ def add(commands: Commands) -> None:
         commands,
         "draw-alignment",
         _draw_alignment,
-        "draw an utterance and what an ear hears of it, before and after alignment",
+        "draw an utterance and what an ear hears of it, raised to the utterance's level, before and after alignment",
     )
     sub.add_argument(
         "input", type=Path, metavar="IN", help="wav, flac or ogg, 16 to 48 kHz; its first channel"

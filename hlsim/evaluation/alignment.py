@@ -22,7 +22,7 @@ def draw_alignment(
 ) -> float:
     """Write a PNG of the 0.12 s about the loudest place: A as MSBG gives it, B aligned. Returns the delay in samples.
 
-    What is heard is drawn at the input's level, for it is the time that is to be seen.
+    What is heard is drawn raised to the input's level, for it is the time that is to be seen. The legend says how far.
 
     Shape: (time,) in pascals.
 
@@ -61,11 +61,19 @@ def draw_alignment(
         (f"A. MSBG as it is, {1000.0 * delay / sample_rate:.1f} ms late", f"B. aligned, {method} method"),
         strict=True,
     ):
-        gain = 10.0 ** (float(dbfs(signal) - dbfs(heard)) / 20.0)
+        gain, label = _raised(signal, heard)
         axes.plot(times, signal[first : first + shown], color="tab:blue", label="input")
-        axes.plot(times, gain * heard[first : first + shown], color="tab:red", label="MSBG", alpha=0.8)
+        axes.plot(times, gain * heard[first : first + shown], color="tab:red", label=label, alpha=0.8)
         axes.set(title=title, ylabel="Pa")
         axes.legend(fontsize="small", loc="upper right")
     axes.set(xlabel="s")
     figure.savefig(path, dpi=110, format="png")
     return delay
+
+
+def _raised(signal: Tensor, heard: Tensor) -> tuple[float, str]:
+    """The factor that brings what is heard to the signal's level, and the legend's word for it."""
+    if dbfs(heard) <= dbfs(torch.zeros_like(heard)):  # where levels end
+        return 1.0, "MSBG: nothing is heard"
+    gain_db = float(dbfs(signal) - dbfs(heard))
+    return 10.0 ** (gain_db / 20.0), f"MSBG, raised by {gain_db:.0f} dB"

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from hlsim.audio import resample
 from hlsim.audiogram import Audiogram
-from hlsim.calibration import set_level
+from hlsim.calibration import level_spl, set_level
 from hlsim.data.teacher import Teacher
 from hlsim.evaluation.alignment import draw_alignment
 
@@ -47,3 +47,23 @@ def test_the_picture(speech: list[tuple[Tensor, int]], tmp_path: Path, method: s
     with pytest.raises(ValueError, match="unknown alignments none"):
         draw_alignment(waveform[0], ear, rate, tmp_path / "b.png", method="none")
     assert not (tmp_path / "b.png").exists()
+
+
+@pytest.mark.parametrize("spl", [65.0, 20.0])
+def test_the_legend_says_how_far_what_is_heard_was_raised(
+    speech: list[tuple[Tensor, int]], tmp_path: Path, spl: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("matplotlib")
+    from matplotlib.axes import Axes
+
+    legends: list[list[str]] = []
+    monkeypatch.setattr(
+        Axes, "legend", lambda axes, **options: legends.append([line.get_label() for line in axes.lines])
+    )
+    waveform, rate = speech[0]
+    signal, ear = set_level(waveform[0], spl), Audiogram.standard("N6")
+    draw_alignment(signal, ear, rate, tmp_path / "a.png", method="structural")
+    heard = Teacher(rate, alignment="none")(signal[None], torch.tensor(ear.thresholds)[None])[0]
+    raised = spl - float(level_spl(heard))
+    label = f"MSBG, raised by {raised:.0f} dB" if spl > 50.0 else "MSBG: nothing is heard"
+    assert legends[0] == ["input", label] and legends[1][1].startswith(label[:10])
