@@ -42,11 +42,11 @@ def add(commands: Commands) -> None:
         "hl_250, ... or audiogram, spl or full_scale_spl where known",
     )
     sub.add_argument("--root", type=Path, help="folder of the manifest's paths; its own folder by default")
-    audiogram_option(sub, default=None, text=", for all files")
+    audiogram_option(sub, default=None, text=", for all files, or of a manifest for rows that bring none")
     sub.add_argument(
         "--audiograms",
         type=Path,
-        help=f"{EARS_TABLE}; and a column file (folders) or columns listener and ear (manifest)",
+        help=f"{EARS_TABLE}; and a column file (folders) or columns listener and ear (manifest, for rows without)",
     )
     sub.add_argument(
         "--measures",
@@ -57,7 +57,9 @@ def add(commands: Commands) -> None:
     level = sub.add_mutually_exclusive_group()
     full_scale_option(level)
     level.add_argument(
-        "--spl", type=positive, help="level of each clean file in dB SPL, in place of --full-scale-spl"
+        "--spl",
+        type=positive,
+        help="level of each clean file in dB SPL, in place of --full-scale-spl; of a manifest for rows that bring none",
     )
     sub.add_argument("--scores", type=Path, help="file of scores made so far; OUT/scores.jsonl by default")
     sub.add_argument("--jobs", type=count, help="processes; all cores by default")

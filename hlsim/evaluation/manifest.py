@@ -49,16 +49,19 @@ def read_manifest(
 
     Raises:
         ValueError: the file cannot be read, lacks a column, or a row is wrong: an ear other than left and right, a path
-            that leaves the root, no audiogram or level, a second row of a condition, or one unlike its item's others.
+            that leaves the root, no audiogram or level, a second row of a condition, or one unlike its item's others; or
+            no row takes ``audiogram``, ``audiograms`` or ``spl``.
     """
     folder = (Path(path).parent if root is None else Path(root)).resolve()
     if not folder.is_dir():
         raise ValueError(f"{folder}: no such folder; the manifest's paths are relative to it")
     ears = {} if audiograms is None else _ears(audiograms)
     items: dict[tuple[str, ...], Item] = {}
-    for line, row in _rows(path):
+    rows, taken = _rows(path), []
+    for line, row in rows:
         try:
             name, condition, item = _item(row, folder, ears, audiogram, full_scale_spl, spl)
+            taken.append(item.audiogram)
             known = items.get(name)
             if known is None:
                 items[name] = item
@@ -70,6 +73,16 @@ def read_manifest(
             items[name] = replace(known, processed={**known.processed, **item.processed})
         except ValueError as error:
             raise ValueError(f"{path}, line {line}: {error}") from error
+    for what, idle in (
+        ("audiogram", audiogram is not None and all(ear is not audiogram for ear in taken)),
+        (
+            "audiograms",
+            audiograms is not None and not any(own is ear for own in taken for ear in ears.values()),
+        ),
+        ("spl", spl is not None and all(row.get("spl") or row.get("full_scale_spl") for _, row in rows)),
+    ):
+        if idle:
+            raise ValueError(f"{path}: no row takes {what}, for each has its own; leave one of the two out")
     return list(items.values())
 
 

@@ -52,7 +52,7 @@ def haspi_report(
     Args:
         clean, before, after: folders of wav, flac or ogg files whose names below the folder, but for the extension, are
             the same. Of one name, the three files have one rate and one length.
-        audiogram: the ear, of all files; or else
+        audiogram: the ear, of all files, or of a manifest's rows that bring none; or else
         audiograms: for folders a CSV file with columns ``file`` and ``hl_250``,
             ``hl_500``, ... in dB HL, one row a file; for a manifest with ``listener`` and ``ear`` in place of ``file``.
         manifest: in place of the folders, a CSV file with a row a file, see ``hlsim.evaluation.manifest``.
@@ -63,7 +63,8 @@ def haspi_report(
         out: folder for ``report.json``, ``.md``, ``.tex``, ``.html`` and ``before-after.png``; None writes nothing.
         store: file of scores; by default ``scores.jsonl`` in ``out``, or none.
         full_scale_spl: level in dB SPL of a file with RMS 1.0.
-        spl: or else the level in dB SPL of every clean file; the processed ones are on the same scale.
+        spl: or else the level in dB SPL of every clean file, or of a manifest's rows that bring none; the processed ones
+            are on the same scale.
         seed: of the noise that HASPI and HASQI add; each item has its own from it.
         jobs: processes; None takes all cores. The scores do not depend on it.
         backend, scheduler: ``"loky"``, or ``"dask"`` with the address of a Dask scheduler.

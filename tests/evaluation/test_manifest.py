@@ -77,6 +77,23 @@ def test_levels_of_rows_and_of_all(tmp_path: Path) -> None:
     ]
 
 
+def test_what_no_row_takes_is_refused(tmp_path: Path) -> None:
+    own = write(tmp_path, "listener,condition,clean,processed,audiogram,spl", "L1,u,c.wav,u.wav,N3,65")
+    ears = write(tmp_path, "listener,hl_250", "L1,10", name="ears.csv")
+    for options in ({"audiogram": N3}, {"audiograms": ears}, {"spl": 70.0}):
+        with pytest.raises(
+            ValueError, match=rf"study\.csv: no row takes {next(iter(options))}, for each has its"
+        ):
+            read_manifest(own, **options)  # type: ignore[arg-type]
+    some = write(tmp_path, "listener,condition,clean,processed,audiogram,spl", "L1,u,c.wav,u.wav,,")
+    with pytest.raises(ValueError, match="no row takes audiogram,"):
+        read_manifest(some, audiogram=N3, audiograms=ears)
+    both = write(
+        tmp_path, "condition,clean,processed,audiogram,spl", "u,c.wav,u.wav,N4,60", "v,d.wav,v.wav,,"
+    )
+    assert [item.spl for item in read_manifest(both, audiogram=N3, spl=70.0)] == [60.0, 70.0]
+
+
 def test_root(tmp_path: Path) -> None:
     (tmp_path / "root").mkdir()
     path = write(tmp_path, "condition,clean,processed,audiogram", "u,a/../c.wav,u.wav,N3")
