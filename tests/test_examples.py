@@ -5,11 +5,14 @@ import importlib.util
 from pathlib import Path
 from types import ModuleType
 
+import numpy as np
 import pytest
 import torch
 
 from hlsim import MSBG, Audiogram
 from hlsim.audio import read_audio, write_audio
+from hlsim.msbg.ear import RATE
+from hlsim.msbg.filterbank import BANKS, gammatone_response
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 
@@ -57,6 +60,27 @@ def test_the_papers_last_table(tmp_path: Path, speech_dir: Path, capsys: pytest.
     # one utterance, two different ears of the file, two conditions
     assert len(table) == 4 and len({row["hl_1000"] for row in table}) == 2
     assert (out / "report" / "report.json").is_file()
+
+
+def test_delay_by_frequency(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("matplotlib")
+    example = load("delay.py")
+    given = example.bursts()
+    assert example.left_of_the_delay(given.roll(-7, -1), given) == [-7] * len(example.HERTZ)
+    # with no loss the model is linear: of 33 samples remains what the sum of the channels does not take back
+    points = 4 * RATE
+    response = gammatone_response(BANKS["none"], points).sum(0)
+    advance = np.gradient(np.unwrap(np.angle(response)), 2 * np.pi / points)
+    spectra = np.abs(np.fft.rfft(given.numpy(), points) * response) ** 2
+    expected = 33 - spectra @ advance / spectra.sum(-1)
+    left = example.left_of_the_delay(MSBG(Audiogram.standard("NH"))(given), given)
+    np.testing.assert_allclose(left, expected, atol=2)
+    drawn: list[Path] = []
+    monkeypatch.setattr(example, "draw", drawn.append)
+    example.main()
+    table = capsys.readouterr().out.splitlines()
+    assert table[2] == "| NH | none |" + "".join(f" {samples:+d} |" for samples in left)
+    assert len(table) == 2 + len(example.TABLED) and drawn == [EXAMPLES / "delay.png"]
 
 
 def test_other_sounds(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
