@@ -83,6 +83,27 @@ def test_delay_by_frequency(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Capt
     assert len(table) == 2 + len(example.TABLED) and drawn == [EXAMPLES / "delay.png"]
 
 
+def test_parity(
+    tmp_path: Path, speech_dir: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("clarity")
+    example = load("parity.py")
+    generator = torch.Generator().manual_seed(1)
+    for number, name in enumerate(("N4", "N5", "N6", "S3")):
+        ear, level = example.amplified(number, [], generator)
+        off = torch.tensor(ear.thresholds) - torch.tensor(Audiogram.standard(name).thresholds)
+        assert 0.0 < float(off.abs().max()) < 25.0 and 80.0 <= level <= 115.0
+    ears = tmp_path / "ears.csv"
+    rows = [{"listener": "N2", **Audiogram.standard("N2").to_row()}]
+    ears.write_text("\n".join([",".join(rows[0]), *(",".join(row.values()) for row in rows)]))
+    monkeypatch.setattr(example.sys, "argv", ["parity.py", str(speech_dir / "valid"), str(ears), "1"])
+    example.main()
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split(", ")[0] for line in lines] == ["44.1 kHz", "16 kHz"] * 2
+    assert all("80 to 115 dB SPL" in line for line in lines[2:])
+    assert all(float(line.split("worst ")[1].split()[0]) < 4e-2 for line in lines)
+
+
 def test_other_sounds(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     example = load("other_sounds.py")
     monkeypatch.setattr(example, "EARS", ("N3",))
