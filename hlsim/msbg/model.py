@@ -56,8 +56,8 @@ class MSBG(nn.Module):
         aligned: remove the model's delay and return as many samples as came in. Otherwise the reference's output, sample
             for sample at 44.1 kHz: with its delay, and where it smears 64 * (ceil(time / 64) + 3) samples long (in a
             mixed batch the shorter ones end in zeros).
-        rescale_active: first scale each signal by the ratio of its overall to its active RMS, as the reference does; a
-            gain of 1 to 3 dB down that depends on the utterance.
+        rescale_active: first scale each signal by the ratio of its overall to its active RMS, as the reference does with
+            one channel (two it scales alike); a gain of 1 to 3 dB down that depends on the utterance.
 
     Raises:
         ValueError: a rate, level or audiogram out of range.
