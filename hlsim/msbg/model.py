@@ -55,7 +55,10 @@ class MSBG(nn.Module):
         full_scale_spl: level in dB SPL of RMS 1.0.
         aligned: remove the model's delay and return as many samples as came in. Otherwise the reference's output, sample
             for sample at 44.1 kHz: with its delay, and where it smears 64 * (ceil(time / 64) + 3) samples long (in a
-            mixed batch the shorter ones end in zeros).
+            mixed batch the shorter ones end in zeros). Under 1000 samples, all is the first filter's onset, and what the
+            reference makes of a beginning, which is left out, counts: ``filtfilt``'s padding, and high-passes that start
+            behind the advance. From 701 samples such signals were up to 0.03 off, from 501 0.1, from 441 0.2; below,
+            pyclarity gives NaN or fails.
         rescale_active: first scale each signal by the ratio of its overall to its active RMS, as the reference does with
             one channel (two it scales alike); a gain of 1 to 3 dB down that depends on the utterance.
 
