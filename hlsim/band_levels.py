@@ -32,7 +32,7 @@ RISE = 20.0
 def band_levels(waveform: Tensor, sample_rate: int) -> Tensor:
     """Level of each band in each frame of 32 ms, every 16 ms.
 
-    The bands are equally wide on the ERB-number scale of Glasberg and Moore (1990), 1.24 ERB each, from 80 Hz to 7.5
+    The bands are equally wide on the ERB-number scale of Glasberg and Moore (1990), 1.25 ERB each, from 80 Hz to 7.5
     kHz, rectangular and without gaps, so that their powers add up to the signal's.
 
     Shape: (..., time) in pascals -> (..., frames, 24) in dB SPL; silence gives -86.
