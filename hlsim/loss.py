@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from hlsim import criteria
 from hlsim.audio import check_rate, check_waveform, resample
-from hlsim.audiogram import FREQUENCIES, AudiogramLike, as_thresholds
+from hlsim.audiogram import FREQUENCIES, AudiogramLike, as_thresholds, own_thresholds
 from hlsim.band_levels import HIGHEST, band_level_loss
 from hlsim.calibration import PASCAL_SPL, check_full_scale, gain_to_pascals, is_finite
 from hlsim.compiling import not_compiled
@@ -40,7 +40,8 @@ class HearingLossLoss(nn.Module):
     Levels matter, nothing is normalised: 65 dB SPL is RMS 0.035 at the default ``full_scale_spl``.
 
     Args:
-        audiogram: the ear or ears; may be given with each call instead.
+        audiogram: the ear or ears; may be given with each call instead. A tensor that is trained gets its gradient; it is
+            not registered either.
         simulator: ``"neuro-msbg"`` or another checkpoint's name or folder; ``"msbg"``, the exact model; or a module
             called as they are, which is frozen as it stands (give a copy of one that still trains).
         sample_rate: of the speech in Hz, 16000 to 48000. Neuro-MSBG judges the band under 8 kHz, above 16000 that under
@@ -84,14 +85,20 @@ class HearingLossLoss(nn.Module):
         self.reference, self.criterion, self.reduction = reference, criterion, reduction
         self.weights = _check_weights(CRITERIA[criterion] if weights is None else weights, criterion)
         with torch.device("cpu"):  # where the host is made on ``meta``, nobody gives the ear its values later
-            self.thresholds = None if audiogram is None else as_thresholds(audiogram).detach().clone()
+            thresholds = own_thresholds(audiogram)
         built = _build(simulator, self.sample_rate, self.full_scale_spl)
-        self._unregistered = (built.eval().requires_grad_(False),)  # in a tuple, nn.Module does not see it
+        # in a tuple, nn.Module does not see them
+        self._unregistered = (built.eval().requires_grad_(False), thresholds)
 
     @property
     def simulator(self) -> nn.Module:
         """The simulator, frozen."""
         return self._unregistered[0]
+
+    @property
+    def thresholds(self) -> Tensor | None:
+        """The ear or ears given to the constructor. Shape: (..., 8) dB HL."""
+        return self._unregistered[1]
 
     @not_compiled  # a compiled caller calls it as it is
     def forward(

@@ -265,6 +265,19 @@ def test_batch_is_the_mean_of_its_items(simulator: str, criterion: str, clean: T
     assert float(folded) == pytest.approx(float(torch.stack(items).mean()), rel=1e-5)
 
 
+@both
+def test_an_ear_can_be_trained(simulator: str, clean: Tensor) -> None:
+    ear = nn.Parameter(torch.tensor(N3.thresholds))
+    loss = HearingLossLoss(ear, simulator=simulator)
+    loss(3.0 * clean, clean).backward()
+    given = torch.tensor(N3.thresholds, requires_grad=True)
+    HearingLossLoss(simulator=simulator)(3.0 * clean, clean, given).backward()
+    assert ear.grad is not None and given.grad is not None and bool(ear.grad.any())
+    torch.testing.assert_close(ear.grad, given.grad)
+    assert list(loss.parameters()) == [] and loss.state_dict() == {}
+    assert torch.equal(copy.deepcopy(loss)(3.0 * clean, clean), loss(3.0 * clean, clean))
+
+
 def test_one_clip_in_several_ears(clean: Tensor) -> None:
     loss = HearingLossLoss([N3, N4], criterion="bands")
     alone = [loss(clean[0], clean[0], ear) for ear in (N3, N4)]
