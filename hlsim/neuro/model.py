@@ -25,6 +25,10 @@ class NeuroMSBG(EarNetwork):
     follow, and two decoders give a mask for the magnitude and a phase; the inverse transform makes a waveform. With
     ``config.prior``, MSBG's known gains come first and enter as a fourth channel, and the decoders correct them.
 
+    On a CPU, second derivatives and ``torch.func.grad`` work with ``cnn`` and ``lstm`` blocks, the latter alone with
+    ``transformer`` blocks, and neither with ``mamba`` blocks; ``torch.vmap``, ``torch.func.jvp`` and forward mode work
+    with none. What does not work raises an error.
+
     Args:
         config: sizes and choices.
         sample_rate, full_scale_spl: as ``EarNetwork``.

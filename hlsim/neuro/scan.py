@@ -9,7 +9,6 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 from torch.nn import functional
 
 # States held at a time: what fits a core's cache, or keeps a GPU busy. Items and channels are taken in blocks of so many.
@@ -36,7 +35,8 @@ def selective_scan(
 
     The signature of ``mamba_ssm``'s function of that name, whose kernel does the work where it imports and the tensors
     are on a GPU. Here the recurrence is a tree: about log2(time) steps, each over all times at once; the states are
-    computed again in the backward pass instead of being kept.
+    computed again in the backward pass instead of being kept. It has a first derivative only; asked for a second, it
+    raises RuntimeError.
 
     Shape: u, delta, z (items, channels, time); A (channels, states); B, C (items, states, time); D, delta_bias
         (channels,) -> (items, channels, time).
@@ -149,9 +149,20 @@ class _SelectiveScan(torch.autograd.Function):
         return y
 
     @staticmethod
-    @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, ...]:
-        delta, u, B, C, A = ctx.saved_tensors
+        slopes: tuple[Tensor, ...] = _Slopes.apply(grad, *ctx.saved_tensors)
+        return slopes
+
+
+class _Slopes(torch.autograd.Function):
+    """The gradients, by a function of its own: with ``once_differentiable``, ``torch.autograd.grad`` for chosen inputs
+    finds no way through a second derivative and leaves its part out.
+    """
+
+    @staticmethod
+    def forward(
+        ctx: Any, grad: Tensor, delta: Tensor, u: Tensor, B: Tensor, C: Tensor, A: Tensor
+    ) -> tuple[Tensor, ...]:
         grad_delta, grad_u = u.new_empty(u.shape), u.new_empty(u.shape)
         grad_A, grad_B, grad_C = torch.zeros_like(A), torch.zeros_like(B), torch.zeros_like(C)
         with torch.autocast(u.device.type, enabled=False):  # backward may be called in an autocast region
@@ -170,6 +181,12 @@ class _SelectiveScan(torch.autograd.Function):
                 grad_delta[rows, :, columns] = driven
                 grad_A[:, columns] += exponent.mul_(d[:, 1:].unsqueeze(-2)).sum((0, 1))
         return grad_delta, grad_u, grad_B, grad_C, grad_A
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, ...]:
+        raise RuntimeError(
+            "the selective scan (mamba blocks) has no second derivative; allowed: cnn or lstm blocks"
+        )
 
 
 class _Workspace:

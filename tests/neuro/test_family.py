@@ -190,3 +190,32 @@ def test_the_concatenated_audiogram_is_seen() -> None:
 def test_bad_choices(change: dict[str, object]) -> None:
     with pytest.raises(ValueError, match="allowed"):
         NeuroConfig.from_dict(change)
+
+
+@pytest.mark.parametrize("block", ["cnn", "lstm", "transformer", "mamba"])
+def test_derivatives_are_right_or_refused(block: str) -> None:
+    """What the docstring of NeuroMSBG says of each kind of block."""
+    model, ear = network(block).double(), Audiogram.standard("N3")
+    wave, along = 0.02 * torch.randn(2, 400, dtype=torch.float64), torch.randn(400, dtype=torch.float64)
+
+    def energy(waveform: torch.Tensor) -> torch.Tensor:
+        return model(waveform, ear).square().sum()
+
+    def slope(waveform: torch.Tensor, create_graph: bool = False) -> torch.Tensor:
+        given = waveform if create_graph else waveform.detach().requires_grad_()
+        return torch.autograd.grad(energy(given), given, create_graph=create_graph)[0]
+
+    if block == "mamba":
+        with pytest.raises(RuntimeError, match="autograd"):
+            torch.func.grad(energy)(wave)
+    else:
+        torch.testing.assert_close(torch.func.grad(energy)(wave), slope(wave))
+    given = wave.clone().requires_grad_()
+    first = (slope(given, create_graph=True) * along).sum()
+    if block in ("mamba", "transformer"):
+        with pytest.raises(RuntimeError, match=r"no second derivative|is not implemented"):
+            torch.autograd.grad(first, given)
+        return
+    (found,) = torch.autograd.grad(first, given)
+    expected = (slope(wave + 1e-8 * along) - slope(wave - 1e-8 * along)) / 2e-8
+    assert float((found - expected).norm() / expected.norm()) < 1e-4

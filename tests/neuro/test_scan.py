@@ -59,6 +59,16 @@ def test_gradcheck() -> None:
     assert torch.autograd.gradcheck(selective_scan, given)
 
 
+@pytest.mark.parametrize("wanted", range(5))
+def test_a_second_derivative_is_refused(wanted: int) -> None:
+    """For any input, where torch would leave out what it cannot follow."""
+    given = [tensor.requires_grad_() for tensor in arguments(7, 2, 2, 3)]
+    slopes = torch.autograd.grad(selective_scan(*given).square().sum(), given, create_graph=True)
+    for slope in slopes:
+        with pytest.raises(RuntimeError, match="no second derivative; allowed: cnn or lstm blocks"):
+            torch.autograd.grad(slope.sum(), given[wanted], retain_graph=True)
+
+
 def test_skip_gate_bias_and_softplus() -> None:
     u, delta, A, B, C = arguments(9)
     D, bias, z = torch.randn(5).double(), torch.randn(5).double(), torch.randn_like(u)
