@@ -69,15 +69,19 @@ def export_onnx(simulator: nn.Module, path: str | Path, *, seconds: float = 1.0,
     """Write ``export_program``'s program as an ONNX file, whole or not at all; with Mamba blocks that takes minutes.
 
     Raises:
-        ValueError: as ``export_program``, or an operation that ONNX or its exporter does not have; the message names it;
-            or onnxruntime's output is not the simulator's to 1e-4 of its peak, for noise at 64 dB SPL.
+        ValueError: as ``export_program``; no such folder; an operation that ONNX or its exporter does not have, which the
+            message names; or onnxruntime's output is not the simulator's to 1e-4 of its peak, for noise at 64 dB SPL.
         MissingExtraError: onnx, onnxscript or onnxruntime is not installed.
     """
+    target = Path(path)
+    if not target.parent.is_dir():  # the export takes minutes
+        raise ValueError(
+            f"{target}: there is no folder {str(target.parent)!r}; allowed: a file in a folder that exists"
+        )
     for module in ("onnx", "onnxscript", "onnxruntime"):
         require(module, "dev")
     program = export_program(simulator, seconds=seconds, items=items)
     assert isinstance(simulator, NeuroMSBG)  # others are refused there
-    target = Path(path)
     partial = target.with_name(f".{target.name}.{os.getpid()}.part")
     try:
         # not optimised: onnxscript's rules take a constant under 1e-8 for zero, and log(x + 1e-12) for log(x)

@@ -57,6 +57,12 @@ def test_what_cannot_be_exported_is_said(tmp_path: Path) -> None:
         export_program(load_pretrained("neuro-msbg", sample_rate=44100))
 
 
+def test_a_missing_folder_is_said_before_the_export(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("hlsim.export.export_program", lambda *_, **__: pytest.fail("exported"))
+    with pytest.raises(ValueError, match=r"there is no folder '.*missing'; allowed: a file in a folder"):
+        export_onnx(NeuroMSBG(NeuroConfig(channels=4, blocks=1)), tmp_path / "missing" / "simulator.onnx")
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(("items", "seconds"), [(2, 0.5), (1, 1.0)])
 def test_onnx_gives_the_outputs(tmp_path: Path, items: int, seconds: float) -> None:
