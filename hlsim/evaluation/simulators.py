@@ -28,6 +28,8 @@ from hlsim.msbg import MSBG
 
 STORE = "scores.jsonl"
 
+_SHORTEST = 0.02  # s: a window of the spectrograms
+
 _REVISION = 2  # of what is measured: raise it where that changes a figure
 
 Report = Callable[[int, int], None]
@@ -82,6 +84,10 @@ def evaluate_simulators(
             f"{items} items of {len(inputs)} inputs at {len(levels)} levels for {len(simulators)} simulators; allowed: "
             "1 or more of each"
         )
+    if len(set(inputs)) < len(inputs):
+        raise ValueError(f"inputs {', '.join(inputs)}; allowed: each once")
+    if not seconds >= _SHORTEST:
+        raise ValueError(f"items of {seconds:g} s; allowed: {_SHORTEST:g} or more, and 2 for PESQ and STOI")
     drawn = draw_items(speech, noise, audiograms, items=items, seconds=seconds, seed=seed, levels=levels)
     store = ScoreStore(Path(out) / STORE)
     # haspi's for pyclarity's, whose MSBG is the truth

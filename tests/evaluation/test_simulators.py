@@ -287,3 +287,33 @@ def test_settings_of_any_kind_tell_modules_apart(monkeypatch: pytest.MonkeyPatch
 def test_unknown_teacher(tmp_path: Path, speech_dir: Path, ears: Path) -> None:
     with pytest.raises(ValueError, match="allowed: pyclarity, msbg"):
         evaluate_simulators({}, speech=speech_dir, audiograms=ears, out=tmp_path, teacher="nobody")
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"inputs": ("as-is", "louder", "as-is")}, "inputs as-is, louder, as-is; allowed: each once"),
+        ({"seconds": 0.01}, r"items of 0\.01 s; allowed: 0\.02 or more"),
+    ],
+)
+def test_what_would_fail_or_count_twice_is_refused_before_the_work(
+    tmp_path: Path, speech_dir: Path, ears: Path, options: dict[str, Any], said: str
+) -> None:
+    out = tmp_path / "out"
+    call: dict[str, Any] = {"speech": speech_dir / "valid", "audiograms": ears, "teacher": "msbg", "items": 1}
+    with pytest.raises(ValueError, match=said):
+        evaluate_simulators({"identity": Unimpaired()}, **call, out=out, **options)
+    assert not out.exists()
+
+
+def test_the_shortest_items_that_are_taken(tmp_path: Path, speech_dir: Path, ears: Path) -> None:
+    result = evaluate_simulators(
+        {"identity": Unimpaired()},
+        speech=speech_dir / "valid",
+        audiograms=ears,
+        teacher="msbg",
+        items=1,
+        seconds=0.02,
+        out=tmp_path / "out",
+    )
+    assert result["simulators"]["identity"]["inputs"]["as-is"]["overall"]["snr_n"] == 1
