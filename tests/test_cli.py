@@ -227,6 +227,10 @@ def test_options_that_contradict_each_other(tmp_path: Path, capsys: pytest.Captu
     assert "argument --full-scale-spl: not allowed with argument --spl" in error
     call = ["evaluate-simulator", "msbg", "msbg", "--speech", "s", "--audiograms", "a", *out]
     assert "simulators msbg, msbg; allowed: each once" in fails(capsys, *call)
+    call = ["evaluate-simulator", "msbg", "--speech", "s", "--audiograms", "a", "--compensator", "nalr", *out]
+    assert "--compensator without --inputs compensated; allowed" in fails(capsys, *call)
+    call = ["evaluate-compensator", "nalr", "--speech", "s", "--audiogram", "N3", "--gain-ears", "S3", *out]
+    assert "--gain-ears with --audiogram; allowed: without it" in fails(capsys, *call)
     pytest.importorskip("lightning")
     call = ["train-compensator", "--speech", "s", "--audiogram", "N4", "--audiograms", "a", *out]
     assert "--audiogram with --audiograms; allowed: one ear, or a CSV" in fails(capsys, *call)

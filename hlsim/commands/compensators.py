@@ -22,6 +22,8 @@ from hlsim.commands.options import (
 )
 from hlsim.extras import require
 
+GAIN_EARS = ["N3", "S2"]
+
 
 def add(commands: Commands) -> None:
     sub = add_command(
@@ -57,9 +59,9 @@ def add(commands: Commands) -> None:
     sub.add_argument(
         "--gain-ears",
         nargs="+",
-        default=["N3", "S2"],
+        default=GAIN_EARS,
         metavar="EAR",
-        help="standard ears of the gain curves and tones",
+        help="standard ears of the gain curves and tones; with --audiogram that ear's are drawn",
     )
     sub.add_argument("--jobs", type=count, help="processes; all cores by default")
     seed_option(sub)
@@ -67,6 +69,8 @@ def add(commands: Commands) -> None:
 
 
 def _evaluate_compensator(options: argparse.Namespace) -> None:
+    if options.audiogram and options.gain_ears != GAIN_EARS:
+        raise ValueError("--gain-ears with --audiogram; allowed: without it, for that ear's gains are drawn")
     for module in ("clarity", "matplotlib"):
         require(module, "eval")
     from compensators import load_compensator

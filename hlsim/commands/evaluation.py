@@ -60,6 +60,8 @@ def add(commands: Commands) -> None:
 def _evaluate_simulator(options: argparse.Namespace) -> None:
     if len(set(options.names)) < len(options.names):
         raise ValueError(f"simulators {', '.join(options.names)}; allowed: each once")
+    if options.compensator and "compensated" not in options.inputs:
+        raise ValueError("--compensator without --inputs compensated; allowed: only with it")
     for module in ("clarity", "pystoi", "pesq"):
         require(module, "eval")
     from compensators import load_compensator
