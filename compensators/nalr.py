@@ -2,6 +2,7 @@
 
 from functools import lru_cache
 from numbers import Integral
+from typing import Any
 
 import numpy as np
 import torch
@@ -11,12 +12,13 @@ from scipy.signal.windows import hamming
 from torch import Tensor, nn
 
 from hlsim.audio import check_rate, check_waveform
-from hlsim.audiogram import FREQUENCIES, AudiogramLike, own_thresholds
+from hlsim.audiogram import FREQUENCIES, HIGHEST_LEVEL, AudiogramLike, own_thresholds
 from hlsim.calibration import PASCAL_SPL, check_full_scale
 from hlsim.fir import frequency_sampling_fir
 from hlsim.msbg.model import resolve_thresholds
 
 _BIAS = {250.0: -17.0, 500.0: -8.0, 1000.0: 1.0, 2000.0: -1.0, 4000.0: -2.0, 6000.0: -2.0}
+_LIMITS: dict[str, Any] = {"highest": HIGHEST_LEVEL, "taker": "NAL-R"}
 _PRESCRIBED = [FREQUENCIES.index(hz) for hz in _BIAS]
 
 
@@ -55,7 +57,7 @@ class NALR(nn.Module):
                 f"order of the NAL-R filter is {order!r}; allowed: even whole numbers from 2 to 1022"
             )
         self.order: int = int(order)
-        self.register_buffer("thresholds", own_thresholds(audiogram), persistent=False)
+        self.register_buffer("thresholds", own_thresholds(audiogram, **_LIMITS), persistent=False)
 
     def forward(self, waveform: Tensor, audiogram: AudiogramLike | None = None) -> Tensor:
         """The amplified waveform.
@@ -63,12 +65,12 @@ class NALR(nn.Module):
         Shape: (..., time) and one audiogram or (..., 8) that broadcasts over the leading dimensions -> (..., time).
 
         Raises:
-            ValueError: no audiogram, levels outside -10 to 100 dB HL, or shapes that do not fit.
+            ValueError: no audiogram, levels outside -10 to 120 dB HL, or shapes that do not fit.
         """
         check_waveform(waveform)
         if audiogram is None and self.thresholds is None:
             raise ValueError("no audiogram: give one when building NALR or with the call")
-        thresholds = resolve_thresholds(self.thresholds, audiogram, waveform)
+        thresholds = resolve_thresholds(self.thresholds, audiogram, waveform, **_LIMITS)
         with torch.autocast(waveform.device.type, enabled=False):
             signal = waveform.to(torch.promote_types(waveform.dtype, torch.float32))
             time = signal.shape[-1]

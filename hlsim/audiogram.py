@@ -208,19 +208,21 @@ AudiogramLike = Audiogram | Sequence[Audiogram] | Tensor
 """One ear, one a batch item, or a (..., 8) tensor of dB HL."""
 
 
-def as_thresholds(audiogram: AudiogramLike) -> Tensor:
-    """Thresholds that a simulator takes.
+def as_thresholds(
+    audiogram: AudiogramLike, *, highest: float = HIGHEST_SIMULATED, taker: str = "a simulator"
+) -> Tensor:
+    """Thresholds that a simulator takes, or another ``taker``, up to ``highest`` dB HL.
 
     Returns: (8,) for one ear, (batch, 8) for a sequence, the tensor itself otherwise; dB HL.
 
     Raises:
         ValueError: not an audiogram, a complex or bool tensor, a last dimension other than 8, NaN, or levels outside -10
-            to 100 dB HL.
+            to ``highest`` dB HL.
     """
     if isinstance(audiogram, Audiogram):
-        return torch.tensor(_simulated(audiogram.thresholds))
+        return torch.tensor(_taken(audiogram.thresholds, highest, taker))
     if isinstance(audiogram, Sequence) and audiogram and all(isinstance(ear, Audiogram) for ear in audiogram):
-        return torch.tensor([_simulated(ear.thresholds) for ear in audiogram])
+        return torch.tensor([_taken(ear.thresholds, highest, taker) for ear in audiogram])
     if not isinstance(audiogram, Tensor):
         raise ValueError(
             f"audiogram is {type(audiogram).__name__}; allowed: an Audiogram, a sequence of them, or a (..., 8) tensor"
@@ -234,18 +236,18 @@ def as_thresholds(audiogram: AudiogramLike) -> Tensor:
             f"audiogram tensor of shape {tuple(levels.shape)}; allowed: (..., 8), dB HL at {_listed(FREQUENCIES)} Hz"
         )
     with torch.no_grad():
-        good = ((levels >= LOWEST_LEVEL) & (levels <= HIGHEST_SIMULATED)).all(-1)
+        good = ((levels >= LOWEST_LEVEL) & (levels <= highest)).all(-1)
         if not bool(good.all()):
-            _simulated(levels[~good][0].tolist())
+            _taken(levels[~good][0].tolist(), highest, taker)
     return levels
 
 
-def _simulated(levels: Sequence[float]) -> Sequence[float]:
-    """The levels, or ValueError where no simulator takes them."""
-    if not all(LOWEST_LEVEL <= level <= HIGHEST_SIMULATED for level in levels):
+def _taken(levels: Sequence[float], highest: float, taker: str) -> Sequence[float]:
+    """The levels, or ValueError where the taker does not take them."""
+    if not all(LOWEST_LEVEL <= level <= highest for level in levels):
+        reason = " (MSBG is singular at 105)" if highest == HIGHEST_SIMULATED else ""
         raise ValueError(
-            f"audiogram levels {_listed(levels)} dB HL; a simulator takes "
-            f"{LOWEST_LEVEL:g} to {HIGHEST_SIMULATED:g} (MSBG is singular at 105)"
+            f"audiogram levels {_listed(levels)} dB HL; {taker} takes {LOWEST_LEVEL:g} to {highest:g}{reason}"
         )
     return levels
 
@@ -269,12 +271,12 @@ def _instead(given: object) -> str:
     return f"; write {f'[{make}, ...]' if several else make}"
 
 
-def own_thresholds(audiogram: AudiogramLike | None) -> Tensor | None:
+def own_thresholds(audiogram: AudiogramLike | None, **limits: Any) -> Tensor | None:
     """``as_thresholds`` to keep: a copy, for the caller may write into its tensor; one that is trained stays itself."""
     if audiogram is None:
         return None
     with torch.inference_mode(False):  # it may be trained through later
-        levels = as_thresholds(audiogram)
+        levels = as_thresholds(audiogram, **limits)
         return levels if levels.requires_grad else levels.clone()
 
 

@@ -104,6 +104,9 @@ def test_compensate_is_the_compensator(tmp_path: Path, utterance: Path) -> None:
     aided, _ = soundfile.read(out, dtype="float32")
     np.testing.assert_allclose(aided, expected.numpy(), atol=1e-7)
     assert np.std(aided) > 1.5 * np.std(samples)
+    assert (
+        main(["compensate", str(utterance), str(out), "--audiogram", "N7"]) == 0
+    )  # which no simulator takes
 
 
 @pytest.mark.parametrize(("ear", "warned"), [("N4", False), ("N3", True)])

@@ -46,8 +46,8 @@ def audiogram_option(
         "--audiogram",
         default=default,
         required=required,
-        help="NH, N1 to N7 (simulators take up to N6), S1 to S3, or eight levels in dB HL at 250, 500, 1000, 2000, "
-        f"3000, 4000, 6000, 8000 Hz, separated by commas{text}",
+        help="NH, N1 to N7 (simulators and trained compensators take up to N6), S1 to S3, or eight levels in dB HL at "
+        f"250, 500, 1000, 2000, 3000, 4000, 6000, 8000 Hz, separated by commas{text}",
     )
 
 

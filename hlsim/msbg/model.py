@@ -2,6 +2,7 @@
 
 import math
 from functools import partial
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -221,15 +222,20 @@ class MSBG(nn.Module):
         return parts[0] if len(parts) == 1 else torch.cat(parts, -1)
 
 
-def resolve_thresholds(stored: Tensor | None, audiogram: AudiogramLike | None, waveform: Tensor) -> Tensor:
+def resolve_thresholds(
+    stored: Tensor | None, audiogram: AudiogramLike | None, waveform: Tensor, **limits: Any
+) -> Tensor:
     """The call's audiogram, or else the stored one, on the waveform's device, checked to fit its leading dimensions.
+
+    Args:
+        limits: of ``as_thresholds``.
 
     Raises:
         ValueError: there is neither, or the shapes do not broadcast.
     """
     if audiogram is None and stored is None:
         raise ValueError("no audiogram: give one when building the simulator or with the call")
-    thresholds = as_thresholds(audiogram) if audiogram is not None else stored
+    thresholds = as_thresholds(audiogram, **limits) if audiogram is not None else stored
     assert thresholds is not None
     try:
         if thresholds.ndim > 1:

@@ -56,7 +56,7 @@ class EarNetwork(nn.Module):
         check_waveform(waveform)
         if audiogram is None:
             raise ValueError(f"no audiogram: give one with each call, {type(self).__name__} holds none")
-        thresholds = resolve_thresholds(None, audiogram, waveform)
+        thresholds = resolve_thresholds(None, audiogram, waveform, taker=type(self).__name__)
         with torch.autocast(waveform.device.type, enabled=False):
             dtype = self._dtype
             batch = torch.broadcast_shapes(waveform.shape[:-1], thresholds.shape[:-1])

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from compensators import NALR
+from compensators import NALR, MappingCompensator, MappingConfig
 from compensators.nalr import nalr_gains_db
 from hlsim import Audiogram
 from hlsim.audiogram import FREQUENCIES, draw_thresholds
@@ -24,7 +24,7 @@ def reference(waveform: Tensor, ear: Audiogram, rate: int, order: int = 220) -> 
 
 
 @pytest.mark.parametrize("rate", [16000, 22050, 44100])
-@pytest.mark.parametrize("name", EARS)
+@pytest.mark.parametrize("name", [*EARS, "N7"])
 def test_equals_pyclarity(name: str, rate: int) -> None:
     ear = Audiogram.standard(name)
     waveform = torch.randn(4001)
@@ -114,6 +114,14 @@ def test_refuses_what_it_cannot_use() -> None:
         nalr(torch.randn(3, 100), torch.zeros(2, 8))
     with pytest.raises(ValueError, match="16000 to 48000"):
         NALR(sample_rate=8000)
+    for call in (NALR, lambda ears: nalr(torch.randn(100), ears)):
+        with pytest.raises(ValueError, match=r"121 dB HL; NAL-R takes -10 to 120$"):
+            call(torch.full((8,), 121.0))
+
+
+def test_a_trained_compensator_is_named_where_it_refuses_what_the_prescription_takes() -> None:
+    with pytest.raises(ValueError, match="105 dB HL; MappingCompensator takes -10 to 100"):
+        MappingCompensator(MappingConfig(channels=8, blocks=1))(torch.randn(100), Audiogram.standard("N7"))
 
 
 @pytest.mark.parametrize("order", [221, 2.0, "220", None, True, 0, 1024])
