@@ -133,7 +133,7 @@ def evaluate_compensators(
             "seed": seed,
             "levels": [*levels],
             "ears": [name for name, _ in ears],
-            "simulator": Path(simulator).name,
+            "simulator": str(simulator),
         },
     )
     shifted = sorted(result["rows"], key=lambda row: row["condition"] != "clean")[:_SHIFTED]

@@ -33,7 +33,7 @@ from hlsim.evaluation.judging import (
     read_ears,
 )
 from hlsim.evaluation.significance import paired_comparison
-from hlsim.pretrained import save_checkpoint
+from hlsim.pretrained import find_checkpoint, save_checkpoint
 
 pytest.importorskip("clarity")
 pytest.importorskip("matplotlib")
@@ -299,8 +299,10 @@ def test_a_stopped_run_goes_on_and_new_weights_are_judged_anew(
     measured: list[int] = []
     monkeypatch.setattr(compensators, "judge", original)
     monkeypatch.setattr(judging, "_figures", lambda *arguments: measured.append(1))
-    other = evaluate_compensators({"own": Gain()}, **options, simulator="neuro-msbg-cnn", out=parts)
+    folder = find_checkpoint("neuro-msbg-cnn")
+    other = evaluate_compensators({"own": Gain()}, **options, simulator=folder, out=parts)
     assert not measured
+    assert f"with the Neuro-MSBG {folder}." in (parts / "compensators.md").read_text()
     for before, after in zip(whole["rows"], other["rows"], strict=True):
         for name, figures in before["figures"].items():
             assert {key for key, value in figures.items() if value != after["figures"][name][key]} == {
