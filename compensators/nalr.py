@@ -1,6 +1,6 @@
 """NAL-R, the closed-form prescription that a trained compensator has to beat."""
 
-from functools import lru_cache
+from functools import lru_cache, partial
 from numbers import Integral
 from typing import Any
 
@@ -14,12 +14,13 @@ from torch import Tensor, nn
 from hlsim.audio import check_rate, check_waveform
 from hlsim.audiogram import FREQUENCIES, HIGHEST_LEVEL, AudiogramLike, own_thresholds
 from hlsim.calibration import PASCAL_SPL, check_full_scale
+from hlsim.constants import constant
 from hlsim.fir import frequency_sampling_fir
 from hlsim.msbg.model import resolve_thresholds
 
 _BIAS = {250.0: -17.0, 500.0: -8.0, 1000.0: 1.0, 2000.0: -1.0, 4000.0: -2.0, 6000.0: -2.0}
 _LIMITS: dict[str, Any] = {"highest": HIGHEST_LEVEL, "taker": "NAL-R"}
-_PRESCRIBED = [FREQUENCIES.index(hz) for hz in _BIAS]
+_PRESCRIBED = tuple(FREQUENCIES.index(hz) for hz in _BIAS)
 
 
 class NALR(nn.Module):
@@ -82,10 +83,10 @@ class NALR(nn.Module):
 
     def taps(self, thresholds: Tensor) -> Tensor:
         """Coefficients of the filter, symmetric about the middle one. Shape: (..., 8) dB HL -> (..., order + 1)."""
-        design = torch.from_numpy(_design(self.order)).to(thresholds.device)
-        hz = torch.linspace(0.0, self.sample_rate / 2.0, self.order + 1, dtype=torch.float64)
-        gains = interpolate_gains(nalr_gains_db(thresholds.double()), hz.to(thresholds.device))
-        taps = (10.0 ** (gains / 20.0)) @ design
+        fixed = partial(constant, dtype=torch.float64, device=thresholds.device)
+        hz = fixed(_steps_hz, self.sample_rate, self.order + 1)
+        gains = interpolate_gains(nalr_gains_db(thresholds.double()), hz)
+        taps = (10.0 ** (gains / 20.0)) @ fixed(_design, self.order)
         flat = torch.zeros_like(taps)
         flat[..., self.order // 2] = 1.0
         return torch.where(_impaired(thresholds), taps, flat)
@@ -102,10 +103,11 @@ def nalr_gains_db(thresholds: Tensor) -> Tensor:
 
     Shape: (..., 8) dB HL -> (..., 8) dB.
     """
-    losses = thresholds[..., _PRESCRIBED]
+    losses = _prescribed(thresholds)
     three = losses[..., 1:4].sum(-1, keepdim=True)  # at 500, 1000 and 2000 Hz
     common = torch.where(three <= 180.0, 0.05 * three, 9.0 + 0.116 * (three - 180.0))
-    gains = (common + 0.31 * losses + losses.new_tensor(list(_BIAS.values()))).clamp_min(0.0)
+    bias = constant(tuple, tuple(_BIAS.values()), dtype=losses.dtype, device=losses.device)
+    gains = (common + 0.31 * losses + bias).clamp_min(0.0)
     low, high = gains[..., :4], gains[..., 4:]
     between = 0.5 * (low[..., -1:] + high[..., :1])
     return torch.where(_impaired(thresholds), torch.cat((low, between, high, high[..., -1:]), -1), 0.0)
@@ -113,14 +115,24 @@ def nalr_gains_db(thresholds: Tensor) -> Tensor:
 
 def interpolate_gains(gains_db: Tensor, hz: Tensor) -> Tensor:
     """Gains between the audiometric frequencies, linear in Hz and flat beyond. Shape: (..., 8), (n,) -> (..., n)."""
-    points = torch.tensor(FREQUENCIES, dtype=hz.dtype, device=hz.device)
+    points = constant(tuple, FREQUENCIES, dtype=hz.dtype, device=hz.device)
     right = torch.bucketize(hz, points).clamp(1, len(FREQUENCIES) - 1)
     place = ((hz - points[right - 1]) / (points[right] - points[right - 1])).clamp(0.0, 1.0).to(gains_db)
     return gains_db[..., right - 1] * (1.0 - place) + gains_db[..., right] * place
 
 
 def _impaired(thresholds: Tensor) -> Tensor:
-    return (thresholds[..., _PRESCRIBED] > 0.0).any(-1, keepdim=True)
+    return (_prescribed(thresholds) > 0.0).any(-1, keepdim=True)
+
+
+def _prescribed(thresholds: Tensor) -> Tensor:
+    """At the formula's frequencies. Shape: (..., 8) -> (..., 6)."""
+    places = constant(tuple, _PRESCRIBED, dtype=torch.int64, device=thresholds.device)
+    return thresholds.index_select(-1, places)
+
+
+def _steps_hz(sample_rate: int, count: int) -> Tensor:
+    return torch.linspace(0.0, sample_rate / 2.0, count, dtype=torch.float64)
 
 
 @lru_cache(maxsize=8)

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from hlsim.calibration import PASCAL_SPL
+from hlsim.constants import constant
 from hlsim.spectrum import STFT, power
 
 BANDS = 24
@@ -42,7 +43,7 @@ def band_levels(waveform: Tensor, sample_rate: int) -> Tensor:
     spectrum = stft.analyse(waveform.reshape(-1, waveform.shape[-1]))
     # both halves of the spectrum; the squares of a Hann window of n samples sum to 3 n / 8
     powers = power(spectrum) * (2.0 / (stft.fft * 0.375 * stft.window))
-    powers = powers @ torch.from_numpy(_bands(stft.fft, sample_rate)).to(powers)
+    powers = powers @ constant(_bands, stft.fft, sample_rate, dtype=powers.dtype, device=powers.device)
     levels = 10.0 * torch.log10(powers + LOWEST_POWER) + PASCAL_SPL
     return levels.reshape(*waveform.shape[:-1], *levels.shape[-2:])
 
@@ -74,7 +75,7 @@ def least_audible(levels: Tensor) -> Tensor:
 
     Shape: (..., frames, 24) in dB SPL -> (..., 1, 24).
     """
-    quiet = torch.from_numpy(threshold_in_quiet()).to(levels)
+    quiet = constant(threshold_in_quiet, dtype=levels.dtype, device=levels.device)
     return torch.maximum(quiet, levels.amax((-2, -1), keepdim=True) - DEPTH).detach()
 
 

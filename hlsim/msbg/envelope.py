@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy.signal import ellip
 from torch import Tensor
 
+from hlsim.constants import constant
 from hlsim.msbg.ear import RATE
 from hlsim.msbg.filterbank import FilterBank, erb
 from hlsim.spectrum import power, rfft
@@ -94,7 +95,7 @@ def envelope(channels: Tensor, lowpass: Tensor) -> Tensor:
     Shape: (..., channels, time), (channels, time // 48 + 1) -> (..., channels, time // 24), the values at samples 0, 24,
     ...; ``time`` is a multiple of 24 and the signal is taken as periodic.
     """
-    kernel = torch.from_numpy(decimation_kernel()).to(channels)
+    kernel = constant(decimation_kernel, dtype=channels.dtype, device=channels.device)
     return smooth(decimate(channels.abs(), kernel), lowpass)
 
 

@@ -15,6 +15,7 @@ from torch.nn import functional
 
 from hlsim.audiogram import FREQUENCIES
 from hlsim.calibration import PASCAL_SPL
+from hlsim.constants import constant
 from hlsim.msbg.envelope import STEP
 from hlsim.msbg.filterbank import FilterBank
 
@@ -156,7 +157,7 @@ def expand(channels: Tensor, envelopes: Tensor, ratios: Tensor) -> Tensor:
 
     Shape: (..., channels, time), (..., channels, time // 24), (..., channels) -> (..., time).
     """
-    kernel = torch.from_numpy(interpolation_kernel()).to(channels)
+    kernel = constant(interpolation_kernel, dtype=channels.dtype, device=channels.device)
     return weigh(channels, around(gains(envelopes, ratios)), kernel, (envelopes, ratios))
 
 

@@ -159,7 +159,7 @@ class _Spread(torch.autograd.Function):
         direct = factor.conj() * gradient
         products = torch.view_as_real(spectrum) * torch.view_as_real(direct)
         changed = products[..., 0] + products[..., 1]
-        divisor = smeared + torch.copysign(smeared.new_tensor(_NEVER), smeared)
+        divisor = smeared + torch.copysign(smeared.new_full((), _NEVER), smeared)
         along = (changed / divisor) @ matrix - changed / given
         return torch.addcmul(direct, spectrum, along), None
 

@@ -5,6 +5,7 @@ from torch import Tensor, nn
 
 from hlsim.audiogram import FREQUENCIES, SEVERITIES, severity_index
 from hlsim.calibration import PASCAL_SPL
+from hlsim.constants import constant
 from hlsim.msbg.recruitment import CATCH_UP_SPL
 from hlsim.neuro.audiogram_encoder import AudiogramEncoder
 from hlsim.neuro.blocks import DualPathBlock, TimeBlock
@@ -145,7 +146,7 @@ class NeuroMSBG(EarNetwork):
     def _exponents(self, ears: Tensor, frequencies: int) -> Tensor:
         """Recruitment exponents, ratio - 1, at the transform's frequencies. Shape: (items, 8) -> (items, frequencies)."""
         hz = torch.arange(frequencies, device=ears.device, dtype=ears.dtype) * NEURO_RATE / self.config.fft
-        points = torch.tensor(FREQUENCIES, device=ears.device, dtype=ears.dtype)
+        points = constant(tuple, FREQUENCIES, dtype=ears.dtype, device=ears.device)
         right = torch.bucketize(hz, points).clamp(1, len(FREQUENCIES) - 1)
         place = ((hz - points[right - 1]) / (points[right] - points[right - 1])).clamp(0.0, 1.0)
         levels = ears[:, right - 1] * (1.0 - place) + ears[:, right] * place

@@ -14,6 +14,7 @@ from torch.nn import functional
 
 from hlsim.audiogram import SEVERITIES
 from hlsim.calibration import PASCAL_SPL
+from hlsim.constants import constant
 from hlsim.msbg.ear import RATE, ear_filter
 from hlsim.msbg.envelope import envelope_filters
 from hlsim.msbg.filterbank import BANKS, FilterBank, gammatone_response
@@ -129,11 +130,9 @@ class Prior(nn.Module):
         return torch.complex(gain @ relative[0], gain @ relative[1]) * widened
 
     def _exponents(self, thresholds: Tensor, severity: Tensor) -> Tensor:
-        weights = [torch.from_numpy(threshold_weights(BANKS[name])).to(thresholds) for name in SEVERITIES]
-        ratios = [functional.pad(expansion_ratios(thresholds, own), (0, _CHANNELS)) for own in weights]
-        rows = torch.stack([ratio[..., :_CHANNELS] for ratio in ratios], 1)
-        chosen = rows[torch.arange(len(severity), device=severity.device), severity]
-        return (chosen - 1.0).clamp_min(-1.0)
+        """Shape: (items, 8), (items,) -> (items, channels); 0 where a bank has fewer."""
+        weights = constant(_threshold_weights, dtype=thresholds.dtype, device=thresholds.device)
+        return expansion_ratios(thresholds, weights[severity]) - 1.0
 
 
 def _widening(smeared: Tensor, given: Tensor) -> Tensor:
@@ -170,6 +169,11 @@ def _smearing(severity: str, stft: STFT) -> NDArray[np.float64]:
         *(roex_filters(*sides, count, spacing) for sides in ((1.0, 1.0), BROADENING[severity]))
     )
     return matrix[: stft.frequencies, : stft.frequencies]
+
+
+def _threshold_weights() -> NDArray[np.float64]:
+    """Of every severity's bank. Returns (severities, 8, channels)."""
+    return np.stack([_padded(threshold_weights(BANKS[severity]).T).T for severity in SEVERITIES])
 
 
 def _padded(rows: NDArray[np.generic]) -> NDArray[np.generic]:
