@@ -1,6 +1,7 @@
 """What runs on a GPU never mixes devices, as far as that can be told without one.
 
-A pretended device: its tensors compute on the CPU, say that they are on a GPU, and refuse to meet one of the CPU.
+A pretended device: its tensors compute on the CPU, say that they are on a GPU, and refuse to meet one of the CPU. Torch
+itself lets indices of the CPU pass, which it copies with every call; here they are refused, too.
 """
 
 from collections.abc import Callable
@@ -16,7 +17,7 @@ from compensators import MappingCompensator, load_compensator
 from hlsim import MSBG, Audiogram, HearingLossLoss, load_pretrained
 
 GPU = torch.device("cuda", 0)
-MOVES = {"aten::_to_copy", "aten::copy_", "aten::index", "aten::index_put_"}  # these take tensors of both
+MOVES = {"aten::_to_copy", "aten::copy_"}  # these take tensors of both
 
 # of what torch leaves for later, dispatch down here knows nothing
 EAGER = {"aten::_conj": torch.ops.aten.conj_physical.default, "aten::_neg_view": torch.ops.aten.neg.default}
@@ -24,6 +25,9 @@ EAGER = {"aten::_conj": torch.ops.aten.conj_physical.default, "aten::_neg_view":
 
 class OnGPU(Tensor):
     inner: Tensor
+    # properties, for in a backward pass the mode below is not asked
+    device = property(lambda self: GPU)
+    is_cuda = property(lambda self: True)
 
     @staticmethod
     def __new__(cls, inner: Tensor) -> "OnGPU":
@@ -93,8 +97,6 @@ class PretendedGPU(TorchFunctionMode):
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         kwargs = dict(kwargs or {})
         name = getattr(func, "__name__", "")
-        if func in (Tensor.device.__get__, Tensor.is_cuda.__get__) and isinstance(args[0], OnGPU):
-            return GPU if func == Tensor.device.__get__ else True
         if name in ("to", "cpu", "cuda"):
             tensor, *rest = args
             like = next((value for value in rest if isinstance(value, Tensor)), None)
@@ -127,7 +129,7 @@ def to_gpu(module: nn.Module) -> nn.Module:
     return module
 
 
-EARS = torch.tensor([Audiogram.standard(name).thresholds for name in ("N1", "N3", "NH")])
+EARS = torch.tensor([Audiogram.standard(name).thresholds for name in ("N1", "N3", "NH", "N1")])
 MODULES: dict[str, Callable[[], nn.Module]] = {
     "msbg at 16 kHz": lambda: MSBG(sample_rate=16000),
     "msbg at 44.1 kHz": MSBG,
@@ -145,7 +147,11 @@ MODULES: dict[str, Callable[[], nn.Module]] = {
 def output_and_slope(call: Callable[..., Tensor], *given: Tensor) -> tuple[Tensor, Tensor]:
     waveform = given[0].clone().requires_grad_()
     output = call(waveform, *given[1:])
-    (slope,) = torch.autograd.grad(output.square().sum(), waveform)
+    value = output.square().sum()
+    # torch.autograd.grad would switch the pretended device off for what the backward pass makes
+    (slope,) = torch.autograd.graph._engine_run_backward(
+        (value,), (torch.ones_like(value),), False, False, (waveform,), False, accumulate_grad=False
+    )
     return output.detach(), slope
 
 
@@ -159,7 +165,7 @@ def assert_alike(there: tuple[Tensor, Tensor], here: tuple[Tensor, Tensor]) -> N
 def test_modules_keep_to_their_device(name: str) -> None:
     torch.manual_seed(0)
     module = MODULES[name]()
-    wave = 0.02 * torch.randn(3, 9000)
+    wave = 0.02 * torch.randn(4, 9000)
     here = output_and_slope(module, wave, EARS)
     to_gpu(module)
     with PretendedGPU():
@@ -172,7 +178,7 @@ def test_modules_keep_to_their_device(name: str) -> None:
 @pytest.mark.parametrize("reference", ["clean", "normal-hearing"])
 def test_losses_keep_to_their_device(simulator: str, criterion: str, reference: str) -> None:
     loss = HearingLossLoss(simulator=simulator, criterion=criterion, reference=reference)
-    wave, clean = 0.02 * torch.randn(2, 3, 9000)
+    wave, clean = 0.02 * torch.randn(2, 4, 9000)
     here = output_and_slope(loss, wave, clean, EARS)
     to_gpu(loss)
     to_gpu(loss.simulator)
@@ -184,3 +190,33 @@ def test_losses_keep_to_their_device(simulator: str, criterion: str, reference: 
 def test_the_pretended_device_refuses_the_cpus_tensors() -> None:
     with PretendedGPU(), pytest.raises(RuntimeError, match="of the GPU and of the CPU"):
         torch.ones(3, device="cuda") + torch.ones(3)
+
+
+class Doubled(torch.autograd.Function):
+    """Its way back takes a tensor of the device that the gradient, or else that the processor has."""
+
+    seen: torch.device | None = None
+    by_processor = False
+
+    @staticmethod
+    def forward(ctx: Any, waveform: Tensor) -> Tensor:
+        return 2.0 * waveform
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> Tensor:
+        Doubled.seen = gradient.device
+        return gradient * torch.full((3,), 2.0, device="cpu" if Doubled.by_processor else gradient.device)
+
+
+def test_the_pretended_device_is_there_on_the_way_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    with PretendedGPU():
+        _, slope = output_and_slope(Doubled.apply, torch.ones(3, device="cuda"))
+        assert Doubled.seen == GPU and inside(slope).tolist() == [8.0] * 3
+        monkeypatch.setattr(Doubled, "by_processor", True)
+        with pytest.raises(RuntimeError, match="of the GPU and of the CPU"):
+            output_and_slope(Doubled.apply, torch.ones(3, device="cuda"))
+
+
+def test_the_pretended_device_refuses_the_cpus_indices() -> None:
+    with PretendedGPU(), pytest.raises(RuntimeError, match="of the GPU and of the CPU"):
+        torch.ones(3, device="cuda")[[0, 2]]

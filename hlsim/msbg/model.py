@@ -127,7 +127,11 @@ class MSBG(nn.Module):
                 if len(some) == len(signals):
                     outputs.append(self._in_blocks(signals, ears, severity, none))
                 else:
-                    chosen = slice(some[0], some[-1] + 1, 1) if some[-1] - some[0] == len(some) - 1 else some
+                    chosen: slice | Tensor = slice(some[0], some[-1] + 1, 1)
+                    if some[-1] - some[0] != len(some) - 1:
+                        chosen = torch.tensor(
+                            some, device=signals.device
+                        )  # a list would be copied with each use
                     outputs.append(self._in_blocks(signals[chosen], ears[chosen], severity, none))
                 order += some
         longest = max(output.shape[-1] for output in outputs)
