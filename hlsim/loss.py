@@ -119,8 +119,8 @@ class HearingLossLoss(nn.Module):
                 of a network that look at all of a signal (lstm, transformer, mamba) see the silence too.
 
         Raises:
-            ValueError: shapes that do not fit, no audiogram, levels outside -10 to 100 dB HL, lengths outside 1 to time,
-                or a simulator that does not return a waveform of the shape it was given.
+            ValueError: shapes or devices that do not fit, no audiogram, levels outside -10 to 100 dB HL, lengths outside 1
+                to time, or a simulator that does not return a waveform of the shape it was given.
         """
         return criteria.weighted_sum(self.parts(compensated, clean, audiogram, lengths), self.weights)
 
@@ -143,6 +143,10 @@ class HearingLossLoss(nn.Module):
         if compensated.shape != clean.shape:
             raise ValueError(
                 f"compensated has shape {tuple(compensated.shape)}, clean {tuple(clean.shape)}; allowed: the same shape"
+            )
+        if compensated.device != clean.device:
+            raise ValueError(
+                f"compensated is on {compensated.device} and clean on {clean.device}; allowed: the same device"
             )
         ends = None if lengths is None else check_lengths(lengths, compensated.shape)
         ears = self.thresholds if audiogram is None else as_thresholds(audiogram)

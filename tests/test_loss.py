@@ -751,6 +751,13 @@ def test_own_simulator_may_broadcast_with_the_ears(heard: tuple[int, ...]) -> No
     assert float(loss(wave, wave)) == 0.0
 
 
+@each_criterion
+def test_clean_speech_on_another_device_is_named(criterion: str) -> None:
+    loss, wave = HearingLossLoss(N3, criterion=criterion), torch.randn(4000)
+    with pytest.raises(ValueError, match="compensated is on cpu and clean on meta; allowed: the same device"):
+        loss(wave, wave.to("meta"))
+
+
 def test_another_device_is_named() -> None:
     loss = HearingLossLoss(N3)
     loss.simulator.to("meta")

@@ -51,11 +51,18 @@ class EarNetwork(nn.Module):
         Shape: (..., time) and one audiogram or (..., 8) that broadcasts over the leading dimensions -> (..., time).
 
         Raises:
-            ValueError: no audiogram, levels outside -10 to 100 dB HL, or shapes that do not fit.
+            ValueError: no audiogram, levels outside -10 to 100 dB HL, shapes that do not fit, or a waveform on another
+                device than the weights.
         """
         check_waveform(waveform)
         if audiogram is None:
             raise ValueError(f"no audiogram: give one with each call, {type(self).__name__} holds none")
+        weight = next(self.parameters(), None)  # replicas of nn.DataParallel list none
+        if weight is not None and weight.device != waveform.device:
+            raise ValueError(
+                f"the waveform is on {waveform.device} and {type(self).__name__} on {weight.device}; allowed: the same "
+                "device, move either with .to()"
+            )
         thresholds = resolve_thresholds(None, audiogram, waveform, taker=type(self).__name__)
         with torch.autocast(waveform.device.type, enabled=False):
             dtype = self._dtype

@@ -302,3 +302,11 @@ def test_bad_input(trained: NeuroMSBG) -> None:
         NeuroMSBG(5)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="16000 to 48000"):
         NeuroMSBG(sample_rate=8000)
+
+
+def test_a_waveform_on_another_device_is_named() -> None:
+    model = NeuroMSBG()
+    with pytest.raises(
+        ValueError, match="waveform is on meta and NeuroMSBG on cpu; allowed: the same device"
+    ):
+        model(torch.zeros(4000, device="meta"), Audiogram.standard("N3"))
