@@ -4,7 +4,7 @@ Feature maps lie (items, time, frequency, channels): the pointwise layers are th
 """
 
 from collections.abc import Callable
-from typing import Self
+from typing import Self, cast
 
 import torch
 from torch import Tensor, nn
@@ -91,7 +91,10 @@ class BidirectionalLSTM(nn.Module):
         return self
 
     def forward(self, sequence: Tensor) -> Tensor:
-        output: Tensor = self.lstm(sequence)[0]
+        # where the rest runs in bfloat16, cuDNN would run it in float16
+        with torch.autocast(sequence.device.type, enabled=False):
+            weight = cast(Tensor, self.lstm.weight_hh_l0)
+            output: Tensor = self.lstm(sequence.to(weight.dtype))[0]
         return output
 
 

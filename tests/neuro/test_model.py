@@ -13,6 +13,7 @@ from hlsim.audiogram import draw_thresholds
 from hlsim.calibration import set_level
 from hlsim.criteria import noise_to_signal_db
 from hlsim.neuro import NeuroConfig
+from hlsim.neuro.blocks import BidirectionalLSTM, SequencePath
 from hlsim.neuro.network import EarNetwork
 
 N3 = Audiogram.standard("N3")
@@ -310,3 +311,14 @@ def test_a_waveform_on_another_device_is_named() -> None:
         ValueError, match="waveform is on meta and NeuroMSBG on cpu; allowed: the same device"
     ):
         model(torch.zeros(4000, device="meta"), Audiogram.standard("N3"))
+
+
+def test_an_lstm_stays_in_float32_under_autocast() -> None:
+    torch.manual_seed(0)
+    path = SequencePath(8, 0, BidirectionalLSTM(8, 4), 8)
+    seen: list[torch.dtype] = []
+    path.core.register_forward_hook(lambda core, given, output: seen.append(output.dtype))
+    features = torch.randn(1, 12, 3, 8)
+    with torch.no_grad(), torch.autocast("cpu", torch.bfloat16):
+        path(features.bfloat16())
+    assert seen == [torch.float32]
