@@ -263,7 +263,9 @@ def check_name(path: str | Path) -> None:
 def resample(waveform: Tensor, source_rate: int, target_rate: int) -> Tensor:
     """Resample by a windowed sinc, time-aligned and differentiable.
 
-    Flat within 0.1 dB to 90 % of the lower Nyquist frequency, 55 dB down at it and 80 dB from 101 % of it on.
+    Flat within 0.1 dB to 90 % of the lower Nyquist frequency, 55 dB down at it and 80 dB from 101 % of it on; 75 dB on a
+    GPU whose convolutions take TF32, as torch's do by default (from 44.1 to 16 kHz, with the rounding emulated on a CPU).
+    ``torch.backends.cudnn.allow_tf32 = False`` keeps the 80 dB.
 
     Shape: (..., time) -> (..., ceil(time * target_rate / source_rate)).
 

@@ -39,6 +39,9 @@ class HearingLossLoss(nn.Module):
 
     Levels matter, nothing is normalised: 65 dB SPL is RMS 0.035 at the default ``full_scale_spl``.
 
+    It may be called in an autocast region and works in float32 there; call ``backward()`` outside of it, as torch says:
+    inside one of float16, the gradient of ``"bands"`` is NaN.
+
     Args:
         audiogram: the ear or ears; may be given with each call instead. A tensor that is trained gets its gradient; it is
             not registered either.
