@@ -122,8 +122,8 @@ class HearingLossLoss(nn.Module):
                 of a network that look at all of a signal (lstm, transformer, mamba) see the silence too.
 
         Raises:
-            ValueError: shapes or devices that do not fit, no audiogram, levels outside -10 to 100 dB HL, lengths outside 1
-                to time, or a simulator that does not return a waveform of the shape it was given.
+            ValueError: shapes or devices that do not fit, no audiogram, levels outside -10 to 100 dB HL, lengths outside
+                1 to time, or a simulator that does not return a waveform of the shape it was given.
         """
         return criteria.weighted_sum(self.parts(compensated, clean, audiogram, lengths), self.weights)
 

@@ -6,7 +6,6 @@ signal that has the same phase.
 """
 
 import math
-from functools import lru_cache
 
 import numpy as np
 import torch
@@ -14,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from hlsim.audiogram import SEVERITIES, severity_index
-from hlsim.compiling import lasting
+from hlsim.constants import constant
 from hlsim.msbg.ear import RATE, ear_filter, lowpass_filter
 from hlsim.msbg.filterbank import BANKS, FilterBank, gammatone_response
 from hlsim.msbg.fourier import fft_length, irfft, rfft
@@ -54,7 +53,7 @@ def with_phase_of_bank(waveform: Tensor, thresholds: Tensor, rate: int, *, norma
         normal: the signal is what a normal ear hears: the phase of that ear's bank is taken off.
     """
     time, severity = waveform.shape[-1], severity_index(thresholds)
-    taps = _phases(rate, normal, waveform.dtype, waveform.device)[severity]
+    taps = constant(_phases, rate, normal, dtype=waveform.dtype, device=waveform.device)[severity]
     reach = taps.shape[-1] // 2
     points = fft_length(time + 2 * reach, 4)
     moved = irfft(rfft(waveform, points) * rfft(taps, points), points)[..., reach : reach + time]
@@ -62,9 +61,8 @@ def with_phase_of_bank(waveform: Tensor, thresholds: Tensor, rate: int, *, norma
     return torch.where((severity == 0).unsqueeze(-1), waveform, moved) if normal else moved
 
 
-@lru_cache(maxsize=8)
-def _phases(rate: int, normal: bool, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """Impulse response of each severity's phase, its zero in the middle. Shape: (severities, 2 reach)."""
+def _phases(rate: int, normal: bool) -> NDArray[np.float64]:
+    """Impulse response of each severity's phase, its zero in the middle. Returns (severities, 2 reach)."""
     shared = math.gcd(rate, RATE)
     points = rate // shared * 2 * math.ceil(shared / (2.0 * _SPACING))
     responses = np.stack([fixed_response(BANKS[severity], rate, points) for severity in SEVERITIES])
@@ -74,6 +72,4 @@ def _phases(rate: int, normal: bool, dtype: torch.dtype, device: torch.device) -
         magnitude = np.abs(responses)
         phases = responses / np.maximum(magnitude, _FAINT * magnitude.max(-1, keepdims=True))
     reach = math.ceil(_REACH_SECONDS * rate)
-    impulses = np.roll(np.fft.irfft(phases, points), reach, -1)[:, : 2 * reach]
-    with lasting():
-        return torch.from_numpy(impulses.copy()).to(device=device, dtype=dtype)
+    return np.roll(np.fft.irfft(phases, points), reach, -1)[:, : 2 * reach]
