@@ -14,12 +14,15 @@ class MappingConfig(NetworkConfig):
 
     Attributes:
         start: gain before training: ``"nalr"``, or a share of the loss from 0 to 1, as 0.4.
+        phase: of the output: the ``input``'s, or ``predicted``, as the paper's is. A criterion of levels alone, as
+            ``bands``, teaches a predicted phase to take away what is steady, with a different shift in every frame.
         bands: of the correction to it, evenly spaced on the ERB-number scale, 4 to 40.
         reach_db: largest correction up or down.
         limit_spl: peak of the output in dB SPL that no sample passes.
     """
 
     start: str | float = "nalr"
+    phase: str = "input"
     bands: int = 20
     reach_db: float = 40.0
     limit_spl: float = 110.0

@@ -7,6 +7,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
+from torch.nn import functional
 
 from compensators.config import MappingConfig
 from compensators.limiter import soft_limit
@@ -27,11 +28,11 @@ _NEPER_DB = 20.0 / math.log(10.0)
 class MappingCompensator(EarNetwork):
     """Waveform and audiogram to what the impaired ear is to be given, time-aligned and limited.
 
-    Log magnitude, phase, encoded audiogram (Equation 1) and the prescribed gain enter as four channels; a dense encoder
-    and dual-path blocks follow; one decoder gives the log magnitude of the output, the other its phase. The log magnitude
-    is the input's plus the prescription ``config.start`` plus the network's correction, which is smooth over frequency
-    and 0 before training. Started from no gain and free at every frequency, training ends below NAL-R: a band that is not
-    heard has almost no gradient.
+    Log magnitude, encoded audiogram (Equation 1) and the prescribed gain enter as channels; a dense encoder and dual-path
+    blocks follow, and a decoder gives the log magnitude of the output. It is the input's plus the prescription
+    ``config.start`` plus the network's correction, which is smooth over time and frequency and 0 before training. Started
+    from no gain and free at every frequency, training ends below NAL-R: a band that is not heard has almost no gradient.
+    With ``config.phase`` "predicted" the phase enters too, and another decoder shifts it; otherwise it stays.
 
     The level counts, in pascals, and nothing is normalised. The output is softly limited at ``config.limit_spl``.
 
@@ -57,10 +58,11 @@ class MappingCompensator(EarNetwork):
         self.stft = config.stft
         size, depth, stride = config.channels, config.dense_depth, config.stride
         self.audiogram_encoder = AudiogramEncoder(self.stft.frequencies)
-        self.encoder = DenseEncoder(4, size, depth, stride, normalise=False)
+        predicted = config.phase == "predicted"
+        self.encoder = DenseEncoder(4 if predicted else 3, size, depth, stride, normalise=False)
         self.blocks = nn.ModuleList(DualPathBlock(config) for _ in range(config.blocks))
         self.magnitude_decoder = Decoder(size, 1, depth, stride, normalise=False)
-        self.phase_decoder = PhaseDecoder(size, depth, stride, normalise=False)
+        self.phase_decoder = PhaseDecoder(size, depth, stride, normalise=False) if predicted else None
 
     def start_gains_db(self, thresholds: Tensor) -> Tensor:
         """Gain before training at the transform's frequencies. Shape: (items, 8) dB HL -> (items, frequencies) dB."""
@@ -73,7 +75,9 @@ class MappingCompensator(EarNetwork):
 
     @property
     def _reach(self) -> tuple[int, int] | None:
-        return None if self.config.reach is None else (self.config.step, self.config.reach)
+        if self.config.reach is None:
+            return None
+        return self.config.step, self.config.reach + self.config.step - self.config.hop  # with _steady
 
     @property
     def _dtype(self) -> torch.dtype:
@@ -94,27 +98,31 @@ class MappingCompensator(EarNetwork):
         size = (spectrum.shape[-2], spectrum.shape[-1])
         # log magnitude out = log magnitude in + gain, so that silence stays silent and needs no logarithm
         gain = start.unsqueeze(1) + self._correction(features, size)
-        return self.stft.synthesise(
-            spectrum * self.phase_decoder.factor(features, size, gain), signals.shape[-1]
-        )
+        factor = gain.exp() if self.phase_decoder is None else self.phase_decoder.factor(features, size, gain)
+        return self.stft.synthesise(spectrum * factor, signals.shape[-1])
 
     def _correction(self, features: Tensor, size: tuple[int, int]) -> Tensor:
-        """Correction in nepers, smooth over frequency. Shape: (items, channels, ...) -> (items, frames, frequencies)."""
+        """Correction in nepers, smooth over time and frequency.
+
+        Shape: (items, channels, ...) -> (items, frames, frequencies).
+        """
         into, out_of = (
             torch.from_numpy(matrix).to(features) for matrix in _bands(self.config.bands, self.config.fft)
         )
         levels = self.magnitude_decoder(features, size).squeeze(1) @ into
-        return torch.tanh(levels) @ out_of * (self.config.reach_db / _NEPER_DB)
+        return (
+            _steady(torch.tanh(levels), self.config.stride[0]) @ out_of * (self.config.reach_db / _NEPER_DB)
+        )
 
     def _features(self, spectrum: Tensor, ears: Tensor, start: Tensor) -> Tensor:
-        """The input channels. Shape: (items, frames, frequencies), ... -> (items, 4, frames, frequencies)."""
+        """The input channels. Shape: (items, frames, frequencies), ... -> (items, 3 or 4, frames, frequencies)."""
         squared = power(spectrum)
-        encoded = self.audiogram_encoder(ears).unsqueeze(1).expand(squared.shape)
-        # the sine of the phase, faded out near silence: its gradient stays finite and it has no jump at pi
-        sine = spectrum.imag * (squared + 1e-6).rsqrt()
-        return torch.stack(
-            ((squared + _TINY).log() / 4.0, sine, encoded, start.unsqueeze(1).expand(squared.shape)), 1
-        )
+        channels = [(squared + _TINY).log() / 4.0]
+        if self.phase_decoder is not None:
+            # the sine of the phase, faded out near silence: its gradient stays finite and it has no jump at pi
+            channels.append(spectrum.imag * (squared + 1e-6).rsqrt())
+        channels += [self.audiogram_encoder(ears).unsqueeze(1), start.unsqueeze(1)]
+        return torch.stack([channel.expand(squared.shape) for channel in channels], 1)
 
     def _hz(self, like: Tensor) -> Tensor:
         return (
@@ -122,6 +130,15 @@ class MappingCompensator(EarNetwork):
             * NEURO_RATE
             / self.config.fft
         )
+
+
+def _steady(levels: Tensor, stride: int) -> Tensor:
+    """Twice the mean of ``stride`` frames: what the patches of a decoder have alike, with any steady input, goes.
+
+    Shape: (items, frames, bands) -> the same.
+    """
+    padded = functional.pad(levels.mT, (stride - 1, stride - 1), mode="replicate")
+    return functional.avg_pool1d(functional.avg_pool1d(padded, stride, 1), stride, 1).mT
 
 
 @lru_cache(maxsize=8)

@@ -16,6 +16,7 @@ from compensators.pretrained import KIND, load_compensator
 from hlsim.audiogram import Audiogram, draw_thresholds
 from hlsim.calibration import set_level
 from hlsim.data.clips import Clips
+from hlsim.data.sounds import draw_sounds
 from hlsim.data.variation import equalise, mix
 from hlsim.loss import HearingLossLoss
 from hlsim.neuro.config import NEURO_RATE
@@ -46,6 +47,8 @@ class CompensatorRecipe:
         learning_rate: of AdamW at its highest.
         weights: of ``HearingLossLoss``'s criteria: ``bands`` (dB) and ``paper``.
         reference: what the paper's criterion compares with, ``clean`` or ``normal-hearing``.
+        sounds: share of clips that are tones or clicks instead of speech, 0 to 1. Speech in noise alone teaches a network
+            that what is steady is noise, to be taken away.
         levels: lowest and highest level of the speech in dB SPL.
         equalised: share of clips whose speech is equalised at random by up to 15 dB. Few voices teach few spectra, and
             the gain for another can be 20 dB off.
@@ -63,6 +66,7 @@ class CompensatorRecipe:
     learning_rate: float = 3e-3
     weights: dict[str, float] = field(default_factory=lambda: {"bands": 1.0})
     reference: str = "clean"
+    sounds: float = 0.2
     levels: tuple[float, float] = (50.0, 80.0)
     equalised: float = 0.7
     noisy: float = 0.5
@@ -84,8 +88,10 @@ class CompensatorRecipe:
                 "seconds and learning_rate above 0"
             )
         refuse_seed(self.seed, "in the recipe")
-        if not (0.0 <= self.noisy <= 1.0 and 0.0 <= self.equalised <= 1.0):
-            raise ValueError(f"noisy {self.noisy}, equalised {self.equalised} in the recipe; allowed: 0 to 1")
+        shares = {name: getattr(self, name) for name in ("sounds", "equalised", "noisy")}
+        if not all(0.0 <= share <= 1.0 for share in shares.values()):
+            told = ", ".join(f"{name} {share}" for name, share in shares.items())
+            raise ValueError(f"{told} in the recipe; allowed: 0 to 1")
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> CompensatorRecipe:
@@ -184,6 +190,9 @@ class Items:
         gains = 30.0 * torch.rand(count, len(_KNOTS), generator=generator) - 15.0
         equalised = equalise(clean, gains, torch.tensor(_KNOTS), NEURO_RATE)
         clean = torch.where((uniform(0.0, 1.0) < self.recipe.equalised).unsqueeze(-1), equalised, clean)
+        if self.recipe.sounds:
+            sounds = draw_sounds(count, clean.shape[-1], NEURO_RATE, generator)
+            clean = torch.where((uniform(0.0, 1.0) < self.recipe.sounds).unsqueeze(-1), sounds, clean)
         clean = set_level(clean, uniform(*self.recipe.levels))
         speech = clean
         if self.noise is not None:

@@ -21,6 +21,7 @@ SMALL = {
     "model": {"channels": 8, "blocks": 1, "stride": [4, 3]},
     "batch": 2,
     "seconds": 0.4,
+    "sounds": 0.0,
     "validate_every": 10,
     "validation_items": 4,
 }
@@ -132,9 +133,21 @@ def test_general_one_draws_ears_and_noise(data: TrainingData, tmp_path: Path) ->
     assert all(name.startswith("compensator.") for name in module.state_dict())
 
 
+def test_a_share_of_the_clips_are_tones_and_clicks(data: TrainingData) -> None:
+    def clicks(sounds: float) -> int:
+        recipe = CompensatorRecipe.from_dict(SMALL | {"equalised": 0.0, "sounds": sounds})
+        module = CompensatorTraining(recipe, data, EVER, simulator="msbg")
+        _, clean, _ = module.training_items.draw(64, torch.Generator().manual_seed(0), None)
+        return int((clean.count_nonzero(dim=-1) <= 8).sum())
+
+    # every second sound is a few clicks
+    assert clicks(0.0) == 0 and 5 < clicks(0.4) < 21 and clicks(1.0) == 32
+
+
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
+        ({"sounds": 1.5}, "sounds 1.5, equalised 0.7, noisy 0.5 in the recipe; allowed: 0 to 1"),
         ({"lr": 0.1}, "unknown settings lr"),
         ({"weights": {"haspi": 1.0}}, "unknown criteria haspi"),
         ({"levels": [80.0, 50.0]}, "a lowest and a highest"),
