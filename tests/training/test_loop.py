@@ -285,7 +285,7 @@ def test_learning_rate_rises_over_fifty_steps_and_falls_with_time(tmp_path: Path
     go(rising, tmp_path / "a", max_steps=60, validate_every=30)
     assert rising.rates[:50] == pytest.approx([0.5 * (step + 1) / 50 for step in range(50)], rel=1e-3)
     assert rising.rates[50:] == pytest.approx([0.5] * 10, rel=1e-3)
-    falling = Toy(max_minutes=1.0 / 60.0, learning_rate=0.5)
+    falling = Toy(max_minutes=4.0 / 60.0, learning_rate=0.5)
     go(falling, tmp_path / "b", max_steps=-1, validate_every=10_000)
     after = falling.rates[60:]
     assert all(math.isfinite(rate) and 0.0 < rate <= 0.5 for rate in after)
