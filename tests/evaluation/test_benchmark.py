@@ -197,6 +197,7 @@ def test_a_gpu_is_described(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda device: f"GPU {device}")
     monkeypatch.setattr(torch.cuda, "get_device_properties", lambda device: properties)
+    monkeypatch.setattr(torch.backends.cudnn, "version", lambda: 91900)  # it would ask the GPU the first time
     machine = about("cuda:1", 1)
     assert machine["machine"] == "GPU cuda:1" and machine["gpu"]["cuda"] == torch.version.cuda
     line = benchmark_markdown(machine | {"skipped": []}).splitlines()[0]
