@@ -165,7 +165,7 @@ class HearingLossLoss(nn.Module):
             batch, time = heard.shape[:-1], heard.shape[-1]
             gain = gain_to_pascals(self.full_scale_spl)
             heard, aim = heard.reshape(-1, time) * gain, aim.reshape(-1, time) * gain
-            if self.criterion == "paper" and self._has_banks:
+            if self.criterion == "paper" and self._holds(MSBG, NeuroMSBG):
                 own_ears = ears.to(aim.device).expand(*batch, -1).reshape(-1, len(FREQUENCIES))
                 normal = self.reference == "normal-hearing"
                 aim = with_phase_of_bank(aim, own_ears, self.sample_rate, normal=normal)
@@ -225,17 +225,14 @@ class HearingLossLoss(nn.Module):
             ]
         return clean
 
-    @property
-    def _has_banks(self) -> bool:
-        """Whether what is heard has gone through the banks of MSBG."""
-        return any(isinstance(module, MSBG | NeuroMSBG) for module in self.simulator.modules())
+    def _holds(self, *kinds: type[nn.Module]) -> bool:
+        """Whether the simulator is one of these or, compiled or in somebody's module, holds one."""
+        return any(isinstance(module, kinds) for module in self.simulator.modules())
 
     @property
     def _narrow(self) -> bool:
         """Whether the simulator leaves part of the band out."""
-        # it may be compiled, or in somebody's module
-        neuro = any(isinstance(module, NeuroMSBG) for module in self.simulator.modules())
-        return neuro and self.sample_rate > NEURO_RATE
+        return self.sample_rate > NEURO_RATE and self._holds(NeuroMSBG)
 
     def _frequencies(self, fft: int) -> int | None:
         """Number of the transform's frequencies to compare: those that the simulator gives back."""

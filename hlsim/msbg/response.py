@@ -16,7 +16,7 @@ from hlsim.audiogram import SEVERITIES, severity_index
 from hlsim.constants import constant
 from hlsim.msbg.ear import RATE, ear_filter, lowpass_filter
 from hlsim.msbg.filterbank import BANKS, FilterBank, gammatone_response
-from hlsim.msbg.fourier import fft_length, irfft, rfft
+from hlsim.msbg.fourier import filter_centred
 from hlsim.msbg.model import STRUCTURAL_DELAY
 
 _REACH_SECONDS = 0.064
@@ -52,11 +52,9 @@ def with_phase_of_bank(waveform: Tensor, thresholds: Tensor, rate: int, *, norma
     Args:
         normal: the signal is what a normal ear hears: the phase of that ear's bank is taken off.
     """
-    time, severity = waveform.shape[-1], severity_index(thresholds)
+    severity = severity_index(thresholds)
     taps = constant(_phases, rate, normal, dtype=waveform.dtype, device=waveform.device)[severity]
-    reach = taps.shape[-1] // 2
-    points = fft_length(time + 2 * reach, 4)
-    moved = irfft(rfft(waveform, points) * rfft(taps, points), points)[..., reach : reach + time]
+    moved = filter_centred(waveform, taps)
     # a normal ear's stays as it is to the bit, for phases of what is nearly silent hang on rounding
     return torch.where((severity == 0).unsqueeze(-1), waveform, moved) if normal else moved
 

@@ -18,7 +18,7 @@ from hlsim.constants import constant
 from hlsim.msbg.ear import RATE, ear_filter
 from hlsim.msbg.envelope import envelope_filters
 from hlsim.msbg.filterbank import BANKS, FilterBank, gammatone_response
-from hlsim.msbg.fourier import fft_length, irfft, rfft
+from hlsim.msbg.fourier import filter_centred
 from hlsim.msbg.recruitment import CATCH_UP_SPL, expansion_ratios, threshold_weights
 from hlsim.msbg.response import fixed_response
 from hlsim.msbg.smearing import BROADENING, roex_filters, smearing_from_filters
@@ -98,13 +98,7 @@ class Prior(nn.Module):
 
     def filter(self, waveform: Tensor, severity: Tensor) -> Tensor:
         """Apply the fixed response of each item's bank. Shape: (items, time), (items,) -> (items, time)."""
-        time = waveform.shape[-1]
-        points = fft_length(time + 2 * RESPONSE_REACH, 4)
-        if torch.compiler.is_exporting():
-            points = 1 << (points - 1).bit_length()  # at other lengths onnxruntime is off by 1e-3 to 1e-2
-        response = rfft(self.response[severity].to(waveform), points)
-        filtered = irfft(rfft(waveform, points) * response, points)
-        return filtered[..., RESPONSE_REACH : RESPONSE_REACH + time]
+        return filter_centred(waveform, self.response[severity].to(waveform))
 
     def forward(self, powers: Tensor, thresholds: Tensor, severity: Tensor) -> Tensor:
         """Complex factor on the filtered signal's spectrum, of its powers.
