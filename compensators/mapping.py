@@ -13,13 +13,13 @@ from compensators.config import MappingConfig
 from compensators.limiter import soft_limit
 from compensators.nalr import interpolate_gains, nalr_gains_db
 from hlsim.calibration import PASCAL_SPL
+from hlsim.dsp.fft import power
 from hlsim.neuro.audiogram_encoder import AudiogramEncoder
 from hlsim.neuro.blocks import DualPathBlock
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.neuro.decoders import Decoder, PhaseDecoder
 from hlsim.neuro.encoder import DenseEncoder
 from hlsim.neuro.network import EarNetwork
-from hlsim.spectrum import power
 
 _TINY = 1e-11
 _NEPER_DB = 20.0 / math.log(10.0)

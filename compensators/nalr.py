@@ -14,9 +14,9 @@ from torch import Tensor, nn
 from hlsim.audio import check_rate, check_waveform
 from hlsim.audiogram import FREQUENCIES, HIGHEST_LEVEL, AudiogramLike, own_thresholds
 from hlsim.calibration import PASCAL_SPL, check_full_scale
-from hlsim.constants import constant
-from hlsim.fir import frequency_sampling_fir
+from hlsim.dsp.fir import frequency_sampling_fir
 from hlsim.msbg.model import resolve_thresholds
+from hlsim.torchtools import constant
 
 _BIAS = {250.0: -17.0, 500.0: -8.0, 1000.0: 1.0, 2000.0: -1.0, 4000.0: -2.0, 6000.0: -2.0}
 _LIMITS: dict[str, Any] = {"highest": HIGHEST_LEVEL, "taker": "NAL-R"}

@@ -10,8 +10,8 @@ import torch
 
 from hlsim import MSBG, Audiogram, load_pretrained
 from hlsim.calibration import level_spl, set_level
-from hlsim.evaluation.fidelity import snr_db
 from hlsim.evaluation.steadiness import tones
+from hlsim.metrics.fidelity import snr_db
 
 EARS = ("NH", "N1", "N2", "N3", "N4", "N5", "S1", "S2", "S3")
 LEVELS = (50.0, 65.0, 80.0)

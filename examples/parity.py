@@ -16,7 +16,7 @@ from hlsim import MSBG, Audiogram
 from hlsim.audiogram import HIGHEST_SIMULATED, LOWEST_LEVEL, STANDARD, draw_thresholds, read_audiograms
 from hlsim.calibration import set_level
 from hlsim.data.clips import Clips
-from hlsim.evaluation.truth import pyclarity_msbg
+from hlsim.metrics.reference import pyclarity_msbg
 
 
 def sample_for_sample(signal: torch.Tensor, ear: Audiogram) -> float:

@@ -13,7 +13,7 @@ from compensators import NALR
 from hlsim import Audiogram, HearingLossLoss
 from hlsim.calibration import set_level
 from hlsim.data.clips import Clips
-from hlsim.spectrum import STFT
+from hlsim.dsp.stft import STFT
 
 RATE = 16000
 

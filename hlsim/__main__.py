@@ -2,6 +2,6 @@
 
 import sys
 
-from hlsim.cli import main
+from hlsim.cli.main import main
 
 sys.exit(main())

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hlsim.tables import read_rows
+from hlsim.files import read_rows
 
 FREQUENCIES = (250.0, 500.0, 1000.0, 2000.0, 3000.0, 4000.0, 6000.0, 8000.0)
 """The audiometric frequencies in Hz that every simulator uses."""

@@ -11,15 +11,16 @@ from torch import Tensor, nn
 
 from compensators import NALR, MappingCompensator, load_compensator
 from compensators.config import MappingConfig
-from hlsim.audio import find_audio, read_audio, resample, write_audio
+from hlsim.audio import find_audio, read_audio, write_audio
 from hlsim.audiogram import Audiogram
 from hlsim.calibration import level_spl, set_level
-from hlsim.evaluation.figures import draw_spectrograms
-from hlsim.evaluation.haspi import HaspiItem, check_pair, haspi_many
-from hlsim.evaluation.report import HaspiReport, ItemScore
-from hlsim.evaluation.report_files import write_report
+from hlsim.dsp.resample import resample
+from hlsim.evaluation.scores import HaspiReport, ItemScore
+from hlsim.metrics.haspi import HaspiItem, check_pair, haspi_many
 from hlsim.msbg import MSBG
 from hlsim.neuro.config import NEURO_RATE
+from hlsim.report.haspi import write_report
+from hlsim.report.pictures import draw_spectrograms
 from hlsim.training.compensator import CompensatorRecipe, train_compensator
 from hlsim.training.sources import TrainingData
 

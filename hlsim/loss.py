@@ -8,20 +8,21 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from hlsim import criteria
-from hlsim.audio import check_rate, check_waveform, resample
+from hlsim.audio import check_rate, check_waveform
 from hlsim.audiogram import FREQUENCIES, AudiogramLike, as_thresholds, own_thresholds
-from hlsim.band_levels import HIGHEST, band_level_loss
 from hlsim.calibration import PASCAL_SPL, check_full_scale, gain_to_pascals, is_finite
-from hlsim.compiling import not_compiled
-from hlsim.lengths import Lengths, check_lengths, silent_after
+from hlsim.checks import Lengths, check_lengths, silent_after
+from hlsim.criteria import paper
+from hlsim.criteria.bands import HIGHEST, band_level_loss
+from hlsim.dsp.resample import resample
 from hlsim.msbg import MSBG
 from hlsim.msbg.response import with_phase_of_bank
 from hlsim.neuro import NeuroMSBG
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.pretrained import SIMULATOR, find_checkpoint, load_pretrained
+from hlsim.torchtools import not_compiled
 
-CRITERIA: dict[str, Mapping[str, float]] = {"paper": criteria.DEFAULT_WEIGHTS, "bands": {"band_levels": 1.0}}
+CRITERIA: dict[str, Mapping[str, float]] = {"paper": paper.DEFAULT_WEIGHTS, "bands": {"band_levels": 1.0}}
 """Criteria by name: their parts and the default weight of each."""
 
 REFERENCES = ("clean", "normal-hearing")
@@ -125,7 +126,7 @@ class HearingLossLoss(nn.Module):
             ValueError: shapes or devices that do not fit, no audiogram, levels outside -10 to 100 dB HL, lengths outside
                 1 to time, or a simulator that does not return a waveform of the shape it was given.
         """
-        return criteria.weighted_sum(self.parts(compensated, clean, audiogram, lengths), self.weights)
+        return paper.weighted_sum(self.parts(compensated, clean, audiogram, lengths), self.weights)
 
     @not_compiled
     def parts(
@@ -191,8 +192,8 @@ class HearingLossLoss(nn.Module):
         """The parts of each item. Shape: (items, time) twice, in pascals -> (items,) each."""
         if self.criterion == "bands":
             return {"band_levels": band_level_loss(heard, aim, self.sample_rate)}
-        stft = criteria.paper_stft(self.sample_rate)
-        return criteria.paper_parts(heard, aim, stft, self._frequencies(stft.fft))
+        stft = paper.paper_stft(self.sample_rate)
+        return paper.paper_parts(heard, aim, stft, self._frequencies(stft.fft))
 
     def _hear(self, waveform: Tensor, thresholds: Tensor) -> Tensor:
         weight = next(self.simulator.parameters(), None)

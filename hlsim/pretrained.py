@@ -17,9 +17,9 @@ import torch
 from torch import Tensor, nn
 
 from hlsim.calibration import PASCAL_SPL
-from hlsim.compiling import lasting
 from hlsim.neuro.config import NEURO_RATE, NetworkConfig, NeuroConfig
 from hlsim.neuro.model import NeuroMSBG
+from hlsim.torchtools import lasting
 
 Model = TypeVar("Model", bound=nn.Module)
 Config = TypeVar("Config", bound=NetworkConfig)

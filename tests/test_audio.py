@@ -24,9 +24,9 @@ from hlsim.audio import (
     find_audio,
     read_audio,
     read_stretch,
-    resample,
     write_audio,
 )
+from hlsim.dsp.resample import resample
 
 RATES = [(16000, 44100), (44100, 16000), (48000, 16000), (16000, 48000), (22050, 44100), (32000, 44100)]
 

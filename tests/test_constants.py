@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 from torch._subclasses.fake_tensor import FakeTensor, FakeTensorMode
 
-from hlsim.constants import constant
+from hlsim.torchtools import constant
 
 CPU = torch.device("cpu")
 

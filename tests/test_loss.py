@@ -13,10 +13,10 @@ from torch import Tensor, nn
 
 from compensators import NALR
 from hlsim import MSBG, Audiogram, HearingLossLoss, NeuroMSBG, load_pretrained
-from hlsim.audio import resample
-from hlsim.band_levels import band_level_loss
 from hlsim.calibration import set_level
-from hlsim.criteria import DEFAULT_WEIGHTS, PARTS, paper_parts
+from hlsim.criteria.bands import band_level_loss
+from hlsim.criteria.paper import DEFAULT_WEIGHTS, PARTS, paper_parts
+from hlsim.dsp.resample import resample
 from hlsim.msbg.response import with_phase_of_bank
 from hlsim.pretrained import find_checkpoint
 

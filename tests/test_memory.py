@@ -3,7 +3,7 @@ import sys
 
 import pytest
 
-from hlsim import memory
+from hlsim import torchtools as memory
 
 # a child of its own, for the setting is the process's: megabytes again and again, as a training asks for them
 _FAULTS = """

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from hlsim.cli import _parser
+from hlsim.cli.main import _parser
 
 README = Path(__file__).parent.parent / "README.md"
 

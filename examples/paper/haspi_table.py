@@ -14,12 +14,12 @@ import torch
 
 from compensators import load_compensator
 from hlsim.audio import write_audio
-from hlsim.commands.options import show_progress
+from hlsim.cli.options import show_progress
 from hlsim.data.corpora import find_utterances
+from hlsim.data.instances import Plan
 from hlsim.data.manifest import Utterance
 from hlsim.data.plan import prepare
 from hlsim.data.plan_settings import PlanSettings
-from hlsim.data.samples import Plan
 from hlsim.evaluation import haspi_report
 
 

@@ -11,9 +11,9 @@ from pathlib import Path
 from torch import Tensor
 
 from hlsim.audio import read_audio
-from hlsim.data.active_level import active_level_db
 from hlsim.data.corpora import Fault, Found, walk_audio
 from hlsim.data.manifest import inside
+from hlsim.dsp.active_level import active_level_db
 from hlsim.parallel import run_parallel
 
 _SILENT = 10.0 ** (-150.0 / 20.0)  # a peak below the steps of 24 bits

@@ -7,7 +7,8 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from hlsim.audio import find_audio, read_audio, resample
+from hlsim.audio import find_audio, read_audio
+from hlsim.dsp.resample import resample
 
 _TRIES = 100  # draws of files that cannot be used, one after the other, before it ends
 _SILENT_TRIES = 10_000  # more, for a recording may be loud for one second in an hour

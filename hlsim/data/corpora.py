@@ -14,7 +14,7 @@ from random import Random
 
 from hlsim.audio import EXTENSIONS
 from hlsim.data.manifest import SPLITS, Utterance, inside, printable, storable
-from hlsim.tables import read_rows
+from hlsim.files import read_rows
 
 LAYOUTS = ("voicebank-demand", "librispeech", "folder")
 

@@ -14,8 +14,8 @@ from random import Random
 import torch
 
 from hlsim.audiogram import HIGHEST_SIMULATED, SEVERITIES, Audiogram, draw_thresholds, read_audiograms
+from hlsim.checks import refuse_unknown
 from hlsim.data.manifest import SPLITS
-from hlsim.settings import refuse_unknown
 
 MILD_TO_SEVERE: Mapping[str, float] = {"mild": 1.0, "moderate": 1.0, "severe": 1.0}
 """Default proportions of MSBG's severities: the paper says no more than "from mild to severe"."""

@@ -17,9 +17,9 @@ from torch.utils.data import DataLoader, Dataset
 
 from hlsim.audiogram import HIGHEST_SIMULATED, LOWEST_LEVEL
 from hlsim.calibration import level_spl, set_level
-from hlsim.data.samples import Instance, Plan
+from hlsim.data.augment import vary
+from hlsim.data.instances import Instance, Plan
 from hlsim.data.teacher import Teacher, grid_of
-from hlsim.data.variation import vary
 from hlsim.data.writing import Recipe, claimed
 
 _ENDLESS = 10_000_000  # steps: time or steps end a training, not the data

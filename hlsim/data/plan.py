@@ -15,11 +15,11 @@ from hlsim.audiogram import SEVERITIES
 from hlsim.data.checking import Listing, examine_all
 from hlsim.data.corpora import Fault, assign_splits, detect_layout, find_below
 from hlsim.data.ears import Ears, plan_ears
-from hlsim.data.files import PARTIAL, Whole, sha256, write_whole
+from hlsim.data.instances import CLAIM, INSTANCE_COLUMNS, INSTANCES, MANIFEST, SETTINGS
 from hlsim.data.manifest import SPLITS, UTTERANCE_COLUMNS, Rows, csv_line
 from hlsim.data.noises import Noises, find_noises
 from hlsim.data.plan_settings import PlanSettings
-from hlsim.data.samples import CLAIM, INSTANCE_COLUMNS, INSTANCES, MANIFEST, SETTINGS
+from hlsim.files import PARTIAL, Whole, sha256, write_whole
 
 FAULTS = "faults.csv"
 FAULT_COLUMNS = ("path", "reason")

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from hlsim.audio import check_rate
+from hlsim.checks import refuse_unknown
 from hlsim.data.corpora import LAYOUTS
 from hlsim.data.noises import TEST_SNRS_DB, TEST_TYPES, TRAIN_SNRS_DB, TRAIN_TYPES
-from hlsim.settings import refuse_unknown
 
 
 @dataclass(frozen=True)

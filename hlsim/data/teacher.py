@@ -10,9 +10,9 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from hlsim.audiogram import Audiogram
+from hlsim.checks import refuse_unknown
 from hlsim.msbg import MSBG, estimate_delay
 from hlsim.msbg.ear import RATE
-from hlsim.settings import refuse_unknown
 
 TEACHERS = ("msbg", "pyclarity")
 ALIGNMENTS = ("structural", "impulse", "none")

@@ -11,10 +11,10 @@ from typing import Any
 import torch
 
 from hlsim.data.corpora import Fault
-from hlsim.data.files import PARTIAL, alone, write_whole
+from hlsim.data.instances import CLAIM, MANIFEST, Plan, is_whole
 from hlsim.data.manifest import csv_line
-from hlsim.data.samples import CLAIM, MANIFEST, Plan, is_whole
 from hlsim.data.teacher import Reference, Teacher
+from hlsim.files import PARTIAL, alone, write_whole
 from hlsim.parallel import run_parallel
 
 WRITE_FAULTS = "write-faults.csv"

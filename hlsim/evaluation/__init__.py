@@ -3,14 +3,14 @@
 from typing import Any
 
 from hlsim.evaluation.comparison import Comparison
-from hlsim.evaluation.fidelity import fidelity_markdown, summarise
-from hlsim.evaluation.haspi import HaspiItem, haspi_many
-from hlsim.evaluation.report import Failure, HaspiReport, ItemScore
-from hlsim.evaluation.report_files import write_report
+from hlsim.evaluation.haspi_report import haspi_report
+from hlsim.evaluation.scores import Failure, HaspiReport, ItemScore
 from hlsim.evaluation.scoring import Item, score_items
-from hlsim.evaluation.significance import PairedComparison, bootstrap_interval, holm, paired_comparison
+from hlsim.evaluation.statistics import PairedComparison, bootstrap_interval, holm, paired_comparison
 from hlsim.evaluation.store import ScoreStore
-from hlsim.evaluation.study import haspi_report
+from hlsim.metrics.fidelity import fidelity_markdown, summarise
+from hlsim.metrics.haspi import HaspiItem, haspi_many
+from hlsim.report.haspi import write_report
 
 __all__ = [
     "Comparison",
@@ -37,7 +37,7 @@ __all__ = [
 def __getattr__(name: str) -> Any:
     # needs torchmetrics, which the rest does not
     if name == "HASPI":
-        from hlsim.evaluation.metric import HASPI
+        from hlsim.metrics.torchmetric import HASPI
 
         return HASPI
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -9,18 +9,19 @@ from itertools import combinations
 from typing import TYPE_CHECKING, Any
 
 from hlsim.audiogram import SEVERITIES
-from hlsim.evaluation.measures import MEASURES
-from hlsim.evaluation.mixed import MixedModel, mixed_model
-from hlsim.evaluation.significance import (
+from hlsim.evaluation.statistics import (
+    MixedModel,
     PairedComparison,
     differences,
     group_means,
     holm,
+    mixed_model,
     paired_comparison,
 )
+from hlsim.metrics.registry import MEASURES
 
 if TYPE_CHECKING:
-    from hlsim.evaluation.report import ItemScore
+    from hlsim.evaluation.scores import ItemScore
 
 ALPHA = 0.05
 """Below which a p value is said to speak against chance."""

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from hlsim.audiogram import SEVERITIES
-from hlsim.evaluation.fidelity_items import RATE, Item
+from hlsim.evaluation.items import RATE, Item
 from hlsim.evaluation.judging import SIMULATORS, Judged
-from hlsim.evaluation.report import HaspiReport, ItemScore
+from hlsim.evaluation.scores import HaspiReport, ItemScore
 
 HARD = 0.6
 """Unaided HASPI under which an item belongs to those that need help most."""

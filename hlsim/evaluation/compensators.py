@@ -11,11 +11,9 @@ from torch import nn
 
 from compensators.nalr import NALR
 from hlsim.audiogram import Audiogram, as_thresholds
-from hlsim.evaluation.compensator_report import write_compensators
 from hlsim.evaluation.compensator_result import compensator_result
-from hlsim.evaluation.fidelity_items import RATE, Item
 from hlsim.evaluation.gain_curves import gain_curves
-from hlsim.evaluation.haspi import Progress, check_seed
+from hlsim.evaluation.items import RATE, Item
 from hlsim.evaluation.judging import (
     INPUT_LEVELS,
     OF_NETWORK,
@@ -26,14 +24,16 @@ from hlsim.evaluation.judging import (
     judge,
     read_ears,
 )
-from hlsim.evaluation.measures import version_of, versions_of
-from hlsim.evaluation.report_files import check_out
 from hlsim.evaluation.simulators import samples_hash, weights_hash
 from hlsim.evaluation.steadiness import shift_differences, steady_tones
 from hlsim.evaluation.store import ScoreStore, key_of
 from hlsim.extras import require
+from hlsim.metrics.haspi import Progress, check_seed
+from hlsim.metrics.registry import version_of, versions_of
 from hlsim.parallel import check_parallel, run_parallel
 from hlsim.pretrained import load_pretrained
+from hlsim.report.compensators import write_compensators
+from hlsim.report.haspi import check_out
 
 STORE = "scores.jsonl"
 

@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from hlsim.audiogram import FREQUENCIES, Audiogram
-from hlsim.band_levels import band_edges, band_levels
 from hlsim.calibration import set_level
+from hlsim.criteria.bands import band_edges, band_levels
 from hlsim.data.clips import Clips
-from hlsim.evaluation.fidelity_items import RATE
-from hlsim.evaluation.figures import plain
-from hlsim.evaluation.page import Picture, Section, Table
-from hlsim.evaluation.report_figures import draw_svg
+from hlsim.evaluation.items import RATE
+from hlsim.report.haspi_pictures import draw_svg
+from hlsim.report.page import Picture, Section, Table
+from hlsim.report.pictures import plain
 
 _SECONDS = 3.0
 _UTTERANCES = 6
@@ -29,7 +29,7 @@ _TICKS = (250, 500, 1000, 2000, 4000)
 def insertion_gain(
     compensator: nn.Module, ear: Audiogram, speech: Tensor, levels: Sequence[float]
 ) -> list[list[float]]:
-    """Power out over power in, in dB, in 24 ERB-wide bands (``hlsim.band_levels``), over all of the speech.
+    """Power out over power in, in dB, in 24 ERB-wide bands (``hlsim.criteria.bands``), over all of the speech.
 
     Args:
         speech: its spectrum is what a fitter's speech-shaped noise stands for; its own pauses are in it, for a

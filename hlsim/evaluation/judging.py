@@ -12,14 +12,13 @@ import torch
 from torch import Tensor, nn
 
 from hlsim.audiogram import Audiogram, read_audiograms
-from hlsim.band_levels import audibility, band_level_loss, band_levels, least_audible
 from hlsim.calibration import PASCAL_SPL, level_spl, set_level
+from hlsim.criteria.bands import audibility, band_level_loss, band_levels, least_audible
+from hlsim.data.augment import mix
 from hlsim.data.clips import Clips
-from hlsim.data.variation import mix
-from hlsim.evaluation.fidelity_items import RATE, SNRS_DB, Item
-from hlsim.evaluation.haspi import haspi
-from hlsim.evaluation.hasqi import hasqi
-from hlsim.evaluation.truth import pyclarity_msbg
+from hlsim.evaluation.items import RATE, SNRS_DB, Item
+from hlsim.metrics.haspi import haspi, hasqi
+from hlsim.metrics.reference import pyclarity_msbg
 from hlsim.msbg import MSBG
 
 INPUT_LEVELS = (50.0, 65.0, 80.0)

@@ -17,9 +17,9 @@ import torch
 from hlsim.audio import read_audio
 from hlsim.audiogram import Audiogram
 from hlsim.calibration import check_full_scale, dbfs
-from hlsim.evaluation.haspi import Progress, check_seed
-from hlsim.evaluation.measures import MEASURES, check_measures, versions_of
 from hlsim.evaluation.store import ScoreStore, content_hash, key_of
+from hlsim.metrics.haspi import Progress, check_seed
+from hlsim.metrics.registry import MEASURES, check_measures, versions_of
 from hlsim.parallel import check_parallel, run_parallel
 
 EARS = ("left", "right")

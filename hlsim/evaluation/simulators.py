@@ -17,14 +17,14 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from hlsim.evaluation.fidelity import pesq_wb, raw_mse, snr_db, stoi, third_octave_error_db
-from hlsim.evaluation.fidelity_items import LEVELS, RATE, Item, draw_items, treat
-from hlsim.evaluation.fidelity_report import fidelity_result, write_fidelity
-from hlsim.evaluation.measures import version_of, versions_of
+from hlsim.evaluation.items import LEVELS, RATE, Item, draw_items, treat
 from hlsim.evaluation.store import ScoreStore, key_of
-from hlsim.evaluation.truth import pyclarity_msbg
 from hlsim.extras import MissingExtraError
+from hlsim.metrics.fidelity import pesq_wb, raw_mse, snr_db, stoi, third_octave_error_db
+from hlsim.metrics.reference import pyclarity_msbg
+from hlsim.metrics.registry import version_of, versions_of
 from hlsim.msbg import MSBG
+from hlsim.report.simulators import fidelity_result, write_fidelity
 
 STORE = "scores.jsonl"
 

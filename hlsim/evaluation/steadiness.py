@@ -12,10 +12,10 @@ from torch.nn import functional
 
 from hlsim.audiogram import Audiogram
 from hlsim.calibration import level_spl, set_level
-from hlsim.evaluation.fidelity_items import RATE, Item
+from hlsim.evaluation.items import RATE, Item
 from hlsim.evaluation.judging import NORMAL
-from hlsim.evaluation.page import Section, Table
 from hlsim.msbg import MSBG
+from hlsim.report.page import Section, Table
 
 TONES = (250, 500, 1000, 2000, 3001, 4000)
 """In Hz. Frames that are multiples of 4 ms apart all find the others in one phase, but not 3001 Hz."""

@@ -5,13 +5,13 @@ import math
 import torch
 from torch import Tensor
 
+from hlsim.dsp.fft import fft_length, long_irfft, long_rfft
 from hlsim.msbg.ear import RATE
-from hlsim.msbg.ending import ending
 from hlsim.msbg.envelope import HALF_RATE_STEP, STEP, decimate, detect, envelope, smooth
 from hlsim.msbg.filters import Filters
-from hlsim.msbg.fourier import fft_length, irfft, rfft
+from hlsim.msbg.filtfilt_end import ending
+from hlsim.msbg.multirate import Plan
 from hlsim.msbg.recruitment import around, expand, gains, weigh
-from hlsim.msbg.tiers import Plan
 
 BANK_TAIL = 3200
 """Samples, 73 ms: the longest advance, and what it takes the narrowest channel to decay by 80 dB."""
@@ -78,7 +78,7 @@ def hear(spectrum: Tensor, ratios: Tensor, plan: Plan, slight: bool) -> Tensor:
         if analytic:
             bins = torch.fft.fft(torch.view_as_complex(part.unflatten(-1, (-1, 2))))
         else:
-            bins = rfft(part, part.shape[-1])
+            bins = long_rfft(part, part.shape[-1])
         total[..., : bins.shape[-1]].add_(bins[..., : total.shape[-1]])
     return total
 
@@ -90,8 +90,8 @@ def hear_ending(heard: Tensor, ratios: Tensor, severity: str, filters: Filters) 
     """
     length = heard.shape[-1]
     points = fft_length(length + BANK_TAIL, 2 * STEP)
-    spectrum = rfft(heard, points).unsqueeze(-2) * filters.get("bank", severity, points)
-    channels = irfft(spectrum, points) * filters.get("kept", severity, points, length)
+    spectrum = long_rfft(heard, points).unsqueeze(-2) * filters.get("bank", severity, points)
+    channels = long_irfft(spectrum, points) * filters.get("kept", severity, points, length)
     weights = filters.get("ending weights", severity)
     response = filters.get("ending response", severity, (length - 1) % STEP + 1)
     envelopes = envelope(channels, filters.get("lowpass", severity, points))

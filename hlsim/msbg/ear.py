@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy.signal import firwin
 from scipy.signal.windows import kaiser
 
-from hlsim.fir import frequency_sampling_fir
+from hlsim.dsp.fir import frequency_sampling_fir
 
 RATE = 44100
 """The sample rate in Hz at which MSBG is defined."""

@@ -9,10 +9,11 @@ from numpy.typing import NDArray
 from scipy.signal import ellip
 from torch import Tensor
 
-from hlsim.constants import constant
+from hlsim.dsp.erb import erb
+from hlsim.dsp.fft import power, rfft
 from hlsim.msbg.ear import RATE
-from hlsim.msbg.filterbank import FilterBank, erb
-from hlsim.spectrum import power, rfft
+from hlsim.msbg.filterbank import FilterBank
+from hlsim.torchtools import constant
 
 STEP = 24
 """Samples at 44.1 kHz from one value of an envelope, and of the gain that follows it, to the next."""
@@ -109,7 +110,7 @@ def envelope_lowpass(
     """Response that turns the rfft of ``decimate``'s means into that of the envelope at the steps.
 
     The low-pass is ``ellip(2, 0.25, 35)`` at 3/4 of 100 Hz or of the channel's ERB if less, run forwards and backwards
-    as pyclarity does with ``filtfilt``; what that does at the end is in ``hlsim.msbg.ending``.
+    as pyclarity does with ``filtfilt``; what that does at the end is in ``hlsim.msbg.filtfilt_end``.
 
     Args:
         points: FFT length at 44.1 kHz, a whole number of steps.

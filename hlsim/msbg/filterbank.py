@@ -5,17 +5,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from hlsim.dsp.erb import erb
 from hlsim.msbg.ear import RATE
 
 ORDER = 4
 """Order of the gammatone filters."""
 
 _CORNER_STEP = RATE / 8192.0
-
-
-def erb(frequency: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Equivalent rectangular bandwidth in Hz of the normal ear at a frequency in Hz (Glasberg and Moore 1990, Eq. 3)."""
-    return 24.7 * (4.37e-3 * frequency + 1.0)
 
 
 @dataclass(frozen=True)

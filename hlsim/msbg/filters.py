@@ -9,15 +9,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hlsim.compiling import lasting
+from hlsim.dsp.fft import edge
+from hlsim.dsp.fir import block_points
 from hlsim.msbg.ear import RATE, ear_filter, lowpass_filter
-from hlsim.msbg.ending import ending_response, ending_weights
 from hlsim.msbg.envelope import envelope_lowpass
 from hlsim.msbg.filterbank import BANKS, gammatone_response
-from hlsim.msbg.fourier import block_points, edge
+from hlsim.msbg.filtfilt_end import ending_response, ending_weights
+from hlsim.msbg.multirate import Plan, as_tensor, make_plan, total_response
 from hlsim.msbg.recruitment import threshold_weights
 from hlsim.msbg.smearing import BROADENING, smeared_bins, smearing_matrix
-from hlsim.msbg.tiers import Plan, as_tensor, make_plan, total_response
+from hlsim.torchtools import lasting
 
 
 class Filters:

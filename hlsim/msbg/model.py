@@ -12,15 +12,15 @@ from torch.utils.checkpoint import checkpoint
 from hlsim.audio import check_rate, check_waveform
 from hlsim.audiogram import AudiogramLike, as_thresholds, own_thresholds, severity_of
 from hlsim.calibration import PASCAL_SPL, check_full_scale, gain_to_pascals
-from hlsim.compiling import not_compiled
+from hlsim.dsp.fft import long_irfft, long_rfft
 from hlsim.msbg.cochlea import bank_points, hear, hear_ending
 from hlsim.msbg.ear import RATE
 from hlsim.msbg.filterbank import BANKS
 from hlsim.msbg.filters import Filters
-from hlsim.msbg.fourier import irfft, rfft
 from hlsim.msbg.recruitment import expansion_ratios
+from hlsim.msbg.resampling import block_bounds, faded, from_cochlea, from_spectrum, to_cochlea, to_inner
 from hlsim.msbg.smearing import BROADENING, SMEARING_DELAY, smear
-from hlsim.msbg.stages import block_bounds, faded, from_cochlea, from_spectrum, to_cochlea, to_inner
+from hlsim.torchtools import not_compiled
 
 STRUCTURAL_DELAY = 1047
 """Delay in samples at 44.1 kHz of the model without smearing, by which ``aligned`` advances the output.
@@ -190,7 +190,7 @@ class MSBG(nn.Module):
         length = heard.shape[-1]
         if self.aligned:
             points = bank_points(length * step, rate, step)
-            spectrum = rfft(heard, points // step)
+            spectrum = long_rfft(heard, points // step)
             if none:
                 spectrum = spectrum * filters.get("total", severity, points, step)
             else:
@@ -199,7 +199,7 @@ class MSBG(nn.Module):
             if severity in BROADENING:
                 return from_spectrum(spectrum, points, step, rate, samples, filters, gain=gain, delay=delay)
             # without smearing's delay, the way out reaches samples that the advances put before the first one
-            heard = irfft(spectrum, points // step)[..., :length]
+            heard = long_irfft(spectrum, points // step)[..., :length]
             return from_cochlea(heard, rate, length, samples, filters, gain=gain, step=step, delay=delay)
         heard = self._late(heard, ratios, severity, last, filters)
         return from_cochlea(heard, rate, length, round(length * rate / RATE), filters, gain=gain)
@@ -214,7 +214,7 @@ class MSBG(nn.Module):
             points = bank_points(length, RATE)
             plan = filters.get("plan", severity, points, 1, RATE / 2)
             parts.append(
-                irfft(hear(rfft(heard, points), ratios, plan, severity not in BROADENING), points)[
+                long_irfft(hear(long_rfft(heard, points), ratios, plan, severity not in BROADENING), points)[
                     ..., :length
                 ]
             )

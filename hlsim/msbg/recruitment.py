@@ -15,9 +15,9 @@ from torch.nn import functional
 
 from hlsim.audiogram import FREQUENCIES
 from hlsim.calibration import PASCAL_SPL
-from hlsim.constants import constant
 from hlsim.msbg.envelope import STEP
 from hlsim.msbg.filterbank import FilterBank
+from hlsim.torchtools import constant
 
 CATCH_UP_SPL = 105.0
 """Level in dB SPL at which the impaired ear hears as loud as a normal one."""

@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from hlsim.audiogram import SEVERITIES, severity_index
-from hlsim.constants import constant
+from hlsim.dsp.fir import filter_centred
 from hlsim.msbg.ear import RATE, ear_filter, lowpass_filter
 from hlsim.msbg.filterbank import BANKS, FilterBank, gammatone_response
-from hlsim.msbg.fourier import filter_centred
 from hlsim.msbg.model import STRUCTURAL_DELAY
+from hlsim.torchtools import constant
 
 _REACH_SECONDS = 0.064
 _SPACING = 2.5  # Hz, at most: of the grid, whose period is several times what the responses last

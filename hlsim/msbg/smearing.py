@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
-from hlsim.compiling import lasting
+from hlsim.dsp.fft import power, rfft
 from hlsim.msbg.ear import RATE
-from hlsim.spectrum import power, rfft
+from hlsim.torchtools import lasting
 
 FRAME, HOP, FFT = 256, 64, 512
 

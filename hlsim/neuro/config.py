@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from typing import Any, Self
 
-from hlsim.settings import refuse_unknown
-from hlsim.spectrum import STFT
+from hlsim.checks import refuse_unknown
+from hlsim.dsp.stft import STFT
 
 NEURO_RATE = 16000
 """The sample rate in Hz at which the networks work."""

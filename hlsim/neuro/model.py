@@ -5,7 +5,7 @@ from torch import Tensor, nn
 
 from hlsim.audiogram import FREQUENCIES, SEVERITIES, severity_index
 from hlsim.calibration import PASCAL_SPL
-from hlsim.constants import constant
+from hlsim.dsp.fft import power
 from hlsim.msbg.recruitment import CATCH_UP_SPL
 from hlsim.neuro.audiogram_encoder import AudiogramEncoder
 from hlsim.neuro.blocks import DualPathBlock, TimeBlock
@@ -14,7 +14,7 @@ from hlsim.neuro.decoders import MaskDecoder, PhaseDecoder
 from hlsim.neuro.encoder import DenseEncoder, FrameEncoder
 from hlsim.neuro.network import EarNetwork
 from hlsim.neuro.prior import Prior
-from hlsim.spectrum import power
+from hlsim.torchtools import constant
 
 _TINY = 1e-11
 

@@ -7,10 +7,11 @@ import math
 import torch
 from torch import Tensor, nn
 
-from hlsim.audio import check_rate, check_waveform, resample
+from hlsim.audio import check_rate, check_waveform
 from hlsim.audiogram import FREQUENCIES, AudiogramLike
-from hlsim.blocks import overlapping
 from hlsim.calibration import check_full_scale, gain_to_pascals
+from hlsim.dsp.overlap import overlapping
+from hlsim.dsp.resample import resample
 from hlsim.msbg.model import resolve_thresholds
 from hlsim.neuro.config import NEURO_RATE, NetworkConfig
 

@@ -14,16 +14,16 @@ from torch.nn import functional
 
 from hlsim.audiogram import SEVERITIES
 from hlsim.calibration import PASCAL_SPL
-from hlsim.constants import constant
+from hlsim.dsp.fir import filter_centred
+from hlsim.dsp.stft import STFT
 from hlsim.msbg.ear import RATE, ear_filter
 from hlsim.msbg.envelope import envelope_filters
 from hlsim.msbg.filterbank import BANKS, FilterBank, gammatone_response
-from hlsim.msbg.fourier import filter_centred
 from hlsim.msbg.recruitment import CATCH_UP_SPL, expansion_ratios, threshold_weights
 from hlsim.msbg.response import fixed_response
 from hlsim.msbg.smearing import BROADENING, roex_filters, smearing_from_filters
 from hlsim.neuro.config import NEURO_RATE
-from hlsim.spectrum import STFT
+from hlsim.torchtools import constant
 
 RESPONSE_REACH = 1024
 """Samples at 16 kHz by which the fixed responses reach to either side."""

@@ -15,13 +15,13 @@ from compensators.mapping import MappingCompensator
 from compensators.pretrained import KIND, load_compensator
 from hlsim.audiogram import Audiogram, draw_thresholds
 from hlsim.calibration import set_level
+from hlsim.checks import refuse_other_kinds, refuse_seed, refuse_unknown, refuse_weights
+from hlsim.data.augment import equalise, mix
 from hlsim.data.clips import Clips
 from hlsim.data.sounds import draw_sounds
-from hlsim.data.variation import equalise, mix
 from hlsim.loss import HearingLossLoss
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.pretrained import checkpoint_digest, save_checkpoint
-from hlsim.settings import refuse_other_kinds, refuse_seed, refuse_unknown, refuse_weights
 from hlsim.training.beginning import start_identity, started
 from hlsim.training.loop import TimedModule, run
 from hlsim.training.sources import TrainingData, read_thresholds

@@ -21,7 +21,7 @@ from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
-from hlsim.data.files import write_whole
+from hlsim.files import write_whole
 from hlsim.pretrained import repair_checkpoint
 from hlsim.training.examples import ShowExamples
 from hlsim.training.state import BEST, CHECKPOINT, LAST, WholeStates, claim

@@ -12,15 +12,16 @@ from torch import Tensor
 
 from hlsim.audiogram import MILDER, Audiogram, draw_thresholds
 from hlsim.calibration import set_level
-from hlsim.criteria import log_spectral_distance_db, noise_to_signal_db, paper_parts, weighted_sum
+from hlsim.checks import refuse_other_kinds, refuse_seed, refuse_unknown, refuse_weights
+from hlsim.criteria.paper import paper_parts, weighted_sum
+from hlsim.criteria.waveform import log_spectral_distance_db, noise_to_signal_db
+from hlsim.data.augment import mix, vary
 from hlsim.data.clips import Clips
 from hlsim.data.sounds import draw_sounds
-from hlsim.data.variation import mix, vary
 from hlsim.msbg import MSBG
 from hlsim.neuro import NeuroConfig, NeuroMSBG
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.pretrained import SIMULATOR, load_pretrained, save_checkpoint
-from hlsim.settings import refuse_other_kinds, refuse_seed, refuse_unknown, refuse_weights
 from hlsim.training.averaging import average_of
 from hlsim.training.beginning import start_identity, started
 from hlsim.training.loop import TimedModule, run

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 
-from hlsim.data.files import PARTIAL, write_whole
+from hlsim.files import PARTIAL, write_whole
 
 CHECKPOINT = "checkpoint"
 """Name of the folder with the best model, in its released form."""

@@ -9,10 +9,10 @@ import torch
 from compensators import NALR, MappingCompensator, MappingConfig
 from compensators.limiter import soft_limit
 from hlsim import Audiogram
-from hlsim.audio import resample
 from hlsim.audiogram import draw_thresholds
-from hlsim.band_levels import band_levels
 from hlsim.calibration import level_spl, set_level
+from hlsim.criteria.bands import band_levels
+from hlsim.dsp.resample import resample
 from hlsim.neuro import NeuroConfig
 
 SMALL = MappingConfig(channels=8, blocks=1)

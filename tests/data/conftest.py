@@ -6,9 +6,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from hlsim.audio import read_audio, resample, write_audio
+from hlsim.audio import read_audio, write_audio
 from hlsim.data.plan import prepare
 from hlsim.data.plan_settings import PlanSettings
+from hlsim.dsp.resample import resample
 
 RATE = 16000
 

@@ -12,8 +12,8 @@ import lightning as L
 
 from hlsim import MSBG
 from hlsim.calibration import level_spl
+from hlsim.data.instances import Instance, Plan
 from hlsim.data.module import Batch, PlanData, PlanItems, TrainingItems, collate
-from hlsim.data.samples import Instance, Plan
 from hlsim.data.writing import Recipe, write_instances
 
 

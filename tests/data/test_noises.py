@@ -9,9 +9,9 @@ from torch import Tensor
 
 from hlsim.audio import read_stretch, write_audio
 from hlsim.calibration import dbfs
-from hlsim.data.active_level import active_level_db
 from hlsim.data.manifest import Utterance
 from hlsim.data.noises import find_noises, mix_at
+from hlsim.dsp.active_level import active_level_db
 
 
 def many(root: Path, *names: str) -> Path:

@@ -13,9 +13,9 @@ import torch
 from torch import Tensor
 
 from hlsim.audio import write_audio
+from hlsim.data.instances import Plan
 from hlsim.data.plan import Prepared, prepare
 from hlsim.data.plan_settings import PlanSettings
-from hlsim.data.samples import Plan
 
 OUTPUTS = ("manifest.csv", "instances.csv", "faults.csv", "plan.json")
 

@@ -5,9 +5,9 @@ import torch
 from torch import Tensor
 
 from hlsim import MSBG, Audiogram
-from hlsim.audio import resample
 from hlsim.calibration import set_level
 from hlsim.data.teacher import Teacher
+from hlsim.dsp.resample import resample
 from hlsim.msbg import estimate_delay
 
 
@@ -58,7 +58,7 @@ def test_the_impulse_method_takes_whole_samples(long_speech: Tensor, name: str) 
 
 def test_pyclarity_as_the_teacher(long_speech: Tensor) -> None:
     pytest.importorskip("clarity")
-    from hlsim.evaluation.truth import pyclarity_msbg
+    from hlsim.metrics.reference import pyclarity_msbg
 
     ear = Audiogram.standard("N3")
     levels, signal = torch.tensor(ear.thresholds), long_speech[:16000]

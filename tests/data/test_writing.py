@@ -17,15 +17,15 @@ import pytest
 import torch
 from torch import Tensor
 
+from hlsim import files
 from hlsim.audio import write_audio
 from hlsim.audiogram import Audiogram
 from hlsim.calibration import level_spl
-from hlsim.data import files
-from hlsim.data.files import alone
+from hlsim.data.instances import MANIFEST, Instance, Plan
 from hlsim.data.plan import prepare
 from hlsim.data.plan_settings import PlanSettings
-from hlsim.data.samples import MANIFEST, Instance, Plan
 from hlsim.data.writing import Recipe, write_instances
+from hlsim.files import alone
 
 ROOT = Path(__file__).parents[2]
 

@@ -8,7 +8,7 @@ import pytest
 from hlsim.audiogram import Audiogram
 from hlsim.evaluation import ItemScore, holm, paired_comparison
 from hlsim.evaluation.comparison import Comparison, compare_conditions, p_text
-from hlsim.evaluation.mixed import MixedModel
+from hlsim.evaluation.statistics import MixedModel
 
 
 def item(i: int, scores: dict[str, float], *, listener: str = "", louder: float = 0.0) -> ItemScore:

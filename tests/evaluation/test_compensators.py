@@ -12,15 +12,12 @@ from torch import Tensor, nn
 
 from compensators import NALR, MappingCompensator, MappingConfig
 from hlsim import MSBG, Audiogram, HearingLossLoss, load_pretrained
-from hlsim.band_levels import band_edges
 from hlsim.calibration import level_spl, set_level
-from hlsim.cli import main
+from hlsim.cli.main import main
+from hlsim.criteria.bands import band_edges
 from hlsim.evaluation import compensators, judging, steadiness
-from hlsim.evaluation.compensator_report import FILES
 from hlsim.evaluation.compensators import evaluate_compensators
 from hlsim.evaluation.gain_curves import insertion_gain
-from hlsim.evaluation.haspi import haspi
-from hlsim.evaluation.hasqi import hasqi
 from hlsim.evaluation.judging import (
     INPUT_LEVELS,
     Judged,
@@ -32,8 +29,10 @@ from hlsim.evaluation.judging import (
     peak_spl,
     read_ears,
 )
-from hlsim.evaluation.significance import paired_comparison
+from hlsim.evaluation.statistics import paired_comparison
+from hlsim.metrics.haspi import haspi, hasqi
 from hlsim.pretrained import find_checkpoint, save_checkpoint
+from hlsim.report.compensators import FILES
 
 pytest.importorskip("clarity")
 pytest.importorskip("matplotlib")

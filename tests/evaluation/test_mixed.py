@@ -6,7 +6,7 @@ import sys
 import numpy as np
 import pytest
 
-from hlsim.evaluation.mixed import MixedModel, mixed_model
+from hlsim.evaluation.statistics import MixedModel, mixed_model
 
 
 def balanced(listeners: int, each: int, between: float, seed: int = 0) -> tuple[np.ndarray, list[str]]:

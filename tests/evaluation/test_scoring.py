@@ -16,10 +16,10 @@ import torch
 
 from hlsim.audio import read_audio, write_audio
 from hlsim.audiogram import FREQUENCIES, Audiogram
-from hlsim.evaluation import measures as measures_module
-from hlsim.evaluation.haspi import haspi
 from hlsim.evaluation.scoring import Item, Results, score_items
 from hlsim.evaluation.store import ScoreStore, content_hash
+from hlsim.metrics import registry as measures_module
+from hlsim.metrics.haspi import haspi
 
 for module in ("clarity", "joblib", "pystoi", "pesq"):
     pytest.importorskip(module)

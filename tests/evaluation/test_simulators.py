@@ -15,10 +15,10 @@ from compensators import NALR
 from hlsim import MSBG, Audiogram
 from hlsim.calibration import level_spl, set_level
 from hlsim.evaluation import simulators
-from hlsim.evaluation.fidelity import snr_db
-from hlsim.evaluation.fidelity_items import LEVELS, draw_items, treat
+from hlsim.evaluation.items import LEVELS, draw_items, treat
 from hlsim.evaluation.simulators import evaluate_simulators, weights_hash
-from hlsim.evaluation.truth import pyclarity_msbg
+from hlsim.metrics.fidelity import snr_db
+from hlsim.metrics.reference import pyclarity_msbg
 from hlsim.pretrained import SIMULATOR, load_pretrained, shipped
 
 pytest.importorskip("clarity")

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from compensators import NALR
 from hlsim import MSBG, Audiogram
 from hlsim.calibration import level_spl
-from hlsim.evaluation.fidelity_items import Item
+from hlsim.evaluation.items import Item
 from hlsim.evaluation.judging import NORMAL, Unaided
 from hlsim.evaluation.steadiness import TONES, shift_differences, shift_table, steady_tones, tone_table, tones
 

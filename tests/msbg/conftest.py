@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 import scipy.signal
 
+from hlsim.dsp.erb import erb
 from hlsim.msbg.ear import RATE
-from hlsim.msbg.filterbank import FilterBank, erb
+from hlsim.msbg.filterbank import FilterBank
 
 
 @pytest.fixture

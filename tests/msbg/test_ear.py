@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import scipy.signal
 
-from hlsim.fir import frequency_sampling_fir
+from hlsim.dsp.fir import frequency_sampling_fir
 from hlsim.msbg.ear import EAR_DELAY, RATE, ear_filter, lowpass_filter
 
 msbg = pytest.importorskip("clarity.evaluator.msbg.msbg")

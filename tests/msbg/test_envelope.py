@@ -8,9 +8,10 @@ import pytest
 import torch
 from torch import Tensor
 
+from hlsim.dsp.erb import erb
 from hlsim.msbg.ear import RATE
 from hlsim.msbg.envelope import STEP, detect, envelope, envelope_lowpass
-from hlsim.msbg.filterbank import BANKS, FilterBank, erb
+from hlsim.msbg.filterbank import BANKS, FilterBank
 
 TIME = 2 * STEP * 342
 EDGE = 3000  # samples from each end that filtfilt treats its own way

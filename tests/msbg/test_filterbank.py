@@ -7,8 +7,9 @@ import pytest
 import scipy.signal
 
 from hlsim.audiogram import SEVERITIES
+from hlsim.dsp.erb import erb
 from hlsim.msbg.ear import RATE
-from hlsim.msbg.filterbank import BANKS, ORDER, FilterBank, erb, gammatone_response
+from hlsim.msbg.filterbank import BANKS, ORDER, FilterBank, gammatone_response
 
 msbg_utils = pytest.importorskip("clarity.evaluator.msbg.msbg_utils")
 cochlea = pytest.importorskip("clarity.evaluator.msbg.cochlea")

@@ -18,8 +18,8 @@ from hlsim.audiogram import STANDARD, Audiogram, draw_thresholds
 from hlsim.calibration import gain_to_pascals, level_spl, set_level
 from hlsim.msbg import MSBG, filters
 from hlsim.msbg.model import STRUCTURAL_DELAY, active_rescaling
+from hlsim.msbg.resampling import block_bounds, to_inner
 from hlsim.msbg.smearing import smeared_length
-from hlsim.msbg.stages import block_bounds, to_inner
 
 EARS = {"none": "NH", "mild": "N1", "moderate": "N2", "severe": "N4"}  # one a severity
 RATE = 44100
@@ -449,7 +449,7 @@ def test_blocks_of_a_rate_that_shares_little_keep_the_length() -> None:
 
 
 def test_gradients_through_blocks_are_those_of_the_whole(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("hlsim.msbg.stages._BLOCK_SECONDS", 1.0)
+    monkeypatch.setattr("hlsim.msbg.resampling._BLOCK_SECONDS", 1.0)
     wave = 0.03 * torch.randn(2 * 44100, dtype=torch.float64)
     model, gradients = MSBG(Audiogram.standard("N3")), []
     for _ in range(2):
@@ -462,7 +462,7 @@ def test_gradients_through_blocks_are_those_of_the_whole(monkeypatch: pytest.Mon
 
 
 def test_gradients_through_blocks_are_the_same_by_a_transform(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("hlsim.msbg.stages._BLOCK_SECONDS", 1.0)
+    monkeypatch.setattr("hlsim.msbg.resampling._BLOCK_SECONDS", 1.0)
     model, wave = MSBG(Audiogram.standard("N3"), sample_rate=16000), 0.03 * torch.randn(20000)
     assert len(block_bounds(20000, 16000)) > 1
     leaf = wave.clone().requires_grad_()

@@ -11,9 +11,10 @@ from torch.overrides import TorchFunctionMode
 
 from hlsim.audiogram import FREQUENCIES, draw_thresholds
 from hlsim.calibration import gain_to_pascals
+from hlsim.dsp.erb import erb
 from hlsim.msbg.ear import RATE
 from hlsim.msbg.envelope import STEP, envelope, envelope_lowpass
-from hlsim.msbg.filterbank import BANKS, FilterBank, erb
+from hlsim.msbg.filterbank import BANKS, FilterBank
 from hlsim.msbg.recruitment import (
     CATCH_UP_SPL,
     around,

@@ -6,8 +6,8 @@ import torch
 from torch import Tensor
 
 from hlsim import MSBG, Audiogram
-from hlsim.audio import resample
 from hlsim.calibration import set_level
+from hlsim.dsp.resample import resample
 from hlsim.msbg.filterbank import BANKS
 from hlsim.msbg.response import fixed_response, with_phase_of_bank
 

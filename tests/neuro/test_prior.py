@@ -5,10 +5,10 @@ import torch
 
 from hlsim import MSBG, Audiogram
 from hlsim.audiogram import SEVERITIES
+from hlsim.dsp.fft import power
 from hlsim.msbg.filterbank import BANKS
 from hlsim.neuro.config import NeuroConfig
 from hlsim.neuro.prior import RESPONSE_REACH, Prior, _widening
-from hlsim.spectrum import power
 
 
 def test_fixed_response_is_msbg_without_a_loss() -> None:

@@ -11,7 +11,7 @@ pytest.importorskip("lightning")
 
 from compensators import MappingCompensator, load_compensator
 from hlsim import Audiogram, NeuroMSBG, load_pretrained
-from hlsim.cli import main
+from hlsim.cli.main import main
 from hlsim.pretrained import CONFIG, checkpoint_digest
 from hlsim.training.compensator import CompensatorRecipe, CompensatorTraining, train_compensator
 from hlsim.training.simulator import SimulatorRecipe, SimulatorTraining, train_simulator

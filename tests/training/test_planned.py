@@ -11,10 +11,10 @@ from hlsim.audio import write_audio
 
 pytest.importorskip("lightning")
 
-from hlsim.cli import main
+from hlsim.cli.main import main
+from hlsim.data.instances import Instance
 from hlsim.data.plan import prepare
 from hlsim.data.plan_settings import PlanSettings
-from hlsim.data.samples import Instance
 from hlsim.data.writing import Recipe, write_instances
 from hlsim.pretrained import load_pretrained
 from hlsim.training.planned import PlannedSource, PlannedTraining

@@ -1,0 +1,1 @@
+"""Times simulators, a training step and the scan."""

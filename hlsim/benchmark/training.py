@@ -1,0 +1,157 @@
+"""What a training step costs, and the selective scan against other ways to run it."""
+
+from __future__ import annotations
+
+import importlib
+import statistics
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from hlsim.audiogram import Audiogram
+from hlsim.benchmark.timing import attempt, milliseconds, peak_mib
+from hlsim.calibration import set_level
+from hlsim.loss import HearingLossLoss
+from hlsim.neuro.config import NEURO_RATE
+from hlsim.neuro.scan import kernel_for, selective_scan, torch_scan
+
+SCAN_SHAPE = (16, 64, 256, 16)
+"""Items, channels, time and states."""
+
+
+def training_step(
+    compensator: nn.Module, *, device: str = "cpu", batch: int = 8, seconds: float = 2.0, repeats: int = 5
+) -> tuple[list[dict[str, Any]], list[str]]:
+    """Where a step's time goes: the compensator, the loss that judges it, its simulator alone, and the whole step.
+
+    Args:
+        compensator: called with speech at 16 kHz and an audiogram.
+
+    Returns: rows of name, forward, and forward plus backward: median, least and greatest milliseconds and, on a GPU, peak
+        memory in MiB; and what failed, with its reason.
+    """
+    place, ear = torch.device(device), Audiogram.standard("N3")
+    generator = torch.Generator().manual_seed(0)
+    clean = set_level(torch.randn(batch, round(NEURO_RATE * seconds), generator=generator), 65.0).to(place)
+    compensator = compensator.to(place).train()
+    loss = HearingLossLoss(ear).to(place)
+    exact = HearingLossLoss(ear, simulator="msbg").to(place)
+    leaf = clean.clone().requires_grad_()
+    parts: list[tuple[str, Callable[[], Tensor]]] = [
+        ("compensator", lambda: compensator(clean, ear).square().sum()),
+        ("HearingLossLoss (neuro-msbg)", lambda: loss(leaf, clean)),
+        ("- its simulator", lambda: loss.simulator(leaf, ear).square().sum()),
+        ("HearingLossLoss (msbg)", lambda: exact(leaf, clean)),
+        ("- its simulator", lambda: exact.simulator(leaf, ear).square().sum()),
+        ("whole step (neuro-msbg)", lambda: loss(compensator(clean, ear), clean)),
+        ("whole step (msbg)", lambda: exact(compensator(clean, ear), clean)),
+    ]
+    return _table(parts, place, repeats)
+
+
+def scan_rows(*, device: str = "cpu", repeats: int = 5) -> tuple[list[dict[str, Any]], list[str]]:
+    """The selective scan in plain torch, and with mamba-ssm's kernel as hlsim calls it, against the step-by-step loop,
+    that kernel alone and mambapy; rows, and what is missing."""
+    place = torch.device(device)
+    items, channels, length, states = SCAN_SHAPE
+    torch.manual_seed(0)
+    u = torch.randn(items, channels, length, device=place)
+    delta = torch.rand(items, channels, length, device=place).mul(0.1)
+    B, C = (torch.randn(items, states, length, device=place) for _ in range(2))
+    A = -torch.rand(channels, states, device=place) - 0.5
+    for tensor in (u, delta, A, B, C):
+        tensor.requires_grad_()
+    parts: list[tuple[str, Callable[[], Tensor]]] = [
+        ("hlsim (plain torch)", lambda: torch_scan(u, delta, A, B, C).sum()),
+        ("step by step", lambda: scan_loop(u, delta, A, B, C).sum()),
+    ]
+    if kernel_for(u) is not None:
+        parts.append(("hlsim (by mamba-ssm's kernel)", lambda: selective_scan(u, delta, A, B, C).sum()))
+    skipped = []
+    try:
+        kernel = importlib.import_module("mamba_ssm.ops.selective_scan_interface").selective_scan_fn
+        if place.type != "cuda":
+            raise ImportError("runs on a GPU only")
+        parts.append(("mamba-ssm", lambda: kernel(u, delta, A, B, C).sum()))
+    except Exception as error:  # a build for another torch or GPU fails with whatever it likes
+        skipped.append(f"mamba-ssm: {str(error).splitlines()[0]}")
+    try:
+        pscan = importlib.import_module("mambapy.pscan").pscan
+
+        def mambapy() -> Tensor:
+            decay = (delta.mT.unsqueeze(-1) * A).exp()
+            drive = (delta * u).mT.unsqueeze(-1) * B.mT.unsqueeze(2)
+            return (pscan(decay, drive) @ C.mT.unsqueeze(-1)).sum()
+
+        parts.append(("mambapy", mambapy))
+    except ImportError as error:
+        skipped.append(f"mambapy: {error}")
+    rows, failed = _table(parts, place, repeats)
+    return rows, skipped + failed
+
+
+def scan_loop(u: Tensor, delta: Tensor, A: Tensor, B: Tensor, C: Tensor) -> Tensor:
+    """The recurrence as it is written. Shapes as ``hlsim.neuro.scan.selective_scan``'s."""
+    state = torch.zeros(*u.shape[:2], A.shape[-1], device=u.device, dtype=u.dtype)
+    outputs = []
+    for t in range(u.shape[-1]):
+        step = delta[..., t, None]
+        state = (step * A).exp() * state + step * u[..., t, None] * B[:, None, :, t]
+        outputs.append((state * C[:, None, :, t]).sum(-1))
+    return torch.stack(outputs, -1)
+
+
+def _table(
+    parts: list[tuple[str, Callable[[], Tensor]]], device: torch.device, repeats: int
+) -> tuple[list[dict[str, Any]], list[str]]:
+    cells = [{"forward": _Cell(), "both": _Cell()} for _ in parts]
+    skipped: list[str] = []
+    for turn in range(repeats + 1):  # in turns, so that all see the same machine; the first does not count
+        for (name, part), own in zip(parts, cells, strict=True):
+            for direction, cell in own.items():
+                call = partial(cell.take, partial(_run, part, direction), device, turn > 0)
+                what = f"{name}, " + ("forward" if direction == "forward" else "forward and backward")
+                if not cell.failed:
+                    cell.failed = not attempt(what, call, device, skipped)
+    rows = [
+        {"name": name} | {direction: cell.figures() for direction, cell in own.items()}
+        for (name, _), own in zip(parts, cells, strict=True)
+    ]
+    return [row for row in rows if row["forward"] or row["both"]], skipped
+
+
+@dataclass
+class _Cell:
+    times: list[float] = field(default_factory=list)
+    peak: float | None = None
+    failed: bool = False
+
+    def take(self, call: Callable[[], None], device: torch.device, counted: bool) -> None:
+        elapsed = milliseconds(call, device)
+        if counted:
+            self.times.append(elapsed)
+        elif (
+            device.type == "cuda"
+        ):  # on a CPU the first call leaves memory to the process, which the second takes
+            self.peak = peak_mib(call, device)
+
+    def figures(self) -> dict[str, float | None] | None:
+        if not self.times:
+            return None
+        return {
+            "median_ms": statistics.median(self.times),
+            "least_ms": min(self.times),
+            "greatest_ms": max(self.times),
+            "peak_mib": self.peak,
+        }
+
+
+def _run(part: Callable[[], Tensor], direction: str) -> None:
+    with torch.set_grad_enabled(direction == "both"):
+        value = part()
+    if direction == "both":
+        value.backward()

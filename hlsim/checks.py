@@ -1,0 +1,132 @@
+"""Checks of settings, weights, seeds and lengths: what is refused is told with what is allowed."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import fields
+from decimal import Decimal, InvalidOperation
+from typing import Any, get_type_hints
+
+import torch
+from torch import Tensor
+
+_KINDS = {int: "a whole number", float: "a number", bool: "true or false", str: "text"}
+
+
+def refuse_unknown(found: Iterable[Any], allowed: Iterable[str], what: str, where: str = "") -> None:
+    """Raise ValueError unless every name is allowed.
+
+    Args:
+        what: what the names are of, for the message: "network settings".
+        where: where they stand: "in the recipe".
+    """
+    allowed = list(allowed)
+    if unknown := sorted({str(name) for name in found} - set(allowed)):
+        place = f" {where}" if where else ""
+        raise ValueError(f"unknown {what} {', '.join(unknown)}{place}; allowed: {', '.join(allowed)}")
+
+
+def refuse_other_kinds(settings: Any, where: str) -> None:
+    """Raise ValueError unless every field of a dataclass holds what it is annotated with.
+
+    Args:
+        settings: with fields that are an int, a float, a bool, a str, a pair of floats (ascending) or a dict of them.
+        where: where they stand: "in the recipe".
+    """
+    kinds = get_type_hints(type(settings))
+    for name in (entry.name for entry in fields(settings)):
+        kind, value = kinds[name], getattr(settings, name)
+        origin = getattr(kind, "__origin__", None)
+        if origin is tuple:
+            if not isinstance(value, tuple | list) or len(value) != 2:
+                raise ValueError(f"{name} {value!r} {where}; allowed: a lowest and a highest, as [0, 20]")
+            for one in value:
+                _refuse(one, float, name, where)
+            if value[0] > value[1]:
+                raise ValueError(f"{name} {list(value)} {where}; allowed: a lowest and a highest, ascending")
+        elif origin is dict:
+            if not isinstance(value, Mapping):
+                raise ValueError(f"{name} {value!r} {where}; allowed: 'name: value' lines below it")
+            if float in kind.__args__:
+                for key, one in value.items():
+                    _refuse(one, float, f"{name}: {key}", where)
+        else:
+            _refuse(value, kind, name, where)
+
+
+def refuse_weights(weights: Mapping[str, float], allowed: Iterable[str], where: str) -> None:
+    """Raise ValueError unless all are of known criteria, none is negative and one or more is above 0."""
+    refuse_unknown(weights, allowed, "criteria", where)
+    if min(weights.values(), default=0.0) < 0.0 or not any(weights.values()):
+        raise ValueError(f"weights {dict(weights)} {where}; allowed: 0 or more, one or more above 0")
+
+
+def refuse_seed(seed: int, where: str) -> None:
+    """Raise ValueError for a seed that torch's generators do not take."""
+    if not -(2**62) < seed < 2**62:
+        raise ValueError(f"seed {seed} {where}; allowed: whole numbers between -2**62 and 2**62")
+
+
+def _refuse(value: Any, kind: type, name: str, where: str) -> None:
+    if kind is float:
+        fits = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    else:
+        fits = type(value) is kind
+    if fits:
+        return
+    wanted = f"allowed: {_KINDS[kind]}"
+    if kind in (int, float) and isinstance(value, str) and (written := _as_number(value)):
+        wanted = f"that is text in YAML; write {written}"
+    raise ValueError(f"{name} {value!r} {where}; {wanted}")
+
+
+def _as_number(text: str) -> str | None:
+    """How YAML reads what the text means; None where it is no number."""
+    try:
+        number = Decimal(text)
+    except InvalidOperation:
+        return None
+    if not number.is_finite() or abs(number.adjusted()) > 15:
+        return None
+    plain = f"{number:f}"
+    if "e" not in text.lower():
+        return plain
+    mantissa, _, exponent = f"{number:e}".partition("e")
+    return f"{plain} or {mantissa if '.' in mantissa else mantissa + '.0'}e{exponent}"
+
+
+Lengths = Tensor | Sequence[int]
+"""Samples of each item, in the shape of the leading dimensions."""
+
+
+def check_lengths(lengths: Lengths, shape: torch.Size) -> Tensor:
+    """The lengths as a tensor on the CPU.
+
+    Args:
+        shape: of the batch, (..., time).
+
+    Returns: (...), int64.
+
+    Raises:
+        ValueError: not whole numbers, of another shape, or outside 1 to time.
+    """
+    *items, time = shape
+    allowed = f"allowed: whole numbers from 1 to {time} (samples) of shape {tuple(items)}, one an item"
+    try:
+        ends = torch.as_tensor(lengths, device="cpu")
+    except (TypeError, ValueError, RuntimeError):
+        raise ValueError(f"lengths is {type(lengths).__name__}; {allowed}") from None
+    if ends.is_floating_point() or ends.is_complex() or ends.dtype == torch.bool:
+        raise ValueError(f"lengths of {ends.dtype}; {allowed}")
+    if ends.shape != shape[:-1]:
+        raise ValueError(f"lengths of shape {tuple(ends.shape)}; {allowed}")
+    if not bool(((ends >= 1) & (ends <= time)).all()):
+        raise ValueError(f"lengths from {int(ends.min())} to {int(ends.max())}; {allowed}")
+    return ends.long()
+
+
+def silent_after(waveform: Tensor, ends: Tensor) -> Tensor:
+    """Zeros in place of what follows each item's end. Shape: (..., time), (...) -> (..., time)."""
+    places = torch.arange(waveform.shape[-1], device=waveform.device)
+    return torch.where(places < ends.to(waveform.device).unsqueeze(-1), waveform, 0.0)

@@ -1,0 +1,1 @@
+"""The program ``hlsim``: a module a command, which joins what computes to what presents."""

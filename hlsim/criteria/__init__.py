@@ -1,0 +1,1 @@
+"""What a loss compares of two waveforms."""

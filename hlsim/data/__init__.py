@@ -1,0 +1,1 @@
+"""Corpora, plans, instances, augmentation: what training reads."""

@@ -1,0 +1,204 @@
+"""The instances of a prepared plan: one function makes them, whether on the fly or for the disk."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save
+from torch import Tensor
+
+from hlsim.audio import read_audio, read_stretch
+from hlsim.audiogram import FREQUENCIES, Audiogram
+from hlsim.calibration import PASCAL_SPL
+from hlsim.data.manifest import UTTERANCE_COLUMNS, Rows, Utterance, inside
+from hlsim.data.noises import mix_at
+from hlsim.dsp.resample import resample
+from hlsim.files import sha256
+
+MANIFEST, INSTANCES, SETTINGS = "manifest.csv", "instances.csv", "plan.json"
+"""Names in a prepared folder."""
+
+CLAIM = "instances/made-of.txt"
+"""What the instances in a prepared folder are made of: the plan's digest, and how."""
+
+INSTANCE_COLUMNS = (
+    "number",
+    "id",
+    "split",
+    "input",
+    "level",
+    "severity",
+    *(f"hl_{frequency:g}" for frequency in FREQUENCIES),
+)
+
+
+@dataclass(frozen=True)
+class Instance:
+    """What an ear is given and hears, in pascals, time-aligned and equally long.
+
+    Attributes:
+        clean: the reference. Shape: (time,).
+        signal: the normal-hearing input, clean or noisy. Shape: (time,).
+        thresholds: of the ear, dB HL. Shape: (8,).
+        impaired: what the ear hears of ``signal``; None where a teacher is still to say. Shape: (time,).
+    """
+
+    clean: Tensor
+    signal: Tensor
+    thresholds: Tensor
+    impaired: Tensor | None = None
+
+    def to_bytes(self) -> bytes:
+        """A safetensors file; equal instances give equal bytes."""
+        assert self.impaired is not None
+        tensors = {name: value.clone().contiguous() for name, value in vars(self).items()}
+        return save(tensors)
+
+    @classmethod
+    def read(cls, path: str | Path) -> Instance:
+        """Raises ValueError where the file is missing or broken."""
+        try:
+            return cls(**load_file(path))
+        except (OSError, SafetensorError, TypeError) as error:
+            raise ValueError(f"{path}: no instance ({error}); 'hlsim prepare --write' makes them") from error
+
+
+class Plan:
+    """A folder that ``hlsim prepare`` made: its utterances and instances, read when asked for.
+
+    Args:
+        folder: the folder, or its ``manifest.csv``.
+        root: where the audio lies, if not where it was prepared.
+
+    Raises:
+        ValueError: the folder is no such plan.
+    """
+
+    def __init__(self, folder: str | Path, root: str | Path | None = None) -> None:
+        self.folder = Path(folder).parent if Path(folder).name == MANIFEST else Path(folder)
+        try:
+            about = json.loads((self.folder / SETTINGS).read_text(encoding="utf-8"))
+            self.root = Path(root if root is not None else about["root"])
+            self.rate = int(about["settings"]["rate"])
+            self.inputs: list[str] = about["inputs"]
+            self.ears = int(about["settings"]["ears"])
+            # neither table has the rate
+            self.digest: str = f"{about['manifest_sha256']}{about['instances_sha256']} at {self.rate} Hz"
+        except (OSError, KeyError, TypeError, ValueError) as error:
+            raise ValueError(f"{self.folder}: not prepared ({error}); 'hlsim prepare' makes it") from error
+        self.utterances = Rows(self.folder / MANIFEST, UTTERANCE_COLUMNS)
+        self.rows = Rows(self.folder / INSTANCES, INSTANCE_COLUMNS)
+        self._last = (-1, torch.empty(0))  # an utterance is wanted as often as it has instances, and in a row
+        if len(self.rows) != len(self.utterances) * self.each:
+            raise ValueError(
+                f"{self.folder}: {len(self.rows)} instances of {len(self.utterances)} utterances; "
+                f"allowed: {self.each} of each"
+            )
+        for name in (MANIFEST, INSTANCES):
+            if sha256(self.folder / name) != about[f"{Path(name).stem}_sha256"]:
+                raise ValueError(
+                    f"{self.folder / name}: has changed since it was prepared; 'hlsim prepare' makes it anew"
+                )
+
+    def __len__(self) -> int:
+        """How many instances."""
+        return len(self.rows)
+
+    @property
+    def each(self) -> int:
+        """Instances of an utterance."""
+        return len(self.inputs) * self.ears
+
+    def indices(self, split: str) -> Tensor:
+        """Numbers of the instances of a split. Shape: -> (instances,), int64."""
+        return torch.tensor(
+            [i for i, row in enumerate(self.rows) if row["split"] == split], dtype=torch.int64
+        )
+
+    def utterance(self, index: int) -> Utterance:
+        """Of an instance."""
+        return Utterance.from_row(self.utterances[index // self.each])
+
+    def thresholds(self, index: int) -> Tensor:
+        """Of an instance's ear, dB HL. Shape: -> (8,)."""
+        return torch.tensor(Audiogram.from_row(self.rows[index]).thresholds)
+
+    def pair(self, index: int) -> tuple[Tensor, Tensor]:
+        """Clean and noisy speech of an instance's utterance at the plan's rate and the instance's level, in pascals.
+
+        Noise is mixed in at the rate of the files, so that its level counts all its bands; a plan without noise gives the
+        clean speech twice.
+
+        Shape: -> (time,) twice.
+
+        Raises:
+            ValueError: a file that can no longer be used, or a path that leads out of the root.
+        """
+        utterance = self.utterance(index)
+        key, both = self._last
+        if key != index // self.each:
+            both = self._read(utterance)
+            self._last = (index // self.each, both)
+        level = float(self.rows[index]["level"])
+        both = both * 10.0 ** ((level - PASCAL_SPL - utterance.active_level) / 20.0)
+        return both[0], both[1]
+
+    def _read(self, utterance: Utterance) -> Tensor:
+        """Clean and noisy as they are in the files. Shape: -> (2, time) at the plan's rate."""
+        clean, rate = read_audio(inside(self.root, utterance.clean))
+        clean = clean[0]
+        if utterance.noisy:
+            noisy = read_audio(inside(self.root, utterance.noisy))[0][0]
+        elif utterance.mixed:
+            assert utterance.snr is not None
+            noisy = mix_at(
+                clean, self._noise(utterance, len(clean), rate), utterance.snr, utterance.active_level
+            )
+        else:
+            noisy = clean
+        # the manifest has six digits of the seconds
+        same_length = math.isclose(len(clean) / rate, utterance.seconds, rel_tol=1e-5)
+        if noisy.shape != clean.shape or rate != utterance.rate or not same_length:
+            raise ValueError(f"{inside(self.root, utterance.clean)}: has changed since it was prepared")
+        return resample(torch.stack((clean, noisy)), rate, self.rate)
+
+    def noise(self, index: int, samples: int) -> Tensor:
+        """As long a piece as asked of the noise that an instance's utterance is mixed with, at the plan's rate.
+
+        Shape: -> (samples,).
+        """
+        return self._noise(self.utterance(index), samples, self.rate)
+
+    def _noise(self, utterance: Utterance, samples: int, rate: int) -> Tensor:
+        start = utterance.noise_start or 0.0
+        # a little more, for resampling rounds
+        noise, own_rate = read_stretch(inside(self.root, utterance.noise), start, samples / rate + 0.01)
+        return resample(noise[0], own_rate, rate)[:samples]
+
+    def instance(self, index: int) -> Instance:
+        """Without ``impaired``. Raises ValueError as ``pair``."""
+        clean, noisy = self.pair(index)
+        signal = noisy if self.rows[index]["input"] == "noisy" else clean
+        return Instance(clean, signal, self.thresholds(index))
+
+    def path(self, index: int) -> Path:
+        """Of a prepared instance."""
+        return self.folder / "instances" / f"{index // 1000:05d}" / f"{index:08d}.safetensors"
+
+
+def is_whole(path: Path) -> bool:
+    """Whether a file is an instance, as far as its head and its length tell."""
+    from safetensors import safe_open
+
+    try:
+        with safe_open(path, "pt") as file:
+            names: Any = file.keys()
+            return set(names) == {"clean", "signal", "thresholds", "impaired"}
+    except (OSError, SafetensorError):
+        return False

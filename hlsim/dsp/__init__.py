@@ -1,0 +1,1 @@
+"""Signal code that knows nothing of hearing: transforms, filters, blocks, rates, levels."""

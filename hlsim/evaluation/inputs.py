@@ -1,0 +1,297 @@
+"""A CSV manifest: which files which ear of which listener is given, under any number of conditions.
+
+A row is one file that one ear is given::
+
+    listener,ear,condition,clean,processed,snr,hl_250,hl_500,...,hl_8000
+    L1,left,unaided,clean/s01.flac,noisy/s01.flac,5,35,35,...,65
+    L1,left,NAL-R,clean/s01.flac,nalr/L1-left/s01.flac,5,35,35,...,65
+
+Columns: ``condition``, ``clean`` and ``processed`` are needed, the paths relative to the root; ``listener``, ``ear``
+(left or right), ``item`` and ``snr`` (dB) may be there. Rows of one listener, ear, clean file, item and SNR are one item
+of the report. The ear's audiogram is in columns ``hl_250`` and so on, or in a column ``audiogram`` by its standard name,
+or in a second CSV file by ``listener`` and ``ear``. The level is in a column ``spl`` (dB SPL of the clean file) or
+``full_scale_spl`` (dB SPL of RMS 1.0), or is given for all.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from itertools import chain
+from pathlib import Path, PurePath, PurePosixPath
+
+from hlsim.audio import EXTENSIONS, find_audio
+from hlsim.audiogram import Audiogram, numbered_audiograms
+from hlsim.calibration import check_full_scale
+from hlsim.evaluation.scoring import EARS, Item
+from hlsim.files import read_rows
+
+_EAR_NAMES = {"": "", "l": "left", "left": "left", "r": "right", "right": "right"}
+_NEEDED = ("condition", "clean", "processed")
+
+
+def read_manifest(
+    path: str | Path,
+    root: str | Path | None = None,
+    *,
+    audiogram: Audiogram | None = None,
+    audiograms: str | Path | None = None,
+    full_scale_spl: float = 94.0,
+    spl: float | None = None,
+) -> list[Item]:
+    """The items of a manifest, in the order of their first rows.
+
+    Args:
+        root: the folder that the paths are relative to, and that they may not leave; by default the manifest's own.
+        audiogram: the ear of all rows that bring none; or else
+        audiograms: a CSV file with columns ``listener``, ``ear`` (where left and right differ) and ``hl_250``, ....
+        full_scale_spl, spl: the level, as in ``Item``, of rows that bring none.
+
+    Raises:
+        ValueError: the file cannot be read, lacks a column, or a row is wrong: an ear other than left and right, a path
+            that leaves the root, no audiogram or level, a second row of a condition, or one unlike its item's others; or
+            no row takes ``audiogram``, ``audiograms`` or ``spl``.
+    """
+    folder = (Path(path).parent if root is None else Path(root)).resolve()
+    if not folder.is_dir():
+        raise ValueError(f"{folder}: no such folder; the manifest's paths are relative to it")
+    ears = {} if audiograms is None else _ears(audiograms)
+    items: dict[tuple[str, ...], Item] = {}
+    rows, taken = _rows(path), []
+    for line, row in rows:
+        try:
+            name, condition, item = _item(row, folder, ears, audiogram, full_scale_spl, spl)
+            taken.append(item.audiogram)
+            known = items.get(name)
+            if known is None:
+                items[name] = item
+                continue
+            if condition in known.processed:
+                raise ValueError(f"a second row of condition {condition!r} of {item.name}")
+            if replace(known, processed={}) != replace(item, processed={}):
+                raise ValueError(f"audiogram or level is not that of the other rows of {item.name}")
+            items[name] = replace(known, processed={**known.processed, **item.processed})
+        except ValueError as error:
+            raise ValueError(f"{path}, line {line}: {error}") from error
+    for what, idle in (
+        ("audiogram", audiogram is not None and all(ear is not audiogram for ear in taken)),
+        (
+            "audiograms",
+            audiograms is not None and not any(own is ear for own in taken for ear in ears.values()),
+        ),
+        ("spl", spl is not None and all(row.get("spl") or row.get("full_scale_spl") for _, row in rows)),
+    ):
+        if idle:
+            raise ValueError(f"{path}: no row takes {what}, for each has its own; leave one of the two out")
+    return list(items.values())
+
+
+def inside(root: Path, name: str, column: str) -> Path:
+    """A path below a root, links followed, or ValueError where it leaves it."""
+    path = (root / name).resolve()
+    if not name or PurePosixPath(name).is_absolute() or Path(name).is_absolute():
+        raise ValueError(f"{column} is {name!r}; allowed: a path relative to {root}")
+    if not path.is_relative_to(root):
+        raise ValueError(f"{column} is {name!r}, which leaves {root}; allowed: paths below it")
+    return path
+
+
+def _rows(path: str | Path) -> list[tuple[int, dict[str, str]]]:
+    """With the number of each row's line."""
+    try:
+        rows = list(read_rows(path))
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise ValueError(f"{path}: cannot read the manifest: {error}") from error
+    if not rows:
+        raise ValueError(f"{path}: no rows; needs a header with {', '.join(_NEEDED)} and a row a file")
+    missing = [column for column in _NEEDED if column not in rows[0][1]]
+    if missing:
+        raise ValueError(f"{path}: no column {', '.join(missing)}; needs {', '.join(_NEEDED)}")
+    return rows
+
+
+def _item(
+    row: Mapping[str, str],
+    root: Path,
+    ears: Mapping[tuple[str, str], Audiogram],
+    audiogram: Audiogram | None,
+    full_scale_spl: float,
+    spl: float | None,
+) -> tuple[tuple[str, ...], str, Item]:
+    condition, listener = row["condition"], row.get("listener", "")
+    if not condition:
+        raise ValueError("no condition")
+    ear = _ear(row.get("ear", ""))
+    clean = inside(root, row["clean"], "clean")
+    own = {key: _number(row, key) for key in ("spl", "full_scale_spl", "snr")}
+    if own["spl"] is not None and own["full_scale_spl"] is not None:
+        raise ValueError("both spl and full_scale_spl; allowed: one of them a row")
+    if own["full_scale_spl"] is not None:
+        full_scale_spl, spl = own["full_scale_spl"], None
+    elif own["spl"] is not None:
+        spl = own["spl"]
+    parts = (listener, ear, row.get("item", "") or PurePosixPath(row["clean"]).with_suffix("").as_posix())
+    label = " ".join(part for part in parts if part)
+    item = Item(
+        name=label if own["snr"] is None else f"{label} {own['snr']:g} dB",
+        clean=clean,
+        processed={condition: inside(root, row["processed"], "processed")},
+        audiogram=_audiogram(row, ears, listener, ear, audiogram),
+        listener=listener,
+        ear=ear,
+        snr=own["snr"],
+        full_scale_spl=check_full_scale(full_scale_spl),
+        spl=spl,
+    )
+    return (*parts, str(clean), str(own["snr"])), condition, item
+
+
+def _audiogram(
+    row: Mapping[str, str],
+    ears: Mapping[tuple[str, str], Audiogram],
+    listener: str,
+    ear: str,
+    default: Audiogram | None,
+) -> Audiogram:
+    levels = {key: value for key, value in row.items() if key.lower().startswith("hl")}
+    if any(levels.values()):  # then all: a blank is no threshold, and not one like its neighbour's either
+        return Audiogram.from_row(levels)
+    if row.get("audiogram"):
+        return Audiogram.standard(row["audiogram"])
+    known = ears.get((listener, ear)) or ears.get((listener, "")) or default
+    if known is None:
+        raise ValueError(
+            f"no audiogram of listener {listener!r}, ear {ear!r}: neither in columns hl_250, hl_500, ... or audiogram "
+            "nor in a file of audiograms"
+        )
+    return known
+
+
+def _ears(path: str | Path) -> dict[tuple[str, str], Audiogram]:
+    ears: dict[tuple[str, str], Audiogram] = {}
+    for line, row, audiogram in numbered_audiograms(path):
+        try:
+            name = (row.get("listener", ""), _ear(row.get("ear", "")))
+            if not name[0]:
+                raise ValueError("no listener; needs a column 'listener'")
+            if name in ears:
+                raise ValueError(f"a second row of listener {name[0]}, ear {name[1]!r}")
+        except ValueError as error:
+            raise ValueError(f"{path}, line {line}: {error}") from error
+        ears[name] = audiogram
+    return ears
+
+
+def _ear(text: str) -> str:
+    if text.lower() not in _EAR_NAMES:
+        raise ValueError(f"ear is {text!r}; allowed: {', '.join(EARS)}")
+    return _EAR_NAMES[text.lower()]
+
+
+def _number(row: Mapping[str, str], column: str) -> float | None:
+    text = row.get(column, "")
+    if not text:
+        return None
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise ValueError(f"{column} is {text!r}; allowed: a number of dB")
+    return value
+
+
+_NAMED = 3  # of many missing files a message names the first few
+
+
+def read_folders(
+    clean: str | Path,
+    before: str | Path,
+    after: str | Path,
+    audiogram: Audiogram | None = None,
+    *,
+    audiograms: str | Path | None = None,
+    full_scale_spl: float = 94.0,
+    spl: float | None = None,
+) -> list[Item]:
+    """An item a name, with the conditions ``before`` and ``after``, sorted by name.
+
+    Args:
+        clean, before, after: folders of wav, flac or ogg files whose names below the folder, but for the extension, are
+            the same.
+        audiogram: the ear, of all files; or else
+        audiograms: a CSV file with columns ``file`` (the name below the folder, with or without extension) and
+            ``hl_250``, ``hl_500``, ... in dB HL, one row a file. Rows of other files are passed over.
+        full_scale_spl, spl: the level, as in ``Item``.
+
+    Raises:
+        ValueError: names differ between the folders, a file has no audiogram, or both or none of ``audiogram`` and
+            ``audiograms`` are given.
+    """
+    if (audiogram is None) == (audiograms is None):
+        raise ValueError(
+            "give either audiogram, one ear of all files, or audiograms, a CSV file with a row a file"
+        )
+    folders = [_by_name(folder) for folder in (clean, before, after)]
+    names = _common_names((clean, before, after), folders)
+    ears = dict.fromkeys(names, audiogram) if audiogram is not None else _named_ears(str(audiograms), names)
+    return [
+        Item(
+            name=name,
+            clean=folders[0][name].absolute(),
+            processed={"before": folders[1][name].absolute(), "after": folders[2][name].absolute()},
+            audiogram=ears[name],
+            full_scale_spl=full_scale_spl,
+            spl=spl,
+        )
+        for name in names
+    ]
+
+
+def _name(path: PurePath) -> str:
+    """The path in POSIX form without the extension of audio; other dots belong to the name."""
+    return (path.with_suffix("") if path.suffix.lower() in EXTENSIONS else path).as_posix()
+
+
+def _by_name(folder: str | Path) -> dict[str, Path]:
+    files: dict[str, Path] = {}
+    for path in find_audio(folder):
+        name = _name(path.relative_to(folder))
+        if name in files:
+            raise ValueError(f"{files[name]} and {path}: one name twice; allowed: one file a name")
+        files[name] = path
+    return files
+
+
+def _common_names(roots: Iterable[str | Path], folders: list[dict[str, Path]]) -> list[str]:
+    """The names, sorted, or ValueError naming the folder that lacks some."""
+    names = sorted(set(chain(*folders)))
+    for root, files in zip(roots, folders, strict=True):
+        missing = [name for name in names if name not in files]
+        if missing:
+            raise ValueError(
+                f"{root}: {len(missing)} of {len(names)} files missing, {_listed(missing)}; "
+                "clean, before and after need the same names"
+            )
+    return names
+
+
+def _named_ears(path: str, names: list[str]) -> dict[str, Audiogram]:
+    ears: dict[str, Audiogram] = {}
+    for line, row, ear in numbered_audiograms(path):
+        if not row.get("file"):
+            raise ValueError(f"{path}, line {line}: no file named; needs a column 'file' with a name a row")
+        name = _name(PurePath(row["file"]))
+        if name in ears:
+            raise ValueError(f"{path}, line {line}: a second row of {row['file']}; allowed: one ear a file")
+        ears[name] = ear
+    missing = [name for name in names if name not in ears]
+    if missing:
+        raise ValueError(f"{path}: no audiogram of {len(missing)} of {len(names)} files, {_listed(missing)}")
+    return ears
+
+
+def _listed(names: list[str]) -> str:
+    return ", ".join(names[:_NAMED]) + (", ..." if len(names) > _NAMED else "")

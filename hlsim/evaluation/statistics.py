@@ -1,0 +1,265 @@
+"""Is after better than before? Paired tests of scores of the same items."""
+
+from __future__ import annotations
+
+import importlib
+import math
+import warnings
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from scipy import stats
+
+RESAMPLES = 9999
+"""Of the bootstrap."""
+
+_DRAWS = 1_000_000  # indices drawn at a time: keeps the bootstrap's memory at some 16 MB
+
+FEWEST = 6
+"""Values from which on an interval is given, and Wilcoxon's p can fall below 0.05."""
+
+ROUNDING = 1e-7
+"""What is less than this part of the largest score is rounding: scores of files hang on float32."""
+
+
+@dataclass(frozen=True)
+class PairedComparison:
+    """Scores of the same items before and after, compared.
+
+    Differences are after minus before throughout, so that a gain is positive where higher scores are better; those
+    under 1e-7 of the largest score are rounding, and count as zero. What the data do not define is None, never NaN: with
+    one pair everything that needs a spread (deviations, t, d, both tests); with differences that are all equal t, p_t and
+    d (a spread of zero); with no difference other than zero w and p_w; under six pairs the interval.
+
+    Attributes:
+        n: pairs.
+        zeros: pairs whose difference is zero; the Wilcoxon test leaves them out.
+        before_mean, after_mean: means of the scores.
+        before_std, after_std: standard deviations with n - 1.
+        delta: mean difference.
+        t, p_t: paired t-test, n - 1 degrees of freedom, two-sided.
+        w, p_w: Wilcoxon signed-rank test, two-sided; zero differences dropped before all else, as Wilcoxon proposed; w is
+            the smaller of the two rank sums. Differences of one size but for rounding, to a power of ten that is 1e-7
+            of the largest score or less, share a rank. p as scipy's ``method="auto"`` takes it of the rest: exact up to
+            50, the normal approximation beyond; where sizes are shared exact up to 13, the approximation with its
+            correction for ties beyond (scipy before 1.15: up to 50 as if none were shared).
+        cohens_d: mean difference over the standard deviation (n - 1) of the differences, which is t / sqrt(n).
+        ci_low, ci_high: 95 % interval of the mean difference by ``bootstrap_interval``, seed 0.
+    """
+
+    n: int
+    zeros: int
+    before_mean: float
+    before_std: float | None
+    after_mean: float
+    after_std: float | None
+    delta: float
+    t: float | None
+    p_t: float | None
+    w: float | None
+    p_w: float | None
+    cohens_d: float | None
+    ci_low: float | None = None
+    ci_high: float | None = None
+
+    def to_dict(self) -> dict[str, float | int | None]:
+        """A plain dictionary that JSON can hold."""
+        return asdict(self)
+
+
+def paired_comparison(before: Iterable[float], after: Iterable[float]) -> PairedComparison:
+    """Compare scores of the same items, in the same order, before and after.
+
+    The tests take the pairs as independent. Where several come from one talker or listener they are not, and the p
+    values are too small.
+
+    Raises:
+        ValueError: no pairs, unequal counts, or a score that is NaN or infinite.
+    """
+    first, second = _scores(before, "before"), _scores(after, "after")
+    if len(first) != len(second):
+        raise ValueError(
+            f"{len(first)} scores before and {len(second)} after; a paired comparison needs one each an item"
+        )
+    difference = differences(first, second)
+    n = len(first)
+    many = n > 1
+    zeros = int(np.count_nonzero(difference == 0.0))
+    deviation = float(difference.std(ddof=1)) if many else 0.0
+    t = p_t = w = p_w = d = None
+    if deviation > ROUNDING * _largest(first, second):
+        t, p_t = (float(value) for value in stats.ttest_1samp(difference, 0.0))
+        d = float(difference.mean()) / deviation
+    if many and zeros < n:
+        # scipy counts zeros where it chooses between exact and approximate, its versions differently
+        changes = difference[difference != 0.0]
+        # by a power of ten: decimal scores lie on its steps, never between two, where rounding would part them again
+        places = -math.floor(math.log10(ROUNDING * _largest(first, second)))
+        w, p_w = (float(value) for value in stats.wilcoxon(np.round(changes, places)))
+    low, high = bootstrap_interval(difference) if n >= FEWEST else (None, None)
+    return PairedComparison(
+        n=n,
+        zeros=zeros,
+        before_mean=float(first.mean()),
+        before_std=float(first.std(ddof=1)) if many else None,
+        after_mean=float(second.mean()),
+        after_std=float(second.std(ddof=1)) if many else None,
+        delta=float(difference.mean()),
+        t=t,
+        p_t=p_t,
+        w=w,
+        p_w=p_w,
+        cohens_d=d,
+        ci_low=low,
+        ci_high=high,
+    )
+
+
+def differences(before: Iterable[float], after: Iterable[float]) -> np.ndarray:
+    """After minus before, 0 where that is rounding."""
+    first, second = (np.asarray(list(values), dtype=np.float64) for values in (before, after))
+    difference = second - first
+    return np.where(np.abs(difference) <= ROUNDING * _largest(first, second), 0.0, difference)
+
+
+def bootstrap_interval(
+    values: Iterable[float], *, confidence: float = 0.95, resamples: int = RESAMPLES, seed: int = 0
+) -> tuple[float, float]:
+    """Bootstrap interval of the mean: values drawn with replacement, as many as there are.
+
+    Percentiles of the means (Efron 1979), expanded as Student's t asks for (Hesterberg 2015, Am. Stat. 69): plain ones
+    are too narrow for few values. Of normal values these held the mean in 93, 94, 94 and 94 % of 1500 draws of 6, 8, 12
+    and 30 (plain ones: 86, 88, 90, 93), of exponential ones in 88, 91, 92 and 94 %.
+
+    The values are taken as independent.
+
+    Raises:
+        ValueError: fewer than six values, of which no percentiles are wide enough.
+    """
+    data = np.asarray(list(values), dtype=np.float64)
+    if len(data) < FEWEST:
+        raise ValueError(f"{len(data)} values; an interval needs {FEWEST} or more")
+    generator = np.random.default_rng(seed)
+    at_once = max(1, _DRAWS // len(data))
+    means = [
+        data[generator.integers(0, len(data), (min(at_once, resamples - start), len(data)))].mean(-1)
+        for start in range(0, resamples, at_once)
+    ]
+    reach = stats.t.ppf(0.5 + 0.5 * confidence, len(data) - 1) * math.sqrt(len(data) / (len(data) - 1))
+    tail = 100.0 * stats.norm.cdf(-reach)
+    low, high = np.percentile(np.concatenate(means), [tail, 100.0 - tail])
+    return float(low), float(high)
+
+
+def holm(p_values: Iterable[float | None]) -> list[float | None]:
+    """P values adjusted for their number by Holm (1979, Scand. J. Statist. 6): each at most its own times the number.
+
+    Undefined ones stay None, and count.
+    """
+    given = list(p_values)
+    order = sorted((p, i) for i, p in enumerate(given) if p is not None)
+    adjusted: list[float | None] = [None] * len(given)
+    largest = 0.0
+    for rank, (p, i) in enumerate(order):
+        largest = max(largest, min(1.0, (len(given) - rank) * p))
+        adjusted[i] = largest
+    return adjusted
+
+
+def group_means(values: Iterable[float], groups: Iterable[str]) -> dict[str, float]:
+    """The mean of each group's values, in the order of the groups' first places."""
+    members: dict[str, list[float]] = {}
+    for value, group in zip(values, groups, strict=True):
+        members.setdefault(group, []).append(float(value))
+    return {group: math.fsum(own) / len(own) for group, own in members.items()}
+
+
+def _largest(first: np.ndarray, second: np.ndarray) -> float:
+    return max(float(np.abs(first).max()), float(np.abs(second).max()))
+
+
+def _scores(values: Iterable[float], name: str) -> np.ndarray:
+    scores = np.array([float(value) for value in values], dtype=np.float64)
+    if not len(scores):
+        raise ValueError(f"no scores {name}; a paired comparison needs at least one pair")
+    for index, score in enumerate(scores):
+        if not math.isfinite(score):
+            raise ValueError(f"score {index} {name} is {score}; allowed: finite numbers")
+    return scores
+
+
+@dataclass(frozen=True)
+class MixedModel:
+    """Differences = mean + listener's own deviation + residual, fitted by REML.
+
+    Attributes:
+        n, listeners: differences, and listeners they come from.
+        delta: estimated mean difference.
+        standard_error, z, p: of it; Wald test, two-sided.
+        ci_low, ci_high: its 95 % Wald interval.
+        listener_variance, residual_variance: between and within listeners.
+        note: what the fit complained of, such as no convergence; empty where it did not.
+    """
+
+    n: int
+    listeners: int
+    delta: float
+    standard_error: float
+    z: float
+    p: float
+    ci_low: float
+    ci_high: float
+    listener_variance: float
+    residual_variance: float
+    note: str = ""
+
+    def to_dict(self) -> dict[str, Any]:
+        """A plain dictionary that JSON can hold."""
+        return asdict(self)
+
+
+def mixed_model(differences: Sequence[float], listeners: Sequence[str]) -> MixedModel | str:
+    """The mean difference with listeners as a random intercept, or the reason in words why there is none.
+
+    With few listeners the Wald test is too sure of itself (Luke 2017, Behav. Res. Methods 49): read it beside the tests
+    of the listeners' means.
+    """
+    groups = len(set(listeners))
+    if groups < 2 or len(differences) <= groups:
+        return "needs two listeners or more, and more items than listeners"
+    values = np.asarray(differences, dtype=np.float64)
+    if np.ptp(values) <= ROUNDING * np.abs(values).max():
+        return "the differences do not vary"
+    try:
+        # no extra brings statsmodels: the report is whole without it
+        models = importlib.import_module("statsmodels.regression.mixed_linear_model")
+    except ImportError:
+        return "statsmodels is not installed"
+    ones = np.ones((len(values), 1))
+    # statsmodels takes any variance below 0.01 for one at its boundary, whatever the unit
+    scale = float(values.std())
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        try:
+            fit = models.MixedLM(values / scale, ones, groups=np.asarray(listeners)).fit(reml=True)
+            z, p = (float(x[0]) for x in (fit.tvalues, fit.pvalues))
+            delta, error, low, high = (
+                scale * float(x) for x in (fit.fe_params[0], fit.bse_fe[0], *fit.conf_int()[0])
+            )
+        except (np.linalg.LinAlgError, ValueError) as failure:
+            return f"the fit failed ({failure})"
+    figures = (delta, error, z, p, low, high)
+    if not np.isfinite(figures).all():
+        return "the fit has no standard error"
+    complaints = [] if fit.converged else ["no convergence"]
+    complaints += sorted({str(w.message) for w in caught if "boundary" in str(w.message)})
+    return MixedModel(
+        len(values),
+        groups,
+        *figures,
+        listener_variance=scale**2 * float(np.asarray(fit.cov_re)[0, 0]),
+        residual_variance=scale**2 * float(fit.scale),
+        note="; ".join(complaints),
+    )

@@ -1,0 +1,1 @@
+"""Numbers of signals: scores and errors, without files."""

@@ -1,0 +1,284 @@
+"""How close a simulator comes to the truth: errors of waveforms and bands, and scores of both that ought to agree."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from scipy import stats
+from torch import Tensor
+
+from hlsim.audiogram import SEVERITIES
+from hlsim.dsp.resample import resample
+from hlsim.extras import require
+
+Signal = np.ndarray | Tensor
+
+_PESQ_RATE = 16000
+_BANDS = 1000.0 * 2.0 ** (np.arange(-9, 9) / 3.0)  # centres in Hz, 125 to 6350: the last band ends at 7127
+_BAND_RANGE_DB = 50.0
+_FLOOR = 1e-20  # of the truth's power: keeps an exact estimate at 200 dB SNR, which JSON can hold
+
+
+COLUMNS = {
+    "n": ("n", "d"),
+    "SNR median (dB)": ("snr_median", ".1f"),
+    "SNR worst tenth (dB)": ("snr_worst_tenth", ".1f"),
+    "STOI LCC": ("stoi_lcc", ".4f"),
+    "STOI SRCC": ("stoi_srcc", ".4f"),
+    "STOI MSE": ("stoi_mse", ".5f"),
+    "PESQ LCC": ("pesq_lcc", ".4f"),
+    "PESQ SRCC": ("pesq_srcc", ".4f"),
+    "PESQ MSE": ("pesq_mse", ".4f"),
+    "RAW MSE": ("raw_mse", ".4f"),
+    "Band error median (dB)": ("band_error_median", ".2f"),
+}
+"""Titles of a table's columns, with the figure and its format."""
+
+GROUPS = {"severity": "By degree of loss", "level": "By level (dB SPL)", "condition": "By condition"}
+
+
+class Score(NamedTuple):
+    """A score, or None and the reason why there is none."""
+
+    value: float | None
+    reason: str | None = None
+
+
+def snr_db(truth: Signal, estimate: Signal) -> float:
+    """Power of the truth over that of the error, in dB; at most 200.
+
+    Shape: (time,) and (time,).
+
+    Raises:
+        ValueError: shapes differ or are not (time,), a sample is not finite, or the truth is silent.
+    """
+    return -10.0 * math.log10(max(raw_mse(truth, estimate), _FLOOR))
+
+
+def raw_mse(truth: Signal, estimate: Signal) -> float:
+    """Mean squared error of the waveforms, both scaled so that the truth has unit power: 10 ** (-snr_db / 10).
+
+    Without that scale the figure would grow with the level, and quiet items would not count. The paper's RAW MSE says
+    nothing about its scale.
+
+    Shape: (time,) and (time,). Raises ValueError as ``snr_db``.
+    """
+    true, found = _pair(truth, estimate)
+    return float(np.mean((true - found) ** 2) / np.mean(true**2))
+
+
+def third_octave_error_db(truth: Signal, estimate: Signal, sample_rate: int) -> float:
+    """Median absolute difference of the levels in one-third-octave bands, 125 Hz to 7 kHz, in dB.
+
+    Of the whole signal's spectrum. Bands more than 50 dB below the truth's loudest are left out; a band that the
+    estimate lacks counts as 120 dB below that loudest one.
+
+    Shape: (time,) and (time,). Raises ValueError as ``snr_db``, and for a rate below 16000 Hz.
+    """
+    true, found = _pair(truth, estimate)
+    if sample_rate < 2 * 8000:
+        raise ValueError(f"sample rate {sample_rate} Hz; bands up to 7 kHz need 16000 or more")
+    points = max(len(true), sample_rate // 4)  # 4 Hz apart or less: the lowest band is 29 Hz wide
+    frequencies = np.fft.rfftfreq(points, 1.0 / sample_rate)
+    edges = np.searchsorted(frequencies, np.append(_BANDS * 2.0 ** (-1 / 6), _BANDS[-1] * 2.0 ** (1 / 6)))
+    powers = []
+    for signal in (true, found):
+        total = np.append(0.0, np.cumsum(np.abs(np.fft.rfft(signal, points)) ** 2))
+        powers.append(np.diff(total[edges]))
+    loudest = powers[0].max()
+    if loudest <= 0.0:
+        raise ValueError("truth holds nothing between 125 Hz and 7 kHz")
+    levels = [10.0 * np.log10(np.maximum(power / loudest, 1e-12)) for power in powers]
+    used = levels[0] >= -_BAND_RANGE_DB
+    return float(np.median(np.abs(levels[0] - levels[1])[used]))
+
+
+def stoi(clean: Signal, heard: Signal, sample_rate: int) -> Score:
+    """STOI (Taal 2011) by pystoi, or the reason why there is none: silence, or less than 0.4 s of speech.
+
+    Shape: (time,) and (time,).
+
+    Raises:
+        ValueError: shapes differ or are not (time,).
+        MissingExtraError: pystoi is not installed.
+    """
+    return _score(require("pystoi", "eval").stoi, clean, heard, lambda a, b, run: run(a, b, sample_rate))
+
+
+def pesq_wb(clean: Signal, heard: Signal, sample_rate: int) -> Score:
+    """Wide-band PESQ (ITU-T P.862.2) by pesq, at 16 kHz, to which other rates are resampled; or why there is none.
+
+    Shape: (time,) and (time,). Raises as ``stoi``, for pesq.
+    """
+
+    def at_16k(a: np.ndarray, b: np.ndarray, run: Callable[..., float]) -> float:
+        pair = [resample(torch.from_numpy(x), sample_rate, _PESQ_RATE).numpy() for x in (a, b)]
+        return run(_PESQ_RATE, *pair, "wb")
+
+    return _score(require("pesq", "eval").pesq, clean, heard, at_16k)
+
+
+def linear_correlation(true: Iterable[float], simulated: Iterable[float]) -> float | None:
+    """Pearson's correlation (LCC); None for fewer than two pairs or where either side does not vary."""
+    return _correlation(stats.pearsonr, true, simulated)
+
+
+def rank_correlation(true: Iterable[float], simulated: Iterable[float]) -> float | None:
+    """Spearman's correlation (SRCC), ties at their mean rank; None as ``linear_correlation``."""
+    return _correlation(stats.spearmanr, true, simulated)
+
+
+def mean_squared_error(true: Iterable[float], simulated: Iterable[float]) -> float | None:
+    """Mean squared difference of the scores; None without pairs."""
+    a, b = _values(true, simulated)
+    return float(np.mean((a - b) ** 2)) if len(a) else None
+
+
+def _correlation(
+    measure: Callable[..., Any], true: Iterable[float], simulated: Iterable[float]
+) -> float | None:
+    a, b = _values(true, simulated)
+    if len(a) < 2 or np.ptp(a) == 0.0 or np.ptp(b) == 0.0:
+        return None
+    return float(measure(a, b)[0])
+
+
+def _values(true: Iterable[float], simulated: Iterable[float]) -> tuple[np.ndarray, np.ndarray]:
+    a, b = np.array(list(true), dtype=np.float64), np.array(list(simulated), dtype=np.float64)
+    if a.shape != b.shape or a.ndim != 1:
+        raise ValueError(f"{a.size} true scores and {b.size} simulated; allowed: equal counts")
+    if not (np.isfinite(a).all() and np.isfinite(b).all()):
+        raise ValueError("scores hold NaN or infinity; allowed: finite numbers")
+    return a, b
+
+
+def _score(run: Callable[..., float], clean: Signal, heard: Signal, call: Callable[..., float]) -> Score:
+    a, b = _equal(clean, heard)
+    for name, signal in (("clean", a), ("heard", b)):
+        if not np.isfinite(signal).all():
+            return Score(None, f"{name} holds samples that are NaN or infinite")
+        if not signal.any():
+            return Score(None, f"{name} is silent")
+    try:
+        with warnings.catch_warnings():
+            warnings.filterwarnings(
+                "error", message="Not enough STFT frames"
+            )  # pystoi's word, and its score is 1e-5
+            value = float(call(a, b, run))
+    except Exception as error:  # whatever a third party's measure raises is that item's reason, no more
+        text = error.args[0] if error.args else error
+        return Score(None, text.decode() if isinstance(text, bytes) else str(text))
+    return Score(value) if math.isfinite(value) else Score(None, f"the score is {value}")
+
+
+def _equal(first: Signal, second: Signal) -> tuple[np.ndarray, np.ndarray]:
+    a, b = (
+        (x.detach().cpu().numpy() if isinstance(x, Tensor) else np.asarray(x)).astype(np.float64)
+        for x in (first, second)
+    )
+    if a.ndim != 1 or a.shape != b.shape or not len(a):
+        raise ValueError(f"signals have shapes {a.shape} and {b.shape}; allowed: (time,) twice, equally long")
+    return a, b
+
+
+def _pair(truth: Signal, estimate: Signal) -> tuple[np.ndarray, np.ndarray]:
+    true, found = _equal(truth, estimate)
+    if not (np.isfinite(true).all() and np.isfinite(found).all()):
+        raise ValueError("truth or estimate holds samples that are NaN or infinite")
+    if not true.any():
+        raise ValueError("truth is silent; an error relative to it is not defined")
+    return true, found
+
+
+def summarise(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Fidelity over many items: overall, and by each of severity, level and condition that rows have.
+
+    Args:
+        rows: one an item, with any of ``snr``, ``raw_mse``, ``band_error``, ``stoi_true``, ``stoi_sim``,
+            ``pesq_true``, ``pesq_sim`` (a number, or None: then it, or its pair, is left out) and any of ``severity``,
+            ``level`` (dB SPL), ``condition``.
+
+    Returns: ``{"overall": figures, "severity": {"mild": figures, ...}, "level": {"65": figures, ...}, "condition":
+        {...}}``, for JSON. Figures are ``n``, ``snr_n`` (how many have one), ``snr_median``, ``snr_worst_tenth`` (10th
+        percentile), ``raw_mse`` (mean), ``band_error_median`` and, for stoi and pesq, ``_n`` (pairs used), ``_lcc``,
+        ``_srcc``, ``_mse``; None where undefined.
+
+    Raises:
+        ValueError: no rows, or a number that is not finite.
+    """
+    if not rows:
+        raise ValueError("no items to summarise")
+    summary: dict[str, Any] = {"overall": _figures(rows)}
+    for key in ("severity", "level", "condition"):
+        groups: dict[Any, list[Mapping[str, Any]]] = {}
+        for row in rows:
+            if row.get(key) is not None:
+                groups.setdefault(row[key], []).append(row)
+        # degrees of loss in their own order, levels as numbers, conditions by name
+        order = sorted(groups, key=lambda g: (SEVERITIES.index(g) if g in SEVERITIES else 0, g))
+        summary[key] = {g if isinstance(g, str) else f"{g:g}": _figures(groups[g]) for g in order}
+    return summary
+
+
+def fidelity_markdown(summary: Mapping[str, Any]) -> str:
+    """What ``summarise`` returned as Markdown tables: the whole first, then each grouping."""
+    sections = [_table("Items", {"all": summary["overall"]})]
+    sections += [f"**{GROUPS[key]}**\n\n" + _table(key, summary[key]) for key in GROUPS if summary.get(key)]
+    return "\n\n".join(sections) + "\n"
+
+
+def _figures(rows: Sequence[Mapping[str, Any]]) -> dict[str, float | int | None]:
+    def column(key: str) -> np.ndarray:
+        values = np.array([row[key] for row in rows if row.get(key) is not None], dtype=np.float64)
+        if not np.isfinite(values).all():
+            raise ValueError(
+                f"{key} holds NaN or infinity; allowed: finite numbers, or None where there is none"
+            )
+        return values
+
+    def over(measure: Callable[[np.ndarray], Any], key: str) -> float | None:
+        values = column(key)
+        return float(measure(values)) if len(values) else None
+
+    figures: dict[str, float | int | None] = {
+        "n": len(rows),
+        "snr_n": len(column("snr")),
+        "snr_median": over(np.median, "snr"),
+        "snr_worst_tenth": over(lambda v: np.percentile(v, 10), "snr"),
+        "raw_mse": over(np.mean, "raw_mse"),
+        "band_error_median": over(np.median, "band_error"),
+    }
+    for name in ("stoi", "pesq"):
+        scored = [
+            row for row in rows if row.get(f"{name}_true") is not None and row.get(f"{name}_sim") is not None
+        ]
+        true, simulated = [row[f"{name}_true"] for row in scored], [row[f"{name}_sim"] for row in scored]
+        figures[f"{name}_n"] = len(scored)
+        figures[f"{name}_lcc"] = linear_correlation(true, simulated)
+        figures[f"{name}_srcc"] = rank_correlation(true, simulated)
+        figures[f"{name}_mse"] = mean_squared_error(true, simulated)
+    return figures
+
+
+def _table(what: str, groups: Mapping[str, Mapping[str, float | int | None]]) -> str:
+    lines = [f"| {what.capitalize()} | " + " | ".join(COLUMNS) + " |", "|---" * (len(COLUMNS) + 1) + "|"]
+    for name, figures in groups.items():
+        lines.append(f"| {name} | " + " | ".join(column_cells(figures)) + " |")
+    return "\n".join(lines)
+
+
+def column_cells(figures: Mapping[str, float | int | None]) -> list[str]:
+    """The figures of ``summarise`` under ``COLUMNS``, ``n/a`` where there is none; with their own n where it is less."""
+    cells = []
+    for key, form in COLUMNS.values():
+        cell = "n/a" if figures[key] is None else f"{figures[key]:{form}}"
+        # raw MSE and band error are there where an SNR is
+        used = figures.get(f"{key.split('_')[0]}_n", figures["snr_n"])
+        fewer = key != "n" and used != figures["n"] and figures[key] is not None
+        cells.append(f"{cell} ({used} of {figures['n']})" if fewer else cell)
+    return cells

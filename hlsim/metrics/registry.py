@@ -1,0 +1,111 @@
+"""The measures that a report can hold: HASPI v2, HASQI v2, STOI and PESQ, each by the library that defines it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from importlib import metadata
+from typing import NamedTuple
+
+import numpy as np
+
+import hlsim
+from hlsim.audiogram import Audiogram
+from hlsim.checks import refuse_unknown
+from hlsim.extras import require
+from hlsim.metrics import fidelity
+from hlsim.metrics.haspi import haspi, hasqi
+
+
+class Measure(NamedTuple):
+    """How a measure is named and computed.
+
+    Attributes:
+        title: as a table writes it.
+        module: what must be installed (extra ``eval``).
+        packages: those whose versions its scores depend on.
+        of_an_ear: whether audiogram, level and seed change the score. STOI and PESQ know none of them: they compare the
+            signal at the ear with the clean speech, and do not say what is heard.
+        rewards_gain: whether more level alone brings a higher score.
+        score: of (clean, processed, audiogram, rate in Hz, full_scale_spl, seed); raises ValueError where there is none.
+    """
+
+    title: str
+    module: str
+    packages: tuple[str, ...]
+    of_an_ear: bool
+    rewards_gain: bool
+    score: Callable[[np.ndarray, np.ndarray, Audiogram, int, float, int], float]
+
+
+def measure_stoi(
+    clean: np.ndarray, processed: np.ndarray, ear: Audiogram, rate: int, full_scale_spl: float, seed: int
+) -> float:
+    """STOI of the signal at the ear; see ``fidelity.stoi``."""
+    return _known(fidelity.stoi(clean, processed, rate))
+
+
+def measure_pesq(
+    clean: np.ndarray, processed: np.ndarray, ear: Audiogram, rate: int, full_scale_spl: float, seed: int
+) -> float:
+    """Wide-band PESQ of the signal at the ear, at 16 kHz; see ``fidelity.pesq_wb``.
+
+    The library (pesq 0.0.4) crashed on 90 s of noise in 90 bursts: score minutes of speech with two processes or more,
+    which outlive it.
+    """
+    return _known(fidelity.pesq_wb(clean, processed, rate))
+
+
+def measure_haspi(
+    clean: np.ndarray, processed: np.ndarray, ear: Audiogram, rate: int, full_scale_spl: float, seed: int
+) -> float:
+    """HASPI v2; see ``haspi``."""
+    return haspi(clean, processed, ear, rate, full_scale_spl=full_scale_spl, seed=seed)
+
+
+def measure_hasqi(
+    clean: np.ndarray, processed: np.ndarray, ear: Audiogram, rate: int, full_scale_spl: float, seed: int
+) -> float:
+    """HASQI v2; see ``hasqi``."""
+    return hasqi(clean, processed, ear, rate, full_scale_spl=full_scale_spl, seed=seed)
+
+
+MEASURES = {
+    "haspi": Measure("HASPI", "clarity", ("pyclarity", "numpy", "scipy"), True, True, measure_haspi),
+    "hasqi": Measure("HASQI", "clarity", ("pyclarity", "numpy", "scipy"), True, False, measure_hasqi),
+    "stoi": Measure("STOI", "pystoi", ("pystoi", "numpy", "scipy"), False, False, measure_stoi),
+    "pesq": Measure("PESQ", "pesq", ("pesq", "numpy", "torchaudio"), False, False, measure_pesq),
+}
+"""By the names that options and files use. Higher is better in all: HASPI, HASQI and STOI end at 1, PESQ at 4.64."""
+
+
+def check_measures(names: Iterable[str]) -> tuple[str, ...]:
+    """The names, each once, or ValueError with those that are allowed; MissingExtraError where a package lacks."""
+    chosen = tuple(dict.fromkeys(names))
+    refuse_unknown(chosen, MEASURES, "measures")
+    if not chosen:
+        raise ValueError(f"no measure; allowed: {', '.join(MEASURES)}")
+    for name in chosen:
+        require(MEASURES[name].module, "eval")
+    return chosen
+
+
+def versions_of(names: Iterable[str]) -> dict[str, str]:
+    """Versions of the packages that the scores of these measures depend on."""
+    packages = dict.fromkeys(package for name in names for package in MEASURES[name].packages)
+    return {package: version_of(package) for package in packages}
+
+
+def version_of(package: str) -> str:
+    """An installed package's version, or that it is not installed; hlsim's own also where it runs from its sources."""
+    if package == "hlsim":
+        return hlsim.__version__
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return "not installed"
+
+
+def _known(score: fidelity.Score) -> float:
+    if score.value is None:
+        raise ValueError(score.reason)
+    return score.value

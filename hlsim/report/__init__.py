@@ -1,0 +1,1 @@
+"""Results become tables, pictures, pages and players."""

@@ -1,0 +1,115 @@
+"""Chosen items of a report as they are heard: signals through MSBG, as pictures and players of a page."""
+
+from __future__ import annotations
+
+import io
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from hlsim.audio import encode_flac
+from hlsim.calibration import gain_to_pascals, level_spl
+from hlsim.evaluation.scoring import read_channel
+from hlsim.msbg.model import MSBG
+from hlsim.report.page import Picture, Player, Section
+from hlsim.report.pictures import draw_spectrograms
+
+if TYPE_CHECKING:
+    from hlsim.evaluation.scores import HaspiReport, ItemScore
+
+LONGEST_SECONDS = 8.0
+"""Of an item in a page: longer ones are cut there."""
+
+_PEAK = 0.9
+
+
+def choose_items(report: HaspiReport, count: int) -> list[tuple[str, ItemScore]]:
+    """Items spread over the headline's change, from the largest rise to the largest fall, with the reason for each."""
+    c = report.headline
+    changes = []
+    for item in report.items:
+        scores = item.scores.get(c.measure, {})
+        if c.before in scores and c.after in scores and item.clean is not None:
+            changes.append((scores[c.after] - scores[c.before], item))
+    changes.sort(key=lambda pair: -pair[0])
+    count = min(count, len(changes))
+    if count < 1:
+        return []
+    places = [0] if count == 1 else [round(i * (len(changes) - 1) / (count - 1)) for i in range(count)]
+    chosen = [(place + 1, *changes[place]) for place in places]
+    return [(f"rank {rank} of {len(changes)}, change {change:+.3f}", item) for rank, change, item in chosen]
+
+
+def heard(item: ItemScore) -> tuple[dict[str, Tensor], int]:
+    """The clean speech and what the ear hears of each condition, in pascals, and the rate in Hz.
+
+    The exact MSBG of the item's audiogram, aligned. At most the first 8 s.
+
+    Shape: (time,) each.
+
+    Raises:
+        ValueError: a file cannot be read, or a threshold is above the 100 dB HL that MSBG takes.
+    """
+    if item.clean is None:
+        raise ValueError(f"{item.file}: its files are not known")
+    clean, rate = read_channel(item.clean, item.ear)
+    to_pascals, end = gain_to_pascals(item.full_scale_spl), int(LONGEST_SECONDS * rate)
+    ear = MSBG(item.audiogram, sample_rate=rate)
+    signals = {"original": torch.from_numpy(clean[:end]).float() * to_pascals}
+    for name in item.levels:
+        if name in item.processed and item.levels[name] is not None:
+            samples, _ = read_channel(item.processed[name], item.ear)
+            with torch.no_grad():
+                signals[f"{name}, as heard"] = ear(torch.from_numpy(samples[:end]).float() * to_pascals)
+    return signals, rate
+
+
+def listening_section(report: HaspiReport, count: int) -> Section | None:
+    """Spectrograms and players of chosen items; None where their files are not known or ``count`` is 0."""
+    sections = []
+    for reason, item in choose_items(report, count):
+        title = f"{item.file} ({reason})"
+        try:
+            signals, rate = heard(item)
+        except ValueError as error:
+            sections.append(Section(title, paragraphs=[f"Not to be heard here: {error}"]))
+            continue
+        peak = max(float(signal.abs().max()) for signal in signals.values())
+        if peak == 0.0:  # speech that begins later is scored, but cut away here
+            reason = f"the first {LONGEST_SECONDS:g} s are silent"
+            sections.append(Section(title, paragraphs=[f"Not to be heard here: {reason}"]))
+            continue
+        levels = {name: float(level_spl(signal)) for name, signal in signals.items()}
+        # one gain for all: what is softer in the ear is softer here
+        players = [
+            Player(encode_flac(signal * (_PEAK / peak), rate), f"{name} ({levels[name]:.0f} dB SPL)")
+            for name, signal in signals.items()
+        ]
+        picture = io.BytesIO()
+        draw_spectrograms(signals, rate, picture, width=5.0)
+        alt = f"Spectrograms of {item.file}: " + ", ".join(signals)
+        levels_text = ", ".join(f"{name} {level:.1f}" for name, level in levels.items())
+        sections.append(
+            Section(
+                title,
+                paragraphs=[
+                    f"{item.audiogram.severity} loss, thresholds "
+                    + ", ".join(f"{level:g}" for level in item.audiogram.levels)
+                    + f" dB HL. Levels in dB SPL: {levels_text}."
+                ],
+                pictures=[Picture(picture.getvalue(), alt)],
+                players=players,
+            )
+        )
+    if not sections:
+        return None
+    return Section(
+        "Listen",
+        paragraphs=[
+            "What the impaired ear hears, by MSBG, beside the clean speech. Within an item all players have one gain, so "
+            "that what is softer in that ear is softer here; set the volume by the original. "
+            f"Items longer than {LONGEST_SECONDS:g} s are cut."
+        ],
+        sections=sections,
+    )

@@ -1,0 +1,411 @@
+"""The program: what it writes, and that bad input ends with status 2, one line and nothing half-written."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import soundfile
+import torch
+
+from compensators import NALR, MappingCompensator, MappingConfig
+from hlsim import MSBG, Audiogram
+from hlsim.cli.main import main
+from hlsim.pretrained import save_checkpoint
+
+
+@pytest.fixture
+def utterance(speech_dir: Path) -> Path:
+    return sorted(speech_dir.glob("valid/*.flac"))[0]
+
+
+def fails(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
+    """The one line of a failing call."""
+    assert main([str(argument) for argument in arguments]) == 2
+    error = capsys.readouterr().err.strip()
+    assert len(error.splitlines()) == 1 and error.startswith("hlsim: error: ")
+    return error
+
+
+def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
+    """The one line of a call whose options cannot be read."""
+    with pytest.raises(SystemExit) as end:
+        main([str(argument) for argument in arguments])
+    assert end.value.code == 2
+    error = capsys.readouterr().err.strip()
+    assert len(error.splitlines()) == 1 and error.startswith("hlsim")
+    return error
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["simulate"], "hlsim simulate: error: the following arguments are required: IN"),
+        (["simulate", "a", "b", "--audiogram", "N3", "--loud"], "hlsim simulate: error: unrecognized"),
+        (["nothing"], "hlsim: error: argument COMMAND: invalid choice"),
+        ([], "hlsim: error: the following arguments are required: COMMAND"),
+    ],
+)
+def test_unreadable_options_are_one_line_without_the_usage(
+    capsys: pytest.CaptureFixture[str], arguments: list[str], said: str
+) -> None:
+    error = refused(capsys, *arguments)
+    assert error.startswith(said) and error.endswith(f"; see {said.split(':')[0]} --help")
+
+
+@pytest.mark.parametrize(
+    ("command", "option", "said"),
+    [
+        ("prepare", ["--severities", "mild=x"], "mild=x; allowed: severities with a number each"),
+        ("prepare", ["--severities", "mild"], "mild; allowed: severities with a number each"),
+        ("prepare", ["--train-snr", "0,x"], "0,x; allowed: numbers separated by commas"),
+        ("prepare", ["--seed", "a"], "a; allowed: whole numbers"),
+        ("draw-alignment", ["--full-scale-spl", "abc"], "abc; allowed: numbers such as"),
+        ("draw-alignment", ["--full-scale-spl", "nan"], "nan; allowed: numbers such as"),
+    ],
+)
+def test_values_of_another_kind(
+    capsys: pytest.CaptureFixture[str], command: str, option: list[str], said: str
+) -> None:
+    assert f"argument {option[0]}: {said}" in refused(capsys, command, *option)
+
+
+@pytest.mark.parametrize("simulator", ["msbg", "neuro-msbg"])
+@pytest.mark.parametrize(("rate", "channels"), [(16000, 1), (44100, 2), (96000, 1)])
+def test_simulate_keeps_rate_channels_and_length(
+    tmp_path: Path, simulator: str, rate: int, channels: int
+) -> None:
+    samples = np.random.default_rng(0).standard_normal((rate // 2, channels)) * 0.02
+    soundfile.write(tmp_path / "in.wav", samples, rate, subtype="FLOAT")
+    arguments = ["simulate", str(tmp_path / "in.wav"), str(tmp_path / "out.wav")]
+    assert main([*arguments, "--audiogram", "N3", "--simulator", simulator]) == 0
+    heard, heard_rate = soundfile.read(tmp_path / "out.wav", always_2d=True)
+    assert (heard_rate, heard.shape) == (rate, samples.shape)
+    assert 0 < np.std(heard) < np.std(samples)
+
+
+def test_simulate_is_the_model(tmp_path: Path, utterance: Path) -> None:
+    out = tmp_path / "out.wav"
+    levels = "30,35,40,50,55,60,65,70"
+    options = ["--audiogram", levels, "--simulator", "msbg", "--full-scale-spl", "100"]
+    assert main(["simulate", str(utterance), str(out), *options]) == 0
+    samples, rate = soundfile.read(utterance, dtype="float32")
+    ear = Audiogram(tuple(map(float, levels.split(","))))
+    expected = MSBG(ear, sample_rate=rate, full_scale_spl=100.0)(torch.from_numpy(samples))
+    heard, _ = soundfile.read(out, dtype="float32")
+    np.testing.assert_allclose(heard, expected.numpy(), atol=1e-7)
+
+
+def test_compensate_is_the_compensator(tmp_path: Path, utterance: Path) -> None:
+    out = tmp_path / "out.wav"
+    assert main(["compensate", str(utterance), str(out), "--audiogram", "N3", "--full-scale-spl", "100"]) == 0
+    samples, rate = soundfile.read(utterance, dtype="float32")
+    expected = NALR(Audiogram.standard("N3"), sample_rate=rate)(torch.from_numpy(samples))
+    aided, _ = soundfile.read(out, dtype="float32")
+    np.testing.assert_allclose(aided, expected.numpy(), atol=1e-7)
+    assert np.std(aided) > 1.5 * np.std(samples)
+    assert (
+        main(["compensate", str(utterance), str(out), "--audiogram", "N7"]) == 0
+    )  # which no simulator takes
+
+
+@pytest.mark.parametrize(("ear", "warned"), [("N4", False), ("N3", True)])
+def test_a_compensator_of_another_ear_warns(
+    tmp_path: Path, utterance: Path, capsys: pytest.CaptureFixture[str], ear: str, warned: bool
+) -> None:
+    model = MappingCompensator(MappingConfig(channels=8, blocks=1))
+    about = {"audiogram": Audiogram.standard("N4").to_dict()}
+    save_checkpoint(tmp_path / "mine", "mapping-compensator", model, model.config.to_dict(), about)
+    call = ["compensate", str(utterance), str(tmp_path / "out.wav"), "--compensator", str(tmp_path / "mine")]
+    assert main([*call, "--audiogram", ear]) == 0
+    line = (
+        f"hlsim: warning: {tmp_path / 'mine'} was trained for one ear, 55, 55, 55, 65, 70, 75, 80, 80 dB HL"
+    )
+    assert (line in capsys.readouterr().err) == warned
+
+
+def _bad_files(folder: Path) -> dict[str, tuple[Path, str]]:
+    tone = np.sin(np.arange(8000) / 10.0) * 0.1
+    soundfile.write(folder / "slow.wav", tone, 8000)
+    soundfile.write(folder / "empty.wav", np.zeros(0), 16000)
+    soundfile.write(folder / "silent.wav", np.zeros(8000), 16000)
+    soundfile.write(folder / "nan.wav", np.append(tone, np.nan), 16000, subtype="FLOAT")
+    (folder / "broken.wav").write_text("this is no audio")
+    return {
+        "missing": (folder / "missing.wav", "no such file"),
+        "broken": (folder / "broken.wav", "not readable as audio"),
+        "empty": (folder / "empty.wav", "empty"),
+        "silent": (folder / "silent.wav", "silent"),
+        "nan": (folder / "nan.wav", "NaN"),
+        "slow": (folder / "slow.wav", "16000 to 48000"),
+    }
+
+
+@pytest.mark.parametrize("kind", ["missing", "broken", "empty", "silent", "nan", "slow"])
+def test_bad_audio(tmp_path: Path, capsys: pytest.CaptureFixture[str], kind: str) -> None:
+    path, reason = _bad_files(tmp_path)[kind]
+    before = set(tmp_path.iterdir())
+    error = fails(capsys, "simulate", path, tmp_path / "out.wav", "--audiogram", "N3")
+    assert str(path) in error and reason in error
+    assert set(tmp_path.iterdir()) == before
+
+
+@pytest.mark.parametrize(
+    ("audiogram", "reason"),
+    [
+        ("10,20,30,40,50,60,70", "7 levels and 8 frequencies"),
+        ("10,20,30,40,50,60,70,130", "-10 to 120"),
+        ("N7", "-10 to 100"),
+        ("N9", "N1, N2, N3"),
+        ("10,20,30,x,50,60,70,80", "allowed: a standard ear such as N3, or eight numbers"),
+    ],
+)
+def test_bad_audiogram(
+    tmp_path: Path, utterance: Path, capsys: pytest.CaptureFixture[str], audiogram: str, reason: str
+) -> None:
+    error = fails(capsys, "simulate", utterance, tmp_path / "out.wav", "--audiogram", audiogram)
+    assert reason in error and not list(tmp_path.iterdir())
+
+
+def test_levels_below_zero_need_no_sign_of_equality(tmp_path: Path, utterance: Path) -> None:
+    out = tmp_path / "out.wav"
+    call = ["simulate", str(utterance), str(out), "--simulator", "msbg", "--audiogram"]
+    assert main([*call, "-10,-5,0,0,0,0,0,0"]) == 0 and out.is_file()
+
+
+@pytest.mark.parametrize("command", ["simulate", "compensate"])
+def test_files_that_cannot_be_in_and_out(
+    tmp_path: Path, utterance: Path, capsys: pytest.CaptureFixture[str], command: str
+) -> None:
+    given, plain, out = tmp_path / "in.flac", tmp_path / "plain", tmp_path / "out.wav"
+    given.write_bytes(utterance.read_bytes())
+    plain.touch()
+    for source, target, said in (
+        (given, plain / "o.wav", f"{plain}: not a folder; allowed"),
+        (given, tmp_path / "none" / "o.wav", f"{tmp_path / 'none'}: no such folder; allowed"),
+        (given, given, f"{given}: OUT is IN itself"),
+        (tmp_path, out, f"{tmp_path}: a folder; allowed: one file"),
+        (tmp_path / "missing.wav", tmp_path / "missing.wav", "missing.wav: no such file"),
+        (tmp_path / "missing.wav", tmp_path / "o.mp3", "o.mp3: cannot write .mp3; allowed: .wav"),
+    ):
+        assert said in fails(capsys, command, source, target, "--audiogram", "N3")
+    assert given.read_bytes() == utterance.read_bytes()
+    assert {path.name for path in tmp_path.iterdir()} == {"in.flac", "plain"}
+
+
+@pytest.mark.parametrize("command", ["simulate", "compensate"])
+def test_ogg_of_many_channels_is_refused_before_anything_is_loaded(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], command: str
+) -> None:
+    soundfile.write(tmp_path / "in.wav", np.full((1600, 6), 0.01), 16000)
+    call = (command, tmp_path / "in.wav", tmp_path / "out.ogg", "--audiogram", "N3")
+    loaded = {"simulate": "--simulator", "compensate": "--compensator"}[command]
+    assert "6 channels; allowed: up to 2 in .ogg, more in .wav and .flac" in fails(
+        capsys, *call, loaded, "no-such-model"
+    )
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ["train-compensator", "--speech", "s"],
+        ["train-simulator", "--speech", "s", "--config", "c"],
+        ["prepare", "s"],
+        ["demo"],
+    ],
+)
+def test_a_file_in_the_place_of_the_folder_for_results(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], command: list[str]
+) -> None:
+    plain = tmp_path / "plain"
+    plain.touch()
+    for out in (plain, plain / "below"):
+        error = refused(capsys, *command, "--out", out)
+        assert f"argument --out: {plain}: not a folder; allowed: a folder, there or not" in error
+
+
+def test_options_that_contradict_each_other(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = ["--out", tmp_path / "out"]
+    error = refused(capsys, "haspi-report", "--spl", "65", "--full-scale-spl", "94", *out)
+    assert "argument --full-scale-spl: not allowed with argument --spl" in error
+    call = ["evaluate-simulator", "msbg", "msbg", "--speech", "s", "--audiograms", "a", *out]
+    assert "simulators msbg, msbg; allowed: each once" in fails(capsys, *call)
+    call = ["evaluate-simulator", "msbg", "--speech", "s", "--audiograms", "a", "--compensator", "nalr", *out]
+    assert "--compensator without --inputs compensated; allowed" in fails(capsys, *call)
+    call = ["evaluate-compensator", "nalr", "--speech", "s", "--audiogram", "N3", "--gain-ears", "S3", *out]
+    assert "--gain-ears with --audiogram; allowed: without it" in fails(capsys, *call)
+    pytest.importorskip("lightning")
+    call = ["train-compensator", "--speech", "s", "--audiogram", "N4", "--audiograms", "a", *out]
+    assert "--audiogram with --audiograms; allowed: one ear, or a CSV" in fails(capsys, *call)
+    assert not list(tmp_path.iterdir())
+
+
+def test_audiograms_that_do_not_ascend(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], speech_dir: Path
+) -> None:
+    table = tmp_path / "ears.csv"
+    table.write_text("hl_500,hl_250,hl_1000\n10,20,30\n")
+    out = tmp_path / "out"
+    speech = speech_dir / "valid"
+    error = fails(
+        capsys, "evaluate-simulator", "msbg", "--speech", speech, "--audiograms", table, "--out", out
+    )
+    assert f"{table}, line 2" in error and "ascending" in error
+
+
+def test_unknown_and_changed_checkpoints(
+    tmp_path: Path, utterance: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from hlsim.pretrained import find_checkpoint
+
+    call = ("simulate", utterance, tmp_path / "out.wav", "--audiogram", "N3", "--simulator")
+    assert "neuro-msbg" in fails(capsys, *call, "no-such-model")
+    changed = tmp_path / "changed"
+    changed.mkdir()
+    for file in find_checkpoint("neuro-msbg").iterdir():
+        (changed / file.name).write_bytes(file.read_bytes())
+    weights = bytearray((changed / "model.safetensors").read_bytes())
+    weights[-1] ^= 1
+    (changed / "model.safetensors").write_bytes(weights)
+    assert "SHA-256" in fails(capsys, *call, changed)
+    assert not (tmp_path / "out.wav").exists()
+
+
+def test_unequal_file_lists(tmp_path: Path, utterance: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for name in ("clean", "before", "after"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "a.flac").write_bytes(utterance.read_bytes())
+    (tmp_path / "clean" / "b.flac").write_bytes(utterance.read_bytes())
+    folders = [part for name in ("clean", "before", "after") for part in (f"--{name}", tmp_path / name)]
+    error = fails(capsys, "haspi-report", *folders, "--audiogram", "N4", "--out", tmp_path / "out")
+    assert "b" in error and not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("command", "module"),
+    [
+        (["train-simulator", "--config", "c", "--speech", "s", "--out", "o"], "lightning"),
+        (["train-simulator", "--config", "c", "--speech", "s", "--out", "o"], "tensorboard"),
+        (["train-compensator", "--speech", "s", "--out", "o"], "tensorboard"),
+        (["demo", "--out", "o"], "tensorboard"),
+        (
+            [
+                "haspi-report",
+                "--clean",
+                "c",
+                "--before",
+                "b",
+                "--after",
+                "a",
+                "--audiogram",
+                "N4",
+                "--out",
+                "o",
+            ],
+            "clarity",
+        ),
+        (["evaluate-simulator", "msbg", "--speech", "s", "--audiograms", "a", "--out", "o"], "pesq"),
+        (["demo", "--out", "o"], "matplotlib"),
+    ],
+)
+def test_missing_extra_names_the_install_command(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    command: list[str],
+    module: str,
+) -> None:
+    import sys
+
+    monkeypatch.chdir(tmp_path)
+    for name in [name for name in sys.modules if name.split(".")[0] == module]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, module, None)
+    error = fails(capsys, *command)
+    assert module in error and "pip install 'hlsim[" in error
+    assert not list(tmp_path.iterdir())
+
+
+def test_bad_recipe(tmp_path: Path, speech_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    recipe = tmp_path / "recipe.yaml"
+    recipe.write_text("learning_rat: 1\n")
+    out = tmp_path / "out"
+    call = ("train-simulator", "--config", recipe, "--speech", speech_dir / "train", "--out", out)
+    assert "learning_rat" in fails(capsys, *call) and not out.exists()
+    recipe.write_text("batch: 2\n")
+    assert "no such folder" in fails(capsys, *call[:3], "--speech", tmp_path / "nowhere", "--out", out)
+
+
+def test_evaluate_simulator_writes_both_files(tmp_path: Path, speech_dir: Path) -> None:
+    ears = tmp_path / "ears.csv"
+    ears.write_text(",".join(Audiogram.standard("N3").to_row()) + "\n35,35,40,50,55,60,65,65\n")
+    arguments = ["evaluate-simulator", "msbg", "neuro-msbg", "--speech", str(speech_dir / "valid")]
+    arguments += ["--audiograms", str(ears), "--items", "4", "--seconds", "2", "--out", str(tmp_path / "out")]
+    assert main(arguments) == 0
+    result = json.loads((tmp_path / "out" / "fidelity.json").read_text())
+    assert list(result["simulators"]) == ["msbg", "neuro-msbg"]
+    exact = [row["snr"] for row in result["simulators"]["msbg"]["items"]]
+    assert len(exact) == 4 and min(exact) > 40.0
+    assert "neuro-msbg" in (tmp_path / "out" / "fidelity.md").read_text()
+
+
+@pytest.mark.parametrize("device", ["gpu", "cuda:99", "cpu:3"])
+def test_benchmark_on_no_device(device: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["benchmark", "--device", device]) == 2
+    assert f"device '{device}': there is none that torch can use; allowed: cpu" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_benchmark(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "speed.json"
+    arguments = ["benchmark", "--repeats", "1", "--limit", "0.001", "--what", "simulators", "scan"]
+    assert main([*arguments, "--json", str(path)]) == 0
+    result = json.loads(path.read_text())
+    names = [row["name"] for row in result["rows"]]
+    assert {"identity", "MSBG (exact)", "Neuro-MSBG (neuro-msbg)"} <= set(names)
+    cells = [cell for row in result["rows"] for cell in row["cells"]]
+    assert {cell["sample_rate"] for cell in cells} >= {16000, 44100}
+    assert all(0 < cell["least_ms"] <= cell["median_ms"] <= cell["greatest_ms"] for cell in cells)
+    connear = next(row for row in result["rows"] if "CoNNear" in row["name"])
+    assert round(connear["parameters"] / 1e6, 1) == 11.7
+    assert [row["name"] for row in result["scan"]][:2] == ["hlsim (plain torch)", "step by step"]
+    printed = capsys.readouterr().out
+    assert "pyclarity" in printed and "step by step" in printed
+
+
+def test_haspi_report_of_a_manifest(
+    tmp_path: Path, utterance: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for module in ("clarity", "joblib", "matplotlib", "pystoi"):
+        pytest.importorskip(module)
+    samples, rate = soundfile.read(utterance)
+    for name, gain in (("clean", 1.0), ("aided", 4.0)):
+        soundfile.write(tmp_path / f"{name}.wav", gain * samples[rate : 2 * rate], rate, subtype="FLOAT")
+    (tmp_path / "broken.wav").write_text("this is no audio")
+    lines = ["listener,ear,condition,clean,processed,audiogram"]
+    lines += [f"L1,l,{c},clean.wav,{f}.wav,N4" for c, f in (("unaided", "clean"), ("aided", "aided"))]
+    lines += [f"L2,r,{c},clean.wav,{f}.wav,N2" for c, f in (("unaided", "clean"), ("aided", "broken"))]
+    (tmp_path / "study.csv").write_text("\n".join(lines))
+    call = ["haspi-report", "--manifest", tmp_path / "study.csv", "--out", tmp_path / "out", "--jobs", "1"]
+    call += ["--measures", "stoi", "--spl", "65", "--listen", "1"]
+    assert main([str(part) for part in call]) == 0
+    printed = capsys.readouterr()
+    assert "| L2 right clean | aided | STOI | " in printed.out and "broken.wav" in printed.out
+    assert "1 of 4 scores could not be made" in printed.err and "3 of 4 scores" in printed.err
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert report["conditions"] == ["unaided", "aided"] and report["n"] == 1
+    assert report["before_level_mean"] == pytest.approx(65.0)
+    stored = (tmp_path / "out" / "scores.jsonl").read_text()
+    # what failed is not stored
+    assert stored.count("\n") == 3
+    assert main([str(part) for part in call]) == 0
+    assert (tmp_path / "out" / "scores.jsonl").read_text() == stored
+    capsys.readouterr()
+    for extra, says in (
+        (["--measures", "loud"], "unknown measures loud; allowed: haspi, hasqi, stoi, pesq"),
+        (["--backend", "dask"], "needs the scheduler's address"),
+        (["--root", tmp_path / "none"], "none: no such folder"),
+        (["--baseline", "x"], "no condition 'x'; allowed: unaided, aided"),
+        (["--clean", tmp_path], "either the folders clean, before and after, or a manifest"),
+    ):
+        assert says in fails(capsys, *call, *extra)

@@ -1,0 +1,127 @@
+"""What training speech goes through: levels, ratios and gains as asked for."""
+
+import pytest
+import torch
+from torch import Tensor
+
+from hlsim.audiogram import FREQUENCIES, draw_thresholds
+from hlsim.calibration import level_spl, set_level
+from hlsim.data.augment import HIGHEST_LEVEL, compress, equalise, mix, vary
+
+
+def tones(*hz: float, rate: int = 16000, seconds: float = 0.5) -> Tensor:
+    time = torch.arange(round(rate * seconds)) / rate
+    return torch.stack([torch.sin(2 * torch.pi * f * time) for f in hz])
+
+
+def test_mix_has_the_ratio_asked_for_and_leaves_the_speech() -> None:
+    speech, noise = 0.03 * torch.randn(4, 2000), 7.0 * torch.randn(4, 2000)
+    snr = torch.tensor([-5.0, 0.0, 10.0, 20.0])
+    added = mix(speech, noise, snr) - speech
+    measured = level_spl(speech) - level_spl(added)
+    torch.testing.assert_close(measured, snr, atol=0.01, rtol=0)
+    # only the noise's level is changed
+    torch.testing.assert_close(
+        added / added.norm(dim=-1, keepdim=True), noise / noise.norm(dim=-1, keepdim=True)
+    )
+
+
+@pytest.mark.parametrize("rate", [16000, 44100])
+def test_equalise_has_the_gains_at_and_between_the_frequencies(rate: int) -> None:
+    knots = torch.tensor([200.0, 800.0, 3200.0])
+    gains = torch.tensor([[-12.0, 6.0, 0.0]])
+    for hz, gain_db in (
+        (100, -12.0),
+        (200, -12.0),
+        (400, -3.0),
+        (800, 6.0),
+        (1600, 3.0),
+        (3200, 0.0),
+        (6000, 0.0),
+    ):
+        tone = tones(hz, rate=rate)
+        out = equalise(tone, gains, knots, rate)
+        assert out.shape == tone.shape
+        middle = slice(rate // 8, -rate // 8)
+        # zero-phase: the tone itself, louder or softer
+        torch.testing.assert_close(out[:, middle], 10 ** (gain_db / 20) * tone[:, middle], atol=0.02, rtol=0)
+
+
+def test_equalise_gives_each_item_its_gains() -> None:
+    wave = torch.randn(3, 1000)
+    flat = torch.tensor([0.0, 20.0, -20.0]).unsqueeze(-1).expand(3, 8)
+    out = equalise(wave, flat, torch.tensor(FREQUENCIES), 16000)
+    torch.testing.assert_close(out, wave * torch.tensor([[1.0], [10.0], [0.1]]), atol=1e-5, rtol=1e-4)
+
+
+def test_compress_divides_level_differences_by_the_ratio() -> None:
+    loud_and_soft = torch.cat((tones(1000)[0], 0.1 * tones(1000)[0])).unsqueeze(0)
+    half = loud_and_soft.shape[-1] // 2
+    for ratio in (1.0, 2.0, 4.0):
+        out = compress(loud_and_soft, torch.tensor([ratio]), 16000)
+        apart = level_spl(out[:, 1000 : half - 1000]) - level_spl(out[:, half + 1000 : -1000])
+        # 20 dB; the floor 30 dB under the mean takes a little
+        assert float(apart) == pytest.approx(20.0 / ratio, abs=0.5)
+    torch.testing.assert_close(compress(loud_and_soft, torch.ones(1), 16000), loud_and_soft)
+
+
+def test_compress_does_not_depend_on_the_level() -> None:
+    wave, ratio = torch.randn(2, 1600), torch.tensor([2.0, 3.0])
+    torch.testing.assert_close(compress(100.0 * wave, ratio, 16000), 100.0 * compress(wave, ratio, 16000))
+    assert bool(torch.isfinite(compress(torch.zeros(2, 1600), ratio, 16000)).all())
+
+
+def drawn(items: int, seed: int, ears: Tensor | None = None, noise: bool = True) -> Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    speech = torch.randn(items, 1600, generator=generator)
+    noises = torch.randn(items, 1600, generator=generator) if noise else None
+    ears = draw_thresholds(items, generator) if ears is None else ears
+    return vary(speech, noises, ears, 16000, generator)
+
+
+def test_vary_draws_from_the_generator_alone() -> None:
+    assert torch.equal(drawn(16, 0), drawn(16, 0))
+    assert not torch.equal(drawn(16, 0), drawn(16, 1))
+    assert drawn(3, 2, noise=False).shape == (3, 1600)
+
+
+def test_levels_are_in_the_stated_range() -> None:
+    """Before amplification and equalisation 40 to 95 dB SPL, after them none above the highest."""
+    levels = level_spl(drawn(2000, 0))
+    assert bool(torch.isfinite(levels).all())
+    assert float(levels.max()) <= HIGHEST_LEVEL + 0.01
+    assert float(levels.min()) > 40.0 - 15.0
+    assert float(levels.max()) > 110.0 and float(levels.min()) < 42.0
+    plain = level_spl(drawn(2000, 0, ears=torch.zeros(2000, 8)))
+    assert 65.0 < float(plain.median()) < 71.0
+
+
+def test_two_in_five_are_amplified_for_the_ear() -> None:
+    deaf = torch.full((2000, 8), 80.0)
+    normal = level_spl(drawn(2000, 3, ears=torch.zeros(2000, 8)))
+    aided = level_spl(drawn(2000, 3, ears=deaf))
+    gain = aided - normal
+    amplified = gain > 1.0
+    assert 0.36 < float(amplified.float().mean()) < 0.44
+    # 0.2 to 0.8 of the loss, unless that would be too loud
+    free = amplified & (aided < HIGHEST_LEVEL - 0.1)
+    assert float(gain[free].min()) > 0.2 * 80 - 0.1 and float(gain[free].max()) < 0.8 * 80 + 0.1
+    assert float(gain[~amplified].abs().max()) < 0.1
+
+
+def test_silence_stays_finite() -> None:
+    generator = torch.Generator().manual_seed(0)
+    speech = torch.zeros(32, 1600)
+    out = vary(speech, torch.randn(32, 1600), draw_thresholds(32, generator), 16000, generator)
+    assert bool(torch.isfinite(out).all())
+    assert not bool(vary(speech, None, torch.zeros(32, 8), 16000, generator).any())
+
+
+def test_levels_of_items_do_not_depend_on_the_recordings() -> None:
+    generator = torch.Generator().manual_seed(5)
+    speech = torch.randn(8, 1600, generator=generator)
+    outs = []
+    for gain in (1.0, 1e-3):
+        generator.manual_seed(7)
+        outs.append(vary(set_level(speech, 60.0) * gain, None, torch.zeros(8, 8), 16000, generator))
+    torch.testing.assert_close(outs[0], outs[1], atol=1e-6, rtol=1e-3)

@@ -1,0 +1,56 @@
+"""Active speech level: known answers, its laws, and pyclarity's level of active frames."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from hlsim.calibration import dbfs
+from hlsim.dsp.active_level import active_level_db
+
+
+def tone(seconds: float, rate: int = 16000) -> Tensor:
+    return torch.sin(2 * torch.pi * 400 * torch.arange(round(seconds * rate)) / rate)
+
+
+@pytest.mark.parametrize("rate", [16000, 48000])
+def test_a_steady_tone_is_active_throughout(rate: int) -> None:
+    assert active_level_db(tone(4.0, rate), rate) == pytest.approx(10 * math.log10(0.5), abs=0.05)
+
+
+@pytest.mark.parametrize("pause", [3.0, 6.0, 12.0])
+def test_pauses_do_not_count(pause: float) -> None:
+    """Four bursts of 1.5 s: what the pauses add is no more than the hangover and the envelope's decay after a burst."""
+    signal = torch.cat([tone(1.5), torch.zeros(round(16000 * pause))] * 4)
+    level = active_level_db(signal, 16000)
+    longest = 10 * math.log10(0.5 * 1.5 / (1.5 + 0.2 + 0.15))
+    assert longest < level < 10 * math.log10(0.5)
+    assert float(dbfs(signal)) < level - 3.0
+
+
+def test_a_gain_is_a_gain_and_the_rate_hardly_matters(speech: list[tuple[Tensor, int]]) -> None:
+    for waveform, rate in speech:
+        level = active_level_db(waveform[0], rate)
+        for gain in (1e-3, 20.0):
+            louder = active_level_db(gain * waveform[0].double(), rate)
+            assert louder - level == pytest.approx(20 * math.log10(gain), abs=1e-6)
+        assert float(dbfs(waveform[0])) <= level
+        padded = torch.cat((torch.zeros(2 * rate), waveform[0], torch.zeros(3 * rate)))
+        assert active_level_db(padded, rate) == pytest.approx(level, abs=0.3)
+
+
+def test_it_is_near_pyclaritys_level_of_active_frames(speech: list[tuple[Tensor, int]]) -> None:
+    """Another definition, frames within 12 dB of the mean, which leaves out more of what is soft."""
+    utils = pytest.importorskip("clarity.evaluator.msbg.msbg_utils")
+    for waveform, rate in speech:
+        theirs = utils.measure_rms(waveform[0].double().numpy(), rate, -12)[0]
+        difference = 20 * math.log10(theirs) - active_level_db(waveform[0], rate)
+        assert -0.5 < difference < 1.5
+
+
+@pytest.mark.parametrize("bad", [np.zeros(100), np.ones((2, 100))])
+def test_what_has_no_active_level(bad: np.ndarray) -> None:
+    with pytest.raises(ValueError, match=r"allowed: \(time,\), not silent"):
+        active_level_db(bad, 16000)

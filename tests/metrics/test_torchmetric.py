@@ -1,0 +1,137 @@
+"""The HASPI metric against HASPI itself, alone and in a Lightning validation loop."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from hlsim.audio import read_audio
+from hlsim.audiogram import Audiogram
+from hlsim.metrics.haspi import haspi
+
+pytest.importorskip("torchmetrics")
+pytest.importorskip("clarity")
+pytest.importorskip("joblib")
+
+from hlsim.evaluation import HASPI
+
+N3, S2 = Audiogram.standard("N3"), Audiogram.standard("S2")
+
+
+@pytest.fixture(scope="module")
+def clean(speech_dir: Path) -> Tensor:
+    """Two clips of 0.8 s at 16 kHz, (2, time)."""
+    clips = [read_audio(speech_dir / "train" / f"flite-slt-0{i}.flac")[0][0, 16000:28800] for i in (1, 2)]
+    return torch.stack(clips)
+
+
+def noisy(clean: Tensor) -> Tensor:
+    return clean + 0.003 * torch.randn(clean.shape, generator=torch.Generator().manual_seed(0))
+
+
+def test_mean_over_batches(clean: Tensor) -> None:
+    metric = HASPI(16000, seed=3, full_scale_spl=96.0)
+    metric.update(noisy(clean), clean, [N3, S2])
+    metric.update(clean[0], clean[0], N3)
+    expected = [
+        haspi(clean[0], noisy(clean)[0], N3, 16000, full_scale_spl=96.0, seed=3),
+        haspi(clean[1], noisy(clean)[1], S2, 16000, full_scale_spl=96.0, seed=4),
+        haspi(clean[0], clean[0], N3, 16000, full_scale_spl=96.0, seed=5),
+    ]
+    assert float(metric.compute()) == pytest.approx(sum(expected) / 3, abs=1e-6)
+    powers = [*noisy(clean).square().mean(-1), clean[0].square().mean()]
+    levels = [96.0 + 10 * float(torch.log10(power)) for power in powers]
+    assert float(metric.level) == pytest.approx(sum(levels) / 3, abs=1e-3)
+    metric.reset()
+    assert int(metric.count) == 0
+    metric.update(noisy(clean)[:1].requires_grad_(), clean[:1], torch.tensor([N3.levels]))
+    assert float(metric.compute()) == pytest.approx(expected[0], abs=1e-6)
+
+
+def test_limit_and_lengths(clean: Tensor) -> None:
+    metric = HASPI(16000, limit=1)
+    padded = torch.nn.functional.pad(clean, (0, 4000))
+    for _ in range(2):
+        metric.update(padded, padded, torch.tensor(N3.levels), lengths=torch.tensor([12800, 12800]))
+    assert int(metric.count) == 1 and int(metric.seen) == 4
+    assert float(metric.compute()) == pytest.approx(haspi(clean[0], clean[0], N3, 16000), abs=1e-6)
+
+
+def test_what_cannot_be_scored_is_left_out_and_said(clean: Tensor) -> None:
+    metric = HASPI(16000)
+    processed = torch.stack([clean[0] * 0, clean[1]])
+    with pytest.warns(UserWarning, match="HASPI leaves out item 0: processed is silent"):
+        metric.update(processed, clean, N3)
+    assert (int(metric.failed), int(metric.count)) == (1, 1)
+    # the second item's seed does not depend on the first one's fate
+    assert float(metric.compute()) == pytest.approx(haspi(clean[1], clean[1], N3, 16000, seed=1), abs=1e-6)
+
+
+def test_bad_input(clean: Tensor) -> None:
+    metric = HASPI(16000)
+    for call, message in (
+        ((clean, clean[:1], N3), r"processed \(2, 12800\) and clean \(1, 12800\)"),
+        ((clean, clean, [N3]), "1 audiograms of 2 items"),
+        ((clean, clean, "N3"), "audiogram is str; allowed: an Audiogram, one an item, or"),
+        ((clean, clean, 3), "audiogram is int; allowed"),
+        ((clean, clean, [N3, "N3"]), "audiogram is list; allowed"),
+        ((clean, clean, torch.zeros(3, 8)), r"audiogram of shape \(3, 8\); allowed: \(8,\) or \(2, 8\)"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            metric.update(*call)
+    for lengths, message in (
+        ([12800], "1 lengths of 2 items; allowed: one an item"),
+        ([12800, -5], "a length is -5; allowed: 0 to 12800 samples"),
+        ([12801, 12800], "a length is 12801; allowed: 0 to 12800 samples"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            metric.update(clean, clean, N3, lengths=torch.tensor(lengths))
+    for options, message in (
+        ({"limit": 0}, "limit is 0"),
+        ({"full_scale_spl": float("inf")}, "full_scale_spl is inf"),
+        ({"seed": -1}, "seed is -1"),
+        ({"seed": "a"}, "seed is 'a'; allowed: whole numbers"),
+        ({"sample_rate": 8000}, "8000 Hz; allowed: 16000 to 48000"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            HASPI(**options)
+
+
+def test_in_a_lightning_validation_loop(clean: Tensor, tmp_path: Path) -> None:
+    lightning = pytest.importorskip("lightning")
+
+    class Amplifier(lightning.LightningModule):
+        def __init__(self) -> None:
+            super().__init__()
+            self.gain = torch.nn.Parameter(torch.tensor(4.0))
+            self.haspi = HASPI(16000)
+
+        def training_step(self, batch: list[Tensor], _: int) -> Tensor:
+            return (self.gain * batch[0]).square().mean()
+
+        def validation_step(self, batch: list[Tensor], _: int) -> None:
+            self.haspi.update(self.gain * batch[0], batch[0], N3)
+            self.log("haspi", self.haspi, on_epoch=True)
+
+        def configure_optimizers(self) -> torch.optim.Optimizer:
+            return torch.optim.SGD(self.parameters(), lr=0.0)
+
+    loader = torch.utils.data.DataLoader(torch.utils.data.TensorDataset(clean), batch_size=1)
+    trainer = lightning.Trainer(
+        max_epochs=2,
+        accelerator="cpu",
+        logger=False,
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        num_sanity_val_steps=0,
+        default_root_dir=tmp_path,
+    )
+    model = Amplifier()
+    trainer.fit(model, loader, loader)
+    # the second epoch starts anew: the same items with the same seeds
+    expected = sum(haspi(clean[i], 4.0 * clean[i], N3, 16000, seed=i) for i in range(2)) / 2
+    assert float(trainer.callback_metrics["haspi"]) == pytest.approx(expected, abs=1e-6)
+    # nothing of the metric is in the checkpoint
+    assert set(model.state_dict()) == {"gain"}

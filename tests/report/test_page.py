@@ -1,0 +1,77 @@
+"""One HTML file with everything in it: escaped, closed, and without an address."""
+
+import re
+from html.parser import HTMLParser
+
+from hlsim.report.page import Picture, Player, Section, Table, render_page
+
+VOID = {"meta", "link", "img", "input", "br"}
+
+
+class Balance(HTMLParser):
+    """Checks that every element that is opened is closed, in order, and notes attributes."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.attributes: list[tuple[str, str, str]] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.attributes += [(tag, name, value or "") for name, value in attrs]
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+
+NASTY = '<script>alert("x")</script> & \'quotes\' "too"'
+
+
+def page() -> str:
+    inner = Section("Inner", players=[Player(b"fLaC123", NASTY), Player(b"RIFF123", "wav")])
+    sections = [
+        Section(NASTY, paragraphs=[NASTY], tables=[Table(NASTY, ("a", NASTY), [(NASTY, "1"), ("b", "2")])]),
+        Section(
+            "Pictures",
+            pictures=[Picture(b"\x89PNG", NASTY, NASTY), Picture(b"<svg/>", "svg")],
+            sections=[inner],
+        ),
+        Section("Folded", paragraphs=["text"], folded=True),
+    ]
+    return render_page(NASTY, sections, NASTY)
+
+
+def test_everything_is_escaped_and_closed() -> None:
+    text = page()
+    parser = Balance()
+    parser.feed(text)
+    assert parser.open == []
+    assert "<script" not in text and text.count("&lt;script&gt;") >= 8
+    assert ("img", "alt", NASTY) in parser.attributes and ("audio", "aria-label", NASTY) in parser.attributes
+
+
+def test_nothing_is_fetched() -> None:
+    parser = Balance()
+    parser.feed(page())
+    addresses = [value for _, name, value in parser.attributes if name in ("src", "href", "data", "srcset")]
+    assert len(addresses) == 2 + 2 + 1 + 1 + 3  # pictures, players, icon, skip link, sections
+    assert all(value.startswith(("data:", "#")) for value in addresses)
+    assert {value.split(";")[0] for value in addresses if value.startswith("data:") and ";" in value} == {
+        "data:image/png",
+        "data:image/svg+xml",
+        "data:audio/flac",
+        "data:audio/wav",
+    }
+    assert "url(" not in page() and "@import" not in page()
+    assert "default-src 'none'" in page()
+
+
+def test_links_lead_to_sections_and_tables_take_the_focus() -> None:
+    text = page()
+    names = set(re.findall(r' id="([^"]+)"', text))
+    assert set(re.findall(r'href="#([^"]+)"', text)) <= names
+    assert re.findall(r"<h(\d)", text) == ["1", "2", "2", "3", "2"]
+    assert text.count('role="region" tabindex="0"') == text.count("<table") == 1
+    assert '<html lang="en">' in text and "width=device-width" in text
+    assert text.count("<details>") == text.count("<summary>") == 1
