@@ -9,7 +9,7 @@ from hlsim.evaluation.scoring import Item, score_items
 from hlsim.evaluation.statistics import PairedComparison, bootstrap_interval, holm, paired_comparison
 from hlsim.evaluation.store import ScoreStore
 from hlsim.metrics.fidelity import fidelity_markdown, summarise
-from hlsim.metrics.haspi import HaspiItem, haspi_many
+from hlsim.metrics.pyclarity import HaspiItem, haspi_many
 from hlsim.report.haspi import write_report
 
 __all__ = [

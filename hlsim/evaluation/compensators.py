@@ -28,7 +28,7 @@ from hlsim.evaluation.simulators import samples_hash, weights_hash
 from hlsim.evaluation.steadiness import shift_differences, steady_tones
 from hlsim.evaluation.store import ScoreStore, key_of
 from hlsim.extras import require
-from hlsim.metrics.haspi import Progress, check_seed
+from hlsim.metrics.pyclarity import Progress, check_seed
 from hlsim.metrics.registry import version_of, versions_of
 from hlsim.parallel import check_parallel, run_parallel
 from hlsim.pretrained import load_pretrained

@@ -12,7 +12,7 @@ from hlsim.evaluation.scores import Failure, HaspiReport, ItemScore
 from hlsim.evaluation.scoring import Item, Result, score_items
 from hlsim.evaluation.store import ScoreStore
 from hlsim.extras import require
-from hlsim.metrics.haspi import Progress, check_seed
+from hlsim.metrics.pyclarity import Progress, check_seed
 from hlsim.metrics.registry import check_measures
 from hlsim.parallel import check_parallel
 from hlsim.report.haspi import check_out, write_report

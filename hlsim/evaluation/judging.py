@@ -17,7 +17,7 @@ from hlsim.criteria.bands import audibility, band_level_loss, band_levels, least
 from hlsim.data.augment import mix
 from hlsim.data.clips import Clips
 from hlsim.evaluation.items import RATE, SNRS_DB, Item
-from hlsim.metrics.haspi import haspi, hasqi
+from hlsim.metrics.pyclarity import haspi, hasqi
 from hlsim.metrics.reference import pyclarity_msbg
 from hlsim.msbg import MSBG
 

@@ -18,7 +18,7 @@ from hlsim.audio import read_audio
 from hlsim.audiogram import Audiogram
 from hlsim.calibration import check_full_scale, dbfs
 from hlsim.evaluation.store import ScoreStore, content_hash, key_of
-from hlsim.metrics.haspi import Progress, check_seed
+from hlsim.metrics.pyclarity import Progress, check_seed
 from hlsim.metrics.registry import MEASURES, check_measures, versions_of
 from hlsim.parallel import check_parallel, run_parallel
 

@@ -13,7 +13,7 @@ from hlsim.audiogram import Audiogram
 from hlsim.checks import refuse_unknown
 from hlsim.extras import require
 from hlsim.metrics import fidelity
-from hlsim.metrics.haspi import haspi, hasqi
+from hlsim.metrics.pyclarity import haspi, hasqi
 
 
 class Measure(NamedTuple):

@@ -13,7 +13,7 @@ from hlsim.audio import check_rate
 from hlsim.audiogram import FREQUENCIES, Audiogram, AudiogramLike
 from hlsim.calibration import check_full_scale, level_spl
 from hlsim.extras import require
-from hlsim.metrics.haspi import HaspiItem, check_pair, check_seed, haspi_many
+from hlsim.metrics.pyclarity import HaspiItem, check_pair, check_seed, haspi_many
 
 _Metric: Any = require("torchmetrics", "train").Metric
 

@@ -30,7 +30,7 @@ from hlsim.evaluation.judging import (
     read_ears,
 )
 from hlsim.evaluation.statistics import paired_comparison
-from hlsim.metrics.haspi import haspi, hasqi
+from hlsim.metrics.pyclarity import haspi, hasqi
 from hlsim.pretrained import find_checkpoint, save_checkpoint
 from hlsim.report.compensators import FILES
 

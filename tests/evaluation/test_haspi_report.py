@@ -16,7 +16,7 @@ from hlsim.audio import read_audio, write_audio
 from hlsim.audiogram import Audiogram
 from hlsim.evaluation import HaspiReport, haspi_report
 from hlsim.evaluation.store import content_hash
-from hlsim.metrics.haspi import haspi
+from hlsim.metrics.pyclarity import haspi
 
 for module in ("clarity", "joblib", "matplotlib"):
     pytest.importorskip(module)

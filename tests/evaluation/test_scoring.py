@@ -19,7 +19,7 @@ from hlsim.audiogram import FREQUENCIES, Audiogram
 from hlsim.evaluation.scoring import Item, Results, score_items
 from hlsim.evaluation.store import ScoreStore, content_hash
 from hlsim.metrics import registry as measures_module
-from hlsim.metrics.haspi import haspi
+from hlsim.metrics.pyclarity import haspi
 
 for module in ("clarity", "joblib", "pystoi", "pesq"):
     pytest.importorskip(module)

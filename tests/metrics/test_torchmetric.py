@@ -8,7 +8,7 @@ from torch import Tensor
 
 from hlsim.audio import read_audio
 from hlsim.audiogram import Audiogram
-from hlsim.metrics.haspi import haspi
+from hlsim.metrics.pyclarity import haspi
 
 pytest.importorskip("torchmetrics")
 pytest.importorskip("clarity")

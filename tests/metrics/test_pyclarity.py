@@ -11,7 +11,7 @@ from torch import Tensor
 from hlsim import extras
 from hlsim.audio import read_audio, write_audio
 from hlsim.audiogram import FREQUENCIES, Audiogram
-from hlsim.metrics.haspi import HaspiItem, haspi, haspi_many
+from hlsim.metrics.pyclarity import HaspiItem, haspi, haspi_many
 
 clarity_haspi = pytest.importorskip("clarity.evaluator.haspi")
 clarity_audiogram = pytest.importorskip("clarity.utils.audiogram")
