@@ -1,11 +1,38 @@
 """Hear through an impaired ear, and backpropagate through it."""
 
-from hlsim.audiogram import Audiogram
-from hlsim.loss import HearingLossLoss
-from hlsim.msbg import MSBG, estimate_delay
-from hlsim.neuro import NeuroMSBG
-from hlsim.pretrained import load_pretrained
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from hlsim.audiogram import Audiogram
+    from hlsim.loss import HearingLossLoss
+    from hlsim.msbg import MSBG, estimate_delay
+    from hlsim.neuro import NeuroMSBG
+    from hlsim.pretrained import load_pretrained
 
 __version__ = "0.1.0"
 
 __all__ = ["MSBG", "Audiogram", "HearingLossLoss", "NeuroMSBG", "estimate_delay", "load_pretrained"]
+
+# imported when asked for, so that the program's help and its refusals do not wait for torch
+_MODULES = {
+    "MSBG": "hlsim.msbg",
+    "Audiogram": "hlsim.audiogram",
+    "HearingLossLoss": "hlsim.loss",
+    "NeuroMSBG": "hlsim.neuro",
+    "estimate_delay": "hlsim.msbg",
+    "load_pretrained": "hlsim.pretrained",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = globals()[name] = getattr(import_module(_MODULES[name]), name)
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -14,7 +14,7 @@ import torch
 
 from compensators import load_compensator
 from hlsim.audio import write_audio
-from hlsim.cli.options import show_progress
+from hlsim.cli.progress import show_progress
 from hlsim.data.corpora import find_utterances
 from hlsim.data.instances import Plan
 from hlsim.data.manifest import Utterance

@@ -6,73 +6,38 @@ import argparse
 import sys
 from pathlib import Path
 
-from hlsim.cli.options import (
-    EARS_TABLE,
-    Commands,
-    add_command,
-    audiogram_option,
-    count,
-    number,
-    other_ear,
-    out_option,
-    positive,
-    read_ear,
-    seed_option,
-    show_progress,
-)
-from hlsim.extras import require
+from hlsim.cli.inputs import check_there, need, other_ear, read_ear
+from hlsim.cli.options import EARS_TABLE, Parser, count, number, positive
+from hlsim.cli.progress import show_progress
 
 GAIN_EARS = ["N3", "S2"]
 
 
-def add(commands: Commands) -> None:
-    sub = add_command(
-        commands,
-        "evaluate-compensator",
-        _evaluate_compensator,
-        "judge compensators beside no aid and NAL-R: HASPI, HASQI, loudness as heard, surrogate gap, gain curves, tones",
-    )
-    sub.add_argument(
-        "names",
-        nargs="+",
-        metavar="NAME",
-        help="compensators, by name or folder; LABEL=FOLDER is LABEL in the tables",
-    )
-    sub.add_argument("--speech", type=Path, required=True, help="folder of clean speech of unseen speakers")
-    sub.add_argument(
-        "--audiograms",
-        type=Path,
-        help=f"{EARS_TABLE}; its ears join Bisgaard's N2 to N6 and S1 to S3",
-    )
-    audiogram_option(sub, text="; one ear in place of all, for a compensator trained for it")
-    sub.add_argument(
-        "--noise", type=Path, help="folder of noises; every second item is then noisy, at 2.5 to 17.5 dB"
-    )
-    sub.add_argument(
-        "--simulator", default="neuro-msbg", help="Neuro-MSBG of the surrogate gap, by name or folder"
-    )
-    sub.add_argument(
-        "--levels", type=number, nargs="+", default=[50, 65, 80], help="of the speech in dB SPL, in turn"
-    )
-    sub.add_argument("--items", type=count, default=400, help="how many in all")
-    sub.add_argument("--seconds", type=positive, default=3.0, help="length of an item")
-    sub.add_argument(
-        "--gain-ears",
-        nargs="+",
-        default=GAIN_EARS,
-        metavar="EAR",
-        help="standard ears of the gain curves and tones; with --audiogram that ear's are drawn",
-    )
-    sub.add_argument("--jobs", type=count, help="processes; all cores by default")
-    seed_option(sub)
-    out_option(sub)
+def evaluate_compensator(parser: Parser) -> None:
+    parser.set_defaults(run=_evaluate_compensator)
+    option = parser.option
+    text = "compensators, by name or folder; LABEL=FOLDER is LABEL in the tables"
+    option("names", str, text, nargs="+", metavar="NAME")
+    option("--speech", Path, "folder of clean speech of unseen speakers", required=True)
+    option("--audiograms", Path, f"{EARS_TABLE}; its ears join Bisgaard's N2 to N6 and S1 to S3")
+    parser.audiogram(text="; one ear in place of all, for a compensator trained for it")
+    option("--noise", Path, "folder of noises; every second item is then noisy, at 2.5 to 17.5 dB")
+    option("--simulator", str, "Neuro-MSBG of the surrogate gap, by name or folder", "neuro-msbg")
+    option("--levels", number, "of the speech in dB SPL, in turn", [50, 65, 80], nargs="+")
+    option("--items", count, "how many in all", 400)
+    option("--seconds", positive, "length of an item", 3.0)
+    text = "standard ears of the gain curves and tones; with --audiogram that ear's are drawn"
+    option("--gain-ears", str, text, GAIN_EARS, nargs="+", metavar="EAR")
+    parser.jobs()
+    parser.seed()
+    parser.out()
 
 
 def _evaluate_compensator(options: argparse.Namespace) -> None:
     if options.audiogram and options.gain_ears != GAIN_EARS:
         raise ValueError("--gain-ears with --audiogram; allowed: without it, for that ear's gains are drawn")
-    for module in ("clarity", "matplotlib"):
-        require(module, "eval")
+    need("eval", "clarity", "matplotlib")
+    check_there(folders=(options.speech, options.noise), files=(options.audiograms,))
     from compensators import load_compensator
     from hlsim.evaluation.compensators import evaluate_compensators
 

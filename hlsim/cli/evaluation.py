@@ -5,56 +5,27 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from hlsim.cli.options import (
-    EARS_TABLE,
-    Commands,
-    add_command,
-    count,
-    number,
-    out_option,
-    positive,
-    read_simulator,
-    seed_option,
-    show_progress,
-)
-from hlsim.extras import require
+from hlsim.cli.inputs import check_there, need, read_simulator
+from hlsim.cli.options import EARS_TABLE, Parser, count, number, positive
+from hlsim.cli.progress import show_progress
 
 
-def add(commands: Commands) -> None:
-    sub = add_command(
-        commands,
-        "evaluate-simulator",
-        _evaluate_simulator,
-        "compare simulators with MSBG: SNR, STOI, PESQ, bands",
-    )
-    sub.add_argument(
-        "names", nargs="+", metavar="NAME", help="checkpoints, by name or folder, or msbg (exact)"
-    )
-    sub.add_argument("--speech", type=Path, required=True, help="folder of clean speech")
-    sub.add_argument("--audiograms", type=Path, required=True, help=EARS_TABLE)
-    sub.add_argument("--noise", type=Path, help="folder of noises; every second item is then noisy")
-    sub.add_argument(
-        "--teacher", choices=("pyclarity", "msbg"), default="pyclarity", help="what counts as the truth"
-    )
-    sub.add_argument(
-        "--levels",
-        type=number,
-        nargs="+",
-        default=[50, 60, 65, 70, 80],
-        help="dB SPL that items take in turn",
-    )
-    sub.add_argument(
-        "--inputs",
-        nargs="+",
-        default=["as-is"],
-        metavar="INPUT",
-        help="what the ear is given: as-is, louder (20 dB), nal-r, compressed (3:1), compensated",
-    )
-    sub.add_argument("--compensator", help="its name or folder, for the input compensated")
-    sub.add_argument("--items", type=count, default=240, help="how many")
-    sub.add_argument("--seconds", type=positive, default=3.0, help="length of an item")
-    seed_option(sub)
-    out_option(sub)
+def evaluate_simulator(parser: Parser) -> None:
+    parser.set_defaults(run=_evaluate_simulator)
+    option = parser.option
+    option("names", str, "checkpoints, by name or folder, or msbg (exact)", nargs="+", metavar="NAME")
+    option("--speech", Path, "folder of clean speech", required=True)
+    option("--audiograms", Path, EARS_TABLE, required=True)
+    option("--noise", Path, "folder of noises; every second item is then noisy")
+    option("--teacher", str, "what counts as the reference", "pyclarity", choices=("pyclarity", "msbg"))
+    option("--levels", number, "dB SPL that items take in turn", [50, 60, 65, 70, 80], nargs="+")
+    text = "what the ear is given: as-is, louder (20 dB), nal-r, compressed (3:1), compensated"
+    option("--inputs", str, text, ["as-is"], nargs="+", metavar="INPUT")
+    option("--compensator", str, "its name or folder, for the input compensated")
+    option("--items", count, "how many", 240)
+    option("--seconds", positive, "length of an item", 3.0)
+    parser.seed()
+    parser.out()
 
 
 def _evaluate_simulator(options: argparse.Namespace) -> None:
@@ -62,8 +33,8 @@ def _evaluate_simulator(options: argparse.Namespace) -> None:
         raise ValueError(f"simulators {', '.join(options.names)}; allowed: each once")
     if options.compensator and "compensated" not in options.inputs:
         raise ValueError("--compensator without --inputs compensated; allowed: only with it")
-    for module in ("clarity", "pystoi", "pesq"):
-        require(module, "eval")
+    need("eval", "clarity", "pystoi", "pesq")
+    check_there(folders=(options.speech, options.noise), files=(options.audiograms,))
     from compensators import load_compensator
     from hlsim.evaluation.items import RATE
     from hlsim.evaluation.simulators import evaluate_simulators

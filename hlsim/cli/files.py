@@ -6,50 +6,34 @@ import argparse
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import torch
+from hlsim.cli.inputs import check_files, other_ear, read_ear, read_simulator
+from hlsim.cli.options import Parser
 
-from compensators import load_compensator
-from hlsim.audio import HIGHEST_RATE, check_channels, check_extension, read_audio, write_audio
-from hlsim.cli.options import (
-    Commands,
-    add_command,
-    audiogram_option,
-    check_files,
-    full_scale_option,
-    other_ear,
-    read_ear,
-    read_simulator,
-)
-from hlsim.dsp.resample import resample
+if TYPE_CHECKING:
+    from torch import nn
+
+ENDINGS = (".wav", ".flac", ".ogg")
 
 
-def add(commands: Commands) -> None:
-    sub = _command(commands, "simulate", _simulate, "write what an impaired ear hears of a file")
-    sub.add_argument(
-        "--simulator", default="neuro-msbg", help="msbg (exact), or a checkpoint's name or folder"
-    )
-    sub = _command(commands, "compensate", _compensate, "write what an impaired ear is to be given of a file")
-    sub.add_argument(
-        "--compensator",
-        default="nalr",
-        help="nalr (the prescription), or a checkpoint's name or folder; one of one ear alone warns of another",
-    )
+def simulate(parser: Parser) -> None:
+    _in_and_out(parser, _simulate)
+    parser.option("--simulator", str, "msbg (exact), or a checkpoint's name or folder", default="neuro-msbg")
 
 
-def _command(
-    commands: Commands, name: str, run: Callable[[argparse.Namespace], None], text: str
-) -> argparse.ArgumentParser:
-    sub = add_command(commands, name, run, text)
-    sub.add_argument(
-        "input", type=Path, metavar="IN", help="wav, flac or ogg, 16 kHz or more, any number of channels"
-    )
-    sub.add_argument(
-        "output", type=Path, metavar="OUT", help="wav (32-bit float), flac, or ogg, which takes two channels"
-    )
-    audiogram_option(sub, required=True)
-    full_scale_option(sub)
-    return sub
+def compensate(parser: Parser) -> None:
+    _in_and_out(parser, _compensate)
+    text = "nalr (the prescription), or a checkpoint's name or folder; one of one ear alone warns of another"
+    parser.option("--compensator", str, text, default="nalr")
+
+
+def _in_and_out(parser: Parser, run: Callable[[argparse.Namespace], None]) -> None:
+    parser.set_defaults(run=run)
+    parser.option("input", Path, "wav, flac or ogg, 16 kHz or more, any number of channels", metavar="IN")
+    parser.option("output", Path, "wav (32-bit float), flac, or ogg, which takes two channels", metavar="OUT")
+    parser.audiogram(required=True)
+    parser.full_scale()
 
 
 def _simulate(options: argparse.Namespace) -> None:
@@ -57,7 +41,9 @@ def _simulate(options: argparse.Namespace) -> None:
 
 
 def _compensate(options: argparse.Namespace) -> None:
-    def build(rate: int) -> torch.nn.Module:
+    def build(rate: int) -> nn.Module:
+        from compensators import load_compensator
+
         name = options.compensator
         compensator = load_compensator(name, sample_rate=rate, full_scale_spl=options.full_scale_spl)
         for line in other_ear(name, name, read_ear(options.audiogram)):
@@ -67,11 +53,23 @@ def _compensate(options: argparse.Namespace) -> None:
     _pass_through(options, build)
 
 
-def _pass_through(options: argparse.Namespace, build: Callable[[int], torch.nn.Module]) -> None:
+def _check_ending(path: Path) -> None:
+    """As ``hlsim.audio.check_extension``, without torch."""
+    if (ending := path.suffix.lower()) not in ENDINGS:
+        found = ending or "a file without extension"
+        raise ValueError(f"{path}: cannot write {found}; allowed: {', '.join(ENDINGS)}")
+
+
+def _pass_through(options: argparse.Namespace, build: Callable[[int], nn.Module]) -> None:
     """Read, run what ``build`` makes for a sample rate, and write at the file's own rate."""
+    _check_ending(options.output)
     check_files(options.input, options.output)
-    check_extension(options.output)
     ear = read_ear(options.audiogram)
+    import torch
+
+    from hlsim.audio import HIGHEST_RATE, check_channels, read_audio, write_audio
+    from hlsim.dsp.resample import resample
+
     waveform, rate = read_audio(options.input, any_rate=True)
     check_channels(options.output, waveform.shape[0])
     inner = min(rate, HIGHEST_RATE)

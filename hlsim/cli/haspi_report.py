@@ -6,71 +6,46 @@ import argparse
 import sys
 from pathlib import Path
 
-from hlsim.cli.options import (
-    EARS_TABLE,
-    Commands,
-    add_command,
-    audiogram_option,
-    count,
-    full_scale_option,
-    natural,
-    out_option,
-    positive,
-    read_ear,
-    seed_option,
-    show_progress,
-)
+from hlsim.cli.inputs import check_there, need, read_ear
+from hlsim.cli.options import EARS_TABLE, Parser, natural, positive
+from hlsim.cli.progress import show_progress
 
 
-def add(commands: Commands) -> None:
-    sub = add_command(
-        commands,
-        "haspi-report",
-        _haspi_report,
-        "HASPI (HASQI, STOI, PESQ) before and after a treatment, with paired tests",
+def haspi_report(parser: Parser) -> None:
+    parser.set_defaults(run=_haspi_report)
+    option = parser.option
+    option("--clean", Path, "folder of clean speech; the file names are the same in all three")
+    option("--before", Path, "folder of what the ear was given")
+    option("--after", Path, "folder of what it is given now")
+    text = (
+        "in place of the folders: CSV with columns condition, clean, processed, and listener, ear, snr, hl_250, ... or "
+        "audiogram, spl or full_scale_spl where known"
     )
-    for name, text in (
-        ("clean", "clean speech"),
-        ("before", "what the ear was given"),
-        ("after", "what it is given now"),
-    ):
-        sub.add_argument(f"--{name}", type=Path, help=f"folder of {text}; the file names are the same")
-    sub.add_argument(
-        "--manifest",
-        type=Path,
-        help="in place of the folders: CSV with columns condition, clean, processed, and listener, ear, snr, "
-        "hl_250, ... or audiogram, spl or full_scale_spl where known",
-    )
-    sub.add_argument("--root", type=Path, help="folder of the manifest's paths; its own folder by default")
-    audiogram_option(sub, default=None, text=", for all files, or of a manifest for rows that bring none")
-    sub.add_argument(
-        "--audiograms",
-        type=Path,
-        help=f"{EARS_TABLE}; and a column file (folders) or columns listener and ear (manifest, for rows without)",
-    )
-    sub.add_argument(
-        "--measures",
-        default="haspi",
-        help="of haspi, hasqi, stoi, pesq, separated by commas; the first leads",
-    )
-    sub.add_argument("--baseline", help="condition that all others are compared with; all pairs by default")
-    level = sub.add_mutually_exclusive_group()
-    full_scale_option(level)
-    level.add_argument(
-        "--spl",
-        type=positive,
-        help="level of each clean file in dB SPL, in place of --full-scale-spl; of a manifest for rows that bring none",
-    )
-    sub.add_argument("--scores", type=Path, help="file of scores made so far; OUT/scores.jsonl by default")
-    sub.add_argument("--jobs", type=count, help="processes; all cores by default")
-    sub.add_argument("--backend", choices=("loky", "dask"), default="loky", help="this machine, or a cluster")
-    sub.add_argument("--scheduler", help="of --backend dask: its address, such as tcp://host:8786")
-    sub.add_argument("--listen", type=natural, default=3, help="items with players in report.html")
-    seed_option(sub)
-    out_option(sub)
+    option("--manifest", Path, text)
+    option("--root", Path, "folder of the manifest's paths; its own folder by default")
+    parser.audiogram(text=", for all files, or of a manifest for rows that bring none")
+    text = "; and a column file (folders) or columns listener and ear (manifest, for rows without)"
+    option("--audiograms", Path, EARS_TABLE + text)
+    option("--measures", str, "of haspi, hasqi, stoi, pesq, separated by commas; the first leads", "haspi")
+    option("--baseline", str, "condition that all others are compared with; all pairs by default")
+    level = parser.add_mutually_exclusive_group()
+    parser.full_scale(group=level)
+    text = "level of each clean file in dB SPL, in place of --full-scale-spl; of a manifest for rows that bring none"
+    option("--spl", positive, text, group=level)
+    option("--scores", Path, "file of scores made so far; OUT/scores.jsonl by default")
+    parser.parallel()
+    option("--listen", natural, "items with players in report.html", 3)
+    parser.seed()
+    parser.out()
 
 
 def _haspi_report(options: argparse.Namespace) -> None:
+    measures = [name.strip() for name in options.measures.split(",")]
+    need("eval", "joblib", "matplotlib", *(["clarity"] if {"haspi", "hasqi"} & {*measures} else []))
+    check_there(
+        folders=(options.clean, options.before, options.after, options.root),
+        files=(options.manifest, options.audiograms),
+    )
     from hlsim.evaluation import haspi_report
 
     report = haspi_report(
@@ -81,7 +56,7 @@ def _haspi_report(options: argparse.Namespace) -> None:
         audiograms=options.audiograms,
         manifest=options.manifest,
         root=options.root,
-        measures=[name.strip() for name in options.measures.split(",")],
+        measures=measures,
         baseline=options.baseline,
         out=options.out,
         store=options.scores,

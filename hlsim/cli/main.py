@@ -2,15 +2,41 @@
 
 from __future__ import annotations
 
-import argparse
-import re
 import sys
 from collections.abc import Sequence
-from typing import Any, NoReturn
+from functools import partial
+from importlib import import_module
 
 from hlsim import __version__
-from hlsim.cli import benchmark, compensators, demo, evaluation, files, haspi_report, prepare, training
+from hlsim.cli.options import Parser
 from hlsim.extras import MissingExtraError
+
+COMMANDS = {
+    "demo": ("demo", "train a compensator for one ear on the embedded speech and score it by HASPI"),
+    "simulate": ("files", "write what an impaired ear hears of a file"),
+    "compensate": ("files", "write what an impaired ear is to be given of a file"),
+    "prepare": (
+        "prepare",
+        "check a corpus and plan training instances: utterances, noise, ears, levels; with --write make them",
+    ),
+    "draw-alignment": (
+        "prepare",
+        "draw an utterance and what an ear hears of it, raised to the utterance's level, before and after alignment",
+    ),
+    "train-simulator": ("training", "train a Neuro-MSBG on targets from the exact MSBG"),
+    "train-compensator": ("training", "train a compensator through a frozen simulator"),
+    "evaluate-simulator": ("evaluation", "compare simulators with MSBG: SNR, STOI, PESQ, bands"),
+    "evaluate-compensator": (
+        "compensators",
+        "judge compensators beside no aid and NAL-R: HASPI, HASQI, loudness as heard, surrogate gap, gain curves, tones",
+    ),
+    "haspi-report": (
+        "haspi_report",
+        "HASPI (HASQI, STOI, PESQ) before and after a treatment, with paired tests",
+    ),
+    "benchmark": ("benchmark", "time simulators, a training step and the scan side by side"),
+}
+"""Each command's module in ``hlsim.cli``, where a function of its name declares its options, and what it does."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -30,31 +56,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-class _Parser(argparse.ArgumentParser):
-    """Says what is wrong in one line, without the usage; its commands' parsers are of this class too."""
-
-    def __init__(self, **settings: Any) -> None:
-        super().__init__(**settings)
-        # as from Python 3.14 on: no option begins with a digit, so that -10,0 and -2.5e1 are values
-        self._negative_number_matcher = re.compile(r"-\.?\d")
-
-    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
-        found, unknown = super().parse_known_args(args, namespace)
-        if unknown:  # here, not in the program's own parser, so that the command is named
-            self.error(f"unrecognized arguments: {' '.join(unknown)}")
-        return found, unknown
-
-    def error(self, message: str) -> NoReturn:
-        self.exit(2, f"{self.prog}: error: {' '.join(message.split())}; see {self.prog} --help\n")
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = _Parser(prog="hlsim", description="Hear through an impaired ear, and train through it.")
+def _parser() -> Parser:
+    parser = Parser(prog="hlsim", description="Hear through an impaired ear, and train through it.")
     parser.add_argument("--version", action="version", version=f"hlsim {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    for module in (demo, files, prepare, training, evaluation, compensators, haspi_report, benchmark):
-        module.add(commands)
+    for command, (module, text) in COMMANDS.items():
+        commands.add_parser(
+            command, help=text, description=text, declare=partial(_declare, module, command.replace("-", "_"))
+        )
     return parser
+
+
+def _declare(module: str, function: str, parser: Parser) -> None:
+    getattr(import_module(f"hlsim.cli.{module}"), function)(parser)
 
 
 if __name__ == "__main__":

@@ -3,167 +3,108 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+from hlsim.cli.inputs import check_files, check_there, need, read_ear
 from hlsim.cli.options import (
     EARS_TABLE,
-    Commands,
-    add_command,
-    audiogram_option,
-    check_files,
+    Parser,
     count,
-    full_scale_option,
     integer,
     number,
-    out_option,
+    numbers,
     positive,
-    read_ear,
-    seed_option,
-    show_progress,
+    shares,
 )
-from hlsim.data.corpora import LAYOUTS
-from hlsim.data.noises import TEST_SNRS_DB, TEST_TYPES, TRAIN_SNRS_DB, TRAIN_TYPES
-from hlsim.data.teacher import ALIGNMENTS, TEACHERS, Reference, check_grid
-from hlsim.parallel import BACKENDS
+from hlsim.cli.progress import show_progress
+
+if TYPE_CHECKING:
+    from hlsim.data.teacher import Reference
+
+ALIGNMENTS = ("structural", "impulse")
+
+# what has a use only with another option: their defaults
+MIXING: dict[str, Any] = {
+    "train_snr": (0.0, 5.0, 10.0, 15.0),
+    "test_snr": (2.5, 7.5, 12.5, 17.5),
+    "train_types": 8,
+    "test_types": 2,
+}
+MAKING: dict[str, Any] = {"teacher": "msbg", "alignment": "structural"}
 
 
-def add(commands: Commands) -> None:
-    sub = add_command(
-        commands,
-        "prepare",
-        _prepare,
-        "check a corpus and plan training instances: utterances, noise, ears, levels; with --write make them",
+def prepare(parser: Parser) -> None:
+    parser.set_defaults(run=_prepare)
+    option = parser.option
+    option("corpus", Path, "folder: VoiceBank-DEMAND's, LibriSpeech's, or any with wav, flac or ogg files")
+    layouts = ("auto", "voicebank-demand", "librispeech", "folder")
+    option("--layout", str, "of the corpus", default="auto", choices=layouts)
+    option("--table", Path, "CSV with columns file and any of id, speaker, split, noisy, noise, snr (dB)")
+    option("--noise", Path, "folder of noises to mix in, a folder a type")
+    option("--root", Path, "folder that holds corpus and noise; by default what they share")
+    option("--train-snr", numbers, "SNRs in dB by active speech level", MIXING["train_snr"])
+    option("--test-snr", numbers, "other ones", MIXING["test_snr"])
+    option("--train-types", count, "types of noise to train with", MIXING["train_types"])
+    option("--test-types", count, "other ones to test with", MIXING["test_types"])
+    option("--audiograms", Path, f"{EARS_TABLE}. Without it ears are drawn")
+    option("--test-audiograms", Path, "CSV of the ears for test")
+    option("--ears", count, "an utterance", default=2)
+    text = (
+        "proportions such as mild=1,moderate=1,severe=2, also none; by default equal ones of mild, moderate and severe, "
+        "or as in the CSV"
     )
-    sub.add_argument(
-        "corpus",
-        type=Path,
-        help="folder: VoiceBank-DEMAND's, LibriSpeech's, or any with wav, flac or ogg files",
-    )
-    sub.add_argument("--layout", choices=("auto", *LAYOUTS), default="auto", help="of the corpus")
-    sub.add_argument(
-        "--table",
-        type=Path,
-        help="CSV with columns file and any of id, speaker, split, noisy, noise, snr (dB)",
-    )
-    sub.add_argument("--noise", type=Path, help="folder of noises to mix in, a folder a type")
-    sub.add_argument(
-        "--root", type=Path, help="folder that holds corpus and noise; by default what they share"
-    )
-    sub.add_argument(
-        "--train-snr", type=numbers, default=TRAIN_SNRS_DB, help="SNRs in dB by active speech level"
-    )
-    sub.add_argument("--test-snr", type=numbers, default=TEST_SNRS_DB, help="other ones")
-    sub.add_argument("--train-types", type=count, default=TRAIN_TYPES, help="types of noise to train with")
-    sub.add_argument("--test-types", type=count, default=TEST_TYPES, help="other ones to test with")
-    sub.add_argument("--audiograms", type=Path, help=f"{EARS_TABLE}. Without it ears are drawn")
-    sub.add_argument("--test-audiograms", type=Path, help="CSV of the ears for test")
-    sub.add_argument("--ears", type=count, default=2, help="an utterance")
-    sub.add_argument(
-        "--severities",
-        type=shares,
-        help="proportions such as mild=1,moderate=1,severe=2, also none; by default equal ones of mild, moderate and "
-        "severe, or as in the CSV",
-    )
-    sub.add_argument(
-        "--level",
-        type=number,
-        nargs="+",
-        default=[65.0],
-        help="active speech level in dB SPL that ears are given; two draw one in between for each utterance and ear",
-    )
-    sub.add_argument("--rate", type=integer, default=16000, help="of the instances, Hz")
-    sub.add_argument(
-        "--test-share",
-        type=number,
-        default=0.1,
-        help="of speakers, where the corpus has no splits of its own",
-    )
-    sub.add_argument("--valid-share", type=number, default=0.0, help="of the speakers to train with")
-    sub.add_argument("--shortest", type=positive, default=0.5, help="seconds; shorter files are left out")
-    sub.add_argument("--strict", action="store_true", help="make a fault an error")
-    sub.add_argument("--write", action="store_true", help="make the instances too, 12 bytes a sample")
-    sub.add_argument(
-        "--teacher", choices=TEACHERS, default="msbg", help="that says what is heard, with --write"
-    )
-    sub.add_argument(
-        "--alignment",
-        choices=ALIGNMENTS[:2],
-        default="structural",
-        help="impulse is the paper's, with --write",
-    )
-    sub.add_argument("--jobs", type=count, help="processes; all cores by default")
-    sub.add_argument("--backend", choices=BACKENDS, default="loky", help="this machine, or a cluster")
-    sub.add_argument("--scheduler", help="of --backend dask: its address, such as tcp://host:8786")
-    seed_option(sub)
-    out_option(sub)
-
-    sub = add_command(
-        commands,
-        "draw-alignment",
-        _draw_alignment,
-        "draw an utterance and what an ear hears of it, raised to the utterance's level, before and after alignment",
-    )
-    sub.add_argument(
-        "input", type=Path, metavar="IN", help="wav, flac or ogg, 16 to 48 kHz; its first channel"
-    )
-    sub.add_argument("output", type=Path, metavar="OUT", help="png")
-    audiogram_option(sub, default="N3")
-    sub.add_argument("--alignment", choices=ALIGNMENTS[:2], default="impulse", help="impulse is the paper's")
-    full_scale_option(sub)
+    option("--severities", shares, text)
+    text = "active speech level in dB SPL that ears are given; two draw one in between for each utterance and ear"
+    option("--level", number, text, default=[65.0], nargs="+")
+    option("--rate", integer, "of the instances, Hz", default=16000)
+    option("--test-share", number, "of speakers, where the corpus has no splits of its own", default=0.1)
+    option("--valid-share", number, "of the speakers to train with", default=0.0)
+    option("--shortest", positive, "seconds; shorter files are left out", default=0.5)
+    parser.flag("--strict", "make a fault an error")
+    parser.flag("--write", "make the instances too, 12 bytes a sample")
+    text = "that says what is heard, with --write"
+    option("--teacher", str, text, MAKING["teacher"], choices=("msbg", "pyclarity"))
+    text = "impulse is the paper's, with --write"
+    option("--alignment", str, text, MAKING["alignment"], choices=ALIGNMENTS)
+    parser.parallel()
+    parser.seed()
+    parser.out()
 
 
-def numbers(text: str) -> tuple[float, ...]:
-    try:
-        return tuple(number(part) for part in text.split(","))
-    except argparse.ArgumentTypeError:
-        raise argparse.ArgumentTypeError(
-            f"{text}; allowed: numbers separated by commas, such as 0,2.5,5"
-        ) from None
-
-
-def shares(text: str) -> dict[str, float]:
-    pairs = [part.partition("=") for part in text.split(",")]
-    try:
-        return {name.strip(): number(value) for name, _, value in pairs}
-    except argparse.ArgumentTypeError:
-        raise argparse.ArgumentTypeError(
-            f"{text}; allowed: severities with a number each, such as mild=1,severe=2"
-        ) from None
+def draw_alignment(parser: Parser) -> None:
+    parser.set_defaults(run=_draw_alignment)
+    parser.option("input", Path, "wav, flac or ogg, 16 to 48 kHz; its first channel", metavar="IN")
+    parser.option("output", Path, "png", metavar="OUT")
+    parser.audiogram("N3")
+    parser.option("--alignment", str, "impulse is the paper's", default="impulse", choices=ALIGNMENTS)
+    parser.full_scale()
 
 
 def _prepare(options: argparse.Namespace) -> None:
-    from hlsim.data.plan import FAULTS, prepare
-    from hlsim.data.plan_settings import PlanSettings
-    from hlsim.data.writing import Recipe, write_instances
-
     if len(options.level) > 2:
         raise ValueError(f"--level {options.level}; allowed: one level, or lowest and highest")
-    _refuse_what_has_no_use(options)
-    settings = PlanSettings(
-        corpus=options.corpus,
-        noise=options.noise,
-        root=options.root,
-        layout=options.layout,
-        table=options.table,
-        train_snrs=options.train_snr,
-        test_snrs=options.test_snr,
-        train_types=options.train_types,
-        test_types=options.test_types,
-        audiograms=options.audiograms,
-        test_audiograms=options.test_audiograms,
-        ears=options.ears,
-        severities=options.severities,
-        level=(options.level[0], options.level[-1]),
-        rate=options.rate,
-        test_share=options.test_share,
-        valid_share=options.valid_share,
-        shortest=options.shortest,
-        seed=options.seed,
+    _refuse_without(options, "--noise", options.noise, MIXING)
+    _refuse_without(options, "--write", options.write, MAKING)
+    check_there(
+        folders=(options.corpus, options.noise, options.root),
+        files=(options.table, options.audiograms, options.test_audiograms),
     )
+    from hlsim.data.plan import FAULTS, prepare
+    from hlsim.data.plan_settings import PlanSettings
+    from hlsim.data.teacher import check_grid
+    from hlsim.data.writing import Recipe, write_instances
+
+    given = vars(options) | {
+        "train_snrs": options.train_snr,
+        "test_snrs": options.test_snr,
+        "level": (options.level[0], options.level[-1]),
+    }
+    settings = PlanSettings(**{entry.name: given[entry.name] for entry in fields(PlanSettings)})
+    where: dict[str, Any] = {name: given[name] for name in ("jobs", "backend", "scheduler")}
     if options.write:
         check_grid(options.rate)  # before hours of checking files
-    where: dict[str, Any] = {"jobs": options.jobs, "backend": options.backend, "scheduler": options.scheduler}
     recipe = Recipe(options.alignment, _reference(options.teacher)) if options.write else None
     prepared = prepare(
         settings, options.out, strict=options.strict, progress=show_progress("utterances"), **where
@@ -176,46 +117,36 @@ def _prepare(options: argparse.Namespace) -> None:
         print(f"{count_made} instances are in {options.out / 'instances'}")
 
 
-def _refuse_what_has_no_use(options: argparse.Namespace) -> None:
+def _refuse_without(
+    options: argparse.Namespace, needed: str, there: object, defaults: dict[str, Any]
+) -> None:
     """Options that another one has to be given with. A value that is the default's equal passes: it changes nothing."""
-    mixing = {
-        "--train-snr": options.train_snr != TRAIN_SNRS_DB,
-        "--test-snr": options.test_snr != TEST_SNRS_DB,
-        "--train-types": options.train_types != TRAIN_TYPES,
-        "--test-types": options.test_types != TEST_TYPES,
-    }
-    making = {
-        "--teacher": options.teacher != TEACHERS[0],
-        "--alignment": options.alignment != ALIGNMENTS[0],
-    }
-    for needed, there, given in (
-        ("--noise", options.noise is not None, mixing),
-        ("--write", options.write, making),
-    ):
-        if not there and any(given.values()):
-            names = ", ".join(name for name, other in given.items() if other)
-            raise ValueError(f"{names} without {needed}; allowed: only with it")
+    given = [
+        f"--{name.replace('_', '-')}"
+        for name, default in defaults.items()
+        if getattr(options, name) != default
+    ]
+    if given and not there:
+        raise ValueError(f"{', '.join(given)} without {needed}; allowed: only with it")
 
 
 def _reference(teacher: str) -> Reference | None:
     if teacher == "msbg":
         return None
-    from hlsim.extras import require
+    need("eval", "clarity")
     from hlsim.metrics.reference import pyclarity_msbg
 
-    require("clarity", "eval")
     return pyclarity_msbg
 
 
 def _draw_alignment(options: argparse.Namespace) -> None:
+    check_files(options.input, options.output)
+    ear = read_ear(options.audiogram)
     from hlsim.audio import read_audio
     from hlsim.calibration import gain_to_pascals
     from hlsim.report.alignment import draw_alignment
 
-    check_files(options.input, options.output)
     waveform, rate = read_audio(options.input)
     signal = waveform[0] * gain_to_pascals(options.full_scale_spl)
-    delay = draw_alignment(
-        signal, read_ear(options.audiogram), rate, options.output, method=options.alignment
-    )
+    delay = draw_alignment(signal, ear, rate, options.output, method=options.alignment)
     print(f"{options.output}: delay {delay:.1f} samples at {rate} Hz ({1000 * delay / rate:.2f} ms)")

@@ -7,166 +7,129 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from hlsim.cli.options import (
-    Commands,
-    add_command,
-    audiogram_option,
-    count,
-    integer,
-    natural,
-    out_option,
-    positive,
-    read_ear,
-    read_recipe,
-)
-from hlsim.extras import require
-from hlsim.torchtools import keep_freed_memory
+from hlsim.cli.inputs import check_there, need, read_ear, read_recipe
+from hlsim.cli.options import Parser, count, integer, natural, positive
 
 FOLDERS = ("speech", "noise", "audiograms", "valid_speech", "valid_noise", "valid_audiograms")
 
 
-def add(commands: Commands) -> None:
-    sub = add_command(
-        commands, "train-simulator", _train_simulator, "train a Neuro-MSBG on targets from the exact MSBG"
-    )
-    sub.add_argument(
-        "--config", type=Path, required=True, help="recipe, a YAML file (examples/neuro-msbg.yaml)"
-    )
-    sub.add_argument(
-        "--manifest", type=Path, help="manifest.csv that 'hlsim prepare' wrote, instead of folders and files"
-    )
-    sub.add_argument("--root", type=Path, help="folder of the manifest's paths, if not where it was prepared")
-    sub.add_argument("--prepared", action="store_true", help="train on what 'hlsim prepare --write' wrote")
-    sub.add_argument("--workers", type=natural, help="processes that read the manifest's files; 1 by default")
-    training_options(sub, minutes=60.0, speech_required=False)
+def train_simulator(parser: Parser) -> None:
+    parser.set_defaults(run=_train_simulator)
+    parser.option("--config", Path, "recipe, a YAML file (examples/neuro-msbg.yaml)", required=True)
+    text = "manifest.csv that 'hlsim prepare' wrote, instead of folders and files"
+    parser.option("--manifest", Path, text)
+    parser.option("--root", Path, "folder of the manifest's paths, if not where it was prepared")
+    parser.flag("--prepared", "train on what 'hlsim prepare --write' wrote")
+    parser.option("--workers", natural, "processes that read the manifest's files; 1 by default")
+    _training_options(parser, minutes=60.0)
 
-    sub = add_command(
-        commands, "train-compensator", _train_compensator, "train a compensator through a frozen simulator"
-    )
-    sub.add_argument("--config", type=Path, help="recipe, a YAML file (examples/compensator.yaml)")
-    audiogram_option(sub, default=None, text="; without it one compensator for all ears is trained")
-    sub.add_argument(
-        "--simulator", default="neuro-msbg", help="msbg (exact), or a checkpoint's name or folder"
-    )
-    training_options(sub, minutes=10.0)
+
+def train_compensator(parser: Parser) -> None:
+    parser.set_defaults(run=_train_compensator)
+    parser.option("--config", Path, "recipe, a YAML file (examples/compensator.yaml)")
+    parser.audiogram(text="; without it one compensator for all ears is trained")
+    parser.option("--simulator", str, "msbg (exact), or a checkpoint's name or folder", "neuro-msbg")
+    _training_options(parser, minutes=10.0, required=True)
+
+
+def _training_options(parser: Parser, *, minutes: float, required: bool = False) -> None:
+    option = parser.option
+    option("--speech", Path, "folder of clean speech to train on", required=required)
+    option("--noise", Path, "folder of noises to mix in")
+    option("--audiograms", Path, "CSV of measured ears to join the drawn ones")
+    option("--valid-speech", Path, "folder of other speakers to validate on")
+    option("--valid-noise", Path, "folder of noises to validate with")
+    option("--valid-audiograms", Path, "CSV of ears to validate with")
+    text = "checkpoint whose weights to start from, instead of random ones"
+    option("--start", str, text, metavar="NAME")
+    option("--max-minutes", positive, "of training, resumed parts included", minutes)
+    option("--max-steps", integer, "stop earlier; -1 for no such limit", -1)
+    option("--device", str, "where to train", "auto", choices=("auto", "cpu", "cuda"))
+    option("--devices", count, "GPUs or processes a machine", 1)
+    option("--nodes", count, "machines", 1)
+    option("--strategy", str, "Lightning's, e.g. ddp", "auto")
+    parser.flag("--quiet", "no progress bar, only a line a validation")
+    parser.out()
 
 
 def _train_simulator(options: argparse.Namespace) -> None:
-    _require_extras()
-    keep_freed_memory()
-    from hlsim.training.simulator import SimulatorRecipe, train_simulator
-
-    if options.manifest is not None:
-        _train_planned(options)
-        return
-    planned = {"--root": options.root, "--prepared": options.prepared or None, "--workers": options.workers}
-    if given := [name for name, value in planned.items() if value is not None]:
-        raise ValueError(f"{', '.join(given)} without --manifest; allowed: with it alone")
-    if options.speech is None:
-        raise ValueError(
-            "nothing to train on; allowed: --speech, a folder, or --manifest, of 'hlsim prepare'"
-        )
-    folder = train_simulator(
-        training_data(options), SimulatorRecipe.from_dict(recipe(options)), **training_arguments(options)
-    )
-    print(f"the best checkpoint is in {folder}")
-
-
-def _train_planned(options: argparse.Namespace) -> None:
+    if options.manifest is None:
+        planned = {"root": options.root, "prepared": options.prepared or None, "workers": options.workers}
+        if given := _given(planned, planned):
+            raise ValueError(f"{given} without --manifest; allowed: with it alone")
+        if options.speech is None:
+            raise ValueError(
+                "nothing to train on; allowed: --speech, a folder, or --manifest, of 'hlsim prepare'"
+            )
+    elif given := _given(vars(options), FOLDERS):
+        raise ValueError(f"--manifest with {given}; allowed: one or the other, for a manifest has it all")
+    _check(options)
     from hlsim.training.planned import PlannedSource, PlannedTraining
     from hlsim.training.simulator import SimulatorRecipe, train_simulator
 
-    if given := _given(options, FOLDERS):
-        raise ValueError(
-            f"--manifest with {', '.join(given)}; allowed: one or the other, for a manifest has it all"
-        )
-    folder = train_simulator(
-        PlannedSource(
-            options.manifest,
-            options.root,
-            options.prepared,
-            workers=1 if options.workers is None else options.workers,
-        ),
-        SimulatorRecipe.from_dict(recipe(options)),
-        kind=PlannedTraining,
-        **training_arguments(options),
-    )
+    arguments = _arguments(options)
+    if options.manifest is None:
+        data = _data(options)
+    else:
+        workers = 1 if options.workers is None else options.workers
+        data = PlannedSource(options.manifest, options.root, options.prepared, workers=workers)
+        arguments["kind"] = PlannedTraining
+    folder = train_simulator(data, SimulatorRecipe.from_dict(_recipe(options)), **arguments)
     print(f"the best checkpoint is in {folder}")
 
 
 def _train_compensator(options: argparse.Namespace) -> None:
-    _require_extras()
-    if options.audiogram and (given := _given(options, ("audiograms", "valid_audiograms"))):
-        raise ValueError(f"--audiogram with {', '.join(given)}; allowed: one ear, or a CSV of ears, not both")
-    keep_freed_memory()
+    if options.audiogram and (given := _given(vars(options), ("audiograms", "valid_audiograms"))):
+        raise ValueError(f"--audiogram with {given}; allowed: one ear, or a CSV of ears, not both")
+    _check(options)
+    ear = read_ear(options.audiogram) if options.audiogram else None
     from hlsim.training.compensator import CompensatorRecipe, train_compensator
 
     folder = train_compensator(
-        training_data(options),
-        CompensatorRecipe.from_dict(recipe(options)),
-        audiogram=read_ear(options.audiogram) if options.audiogram else None,
+        _data(options),
+        CompensatorRecipe.from_dict(_recipe(options)),
+        audiogram=ear,
         simulator=options.simulator,
-        **training_arguments(options),
+        **_arguments(options),
     )
     print(f"the best checkpoint is in {folder}")
 
 
-def _require_extras() -> None:
-    for module in ("lightning", "tensorboard"):
-        require(module, "train")
+def _check(options: argparse.Namespace) -> None:
+    need("train", "lightning", "tensorboard")
+    check_there(
+        folders=(options.speech, options.noise, options.valid_speech, options.valid_noise),
+        files=(
+            options.config,
+            getattr(options, "manifest", None),
+            options.audiograms,
+            options.valid_audiograms,
+        ),
+    )
 
 
-def _given(options: argparse.Namespace, names: Iterable[str]) -> list[str]:
+def _given(options: dict[str, Any], names: Iterable[str]) -> str:
     """Those of the options that were given, as they are written."""
-    return [f"--{name.replace('_', '-')}" for name in names if getattr(options, name) is not None]
+    return ", ".join(f"--{name.replace('_', '-')}" for name in names if options[name] is not None)
 
 
-def training_options(
-    parser: argparse.ArgumentParser, *, minutes: float, speech_required: bool = True
-) -> None:
-    parser.add_argument(
-        "--speech", type=Path, required=speech_required, help="folder of clean speech to train on"
-    )
-    parser.add_argument("--noise", type=Path, help="folder of noises to mix in")
-    parser.add_argument("--audiograms", type=Path, help="CSV of measured ears to join the drawn ones")
-    parser.add_argument("--valid-speech", type=Path, help="folder of other speakers to validate on")
-    parser.add_argument("--valid-noise", type=Path, help="folder of noises to validate with")
-    parser.add_argument("--valid-audiograms", type=Path, help="CSV of ears to validate with")
-    parser.add_argument(
-        "--start", metavar="NAME", help="checkpoint whose weights to start from, instead of random ones"
-    )
-    parser.add_argument(
-        "--max-minutes", type=positive, default=minutes, help="of training, resumed parts included"
-    )
-    parser.add_argument("--max-steps", type=integer, default=-1, help="stop earlier; -1 for no such limit")
-    parser.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto", help="where to train")
-    parser.add_argument("--devices", type=count, default=1, help="GPUs or processes a machine")
-    parser.add_argument("--nodes", type=count, default=1, help="machines")
-    parser.add_argument("--strategy", default="auto", help="Lightning's, e.g. ddp")
-    parser.add_argument("--quiet", action="store_true", help="no progress bar, only a line a validation")
-    out_option(parser)
-
-
-def recipe(options: argparse.Namespace) -> dict[str, Any]:
+def _recipe(options: argparse.Namespace) -> dict[str, Any]:
     """What the recipe's file holds, and what options say instead."""
-    start = {} if options.start is None else {"start": options.start}
-    return read_recipe(options.config) | start
+    return read_recipe(options.config) | ({} if options.start is None else {"start": options.start})
 
 
-def training_data(options: argparse.Namespace) -> Any:
+def _data(options: argparse.Namespace) -> Any:
     from hlsim.training.sources import TrainingData
 
     return TrainingData(**{name: getattr(options, name) for name in FOLDERS})
 
 
-def training_arguments(options: argparse.Namespace) -> dict[str, Any]:
-    return {
-        "out": options.out,
-        "max_minutes": options.max_minutes,
-        "max_steps": options.max_steps,
+def _arguments(options: argparse.Namespace) -> dict[str, Any]:
+    from hlsim.torchtools import keep_freed_memory
+
+    keep_freed_memory()
+    same = ("out", "max_minutes", "max_steps", "devices", "nodes", "strategy")
+    return {name: getattr(options, name) for name in same} | {
         "accelerator": "gpu" if options.device == "cuda" else options.device,
-        "devices": options.devices,
-        "nodes": options.nodes,
-        "strategy": options.strategy,
         "progress": not options.quiet,
     }

@@ -2,14 +2,14 @@
 
 import pytest
 
-from hlsim.cli.options import show_progress
+from hlsim.cli.progress import show_progress
 
 
 def test_the_end_is_told_from_the_pace_since_the_first_call(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     now = [1_000_000.0]
-    monkeypatch.setattr("hlsim.cli.options.time.time", lambda: now[0])
+    monkeypatch.setattr("hlsim.cli.progress.time.time", lambda: now[0])
     show = show_progress("scores")
     show(50, 100)  # made by an earlier run
     now[0] += 60.0

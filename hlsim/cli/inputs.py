@@ -1,0 +1,98 @@
+"""What options name: ears, models, recipes and files, and what is refused before anything slow is imported."""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from hlsim.cli.options import STANDARD_EARS
+from hlsim.extras import require
+
+if TYPE_CHECKING:
+    import torch
+
+    from hlsim.audiogram import Audiogram
+
+
+def need(extra: str, *modules: str) -> None:
+    """Raise MissingExtraError where one is not installed, without the seconds that importing them takes."""
+    for module in modules:
+        if find_spec(module) is None:
+            require(module, extra)
+
+
+def check_there(*, folders: tuple[Path | None, ...] = (), files: tuple[Path | None, ...] = ()) -> None:
+    """Refuse folders and files to read that are not there; those that were not given pass."""
+    for path in folders:
+        if path is not None and not path.is_dir():
+            raise ValueError(f"{path}: no such folder")
+    for path in files:
+        if path is not None and not path.exists():
+            raise ValueError(f"{path}: no such file")
+
+
+def check_files(source: Path, target: Path) -> None:
+    """Refuse an IN and OUT that would end in nothing after the work, or in the loss of IN."""
+    if source.is_dir():
+        raise ValueError(f"{source}: a folder; allowed: one file, wav, flac or ogg")
+    if not target.parent.is_dir():
+        found = "not a folder" if target.parent.exists() else "no such folder"
+        raise ValueError(f"{target.parent}: {found}; allowed: an OUT in a folder that is there")
+    if not source.exists():
+        raise ValueError(f"{source}: no such file")
+    if target.exists() and target.samefile(source):
+        raise ValueError(f"{target}: OUT is IN itself; allowed: another file, for IN would be lost")
+
+
+def read_ear(text: str) -> Audiogram:
+    """An ear from what ``--audiogram`` holds."""
+    levels = None
+    if "," in text:
+        try:
+            levels = tuple(float(part) for part in text.split(","))
+        except ValueError:
+            raise ValueError(
+                f"--audiogram {text}; allowed: a standard ear such as N3, or eight numbers in dB HL separated by commas"
+            ) from None
+    elif text.upper() not in STANDARD_EARS:
+        raise ValueError(f"no standard audiogram {text!r}; allowed: {', '.join(STANDARD_EARS)}")
+    from hlsim.audiogram import Audiogram
+
+    if levels is None:
+        return Audiogram.standard(text.upper())
+    try:
+        return Audiogram(levels)
+    except ValueError as error:
+        raise ValueError(f"--audiogram {text}: {error}") from error
+
+
+def other_ear(label: str, name: str, ear: Audiogram | None) -> list[str]:
+    """What there is to say of a compensator that was trained for one ear and is given another, or several (None)."""
+    from compensators import trained_for
+
+    own = trained_for(name)
+    if own is None or (ear is not None and own.thresholds == ear.thresholds):
+        return []
+    levels = ", ".join(f"{level:g}" for level in own.thresholds)
+    return [f"{label} was trained for one ear, {levels} dB HL, and is meant for no other."]
+
+
+def read_simulator(name: str, sample_rate: int, full_scale_spl: float = 94.0) -> torch.nn.Module:
+    from hlsim import MSBG, load_pretrained
+
+    options: dict[str, Any] = {"sample_rate": sample_rate, "full_scale_spl": full_scale_spl}
+    return MSBG(**options) if name == "msbg" else load_pretrained(name, **options)
+
+
+def read_recipe(path: Path | None) -> dict[str, Any]:
+    if path is None:
+        return {}
+    yaml = require("yaml", "train")
+    try:
+        data = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise ValueError(f"{path}: not readable as YAML ({error})") from error
+    if not isinstance(data, dict):
+        raise ValueError(f"{path}: holds no settings; allowed: 'name: value' lines")
+    return data

@@ -1,0 +1,93 @@
+"""What the program declares without importing it is what the library has."""
+
+import inspect
+from collections.abc import Callable
+from importlib import import_module
+from typing import Any
+
+import pytest
+
+from hlsim.audio import EXTENSIONS
+from hlsim.audiogram import STANDARD
+from hlsim.cli import files, options
+from hlsim.cli.inputs import read_ear
+from hlsim.cli.main import COMMANDS
+from hlsim.cli.options import Parser
+from hlsim.data.corpora import LAYOUTS
+from hlsim.data.plan_settings import PlanSettings
+from hlsim.data.teacher import ALIGNMENTS, TEACHERS
+from hlsim.parallel import BACKENDS
+
+
+def declared(command: str) -> Parser:
+    parser = Parser(prog=command)
+    getattr(import_module(f"hlsim.cli.{COMMANDS[command][0]}"), command.replace("-", "_"))(parser)
+    return parser
+
+
+def choices(command: str, option: str) -> tuple[str, ...]:
+    (action,) = (action for action in declared(command)._actions if option in action.option_strings)
+    return tuple(action.choices or ())
+
+
+def test_names_that_are_written_twice_agree() -> None:
+    assert tuple(STANDARD) == options.STANDARD_EARS
+    assert files.ENDINGS == EXTENSIONS
+    assert choices("prepare", "--layout") == ("auto", *LAYOUTS)
+    assert choices("prepare", "--teacher") == TEACHERS
+    assert choices("prepare", "--alignment") == choices("draw-alignment", "--alignment") == ALIGNMENTS[:2]
+    assert choices("prepare", "--backend") == choices("haspi-report", "--backend") == BACKENDS
+
+
+def _functions() -> dict[str, Callable[..., Any]]:
+    pytest.importorskip("clarity")
+    pytest.importorskip("lightning")
+    from hlsim.benchmark.run import benchmark
+    from hlsim.demo import demo
+    from hlsim.evaluation import haspi_report
+    from hlsim.evaluation.compensators import evaluate_compensators
+    from hlsim.evaluation.simulators import evaluate_simulators
+    from hlsim.training.compensator import train_compensator
+    from hlsim.training.simulator import train_simulator
+
+    return {
+        "prepare": PlanSettings,
+        "demo": demo,
+        "benchmark": benchmark,
+        "haspi-report": haspi_report,
+        "evaluate-compensator": evaluate_compensators,
+        "evaluate-simulator": evaluate_simulators,
+        "train-compensator": train_compensator,
+        "train-simulator": train_simulator,
+    }
+
+
+def test_defaults_of_the_program_are_the_functions() -> None:
+    compared = 0
+    for command, function in _functions().items():
+        parser = declared(command)
+        for name, parameter in inspect.signature(function).parameters.items():
+            default = parser.get_default({"train_snrs": "train_snr", "test_snrs": "test_snr"}.get(name, name))
+            if default is None or parameter.default in (None, inspect.Parameter.empty):
+                continue  # required of one or the other, or read before it is passed on
+            expected = parameter.default
+            if name == "level":
+                default = [default[0], default[-1]]
+            if name == "measures":
+                default = default.split(",")
+            if isinstance(default, list | tuple):
+                default, expected = list(default), list(expected)
+            assert default == expected, (command, name)
+            compared += 1
+    assert compared > 30
+
+
+def test_required_options_are_shown_as_required() -> None:
+    text = " ".join(declared("evaluate-simulator").format_help().split())
+    assert "folder of clean speech (required)" in text and "None" not in text
+    assert "(default: 50 60 65 70 80)" in text
+    assert "(default: 0,5,10,15)" in " ".join(declared("prepare").format_help().split())
+
+
+def test_names_of_ears_may_be_written_small() -> None:
+    assert read_ear("n3") == read_ear("N3") and read_ear("nh") == read_ear("NH")

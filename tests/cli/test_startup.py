@@ -1,0 +1,67 @@
+"""Help and refusals come without torch: nobody waits seconds for them."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import hlsim
+from hlsim.cli.main import COMMANDS
+
+SCRIPT = """
+import json, sys
+from hlsim.cli.main import main
+for arguments, status in json.loads(sys.argv[1]):
+    try:
+        ended = main(arguments)
+    except SystemExit as end:
+        ended = end.code
+    heavy = {"torch", "numpy", "scipy", "soundfile", "lightning", "clarity", "matplotlib"} & set(sys.modules)
+    assert ended == status and not heavy, (arguments, ended, heavy)
+"""
+
+
+def test_help_and_refusals_import_nothing_heavy(tmp_path: Path) -> None:
+    plain, missing, out = tmp_path / "plain.wav", str(tmp_path / "missing"), str(tmp_path / "out.wav")
+    plain.touch()
+    refused: list[list[str]] = [
+        [],
+        ["nothing"],
+        ["simulate", str(plain), out, "--audiogram", "N3", "--loud"],
+        ["simulate", missing, out, "--audiogram", "N3"],
+        ["simulate", str(plain), out, "--audiogram", "N9"],
+        ["simulate", str(plain), out + ".mp3", "--audiogram", "N3"],
+        ["compensate", missing, out, "--audiogram", "n3"],
+        ["prepare", missing, "--out", out],
+        ["prepare", str(tmp_path), "--out", out, "--layout", "mine"],
+        ["draw-alignment", missing, out],
+        ["train-simulator", "--config", missing, "--speech", str(tmp_path), "--out", out],
+        ["train-simulator", "--config", str(plain), "--out", out],
+        ["train-compensator", "--speech", missing, "--out", out],
+        ["evaluate-simulator", "msbg", "--speech", str(tmp_path), "--audiograms", missing, "--out", out],
+        ["evaluate-compensator", "nalr", "--speech", missing, "--out", out],
+        ["haspi-report", "--manifest", missing, "--out", out],
+        ["demo", "--speech", missing],
+        ["benchmark", "--repeats", "0"],
+    ]
+    shown = [["--help"], ["--version"], *([command, "--help"] for command in COMMANDS)]
+    calls = [(call, 0) for call in shown] + [(call, 2) for call in refused]
+    command = [sys.executable, "-c", SCRIPT, json.dumps(calls)]
+    ended = subprocess.run(command, capture_output=True, text=True, cwd=Path(hlsim.__file__).parents[1])
+    assert ended.returncode == 0, ended.stderr[-2000:]
+    assert not (tmp_path / "out.wav").exists()
+
+
+def test_names_are_handed_on_when_they_are_asked_for() -> None:
+    script = """
+import sys, hlsim
+assert "torch" not in sys.modules and {*hlsim.__all__, "__version__"} <= set(dir(hlsim))
+assert hlsim.HearingLossLoss.__module__ == "hlsim.loss"
+from hlsim import *
+assert Audiogram is hlsim.Audiogram and MSBG is hlsim.MSBG and load_pretrained("neuro-msbg")
+try:
+    hlsim.Audiograms
+except AttributeError as error:
+    assert "module 'hlsim' has no attribute 'Audiograms'" in str(error)
+"""
+    subprocess.run([sys.executable, "-c", script], check=True, cwd=Path(hlsim.__file__).parents[1])
