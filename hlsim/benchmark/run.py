@@ -3,21 +3,31 @@
 from __future__ import annotations
 
 import math
-import statistics
 from collections.abc import Callable, Sequence
-from typing import Any
+from functools import partial
+from statistics import median
+from typing import Any, NamedTuple
 
 import torch
+from torch import Tensor
 
-from hlsim.benchmark.machine import about
-from hlsim.benchmark.measuring import Key, Measuring
+from hlsim.audiogram import Audiogram
 from hlsim.benchmark.models import Row, rows
+from hlsim.benchmark.timing import about, attempt, figures, finish, milliseconds, peak_mib
+from hlsim.calibration import set_level
+from hlsim.neuro.config import NEURO_RATE
 
 LENGTHS = (1.0, 4.0, 16.0, 60.0)
 BATCHES = (1, 8, 64)
 
 TRAINING = (4.0, 64)
 """Seconds and clips of a batch that the default network is trained or trained through with."""
+
+EARS = ("N1", "N2", "N3")
+"""One ear of each degree of loss: mild, moderate and severe in MSBG's sense."""
+
+# milliseconds: what takes longer is timed in so many rounds only, with the middle ear and no uncounted call
+_SLOW, _SLOW_ROUNDS = 400.0, 2
 
 Progress = Callable[[int, int, str], None]
 
@@ -51,8 +61,8 @@ def benchmark(
         training: seconds and clips of the batch to train on, left out on a CPU that would take longer than ``limit``.
         simulators: the Neuro-MSBGs, by name or folder; by default all that ship.
         only: parts of names: rows with none of them are left out.
-        progress: called with cells done, cells in all, and what comes.
-        keep: called with the result so far after each round and each row's sizes.
+        progress: called with timings done, timings in all, and what comes.
+        keep: called with the result so far after each.
 
     Returns: machine, ``rows`` and ``skipped``, what failed and why. A row has name, parameters and a list of ``cells``,
         each with sample rate, seconds, batch, direction, median, least and greatest milliseconds, peak memory in MiB,
@@ -70,83 +80,162 @@ def benchmark(
         found = [row for row in found if any(part in row.name for part in only)]
         if not found:
             raise ValueError(f"only {' '.join(only)}: no such row; there are {', '.join(names)}")
-    measured = Measuring(torch.device(device), repeats, limit, skipped)
-    done, total = 0, _count(found, repeats, lengths, batches, training)
-
-    def step(text: str) -> None:
-        nonlocal done
-        done += 1
-        if progress is not None:
-            progress(done, total, text)
-
-    def so_far() -> dict[str, Any]:
-        result = machine | _result(found, measured)
-        if keep is not None:
-            keep(result)
-        return result
-
+    timings = _Timings(torch.device(device), repeats, limit, skipped)
     for row in found:
-        measured.prepare(row)
-    for turn in range(repeats + 1):
-        for row in found:
-            for rate in row.rates:
-                step(f"{row.name}, 1 s")
-                measured.second(row, rate, turn)
-        so_far()
+        timings.prepare(row)
+    steps: list[tuple[str, Callable[[], None]]] = [
+        (f"{row.name}, 1 s", partial(timings.second, row, rate, turn))
+        for turn in range(repeats + 1)
+        for row in found
+        for rate in row.rates
+    ]
+    sizes = [(s, 1) for s in lengths if s != 1.0] + [(1.0, b) for b in batches if b != 1]
     for row in found:
-        for seconds, batch in _sizes(lengths, batches):
-            step(f"{row.name}, {seconds:g} s, batch {batch}")
-            measured.size(row, seconds, batch)
+        for s, b in sizes:
+            steps.append((f"{row.name}, {s:g} s, batch {b}", partial(timings.size, row, s, b)))
         if row.default and training is not None:
-            step(f"{row.name}, {training[0]:g} s, batch {training[1]}, forward and backward")
-            measured.training(row, *training)
-        so_far()
-    return so_far()
+            what = f"{row.name}, {training[0]:g} s, batch {training[1]}, forward and backward"
+            steps.append((what, partial(timings.training, row, *training)))
+    for done, (what, take) in enumerate(steps):
+        if progress is not None:
+            progress(done, len(steps), what)
+        take()
+        if keep is not None:
+            keep(machine | timings.result(found))
+    if progress is not None:
+        progress(len(steps), len(steps), "")
+    return machine | timings.result(found)
 
 
-def _result(found: list[Row], measured: Measuring) -> dict[str, Any]:
-    reference = measured.times.get(("pyclarity Ear", 44100, 1.0, 1, "forward"))
-    timed = {key[0] for key in measured.times}
-    return {
-        "rows": [_row(row, measured.times, measured.memory, reference) for row in found if row.name in timed],
-        "skipped": list(measured.skipped),
-    }
+class _Key(NamedTuple):
+    name: str
+    sample_rate: int
+    seconds: float
+    batch: int
+    direction: str  # "forward" or "both"
+
+    def __str__(self) -> str:
+        direction = "forward" if self.direction == "forward" else "forward and backward"
+        return f"{self.name}, {self.sample_rate} Hz, {self.seconds:g} s, batch {self.batch}, {direction}"
 
 
-def _row(
-    row: Row,
-    cells: dict[Key, list[float]],
-    memory: dict[Key, float | None],
-    reference: list[float] | None,
-) -> dict[str, Any]:
-    out: list[dict[str, Any]] = []
-    for key, times in cells.items():
-        name, rate, seconds, batch, direction = key
-        if name != row.name:
-            continue
-        single = seconds == 1.0 and batch == 1
-        median = statistics.median(times)
-        out.append(
-            {
-                "sample_rate": rate,
-                "seconds": seconds,
-                "batch": batch,
-                "direction": direction,
-                "median_ms": median,
-                "least_ms": min(times),
-                "greatest_ms": max(times),
-                "counted": len(times),
-                "peak_mib": memory.get(key),
-                "times_real_time": 1000.0 * seconds * batch / median,
-                "speedup": statistics.median(reference) / median if reference and single else None,
+class _Timings:
+    """Times and memory, of what did not fail."""
+
+    def __init__(self, device: torch.device, repeats: int, limit: float, skipped: list[str]) -> None:
+        self.device, self.repeats, self.limit, self.skipped = device, repeats, limit, skipped
+        self.calls: dict[tuple[str, int, str], Callable[[Tensor], Tensor]] = {}
+        self.times: dict[_Key, list[float]] = {}
+        self.memory: dict[_Key, float | None] = {}
+        self.failed: set[_Key] = set()
+        self.fastest: dict[tuple[str, int], float] = {}
+
+    def prepare(self, row: Row) -> None:
+        def make(rate: int) -> None:
+            made = {
+                (row.name, rate, ear): row.prepare(rate, Audiogram.standard(ear), self.device) for ear in EARS
             }
-        )
-    return {
-        "name": row.name,
-        "parameters": row.parameters,
-        "cells": out,
-        "growth": {by: _growth(out, by, row.rates[0]) for by in ("seconds", "batch")},
-    }
+            self.calls.update(made)
+
+        for rate in row.rates:
+            attempt(f"{row.name}, {rate} Hz", partial(make, rate), self.device, self.skipped)
+
+    def second(self, row: Row, rate: int, turn: int) -> None:
+        """One second at batch 1: with every ear in both directions, in round ``turn``, of which 0 does not count."""
+        slow = turn == 0 or self.fastest.get((row.name, rate), 0.0) > _SLOW
+        if (row.name, rate, EARS[1]) not in self.calls or (slow and turn > _SLOW_ROUNDS):
+            return
+        forward = _Key(row.name, rate, 1.0, 1, "forward")
+        both = forward._replace(direction="both")
+        for ear in EARS[1:2] if slow else EARS:
+            for key in (forward, both) if row.differentiable else (forward,):
+                if not self.failed & {forward, key}:
+                    self._attempt(key, partial(self._round, key, ear, turn, slow))
+
+    def _round(self, key: _Key, ear: str, turn: int, slow: bool) -> None:
+        call = self._call(key, ear)
+        if not slow:
+            finish(call, self.device)  # the one before left its own data in the caches
+        elapsed = milliseconds(call, self.device)
+        if turn == 0 and elapsed > _SLOW:  # a row's first call makes what the later ones find
+            elapsed = milliseconds(call, self.device)
+        if key.direction == "forward":
+            place = (key.name, key.sample_rate)
+            self.fastest[place] = min(self.fastest.get(place, math.inf), elapsed)
+        if turn:
+            self.times.setdefault(key, []).append(elapsed)
+        else:
+            self.memory[key] = peak_mib(call, self.device)
+
+    def size(self, row: Row, seconds: float, batch: int) -> None:
+        """Another length or batch, forward at the row's own rate, where it does not take too long."""
+        key = _Key(row.name, row.rates[0], seconds, batch, "forward")
+        same = {
+            k.seconds: median(t)
+            for k, t in self.times.items()
+            if k._replace(seconds=seconds) == key._replace(batch=1)
+        }
+        if 1.0 in same:
+            self._repeat(key, same[1.0] * batch if batch > 1 else _expected(list(same.items()), seconds))
+
+    def training(self, row: Row, seconds: float, batch: int) -> None:
+        """A batch to train on, forward plus backward at the network's own rate, where a CPU does not take too long."""
+        key = _Key(row.name, NEURO_RATE, seconds, batch, "both")
+        if second := self.times.get(key._replace(seconds=1.0, batch=1)):
+            # a GPU takes much less than what one second tells
+            self._repeat(key, median(second) * seconds * batch if self.device.type == "cpu" else 0.0)
+
+    def _repeat(self, key: _Key, expected: float) -> None:
+        def take() -> None:
+            call = self._call(key, EARS[1])
+            self.memory[key] = peak_mib(call, self.device)
+            first = milliseconds(call, self.device)
+            more = min(self.repeats, int(3000.0 * self.limit / max(1.0, first))) - 1
+            self.times[key] = [first, *(milliseconds(call, self.device) for _ in range(more))]
+
+        if expected <= 1000.0 * self.limit:
+            self._attempt(key, take)
+
+    def _call(self, key: _Key, ear: str) -> Callable[[], None]:
+        clip = _clip(key.sample_rate, key.seconds, key.batch).to(self.device)
+        return partial(_run, self.calls[key.name, key.sample_rate, ear], clip, key.direction)
+
+    def _attempt(self, key: _Key, call: Callable[[], None]) -> None:
+        if not attempt(str(key), call, self.device, self.skipped):
+            self.failed.add(key)
+
+    def result(self, found: list[Row]) -> dict[str, Any]:
+        reference = self.times.get(_Key("pyclarity Ear", 44100, 1.0, 1, "forward"))
+        out = []
+        for row in found:
+            cells = [
+                self._cell(key, median(reference) if reference else None)
+                for key in self.times
+                if key.name == row.name
+            ]
+            growth = {by: _growth(cells, by, row.rates[0]) for by in ("seconds", "batch")}
+            if cells:
+                out.append({"name": row.name, "parameters": row.parameters, "cells": cells, "growth": growth})
+        return {"rows": out, "skipped": list(self.skipped)}
+
+    def _cell(self, key: _Key, reference: float | None) -> dict[str, Any]:
+        cell = key._asdict() | figures(self.times[key], self.memory.get(key))
+        del cell["name"]
+        single = key.seconds == 1.0 and key.batch == 1
+        return cell | {
+            "counted": len(self.times[key]),
+            "times_real_time": 1000.0 * key.seconds * key.batch / cell["median_ms"],
+            "speedup": reference / cell["median_ms"] if reference and single else None,
+        }
+
+
+def _expected(line: list[tuple[float, float]], seconds: float) -> float:
+    """Milliseconds of a longer clip, by how the time grew so far: attention's grows with the square of the length."""
+    power = 1.0
+    if len(line) > 1:
+        # no more than that, for what takes microseconds may look as if, where the machine was busy once
+        power = min(2.0, max(1.0, _exponent(*line[-2:])))
+    return line[-1][1] * (seconds / line[-1][0]) ** power
 
 
 def _growth(cells: list[dict[str, Any]], by: str, rate: int) -> float | None:
@@ -157,21 +246,23 @@ def _growth(cells: list[dict[str, Any]], by: str, rate: int) -> float | None:
         for cell in cells
         if cell[other] == 1 and cell["direction"] == "forward" and cell["sample_rate"] == rate
     ]
-    (low, first), (high, last) = min(line, default=(1, 0.0)), max(line, default=(1, 0.0))
-    return math.log(last / first) / math.log(high / low) if high > low else None
+    return _exponent(min(line), max(line)) if len(line) > 1 else None
 
 
-def _sizes(lengths: tuple[float, ...], batches: tuple[int, ...]) -> list[tuple[float, int]]:
-    return [(s, 1) for s in lengths if s != 1.0] + [(1.0, b) for b in batches if b != 1]
+def _exponent(low: tuple[float, float], high: tuple[float, float]) -> float:
+    return math.log(high[1] / low[1]) / math.log(high[0] / low[0])
 
 
-def _count(
-    found: list[Row],
-    repeats: int,
-    lengths: tuple[float, ...],
-    batches: tuple[int, ...],
-    training: tuple[float, int] | None,
-) -> int:
-    sizes = len(found) * len(_sizes(lengths, batches))
-    steps = sum(row.default for row in found) if training is not None else 0
-    return (repeats + 1) * sum(len(row.rates) for row in found) + sizes + steps
+def _clip(rate: int, seconds: float, batch: int) -> Tensor:
+    generator = torch.Generator().manual_seed(0)
+    samples = round(rate * seconds)
+    syllables = torch.sin(torch.arange(samples) * (2.0 * torch.pi * 4.0 / rate)).clamp_min(0.05)
+    return set_level(torch.randn(batch, samples, generator=generator) * syllables, 65.0)
+
+
+def _run(call: Callable[[Tensor], Tensor], clip: Tensor, direction: str) -> None:
+    if direction == "both":
+        call(clip.clone().requires_grad_()).square().sum().backward()
+    else:
+        with torch.inference_mode():
+            call(clip)

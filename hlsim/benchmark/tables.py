@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
+
+Cell = dict[str, Any]
 
 
 def benchmark_markdown(result: dict[str, Any]) -> str:
@@ -15,109 +18,102 @@ def benchmark_markdown(result: dict[str, Any]) -> str:
         "",
     ]
     if "rows" in result:
-        lines += [*_one_second(result["rows"]), "", *_sizes(result["rows"]), "", *_training(result["rows"])]
-    for title, table in (("A training step", result.get("training")), ("Selective scan", result.get("scan"))):
-        if table:
-            lines += [
-                f"| {title} | forward | forward + backward | peak memory (MiB) |",
-                "|---|---|---|---|",
-                *(f"| {row['name']} | {_step(row['forward'], row['both'])} |" for row in table),
-                "",
+        lines += _one_second(result["rows"]) + _sizes(result["rows"]) + _training(result["rows"])
+    for name, title in (("training", "A training step"), ("scan", "Selective scan")):
+        if table := result.get(name):
+            rows = [
+                (
+                    row["name"],
+                    _times(row["forward"]),
+                    _times(row["both"]),
+                    _peaks(row["forward"], row["both"]),
+                )
+                for row in table
             ]
+            lines += _table((title, "forward", "forward + backward", "peak memory (MiB)"), rows)
     return "\n".join([*lines, *(f"skipped: {reason}" for reason in result["skipped"])]) + "\n"
 
 
+def _table(heads: Iterable[str], rows: Iterable[Iterable[Any]]) -> list[str]:
+    heads = list(heads)
+    lines = ["| " + " | ".join(map(str, row)) + " |" for row in (heads, *rows)]
+    return [lines[0], "|---" * len(heads) + "|", *lines[1:], ""]
+
+
 def _one_second(rows: list[dict[str, Any]]) -> list[str]:
-    lines = [
-        "| 1 s, batch 1 | parameters | rate (Hz) | forward | forward + backward | peak memory (MiB) | times pyclarity |",
-        "|---|---|---|---|---|---|---|",
-    ]
+    table = []
     most = max((cell["counted"] for row in rows for cell in row["cells"]), default=0)
     for row in rows:
-        single = [cell for cell in row["cells"] if cell["seconds"] == 1.0 and cell["batch"] == 1]
-        for forward in (cell for cell in single if cell["direction"] == "forward"):
-            rate = forward["sample_rate"]
-            both = next((c for c in single if c["direction"] == "both" and c["sample_rate"] == rate), None)
-            slow = f" ({forward['counted']} calls)" if forward["counted"] < most else ""
-            cells = (
-                row["name"] + slow,
-                f"{row['parameters']:,}" if row["parameters"] else "-",
-                rate,
-                _cell(forward),
-                _cell(both),
-                _peaks(forward, both),
-                f"{forward['speedup']:.1f}" if forward["speedup"] else "-",
-            )
-            lines.append("| " + " | ".join(map(str, cells)) + " |")
-    return lines
+        single = {
+            (cell["sample_rate"], cell["direction"]): cell
+            for cell in row["cells"]
+            if cell["seconds"] == 1.0 and cell["batch"] == 1
+        }
+        for (rate, direction), forward in single.items():
+            if direction == "forward":
+                both = single.get((rate, "both"))
+                slow = f" ({forward['counted']} calls)" if forward["counted"] < most else ""
+                parameters = f"{row['parameters']:,}" if row["parameters"] else "-"
+                speedup = f"{forward['speedup']:.1f}" if forward["speedup"] else "-"
+                times = (_times(forward), _times(both), _peaks(forward, both))
+                table.append((row["name"] + slow, parameters, rate, *times, speedup))
+    heads = "1 s, batch 1|parameters|rate (Hz)|forward|forward + backward|peak memory (MiB)|times pyclarity"
+    return _table(heads.split("|"), table)
 
 
 def _sizes(rows: list[dict[str, Any]]) -> list[str]:
-    keys = sorted(
-        {(c["batch"], c["seconds"]) for row in rows for c in row["cells"] if c["direction"] == "forward"}
-    )
-    heads = [f"{seconds:g} s" if batch == 1 else f"{batch} of {seconds:g} s" for batch, seconds in keys]
-    lines = [
-        "| forward, ms (MiB) | " + " | ".join(heads) + " | growth with length, batch |",
-        "|---" * (len(keys) + 2) + "|",
-    ]
+    forward = {row["name"]: [cell for cell in row["cells"] if cell["direction"] == "forward"] for row in rows}
+    keys = sorted({(cell["batch"], cell["seconds"]) for cells in forward.values() for cell in cells})
+    table = []
     for row in rows:
-        forward = [cell for cell in row["cells"] if cell["direction"] == "forward"]
-        rate = forward[0]["sample_rate"]
-        by_size = {(c["batch"], c["seconds"]): c for c in forward if c["sample_rate"] == rate}
-        cells = [_size(by_size.get(key)) for key in keys]
+        rate = forward[row["name"]][0]["sample_rate"]
+        cells = {(c["batch"], c["seconds"]): c for c in forward[row["name"]] if c["sample_rate"] == rate}
         growth = [f"{value:.2f}" if value is not None else "-" for value in row["growth"].values()]
-        lines.append(f"| {row['name']}, {rate} Hz | " + " | ".join([*cells, ", ".join(growth)]) + " |")
-    return lines
+        table.append(
+            (f"{row['name']}, {rate} Hz", *(_size(cells.get(key)) for key in keys), ", ".join(growth))
+        )
+    heads = [f"{seconds:g} s" if batch == 1 else f"{batch} of {seconds:g} s" for batch, seconds in keys]
+    return _table(("forward, ms (MiB)", *heads, "growth with length, batch"), table)
 
 
 def _training(rows: list[dict[str, Any]]) -> list[str]:
     """Batches to train on, as far as they were timed."""
-    found = [
-        (row["name"], cell)
+    table = [
+        (
+            f"{row['name']}, {cell['sample_rate']} Hz, {cell['batch']} of {cell['seconds']:g} s",
+            _times(cell),
+            f"{cell['times_real_time']:.0f}",
+            _peaks(cell),
+        )
         for row in rows
         for cell in row["cells"]
         if cell["direction"] == "both" and (cell["seconds"], cell["batch"]) != (1.0, 1)
     ]
-    if not found:
-        return []
-    lines = ["| batch, forward + backward | ms | times real time | peak memory (MiB) |", "|---|---|---|---|"]
-    lines += [
-        f"| {name}, {cell['sample_rate']} Hz, {cell['batch']} of {cell['seconds']:g} s | {_cell(cell)} | "
-        f"{cell['times_real_time']:.0f} | {_peaks(cell)} |"
-        for name, cell in found
-    ]
-    return [*lines, ""]
+    heads = ("batch, forward + backward", "ms", "times real time", "peak memory (MiB)")
+    return _table(heads, table) if table else []
 
 
 def _gpu(gpu: dict[str, Any] | None) -> str:
     if gpu is None:
         return ""
-    rounded = [name for name, on in gpu["tf32"].items() if on]
-    return (
-        f", GPU memory {gpu['memory_mib']:.0f} MiB, CUDA {gpu['cuda']}, cuDNN {gpu['cudnn']}, "
-        f"TF32 in {', '.join(rounded) or 'nothing'}"
-    )
+    rounded = ", ".join(name for name, on in gpu["tf32"].items() if on) or "nothing"
+    return f", GPU memory {gpu['memory_mib']:.0f} MiB, CUDA {gpu['cuda']}, cuDNN {gpu['cudnn']}, TF32 in {rounded}"
 
 
-def _size(cell: dict[str, Any] | None) -> str:
+def _size(cell: Cell | None) -> str:
     if cell is None:
         return "-"
     peak = f" ({cell['peak_mib']:.0f})" if cell["peak_mib"] is not None else ""
     return f"{cell['median_ms']:.1f}{peak}"
 
 
-def _cell(cell: dict[str, Any] | None) -> str:
+def _times(cell: Cell | None) -> str:
     if cell is None:
         return "-"
     return f"{cell['median_ms']:.1f} ({cell['least_ms']:.1f} to {cell['greatest_ms']:.1f})"
 
 
-def _step(forward: dict[str, Any] | None, both: dict[str, Any] | None) -> str:
-    return f"{_cell(forward)} | {_cell(both)} | {_peaks(forward, both)}"
-
-
-def _peaks(*cells: dict[str, Any] | None) -> str:
+def _peaks(*cells: Cell | None) -> str:
     return (
         ", ".join(f"{cell['peak_mib']:.0f}" for cell in cells if cell and cell["peak_mib"] is not None) or "-"
     )

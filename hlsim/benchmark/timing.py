@@ -1,9 +1,15 @@
-"""Time and memory of a call, and what becomes of one that fails."""
+"""Time and memory of a call, what becomes of one that fails, and the machine that it ran on.
+
+``torch.utils.benchmark`` was tried and left: it times one statement until it has enough, where rows are to take turns on
+a busy machine; it makes two uncounted calls before each count, waits for the current GPU only, and knows no peak memory.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import os
+import platform
+import statistics
 import threading
 import time
 from collections.abc import Callable
@@ -37,29 +43,37 @@ def peak_mib(call: Call, device: torch.device) -> float | None:
         return (torch.cuda.max_memory_allocated(device) - held) / 2**20
     statm = Path("/proc/self/statm")
     if not statm.is_file():
-        finish(call, device)
+        call()
         return None
 
     def resident() -> float:
         return float(statm.read_text(encoding="ascii").split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**20
 
-    before = resident()
-    highest = before
+    seen = [resident()]
     over = threading.Event()
 
     def watch() -> None:
-        nonlocal highest
         while not over.wait(0.002):
-            highest = max(highest, resident())
+            seen.append(resident())
 
     watcher = threading.Thread(target=watch, daemon=True)
     watcher.start()
     try:
-        finish(call, device)
+        call()
     finally:
         over.set()
         watcher.join()
-    return max(highest, resident()) - before
+    return max(*seen, resident()) - seen[0]
+
+
+def figures(times: list[float], peak: float | None) -> dict[str, Any]:
+    """Median, least and greatest of milliseconds, and the peak in MiB."""
+    return {
+        "median_ms": statistics.median(times),
+        "least_ms": min(times),
+        "greatest_ms": max(times),
+        "peak_mib": peak,
+    }
 
 
 def attempt(what: str, call: Call, device: torch.device, skipped: list[str]) -> bool:
@@ -82,3 +96,49 @@ def reason(error: Exception) -> str:
     if isinstance(error, MemoryError) or "memory" in text or "ALLOC_FAILED" in text:
         return "memory ran out"
     return f"{type(error).__name__}: {text}" if text else type(error).__name__
+
+
+def about(device: str, repeats: int) -> dict[str, Any]:
+    """Machine, versions and date; of a GPU its memory, CUDA and cuDNN, and how float32 is multiplied there, too.
+
+    Raises:
+        ValueError: there is no such device.
+    """
+    found = ["cpu", *(f"cuda:{index}" for index in range(torch.cuda.device_count()))]
+    if device not in (*found, *(["cuda"] if len(found) > 1 else ())):
+        raise ValueError(f"device {device!r}: there is none that torch can use; allowed: {', '.join(found)}")
+    on_gpu = device.startswith("cuda")
+    machine = torch.cuda.get_device_name(device) if on_gpu else _processor()
+    return {
+        "device": device,
+        "machine": machine,
+        "cores": os.cpu_count(),
+        "threads": torch.get_num_threads(),
+        "torch": torch.__version__,
+        "date": time.strftime("%Y-%m-%d"),
+        "repeats": repeats,
+        "gpu": _gpu(device) if on_gpu else None,
+    }
+
+
+def _gpu(device: str) -> dict[str, Any]:
+    backends: Any = torch.backends  # torch's own types know little of it
+    return {
+        "memory_mib": torch.cuda.get_device_properties(device).total_memory / 2**20,
+        "cuda": torch.version.cuda,
+        "cudnn": torch.backends.cudnn.version(),
+        "tf32": {
+            "products": backends.cuda.matmul.fp32_precision == "tf32",
+            "convolutions": backends.cudnn.conv.fp32_precision == "tf32",
+            "recurrent": backends.cudnn.rnn.fp32_precision == "tf32",
+        },
+    }
+
+
+def _processor() -> str:
+    info = Path("/proc/cpuinfo")
+    if info.is_file():
+        for line in info.read_text(encoding="utf-8").splitlines():
+            if line.startswith("model name"):
+                return line.split(":", 1)[1].strip()
+    return platform.processor() or platform.machine()

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import importlib
-import statistics
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
@@ -14,7 +12,7 @@ from torch import Tensor, nn
 
 from compensators import MappingCompensator
 from hlsim.audiogram import Audiogram
-from hlsim.benchmark.timing import attempt, milliseconds, peak_mib
+from hlsim.benchmark.timing import attempt, figures, milliseconds, peak_mib
 from hlsim.calibration import set_level
 from hlsim.loss import HearingLossLoss
 from hlsim.neuro.config import NEURO_RATE
@@ -114,46 +112,36 @@ def scan_loop(u: Tensor, delta: Tensor, A: Tensor, B: Tensor, C: Tensor) -> Tens
 def _table(
     parts: list[tuple[str, Callable[[], Tensor]]], device: torch.device, repeats: int
 ) -> tuple[list[dict[str, Any]], list[str]]:
-    cells = [{"forward": _Cell(), "both": _Cell()} for _ in parts]
+    directions = {"forward": "forward", "both": "forward and backward"}
+    calls = {
+        (number, direction): (f"{name}, {what}", partial(_run, part, direction))
+        for number, (name, part) in enumerate(parts)
+        for direction, what in directions.items()
+    }
+    times: dict[tuple[int, str], list[float]] = {key: [] for key in calls}
+    peaks: dict[tuple[int, str], float | None] = {}
+    failed: set[tuple[int, str]] = set()
     skipped: list[str] = []
-    for turn in range(repeats + 1):  # in turns, so that all see the same machine; the first does not count
-        for (name, part), own in zip(parts, cells, strict=True):
-            for direction, cell in own.items():
-                call = partial(cell.take, partial(_run, part, direction), device, turn > 0)
-                what = f"{name}, " + ("forward" if direction == "forward" else "forward and backward")
-                if not cell.failed:
-                    cell.failed = not attempt(what, call, device, skipped)
-    rows = [
-        {"name": name} | {direction: cell.figures() for direction, cell in own.items()}
-        for (name, _), own in zip(parts, cells, strict=True)
-    ]
-    return [row for row in rows if row["forward"] or row["both"]], skipped
 
-
-@dataclass
-class _Cell:
-    times: list[float] = field(default_factory=list)
-    peak: float | None = None
-    failed: bool = False
-
-    def take(self, call: Callable[[], None], device: torch.device, counted: bool) -> None:
+    def take(key: tuple[int, str], call: Callable[[], None], counted: bool) -> None:
         elapsed = milliseconds(call, device)
         if counted:
-            self.times.append(elapsed)
+            times[key].append(elapsed)
         elif (
             device.type == "cuda"
         ):  # on a CPU the first call leaves memory to the process, which the second takes
-            self.peak = peak_mib(call, device)
+            peaks[key] = peak_mib(call, device)
 
-    def figures(self) -> dict[str, float | None] | None:
-        if not self.times:
-            return None
-        return {
-            "median_ms": statistics.median(self.times),
-            "least_ms": min(self.times),
-            "greatest_ms": max(self.times),
-            "peak_mib": self.peak,
-        }
+    for turn in range(repeats + 1):  # in turns, so that all see the same machine; the first does not count
+        for key, (what, call) in calls.items():
+            if key not in failed and not attempt(what, partial(take, key, call, turn > 0), device, skipped):
+                failed.add(key)
+    measured = {key: figures(own, peaks.get(key)) if own else None for key, own in times.items()}
+    rows = [
+        {"name": name} | {direction: measured[number, direction] for direction in directions}
+        for number, (name, _) in enumerate(parts)
+    ]
+    return [row for row in rows if row["forward"] or row["both"]], skipped
 
 
 def _run(part: Callable[[], Tensor], direction: str) -> None:

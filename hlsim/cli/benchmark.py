@@ -40,10 +40,9 @@ def benchmark(parser: Parser) -> None:
 def _benchmark(options: argparse.Namespace) -> None:
     import torch
 
-    from hlsim.benchmark.machine import about
     from hlsim.benchmark.run import benchmark
     from hlsim.benchmark.tables import benchmark_markdown
-    from hlsim.benchmark.timing import attempt
+    from hlsim.benchmark.timing import about, attempt
     from hlsim.benchmark.training import scan_rows, training_step
 
     device, repeats = options.device, options.repeats

@@ -15,11 +15,10 @@ from torch import Tensor
 from hlsim.audiogram import Audiogram
 from hlsim.benchmark import run as benchmark_module
 from hlsim.benchmark import training as benchmark_training
-from hlsim.benchmark.machine import about
 from hlsim.benchmark.models import Row
 from hlsim.benchmark.run import benchmark
 from hlsim.benchmark.tables import benchmark_markdown
-from hlsim.benchmark.timing import peak_mib
+from hlsim.benchmark.timing import about, peak_mib
 from hlsim.cli.main import main
 from hlsim.neuro import scan as scan_module
 
