@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from statistics import fmean
 
 import torch
 from torch import Tensor, nn
@@ -15,6 +16,7 @@ from hlsim.audio import find_audio, read_audio, write_audio
 from hlsim.audiogram import Audiogram
 from hlsim.calibration import level_spl, set_level
 from hlsim.dsp.resample import resample
+from hlsim.evaluation.judging import NORMAL, Unaided
 from hlsim.evaluation.scores import HaspiReport, ItemScore
 from hlsim.metrics.pyclarity import HaspiItem, check_pair, haspi_many
 from hlsim.msbg import MSBG
@@ -59,10 +61,9 @@ def demo(
     """
     folder = Path(out)
     training, scored = _split(speech)
-    utterances = [_read(path) for path in scored]
-    for path, utterance in zip(scored, utterances, strict=True):  # not after minutes of training
+    clean = [_read(path) for path in scored]
+    for path, utterance in zip(scored, clean, strict=True):  # not after minutes of training
         check_pair(utterance, utterance, NEURO_RATE, names=(str(path), str(path)))
-    names = _names(scored, speech)
     recipe = CompensatorRecipe(seed=seed)
     report(f"training on {len(training)} utterances for {minutes:g} minutes, ear {_name(audiogram)}")
     threads = torch.get_num_threads()
@@ -80,65 +81,57 @@ def demo(
         torch.set_num_threads(threads)
     torch.manual_seed(seed)
     conditions: dict[str, nn.Module] = {
-        "unaided": nn.Identity(),
+        "unaided": Unaided(),
         "nalr": NALR(),
         "initial": MappingCompensator(MappingConfig.from_dict(recipe.model)).eval(),
         "compensated": load_compensator(checkpoint),
     }
     report(f"scoring {len(scored)} other utterances by HASPI, {len(conditions)} conditions")
+    ear, normal = (MSBG(a, sample_rate=NEURO_RATE) for a in (audiogram, NORMAL))
+    heard: dict[str, list[Tensor]] = {}
+    haspi: dict[str, list[float]] = {}
+    levels: dict[str, list[float]] = {}
     with torch.no_grad():
-        given = {
-            name: [_give(model, utterance, audiogram) for utterance in utterances]
-            for name, model in conditions.items()
-        }
-    haspi = {}
-    for name, signals in given.items():
-        pairs = zip(utterances, signals, strict=True)
-        items = [
-            HaspiItem(clean, aided, audiogram, NEURO_RATE, (seed + i) % 2**32)
-            for i, (clean, aided) in enumerate(pairs)
+        heard_normally = _levels([normal(utterance) for utterance in clean])
+        extra: dict[str, object] = {"normal_heard_level_mean": fmean(heard_normally)}
+        table = [
+            "| what the ear is given | HASPI mean | level given (dB SPL) | level heard, against a normal ear (dB) |",
+            "|---|---|---|---|",
         ]
-        haspi[name] = haspi_many(items)
-        report(f"  {name}: mean HASPI {_mean(haspi[name]):.3f}")
+        for name, model in conditions.items():
+            given = [model(utterance, audiogram) for utterance in clean]
+            pairs = zip(clean, given, strict=True)
+            items = [HaspiItem(utterance, aided, audiogram, NEURO_RATE) for utterance, aided in pairs]
+            haspi[name], levels[name] = haspi_many(items, seed=seed % 2**32), _levels(given)
+            heard[name] = [ear(signal) for signal in given]
+            mean, level = fmean(haspi[name]), fmean(levels[name])
+            difference = fmean(_levels(heard[name])) - fmean(heard_normally)
+            report(f"  {name}: mean HASPI {mean:.3f}")
+            table.append(f"| {name} | {mean:.3f} | {level:.1f} | {difference:+.1f} |")
+            extra |= {f"{name}_mean": mean, f"{name}_level_mean": level}
+            extra |= {f"{name}_heard_difference_db": difference, f"{name}_haspi": haspi[name]}
 
+    names = _names(scored, speech)
     ends = {"before": "unaided", "after": "compensated"}
     scores = [
         ItemScore(
             file=names[i],
             scores={"haspi": {end: haspi[name][i] for end, name in ends.items()}},
-            clean_level=float(level_spl(utterances[i])),
-            levels={end: float(level_spl(given[name][i])) for end, name in ends.items()},
+            clean_level=float(level_spl(clean[i])),
+            levels={end: levels[name][i] for end, name in ends.items()},
             audiogram=audiogram,
             sample_rate=NEURO_RATE,
-            seconds=len(utterances[i]) / NEURO_RATE,
+            seconds=len(clean[i]) / NEURO_RATE,
             seed=(seed + i) % 2**32,
         )
         for i in range(len(scored))
     ]
-    heard = _heard(given, utterances, audiogram)
-    normal = [float(level_spl(signal)) for signal in heard["normal ear"]]
-    table = [
-        "| what the ear is given | HASPI mean | level given (dB SPL) | level heard, against a normal ear (dB) |",
-        "|---|---|---|---|",
-    ]
-    extra: dict[str, object] = {"normal_heard_level_mean": _mean(normal)}
-    for name, signals in given.items():
-        levels = [float(level_spl(signal)) for signal in signals]
-        differences = [
-            float(level_spl(signal)) - own for signal, own in zip(heard[name], normal, strict=True)
-        ]
-        extra |= {f"{name}_mean": _mean(haspi[name]), f"{name}_level_mean": _mean(levels)}
-        extra[f"{name}_heard_difference_db"] = _mean(differences)
-        extra[f"{name}_haspi"] = haspi[name]
-        table.append(
-            f"| {name} | {_mean(haspi[name]):.3f} | {_mean(levels):.1f} | {_mean(differences):+.1f} |"
-        )
     result = replace(HaspiReport(items=scores, seed=seed), extra=extra)
     write_report(result, folder)
     text = f"# {_name(audiogram)}\n\n{result.to_markdown()}\n" + "\n".join(table) + "\n"
     (folder / "report.md").write_text(text, encoding="utf-8")
-    _write_audio(folder / "audio", names, utterances, heard)
-    panel = {"original": utterances[0]} | {
+    _write_audio(folder / "audio", names, clean, heard)
+    panel = {"original": clean[0]} | {
         f"heard, {name}": heard[name][0] for name in ("unaided", "nalr", "compensated")
     }
     draw_spectrograms(panel, NEURO_RATE, folder / "spectrograms.png")
@@ -170,21 +163,6 @@ def _names(files: list[Path], speech: str | Path | None) -> list[str]:
     return ["-".join(path.relative_to(root).with_suffix("").parts) for path in files]
 
 
-def _give(model: nn.Module, utterance: Tensor, audiogram: Audiogram) -> Tensor:
-    given: Tensor = model(utterance) if isinstance(model, nn.Identity) else model(utterance, audiogram)
-    return given
-
-
-def _heard(
-    given: dict[str, list[Tensor]], clean: list[Tensor], audiogram: Audiogram
-) -> dict[str, list[Tensor]]:
-    """Every condition through the exact MSBG, and the clean speech through it with no loss."""
-    ear, normal = (MSBG(a, sample_rate=NEURO_RATE) for a in (audiogram, Audiogram.standard("NH")))
-    with torch.no_grad():
-        heard = {name: [ear(signal) for signal in signals] for name, signals in given.items()}
-        return heard | {"normal ear": [normal(signal) for signal in clean]}
-
-
 def _write_audio(folder: Path, names: list[str], clean: list[Tensor], heard: dict[str, list[Tensor]]) -> None:
     """Three files an utterance, all by one gain, so that their loudness can be compared."""
     folder.mkdir(parents=True, exist_ok=True)
@@ -204,5 +182,5 @@ def _name(audiogram: Audiogram) -> str:
     return f"{levels} dB HL ({audiogram.severity})"
 
 
-def _mean(values: list[float]) -> float:
-    return sum(values) / len(values)
+def _levels(signals: list[Tensor]) -> list[float]:
+    return [float(level_spl(signal)) for signal in signals]

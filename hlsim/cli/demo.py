@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from hlsim.cli.inputs import check_there, need, read_ear
-from hlsim.cli.options import Parser, folder, positive
+from hlsim.cli.options import Parser, folder, passed, positive
 
 
 def demo(parser: Parser) -> None:
@@ -28,4 +28,4 @@ def _demo(options: argparse.Namespace) -> None:
     from hlsim.torchtools import keep_freed_memory
 
     keep_freed_memory()
-    print(demo(options.out, ear, speech=options.speech, minutes=options.minutes, seed=options.seed))
+    print(demo(**passed(options, demo, audiogram=ear)))

@@ -8,6 +8,7 @@ import os
 import re
 from collections.abc import Callable
 from contextlib import suppress
+from inspect import signature
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -99,6 +100,12 @@ class Parser(argparse.ArgumentParser):
         self.option("--out", folder, "folder for the results", required=True)
 
 
+def passed(options: argparse.Namespace, function: Callable[..., Any], **instead: Any) -> dict[str, Any]:
+    """The options that are arguments of the function, by their names, and what it is given in the place of some."""
+    names = signature(function).parameters
+    return {name: value for name, value in vars(options).items() if name in names} | instead
+
+
 def kind(read: Callable[[str], Any], fits: Callable[[Any], bool], allowed: str) -> Callable[[str], Any]:
     """Reads a value that ``fits``, and refuses any other with what is allowed."""
 
@@ -121,7 +128,6 @@ numbers = kind(
     lambda values: all(map(math.isfinite, values)),
     "numbers separated by commas, such as 0,2.5,5",
 )
-
 shares = kind(
     lambda text: {
         name.strip(): float(value) for name, _, value in (part.partition("=") for part in text.split(","))

@@ -3,22 +3,13 @@
 from __future__ import annotations
 
 import argparse
-from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hlsim.cli.inputs import check_files, check_there, need, read_ear
-from hlsim.cli.options import (
-    EARS_TABLE,
-    Parser,
-    count,
-    integer,
-    number,
-    numbers,
-    positive,
-    shares,
-)
+from hlsim.cli.options import EARS_TABLE, Parser, count, integer, number, numbers, passed, positive, shares
 from hlsim.cli.progress import show_progress
+from hlsim.parallel import run_parallel
 
 if TYPE_CHECKING:
     from hlsim.data.teacher import Reference
@@ -96,23 +87,18 @@ def _prepare(options: argparse.Namespace) -> None:
     from hlsim.data.teacher import check_grid
     from hlsim.data.writing import Recipe, write_instances
 
-    given = vars(options) | {
-        "train_snrs": options.train_snr,
-        "test_snrs": options.test_snr,
-        "level": (options.level[0], options.level[-1]),
-    }
-    settings = PlanSettings(**{entry.name: given[entry.name] for entry in fields(PlanSettings)})
-    where: dict[str, Any] = {name: given[name] for name in ("jobs", "backend", "scheduler")}
+    levels = (options.level[0], options.level[-1])
+    snrs = {"train_snrs": options.train_snr, "test_snrs": options.test_snr}
+    settings = PlanSettings(**passed(options, PlanSettings, level=levels, **snrs))
     if options.write:
         check_grid(options.rate)  # before hours of checking files
     recipe = Recipe(options.alignment, _reference(options.teacher)) if options.write else None
-    prepared = prepare(
-        settings, options.out, strict=options.strict, progress=show_progress("utterances"), **where
-    )
+    prepared = prepare(settings, **passed(options, prepare, progress=show_progress("utterances")))
     print(prepared.to_text())
     if prepared.faults:
         print(f"{prepared.faults} faults are left out: {options.out / FAULTS}")
     if recipe is not None:
+        where = passed(options, run_parallel)
         count_made = write_instances(options.out, recipe, progress=show_progress("instances"), **where)
         print(f"{count_made} instances are in {options.out / 'instances'}")
 

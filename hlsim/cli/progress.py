@@ -25,7 +25,7 @@ def show_progress(what: str) -> Callable[..., None]:
             left = (now - first[1]) / (done - first[0]) * (total - done)
             clock = time.strftime("%a %H:%M:%S", time.localtime(now + left))
             text += f", ends about {clock} (in {left / 60:.1f} min)"
-        text = f"{text}: {coming}"[:110].ljust(110) if coming else f"{text:<70}"
-        print(f"\r{text}", end="\n" if done == total else "", file=sys.stderr, flush=True)
+        text += f": {coming}" if coming else ""
+        print(f"\r{text:<79.79}", end="\n" if done == total else "", file=sys.stderr, flush=True)
 
     return show

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
 from hlsim.cli.inputs import check_there, need, read_ear, read_recipe
-from hlsim.cli.options import Parser, count, integer, natural, positive
+from hlsim.cli.options import Parser, count, integer, natural, passed, positive
 
 FOLDERS = ("speech", "noise", "audiograms", "valid_speech", "valid_noise", "valid_audiograms")
 
@@ -67,14 +67,12 @@ def _train_simulator(options: argparse.Namespace) -> None:
     from hlsim.training.planned import PlannedSource, PlannedTraining
     from hlsim.training.simulator import SimulatorRecipe, train_simulator
 
-    arguments = _arguments(options)
-    if options.manifest is None:
-        data = _data(options)
-    else:
+    arguments = _arguments(options, train_simulator)
+    if options.manifest is not None:
         workers = 1 if options.workers is None else options.workers
-        data = PlannedSource(options.manifest, options.root, options.prepared, workers=workers)
+        arguments["data"] = PlannedSource(options.manifest, options.root, options.prepared, workers=workers)
         arguments["kind"] = PlannedTraining
-    folder = train_simulator(data, SimulatorRecipe.from_dict(_recipe(options)), **arguments)
+    folder = train_simulator(recipe=SimulatorRecipe.from_dict(_recipe(options)), **arguments)
     print(f"the best checkpoint is in {folder}")
 
 
@@ -85,13 +83,8 @@ def _train_compensator(options: argparse.Namespace) -> None:
     ear = read_ear(options.audiogram) if options.audiogram else None
     from hlsim.training.compensator import CompensatorRecipe, train_compensator
 
-    folder = train_compensator(
-        _data(options),
-        CompensatorRecipe.from_dict(_recipe(options)),
-        audiogram=ear,
-        simulator=options.simulator,
-        **_arguments(options),
-    )
+    recipe = CompensatorRecipe.from_dict(_recipe(options))
+    folder = train_compensator(recipe=recipe, **_arguments(options, train_compensator, audiogram=ear))
     print(f"the best checkpoint is in {folder}")
 
 
@@ -118,18 +111,16 @@ def _recipe(options: argparse.Namespace) -> dict[str, Any]:
     return read_recipe(options.config) | ({} if options.start is None else {"start": options.start})
 
 
-def _data(options: argparse.Namespace) -> Any:
+def _arguments(options: argparse.Namespace, train: Callable[..., Path], **more: Any) -> dict[str, Any]:
+    from hlsim.torchtools import keep_freed_memory
     from hlsim.training.sources import TrainingData
 
-    return TrainingData(**{name: getattr(options, name) for name in FOLDERS})
-
-
-def _arguments(options: argparse.Namespace) -> dict[str, Any]:
-    from hlsim.torchtools import keep_freed_memory
-
     keep_freed_memory()
-    same = ("out", "max_minutes", "max_steps", "devices", "nodes", "strategy")
-    return {name: getattr(options, name) for name in same} | {
-        "accelerator": "gpu" if options.device == "cuda" else options.device,
-        "progress": not options.quiet,
-    }
+    return passed(
+        options,
+        train,
+        data=None if options.speech is None else TrainingData(**passed(options, TrainingData)),
+        accelerator="gpu" if options.device == "cuda" else options.device,
+        progress=not options.quiet,
+        **more,
+    )
