@@ -5,6 +5,8 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
+from typing import Any
 
 import numpy as np
 import torch
@@ -19,7 +21,8 @@ from hlsim.pretrained import SIMULATOR, load_pretrained, shipped
 
 CONNEAR_RATE = 20000
 
-Prepare = Callable[[int, Audiogram, torch.device], Callable[[Tensor], Tensor]]
+Call = Callable[[Tensor], Tensor]
+Prepare = Callable[[int, Audiogram, torch.device], Call]
 
 
 @dataclass(frozen=True)
@@ -52,22 +55,27 @@ def rows(simulators: list[str] | None = None) -> tuple[list[Row], list[str]]:
     both = (MSBG_RATE, NEURO_RATE)
     found = [Row("identity", both, lambda rate, ear, device: lambda wave: wave * 1.0)]
     skipped = []
-    for name, build in (("pyclarity Ear", _pyclarity), ("pyclarity torch_msbg", _torch_msbg)):
+    for name, module, prepare, differentiable in (
+        ("pyclarity Ear", "clarity.evaluator.msbg.msbg", _pyclarity_ear, False),
+        ("pyclarity torch_msbg", "clarity.predictor.torch_msbg", _pyclarity_torch, True),
+    ):
         try:
-            found.append(build(name))
+            prepare = partial(prepare, require(module, "eval"))
+            found.append(Row(name, (MSBG_RATE,), prepare, differentiable))
         except MissingExtraError as error:
             skipped.append(f"{name}: {error}")
-    found.append(Row("MSBG (exact)", both, _exact))
+    found.append(Row("MSBG (exact)", both, lambda rate, ear, device: MSBG(ear, sample_rate=rate).to(device)))
     for name in shipped(SIMULATOR) if simulators is None else simulators:
-        model = load_pretrained(name)
-        count = sum(p.numel() for p in model.parameters())
-        default = name == "neuro-msbg"
-        found.append(Row(f"Neuro-MSBG ({name})", both, _neuro(name), parameters=count, default=default))
-    count = sum(p.numel() for p in ConnearShape().parameters())
-    found.append(
-        Row("CoNNear's shape (random weights, speed only)", (CONNEAR_RATE,), _connear, parameters=count)
-    )
+        count, default = _count(load_pretrained(name)), name == "neuro-msbg"
+        title = f"Neuro-MSBG ({name})"
+        found.append(Row(title, both, partial(_neuro, name), parameters=count, default=default))
+    name, count = "CoNNear's shape (random weights, speed only)", _count(ConnearShape())
+    found.append(Row(name, (CONNEAR_RATE,), _connear, parameters=count))
     return found, skipped
+
+
+def _count(network: nn.Module) -> int:
+    return sum(parameter.numel() for parameter in network.parameters())
 
 
 class ConnearShape(nn.Module):
@@ -99,47 +107,30 @@ class ConnearShape(nn.Module):
         return hidden[..., 256 : 256 + time]
 
 
-def _exact(rate: int, ear: Audiogram, device: torch.device) -> Callable[[Tensor], Tensor]:
-    return MSBG(ear, sample_rate=rate).to(device)
+def _neuro(name: str, rate: int, ear: Audiogram, device: torch.device) -> Call:
+    model = load_pretrained(name, sample_rate=rate).to(device)
+    return lambda wave: model(wave, ear)
 
 
-def _neuro(name: str) -> Prepare:
-    def prepare(rate: int, ear: Audiogram, device: torch.device) -> Callable[[Tensor], Tensor]:
-        model = load_pretrained(name, sample_rate=rate).to(device)
-        return lambda wave: model(wave, ear)
-
-    return prepare
-
-
-def _connear(rate: int, ear: Audiogram, device: torch.device) -> Callable[[Tensor], Tensor]:
+def _connear(rate: int, ear: Audiogram, device: torch.device) -> Call:
     return ConnearShape().eval().requires_grad_(False).to(device)
 
 
-def _pyclarity(name: str) -> Row:
+def _pyclarity_ear(module: Any, rate: int, ear: Audiogram, device: torch.device) -> Call:
     """One item after the other, always on the CPU."""
-    module = require("clarity.evaluator.msbg.msbg", "eval")
+    logging.getLogger("clarity").setLevel(logging.ERROR)
+    model = module.Ear(equiv_0db_spl=74.0)  # plus 20: RMS 1.0 is 94 dB SPL
+    model.set_audiogram(ear.to_clarity())
 
-    def prepare(rate: int, ear: Audiogram, device: torch.device) -> Callable[[Tensor], Tensor]:
-        logging.getLogger("clarity").setLevel(logging.ERROR)
-        model = module.Ear(equiv_0db_spl=74.0)  # plus 20: RMS 1.0 is 94 dB SPL
-        model.set_audiogram(ear.to_clarity())
+    def call(wave: Tensor) -> Tensor:
+        heard = [model.process(item)[0] for item in wave.double().cpu().numpy()]
+        return torch.from_numpy(np.stack(heard))
 
-        def call(wave: Tensor) -> Tensor:
-            heard = [model.process(item)[0] for item in wave.double().cpu().numpy()]
-            return torch.from_numpy(np.stack(heard))
-
-        return call
-
-    return Row(name, (MSBG_RATE,), prepare, differentiable=False)
+    return call
 
 
-def _torch_msbg(name: str) -> Row:
+def _pyclarity_torch(module: Any, rate: int, ear: Audiogram, device: torch.device) -> Call:
     """As it stands in pyclarity 0.9.0; its filters are built beforehand."""
-    module = require("clarity.predictor.torch_msbg", "eval")
-
-    def prepare(rate: int, ear: Audiogram, device: torch.device) -> Callable[[Tensor], Tensor]:
-        levels = np.array(ear.thresholds)
-        model = module.MSBGHearingModel(levels, np.array(FREQUENCIES), sr=rate, device=str(device)).to(device)
-        return lambda wave: model(wave)
-
-    return Row(name, (MSBG_RATE,), prepare)
+    levels, frequencies = np.array(ear.thresholds), np.array(FREQUENCIES)
+    model = module.MSBGHearingModel(levels, frequencies, sr=rate, device=str(device)).to(device)
+    return lambda wave: model(wave)

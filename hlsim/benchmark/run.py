@@ -13,7 +13,7 @@ from torch import Tensor
 
 from hlsim.audiogram import Audiogram
 from hlsim.benchmark.models import Row, rows
-from hlsim.benchmark.timing import about, attempt, figures, finish, milliseconds, peak_mib
+from hlsim.benchmark.timing import Timings, about, attempt, finish, peak_mib
 from hlsim.calibration import set_level
 from hlsim.neuro.config import NEURO_RATE
 
@@ -80,7 +80,7 @@ def benchmark(
         found = [row for row in found if any(part in row.name for part in only)]
         if not found:
             raise ValueError(f"only {' '.join(only)}: no such row; there are {', '.join(names)}")
-    timings = _Timings(torch.device(device), repeats, limit, skipped)
+    timings = _Simulators(torch.device(device), repeats, limit, skipped)
     for row in found:
         timings.prepare(row)
     steps: list[tuple[str, Callable[[], None]]] = [
@@ -119,15 +119,13 @@ class _Key(NamedTuple):
         return f"{self.name}, {self.sample_rate} Hz, {self.seconds:g} s, batch {self.batch}, {direction}"
 
 
-class _Timings:
-    """Times and memory, of what did not fail."""
+class _Simulators(Timings):
+    """What is timed of each row."""
 
     def __init__(self, device: torch.device, repeats: int, limit: float, skipped: list[str]) -> None:
-        self.device, self.repeats, self.limit, self.skipped = device, repeats, limit, skipped
+        super().__init__(device, skipped)
+        self.repeats, self.limit = repeats, limit
         self.calls: dict[tuple[str, int, str], Callable[[Tensor], Tensor]] = {}
-        self.times: dict[_Key, list[float]] = {}
-        self.memory: dict[_Key, float | None] = {}
-        self.failed: set[_Key] = set()
         self.fastest: dict[tuple[str, int], float] = {}
 
     def prepare(self, row: Row) -> None:
@@ -149,23 +147,21 @@ class _Timings:
         both = forward._replace(direction="both")
         for ear in EARS[1:2] if slow else EARS:
             for key in (forward, both) if row.differentiable else (forward,):
-                if not self.failed & {forward, key}:
-                    self._attempt(key, partial(self._round, key, ear, turn, slow))
+                if forward not in self.failed:
+                    self.attempt(key, partial(self._round, key, ear, turn, slow))
 
     def _round(self, key: _Key, ear: str, turn: int, slow: bool) -> None:
         call = self._call(key, ear)
         if not slow:
             finish(call, self.device)  # the one before left its own data in the caches
-        elapsed = milliseconds(call, self.device)
-        if turn == 0 and elapsed > _SLOW:  # a row's first call makes what the later ones find
-            elapsed = milliseconds(call, self.device)
+        elapsed = self.take(key, call, turn > 0)
+        if turn == 0:
+            if elapsed > _SLOW:  # a row's first call makes what the later ones find
+                elapsed = self.take(key, call, False)
+            self.peaks[key] = peak_mib(call, self.device)
         if key.direction == "forward":
             place = (key.name, key.sample_rate)
             self.fastest[place] = min(self.fastest.get(place, math.inf), elapsed)
-        if turn:
-            self.times.setdefault(key, []).append(elapsed)
-        else:
-            self.memory[key] = peak_mib(call, self.device)
 
     def size(self, row: Row, seconds: float, batch: int) -> None:
         """Another length or batch, forward at the row's own rate, where it does not take too long."""
@@ -188,21 +184,17 @@ class _Timings:
     def _repeat(self, key: _Key, expected: float) -> None:
         def take() -> None:
             call = self._call(key, EARS[1])
-            self.memory[key] = peak_mib(call, self.device)
-            first = milliseconds(call, self.device)
-            more = min(self.repeats, int(3000.0 * self.limit / max(1.0, first))) - 1
-            self.times[key] = [first, *(milliseconds(call, self.device) for _ in range(more))]
+            self.peaks[key] = peak_mib(call, self.device)
+            first = self.take(key, call)
+            for _ in range(min(self.repeats, int(3000.0 * self.limit / max(1.0, first))) - 1):
+                self.take(key, call)
 
         if expected <= 1000.0 * self.limit:
-            self._attempt(key, take)
+            self.attempt(key, take)
 
     def _call(self, key: _Key, ear: str) -> Callable[[], None]:
         clip = _clip(key.sample_rate, key.seconds, key.batch).to(self.device)
         return partial(_run, self.calls[key.name, key.sample_rate, ear], clip, key.direction)
-
-    def _attempt(self, key: _Key, call: Callable[[], None]) -> None:
-        if not attempt(str(key), call, self.device, self.skipped):
-            self.failed.add(key)
 
     def result(self, found: list[Row]) -> dict[str, Any]:
         reference = self.times.get(_Key("pyclarity Ear", 44100, 1.0, 1, "forward"))
@@ -219,7 +211,7 @@ class _Timings:
         return {"rows": out, "skipped": list(self.skipped)}
 
     def _cell(self, key: _Key, reference: float | None) -> dict[str, Any]:
-        cell = key._asdict() | figures(self.times[key], self.memory.get(key))
+        cell = key._asdict() | self.figures(key)
         del cell["name"]
         single = key.seconds == 1.0 and key.batch == 1
         return cell | {

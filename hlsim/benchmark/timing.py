@@ -12,7 +12,7 @@ import platform
 import statistics
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from pathlib import Path
 from typing import Any
 
@@ -26,12 +26,6 @@ def finish(call: Call, device: torch.device) -> None:
     call()
     if device.type == "cuda":
         torch.cuda.synchronize(device)
-
-
-def milliseconds(call: Call, device: torch.device) -> float:
-    start = time.perf_counter()
-    finish(call, device)
-    return 1000.0 * (time.perf_counter() - start)
 
 
 def peak_mib(call: Call, device: torch.device) -> float | None:
@@ -66,16 +60,6 @@ def peak_mib(call: Call, device: torch.device) -> float | None:
     return max(*seen, resident()) - seen[0]
 
 
-def figures(times: list[float], peak: float | None) -> dict[str, Any]:
-    """Median, least and greatest of milliseconds, and the peak in MiB."""
-    return {
-        "median_ms": statistics.median(times),
-        "least_ms": min(times),
-        "greatest_ms": max(times),
-        "peak_mib": peak,
-    }
-
-
 def attempt(what: str, call: Call, device: torch.device, skipped: list[str]) -> bool:
     """Whether a call went through; ``skipped`` is told why not, and a GPU's memory is freed for the next."""
     try:
@@ -96,6 +80,43 @@ def reason(error: Exception) -> str:
     if isinstance(error, MemoryError) or "memory" in text or "ALLOC_FAILED" in text:
         return "memory ran out"
     return f"{type(error).__name__}: {text}" if text else type(error).__name__
+
+
+class Timings:
+    """Milliseconds and peak memory by key, of the calls that did not fail.
+
+    Args:
+        skipped: what failed and why, added to.
+    """
+
+    def __init__(self, device: torch.device, skipped: list[str]) -> None:
+        self.device, self.skipped = device, skipped
+        self.times: dict[Any, list[float]] = {}
+        self.peaks: dict[Any, float | None] = {}
+        self.failed: set[Any] = set()
+
+    def attempt(self, key: Hashable, call: Call) -> None:
+        """Call unless that failed before; ``str(key)`` names it where it fails."""
+        if key not in self.failed and not attempt(str(key), call, self.device, self.skipped):
+            self.failed.add(key)
+
+    def take(self, key: Hashable, call: Call, counted: bool = True) -> float:
+        """Milliseconds of a call, kept where it counts."""
+        start = time.perf_counter()
+        finish(call, self.device)
+        elapsed = 1000.0 * (time.perf_counter() - start)
+        if counted:
+            self.times.setdefault(key, []).append(elapsed)
+        return elapsed
+
+    def figures(self, key: Hashable) -> dict[str, Any]:
+        times = self.times[key]
+        return {
+            "median_ms": statistics.median(times),
+            "least_ms": min(times),
+            "greatest_ms": max(times),
+            "peak_mib": self.peaks.get(key),
+        }
 
 
 def about(device: str, repeats: int) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from compensators import MappingCompensator
 from hlsim.audiogram import Audiogram
-from hlsim.benchmark.timing import attempt, figures, milliseconds, peak_mib
+from hlsim.benchmark.timing import Timings, peak_mib
 from hlsim.calibration import set_level
 from hlsim.loss import HearingLossLoss
 from hlsim.neuro.config import NEURO_RATE
@@ -45,15 +45,15 @@ def training_step(
     loss = HearingLossLoss(ear).to(place)
     exact = HearingLossLoss(ear, simulator="msbg").to(place)
     leaf = clean.clone().requires_grad_()
-    parts: list[tuple[str, Callable[[], Tensor]]] = [
-        ("compensator", lambda: compensator(clean, ear).square().sum()),
-        ("HearingLossLoss (neuro-msbg)", lambda: loss(leaf, clean)),
-        ("- its simulator", lambda: loss.simulator(leaf, ear).square().sum()),
-        ("HearingLossLoss (msbg)", lambda: exact(leaf, clean)),
-        ("- its simulator", lambda: exact.simulator(leaf, ear).square().sum()),
-        ("whole step (neuro-msbg)", lambda: loss(compensator(clean, ear), clean)),
-        ("whole step (msbg)", lambda: exact(compensator(clean, ear), clean)),
-    ]
+    parts: dict[str, Callable[[], Tensor]] = {
+        "compensator": lambda: compensator(clean, ear).square().sum(),
+        "HearingLossLoss (neuro-msbg)": lambda: loss(leaf, clean),
+        "- its simulator (neuro-msbg)": lambda: loss.simulator(leaf, ear).square().sum(),
+        "HearingLossLoss (msbg)": lambda: exact(leaf, clean),
+        "- its simulator (msbg)": lambda: exact.simulator(leaf, ear).square().sum(),
+        "whole step (neuro-msbg)": lambda: loss(compensator(clean, ear), clean),
+        "whole step (msbg)": lambda: exact(compensator(clean, ear), clean),
+    }
     return _table(parts, place, repeats)
 
 
@@ -69,18 +69,18 @@ def scan_rows(*, device: str = "cpu", repeats: int = 5) -> tuple[list[dict[str, 
     A = -torch.rand(channels, states, device=place) - 0.5
     for tensor in (u, delta, A, B, C):
         tensor.requires_grad_()
-    parts: list[tuple[str, Callable[[], Tensor]]] = [
-        ("hlsim (plain torch)", lambda: torch_scan(u, delta, A, B, C).sum()),
-        ("step by step", lambda: scan_loop(u, delta, A, B, C).sum()),
-    ]
+    parts: dict[str, Callable[[], Tensor]] = {
+        "hlsim (plain torch)": lambda: torch_scan(u, delta, A, B, C).sum(),
+        "step by step": lambda: scan_loop(u, delta, A, B, C).sum(),
+    }
     if kernel_for(u) is not None:
-        parts.append(("hlsim (by mamba-ssm's kernel)", lambda: selective_scan(u, delta, A, B, C).sum()))
+        parts["hlsim (by mamba-ssm's kernel)"] = lambda: selective_scan(u, delta, A, B, C).sum()
     skipped = []
     try:
         kernel = importlib.import_module("mamba_ssm.ops.selective_scan_interface").selective_scan_fn
         if place.type != "cuda":
             raise ImportError("runs on a GPU only")
-        parts.append(("mamba-ssm", lambda: kernel(u, delta, A, B, C).sum()))
+        parts["mamba-ssm"] = lambda: kernel(u, delta, A, B, C).sum()
     except Exception as error:  # a build for another torch or GPU fails with whatever it likes
         skipped.append(f"mamba-ssm: {str(error).splitlines()[0]}")
     try:
@@ -91,7 +91,7 @@ def scan_rows(*, device: str = "cpu", repeats: int = 5) -> tuple[list[dict[str, 
             drive = (delta * u).mT.unsqueeze(-1) * B.mT.unsqueeze(2)
             return (pscan(decay, drive) @ C.mT.unsqueeze(-1)).sum()
 
-        parts.append(("mambapy", mambapy))
+        parts["mambapy"] = mambapy
     except ImportError as error:
         skipped.append(f"mambapy: {error}")
     rows, failed = _table(parts, place, repeats)
@@ -110,38 +110,31 @@ def scan_loop(u: Tensor, delta: Tensor, A: Tensor, B: Tensor, C: Tensor) -> Tens
 
 
 def _table(
-    parts: list[tuple[str, Callable[[], Tensor]]], device: torch.device, repeats: int
+    parts: dict[str, Callable[[], Tensor]], device: torch.device, repeats: int
 ) -> tuple[list[dict[str, Any]], list[str]]:
-    directions = {"forward": "forward", "both": "forward and backward"}
-    calls = {
-        (number, direction): (f"{name}, {what}", partial(_run, part, direction))
-        for number, (name, part) in enumerate(parts)
-        for direction, what in directions.items()
-    }
-    times: dict[tuple[int, str], list[float]] = {key: [] for key in calls}
-    peaks: dict[tuple[int, str], float | None] = {}
-    failed: set[tuple[int, str]] = set()
-    skipped: list[str] = []
+    timings = Timings(device, [])
+    keys = {name: {"forward": f"{name}, forward", "both": f"{name}, forward and backward"} for name in parts}
 
-    def take(key: tuple[int, str], call: Callable[[], None], counted: bool) -> None:
-        elapsed = milliseconds(call, device)
-        if counted:
-            times[key].append(elapsed)
-        elif (
-            device.type == "cuda"
-        ):  # on a CPU the first call leaves memory to the process, which the second takes
-            peaks[key] = peak_mib(call, device)
+    def take(key: str, call: Callable[[], None], turn: int) -> None:
+        timings.take(key, call, turn > 0)
+        if (
+            turn == 0 and device.type == "cuda"
+        ):  # on a CPU the first call leaves memory to the process for the second
+            timings.peaks[key] = peak_mib(call, device)
 
     for turn in range(repeats + 1):  # in turns, so that all see the same machine; the first does not count
-        for key, (what, call) in calls.items():
-            if key not in failed and not attempt(what, partial(take, key, call, turn > 0), device, skipped):
-                failed.add(key)
-    measured = {key: figures(own, peaks.get(key)) if own else None for key, own in times.items()}
+        for name, part in parts.items():
+            for direction, key in keys[name].items():
+                timings.attempt(key, partial(take, key, partial(_run, part, direction), turn))
     rows = [
-        {"name": name} | {direction: measured[number, direction] for direction in directions}
-        for number, (name, _) in enumerate(parts)
+        {"name": name}
+        | {
+            direction: timings.figures(key) if key in timings.times else None
+            for direction, key in own.items()
+        }
+        for name, own in keys.items()
     ]
-    return [row for row in rows if row["forward"] or row["both"]], skipped
+    return [row for row in rows if row["forward"] or row["both"]], timings.skipped
 
 
 def _run(part: Callable[[], Tensor], direction: str) -> None:

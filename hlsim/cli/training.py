@@ -64,6 +64,8 @@ def _train_simulator(options: argparse.Namespace) -> None:
     elif given := _given(vars(options), FOLDERS):
         raise ValueError(f"--manifest with {given}; allowed: one or the other, for a manifest has it all")
     _check(options)
+    if options.manifest is not None and not options.manifest.exists():
+        raise ValueError(f"{options.manifest}: not prepared (no such file); 'hlsim prepare' makes it")
     from hlsim.training.planned import PlannedSource, PlannedTraining
     from hlsim.training.simulator import SimulatorRecipe, train_simulator
 
@@ -92,12 +94,7 @@ def _check(options: argparse.Namespace) -> None:
     need("train", "lightning", "tensorboard")
     check_there(
         folders=(options.speech, options.noise, options.valid_speech, options.valid_noise),
-        files=(
-            options.config,
-            getattr(options, "manifest", None),
-            options.audiograms,
-            options.valid_audiograms,
-        ),
+        files=(options.config, options.audiograms, options.valid_audiograms),
     )
 
 
