@@ -11,11 +11,11 @@ from hlsim.cli.options import Parser, folder, passed, positive
 
 def demo(parser: Parser) -> None:
     parser.set_defaults(run=_demo)
-    parser.option("--out", folder, "folder for report, audio and pictures", default=Path("hlsim-demo"))
+    parser.option("--out", folder, "folder for report, audio and pictures", Path("hlsim-demo"))
     parser.audiogram("N4")
     text = "folder of 22 files or more instead of the embedded speech; a third is scored"
     parser.option("--speech", Path, text)
-    parser.option("--minutes", positive, "of training", default=3.0)
+    parser.option("--minutes", positive, "of training", 3.0)
     parser.seed()
 
 

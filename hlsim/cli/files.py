@@ -19,13 +19,13 @@ ENDINGS = (".wav", ".flac", ".ogg")
 
 def simulate(parser: Parser) -> None:
     _in_and_out(parser, _simulate)
-    parser.option("--simulator", str, "msbg (exact), or a checkpoint's name or folder", default="neuro-msbg")
+    parser.option("--simulator", str, "msbg (exact), or a checkpoint's name or folder", "neuro-msbg")
 
 
 def compensate(parser: Parser) -> None:
     _in_and_out(parser, _compensate)
     text = "nalr (the prescription), or a checkpoint's name or folder; one of one ear alone warns of another"
-    parser.option("--compensator", str, text, default="nalr")
+    parser.option("--compensator", str, text, "nalr")
 
 
 def _in_and_out(parser: Parser, run: Callable[[argparse.Namespace], None]) -> None:

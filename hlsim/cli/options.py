@@ -81,9 +81,7 @@ class Parser(argparse.ArgumentParser):
         self.option("--audiogram", str, help_, default, **more)
 
     def full_scale(self, **more: Any) -> None:
-        self.option(
-            "--full-scale-spl", number, "level in dB SPL of a file whose RMS is 1.0", default=94.0, **more
-        )
+        self.option("--full-scale-spl", number, "level in dB SPL of a file whose RMS is 1.0", 94.0, **more)
 
     def jobs(self) -> None:
         self.option("--jobs", count, "processes; all cores by default")
@@ -94,7 +92,7 @@ class Parser(argparse.ArgumentParser):
         self.option("--scheduler", str, "of --backend dask: its address, such as tcp://host:8786")
 
     def seed(self) -> None:
-        self.option("--seed", integer, "of every random draw", default=0)
+        self.option("--seed", integer, "of every random draw", 0)
 
     def out(self) -> None:
         self.option("--out", folder, "folder for the results", required=True)

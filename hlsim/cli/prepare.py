@@ -31,7 +31,7 @@ def prepare(parser: Parser) -> None:
     option = parser.option
     option("corpus", Path, "folder: VoiceBank-DEMAND's, LibriSpeech's, or any with wav, flac or ogg files")
     layouts = ("auto", "voicebank-demand", "librispeech", "folder")
-    option("--layout", str, "of the corpus", default="auto", choices=layouts)
+    option("--layout", str, "of the corpus", "auto", choices=layouts)
     option("--table", Path, "CSV with columns file and any of id, speaker, split, noisy, noise, snr (dB)")
     option("--noise", Path, "folder of noises to mix in, a folder a type")
     option("--root", Path, "folder that holds corpus and noise; by default what they share")
@@ -41,18 +41,18 @@ def prepare(parser: Parser) -> None:
     option("--test-types", count, "other ones to test with", MIXING["test_types"])
     option("--audiograms", Path, f"{EARS_TABLE}. Without it ears are drawn")
     option("--test-audiograms", Path, "CSV of the ears for test")
-    option("--ears", count, "an utterance", default=2)
+    option("--ears", count, "an utterance", 2)
     text = (
         "proportions such as mild=1,moderate=1,severe=2, also none; by default equal ones of mild, moderate and severe, "
         "or as in the CSV"
     )
     option("--severities", shares, text)
     text = "active speech level in dB SPL that ears are given; two draw one in between for each utterance and ear"
-    option("--level", number, text, default=[65.0], nargs="+")
-    option("--rate", integer, "of the instances, Hz", default=16000)
-    option("--test-share", number, "of speakers, where the corpus has no splits of its own", default=0.1)
-    option("--valid-share", number, "of the speakers to train with", default=0.0)
-    option("--shortest", positive, "seconds; shorter files are left out", default=0.5)
+    option("--level", number, text, [65.0], nargs="+")
+    option("--rate", integer, "of the instances, Hz", 16000)
+    option("--test-share", number, "of speakers, where the corpus has no splits of its own", 0.1)
+    option("--valid-share", number, "of the speakers to train with", 0.0)
+    option("--shortest", positive, "seconds; shorter files are left out", 0.5)
     parser.flag("--strict", "make a fault an error")
     parser.flag("--write", "make the instances too, 12 bytes a sample")
     text = "that says what is heard, with --write"
@@ -69,7 +69,7 @@ def draw_alignment(parser: Parser) -> None:
     parser.option("input", Path, "wav, flac or ogg, 16 to 48 kHz; its first channel", metavar="IN")
     parser.option("output", Path, "png", metavar="OUT")
     parser.audiogram("N3")
-    parser.option("--alignment", str, "impulse is the paper's", default="impulse", choices=ALIGNMENTS)
+    parser.option("--alignment", str, "impulse is the paper's", "impulse", choices=ALIGNMENTS)
     parser.full_scale()
 
 
