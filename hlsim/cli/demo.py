@@ -7,6 +7,7 @@ from pathlib import Path
 
 from hlsim.cli.inputs import check_there, need, read_ear
 from hlsim.cli.options import Parser, folder, passed, positive
+from hlsim.extras import require
 
 
 def demo(parser: Parser) -> None:
@@ -24,6 +25,7 @@ def _demo(options: argparse.Namespace) -> None:
     need("eval", "clarity", "matplotlib")
     check_there(folders=(options.speech,))
     ear = read_ear(options.audiogram)
+    require("lightning", "train")  # one that is there may be broken
     from hlsim.demo import demo
     from hlsim.torchtools import keep_freed_memory
 

@@ -9,6 +9,7 @@ from typing import Any
 
 from hlsim.cli.inputs import check_there, need, read_ear, read_recipe
 from hlsim.cli.options import Parser, count, integer, natural, passed, positive
+from hlsim.extras import require
 
 FOLDERS = ("speech", "noise", "audiograms", "valid_speech", "valid_noise", "valid_audiograms")
 
@@ -63,9 +64,9 @@ def _train_simulator(options: argparse.Namespace) -> None:
             )
     elif given := _given(vars(options), FOLDERS):
         raise ValueError(f"--manifest with {given}; allowed: one or the other, for a manifest has it all")
-    _check(options)
-    if options.manifest is not None and not options.manifest.exists():
+    elif not options.manifest.exists():
         raise ValueError(f"{options.manifest}: not prepared (no such file); 'hlsim prepare' makes it")
+    _check(options)
     from hlsim.training.planned import PlannedSource, PlannedTraining
     from hlsim.training.simulator import SimulatorRecipe, train_simulator
 
@@ -96,6 +97,7 @@ def _check(options: argparse.Namespace) -> None:
         folders=(options.speech, options.noise, options.valid_speech, options.valid_noise),
         files=(options.config, options.audiograms, options.valid_audiograms),
     )
+    require("lightning", "train")  # one that is there may be broken
 
 
 def _given(options: dict[str, Any], names: Iterable[str]) -> str:

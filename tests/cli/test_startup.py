@@ -37,6 +37,7 @@ def test_help_and_refusals_import_nothing_heavy(tmp_path: Path) -> None:
         ["draw-alignment", missing, out],
         ["train-simulator", "--config", missing, "--speech", str(tmp_path), "--out", out],
         ["train-simulator", "--config", str(plain), "--out", out],
+        ["train-simulator", "--config", str(plain), "--manifest", missing, "--out", out],
         ["train-compensator", "--speech", missing, "--out", out],
         ["evaluate-simulator", "msbg", "--speech", str(tmp_path), "--audiograms", missing, "--out", out],
         ["evaluate-compensator", "nalr", "--speech", missing, "--out", out],
