@@ -27,7 +27,7 @@ def evaluate_compensator(parser: Parser) -> None:
     option("--items", count, "how many in all", 400)
     option("--seconds", positive, "length of an item", 3.0)
     text = "standard ears of the gain curves and tones; with --audiogram that ear's are drawn"
-    option("--gain-ears", str, text, GAIN_EARS, nargs="+", metavar="EAR")
+    option("--gain-ears", str.upper, text, GAIN_EARS, nargs="+", metavar="EAR")
     parser.jobs()
     parser.seed()
     parser.out()
