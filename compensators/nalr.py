@@ -11,9 +11,9 @@ from scipy.fft import next_fast_len
 from scipy.signal.windows import hamming
 from torch import Tensor, nn
 
-from hlsim.audio import check_rate, check_waveform
 from hlsim.audiogram import FREQUENCIES, HIGHEST_LEVEL, AudiogramLike, own_thresholds
 from hlsim.calibration import PASCAL_SPL, check_full_scale
+from hlsim.checks import check_rate, check_waveform
 from hlsim.dsp.fir import frequency_sampling_fir
 from hlsim.msbg.model import resolve_thresholds
 from hlsim.torchtools import constant

@@ -10,7 +10,8 @@ from pathlib import Path
 import torch
 
 from compensators import load_compensator
-from hlsim.audio import HIGHEST_RATE, check_channels, check_extension, read_audio, write_audio
+from hlsim.audio import check_channels, check_extension, read_audio, write_audio
+from hlsim.checks import HIGHEST_RATE
 from hlsim.cli.options import (
     Commands,
     add_command,

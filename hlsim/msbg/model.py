@@ -9,9 +9,9 @@ from torch import Tensor, nn
 from torch.nn import functional
 from torch.utils.checkpoint import checkpoint
 
-from hlsim.audio import check_rate, check_waveform
 from hlsim.audiogram import AudiogramLike, as_thresholds, own_thresholds, severity_of
 from hlsim.calibration import PASCAL_SPL, check_full_scale, gain_to_pascals
+from hlsim.checks import check_rate, check_waveform
 from hlsim.dsp.fft import long_irfft, long_rfft
 from hlsim.msbg.cochlea import bank_points, hear, hear_ending
 from hlsim.msbg.ear import RATE

@@ -7,9 +7,9 @@ import math
 import torch
 from torch import Tensor, nn
 
-from hlsim.audio import check_rate, check_waveform
 from hlsim.audiogram import FREQUENCIES, AudiogramLike
 from hlsim.calibration import check_full_scale, gain_to_pascals
+from hlsim.checks import check_rate, check_waveform
 from hlsim.dsp.overlap import overlapping
 from hlsim.dsp.resample import resample
 from hlsim.msbg.model import resolve_thresholds
