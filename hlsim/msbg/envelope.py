@@ -13,7 +13,7 @@ from hlsim.dsp.erb import erb
 from hlsim.dsp.fft import power, rfft
 from hlsim.msbg.ear import RATE
 from hlsim.msbg.filterbank import FilterBank
-from hlsim.torchtools import constant
+from hlsim.torchtools import constant_like
 
 STEP = 24
 """Samples at 44.1 kHz from one value of an envelope, and of the gain that follows it, to the next."""
@@ -96,7 +96,7 @@ def envelope(channels: Tensor, lowpass: Tensor) -> Tensor:
     Shape: (..., channels, time), (channels, time // 48 + 1) -> (..., channels, time // 24), the values at samples 0, 24,
     ...; ``time`` is a multiple of 24 and the signal is taken as periodic.
     """
-    kernel = constant(decimation_kernel, dtype=channels.dtype, device=channels.device)
+    kernel = constant_like(channels, decimation_kernel)
     return smooth(decimate(channels.abs(), kernel), lowpass)
 
 

@@ -2,14 +2,13 @@
 
 import math
 from functools import partial
-from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 from torch.utils.checkpoint import checkpoint
 
-from hlsim.audiogram import AudiogramLike, as_thresholds, own_thresholds, severity_of
+from hlsim.audiogram import AudiogramLike, own_thresholds, resolve_thresholds, severity_of
 from hlsim.calibration import PASCAL_SPL, check_full_scale, gain_to_pascals
 from hlsim.checks import check_rate, check_waveform
 from hlsim.dsp.fft import long_irfft, long_rfft
@@ -224,32 +223,6 @@ class MSBG(nn.Module):
             )
             parts = [ending] if whole else [parts[0][..., :-_ENDING], ending[..., -_ENDING:]]
         return parts[0] if len(parts) == 1 else torch.cat(parts, -1)
-
-
-def resolve_thresholds(
-    stored: Tensor | None, audiogram: AudiogramLike | None, waveform: Tensor, **limits: Any
-) -> Tensor:
-    """The call's audiogram, or else the stored one, on the waveform's device, checked to fit its leading dimensions.
-
-    Args:
-        limits: of ``as_thresholds``.
-
-    Raises:
-        ValueError: there is neither, or the shapes do not broadcast.
-    """
-    if audiogram is None and stored is None:
-        raise ValueError("no audiogram: give one when building the simulator or with the call")
-    thresholds = as_thresholds(audiogram, **limits) if audiogram is not None else stored
-    assert thresholds is not None
-    try:
-        if thresholds.ndim > 1:
-            torch.broadcast_shapes(waveform.shape[:-1], thresholds.shape[:-1])
-    except RuntimeError:
-        raise ValueError(
-            f"audiograms of shape {tuple(thresholds.shape)} for a waveform of shape {tuple(waveform.shape)}; allowed: "
-            "one audiogram, or leading dimensions that broadcast"
-        ) from None
-    return thresholds.to(waveform.device)
 
 
 def active_rescaling(signals: Tensor) -> Tensor:

@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
-from hlsim.audiogram import FREQUENCIES
+from hlsim.audiogram import interpolation_weights
 from hlsim.calibration import PASCAL_SPL
 from hlsim.msbg.envelope import STEP
 from hlsim.msbg.filterbank import FilterBank
-from hlsim.torchtools import constant
+from hlsim.torchtools import constant_like
 
 CATCH_UP_SPL = 105.0
 """Level in dB SPL at which the impaired ear hears as loud as a normal one."""
@@ -42,15 +42,9 @@ def expansion_ratios(thresholds: Tensor, weights: Tensor) -> Tensor:
     return CATCH_UP_SPL / (CATCH_UP_SPL - (thresholds.unsqueeze(-1) * weights).sum(-2))
 
 
-@lru_cache(maxsize=8)
 def threshold_weights(bank: FilterBank) -> NDArray[np.float64]:
-    """Weights of the eight thresholds in that of each channel: linear in Hz, flat below 250 and above 8000 Hz.
-
-    Returns: (8, channels).
-    """
-    return np.array(
-        [np.interp(bank.centre_frequencies, FREQUENCIES, row) for row in np.eye(len(FREQUENCIES))]
-    )
+    """Weights of the eight thresholds in that of each channel. Returns (8, channels)."""
+    return interpolation_weights(bank.centre_frequencies)
 
 
 def gains(envelopes: Tensor, ratios: Tensor) -> Tensor:
@@ -157,7 +151,7 @@ def expand(channels: Tensor, envelopes: Tensor, ratios: Tensor) -> Tensor:
 
     Shape: (..., channels, time), (..., channels, time // 24), (..., channels) -> (..., time).
     """
-    kernel = constant(interpolation_kernel, dtype=channels.dtype, device=channels.device)
+    kernel = constant_like(channels, interpolation_kernel)
     return weigh(channels, around(gains(envelopes, ratios)), kernel, (envelopes, ratios))
 
 

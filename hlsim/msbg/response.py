@@ -17,7 +17,7 @@ from hlsim.dsp.fir import filter_centred
 from hlsim.msbg.ear import RATE, ear_filter, lowpass_filter
 from hlsim.msbg.filterbank import BANKS, FilterBank, gammatone_response
 from hlsim.msbg.model import STRUCTURAL_DELAY
-from hlsim.torchtools import constant
+from hlsim.torchtools import constant_like
 
 _REACH_SECONDS = 0.064
 _SPACING = 2.5  # Hz, at most: of the grid, whose period is several times what the responses last
@@ -53,7 +53,7 @@ def with_phase_of_bank(waveform: Tensor, thresholds: Tensor, rate: int, *, norma
         normal: the signal is what a normal ear hears: the phase of that ear's bank is taken off.
     """
     severity = severity_index(thresholds)
-    taps = constant(_phases, rate, normal, dtype=waveform.dtype, device=waveform.device)[severity]
+    taps = constant_like(waveform, _phases, rate, normal)[severity]
     moved = filter_centred(waveform, taps)
     # a normal ear's stays as it is to the bit, for phases of what is nearly silent hang on rounding
     return torch.where((severity == 0).unsqueeze(-1), waveform, moved) if normal else moved

@@ -86,6 +86,11 @@ class NetworkConfig:
         return STFT(self.fft, self.window, self.hop)
 
     @property
+    def hz(self) -> tuple[float, ...]:
+        """The transform's frequencies."""
+        return tuple(NEURO_RATE * k / self.fft for k in range(self.fft // 2 + 1))
+
+    @property
     def step(self) -> int:
         """Samples from one place of the feature maps to the next."""
         return self.hop * self.stride[0]

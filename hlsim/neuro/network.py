@@ -7,12 +7,11 @@ import math
 import torch
 from torch import Tensor, nn
 
-from hlsim.audiogram import FREQUENCIES, AudiogramLike
+from hlsim.audiogram import FREQUENCIES, AudiogramLike, resolve_thresholds
 from hlsim.calibration import check_full_scale, gain_to_pascals
 from hlsim.checks import check_rate, check_waveform
 from hlsim.dsp.overlap import overlapping
 from hlsim.dsp.resample import resample
-from hlsim.msbg.model import resolve_thresholds
 from hlsim.neuro.config import NEURO_RATE, NetworkConfig
 
 # Values of the widest feature map of all items that run together on a CPU, and the samples at 16 kHz that this may be at

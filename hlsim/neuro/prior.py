@@ -23,7 +23,7 @@ from hlsim.msbg.recruitment import CATCH_UP_SPL, expansion_ratios, threshold_wei
 from hlsim.msbg.response import fixed_response
 from hlsim.msbg.smearing import BROADENING, roex_filters, smearing_from_filters
 from hlsim.neuro.config import NEURO_RATE
-from hlsim.torchtools import constant
+from hlsim.torchtools import constant_like
 
 RESPONSE_REACH = 1024
 """Samples at 16 kHz by which the fixed responses reach to either side."""
@@ -125,7 +125,7 @@ class Prior(nn.Module):
 
     def _exponents(self, thresholds: Tensor, severity: Tensor) -> Tensor:
         """Shape: (items, 8), (items,) -> (items, channels); 0 where a bank has fewer."""
-        weights = constant(_threshold_weights, dtype=thresholds.dtype, device=thresholds.device)
+        weights = constant_like(thresholds, _threshold_weights)
         return expansion_ratios(thresholds, weights[severity]) - 1.0
 
 
