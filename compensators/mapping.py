@@ -76,10 +76,11 @@ class MappingCompensator(EarNetwork):
         return f"sample_rate={self.sample_rate}, full_scale_spl={self.full_scale_spl:g}, start={self.config.start!r}"
 
     @property
-    def _reach(self) -> tuple[int, int] | None:
-        if self.config.reach is None:
+    def _receptive_field(self) -> tuple[int, int] | None:
+        if self.config.receptive_field is None:
             return None
-        return self.config.step, self.config.reach + self.config.step - self.config.hop  # with _steady
+        steady = self.config.step - self.config.hop
+        return self.config.step, self.config.receptive_field + steady
 
     @property
     def _dtype(self) -> torch.dtype:

@@ -3,13 +3,17 @@
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
 from torch._subclasses.fake_tensor import FakeTensor, FakeTensorMode
+from torch.func import grad
 
-from hlsim import torchtools
-from hlsim.torchtools import constant
+from hlsim import MSBG, Audiogram, torchtools
+from hlsim.msbg.filterbank import BANKS
+from hlsim.msbg.multirate import multirate_bank
+from hlsim.torchtools import constant, constant_like, made_once
 
 CPU = torch.device("cpu")
 
@@ -53,6 +57,58 @@ def test_what_fake_tensors_ask_for_is_not_kept() -> None:
     with FakeTensorMode():
         assert isinstance(constant(make, dtype=torch.float32, device=CPU), FakeTensor)
     assert constant(make, dtype=torch.float32, device=CPU).tolist() == [5.0]
+
+
+@pytest.fixture
+def small(monkeypatch: pytest.MonkeyPatch) -> torchtools._Kept:
+    kept = torchtools._Kept(4 * 2**20)
+    monkeypatch.setattr(torchtools, "_KEPT", kept)
+    return kept
+
+
+def test_complex_constants_and_those_like_a_tensor() -> None:
+    def make(count: int) -> np.ndarray:
+        return 1j * np.arange(count)[::-1]
+
+    for dtype, expected in ((torch.float32, torch.complex64), (torch.float64, torch.complex128)):
+        made = constant(make, 3, dtype=dtype, device=CPU)
+        assert made.dtype == expected and made.is_contiguous() and made.imag.tolist() == [2.0, 1.0, 0.0]
+        for like in (torch.ones(1, dtype=dtype), torch.ones(1, dtype=expected)):
+            assert constant_like(like, make, 3) is made
+    assert constant(make, 4, dtype=torch.float32, device=CPU) is not constant(
+        make, 3, dtype=torch.float32, device=CPU
+    )
+
+
+def test_memory_does_not_grow_with_the_number_of_lengths(small: torchtools._Kept) -> None:
+    model = MSBG(Audiogram.standard("N3"), sample_rate=16000)
+    signals = [0.01 * torch.ones(1, 3000 + 2000 * n) for n in range(8)]
+    first = [model(signal) for signal in signals]
+    assert small.held <= small.limit
+    for signal, expected in zip(signals, first, strict=True):  # the early ones are made again
+        assert torch.equal(model(signal), expected)
+    assert small.held <= small.limit
+
+
+def test_one_that_is_too_large_is_held_all_the_same(small: torchtools._Kept) -> None:
+    key = (multirate_bank, BANKS["severe"], 24 * 4000, 1, 22050.0, torch.float32, CPU)
+    bank = made_once(*key)
+    assert made_once(*key) is bank and small.held > small.limit
+    constant(np.arange, 4410, dtype=torch.float32, device=CPU)
+    assert small.held <= small.limit
+
+
+def test_what_a_transform_makes_serves_after_it(small: torchtools._Kept) -> None:
+    model = MSBG(Audiogram.standard("N3"), sample_rate=16000)
+    wave, gain = 0.03 * torch.randn(1, 1200), torch.tensor(1.0)
+
+    def energy(factor: Tensor) -> Tensor:
+        return model(wave * factor).square().sum()
+
+    second = grad(grad(energy))(gain)
+    assert torch.equal(grad(grad(energy))(gain), second)
+    leaf = gain.clone().requires_grad_()
+    torch.testing.assert_close(grad(energy)(gain), torch.autograd.grad(energy(leaf), leaf)[0])
 
 
 # a child of its own, for the setting is the process's: megabytes again and again, as a training asks for them

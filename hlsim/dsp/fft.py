@@ -62,7 +62,7 @@ def fft_length(least: int, multiple: int = 1) -> int:
 def edge(bins: int, hz: float, end: float) -> NDArray[np.float64]:
     """Factors on a spectrum that ends where there is more to come: 1, and down to 0 within the last 80 Hz.
 
-    A sharp end would ring on for seconds, and how much of that comes round again hangs on the FFT's length.
+    A sharp end would ring on for seconds, and how much of that comes round again depends on the FFT's length.
 
     Args:
         bins: of the spectrum.

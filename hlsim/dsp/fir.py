@@ -49,14 +49,12 @@ _BLOCK, _HOP = 4096, 3072
 
 
 def filter_centred(waveform: Tensor, taps: Tensor) -> Tensor:
-    """FIR of as many samples before as after, which does not delay. Shape: (..., time), (..., 2 reach) -> (..., time)."""
-    time, reach = waveform.shape[-1], taps.shape[-1] // 2
-    points = fft_length(time + 2 * reach, 4)
+    """FIR of as many samples before as after, which does not delay. Shape: (..., time), (..., 2 half) -> (..., time)."""
+    time, half = waveform.shape[-1], taps.shape[-1] // 2
+    points = fft_length(time + 2 * half, 4)
     if torch.compiler.is_exporting():
         points = 1 << (points - 1).bit_length()  # at other lengths onnxruntime is off by 1e-3 to 1e-2
-    return long_irfft(long_rfft(waveform, points) * long_rfft(taps, points), points)[
-        ..., reach : reach + time
-    ]
+    return long_irfft(long_rfft(waveform, points) * long_rfft(taps, points), points)[..., half : half + time]
 
 
 def filter_blocks(waveform: Tensor, response: Tensor, length: int) -> Tensor:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from hlsim.dsp.erb import erb
 from hlsim.dsp.fft import power, rfft
-from hlsim.msbg.ear import RATE
+from hlsim.msbg.ear import MSBG_RATE
 from hlsim.msbg.filterbank import FilterBank
 from hlsim.torchtools import constant_like
 
@@ -134,7 +134,7 @@ def envelope_lowpass(
 def envelope_filters(bank: FilterBank) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
     """Numerator and denominator of each channel's low-pass."""
     widths = erb(np.array(bank.centre_frequencies))
-    return [ellip(2, 0.25, 35, 0.75 * min(100.0, width) / (RATE / 2.0)) for width in widths]
+    return [ellip(2, 0.25, 35, 0.75 * min(100.0, width) / (MSBG_RATE / 2.0)) for width in widths]
 
 
 @lru_cache(maxsize=8)

@@ -61,14 +61,14 @@ def interpolate(values: Tensor, kernel: Tensor) -> Tensor:
 
     Shape: ``around``'s (..., steps + 5), ``interpolation_kernel`` -> (..., time).
     """
-    reach, columns = kernel.shape
-    together = reach - _TAPS + 1
+    width, columns = kernel.shape
+    together = width - _TAPS + 1
     steps = values.shape[-1] - _TAPS + 1
     if steps % together:
         values = functional.pad(values, (0, -steps % together))
-    windows = values.unfold(-1, reach, together)
+    windows = values.unfold(-1, width, together)
     # as one product, for matmul makes one a channel of it, at twice the cost
-    fine = (windows.reshape(-1, reach) @ kernel).view(*windows.shape[:-2], -1)
+    fine = (windows.reshape(-1, width) @ kernel).view(*windows.shape[:-2], -1)
     return fine if steps % together == 0 else fine[..., : steps * columns // together]
 
 
@@ -90,9 +90,9 @@ def weigh(
         steep = _steep(envelopes) & ((ratios != 1.0) & (ratios < _SLIGHT)).unsqueeze(-1)
         every = full.shape[-1] // steep.shape[-1]
         if steep.device.type == "cpu":
-            own = ratios.unsqueeze(-1).expand(steep.shape)[steep]
+            theirs = ratios.unsqueeze(-1).expand(steep.shape)[steep]
             about = around(envelopes).unfold(-1, _TAPS, 1)[steep]
-            full.unflatten(-1, (-1, every))[steep] = gains(about @ kernel[:_TAPS, :every], own)
+            full.unflatten(-1, (-1, every))[steep] = gains(about @ kernel[:_TAPS, :every], theirs)
         else:  # indices would have to come back from the device
             fine = gains(interpolate(around(envelopes), kernel), ratios)
             full = torch.where(steep.repeat_interleave(every, -1), fine, full)

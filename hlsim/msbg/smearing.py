@@ -12,7 +12,7 @@ from torch.nn import functional
 
 from hlsim.dsp.erb import ERB_AT_0_HZ, erb
 from hlsim.dsp.fft import power, rfft
-from hlsim.msbg.ear import RATE
+from hlsim.msbg.ear import MSBG_RATE
 from hlsim.torchtools import constant_like
 
 FRAME, HOP, FFT = 256, 64, 512
@@ -73,13 +73,18 @@ def smearing_from_filters(normal: NDArray[np.float64], wide: NDArray[np.float64]
 @lru_cache(maxsize=4)
 def smearing_matrix(lower: float, upper: float) -> NDArray[np.float64]:
     """The matrix for MSBG's 512-point spectra. Returns (256, 256)."""
-    normal, wide = (roex_filters(*sides, FFT // 2, RATE / FFT) for sides in ((1.0, 1.0), (lower, upper)))
+    normal, wide = (roex_filters(*sides, FFT // 2, MSBG_RATE / FFT) for sides in ((1.0, 1.0), (lower, upper)))
     return smearing_from_filters(normal, wide)
 
 
-def smeared_bins(step: int, highest: float) -> int:
-    """Frequencies of a frame at 44.1 kHz / step on which what is below ``highest`` Hz depends, by the window's skirts."""
-    return min(FFT // 2 // step, math.ceil((highest + SKIRT_HZ) * FFT / RATE))
+def smearing_matrix_below(severity: str, step: int, highest: float) -> NDArray[np.float64]:
+    """The part of the matrix on which what is below ``highest`` Hz depends, by the window's skirts.
+
+    Args:
+        step: the signal runs at 44.1 kHz / step.
+    """
+    bins = min(FFT // 2 // step, math.ceil((highest + SKIRT_HZ) * FFT / MSBG_RATE))
+    return smearing_matrix(*BROADENING[severity])[:bins, :bins]
 
 
 def smeared_length(samples: int) -> int:

@@ -102,7 +102,7 @@ class NetworkConfig:
         return self.channels * self.expansion * rows / self.step
 
     @property
-    def reach(self) -> int | None:
+    def receptive_field(self) -> int | None:
         """Samples to either side on which one depends by transform and network; None where it is all of them."""
         if self.block != "cnn":
             return None

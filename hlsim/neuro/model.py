@@ -76,11 +76,11 @@ class NeuroMSBG(EarNetwork):
         self.autocast_dtype: torch.dtype | None = None
 
     @property
-    def _reach(self) -> tuple[int, int] | None:
-        if self.config.reach is None or not self.config.level_aware:
+    def _receptive_field(self) -> tuple[int, int] | None:
+        if self.config.receptive_field is None or not self.config.level_aware:
             return None
-        known = self.prior.reach if self.prior is not None else 0
-        return self.config.step, self.config.reach + known
+        known = self.prior.receptive_field if self.prior is not None else 0
+        return self.config.step, self.config.receptive_field + known
 
     @property
     def _dtype(self) -> torch.dtype:
