@@ -19,11 +19,10 @@ from hlsim.neuro.audiogram_encoder import AudiogramEncoder
 from hlsim.neuro.blocks import DualPathBlock
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.neuro.decoders import Decoder, PhaseDecoder
-from hlsim.neuro.encoder import DenseEncoder
+from hlsim.neuro.encoder import DenseEncoder, log_magnitude, sine_of_phase
 from hlsim.neuro.network import EarNetwork
 from hlsim.torchtools import constant_like
 
-_TINY = 1e-11
 _NEPER_DB = 20.0 / math.log(10.0)
 
 
@@ -122,10 +121,9 @@ class MappingCompensator(EarNetwork):
     def _features(self, spectrum: Tensor, ears: Tensor, start: Tensor) -> Tensor:
         """The input channels. Shape: (items, frames, frequencies), ... -> (items, 3 or 4, frames, frequencies)."""
         squared = power(spectrum)
-        channels = [(squared + _TINY).log() / 4.0]
+        channels = [log_magnitude(squared)]
         if self.phase_decoder is not None:
-            # the sine of the phase, faded out near silence: its gradient stays finite and it has no jump at pi
-            channels.append(spectrum.imag * (squared + 1e-6).rsqrt())
+            channels.append(sine_of_phase(spectrum, squared))
         channels += [self.audiogram_encoder(ears).unsqueeze(1), start.unsqueeze(1)]
         return torch.stack([channel.expand(squared.shape) for channel in channels], 1)
 

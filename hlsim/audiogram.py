@@ -19,6 +19,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from hlsim.extras import require
 from hlsim.files import read_rows
 from hlsim.torchtools import constant, constant_like
 
@@ -174,8 +175,6 @@ class Audiogram:
 
     def to_clarity(self) -> Any:
         """The same ear as pyclarity's ``Audiogram`` (needs the extra ``eval``)."""
-        from hlsim.extras import require
-
         clarity = require("clarity.utils.audiogram", "eval")
         return clarity.Audiogram(levels=np.array(self.levels), frequencies=np.array(self.frequencies))
 
@@ -319,7 +318,7 @@ def _taken(levels: Sequence[float], highest: float, taker: str) -> Sequence[floa
 def _instead(given: object) -> str:
     """What to write in place of something that is no audiogram but holds one."""
     several = isinstance(given, list | tuple) and len(given) > 0
-    first = given[0] if isinstance(given, list | tuple) and given else given
+    first: Any = given[0] if several else given  # type: ignore[index]
     if isinstance(first, str) and first in STANDARD:
         make = f"Audiogram.standard({first!r})"
     elif isinstance(first, Mapping):

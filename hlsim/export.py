@@ -114,7 +114,7 @@ def _check(path: Path, program: torch.export.ExportedProgram, level: float) -> N
         (heard,) = session.run(
             None, {name: tensor.cpu().numpy() for name, tensor in zip(names, given, strict=True)}
         )
-    except Exception as error:  # onnxruntime has a class of its own for each kind of refusal
+    except Exception as error:  # onnxruntime has a class for each kind of refusal
         reason = str(error).split("failed:", 1)[-1].strip().splitlines()[0]
         raise ValueError(
             f"ONNX cannot take the simulator: onnxruntime refuses the file ({reason})"

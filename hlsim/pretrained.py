@@ -106,7 +106,7 @@ def read_checkpoint(
 
 
 def find_checkpoint(name: str | Path, kind: str | None = None, also: Sequence[str] = ()) -> Path:
-    """The folder of a checkpoint that ships with hlsim, or of one's own.
+    """The folder of a checkpoint that ships with hlsim, or another.
 
     Args:
         kind: of those that the message lists; None lists all.
@@ -119,8 +119,8 @@ def find_checkpoint(name: str | Path, kind: str | None = None, also: Sequence[st
         raise ValueError(f"checkpoint is {type(name).__name__}; allowed: a name or a folder")
     if (Path(name) / CONFIG).is_file():
         return Path(name)
-    if str(name) in (own := shipped()):
-        return own[str(name)]
+    if str(name) in (ours := shipped()):
+        return ours[str(name)]
     names = [*also, *shipped(kind)]
     inner = Path(name) / "checkpoint"  # as a training leaves it
     hint = f", but {str(inner)!r} is one" if (inner / CONFIG).is_file() else ""

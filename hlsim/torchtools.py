@@ -111,7 +111,7 @@ def keep_freed_memory() -> bool:
     """Let the process keep what it frees, for a training step asks for the same hundreds of megabytes as the one before.
 
     By default glibc returns them, and the next step pays for every page of 4 KiB anew: up to 40 % of its time on a CPU.
-    For programs of our own; a library leaves the process to its host, which can set ``MALLOC_TRIM_THRESHOLD_`` and
+    For hlsim's programs; a library leaves the process to its host, which can set ``MALLOC_TRIM_THRESHOLD_`` and
     ``MALLOC_MMAP_MAX_`` in the environment.
 
     Returns: whether the C library is one that can.

@@ -12,7 +12,7 @@ from hlsim.msbg.ear import MSBG_RATE
 from hlsim.msbg.envelope import HALF_RATE_STEP, STEP, decimate, detect, envelope, envelope_lowpass, smooth
 from hlsim.msbg.filterbank import FilterBank, gammatone_response
 from hlsim.msbg.filtfilt_end import ending, ending_response, ending_weights
-from hlsim.msbg.multirate import MultirateBank
+from hlsim.msbg.multirate import MultirateBank, RateBand
 from hlsim.msbg.recruitment import around, expand, gains, weigh
 from hlsim.torchtools import constant_like
 
@@ -54,34 +54,45 @@ def hear(spectrum: Tensor, ratios: Tensor, bank: MultirateBank, slight: bool) ->
     Args:
         slight: look after the kinks of slight losses, which a smeared signal buries.
     """
-    waves, sums = [], []
-    for band in bank.bands:
-        bins = spectrum[..., None, : band.response.shape[-1]] * band.response
-        if band.detector == "itself":
-            wave = torch.fft.irfft(bins, band.points)
-            rectified = wave.abs()
-        else:
-            both = torch.fft.ifft(bins, band.points)
-            rectified = detect(both, harmonics=band.detector == "harmonics")
-            wave = torch.view_as_real(both).flatten(-2) if band.detector == "modulus" else both.real
-        waves.append(wave)
-        sums.append(decimate(rectified, band.decimation))
+    waves, sums = zip(*(filter_and_rectify(spectrum, band) for band in bank.bands), strict=True)
     envelopes = smooth(torch.cat(sums, -3), bank.lowpass)
     ratios = ratios[..., : len(bank.lowpass)]
-    all_gains = around(gains(envelopes, ratios))
-
+    recruitment = around(gains(envelopes, ratios))
     heard: dict[tuple[int, bool], Tensor] = {}
     for band, wave in zip(bank.bands, waves, strict=True):
         channels, kind = band.channels, (band.points, band.detector == "modulus")
         kinks = (envelopes[..., channels, :], ratios[..., channels]) if slight else None
-        part = weigh(wave, all_gains[..., channels, :], band.interpolation, kinks)
+        part = weigh(wave, recruitment[..., channels, :], band.interpolation, kinks)
         heard[kind] = heard[kind] + part if kind in heard else part
-    total = torch.zeros_like(spectrum)
-    for (_, analytic), part in heard.items():
+    return recombine(heard, spectrum)
+
+
+def filter_and_rectify(spectrum: Tensor, band: RateBand) -> tuple[Tensor, Tensor]:
+    """A rate band's channels as signals, analytic ones with their parts in turn, and for ``smooth`` their rectified sums.
+
+    Shape: (items, bins) -> (items, channels, points or 2 points), (items, channels, 3, steps).
+    """
+    bins = spectrum[..., None, : band.response.shape[-1]] * band.response
+    if band.detector == "itself":
+        wave = torch.fft.irfft(bins, band.points)
+        return wave, decimate(wave.abs(), band.decimation)
+    both = torch.fft.ifft(bins, band.points)
+    rectified = detect(both, harmonics=band.detector == "harmonics")
+    wave = torch.view_as_real(both).flatten(-2) if band.detector == "modulus" else both.real
+    return wave, decimate(rectified, band.decimation)
+
+
+def recombine(heard: dict[tuple[int, bool], Tensor], like: Tensor) -> Tensor:
+    """The spectrum of the sum of signals at several rates, by their FFT lengths and whether they are analytic.
+
+    Shape: (items, time) each, ``like`` (items, bins) -> as ``like``.
+    """
+    total = torch.zeros_like(like)
+    for (points, analytic), part in heard.items():
         if analytic:
             bins = torch.fft.fft(torch.view_as_complex(part.unflatten(-1, (-1, 2))))
         else:
-            bins = long_rfft(part, part.shape[-1])
+            bins = long_rfft(part, points)
         total[..., : bins.shape[-1]].add_(bins[..., : total.shape[-1]])
     return total
 

@@ -42,7 +42,7 @@ def _detect(signals: Tensor, harmonics: bool) -> tuple[Tensor, ...]:
     """What is detected; with harmonics also the modulus, and the squared cosine of the angle."""
     squared = power(signals).add_(_TINY)
     if not harmonics:
-        return (squared.sqrt_(),)  # torch's own modulus takes four times as long
+        return (squared.sqrt_(),)  # torch's modulus takes four times as long
     cosine, modulus = signals.real.square() / squared, squared.sqrt()
     return modulus * ((cosine * (-16 / 15) + 12 / 5) * cosine + 1 / 5), modulus, cosine
 
@@ -67,7 +67,7 @@ class _Detect(torch.autograd.Function):
         signals, *detected = ctx.saved_tensors
         if not ctx.harmonics:
             return signals * (gradient / detected[0]), None
-        # with a gradient of its own, what is constant here comes from the signals anew
+        # where the gradient is differentiated, what is constant here comes from the signals anew
         _, modulus, cosine = _detect(signals, True) if torch.is_grad_enabled() else detected
         share = gradient / modulus
         along = share * ((cosine * (16 / 5) - 20 / 3) * cosine + 5)

@@ -4,7 +4,7 @@ A channel is kept up to five bandwidths above its frequency, where it is 57 dB d
 interest. Narrow ones run as analytic signals at about 5.5 or 11 kHz, or 9 where that is enough, whose modulus is the
 envelope: what a rectifier adds, harmonics of the band, lies above its low-pass. It does not where bands are so wide for
 their frequency that they come down to 0 Hz: with severe losses two harmonics complete the modulus. The lowest channels,
-and the widest at 44.1 kHz, are rectified as they are, as the reference does: at that rate its own harmonics fold too.
+and the widest at 44.1 kHz, are rectified as they are, as the reference does: at that rate its harmonics fold, too.
 
 Channels centred far above the highest frequency of interest all hear what there is next to it, by their skirts, and
 expand it alike, by the threshold at 8 kHz: they run as one, the sum of them.
@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from hlsim.dsp.erb import erb
-from hlsim.dsp.fft import edge
+from hlsim.dsp.fft import soft_end
 from hlsim.msbg.ear import MSBG_RATE
 from hlsim.msbg.envelope import HALF_RATE_STEP, STEP, decimation_kernel, envelope_lowpass
 from hlsim.msbg.filterbank import FilterBank, gammatone_response
@@ -148,7 +148,9 @@ def multirate_bank(
             response[:, 1:] *= 2.0
             decimation = decimation * (2.0 / math.pi)
         if samples < STEP:
-            response *= edge(bins, MSBG_RATE / points, count / (1 if analytic else 2) * MSBG_RATE / points)
+            response *= soft_end(
+                bins, MSBG_RATE / points, count / (1 if analytic else 2) * MSBG_RATE / points
+            )
         kernels = tensor(decimation), tensor(interpolation)
         bands.append(RateBand(channels, count, detector, tensor(response), *kernels))
         lowpass.append(smoothing)

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from hlsim.dsp.fft import edge, fft_length, long_irfft, long_rfft
-from hlsim.dsp.fir import block_points, filter_blocks
+from hlsim.dsp.fft import fft_length, long_irfft, long_rfft, soft_end
+from hlsim.dsp.fir import BLOCK_POINTS, filter_blocks
 from hlsim.msbg.cochlea import shared_multiple
 from hlsim.msbg.ear import EAR_DELAY, MSBG_RATE, ear_filter, lowpass_filter
 from hlsim.torchtools import constant_like
@@ -78,7 +78,7 @@ def to_inner(signals: Tensor, rate: int) -> Tensor:
 
 def _inward_blocks() -> NDArray[np.complex128]:
     """The way in for ``filter_blocks``."""
-    return np.fft.rfft(ear_filter(), block_points())
+    return np.fft.rfft(ear_filter(), BLOCK_POINTS)
 
 
 def _inward(points: int, bins: int, gain: float, rate: int) -> NDArray[np.complex128]:
@@ -102,7 +102,7 @@ def _end(points: int, bins: int, rate: int) -> NDArray[np.float64]:
     """How the spectrum ends where a signal's rate is not the model's."""
     if rate == MSBG_RATE:
         return np.ones(bins)
-    return edge(bins, MSBG_RATE / points, min(rate, MSBG_RATE) / 2)
+    return soft_end(bins, MSBG_RATE / points, min(rate, MSBG_RATE) / 2)
 
 
 def _ratio(rate: int, step: int) -> tuple[int, int]:

@@ -32,18 +32,18 @@ def fixed_response(bank: FilterBank, rate: int, points: int) -> NDArray[np.compl
 
     Returns: (points // 2 + 1,), 0 above 22.05 kHz.
     """
-    own = points * MSBG_RATE // rate
-    bins = min(points, own) // 2 + 1
-    omega = 2.0 * np.pi * np.arange(bins) / own
-    total = gammatone_response(bank, own, bins=bins).sum(0)
+    inner = points * MSBG_RATE // rate
+    bins = min(points, inner) // 2 + 1
+    omega = 2.0 * np.pi * np.arange(bins) / inner
+    total = gammatone_response(bank, inner, bins=bins).sum(0)
     for taps in (ear_filter(), ear_filter(backward=True), lowpass_filter()):
-        total = total * np.fft.rfft(taps, own)[:bins]
+        total = total * np.fft.rfft(taps, inner)[:bins]
     total = total * np.exp(1j * omega * STRUCTURAL_DELAY) * 10.0 ** (-bank.recombination_db / 20.0)
     return np.pad(total, (0, points // 2 + 1 - bins))
 
 
 def with_phase_of_bank(waveform: Tensor, thresholds: Tensor, rate: int, *, normal: bool = False) -> Tensor:
-    """A signal with the phase that MSBG's bank of each ear's severity gives it, and its own magnitude.
+    """A signal with the phase that MSBG's bank of each ear's severity gives it, and the magnitude as it is.
 
     Where the response ends, from 20 dB down, the magnitude goes with it.
 

@@ -160,7 +160,7 @@ class _Spread(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, gradient: Tensor, *others: Tensor) -> tuple[Tensor, None]:
         spectrum, matrix, *made = ctx.saved_tensors
-        # with a gradient of its own, what is constant here comes from the spectrum anew
+        # where the gradient is differentiated, what is constant here comes from the spectrum anew
         factor, given, smeared = _spread(spectrum, matrix)[1:] if torch.is_grad_enabled() else made
         direct = factor.conj() * gradient
         products = torch.view_as_real(spectrum) * torch.view_as_real(direct)

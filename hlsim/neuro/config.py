@@ -140,7 +140,7 @@ class NeuroConfig(NetworkConfig):
             phase along frequency (the paper's Table IV).
         phase: ``predicted``, or the ``input``'s reused: magnitude only (the paper's Table III).
         prior: start from what is known of MSBG (``hlsim.neuro.prior``) and let the network correct it. Without it the
-            network is on its own, as in the paper.
+            network learns everything, as in the paper.
         level_aware: log magnitude and no normalisation. Otherwise each utterance is scaled to unit RMS and back, and
             instance normalisation follows the convolutions, as in MP-SENet: a level is then invisible.
     """

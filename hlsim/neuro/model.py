@@ -11,7 +11,7 @@ from hlsim.neuro.audiogram_encoder import AudiogramEncoder
 from hlsim.neuro.blocks import DualPathBlock, TimeBlock
 from hlsim.neuro.config import NEURO_RATE, NeuroConfig
 from hlsim.neuro.decoders import MaskDecoder, PhaseDecoder
-from hlsim.neuro.encoder import DenseEncoder, FrameEncoder
+from hlsim.neuro.encoder import DenseEncoder, FrameEncoder, log_magnitude, sine_of_phase
 from hlsim.neuro.network import EarNetwork
 from hlsim.neuro.prior import Prior
 
@@ -128,8 +128,7 @@ class NeuroMSBG(EarNetwork):
         Shape: (items, frames, frequencies) twice, (items, 8) -> (items, 2 to 4, frames, rows).
         """
         if self.config.level_aware:
-            # the sine of the phase, faded out near silence: its gradient stays finite and it has no jump at pi
-            channels = [(squared + _TINY).log() / 4.0, spectrum.imag * (squared + 1e-6).rsqrt()]
+            channels = [log_magnitude(squared), sine_of_phase(spectrum, squared)]
         else:
             channels = [(squared + _TINY).sqrt(), torch.angle(spectrum)]
         if self.audiogram_encoder is not None:

@@ -1,4 +1,4 @@
-"""What every network here does with a waveform and an ear before and after its own work."""
+"""What every network here does with a waveform and an ear before and after its work."""
 
 from __future__ import annotations
 

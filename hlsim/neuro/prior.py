@@ -1,4 +1,4 @@
-"""What is known of MSBG, as the starting point of a network: smearing, band envelopes and gains on its own frames.
+"""What is known of MSBG, as the starting point of a network: smearing, band envelopes and gains on short frames.
 
 One set of weights a severity, computed from MSBG's formulae; what is trained is a correction to them.
 """
@@ -156,7 +156,7 @@ def _smoothing(bank: FilterBank, hop: int) -> NDArray[np.float64]:
 
 
 def _smearing(severity: str, stft: STFT) -> NDArray[np.float64]:
-    """MSBG's smearing matrix on the transform's own frequencies."""
+    """MSBG's smearing matrix on the transform's frequencies."""
     spacing = NEURO_RATE / stft.fft
     count = round(20000.0 / spacing / 4.0) * 4
     matrix = smearing_from_filters(
