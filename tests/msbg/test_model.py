@@ -3,6 +3,8 @@
 import copy
 import logging
 import math
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -499,3 +501,8 @@ def test_outputs_hold_no_more_than_themselves(rate: int, ears: list[str]) -> Non
     heard = model(0.01 * torch.randn(len(ears), 400))
     assert heard.is_contiguous()
     assert heard.untyped_storage().nbytes() == heard.nbytes
+
+
+def test_it_needs_no_reader_of_files() -> None:
+    code = "import sys; sys.modules['soundfile'] = None; import hlsim.msbg; assert 'hlsim.audio' not in sys.modules"
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=120)
