@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from hlsim.calibration import is_finite
+from hlsim.checks import is_finite
 from hlsim.neuro.config import NetworkConfig
 
 

@@ -1,7 +1,6 @@
 """The paper's compensator: Neuro-MSBG's family, with a magnitude path that maps instead of masking."""
 
 import math
-from functools import lru_cache
 
 import numpy as np
 import torch
@@ -11,17 +10,19 @@ from torch.nn import functional
 
 from compensators.config import MappingConfig
 from compensators.limiter import soft_limit
-from compensators.nalr import interpolate_gains, nalr_gains_db
+from compensators.nalr import nalr_gains_db
+from hlsim.audiogram import interpolate
 from hlsim.calibration import PASCAL_SPL
+from hlsim.dsp.erb import erb_number
 from hlsim.dsp.fft import power
 from hlsim.neuro.audiogram_encoder import AudiogramEncoder
 from hlsim.neuro.blocks import DualPathBlock
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.neuro.decoders import Decoder, PhaseDecoder
-from hlsim.neuro.encoder import DenseEncoder
+from hlsim.neuro.encoder import DenseEncoder, log_magnitude, sine_of_phase
 from hlsim.neuro.network import EarNetwork
+from hlsim.torchtools import constant_like
 
-_TINY = 1e-11
 _NEPER_DB = 20.0 / math.log(10.0)
 
 
@@ -68,16 +69,17 @@ class MappingCompensator(EarNetwork):
         """Gain before training at the transform's frequencies. Shape: (items, 8) dB HL -> (items, frequencies) dB."""
         start = self.config.start
         gains = nalr_gains_db(thresholds) if start == "nalr" else float(start) * thresholds.clamp_min(0.0)
-        return interpolate_gains(gains, self._hz(thresholds))
+        return interpolate(gains, self.config.hz)
 
     def extra_repr(self) -> str:
         return f"sample_rate={self.sample_rate}, full_scale_spl={self.full_scale_spl:g}, start={self.config.start!r}"
 
     @property
-    def _reach(self) -> tuple[int, int] | None:
-        if self.config.reach is None:
+    def _receptive_field(self) -> tuple[int, int] | None:
+        if self.config.receptive_field is None:
             return None
-        return self.config.step, self.config.reach + self.config.step - self.config.hop  # with _steady
+        steady = self.config.step - self.config.hop
+        return self.config.step, self.config.receptive_field + steady
 
     @property
     def _dtype(self) -> torch.dtype:
@@ -106,8 +108,10 @@ class MappingCompensator(EarNetwork):
 
         Shape: (items, channels, ...) -> (items, frames, frequencies).
         """
+        bands = self.config.bands, self.config.fft
         into, out_of = (
-            torch.from_numpy(matrix).to(features) for matrix in _bands(self.config.bands, self.config.fft)
+            constant_like(features, _into_bands, *bands),
+            constant_like(features, _out_of_bands, *bands),
         )
         levels = self.magnitude_decoder(features, size).squeeze(1) @ into
         return (
@@ -117,19 +121,11 @@ class MappingCompensator(EarNetwork):
     def _features(self, spectrum: Tensor, ears: Tensor, start: Tensor) -> Tensor:
         """The input channels. Shape: (items, frames, frequencies), ... -> (items, 3 or 4, frames, frequencies)."""
         squared = power(spectrum)
-        channels = [(squared + _TINY).log() / 4.0]
+        channels = [log_magnitude(squared)]
         if self.phase_decoder is not None:
-            # the sine of the phase, faded out near silence: its gradient stays finite and it has no jump at pi
-            channels.append(spectrum.imag * (squared + 1e-6).rsqrt())
+            channels.append(sine_of_phase(spectrum, squared))
         channels += [self.audiogram_encoder(ears).unsqueeze(1), start.unsqueeze(1)]
         return torch.stack([channel.expand(squared.shape) for channel in channels], 1)
-
-    def _hz(self, like: Tensor) -> Tensor:
-        return (
-            torch.arange(self.stft.frequencies, device=like.device, dtype=like.dtype)
-            * NEURO_RATE
-            / self.config.fft
-        )
 
 
 def _steady(levels: Tensor, stride: int) -> Tensor:
@@ -141,20 +137,18 @@ def _steady(levels: Tensor, stride: int) -> Tensor:
     return functional.avg_pool1d(functional.avg_pool1d(padded, stride, 1), stride, 1).mT
 
 
-@lru_cache(maxsize=8)
-def _bands(count: int, fft: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Weights from frequencies to bands, a mean of each, and back, by straight lines between the bands' centres.
+def _out_of_bands(count: int, fft: int) -> NDArray[np.float64]:
+    """Weights from bands to frequencies, by straight lines between the bands' centres. Returns (count, frequencies).
 
-    The centres lie evenly on the ERB-number scale of Glasberg and Moore (1990) from 100 Hz to 8 kHz.
-
-    Returns: (frequencies, count) and (count, frequencies).
+    The centres lie evenly on the ERB-number scale from 100 Hz to 8 kHz.
     """
-
-    def number(hz: NDArray[np.float64]) -> NDArray[np.float64]:
-        return 21.4 * np.log10(1.0 + 0.00437 * hz)
-
-    places = number(np.arange(fft // 2 + 1) * NEURO_RATE / fft)
-    lowest, highest = number(np.array([100.0, NEURO_RATE / 2.0]))
+    places = erb_number(np.arange(fft // 2 + 1) * NEURO_RATE / fft)
+    lowest, highest = erb_number(np.array([100.0, NEURO_RATE / 2.0]))
     centres = np.linspace(lowest, highest, count)
-    out_of = np.stack([np.interp(places, centres, row) for row in np.eye(count)])
-    return (out_of / out_of.sum(1, keepdims=True).clip(1e-6)).T.copy(), out_of
+    return np.stack([np.interp(places, centres, row) for row in np.eye(count)])
+
+
+def _into_bands(count: int, fft: int) -> NDArray[np.float64]:
+    """Weights from frequencies to bands, a mean of each. Returns (frequencies, count)."""
+    out_of = _out_of_bands(count, fft)
+    return (out_of / out_of.sum(1, keepdims=True).clip(1e-6)).T

@@ -1,6 +1,6 @@
 """NAL-R, the closed-form prescription that a trained compensator has to beat."""
 
-from functools import lru_cache, partial
+from functools import lru_cache
 from numbers import Integral
 from typing import Any
 
@@ -11,12 +11,18 @@ from scipy.fft import next_fast_len
 from scipy.signal.windows import hamming
 from torch import Tensor, nn
 
-from hlsim.audio import check_rate, check_waveform
-from hlsim.audiogram import FREQUENCIES, HIGHEST_LEVEL, AudiogramLike, own_thresholds
+from hlsim.audiogram import (
+    FREQUENCIES,
+    HIGHEST_LEVEL,
+    AudiogramLike,
+    interpolate,
+    own_thresholds,
+    resolve_thresholds,
+)
 from hlsim.calibration import PASCAL_SPL, check_full_scale
+from hlsim.checks import check_rate, check_waveform
 from hlsim.dsp.fir import frequency_sampling_fir
-from hlsim.msbg.model import resolve_thresholds
-from hlsim.torchtools import constant
+from hlsim.torchtools import constant, constant_like
 
 _BIAS = {250.0: -17.0, 500.0: -8.0, 1000.0: 1.0, 2000.0: -1.0, 4000.0: -2.0, 6000.0: -2.0}
 _LIMITS: dict[str, Any] = {"highest": HIGHEST_LEVEL, "taker": "NAL-R"}
@@ -83,10 +89,9 @@ class NALR(nn.Module):
 
     def taps(self, thresholds: Tensor) -> Tensor:
         """Coefficients of the filter, symmetric about the middle one. Shape: (..., 8) dB HL -> (..., order + 1)."""
-        fixed = partial(constant, dtype=torch.float64, device=thresholds.device)
-        hz = fixed(_steps_hz, self.sample_rate, self.order + 1)
-        gains = interpolate_gains(nalr_gains_db(thresholds.double()), hz)
-        taps = (10.0 ** (gains / 20.0)) @ fixed(_design, self.order)
+        gains = nalr_gains_db(thresholds.double())
+        gains = interpolate(gains, _steps_hz(self.sample_rate, self.order + 1))
+        taps = (10.0 ** (gains / 20.0)) @ constant_like(gains, _design, self.order)
         flat = torch.zeros_like(taps)
         flat[..., self.order // 2] = 1.0
         return torch.where(_impaired(thresholds), taps, flat)
@@ -106,19 +111,11 @@ def nalr_gains_db(thresholds: Tensor) -> Tensor:
     losses = _prescribed(thresholds)
     three = losses[..., 1:4].sum(-1, keepdim=True)  # at 500, 1000 and 2000 Hz
     common = torch.where(three <= 180.0, 0.05 * three, 9.0 + 0.116 * (three - 180.0))
-    bias = constant(tuple, tuple(_BIAS.values()), dtype=losses.dtype, device=losses.device)
+    bias = constant_like(losses, tuple, tuple(_BIAS.values()))
     gains = (common + 0.31 * losses + bias).clamp_min(0.0)
     low, high = gains[..., :4], gains[..., 4:]
     between = 0.5 * (low[..., -1:] + high[..., :1])
     return torch.where(_impaired(thresholds), torch.cat((low, between, high, high[..., -1:]), -1), 0.0)
-
-
-def interpolate_gains(gains_db: Tensor, hz: Tensor) -> Tensor:
-    """Gains between the audiometric frequencies, linear in Hz and flat beyond. Shape: (..., 8), (n,) -> (..., n)."""
-    points = constant(tuple, FREQUENCIES, dtype=hz.dtype, device=hz.device)
-    right = torch.bucketize(hz, points).clamp(1, len(FREQUENCIES) - 1)
-    place = ((hz - points[right - 1]) / (points[right] - points[right - 1])).clamp(0.0, 1.0).to(gains_db)
-    return gains_db[..., right - 1] * (1.0 - place) + gains_db[..., right] * place
 
 
 def _impaired(thresholds: Tensor) -> Tensor:
@@ -131,8 +128,9 @@ def _prescribed(thresholds: Tensor) -> Tensor:
     return thresholds.index_select(-1, places)
 
 
-def _steps_hz(sample_rate: int, count: int) -> Tensor:
-    return torch.linspace(0.0, sample_rate / 2.0, count, dtype=torch.float64)
+@lru_cache(maxsize=8)
+def _steps_hz(sample_rate: int, count: int) -> tuple[float, ...]:
+    return tuple(torch.linspace(0.0, sample_rate / 2.0, count, dtype=torch.float64, device="cpu").tolist())
 
 
 @lru_cache(maxsize=8)

@@ -9,7 +9,7 @@ from hlsim import __version__
 from hlsim.audiogram import Audiogram
 from hlsim.calibration import PASCAL_SPL
 from hlsim.neuro.config import NEURO_RATE
-from hlsim.pretrained import CONFIG, checkpoint_about, read_checkpoint, save_checkpoint
+from hlsim.pretrained import checkpoint_about, read_checkpoint, save_checkpoint
 
 KIND = "mapping-compensator"
 """What ``config.json`` of a checkpoint of such a compensator calls it."""
@@ -48,12 +48,7 @@ def save_compensator(model: MappingCompensator, folder: str | Path) -> None:
     """
     if not isinstance(model, MappingCompensator):
         raise ValueError(f"{type(model).__name__} cannot be saved; allowed: a MappingCompensator")
-    target = Path(folder)
-    if target.exists() and not (
-        target.is_dir() and ((target / CONFIG).is_file() or not any(target.iterdir()))
-    ):
-        raise ValueError(f"{target}: holds something else; allowed: a new folder, or that of a checkpoint")
-    save_checkpoint(target, KIND, model, model.config.to_dict(), {"hlsim": __version__})
+    save_checkpoint(folder, KIND, model, model.config.to_dict(), {"hlsim": __version__})
 
 
 def trained_for(name: str | Path) -> Audiogram | None:

@@ -13,7 +13,7 @@ from torch import Tensor
 from hlsim import MSBG, Audiogram
 from hlsim.calibration import set_level
 from hlsim.msbg import estimate_delay
-from hlsim.msbg.ear import RATE
+from hlsim.msbg.ear import MSBG_RATE
 
 EARS = ("NH", "N1", "N2", "N3", "N4", "S1", "S2", "S3")
 TABLED = EARS[:5]
@@ -23,7 +23,7 @@ HERTZ = (200, 300, 400, 500, 750, 1000, 2000, 4000, 8000)
 
 def bursts() -> Tensor:
     """Gaussian tone bursts, half a second each, about a third of an octave wide. Shape: -> (HERTZ, time)."""
-    cycles = torch.tensor(HERTZ).unsqueeze(-1) * torch.linspace(-0.25, 0.25, RATE // 2 + 1)
+    cycles = torch.tensor(HERTZ).unsqueeze(-1) * torch.linspace(-0.25, 0.25, MSBG_RATE // 2 + 1)
     return set_level((2.0 * torch.pi * cycles).cos() * (-0.5 * cycles.square()).exp(), 65.0)
 
 

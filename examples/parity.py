@@ -23,9 +23,9 @@ def sample_for_sample(signal: torch.Tensor, ear: Audiogram) -> float:
     """At 44.1 kHz and pyclarity's full scale of 120 dB SPL."""
     reference = Ear()
     reference.set_audiogram(ear.to_clarity())
-    truth = reference.process(signal.double().numpy())[0]
+    expected = reference.process(signal.double().numpy())[0]
     heard = MSBG(ear, full_scale_spl=120.0, aligned=False, rescale_active=True)(signal).numpy()
-    return float(np.linalg.norm(heard - truth) / np.linalg.norm(truth))
+    return float(np.linalg.norm(heard - expected) / np.linalg.norm(expected))
 
 
 def below_7_khz(signal: torch.Tensor, ear: Audiogram) -> float:
@@ -34,8 +34,8 @@ def below_7_khz(signal: torch.Tensor, ear: Audiogram) -> float:
         np.fft.rfft(x.numpy())
         for x in (pyclarity_msbg(signal, ear, 16000), MSBG(ear, sample_rate=16000)(signal))
     ]
-    truth, heard = (spectrum[: len(spectrum) * 7 // 8] for spectrum in spectra)
-    return float(np.linalg.norm(heard - truth) / np.linalg.norm(truth))
+    expected, heard = (spectrum[: len(spectrum) * 7 // 8] for spectrum in spectra)
+    return float(np.linalg.norm(heard - expected) / np.linalg.norm(expected))
 
 
 def everyday(number: int, measured: list[Audiogram], generator: torch.Generator) -> tuple[Audiogram, float]:

@@ -8,38 +8,19 @@ import soundfile
 import torch
 from torch import Tensor
 
-from hlsim.calibration import is_finite
-
-LOWEST_RATE, HIGHEST_RATE = 16000, 48000
-"""Sample rates in Hz that simulators and compensators take."""
+from hlsim.checks import HIGHEST_RATE, check_rate, check_waveform, is_finite
+from hlsim.files import Whole
 
 EXTENSIONS = (".wav", ".flac", ".ogg")
-
 
 _STREAMED = 0x7FFF0000  # sizes from here on were written before the length was known: 0x7FFFF000, 0xFFFFFFFF
 
 _HIGHEST_STORED = {".wav": 2**31 - 1, ".flac": 655_350, ".ogg": 200_000}  # in Hz; libvorbis crashes beyond
-_SUBTYPES = {".wav": "FLOAT", ".flac": "PCM_24", ".ogg": "VORBIS"}
-
-
-def check_rate(sample_rate: int) -> int:
-    """Return the rate, or raise ValueError unless it is a whole number of Hz from 16000 to 48000."""
-    inside = is_finite(sample_rate) and LOWEST_RATE <= sample_rate <= HIGHEST_RATE
-    if not inside or int(sample_rate) != sample_rate:
-        raise ValueError(f"sample rate {sample_rate!r} Hz; allowed: {LOWEST_RATE} to {HIGHEST_RATE}")
-    return int(sample_rate)
-
-
-def check_waveform(waveform: Tensor, name: str = "waveform") -> Tensor:
-    """Return the waveform, or raise ValueError unless it is a floating-point (..., time) tensor with samples."""
-    if not isinstance(waveform, Tensor) or not waveform.is_floating_point():
-        kind = waveform.dtype if isinstance(waveform, Tensor) else type(waveform).__name__
-        raise ValueError(f"{name} is {kind}; allowed: a floating-point tensor (..., time)")
-    if waveform.ndim == 0 or waveform.numel() == 0:
-        raise ValueError(
-            f"{name} has shape {tuple(waveform.shape)}; allowed: (..., time) with at least one sample"
-        )
-    return waveform
+_FORMATS = {
+    ".wav": ("FLOAT", None, "WAV"),
+    ".flac": ("PCM_24", None, "FLAC"),
+    ".ogg": ("VORBIS", None, "OGG"),
+}
 
 
 def read_audio(path: str | Path, *, any_rate: bool = False) -> tuple[Tensor, int]:
@@ -127,7 +108,7 @@ def _refuse_cut(path: str | Path) -> None:
 def check_extension(path: str | Path) -> str:
     """Return the extension in lower case, or raise ValueError unless it is one that ``write_audio`` writes."""
     suffix = Path(path).suffix.lower()
-    if suffix not in _SUBTYPES:
+    if suffix not in _FORMATS:
         raise ValueError(
             f"{path}: cannot write {suffix or 'a file without extension'}; allowed: {', '.join(EXTENSIONS)}"
         )
@@ -160,7 +141,6 @@ def write_audio(path: str | Path, waveform: Tensor, sample_rate: int) -> None:
             such a file cannot hold, samples that are NaN or infinite, or, for flac and ogg, beyond full scale (they would
             be clipped).
     """
-    target = Path(path)
     suffix = check_extension(path)
     if check_waveform(waveform).ndim > 2:
         raise ValueError(f"{path}: shape {tuple(waveform.shape)}; allowed: (channels, time) or (time,)")
@@ -177,19 +157,14 @@ def write_audio(path: str | Path, waveform: Tensor, sample_rate: int) -> None:
         raise ValueError(
             f"{path}: samples reach {float(samples.abs().max()):.3g}, {suffix} holds 1.0; write .wav"
         )
-    partial = target.with_name(f".{target.name}.{os.getpid()}.part{suffix}")
-    try:
-        soundfile.write(
-            str(partial),
-            samples.mT.numpy() if samples.ndim == 2 else samples.numpy(),
-            rate,
-            subtype=_SUBTYPES[suffix],
-        )
-        os.replace(partial, target)
-    except (OSError, soundfile.LibsndfileError) as error:
-        raise ValueError(f"{path}: cannot be written ({error})") from error
-    finally:
-        partial.unlink(missing_ok=True)
+    with Whole(path, new_folder=False) as file:
+        try:
+            soundfile.write(
+                str(file.partial), samples.reshape(-1, samples.shape[-1]).mT.numpy(), rate, *_FORMATS[suffix]
+            )
+        except (OSError, soundfile.LibsndfileError) as error:
+            raise file.refusal(error) from error
+        file.keep()
 
 
 def encode_flac(waveform: Tensor, sample_rate: int) -> bytes:

@@ -1,4 +1,4 @@
-"""Hearing thresholds of one ear: validated, interpolated, read, written and drawn at random."""
+"""Hearing thresholds of one ear: validated, interpolated, read, written, drawn at random, and as simulators take them."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import re
 from bisect import bisect_left
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import reduce
+from functools import lru_cache, reduce
 from itertools import pairwise
 from operator import add
 from pathlib import Path
@@ -16,9 +16,12 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
+from hlsim.extras import require
 from hlsim.files import read_rows
+from hlsim.torchtools import constant, constant_like
 
 FREQUENCIES = (250.0, 500.0, 1000.0, 2000.0, 3000.0, 4000.0, 6000.0, 8000.0)
 """The audiometric frequencies in Hz that every simulator uses."""
@@ -172,8 +175,6 @@ class Audiogram:
 
     def to_clarity(self) -> Any:
         """The same ear as pyclarity's ``Audiogram`` (needs the extra ``eval``)."""
-        from hlsim.extras import require
-
         clarity = require("clarity.utils.audiogram", "eval")
         return clarity.Audiogram(levels=np.array(self.levels), frequencies=np.array(self.frequencies))
 
@@ -242,6 +243,68 @@ def as_thresholds(
     return levels
 
 
+def own_thresholds(audiogram: AudiogramLike | None, **limits: Any) -> Tensor | None:
+    """``as_thresholds`` to keep: a copy, for the caller may write into its tensor; one that is trained stays itself."""
+    if audiogram is None:
+        return None
+    with torch.inference_mode(False):  # it may be trained through later
+        levels = as_thresholds(audiogram, **limits)
+        return levels if levels.requires_grad else levels.clone()
+
+
+def resolve_thresholds(
+    stored: Tensor | None, audiogram: AudiogramLike | None, waveform: Tensor, **limits: Any
+) -> Tensor:
+    """The call's audiogram, or else the stored one, on the waveform's device, checked to fit its leading dimensions.
+
+    Args:
+        limits: of ``as_thresholds``.
+
+    Raises:
+        ValueError: there is neither, or the shapes do not broadcast.
+    """
+    if audiogram is None and stored is None:
+        raise ValueError("no audiogram: give one when building the simulator or with the call")
+    thresholds = as_thresholds(audiogram, **limits) if audiogram is not None else stored
+    assert thresholds is not None
+    try:
+        if thresholds.ndim > 1:
+            torch.broadcast_shapes(waveform.shape[:-1], thresholds.shape[:-1])
+    except RuntimeError:
+        raise ValueError(
+            f"audiograms of shape {tuple(thresholds.shape)} for a waveform of shape {tuple(waveform.shape)}; allowed: "
+            "one audiogram, or leading dimensions that broadcast"
+        ) from None
+    return thresholds.to(waveform.device)
+
+
+def interpolate(levels: Tensor, hz: tuple[float, ...]) -> Tensor:
+    """Levels between the audiometric frequencies, linear in Hz and flat beyond. Shape: (..., 8) -> (..., frequencies)."""
+    right = constant(_right, hz, dtype=torch.int64, device=levels.device)
+    place = constant_like(levels, _place, hz)
+    return levels[..., right - 1] * (1.0 - place) + levels[..., right] * place
+
+
+@lru_cache(maxsize=8)
+def interpolation_weights(hz: tuple[float, ...]) -> NDArray[np.float64]:
+    """``interpolate`` as a matrix. Returns (8, frequencies)."""
+    one, right, place = np.eye(len(FREQUENCIES)), _right(hz), _place(hz)
+    weights: NDArray[np.float64] = one[:, right - 1] * (1.0 - place) + one[:, right] * place
+    return weights
+
+
+def _right(hz: tuple[float, ...]) -> NDArray[np.int64]:
+    """Index of the audiometric frequency at or above each one, but for the first."""
+    return np.searchsorted(FREQUENCIES, hz).clip(1, len(FREQUENCIES) - 1)
+
+
+def _place(hz: tuple[float, ...]) -> NDArray[np.float64]:
+    """Where each lies between the audiometric frequencies around it, 0 to 1."""
+    points, right = np.array(FREQUENCIES), _right(hz)
+    place: NDArray[np.float64] = (np.array(hz) - points[right - 1]) / (points[right] - points[right - 1])
+    return place.clip(0.0, 1.0)
+
+
 def _taken(levels: Sequence[float], highest: float, taker: str) -> Sequence[float]:
     """The levels, or ValueError where the taker does not take them."""
     if not all(LOWEST_LEVEL <= level <= highest for level in levels):
@@ -255,7 +318,7 @@ def _taken(levels: Sequence[float], highest: float, taker: str) -> Sequence[floa
 def _instead(given: object) -> str:
     """What to write in place of something that is no audiogram but holds one."""
     several = isinstance(given, list | tuple) and len(given) > 0
-    first = given[0] if isinstance(given, list | tuple) and given else given
+    first: Any = given[0] if several else given  # type: ignore[index]
     if isinstance(first, str) and first in STANDARD:
         make = f"Audiogram.standard({first!r})"
     elif isinstance(first, Mapping):
@@ -269,15 +332,6 @@ def _instead(given: object) -> str:
     else:
         return ""
     return f"; write {f'[{make}, ...]' if several else make}"
-
-
-def own_thresholds(audiogram: AudiogramLike | None, **limits: Any) -> Tensor | None:
-    """``as_thresholds`` to keep: a copy, for the caller may write into its tensor; one that is trained stays itself."""
-    if audiogram is None:
-        return None
-    with torch.inference_mode(False):  # it may be trained through later
-        levels = as_thresholds(audiogram, **limits)
-        return levels if levels.requires_grad else levels.clone()
 
 
 def read_audiograms(path: str | Path, *, simulated: bool = False) -> list[tuple[dict[str, str], Audiogram]]:

@@ -4,27 +4,15 @@ A signal inside hlsim is in pascals over the root-mean-square pressure of 94 dB 
 as 94): RMS 1.0 is 94 dB SPL. ``full_scale_spl`` says what RMS 1.0 is in somebody else's file or tensor.
 """
 
-import math
-from numbers import Real
-from typing import Any
-
 import torch
 from torch import Tensor
+
+from hlsim.checks import is_finite
 
 PASCAL_SPL = 94.0
 """Level in dB SPL of a signal in pascals whose RMS is 1.0."""
 
 _LOWEST_POWER = 1e-20  # -106 dB SPL: keeps the level of silence finite
-
-
-def is_finite(value: Any) -> bool:
-    """Whether it is a finite number, Python's or numpy's; a bool is none."""
-    if not isinstance(value, Real) or isinstance(value, bool):
-        return False
-    try:
-        return math.isfinite(value)
-    except OverflowError:  # a whole number that no float holds
-        return False
 
 
 def check_full_scale(full_scale_spl: float) -> float:

@@ -1,4 +1,4 @@
-"""Checks of settings, weights, seeds and lengths: what is refused is told with what is allowed."""
+"""Checks of values: settings first, then rates, waveforms and lengths; what is refused is told with what is allowed."""
 
 from __future__ import annotations
 
@@ -6,10 +6,17 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields
 from decimal import Decimal, InvalidOperation
+from numbers import Real
 from typing import Any, get_type_hints
 
 import torch
 from torch import Tensor
+
+LOWEST_RATE, HIGHEST_RATE = 16000, 48000
+"""Sample rates in Hz that simulators and compensators take."""
+
+Lengths = Tensor | Sequence[int]
+"""Samples of each item, in the shape of the leading dimensions."""
 
 _KINDS = {int: "a whole number", float: "a number", bool: "true or false", str: "text"}
 
@@ -96,8 +103,34 @@ def _as_number(text: str) -> str | None:
     return f"{plain} or {mantissa if '.' in mantissa else mantissa + '.0'}e{exponent}"
 
 
-Lengths = Tensor | Sequence[int]
-"""Samples of each item, in the shape of the leading dimensions."""
+def is_finite(value: Any) -> bool:
+    """Whether it is a finite number, Python's or numpy's; a bool is none."""
+    if not isinstance(value, Real) or isinstance(value, bool):
+        return False
+    try:
+        return math.isfinite(value)
+    except OverflowError:  # a whole number that no float holds
+        return False
+
+
+def check_rate(sample_rate: int) -> int:
+    """Return the rate, or raise ValueError unless it is a whole number of Hz from 16000 to 48000."""
+    inside = is_finite(sample_rate) and LOWEST_RATE <= sample_rate <= HIGHEST_RATE
+    if not inside or int(sample_rate) != sample_rate:
+        raise ValueError(f"sample rate {sample_rate!r} Hz; allowed: {LOWEST_RATE} to {HIGHEST_RATE}")
+    return int(sample_rate)
+
+
+def check_waveform(waveform: Tensor, name: str = "waveform") -> Tensor:
+    """Return the waveform, or raise ValueError unless it is a floating-point (..., time) tensor with samples."""
+    if not isinstance(waveform, Tensor) or not waveform.is_floating_point():
+        kind = waveform.dtype if isinstance(waveform, Tensor) else type(waveform).__name__
+        raise ValueError(f"{name} is {kind}; allowed: a floating-point tensor (..., time)")
+    if waveform.ndim == 0 or waveform.numel() == 0:
+        raise ValueError(
+            f"{name} has shape {tuple(waveform.shape)}; allowed: (..., time) with at least one sample"
+        )
+    return waveform
 
 
 def check_lengths(lengths: Lengths, shape: torch.Size) -> Tensor:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 from pathlib import Path
 
@@ -10,8 +9,10 @@ import torch
 from torch import Tensor, nn
 
 from hlsim.audiogram import FREQUENCIES
-from hlsim.calibration import gain_to_pascals, is_finite
+from hlsim.calibration import gain_to_pascals
+from hlsim.checks import is_finite
 from hlsim.extras import require
+from hlsim.files import Whole
 from hlsim.neuro import NeuroMSBG
 from hlsim.neuro.config import NEURO_RATE
 
@@ -82,18 +83,16 @@ def export_onnx(simulator: nn.Module, path: str | Path, *, seconds: float = 1.0,
         require(module, "dev")
     program = export_program(simulator, seconds=seconds, items=items)
     assert isinstance(simulator, NeuroMSBG)  # others are refused there
-    partial = target.with_name(f".{target.name}.{os.getpid()}.part")
     try:
-        # not optimised: onnxscript's rules take a constant under 1e-8 for zero, and log(x + 1e-12) for log(x)
-        converted = torch.onnx.export(program, dynamo=True, verbose=False, optimize=False)
-        assert converted is not None
-        converted.save(str(partial), external_data=False)
-        _check(partial, program, 0.03 / gain_to_pascals(simulator.full_scale_spl))
-        os.replace(partial, target)
+        with Whole(target) as file:
+            # not optimised: onnxscript's rules take a constant under 1e-8 for zero, and log(x + 1e-12) for log(x)
+            converted = torch.onnx.export(program, dynamo=True, verbose=False, optimize=False)
+            assert converted is not None
+            converted.save(str(file.partial), external_data=False)
+            _check(file.partial, program, 0.03 / gain_to_pascals(simulator.full_scale_spl))
+            file.keep()
     except torch.onnx.errors.OnnxExporterError as error:
         raise ValueError(f"ONNX cannot take the simulator: {_reason(error)}") from error
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 def _check(path: Path, program: torch.export.ExportedProgram, level: float) -> None:
@@ -115,7 +114,7 @@ def _check(path: Path, program: torch.export.ExportedProgram, level: float) -> N
         (heard,) = session.run(
             None, {name: tensor.cpu().numpy() for name, tensor in zip(names, given, strict=True)}
         )
-    except Exception as error:  # onnxruntime has a class of its own for each kind of refusal
+    except Exception as error:  # onnxruntime has a class for each kind of refusal
         reason = str(error).split("failed:", 1)[-1].strip().splitlines()[0]
         raise ValueError(
             f"ONNX cannot take the simulator: onnxruntime refuses the file ({reason})"

@@ -1,4 +1,7 @@
-"""Files that are written whole or not at all, and rows of CSV files as people and spreadsheets write them."""
+"""Files and folders that are written whole or not at all, by one process at a time; rows of CSV files.
+
+Everything that hlsim leaves on a disk is first written under a temporary name beside its place, and then renamed.
+"""
 
 from __future__ import annotations
 
@@ -6,8 +9,11 @@ import csv
 import errno
 import hashlib
 import os
+import re
+import shutil
+import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from itertools import zip_longest
 from pathlib import Path
 from types import TracebackType
@@ -23,7 +29,7 @@ PARTIAL = ".part"
 
 
 @contextmanager
-def alone(path: Path) -> Iterator[None]:
+def file_lock(path: Path) -> Iterator[None]:
     """Be the only process that holds this file, which exists; it ends with the process, however that ends.
 
     Raises:
@@ -43,23 +49,30 @@ def alone(path: Path) -> Iterator[None]:
 
 
 class Whole:
-    """A file under a temporary name, until ``keep`` gives it its own; left without that, it is removed.
+    """A file under a temporary name, until ``keep`` gives it the right one; left without that, it is removed.
+
+    Args:
+        new_folder: make the folder that it is in, if need be.
+
+    Attributes:
+        partial: the temporary name, for libraries that write by themselves.
 
     Raises:
         ValueError: it cannot be written; the message says so where the disk is full.
     """
 
-    def __init__(self, path: str | Path) -> None:
-        self.path = Path(path)
-        self._partial = self.path.with_name(f".{self.path.name}.{os.getpid()}{PARTIAL}")
+    def __init__(self, path: str | Path, *, new_folder: bool = True) -> None:
+        self.path, self._new_folder = Path(path), new_folder
+        self.partial = self.path.with_name(f".{self.path.name}.{os.getpid()}{PARTIAL}")
         self._file: IO[bytes] | None = None
 
     def __enter__(self) -> Self:
         try:
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            self._file = open(self._partial, "wb")
+            if self._new_folder:
+                self.path.parent.mkdir(parents=True, exist_ok=True)
+            self._file = open(self.partial, "wb")
         except OSError as error:
-            raise self._refusal(error) from error
+            raise self.refusal(error) from error
         return self
 
     def write(self, data: str | bytes) -> None:
@@ -67,16 +80,16 @@ class Whole:
         try:
             self._file.write(data.encode(errors="backslashreplace") if isinstance(data, str) else data)
         except OSError as error:
-            raise self._refusal(error) from error
+            raise self.refusal(error) from error
 
     def keep(self) -> None:
         """End the file and give it its name, over what had it."""
         assert self._file is not None
         try:
             self._file.close()
-            os.replace(self._partial, self.path)
+            os.replace(self.partial, self.path)
         except OSError as error:
-            raise self._refusal(error) from error
+            raise self.refusal(error) from error
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
@@ -87,21 +100,16 @@ class Whole:
         except OSError:
             pass  # what could not be flushed is thrown away
         finally:
-            self._partial.unlink(missing_ok=True)
+            self.partial.unlink(missing_ok=True)
 
-    def _refusal(self, error: OSError) -> ValueError:
-        if error.errno in (errno.ENOSPC, errno.EDQUOT):
+    def refusal(self, error: Exception) -> ValueError:
+        """What to raise where writing failed."""
+        if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
             return ValueError(
                 f"{self.path}: the disk is full; what was finished is kept, and with more space the same command goes on "
                 "from there"
             )
-        return ValueError(f"{self.path}: cannot be written ({error.strerror})")
-
-
-def sha256(path: Path) -> str:
-    """Of what a file holds."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+        return ValueError(f"{self.path}: cannot be written ({getattr(error, 'strerror', None) or error})")
 
 
 def write_whole(path: str | Path, data: str | bytes) -> None:
@@ -109,6 +117,51 @@ def write_whole(path: str | Path, data: str | bytes) -> None:
     with Whole(path) as file:
         file.write(data)
         file.keep()
+
+
+@contextmanager
+def whole_folder(folder: Path) -> Iterator[Path]:
+    """A folder to fill; it takes its name at the end, and an older one of that name goes.
+
+    Left by an error, the older one stays; killed, ``repair_folder`` brings it back.
+    """
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    repair_folder(folder)
+    staging, old = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent)), _old(folder)
+    try:
+        yield staging
+        staging.chmod(0o755)
+        shutil.rmtree(old, ignore_errors=True)
+        if folder.exists():
+            os.replace(folder, old)
+        os.replace(staging, folder)
+        shutil.rmtree(old, ignore_errors=True)
+    finally:
+        shutil.rmtree(staging, ignore_errors=True)
+        if old.exists() and not folder.exists():
+            os.replace(old, folder)
+
+
+def repair_folder(folder: Path) -> None:
+    """Undo what a kill within ``whole_folder`` left: the older folder gets its name back, and the rest goes."""
+    old = _old(folder)
+    if old.exists() and not folder.exists():
+        with suppress(FileNotFoundError):  # another process was first
+            os.replace(old, folder)
+    staged = re.compile(rf"\.{re.escape(folder.name)}\.[a-z0-9_]{{8}}")  # as mkdtemp names it
+    for path in folder.parent.glob(f".{folder.name}.*"):
+        if path.is_dir() and staged.fullmatch(path.name):
+            shutil.rmtree(path, ignore_errors=True)
+
+
+def _old(folder: Path) -> Path:
+    return folder.with_name(f".{folder.name}.old")
+
+
+def sha256(path: Path) -> str:
+    """Of what a file holds."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def read_rows(path: str | Path) -> Iterator[tuple[int, dict[str, str]]]:

@@ -8,10 +8,9 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from hlsim.audio import check_rate, check_waveform
 from hlsim.audiogram import FREQUENCIES, AudiogramLike, as_thresholds, own_thresholds
-from hlsim.calibration import PASCAL_SPL, check_full_scale, gain_to_pascals, is_finite
-from hlsim.checks import Lengths, check_lengths, silent_after
+from hlsim.calibration import PASCAL_SPL, check_full_scale, gain_to_pascals
+from hlsim.checks import Lengths, check_lengths, check_rate, check_waveform, is_finite, silent_after
 from hlsim.criteria import paper
 from hlsim.criteria.bands import HIGHEST, band_level_loss
 from hlsim.dsp.resample import resample

@@ -1,12 +1,9 @@
 """Checkpoints: a folder of safetensors, a JSON configuration with its hash, and a model card. No pickle."""
 
-import contextlib
 import hashlib
 import json
 import os
-import re
 import shutil
-import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
@@ -17,6 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from hlsim.calibration import PASCAL_SPL
+from hlsim.files import whole_folder
 from hlsim.neuro.config import NEURO_RATE, NetworkConfig, NeuroConfig
 from hlsim.neuro.model import NeuroMSBG
 from hlsim.torchtools import lasting
@@ -72,7 +70,7 @@ def read_checkpoint(
     """
     folder = find_checkpoint(name, kind, also)
     try:
-        record = json.loads((folder / CONFIG).read_text(encoding="utf-8"))
+        record = _record(folder)
         weights = (folder / WEIGHTS).read_bytes()
     except (OSError, ValueError) as error:
         raise ValueError(f"{folder}: not readable as a checkpoint ({error})") from error
@@ -108,7 +106,7 @@ def read_checkpoint(
 
 
 def find_checkpoint(name: str | Path, kind: str | None = None, also: Sequence[str] = ()) -> Path:
-    """The folder of a checkpoint that ships with hlsim, or of one's own.
+    """The folder of a checkpoint that ships with hlsim, or another.
 
     Args:
         kind: of those that the message lists; None lists all.
@@ -121,8 +119,8 @@ def find_checkpoint(name: str | Path, kind: str | None = None, also: Sequence[st
         raise ValueError(f"checkpoint is {type(name).__name__}; allowed: a name or a folder")
     if (Path(name) / CONFIG).is_file():
         return Path(name)
-    if str(name) in (own := shipped()):
-        return own[str(name)]
+    if str(name) in (ours := shipped()):
+        return ours[str(name)]
     names = [*also, *shipped(kind)]
     inner = Path(name) / "checkpoint"  # as a training leaves it
     hint = f", but {str(inner)!r} is one" if (inner / CONFIG).is_file() else ""
@@ -135,24 +133,18 @@ def find_checkpoint(name: str | Path, kind: str | None = None, also: Sequence[st
 
 def checkpoint_digest(name: str | Path) -> str:
     """The SHA-256 of a checkpoint's weights, as it tells it. Raises ValueError where there is no such checkpoint."""
-    record = json.loads((find_checkpoint(name) / CONFIG).read_text(encoding="utf-8"))
-    return str(record["sha256"])
+    return str(_record(find_checkpoint(name))["sha256"])
 
 
 def checkpoint_about(name: str | Path) -> dict[str, Any]:
     """How a checkpoint was trained, as it tells it. Raises ValueError where there is no such checkpoint."""
-    record = json.loads((find_checkpoint(name) / CONFIG).read_text(encoding="utf-8"))
-    return dict(record.get("about") or {})
+    return dict(_record(find_checkpoint(name)).get("about") or {})
 
 
 def shipped(kind: str | None = None) -> dict[str, Path]:
     """The checkpoints that ship with hlsim, name and folder; all kinds by default."""
-    records = sorted(checkpoints_folder().glob(f"*/{CONFIG}"))
-    if kind is not None:
-        records = [
-            path for path in records if json.loads(path.read_text(encoding="utf-8")).get("kind") == kind
-        ]
-    return {path.parent.name: path.parent for path in records}
+    folders = (path.parent for path in sorted(checkpoints_folder().glob(f"*/{CONFIG}")))
+    return {folder.name: folder for folder in folders if kind is None or _record(folder).get("kind") == kind}
 
 
 def checkpoints_folder() -> Path:
@@ -175,10 +167,13 @@ def save_checkpoint(
     Args:
         about: how it was trained: data, seed, command, time, metrics, version. Stored beside the configuration.
         card: text of its README.md; an existing card is kept where this is empty.
+
+    Raises:
+        ValueError: the folder holds something else.
     """
     target = Path(folder)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    repair_checkpoint(target)
+    if not ((target / CONFIG).is_file() or _is_empty(target)):
+        raise ValueError(f"{target}: holds something else; allowed: a new folder, or that of a checkpoint")
     state: dict[str, Tensor] = {
         name: tensor.detach().cpu().contiguous() for name, tensor in model.state_dict().items()
     }
@@ -190,44 +185,23 @@ def save_checkpoint(
         "config_sha256": _digest(dict(config)),
         "about": dict(about),
     }
-    staging = Path(tempfile.mkdtemp(prefix=f".{target.name}.", dir=target.parent))
-    old = _old(target)
-    try:
+    with whole_folder(target) as staging:
         (staging / WEIGHTS).write_bytes(weights)
         (staging / CONFIG).write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
         if card:
             (staging / CARD).write_text(card, encoding="utf-8")
         elif (target / CARD).is_file():
             shutil.copy(target / CARD, staging / CARD)
-        staging.chmod(0o755)
-        shutil.rmtree(old, ignore_errors=True)
-        if target.exists():
-            os.replace(target, old)
-        os.replace(staging, target)
-        shutil.rmtree(old, ignore_errors=True)
-    finally:
-        shutil.rmtree(staging, ignore_errors=True)
-        if old.exists() and not target.exists():
-            os.replace(old, target)
 
 
-def repair_checkpoint(folder: str | Path) -> None:
-    """Undo what a kill within ``save_checkpoint`` left: the older checkpoint gets its name back, and the rest goes."""
-    target = Path(folder)
-    old = _old(target)
-    if old.exists() and not target.exists():
-        with contextlib.suppress(FileNotFoundError):  # another process of the training was first
-            os.replace(old, target)
-    staged = re.compile(rf"\.{re.escape(target.name)}\.[a-z0-9_]{{8}}")  # as mkdtemp names it
-    for path in target.parent.glob(f".{target.name}.*"):
-        if path.is_dir() and staged.fullmatch(path.name):
-            shutil.rmtree(path, ignore_errors=True)
+def _is_empty(folder: Path) -> bool:
+    return not any(folder.iterdir()) if folder.is_dir() else not folder.exists()
+
+
+def _record(folder: Path) -> Any:
+    return json.loads((folder / CONFIG).read_text(encoding="utf-8"))
 
 
 def _digest(config: Any) -> str:
     """The SHA-256 of a configuration, whatever the order of its names."""
     return hashlib.sha256(json.dumps(config, sort_keys=True).encode()).hexdigest()
-
-
-def _old(target: Path) -> Path:
-    return target.with_name(f".{target.name}.old")

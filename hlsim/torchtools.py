@@ -1,11 +1,14 @@
-"""Where torch needs help: what its compiler and modes are to leave as it is, constants on devices, freed memory."""
+"""Where torch needs help: what its compiler leaves as it is, tensors that are made once, and freed memory."""
 
 import ctypes
+from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import lru_cache, wraps
+from functools import wraps
+from threading import RLock
 from typing import Any, ParamSpec, TypeVar
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -33,26 +36,72 @@ def lasting() -> Iterator[None]:
 
 
 def constant(make: Callable[..., Any], *arguments: Any, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """What ``make`` returns for these arguments, an array or numbers, as a tensor that nobody may write into."""
+    """What ``make`` returns for these arguments as a tensor that nobody may write into, made once.
+
+    Args:
+        make: a function of a module, which returns an array or numbers.
+        dtype: the tensor's, or, where the values are complex, the real type of its parts.
+    """
+    tensor: Tensor = made_once(_constant, make, arguments, dtype, device)
+    return tensor
+
+
+def constant_like(like: Tensor, make: Callable[..., Any], *arguments: Any) -> Tensor:
+    """``constant`` of the type, complex or not, and on the device of a tensor."""
+    dtype = like.dtype.to_real() if like.is_complex() else like.dtype
+    return constant(make, *arguments, dtype=dtype, device=like.device)
+
+
+def made_once(make: Callable[..., Any], *arguments: Any) -> Any:
+    """What ``make`` returns for these arguments: a tensor or another object with ``nbytes``.
+
+    The process keeps what was asked for last, no model does: nothing of it is stored or copied.
+    """
     # what a trace or a mode, as that of fake tensors, makes is of no use to others
     if torch.compiler.is_compiling() or torch._C._len_torch_dispatch_stack():
-        return _made(make, arguments, dtype, device)
-    return _kept(make, arguments, dtype, device)
+        return make(*arguments)
+    return _KEPT.get(make, arguments)
 
 
-def _made(
+def as_tensor(values: Any, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Real or complex values as a tensor of ``dtype`` or its complex counterpart."""
+    tensor = torch.as_tensor(np.ascontiguousarray(values) if isinstance(values, np.ndarray) else values)
+    return tensor.to(device=device, dtype=dtype.to_complex() if tensor.is_complex() else dtype)
+
+
+def _constant(
     make: Callable[..., Any], arguments: tuple[Any, ...], dtype: torch.dtype, device: torch.device
 ) -> Tensor:
-    return torch.as_tensor(make(*arguments)).to(device=device, dtype=dtype)
+    return as_tensor(make(*arguments), dtype, device)
 
 
-@lru_cache(maxsize=128)
-def _kept(
-    make: Callable[..., Any], arguments: tuple[Any, ...], dtype: torch.dtype, device: torch.device
-) -> Tensor:
-    with lasting():
-        return _made(make, arguments, dtype, device)
+class _Kept:
+    """The results asked for last, up to ``limit`` bytes of them: MSBG's filters take 5 MiB a second of signal."""
 
+    def __init__(self, limit: int) -> None:
+        self.limit = limit
+        self._results: OrderedDict[Any, Any] = OrderedDict()
+        self._lock = RLock()  # modules may run in threads
+
+    def get(self, make: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:
+        key = make, arguments
+        with self._lock:
+            if key in self._results:
+                self._results.move_to_end(key)
+            else:
+                with lasting():
+                    self._results[key] = make(*arguments)
+                while len(self._results) > 1 and self.held > self.limit:
+                    self._results.popitem(last=False)
+            return self._results[key]
+
+    @property
+    def held(self) -> int:
+        """Bytes of all."""
+        return sum(result.nbytes for result in self._results.values())
+
+
+_KEPT = _Kept(2**28)
 
 # of glibc's malloc.h
 _TRIM_THRESHOLD, _MMAP_MAX = -1, -4
@@ -62,7 +111,7 @@ def keep_freed_memory() -> bool:
     """Let the process keep what it frees, for a training step asks for the same hundreds of megabytes as the one before.
 
     By default glibc returns them, and the next step pays for every page of 4 KiB anew: up to 40 % of its time on a CPU.
-    For programs of our own; a library leaves the process to its host, which can set ``MALLOC_TRIM_THRESHOLD_`` and
+    For hlsim's programs; a library leaves the process to its host, which can set ``MALLOC_TRIM_THRESHOLD_`` and
     ``MALLOC_MMAP_MAX_`` in the environment.
 
     Returns: whether the C library is one that can.

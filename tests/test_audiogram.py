@@ -21,6 +21,8 @@ from hlsim.audiogram import (
     Audiogram,
     as_thresholds,
     draw_thresholds,
+    interpolate,
+    interpolation_weights,
     read_audiograms,
     severity_index,
     severity_of,
@@ -452,3 +454,16 @@ def test_drawing_depends_on_the_generator_alone() -> None:
     assert torch.equal(first, draw_thresholds(64, torch.Generator().manual_seed(5)))
     assert not torch.equal(first, draw_thresholds(64, torch.Generator().manual_seed(6)))
     as_thresholds(first)  # every one is fit for a simulator
+
+
+def test_interpolation_is_linear_in_hz_and_flat_beyond() -> None:
+    hz = (0.0, 250.0, 251.0, 750.0, 1000.0, 2500.0, 7000.0, 8000.0, 12000.0)
+    levels = draw_thresholds(6).reshape(2, 3, 8)
+    expected = np.array([np.interp(hz, FREQUENCIES, ear) for ear in levels.reshape(6, 8).double().numpy()])
+    for ears in (levels, levels.double()):
+        found = interpolate(ears, hz)
+        assert found.shape == (2, 3, 9) and found.dtype == ears.dtype
+        np.testing.assert_allclose(found.reshape(6, 9).numpy(), expected, rtol=1e-5)
+    np.testing.assert_allclose(
+        levels.reshape(6, 8).double().numpy() @ interpolation_weights(hz), expected, rtol=1e-12
+    )

@@ -1,13 +1,17 @@
-"""Settings: values of another kind are refused in both recipes, and the message says what to write."""
+"""Checks: values of another kind are refused in both recipes, and the message says what to write; rates and waveforms."""
 
+import math
 from typing import Any
 
 import pytest
 
 pytest.importorskip("lightning")
 
+import numpy as np
+import torch
 import yaml
 
+from hlsim.checks import check_rate, check_waveform
 from hlsim.training.compensator import CompensatorRecipe
 from hlsim.training.simulator import SimulatorRecipe
 
@@ -65,3 +69,25 @@ def test_other_names() -> None:
         SimulatorRecipe.from_dict({"treated": "no way"})
     with pytest.raises(ValueError, match=r"precision 16 in the recipe; allowed: text"):
         SimulatorRecipe.from_dict({"precision": 16})
+
+
+@pytest.mark.parametrize(
+    "rate",
+    [15999, 48001, 16000.5, -16000, 0, math.nan, math.inf, 10**400, None, "16k", "16000", True, [16000]],
+)
+def test_rates_out_of_range(rate: Any) -> None:
+    with pytest.raises(ValueError, match=r"sample rate .* Hz; allowed: 16000 to 48000"):
+        check_rate(rate)
+
+
+@pytest.mark.parametrize("rate", [16000, 44100.0, 48000, np.int64(16000), np.float32(16000)])
+def test_rates_in_range_come_back_whole(rate: int) -> None:
+    assert check_rate(rate) == rate and type(check_rate(rate)) is int
+
+
+@pytest.mark.parametrize(
+    "wave", [torch.zeros(10, dtype=torch.int16), np.zeros(10), None, torch.tensor(1.0), torch.zeros(2, 0)]
+)
+def test_what_is_no_waveform(wave: Any) -> None:
+    with pytest.raises(ValueError, match=r"heard (is|has shape) .*; allowed: .*\(\.\.\., time\)"):
+        check_waveform(wave, "heard")

@@ -11,7 +11,7 @@ import torch
 
 from hlsim import MSBG, Audiogram
 from hlsim.audio import read_audio, write_audio
-from hlsim.msbg.ear import RATE
+from hlsim.msbg.ear import MSBG_RATE
 from hlsim.msbg.filterbank import BANKS, gammatone_response
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
@@ -68,7 +68,7 @@ def test_delay_by_frequency(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Capt
     given = example.bursts()
     assert example.left_of_the_delay(given.roll(-7, -1), given) == [-7] * len(example.HERTZ)
     # with no loss the model is linear: of 33 samples remains what the sum of the channels does not take back
-    points = 4 * RATE
+    points = 4 * MSBG_RATE
     response = gammatone_response(BANKS["none"], points).sum(0)
     advance = np.gradient(np.unwrap(np.angle(response)), 2 * np.pi / points)
     spectra = np.abs(np.fft.rfft(given.numpy(), points) * response) ** 2

@@ -11,8 +11,9 @@ import torch
 
 from compensators import load_compensator
 from hlsim import NeuroMSBG, load_pretrained
+from hlsim.files import repair_folder
 from hlsim.neuro import NeuroConfig
-from hlsim.pretrained import checkpoints_folder, find_checkpoint, repair_checkpoint, save_checkpoint, shipped
+from hlsim.pretrained import checkpoints_folder, find_checkpoint, save_checkpoint, shipped
 
 SMALL = NeuroConfig(channels=4, blocks=1)
 
@@ -229,7 +230,7 @@ def test_a_kill_between_the_renames_loses_nothing(folder: Path, again: bool) -> 
     if again:
         save_checkpoint(folder, "neuro-msbg", NeuroMSBG(SMALL), SMALL.to_dict(), {})
     else:
-        repair_checkpoint(folder)
+        repair_folder(folder)
     assert {path.name for path in parent.iterdir()} == {"small", ".small.er.abcd_123"}
     assert (folder / "README.md").read_text() == "# small\n"
     load_pretrained(folder)

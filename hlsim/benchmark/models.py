@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from hlsim.audiogram import FREQUENCIES, Audiogram
 from hlsim.extras import MissingExtraError, require
 from hlsim.msbg import MSBG
-from hlsim.msbg.ear import RATE as MSBG_RATE
+from hlsim.msbg.ear import MSBG_RATE
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.pretrained import SIMULATOR, load_pretrained, shipped
 

@@ -67,7 +67,8 @@ def _pass_through(options: argparse.Namespace, build: Callable[[int], nn.Module]
     ear = read_ear(options.audiogram)
     import torch
 
-    from hlsim.audio import HIGHEST_RATE, check_channels, read_audio, write_audio
+    from hlsim.audio import check_channels, read_audio, write_audio
+    from hlsim.checks import HIGHEST_RATE
     from hlsim.dsp.resample import resample
 
     waveform, rate = read_audio(options.input, any_rate=True)

@@ -1,6 +1,5 @@
 """Levels in bands one ERB wide or so, and how far what is heard lies from what a normal ear hears."""
 
-import math
 from functools import lru_cache
 
 import numpy as np
@@ -9,6 +8,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from hlsim.calibration import PASCAL_SPL
+from hlsim.dsp.erb import erb_frequency, erb_number
 from hlsim.dsp.fft import power
 from hlsim.dsp.stft import STFT
 from hlsim.torchtools import constant
@@ -90,10 +90,8 @@ def audibility(levels: Tensor, least: Tensor) -> Tensor:
 
 def band_edges() -> NDArray[np.float64]:
     """Edges of the bands in Hz. Returns (25,)."""
-    low, high = (21.4 * math.log10(1.0 + 0.00437 * hz) for hz in (LOWEST, HIGHEST))
-    numbers = np.linspace(low, high, BANDS + 1)
-    edges: NDArray[np.float64] = (10.0 ** (numbers / 21.4) - 1.0) / 0.00437
-    return edges
+    lowest, highest = erb_number(np.array([LOWEST, HIGHEST]))
+    return erb_frequency(np.linspace(lowest, highest, BANDS + 1))
 
 
 @lru_cache(maxsize=16)

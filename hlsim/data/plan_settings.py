@@ -7,8 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from hlsim.audio import check_rate
-from hlsim.checks import refuse_unknown
+from hlsim.checks import check_rate, refuse_unknown
 from hlsim.data.corpora import LAYOUTS
 from hlsim.data.noises import TEST_SNRS_DB, TEST_TYPES, TRAIN_SNRS_DB, TRAIN_TYPES
 

@@ -12,7 +12,7 @@ from torch.nn import functional
 from hlsim.audiogram import Audiogram
 from hlsim.checks import refuse_unknown
 from hlsim.msbg import MSBG, estimate_delay
-from hlsim.msbg.ear import RATE
+from hlsim.msbg.ear import MSBG_RATE
 
 TEACHERS = ("msbg", "pyclarity")
 ALIGNMENTS = ("structural", "impulse", "none")
@@ -97,7 +97,7 @@ class Teacher(nn.Module):
             unaligned = MSBG(sample_rate=self.sample_rate, aligned=False)
             delay = estimate_delay(unaligned, Audiogram(ear))
             if self.reference is not None:  # it has been advanced by the structural delay
-                delay -= round(unaligned.delay(Audiogram(ear).severity) * self.sample_rate / RATE)
+                delay -= round(unaligned.delay(Audiogram(ear).severity) * self.sample_rate / MSBG_RATE)
             self._delays[ear] = delay
         return self._delays[ear]
 
@@ -111,7 +111,7 @@ class Teacher(nn.Module):
 
 def grid_of(sample_rate: int) -> int:
     """Samples from one place where a frame of MSBG's smearing starts to the next that falls on a sample."""
-    return _FRAME * sample_rate // math.gcd(_FRAME * sample_rate, RATE)
+    return _FRAME * sample_rate // math.gcd(_FRAME * sample_rate, MSBG_RATE)
 
 
 def check_grid(sample_rate: int) -> int:

@@ -14,7 +14,7 @@ from hlsim.data.corpora import Fault
 from hlsim.data.instances import CLAIM, MANIFEST, Plan, is_whole
 from hlsim.data.manifest import csv_line
 from hlsim.data.teacher import Reference, Teacher
-from hlsim.files import PARTIAL, alone, write_whole
+from hlsim.files import PARTIAL, file_lock, write_whole
 from hlsim.parallel import run_parallel
 
 WRITE_FAULTS = "write-faults.csv"
@@ -59,7 +59,7 @@ def write_instances(
             ``write-faults.csv`` names the files.
     """
     plan = Plan(folder, root)
-    with alone(plan.folder / MANIFEST):  # what others have begun would look like leftovers
+    with file_lock(plan.folder / MANIFEST):  # what others have begun would look like leftovers
         return _write(plan, recipe, jobs=jobs, backend=backend, scheduler=scheduler, progress=progress)
 
 

@@ -1,4 +1,4 @@
-"""FIR filters: design by frequency sampling, and filtering through transforms."""
+"""FIR filters: designed by frequency sampling, and run through Fourier transforms."""
 
 import math
 
@@ -9,6 +9,9 @@ from torch import Tensor
 from torch.nn import functional
 
 from hlsim.dsp.fft import fft_length, long_irfft, long_rfft
+
+BLOCK_POINTS, _HOP = 4096, 3072
+"""FFT length of ``filter_blocks``, and samples from block to block."""
 
 _GRID = 512
 
@@ -44,19 +47,14 @@ def frequency_sampling_fir(
     return impulse[:taps] * window
 
 
-_BLOCK, _HOP = 4096, 3072
-"""Blocks of ``filter_blocks``; taps may be 1025 at most."""
-
-
 def filter_centred(waveform: Tensor, taps: Tensor) -> Tensor:
-    """FIR of as many samples before as after, which does not delay. Shape: (..., time), (..., 2 reach) -> (..., time)."""
-    time, reach = waveform.shape[-1], taps.shape[-1] // 2
-    points = fft_length(time + 2 * reach, 4)
+    """FIR of as many samples before as after, which does not delay. Shape: (..., time), (..., 2 half) -> (..., time)."""
+    time, half = waveform.shape[-1], taps.shape[-1] // 2
+    points = fft_length(time + 2 * half, 4)
     if torch.compiler.is_exporting():
         points = 1 << (points - 1).bit_length()  # at other lengths onnxruntime is off by 1e-3 to 1e-2
-    return long_irfft(long_rfft(waveform, points) * long_rfft(taps, points), points)[
-        ..., reach : reach + time
-    ]
+    product = long_rfft(waveform, points) * long_rfft(taps, points)
+    return long_irfft(product, points)[..., half : half + time]
 
 
 def filter_blocks(waveform: Tensor, response: Tensor, length: int) -> Tensor:
@@ -65,15 +63,10 @@ def filter_blocks(waveform: Tensor, response: Tensor, length: int) -> Tensor:
     Shape: (..., time), (2049,) -> (..., length).
 
     Args:
-        response: of at most 1025 taps, on the grid of ``block_points``.
+        response: of at most 1025 taps, by an rfft of ``BLOCK_POINTS``.
     """
-    lead = _BLOCK - _HOP
+    lead = BLOCK_POINTS - _HOP
     blocks = math.ceil(length / _HOP)
     padded = functional.pad(waveform, (lead, blocks * _HOP - waveform.shape[-1]))
-    frames = torch.fft.rfft(padded.unfold(-1, _BLOCK, _HOP)) * response
-    return torch.fft.irfft(frames, _BLOCK)[..., lead:].flatten(-2)[..., :length]
-
-
-def block_points() -> int:
-    """FFT length of ``filter_blocks``."""
-    return _BLOCK
+    frames = torch.fft.rfft(padded.unfold(-1, BLOCK_POINTS, _HOP)) * response
+    return torch.fft.irfft(frames, BLOCK_POINTS)[..., lead:].flatten(-2)[..., :length]

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from hlsim.extras import MissingExtraError
-from hlsim.torchtools import lasting
+from hlsim.torchtools import lasting, made_once
 
 _SINC: dict[str, Any] = {
     "lowpass_filter_width": 64,
@@ -19,10 +19,8 @@ _SINC: dict[str, Any] = {
     "beta": 14.769656459379492,
 }
 
-
 # values of torchaudio's kernel: 441 / 160 has 70,560, but 44101 / 16000 would have 700 million
 _LARGEST_KERNEL = 1_000_000
-
 
 _TOGETHER = 64  # output samples that share a row of inputs between rates with larger ones
 
@@ -67,8 +65,8 @@ def _resample_odd(waveform: Tensor, source: int, target: int) -> Tensor:
     """
     time = waveform.shape[-1]
     length = -(-time * target // source)
-    make = _odd_kernel if torch.compiler.is_compiling() else _kept_odd_kernel
-    kernel = make(source, target, waveform.dtype, waveform.device)[: -(-min(length, target) // _TOGETHER)]
+    kernel = made_once(_odd_kernel, source, target, waveform.dtype, waveform.device)
+    kernel = kernel[: -(-min(length, target) // _TOGETHER)]
     periods, (rows, _, span) = -(-length // target), kernel.shape
     first = torch.arange(rows, device=waveform.device) * _TOGETHER * source // target
     first = first + source * torch.arange(periods, device=waveform.device)[:, None]
@@ -85,7 +83,7 @@ def _width(source: int, target: int) -> int:
 
 
 def _odd_kernel(source: int, target: int, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """Weights of one period. Shape: (rows, output samples of a row, inputs of a row)."""
+    """Weights of one period, some 40 MB in float32. Shape: (rows, output samples of a row, inputs of a row)."""
     zeros, beta = _SINC["lowpass_filter_width"], torch.tensor(_SINC["beta"], dtype=torch.float64)
     width, scale = _width(source, target), min(1.0, target / source) * _SINC["rolloff"]
     span = 2 * width + -(-(_TOGETHER - 1) * source // target)
@@ -97,13 +95,6 @@ def _odd_kernel(source: int, target: int, dtype: torch.dtype, device: torch.devi
         window = torch.i0(beta * (1.0 - (t / zeros).square()).sqrt()) / torch.i0(beta)
         made.append((torch.sinc(t) * window * scale).to(dtype))
     return torch.cat(made).to(device)
-
-
-@lru_cache(maxsize=4)
-def _kept_odd_kernel(source: int, target: int, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """Some 40 MB in float32."""
-    with lasting():
-        return _odd_kernel(source, target, dtype, device)
 
 
 def _torchaudio() -> ModuleType:

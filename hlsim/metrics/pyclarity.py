@@ -27,9 +27,10 @@ from pathlib import Path
 import numpy as np
 from torch import Tensor
 
-from hlsim.audio import check_rate, read_audio
+from hlsim.audio import read_audio
 from hlsim.audiogram import Audiogram
 from hlsim.calibration import check_full_scale
+from hlsim.checks import check_rate
 from hlsim.extras import require
 from hlsim.parallel import check_parallel, run_parallel
 

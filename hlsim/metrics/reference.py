@@ -12,7 +12,7 @@ from torch import Tensor
 from hlsim.audiogram import Audiogram
 from hlsim.calibration import PASCAL_SPL, gain_to_pascals
 from hlsim.extras import require
-from hlsim.msbg.ear import RATE
+from hlsim.msbg.ear import MSBG_RATE
 from hlsim.msbg.model import MSBG
 
 _TAIL = 2048  # samples of silence in which what is delayed comes out
@@ -36,14 +36,14 @@ def pyclarity_msbg(waveform: Tensor, audiogram: Audiogram, sample_rate: int) -> 
     try:
         ear.set_audiogram(audiogram.to_clarity())
         to_reference = gain_to_pascals(PASCAL_SPL) / gain_to_pascals(float(ear.equiv_0db_spl + ear.ahr))
-        common = math.gcd(RATE, sample_rate)
-        up, down = RATE // common, sample_rate // common
+        common = math.gcd(MSBG_RATE, sample_rate)
+        up, down = MSBG_RATE // common, sample_rate // common
         signal = resample_poly(waveform.double().numpy(), up, down, window=("kaiser", 12.0)) * to_reference
         signal = np.append(signal, np.zeros(_TAIL))
         heard = ear.process(signal * _undo_rescaling(signal, utils.measure_rms))[0]
     finally:
         logging.disable(logging.NOTSET)
-    delay = MSBG(sample_rate=RATE).delay(audiogram.severity)
+    delay = MSBG(sample_rate=MSBG_RATE).delay(audiogram.severity)
     heard = heard[delay : delay + len(signal) - _TAIL] / to_reference
     back = resample_poly(heard, down, up, window=("kaiser", 12.0))[: len(waveform)]
     return torch.from_numpy(np.pad(back, (0, len(waveform) - len(back))))
@@ -58,7 +58,7 @@ def _undo_rescaling(signal: np.ndarray, measure_rms: Callable[..., tuple[float, 
     factor = 1.0
     for _ in range(5):
         with np.errstate(divide="ignore", invalid="ignore"):
-            factor = float(measure_rms(signal * factor, RATE, -12)[0] / (overall * factor))
+            factor = float(measure_rms(signal * factor, MSBG_RATE, -12)[0] / (overall * factor))
         if not math.isfinite(factor):
             raise ValueError(
                 "too soft for pyclarity's active level, which starts at 40 dB SPL; allowed: louder signals, or the "

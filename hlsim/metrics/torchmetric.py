@@ -9,9 +9,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from hlsim.audio import check_rate
 from hlsim.audiogram import FREQUENCIES, Audiogram, AudiogramLike
 from hlsim.calibration import check_full_scale, level_spl
+from hlsim.checks import check_rate
 from hlsim.extras import require
 from hlsim.metrics.pyclarity import HaspiItem, check_pair, check_seed, haspi_many
 

@@ -9,7 +9,7 @@ from scipy.signal.windows import kaiser
 
 from hlsim.dsp.fir import frequency_sampling_fir
 
-RATE = 44100
+MSBG_RATE = 44100
 """The sample rate in Hz at which MSBG is defined."""
 
 EAR_DELAY = 507
@@ -40,7 +40,7 @@ _FREE_FIELD_DB = np.array(
 @lru_cache(maxsize=2)
 def ear_filter(backward: bool = False) -> NDArray[np.float64]:
     """FIR from the frontal free field to the cochlea, or ``backward``. Returns (1015,) for 44.1 kHz."""
-    nyquist = RATE / 2.0
+    nyquist = MSBG_RATE / 2.0
     gain_db = _FREE_FIELD_DB - _MIDDLE_EAR_DB
     below = nyquist > _HZ
     frequencies = np.append(_HZ[below], nyquist) / nyquist
@@ -54,6 +54,6 @@ def ear_filter(backward: bool = False) -> NDArray[np.float64]:
 @lru_cache(maxsize=1)
 def lowpass_filter() -> NDArray[np.float64]:
     """FIR that keeps processing noise above 18 kHz out. Returns (133,) for 44.1 kHz."""
-    taps = 2 * int(0.0015 * RATE) + 1
-    coefficients: NDArray[np.float64] = firwin(taps, LOWPASS_HZ / (RATE / 2.0), window=("kaiser", 8.0))
+    taps = 2 * int(0.0015 * MSBG_RATE) + 1
+    coefficients: NDArray[np.float64] = firwin(taps, LOWPASS_HZ / (MSBG_RATE / 2.0), window=("kaiser", 8.0))
     return coefficients

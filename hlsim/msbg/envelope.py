@@ -11,9 +11,9 @@ from torch import Tensor
 
 from hlsim.dsp.erb import erb
 from hlsim.dsp.fft import power, rfft
-from hlsim.msbg.ear import RATE
+from hlsim.msbg.ear import MSBG_RATE
 from hlsim.msbg.filterbank import FilterBank
-from hlsim.torchtools import constant
+from hlsim.torchtools import constant_like
 
 STEP = 24
 """Samples at 44.1 kHz from one value of an envelope, and of the gain that follows it, to the next."""
@@ -42,7 +42,7 @@ def _detect(signals: Tensor, harmonics: bool) -> tuple[Tensor, ...]:
     """What is detected; with harmonics also the modulus, and the squared cosine of the angle."""
     squared = power(signals).add_(_TINY)
     if not harmonics:
-        return (squared.sqrt_(),)  # torch's own modulus takes four times as long
+        return (squared.sqrt_(),)  # torch's modulus takes four times as long
     cosine, modulus = signals.real.square() / squared, squared.sqrt()
     return modulus * ((cosine * (-16 / 15) + 12 / 5) * cosine + 1 / 5), modulus, cosine
 
@@ -67,7 +67,7 @@ class _Detect(torch.autograd.Function):
         signals, *detected = ctx.saved_tensors
         if not ctx.harmonics:
             return signals * (gradient / detected[0]), None
-        # with a gradient of its own, what is constant here comes from the signals anew
+        # where the gradient is differentiated, what is constant here comes from the signals anew
         _, modulus, cosine = _detect(signals, True) if torch.is_grad_enabled() else detected
         share = gradient / modulus
         along = share * ((cosine * (16 / 5) - 20 / 3) * cosine + 5)
@@ -96,7 +96,7 @@ def envelope(channels: Tensor, lowpass: Tensor) -> Tensor:
     Shape: (..., channels, time), (channels, time // 48 + 1) -> (..., channels, time // 24), the values at samples 0, 24,
     ...; ``time`` is a multiple of 24 and the signal is taken as periodic.
     """
-    kernel = constant(decimation_kernel, dtype=channels.dtype, device=channels.device)
+    kernel = constant_like(channels, decimation_kernel)
     return smooth(decimate(channels.abs(), kernel), lowpass)
 
 
@@ -134,7 +134,7 @@ def envelope_lowpass(
 def envelope_filters(bank: FilterBank) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
     """Numerator and denominator of each channel's low-pass."""
     widths = erb(np.array(bank.centre_frequencies))
-    return [ellip(2, 0.25, 35, 0.75 * min(100.0, width) / (RATE / 2.0)) for width in widths]
+    return [ellip(2, 0.25, 35, 0.75 * min(100.0, width) / (MSBG_RATE / 2.0)) for width in widths]
 
 
 @lru_cache(maxsize=8)

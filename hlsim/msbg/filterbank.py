@@ -6,12 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hlsim.dsp.erb import erb
-from hlsim.msbg.ear import RATE
+from hlsim.msbg.ear import MSBG_RATE
 
 ORDER = 4
 """Order of the gammatone filters."""
 
-_CORNER_STEP = RATE / 8192.0
+_CORNER_STEP = MSBG_RATE / 8192.0
 
 
 @dataclass(frozen=True)
@@ -115,16 +115,16 @@ def gammatone_response(
     chosen = range(bank.channels)[channels]
     centre = np.array(bank.centre_frequencies)[chosen, None]
     omega = 2.0 * np.pi * np.arange(points // 2 + 1 if bins is None else bins)[None] / points
-    own = 2.0 * np.pi * centre / RATE
-    radius = np.exp(-2.0 * np.pi * bank.broadening * erb(centre) / RATE)
+    peak = 2.0 * np.pi * centre / MSBG_RATE
+    radius = np.exp(-2.0 * np.pi * bank.broadening * erb(centre) / MSBG_RATE)
 
     def stage(w: NDArray[np.floating]) -> NDArray[np.complex128]:
         delayed = radius * np.exp(-1j * w)
-        out = 1.0 - np.cos(own) * delayed
-        out /= out - np.cos(own) * delayed + delayed**2
+        out = 1.0 - np.cos(peak) * delayed
+        out /= out - np.cos(peak) * delayed + delayed**2
         return out
 
-    response = stage(omega) / np.abs(stage(own))
+    response = stage(omega) / np.abs(stage(peak))
     for _ in range(2):  # to the fourth
         response *= response
     response *= np.exp(1j * omega * np.array(bank.advances)[chosen, None])
@@ -132,12 +132,12 @@ def gammatone_response(
     upper = [place for place, channel in enumerate(chosen) if channel >= first]
     if upper:
         corners = _CORNER_STEP * np.array(bank.highpass_corners)[[chosen[i] - first for i in upper], None]
-        unity = np.abs(_bessel_highpass(corners, own[upper]))
+        unity = np.abs(_bessel_highpass(corners, peak[upper]))
         response[upper] *= _bessel_highpass(corners, omega) / unity
     return response
 
 
 def _bessel_highpass(corner: NDArray[np.float64], omega: NDArray[np.floating]) -> NDArray[np.complex128]:
     """s^2 / (s^2 + 3 s + 3) of the corner in Hz, by the bilinear transform with the corner kept in place."""
-    s = 1j * np.tan(omega / 2.0) / np.tan(np.pi * corner / RATE)
+    s = 1j * np.tan(omega / 2.0) / np.tan(np.pi * corner / MSBG_RATE)
     return s**2 / (s**2 + 3.0 * s + 3.0)

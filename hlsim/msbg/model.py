@@ -2,25 +2,24 @@
 
 import math
 from functools import partial
-from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
-from torch.utils.checkpoint import checkpoint
 
-from hlsim.audio import check_rate, check_waveform
-from hlsim.audiogram import AudiogramLike, as_thresholds, own_thresholds, severity_of
+from hlsim.audiogram import AudiogramLike, own_thresholds, resolve_thresholds, severity_of
 from hlsim.calibration import PASCAL_SPL, check_full_scale, gain_to_pascals
+from hlsim.checks import check_rate, check_waveform
 from hlsim.dsp.fft import long_irfft, long_rfft
+from hlsim.msbg.blocks import in_blocks
 from hlsim.msbg.cochlea import bank_points, hear, hear_ending
-from hlsim.msbg.ear import RATE
-from hlsim.msbg.filterbank import BANKS
-from hlsim.msbg.filters import Filters
-from hlsim.msbg.recruitment import expansion_ratios
-from hlsim.msbg.resampling import block_bounds, faded, from_cochlea, from_spectrum, to_cochlea, to_inner
-from hlsim.msbg.smearing import BROADENING, SMEARING_DELAY, smear
-from hlsim.torchtools import not_compiled
+from hlsim.msbg.ear import MSBG_RATE
+from hlsim.msbg.filterbank import BANKS, FilterBank
+from hlsim.msbg.multirate import multirate_bank, total_response
+from hlsim.msbg.recruitment import expansion_ratios, threshold_weights
+from hlsim.msbg.resampling import from_cochlea, from_spectrum, to_cochlea, to_inner
+from hlsim.msbg.smearing import BROADENING, SMEARING_DELAY, smear, smearing_matrix_below
+from hlsim.torchtools import constant_like, made_once, not_compiled
 
 STRUCTURAL_DELAY = 1047
 """Delay in samples at 44.1 kHz of the model without smearing, by which ``aligned`` advances the output.
@@ -73,7 +72,7 @@ class MSBG(nn.Module):
         self,
         audiogram: AudiogramLike | None = None,
         *,
-        sample_rate: int = RATE,
+        sample_rate: int = MSBG_RATE,
         full_scale_spl: float = PASCAL_SPL,
         aligned: bool = True,
         rescale_active: bool = False,
@@ -123,16 +122,12 @@ class MSBG(nn.Module):
         outputs: list[Tensor] = []
         order: list[int] = []
         for severity, none, members in _alike(ears):
+            process = partial(self._simulate_alike, severity=severity, none=none)
             for some in _portions(members, signals.shape[-1], signals.device.type):
-                if len(some) == len(signals):
-                    outputs.append(self._in_blocks(signals, ears, severity, none))
-                else:
-                    chosen: slice | Tensor = slice(some[0], some[-1] + 1, 1)
-                    if some[-1] - some[0] != len(some) - 1:
-                        chosen = torch.tensor(
-                            some, device=signals.device
-                        )  # a list would be copied with each use
-                    outputs.append(self._in_blocks(signals[chosen], ears[chosen], severity, none))
+                chosen: slice | Tensor = slice(some[0], some[-1] + 1)
+                if some[-1] - some[0] != len(some) - 1:  # a list would be copied with each use
+                    chosen = torch.tensor(some, device=signals.device)
+                outputs.append(in_blocks(process, signals[chosen], ears[chosen], self.sample_rate))
                 order += some
         longest = max(output.shape[-1] for output in outputs)
         if len(outputs) == 1:  # a copy, or it would hold all that the last transform made
@@ -145,111 +140,60 @@ class MSBG(nn.Module):
             heard = heard / gain
         return heard.reshape(*batch, longest).to(waveform.dtype)
 
-    def _in_blocks(self, signals: Tensor, ears: Tensor, severity: str, none: bool) -> Tensor:
-        """Long signals by overlapping blocks, so that memory does not grow. Shapes as ``_simulate_alike``'s."""
-        samples = signals.shape[-1]
-        bounds = block_bounds(samples, self.sample_rate)
-        if len(bounds) == 1:
-            return self._simulate_alike(signals, ears, severity, none, True)
-        heard = []
-        # torch.func's transforms refuse the hooks by which a block is computed again
-        again = torch.is_grad_enabled() and torch._C._functorch.peek_interpreter_stack() is None
-        for begin, start, stop, end in bounds:
-            last = end == samples
-            call = partial(self._simulate_alike, severity=severity, none=none, last=last)
-            block = faded(signals[:, begin:end], self.sample_rate, begin > 0, not last)
-            if again and (block.requires_grad or ears.requires_grad):
-                output = checkpoint(call, block, ears, use_reentrant=False)
-            else:
-                output = call(block, ears)
-            heard.append(output[:, start - begin : None if stop == samples else stop - begin])
-        return torch.cat(heard, -1)
-
-    def _simulate_alike(self, signals: Tensor, ears: Tensor, severity: str, none: bool, last: bool) -> Tensor:
+    def _simulate_alike(self, signals: Tensor, ears: Tensor, last: bool, severity: str, none: bool) -> Tensor:
         """All items have the same severity. Shape: (items, time), (items, 8) -> (items, time).
 
         Args:
-            none: they hear everything at its level: 0 dB HL throughout.
             last: the signals end where they end, and are not cut from longer ones.
+            none: they hear everything at its level: 0 dB HL throughout.
         """
         samples, rate = signals.shape[-1], self.sample_rate
+        bank, smears = BANKS[severity], severity in BROADENING
         step = 2 if self.aligned and rate <= _HALF_RATE_HZ else 1
         delay = self.delay(severity) if self.aligned else 0
-        highest = rate / 2 if step == 2 else RATE / 2
-        inner = math.ceil(samples * RATE / rate)
-        filters = Filters(signals.dtype, signals.device)
-        # a frame that smearing leaves next to nothing hangs on the last bits: where every sample counts, keep more
-        fine = filters if self.aligned else Filters(torch.float64, signals.device)
-        heard = to_cochlea(signals.to(fine.dtype), rate, math.ceil((inner + delay) / step), step, fine)
-        if severity in BROADENING:
-            heard = smear(heard, fine.get("smearing", severity, step, highest), step)
+        highest = rate / 2 if step == 2 else MSBG_RATE / 2
+        # a frame that smearing leaves next to nothing depends on the last bits: where every sample counts, keep more
+        given = signals if self.aligned else signals.double()
+        heard = to_cochlea(
+            given, rate, math.ceil((math.ceil(samples * MSBG_RATE / rate) + delay) / step), step
+        )
+        if smears:
+            heard = smear(heard, constant_like(heard, smearing_matrix_below, severity, step, highest), step)
         heard = heard.to(signals.dtype)
-        ratios = expansion_ratios(ears, filters.get("thresholds", severity))
-        gain = 10.0 ** (-BANKS[severity].recombination_db / 20.0)
-
+        ratios = expansion_ratios(ears, constant_like(signals, threshold_weights, bank))
+        gain = 10.0 ** (-bank.recombination_db / 20.0)
         length = heard.shape[-1]
-        if self.aligned:
-            points = bank_points(length * step, rate, step)
-            spectrum = long_rfft(heard, points // step)
-            if none:
-                spectrum = spectrum * filters.get("total", severity, points, step)
-            else:
-                plan = filters.get("plan", severity, points, step, highest)
-                spectrum = hear(spectrum, ratios, plan, severity not in BROADENING)
-            if severity in BROADENING:
-                return from_spectrum(spectrum, points, step, rate, samples, filters, gain=gain, delay=delay)
-            # without smearing's delay, the way out reaches samples that the advances put before the first one
-            heard = long_irfft(spectrum, points // step)[..., :length]
-            return from_cochlea(heard, rate, length, samples, filters, gain=gain, step=step, delay=delay)
-        heard = self._late(heard, ratios, severity, last, filters)
-        return from_cochlea(heard, rate, length, round(length * rate / RATE), filters, gain=gain)
+        if not self.aligned:
+            heard = self._late(heard, ratios, bank, smears, last)
+            return from_cochlea(heard, rate, round(length * rate / MSBG_RATE), gain=gain)
 
-    def _late(self, heard: Tensor, ratios: Tensor, severity: str, last: bool, filters: Filters) -> Tensor:
+        points = bank_points(length * step, rate, step)
+        spectrum = long_rfft(heard, points // step)
+        if none:
+            spectrum = spectrum * constant_like(heard, total_response, bank, points, step)
+        else:
+            key = bank, points, step, highest, heard.dtype, heard.device
+            spectrum = hear(spectrum, ratios, made_once(multirate_bank, *key), not smears)
+        if smears:
+            return from_spectrum(spectrum, points, step, rate, samples, gain=gain, delay=delay)
+        # without smearing's delay, the way out reaches samples that the advances put before the first one
+        heard = long_irfft(spectrum, points // step)[..., :length]
+        return from_cochlea(heard, rate, samples, gain=gain, step=step, delay=delay)
+
+    def _late(self, heard: Tensor, ratios: Tensor, bank: FilterBank, smears: bool, last: bool) -> Tensor:
         """With the delay and, at the end, what the reference makes of it. Shape: (items, time) -> (items, time)."""
         length = heard.shape[-1]
         # with a slight loss and no smearing, nothing buries what the lower rates change where the envelope is next to 0
-        whole = length <= _ENDING + _ENDING_LEAD or severity not in BROADENING
-        parts = []
-        if not whole or not last:
-            points = bank_points(length, RATE)
-            plan = filters.get("plan", severity, points, 1, RATE / 2)
-            parts.append(
-                long_irfft(hear(long_rfft(heard, points), ratios, plan, severity not in BROADENING), points)[
-                    ..., :length
-                ]
-            )
-        if last:
-            ending = hear_ending(
-                heard if whole else heard[..., -_ENDING - _ENDING_LEAD :], ratios, severity, filters
-            )
-            parts = [ending] if whole else [parts[0][..., :-_ENDING], ending[..., -_ENDING:]]
-        return parts[0] if len(parts) == 1 else torch.cat(parts, -1)
-
-
-def resolve_thresholds(
-    stored: Tensor | None, audiogram: AudiogramLike | None, waveform: Tensor, **limits: Any
-) -> Tensor:
-    """The call's audiogram, or else the stored one, on the waveform's device, checked to fit its leading dimensions.
-
-    Args:
-        limits: of ``as_thresholds``.
-
-    Raises:
-        ValueError: there is neither, or the shapes do not broadcast.
-    """
-    if audiogram is None and stored is None:
-        raise ValueError("no audiogram: give one when building the simulator or with the call")
-    thresholds = as_thresholds(audiogram, **limits) if audiogram is not None else stored
-    assert thresholds is not None
-    try:
-        if thresholds.ndim > 1:
-            torch.broadcast_shapes(waveform.shape[:-1], thresholds.shape[:-1])
-    except RuntimeError:
-        raise ValueError(
-            f"audiograms of shape {tuple(thresholds.shape)} for a waveform of shape {tuple(waveform.shape)}; allowed: "
-            "one audiogram, or leading dimensions that broadcast"
-        ) from None
-    return thresholds.to(waveform.device)
+        if last and (length <= _ENDING + _ENDING_LEAD or not smears):
+            return hear_ending(heard, ratios, bank)
+        points = bank_points(length, MSBG_RATE)
+        key = bank, points, 1, MSBG_RATE / 2, heard.dtype, heard.device
+        spectrum = hear(long_rfft(heard, points), ratios, made_once(multirate_bank, *key), not smears)
+        all_but_the_end = long_irfft(spectrum, points)[..., :length]
+        if not last:
+            return all_but_the_end
+        ending = hear_ending(heard[..., -_ENDING - _ENDING_LEAD :], ratios, bank)
+        return torch.cat((all_but_the_end[..., :-_ENDING], ending[..., -_ENDING:]), -1)
 
 
 def active_rescaling(signals: Tensor) -> Tensor:
@@ -257,7 +201,7 @@ def active_rescaling(signals: Tensor) -> Tensor:
 
     Shape: (..., time) at 44.1 kHz in pascals -> (..., 1); 1 where nothing is active.
     """
-    frame = round(0.01 * RATE)
+    frame = round(0.01 * MSBG_RATE)
     to_reference = 10.0 ** ((PASCAL_SPL - 120.0) / 10.0)  # powers in pyclarity's full scale
     overall = signals.square().mean(-1) * to_reference
     threshold_db = (10.0 * overall.clamp_min(1e-30).log10() - 12.0).clamp_min(-80.0)

@@ -1,10 +1,10 @@
-"""At which rate each channel runs: a gammatone channel is a band, and only the widest need 44.1 kHz.
+"""The multirate filter bank: a gammatone channel is a band, and only the widest need 44.1 kHz.
 
 A channel is kept up to five bandwidths above its frequency, where it is 57 dB down, or to the highest frequency of
 interest. Narrow ones run as analytic signals at about 5.5 or 11 kHz, or 9 where that is enough, whose modulus is the
 envelope: what a rectifier adds, harmonics of the band, lies above its low-pass. It does not where bands are so wide for
 their frequency that they come down to 0 Hz: with severe losses two harmonics complete the modulus. The lowest channels,
-and the widest at 44.1 kHz, are rectified as they are, as the reference does: at that rate its own harmonics fold too.
+and the widest at 44.1 kHz, are rectified as they are, as the reference does: at that rate its harmonics fold, too.
 
 Channels centred far above the highest frequency of interest all hear what there is next to it, by their skirts, and
 expand it alike, by the threshold at 8 kHz: they run as one, the sum of them.
@@ -22,20 +22,20 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from hlsim.dsp.erb import erb
-from hlsim.dsp.fft import edge
-from hlsim.msbg.ear import RATE
+from hlsim.dsp.fft import soft_end
+from hlsim.msbg.ear import MSBG_RATE
 from hlsim.msbg.envelope import HALF_RATE_STEP, STEP, decimation_kernel, envelope_lowpass
-from hlsim.msbg.filterbank import BANKS, FilterBank, gammatone_response
+from hlsim.msbg.filterbank import FilterBank, gammatone_response
 from hlsim.msbg.recruitment import interpolation_kernel
 from hlsim.msbg.smearing import SKIRT_HZ
+from hlsim.torchtools import as_tensor
 
-_REACH = 5.0  # bandwidths above its frequency to which a channel is kept
-
+_KEPT = 5.0  # bandwidths above its frequency to which a channel is kept
 _WIDE = 2.5  # broadening above which bands come so near to 0 Hz that a rectifier's harmonics count
 _TRUE_HZ = 400.0  # below, channels are rectified as they are
 _FAR = 1.75  # times the highest frequency of interest, above which channels run as one
 _FAR_RATIO = 1.3  # expansion, of a loss of 24 dB, at which their gain is right; with more they are heard less
-_CACHED = 2_000_000  # samples of a tier on a CPU, for each step to find the last one's in its cache
+_CACHED = 2_000_000  # samples of a rate band on a CPU, for each step to find the last one's in its cache
 
 
 Detector = Literal["itself", "modulus", "harmonics"]
@@ -43,7 +43,7 @@ Detector = Literal["itself", "modulus", "harmonics"]
 
 
 @dataclass(frozen=True)
-class Tier:
+class RateBand:
     """Channels that run together, at one rate.
 
     Attributes:
@@ -64,18 +64,25 @@ class Tier:
 
 
 @dataclass(frozen=True)
-class Plan:
-    """A bank on the FFT grid of a length: ``tiers`` from the lowest channels up, and the envelopes' ``lowpass``.
+class MultirateBank:
+    """A bank on the FFT grid of a length.
 
     Attributes:
-        lowpass: (channels, steps // 2 + 1), as many channels as the tiers have.
+        bands: from the lowest channels up.
+        lowpass: of the envelopes, (channels, steps // 2 + 1), as many channels as the bands have.
     """
 
-    tiers: tuple[Tier, ...]
+    bands: tuple[RateBand, ...]
     lowpass: Tensor
 
+    @property
+    def nbytes(self) -> int:
+        return self.lowpass.nbytes + sum(band.response.nbytes for band in self.bands)
 
-def assign(bank: FilterBank, step: int, highest: float = RATE / 2) -> list[tuple[slice, int, Detector]]:
+
+def assign_rates(
+    bank: FilterBank, step: int, highest: float = MSBG_RATE / 2
+) -> list[tuple[slice, int, Detector]]:
     """Channels, samples in each of an envelope's steps and how they are rectified, from the lowest channels up.
 
     Where the bank has more, the last one stands for those, too.
@@ -84,12 +91,12 @@ def assign(bank: FilterBank, step: int, highest: float = RATE / 2) -> list[tuple
         step: of the signal: 1, or 2 where nothing above 11 kHz is of interest.
         highest: frequency of interest in Hz.
     """
-    a_second = RATE / envelope_step(step)
+    a_second = MSBG_RATE / envelope_step(step)
     slow, fast = 3, 6
     widest = int((highest + SKIRT_HZ) / a_second) + 1
     kinds: list[tuple[int, Detector]] = []
     for hz, width in zip(bank.centre_frequencies, erb(np.array(bank.centre_frequencies)), strict=True):
-        top = hz + _REACH * bank.broadening * float(width)
+        top = hz + _KEPT * bank.broadening * float(width)
         if hz < _TRUE_HZ:
             kinds.append((fast, "itself"))
         elif top <= slow * a_second:
@@ -100,28 +107,27 @@ def assign(bank: FilterBank, step: int, highest: float = RATE / 2) -> list[tuple
             kinds.append((fast, "modulus"))
         else:
             kinds.append((STEP, "itself"))
-    kinds = kinds[: _kept(bank, highest)]
+    kinds = kinds[: _count_kept(bank, highest)]
     bounds = [0, *(i for i in range(1, len(kinds)) if kinds[i] != kinds[i - 1]), len(kinds)]
     return [(slice(a, b), *kinds[a]) for a, b in itertools.pairwise(bounds)]
 
 
-def make_plan(
-    severity: str, points: int, step: int, highest: float, dtype: torch.dtype, device: torch.device
-) -> Plan:
-    """The tiers of a severity's bank.
+def multirate_bank(
+    bank: FilterBank, points: int, step: int, highest: float, dtype: torch.dtype, device: torch.device
+) -> MultirateBank:
+    """A bank's channels, each at the rate that it needs.
 
     Args:
         points: FFT length at 44.1 kHz, a whole number of the envelopes' steps.
-        step, highest: as in ``assign``.
+        step, highest: as in ``assign_rates``.
     """
 
     tensor = partial(as_tensor, dtype=dtype, device=device)
-    bank = BANKS[severity]
-    last = _kept(bank, highest)
+    last = _count_kept(bank, highest)
     steps = round(points / envelope_step(step))
     together = next((count for count in (8, 9, 7, 10, 6, 5) if steps % count == 0), 8)
-    tiers, lowpass = [], []
-    for channels, samples, detector in _parts(assign(bank, step, highest), steps, device):
+    bands, lowpass = [], []
+    for channels, samples, detector in _cut_for_cache(assign_rates(bank, step, highest), steps, device):
         count, analytic = steps * samples, detector != "itself"
         bins = min(count if analytic else count // 2 + 1, points // step // 2 + 1)
         # signals are too loud by the ratio of the rates, as their sum's spectrum is to be; those that are to be
@@ -131,7 +137,7 @@ def make_plan(
         if channels.stop == last < bank.channels:
             far = gammatone_response(bank, points, slice(last - 1, None), bins)
             response[-1] = far.sum(0)
-            smoothing[-1] *= _far_level(far[:, round(highest * points / RATE)])
+            smoothing[-1] *= _far_level(far[:, round(highest * points / MSBG_RATE)])
         # by how much slower than the signal's the channels' rate is
         decimation = decimation_kernel(samples) * (step * samples / envelope_step(step))
         interpolation = interpolation_kernel(samples, 2 if detector == "modulus" else 1, together)
@@ -142,11 +148,13 @@ def make_plan(
             response[:, 1:] *= 2.0
             decimation = decimation * (2.0 / math.pi)
         if samples < STEP:
-            response *= edge(bins, RATE / points, count / (1 if analytic else 2) * RATE / points)
+            response *= soft_end(
+                bins, MSBG_RATE / points, count / (1 if analytic else 2) * MSBG_RATE / points
+            )
         kernels = tensor(decimation), tensor(interpolation)
-        tiers.append(Tier(channels, count, detector, tensor(response), *kernels))
+        bands.append(RateBand(channels, count, detector, tensor(response), *kernels))
         lowpass.append(smoothing)
-    return Plan(tuple(tiers), tensor(np.concatenate(lowpass)))
+    return MultirateBank(tuple(bands), tensor(np.concatenate(lowpass)))
 
 
 def envelope_step(step: int) -> float:
@@ -154,7 +162,7 @@ def envelope_step(step: int) -> float:
     return STEP if step == 1 else HALF_RATE_STEP
 
 
-def _kept(bank: FilterBank, highest: float) -> int:
+def _count_kept(bank: FilterBank, highest: float) -> int:
     """Channels, those far above the highest frequency of interest as one."""
     return min(bank.channels, 1 + sum(hz <= _FAR * highest for hz in bank.centre_frequencies))
 
@@ -171,28 +179,22 @@ def _far_level(responses: NDArray[np.complex128]) -> float:
     return float(expanded ** (1.0 / more) / total)
 
 
-def as_tensor(values: NDArray[np.generic], dtype: torch.dtype, device: torch.device) -> Tensor:
-    """Real or complex values as a tensor of ``dtype`` or its complex counterpart."""
-    kind = dtype.to_complex() if np.iscomplexobj(values) else dtype
-    return torch.from_numpy(np.ascontiguousarray(values)).to(device=device, dtype=kind)
-
-
-def total_response(severity: str, points: int, step: int) -> NDArray[np.complex128]:
+def total_response(bank: FilterBank, points: int, step: int) -> NDArray[np.complex128]:
     """The sum of all channels, for ears with no loss at all. Returns (points // step // 2 + 1,)."""
-    total = gammatone_response(BANKS[severity], points, bins=points // step // 2 + 1).sum(0)
+    total = gammatone_response(bank, points, bins=points // step // 2 + 1).sum(0)
     if step > 1 and (points // step) % 2 == 0:
         total[-1] = 0.0
     return total
 
 
-def _parts(
-    tiers: list[tuple[slice, int, Detector]], steps: int, device: torch.device
+def _cut_for_cache(
+    bands: list[tuple[slice, int, Detector]], steps: int, device: torch.device
 ) -> list[tuple[slice, int, Detector]]:
-    """The tiers, on a CPU cut to what its cache holds."""
+    """The rate bands, on a CPU cut to what its cache holds."""
     if device.type != "cpu":
-        return tiers
+        return bands
     parts = []
-    for channels, samples, detector in tiers:
+    for channels, samples, detector in bands:
         count = channels.stop - channels.start
         size = count * (1 if detector == "itself" else 2) * steps * samples
         pieces = min(count, math.ceil(size / _CACHED))

@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
-from hlsim.audiogram import FREQUENCIES
+from hlsim.audiogram import interpolation_weights
 from hlsim.calibration import PASCAL_SPL
 from hlsim.msbg.envelope import STEP
 from hlsim.msbg.filterbank import FilterBank
-from hlsim.torchtools import constant
+from hlsim.torchtools import constant_like
 
 CATCH_UP_SPL = 105.0
 """Level in dB SPL at which the impaired ear hears as loud as a normal one."""
@@ -42,15 +42,9 @@ def expansion_ratios(thresholds: Tensor, weights: Tensor) -> Tensor:
     return CATCH_UP_SPL / (CATCH_UP_SPL - (thresholds.unsqueeze(-1) * weights).sum(-2))
 
 
-@lru_cache(maxsize=8)
 def threshold_weights(bank: FilterBank) -> NDArray[np.float64]:
-    """Weights of the eight thresholds in that of each channel: linear in Hz, flat below 250 and above 8000 Hz.
-
-    Returns: (8, channels).
-    """
-    return np.array(
-        [np.interp(bank.centre_frequencies, FREQUENCIES, row) for row in np.eye(len(FREQUENCIES))]
-    )
+    """Weights of the eight thresholds in that of each channel. Returns (8, channels)."""
+    return interpolation_weights(bank.centre_frequencies)
 
 
 def gains(envelopes: Tensor, ratios: Tensor) -> Tensor:
@@ -67,14 +61,14 @@ def interpolate(values: Tensor, kernel: Tensor) -> Tensor:
 
     Shape: ``around``'s (..., steps + 5), ``interpolation_kernel`` -> (..., time).
     """
-    reach, columns = kernel.shape
-    together = reach - _TAPS + 1
+    width, columns = kernel.shape
+    together = width - _TAPS + 1
     steps = values.shape[-1] - _TAPS + 1
     if steps % together:
         values = functional.pad(values, (0, -steps % together))
-    windows = values.unfold(-1, reach, together)
+    windows = values.unfold(-1, width, together)
     # as one product, for matmul makes one a channel of it, at twice the cost
-    fine = (windows.reshape(-1, reach) @ kernel).view(*windows.shape[:-2], -1)
+    fine = (windows.reshape(-1, width) @ kernel).view(*windows.shape[:-2], -1)
     return fine if steps % together == 0 else fine[..., : steps * columns // together]
 
 
@@ -96,9 +90,9 @@ def weigh(
         steep = _steep(envelopes) & ((ratios != 1.0) & (ratios < _SLIGHT)).unsqueeze(-1)
         every = full.shape[-1] // steep.shape[-1]
         if steep.device.type == "cpu":
-            own = ratios.unsqueeze(-1).expand(steep.shape)[steep]
+            theirs = ratios.unsqueeze(-1).expand(steep.shape)[steep]
             about = around(envelopes).unfold(-1, _TAPS, 1)[steep]
-            full.unflatten(-1, (-1, every))[steep] = gains(about @ kernel[:_TAPS, :every], own)
+            full.unflatten(-1, (-1, every))[steep] = gains(about @ kernel[:_TAPS, :every], theirs)
         else:  # indices would have to come back from the device
             fine = gains(interpolate(around(envelopes), kernel), ratios)
             full = torch.where(steep.repeat_interleave(every, -1), fine, full)
@@ -157,7 +151,7 @@ def expand(channels: Tensor, envelopes: Tensor, ratios: Tensor) -> Tensor:
 
     Shape: (..., channels, time), (..., channels, time // 24), (..., channels) -> (..., time).
     """
-    kernel = constant(interpolation_kernel, dtype=channels.dtype, device=channels.device)
+    kernel = constant_like(channels, interpolation_kernel)
     return weigh(channels, around(gains(envelopes, ratios)), kernel, (envelopes, ratios))
 
 

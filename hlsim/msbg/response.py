@@ -1,8 +1,8 @@
 """The fixed response of MSBG with every gain at 1, and its phase alone: what a filter bank does to any ear's signals.
 
 The bank's channels add up to a level response within a few dB, but not to a linear phase: at 1 to 2 kHz what is heard is
-nearer to the signal turned over than to the signal. Waveforms, phases and complex spectra can only be compared with a
-signal that has the same phase.
+nearer to the polarity-inverted signal than to the signal. Waveforms, phases and complex spectra can only be compared with
+a signal that has the same phase.
 """
 
 import math
@@ -14,12 +14,12 @@ from torch import Tensor
 
 from hlsim.audiogram import SEVERITIES, severity_index
 from hlsim.dsp.fir import filter_centred
-from hlsim.msbg.ear import RATE, ear_filter, lowpass_filter
+from hlsim.msbg.ear import MSBG_RATE, ear_filter, lowpass_filter
 from hlsim.msbg.filterbank import BANKS, FilterBank, gammatone_response
 from hlsim.msbg.model import STRUCTURAL_DELAY
-from hlsim.torchtools import constant
+from hlsim.torchtools import constant_like
 
-_REACH_SECONDS = 0.064
+_HALF_SECONDS = 0.064
 _SPACING = 2.5  # Hz, at most: of the grid, whose period is several times what the responses last
 _FAINT = 0.1
 
@@ -32,18 +32,18 @@ def fixed_response(bank: FilterBank, rate: int, points: int) -> NDArray[np.compl
 
     Returns: (points // 2 + 1,), 0 above 22.05 kHz.
     """
-    own = points * RATE // rate
-    bins = min(points, own) // 2 + 1
-    omega = 2.0 * np.pi * np.arange(bins) / own
-    total = gammatone_response(bank, own, bins=bins).sum(0)
+    inner = points * MSBG_RATE // rate
+    bins = min(points, inner) // 2 + 1
+    omega = 2.0 * np.pi * np.arange(bins) / inner
+    total = gammatone_response(bank, inner, bins=bins).sum(0)
     for taps in (ear_filter(), ear_filter(backward=True), lowpass_filter()):
-        total = total * np.fft.rfft(taps, own)[:bins]
+        total = total * np.fft.rfft(taps, inner)[:bins]
     total = total * np.exp(1j * omega * STRUCTURAL_DELAY) * 10.0 ** (-bank.recombination_db / 20.0)
     return np.pad(total, (0, points // 2 + 1 - bins))
 
 
 def with_phase_of_bank(waveform: Tensor, thresholds: Tensor, rate: int, *, normal: bool = False) -> Tensor:
-    """A signal with the phase that MSBG's bank of each ear's severity gives it, and its own magnitude.
+    """A signal with the phase that MSBG's bank of each ear's severity gives it, and the magnitude as it is.
 
     Where the response ends, from 20 dB down, the magnitude goes with it.
 
@@ -53,15 +53,15 @@ def with_phase_of_bank(waveform: Tensor, thresholds: Tensor, rate: int, *, norma
         normal: the signal is what a normal ear hears: the phase of that ear's bank is taken off.
     """
     severity = severity_index(thresholds)
-    taps = constant(_phases, rate, normal, dtype=waveform.dtype, device=waveform.device)[severity]
+    taps = constant_like(waveform, _phases, rate, normal)[severity]
     moved = filter_centred(waveform, taps)
-    # a normal ear's stays as it is to the bit, for phases of what is nearly silent hang on rounding
+    # a normal ear's stays as it is to the bit, for phases of what is nearly silent depend on rounding
     return torch.where((severity == 0).unsqueeze(-1), waveform, moved) if normal else moved
 
 
 def _phases(rate: int, normal: bool) -> NDArray[np.float64]:
-    """Impulse response of each severity's phase, its zero in the middle. Returns (severities, 2 reach)."""
-    shared = math.gcd(rate, RATE)
+    """Impulse response of each severity's phase, its zero in the middle. Returns (severities, 2 half)."""
+    shared = math.gcd(rate, MSBG_RATE)
     points = rate // shared * 2 * math.ceil(shared / (2.0 * _SPACING))
     responses = np.stack([fixed_response(BANKS[severity], rate, points) for severity in SEVERITIES])
     if normal:
@@ -69,5 +69,5 @@ def _phases(rate: int, normal: bool) -> NDArray[np.float64]:
     else:
         magnitude = np.abs(responses)
         phases = responses / np.maximum(magnitude, _FAINT * magnitude.max(-1, keepdims=True))
-    reach = math.ceil(_REACH_SECONDS * rate)
-    return np.roll(np.fft.irfft(phases, points), reach, -1)[:, : 2 * reach]
+    half = math.ceil(_HALF_SECONDS * rate)
+    return np.roll(np.fft.irfft(phases, points), half, -1)[:, : 2 * half]

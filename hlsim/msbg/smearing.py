@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
+from hlsim.dsp.erb import ERB_AT_0_HZ, erb
 from hlsim.dsp.fft import power, rfft
-from hlsim.msbg.ear import RATE
-from hlsim.torchtools import lasting
+from hlsim.msbg.ear import MSBG_RATE
+from hlsim.torchtools import constant_like
 
 FRAME, HOP, FFT = 256, 64, 512
 
@@ -42,11 +43,11 @@ def roex_filters(lower: float, upper: float, count: int, spacing: float) -> NDAr
     """
     bins = np.arange(count, dtype=float)
     hz = bins * spacing
-    bandwidth = 24.7 * (0.00437 * hz + 1.0)
+    bandwidth = erb(hz)
     with np.errstate(divide="ignore", invalid="ignore"):
         distance = np.abs(bins[:, None] - bins) / bins[:, None] * 4.0 * hz[:, None] / bandwidth[:, None]
     g = distance / np.where(bins < bins[:, None], lower, upper)
-    filters = (1.0 + g) * np.exp(-g) / (bandwidth * (lower + upper) / (2.0 * 24.7))[:, None]
+    filters = (1.0 + g) * np.exp(-g) / (bandwidth * (lower + upper) / (2.0 * ERB_AT_0_HZ))[:, None]
     filters[0] = 0.0
     filters[0, 0] = 2.0 / (lower + upper)
     return filters
@@ -72,13 +73,18 @@ def smearing_from_filters(normal: NDArray[np.float64], wide: NDArray[np.float64]
 @lru_cache(maxsize=4)
 def smearing_matrix(lower: float, upper: float) -> NDArray[np.float64]:
     """The matrix for MSBG's 512-point spectra. Returns (256, 256)."""
-    normal, wide = (roex_filters(*sides, FFT // 2, RATE / FFT) for sides in ((1.0, 1.0), (lower, upper)))
+    normal, wide = (roex_filters(*sides, FFT // 2, MSBG_RATE / FFT) for sides in ((1.0, 1.0), (lower, upper)))
     return smearing_from_filters(normal, wide)
 
 
-def smeared_bins(step: int, highest: float) -> int:
-    """Frequencies of a frame at 44.1 kHz / step on which what is below ``highest`` Hz depends, by the window's skirts."""
-    return min(FFT // 2 // step, math.ceil((highest + SKIRT_HZ) * FFT / RATE))
+def smearing_matrix_below(severity: str, step: int, highest: float) -> NDArray[np.float64]:
+    """The part of the matrix on which what is below ``highest`` Hz depends, by the window's skirts.
+
+    Args:
+        step: the signal runs at 44.1 kHz / step.
+    """
+    bins = min(FFT // 2 // step, math.ceil((highest + SKIRT_HZ) * FFT / MSBG_RATE))
+    return smearing_matrix(*BROADENING[severity])[:bins, :bins]
 
 
 def smeared_length(samples: int) -> int:
@@ -99,7 +105,7 @@ def smear(waveform: Tensor, matrix: Tensor, step: int = 1) -> Tensor:
     """
     hop = HOP // step
     count = math.ceil(waveform.shape[-1] / hop)
-    window = _window(step, waveform.dtype, waveform.device)
+    window = constant_like(waveform, _window, step)
     frames = _frames(waveform, count, hop, window)
     # on a CPU a few frames at a time, for the steps from one to the next to find them in its cache
     size = max(1, _CACHED * step // waveform[..., 0].numel()) if waveform.device.type == "cpu" else count
@@ -154,7 +160,7 @@ class _Spread(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, gradient: Tensor, *others: Tensor) -> tuple[Tensor, None]:
         spectrum, matrix, *made = ctx.saved_tensors
-        # with a gradient of its own, what is constant here comes from the spectrum anew
+        # where the gradient is differentiated, what is constant here comes from the spectrum anew
         factor, given, smeared = _spread(spectrum, matrix)[1:] if torch.is_grad_enabled() else made
         direct = factor.conj() * gradient
         products = torch.view_as_real(spectrum) * torch.view_as_real(direct)
@@ -164,13 +170,11 @@ class _Spread(torch.autograd.Function):
         return torch.addcmul(direct, spectrum, along), None
 
 
-@lru_cache(maxsize=16)
-def _window(step: int, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """Of analysis and synthesis: their product adds up to 1 over four frames; then zeros. Shape: (512 // step,)."""
-    with lasting():
-        place = 2.0 * math.pi * (torch.arange(0, FRAME, step, dtype=torch.float64) + 0.5) / FRAME
-        window = (0.5 - 0.5 * place.cos()) / math.sqrt(1.5)
-        return functional.pad(window, (0, (FFT - FRAME) // step)).to(device=device, dtype=dtype)
+def _window(step: int) -> Tensor:
+    """Of analysis and synthesis: their product adds up to 1 over four frames; then zeros. Returns (512 // step,)."""
+    place = 2.0 * math.pi * (torch.arange(0, FRAME, step, dtype=torch.float64) + 0.5) / FRAME
+    window = (0.5 - 0.5 * place.cos()) / math.sqrt(1.5)
+    return functional.pad(window, (0, (FFT - FRAME) // step))
 
 
 def _frames(waveform: Tensor, count: int, hop: int, window: Tensor) -> Tensor:

@@ -3,8 +3,7 @@
 Feature maps lie (items, time, frequency, channels): the pointwise layers are then plain matrix products.
 """
 
-from collections.abc import Callable
-from typing import Self, cast
+from typing import Any, Self, cast
 
 import torch
 from torch import Tensor, nn
@@ -46,7 +45,7 @@ class SequencePath(nn.Module):
     Shape: (items, time, frequency, channels) -> the same.
 
     Args:
-        axis: 0 for time, 1 for frequency; each row along it is a sequence of its own.
+        axis: 0 for time, 1 for frequency; each row along it is a sequence.
         core: (sequences, length, channels) -> (sequences, length, width).
     """
 
@@ -104,6 +103,10 @@ class EncoderLayer(nn.TransformerEncoderLayer):
     It stays in training mode: in evaluation torch's shortcut holds every pair of times, 64 GiB for a minute of signal.
     """
 
+    def __init__(self, channels: int, heads: int, hidden: int) -> None:
+        options: dict[str, Any] = {"activation": "gelu", "batch_first": True, "norm_first": True}
+        super().__init__(channels, heads, hidden, dropout=0.0, **options)
+
     def train(self, mode: bool = True) -> Self:
         return super().train(True)
 
@@ -111,30 +114,17 @@ class EncoderLayer(nn.TransformerEncoderLayer):
 def _path(config: NetworkConfig, axis: int) -> nn.Module:
     """The path that ``config.block`` names, along time (0) or frequency (1)."""
     channels, expansion = config.channels, config.expansion
-    kinds: dict[str, Callable[[], nn.Module]] = {
-        "cnn": lambda: ConvPath(channels, axis, config.kernel[axis], expansion),
-        "mamba": lambda: SequencePath(
-            channels, axis, BidirectionalMamba(channels, config.states, expansion), 2 * channels
-        ),
-        "lstm": lambda: SequencePath(
-            channels, axis, BidirectionalLSTM(channels, expansion * channels), 2 * expansion * channels
-        ),
-        "transformer": lambda: SequencePath(
-            channels,
-            axis,
-            EncoderLayer(
-                channels,
-                config.heads,
-                expansion * channels,
-                dropout=0.0,
-                activation="gelu",
-                batch_first=True,
-                norm_first=True,
-            ),
-            channels,
-        ),
-    }
-    return kinds[config.block]()
+    core: nn.Module
+    match config.block:
+        case "cnn":
+            return ConvPath(channels, axis, config.kernel[axis], expansion)
+        case "mamba":
+            core, width = BidirectionalMamba(channels, config.states, expansion), 2 * channels
+        case "lstm":
+            core, width = BidirectionalLSTM(channels, expansion * channels), 2 * expansion * channels
+        case _:
+            core, width = EncoderLayer(channels, config.heads, expansion * channels), channels
+    return SequencePath(channels, axis, core, width)
 
 
 class DualPathBlock(nn.Module):

@@ -86,6 +86,11 @@ class NetworkConfig:
         return STFT(self.fft, self.window, self.hop)
 
     @property
+    def hz(self) -> tuple[float, ...]:
+        """The transform's frequencies."""
+        return tuple(NEURO_RATE * k / self.fft for k in range(self.fft // 2 + 1))
+
+    @property
     def step(self) -> int:
         """Samples from one place of the feature maps to the next."""
         return self.hop * self.stride[0]
@@ -97,7 +102,7 @@ class NetworkConfig:
         return self.channels * self.expansion * rows / self.step
 
     @property
-    def reach(self) -> int | None:
+    def receptive_field(self) -> int | None:
         """Samples to either side on which one depends by transform and network; None where it is all of them."""
         if self.block != "cnn":
             return None
@@ -135,7 +140,7 @@ class NeuroConfig(NetworkConfig):
             phase along frequency (the paper's Table IV).
         phase: ``predicted``, or the ``input``'s reused: magnitude only (the paper's Table III).
         prior: start from what is known of MSBG (``hlsim.neuro.prior``) and let the network correct it. Without it the
-            network is on its own, as in the paper.
+            network learns everything, as in the paper.
         level_aware: log magnitude and no normalisation. Otherwise each utterance is scaled to unit RMS and back, and
             instance normalisation follows the convolutions, as in MP-SENet: a level is then invisible.
     """

@@ -1,7 +1,17 @@
-"""The dense encoder that turns the input channels into feature maps."""
+"""Input channels, and the dense encoder that turns them into feature maps."""
 
 import torch
 from torch import Tensor, nn
+
+
+def log_magnitude(squared: Tensor) -> Tensor:
+    """Half the logarithm of a magnitude, from its square. Any shape; silence gives -6.3."""
+    return (squared + 1e-11).log() / 4.0
+
+
+def sine_of_phase(spectrum: Tensor, squared: Tensor) -> Tensor:
+    """Faded out near silence: its gradient stays finite, and unlike the phase it has no jump at pi. Any shape."""
+    return spectrum.imag * (squared + 1e-6).rsqrt()
 
 
 class Unit(nn.Sequential):

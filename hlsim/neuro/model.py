@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor, nn
 
-from hlsim.audiogram import FREQUENCIES, SEVERITIES, severity_index
+from hlsim.audiogram import FREQUENCIES, SEVERITIES, interpolate, severity_index
 from hlsim.calibration import PASCAL_SPL
 from hlsim.dsp.fft import power
 from hlsim.msbg.recruitment import CATCH_UP_SPL
@@ -11,10 +11,9 @@ from hlsim.neuro.audiogram_encoder import AudiogramEncoder
 from hlsim.neuro.blocks import DualPathBlock, TimeBlock
 from hlsim.neuro.config import NEURO_RATE, NeuroConfig
 from hlsim.neuro.decoders import MaskDecoder, PhaseDecoder
-from hlsim.neuro.encoder import DenseEncoder, FrameEncoder
+from hlsim.neuro.encoder import DenseEncoder, FrameEncoder, log_magnitude, sine_of_phase
 from hlsim.neuro.network import EarNetwork
 from hlsim.neuro.prior import Prior
-from hlsim.torchtools import constant
 
 _TINY = 1e-11
 
@@ -77,11 +76,11 @@ class NeuroMSBG(EarNetwork):
         self.autocast_dtype: torch.dtype | None = None
 
     @property
-    def _reach(self) -> tuple[int, int] | None:
-        if self.config.reach is None or not self.config.level_aware:
+    def _receptive_field(self) -> tuple[int, int] | None:
+        if self.config.receptive_field is None or not self.config.level_aware:
             return None
-        known = self.prior.reach if self.prior is not None else 0
-        return self.config.step, self.config.reach + known
+        known = self.prior.receptive_field if self.prior is not None else 0
+        return self.config.step, self.config.receptive_field + known
 
     @property
     def _dtype(self) -> torch.dtype:
@@ -100,7 +99,7 @@ class NeuroMSBG(EarNetwork):
         factor = self.prior(squared, ears, severity) if self.prior is not None else None
         features = self._features(spectrum, squared, ears, factor)
         size = (spectrum.shape[-2], spectrum.shape[-1])
-        exponents = self._exponents(ears, size[1])
+        exponents = self._exponents(ears)
         lower = self.autocast_dtype
         with torch.autocast(signals.device.type, lower or torch.bfloat16, enabled=lower is not None):
             features = self._network(features, severity)
@@ -129,8 +128,7 @@ class NeuroMSBG(EarNetwork):
         Shape: (items, frames, frequencies) twice, (items, 8) -> (items, 2 to 4, frames, rows).
         """
         if self.config.level_aware:
-            # the sine of the phase, faded out near silence: its gradient stays finite and it has no jump at pi
-            channels = [(squared + _TINY).log() / 4.0, spectrum.imag * (squared + 1e-6).rsqrt()]
+            channels = [log_magnitude(squared), sine_of_phase(spectrum, squared)]
         else:
             channels = [(squared + _TINY).sqrt(), torch.angle(spectrum)]
         if self.audiogram_encoder is not None:
@@ -143,11 +141,6 @@ class NeuroMSBG(EarNetwork):
         levels = (ears / 100.0)[:, None, None].expand(*features.shape[:3], -1)
         return torch.cat((features, levels), -1)
 
-    def _exponents(self, ears: Tensor, frequencies: int) -> Tensor:
+    def _exponents(self, ears: Tensor) -> Tensor:
         """Recruitment exponents, ratio - 1, at the transform's frequencies. Shape: (items, 8) -> (items, frequencies)."""
-        hz = torch.arange(frequencies, device=ears.device, dtype=ears.dtype) * NEURO_RATE / self.config.fft
-        points = constant(tuple, FREQUENCIES, dtype=ears.dtype, device=ears.device)
-        right = torch.bucketize(hz, points).clamp(1, len(FREQUENCIES) - 1)
-        place = ((hz - points[right - 1]) / (points[right] - points[right - 1])).clamp(0.0, 1.0)
-        levels = ears[:, right - 1] * (1.0 - place) + ears[:, right] * place
-        return CATCH_UP_SPL / (CATCH_UP_SPL - levels) - 1.0
+        return CATCH_UP_SPL / (CATCH_UP_SPL - interpolate(ears, self.config.hz)) - 1.0

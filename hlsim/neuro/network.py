@@ -1,18 +1,15 @@
-"""What every network here does with a waveform and an ear before and after its own work."""
+"""What every network here does with a waveform and an ear before and after its work."""
 
 from __future__ import annotations
-
-import math
 
 import torch
 from torch import Tensor, nn
 
-from hlsim.audio import check_rate, check_waveform
-from hlsim.audiogram import FREQUENCIES, AudiogramLike
+from hlsim.audiogram import FREQUENCIES, AudiogramLike, resolve_thresholds
 from hlsim.calibration import check_full_scale, gain_to_pascals
+from hlsim.checks import check_rate, check_waveform
 from hlsim.dsp.overlap import overlapping
 from hlsim.dsp.resample import resample
-from hlsim.msbg.model import resolve_thresholds
 from hlsim.neuro.config import NEURO_RATE, NetworkConfig
 
 # Values of the widest feature map of all items that run together on a CPU, and the samples at 16 kHz that this may be at
@@ -72,7 +69,7 @@ class EarNetwork(nn.Module):
             ears = thresholds.to(dtype).expand(*batch, -1).reshape(-1, len(FREQUENCIES))
             together = self._together(signals)
             parts = zip(signals.split(together), ears.split(together), strict=True)
-            result = torch.cat([self._run(some, own) for some, own in parts])
+            result = torch.cat([self._run(some, theirs) for some, theirs in parts])
             return result.reshape(*batch, -1).to(waveform.dtype)
 
     def _together(self, signals: Tensor) -> int:
@@ -90,17 +87,13 @@ class EarNetwork(nn.Module):
 
     def _in_blocks(self, signals: Tensor, ears: Tensor) -> Tensor:
         """``_process``, of long signals by blocks where that is the same. Shapes as ``_process``'s."""
-        if self._reach is None or torch.compiler.is_compiling():
+        if self._receptive_field is None or torch.compiler.is_compiling():
             return self._process(signals, ears)
-        unit, reach = self._reach
-        lead = math.ceil(reach / unit) * unit
-        hop = (self._at_once if signals.device.type == "cpu" else _DEVICE_SAMPLES) // unit * unit
-        bounds = overlapping(signals.shape[-1], hop, lead, lead)
-        blocks = [
-            self._process(signals[:, begin:end], ears)[:, start - begin : stop - begin]
-            for begin, start, stop, end in bounds
-        ]
-        return blocks[0] if len(blocks) == 1 else torch.cat(blocks, -1)
+        unit, field = self._receptive_field
+        hop = self._at_once if signals.device.type == "cpu" else _DEVICE_SAMPLES
+        blocks = overlapping(signals.shape[-1], hop, field, field, unit)
+        outputs = [block.kept(self._process(block.given(signals), ears)) for block in blocks]
+        return outputs[0] if len(outputs) == 1 else torch.cat(outputs, -1)
 
     @property
     def _at_once(self) -> int:
@@ -109,7 +102,7 @@ class EarNetwork(nn.Module):
         return min(max(int(_CPU_VALUES / self.config.density), least), most)
 
     @property
-    def _reach(self) -> tuple[int, int] | None:
+    def _receptive_field(self) -> tuple[int, int] | None:
         """Samples of which blocks begin at multiples, and on how many to either side one depends; None if on all."""
         raise NotImplementedError
 

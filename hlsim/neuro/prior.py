@@ -1,4 +1,4 @@
-"""What is known of MSBG, as the starting point of a network: smearing, band envelopes and gains on its own frames.
+"""What is known of MSBG, as the starting point of a network: smearing, band envelopes and gains on short frames.
 
 One set of weights a severity, computed from MSBG's formulae; what is trained is a correction to them.
 """
@@ -16,20 +16,20 @@ from hlsim.audiogram import SEVERITIES
 from hlsim.calibration import PASCAL_SPL
 from hlsim.dsp.fir import filter_centred
 from hlsim.dsp.stft import STFT
-from hlsim.msbg.ear import RATE, ear_filter
+from hlsim.msbg.ear import MSBG_RATE, ear_filter
 from hlsim.msbg.envelope import envelope_filters
 from hlsim.msbg.filterbank import BANKS, FilterBank, gammatone_response
 from hlsim.msbg.recruitment import CATCH_UP_SPL, expansion_ratios, threshold_weights
 from hlsim.msbg.response import fixed_response
 from hlsim.msbg.smearing import BROADENING, roex_filters, smearing_from_filters
 from hlsim.neuro.config import NEURO_RATE
-from hlsim.torchtools import constant
+from hlsim.torchtools import constant_like
 
-RESPONSE_REACH = 1024
-"""Samples at 16 kHz by which the fixed responses reach to either side."""
+RESPONSE_HALF_LENGTH = 1024
+"""Samples at 16 kHz of the fixed responses to either side of zero."""
 
 _CHANNELS = max(bank.channels for bank in BANKS.values())
-_ENVELOPE_REACH = 20  # frames
+_ENVELOPE_HALF_LENGTH = 20  # frames
 _TINY = 1e-14
 
 # By how much MSBG's envelope of speech is lower than a sinusoid's of the same power, since it fluctuates and smeared
@@ -47,7 +47,7 @@ class Prior(nn.Module):
         stft: the transform; its window should be about as short as MSBG's smearing frame, 5.8 ms.
 
     Attributes:
-        reach: samples to either side on which one depends, besides those of the transform.
+        receptive_field: samples to either side on which one depends, besides those of the transform.
     """
 
     response: Tensor
@@ -55,7 +55,7 @@ class Prior(nn.Module):
 
     def __init__(self, stft: STFT) -> None:
         super().__init__()
-        self.reach = RESPONSE_REACH + _ENVELOPE_REACH * stft.hop
+        self.receptive_field = RESPONSE_HALF_LENGTH + _ENVELOPE_HALF_LENGTH * stft.hop
         points = 160 * stft.fft  # a fine grid that 44.1 kHz shares
         coarse = slice(None, points // 2 + 1, 160)
         banks = [BANKS[severity] for severity in SEVERITIES]
@@ -113,7 +113,7 @@ class Prior(nn.Module):
         level = ((smeared.relu() @ self._corrected("excitation")[severity].mT) + _TINY).sqrt().mT
         items, channels, frames = level.shape
         kernels = self._corrected("smoothing")[severity].reshape(items * channels, 1, -1)
-        level = functional.pad(level, (_ENVELOPE_REACH, _ENVELOPE_REACH), mode="replicate")
+        level = functional.pad(level, (_ENVELOPE_HALF_LENGTH, _ENVELOPE_HALF_LENGTH), mode="replicate")
         level = functional.conv1d(level.reshape(1, items * channels, -1), kernels, groups=items * channels)
         level = level.reshape(items, channels, frames).clamp_min(1e-7)
 
@@ -125,7 +125,7 @@ class Prior(nn.Module):
 
     def _exponents(self, thresholds: Tensor, severity: Tensor) -> Tensor:
         """Shape: (items, 8), (items,) -> (items, channels); 0 where a bank has fewer."""
-        weights = constant(_threshold_weights, dtype=thresholds.dtype, device=thresholds.device)
+        weights = constant_like(thresholds, _threshold_weights)
         return expansion_ratios(thresholds, weights[severity]) - 1.0
 
 
@@ -137,26 +137,26 @@ def _widening(smeared: Tensor, given: Tensor) -> Tensor:
 
 
 def _sum_response(bank: FilterBank) -> NDArray[np.float64]:
-    """Impulse response of all of MSBG at 16 kHz with every gain at 1, aligned. Returns (2 reach,), its zero at reach."""
+    """Impulse response of all of MSBG at 16 kHz, gains at 1, aligned. Returns (2 half lengths,), zero in the middle."""
     points = 160 * 160
     impulse = np.fft.irfft(fixed_response(bank, NEURO_RATE, points), points)
-    return np.roll(impulse, RESPONSE_REACH)[: 2 * RESPONSE_REACH]
+    return np.roll(impulse, RESPONSE_HALF_LENGTH)[: 2 * RESPONSE_HALF_LENGTH]
 
 
 def _smoothing(bank: FilterBank, hop: int) -> NDArray[np.float64]:
-    """The envelope's low-pass at the frame rate. Returns (channels, 2 reach + 1)."""
+    """The envelope's low-pass at the frame rate. Returns (channels, 2 half lengths + 1)."""
     points = 4096
-    omega = 2.0 * np.pi * np.fft.rfftfreq(points) * (NEURO_RATE / hop) / RATE
+    omega = 2.0 * np.pi * np.fft.rfftfreq(points) * (NEURO_RATE / hop) / MSBG_RATE
     rows = []
     for numerator, denominator in envelope_filters(bank):
         impulse = np.fft.irfft(np.abs(freqz(numerator, denominator, omega)[1]) ** 2, points)
-        row = np.roll(impulse, _ENVELOPE_REACH)[: 2 * _ENVELOPE_REACH + 1]
+        row = np.roll(impulse, _ENVELOPE_HALF_LENGTH)[: 2 * _ENVELOPE_HALF_LENGTH + 1]
         rows.append(row / row.sum())
     return np.array(rows)
 
 
 def _smearing(severity: str, stft: STFT) -> NDArray[np.float64]:
-    """MSBG's smearing matrix on the transform's own frequencies."""
+    """MSBG's smearing matrix on the transform's frequencies."""
     spacing = NEURO_RATE / stft.fft
     count = round(20000.0 / spacing / 4.0) * 4
     matrix = smearing_from_filters(

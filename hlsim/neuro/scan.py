@@ -86,7 +86,7 @@ def torch_scan(
 
 
 def _onward(decay: Tensor, states: Tensor, spare: Tensor) -> list[_Step]:
-    """The steps of h[t] = decay[t] h[t-1] + drive[t] with h[-1] = 0, over its own drive.
+    """The steps of h[t] = decay[t] h[t-1] + drive[t] with h[-1] = 0, in place of the drive.
 
     Neighbours are joined in pairs, their scan is one of half the length, and the times between follow from it: about
     three operations a time, log2(time) deep, and only products of decays, so that nothing overflows.
@@ -155,7 +155,7 @@ class _SelectiveScan(torch.autograd.Function):
 
 
 class _Slopes(torch.autograd.Function):
-    """The gradients, by a function of its own: with ``once_differentiable``, ``torch.autograd.grad`` for chosen inputs
+    """The gradients, by another function: with ``once_differentiable``, ``torch.autograd.grad`` for chosen inputs
     finds no way through a second derivative and leaves its part out.
     """
 
@@ -193,7 +193,7 @@ class _Workspace:
     """Decays and states of a block, in memory that the next block uses again. Shape: (items, time, states, channels)."""
 
     def __init__(self, shape: tuple[int, ...], memory: list[Tensor]) -> None:
-        views = [own[: math.prod(shape)].view(shape) for own in memory]
+        views = [part[: math.prod(shape)].view(shape) for part in memory]
         self.decay, self.states, self.spare = views[:3]
         self.slope = views[-1]  # a fourth, where there is a way back
         self.onward = _onward(self.decay, self.states, self.spare)

@@ -12,7 +12,7 @@ from hlsim.calibration import dbfs
 from hlsim.checks import refuse_unknown
 from hlsim.data.teacher import Teacher
 from hlsim.extras import require
-from hlsim.msbg.ear import RATE
+from hlsim.msbg.ear import MSBG_RATE
 
 _SHOWN = 0.12  # s: a delay of 28 ms is plain to see
 
@@ -49,7 +49,7 @@ def draw_alignment(
     if method == "impulse":
         delay = float(impulse.delay(thresholds))
     else:
-        delay = impulse.msbg.delay(ear.severity) * sample_rate / RATE
+        delay = impulse.msbg.delay(ear.severity) * sample_rate / MSBG_RATE
     first = min(max(0, int(signal.abs().argmax()) - shown // 2), signal.shape[-1] - shown)
     times = torch.arange(first, first + shown) / sample_rate
 

@@ -21,8 +21,7 @@ from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
-from hlsim.files import write_whole
-from hlsim.pretrained import repair_checkpoint
+from hlsim.files import repair_folder, write_whole
 from hlsim.training.examples import ShowExamples
 from hlsim.training.state import BEST, CHECKPOINT, LAST, WholeStates, claim
 
@@ -266,7 +265,7 @@ def run(
                 f"cannot train with device {accelerator}, devices {devices}, nodes {nodes}, strategy {strategy}: {error}"
             ) from error
         claim(folder, recipe)  # now that the training can begin
-        repair_checkpoint(folder / CHECKPOINT)
+        repair_folder(folder / CHECKPOINT)
         # SLURM's end of a job leaves its own, newer than the last validation's
         left = [path for path in (last, *folder.glob("hpc_ckpt_*.ckpt")) if path.is_file()]
         newest = max(left, key=lambda path: path.stat().st_mtime_ns, default=None)

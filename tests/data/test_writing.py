@@ -25,7 +25,7 @@ from hlsim.data.instances import MANIFEST, Instance, Plan
 from hlsim.data.plan import prepare
 from hlsim.data.plan_settings import PlanSettings
 from hlsim.data.writing import Recipe, write_instances
-from hlsim.files import alone
+from hlsim.files import file_lock
 
 ROOT = Path(__file__).parents[2]
 
@@ -129,7 +129,7 @@ def test_what_is_there_is_kept_and_the_rest_made(plan: Path) -> None:
 
 def test_two_do_not_write_at_once(plan: Path) -> None:
     pytest.importorskip("fcntl")
-    with alone(plan / MANIFEST), pytest.raises(ValueError, match="another process is writing there"):
+    with file_lock(plan / MANIFEST), pytest.raises(ValueError, match="another process is writing there"):
         write(plan)
     write(plan)
 
@@ -204,7 +204,7 @@ def test_a_full_disk_ends_it_clearly_and_leaves_no_broken_instance(
 def test_a_device_that_is_full(tmp_path: Path) -> None:
     """The kernel's own error, which comes when the buffer is flushed."""
     with files.Whole(tmp_path / "a") as file:
-        file._partial.unlink()
+        file.partial.unlink()
         file._file.close()  # type: ignore[union-attr]
         file._file = open("/dev/full", "wb")  # noqa: SIM115
         file.write(b"x")

@@ -5,7 +5,7 @@ import pytest
 import scipy.signal
 
 from hlsim.dsp.erb import erb
-from hlsim.msbg.ear import RATE
+from hlsim.msbg.ear import MSBG_RATE
 from hlsim.msbg.filterbank import FilterBank
 
 
@@ -21,7 +21,7 @@ def _band_noise(bank: FilterBank, time: int) -> np.ndarray:
     rows = []
     for hz, width in zip(bank.centre_frequencies, erb(np.array(bank.centre_frequencies)), strict=True):
         edges = [max(20.0, hz - width), min(22000.0, hz + width)]
-        sos = scipy.signal.butter(2, edges, "bandpass", fs=RATE, output="sos")
+        sos = scipy.signal.butter(2, edges, "bandpass", fs=MSBG_RATE, output="sos")
         row = scipy.signal.sosfilt(sos, rng.standard_normal(time)) * slow
         rows.append(row / np.sqrt(np.mean(row**2)))
     return 10 ** (-30 / 20) * np.array(rows)

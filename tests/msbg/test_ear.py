@@ -5,7 +5,7 @@ import pytest
 import scipy.signal
 
 from hlsim.dsp.fir import frequency_sampling_fir
-from hlsim.msbg.ear import EAR_DELAY, RATE, ear_filter, lowpass_filter
+from hlsim.msbg.ear import EAR_DELAY, MSBG_RATE, ear_filter, lowpass_filter
 
 msbg = pytest.importorskip("clarity.evaluator.msbg.msbg")
 msbg_utils = pytest.importorskip("clarity.evaluator.msbg.msbg_utils")
@@ -29,10 +29,10 @@ def test_delay_is_half_the_length(backward: bool) -> None:
 
 def test_there_and_back_is_nothing_but_delay_where_the_filter_is_long_enough() -> None:
     hz = np.geomspace(150, 5000, 400)
-    both = [scipy.signal.freqz(ear_filter(way), 1.0, hz, fs=RATE)[1] for way in (False, True)]
+    both = [scipy.signal.freqz(ear_filter(way), 1.0, hz, fs=MSBG_RATE)[1] for way in (False, True)]
     assert np.abs(20 * np.log10(np.abs(both[0] * both[1]))).max() < 0.5
     # 1 kHz is where the tables are 0 dB
-    at_1_khz = np.abs(scipy.signal.freqz(ear_filter(), 1.0, [1000.0], fs=RATE)[1])
+    at_1_khz = np.abs(scipy.signal.freqz(ear_filter(), 1.0, [1000.0], fs=MSBG_RATE)[1])
     assert abs(20 * np.log10(at_1_khz[0])) < 0.1
 
 
@@ -44,7 +44,7 @@ def test_lowpass_is_the_reference() -> None:
 
 
 def test_lowpass_is_flat_in_the_band_of_speech_and_shut_at_20_khz() -> None:
-    response = np.abs(scipy.signal.freqz(lowpass_filter(), 1.0, [100, 8000, 15000, 20000], fs=RATE)[1])
+    response = np.abs(scipy.signal.freqz(lowpass_filter(), 1.0, [100, 8000, 15000, 20000], fs=MSBG_RATE)[1])
     np.testing.assert_allclose(response[:3], 1.0, atol=1e-3)
     assert response[3] < 1e-4
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from hlsim.dsp.erb import erb
-from hlsim.msbg.ear import RATE
+from hlsim.msbg.ear import MSBG_RATE
 from hlsim.msbg.envelope import STEP, detect, envelope, envelope_lowpass
 from hlsim.msbg.filterbank import BANKS, FilterBank
 
@@ -51,7 +51,7 @@ def test_envelope(name: str, band_noise: Callable[[FilterBank, int], np.ndarray]
     cochlea = pytest.importorskip("clarity.evaluator.msbg.cochlea")
     bank = BANKS[name]
     channels = band_noise(bank, TIME)
-    theirs = cochlea.compute_envelope(channels, erb(np.array(bank.centre_frequencies)), RATE)
+    theirs = cochlea.compute_envelope(channels, erb(np.array(bank.centre_frequencies)), MSBG_RATE)
     ours = envelope(torch.from_numpy(channels), lowpass(bank)).numpy()
     assert ours.shape == (bank.channels, TIME // STEP)
     kept = slice(EDGE // STEP, -(EDGE // STEP))

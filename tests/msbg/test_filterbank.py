@@ -8,7 +8,7 @@ import scipy.signal
 
 from hlsim.audiogram import SEVERITIES
 from hlsim.dsp.erb import erb
-from hlsim.msbg.ear import RATE
+from hlsim.msbg.ear import MSBG_RATE
 from hlsim.msbg.filterbank import BANKS, ORDER, FilterBank, gammatone_response
 
 msbg_utils = pytest.importorskip("clarity.evaluator.msbg.msbg_utils")
@@ -32,7 +32,7 @@ def test_tables(both: tuple[FilterBank, dict[str, Any]]) -> None:
     assert bank.recombination_db == pytest.approx(theirs["Recombination_dB"], abs=1e-12)
     assert bank.broadening == theirs["BROADEN"]
     assert bank.first_highpass == theirs["Start2PoleHP"] - 1
-    assert (theirs["NGAMMA"], theirs["Fs"]) == (ORDER, RATE)
+    assert (theirs["NGAMMA"], theirs["Fs"]) == (ORDER, MSBG_RATE)
     # its "ERBn_CentFrq" are bandwidths
     np.testing.assert_allclose(erb(np.array(bank.centre_frequencies)), theirs["ERBn_CentFrq"], rtol=1e-6)
 
@@ -68,7 +68,7 @@ def test_a_click_through_the_reference_bank(both: tuple[FilterBank, dict[str, An
 
 def test_channels_have_unit_gain_at_their_frequency_and_the_sum_is_what_the_table_says() -> None:
     for bank in (BANKS["mild"], BANKS["moderate"], BANKS["severe"]):
-        response = gammatone_response(bank, RATE)  # a bin a hertz
+        response = gammatone_response(bank, MSBG_RATE)  # a bin a hertz
         for channel, hz in zip(response, bank.centre_frequencies, strict=True):
             assert np.interp(hz, np.arange(len(channel)), np.abs(channel)) == pytest.approx(1.0, abs=1e-3)
         level = 20 * np.log10(np.abs(response.sum(0)[300:8000])) - bank.recombination_db

@@ -6,10 +6,10 @@ import torch
 from torch import Tensor
 
 from hlsim.dsp.erb import erb
-from hlsim.msbg.ear import RATE
+from hlsim.msbg.ear import MSBG_RATE
 from hlsim.msbg.envelope import STEP, envelope, envelope_lowpass
 from hlsim.msbg.filterbank import BANKS, FilterBank
-from hlsim.msbg.filtfilt_end import REACH, ending, ending_response, ending_weights
+from hlsim.msbg.filtfilt_end import LOOK_BACK, ending, ending_response, ending_weights
 
 cochlea = pytest.importorskip("clarity.evaluator.msbg.cochlea")
 
@@ -24,7 +24,7 @@ def tones(bank: FilterBank, length: int, points: int) -> np.ndarray:
     """A tone a channel that begins softly and ends abruptly at ``length``."""
     time = np.arange(points)
     hz = np.array(bank.centre_frequencies)[:, None]
-    channels = np.sin(2 * np.pi * hz * time / RATE + 0.3) * np.minimum(1.0, time / 3000.0) ** 2
+    channels = np.sin(2 * np.pi * hz * time / MSBG_RATE + 0.3) * np.minimum(1.0, time / 3000.0) ** 2
     channels[:, length:] = 0.0
     return channels
 
@@ -34,7 +34,7 @@ def tones(bank: FilterBank, length: int, points: int) -> np.ndarray:
 def test_envelopes_of_what_ends_abruptly(name: str, length: int) -> None:
     bank = BANKS[name]
     channels = tones(bank, length, 2 * STEP * 342)
-    theirs = cochlea.compute_envelope(channels[:, :length], erb(np.array(bank.centre_frequencies)), RATE)
+    theirs = cochlea.compute_envelope(channels[:, :length], erb(np.array(bank.centre_frequencies)), MSBG_RATE)
     ours = torch.from_numpy(channels)
     silent = envelope(ours, torch.from_numpy(envelope_lowpass(bank, channels.shape[-1])))
     held = (silent + added(ours, bank, length)).numpy()[:, : -(-length // STEP)]
@@ -51,7 +51,7 @@ def test_single_precision_is_enough() -> None:
     assert float((added(channels.float(), bank, 8000) - wide).abs().max()) < 1e-5
 
 
-@pytest.mark.parametrize("length", [1, 5, STEP, STEP + 1, 100, REACH - 1, REACH + 1])
+@pytest.mark.parametrize("length", [1, 5, STEP, STEP + 1, 100, LOOK_BACK - 1, LOOK_BACK + 1])
 def test_short_signals_and_leading_dimensions(length: int) -> None:
     bank = BANKS["severe"]
     points = 2 * STEP * (length // 32 + 100)

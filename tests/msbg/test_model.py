@@ -3,6 +3,8 @@
 import copy
 import logging
 import math
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +15,14 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from hlsim import torchtools
 from hlsim.audio import find_audio, read_audio
 from hlsim.audiogram import STANDARD, Audiogram, draw_thresholds
 from hlsim.calibration import gain_to_pascals, level_spl, set_level
-from hlsim.msbg import MSBG, filters
+from hlsim.msbg import MSBG
+from hlsim.msbg.blocks import block_bounds
 from hlsim.msbg.model import STRUCTURAL_DELAY, active_rescaling
-from hlsim.msbg.resampling import block_bounds, to_inner
+from hlsim.msbg.resampling import to_inner
 from hlsim.msbg.smearing import smeared_length
 
 EARS = {"none": "NH", "mild": "N1", "moderate": "N2", "severe": "N4"}  # one a severity
@@ -338,7 +342,8 @@ def test_autocast_is_left(speech: list[tuple[Tensor, int]]) -> None:
 
 
 def test_compiled_it_is_called_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(filters, "_KNOWN", filters._Cache(2**28))  # empty: what makes filters is called, too
+    # empty: what makes filters is called, too
+    monkeypatch.setattr(torchtools, "_KEPT", torchtools._Kept(2**28))
     model, wave = MSBG(Audiogram.standard("N3"), sample_rate=16000), 0.03 * torch.randn(1, 1200)
     heard = torch.compile(model, backend="eager")(wave)
     assert torch.equal(heard, model(wave))
@@ -435,7 +440,7 @@ def test_long_signals_go_by_blocks_that_equal_the_whole(
     with torch.no_grad():
         blocks = model(wave)
         assert len(block_bounds(samples, rate)) == 2
-        monkeypatch.setattr("hlsim.msbg.model.block_bounds", lambda n, _: [(0, 0, n, n)])
+        monkeypatch.setattr("hlsim.msbg.blocks.block_bounds", lambda n, _: [(0, 0, n, n)])
         whole = model(wave)
     assert blocks.shape == whole.shape
     assert relative(blocks.numpy(), whole.numpy()) < 1e-5
@@ -449,7 +454,7 @@ def test_blocks_of_a_rate_that_shares_little_keep_the_length() -> None:
 
 
 def test_gradients_through_blocks_are_those_of_the_whole(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("hlsim.msbg.resampling._BLOCK_SECONDS", 1.0)
+    monkeypatch.setattr("hlsim.msbg.blocks._BLOCK_SECONDS", 1.0)
     wave = 0.03 * torch.randn(2 * 44100, dtype=torch.float64)
     model, gradients = MSBG(Audiogram.standard("N3")), []
     for _ in range(2):
@@ -457,12 +462,12 @@ def test_gradients_through_blocks_are_those_of_the_whole(monkeypatch: pytest.Mon
         model(leaf).square().sum().backward()
         assert leaf.grad is not None
         gradients.append(leaf.grad.numpy())
-        monkeypatch.setattr("hlsim.msbg.model.block_bounds", lambda n, _: [(0, 0, n, n)])
+        monkeypatch.setattr("hlsim.msbg.blocks.block_bounds", lambda n, _: [(0, 0, n, n)])
     assert relative(gradients[0], gradients[1]) < 1e-4
 
 
 def test_gradients_through_blocks_are_the_same_by_a_transform(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("hlsim.msbg.resampling._BLOCK_SECONDS", 1.0)
+    monkeypatch.setattr("hlsim.msbg.blocks._BLOCK_SECONDS", 1.0)
     model, wave = MSBG(Audiogram.standard("N3"), sample_rate=16000), 0.03 * torch.randn(20000)
     assert len(block_bounds(20000, 16000)) > 1
     leaf = wave.clone().requires_grad_()
@@ -496,3 +501,8 @@ def test_outputs_hold_no_more_than_themselves(rate: int, ears: list[str]) -> Non
     heard = model(0.01 * torch.randn(len(ears), 400))
     assert heard.is_contiguous()
     assert heard.untyped_storage().nbytes() == heard.nbytes
+
+
+def test_it_needs_no_reader_of_files() -> None:
+    code = "import sys; sys.modules['soundfile'] = None; import hlsim.msbg; assert 'hlsim.audio' not in sys.modules"
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=120)

@@ -12,7 +12,7 @@ from torch.overrides import TorchFunctionMode
 from hlsim.audiogram import FREQUENCIES, draw_thresholds
 from hlsim.calibration import gain_to_pascals
 from hlsim.dsp.erb import erb
-from hlsim.msbg.ear import RATE
+from hlsim.msbg.ear import MSBG_RATE
 from hlsim.msbg.envelope import STEP, envelope, envelope_lowpass
 from hlsim.msbg.filterbank import BANKS, FilterBank
 from hlsim.msbg.recruitment import (
@@ -73,7 +73,7 @@ def test_recruitment(name: str, band_noise: Callable[[FilterBank, int], np.ndarr
     bank = BANKS[name]
     channels = band_noise(bank, TIME)
     theirs = np.maximum(
-        cochlea.compute_envelope(channels, erb(np.array(bank.centre_frequencies)), RATE), 1e-7
+        cochlea.compute_envelope(channels, erb(np.array(bank.centre_frequencies)), MSBG_RATE), 1e-7
     )
     ratios = expansion_ratios(
         torch.linspace(20.0, 70.0, 8, dtype=torch.float64), torch.from_numpy(threshold_weights(bank))

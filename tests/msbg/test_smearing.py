@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from hlsim.msbg.ear import RATE
+from hlsim.msbg.ear import MSBG_RATE
 from hlsim.msbg.smearing import (
     BROADENING,
     FFT,
@@ -13,9 +13,9 @@ from hlsim.msbg.smearing import (
     SMEARING_DELAY,
     roex_filters,
     smear,
-    smeared_bins,
     smeared_length,
     smearing_matrix,
+    smearing_matrix_below,
 )
 
 clarity = pytest.importorskip("clarity.evaluator.msbg.smearing")
@@ -32,7 +32,7 @@ def test_broadening_is_the_references() -> None:
 
 @pytest.mark.parametrize("sides", [(1.0, 1.0), *BROADENING.values()])
 def test_auditory_filters(sides: tuple[float, float]) -> None:
-    ours = roex_filters(*sides, FFT // 2, RATE / FFT)
+    ours = roex_filters(*sides, FFT // 2, MSBG_RATE / FFT)
     np.testing.assert_allclose(ours, clarity.audfilt(*sides, 44100.0, 256), rtol=1e-12, atol=1e-15)
 
 
@@ -64,12 +64,12 @@ def test_smearing_sample_for_sample(severity: str, length: int) -> None:
 @pytest.mark.parametrize("highest", [8000.0, 9000.0])
 def test_frequencies_above_the_highest_of_interest_need_not_be_smeared(severity: str, highest: float) -> None:
     spectrum = torch.fft.rfft(torch.randn(32 * 400, dtype=torch.float64))
-    spectrum[round(highest / (RATE / 2) * 32 * 400) :] = 0.0
+    spectrum[round(highest / (MSBG_RATE / 2) * 32 * 400) :] = 0.0
     noise = torch.fft.irfft(spectrum)
-    matrix, bins = torch.from_numpy(smearing_matrix(*BROADENING[severity])), smeared_bins(2, highest)
-    assert bins < 128
-    whole, part = (torch.fft.rfft(smear(noise, matrix[:n, :n], 2)) for n in (128, bins))
-    below = slice(round(highest / (RATE / 2) * smeared_length(32 * 400)))
+    matrices = smearing_matrix(*BROADENING[severity])[:128, :128], smearing_matrix_below(severity, 2, highest)
+    assert len(matrices[1]) < 128
+    whole, part = (torch.fft.rfft(smear(noise, torch.from_numpy(matrix), 2)) for matrix in matrices)
+    below = slice(round(highest / (MSBG_RATE / 2) * smeared_length(32 * 400)))
     assert (whole - part)[below].norm() < 1e-3 * whole[below].norm()
 
 

@@ -8,7 +8,7 @@ from hlsim.audiogram import SEVERITIES
 from hlsim.dsp.fft import power
 from hlsim.msbg.filterbank import BANKS
 from hlsim.neuro.config import NeuroConfig
-from hlsim.neuro.prior import RESPONSE_REACH, Prior, _widening
+from hlsim.neuro.prior import RESPONSE_HALF_LENGTH, Prior, _widening
 
 
 def test_fixed_response_is_msbg_without_a_loss() -> None:
@@ -22,7 +22,9 @@ def test_fixed_response_is_msbg_without_a_loss() -> None:
     exact = MSBG(Audiogram.standard("NH"), sample_rate=16000)(smooth)
     assert float((prior.filter(smooth, torch.tensor([0])) - exact).norm() / exact.norm()) < 2e-3
     kernel = prior.response[0].numpy()
-    np.testing.assert_allclose(filtered[0, 4000 - RESPONSE_REACH : 4000 + RESPONSE_REACH], kernel, atol=1e-6)
+    np.testing.assert_allclose(
+        filtered[0, 4000 - RESPONSE_HALF_LENGTH : 4000 + RESPONSE_HALF_LENGTH], kernel, atol=1e-6
+    )
 
 
 def test_no_loss_means_no_gain_and_no_smearing() -> None:

@@ -1,0 +1,150 @@
+"""Constants are made once for each type and device, and what a mode makes of them is not kept; freed memory is."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+from torch._subclasses.fake_tensor import FakeTensor, FakeTensorMode
+from torch.func import grad
+
+from hlsim import MSBG, Audiogram, torchtools
+from hlsim.msbg.filterbank import BANKS
+from hlsim.msbg.multirate import multirate_bank
+from hlsim.torchtools import constant, constant_like, made_once
+
+CPU = torch.device("cpu")
+
+
+def test_made_once_for_each_type_and_device() -> None:
+    calls = []
+
+    def make(count: int) -> list[int]:
+        calls.append(count)
+        return [1] * count
+
+    first = constant(make, 3, dtype=torch.float32, device=CPU)
+    assert constant(make, 3, dtype=torch.float32, device=CPU) is first and first.tolist() == [1.0] * 3
+    assert constant(make, 3, dtype=torch.float64, device=CPU).dtype == torch.float64
+    assert constant(make, 4, dtype=torch.float32, device=CPU).shape == (4,)
+    assert constant(make, 3, dtype=torch.float32, device=torch.device("meta")).is_meta
+    assert calls == [3, 3, 4, 3]
+
+
+def test_what_inference_mode_or_a_transform_asks_for_first_serves_gradients_too() -> None:
+    def make(value: float) -> list[float]:
+        return [value]
+
+    def scale(x: Tensor, value: float) -> Tensor:
+        return x * constant(make, value, dtype=x.dtype, device=x.device)
+
+    with torch.inference_mode():
+        scale(torch.ones(1), 2.0)
+    torch.func.vmap(lambda x: scale(x, 3.0))(torch.ones(4, 1))
+    torch.func.grad(lambda x: scale(x, 4.0).sum())(torch.ones(1))
+    for value in (2.0, 3.0, 4.0):
+        x = torch.ones(1, requires_grad=True)
+        scale(x, value).sum().backward()
+        assert x.grad is not None and x.grad.item() == value
+
+
+def test_what_fake_tensors_ask_for_is_not_kept() -> None:
+    def make() -> list[float]:
+        return [5.0]
+
+    with FakeTensorMode():
+        assert isinstance(constant(make, dtype=torch.float32, device=CPU), FakeTensor)
+    assert constant(make, dtype=torch.float32, device=CPU).tolist() == [5.0]
+
+
+@pytest.fixture
+def small(monkeypatch: pytest.MonkeyPatch) -> torchtools._Kept:
+    kept = torchtools._Kept(4 * 2**20)
+    monkeypatch.setattr(torchtools, "_KEPT", kept)
+    return kept
+
+
+def test_complex_constants_and_those_like_a_tensor() -> None:
+    def make(count: int) -> np.ndarray:
+        return 1j * np.arange(count)[::-1]
+
+    for dtype, expected in ((torch.float32, torch.complex64), (torch.float64, torch.complex128)):
+        made = constant(make, 3, dtype=dtype, device=CPU)
+        assert made.dtype == expected and made.is_contiguous() and made.imag.tolist() == [2.0, 1.0, 0.0]
+        for like in (torch.ones(1, dtype=dtype), torch.ones(1, dtype=expected)):
+            assert constant_like(like, make, 3) is made
+    assert constant(make, 4, dtype=torch.float32, device=CPU) is not constant(
+        make, 3, dtype=torch.float32, device=CPU
+    )
+
+
+def test_memory_does_not_grow_with_the_number_of_lengths(small: torchtools._Kept) -> None:
+    model = MSBG(Audiogram.standard("N3"), sample_rate=16000)
+    signals = [0.01 * torch.ones(1, 3000 + 2000 * n) for n in range(8)]
+    first = [model(signal) for signal in signals]
+    assert small.held <= small.limit
+    for signal, expected in zip(signals, first, strict=True):  # the early ones are made again
+        assert torch.equal(model(signal), expected)
+    assert small.held <= small.limit
+
+
+def test_one_that_is_too_large_is_held_all_the_same(small: torchtools._Kept) -> None:
+    key = (multirate_bank, BANKS["severe"], 24 * 4000, 1, 22050.0, torch.float32, CPU)
+    bank = made_once(*key)
+    assert made_once(*key) is bank and small.held > small.limit
+    constant(np.arange, 4410, dtype=torch.float32, device=CPU)
+    assert small.held <= small.limit
+
+
+def test_what_a_transform_makes_serves_after_it(small: torchtools._Kept) -> None:
+    model = MSBG(Audiogram.standard("N3"), sample_rate=16000)
+    wave, gain = 0.03 * torch.randn(1, 1200), torch.tensor(1.0)
+
+    def energy(factor: Tensor) -> Tensor:
+        return model(wave * factor).square().sum()
+
+    second = grad(grad(energy))(gain)
+    assert torch.equal(grad(grad(energy))(gain), second)
+    leaf = gain.clone().requires_grad_()
+    torch.testing.assert_close(grad(energy)(gain), torch.autograd.grad(energy(leaf), leaf)[0])
+
+
+# a child of its own, for the setting is the process's: megabytes again and again, as a training asks for them
+_FAULTS = """
+import resource, sys, torch
+from hlsim.torchtools import keep_freed_memory
+if sys.argv[1] == "keep" and not keep_freed_memory():
+    sys.exit(7)
+def step():
+    held = [torch.ones(5_000_000) for _ in range(8)]
+for _ in range(2):
+    step()
+before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+for _ in range(5):
+    step()
+print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
+"""
+
+
+def faults(how: str) -> int:
+    done = subprocess.run([sys.executable, "-c", _FAULTS, how], capture_output=True, text=True, timeout=120)
+    if done.returncode == 7:
+        pytest.skip("no glibc")
+    assert done.returncode == 0, done.stderr
+    return int(done.stdout)
+
+
+def test_kept_memory_costs_no_page_faults() -> None:
+    assert faults("keep") < faults("as it is") / 10
+
+
+def test_other_c_libraries_are_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    def none(_: object) -> object:
+        raise OSError("no such library")
+
+    monkeypatch.setattr(torchtools.ctypes, "CDLL", none)
+    assert torchtools.keep_freed_memory() is False
+    monkeypatch.setattr(torchtools.ctypes, "CDLL", lambda _: object())
+    assert torchtools.keep_freed_memory() is False
