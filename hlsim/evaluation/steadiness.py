@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
@@ -15,7 +14,6 @@ from hlsim.calibration import level_spl, set_level
 from hlsim.evaluation.items import RATE, Item
 from hlsim.evaluation.judging import NORMAL
 from hlsim.msbg import MSBG
-from hlsim.report.page import Section, Table
 
 TONES = (250, 500, 1000, 2000, 3001, 4000)
 """In Hz. Frames that are multiples of 4 ms apart all find the others in one phase, but not 3001 Hz."""
@@ -116,56 +114,6 @@ def shift_differences(
         about = {"compensator": name, "items": [*items], "delays": [*DELAYS]}
         found.append({**about, "difference_db": differences})
     return found
-
-
-def tone_table(found: Sequence[Mapping[str, Any]]) -> Table:
-    """A row an ear, compensator and level, with the worst sidebands of the row."""
-    rows = []
-    for own in found:
-        figures = zip(own["levels"], own["heard_off_db"], own["sidebands_db"], strict=True)
-        for level, offs, sidebands in figures:
-            worst = int(np.argmax(sidebands))
-            name = f"{own['ear']}, {own['compensator']}, {level:g} dB SPL"
-            most = f"{round(sidebands[worst])} ({own['frequencies'][worst]} Hz)"
-            rows.append([name, *(f"{off:+.1f}" for off in offs), most])
-    header = ["Ear, compensator, input", *(f"{hz} Hz" for hz in TONES), "Worst sidebands (of the tone)"]
-    return Table(
-        "Level heard less a normal ear's of the same tone, and sidebands of the output, in dB", header, rows
-    )
-
-
-def shift_table(found: Sequence[Mapping[str, Any]]) -> Table:
-    """A row a compensator."""
-    rows = []
-    for own in found:
-        figures = np.array(own["difference_db"])
-        rows.append(
-            [own["compensator"], str(figures.size), f"{np.median(figures):.0f}", f"{figures.max():.0f}"]
-        )
-    header = ("What the ear is given", "n", "Median", "Worst")
-    return Table("Difference of the outputs relative to the output, in dB", header, rows)
-
-
-def steadiness_sections(
-    steady: Sequence[Mapping[str, Any]], shifts: Sequence[Mapping[str, Any]]
-) -> list[Section]:
-    """Both tables, each with what it is."""
-    count, delays = len(shifts[0]["items"]), " or ".join(map(str, DELAYS))
-    return [
-        Section("Steady tones", [_STEADY], [tone_table(steady)]),
-        Section("Does it matter where frames fall?", [_SHIFTS.format(count, delays)], [shift_table(shifts)]),
-    ]
-
-
-_STEADY = (
-    "By the exact MSBG, all that is heard. A tone that the ear cannot hear under any output limit is far below 0 "
-    "whatever is done. Sidebands are the power of all that is further than 20 Hz from the tone, relative to the tone, in "
-    "what the ear is given: modulation, hiss, and the harmonics of a limiter."
-)
-_SHIFTS = (
-    "The clean speech of {} items is delayed by {} samples, and the output, shifted back, is compared with that of the "
-    "speech as it was, without 0.25 s at either end. A filter gives the same; what hangs on where frames fall does not."
-)
 
 
 def _outputs(compensator: nn.Module, signals: Iterable[Tensor], ear: Audiogram, what: str) -> Tensor:
