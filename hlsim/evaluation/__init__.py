@@ -6,9 +6,9 @@ from hlsim.evaluation.comparison import Comparison
 from hlsim.evaluation.haspi_report import haspi_report
 from hlsim.evaluation.scores import Failure, HaspiReport, ItemScore
 from hlsim.evaluation.scoring import Item, score_items
+from hlsim.evaluation.simulators import summarise
 from hlsim.evaluation.statistics import PairedComparison, bootstrap_interval, holm, paired_comparison
 from hlsim.evaluation.store import ScoreStore
-from hlsim.metrics.fidelity import fidelity_markdown, summarise
 from hlsim.metrics.pyclarity import HaspiItem, haspi_many
 from hlsim.report.haspi import write_report
 
@@ -23,7 +23,6 @@ __all__ = [
     "PairedComparison",
     "ScoreStore",
     "bootstrap_interval",
-    "fidelity_markdown",
     "haspi_many",
     "haspi_report",
     "holm",

@@ -11,15 +11,33 @@ from typing import Any
 from torch import Tensor
 
 from hlsim.audiogram import SEVERITIES
-from hlsim.evaluation.items import RATE, Item
+from hlsim.evaluation.items import Item
 from hlsim.files import write_whole
-from hlsim.metrics.fidelity import COLUMNS, GROUPS, column_cells, fidelity_markdown, summarise
+from hlsim.neuro.config import NEURO_RATE
 from hlsim.report.haspi_pictures import draw_svg
 from hlsim.report.haspi_text import markdown_table
 from hlsim.report.page import Picture, Section, Table, render_page
 from hlsim.report.pictures import draw_spectrograms
 
 FILES = ("fidelity.json", "fidelity.md", "fidelity.html", "spectrograms.png")
+
+COLUMNS = {
+    "n": ("n", "d"),
+    "SNR median (dB)": ("snr_median", ".1f"),
+    "SNR worst tenth (dB)": ("snr_worst_tenth", ".1f"),
+    "STOI LCC": ("stoi_lcc", ".4f"),
+    "STOI SRCC": ("stoi_srcc", ".4f"),
+    "STOI MSE": ("stoi_mse", ".5f"),
+    "PESQ LCC": ("pesq_lcc", ".4f"),
+    "PESQ SRCC": ("pesq_srcc", ".4f"),
+    "PESQ MSE": ("pesq_mse", ".4f"),
+    "RAW MSE": ("raw_mse", ".4f"),
+    "Band error median (dB)": ("band_error_median", ".2f"),
+}
+"""Titles of a table's columns, with the figure and its format."""
+
+GROUPS = {"severity": "By degree of loss", "level": "By level (dB SPL)", "condition": "By condition"}
+
 
 _INPUT_TITLES = {
     "as-is": "Speech as it is",
@@ -30,18 +48,36 @@ _INPUT_TITLES = {
 }
 
 
-def fidelity_result(rows: Mapping[str, Sequence[Mapping[str, Any]]], **settings: Any) -> dict[str, Any]:
-    """Summaries by simulator and input, and the items themselves.
+def fidelity_markdown(summary: Mapping[str, Any]) -> str:
+    """What ``summarise`` returned as Markdown tables: the whole first, then each grouping."""
+    whole = Table("", ["Items", *COLUMNS], [["all", *column_cells(summary["overall"])]])
+    groups = [f"**{table.caption}**\n\n{markdown_table(table)}" for table in group_tables(summary)]
+    return "\n\n".join([markdown_table(whole), *groups]) + "\n"
 
-    Returns: ``{**settings, "simulators": {name: {"inputs": {input: summary}, "items": rows}}}``, for JSON.
-    """
-    simulators = {}
-    for name, table in rows.items():
-        inputs = {
-            given: summarise([row for row in table if row["input"] == given]) for given in settings["inputs"]
-        }
-        simulators[name] = {"inputs": inputs, "items": [*table]}
-    return {**settings, "simulators": simulators}
+
+def group_tables(summary: Mapping[str, Any]) -> list[Table]:
+    """A table for each of severity, level and condition that the items have."""
+    return [
+        Table(
+            title,
+            [key.capitalize(), *COLUMNS],
+            [[group, *column_cells(figures)] for group, figures in summary[key].items()],
+        )
+        for key, title in GROUPS.items()
+        if summary.get(key)
+    ]
+
+
+def column_cells(figures: Mapping[str, float | int | None]) -> list[str]:
+    """The figures of ``summarise`` under ``COLUMNS``, ``n/a`` where there is none; with their n where it is less."""
+    cells = []
+    for key, form in COLUMNS.values():
+        cell = "n/a" if figures[key] is None else f"{figures[key]:{form}}"
+        # raw MSE and band error are there where an SNR is
+        used = figures.get(f"{key.split('_')[0]}_n", figures["snr_n"])
+        fewer = key != "n" and used != figures["n"] and figures[key] is not None
+        cells.append(f"{cell} ({used} of {figures['n']})" if fewer else cell)
+    return cells
 
 
 def side_by_side(result: Mapping[str, Any], given: str) -> Table:
@@ -94,7 +130,7 @@ def write_fidelity(
         MissingExtraError: matplotlib is not installed.
     """
     picture = io.BytesIO()
-    draw_spectrograms(panels, RATE, picture)
+    draw_spectrograms(panels, NEURO_RATE, picture)
     contents: dict[str, str | bytes] = {
         "fidelity.json": json.dumps(result, indent=1),
         "fidelity.md": fidelity_text(result),
@@ -129,17 +165,7 @@ def _page(result: Mapping[str, Any], spectrograms: bytes, shown: Item) -> str:
     for name, entry in result["simulators"].items():
         given = result["inputs"][0]
         rows = [row for row in entry["items"] if row["input"] == given]
-        tables = [
-            Table(
-                title,
-                [key.capitalize(), *COLUMNS],
-                [
-                    [group, *column_cells(figures)]
-                    for group, figures in entry["inputs"][given].get(key, {}).items()
-                ],
-            )
-            for key, title in GROUPS.items()
-        ]
+        tables = group_tables(entry["inputs"][given])
         sections.append(Section(f"{name}: {_INPUT_TITLES[given].lower()}", (), tables, _pictures(rows)))
     if (failures := failure_table(result)) is not None:
         sections.append(Section("Failures", tables=[failures]))
