@@ -20,6 +20,7 @@ from hlsim.cli.options import (
     seed_option,
     show_progress,
 )
+from hlsim.extras import require
 
 
 def add(commands: Commands) -> None:
@@ -72,7 +73,10 @@ def add(commands: Commands) -> None:
 
 def _haspi_report(options: argparse.Namespace) -> None:
     from hlsim.evaluation import haspi_report
+    from hlsim.report.haspi import markdown, write_report
+    from hlsim.report.page import check_out
 
+    require("matplotlib", "eval")  # not after hours of scoring
     report = haspi_report(
         options.clean,
         options.before,
@@ -83,18 +87,17 @@ def _haspi_report(options: argparse.Namespace) -> None:
         root=options.root,
         measures=[name.strip() for name in options.measures.split(",")],
         baseline=options.baseline,
-        out=options.out,
-        store=options.scores,
+        store=options.scores or check_out(options.out) / "scores.jsonl",
         full_scale_spl=options.full_scale_spl,
         spl=options.spl,
         seed=options.seed,
         jobs=options.jobs,
         backend=options.backend,
         scheduler=options.scheduler,
-        listen=options.listen,
         progress=show_progress("scores"),
     )
-    print(report.to_markdown())
+    write_report(report, options.out, listen=options.listen)
+    print(markdown(report))
     if report.failures:
         made = sum(len(own) for item in report.items for own in item.scores.values())
         print(

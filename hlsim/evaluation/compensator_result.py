@@ -8,9 +8,11 @@ from typing import Any
 import numpy as np
 
 from hlsim.audiogram import SEVERITIES
-from hlsim.evaluation.items import RATE, Item
+from hlsim.evaluation.haspi_report import HaspiReport
+from hlsim.evaluation.items import Item
 from hlsim.evaluation.judging import SIMULATORS, Judged
-from hlsim.evaluation.scores import HaspiReport, ItemScore
+from hlsim.evaluation.scores import ItemScore
+from hlsim.neuro.config import NEURO_RATE
 
 HARD = 0.6
 """Unaided HASPI under which an item belongs to those that need help most."""
@@ -97,7 +99,7 @@ def _report(rows: Rows, items: Sequence[Item], settings: Mapping[str, Any]) -> H
                 measure: {name: own[measure] for name, own in row["figures"].items()}
                 for measure in ("haspi", "hasqi")
             },
-            sample_rate=RATE,
+            sample_rate=NEURO_RATE,
             seconds=settings["seconds"],
             seed=(settings["seed"] + row["item"]) % 2**32,
             listener=row["name"],  # utterances are nested in ears

@@ -13,7 +13,8 @@ from compensators.nalr import NALR
 from hlsim.audiogram import Audiogram, as_thresholds
 from hlsim.evaluation.compensator_result import compensator_result
 from hlsim.evaluation.gain_curves import gain_curves
-from hlsim.evaluation.items import RATE, Item
+from hlsim.evaluation.haspi_report import HaspiReport
+from hlsim.evaluation.items import Item
 from hlsim.evaluation.judging import (
     INPUT_LEVELS,
     OF_NETWORK,
@@ -30,12 +31,9 @@ from hlsim.evaluation.store import ScoreStore, key_of
 from hlsim.extras import require
 from hlsim.metrics.pyclarity import Progress, check_seed
 from hlsim.metrics.registry import version_of, versions_of
+from hlsim.neuro.config import NEURO_RATE
 from hlsim.parallel import check_parallel, run_parallel
 from hlsim.pretrained import load_pretrained
-from hlsim.report.compensators import write_compensators
-from hlsim.report.haspi import check_out
-
-STORE = "scores.jsonl"
 
 UNAIDED, PRESCRIBED = "unaided", "NAL-R"
 """The conditions that every compensator is compared with."""
@@ -45,11 +43,25 @@ _SHIFTED = 6  # items, of which every condition has figures
 _REVISION = 2  # of what ``judge`` measures and how it is kept: raise it where that changes
 
 
+@dataclass(frozen=True)
+class CompensatorEvaluation:
+    """What a comparison of compensators comes to.
+
+    Attributes:
+        result: what ``compensators.json`` holds: ``compensator_result``'s, and ``gain_curves``, ``steady_tones``,
+            ``shifts`` and ``notes``.
+        reports: of each group of items that there is, ``clean``, ``noisy`` and ``hard``.
+    """
+
+    result: dict[str, Any]
+    reports: Mapping[str, HaspiReport]
+
+
 def evaluate_compensators(
     compensators: Mapping[str, nn.Module],
     *,
     speech: str | Path,
-    out: str | Path,
+    store: str | Path | None = None,
     audiograms: str | Path | None = None,
     audiogram: Audiogram | None = None,
     noise: str | Path | None = None,
@@ -62,10 +74,10 @@ def evaluate_compensators(
     seed: int = 0,
     jobs: int | None = None,
     progress: Progress | None = None,
-) -> dict[str, Any]:
-    """Judge compensators, and write ``compensators.json``, ``.md`` and ``.html``.
+) -> CompensatorEvaluation:
+    """Judge compensators beside no aid and NAL-R.
 
-    Figures are stored in ``scores.jsonl`` as they are made, by the samples, the ear and the weights that they are of: a
+    Figures are stored as they are made, by the samples, the ear and the weights that they are of: a
     run that was stopped goes on where it was, one with a compensator more scores that one alone, and one with another
     simulator computes the surrogate gap alone.
 
@@ -73,7 +85,7 @@ def evaluate_compensators(
         compensators: by name, modules at 16 kHz and 94 dB SPL full scale, called with a waveform and an ear. One with a
             ``config.limit_spl`` is held to it.
         speech, noise: folders of recordings; with ``noise`` every second item is noisy, at 2.5 to 17.5 dB.
-        out: folder for the files.
+        store: file of figures, there or not; None keeps nothing.
         audiograms: CSV file of ears that join Bisgaard's N2 to N6 and S1 to S3.
         audiogram: one ear in place of all, for a compensator that was trained for it.
         simulator: the Neuro-MSBG of the surrogate gap, by name or folder.
@@ -85,17 +97,15 @@ def evaluate_compensators(
         jobs: processes; None takes all cores. The figures do not depend on it.
         progress: called with the number of outputs judged and of all.
 
-    Returns: what ``compensators.json`` holds. Items that failed are listed in it with the reason, under ``failures``.
+    Returns: an evaluation. Items that failed are listed in its result with the reason, under ``failures``.
 
     Raises:
         ValueError: data or settings that cannot be used, or no item could be judged.
-        MissingExtraError: pyclarity, joblib or matplotlib is not installed.
+        MissingExtraError: pyclarity or joblib is not installed.
     """
-    for module in ("clarity", "matplotlib"):
-        require(module, "eval")
+    require("clarity", "eval")
     check_parallel(jobs, "loky", None)
     check_seed(seed)
-    check_out(out)
     if items < 1 or not compensators or not levels:
         raise ValueError(
             f"{items} items at {len(levels)} levels for {len(compensators)} compensators; allowed: 1 or more of each"
@@ -111,7 +121,7 @@ def evaluate_compensators(
         ears = [*shown.items()]
     for ear in shown.values():
         as_thresholds(ear)  # to be known before hours of judging
-    conditions = {UNAIDED: Unaided(), PRESCRIBED: NALR(sample_rate=RATE), **compensators}
+    conditions = {UNAIDED: Unaided(), PRESCRIBED: NALR(sample_rate=NEURO_RATE), **compensators}
     conditions = {name: module.eval() for name, module in conditions.items()}
     drawn = draw_judged_items(speech, noise, ears, items=items, seconds=seconds, seed=seed, levels=levels)
     aided = {name: module for name, module in conditions.items() if name != UNAIDED}
@@ -119,7 +129,7 @@ def evaluate_compensators(
     steady = steady_tones(conditions, shown, levels)
     judged = _judge_all(
         _Panel(drawn, conditions, load_pretrained(simulator), seed),
-        ScoreStore(Path(out) / STORE),
+        ScoreStore(store),
         jobs,
         progress,
     )
@@ -139,8 +149,7 @@ def evaluate_compensators(
     shifted = sorted(result["rows"], key=lambda row: row["condition"] != "clean")[:_SHIFTED]
     shifts = shift_differences(aided, {row["item"]: drawn[row["item"]] for row in shifted})
     result |= {"gain_curves": curves, "steady_tones": steady, "shifts": shifts, "notes": [*notes]}
-    write_compensators(result, reports, out)
-    return result
+    return CompensatorEvaluation(result, reports)
 
 
 class _Keys(NamedTuple):

@@ -15,7 +15,7 @@ from hlsim.audiogram import Audiogram
 from hlsim.calibration import set_level
 from hlsim.criteria.bands import band_edges, band_levels
 from hlsim.data.clips import Clips
-from hlsim.evaluation.items import RATE
+from hlsim.neuro.config import NEURO_RATE
 
 UTTERANCES = 6
 """Clips of speech that the curves are of."""
@@ -66,7 +66,7 @@ def gain_curves(
 
     Returns: for each ``{"compensator", "ear", "levels", "frequencies", "gain_db": (levels, 24)}``.
     """
-    clips = Clips(speech, sample_rate=RATE, seconds=_SECONDS)
+    clips = Clips(speech, sample_rate=NEURO_RATE, seconds=_SECONDS)
     drawn = clips.draw(UTTERANCES, torch.Generator().manual_seed(seed))
     curves = []
     for ear_name, ear in ears.items():
@@ -82,7 +82,7 @@ def gain_curves(
 
 def _powers(signal: Tensor) -> Tensor:
     """Mean power of each band. Shape: (utterances, time) -> (24,)."""
-    return (10.0 ** (band_levels(signal.double(), RATE) / 10.0)).mean((0, 1))
+    return (10.0 ** (band_levels(signal.double(), NEURO_RATE) / 10.0)).mean((0, 1))
 
 
 def _centres() -> NDArray[np.float64]:

@@ -149,7 +149,9 @@ class HaspiReport:
         self, rows: Sequence[Mapping[str, float | None]], conditions: Sequence[str] | None
     ) -> np.ndarray:
         names = self.conditions if conditions is None else conditions
-        return np.array([[row.get(name) for name in names] for row in rows], dtype=np.float64)  # None becomes NaN
+        return np.array(
+            [[row.get(name) for name in names] for row in rows], dtype=np.float64
+        )  # None becomes NaN
 
     @property
     def table(self) -> pandas.DataFrame:
@@ -158,7 +160,17 @@ class HaspiReport:
         Raises:
             MissingExtraError: pandas is not installed.
         """
-        facts = ("file", "listener", "ear", "severity", "snr", "clean_level", "full_scale_spl", "seconds", "seed")
+        facts = (
+            "file",
+            "listener",
+            "ear",
+            "severity",
+            "snr",
+            "clean_level",
+            "full_scale_spl",
+            "seconds",
+            "seed",
+        )
         rows = [
             {**{name: getattr(item, name) for name in facts}, "condition": condition}
             for item in self.items

@@ -17,7 +17,6 @@ from hlsim.data.augment import compress, mix
 from hlsim.data.clips import Clips
 from hlsim.neuro.config import NEURO_RATE
 
-RATE = NEURO_RATE
 LEVELS = (50.0, 60.0, 65.0, 70.0, 80.0)
 """Levels in dB SPL that the items take in turn."""
 
@@ -62,8 +61,8 @@ def draw_items(
     once in 160 items.
     """
     generator = torch.Generator().manual_seed(seed)
-    clips = Clips(speech, sample_rate=RATE, seconds=seconds)
-    noises = Clips(noise, sample_rate=RATE, seconds=seconds, repeat=True) if noise is not None else None
+    clips = Clips(speech, sample_rate=NEURO_RATE, seconds=seconds)
+    noises = Clips(noise, sample_rate=NEURO_RATE, seconds=seconds, repeat=True) if noise is not None else None
     measured = [ear for _, ear in read_audiograms(audiograms, simulated=True)]
     chosen = []
     for i in range(items):
@@ -111,7 +110,9 @@ def treat(
         "as-is": lambda item: item.signal,
         "louder": lambda item: 10.0 * item.signal,
         "nal-r": _nalr,
-        "compressed": lambda item: compress(item.signal.unsqueeze(0), torch.tensor([3.0]), RATE).squeeze(0),
+        "compressed": lambda item: compress(
+            item.signal.unsqueeze(0), torch.tensor([3.0]), NEURO_RATE
+        ).squeeze(0),
     }
     if compensator is not None:
         treatments["compensated"] = lambda item: compensator(item.signal, item.ear)
@@ -127,5 +128,5 @@ def treat(
 
 
 def _nalr(item: Item) -> Tensor:
-    aided: Tensor = NALR(item.ear, sample_rate=RATE)(item.signal)
+    aided: Tensor = NALR(item.ear, sample_rate=NEURO_RATE)(item.signal)
     return aided

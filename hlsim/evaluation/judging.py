@@ -16,10 +16,11 @@ from hlsim.calibration import PASCAL_SPL, level_spl, set_level
 from hlsim.criteria.bands import audibility, band_level_loss, band_levels, least_audible
 from hlsim.data.augment import mix
 from hlsim.data.clips import Clips
-from hlsim.evaluation.items import RATE, SNRS_DB, Item
+from hlsim.evaluation.items import SNRS_DB, Item
 from hlsim.metrics.pyclarity import haspi, hasqi
 from hlsim.metrics.reference import pyclarity_msbg
 from hlsim.msbg import MSBG
+from hlsim.neuro.config import NEURO_RATE
 
 INPUT_LEVELS = (50.0, 65.0, 80.0)
 """Levels of the clean speech in dB SPL that the items take in turn."""
@@ -101,8 +102,8 @@ def draw_judged_items(
     Returns: items whose ``about`` has name (of the ear), severity, level, condition, snr (None without noise).
     """
     generator = torch.Generator().manual_seed(seed)
-    clips = Clips(speech, sample_rate=RATE, seconds=seconds)
-    noises = Clips(noise, sample_rate=RATE, seconds=seconds, repeat=True) if noise is not None else None
+    clips = Clips(speech, sample_rate=NEURO_RATE, seconds=seconds)
+    noises = Clips(noise, sample_rate=NEURO_RATE, seconds=seconds, repeat=True) if noise is not None else None
     chosen = []
     for i in range(items):
         turn = i if noises is None else i // 2
@@ -173,7 +174,7 @@ def _figures(task: Task, aided: Tensor, normal: Mapping[str, Tensor]) -> dict[st
     """All but ``OF_NETWORK``."""
     item = task.item
     scores = {
-        name: measure(item.clean, aided, item.ear, RATE, full_scale_spl=PASCAL_SPL, seed=task.seed)
+        name: measure(item.clean, aided, item.ear, NEURO_RATE, full_scale_spl=PASCAL_SPL, seed=task.seed)
         for name, measure in (("haspi", haspi), ("hasqi", hasqi))
     }
     heard = {name: _hear(task, name, aided, item.ear) for name in EXACT}
@@ -190,7 +191,7 @@ def _figures(task: Task, aided: Tensor, normal: Mapping[str, Tensor]) -> dict[st
 
 
 def _loss(heard: Tensor, normal: Tensor) -> float:
-    return float(band_level_loss(heard, normal, RATE))
+    return float(band_level_loss(heard, normal, NEURO_RATE))
 
 
 def peak_spl(waveform: Tensor) -> float:
@@ -206,7 +207,7 @@ def band_error_db(heard: Tensor, normal: Tensor) -> float:
     Raises:
         ValueError: it finds none audible.
     """
-    levels, truth = band_levels(heard, RATE), band_levels(normal, RATE)
+    levels, truth = band_levels(heard, NEURO_RATE), band_levels(normal, NEURO_RATE)
     audible = audibility(truth, least_audible(truth)) > 0.0
     if not bool(audible.any()):
         raise ValueError("nothing of the clean speech is audible to a normal ear")
@@ -215,8 +216,8 @@ def band_error_db(heard: Tensor, normal: Tensor) -> float:
 
 def _hear(task: Task, simulator: str, signal: Tensor, ear: Audiogram) -> Tensor:
     if simulator == "pyclarity":
-        return pyclarity_msbg(signal, ear, RATE)
-    model = task.simulator if simulator == "neuro" else MSBG(sample_rate=RATE)
+        return pyclarity_msbg(signal, ear, NEURO_RATE)
+    model = task.simulator if simulator == "neuro" else MSBG(sample_rate=NEURO_RATE)
     heard: Tensor = model(signal, ear)
     return heard
 

@@ -9,7 +9,6 @@ from typing import Any
 
 from hlsim.audiogram import Audiogram
 
-
 _JSON = (
     *("file", "listener", "ear", "snr", "before", "after", "clean_level", "before_level", "after_level"),
     *("full_scale_spl", "severity", "sample_rate", "seconds", "seed"),

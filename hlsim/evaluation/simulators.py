@@ -9,6 +9,7 @@ import pickle
 import uuid
 import weakref
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -17,16 +18,24 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from hlsim.evaluation.items import LEVELS, RATE, Item, draw_items, treat
+from hlsim.audiogram import SEVERITIES
+from hlsim.evaluation.items import LEVELS, Item, draw_items, treat
 from hlsim.evaluation.store import ScoreStore, key_of
 from hlsim.extras import MissingExtraError
-from hlsim.metrics.fidelity import pesq_wb, raw_mse, snr_db, stoi, third_octave_error_db
+from hlsim.metrics.fidelity import (
+    linear_correlation,
+    mean_squared_error,
+    pesq_wb,
+    rank_correlation,
+    raw_mse,
+    snr_db,
+    stoi,
+    third_octave_error_db,
+)
 from hlsim.metrics.reference import pyclarity_msbg
 from hlsim.metrics.registry import version_of, versions_of
 from hlsim.msbg import MSBG
-from hlsim.report.simulators import fidelity_result, write_fidelity
-
-STORE = "scores.jsonl"
+from hlsim.neuro.config import NEURO_RATE
 
 _SHORTEST = 0.02  # s: a window of the spectrograms
 
@@ -35,12 +44,27 @@ _REVISION = 2  # of what is measured: raise it where that changes a figure
 Report = Callable[[int, int], None]
 
 
+@dataclass(frozen=True)
+class SimulatorEvaluation:
+    """What a comparison of simulators comes to.
+
+    Attributes:
+        result: what ``fidelity.json`` holds, see ``fidelity_result``.
+        shown: the item of the spectrograms.
+        heard: of it, by the truth and by each simulator, by name: (time,), in pascals at 16 kHz.
+    """
+
+    result: dict[str, Any]
+    shown: Item
+    heard: Mapping[str, Tensor]
+
+
 def evaluate_simulators(
     simulators: Mapping[str, nn.Module],
     *,
     speech: str | Path,
     audiograms: str | Path,
-    out: str | Path,
+    store: str | Path | None = None,
     noise: str | Path | None = None,
     teacher: str = "pyclarity",
     items: int = 240,
@@ -50,10 +74,10 @@ def evaluate_simulators(
     compensator: nn.Module | None = None,
     seed: int = 0,
     progress: Report | None = None,
-) -> dict[str, Any]:
-    """Compare simulators with MSBG, side by side, and write ``fidelity.json``, ``.md``, ``.html`` and spectrograms.
+) -> SimulatorEvaluation:
+    """Compare simulators with MSBG, side by side.
 
-    Scores are stored in ``scores.jsonl`` as they are made, by the samples, the ear and the weights that they are of: a
+    Scores are stored as they are made, by the samples, the ear and the weights that they are of: a
     run that was stopped goes on where it was, and one with a simulator more scores that one alone.
 
     Args:
@@ -61,7 +85,7 @@ def evaluate_simulators(
         speech, noise: folders of recordings; with ``noise`` every second item is noisy.
         audiograms: CSV file of ears, half of those used; the milder standard ones (NH, N1, N2, S1) and drawn ones are
             a quarter each.
-        out: folder for the files.
+        store: file of scores, there or not; None keeps nothing.
         teacher: ``"pyclarity"``, the reference itself, or ``"msbg"``, hlsim's own.
         items: how many; each is scored under each of ``inputs``.
         seconds: length of an item; PESQ and STOI want 2 or more.
@@ -70,12 +94,12 @@ def evaluate_simulators(
         compensator: called with a waveform and an ear.
         progress: called with what is done and all.
 
-    Returns: what ``fidelity.json`` holds. An item that a simulator or the truth fails on, or that has no STOI or PESQ, is
-        listed with the ``reasons`` and counts in no figure that it has no value for.
+    Returns: an evaluation. An item that a simulator or the truth fails on, or that has no STOI or PESQ, is listed with
+        the ``reasons`` and counts in no figure that it has no value for.
 
     Raises:
         ValueError: data that cannot be used, an unknown teacher or input, or no item that the truth does not fail on.
-        MissingExtraError: pyclarity, pystoi, pesq or matplotlib is not installed.
+        MissingExtraError: pyclarity, pystoi or pesq is not installed.
     """
     if teacher not in ("pyclarity", "msbg"):
         raise ValueError(f"teacher {teacher!r}; allowed: pyclarity, msbg")
@@ -89,7 +113,7 @@ def evaluate_simulators(
     if not seconds >= _SHORTEST:
         raise ValueError(f"items of {seconds:g} s; allowed: {_SHORTEST:g} or more, and 2 for PESQ and STOI")
     drawn = draw_items(speech, noise, audiograms, items=items, seconds=seconds, seed=seed, levels=levels)
-    store = ScoreStore(Path(out) / STORE)
+    scored = ScoreStore(store)
     # haspi's for pyclarity's, whose MSBG is the truth
     versions = {**versions_of(["stoi", "pesq", "haspi"]), "hlsim": version_of("hlsim")}
     weights = {name: weights_hash(simulator) for name, simulator in simulators.items()}
@@ -104,7 +128,7 @@ def evaluate_simulators(
             "versions": versions,
         }
         keys = {name: key_of({**about, "weights": weights[name]}) for name in simulators}
-        missing = [name for name in simulators if store.get(keys[name]) is None]
+        missing = [name for name in simulators if scored.get(keys[name]) is None]
         failed: dict[str, str] = {}
         if missing:
             try:
@@ -124,9 +148,9 @@ def evaluate_simulators(
                     failed[name] = f"{type(error).__name__}: {error}"
                 else:
                     reasons = true["reasons"] + scores["reasons"]
-                    store.append(keys[name], true | scores | {"reasons": reasons})
+                    scored.append(keys[name], true | scores | {"reasons": reasons})
         for name in simulators:
-            scores = store.get(keys[name]) or {"reasons": [failed[name]]}
+            scores = scored.get(keys[name]) or {"reasons": [failed[name]]}
             rows[name].append({"item": number // len(inputs), **item.about, **scores})
         if progress is not None:
             progress(number + 1, total)
@@ -134,20 +158,19 @@ def evaluate_simulators(
         rows, teacher=teacher, items=items, seconds=seconds, seed=seed, levels=[*levels], inputs=[*inputs]
     )
     shown, truth = _shown(drawn, treat(drawn, inputs, compensator), teacher)
-    panels = {"truth": truth}
+    heard_of = {"truth": truth}
     for name, simulator in simulators.items():
         with contextlib.suppress(Exception), torch.no_grad():  # its failure is in the tables
             heard = simulator(shown.signal, shown.ear)
-            panels |= {name: heard} if heard.isfinite().all() else {}
-    write_fidelity(result, panels, shown, out)
-    return result
+            heard_of |= {name: heard} if heard.isfinite().all() else {}
+    return SimulatorEvaluation(result, shown, heard_of)
 
 
 def _truth(item: Item, teacher: str) -> Tensor:
     if teacher == "pyclarity":
-        return pyclarity_msbg(item.signal, item.ear, RATE)
+        return pyclarity_msbg(item.signal, item.ear, NEURO_RATE)
     with torch.no_grad():
-        heard: Tensor = MSBG(sample_rate=RATE)(item.signal, item.ear)
+        heard: Tensor = MSBG(sample_rate=NEURO_RATE)(item.signal, item.ear)
     return heard
 
 
@@ -155,14 +178,17 @@ def _scores(clean: Tensor, truth: Tensor, heard: Tensor) -> dict[str, Any]:
     return {
         "snr": snr_db(truth, heard),
         "raw_mse": raw_mse(truth, heard),
-        "band_error": third_octave_error_db(truth, heard, RATE),
+        "band_error": third_octave_error_db(truth, heard, NEURO_RATE),
         **_both(clean, heard, "sim"),
     }
 
 
 def _both(clean: Tensor, heard: Tensor, whose: str) -> dict[str, Any]:
     """STOI and PESQ of the truth or the simulator, and the reasons why there is none."""
-    scores = {f"stoi_{whose}": stoi(clean, heard, RATE), f"pesq_{whose}": pesq_wb(clean, heard, RATE)}
+    scores = {
+        f"stoi_{whose}": stoi(clean, heard, NEURO_RATE),
+        f"pesq_{whose}": pesq_wb(clean, heard, NEURO_RATE),
+    }
     reasons = [f"no {name}: {score.reason}" for name, score in scores.items() if score.value is None]
     return {name: score.value for name, score in scores.items()} | {"reasons": reasons}
 
@@ -176,6 +202,83 @@ def _shown(items: Sequence[Item], others: Iterable[Item], teacher: str) -> tuple
         except Exception as error:
             reason = reason or error
     raise ValueError(f"no item has a truth: {reason}")
+
+
+def fidelity_result(rows: Mapping[str, Sequence[Mapping[str, Any]]], **settings: Any) -> dict[str, Any]:
+    """Summaries by simulator and input, and the items themselves.
+
+    Returns: ``{**settings, "simulators": {name: {"inputs": {input: summary}, "items": rows}}}``, for JSON.
+    """
+    simulators = {}
+    for name, table in rows.items():
+        inputs = {
+            given: summarise([row for row in table if row["input"] == given]) for given in settings["inputs"]
+        }
+        simulators[name] = {"inputs": inputs, "items": [*table]}
+    return {**settings, "simulators": simulators}
+
+
+def summarise(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Fidelity over many items: overall, and by each of severity, level and condition that rows have.
+
+    Args:
+        rows: one an item, with any of ``snr``, ``raw_mse``, ``band_error``, ``stoi_true``, ``stoi_sim``,
+            ``pesq_true``, ``pesq_sim`` (a number, or None: then it, or its pair, is left out) and any of ``severity``,
+            ``level`` (dB SPL), ``condition``.
+
+    Returns: ``{"overall": figures, "severity": {"mild": figures, ...}, "level": {"65": figures, ...}, "condition":
+        {...}}``, for JSON. Figures are ``n``, ``snr_n`` (how many have one), ``snr_median``, ``snr_worst_tenth`` (10th
+        percentile), ``raw_mse`` (mean), ``band_error_median`` and, for stoi and pesq, ``_n`` (pairs used), ``_lcc``,
+        ``_srcc``, ``_mse``; None where undefined.
+
+    Raises:
+        ValueError: no rows, or a number that is not finite.
+    """
+    if not rows:
+        raise ValueError("no items to summarise")
+    summary: dict[str, Any] = {"overall": _figures(rows)}
+    for key in ("severity", "level", "condition"):
+        groups: dict[Any, list[Mapping[str, Any]]] = {}
+        for row in rows:
+            if row.get(key) is not None:
+                groups.setdefault(row[key], []).append(row)
+        # degrees of loss in their own order, levels as numbers, conditions by name
+        order = sorted(groups, key=lambda g: (SEVERITIES.index(g) if g in SEVERITIES else 0, g))
+        summary[key] = {g if isinstance(g, str) else f"{g:g}": _figures(groups[g]) for g in order}
+    return summary
+
+
+def _figures(rows: Sequence[Mapping[str, Any]]) -> dict[str, float | int | None]:
+    def column(key: str) -> np.ndarray:
+        values = np.array([row[key] for row in rows if row.get(key) is not None], dtype=np.float64)
+        if not np.isfinite(values).all():
+            raise ValueError(
+                f"{key} holds NaN or infinity; allowed: finite numbers, or None where there is none"
+            )
+        return values
+
+    def over(measure: Callable[[np.ndarray], Any], key: str) -> float | None:
+        values = column(key)
+        return float(measure(values)) if len(values) else None
+
+    figures: dict[str, float | int | None] = {
+        "n": len(rows),
+        "snr_n": len(column("snr")),
+        "snr_median": over(np.median, "snr"),
+        "snr_worst_tenth": over(lambda v: np.percentile(v, 10), "snr"),
+        "raw_mse": over(np.mean, "raw_mse"),
+        "band_error_median": over(np.median, "band_error"),
+    }
+    for name in ("stoi", "pesq"):
+        scored = [
+            row for row in rows if row.get(f"{name}_true") is not None and row.get(f"{name}_sim") is not None
+        ]
+        true, simulated = [row[f"{name}_true"] for row in scored], [row[f"{name}_sim"] for row in scored]
+        figures[f"{name}_n"] = len(scored)
+        figures[f"{name}_lcc"] = linear_correlation(true, simulated)
+        figures[f"{name}_srcc"] = rank_correlation(true, simulated)
+        figures[f"{name}_mse"] = mean_squared_error(true, simulated)
+    return figures
 
 
 def weights_hash(module: nn.Module) -> str:

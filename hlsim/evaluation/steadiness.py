@@ -11,9 +11,10 @@ from torch.nn import functional
 
 from hlsim.audiogram import Audiogram
 from hlsim.calibration import level_spl, set_level
-from hlsim.evaluation.items import RATE, Item
+from hlsim.evaluation.items import Item
 from hlsim.evaluation.judging import NORMAL
 from hlsim.msbg import MSBG
+from hlsim.neuro.config import NEURO_RATE
 
 TONES = (250, 500, 1000, 2000, 3001, 4000)
 """In Hz. Frames that are multiples of 4 ms apart all find the others in one phase, but not 3001 Hz."""
@@ -22,14 +23,14 @@ DELAYS = (7, 30)
 """In samples, no multiples of a usual hop."""
 
 _NEAR_HZ = 20.0
-_MIDDLE = slice(RATE // 2, -RATE // 2)  # one second: every tone has whole periods in it
-_END = RATE // 4  # left out at either end of speech
+_MIDDLE = slice(NEURO_RATE // 2, -NEURO_RATE // 2)  # one second: every tone has whole periods in it
+_END = NEURO_RATE // 4  # left out at either end of speech
 _LEAST, _SILENCE = 1e-20, 1e-30  # smallest ratio of powers, and power: JSON holds no infinity
 
 
 def tones(hertz: Sequence[int], levels: Sequence[float]) -> Tensor:
     """Sines of 2 s at 16 kHz in pascals, each at each level in dB SPL. Shape: -> (tones * levels, 32000)."""
-    turns = torch.tensor(hertz).unsqueeze(-1) * torch.arange(2 * RATE) % RATE / RATE
+    turns = torch.tensor(hertz).unsqueeze(-1) * torch.arange(2 * NEURO_RATE) % NEURO_RATE / NEURO_RATE
     sines = (2.0 * torch.pi * turns).sin().repeat_interleave(len(levels), 0)
     return set_level(sines, torch.tensor(levels, dtype=torch.float32).repeat(len(hertz)))
 
@@ -44,7 +45,7 @@ def sidebands_db(waveform: Tensor, hertz: Tensor) -> Tensor:
     middle = waveform[:, _MIDDLE].double()
     window = torch.hann_window(middle.shape[-1], dtype=middle.dtype)
     power = torch.fft.fft(middle * window).abs().square()
-    bins = torch.fft.fftfreq(middle.shape[-1], 1.0 / RATE).abs()
+    bins = torch.fft.fftfreq(middle.shape[-1], 1.0 / NEURO_RATE).abs()
     near = (bins - hertz.unsqueeze(-1)).abs() <= _NEAR_HZ
     return _ratio_db((power * ~near).sum(-1), (power * near).sum(-1))
 
@@ -128,7 +129,7 @@ def _outputs(compensator: nn.Module, signals: Iterable[Tensor], ear: Audiogram, 
 def _heard(sounds: Tensor, ear: Audiogram) -> Tensor:
     """Level in dB SPL of the middle second. Shape: (items, time) -> (items,)."""
     with torch.no_grad():
-        return level_spl(MSBG(ear, sample_rate=RATE)(sounds)[:, _MIDDLE])
+        return level_spl(MSBG(ear, sample_rate=NEURO_RATE)(sounds)[:, _MIDDLE])
 
 
 def _ratio_db(part: Tensor, whole: Tensor) -> Tensor:

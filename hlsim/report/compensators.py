@@ -70,7 +70,11 @@ def _sections(result: Result, reports: Mapping[str, HaspiReport]) -> list[Sectio
     curves = result["gain_curves"]
     ears = dict.fromkeys(curve["ear"] for curve in curves)
     sections += [
-        Section("As loud as a normal ear hears it?", [_LOUDNESS], [loudness_table(result, group) for group in whole]),
+        Section(
+            "As loud as a normal ear hears it?",
+            [_LOUDNESS],
+            [loudness_table(result, group) for group in whole],
+        ),
         Section("By degree of loss", [_HASQI], by_severity),
         Section("The surrogate gap", [_GAP.format(**result)], [gap_table(result)]),
         Section("Does any output pass the limit?", (), [peak_table(result)]),
@@ -79,7 +83,8 @@ def _sections(result: Result, reports: Mapping[str, HaspiReport]) -> list[Sectio
         Section("Does it matter where frames fall?", [shifts], [shift_table(result["shifts"])]),
     ]
     sections += [
-        Section(f"Pictures: {GROUPS[group].lower()}", pictures=report_pictures(reports[group])) for group in whole
+        Section(f"Pictures: {GROUPS[group].lower()}", pictures=report_pictures(reports[group]))
+        for group in whole
     ]
     if result["failures"]:
         rows = [(str(f["item"]), f["compensator"], f["name"], f["reason"]) for f in result["failures"]]
@@ -261,7 +266,9 @@ def tone_table(found: Sequence[Result]) -> Table:
     """A row an ear, compensator and level, with the worst sidebands of the row."""
     rows = []
     for own in found:
-        for level, offs, sidebands in zip(own["levels"], own["heard_off_db"], own["sidebands_db"], strict=True):
+        for level, offs, sidebands in zip(
+            own["levels"], own["heard_off_db"], own["sidebands_db"], strict=True
+        ):
             worst = int(np.argmax(sidebands))
             rows.append(
                 {
@@ -270,7 +277,9 @@ def tone_table(found: Sequence[Result]) -> Table:
                     "Worst sidebands (of the tone)": f"{round(sidebands[worst])} ({own['frequencies'][worst]} Hz)",
                 }
             )
-    return Table.of("Level heard less a normal ear's of the same tone, and sidebands of the output, in dB", rows)
+    return Table.of(
+        "Level heard less a normal ear's of the same tone, and sidebands of the output, in dB", rows
+    )
 
 
 def shift_table(found: Sequence[Result]) -> Table:
@@ -291,16 +300,19 @@ def _gain_picture(ear: str, curves: Sequence[Result]) -> Picture:
     curves = [curve for curve in curves if curve["ear"] == ear]
 
     def draw(axes: Any) -> None:
-        for number, curve in enumerate(curves):
-            for style, level, gains in zip(("-", "--", ":", "-."), curve["levels"], curve["gain_db"], strict=False):
+        for k, curve in enumerate(curves):
+            for style, level, gains in zip(
+                ("-", "--", ":", "-."), curve["levels"], curve["gain_db"], strict=False
+            ):
                 label = plain(f"{curve['compensator'][:18]}, {level:g}")
-                axes.plot(curve["frequencies"], gains, style, color=f"C{number}", label=label)
+                axes.plot(curve["frequencies"], gains, style, color=f"C{k}", label=label)
         axes.set(ylabel="insertion gain (dB)")
         frequency_axis(axes, (250, 500, 1000, 2000, 4000))
         axes.legend(fontsize="x-small")
 
     at_2k = [
-        f"{curve['compensator']} " + ", ".join(f"{_gains_at(2000.0, curve, own):.0f}" for own in curve["gain_db"])
+        f"{curve['compensator']} "
+        + ", ".join(f"{_gains_at(2000.0, curve, own):.0f}" for own in curve["gain_db"])
         for curve in curves
     ]
     levels = ", ".join(f"{level:g}" for level in curves[0]["levels"])
@@ -319,6 +331,7 @@ def _conditions(result: Result, group: str) -> Mapping[str, Any]:
 
 def _scores(own: Result) -> dict[str, str]:
     means = {
-        f"{name.upper()} (mean ± std)": spread(own[f"{name}_mean"], own[f"{name}_std"]) for name in ("haspi", "hasqi")
+        f"{name.upper()} (mean ± std)": spread(own[f"{name}_mean"], own[f"{name}_std"])
+        for name in ("haspi", "hasqi")
     }
     return {"n": str(own["n"]), **means}

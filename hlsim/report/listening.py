@@ -98,4 +98,6 @@ def _item_section(title: str, item: ItemScore) -> Section:
     thresholds = ", ".join(f"{level:g}" for level in item.audiogram.levels)
     text = f"{item.severity} loss, thresholds {thresholds} dB HL. Levels in dB SPL: {told}."
     alt = f"Spectrograms of {item.file}: {', '.join(signals)}"
-    return Section(title, [text], pictures=[Picture(draw_spectrograms(signals, rate, width=5.0), alt)], players=players)
+    return Section(
+        title, [text], pictures=[Picture(draw_spectrograms(signals, rate, width=5.0), alt)], players=players
+    )

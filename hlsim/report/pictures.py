@@ -15,7 +15,6 @@ from hlsim.calibration import PASCAL_SPL
 from hlsim.evaluation.haspi_report import HaspiReport
 from hlsim.evaluation.statistics import FEWEST, bootstrap_interval
 from hlsim.extras import require
-from hlsim.metrics.registry import MEASURES
 from hlsim.report.page import Picture
 from hlsim.report.tables import loss_name
 
@@ -117,7 +116,12 @@ def draw_report(report: HaspiReport) -> bytes:
     scores, levels = report.scores(c.measure, (c.before, c.after)), report.levels((c.before, c.after))
     levels[np.isnan(scores).any(1)] = np.nan
     panels = (
-        (scores, score_range(c.measure), c.title, f"mean {c.overall.before_mean:.3f} to {c.overall.after_mean:.3f}"),
+        (
+            scores,
+            score_range(c.measure),
+            c.title,
+            f"mean {c.overall.before_mean:.3f} to {c.overall.after_mean:.3f}",
+        ),
         (
             levels,
             (float(np.nanmin(levels)) - 3.0, float(np.nanmax(levels)) + 3.0),
@@ -126,7 +130,7 @@ def draw_report(report: HaspiReport) -> bytes:
         ),
     )
     for axes, (values, limits, what, title) in zip(figure.subplots(1, 2), panels, strict=True):
-        scatter(axes, *values.T, report.severities)
+        scatter(axes, values[:, 0], values[:, 1], report.severities)
         axes.set(xlim=limits, ylim=limits, aspect="equal", title=title)
         axes.set(xlabel=plain(f"{what}, {c.before}"), ylabel=plain(f"{what}, {c.after}"))
     figure.suptitle(plain(f"{c.overall.n} items, {c.before} and {c.after}"))
@@ -155,7 +159,7 @@ def _before_after(report: HaspiReport) -> Picture:
     scores, limits = report.scores(c.measure, (c.before, c.after)), score_range(c.measure)
 
     def draw(axes: Any) -> None:
-        scatter(axes, *scores.T, report.severities)
+        scatter(axes, scores[:, 0], scores[:, 1], report.severities)
         axes.set(xlim=limits, ylim=limits, aspect="equal")
         axes.set(xlabel=plain(f"{c.title}, {c.before}"), ylabel=plain(f"{c.title}, {c.after}"))
 
@@ -179,7 +183,9 @@ def _levels(report: HaspiReport) -> Picture:
         axes.set(xlabel="change of level (dB)", ylabel=f"change of {c.title}")
 
     alt = f"Change of {c.title} over the change of level; the level changed by {x.min():+.1f} to {x.max():+.1f} dB."
-    return Picture(draw_svg(draw), alt, "What gain may explain: the change of the score over that of the level.")
+    return Picture(
+        draw_svg(draw), alt, "What gain may explain: the change of the score over that of the level."
+    )
 
 
 def _distributions(report: HaspiReport) -> Picture:
@@ -198,7 +204,9 @@ def _distributions(report: HaspiReport) -> Picture:
         axes.set(ylim=score_range(measure), ylabel=title)
 
     medians = ", ".join(
-        f"{name} {np.median(own):.3f}" for name, own in zip(report.conditions, values, strict=True) if len(own)
+        f"{name} {np.median(own):.3f}"
+        for name, own in zip(report.conditions, values, strict=True)
+        if len(own)
     )
     alt = f"{title} by condition; medians: {medians}."
     return Picture(draw_svg(draw), alt, "Quartiles, median and every item.")
@@ -237,7 +245,10 @@ def _by_snr(report: HaspiReport) -> Picture:
     def draw(axes: Any) -> None:
         for k, condition in enumerate(report.conditions):
             axes.plot(
-                snrs, [_mean(_known(own[:, k])) for own in groups.values()], marker="o", label=plain(condition)
+                snrs,
+                [_mean(_known(own[:, k])) for own in groups.values()],
+                marker="o",
+                label=plain(condition),
             )
         axes.set(xlabel="SNR (dB)", ylabel=title, ylim=score_range(report.measures[0]))
         axes.legend(fontsize="small")
@@ -254,12 +265,16 @@ def _audiograms(report: HaspiReport) -> Picture:
         for ear in ears:
             axes.plot(ear.frequencies, ear.levels, color="C0", alpha=max(0.15, 1.0 / len(ears)), marker=".")
         if len(ears) > 1:
-            axes.plot(FREQUENCIES, np.mean([ear.thresholds for ear in ears], axis=0), color="black", label="mean")
+            axes.plot(
+                FREQUENCIES, np.mean([ear.thresholds for ear in ears], axis=0), color="black", label="mean"
+            )
             axes.legend(fontsize="small")
         axes.set(ylim=(125.0, -15.0), ylabel="threshold (dB HL)")
         frequency_axis(axes, (250, 500, 1000, 2000, 4000, 8000))
 
-    return Picture(draw_svg(draw), f"Audiograms of {len(ears)} ears.", f"Audiograms: {len(ears)} different ears.")
+    return Picture(
+        draw_svg(draw), f"Audiograms of {len(ears)} ears.", f"Audiograms: {len(ears)} different ears."
+    )
 
 
 def _groups(report: HaspiReport, of_items: Sequence[Any], names: Sequence[Any]) -> dict[Any, np.ndarray]:
@@ -273,7 +288,9 @@ def _in_words(report: HaspiReport, groups: Mapping[str, np.ndarray]) -> str:
     told = []
     for name, group in groups.items():
         means = zip(report.conditions, map(_mean, map(_known, group.T)), strict=True)
-        told.append(f"{name}: " + ", ".join(f"{c} " + ("n/a" if np.isnan(m) else f"{m:.3f}") for c, m in means))
+        told.append(
+            f"{name}: " + ", ".join(f"{c} " + ("n/a" if np.isnan(m) else f"{m:.3f}") for c, m in means)
+        )
     return "; ".join(told)
 
 

@@ -75,7 +75,9 @@ def _lead(result: Row) -> str:
 
 
 def _sections(result: Row, spectrograms: bytes, shown: Item) -> list[Section]:
-    sections = [Section(_INPUT_TITLES[given], tables=[side_by_side(result, given)]) for given in result["inputs"]]
+    sections = [
+        Section(_INPUT_TITLES[given], tables=[side_by_side(result, given)]) for given in result["inputs"]
+    ]
     about = (
         f"{_INPUT_TITLES[shown.about['input']]}, {shown.about['condition']}, {shown.about['level']:g} dB SPL, "
         f"{shown.about['severity']} loss"
@@ -110,7 +112,9 @@ def side_by_side(result: Row, given: str) -> Table:
 
 def summary_tables(summary: Row) -> list[Table]:
     """What ``summarise`` returned: the whole first, then each of severity, level and condition that the items have."""
-    groups = [_table(title, key.capitalize(), summary[key]) for key, title in _GROUPS.items() if summary.get(key)]
+    groups = [
+        _table(title, key.capitalize(), summary[key]) for key, title in _GROUPS.items() if summary.get(key)
+    ]
     return [_table("All items", "Items", {"all": summary["overall"]}), *groups]
 
 
@@ -137,7 +141,9 @@ def _pictures(rows: Sequence[Row]) -> list[Picture]:
 
         def points(axes: Any, measure: str = measure, title: str = title) -> None:
             x, y = (
-                np.array([row.get(f"{measure}_{whose}") for row in rows], dtype=np.float64)  # None becomes NaN
+                np.array(
+                    [row.get(f"{measure}_{whose}") for row in rows], dtype=np.float64
+                )  # None becomes NaN
                 for whose in ("true", "sim")
             )
             scatter(axes, x, y, severities, "equal")

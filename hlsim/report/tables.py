@@ -40,7 +40,9 @@ class Table:
     def markdown(self) -> str:
         """Without the caption."""
         lines = [self.header, ["---"] * len(self.header), *self.rows]
-        return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines)
+        return "\n".join(
+            "| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines
+        )
 
     def latex(self) -> str:
         """For ``\\input``; needs the package booktabs."""
