@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from hlsim.audiogram import Audiogram
 from hlsim.calibration import set_level
 from hlsim.criteria.bands import band_edges, band_levels
 from hlsim.data.clips import Clips
+from hlsim.evaluation.steadiness import outputs
 from hlsim.neuro.config import NEURO_RATE
 
 UTTERANCES = 6
@@ -29,7 +30,7 @@ def insertion_gain(
     """Power out over power in, in dB, in 24 ERB-wide bands (``hlsim.criteria.bands``), over all of the speech.
 
     Args:
-        speech: its spectrum is what a fitter's speech-shaped noise stands for; its own pauses are in it, for a
+        speech: its spectrum is what a fitter's speech-shaped noise stands for; its pauses are in it, for a
             compensator may take noise for noise.
         levels: of each utterance in dB SPL.
 
@@ -39,16 +40,10 @@ def insertion_gain(
         ValueError: the compensator gives samples that are NaN or infinite.
     """
     curves = []
-    with torch.no_grad():
-        for level in levels:
-            given = set_level(speech, level)
-            aided = torch.stack([compensator(utterance, ear) for utterance in given])
-            if not aided.isfinite().all():
-                raise ValueError(
-                    f"the output for speech at {level:g} dB SPL holds samples that are NaN or infinite"
-                )
-            taken, made = (_powers(signal) for signal in (given, aided))
-            curves.append((10.0 * (made / taken).log10()).tolist())
+    for level in levels:
+        given = set_level(speech, level)
+        aided = outputs(compensator, given, ear, f"the output for speech at {level:g} dB SPL")
+        curves.append((10.0 * (_powers(aided) / _powers(given)).log10()).tolist())
     return curves
 
 
@@ -68,24 +63,19 @@ def gain_curves(
     """
     clips = Clips(speech, sample_rate=NEURO_RATE, seconds=_SECONDS)
     drawn = clips.draw(UTTERANCES, torch.Generator().manual_seed(seed))
+    edges = band_edges()
+    centres = np.sqrt(edges[1:] * edges[:-1]).tolist()
     curves = []
-    for ear_name, ear in ears.items():
-        for name, compensator in compensators.items():
-            try:
-                gains = insertion_gain(compensator, ear, drawn, levels)
-            except ValueError as error:
-                raise ValueError(f"{name}, ear {ear_name}: {error}") from error
-            about = {"compensator": name, "ear": ear_name, "levels": [*levels]}
-            curves.append({**about, "frequencies": _centres().tolist(), "gain_db": gains})
+    for (ear_name, ear), (name, compensator) in product(ears.items(), compensators.items()):
+        try:
+            gains = insertion_gain(compensator, ear, drawn, levels)
+        except ValueError as error:
+            raise ValueError(f"{name}, ear {ear_name}: {error}") from error
+        about = {"compensator": name, "ear": ear_name, "levels": [*levels]}
+        curves.append({**about, "frequencies": centres, "gain_db": gains})
     return curves
 
 
 def _powers(signal: Tensor) -> Tensor:
     """Mean power of each band. Shape: (utterances, time) -> (24,)."""
     return (10.0 ** (band_levels(signal.double(), NEURO_RATE) / 10.0)).mean((0, 1))
-
-
-def _centres() -> NDArray[np.float64]:
-    edges = band_edges()
-    centres: NDArray[np.float64] = np.sqrt(edges[1:] * edges[:-1])
-    return centres

@@ -149,9 +149,8 @@ class HaspiReport:
         self, rows: Sequence[Mapping[str, float | None]], conditions: Sequence[str] | None
     ) -> np.ndarray:
         names = self.conditions if conditions is None else conditions
-        return np.array(
-            [[row.get(name) for name in names] for row in rows], dtype=np.float64
-        )  # None becomes NaN
+        # None becomes NaN
+        return np.array([[row.get(name) for name in names] for row in rows], dtype=np.float64)
 
     @property
     def table(self) -> pandas.DataFrame:
@@ -160,19 +159,10 @@ class HaspiReport:
         Raises:
             MissingExtraError: pandas is not installed.
         """
-        facts = (
-            "file",
-            "listener",
-            "ear",
-            "severity",
-            "snr",
-            "clean_level",
-            "full_scale_spl",
-            "seconds",
-            "seed",
-        )
+        facts = ("file", "listener", "ear", "severity", "snr", "clean_level")
+        scale = ("full_scale_spl", "seconds", "seed")
         rows = [
-            {**{name: getattr(item, name) for name in facts}, "condition": condition}
+            {**{name: getattr(item, name) for name in (*facts, *scale)}, "condition": condition}
             for item in self.items
             for condition in self.conditions
         ]

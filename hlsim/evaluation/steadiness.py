@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from itertools import product
 from typing import Any
 
 import torch
@@ -67,16 +68,12 @@ def steady_tones(
     sounds, hertz = tones(TONES, levels), torch.tensor(TONES).repeat_interleave(len(levels))
     normal = _heard(sounds, NORMAL)
     found = []
-    for ear_name, ear in ears.items():
-        for name, compensator in compensators.items():
-            aided = _outputs(compensator, sounds, ear, f"{name}, ear {ear_name}, steady tones")
-            figures = {
-                "heard_off_db": _heard(aided, ear) - normal,
-                "sidebands_db": sidebands_db(aided, hertz),
-            }
-            about = {"compensator": name, "ear": ear_name, "levels": [*levels], "frequencies": [*TONES]}
-            shaped = {key: own.reshape(len(TONES), -1).T.tolist() for key, own in figures.items()}
-            found.append({**about, **shaped})
+    for (ear_name, ear), (name, compensator) in product(ears.items(), compensators.items()):
+        aided = outputs(compensator, sounds, ear, f"{name}, ear {ear_name}, steady tones: the output")
+        figures = {"heard_off_db": _heard(aided, ear) - normal, "sidebands_db": sidebands_db(aided, hertz)}
+        about = {"compensator": name, "ear": ear_name, "levels": [*levels], "frequencies": [*TONES]}
+        shaped = {key: values.reshape(len(TONES), -1).T.tolist() for key, values in figures.items()}
+        found.append({**about, **shaped})
     return found
 
 
@@ -103,9 +100,8 @@ def shift_differences(
         for number, item in items.items():
             time = len(item.clean)
             given = [functional.pad(item.clean, (delay, last - delay)) for delay in (0, *DELAYS)]
-            aided = _outputs(
-                compensator, given, item.ear, f"{name}, delayed speech of item {number}"
-            ).double()
+            what = f"{name}, delayed speech of item {number}: the output"
+            aided = outputs(compensator, given, item.ear, what).double()
             end = min(_END, time // 4)
             first, *later = (
                 own[delay + end : delay + time - end] for own, delay in zip(aided, (0, *DELAYS), strict=True)
@@ -117,12 +113,15 @@ def shift_differences(
     return found
 
 
-def _outputs(compensator: nn.Module, signals: Iterable[Tensor], ear: Audiogram, what: str) -> Tensor:
-    """Shape: signals of (time,) -> (signals, time)."""
+def outputs(compensator: nn.Module, signals: Iterable[Tensor], ear: Audiogram, what: str) -> Tensor:
+    """What a compensator gives, one signal at a time; ValueError where it is NaN or infinite, which says of ``what``.
+
+    Shape: signals of (time,) -> (signals, time).
+    """
     with torch.no_grad():
         aided = torch.stack([compensator(signal, ear) for signal in signals])
     if not aided.isfinite().all():
-        raise ValueError(f"{what}: the output holds samples that are NaN or infinite")
+        raise ValueError(f"{what} holds samples that are NaN or infinite")
     return aided
 
 

@@ -216,17 +216,14 @@ def severity_table(result: Result, group: str) -> Table:
 def gap_table(result: Result) -> Table:
     """The loss under the three simulators."""
     titles = {"neuro": "Neuro-MSBG", "msbg": "exact MSBG", "pyclarity": "pyclarity"}
-    gaps = {
-        "Neuro to exact": "neuro_to_msbg",
-        "Neuro to pyclarity": "neuro_to_pyclarity",
-        "exact to pyclarity": "msbg_to_pyclarity",
-    }
     rows = [
         {
             "What the ear is given": f"{group}, {name}",
             **{title: f"{own[f'loss_{simulator}']:.2f}" for simulator, title in titles.items()},
-            **{title: number(own[key], "+.1%").replace("%", " %") for title, key in gaps.items()},
-            "Neuro to pyclarity, median item": number(own["item_median"], ".1%").replace("%", " %"),
+            "Neuro to exact": _share(own["neuro_to_msbg"], "+.1%"),
+            "Neuro to pyclarity": _share(own["neuro_to_pyclarity"], "+.1%"),
+            "exact to pyclarity": _share(own["msbg_to_pyclarity"], "+.1%"),
+            "Neuro to pyclarity, median item": _share(own["item_median"], ".1%"),
         }
         for group, conditions in result["gap"].items()
         for name, own in conditions.items()
@@ -318,6 +315,10 @@ def _gain_picture(ear: str, curves: Sequence[Result]) -> Picture:
     levels = ", ".join(f"{level:g}" for level in curves[0]["levels"])
     alt = f"Insertion gain for {ear} over frequency; at 2 kHz and {levels} dB SPL: {'; '.join(at_2k)} dB."
     return Picture(draw_svg(draw), alt, f"{ear}; the legend tells the input level in dB SPL.")
+
+
+def _share(value: float | None, form: str) -> str:
+    return number(value, form).replace("%", " %")
 
 
 def _gains_at(hertz: Any, curve: Result, gains: Sequence[float]) -> Any:

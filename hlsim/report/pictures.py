@@ -1,4 +1,7 @@
-"""Pictures: of a HASPI report, narrow enough to be read on a phone, and spectrograms."""
+"""Pictures: of a HASPI report, narrow enough to be read on a phone, and spectrograms.
+
+All raise MissingExtraError where matplotlib is not installed.
+"""
 
 from __future__ import annotations
 
@@ -23,11 +26,7 @@ _MANY = 2000  # points beyond which they are drawn as pixels: the page stays sma
 
 
 def draw_svg(draw: Callable[[Any], None], inches: tuple[float, float] = _INCHES) -> bytes:
-    """The SVG of what ``draw`` puts on a matplotlib axes.
-
-    Raises:
-        MissingExtraError: matplotlib is not installed.
-    """
+    """The SVG of what ``draw`` puts on a matplotlib axes."""
     figure = new_figure(inches)
     draw(figure.subplots())
     data = io.BytesIO()
@@ -74,15 +73,9 @@ def frequency_axis(axes: Any, hertz: Iterable[float]) -> None:
 
 
 def draw_spectrograms(signals: Mapping[str, Tensor], sample_rate: int, *, width: float = 9.0) -> bytes:
-    """The PNG of log-magnitude spectrograms, one a signal, on one scale of dB SPL.
-
-    Args:
-        width: inches.
+    """The PNG of log-magnitude spectrograms, one a signal, on one scale of dB SPL; ``width`` is in inches.
 
     Shape: (time,) each, in pascals.
-
-    Raises:
-        MissingExtraError: matplotlib is not installed.
     """
     figure = new_figure((width, 2.2 * len(signals)))
     points = 2 * (sample_rate // 100)  # 20 ms
@@ -107,32 +100,16 @@ def draw_spectrograms(signals: Mapping[str, Tensor], sample_rate: int, *, width:
 
 
 def draw_report(report: HaspiReport) -> bytes:
-    """The PNG of score and level of the headline, after over before.
-
-    Raises:
-        MissingExtraError: matplotlib is not installed.
-    """
+    """The PNG of score and level of the headline, after over before."""
     figure, c = new_figure((9.0, 4.8)), report.headline
     scores, levels = report.scores(c.measure, (c.before, c.after)), report.levels((c.before, c.after))
     levels[np.isnan(scores).any(1)] = np.nan
-    panels = (
-        (
-            scores,
-            score_range(c.measure),
-            c.title,
-            f"mean {c.overall.before_mean:.3f} to {c.overall.after_mean:.3f}",
-        ),
-        (
-            levels,
-            (float(np.nanmin(levels)) - 3.0, float(np.nanmax(levels)) + 3.0),
-            "Level (dB SPL)",
-            f"mean {report.before_level_mean:.1f} to {report.after_level_mean:.1f} dB SPL",
-        ),
-    )
-    for axes, (values, limits, what, title) in zip(figure.subplots(1, 2), panels, strict=True):
-        scatter(axes, values[:, 0], values[:, 1], report.severities)
-        axes.set(xlim=limits, ylim=limits, aspect="equal", title=title)
-        axes.set(xlabel=plain(f"{what}, {c.before}"), ylabel=plain(f"{what}, {c.after}"))
+    ends = (float(np.nanmin(levels)) - 3.0, float(np.nanmax(levels)) + 3.0)
+    left, right = figure.subplots(1, 2)
+    _draw_ends(left, report, scores, score_range(c.measure), c.title)
+    left.set(title=f"mean {c.overall.before_mean:.3f} to {c.overall.after_mean:.3f}")
+    _draw_ends(right, report, levels, ends, "Level (dB SPL)")
+    right.set(title=f"mean {report.before_level_mean:.1f} to {report.after_level_mean:.1f} dB SPL")
     figure.suptitle(plain(f"{c.overall.n} items, {c.before} and {c.after}"))
     return _png(figure, 150)
 
@@ -143,11 +120,7 @@ def score_range(measure: str) -> tuple[float, float]:
 
 
 def report_pictures(report: HaspiReport) -> list[Picture]:
-    """Before against after, change of level, distributions, by severity, by SNR (where there are any), the audiograms.
-
-    Raises:
-        MissingExtraError: matplotlib is not installed.
-    """
+    """Before against after, change of level, distributions, by severity, by SNR (where there are any), the audiograms."""
     pictures = [_before_after(report), _levels(report), _distributions(report), _by_severity(report)]
     if any(item.snr is not None for item in report.items):
         pictures.append(_by_snr(report))
@@ -156,18 +129,24 @@ def report_pictures(report: HaspiReport) -> list[Picture]:
 
 def _before_after(report: HaspiReport) -> Picture:
     c = report.headline
-    scores, limits = report.scores(c.measure, (c.before, c.after)), score_range(c.measure)
-
-    def draw(axes: Any) -> None:
-        scatter(axes, scores[:, 0], scores[:, 1], report.severities)
-        axes.set(xlim=limits, ylim=limits, aspect="equal")
-        axes.set(xlabel=plain(f"{c.title}, {c.before}"), ylabel=plain(f"{c.title}, {c.after}"))
-
+    scores = report.scores(c.measure, (c.before, c.after))
+    data = draw_svg(lambda axes: _draw_ends(axes, report, scores, score_range(c.measure), c.title))
     alt = (
         f"{c.title} {c.after} over {c.title} {c.before}, {c.overall.n} items: mean {c.overall.before_mean:.3f} to "
         f"{c.overall.after_mean:.3f}."
     )
-    return Picture(draw_svg(draw), alt, "Each point is an item; above the dashed line the score rose.")
+    return Picture(data, alt, "Each point is an item; above the dashed line the score rose.")
+
+
+def _draw_ends(
+    axes: Any, report: HaspiReport, values: np.ndarray, limits: tuple[float, float], what: str
+) -> None:
+    """The headline's conditions, after over before. Shape: (items, 2)."""
+    scatter(axes, values[:, 0], values[:, 1], report.severities)
+    axes.set(xlim=limits, ylim=limits, aspect="equal")
+    axes.set(
+        xlabel=plain(f"{what}, {report.headline.before}"), ylabel=plain(f"{what}, {report.headline.after}")
+    )
 
 
 def _levels(report: HaspiReport) -> Picture:
