@@ -16,7 +16,8 @@ from hlsim.audiogram import Audiogram
 from hlsim.calibration import level_spl, set_level
 from hlsim.dsp.resample import resample
 from hlsim.evaluation import HaspiReport, ItemScore
-from hlsim.metrics.pyclarity import HaspiItem, check_pair, haspi_many
+from hlsim.evaluation.scoring import HaspiItem, haspi_many
+from hlsim.metrics.pyclarity import check_pair
 from hlsim.msbg import MSBG
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.report.haspi import markdown, write_report

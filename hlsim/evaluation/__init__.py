@@ -5,19 +5,18 @@ from typing import Any
 from hlsim.evaluation.comparison import Comparison
 from hlsim.evaluation.haspi_report import HaspiReport, haspi_report
 from hlsim.evaluation.scores import Failure, ItemScore
-from hlsim.evaluation.scoring import Item, score_items
+from hlsim.evaluation.scoring import FileItem, HaspiItem, haspi_many, score_items
 from hlsim.evaluation.simulators import summarise
 from hlsim.evaluation.statistics import PairedComparison, bootstrap_interval, holm, paired_comparison
 from hlsim.evaluation.store import ScoreStore
-from hlsim.metrics.pyclarity import HaspiItem, haspi_many
 
 __all__ = [
     "Comparison",
     "Failure",
+    "FileItem",
     "HASPI",
     "HaspiItem",
     "HaspiReport",
-    "Item",
     "ItemScore",
     "PairedComparison",
     "ScoreStore",

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from torch import nn
 
@@ -17,22 +17,21 @@ from hlsim.evaluation.haspi_report import HaspiReport
 from hlsim.evaluation.items import Item
 from hlsim.evaluation.judging import (
     INPUT_LEVELS,
-    OF_NETWORK,
     Judged,
-    Task,
+    Keys,
+    Trial,
     Unaided,
     draw_judged_items,
     judge,
     read_ears,
 )
-from hlsim.evaluation.simulators import samples_hash, weights_hash
 from hlsim.evaluation.steadiness import shift_differences, steady_tones
-from hlsim.evaluation.store import ScoreStore, key_of
+from hlsim.evaluation.store import ScoreStore, key_of, weights_hash
 from hlsim.extras import require
-from hlsim.metrics.pyclarity import Progress, check_seed
+from hlsim.metrics.pyclarity import check_seed
 from hlsim.metrics.registry import version_of, versions_of
 from hlsim.neuro.config import NEURO_RATE
-from hlsim.parallel import check_parallel, run_parallel
+from hlsim.parallel import Progress, check_parallel, make_missing
 from hlsim.pretrained import load_pretrained
 
 UNAIDED, PRESCRIBED = "unaided", "NAL-R"
@@ -128,10 +127,7 @@ def evaluate_compensators(
     curves = gain_curves(aided, shown, speech, levels, seed)  # first: what cannot be used shows at once
     steady = steady_tones(conditions, shown, levels)
     judged = _judge_all(
-        _Panel(drawn, conditions, load_pretrained(simulator), seed),
-        ScoreStore(store),
-        jobs,
-        progress,
+        drawn, conditions, load_pretrained(simulator), seed, ScoreStore(store), jobs, progress
     )
     result, reports = compensator_result(
         drawn,
@@ -152,84 +148,47 @@ def evaluate_compensators(
     return CompensatorEvaluation(result, reports)
 
 
-class _Keys(NamedTuple):
-    """Under which figures are stored: all but ``OF_NETWORK``, which hangs on more, and that one."""
-
-    most: str
-    of_network: str
-
-
-@dataclass(frozen=True)
-class _Panel:
-    """All that is to be judged."""
-
-    items: Sequence[Item]
-    conditions: Mapping[str, nn.Module]
-    simulator: nn.Module
-    seed: int
-
-    def keys(self) -> Iterator[dict[str, _Keys]]:
-        """What each item's figures are stored under, by condition."""
-        weights = {name: weights_hash(module) for name, module in self.conditions.items()}
-        about = {
-            "revision": _REVISION,
-            "versions": {**versions_of(["haspi", "hasqi"]), "hlsim": version_of("hlsim")},
-        }
-        network = weights_hash(self.simulator)
-        for number, item in enumerate(self.items):
-            own = about | {
-                "signal": samples_hash(item.clean, item.signal),
-                "ear": list(item.ear.thresholds),
-                "seed": self.item_seed(number),
-            }
-            of = {name: {**own, "weights": weights[name]} for name in self.conditions}
-            yield {
-                name: _Keys(key_of(settings), key_of({**settings, "simulator": network}))
-                for name, settings in of.items()
-            }
-
-    def item_seed(self, number: int) -> int:
-        return (self.seed + number) % 2**32
-
-
 def _judge_all(
-    panel: _Panel, store: ScoreStore, jobs: int | None, progress: Progress | None
+    items: Sequence[Item],
+    conditions: Mapping[str, nn.Module],
+    simulator: nn.Module,
+    seed: int,
+    store: ScoreStore,
+    jobs: int | None,
+    progress: Progress | None,
 ) -> list[dict[str, Judged]]:
     """Each item's figures by condition, those from the store among them."""
-    keys = list(panel.keys())
-    judged: list[dict[str, Judged]] = []
-    tasks = []
-    for number, (item, own) in enumerate(zip(panel.items, keys, strict=True)):
-        known = {name: record for name, key in own.items() if (record := store.get(key.most)) is not None}
-        found = {
-            name: known[name] | record
-            for name, key in own.items()
-            if name in known and (record := store.get(key.of_network)) is not None
+    weights = {name: weights_hash(module) for name, module in conditions.items()}
+    network = weights_hash(simulator)
+    versions = {**versions_of(["haspi", "hasqi"]), "hlsim": version_of("hlsim")}
+    trials = []
+    for number, item in enumerate(items):
+        own = {
+            "revision": _REVISION,
+            "versions": versions,
+            "seed": (seed + number) % 2**32,
+            **item.settings(),
         }
-        judged.append({name: Judged(record) for name, record in found.items()})
-        missing = {name: module for name, module in panel.conditions.items() if name not in found}
-        if missing:
-            left = {name: known[name] for name in missing if name in known}
-            tasks.append(Task(number, item, missing, panel.simulator, panel.item_seed(number), left))
-    total = len(panel.items) * len(panel.conditions)
-    done = total - sum(len(task.compensators) for task in tasks)
-    if progress is not None and done and tasks:
-        progress(done, total)
-    for task, result in run_parallel(judge, tasks, jobs=jobs) if tasks else ():
-        if result is None:
-            died = Judged(None, "the process that judged it died (a crash in a measure, or memory ran out)")
-            result = dict.fromkeys(task.compensators, died)
-        for name, own_result in result.items():
-            if own_result.figures is not None:
-                most, key = dict(own_result.figures), keys[task.number][name]
-                store.append(key.of_network, {OF_NETWORK: most.pop(OF_NETWORK)})
-                if name not in task.known:
-                    store.append(key.most, most)
-        judged[task.number].update(result)
-        done += len(result)
-        if progress is not None:
-            progress(done, total)
-    return judged
+        of = {name: {**own, "weights": weights[name]} for name in conditions}
+        keys = {name: Keys(key_of(it), key_of({**it, "simulator": network})) for name, it in of.items()}
+        trials.append(Trial(item, conditions, simulator, own["seed"], keys))
+    failed = make_missing(
+        judge,
+        trials,
+        lambda trial: [key for keys in trial.keys.values() for key in keys],
+        store,
+        jobs=jobs,
+        progress=progress and (lambda done, total: progress(done // 2, total // 2)),  # both of an output
+    )
+    return [
+        {
+            name: Judged(None, next(failed[key] for key in keys if key in failed))
+            if failed.keys() & set(keys)
+            else Judged(store.records[keys.most] | store.records[keys.of_network])
+            for name, keys in trial.keys.items()
+        }
+        for trial in trials
+    ]
 
 
 def _limit(compensator: nn.Module) -> float | None:

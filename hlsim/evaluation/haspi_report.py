@@ -15,13 +15,13 @@ from hlsim.calibration import check_full_scale
 from hlsim.evaluation.comparison import Comparison, compare_conditions
 from hlsim.evaluation.inputs import read_folders, read_manifest
 from hlsim.evaluation.scores import Failure, ItemScore
-from hlsim.evaluation.scoring import Item, Result, score_items
+from hlsim.evaluation.scoring import FileItem, Result, score_items
 from hlsim.evaluation.statistics import RESAMPLES, PairedComparison
 from hlsim.evaluation.store import ScoreStore
 from hlsim.extras import require
-from hlsim.metrics.pyclarity import Progress, check_seed
+from hlsim.metrics.pyclarity import check_seed
 from hlsim.metrics.registry import check_measures, version_of, versions_of
-from hlsim.parallel import check_parallel
+from hlsim.parallel import Progress, check_parallel
 
 if TYPE_CHECKING:
     import pandas
@@ -278,7 +278,7 @@ def haspi_report(
     return HaspiReport(scores, measures=names, seed=seed, failures=failures, baseline=baseline)
 
 
-def _conditions(items: Sequence[Item], baseline: str | None) -> list[str]:
+def _conditions(items: Sequence[FileItem], baseline: str | None) -> list[str]:
     found = list(dict.fromkeys(condition for item in items for condition in item.processed))
     if len(found) < 2:
         raise ValueError(f"one condition only, {found[0]}; allowed: two or more to compare")
@@ -288,7 +288,7 @@ def _conditions(items: Sequence[Item], baseline: str | None) -> list[str]:
 
 
 def _gather(
-    items: Sequence[Item],
+    items: Sequence[FileItem],
     scored: Sequence[dict[tuple[str, str], Result]],
     conditions: Sequence[str],
     measures: Sequence[str],

@@ -25,7 +25,7 @@ from pathlib import Path, PurePath, PurePosixPath
 from hlsim.audio import EXTENSIONS, find_audio
 from hlsim.audiogram import Audiogram, numbered_audiograms
 from hlsim.calibration import check_full_scale
-from hlsim.evaluation.scoring import EARS, Item
+from hlsim.evaluation.scoring import EARS, FileItem
 from hlsim.files import read_rows
 
 _EAR_NAMES = {"": "", "l": "left", "left": "left", "r": "right", "right": "right"}
@@ -40,14 +40,14 @@ def read_manifest(
     audiograms: str | Path | None = None,
     full_scale_spl: float = 94.0,
     spl: float | None = None,
-) -> list[Item]:
+) -> list[FileItem]:
     """The items of a manifest, in the order of their first rows.
 
     Args:
         root: the folder that the paths are relative to, and that they may not leave; by default the manifest's own.
         audiogram: the ear of all rows that bring none; or else
         audiograms: a CSV file with columns ``listener``, ``ear`` (where left and right differ) and ``hl_250``, ....
-        full_scale_spl, spl: the level, as in ``Item``, of rows that bring none.
+        full_scale_spl, spl: the level, as in ``FileItem``, of rows that bring none.
 
     Raises:
         ValueError: the file cannot be read, lacks a column, or a row is wrong: an ear other than left and right, a path
@@ -58,7 +58,7 @@ def read_manifest(
     if not folder.is_dir():
         raise ValueError(f"{folder}: no such folder; the manifest's paths are relative to it")
     ears = {} if audiograms is None else _ears(audiograms)
-    items: dict[tuple[str, ...], Item] = {}
+    items: dict[tuple[str, ...], FileItem] = {}
     rows, taken = _rows(path), []
     for line, row in rows:
         try:
@@ -119,7 +119,7 @@ def _item(
     audiogram: Audiogram | None,
     full_scale_spl: float,
     spl: float | None,
-) -> tuple[tuple[str, ...], str, Item]:
+) -> tuple[tuple[str, ...], str, FileItem]:
     condition, listener = row["condition"], row.get("listener", "")
     if not condition:
         raise ValueError("no condition")
@@ -134,7 +134,7 @@ def _item(
         spl = own["spl"]
     parts = (listener, ear, row.get("item", "") or PurePosixPath(row["clean"]).with_suffix("").as_posix())
     label = " ".join(part for part in parts if part)
-    item = Item(
+    item = FileItem(
         name=label if own["snr"] is None else f"{label} {own['snr']:g} dB",
         clean=clean,
         processed={condition: inside(root, row["processed"], "processed")},
@@ -215,7 +215,7 @@ def read_folders(
     audiograms: str | Path | None = None,
     full_scale_spl: float = 94.0,
     spl: float | None = None,
-) -> list[Item]:
+) -> list[FileItem]:
     """An item a name, with the conditions ``before`` and ``after``, sorted by name.
 
     Args:
@@ -224,7 +224,7 @@ def read_folders(
         audiogram: the ear, of all files; or else
         audiograms: a CSV file with columns ``file`` (the name below the folder, with or without extension) and
             ``hl_250``, ``hl_500``, ... in dB HL, one row a file. Rows of other files are passed over.
-        full_scale_spl, spl: the level, as in ``Item``.
+        full_scale_spl, spl: the level, as in ``FileItem``.
 
     Raises:
         ValueError: names differ between the folders, a file has no audiogram, or both or none of ``audiogram`` and
@@ -238,7 +238,7 @@ def read_folders(
     names = _common_names((clean, before, after), folders)
     ears = dict.fromkeys(names, audiogram) if audiogram is not None else _named_ears(str(audiograms), names)
     return [
-        Item(
+        FileItem(
             name=name,
             clean=folders[0][name].absolute(),
             processed={"before": folders[1][name].absolute(), "after": folders[2][name].absolute()},

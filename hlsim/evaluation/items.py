@@ -15,6 +15,7 @@ from hlsim.audiogram import MILDER, Audiogram, draw_thresholds, read_audiograms
 from hlsim.calibration import level_spl
 from hlsim.data.augment import compress, mix
 from hlsim.data.clips import Clips
+from hlsim.evaluation.store import samples_hash
 from hlsim.neuro.config import NEURO_RATE
 
 LEVELS = (50.0, 60.0, 65.0, 70.0, 80.0)
@@ -42,6 +43,10 @@ class Item:
     signal: Tensor
     ear: Audiogram
     about: Mapping[str, Any]
+
+    def settings(self) -> dict[str, Any]:
+        """What its scores are stored under, beside what scores it."""
+        return {"signal": samples_hash(self.clean, self.signal), "ear": list(self.ear.thresholds)}
 
 
 def draw_items(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
@@ -21,6 +21,7 @@ from hlsim.metrics.pyclarity import haspi, hasqi
 from hlsim.metrics.reference import pyclarity_msbg
 from hlsim.msbg import MSBG
 from hlsim.neuro.config import NEURO_RATE
+from hlsim.parallel import Failed, one_thread, reason_of
 
 INPUT_LEVELS = (50.0, 65.0, 80.0)
 """Levels of the clean speech in dB SPL that the items take in turn."""
@@ -33,7 +34,7 @@ SIMULATORS = ("neuro", *EXACT)
 """Under which a compensator's loss is told: the named network, hlsim's exact MSBG, pyclarity's."""
 
 OF_NETWORK = "loss_neuro"
-"""The figure that hangs on the named network; no other does."""
+"""The figure that depends on the named network; no other does."""
 
 NORMAL = Audiogram.standard("NH")
 
@@ -45,24 +46,29 @@ class Unaided(nn.Module):
         return waveform
 
 
+class Keys(NamedTuple):
+    """What figures are stored under: all but ``OF_NETWORK``, which depends on more, and that one."""
+
+    most: str
+    of_network: str
+
+
 @dataclass(frozen=True)
-class Task:
-    """An item, and the compensators that it lacks figures of.
+class Trial:
+    """An item to be judged as each compensator gives it.
 
     Args:
-        number: of the item, for the caller.
         compensators: by name, at 16 kHz and 94 dB SPL full scale.
-        known: figures by name of those that lack ``OF_NETWORK`` alone.
         simulator: the network of ``neuro``, of the same rate and scale.
         seed: of the noise that HASPI and HASQI add, the same for every compensator.
+        keys: of the figures, by compensator.
     """
 
-    number: int
     item: Item
     compensators: Mapping[str, nn.Module]
     simulator: nn.Module
     seed: int
-    known: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    keys: Mapping[str, Keys]
 
 
 class Judged(NamedTuple):
@@ -126,8 +132,8 @@ def draw_judged_items(
     return chosen
 
 
-def judge(task: Task) -> dict[str, Judged]:
-    """Each compensator's figures for an item; what goes wrong is the reason.
+def judge(trial: Trial, missing: Sequence[str]) -> dict[str, dict[str, float] | Failed]:
+    """The figures whose keys are missing; what goes wrong is the reason.
 
     - ``haspi``, ``hasqi``: v2, of the output against the clean speech, in noise too.
     - ``level``, ``peak``: of the output, RMS and largest sample in dB SPL (a sample of 1.0 is 94).
@@ -137,47 +143,46 @@ def judge(task: Task) -> dict[str, Judged]:
       hears and what a normal one hears of the clean speech, both by the exact MSBG, where the latter is audible.
     - ``loss_neuro``, ``loss_msbg``, ``loss_pyclarity``: what ``HearingLossLoss(criterion="bands")`` is under each.
     """
-    # small steps: threads would wait for each other, and items are what is parallel
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        with torch.no_grad():
-            return _judge(task)
-    finally:
-        torch.set_num_threads(threads)
+    with one_thread(), torch.no_grad():
+        return _judge(trial, missing)
 
 
-def _judge(task: Task) -> dict[str, Judged]:
-    item = task.item
-    needed = ("neuro",) if task.compensators.keys() <= task.known.keys() else SIMULATORS
+def _judge(trial: Trial, missing: Sequence[str]) -> dict[str, dict[str, float] | Failed]:
+    item = trial.item
     try:
-        normal = {name: _hear(task, name, item.clean, NORMAL) for name in needed}
-        if needed == SIMULATORS:
-            normal["msbg, of the input"] = _hear(task, "msbg", item.signal, NORMAL)
+        normal = {"neuro": _hear(trial, "neuro", item.clean, NORMAL)}
+        if any(keys.most in missing for keys in trial.keys.values()):
+            normal |= {name: _hear(trial, name, item.clean, NORMAL) for name in EXACT}
+            normal["msbg, of the input"] = _hear(trial, "msbg", item.signal, NORMAL)
     except Exception as error:  # whatever it is, it is this item's reason, and the others go on
-        return dict.fromkeys(task.compensators, Judged(None, _reason(error)))
-    judged = {}
-    for name, compensator in task.compensators.items():
+        return dict.fromkeys(missing, Failed(reason_of(error)))
+    made: dict[str, dict[str, float] | Failed] = {}
+    for name, keys in trial.keys.items():
+        if not (wanted := set(keys) & set(missing)):
+            continue
         try:
-            aided = compensator(item.signal, item.ear)
-            figures = dict(task.known.get(name) or _figures(task, aided, normal))
-            figures[OF_NETWORK] = _loss(_hear(task, "neuro", aided, item.ear), normal["neuro"])
+            aided = trial.compensators[name](item.signal, item.ear)
+            own = {keys.most: _figures(trial, aided, normal)} if keys.most in wanted else {}
+            own[keys.of_network] = {
+                OF_NETWORK: _loss(_hear(trial, "neuro", aided, item.ear), normal["neuro"])
+            }
+            figures = {figure: value for record in own.values() for figure, value in record.items()}
             if unknown := [figure for figure, value in figures.items() if not math.isfinite(value)]:
                 raise ValueError(f"{', '.join(unknown)}: not finite")
-            judged[name] = Judged(figures)
+            made |= own
         except Exception as error:
-            judged[name] = Judged(None, _reason(error))
-    return judged
+            made |= dict.fromkeys(wanted, Failed(reason_of(error)))
+    return made
 
 
-def _figures(task: Task, aided: Tensor, normal: Mapping[str, Tensor]) -> dict[str, float]:
+def _figures(trial: Trial, aided: Tensor, normal: Mapping[str, Tensor]) -> dict[str, float]:
     """All but ``OF_NETWORK``."""
-    item = task.item
+    item = trial.item
     scores = {
-        name: measure(item.clean, aided, item.ear, NEURO_RATE, full_scale_spl=PASCAL_SPL, seed=task.seed)
+        name: measure(item.clean, aided, item.ear, NEURO_RATE, full_scale_spl=PASCAL_SPL, seed=trial.seed)
         for name, measure in (("haspi", haspi), ("hasqi", hasqi))
     }
-    heard = {name: _hear(task, name, aided, item.ear) for name in EXACT}
+    heard = {name: _hear(trial, name, aided, item.ear) for name in EXACT}
     return {
         **scores,
         "level": float(level_spl(aided)),
@@ -214,14 +219,9 @@ def band_error_db(heard: Tensor, normal: Tensor) -> float:
     return float((levels - truth).abs()[audible].double().quantile(0.5))
 
 
-def _hear(task: Task, simulator: str, signal: Tensor, ear: Audiogram) -> Tensor:
+def _hear(trial: Trial, simulator: str, signal: Tensor, ear: Audiogram) -> Tensor:
     if simulator == "pyclarity":
         return pyclarity_msbg(signal, ear, NEURO_RATE)
-    model = task.simulator if simulator == "neuro" else MSBG(sample_rate=NEURO_RATE)
+    model = trial.simulator if simulator == "neuro" else MSBG(sample_rate=NEURO_RATE)
     heard: Tensor = model(signal, ear)
     return heard
-
-
-def _reason(error: Exception) -> str:
-    kind = "" if isinstance(error, ValueError) else f"{type(error).__name__}: "
-    return kind + " ".join(str(error).split())

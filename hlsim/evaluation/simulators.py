@@ -3,13 +3,9 @@
 from __future__ import annotations
 
 import contextlib
-import hashlib
-import inspect
-import pickle
-import uuid
-import weakref
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -20,7 +16,7 @@ from torch import Tensor, nn
 
 from hlsim.audiogram import SEVERITIES
 from hlsim.evaluation.items import LEVELS, Item, draw_items, treat
-from hlsim.evaluation.store import ScoreStore, key_of
+from hlsim.evaluation.store import ScoreStore, key_of, weights_hash
 from hlsim.extras import MissingExtraError
 from hlsim.metrics.fidelity import (
     linear_correlation,
@@ -36,12 +32,11 @@ from hlsim.metrics.reference import pyclarity_msbg
 from hlsim.metrics.registry import version_of, versions_of
 from hlsim.msbg import MSBG
 from hlsim.neuro.config import NEURO_RATE
+from hlsim.parallel import Failed, Progress, make_missing, reason_of
 
 _SHORTEST = 0.02  # s: a window of the spectrograms
 
 _REVISION = 2  # of what is measured: raise it where that changes a figure
-
-Report = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)
@@ -73,7 +68,7 @@ def evaluate_simulators(
     inputs: Sequence[str] = ("as-is",),
     compensator: nn.Module | None = None,
     seed: int = 0,
-    progress: Report | None = None,
+    progress: Progress | None = None,
 ) -> SimulatorEvaluation:
     """Compare simulators with MSBG, side by side.
 
@@ -114,56 +109,77 @@ def evaluate_simulators(
         raise ValueError(f"items of {seconds:g} s; allowed: {_SHORTEST:g} or more, and 2 for PESQ and STOI")
     drawn = draw_items(speech, noise, audiograms, items=items, seconds=seconds, seed=seed, levels=levels)
     scored = ScoreStore(store)
-    # haspi's for pyclarity's, whose MSBG is the truth
-    versions = {**versions_of(["stoi", "pesq", "haspi"]), "hlsim": version_of("hlsim")}
+    settings = {
+        "teacher": teacher,
+        "revision": _REVISION,
+        # haspi's for pyclarity's, whose MSBG is the truth
+        "versions": {**versions_of(["stoi", "pesq", "haspi"]), "hlsim": version_of("hlsim")},
+    }
     weights = {name: weights_hash(simulator) for name, simulator in simulators.items()}
-    rows: dict[str, list[dict[str, Any]]] = {name: [] for name in simulators}
-    total = items * len(inputs)
-    for number, item in enumerate(treat(drawn, inputs, compensator)):
-        about = {
-            "signal": samples_hash(item.clean, item.signal),
-            "ear": list(item.ear.thresholds),
-            "teacher": teacher,
-            "revision": _REVISION,
-            "versions": versions,
-        }
-        keys = {name: key_of({**about, "weights": weights[name]}) for name in simulators}
-        missing = [name for name in simulators if scored.get(keys[name]) is None]
-        failed: dict[str, str] = {}
-        if missing:
-            try:
-                truth = _truth(item, teacher)
-                true = _both(item.clean, truth, "true")
-            except MissingExtraError:
-                raise
-            except Exception as error:  # of this item alone: all simulators go without
-                failed = dict.fromkeys(missing, f"no truth: {error}")
-                missing = []
-            for name in missing:
-                try:
-                    with torch.no_grad():
-                        heard = simulators[name](item.signal, item.ear).double()
-                    scores = _scores(item.clean, truth, heard)
-                except Exception as error:  # one simulator's, and tried again next time; the others go on
-                    failed[name] = f"{type(error).__name__}: {error}"
-                else:
-                    reasons = true["reasons"] + scores["reasons"]
-                    scored.append(keys[name], true | scores | {"reasons": reasons})
-        for name in simulators:
-            scores = scored.get(keys[name]) or {"reasons": [failed[name]]}
-            rows[name].append({"item": number // len(inputs), **item.about, **scores})
-        if progress is not None:
-            progress(number + 1, total)
+    tasks = []
+    for item in treat(drawn, inputs, compensator):
+        about = settings | item.settings()
+        tasks.append((item, {name: key_of({**about, "weights": weights[name]}) for name in simulators}))
+    failed = make_missing(
+        partial(_score_item, simulators, teacher),
+        tasks,
+        lambda task: [*task[1].values()],
+        scored,
+        jobs=1,
+        progress=progress
+        and (lambda done, total: progress(done // len(simulators), total // len(simulators))),
+    )
+    rows = {
+        name: [
+            {
+                "item": number // len(inputs),
+                **item.about,
+                **(scored.get(keys[name]) or {"reasons": [failed[keys[name]]]}),
+            }
+            for number, (item, keys) in enumerate(tasks)
+        ]
+        for name in simulators
+    }
     result = fidelity_result(
         rows, teacher=teacher, items=items, seconds=seconds, seed=seed, levels=[*levels], inputs=[*inputs]
     )
-    shown, truth = _shown(drawn, treat(drawn, inputs, compensator), teacher)
+    shown, truth = _shown(drawn, [item for item, _ in tasks], teacher)
     heard_of = {"truth": truth}
     for name, simulator in simulators.items():
         with contextlib.suppress(Exception), torch.no_grad():  # its failure is in the tables
             heard = simulator(shown.signal, shown.ear)
             heard_of |= {name: heard} if heard.isfinite().all() else {}
     return SimulatorEvaluation(result, shown, heard_of)
+
+
+def _score_item(
+    simulators: Mapping[str, nn.Module],
+    teacher: str,
+    task: tuple[Item, Mapping[str, str]],
+    missing: Sequence[str],
+) -> dict[str, dict[str, Any] | Failed]:
+    """The scores of an item by each simulator whose key is missing."""
+    item, keys = task
+    try:
+        truth = _truth(item, teacher)
+        true = _both(item.clean, truth, "true")
+    except MissingExtraError:
+        raise
+    except Exception as error:  # of this item alone: all simulators go without
+        return dict.fromkeys(missing, Failed(f"no truth: {reason_of(error)}"))
+    made: dict[str, dict[str, Any] | Failed] = {}
+    for name, key in keys.items():
+        if key not in missing:
+            continue
+        try:
+            with torch.no_grad():
+                heard = simulators[name](item.signal, item.ear).double()
+            scores = _scores(item.clean, truth, heard)
+        except Exception as error:  # one simulator's; the others go on
+            made[key] = Failed(reason_of(error))
+        else:
+            made[key] = true | scores | {"reasons": true["reasons"] + scores["reasons"]}
+    return made
 
 
 def _truth(item: Item, teacher: str) -> Tensor:
@@ -279,65 +295,3 @@ def _figures(rows: Sequence[Mapping[str, Any]]) -> dict[str, float | int | None]
         figures[f"{name}_srcc"] = rank_correlation(true, simulated)
         figures[f"{name}_mse"] = mean_squared_error(true, simulated)
     return figures
-
-
-def weights_hash(module: nn.Module) -> str:
-    """What makes a simulator or compensator this one: its class, its settings and its weights, kept in it or not.
-
-    Of a class of your own the source counts too, where it can be had; not that of what it calls.
-    """
-    torchs = vars(nn.Module()).keys()  # what every module has
-    settings = [
-        (place, name, _setting(value))
-        for place, part in module.named_modules()
-        for name, value in sorted(vars(part).items())
-        if name not in torchs
-    ]
-    kinds = {type(part): None for part in module.modules()}
-    about = [f"{kind.__module__}.{kind.__qualname__} {_source(kind)}" for kind in kinds]
-    state = hashlib.sha256(f"{about} {settings}".encode())
-    for name, tensor in (*module.named_parameters(), *module.named_buffers()):
-        state.update(name.encode())
-        state.update(tensor.detach().cpu().contiguous().numpy().tobytes())
-    return state.hexdigest()
-
-
-def _setting(value: Any) -> Any:
-    """What tells one value from another, the same in every process where it can be had."""
-    if isinstance(value, bool | int | float | complex | str | bytes | None):
-        return value
-    if isinstance(value, list | tuple):
-        return [_setting(own) for own in value]
-    if isinstance(value, Mapping):
-        return sorted((repr(name), _setting(own)) for name, own in value.items())
-    if isinstance(value, np.ndarray):
-        return (
-            value.shape,
-            str(value.dtype),
-            hashlib.sha256(np.ascontiguousarray(value).tobytes()).hexdigest(),
-        )
-    if isinstance(value, Tensor):
-        return _setting(value.detach().cpu().numpy())
-    if isinstance(value, torch.dtype | torch.device):
-        return str(value)
-    if isinstance(value, weakref.ref):  # an LSTM holds some to its weights
-        return _setting(value())
-    try:
-        return hashlib.sha256(pickle.dumps(value)).hexdigest()
-    except Exception:  # a lambda, an open file: whatever it does may have changed, so it is scored anew
-        return uuid.uuid4().hex
-
-
-def _source(kind: type) -> str:
-    """Of classes outside hlsim and torch: those have a version, which is in the keys."""
-    if kind.__module__.split(".")[0] in ("hlsim", "compensators", "torch", "torchaudio"):
-        return ""
-    try:
-        return inspect.getsource(kind)
-    except (OSError, TypeError):  # typed in, or compiled
-        return ""
-
-
-def samples_hash(*signals: Tensor) -> str:
-    """What makes signals these ones."""
-    return hashlib.sha256(b"".join(signal.contiguous().numpy().tobytes() for signal in signals)).hexdigest()

@@ -20,8 +20,8 @@ from hlsim.evaluation.compensators import evaluate_compensators
 from hlsim.evaluation.gain_curves import insertion_gain
 from hlsim.evaluation.judging import (
     INPUT_LEVELS,
-    Judged,
-    Task,
+    Keys,
+    Trial,
     Unaided,
     band_error_db,
     draw_judged_items,
@@ -132,9 +132,10 @@ def test_figures_are_those_of_the_measures_and_the_loss(speech_dir: Path) -> Non
         speech_dir / "valid", speech_dir / "train", [("N3", ear)], items=2, seconds=0.8, seed=0
     )
     neuro = load_pretrained("neuro-msbg")
-    judged = judge(Task(0, item, {"NAL-R": NALR()}, neuro, 7))["NAL-R"]
-    figures, aided = judged.figures, NALR()(item.signal, ear)
-    assert figures is not None and judged.reason == ""
+    trial = Trial(item, {"NAL-R": NALR()}, neuro, 7, {"NAL-R": Keys("most", "of network")})
+    judged, aided = judge(trial, ["most", "of network"]), NALR()(item.signal, ear)
+    assert isinstance(judged["most"], dict) and [*judged["of network"]] == ["loss_neuro"]
+    figures = judged["most"] | judged["of network"]
     assert figures["haspi"] == haspi(item.clean, aided, ear, 16000, seed=7)
     assert figures["hasqi"] == hasqi(item.clean, aided, ear, 16000, seed=7)
     for name, simulator in (("neuro", neuro), ("msbg", "msbg")):
@@ -282,11 +283,11 @@ def test_a_stopped_run_goes_on_and_new_weights_are_judged_anew(
     whole = compare({"own": Gain()}, **options, out=tmp_path / "whole")
     original, calls = judging.judge, []
 
-    def counted(task: Task) -> dict[str, Judged]:
+    def counted(trial: Trial, missing: list[str]) -> Any:
         if len(calls) == 2:
             raise KeyboardInterrupt
-        calls.append([*task.compensators])
-        return original(task)
+        calls.append([name for name, keys in trial.keys.items() if {*keys} & {*missing}])
+        return original(trial, missing)
 
     monkeypatch.setattr(compensators, "judge", counted)
     parts = tmp_path / "parts"
