@@ -68,12 +68,12 @@ class Comparison:
 
     def to_dict(self) -> dict[str, Any]:
         """A plain dictionary that JSON can hold."""
-        own = asdict(self)
-        del own["unit"]
-        mixed, listeners = own.pop("mixed"), own.pop("listeners")
+        record = asdict(self)
+        del record["unit"]
+        mixed, listeners = record.pop("mixed"), record.pop("listeners")
         return {
-            **own.pop("overall"),
-            **own,
+            **record.pop("overall"),
+            **record,
             "listener_means": listeners,
             "mixed_model": {"none": mixed} if isinstance(mixed, str) else mixed,
             "in_words": self.in_words(),
@@ -179,11 +179,11 @@ def compare_conditions(
         pairs = [(baseline, other) for other in conditions if other != baseline]
     out = []
     for measure in measures:
-        own = [c for pair in pairs if (c := _compare(items, measure, *pair)) is not None]
-        p_t, p_w = holm(c.overall.p_t for c in own), holm(c.overall.p_w for c in own)
+        found = [c for pair in pairs if (c := _compare(items, measure, *pair)) is not None]
+        p_t, p_w = holm(c.overall.p_t for c in found), holm(c.overall.p_w for c in found)
         out += [
-            replace(c, p_t_holm=t, p_w_holm=w, comparisons=len(own), unit=unit)
-            for c, t, w in zip(own, p_t, p_w, strict=True)
+            replace(c, p_t_holm=t, p_w_holm=w, comparisons=len(found), unit=unit)
+            for c, t, w in zip(found, p_t, p_w, strict=True)
         ]
     return out
 

@@ -40,11 +40,11 @@ def compensator_result(
     """
     conditions = [*limits]
     failures, rows = [], []
-    for number, (item, own) in enumerate(zip(items, judged, strict=True)):
-        bad = {name: own[name].reason for name in conditions if own[name].figures is None}
+    for number, (item, results) in enumerate(zip(items, judged, strict=True)):
+        bad = {name: results[name].reason for name in conditions if results[name].figures is None}
         failures += [{"item": number, **item.about, "compensator": name, "reason": bad[name]} for name in bad]
         if not bad:
-            figures = {name: own[name].figures for name in conditions}
+            figures = {name: results[name].figures for name in conditions}
             about = {**item.about, "audiogram": list(item.ear.thresholds)}
             rows.append({"item": number, **about, "figures": figures})
     if not rows:
@@ -53,18 +53,18 @@ def compensator_result(
         name: [row for row in rows if row["condition"] == name] for name in ("clean", "noisy")
     }
     groups["hard"] = [row for row in rows if row["figures"][conditions[0]]["haspi"] < HARD]
-    groups = {name: own for name, own in groups.items() if own}
-    reports = {name: _report(own, items, settings) for name, own in groups.items()}
+    groups = {name: group for name, group in groups.items() if group}
+    reports = {name: _report(group, items, settings) for name, group in groups.items()}
     result = {
         **settings,
         "limits": dict(limits),
         "groups": {
             name: {
-                "n": len(own),
-                "conditions": {condition: _summary(own, condition) for condition in conditions},
+                "n": len(group),
+                "conditions": {condition: _summary(group, condition) for condition in conditions},
                 "comparisons": [c.to_dict() for c in reports[name].comparisons],
             }
-            for name, own in groups.items()
+            for name, group in groups.items()
         },
         "gap": {
             name: {condition: _gap(groups[name], condition) for condition in conditions}
@@ -94,9 +94,9 @@ def _report(rows: Rows, items: Sequence[Item], settings: Mapping[str, Any]) -> H
             file=f"item {row['item']}",
             audiogram=items[row["item"]].ear,
             clean_level=row["level"],
-            levels={name: own["level"] for name, own in row["figures"].items()},
+            levels={name: figures["level"] for name, figures in row["figures"].items()},
             scores={
-                measure: {name: own[measure] for name, own in row["figures"].items()}
+                measure: {name: figures[measure] for name, figures in row["figures"].items()}
                 for measure in ("haspi", "hasqi")
             },
             sample_rate=NEURO_RATE,
@@ -119,8 +119,8 @@ def _summary(rows: Rows, condition: str) -> dict[str, Any]:
     by_severity = {severity: [row for row in rows if row["severity"] == severity] for severity in SEVERITIES}
     return {
         **_means(rows, condition),
-        "by_level": {level: _means(own, condition) for level, own in by_level.items()},
-        "by_severity": {severity: _means(own, condition) for severity, own in by_severity.items() if own},
+        "by_level": {level: _means(part, condition) for level, part in by_level.items()},
+        "by_severity": {severity: _means(part, condition) for severity, part in by_severity.items() if part},
     }
 
 
@@ -150,7 +150,7 @@ def _gap(rows: Rows, condition: str) -> dict[str, float | None]:
     figures = _columns(rows, condition)
     losses = {f"loss_{name}": float(figures[f"loss_{name}"].mean()) for name in SIMULATORS}
     apart = [gap(row["figures"][condition], "neuro", "pyclarity") for row in rows]
-    known = [abs(own) for own in apart if own is not None]
+    known = [abs(value) for value in apart if value is not None]
     return {
         **losses,
         "neuro_to_msbg": gap(losses, "neuro", "msbg"),
@@ -169,4 +169,4 @@ def _peaks(rows: Rows, condition: str, limit: float | None) -> dict[str, Any]:
 
 def _columns(rows: Rows, condition: str) -> dict[str, np.ndarray]:
     figures = [row["figures"][condition] for row in rows]
-    return {name: np.array([own[name] for own in figures]) for name in figures[0]}
+    return {name: np.array([row[name] for row in figures]) for name in figures[0]}

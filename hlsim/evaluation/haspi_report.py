@@ -19,9 +19,8 @@ from hlsim.evaluation.scoring import FileItem, Result, score_items
 from hlsim.evaluation.statistics import RESAMPLES, PairedComparison
 from hlsim.evaluation.store import ScoreStore
 from hlsim.extras import require
-from hlsim.metrics.pyclarity import check_seed
 from hlsim.metrics.registry import check_measures, version_of, versions_of
-from hlsim.parallel import Progress, check_parallel
+from hlsim.parallel import Progress
 
 if TYPE_CHECKING:
     import pandas
@@ -223,7 +222,7 @@ def haspi_report(
         audiograms: for folders a CSV file with columns ``file`` and ``hl_250``,
             ``hl_500``, ... in dB HL, one row a file; for a manifest with ``listener`` and ``ear`` in place of ``file``.
         manifest: in place of the folders, a CSV file with a row a file, see ``hlsim.evaluation.inputs``.
-        root: the folder that the manifest's paths are relative to; by default the manifest's own.
+        root: the folder that the manifest's paths are relative to; by default the manifest's.
         measures: of ``haspi``, ``hasqi``, ``stoi``, ``pesq``; the first is the headline's.
         baseline: the condition that comes first and that all others are compared with; by default the manifest's first
             comes first, and all are compared with each other.
@@ -231,7 +230,7 @@ def haspi_report(
         full_scale_spl: level in dB SPL of a file with RMS 1.0.
         spl: or else the level in dB SPL of every clean file, or of a manifest's rows that bring none; the processed ones
             are on the same scale.
-        seed: of the noise that HASPI and HASQI add; each item has its own from it.
+        seed: of the noise that HASPI and HASQI add; each item has one from it.
         jobs: processes; None takes all cores. The scores do not depend on it.
         backend, scheduler: ``"loky"``, or ``"dask"`` with the address of a Dask scheduler.
         progress: called with the number of scores there and the number of all.
@@ -242,9 +241,7 @@ def haspi_report(
         MissingExtraError: a measure's package, joblib or distributed is not installed.
     """
     names = check_measures(measures)
-    check_parallel(jobs, backend, scheduler)
     check_full_scale(full_scale_spl if spl is None else spl)
-    check_seed(seed)
     if audiogram is not None and not isinstance(audiogram, Audiogram):
         raise ValueError(
             f"audiogram is {type(audiogram).__name__}; allowed: an Audiogram, one ear of all files"

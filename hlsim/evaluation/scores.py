@@ -50,7 +50,7 @@ class ItemScore:
     processed: Mapping[str, Path] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        for condition in {name for own in self.scores.values() for name in own}:
+        for condition in {name for found in self.scores.values() for name in found}:
             if self.levels.get(condition) is None:
                 raise ValueError(
                     f"{self.file}: a score under {condition!r} without its level; a score needs one"
@@ -88,7 +88,7 @@ class ItemScore:
     def to_dict(self) -> dict[str, Any]:
         """A plain dictionary that JSON can hold."""
         return {name: getattr(self, name) for name in _JSON} | {
-            "scores": {measure: dict(own) for measure, own in self.scores.items()},
+            "scores": {measure: dict(found) for measure, found in self.scores.items()},
             "levels": dict(self.levels),
             "audiogram": self.audiogram.to_dict(),
         }

@@ -45,7 +45,7 @@ def write_compensators(result: Result, reports: Mapping[str, HaspiReport], out: 
 def _lead(result: Result) -> str:
     levels = ", ".join(f"{level:g}" for level in result["levels"])
     # few items do not come to every ear
-    ears = len({own["name"] for own in (*result["rows"], *result["failures"])})
+    ears = len({row["name"] for row in (*result["rows"], *result["failures"])})
     about = (
         f"{result['items']} items of {result['seconds']:g} s, {ears} ears in turn, speech at {levels} "
         f"dB SPL in turn, seed {result['seed']}: {', '.join(result['limits'])}. HASPI v2 and HASQI v2 are pyclarity's, "
@@ -135,14 +135,14 @@ def main_table(result: Result, group: str) -> Table:
     rows = [
         {
             "What the ear is given": name,
-            **_scores(own),
-            "Level (dB SPL)": f"{own['level_mean']:.1f}",
-            "Highest peak (dB SPL)": f"{own['peak_max']:.1f}",
-            "Heard, against normal (dB)": f"{own['heard_off']:+.1f}",
-            "the same, mean absolute": f"{own['heard_off_abs']:.1f}",
-            "Bands, against normal (dB)": f"{own['band_error_mean']:.1f}",
+            **_scores(row),
+            "Level (dB SPL)": f"{row['level_mean']:.1f}",
+            "Highest peak (dB SPL)": f"{row['peak_max']:.1f}",
+            "Heard, against normal (dB)": f"{row['heard_off']:+.1f}",
+            "the same, mean absolute": f"{row['heard_off_abs']:.1f}",
+            "Bands, against normal (dB)": f"{row['band_error_mean']:.1f}",
         }
-        for name, own in _conditions(result, group).items()
+        for name, row in _conditions(result, group).items()
     ]
     return Table.of(f"{GROUPS[group]}: scores, output and what is heard", rows)
 
@@ -165,10 +165,10 @@ def tests_table(report: HaspiReport) -> Table:
 def severity_tests(report: HaspiReport, group: str) -> Table:
     """The same by degree of loss."""
     rows = [
-        {"Change": f"{severity}, {change_name(c)}", "n": str(own.n), **paired_cells(own)}
+        {"Change": f"{severity}, {change_name(c)}", "n": str(row.n), **paired_cells(row)}
         for c in report.comparisons
         if c.before in report.conditions[:2]
-        for severity, own in c.by_severity.items()
+        for severity, row in c.by_severity.items()
     ]
     return Table.of(f"{GROUPS[group]}: paired tests by degree of loss, p not adjusted", rows)
 
@@ -176,7 +176,7 @@ def severity_tests(report: HaspiReport, group: str) -> Table:
 def loudness_table(result: Result, group: str) -> Table:
     """Level as heard against the normal ear's, a column an input level."""
     rows = []
-    for name, own in _conditions(result, group).items():
+    for name, row in _conditions(result, group).items():
         against = {name: "heard_off"}
         if group == "noisy":
             against[f"{name}, against the speech in it"] = "heard_off_clean"
@@ -185,7 +185,7 @@ def loudness_table(result: Result, group: str) -> Table:
                 "What the ear is given": title,
                 **{
                     f"Speech at {level} dB SPL": f"{cell[f'{key}_abs']:.1f} ({cell[key]:+.1f})"
-                    for level, cell in own["by_level"].items()
+                    for level, cell in row["by_level"].items()
                 },
             }
             for title, key in against.items()
@@ -200,15 +200,15 @@ def severity_table(result: Result, group: str) -> Table:
     rows = [
         {
             "Degree of loss": f"{severity}, {name}",
-            **_scores(own),
-            "HASPI over unaided": f"{own['haspi_mean'] - unaided['haspi_mean']:+.3f}",
-            "HASQI over unaided": f"{own['hasqi_mean'] - unaided['hasqi_mean']:+.3f}",
-            "Heard, mean absolute (dB)": f"{own['heard_off_abs']:.1f}",
-            "Bands (dB)": f"{own['band_error_mean']:.1f}",
+            **_scores(row),
+            "HASPI over unaided": f"{row['haspi_mean'] - unaided['haspi_mean']:+.3f}",
+            "HASQI over unaided": f"{row['hasqi_mean'] - unaided['hasqi_mean']:+.3f}",
+            "Heard, mean absolute (dB)": f"{row['heard_off_abs']:.1f}",
+            "Bands (dB)": f"{row['band_error_mean']:.1f}",
         }
         for severity, unaided in first.items()
         for name, condition in conditions.items()
-        for own in [condition["by_severity"][severity]]
+        for row in [condition["by_severity"][severity]]
     ]
     return Table.of(f"{GROUPS[group]}, by degree of loss", rows)
 
@@ -219,14 +219,14 @@ def gap_table(result: Result) -> Table:
     rows = [
         {
             "What the ear is given": f"{group}, {name}",
-            **{title: f"{own[f'loss_{simulator}']:.2f}" for simulator, title in titles.items()},
-            "Neuro to exact": _share(own["neuro_to_msbg"], "+.1%"),
-            "Neuro to pyclarity": _share(own["neuro_to_pyclarity"], "+.1%"),
-            "exact to pyclarity": _share(own["msbg_to_pyclarity"], "+.1%"),
-            "Neuro to pyclarity, median item": _share(own["item_median"], ".1%"),
+            **{title: f"{row[f'loss_{simulator}']:.2f}" for simulator, title in titles.items()},
+            "Neuro to exact": _share(row["neuro_to_msbg"], "+.1%"),
+            "Neuro to pyclarity": _share(row["neuro_to_pyclarity"], "+.1%"),
+            "exact to pyclarity": _share(row["msbg_to_pyclarity"], "+.1%"),
+            "Neuro to pyclarity, median item": _share(row["item_median"], ".1%"),
         }
         for group, conditions in result["gap"].items()
-        for name, own in conditions.items()
+        for name, row in conditions.items()
     ]
     return Table.of("Mean loss in dB on the same utterances, and relative differences", rows)
 
@@ -236,11 +236,11 @@ def peak_table(result: Result) -> Table:
     rows = [
         {
             "What the ear is given": name,
-            "Limit (dB SPL)": number(own["limit"], "g", "none"),
-            "Highest peak (dB SPL)": f"{own['highest']:.2f}",
-            "Outputs beyond": "n/a" if own["over"] is None else f"{own['over']} of {own['n']}",
+            "Limit (dB SPL)": number(row["limit"], "g", "none"),
+            "Highest peak (dB SPL)": f"{row['highest']:.2f}",
+            "Outputs beyond": "n/a" if row["over"] is None else f"{row['over']} of {row['n']}",
         }
-        for name, own in result["peaks"].items()
+        for name, row in result["peaks"].items()
     ]
     return Table.of("Peaks of all outputs, a sample of 1.0 being 94 dB SPL", rows)
 
@@ -262,16 +262,16 @@ def gain_table(curves: Sequence[Result]) -> Table:
 def tone_table(found: Sequence[Result]) -> Table:
     """A row an ear, compensator and level, with the worst sidebands of the row."""
     rows = []
-    for own in found:
+    for row in found:
         for level, offs, sidebands in zip(
-            own["levels"], own["heard_off_db"], own["sidebands_db"], strict=True
+            row["levels"], row["heard_off_db"], row["sidebands_db"], strict=True
         ):
             worst = int(np.argmax(sidebands))
             rows.append(
                 {
-                    "Ear, compensator, input": f"{own['ear']}, {own['compensator']}, {level:g} dB SPL",
-                    **{f"{hz} Hz": f"{off:+.1f}" for hz, off in zip(own["frequencies"], offs, strict=True)},
-                    "Worst sidebands (of the tone)": f"{round(sidebands[worst])} ({own['frequencies'][worst]} Hz)",
+                    "Ear, compensator, input": f"{row['ear']}, {row['compensator']}, {level:g} dB SPL",
+                    **{f"{hz} Hz": f"{off:+.1f}" for hz, off in zip(row["frequencies"], offs, strict=True)},
+                    "Worst sidebands (of the tone)": f"{round(sidebands[worst])} ({row['frequencies'][worst]} Hz)",
                 }
             )
     return Table.of(
@@ -283,12 +283,12 @@ def shift_table(found: Sequence[Result]) -> Table:
     """A row a compensator."""
     rows = [
         {
-            "What the ear is given": own["compensator"],
-            "n": str(np.size(own["difference_db"])),
-            "Median": f"{np.median(own['difference_db']):.0f}",
-            "Worst": f"{np.max(own['difference_db']):.0f}",
+            "What the ear is given": row["compensator"],
+            "n": str(np.size(row["difference_db"])),
+            "Median": f"{np.median(row['difference_db']):.0f}",
+            "Worst": f"{np.max(row['difference_db']):.0f}",
         }
-        for own in found
+        for row in found
     ]
     return Table.of("Difference of the outputs relative to the output, in dB", rows)
 
@@ -309,7 +309,7 @@ def _gain_picture(ear: str, curves: Sequence[Result]) -> Picture:
 
     at_2k = [
         f"{curve['compensator']} "
-        + ", ".join(f"{_gains_at(2000.0, curve, own):.0f}" for own in curve["gain_db"])
+        + ", ".join(f"{_gains_at(2000.0, curve, row):.0f}" for row in curve["gain_db"])
         for curve in curves
     ]
     levels = ", ".join(f"{level:g}" for level in curves[0]["levels"])
@@ -330,9 +330,9 @@ def _conditions(result: Result, group: str) -> Mapping[str, Any]:
     return conditions
 
 
-def _scores(own: Result) -> dict[str, str]:
+def _scores(row: Result) -> dict[str, str]:
     means = {
-        f"{name.upper()} (mean ± std)": spread(own[f"{name}_mean"], own[f"{name}_std"])
+        f"{name.upper()} (mean ± std)": spread(row[f"{name}_mean"], row[f"{name}_std"])
         for name in ("haspi", "hasqi")
     }
-    return {"n": str(own["n"]), **means}
+    return {"n": str(row["n"]), **means}

@@ -41,7 +41,7 @@ def write_report(report: HaspiReport, out_dir: str | Path, *, listen: int = 3) -
 
 
 def markdown(report: HaspiReport) -> str:
-    """What ``report.md`` says: the page without its own pictures, what is heard, and the table of all items."""
+    """What ``report.md`` says: the page without its pictures, what is heard, and the table of all items."""
     picture = f"![{report.headline.title} and level, before against after](before-after.png)"
     return render_markdown(_title(report), _sections(report), f"{_lead(report)}\n\n{picture}")
 

@@ -1,6 +1,6 @@
 """Sections of text, tables, pictures and players, as Markdown or as one HTML file, and the files of a report.
 
-Nothing is fetched and no script runs in the HTML: pictures and sounds are data in the page, and its own policy forbids
+Nothing is fetched and no script runs in the HTML: pictures and sounds are data in the page, and its policy forbids
 the rest. It reads on a phone's width (wide tables scroll by themselves) and by keyboard (a skip link, regions that take
 the focus).
 """
@@ -49,7 +49,7 @@ class Player:
 
 @dataclass(frozen=True)
 class Section:
-    """A part of a page, in this order: paragraphs, tables, pictures, players, and parts of its own.
+    """A part of a page, in this order: paragraphs, tables, pictures, players, and inner parts.
 
     Args:
         folded: shown only when it is opened.

@@ -176,16 +176,16 @@ def _distributions(report: HaspiReport) -> Picture:
         generator = np.random.default_rng(0)
         places = range(1, len(values) + 1)
         axes.boxplot(values, positions=places, widths=0.5, showfliers=False, medianprops={"color": "black"})
-        for place, own in zip(places, values, strict=True):
-            shift = generator.uniform(-0.18, 0.18, len(own))
-            axes.scatter(place + shift, own, s=7, alpha=0.4, linewidths=0, rasterized=len(own) > _MANY)
+        for place, group in zip(places, values, strict=True):
+            shift = generator.uniform(-0.18, 0.18, len(group))
+            axes.scatter(place + shift, group, s=7, alpha=0.4, linewidths=0, rasterized=len(group) > _MANY)
         axes.set_xticks(list(places), labels)
         axes.set(ylim=score_range(measure), ylabel=title)
 
     medians = ", ".join(
-        f"{name} {np.median(own):.3f}"
-        for name, own in zip(report.conditions, values, strict=True)
-        if len(own)
+        f"{name} {np.median(group):.3f}"
+        for name, group in zip(report.conditions, values, strict=True)
+        if len(group)
     )
     alt = f"{title} by condition; medians: {medians}."
     return Picture(draw_svg(draw), alt, "Quartiles, median and every item.")
@@ -200,11 +200,11 @@ def _by_severity(report: HaspiReport) -> Picture:
         for k, condition in enumerate(report.conditions):
             at = np.arange(len(groups)) + (k - (len(report.conditions) - 1) / 2) * width
             scores = [_known(group[:, k]) for group in groups.values()]
-            axes.bar(at, [_mean(own) for own in scores], width * 0.9, label=plain(condition))
-            for place, own in zip(at, scores, strict=True):
-                if len(own) >= FEWEST:
-                    axes.plot((place, place), bootstrap_interval(own), color="black", linewidth=1.0)
-        axes.set_xticks(range(len(groups)), [f"{name} ({len(own)})" for name, own in groups.items()])
+            axes.bar(at, [_mean(group) for group in scores], width * 0.9, label=plain(condition))
+            for place, group in zip(at, scores, strict=True):
+                if len(group) >= FEWEST:
+                    axes.plot((place, place), bootstrap_interval(group), color="black", linewidth=1.0)
+        axes.set_xticks(range(len(groups)), [f"{name} ({len(group)})" for name, group in groups.items()])
         axes.set(ylim=(0.0, score_range(report.measures[0])[1]), ylabel=title, xlabel="loss (items)")
         axes.legend(fontsize="small")
 
@@ -225,14 +225,14 @@ def _by_snr(report: HaspiReport) -> Picture:
         for k, condition in enumerate(report.conditions):
             axes.plot(
                 snrs,
-                [_mean(_known(own[:, k])) for own in groups.values()],
+                [_mean(_known(group[:, k])) for group in groups.values()],
                 marker="o",
                 label=plain(condition),
             )
         axes.set(xlabel="SNR (dB)", ylabel=title, ylim=score_range(report.measures[0]))
         axes.legend(fontsize="small")
 
-    told = _in_words(report, {f"{snr:g} dB": own for snr, own in groups.items()})
+    told = _in_words(report, {f"{snr:g} dB": group for snr, group in groups.items()})
     alt = f"Mean {report.headline.title} by SNR: {told}."
     return Picture(draw_svg(draw), alt, "By SNR, of the items that have each score.")
 
@@ -259,7 +259,7 @@ def _audiograms(report: HaspiReport) -> Picture:
 def _groups(report: HaspiReport, of_items: Sequence[Any], names: Sequence[Any]) -> dict[Any, np.ndarray]:
     """Scores of the first measure by what the items are. Shape: (items, conditions) each."""
     scores = report.scores(report.measures[0])
-    return {name: scores[[own == name for own in of_items]] for name in names}
+    return {name: scores[[group == name for group in of_items]] for name in names}
 
 
 def _in_words(report: HaspiReport, groups: Mapping[str, np.ndarray]) -> str:

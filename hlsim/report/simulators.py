@@ -119,7 +119,9 @@ def summary_tables(summary: Row) -> list[Table]:
 
 
 def _table(caption: str, of: str, groups: Mapping[str, Row]) -> Table:
-    return Table(caption, (of, *COLUMNS), [(name, *column_cells(own)) for name, own in groups.items()])
+    return Table(
+        caption, (of, *COLUMNS), [(name, *column_cells(figures)) for name, figures in groups.items()]
+    )
 
 
 def column_cells(figures: Row) -> list[str]:
