@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from hlsim.evaluation.haspi_report import GAIN_NOTE, HaspiReport
 from hlsim.evaluation.steadiness import DELAYS
 from hlsim.report.page import Picture, Section, render_markdown, render_page, write_files
 from hlsim.report.pictures import draw_svg, frequency_axis, plain, report_pictures
-from hlsim.report.tables import Table, change_name, number, paired_cells, spread, t_cell
+from hlsim.report.tables import Table, change_name, number, paired_cells, spread
 
 FILES = ("compensators.json", "compensators.md", "compensators.html")
 
@@ -27,6 +28,8 @@ GROUPS = {
 }
 
 Result = Mapping[str, Any]
+
+_cells = partial(paired_cells, digits=2)
 
 
 def write_compensators(result: Result, reports: Mapping[str, HaspiReport], out: str | Path) -> None:
@@ -153,8 +156,8 @@ def tests_table(report: HaspiReport) -> Table:
         {
             "Change": change_name(c),
             "n": str(c.overall.n),
-            **paired_cells(c.overall, c.p_t_holm, c.p_w_holm),
-            "t over means of ears": "n/a" if c.listeners is None else t_cell(c.listeners.t, c.listeners.p_t),
+            **_cells(c.overall, c.p_t_holm, c.p_w_holm),
+            "t over means of ears": "n/a" if c.listeners is None else _cells(c.listeners)["t-test (paired)"],
         }
         for c in report.comparisons
         if c.before in report.conditions[:2]
@@ -165,7 +168,7 @@ def tests_table(report: HaspiReport) -> Table:
 def severity_tests(report: HaspiReport, group: str) -> Table:
     """The same by degree of loss."""
     rows = [
-        {"Change": f"{severity}, {change_name(c)}", "n": str(row.n), **paired_cells(row)}
+        {"Change": f"{severity}, {change_name(c)}", "n": str(row.n), **_cells(row)}
         for c in report.comparisons
         if c.before in report.conditions[:2]
         for severity, row in c.by_severity.items()

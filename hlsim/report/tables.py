@@ -134,24 +134,24 @@ def change_name(c: Comparison) -> str:
     return f"{c.title}: {c.before} to {c.after}"
 
 
-def t_cell(t: float | None, p: float | None, none: str = "n/a") -> str:
-    """A t-test."""
-    return _test(f"t = {number(t, '+.3f')}", p, none)
-
-
 def paired_cells(
-    c: PairedComparison, p_t: float | None = None, p_w: float | None = None, none: str = "n/a"
+    c: PairedComparison,
+    p_t: float | None = None,
+    p_w: float | None = None,
+    none: str = "n/a",
+    digits: int = 3,
 ) -> dict[str, str]:
     """Change and interval, both tests, and d.
 
     Args:
         p_t, p_w: in place of the comparison's, such as adjusted ones.
+        digits: of t and d.
     """
     return {
         _CHANGE: f"{c.delta:+.3f} {_interval(c)}".rstrip(),
-        "t-test (paired)": t_cell(c.t, c.p_t if p_t is None else p_t, none),
+        "t-test (paired)": _test(f"t = {number(c.t, f'+.{digits}f')}", c.p_t if p_t is None else p_t, none),
         "Wilcoxon": _test(f"W = {number(c.w, '.1f')}", c.p_w if p_w is None else p_w, none),
-        "d": number(c.cohens_d, "+.3f", none),
+        "d": number(c.cohens_d, f"+.{digits}f", none),
     }
 
 
