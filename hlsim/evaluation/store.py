@@ -112,7 +112,7 @@ def weights_hash(module: nn.Module) -> str:
     """
     torchs = vars(nn.Module()).keys()  # what every module has
     settings = [
-        (place, name, _setting(value))
+        (place, name, setting(value))
         for place, part in module.named_modules()
         for name, value in sorted(vars(part).items())
         if name not in torchs
@@ -126,14 +126,14 @@ def weights_hash(module: nn.Module) -> str:
     return state.hexdigest()
 
 
-def _setting(value: Any) -> Any:
+def setting(value: Any) -> Any:
     """What tells one value from another, the same in every process where it can be had."""
     if isinstance(value, bool | int | float | complex | str | bytes | None):
         return value
     if isinstance(value, list | tuple):
-        return [_setting(own) for own in value]
+        return [setting(own) for own in value]
     if isinstance(value, Mapping):
-        return sorted((repr(name), _setting(own)) for name, own in value.items())
+        return sorted((repr(name), setting(own)) for name, own in value.items())
     if isinstance(value, np.ndarray):
         return (
             value.shape,
@@ -141,13 +141,15 @@ def _setting(value: Any) -> Any:
             hashlib.sha256(np.ascontiguousarray(value).tobytes()).hexdigest(),
         )
     if isinstance(value, Tensor):
-        return _setting(value.detach().cpu().numpy())
+        return setting(value.detach().cpu().numpy())
     if isinstance(value, torch.dtype | torch.device):
         return str(value)
     if isinstance(value, weakref.ref):  # an LSTM holds some to its weights
-        return _setting(value())
+        return setting(value())
     try:
-        return hashlib.sha256(pickle.dumps(value)).hexdigest()
+        # scores of simulators are stored under this module's first name
+        held = pickle.dumps(value, protocol=4).replace(b"hlsim.dsp.stft", b"hlsim.spectrum")
+        return hashlib.sha256(held).hexdigest()
     except Exception:  # a lambda, an open file: whatever it does may have changed, so it is scored anew
         return uuid.uuid4().hex
 

@@ -2,8 +2,6 @@
 
 import json
 import math
-from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +16,9 @@ from hlsim import MSBG, Audiogram
 from hlsim.calibration import level_spl, set_level
 from hlsim.evaluation import simulators
 from hlsim.evaluation.items import LEVELS, draw_items, treat
-from hlsim.evaluation.simulators import evaluate_simulators, summarise, weights_hash
+from hlsim.evaluation.simulators import evaluate_simulators, summarise
 from hlsim.metrics.fidelity import snr_db
 from hlsim.metrics.reference import pyclarity_msbg
-from hlsim.pretrained import SIMULATOR, load_pretrained, shipped
 from hlsim.report.simulators import write_fidelity
 
 pytest.importorskip("clarity")
@@ -233,65 +230,6 @@ def test_a_stopped_comparison_goes_on_and_a_new_simulator_is_scored_alone(
     result = compare(both, **options, items=3, out=tmp_path / "parts")
     assert result["simulators"]["a"] == whole["simulators"]["a"]
     assert len((tmp_path / "parts" / "scores.jsonl").read_text().splitlines()) == 6
-
-
-def test_modules_that_differ_in_a_setting_differ_in_their_scores_name() -> None:
-    modules = [
-        MSBG(sample_rate=16000),
-        MSBG(sample_rate=16000, rescale_active=True),
-        MSBG(Audiogram.standard("N3"), sample_rate=16000),
-        NALR(sample_rate=16000),
-        NALR(Audiogram.standard("N3"), sample_rate=16000),
-    ]
-    assert len({weights_hash(module) for module in modules}) == len(modules)
-    assert weights_hash(MSBG(sample_rate=16000)) == weights_hash(modules[0])
-
-
-@dataclass
-class Options:
-    gain: float
-
-
-@pytest.mark.parametrize("name", [*shipped(SIMULATOR)])
-def test_a_checkpoint_is_the_same_whenever_it_is_loaded(name: str) -> None:
-    once, again = load_pretrained(name), load_pretrained(name)
-    again(torch.full((1600,), 0.01), Audiogram.standard("N3"))  # nor does use change it
-    assert weights_hash(once) == weights_hash(again)
-
-
-class Own(torch.nn.Module):
-    """A module whose settings are no numbers."""
-
-    def __init__(self, gains: Any) -> None:
-        super().__init__()
-        self._gains = gains
-
-
-def test_settings_of_any_kind_tell_modules_apart(monkeypatch: pytest.MonkeyPatch) -> None:
-    kinds = (
-        [1.0],
-        [2.0],
-        {"a": 1.0},
-        {"a": 2.0},
-        None,
-        np.ones(2),
-        np.zeros(2),
-        torch.ones(3),
-        torch.float32,
-        Options(0.0),
-        Options(20.0),
-        partial(max, 1.0),
-        partial(max, 2.0),
-        [torch.nn.Linear(1, 1)],
-    )
-    hashes = [weights_hash(Own(gains)) for gains in kinds]
-    assert len(set(hashes)) == len(hashes)
-    assert hashes == [weights_hash(Own(gains)) for gains in kinds]
-    # of what cannot be told, a function without a name, nothing that was scored counts
-    assert weights_hash(Own(lambda: 1.0)) != weights_hash(Own(lambda: 1.0))
-    # what a class of one's own does counts too
-    monkeypatch.setattr("inspect.getsource", lambda kind: "changed")
-    assert weights_hash(Own([1.0])) != hashes[0]
 
 
 def test_unknown_teacher(tmp_path: Path, speech_dir: Path, ears: Path) -> None:
