@@ -16,6 +16,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from hlsim.extras import require
 from hlsim.files import Whole
 from hlsim.report.tables import Table
 
@@ -115,8 +116,7 @@ def check_out(out: str | Path) -> Path:
 
 @cache
 def _template() -> Any:
-    import jinja2  # comes with torch
-
+    jinja2 = require("jinja2", "eval")
     source = Path(__file__).with_name("page.html").read_text(encoding="utf-8")
     return jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined).from_string(source)
 
