@@ -84,6 +84,8 @@ def make_missing(
         done += len(missing)
         if progress is not None:
             progress(done, total)
+    if progress is not None and done < total:  # two tasks of one key
+        progress(total, total)
     return failed
 
 

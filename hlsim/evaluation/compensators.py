@@ -14,17 +14,8 @@ from hlsim.audiogram import Audiogram, as_thresholds
 from hlsim.evaluation.compensator_result import compensator_result
 from hlsim.evaluation.gain_curves import gain_curves
 from hlsim.evaluation.haspi_report import HaspiReport
-from hlsim.evaluation.items import Item
-from hlsim.evaluation.judging import (
-    INPUT_LEVELS,
-    Judged,
-    Keys,
-    Trial,
-    Unaided,
-    draw_judged_items,
-    judge,
-    read_ears,
-)
+from hlsim.evaluation.items import INPUT_LEVELS, Item, draw_judged_items, read_ears
+from hlsim.evaluation.judging import Judged, Keys, Trial, Unaided, judge
 from hlsim.evaluation.steadiness import shift_differences, steady_tones
 from hlsim.evaluation.store import ScoreStore, key_of, weights_hash
 from hlsim.extras import require
@@ -76,9 +67,9 @@ def evaluate_compensators(
 ) -> CompensatorEvaluation:
     """Judge compensators beside no aid and NAL-R.
 
-    Figures are stored as they are made, by the samples, the ear and the weights that they are of: a
-    run that was stopped goes on where it was, one with a compensator more scores that one alone, and one with another
-    simulator computes the surrogate gap alone.
+    Figures are stored as they are made, by the samples, the ear and the weights that they are of: a run that was
+    stopped goes on where it was, one with a compensator more scores that one alone, and one with another simulator
+    computes the surrogate gap alone.
 
     Args:
         compensators: by name, modules at 16 kHz and 94 dB SPL full scale, called with a waveform and an ear. One with a
@@ -163,15 +154,11 @@ def _judge_all(
     versions = {**versions_of(["haspi", "hasqi"]), "hlsim": version_of("hlsim")}
     trials = []
     for number, item in enumerate(items):
-        own = {
-            "revision": _REVISION,
-            "versions": versions,
-            "seed": (seed + number) % 2**32,
-            **item.settings(),
-        }
-        of = {name: {**own, "weights": weights[name]} for name in conditions}
+        trial_seed = (seed + number) % 2**32
+        about = {"revision": _REVISION, "versions": versions, "seed": trial_seed, **item.settings()}
+        of = {name: {**about, "weights": weights[name]} for name in conditions}
         keys = {name: Keys(key_of(it), key_of({**it, "simulator": network})) for name, it in of.items()}
-        trials.append(Trial(item, conditions, simulator, own["seed"], keys))
+        trials.append(Trial(item, conditions, simulator, trial_seed, keys))
     failed = make_missing(
         judge,
         trials,
@@ -180,15 +167,13 @@ def _judge_all(
         jobs=jobs,
         progress=progress and (lambda done, total: progress(done // 2, total // 2)),  # both of an output
     )
-    return [
-        {
-            name: Judged(None, next(failed[key] for key in keys if key in failed))
-            if failed.keys() & set(keys)
-            else Judged(store.records[keys.most] | store.records[keys.of_network])
-            for name, keys in trial.keys.items()
-        }
-        for trial in trials
-    ]
+
+    def judged(keys: Keys) -> Judged:
+        if reasons := [failed[key] for key in keys if key in failed]:
+            return Judged(None, reasons[0])
+        return Judged(store.records[keys.most] | store.records[keys.of_network])
+
+    return [{name: judged(keys) for name, keys in trial.keys.items()} for trial in trials]
 
 
 def _limit(compensator: nn.Module) -> float | None:

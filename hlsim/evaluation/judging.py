@@ -1,33 +1,24 @@
-"""Compensators judged one utterance at a time: which utterances and ears, and what is measured of each."""
+"""Compensators judged one utterance at a time: what is measured of each."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 
-from hlsim.audiogram import Audiogram, read_audiograms
-from hlsim.calibration import PASCAL_SPL, level_spl, set_level
+from hlsim.audiogram import Audiogram
+from hlsim.calibration import PASCAL_SPL, level_spl
 from hlsim.criteria.bands import audibility, band_level_loss, band_levels, least_audible
-from hlsim.data.augment import mix
-from hlsim.data.clips import Clips
-from hlsim.evaluation.items import SNRS_DB, Item
+from hlsim.evaluation.items import Item
 from hlsim.metrics.pyclarity import haspi, hasqi
 from hlsim.metrics.reference import pyclarity_msbg
 from hlsim.msbg import MSBG
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.parallel import Failed, one_thread, reason_of
-
-INPUT_LEVELS = (50.0, 65.0, 80.0)
-"""Levels of the clean speech in dB SPL that the items take in turn."""
-
-STANDARD_EARS = ("N2", "N3", "N4", "N5", "N6", "S1", "S2", "S3")
-"""Bisgaard's audiograms that are in every comparison of compensators."""
 
 EXACT = ("msbg", "pyclarity")
 SIMULATORS = ("neuro", *EXACT)
@@ -78,60 +69,6 @@ class Judged(NamedTuple):
     reason: str = ""
 
 
-def read_ears(audiograms: str | Path | None) -> list[tuple[str, Audiogram]]:
-    """The standard ears and those of a CSV file; the latter named by listener and ear, or row, and no two alike."""
-    ears = [(name, Audiogram.standard(name)) for name in STANDARD_EARS]
-    rows = read_audiograms(audiograms, simulated=True) if audiograms is not None else []
-    for number, (row, ear) in enumerate(rows, start=1):
-        named = " ".join(filter(None, (row.get("listener"), row.get("ear"))))
-        if named in (name for name, _ in ears):
-            named += f", row {number}"  # items of one name would count as one ear's
-        ears.append((named or f"row {number}", ear))
-    return ears
-
-
-def draw_judged_items(
-    speech: str | Path,
-    noise: str | Path | None,
-    ears: Sequence[tuple[str, Audiogram]],
-    *,
-    items: int,
-    seconds: float,
-    seed: int,
-    levels: Sequence[float] = INPUT_LEVELS,
-) -> list[Item]:
-    """Random clips for the ears in turn, with noise every second one noisy; all is drawn from the seed.
-
-    An item's speech has one of ``levels``, and its noise comes on top. Every ear meets every level and, of the noisy
-    items, every ratio of 2.5 to 17.5 dB with it.
-
-    Returns: items whose ``about`` has name (of the ear), severity, level, condition, snr (None without noise).
-    """
-    generator = torch.Generator().manual_seed(seed)
-    clips = Clips(speech, sample_rate=NEURO_RATE, seconds=seconds)
-    noises = Clips(noise, sample_rate=NEURO_RATE, seconds=seconds, repeat=True) if noise is not None else None
-    chosen = []
-    for i in range(items):
-        turn = i if noises is None else i // 2
-        number, around = turn % len(ears), turn // len(ears)
-        name, ear = ears[number]
-        # counters of different periods, so that no ear keeps to one level
-        level, snr = levels[(number + around) % len(levels)], SNRS_DB[(number + around) % len(SNRS_DB)]
-        clean = set_level(clips.draw(1, generator), level)
-        signal, noisy = clean, noises is not None and i % 2 == 1
-        if noises is not None and noisy:
-            signal = mix(clean, noises.draw(1, generator), torch.tensor([snr]))
-        about = {
-            "name": name,
-            "severity": ear.severity,
-            "level": level,
-            "condition": "noisy" if noisy else "clean",
-            "snr": snr if noisy else None,
-        }
-        chosen.append(Item(clean.squeeze(0), signal.squeeze(0), ear, about))
-    return chosen
-
-
 def judge(trial: Trial, missing: Sequence[str]) -> dict[str, dict[str, float] | Failed]:
     """The figures whose keys are missing; what goes wrong is the reason.
 
@@ -162,14 +99,13 @@ def _judge(trial: Trial, missing: Sequence[str]) -> dict[str, dict[str, float] |
             continue
         try:
             aided = trial.compensators[name](item.signal, item.ear)
-            own = {keys.most: _figures(trial, aided, normal)} if keys.most in wanted else {}
-            own[keys.of_network] = {
-                OF_NETWORK: _loss(_hear(trial, "neuro", aided, item.ear), normal["neuro"])
-            }
-            figures = {figure: value for record in own.values() for figure, value in record.items()}
+            records = {keys.most: _figures(trial, aided, normal)} if keys.most in wanted else {}
+            of_network = _loss(_hear(trial, "neuro", aided, item.ear), normal["neuro"])
+            records[keys.of_network] = {OF_NETWORK: of_network}
+            figures = {figure: value for record in records.values() for figure, value in record.items()}
             if unknown := [figure for figure, value in figures.items() if not math.isfinite(value)]:
                 raise ValueError(f"{', '.join(unknown)}: not finite")
-            made |= own
+            made |= records
         except Exception as error:
             made |= dict.fromkeys(wanted, Failed(reason_of(error)))
     return made

@@ -131,7 +131,7 @@ def score_items(
             except ValueError as error:
                 results[index] |= {(name, condition): Result(None, str(error)) for name in names}
                 continue
-            own_seed = (seed + int(clean[:8], 16)) % 2**32
+            item_seed = (seed + int(clean[:8], 16)) % 2**32
             for name in names:
                 settings: dict[str, Any] = {
                     "revision": _REVISION,
@@ -145,8 +145,8 @@ def score_items(
                     settings["audiogram"] = list(item.audiogram.thresholds)
                     settings["full_scale_spl"] = item.full_scale_spl if item.spl is None else None
                     settings["spl"] = item.spl
-                    settings["seed"] = own_seed
-                places.append((index, FileTask(item, condition, name, own_seed, key_of(settings))))
+                    settings["seed"] = item_seed
+                places.append((index, FileTask(item, condition, name, item_seed, key_of(settings))))
     counts = Counter(task.key for _, task in places)  # the same score may be wanted twice
     failed = make_missing(
         score_task,
@@ -172,7 +172,13 @@ def score_task(task: FileTask, _: Sequence[str] = ()) -> dict[str, dict[str, Any
     """One score by its key; what goes wrong is the reason."""
     item, processed = task.item, task.item.processed[task.condition]
     try:
-        clean, heard, rate = read_pair(item.clean, processed, item.ear)
+        (clean, rate), (heard, other) = (read_channel(path, item.ear) for path in (item.clean, processed))
+        if other != rate:
+            raise ValueError(f"{processed} has {other} Hz and {item.clean} {rate} Hz; allowed: equal rates")
+        if len(clean) != len(heard):
+            raise ValueError(
+                f"{item.clean} has {len(clean)} samples and {processed} {len(heard)}; allowed: equal lengths"
+            )
         levels = [float(dbfs(torch.from_numpy(signal))) for signal in (clean, heard)]
         full_scale = check_full_scale(item.full_scale(levels[0]))
         score = MEASURES[task.measure].score(clean, heard, item.audiogram, rate, full_scale, task.seed)
@@ -181,18 +187,6 @@ def score_task(task: FileTask, _: Sequence[str] = ()) -> dict[str, dict[str, Any
     result = Result(score, None, task.seed, rate, len(clean) / rate, *levels)
     about = {"file": item.name, "condition": task.condition, "measure": task.measure}
     return {task.key: about | result._asdict()}
-
-
-def read_pair(clean: str | Path, processed: str | Path, ear: str = "") -> tuple[np.ndarray, np.ndarray, int]:
-    """Samples of two files by ``read_channel``, and their rate in Hz; ValueError unless rates and lengths are equal."""
-    (first, rate), (second, other_rate) = (read_channel(path, ear) for path in (clean, processed))
-    if other_rate != rate:
-        raise ValueError(f"{processed} has {other_rate} Hz and {clean} {rate} Hz; allowed: equal rates")
-    if len(first) != len(second):
-        raise ValueError(
-            f"{clean} has {len(first)} samples and {processed} {len(second)}; allowed: equal lengths"
-        )
-    return first, second, rate
 
 
 def read_channel(path: str | Path, ear: str = "") -> tuple[np.ndarray, int]:
@@ -222,7 +216,7 @@ class HaspiItem:
         reference, processed: clean and processed speech: (time,), or paths of one-channel audio files, which are
             read only when their turn comes.
         audiogram: the ear that hears ``processed``.
-        sample_rate: Hz; needed for signals, left out for files, which bring their own.
+        sample_rate: Hz; needed for signals, left out for files, which bring theirs.
         seed: of the noise that HASPI adds; by default that of ``haspi_many`` plus the place in the list.
     """
 
@@ -243,12 +237,12 @@ def haspi_many(
 ) -> list[float]:
     """HASPI of many items in parallel processes, the same whatever their number.
 
-    Each item has a seed of its own, and each process one thread of linear algebra.
+    Each item has its seed, and each process one thread of linear algebra.
 
     Args:
         items: see ``HaspiItem``.
         full_scale_spl: level in dB SPL of RMS 1.0, of all signals.
-        seed: item i, counted from 0, takes seed + i unless it brings its own.
+        seed: item i, counted from 0, takes seed + i unless it brings one.
         jobs: processes; None takes all cores.
         progress: called after each score.
 

@@ -34,6 +34,8 @@ from hlsim.msbg import MSBG
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.parallel import Failed, Progress, make_missing, reason_of
 
+_AGREEMENT = {"lcc": linear_correlation, "srcc": rank_correlation, "mse": mean_squared_error}
+
 _SHORTEST = 0.02  # s: a window of the spectrograms
 
 _REVISION = 2  # of what is measured: raise it where that changes a figure
@@ -44,7 +46,8 @@ class SimulatorEvaluation:
     """What a comparison of simulators comes to.
 
     Attributes:
-        result: what ``fidelity.json`` holds, see ``fidelity_result``.
+        result: what ``fidelity.json`` holds: the settings, and of each of ``simulators`` the ``items`` and, by each of
+            ``inputs``, their summary.
         shown: the item of the spectrograms.
         heard: of it, by the truth and by each simulator, by name: (time,), in pascals at 16 kHz.
     """
@@ -72,8 +75,8 @@ def evaluate_simulators(
 ) -> SimulatorEvaluation:
     """Compare simulators with MSBG, side by side.
 
-    Scores are stored as they are made, by the samples, the ear and the weights that they are of: a
-    run that was stopped goes on where it was, and one with a simulator more scores that one alone.
+    Scores are stored as they are made, by the samples, the ear and the weights that they are of: a run that was stopped
+    goes on where it was, and one with a simulator more scores that one alone.
 
     Args:
         simulators: by name, at 16 kHz and 94 dB SPL full scale.
@@ -81,7 +84,7 @@ def evaluate_simulators(
         audiograms: CSV file of ears, half of those used; the milder standard ones (NH, N1, N2, S1) and drawn ones are
             a quarter each.
         store: file of scores, there or not; None keeps nothing.
-        teacher: ``"pyclarity"``, the reference itself, or ``"msbg"``, hlsim's own.
+        teacher: ``"pyclarity"``, the reference itself, or ``"msbg"``, hlsim's exact one.
         items: how many; each is scored under each of ``inputs``.
         seconds: length of an item; PESQ and STOI want 2 or more.
         levels: dB SPL that the items take in turn.
@@ -140,9 +143,19 @@ def evaluate_simulators(
         ]
         for name in simulators
     }
-    result = fidelity_result(
-        rows, teacher=teacher, items=items, seconds=seconds, seed=seed, levels=[*levels], inputs=[*inputs]
-    )
+    summaries = {
+        name: {given: summarise([row for row in table if row["input"] == given]) for given in inputs}
+        for name, table in rows.items()
+    }
+    result = {
+        "teacher": teacher,
+        "items": items,
+        "seconds": seconds,
+        "seed": seed,
+        "levels": [*levels],
+        "inputs": [*inputs],
+        "simulators": {name: {"inputs": summaries[name], "items": table} for name, table in rows.items()},
+    }
     shown, truth = _shown(drawn, [item for item, _ in tasks], teacher)
     heard_of = {"truth": truth}
     for name, simulator in simulators.items():
@@ -220,20 +233,6 @@ def _shown(items: Sequence[Item], others: Iterable[Item], teacher: str) -> tuple
     raise ValueError(f"no item has a truth: {reason}")
 
 
-def fidelity_result(rows: Mapping[str, Sequence[Mapping[str, Any]]], **settings: Any) -> dict[str, Any]:
-    """Summaries by simulator and input, and the items themselves.
-
-    Returns: ``{**settings, "simulators": {name: {"inputs": {input: summary}, "items": rows}}}``, for JSON.
-    """
-    simulators = {}
-    for name, table in rows.items():
-        inputs = {
-            given: summarise([row for row in table if row["input"] == given]) for given in settings["inputs"]
-        }
-        simulators[name] = {"inputs": inputs, "items": [*table]}
-    return {**settings, "simulators": simulators}
-
-
 def summarise(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Fidelity over many items: overall, and by each of severity, level and condition that rows have.
 
@@ -258,7 +257,7 @@ def summarise(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         for row in rows:
             if row.get(key) is not None:
                 groups.setdefault(row[key], []).append(row)
-        # degrees of loss in their own order, levels as numbers, conditions by name
+        # degrees of loss in their order, levels as numbers, conditions by name
         order = sorted(groups, key=lambda g: (SEVERITIES.index(g) if g in SEVERITIES else 0, g))
         summary[key] = {g if isinstance(g, str) else f"{g:g}": _figures(groups[g]) for g in order}
     return summary
@@ -286,12 +285,9 @@ def _figures(rows: Sequence[Mapping[str, Any]]) -> dict[str, float | int | None]
         "band_error_median": over(np.median, "band_error"),
     }
     for name in ("stoi", "pesq"):
-        scored = [
-            row for row in rows if row.get(f"{name}_true") is not None and row.get(f"{name}_sim") is not None
-        ]
-        true, simulated = [row[f"{name}_true"] for row in scored], [row[f"{name}_sim"] for row in scored]
-        figures[f"{name}_n"] = len(scored)
-        figures[f"{name}_lcc"] = linear_correlation(true, simulated)
-        figures[f"{name}_srcc"] = rank_correlation(true, simulated)
-        figures[f"{name}_mse"] = mean_squared_error(true, simulated)
+        sides = ([row.get(f"{name}_{side}") for row in rows] for side in ("true", "sim"))
+        pairs = [pair for pair in zip(*sides, strict=True) if None not in pair]
+        true, simulated = ([pair[side] for pair in pairs] for side in (0, 1))
+        figures[f"{name}_n"] = len(pairs)
+        figures |= {f"{name}_{key}": measure(true, simulated) for key, measure in _AGREEMENT.items()}
     return figures

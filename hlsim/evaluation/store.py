@@ -108,7 +108,7 @@ def key_of(settings: Mapping[str, Any]) -> str:
 def weights_hash(module: nn.Module) -> str:
     """What makes a simulator or compensator this one: its class, its settings and its weights, kept in it or not.
 
-    Of a class of your own the source counts too, where it can be had; not that of what it calls.
+    Of a class outside hlsim and torch the source counts too, where it can be had; not that of what it calls.
     """
     torchs = vars(nn.Module()).keys()  # what every module has
     settings = [
@@ -131,9 +131,9 @@ def setting(value: Any) -> Any:
     if isinstance(value, bool | int | float | complex | str | bytes | None):
         return value
     if isinstance(value, list | tuple):
-        return [setting(own) for own in value]
+        return [setting(part) for part in value]
     if isinstance(value, Mapping):
-        return sorted((repr(name), setting(own)) for name, own in value.items())
+        return sorted((repr(name), setting(part)) for name, part in value.items())
     if isinstance(value, np.ndarray):
         return (
             value.shape,

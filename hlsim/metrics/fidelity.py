@@ -88,7 +88,8 @@ def stoi(clean: Signal, heard: Signal, sample_rate: int) -> Score:
         ValueError: shapes differ or are not (time,).
         MissingExtraError: pystoi is not installed.
     """
-    return _score(require("pystoi", "eval").stoi, clean, heard, lambda a, b, run: run(a, b, sample_rate))
+    run = require("pystoi", "eval").stoi
+    return _score(lambda a, b: run(a, b, sample_rate), clean, heard)
 
 
 def pesq_wb(clean: Signal, heard: Signal, sample_rate: int) -> Score:
@@ -96,12 +97,13 @@ def pesq_wb(clean: Signal, heard: Signal, sample_rate: int) -> Score:
 
     Shape: (time,) and (time,). Raises as ``stoi``, for pesq.
     """
+    run = require("pesq", "eval").pesq
 
-    def at_16k(a: np.ndarray, b: np.ndarray, run: Callable[..., float]) -> float:
-        pair = [resample(torch.from_numpy(x), sample_rate, _PESQ_RATE).numpy() for x in (a, b)]
-        return run(_PESQ_RATE, *pair, "wb")
+    def at_16k(*signals: np.ndarray) -> float:
+        pair = [resample(torch.from_numpy(x), sample_rate, _PESQ_RATE).numpy() for x in signals]
+        return float(run(_PESQ_RATE, *pair, "wb"))
 
-    return _score(require("pesq", "eval").pesq, clean, heard, at_16k)
+    return _score(at_16k, clean, heard)
 
 
 def linear_correlation(true: Iterable[float], simulated: Iterable[float]) -> float | None:
@@ -138,7 +140,7 @@ def _values(true: Iterable[float], simulated: Iterable[float]) -> tuple[np.ndarr
     return a, b
 
 
-def _score(run: Callable[..., float], clean: Signal, heard: Signal, call: Callable[..., float]) -> Score:
+def _score(run: Callable[[np.ndarray, np.ndarray], float], clean: Signal, heard: Signal) -> Score:
     a, b = _equal(clean, heard)
     for name, signal in (("clean", a), ("heard", b)):
         if not np.isfinite(signal).all():
@@ -147,10 +149,9 @@ def _score(run: Callable[..., float], clean: Signal, heard: Signal, call: Callab
             return Score(None, f"{name} is silent")
     try:
         with warnings.catch_warnings():
-            warnings.filterwarnings(
-                "error", message="Not enough STFT frames"
-            )  # pystoi's word, and its score is 1e-5
-            value = float(call(a, b, run))
+            # pystoi's word, and its score is 1e-5
+            warnings.filterwarnings("error", message="Not enough STFT frames")
+            value = float(run(a, b))
     except Exception as error:  # whatever a third party's measure raises is that item's reason, no more
         text = error.args[0] if error.args else error
         return Score(None, text.decode() if isinstance(text, bytes) else str(text))

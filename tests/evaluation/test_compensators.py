@@ -18,16 +18,14 @@ from hlsim.criteria.bands import band_edges
 from hlsim.evaluation import compensators, judging, steadiness
 from hlsim.evaluation.compensators import evaluate_compensators
 from hlsim.evaluation.gain_curves import insertion_gain
+from hlsim.evaluation.items import INPUT_LEVELS, draw_judged_items, read_ears
 from hlsim.evaluation.judging import (
-    INPUT_LEVELS,
     Keys,
     Trial,
     Unaided,
     band_error_db,
-    draw_judged_items,
     judge,
     peak_spl,
-    read_ears,
 )
 from hlsim.evaluation.statistics import paired_comparison
 from hlsim.metrics.pyclarity import haspi, hasqi
