@@ -145,7 +145,7 @@ def main_table(result: Result, group: str) -> Table:
             "the same, mean absolute": f"{row['heard_off_abs']:.1f}",
             "Bands, against normal (dB)": f"{row['band_error_mean']:.1f}",
         }
-        for name, row in _conditions(result, group).items()
+        for name, row in result["groups"][group]["conditions"].items()
     ]
     return Table.of(f"{GROUPS[group]}: scores, output and what is heard", rows)
 
@@ -179,7 +179,7 @@ def severity_tests(report: HaspiReport, group: str) -> Table:
 def loudness_table(result: Result, group: str) -> Table:
     """Level as heard against the normal ear's, a column an input level."""
     rows = []
-    for name, row in _conditions(result, group).items():
+    for name, row in result["groups"][group]["conditions"].items():
         against = {name: "heard_off"}
         if group == "noisy":
             against[f"{name}, against the speech in it"] = "heard_off_clean"
@@ -198,7 +198,7 @@ def loudness_table(result: Result, group: str) -> Table:
 
 def severity_table(result: Result, group: str) -> Table:
     """A row a degree of loss and condition."""
-    conditions = _conditions(result, group)
+    conditions = result["groups"][group]["conditions"]
     first = next(iter(conditions.values()))["by_severity"]
     rows = [
         {
@@ -326,11 +326,6 @@ def _share(value: float | None, form: str) -> str:
 
 def _gains_at(hertz: Any, curve: Result, gains: Sequence[float]) -> Any:
     return np.interp(np.log(hertz), np.log(curve["frequencies"]), gains)
-
-
-def _conditions(result: Result, group: str) -> Mapping[str, Any]:
-    conditions: Mapping[str, Any] = result["groups"][group]["conditions"]
-    return conditions
 
 
 def _scores(row: Result) -> dict[str, str]:

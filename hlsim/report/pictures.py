@@ -21,13 +21,12 @@ from hlsim.extras import require
 from hlsim.report.page import Picture
 from hlsim.report.tables import loss_name
 
-_INCHES = (4.2, 3.5)
 _MANY = 2000  # points beyond which they are drawn as pixels: the page stays small
 
 
-def draw_svg(draw: Callable[[Any], None], inches: tuple[float, float] = _INCHES) -> bytes:
+def draw_svg(draw: Callable[[Any], None]) -> bytes:
     """The SVG of what ``draw`` puts on a matplotlib axes."""
-    figure = new_figure(inches)
+    figure = new_figure((4.2, 3.5))
     draw(figure.subplots())
     data = io.BytesIO()
     # the same figures give the same bytes
