@@ -22,6 +22,10 @@ from torch import Tensor, nn
 
 from hlsim.files import sha256
 
+# scores of networks were stored when these had other names
+_FORMER = {"receptive_field": "reach"}
+_FORMER_MODULE = b"hlsim.dsp.stft", b"hlsim.spectrum"
+
 
 class ScoreStore:
     """A file of JSON lines, ``{"key": ..., ...}``, that only ever grows; the last line of a key counts.
@@ -114,7 +118,7 @@ def weights_hash(module: nn.Module) -> str:
     settings = [
         (place, name, setting(value))
         for place, part in module.named_modules()
-        for name, value in sorted(vars(part).items())
+        for name, value in sorted((_FORMER.get(name, name), value) for name, value in vars(part).items())
         if name not in torchs
     ]
     kinds = {type(part): None for part in module.modules()}
@@ -147,8 +151,7 @@ def setting(value: Any) -> Any:
     if isinstance(value, weakref.ref):  # an LSTM holds some to its weights
         return setting(value())
     try:
-        # scores of simulators are stored under this module's first name
-        held = pickle.dumps(value, protocol=4).replace(b"hlsim.dsp.stft", b"hlsim.spectrum")
+        held = pickle.dumps(value, protocol=4).replace(*_FORMER_MODULE)
         return hashlib.sha256(held).hexdigest()
     except Exception:  # a lambda, an open file: whatever it does may have changed, so it is scored anew
         return uuid.uuid4().hex

@@ -141,5 +141,8 @@ def test_settings_of_any_kind_tell_modules_apart(monkeypatch: pytest.MonkeyPatch
     assert weights_hash(Own([1.0])) != hashes[0]
 
 
-def test_what_was_stored_under_a_networks_transform_is_still_known() -> None:
+def test_what_was_stored_under_former_names_is_still_known() -> None:
     assert setting(STFT(400, 400, 100)) == "3768d03668076df7778297ca04329f9e91caf8b812e21d4a700033f4b4cad2cf"
+    now, then = torch.nn.Module(), torch.nn.Module()
+    now.receptive_field = then.reach = 1664
+    assert weights_hash(now) == weights_hash(then)
