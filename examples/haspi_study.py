@@ -15,6 +15,7 @@ from hlsim.audio import find_audio, read_audio, write_audio
 from hlsim.audiogram import read_audiograms
 from hlsim.calibration import level_spl, set_level
 from hlsim.evaluation import haspi_report
+from hlsim.report.haspi import markdown, write_report
 
 SPL, SECONDS, LISTENERS = 65.0, 3.0, 4
 
@@ -54,11 +55,12 @@ def main() -> None:
         manifest=out / "study.csv",
         audiograms=audiograms,
         measures=("haspi", "stoi"),
-        out=out / "report",
+        store=out / "report" / "scores.jsonl",
         jobs=1,
         progress=lambda done, total: print(f"\r{done} of {total} scores", end="", file=sys.stderr),
     )
-    print(report.to_markdown())
+    write_report(report, out / "report")
+    print(markdown(report))
 
 
 if __name__ == "__main__":

@@ -16,12 +16,13 @@ from hlsim.audio import find_audio, read_audio, write_audio
 from hlsim.audiogram import Audiogram
 from hlsim.calibration import level_spl, set_level
 from hlsim.dsp.resample import resample
+from hlsim.evaluation import HaspiReport, ItemScore
 from hlsim.evaluation.judging import NORMAL, Unaided
-from hlsim.evaluation.scores import HaspiReport, ItemScore
-from hlsim.metrics.pyclarity import HaspiItem, check_pair, haspi_many
+from hlsim.evaluation.scoring import HaspiItem, haspi_many
+from hlsim.metrics.pyclarity import check_pair
 from hlsim.msbg import MSBG
 from hlsim.neuro.config import NEURO_RATE
-from hlsim.report.haspi import write_report
+from hlsim.report.haspi import markdown, write_report
 from hlsim.report.pictures import draw_spectrograms
 from hlsim.training.compensator import CompensatorRecipe, train_compensator
 from hlsim.training.sources import TrainingData
@@ -128,13 +129,13 @@ def demo(
     ]
     result = replace(HaspiReport(items=scores, seed=seed), extra=extra)
     write_report(result, folder)
-    text = f"# {_name(audiogram)}\n\n{result.to_markdown()}\n" + "\n".join(table) + "\n"
+    text = f"# {_name(audiogram)}\n\n{markdown(result)}\n" + "\n".join(table) + "\n"
     (folder / "report.md").write_text(text, encoding="utf-8")
     _write_audio(folder / "audio", names, clean, heard)
     panel = {"original": clean[0]} | {
         f"heard, {name}": heard[name][0] for name in ("unaided", "nalr", "compensated")
     }
-    draw_spectrograms(panel, NEURO_RATE, folder / "spectrograms.png")
+    (folder / "spectrograms.png").write_bytes(draw_spectrograms(panel, NEURO_RATE))
     report(f"report, audio and pictures are in {folder}")
     return text
 

@@ -1,11 +1,12 @@
-"""One function over many tasks: in this process, over the cores, or over the machines of a Dask cluster."""
+"""One function over many tasks: in this process, over the cores or over a Dask cluster, and not over what is stored."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import ExitStack
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from functools import partial
 from itertools import chain
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, Protocol, TypeVar
 
 from hlsim.extras import require
 
@@ -14,7 +15,97 @@ BACKENDS = ("loky", "dask")
 Task = TypeVar("Task")
 Result = TypeVar("Result")
 
+Progress = Callable[[int, int], None]
+"""Called with how many are done and how many there are."""
+
+_DIED = "the process that made it died (a crash in compiled code, or memory ran out)"
 _PATIENCE = 10.0  # seconds for a scheduler to answer
+
+
+class Failed(NamedTuple):
+    """Why there is no record."""
+
+    reason: str
+
+
+class Store(Protocol):
+    """Where records are kept; what is appended is there for the next process, however this one ends."""
+
+    def get(self, key: str) -> Mapping[str, Any] | None: ...
+
+    def append(self, key: str, record: Mapping[str, Any]) -> None: ...
+
+
+def make_missing(
+    function: Callable[[Task, Sequence[str]], Mapping[str, Mapping[str, Any] | Failed]],
+    tasks: Sequence[Task],
+    keys: Callable[[Task], Sequence[str]],
+    store: Store | None,
+    *,
+    progress: Progress | None = None,
+    **parallel: Any,
+) -> dict[str, str]:
+    """Make the records that a store lacks, each stored as it is made: a run that was stopped goes on where it was.
+
+    Args:
+        function: of a task and those of its keys that are missing; returns a record, or why there is none, for each.
+        keys: of a task's records; quick, for it is asked three times. A key that counts as several stands so often.
+        store: None where ``function`` itself keeps its records, and knows those that are there.
+        progress: called with the keys done and all, first where some were there, and after each task.
+        parallel: ``jobs``, ``backend`` and ``scheduler`` of ``run_parallel``.
+
+    Returns: the reason of each record that could not be made; a later run tries it again.
+
+    Raises:
+        ValueError, MissingExtraError: as ``run_parallel``, or the store cannot be written.
+    """
+
+    def left() -> Iterator[tuple[Task, list[str]]]:
+        for task in tasks:
+            missing = [key for key in keys(task) if store is None or store.get(key) is None]
+            if missing:
+                yield task, missing
+
+    total = sum(len(keys(task)) for task in tasks)
+    done = total - sum(len(missing) for _, missing in left())
+    if progress is not None and 0 < done < total:
+        progress(done, total)
+    failed: dict[str, str] = {}
+    if done == total:
+        return failed
+    for (_, missing), made in run_parallel(partial(_make, function), left(), **parallel):
+        if made is None:
+            made = dict.fromkeys(missing, Failed(_DIED))
+        for key, record in made.items():
+            if isinstance(record, Failed):
+                failed[key] = record.reason
+            elif store is not None:
+                store.append(key, record)
+        done += len(missing)
+        if progress is not None:
+            progress(done, total)
+    if progress is not None and done < total:  # two tasks of one key
+        progress(total, total)
+    return failed
+
+
+def reason_of(error: Exception) -> str:
+    """What an exception says, in one line, with its kind unless it is a ValueError."""
+    kind = "" if isinstance(error, ValueError) else f"{type(error).__name__}: "
+    return kind + " ".join(str(error).split())
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Torch with one thread: it sums in one order, and where tasks are small or parallel, more would wait."""
+    import torch  # here, for the command line takes its options' names from this module
+
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 def check_parallel(jobs: int | None, backend: str, scheduler: str | None) -> None:
@@ -111,6 +202,10 @@ def _pool(
     pool = joblib.Parallel(n_jobs=processes, return_as="generator_unordered", batch_size=1)
     results: Iterator[tuple[int, Result]] = pool(chain([first], calling))
     return results
+
+
+def _make(function: Callable[[Task, Sequence[str]], Result], task: tuple[Task, Sequence[str]]) -> Result:
+    return function(*task)
 
 
 def _indexed(function: Callable[[Task], Result], index: int, task: Task) -> tuple[int, Result]:

@@ -1,13 +1,14 @@
-"""One function over many tasks: its order, its laziness, a process that dies, and a cluster of two workers."""
+"""One function over many tasks: its order, its laziness, a process that dies, a cluster of two workers, and a store."""
 
 import os
 import signal
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from typing import Any
 
 import pytest
 
-from hlsim.parallel import run_parallel
+from hlsim.parallel import Failed, make_missing, run_parallel
 
 pytest.importorskip("joblib")
 
@@ -103,3 +104,49 @@ def test_no_scheduler(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_task_that_ends_its_process_is_found_and_the_others_go_on() -> None:
     results = dict(run_parallel(die_at_three, range(8), jobs=2))
     assert results == {n: None if n == 3 else n * n for n in range(8)}
+
+
+class Kept(dict[str, dict[str, Any]]):
+    """A store in memory."""
+
+    append = dict.__setitem__
+
+
+def square_but_three(number: int, missing: Sequence[str]) -> dict[str, dict[str, int] | Failed]:
+    square = Failed("three") if number == 3 else {"square": number * number}
+    return dict.fromkeys(missing, square)
+
+
+def square_and_die_at_three(number: int, missing: Sequence[str]) -> dict[str, dict[str, int]]:
+    return {key: {"square": die_at_three(number)} for key in missing}
+
+
+def test_what_is_stored_is_not_made_again() -> None:
+    store, seen = Kept({"1": {"square": 1}}), []
+
+    def run() -> dict[str, str]:
+        seen.clear()
+        return make_missing(
+            square_but_three,
+            range(4),
+            lambda number: [str(number)] * (1 + number % 2),  # odd ones count twice
+            store,
+            jobs=1,
+            progress=lambda done, total: seen.append((done, total)),
+        )
+
+    assert run() == {"3": "three"}
+    assert store == {str(n): {"square": n * n} for n in range(3)}
+    assert seen == [(2, 6), (3, 6), (4, 6), (6, 6)]
+    # what failed is tried again, the rest is known
+    assert run() == {"3": "three"} and seen == [(4, 6), (6, 6)]
+    store["3"] = {"square": 9}
+    assert run() == {} and seen == []
+
+
+@pytest.mark.slow
+def test_a_process_that_dies_is_a_reason_and_the_others_are_stored() -> None:
+    store = Kept()
+    failed = make_missing(square_and_die_at_three, range(8), lambda number: [str(number)], store, jobs=2)
+    assert list(failed) == ["3"] and "the process that made it died" in failed["3"]
+    assert store == {str(n): {"square": n * n} for n in range(8) if n != 3}

@@ -21,6 +21,7 @@ from hlsim.data.manifest import Utterance
 from hlsim.data.plan import prepare
 from hlsim.data.plan_settings import PlanSettings
 from hlsim.evaluation import haspi_report
+from hlsim.report.haspi import markdown, write_report
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -75,9 +76,13 @@ def main(arguments: list[str] | None = None) -> None:
     write_table(out / "table.csv", rows)
     progress = show_progress("scores")
     report = haspi_report(
-        manifest=out / "table.csv", out=out / "report", jobs=options.jobs, listen=0, progress=progress
+        manifest=out / "table.csv",
+        store=out / "report" / "scores.jsonl",
+        jobs=options.jobs,
+        progress=progress,
     )
-    print(report.to_markdown())
+    write_report(report, out / "report", listen=0)
+    print(markdown(report))
 
 
 def write_table(path: Path, rows: list[dict[str, str]]) -> None:

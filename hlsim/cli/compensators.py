@@ -40,6 +40,8 @@ def _evaluate_compensator(options: argparse.Namespace) -> None:
     check_there(folders=(options.speech, options.noise), files=(options.audiograms,))
     from compensators import load_compensator
     from hlsim.evaluation.compensators import evaluate_compensators
+    from hlsim.report.compensators import write_compensators
+    from hlsim.report.page import check_out
 
     named = dict(map(_labelled, options.names))
     if len(named) < len(options.names):
@@ -49,14 +51,14 @@ def _evaluate_compensator(options: argparse.Namespace) -> None:
     notes = [line for label, name in named.items() for line in other_ear(label, name, ear)]
     for line in notes:
         print(f"hlsim: warning: {line}", file=sys.stderr)
-    result = evaluate_compensators(
+    done = evaluate_compensators(
         loaded,
         speech=options.speech,
         audiograms=options.audiograms,
         audiogram=ear,
         noise=options.noise,
         simulator=options.simulator,
-        out=options.out,
+        store=check_out(options.out) / "scores.jsonl",
         items=options.items,
         seconds=options.seconds,
         levels=options.levels,
@@ -66,10 +68,11 @@ def _evaluate_compensator(options: argparse.Namespace) -> None:
         jobs=options.jobs,
         progress=show_progress("outputs"),
     )
+    write_compensators(done.result, done.reports, options.out)
     print((options.out / "compensators.md").read_text(encoding="utf-8"))
-    if result["failures"]:
+    if done.result["failures"]:
         print(
-            f"hlsim: {len(result['failures'])} outputs could not be judged; the reasons are in "
+            f"hlsim: {len(done.result['failures'])} outputs could not be judged; the reasons are in "
             f"{options.out / 'compensators.md'}",
             file=sys.stderr,
         )

@@ -33,18 +33,20 @@ def _evaluate_simulator(options: argparse.Namespace) -> None:
         raise ValueError(f"simulators {', '.join(options.names)}; allowed: each once")
     if options.compensator and "compensated" not in options.inputs:
         raise ValueError("--compensator without --inputs compensated; allowed: only with it")
-    need("eval", "clarity", "pystoi", "pesq")
+    need("eval", "clarity", "pystoi", "pesq", "matplotlib")
     check_there(folders=(options.speech, options.noise), files=(options.audiograms,))
     from compensators import load_compensator
-    from hlsim.evaluation.items import RATE
     from hlsim.evaluation.simulators import evaluate_simulators
+    from hlsim.neuro.config import NEURO_RATE
+    from hlsim.report.page import check_out
+    from hlsim.report.simulators import write_fidelity
 
-    evaluate_simulators(
-        {name: read_simulator(name, RATE) for name in options.names},
+    done = evaluate_simulators(
+        {name: read_simulator(name, NEURO_RATE) for name in options.names},
         speech=options.speech,
         audiograms=options.audiograms,
         noise=options.noise,
-        out=options.out,
+        store=check_out(options.out) / "scores.jsonl",
         teacher=options.teacher,
         items=options.items,
         seconds=options.seconds,
@@ -54,4 +56,5 @@ def _evaluate_simulator(options: argparse.Namespace) -> None:
         seed=options.seed,
         progress=show_progress("items"),
     )
+    write_fidelity(done.result, done.heard, done.shown, options.out)
     print((options.out / "fidelity.md").read_text(encoding="utf-8"))

@@ -47,6 +47,8 @@ def _haspi_report(options: argparse.Namespace) -> None:
         files=(options.manifest, options.audiograms),
     )
     from hlsim.evaluation import haspi_report
+    from hlsim.report.haspi import markdown, write_report
+    from hlsim.report.page import check_out
 
     report = haspi_report(
         options.clean,
@@ -58,18 +60,17 @@ def _haspi_report(options: argparse.Namespace) -> None:
         root=options.root,
         measures=measures,
         baseline=options.baseline,
-        out=options.out,
-        store=options.scores,
+        store=options.scores or check_out(options.out) / "scores.jsonl",
         full_scale_spl=options.full_scale_spl,
         spl=options.spl,
         seed=options.seed,
         jobs=options.jobs,
         backend=options.backend,
         scheduler=options.scheduler,
-        listen=options.listen,
         progress=show_progress("scores"),
     )
-    print(report.to_markdown())
+    write_report(report, options.out, listen=options.listen)
+    print(markdown(report))
     if report.failures:
         made = sum(len(own) for item in report.items for own in item.scores.values())
         print(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from pathlib import Path
@@ -10,12 +10,11 @@ from typing import Any
 
 import torch
 
-from hlsim.data.corpora import Fault
 from hlsim.data.instances import CLAIM, MANIFEST, Plan, is_whole
 from hlsim.data.manifest import csv_line
 from hlsim.data.teacher import Reference, Teacher
 from hlsim.files import PARTIAL, file_lock, write_whole
-from hlsim.parallel import run_parallel
+from hlsim.parallel import Failed, Progress, make_missing, one_thread
 
 WRITE_FAULTS = "write-faults.csv"
 
@@ -40,7 +39,7 @@ def write_instances(
     jobs: int | None = None,
     backend: str = "loky",
     scheduler: str | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> int:
     """Write all instances of a plan that are not there yet.
 
@@ -63,49 +62,39 @@ def write_instances(
         return _write(plan, recipe, jobs=jobs, backend=backend, scheduler=scheduler, progress=progress)
 
 
-def _write(
-    plan: Plan, recipe: Recipe, *, progress: Callable[[int, int], None] | None, **parallel: Any
-) -> int:
+def _write(plan: Plan, recipe: Recipe, **parallel: Any) -> int:
     _claim(plan, recipe)
     for leftover in (plan.folder / "instances").rglob(f".*{PARTIAL}"):
         leftover.unlink(missing_ok=True)
     # a worker on another machine has another working folder
     folder, root = str(plan.folder.absolute()), str(plan.root.absolute())
     task = partial(make, folder, root, plan.digest, recipe)
-    faults: list[Fault] = []
-    threads = torch.get_num_threads()
     numbers = range(len(plan.utterances))
-    written = run_parallel(task, numbers, **parallel)
-    try:
-        for done, (number, found) in enumerate(written, start=1):
-            if found is None:  # its process ended
-                faults.append(
-                    Fault(plan.utterance(number * plan.each).clean, "the process that made it died")
-                )
-            else:
-                faults.extend(found)
-            if progress is not None:
-                progress(done * plan.each, len(plan))
-    finally:
-        torch.set_num_threads(threads)
+    with one_thread():
+        # no store but the folder: whoever makes an utterance's instances looks which are there
+        failed = make_missing(task, numbers, lambda number: [str(number)] * plan.each, None, **parallel)
+    faults = [
+        (plan.utterance(number * plan.each).clean, failed[str(number)]) for number in sorted(map(int, failed))
+    ]
     report = plan.folder / WRITE_FAULTS
     if faults:
-        cells = (("path", "reason"), *((fault.path, fault.reason) for fault in faults))
-        write_whole(report, "".join(map(csv_line, cells)))
+        write_whole(report, "".join(map(csv_line, [("path", "reason"), *faults])))
         raise ValueError(
-            f"{len(faults)} of {len(plan.utterances)} utterances have no instances, the first {faults[0].path}: "
-            f"{faults[0].reason}; all are in {report}; the others are written"
+            f"{len(faults)} of {len(plan.utterances)} utterances have no instances, the first {': '.join(faults[0])}; "
+            f"all are in {report}; the others are written"
         )
     report.unlink(missing_ok=True)
     return len(plan)
 
 
-def make(folder: str, root: str, digest: str, recipe: Recipe, number: int) -> list[Fault]:
-    """Write the instances of one utterance that are missing; what is at fault with its audio, if anything.
+def make(
+    folder: str, root: str, digest: str, recipe: Recipe, number: int, keys: Sequence[str]
+) -> dict[str, dict[str, Any] | Failed]:
+    """Write the instances of one utterance that are missing; its key with what is at fault with its audio, if anything.
 
     One at a time, for the last bits of a batch depend on what else is in it.
     """
-    torch.set_num_threads(1)  # which sums in one order
+    torch.set_num_threads(1)  # which sums in one order; for good, for a worker may have other threads
     plan, teacher = _opened(folder, root, digest, recipe)
     for index in range(number * plan.each, (number + 1) * plan.each):
         if is_whole(plan.path(index)):
@@ -114,9 +103,9 @@ def make(folder: str, root: str, digest: str, recipe: Recipe, number: int) -> li
             instance = plan.instance(index)
             heard = teacher(instance.signal[None], instance.thresholds[None])[0]
         except ValueError as error:
-            return [Fault(plan.utterance(index).clean, str(error))]
+            return {keys[0]: Failed(str(error))}
         write_whole(plan.path(index), replace(instance, impaired=heard).to_bytes())
-    return []
+    return {}
 
 
 @lru_cache(maxsize=2)

@@ -3,34 +3,30 @@
 from typing import Any
 
 from hlsim.evaluation.comparison import Comparison
-from hlsim.evaluation.haspi_report import haspi_report
-from hlsim.evaluation.scores import Failure, HaspiReport, ItemScore
-from hlsim.evaluation.scoring import Item, score_items
+from hlsim.evaluation.haspi_report import HaspiReport, haspi_report
+from hlsim.evaluation.scores import Failure, ItemScore
+from hlsim.evaluation.scoring import FileItem, HaspiItem, haspi_many, score_items
+from hlsim.evaluation.simulators import summarise
 from hlsim.evaluation.statistics import PairedComparison, bootstrap_interval, holm, paired_comparison
 from hlsim.evaluation.store import ScoreStore
-from hlsim.metrics.fidelity import fidelity_markdown, summarise
-from hlsim.metrics.pyclarity import HaspiItem, haspi_many
-from hlsim.report.haspi import write_report
 
 __all__ = [
     "Comparison",
     "Failure",
+    "FileItem",
     "HASPI",
     "HaspiItem",
     "HaspiReport",
-    "Item",
     "ItemScore",
     "PairedComparison",
     "ScoreStore",
     "bootstrap_interval",
-    "fidelity_markdown",
     "haspi_many",
     "haspi_report",
     "holm",
     "paired_comparison",
     "score_items",
     "summarise",
-    "write_report",
 ]
 
 

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from itertools import combinations
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+import numpy as np
 
 from hlsim.audiogram import SEVERITIES
+from hlsim.evaluation.scores import ItemScore
 from hlsim.evaluation.statistics import (
     MixedModel,
     PairedComparison,
@@ -19,9 +22,6 @@ from hlsim.evaluation.statistics import (
     paired_comparison,
 )
 from hlsim.metrics.registry import MEASURES
-
-if TYPE_CHECKING:
-    from hlsim.evaluation.scores import ItemScore
 
 ALPHA = 0.05
 """Below which a p value is said to speak against chance."""
@@ -68,21 +68,14 @@ class Comparison:
 
     def to_dict(self) -> dict[str, Any]:
         """A plain dictionary that JSON can hold."""
-        mixed = self.mixed.to_dict() if isinstance(self.mixed, MixedModel) else {"none": self.mixed}
+        record = asdict(self)
+        del record["unit"]
+        mixed, listeners = record.pop("mixed"), record.pop("listeners")
         return {
-            "measure": self.measure,
-            "before": self.before,
-            "after": self.after,
-            **self.overall.to_dict(),
-            "p_t_holm": self.p_t_holm,
-            "p_w_holm": self.p_w_holm,
-            "comparisons": self.comparisons,
-            "left_out": self.left_out,
-            "level_before_mean": self.level_before_mean,
-            "level_after_mean": self.level_after_mean,
-            "by_severity": {name: own.to_dict() for name, own in self.by_severity.items()},
-            "listener_means": None if self.listeners is None else self.listeners.to_dict(),
-            "mixed_model": mixed,
+            **record.pop("overall"),
+            **record,
+            "listener_means": listeners,
+            "mixed_model": {"none": mixed} if isinstance(mixed, str) else mixed,
             "in_words": self.in_words(),
         }
 
@@ -186,11 +179,11 @@ def compare_conditions(
         pairs = [(baseline, other) for other in conditions if other != baseline]
     out = []
     for measure in measures:
-        own = [c for pair in pairs if (c := _compare(items, measure, *pair)) is not None]
-        p_t, p_w = holm(c.overall.p_t for c in own), holm(c.overall.p_w for c in own)
+        found = [c for pair in pairs if (c := _compare(items, measure, *pair)) is not None]
+        p_t, p_w = holm(c.overall.p_t for c in found), holm(c.overall.p_w for c in found)
         out += [
-            replace(c, p_t_holm=t, p_w_holm=w, comparisons=len(own), unit=unit)
-            for c, t, w in zip(own, p_t, p_w, strict=True)
+            replace(c, p_t_holm=t, p_w_holm=w, comparisons=len(found), unit=unit)
+            for c, t, w in zip(found, p_t, p_w, strict=True)
         ]
     return out
 
@@ -204,14 +197,12 @@ def _compare(items: Sequence[ItemScore], measure: str, before: str, after: str) 
     both = [item for item in items if {before, after} <= item.scores.get(measure, {}).keys()]
     if not both:
         return None
-    first = [item.scores[measure][before] for item in both]
-    second = [item.scores[measure][after] for item in both]
-    severities = [item.audiogram.severity for item in both]
+    first, second = (
+        np.array([item.scores[measure][condition] for item in both]) for condition in (before, after)
+    )
+    severities = np.array([item.severity for item in both])
     by_severity = {
-        name: paired_comparison(
-            [x for x, own in zip(first, severities, strict=True) if own == name],
-            [x for x, own in zip(second, severities, strict=True) if own == name],
-        )
+        name: paired_comparison(first[severities == name], second[severities == name])
         for name in SEVERITIES
         if name in severities
     }

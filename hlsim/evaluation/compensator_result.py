@@ -8,9 +8,11 @@ from typing import Any
 import numpy as np
 
 from hlsim.audiogram import SEVERITIES
-from hlsim.evaluation.items import RATE, Item
+from hlsim.evaluation.haspi_report import HaspiReport
+from hlsim.evaluation.items import Item
 from hlsim.evaluation.judging import SIMULATORS, Judged
-from hlsim.evaluation.scores import HaspiReport, ItemScore
+from hlsim.evaluation.scores import ItemScore
+from hlsim.neuro.config import NEURO_RATE
 
 HARD = 0.6
 """Unaided HASPI under which an item belongs to those that need help most."""
@@ -38,11 +40,11 @@ def compensator_result(
     """
     conditions = [*limits]
     failures, rows = [], []
-    for number, (item, own) in enumerate(zip(items, judged, strict=True)):
-        bad = {name: own[name].reason for name in conditions if own[name].figures is None}
+    for number, (item, results) in enumerate(zip(items, judged, strict=True)):
+        bad = {name: results[name].reason for name in conditions if results[name].figures is None}
         failures += [{"item": number, **item.about, "compensator": name, "reason": bad[name]} for name in bad]
         if not bad:
-            figures = {name: own[name].figures for name in conditions}
+            figures = {name: results[name].figures for name in conditions}
             about = {**item.about, "audiogram": list(item.ear.thresholds)}
             rows.append({"item": number, **about, "figures": figures})
     if not rows:
@@ -51,18 +53,18 @@ def compensator_result(
         name: [row for row in rows if row["condition"] == name] for name in ("clean", "noisy")
     }
     groups["hard"] = [row for row in rows if row["figures"][conditions[0]]["haspi"] < HARD]
-    groups = {name: own for name, own in groups.items() if own}
-    reports = {name: _report(own, items, settings) for name, own in groups.items()}
+    groups = {name: group for name, group in groups.items() if group}
+    reports = {name: _report(group, items, settings) for name, group in groups.items()}
     result = {
         **settings,
         "limits": dict(limits),
         "groups": {
             name: {
-                "n": len(own),
-                "conditions": {condition: _summary(own, condition) for condition in conditions},
+                "n": len(group),
+                "conditions": {condition: _summary(group, condition) for condition in conditions},
                 "comparisons": [c.to_dict() for c in reports[name].comparisons],
             }
-            for name, own in groups.items()
+            for name, group in groups.items()
         },
         "gap": {
             name: {condition: _gap(groups[name], condition) for condition in conditions}
@@ -92,12 +94,12 @@ def _report(rows: Rows, items: Sequence[Item], settings: Mapping[str, Any]) -> H
             file=f"item {row['item']}",
             audiogram=items[row["item"]].ear,
             clean_level=row["level"],
-            levels={name: own["level"] for name, own in row["figures"].items()},
+            levels={name: figures["level"] for name, figures in row["figures"].items()},
             scores={
-                measure: {name: own[measure] for name, own in row["figures"].items()}
+                measure: {name: figures[measure] for name, figures in row["figures"].items()}
                 for measure in ("haspi", "hasqi")
             },
-            sample_rate=RATE,
+            sample_rate=NEURO_RATE,
             seconds=settings["seconds"],
             seed=(settings["seed"] + row["item"]) % 2**32,
             listener=row["name"],  # utterances are nested in ears
@@ -110,17 +112,15 @@ def _report(rows: Rows, items: Sequence[Item], settings: Mapping[str, Any]) -> H
 
 def _summary(rows: Rows, condition: str) -> dict[str, Any]:
     """Means over all, by input level and by degree of loss."""
-    levels = sorted({row["level"] for row in rows})
+    by_level = {
+        f"{level:g}": [row for row in rows if row["level"] == level]
+        for level in sorted({row["level"] for row in rows})
+    }
+    by_severity = {severity: [row for row in rows if row["severity"] == severity] for severity in SEVERITIES}
     return {
         **_means(rows, condition),
-        "by_level": {
-            f"{level:g}": _means([r for r in rows if r["level"] == level], condition) for level in levels
-        },
-        "by_severity": {
-            severity: _means(own, condition)
-            for severity in SEVERITIES
-            if (own := [row for row in rows if row["severity"] == severity])
-        },
+        "by_level": {level: _means(part, condition) for level, part in by_level.items()},
+        "by_severity": {severity: _means(part, condition) for severity, part in by_severity.items() if part},
     }
 
 
@@ -130,44 +130,43 @@ def _means(rows: Rows, condition: str) -> dict[str, Any]:
     ``heard_off`` is the level heard less a normal ear's of the same input, ``heard_off_clean`` less its of the clean
     speech; ``_abs`` is the mean of the absolute differences.
     """
-    figures = [row["figures"][condition] for row in rows]
-    heard, normal, clean = (
-        np.array([own[name] for own in figures]) for name in ("heard", "normal", "normal_clean")
-    )
+    figures = _columns(rows, condition)
     means: dict[str, Any] = {"n": len(rows)}
     for name in ("haspi", "hasqi"):
-        values = np.array([own[name] for own in figures])
-        means[f"{name}_mean"] = float(values.mean())
-        means[f"{name}_std"] = float(values.std(ddof=1)) if len(values) > 1 else None
-    for name, difference in (("heard_off", heard - normal), ("heard_off_clean", heard - clean)):
-        means |= {name: float(difference.mean()), f"{name}_abs": float(np.abs(difference).mean())}
+        means[f"{name}_mean"] = float(figures[name].mean())
+        means[f"{name}_std"] = float(figures[name].std(ddof=1)) if len(rows) > 1 else None
+    for name, normal in (("heard_off", "normal"), ("heard_off_clean", "normal_clean")):
+        off = figures["heard"] - figures[normal]
+        means |= {name: float(off.mean()), f"{name}_abs": float(np.abs(off).mean())}
     return means | {
-        "level_mean": _mean(figures, "level"),
-        "peak_max": max(own["peak"] for own in figures),
-        "band_error_mean": _mean(figures, "band_error"),
+        "level_mean": float(figures["level"].mean()),
+        "peak_max": float(figures["peak"].max()),
+        "band_error_mean": float(figures["band_error"].mean()),
     }
 
 
 def _gap(rows: Rows, condition: str) -> dict[str, float | None]:
     """Mean loss under each simulator, and the median over items of the network's relative distance from pyclarity's."""
-    figures = [row["figures"][condition] for row in rows]
-    losses = {f"loss_{name}": _mean(figures, f"loss_{name}") for name in SIMULATORS}
-    apart = [abs(own_gap) for own in figures if (own_gap := gap(own, "neuro", "pyclarity")) is not None]
+    figures = _columns(rows, condition)
+    losses = {f"loss_{name}": float(figures[f"loss_{name}"].mean()) for name in SIMULATORS}
+    apart = [gap(row["figures"][condition], "neuro", "pyclarity") for row in rows]
+    known = [abs(value) for value in apart if value is not None]
     return {
         **losses,
         "neuro_to_msbg": gap(losses, "neuro", "msbg"),
         "neuro_to_pyclarity": gap(losses, "neuro", "pyclarity"),
         "msbg_to_pyclarity": gap(losses, "msbg", "pyclarity"),
-        "item_median": float(np.median(apart)) if apart else None,
+        "item_median": float(np.median(known)) if known else None,
     }
 
 
 def _peaks(rows: Rows, condition: str, limit: float | None) -> dict[str, Any]:
-    peaks = [row["figures"][condition]["peak"] for row in rows]
+    peaks = _columns(rows, condition)["peak"]
     # float32 rounds the limit itself by as little
-    over = None if limit is None else sum(peak > limit + 1e-4 for peak in peaks)
-    return {"n": len(peaks), "limit": limit, "highest": max(peaks), "over": over}
+    over = None if limit is None else int((peaks > limit + 1e-4).sum())
+    return {"n": len(peaks), "limit": limit, "highest": float(peaks.max()), "over": over}
 
 
-def _mean(figures: Sequence[Mapping[str, float]], name: str) -> float:
-    return float(np.mean([own[name] for own in figures]))
+def _columns(rows: Rows, condition: str) -> dict[str, np.ndarray]:
+    figures = [row["figures"][condition] for row in rows]
+    return {name: np.array([row[name] for row in figures]) for name in figures[0]}

@@ -1,23 +1,192 @@
-"""A report of items from folders or a manifest: scored, put together, written."""
+"""Items from folders or a manifest, scored under two conditions or more, and what the scores come to."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from hlsim.audiogram import Audiogram
 from hlsim.calibration import check_full_scale
+from hlsim.evaluation.comparison import Comparison, compare_conditions
 from hlsim.evaluation.inputs import read_folders, read_manifest
-from hlsim.evaluation.scores import Failure, HaspiReport, ItemScore
-from hlsim.evaluation.scoring import Item, Result, score_items
+from hlsim.evaluation.scores import Failure, ItemScore
+from hlsim.evaluation.scoring import FileItem, Result, score_items
+from hlsim.evaluation.statistics import RESAMPLES, PairedComparison
 from hlsim.evaluation.store import ScoreStore
 from hlsim.extras import require
-from hlsim.metrics.pyclarity import Progress, check_seed
-from hlsim.metrics.registry import check_measures
-from hlsim.parallel import check_parallel
-from hlsim.report.haspi import check_out, write_report
+from hlsim.metrics.registry import check_measures, version_of, versions_of
+from hlsim.parallel import Progress
 
-SCORES_FILE = "scores.jsonl"
+if TYPE_CHECKING:
+    import pandas
+
+GAIN_NOTE = (
+    "HASPI rewards any gain, however loud, so the output level stands beside it: a higher score at a much higher level "
+    "may be no more than amplification."
+)
+
+
+@dataclass(frozen=True)
+class HaspiReport:
+    """Scores of the same items under two conditions or more.
+
+    Args:
+        items: at least one with scores; the headline compares the last condition with the first.
+        measures: names of the measures, the headline's first; by default those of the first item's scores.
+        seed: of the whole; each item has its own.
+        failures: scores that could not be made.
+        baseline: the first condition, where all others are to be compared with it alone; by default every later one is
+            with every earlier one.
+        extra: further keys for ``report.json`` beside the others, such as ``nalr_mean``; what JSON can hold.
+        unit: what the items' listeners are called in sentences, such as ``ears``.
+
+    Attributes:
+        conditions: their names, in order, from the items' levels.
+        comparisons: every pair of conditions by every measure, the headline among them.
+        headline: the last condition against the first, by the first measure.
+        comparison: the headline's figures over all items.
+        clean_level_mean, before_level_mean, after_level_mean: means in dB SPL, before and after of the headline.
+
+    Raises:
+        ValueError: no items, or of unlike conditions, or fewer than two; a baseline that is not the first; a score
+            that is not finite, no item with both of the headline's scores, or an extra key that the report has itself.
+    """
+
+    items: Sequence[ItemScore]
+    measures: Sequence[str] = ()
+    seed: int = 0
+    failures: Sequence[Failure] = ()
+    baseline: str | None = None
+    extra: Mapping[str, Any] = field(default_factory=dict)
+    unit: str = "listeners"
+    conditions: Sequence[str] = field(init=False)
+    comparisons: Sequence[Comparison] = field(init=False)
+    headline: Comparison = field(init=False)
+
+    def __post_init__(self) -> None:
+        if not self.items:
+            raise ValueError("no items; a report needs at least one that has scores")
+        conditions = tuple(self.items[0].levels)
+        measures = tuple(self.measures) or tuple(self.items[0].scores)
+        if len(conditions) < 2 or any(tuple(item.levels) != conditions for item in self.items):
+            raise ValueError(
+                f"conditions {', '.join(conditions)}; allowed: two or more, the same of every item"
+            )
+        if self.baseline not in (None, conditions[0]):
+            raise ValueError(
+                f"baseline is {self.baseline!r}; allowed: the first condition, {conditions[0]!r}"
+            )
+        comparisons = compare_conditions(self.items, measures, conditions, self.baseline, self.unit)
+        ends = (measures[0], conditions[0], conditions[-1])
+        headline = next((c for c in comparisons if (c.measure, c.before, c.after) == ends), None)
+        if headline is None:
+            why = f" ({self.failures[0].reason})" if self.failures else ""
+            raise ValueError(f"no item has {measures[0]} under both {ends[1]} and {ends[2]}{why}")
+        # of a frozen dataclass
+        vars(self).update(
+            conditions=conditions, measures=measures, comparisons=comparisons, headline=headline
+        )
+        taken = sorted(set(self._own()) & set(self.extra))
+        if taken:
+            raise ValueError(f"extra keys {', '.join(taken)} are the report's own; allowed: other names")
+
+    @property
+    def comparison(self) -> PairedComparison:
+        """The headline's figures over all items."""
+        return self.headline.overall
+
+    @property
+    def clean_level_mean(self) -> float:
+        """Mean level of the clean speech in dB SPL."""
+        return math.fsum(item.clean_level for item in self.items) / len(self.items)
+
+    @property
+    def before_level_mean(self) -> float:
+        """Mean level of the headline's first condition in dB SPL."""
+        return self.headline.level_before_mean
+
+    @property
+    def after_level_mean(self) -> float:
+        """Mean level of the headline's second condition in dB SPL."""
+        return self.headline.level_after_mean
+
+    @property
+    def full_scale_spl(self) -> float | None:
+        """Level in dB SPL that RMS 1.0 was taken as; None where the items differ, as where ``spl`` was given."""
+        levels = {item.full_scale_spl for item in self.items}
+        return levels.pop() if len(levels) == 1 else None
+
+    @property
+    def versions(self) -> dict[str, str]:
+        """Of the packages that the scores depend on."""
+        return {"hlsim": version_of("hlsim"), **versions_of(self.measures), "scipy": version_of("scipy")}
+
+    @property
+    def note(self) -> str:
+        """What is to be known before the figures: that HASPI rewards gain, where it is among the measures."""
+        return GAIN_NOTE if "haspi" in self.measures else ""
+
+    @property
+    def severities(self) -> list[str]:
+        """Each item's degree of loss."""
+        return [item.severity for item in self.items]
+
+    def scores(self, measure: str, conditions: Sequence[str] | None = None) -> np.ndarray:
+        """Scores by item and condition (all of them by default), NaN where there is none. Shape: (items, conditions)."""
+        return self._array([item.scores.get(measure, {}) for item in self.items], conditions)
+
+    def levels(self, conditions: Sequence[str] | None = None) -> np.ndarray:
+        """Levels in dB SPL, as ``scores``."""
+        return self._array([item.levels for item in self.items], conditions)
+
+    def _array(
+        self, rows: Sequence[Mapping[str, float | None]], conditions: Sequence[str] | None
+    ) -> np.ndarray:
+        names = self.conditions if conditions is None else conditions
+        # None becomes NaN
+        return np.array([[row.get(name) for name in names] for row in rows], dtype=np.float64)
+
+    @property
+    def table(self) -> pandas.DataFrame:
+        """A row an item and condition, with its level (dB SPL) and a column a measure; NaN where there is no score.
+
+        Raises:
+            MissingExtraError: pandas is not installed.
+        """
+        facts = ("file", "listener", "ear", "severity", "snr", "clean_level")
+        scale = ("full_scale_spl", "seconds", "seed")
+        rows = [
+            {**{name: getattr(item, name) for name in (*facts, *scale)}, "condition": condition}
+            for item in self.items
+            for condition in self.conditions
+        ]
+        frame: pandas.DataFrame = require("pandas", "eval").DataFrame(rows).astype({"snr": float})
+        scores = {measure: self.scores(measure).ravel() for measure in self.measures}
+        return frame.assign(level=self.levels().ravel(), **scores)
+
+    def to_dict(self) -> dict[str, Any]:
+        """A plain dictionary that JSON can hold: what ``report.json`` says."""
+        return {**self._own(), **self.extra}
+
+    def _own(self) -> dict[str, Any]:
+        facts = ("full_scale_spl", "clean_level_mean", "before_level_mean", "after_level_mean", "seed")
+        return {
+            **self.comparison.to_dict(),
+            "in_words": self.headline.in_words(),
+            "conditions": list(self.conditions),
+            "measures": list(self.measures),
+            "wilcoxon_zero_method": "wilcox",
+            "bootstrap": {"resamples": RESAMPLES, "method": "expanded percentile", "seed": 0},
+            **{name: getattr(self, name) for name in (*facts, "versions", "note")},
+            "comparisons": [c.to_dict() for c in self.comparisons],
+            "failures": [vars(failure).copy() for failure in self.failures],
+            "items": [item.to_dict() for item in self.items],
+        }
 
 
 def haspi_report(
@@ -31,7 +200,6 @@ def haspi_report(
     root: str | Path | None = None,
     measures: Iterable[str] = ("haspi",),
     baseline: str | None = None,
-    out: str | Path | None = None,
     store: str | Path | None = None,
     full_scale_spl: float = 94.0,
     spl: float | None = None,
@@ -39,7 +207,6 @@ def haspi_report(
     jobs: int | None = None,
     backend: str = "loky",
     scheduler: str | None = None,
-    listen: int = 3,
     progress: Progress | None = None,
 ) -> HaspiReport:
     """HASPI v2 (and HASQI, STOI, PESQ) of speech under two conditions or more, with paired tests and levels.
@@ -55,35 +222,26 @@ def haspi_report(
         audiograms: for folders a CSV file with columns ``file`` and ``hl_250``,
             ``hl_500``, ... in dB HL, one row a file; for a manifest with ``listener`` and ``ear`` in place of ``file``.
         manifest: in place of the folders, a CSV file with a row a file, see ``hlsim.evaluation.inputs``.
-        root: the folder that the manifest's paths are relative to; by default the manifest's own.
+        root: the folder that the manifest's paths are relative to; by default the manifest's.
         measures: of ``haspi``, ``hasqi``, ``stoi``, ``pesq``; the first is the headline's.
         baseline: the condition that comes first and that all others are compared with; by default the manifest's first
             comes first, and all are compared with each other.
-        out: folder for ``report.json``, ``.md``, ``.tex``, ``.html`` and ``before-after.png``; None writes nothing.
-        store: file of scores; by default ``scores.jsonl`` in ``out``, or none.
+        store: file of scores, made where there is none; None keeps them nowhere.
         full_scale_spl: level in dB SPL of a file with RMS 1.0.
         spl: or else the level in dB SPL of every clean file, or of a manifest's rows that bring none; the processed ones
             are on the same scale.
-        seed: of the noise that HASPI and HASQI add; each item has its own from it.
+        seed: of the noise that HASPI and HASQI add; each item has one from it.
         jobs: processes; None takes all cores. The scores do not depend on it.
         backend, scheduler: ``"loky"``, or ``"dask"`` with the address of a Dask scheduler.
-        listen: how many items the page shows with spectrograms and players, as heard.
         progress: called with the number of scores there and the number of all.
 
     Raises:
         ValueError: names differ between the folders, a manifest's row is wrong, a file has no audiogram, settings
-            contradict each other, no item could be scored, or ``out`` is no folder. No report is written then.
-        MissingExtraError: a measure's package, joblib, distributed or (with ``out``) matplotlib is not installed.
+            contradict each other, or no item could be scored.
+        MissingExtraError: a measure's package, joblib or distributed is not installed.
     """
     names = check_measures(measures)
-    for module in ("matplotlib",) if out is not None else ():
-        require(module, "eval")
-    check_parallel(jobs, backend, scheduler)
-    if out is not None:
-        check_out(out)
-        store = Path(out) / SCORES_FILE if store is None else store
     check_full_scale(full_scale_spl if spl is None else spl)
-    check_seed(seed)
     if audiogram is not None and not isinstance(audiogram, Audiogram):
         raise ValueError(
             f"audiogram is {type(audiogram).__name__}; allowed: an Audiogram, one ear of all files"
@@ -114,13 +272,10 @@ def haspi_report(
     if not scores:
         reasons = f"; the first, {failures[0].file}: {failures[0].reason}" if failures else ""
         raise ValueError(f"none of {len(items)} items could be scored{reasons}")
-    report = HaspiReport(scores, measures=names, seed=seed, failures=failures, baseline=baseline)
-    if out is not None:
-        write_report(report, out, listen=listen)
-    return report
+    return HaspiReport(scores, measures=names, seed=seed, failures=failures, baseline=baseline)
 
 
-def _conditions(items: Sequence[Item], baseline: str | None) -> list[str]:
+def _conditions(items: Sequence[FileItem], baseline: str | None) -> list[str]:
     found = list(dict.fromkeys(condition for item in items for condition in item.processed))
     if len(found) < 2:
         raise ValueError(f"one condition only, {found[0]}; allowed: two or more to compare")
@@ -130,37 +285,32 @@ def _conditions(items: Sequence[Item], baseline: str | None) -> list[str]:
 
 
 def _gather(
-    items: Sequence[Item],
+    items: Sequence[FileItem],
     scored: Sequence[dict[tuple[str, str], Result]],
     conditions: Sequence[str],
     measures: Sequence[str],
 ) -> tuple[list[ItemScore], list[Failure]]:
     scores, failures = [], []
     for item, results in zip(items, scored, strict=True):
-        for (measure, condition), result in results.items():
-            if result.score is None:
-                failures.append(Failure(item.name, condition, measure, str(result.reason)))
-        good = {key: result for key, result in results.items() if result.score is not None}
-        if not good:
+        failures += [
+            Failure(item.name, condition, measure, str(result.reason))
+            for (measure, condition), result in results.items()
+            if result.score is None
+        ]
+        known = {key: float(result.score) for key, result in results.items() if result.score is not None}
+        if not known:
             continue
-        fact = next(iter(good.values()))
+        fact = results[next(iter(known))]
         full_scale = item.full_scale(fact.clean_dbfs)
-        by_condition = {condition: result for (_, condition), result in good.items()}
+        levels = {condition: results[measure, condition].dbfs + full_scale for measure, condition in known}
         scores.append(
             ItemScore(
                 file=item.name,
                 audiogram=item.audiogram,
                 clean_level=fact.clean_dbfs + full_scale,
-                levels={
-                    name: by_condition[name].dbfs + full_scale if name in by_condition else None
-                    for name in conditions
-                },
+                levels={name: levels.get(name) for name in conditions},
                 scores={
-                    measure: {
-                        name: float(score)
-                        for name in conditions
-                        if (measure, name) in good and (score := good[measure, name].score) is not None
-                    }
+                    measure: {name: known[measure, name] for name in conditions if (measure, name) in known}
                     for measure in measures
                 },
                 sample_rate=fact.sample_rate,

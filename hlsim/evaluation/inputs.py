@@ -17,18 +17,22 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path, PurePath, PurePosixPath
+from typing import TypeVar
 
 from hlsim.audio import EXTENSIONS, find_audio
 from hlsim.audiogram import Audiogram, numbered_audiograms
 from hlsim.calibration import check_full_scale
-from hlsim.evaluation.scoring import EARS, Item
+from hlsim.evaluation.scoring import EARS, FileItem
 from hlsim.files import read_rows
 
+_Name = TypeVar("_Name")
+
 _EAR_NAMES = {"": "", "l": "left", "left": "left", "r": "right", "right": "right"}
+_NAMED = 3  # of many missing files a message names the first few
 _NEEDED = ("condition", "clean", "processed")
 
 
@@ -40,14 +44,14 @@ def read_manifest(
     audiograms: str | Path | None = None,
     full_scale_spl: float = 94.0,
     spl: float | None = None,
-) -> list[Item]:
+) -> list[FileItem]:
     """The items of a manifest, in the order of their first rows.
 
     Args:
         root: the folder that the paths are relative to, and that they may not leave; by default the manifest's own.
         audiogram: the ear of all rows that bring none; or else
         audiograms: a CSV file with columns ``listener``, ``ear`` (where left and right differ) and ``hl_250``, ....
-        full_scale_spl, spl: the level, as in ``Item``, of rows that bring none.
+        full_scale_spl, spl: the level, as in ``FileItem``, of rows that bring none.
 
     Raises:
         ValueError: the file cannot be read, lacks a column, or a row is wrong: an ear other than left and right, a path
@@ -57,8 +61,8 @@ def read_manifest(
     folder = (Path(path).parent if root is None else Path(root)).resolve()
     if not folder.is_dir():
         raise ValueError(f"{folder}: no such folder; the manifest's paths are relative to it")
-    ears = {} if audiograms is None else _ears(audiograms)
-    items: dict[tuple[str, ...], Item] = {}
+    ears = {} if audiograms is None else _ears(audiograms, _listener)
+    items: dict[tuple[str, ...], FileItem] = {}
     rows, taken = _rows(path), []
     for line, row in rows:
         try:
@@ -75,20 +79,19 @@ def read_manifest(
             items[name] = replace(known, processed={**known.processed, **item.processed})
         except ValueError as error:
             raise ValueError(f"{path}, line {line}: {error}") from error
-    for what, idle in (
-        ("audiogram", audiogram is not None and all(ear is not audiogram for ear in taken)),
-        (
-            "audiograms",
-            audiograms is not None and not any(own is ear for own in taken for ear in ears.values()),
-        ),
-        ("spl", spl is not None and all(row.get("spl") or row.get("full_scale_spl") for _, row in rows)),
-    ):
-        if idle:
+    idle = {
+        "audiogram": audiogram is not None and all(ear is not audiogram for ear in taken),
+        "audiograms": audiograms is not None
+        and not any(used is ear for used in taken for ear in ears.values()),
+        "spl": spl is not None and all(row.get("spl") or row.get("full_scale_spl") for _, row in rows),
+    }
+    for what in idle:
+        if idle[what]:
             raise ValueError(f"{path}: no row takes {what}, for each has its own; leave one of the two out")
     return list(items.values())
 
 
-def inside(root: Path, name: str, column: str) -> Path:
+def below_root(root: Path, name: str, column: str) -> Path:
     """A path below a root, links followed, or ValueError where it leaves it."""
     path = (root / name).resolve()
     if not name or PurePosixPath(name).is_absolute() or Path(name).is_absolute():
@@ -119,33 +122,33 @@ def _item(
     audiogram: Audiogram | None,
     full_scale_spl: float,
     spl: float | None,
-) -> tuple[tuple[str, ...], str, Item]:
+) -> tuple[tuple[str, ...], str, FileItem]:
     condition, listener = row["condition"], row.get("listener", "")
     if not condition:
         raise ValueError("no condition")
     ear = _ear(row.get("ear", ""))
-    clean = inside(root, row["clean"], "clean")
-    own = {key: _number(row, key) for key in ("spl", "full_scale_spl", "snr")}
-    if own["spl"] is not None and own["full_scale_spl"] is not None:
+    clean = below_root(root, row["clean"], "clean")
+    row_spl, row_full_scale, snr = (_number(row, key) for key in ("spl", "full_scale_spl", "snr"))
+    if row_spl is not None and row_full_scale is not None:
         raise ValueError("both spl and full_scale_spl; allowed: one of them a row")
-    if own["full_scale_spl"] is not None:
-        full_scale_spl, spl = own["full_scale_spl"], None
-    elif own["spl"] is not None:
-        spl = own["spl"]
+    if row_full_scale is not None:
+        full_scale_spl, spl = row_full_scale, None
+    elif row_spl is not None:
+        spl = row_spl
     parts = (listener, ear, row.get("item", "") or PurePosixPath(row["clean"]).with_suffix("").as_posix())
     label = " ".join(part for part in parts if part)
-    item = Item(
-        name=label if own["snr"] is None else f"{label} {own['snr']:g} dB",
+    item = FileItem(
+        name=label if snr is None else f"{label} {snr:g} dB",
         clean=clean,
-        processed={condition: inside(root, row["processed"], "processed")},
+        processed={condition: below_root(root, row["processed"], "processed")},
         audiogram=_audiogram(row, ears, listener, ear, audiogram),
         listener=listener,
         ear=ear,
-        snr=own["snr"],
+        snr=snr,
         full_scale_spl=check_full_scale(full_scale_spl),
         spl=spl,
     )
-    return (*parts, str(clean), str(own["snr"])), condition, item
+    return (*parts, str(clean), str(snr)), condition, item
 
 
 def _audiogram(
@@ -169,19 +172,33 @@ def _audiogram(
     return known
 
 
-def _ears(path: str | Path) -> dict[tuple[str, str], Audiogram]:
-    ears: dict[tuple[str, str], Audiogram] = {}
+def _ears(
+    path: str | Path, name_of: Callable[[Mapping[str, str]], tuple[_Name, str]]
+) -> dict[_Name, Audiogram]:
+    """The audiograms of a CSV file by name; ``name_of`` a row gives it, and what a second row of it is one of."""
+    ears: dict[_Name, Audiogram] = {}
     for line, row, audiogram in numbered_audiograms(path):
         try:
-            name = (row.get("listener", ""), _ear(row.get("ear", "")))
-            if not name[0]:
-                raise ValueError("no listener; needs a column 'listener'")
+            name, words = name_of(row)
             if name in ears:
-                raise ValueError(f"a second row of listener {name[0]}, ear {name[1]!r}")
+                raise ValueError(f"a second row of {words}")
         except ValueError as error:
             raise ValueError(f"{path}, line {line}: {error}") from error
         ears[name] = audiogram
     return ears
+
+
+def _listener(row: Mapping[str, str]) -> tuple[tuple[str, str], str]:
+    listener, ear = row.get("listener", ""), _ear(row.get("ear", ""))
+    if not listener:
+        raise ValueError("no listener; needs a column 'listener'")
+    return (listener, ear), f"listener {listener}, ear {ear!r}"
+
+
+def _file(row: Mapping[str, str]) -> tuple[str, str]:
+    if not row.get("file"):
+        raise ValueError("no file named; needs a column 'file' with a name a row")
+    return _name(PurePath(row["file"])), f"{row['file']}; allowed: one ear a file"
 
 
 def _ear(text: str) -> str:
@@ -203,9 +220,6 @@ def _number(row: Mapping[str, str], column: str) -> float | None:
     return value
 
 
-_NAMED = 3  # of many missing files a message names the first few
-
-
 def read_folders(
     clean: str | Path,
     before: str | Path,
@@ -215,7 +229,7 @@ def read_folders(
     audiograms: str | Path | None = None,
     full_scale_spl: float = 94.0,
     spl: float | None = None,
-) -> list[Item]:
+) -> list[FileItem]:
     """An item a name, with the conditions ``before`` and ``after``, sorted by name.
 
     Args:
@@ -224,7 +238,7 @@ def read_folders(
         audiogram: the ear, of all files; or else
         audiograms: a CSV file with columns ``file`` (the name below the folder, with or without extension) and
             ``hl_250``, ``hl_500``, ... in dB HL, one row a file. Rows of other files are passed over.
-        full_scale_spl, spl: the level, as in ``Item``.
+        full_scale_spl, spl: the level, as in ``FileItem``.
 
     Raises:
         ValueError: names differ between the folders, a file has no audiogram, or both or none of ``audiogram`` and
@@ -236,9 +250,13 @@ def read_folders(
         )
     folders = [_by_name(folder) for folder in (clean, before, after)]
     names = _common_names((clean, before, after), folders)
-    ears = dict.fromkeys(names, audiogram) if audiogram is not None else _named_ears(str(audiograms), names)
+    ears = dict.fromkeys(names, audiogram) if audiogram is not None else _ears(str(audiograms), _file)
+    if missing := [name for name in names if name not in ears]:
+        raise ValueError(
+            f"{audiograms}: no audiogram of {len(missing)} of {len(names)} files, {_listed(missing)}"
+        )
     return [
-        Item(
+        FileItem(
             name=name,
             clean=folders[0][name].absolute(),
             processed={"before": folders[1][name].absolute(), "after": folders[2][name].absolute()},
@@ -276,21 +294,6 @@ def _common_names(roots: Iterable[str | Path], folders: list[dict[str, Path]]) -
                 "clean, before and after need the same names"
             )
     return names
-
-
-def _named_ears(path: str, names: list[str]) -> dict[str, Audiogram]:
-    ears: dict[str, Audiogram] = {}
-    for line, row, ear in numbered_audiograms(path):
-        if not row.get("file"):
-            raise ValueError(f"{path}, line {line}: no file named; needs a column 'file' with a name a row")
-        name = _name(PurePath(row["file"]))
-        if name in ears:
-            raise ValueError(f"{path}, line {line}: a second row of {row['file']}; allowed: one ear a file")
-        ears[name] = ear
-    missing = [name for name in names if name not in ears]
-    if missing:
-        raise ValueError(f"{path}: no audiogram of {len(missing)} of {len(names)} files, {_listed(missing)}")
-    return ears
 
 
 def _listed(names: list[str]) -> str:

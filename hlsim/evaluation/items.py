@@ -1,9 +1,10 @@
-"""The signals on which simulators are compared: speech, ears and levels, as they are and as hearing aids change them."""
+"""The signals on which simulators and compensators are compared: speech in noise, ears and levels, all from a seed."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -12,17 +13,21 @@ from torch import Tensor, nn
 
 from compensators.nalr import NALR
 from hlsim.audiogram import MILDER, Audiogram, draw_thresholds, read_audiograms
-from hlsim.calibration import level_spl
+from hlsim.calibration import level_spl, set_level
 from hlsim.data.augment import compress, mix
 from hlsim.data.clips import Clips
+from hlsim.data.noises import TEST_SNRS_DB
+from hlsim.evaluation.store import samples_hash
 from hlsim.neuro.config import NEURO_RATE
 
-RATE = NEURO_RATE
 LEVELS = (50.0, 60.0, 65.0, 70.0, 80.0)
-"""Levels in dB SPL that the items take in turn."""
+"""Levels in dB SPL that the items for simulators take in turn."""
 
-SNRS_DB = (2.5, 7.5, 12.5, 17.5)
-"""Signal-to-noise ratios of the noisy items, the paper's test set."""
+INPUT_LEVELS = (50.0, 65.0, 80.0)
+"""Levels of the clean speech in dB SPL that the items for compensators take in turn."""
+
+STANDARD_EARS = ("N2", "N3", "N4", "N5", "N6", "S1", "S2", "S3")
+"""Bisgaard's audiograms that are in every comparison of compensators."""
 
 INPUTS = ("as-is", "louder", "nal-r", "compressed")
 """What may be done to a signal before the ear gets it: nothing, 20 dB more, NAL-R for the ear, compression 3:1. A
@@ -44,6 +49,10 @@ class Item:
     ear: Audiogram
     about: Mapping[str, Any]
 
+    def settings(self) -> dict[str, Any]:
+        """What its scores are stored under, beside what scores it."""
+        return {"signal": samples_hash(self.clean, self.signal), "ear": list(self.ear.thresholds)}
+
 
 def draw_items(
     speech: str | Path,
@@ -62,21 +71,15 @@ def draw_items(
     once in 160 items.
     """
     generator = torch.Generator().manual_seed(seed)
-    clips = Clips(speech, sample_rate=RATE, seconds=seconds)
-    noises = Clips(noise, sample_rate=RATE, seconds=seconds, repeat=True) if noise is not None else None
     measured = [ear for _, ear in read_audiograms(audiograms, simulated=True)]
     chosen = []
-    for i in range(items):
-        clean = clips.draw(1, generator)
-        condition = "noisy" if noises is not None and i % 2 else "clean"
+    for i, (clean, masker) in zip(range(items), _clips(speech, noise, seconds, generator), strict=False):
         kind, around = (i // 2) % 4, i // 8
         # moved on, or ratios and levels of an even number would go round together
         slip = 0 if len(levels) % 2 else around // len(levels)
         level = levels[(kind + around) % len(levels)]
-        snr = SNRS_DB[(kind + around + slip) % len(SNRS_DB)]
-        signal = clean
-        if noises is not None and condition == "noisy":
-            signal = mix(clean, noises.draw(1, generator), torch.tensor([snr]))
+        snr = None if masker is None else TEST_SNRS_DB[(kind + around + slip) % len(TEST_SNRS_DB)]
+        signal = _mixed(clean, masker, snr)
         if kind < 2:
             ear = measured[int(torch.randint(len(measured), (), generator=generator))]
         elif kind == 2:
@@ -84,16 +87,72 @@ def draw_items(
         else:
             ear = Audiogram(tuple(draw_thresholds(1, generator).squeeze(0).tolist()))
         gain = 10.0 ** ((level - float(level_spl(signal))) / 20.0)
-        about = {
-            "severity": ear.severity,
-            "level": level,
-            "condition": condition,
-            "noise_snr": snr if condition == "noisy" else None,
-            "input": "as-is",
-            "audiogram": list(ear.thresholds),
-        }
+        about = _about(ear, level, snr, "noise_snr") | {"input": "as-is", "audiogram": list(ear.thresholds)}
         chosen.append(Item((clean * gain).squeeze(0), (signal * gain).squeeze(0), ear, about))
     return chosen
+
+
+def read_ears(audiograms: str | Path | None) -> list[tuple[str, Audiogram]]:
+    """The standard ears and those of a CSV file; the latter named by listener and ear, or row, and no two alike."""
+    ears = [(name, Audiogram.standard(name)) for name in STANDARD_EARS]
+    rows = read_audiograms(audiograms, simulated=True) if audiograms is not None else []
+    for number, (row, ear) in enumerate(rows, start=1):
+        named = " ".join(filter(None, (row.get("listener"), row.get("ear"))))
+        if named in (name for name, _ in ears):
+            named += f", row {number}"  # items of one name would count as one ear's
+        ears.append((named or f"row {number}", ear))
+    return ears
+
+
+def draw_judged_items(
+    speech: str | Path,
+    noise: str | Path | None,
+    ears: Sequence[tuple[str, Audiogram]],
+    *,
+    items: int,
+    seconds: float,
+    seed: int,
+    levels: Sequence[float] = INPUT_LEVELS,
+) -> list[Item]:
+    """Random clips for the ears in turn, with noise every second one noisy; all is drawn from the seed.
+
+    An item's speech has one of ``levels``, and its noise comes on top. Every ear meets every level and, of the noisy
+    items, every ratio of 2.5 to 17.5 dB with it.
+
+    Returns: items whose ``about`` has name (of the ear), severity, level, condition, snr (None without noise).
+    """
+    chosen = []
+    clips = _clips(speech, noise, seconds, torch.Generator().manual_seed(seed))
+    for i, (drawn, masker) in zip(range(items), clips, strict=False):
+        around, number = divmod(i if noise is None else i // 2, len(ears))
+        name, ear = ears[number]
+        # counters of different periods, so that no ear keeps to one level
+        level = levels[(number + around) % len(levels)]
+        snr = None if masker is None else TEST_SNRS_DB[(number + around) % len(TEST_SNRS_DB)]
+        clean = set_level(drawn, level)
+        signal = _mixed(clean, masker, snr).squeeze(0)
+        chosen.append(Item(clean.squeeze(0), signal, ear, {"name": name, **_about(ear, level, snr, "snr")}))
+    return chosen
+
+
+def _clips(
+    speech: str | Path, noise: str | Path | None, seconds: float, generator: torch.Generator
+) -> Iterator[tuple[Tensor, Tensor | None]]:
+    """Speech, every second time with a noise to mix in, where there are any. Shape: (1, time)."""
+    clips = Clips(speech, sample_rate=NEURO_RATE, seconds=seconds)
+    noises = Clips(noise, sample_rate=NEURO_RATE, seconds=seconds, repeat=True) if noise is not None else None
+    for i in count():
+        clean = clips.draw(1, generator)
+        yield clean, noises.draw(1, generator) if noises is not None and i % 2 else None
+
+
+def _mixed(clean: Tensor, noise: Tensor | None, snr: float | None) -> Tensor:
+    return clean if noise is None or snr is None else mix(clean, noise, torch.tensor([snr]))
+
+
+def _about(ear: Audiogram, level: float, snr: float | None, name: str) -> dict[str, Any]:
+    condition = "clean" if snr is None else "noisy"
+    return {"severity": ear.severity, "level": level, "condition": condition, name: snr}
 
 
 def treat(
@@ -110,8 +169,10 @@ def treat(
     treatments: dict[str, Callable[[Item], Tensor]] = {
         "as-is": lambda item: item.signal,
         "louder": lambda item: 10.0 * item.signal,
-        "nal-r": _nalr,
-        "compressed": lambda item: compress(item.signal.unsqueeze(0), torch.tensor([3.0]), RATE).squeeze(0),
+        "nal-r": lambda item: NALR(item.ear, sample_rate=NEURO_RATE)(item.signal),
+        "compressed": lambda item: compress(
+            item.signal.unsqueeze(0), torch.tensor([3.0]), NEURO_RATE
+        ).squeeze(0),
     }
     if compensator is not None:
         treatments["compensated"] = lambda item: compensator(item.signal, item.ear)
@@ -124,8 +185,3 @@ def treat(
             with torch.no_grad():
                 signal = treatments[name](item)
             yield Item(item.clean, signal, item.ear, {**item.about, "input": name})
-
-
-def _nalr(item: Item) -> Tensor:
-    aided: Tensor = NALR(item.ear, sample_rate=RATE)(item.signal)
-    return aided

@@ -1,38 +1,31 @@
-"""Compensators judged one utterance at a time: which utterances and ears, and what is measured of each."""
+"""Compensators judged one utterance at a time: what is measured of each."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from pathlib import Path
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 
-from hlsim.audiogram import Audiogram, read_audiograms
-from hlsim.calibration import PASCAL_SPL, level_spl, set_level
+from hlsim.audiogram import Audiogram
+from hlsim.calibration import PASCAL_SPL, level_spl
 from hlsim.criteria.bands import audibility, band_level_loss, band_levels, least_audible
-from hlsim.data.augment import mix
-from hlsim.data.clips import Clips
-from hlsim.evaluation.items import RATE, SNRS_DB, Item
+from hlsim.evaluation.items import Item
 from hlsim.metrics.pyclarity import haspi, hasqi
 from hlsim.metrics.reference import pyclarity_msbg
 from hlsim.msbg import MSBG
-
-INPUT_LEVELS = (50.0, 65.0, 80.0)
-"""Levels of the clean speech in dB SPL that the items take in turn."""
-
-STANDARD_EARS = ("N2", "N3", "N4", "N5", "N6", "S1", "S2", "S3")
-"""Bisgaard's audiograms that are in every comparison of compensators."""
+from hlsim.neuro.config import NEURO_RATE
+from hlsim.parallel import Failed, one_thread, reason_of
 
 EXACT = ("msbg", "pyclarity")
 SIMULATORS = ("neuro", *EXACT)
 """Under which a compensator's loss is told: the named network, hlsim's exact MSBG, pyclarity's."""
 
 OF_NETWORK = "loss_neuro"
-"""The figure that hangs on the named network; no other does."""
+"""The figure that depends on the named network; no other does."""
 
 NORMAL = Audiogram.standard("NH")
 
@@ -44,24 +37,29 @@ class Unaided(nn.Module):
         return waveform
 
 
+class Keys(NamedTuple):
+    """What figures are stored under: all but ``OF_NETWORK``, which depends on more, and that one."""
+
+    most: str
+    of_network: str
+
+
 @dataclass(frozen=True)
-class Task:
-    """An item, and the compensators that it lacks figures of.
+class Trial:
+    """An item to be judged as each compensator gives it.
 
     Args:
-        number: of the item, for the caller.
         compensators: by name, at 16 kHz and 94 dB SPL full scale.
-        known: figures by name of those that lack ``OF_NETWORK`` alone.
         simulator: the network of ``neuro``, of the same rate and scale.
         seed: of the noise that HASPI and HASQI add, the same for every compensator.
+        keys: of the figures, by compensator.
     """
 
-    number: int
     item: Item
     compensators: Mapping[str, nn.Module]
     simulator: nn.Module
     seed: int
-    known: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    keys: Mapping[str, Keys]
 
 
 class Judged(NamedTuple):
@@ -71,62 +69,8 @@ class Judged(NamedTuple):
     reason: str = ""
 
 
-def read_ears(audiograms: str | Path | None) -> list[tuple[str, Audiogram]]:
-    """The standard ears and those of a CSV file; the latter named by listener and ear, or row, and no two alike."""
-    ears = [(name, Audiogram.standard(name)) for name in STANDARD_EARS]
-    rows = read_audiograms(audiograms, simulated=True) if audiograms is not None else []
-    for number, (row, ear) in enumerate(rows, start=1):
-        named = " ".join(filter(None, (row.get("listener"), row.get("ear"))))
-        if named in (name for name, _ in ears):
-            named += f", row {number}"  # items of one name would count as one ear's
-        ears.append((named or f"row {number}", ear))
-    return ears
-
-
-def draw_judged_items(
-    speech: str | Path,
-    noise: str | Path | None,
-    ears: Sequence[tuple[str, Audiogram]],
-    *,
-    items: int,
-    seconds: float,
-    seed: int,
-    levels: Sequence[float] = INPUT_LEVELS,
-) -> list[Item]:
-    """Random clips for the ears in turn, with noise every second one noisy; all is drawn from the seed.
-
-    An item's speech has one of ``levels``, and its noise comes on top. Every ear meets every level and, of the noisy
-    items, every ratio of 2.5 to 17.5 dB with it.
-
-    Returns: items whose ``about`` has name (of the ear), severity, level, condition, snr (None without noise).
-    """
-    generator = torch.Generator().manual_seed(seed)
-    clips = Clips(speech, sample_rate=RATE, seconds=seconds)
-    noises = Clips(noise, sample_rate=RATE, seconds=seconds, repeat=True) if noise is not None else None
-    chosen = []
-    for i in range(items):
-        turn = i if noises is None else i // 2
-        number, around = turn % len(ears), turn // len(ears)
-        name, ear = ears[number]
-        # counters of different periods, so that no ear keeps to one level
-        level, snr = levels[(number + around) % len(levels)], SNRS_DB[(number + around) % len(SNRS_DB)]
-        clean = set_level(clips.draw(1, generator), level)
-        signal, noisy = clean, noises is not None and i % 2 == 1
-        if noises is not None and noisy:
-            signal = mix(clean, noises.draw(1, generator), torch.tensor([snr]))
-        about = {
-            "name": name,
-            "severity": ear.severity,
-            "level": level,
-            "condition": "noisy" if noisy else "clean",
-            "snr": snr if noisy else None,
-        }
-        chosen.append(Item(clean.squeeze(0), signal.squeeze(0), ear, about))
-    return chosen
-
-
-def judge(task: Task) -> dict[str, Judged]:
-    """Each compensator's figures for an item; what goes wrong is the reason.
+def judge(trial: Trial, missing: Sequence[str]) -> dict[str, dict[str, float] | Failed]:
+    """The figures whose keys are missing; what goes wrong is the reason.
 
     - ``haspi``, ``hasqi``: v2, of the output against the clean speech, in noise too.
     - ``level``, ``peak``: of the output, RMS and largest sample in dB SPL (a sample of 1.0 is 94).
@@ -136,47 +80,45 @@ def judge(task: Task) -> dict[str, Judged]:
       hears and what a normal one hears of the clean speech, both by the exact MSBG, where the latter is audible.
     - ``loss_neuro``, ``loss_msbg``, ``loss_pyclarity``: what ``HearingLossLoss(criterion="bands")`` is under each.
     """
-    # small steps: threads would wait for each other, and items are what is parallel
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        with torch.no_grad():
-            return _judge(task)
-    finally:
-        torch.set_num_threads(threads)
+    with one_thread(), torch.no_grad():
+        return _judge(trial, missing)
 
 
-def _judge(task: Task) -> dict[str, Judged]:
-    item = task.item
-    needed = ("neuro",) if task.compensators.keys() <= task.known.keys() else SIMULATORS
+def _judge(trial: Trial, missing: Sequence[str]) -> dict[str, dict[str, float] | Failed]:
+    item = trial.item
     try:
-        normal = {name: _hear(task, name, item.clean, NORMAL) for name in needed}
-        if needed == SIMULATORS:
-            normal["msbg, of the input"] = _hear(task, "msbg", item.signal, NORMAL)
+        normal = {"neuro": _hear(trial, "neuro", item.clean, NORMAL)}
+        if any(keys.most in missing for keys in trial.keys.values()):
+            normal |= {name: _hear(trial, name, item.clean, NORMAL) for name in EXACT}
+            normal["msbg, of the input"] = _hear(trial, "msbg", item.signal, NORMAL)
     except Exception as error:  # whatever it is, it is this item's reason, and the others go on
-        return dict.fromkeys(task.compensators, Judged(None, _reason(error)))
-    judged = {}
-    for name, compensator in task.compensators.items():
+        return dict.fromkeys(missing, Failed(reason_of(error)))
+    made: dict[str, dict[str, float] | Failed] = {}
+    for name, keys in trial.keys.items():
+        if not (wanted := set(keys) & set(missing)):
+            continue
         try:
-            aided = compensator(item.signal, item.ear)
-            figures = dict(task.known.get(name) or _figures(task, aided, normal))
-            figures[OF_NETWORK] = _loss(_hear(task, "neuro", aided, item.ear), normal["neuro"])
+            aided = trial.compensators[name](item.signal, item.ear)
+            records = {keys.most: _figures(trial, aided, normal)} if keys.most in wanted else {}
+            of_network = _loss(_hear(trial, "neuro", aided, item.ear), normal["neuro"])
+            records[keys.of_network] = {OF_NETWORK: of_network}
+            figures = {figure: value for record in records.values() for figure, value in record.items()}
             if unknown := [figure for figure, value in figures.items() if not math.isfinite(value)]:
                 raise ValueError(f"{', '.join(unknown)}: not finite")
-            judged[name] = Judged(figures)
+            made |= records
         except Exception as error:
-            judged[name] = Judged(None, _reason(error))
-    return judged
+            made |= dict.fromkeys(wanted, Failed(reason_of(error)))
+    return made
 
 
-def _figures(task: Task, aided: Tensor, normal: Mapping[str, Tensor]) -> dict[str, float]:
+def _figures(trial: Trial, aided: Tensor, normal: Mapping[str, Tensor]) -> dict[str, float]:
     """All but ``OF_NETWORK``."""
-    item = task.item
+    item = trial.item
     scores = {
-        name: measure(item.clean, aided, item.ear, RATE, full_scale_spl=PASCAL_SPL, seed=task.seed)
+        name: measure(item.clean, aided, item.ear, NEURO_RATE, full_scale_spl=PASCAL_SPL, seed=trial.seed)
         for name, measure in (("haspi", haspi), ("hasqi", hasqi))
     }
-    heard = {name: _hear(task, name, aided, item.ear) for name in EXACT}
+    heard = {name: _hear(trial, name, aided, item.ear) for name in EXACT}
     return {
         **scores,
         "level": float(level_spl(aided)),
@@ -190,7 +132,7 @@ def _figures(task: Task, aided: Tensor, normal: Mapping[str, Tensor]) -> dict[st
 
 
 def _loss(heard: Tensor, normal: Tensor) -> float:
-    return float(band_level_loss(heard, normal, RATE))
+    return float(band_level_loss(heard, normal, NEURO_RATE))
 
 
 def peak_spl(waveform: Tensor) -> float:
@@ -206,21 +148,16 @@ def band_error_db(heard: Tensor, normal: Tensor) -> float:
     Raises:
         ValueError: it finds none audible.
     """
-    levels, truth = band_levels(heard, RATE), band_levels(normal, RATE)
+    levels, truth = band_levels(heard, NEURO_RATE), band_levels(normal, NEURO_RATE)
     audible = audibility(truth, least_audible(truth)) > 0.0
     if not bool(audible.any()):
         raise ValueError("nothing of the clean speech is audible to a normal ear")
     return float((levels - truth).abs()[audible].double().quantile(0.5))
 
 
-def _hear(task: Task, simulator: str, signal: Tensor, ear: Audiogram) -> Tensor:
+def _hear(trial: Trial, simulator: str, signal: Tensor, ear: Audiogram) -> Tensor:
     if simulator == "pyclarity":
-        return pyclarity_msbg(signal, ear, RATE)
-    model = task.simulator if simulator == "neuro" else MSBG(sample_rate=RATE)
+        return pyclarity_msbg(signal, ear, NEURO_RATE)
+    model = trial.simulator if simulator == "neuro" else MSBG(sample_rate=NEURO_RATE)
     heard: Tensor = model(signal, ear)
     return heard
-
-
-def _reason(error: Exception) -> str:
-    kind = "" if isinstance(error, ValueError) else f"{type(error).__name__}: "
-    return kind + " ".join(str(error).split())

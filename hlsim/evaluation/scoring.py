@@ -6,8 +6,10 @@ remains of an item is its key, its scores and its levels.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,9 +20,9 @@ from hlsim.audio import read_audio
 from hlsim.audiogram import Audiogram
 from hlsim.calibration import check_full_scale, dbfs
 from hlsim.evaluation.store import ScoreStore, content_hash, key_of
-from hlsim.metrics.pyclarity import Progress, check_seed
+from hlsim.metrics.pyclarity import Signal, check_seed, haspi
 from hlsim.metrics.registry import MEASURES, check_measures, versions_of
-from hlsim.parallel import check_parallel, run_parallel
+from hlsim.parallel import Failed, Progress, check_parallel, make_missing, reason_of
 
 EARS = ("left", "right")
 
@@ -28,7 +30,7 @@ _REVISION = 1  # of how hlsim calls the measures: raise it where that changes a 
 
 
 @dataclass(frozen=True)
-class Item:
+class FileItem:
     """One utterance in one ear, under each condition.
 
     Args:
@@ -70,10 +72,10 @@ class Result(NamedTuple):
     dbfs: float = 0.0
 
 
-class Task(NamedTuple):
-    """A score to make: a measure of an item under a condition."""
+class FileTask(NamedTuple):
+    """A score to make: a measure of an item under a condition, and what it is stored under."""
 
-    item: Item
+    item: FileItem
     condition: str
     measure: str
     seed: int
@@ -85,7 +87,7 @@ Results = list[dict[tuple[str, str], Result]]
 
 
 def score_items(
-    items: Sequence[Item],
+    items: Sequence[FileItem],
     measures: Iterable[str] = ("haspi",),
     *,
     store: ScoreStore | None = None,
@@ -119,49 +121,60 @@ def score_items(
     names = check_measures(measures)
     store = ScoreStore() if store is None else store
     results: Results = [{} for _ in items]
-    wanted: dict[str, list[tuple[int, str, str]]] = {}  # places by key: the same score may be wanted twice
-    tasks: dict[str, Task] = {}
-    for index, task in _tasks(items, names, seed):
-        place = (index, task.measure, task.condition)
-        if isinstance(task, _Unreadable):
-            results[index][place[1:]] = Result(None, task.reason)
-            continue
-        if stored := store.get(task.key):
-            results[index][place[1:]] = _stored(stored)._replace(seed=task.seed)  # some measures know none
-            continue
-        wanted.setdefault(task.key, []).append(place)
-        tasks.setdefault(task.key, task)
-    total = sum(len(item.processed) for item in items) * len(names)
-    done = total - sum(map(len, wanted.values()))
-    if progress is not None and done and tasks:
-        progress(done, total)
-    made = run_parallel(score_task, tasks.values(), jobs=jobs, backend=backend, scheduler=scheduler)
-    for task, result in made if tasks else ():
-        if result is None:
-            result = Result(
-                None, "the process that scored it died (a crash in the measure, or memory ran out)"
-            )
-        elif result.score is not None:
-            facts = {"file": task.item.name, "condition": task.condition, "measure": task.measure}
-            store.append(task.key, facts | result._asdict())
-        for index, measure, condition in wanted[task.key]:
-            results[index][measure, condition] = result
-            done += 1
-            if progress is not None:
-                progress(done, total)
+    places: list[tuple[int, FileTask]] = []
+    hashes = cache(content_hash)
+    versions = {name: versions_of([name]) for name in names}
+    for index, item in enumerate(items):
+        for condition, path in item.processed.items():
+            try:
+                clean, processed = hashes(item.clean), hashes(path)
+            except ValueError as error:
+                results[index] |= {(name, condition): Result(None, str(error)) for name in names}
+                continue
+            item_seed = (seed + int(clean[:8], 16)) % 2**32
+            for name in names:
+                settings: dict[str, Any] = {
+                    "revision": _REVISION,
+                    "measure": name,
+                    "versions": versions[name],
+                    "clean": clean,
+                    "processed": processed,
+                    "ear": item.ear,
+                }
+                if MEASURES[name].of_an_ear:
+                    settings["audiogram"] = list(item.audiogram.thresholds)
+                    settings["full_scale_spl"] = item.full_scale_spl if item.spl is None else None
+                    settings["spl"] = item.spl
+                    settings["seed"] = item_seed
+                places.append((index, FileTask(item, condition, name, item_seed, key_of(settings))))
+    counts = Counter(task.key for _, task in places)  # the same score may be wanted twice
+    failed = make_missing(
+        score_task,
+        [*{task.key: task for _, task in places}.values()],
+        lambda task: [task.key] * counts[task.key],
+        store,
+        jobs=jobs,
+        backend=backend,
+        scheduler=scheduler,
+        progress=progress,
+    )
+    for index, task in places:
+        known = store.get(task.key)
+        result = Result(None, failed.get(task.key))
+        if known is not None:
+            result = Result(**{name: known[name] for name in Result._fields})
+        # some measures know no seed: the stored one may be of another run
+        results[index][task.measure, task.condition] = result._replace(seed=task.seed)
     return results
 
 
-def score_task(task: Task) -> Result:
-    """One score; what goes wrong is the result's reason."""
+def score_task(task: FileTask, _: Sequence[str] = ()) -> dict[str, dict[str, Any] | Failed]:
+    """One score by its key; what goes wrong is the reason."""
     item, processed = task.item, task.item.processed[task.condition]
     try:
-        clean, rate = read_channel(item.clean, item.ear)
-        heard, own_rate = read_channel(processed, item.ear)
-        if own_rate != rate:
-            raise ValueError(
-                f"{processed} has {own_rate} Hz and {item.clean} {rate} Hz; allowed: equal rates"
-            )
+        (clean, rate), (heard, other) = (read_channel(path, item.ear) for path in (item.clean, processed))
+        if other != rate:
+            raise ValueError(f"{processed} has {other} Hz and {item.clean} {rate} Hz; allowed: equal rates")
         if len(clean) != len(heard):
             raise ValueError(
                 f"{item.clean} has {len(clean)} samples and {processed} {len(heard)}; allowed: equal lengths"
@@ -170,9 +183,10 @@ def score_task(task: Task) -> Result:
         full_scale = check_full_scale(item.full_scale(levels[0]))
         score = MEASURES[task.measure].score(clean, heard, item.audiogram, rate, full_scale, task.seed)
     except Exception as error:  # whatever it is, it is this item's reason, and the others go on
-        kind = "" if isinstance(error, ValueError) else f"{type(error).__name__}: "
-        return Result(None, kind + " ".join(str(error).split()), task.seed)
-    return Result(score, None, task.seed, rate, len(clean) / rate, levels[0], levels[1])
+        return {task.key: Failed(reason_of(error))}
+    result = Result(score, None, task.seed, rate, len(clean) / rate, *levels)
+    about = {"file": item.name, "condition": task.condition, "measure": task.measure}
+    return {task.key: about | result._asdict()}
 
 
 def read_channel(path: str | Path, ear: str = "") -> tuple[np.ndarray, int]:
@@ -194,51 +208,83 @@ def read_channel(path: str | Path, ear: str = "") -> tuple[np.ndarray, int]:
     return waveform[channel].double().numpy(), rate
 
 
-class _Unreadable(NamedTuple):
-    condition: str
-    measure: str
-    reason: str
+@dataclass(frozen=True)
+class HaspiItem:
+    """One score to compute.
+
+    Args:
+        reference, processed: clean and processed speech: (time,), or paths of one-channel audio files, which are
+            read only when their turn comes.
+        audiogram: the ear that hears ``processed``.
+        sample_rate: Hz; needed for signals, left out for files, which bring theirs.
+        seed: of the noise that HASPI adds; by default that of ``haspi_many`` plus the place in the list.
+    """
+
+    reference: Signal | str | Path
+    processed: Signal | str | Path
+    audiogram: Audiogram
+    sample_rate: int | None = None
+    seed: int | None = None
 
 
-def _tasks(items: Sequence[Item], measures: Sequence[str], seed: int) -> Iterable[tuple[int, Any]]:
-    hashes = _Remembered(content_hash)
-    versions = {name: versions_of([name]) for name in measures}
-    for index, item in enumerate(items):
-        for condition, path in item.processed.items():
-            try:
-                clean, processed = hashes[item.clean], hashes[path]
-            except ValueError as error:
-                for name in measures:
-                    yield index, _Unreadable(condition, name, str(error))
-                continue
-            own_seed = (seed + int(clean[:8], 16)) % 2**32
-            for name in measures:
-                settings: dict[str, Any] = {
-                    "revision": _REVISION,
-                    "measure": name,
-                    "versions": versions[name],
-                    "clean": clean,
-                    "processed": processed,
-                    "ear": item.ear,
-                }
-                if MEASURES[name].of_an_ear:
-                    settings["audiogram"] = list(item.audiogram.thresholds)
-                    settings["full_scale_spl"] = item.full_scale_spl if item.spl is None else None
-                    settings["spl"] = item.spl
-                    settings["seed"] = own_seed
-                yield index, Task(item, condition, name, own_seed, key_of(settings))
+def haspi_many(
+    items: Sequence[HaspiItem],
+    *,
+    full_scale_spl: float = 94.0,
+    seed: int = 0,
+    jobs: int | None = None,
+    progress: Progress | None = None,
+) -> list[float]:
+    """HASPI of many items in parallel processes, the same whatever their number.
+
+    Each item has its seed, and each process one thread of linear algebra.
+
+    Args:
+        items: see ``HaspiItem``.
+        full_scale_spl: level in dB SPL of RMS 1.0, of all signals.
+        seed: item i, counted from 0, takes seed + i unless it brings one.
+        jobs: processes; None takes all cores.
+        progress: called after each score.
+
+    Raises:
+        ValueError: as ``haspi``, beginning with the item's processed file or its place in the list; ``jobs`` is below
+            1, or the seed is none that numpy takes.
+        MissingExtraError: pyclarity or joblib is not installed.
+    """
+    check_parallel(jobs, "loky", None)
+    check_seed(seed)
+    seeds = [(seed + i) % 2**32 if item.seed is None else item.seed for i, item in enumerate(items)]
+    store = ScoreStore()
+    failed = make_missing(
+        _score_item,
+        [(str(i), item, full_scale_spl, seeds[i]) for i, item in enumerate(items)],
+        lambda task: [task[0]],
+        store,
+        jobs=1 if len(items) < 2 else jobs,
+        progress=progress,
+    )
+    for i, reason in failed.items():
+        raise ValueError(f"item {i}: {reason}")
+    return [store.records[str(i)]["score"] for i in range(len(items))]
 
 
-class _Remembered(dict[Path, str]):
-    """A function of a path, called once a path."""
+def _score_item(task: tuple[str, HaspiItem, float, int], _: Sequence[str]) -> dict[str, dict[str, float]]:
+    key, item, full_scale_spl, seed = task
+    name = str(item.processed) if isinstance(item.processed, str | Path) else f"item {key}"
+    try:
+        reference, reference_rate = _load(item.reference, item.sample_rate)
+        processed, rate = _load(item.processed, item.sample_rate)
+        if rate != reference_rate:
+            raise ValueError(f"rate {rate} Hz, its reference has {reference_rate}; allowed: equal rates")
+        score = haspi(reference, processed, item.audiogram, rate, full_scale_spl=full_scale_spl, seed=seed)
+    except ValueError as error:
+        raise ValueError(f"{name}: {error}") from error
+    return {key: {"score": score}}
 
-    def __init__(self, function: Callable[[Path], str]) -> None:
-        self._function = function
 
-    def __missing__(self, path: Path) -> str:
-        self[path] = self._function(path)
-        return self[path]
-
-
-def _stored(record: Mapping[str, Any]) -> Result:
-    return Result(**{name: record[name] for name in Result._fields})
+def _load(signal: Signal | str | Path, sample_rate: int | None) -> tuple[Signal, int]:
+    if isinstance(signal, str | Path):
+        return read_channel(signal)
+    if sample_rate is None:
+        raise ValueError("no sample_rate; signals that are not files need one")
+    return signal, sample_rate

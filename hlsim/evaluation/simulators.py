@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import contextlib
-import hashlib
-import inspect
-import pickle
-import uuid
-import weakref
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -17,22 +14,47 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from hlsim.evaluation.items import LEVELS, RATE, Item, draw_items, treat
-from hlsim.evaluation.store import ScoreStore, key_of
+from hlsim.audiogram import SEVERITIES
+from hlsim.evaluation.items import LEVELS, Item, draw_items, treat
+from hlsim.evaluation.store import ScoreStore, key_of, weights_hash
 from hlsim.extras import MissingExtraError
-from hlsim.metrics.fidelity import pesq_wb, raw_mse, snr_db, stoi, third_octave_error_db
+from hlsim.metrics.fidelity import (
+    linear_correlation,
+    mean_squared_error,
+    pesq_wb,
+    rank_correlation,
+    raw_mse,
+    snr_db,
+    stoi,
+    third_octave_error_db,
+)
 from hlsim.metrics.reference import pyclarity_msbg
 from hlsim.metrics.registry import version_of, versions_of
 from hlsim.msbg import MSBG
-from hlsim.report.simulators import fidelity_result, write_fidelity
+from hlsim.neuro.config import NEURO_RATE
+from hlsim.parallel import Failed, Progress, make_missing, reason_of
 
-STORE = "scores.jsonl"
+_AGREEMENT = {"lcc": linear_correlation, "srcc": rank_correlation, "mse": mean_squared_error}
 
 _SHORTEST = 0.02  # s: a window of the spectrograms
 
 _REVISION = 2  # of what is measured: raise it where that changes a figure
 
-Report = Callable[[int, int], None]
+
+@dataclass(frozen=True)
+class SimulatorEvaluation:
+    """What a comparison of simulators comes to.
+
+    Attributes:
+        result: what ``fidelity.json`` holds: the settings, and of each of ``simulators`` the ``items`` and, by each of
+            ``inputs``, their summary.
+        shown: the item of the spectrograms.
+        heard: of it, by the truth and by each simulator, by name: (time,), in pascals at 16 kHz.
+    """
+
+    result: dict[str, Any]
+    shown: Item
+    heard: Mapping[str, Tensor]
 
 
 def evaluate_simulators(
@@ -40,7 +62,7 @@ def evaluate_simulators(
     *,
     speech: str | Path,
     audiograms: str | Path,
-    out: str | Path,
+    store: str | Path | None = None,
     noise: str | Path | None = None,
     teacher: str = "pyclarity",
     items: int = 240,
@@ -49,20 +71,20 @@ def evaluate_simulators(
     inputs: Sequence[str] = ("as-is",),
     compensator: nn.Module | None = None,
     seed: int = 0,
-    progress: Report | None = None,
-) -> dict[str, Any]:
-    """Compare simulators with MSBG, side by side, and write ``fidelity.json``, ``.md``, ``.html`` and spectrograms.
+    progress: Progress | None = None,
+) -> SimulatorEvaluation:
+    """Compare simulators with MSBG, side by side.
 
-    Scores are stored in ``scores.jsonl`` as they are made, by the samples, the ear and the weights that they are of: a
-    run that was stopped goes on where it was, and one with a simulator more scores that one alone.
+    Scores are stored as they are made, by the samples, the ear and the weights that they are of: a run that was stopped
+    goes on where it was, and one with a simulator more scores that one alone.
 
     Args:
         simulators: by name, at 16 kHz and 94 dB SPL full scale.
         speech, noise: folders of recordings; with ``noise`` every second item is noisy.
         audiograms: CSV file of ears, half of those used; the milder standard ones (NH, N1, N2, S1) and drawn ones are
             a quarter each.
-        out: folder for the files.
-        teacher: ``"pyclarity"``, the reference itself, or ``"msbg"``, hlsim's own.
+        store: file of scores, there or not; None keeps nothing.
+        teacher: ``"pyclarity"``, the reference itself, or ``"msbg"``, hlsim's exact one.
         items: how many; each is scored under each of ``inputs``.
         seconds: length of an item; PESQ and STOI want 2 or more.
         levels: dB SPL that the items take in turn.
@@ -70,12 +92,12 @@ def evaluate_simulators(
         compensator: called with a waveform and an ear.
         progress: called with what is done and all.
 
-    Returns: what ``fidelity.json`` holds. An item that a simulator or the truth fails on, or that has no STOI or PESQ, is
-        listed with the ``reasons`` and counts in no figure that it has no value for.
+    Returns: an evaluation. An item that a simulator or the truth fails on, or that has no STOI or PESQ, is listed with
+        the ``reasons`` and counts in no figure that it has no value for.
 
     Raises:
         ValueError: data that cannot be used, an unknown teacher or input, or no item that the truth does not fail on.
-        MissingExtraError: pyclarity, pystoi, pesq or matplotlib is not installed.
+        MissingExtraError: pyclarity, pystoi or pesq is not installed.
     """
     if teacher not in ("pyclarity", "msbg"):
         raise ValueError(f"teacher {teacher!r}; allowed: pyclarity, msbg")
@@ -89,65 +111,95 @@ def evaluate_simulators(
     if not seconds >= _SHORTEST:
         raise ValueError(f"items of {seconds:g} s; allowed: {_SHORTEST:g} or more, and 2 for PESQ and STOI")
     drawn = draw_items(speech, noise, audiograms, items=items, seconds=seconds, seed=seed, levels=levels)
-    store = ScoreStore(Path(out) / STORE)
-    # haspi's for pyclarity's, whose MSBG is the truth
-    versions = {**versions_of(["stoi", "pesq", "haspi"]), "hlsim": version_of("hlsim")}
+    scored = ScoreStore(store)
+    settings = {
+        "teacher": teacher,
+        "revision": _REVISION,
+        # haspi's for pyclarity's, whose MSBG is the truth
+        "versions": {**versions_of(["stoi", "pesq", "haspi"]), "hlsim": version_of("hlsim")},
+    }
     weights = {name: weights_hash(simulator) for name, simulator in simulators.items()}
-    rows: dict[str, list[dict[str, Any]]] = {name: [] for name in simulators}
-    total = items * len(inputs)
-    for number, item in enumerate(treat(drawn, inputs, compensator)):
-        about = {
-            "signal": samples_hash(item.clean, item.signal),
-            "ear": list(item.ear.thresholds),
-            "teacher": teacher,
-            "revision": _REVISION,
-            "versions": versions,
-        }
-        keys = {name: key_of({**about, "weights": weights[name]}) for name in simulators}
-        missing = [name for name in simulators if store.get(keys[name]) is None]
-        failed: dict[str, str] = {}
-        if missing:
-            try:
-                truth = _truth(item, teacher)
-                true = _both(item.clean, truth, "true")
-            except MissingExtraError:
-                raise
-            except Exception as error:  # of this item alone: all simulators go without
-                failed = dict.fromkeys(missing, f"no truth: {error}")
-                missing = []
-            for name in missing:
-                try:
-                    with torch.no_grad():
-                        heard = simulators[name](item.signal, item.ear).double()
-                    scores = _scores(item.clean, truth, heard)
-                except Exception as error:  # one simulator's, and tried again next time; the others go on
-                    failed[name] = f"{type(error).__name__}: {error}"
-                else:
-                    reasons = true["reasons"] + scores["reasons"]
-                    store.append(keys[name], true | scores | {"reasons": reasons})
-        for name in simulators:
-            scores = store.get(keys[name]) or {"reasons": [failed[name]]}
-            rows[name].append({"item": number // len(inputs), **item.about, **scores})
-        if progress is not None:
-            progress(number + 1, total)
-    result = fidelity_result(
-        rows, teacher=teacher, items=items, seconds=seconds, seed=seed, levels=[*levels], inputs=[*inputs]
+    tasks = []
+    for item in treat(drawn, inputs, compensator):
+        about = settings | item.settings()
+        tasks.append((item, {name: key_of({**about, "weights": weights[name]}) for name in simulators}))
+    failed = make_missing(
+        partial(_score_item, simulators, teacher),
+        tasks,
+        lambda task: [*task[1].values()],
+        scored,
+        jobs=1,
+        progress=progress
+        and (lambda done, total: progress(done // len(simulators), total // len(simulators))),
     )
-    shown, truth = _shown(drawn, treat(drawn, inputs, compensator), teacher)
-    panels = {"truth": truth}
+    rows = {
+        name: [
+            {
+                "item": number // len(inputs),
+                **item.about,
+                **(scored.get(keys[name]) or {"reasons": [failed[keys[name]]]}),
+            }
+            for number, (item, keys) in enumerate(tasks)
+        ]
+        for name in simulators
+    }
+    summaries = {
+        name: {given: summarise([row for row in table if row["input"] == given]) for given in inputs}
+        for name, table in rows.items()
+    }
+    result = {
+        "teacher": teacher,
+        "items": items,
+        "seconds": seconds,
+        "seed": seed,
+        "levels": [*levels],
+        "inputs": [*inputs],
+        "simulators": {name: {"inputs": summaries[name], "items": table} for name, table in rows.items()},
+    }
+    shown, truth = _shown(drawn, [item for item, _ in tasks], teacher)
+    heard_of = {"truth": truth}
     for name, simulator in simulators.items():
         with contextlib.suppress(Exception), torch.no_grad():  # its failure is in the tables
             heard = simulator(shown.signal, shown.ear)
-            panels |= {name: heard} if heard.isfinite().all() else {}
-    write_fidelity(result, panels, shown, out)
-    return result
+            heard_of |= {name: heard} if heard.isfinite().all() else {}
+    return SimulatorEvaluation(result, shown, heard_of)
+
+
+def _score_item(
+    simulators: Mapping[str, nn.Module],
+    teacher: str,
+    task: tuple[Item, Mapping[str, str]],
+    missing: Sequence[str],
+) -> dict[str, dict[str, Any] | Failed]:
+    """The scores of an item by each simulator whose key is missing."""
+    item, keys = task
+    try:
+        truth = _truth(item, teacher)
+        true = _both(item.clean, truth, "true")
+    except MissingExtraError:
+        raise
+    except Exception as error:  # of this item alone: all simulators go without
+        return dict.fromkeys(missing, Failed(f"no truth: {reason_of(error)}"))
+    made: dict[str, dict[str, Any] | Failed] = {}
+    for name, key in keys.items():
+        if key not in missing:
+            continue
+        try:
+            with torch.no_grad():
+                heard = simulators[name](item.signal, item.ear).double()
+            scores = _scores(item.clean, truth, heard)
+        except Exception as error:  # one simulator's; the others go on
+            made[key] = Failed(reason_of(error))
+        else:
+            made[key] = true | scores | {"reasons": true["reasons"] + scores["reasons"]}
+    return made
 
 
 def _truth(item: Item, teacher: str) -> Tensor:
     if teacher == "pyclarity":
-        return pyclarity_msbg(item.signal, item.ear, RATE)
+        return pyclarity_msbg(item.signal, item.ear, NEURO_RATE)
     with torch.no_grad():
-        heard: Tensor = MSBG(sample_rate=RATE)(item.signal, item.ear)
+        heard: Tensor = MSBG(sample_rate=NEURO_RATE)(item.signal, item.ear)
     return heard
 
 
@@ -155,14 +207,17 @@ def _scores(clean: Tensor, truth: Tensor, heard: Tensor) -> dict[str, Any]:
     return {
         "snr": snr_db(truth, heard),
         "raw_mse": raw_mse(truth, heard),
-        "band_error": third_octave_error_db(truth, heard, RATE),
+        "band_error": third_octave_error_db(truth, heard, NEURO_RATE),
         **_both(clean, heard, "sim"),
     }
 
 
 def _both(clean: Tensor, heard: Tensor, whose: str) -> dict[str, Any]:
     """STOI and PESQ of the truth or the simulator, and the reasons why there is none."""
-    scores = {f"stoi_{whose}": stoi(clean, heard, RATE), f"pesq_{whose}": pesq_wb(clean, heard, RATE)}
+    scores = {
+        f"stoi_{whose}": stoi(clean, heard, NEURO_RATE),
+        f"pesq_{whose}": pesq_wb(clean, heard, NEURO_RATE),
+    }
     reasons = [f"no {name}: {score.reason}" for name, score in scores.items() if score.value is None]
     return {name: score.value for name, score in scores.items()} | {"reasons": reasons}
 
@@ -178,63 +233,61 @@ def _shown(items: Sequence[Item], others: Iterable[Item], teacher: str) -> tuple
     raise ValueError(f"no item has a truth: {reason}")
 
 
-def weights_hash(module: nn.Module) -> str:
-    """What makes a simulator or compensator this one: its class, its settings and its weights, kept in it or not.
+def summarise(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Fidelity over many items: overall, and by each of severity, level and condition that rows have.
 
-    Of a class of your own the source counts too, where it can be had; not that of what it calls.
+    Args:
+        rows: one an item, with any of ``snr``, ``raw_mse``, ``band_error``, ``stoi_true``, ``stoi_sim``,
+            ``pesq_true``, ``pesq_sim`` (a number, or None: then it, or its pair, is left out) and any of ``severity``,
+            ``level`` (dB SPL), ``condition``.
+
+    Returns: ``{"overall": figures, "severity": {"mild": figures, ...}, "level": {"65": figures, ...}, "condition":
+        {...}}``, for JSON. Figures are ``n``, ``snr_n`` (how many have one), ``snr_median``, ``snr_worst_tenth`` (10th
+        percentile), ``raw_mse`` (mean), ``band_error_median`` and, for stoi and pesq, ``_n`` (pairs used), ``_lcc``,
+        ``_srcc``, ``_mse``; None where undefined.
+
+    Raises:
+        ValueError: no rows, or a number that is not finite.
     """
-    torchs = vars(nn.Module()).keys()  # what every module has
-    settings = [
-        (place, name, _setting(value))
-        for place, part in module.named_modules()
-        for name, value in sorted(vars(part).items())
-        if name not in torchs
-    ]
-    kinds = {type(part): None for part in module.modules()}
-    about = [f"{kind.__module__}.{kind.__qualname__} {_source(kind)}" for kind in kinds]
-    state = hashlib.sha256(f"{about} {settings}".encode())
-    for name, tensor in (*module.named_parameters(), *module.named_buffers()):
-        state.update(name.encode())
-        state.update(tensor.detach().cpu().contiguous().numpy().tobytes())
-    return state.hexdigest()
+    if not rows:
+        raise ValueError("no items to summarise")
+    summary: dict[str, Any] = {"overall": _figures(rows)}
+    for key in ("severity", "level", "condition"):
+        groups: dict[Any, list[Mapping[str, Any]]] = {}
+        for row in rows:
+            if row.get(key) is not None:
+                groups.setdefault(row[key], []).append(row)
+        # degrees of loss in their order, levels as numbers, conditions by name
+        order = sorted(groups, key=lambda g: (SEVERITIES.index(g) if g in SEVERITIES else 0, g))
+        summary[key] = {g if isinstance(g, str) else f"{g:g}": _figures(groups[g]) for g in order}
+    return summary
 
 
-def _setting(value: Any) -> Any:
-    """What tells one value from another, the same in every process where it can be had."""
-    if isinstance(value, bool | int | float | complex | str | bytes | None):
-        return value
-    if isinstance(value, list | tuple):
-        return [_setting(own) for own in value]
-    if isinstance(value, Mapping):
-        return sorted((repr(name), _setting(own)) for name, own in value.items())
-    if isinstance(value, np.ndarray):
-        return (
-            value.shape,
-            str(value.dtype),
-            hashlib.sha256(np.ascontiguousarray(value).tobytes()).hexdigest(),
-        )
-    if isinstance(value, Tensor):
-        return _setting(value.detach().cpu().numpy())
-    if isinstance(value, torch.dtype | torch.device):
-        return str(value)
-    if isinstance(value, weakref.ref):  # an LSTM holds some to its weights
-        return _setting(value())
-    try:
-        return hashlib.sha256(pickle.dumps(value)).hexdigest()
-    except Exception:  # a lambda, an open file: whatever it does may have changed, so it is scored anew
-        return uuid.uuid4().hex
+def _figures(rows: Sequence[Mapping[str, Any]]) -> dict[str, float | int | None]:
+    def column(key: str) -> np.ndarray:
+        values = np.array([row[key] for row in rows if row.get(key) is not None], dtype=np.float64)
+        if not np.isfinite(values).all():
+            raise ValueError(
+                f"{key} holds NaN or infinity; allowed: finite numbers, or None where there is none"
+            )
+        return values
 
+    def over(measure: Callable[[np.ndarray], Any], key: str) -> float | None:
+        values = column(key)
+        return float(measure(values)) if len(values) else None
 
-def _source(kind: type) -> str:
-    """Of classes outside hlsim and torch: those have a version, which is in the keys."""
-    if kind.__module__.split(".")[0] in ("hlsim", "compensators", "torch", "torchaudio"):
-        return ""
-    try:
-        return inspect.getsource(kind)
-    except (OSError, TypeError):  # typed in, or compiled
-        return ""
-
-
-def samples_hash(*signals: Tensor) -> str:
-    """What makes signals these ones."""
-    return hashlib.sha256(b"".join(signal.contiguous().numpy().tobytes() for signal in signals)).hexdigest()
+    figures: dict[str, float | int | None] = {
+        "n": len(rows),
+        "snr_n": len(column("snr")),
+        "snr_median": over(np.median, "snr"),
+        "snr_worst_tenth": over(lambda v: np.percentile(v, 10), "snr"),
+        "raw_mse": over(np.mean, "raw_mse"),
+        "band_error_median": over(np.median, "band_error"),
+    }
+    for name in ("stoi", "pesq"):
+        sides = ([row.get(f"{name}_{side}") for row in rows] for side in ("true", "sim"))
+        pairs = [pair for pair in zip(*sides, strict=True) if None not in pair]
+        true, simulated = ([pair[side] for pair in pairs] for side in (0, 1))
+        figures[f"{name}_n"] = len(pairs)
+        figures |= {f"{name}_{key}": measure(true, simulated) for key, measure in _AGREEMENT.items()}
+    return figures

@@ -21,7 +21,7 @@ FEWEST = 6
 """Values from which on an interval is given, and Wilcoxon's p can fall below 0.05."""
 
 ROUNDING = 1e-7
-"""What is less than this part of the largest score is rounding: scores of files hang on float32."""
+"""What is less than this part of the largest score is rounding: scores of files depend on float32."""
 
 
 @dataclass(frozen=True)
@@ -147,14 +147,14 @@ def bootstrap_interval(
         data[generator.integers(0, len(data), (min(at_once, resamples - start), len(data)))].mean(-1)
         for start in range(0, resamples, at_once)
     ]
-    reach = stats.t.ppf(0.5 + 0.5 * confidence, len(data) - 1) * math.sqrt(len(data) / (len(data) - 1))
-    tail = 100.0 * stats.norm.cdf(-reach)
+    expanded = stats.t.ppf(0.5 + 0.5 * confidence, len(data) - 1) * math.sqrt(len(data) / (len(data) - 1))
+    tail = 100.0 * stats.norm.cdf(-expanded)
     low, high = np.percentile(np.concatenate(means), [tail, 100.0 - tail])
     return float(low), float(high)
 
 
 def holm(p_values: Iterable[float | None]) -> list[float | None]:
-    """P values adjusted for their number by Holm (1979, Scand. J. Statist. 6): each at most its own times the number.
+    """P values adjusted for their number by Holm (1979, Scand. J. Statist. 6): each at most itself times the number.
 
     Undefined ones stay None, and count.
     """
@@ -173,7 +173,7 @@ def group_means(values: Iterable[float], groups: Iterable[str]) -> dict[str, flo
     members: dict[str, list[float]] = {}
     for value, group in zip(values, groups, strict=True):
         members.setdefault(group, []).append(float(value))
-    return {group: math.fsum(own) / len(own) for group, own in members.items()}
+    return {group: math.fsum(mine) / len(mine) for group, mine in members.items()}
 
 
 def _largest(first: np.ndarray, second: np.ndarray) -> float:
@@ -192,7 +192,7 @@ def _scores(values: Iterable[float], name: str) -> np.ndarray:
 
 @dataclass(frozen=True)
 class MixedModel:
-    """Differences = mean + listener's own deviation + residual, fitted by REML.
+    """Differences = mean + the listener's deviation + residual, fitted by REML.
 
     Attributes:
         n, listeners: differences, and listeners they come from.

@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from itertools import product
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
 from hlsim.audiogram import Audiogram
 from hlsim.calibration import level_spl, set_level
-from hlsim.evaluation.items import RATE, Item
+from hlsim.evaluation.items import Item
 from hlsim.evaluation.judging import NORMAL
 from hlsim.msbg import MSBG
-from hlsim.report.page import Section, Table
+from hlsim.neuro.config import NEURO_RATE
 
 TONES = (250, 500, 1000, 2000, 3001, 4000)
 """In Hz. Frames that are multiples of 4 ms apart all find the others in one phase, but not 3001 Hz."""
@@ -24,14 +24,14 @@ DELAYS = (7, 30)
 """In samples, no multiples of a usual hop."""
 
 _NEAR_HZ = 20.0
-_MIDDLE = slice(RATE // 2, -RATE // 2)  # one second: every tone has whole periods in it
-_END = RATE // 4  # left out at either end of speech
+_MIDDLE = slice(NEURO_RATE // 2, -NEURO_RATE // 2)  # one second: every tone has whole periods in it
+_END = NEURO_RATE // 4  # left out at either end of speech
 _LEAST, _SILENCE = 1e-20, 1e-30  # smallest ratio of powers, and power: JSON holds no infinity
 
 
 def tones(hertz: Sequence[int], levels: Sequence[float]) -> Tensor:
     """Sines of 2 s at 16 kHz in pascals, each at each level in dB SPL. Shape: -> (tones * levels, 32000)."""
-    turns = torch.tensor(hertz).unsqueeze(-1) * torch.arange(2 * RATE) % RATE / RATE
+    turns = torch.tensor(hertz).unsqueeze(-1) * torch.arange(2 * NEURO_RATE) % NEURO_RATE / NEURO_RATE
     sines = (2.0 * torch.pi * turns).sin().repeat_interleave(len(levels), 0)
     return set_level(sines, torch.tensor(levels, dtype=torch.float32).repeat(len(hertz)))
 
@@ -46,7 +46,7 @@ def sidebands_db(waveform: Tensor, hertz: Tensor) -> Tensor:
     middle = waveform[:, _MIDDLE].double()
     window = torch.hann_window(middle.shape[-1], dtype=middle.dtype)
     power = torch.fft.fft(middle * window).abs().square()
-    bins = torch.fft.fftfreq(middle.shape[-1], 1.0 / RATE).abs()
+    bins = torch.fft.fftfreq(middle.shape[-1], 1.0 / NEURO_RATE).abs()
     near = (bins - hertz.unsqueeze(-1)).abs() <= _NEAR_HZ
     return _ratio_db((power * ~near).sum(-1), (power * near).sum(-1))
 
@@ -68,16 +68,12 @@ def steady_tones(
     sounds, hertz = tones(TONES, levels), torch.tensor(TONES).repeat_interleave(len(levels))
     normal = _heard(sounds, NORMAL)
     found = []
-    for ear_name, ear in ears.items():
-        for name, compensator in compensators.items():
-            aided = _outputs(compensator, sounds, ear, f"{name}, ear {ear_name}, steady tones")
-            figures = {
-                "heard_off_db": _heard(aided, ear) - normal,
-                "sidebands_db": sidebands_db(aided, hertz),
-            }
-            about = {"compensator": name, "ear": ear_name, "levels": [*levels], "frequencies": [*TONES]}
-            shaped = {key: own.reshape(len(TONES), -1).T.tolist() for key, own in figures.items()}
-            found.append({**about, **shaped})
+    for (ear_name, ear), (name, compensator) in product(ears.items(), compensators.items()):
+        aided = outputs(compensator, sounds, ear, f"{name}, ear {ear_name}, steady tones: the output")
+        figures = {"heard_off_db": _heard(aided, ear) - normal, "sidebands_db": sidebands_db(aided, hertz)}
+        about = {"compensator": name, "ear": ear_name, "levels": [*levels], "frequencies": [*TONES]}
+        shaped = {key: values.reshape(len(TONES), -1).T.tolist() for key, values in figures.items()}
+        found.append({**about, **shaped})
     return found
 
 
@@ -104,9 +100,8 @@ def shift_differences(
         for number, item in items.items():
             time = len(item.clean)
             given = [functional.pad(item.clean, (delay, last - delay)) for delay in (0, *DELAYS)]
-            aided = _outputs(
-                compensator, given, item.ear, f"{name}, delayed speech of item {number}"
-            ).double()
+            what = f"{name}, delayed speech of item {number}: the output"
+            aided = outputs(compensator, given, item.ear, what).double()
             end = min(_END, time // 4)
             first, *later = (
                 own[delay + end : delay + time - end] for own, delay in zip(aided, (0, *DELAYS), strict=True)
@@ -118,69 +113,22 @@ def shift_differences(
     return found
 
 
-def tone_table(found: Sequence[Mapping[str, Any]]) -> Table:
-    """A row an ear, compensator and level, with the worst sidebands of the row."""
-    rows = []
-    for own in found:
-        figures = zip(own["levels"], own["heard_off_db"], own["sidebands_db"], strict=True)
-        for level, offs, sidebands in figures:
-            worst = int(np.argmax(sidebands))
-            name = f"{own['ear']}, {own['compensator']}, {level:g} dB SPL"
-            most = f"{round(sidebands[worst])} ({own['frequencies'][worst]} Hz)"
-            rows.append([name, *(f"{off:+.1f}" for off in offs), most])
-    header = ["Ear, compensator, input", *(f"{hz} Hz" for hz in TONES), "Worst sidebands (of the tone)"]
-    return Table(
-        "Level heard less a normal ear's of the same tone, and sidebands of the output, in dB", header, rows
-    )
+def outputs(compensator: nn.Module, signals: Iterable[Tensor], ear: Audiogram, what: str) -> Tensor:
+    """What a compensator gives, one signal at a time; ValueError where it is NaN or infinite, which says of ``what``.
 
-
-def shift_table(found: Sequence[Mapping[str, Any]]) -> Table:
-    """A row a compensator."""
-    rows = []
-    for own in found:
-        figures = np.array(own["difference_db"])
-        rows.append(
-            [own["compensator"], str(figures.size), f"{np.median(figures):.0f}", f"{figures.max():.0f}"]
-        )
-    header = ("What the ear is given", "n", "Median", "Worst")
-    return Table("Difference of the outputs relative to the output, in dB", header, rows)
-
-
-def steadiness_sections(
-    steady: Sequence[Mapping[str, Any]], shifts: Sequence[Mapping[str, Any]]
-) -> list[Section]:
-    """Both tables, each with what it is."""
-    count, delays = len(shifts[0]["items"]), " or ".join(map(str, DELAYS))
-    return [
-        Section("Steady tones", [_STEADY], [tone_table(steady)]),
-        Section("Does it matter where frames fall?", [_SHIFTS.format(count, delays)], [shift_table(shifts)]),
-    ]
-
-
-_STEADY = (
-    "By the exact MSBG, all that is heard. A tone that the ear cannot hear under any output limit is far below 0 "
-    "whatever is done. Sidebands are the power of all that is further than 20 Hz from the tone, relative to the tone, in "
-    "what the ear is given: modulation, hiss, and the harmonics of a limiter."
-)
-_SHIFTS = (
-    "The clean speech of {} items is delayed by {} samples, and the output, shifted back, is compared with that of the "
-    "speech as it was, without 0.25 s at either end. A filter gives the same; what hangs on where frames fall does not."
-)
-
-
-def _outputs(compensator: nn.Module, signals: Iterable[Tensor], ear: Audiogram, what: str) -> Tensor:
-    """Shape: signals of (time,) -> (signals, time)."""
+    Shape: signals of (time,) -> (signals, time).
+    """
     with torch.no_grad():
         aided = torch.stack([compensator(signal, ear) for signal in signals])
     if not aided.isfinite().all():
-        raise ValueError(f"{what}: the output holds samples that are NaN or infinite")
+        raise ValueError(f"{what} holds samples that are NaN or infinite")
     return aided
 
 
 def _heard(sounds: Tensor, ear: Audiogram) -> Tensor:
     """Level in dB SPL of the middle second. Shape: (items, time) -> (items,)."""
     with torch.no_grad():
-        return level_spl(MSBG(ear, sample_rate=RATE)(sounds)[:, _MIDDLE])
+        return level_spl(MSBG(ear, sample_rate=NEURO_RATE)(sounds)[:, _MIDDLE])
 
 
 def _ratio_db(part: Tensor, whole: Tensor) -> Tensor:

@@ -1,13 +1,30 @@
-"""Scores on disk, each appended as it is made, so that a run that was killed goes on where it was."""
+"""Scores on disk, each appended as it is made, so that a run that was killed goes on where it was; and their keys.
+
+Lines of JSON, not sqlite or diskcache: two runs may share a file, people read it, and scores stored earlier load.
+"""
 
 from __future__ import annotations
 
 import hashlib
+import inspect
 import json
 import os
+import pickle
+import uuid
+import weakref
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from hlsim.files import sha256
+
+# scores of networks were stored when these had other names
+_FORMER = {"receptive_field": "reach"}
+_FORMER_MODULE = b"hlsim.dsp.stft", b"hlsim.spectrum"
 
 
 class ScoreStore:
@@ -24,17 +41,17 @@ class ScoreStore:
 
     def __init__(self, path: str | Path | None = None) -> None:
         self.path = None if path is None else Path(path)
-        self._records: dict[str, dict[str, Any]] = {}
+        self.records: dict[str, dict[str, Any]] = {}
         self._torn = False
         if self.path is not None and self.path.exists():
             self._read(self.path)
 
     def __len__(self) -> int:
-        return len(self._records)
+        return len(self.records)
 
     def get(self, key: str) -> dict[str, Any] | None:
         """The record of a key, or None."""
-        return self._records.get(key)
+        return self.records.get(key)
 
     def append(self, key: str, record: Mapping[str, Any]) -> None:
         """Keep a record, and put it on the disk before returning.
@@ -58,7 +75,7 @@ class ScoreStore:
                 raise ValueError(f"{self.path}: scores cannot be stored ({error})") from error
             if self._torn:
                 raise ValueError(f"{self.path}: scores cannot be stored (the disk is full)")
-        self._records[key] = dict(record)
+        self.records[key] = dict(record)
 
     def _read(self, path: Path) -> None:
         try:
@@ -67,7 +84,7 @@ class ScoreStore:
                     self._torn = not line.endswith("\n")
                     try:
                         record = json.loads(line)
-                        self._records[record.pop("key")] = record
+                        self.records[record.pop("key")] = record
                     except (ValueError, KeyError, TypeError, AttributeError):
                         continue  # cut short, or not ours: it is scored again
         except OSError as error:
@@ -81,8 +98,7 @@ def content_hash(path: str | Path) -> str:
         ValueError: the file cannot be read.
     """
     try:
-        with open(path, "rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
+        return sha256(Path(path))
     except OSError as error:
         reason = "no such file" if isinstance(error, FileNotFoundError) else f"cannot be read ({error})"
         raise ValueError(f"{path}: {reason}") from error
@@ -91,3 +107,66 @@ def content_hash(path: str | Path) -> str:
 def key_of(settings: Mapping[str, Any]) -> str:
     """SHA-256, in hexadecimal, of settings that JSON can hold, whatever their order."""
     return hashlib.sha256(json.dumps(settings, sort_keys=True, allow_nan=False).encode()).hexdigest()
+
+
+def weights_hash(module: nn.Module) -> str:
+    """What makes a simulator or compensator this one: its class, its settings and its weights, kept in it or not.
+
+    Of a class outside hlsim and torch the source counts too, where it can be had; not that of what it calls.
+    """
+    torchs = vars(nn.Module()).keys()  # what every module has
+    settings = [
+        (place, name, setting(value))
+        for place, part in module.named_modules()
+        for name, value in sorted((_FORMER.get(name, name), value) for name, value in vars(part).items())
+        if name not in torchs
+    ]
+    kinds = {type(part): None for part in module.modules()}
+    about = [f"{kind.__module__}.{kind.__qualname__} {_source(kind)}" for kind in kinds]
+    state = hashlib.sha256(f"{about} {settings}".encode())
+    for name, tensor in (*module.named_parameters(), *module.named_buffers()):
+        state.update(name.encode())
+        state.update(tensor.detach().cpu().contiguous().numpy().tobytes())
+    return state.hexdigest()
+
+
+def setting(value: Any) -> Any:
+    """What tells one value from another, the same in every process where it can be had."""
+    if isinstance(value, bool | int | float | complex | str | bytes | None):
+        return value
+    if isinstance(value, list | tuple):
+        return [setting(part) for part in value]
+    if isinstance(value, Mapping):
+        return sorted((repr(name), setting(part)) for name, part in value.items())
+    if isinstance(value, np.ndarray):
+        return (
+            value.shape,
+            str(value.dtype),
+            hashlib.sha256(np.ascontiguousarray(value).tobytes()).hexdigest(),
+        )
+    if isinstance(value, Tensor):
+        return setting(value.detach().cpu().numpy())
+    if isinstance(value, torch.dtype | torch.device):
+        return str(value)
+    if isinstance(value, weakref.ref):  # an LSTM holds some to its weights
+        return setting(value())
+    try:
+        held = pickle.dumps(value, protocol=4).replace(*_FORMER_MODULE)
+        return hashlib.sha256(held).hexdigest()
+    except Exception:  # a lambda, an open file: whatever it does may have changed, so it is scored anew
+        return uuid.uuid4().hex
+
+
+def _source(kind: type) -> str:
+    """Of classes outside hlsim and torch: those have a version, which is in the keys."""
+    if kind.__module__.split(".")[0] in ("hlsim", "compensators", "torch", "torchaudio"):
+        return ""
+    try:
+        return inspect.getsource(kind)
+    except (OSError, TypeError):  # typed in, or compiled
+        return ""
+
+
+def samples_hash(*signals: Tensor) -> str:
+    """What makes signals these ones."""
+    return hashlib.sha256(b"".join(signal.contiguous().numpy().tobytes() for signal in signals)).hexdigest()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,7 +12,6 @@ import torch
 from scipy import stats
 from torch import Tensor
 
-from hlsim.audiogram import SEVERITIES
 from hlsim.dsp.resample import resample
 from hlsim.extras import require
 
@@ -22,24 +21,6 @@ _PESQ_RATE = 16000
 _BANDS = 1000.0 * 2.0 ** (np.arange(-9, 9) / 3.0)  # centres in Hz, 125 to 6350: the last band ends at 7127
 _BAND_RANGE_DB = 50.0
 _FLOOR = 1e-20  # of the truth's power: keeps an exact estimate at 200 dB SNR, which JSON can hold
-
-
-COLUMNS = {
-    "n": ("n", "d"),
-    "SNR median (dB)": ("snr_median", ".1f"),
-    "SNR worst tenth (dB)": ("snr_worst_tenth", ".1f"),
-    "STOI LCC": ("stoi_lcc", ".4f"),
-    "STOI SRCC": ("stoi_srcc", ".4f"),
-    "STOI MSE": ("stoi_mse", ".5f"),
-    "PESQ LCC": ("pesq_lcc", ".4f"),
-    "PESQ SRCC": ("pesq_srcc", ".4f"),
-    "PESQ MSE": ("pesq_mse", ".4f"),
-    "RAW MSE": ("raw_mse", ".4f"),
-    "Band error median (dB)": ("band_error_median", ".2f"),
-}
-"""Titles of a table's columns, with the figure and its format."""
-
-GROUPS = {"severity": "By degree of loss", "level": "By level (dB SPL)", "condition": "By condition"}
 
 
 class Score(NamedTuple):
@@ -107,7 +88,8 @@ def stoi(clean: Signal, heard: Signal, sample_rate: int) -> Score:
         ValueError: shapes differ or are not (time,).
         MissingExtraError: pystoi is not installed.
     """
-    return _score(require("pystoi", "eval").stoi, clean, heard, lambda a, b, run: run(a, b, sample_rate))
+    run = require("pystoi", "eval").stoi
+    return _score(lambda a, b: run(a, b, sample_rate), clean, heard)
 
 
 def pesq_wb(clean: Signal, heard: Signal, sample_rate: int) -> Score:
@@ -115,12 +97,13 @@ def pesq_wb(clean: Signal, heard: Signal, sample_rate: int) -> Score:
 
     Shape: (time,) and (time,). Raises as ``stoi``, for pesq.
     """
+    run = require("pesq", "eval").pesq
 
-    def at_16k(a: np.ndarray, b: np.ndarray, run: Callable[..., float]) -> float:
-        pair = [resample(torch.from_numpy(x), sample_rate, _PESQ_RATE).numpy() for x in (a, b)]
-        return run(_PESQ_RATE, *pair, "wb")
+    def at_16k(*signals: np.ndarray) -> float:
+        pair = [resample(torch.from_numpy(x), sample_rate, _PESQ_RATE).numpy() for x in signals]
+        return float(run(_PESQ_RATE, *pair, "wb"))
 
-    return _score(require("pesq", "eval").pesq, clean, heard, at_16k)
+    return _score(at_16k, clean, heard)
 
 
 def linear_correlation(true: Iterable[float], simulated: Iterable[float]) -> float | None:
@@ -157,7 +140,7 @@ def _values(true: Iterable[float], simulated: Iterable[float]) -> tuple[np.ndarr
     return a, b
 
 
-def _score(run: Callable[..., float], clean: Signal, heard: Signal, call: Callable[..., float]) -> Score:
+def _score(run: Callable[[np.ndarray, np.ndarray], float], clean: Signal, heard: Signal) -> Score:
     a, b = _equal(clean, heard)
     for name, signal in (("clean", a), ("heard", b)):
         if not np.isfinite(signal).all():
@@ -166,10 +149,9 @@ def _score(run: Callable[..., float], clean: Signal, heard: Signal, call: Callab
             return Score(None, f"{name} is silent")
     try:
         with warnings.catch_warnings():
-            warnings.filterwarnings(
-                "error", message="Not enough STFT frames"
-            )  # pystoi's word, and its score is 1e-5
-            value = float(call(a, b, run))
+            # pystoi's word, and its score is 1e-5
+            warnings.filterwarnings("error", message="Not enough STFT frames")
+            value = float(run(a, b))
     except Exception as error:  # whatever a third party's measure raises is that item's reason, no more
         text = error.args[0] if error.args else error
         return Score(None, text.decode() if isinstance(text, bytes) else str(text))
@@ -193,92 +175,3 @@ def _pair(truth: Signal, estimate: Signal) -> tuple[np.ndarray, np.ndarray]:
     if not true.any():
         raise ValueError("truth is silent; an error relative to it is not defined")
     return true, found
-
-
-def summarise(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Fidelity over many items: overall, and by each of severity, level and condition that rows have.
-
-    Args:
-        rows: one an item, with any of ``snr``, ``raw_mse``, ``band_error``, ``stoi_true``, ``stoi_sim``,
-            ``pesq_true``, ``pesq_sim`` (a number, or None: then it, or its pair, is left out) and any of ``severity``,
-            ``level`` (dB SPL), ``condition``.
-
-    Returns: ``{"overall": figures, "severity": {"mild": figures, ...}, "level": {"65": figures, ...}, "condition":
-        {...}}``, for JSON. Figures are ``n``, ``snr_n`` (how many have one), ``snr_median``, ``snr_worst_tenth`` (10th
-        percentile), ``raw_mse`` (mean), ``band_error_median`` and, for stoi and pesq, ``_n`` (pairs used), ``_lcc``,
-        ``_srcc``, ``_mse``; None where undefined.
-
-    Raises:
-        ValueError: no rows, or a number that is not finite.
-    """
-    if not rows:
-        raise ValueError("no items to summarise")
-    summary: dict[str, Any] = {"overall": _figures(rows)}
-    for key in ("severity", "level", "condition"):
-        groups: dict[Any, list[Mapping[str, Any]]] = {}
-        for row in rows:
-            if row.get(key) is not None:
-                groups.setdefault(row[key], []).append(row)
-        # degrees of loss in their own order, levels as numbers, conditions by name
-        order = sorted(groups, key=lambda g: (SEVERITIES.index(g) if g in SEVERITIES else 0, g))
-        summary[key] = {g if isinstance(g, str) else f"{g:g}": _figures(groups[g]) for g in order}
-    return summary
-
-
-def fidelity_markdown(summary: Mapping[str, Any]) -> str:
-    """What ``summarise`` returned as Markdown tables: the whole first, then each grouping."""
-    sections = [_table("Items", {"all": summary["overall"]})]
-    sections += [f"**{GROUPS[key]}**\n\n" + _table(key, summary[key]) for key in GROUPS if summary.get(key)]
-    return "\n\n".join(sections) + "\n"
-
-
-def _figures(rows: Sequence[Mapping[str, Any]]) -> dict[str, float | int | None]:
-    def column(key: str) -> np.ndarray:
-        values = np.array([row[key] for row in rows if row.get(key) is not None], dtype=np.float64)
-        if not np.isfinite(values).all():
-            raise ValueError(
-                f"{key} holds NaN or infinity; allowed: finite numbers, or None where there is none"
-            )
-        return values
-
-    def over(measure: Callable[[np.ndarray], Any], key: str) -> float | None:
-        values = column(key)
-        return float(measure(values)) if len(values) else None
-
-    figures: dict[str, float | int | None] = {
-        "n": len(rows),
-        "snr_n": len(column("snr")),
-        "snr_median": over(np.median, "snr"),
-        "snr_worst_tenth": over(lambda v: np.percentile(v, 10), "snr"),
-        "raw_mse": over(np.mean, "raw_mse"),
-        "band_error_median": over(np.median, "band_error"),
-    }
-    for name in ("stoi", "pesq"):
-        scored = [
-            row for row in rows if row.get(f"{name}_true") is not None and row.get(f"{name}_sim") is not None
-        ]
-        true, simulated = [row[f"{name}_true"] for row in scored], [row[f"{name}_sim"] for row in scored]
-        figures[f"{name}_n"] = len(scored)
-        figures[f"{name}_lcc"] = linear_correlation(true, simulated)
-        figures[f"{name}_srcc"] = rank_correlation(true, simulated)
-        figures[f"{name}_mse"] = mean_squared_error(true, simulated)
-    return figures
-
-
-def _table(what: str, groups: Mapping[str, Mapping[str, float | int | None]]) -> str:
-    lines = [f"| {what.capitalize()} | " + " | ".join(COLUMNS) + " |", "|---" * (len(COLUMNS) + 1) + "|"]
-    for name, figures in groups.items():
-        lines.append(f"| {name} | " + " | ".join(column_cells(figures)) + " |")
-    return "\n".join(lines)
-
-
-def column_cells(figures: Mapping[str, float | int | None]) -> list[str]:
-    """The figures of ``summarise`` under ``COLUMNS``, ``n/a`` where there is none; with their own n where it is less."""
-    cells = []
-    for key, form in COLUMNS.values():
-        cell = "n/a" if figures[key] is None else f"{figures[key]:{form}}"
-        # raw MSE and band error are there where an SNR is
-        used = figures.get(f"{key.split('_')[0]}_n", figures["snr_n"])
-        fewer = key != "n" and used != figures["n"] and figures[key] is not None
-        cells.append(f"{cell} ({used} of {figures['n']})" if fewer else cell)
-    return cells

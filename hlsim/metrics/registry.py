@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from functools import partial
 from importlib import metadata
 from typing import NamedTuple
 
@@ -13,7 +14,7 @@ from hlsim.audiogram import Audiogram
 from hlsim.checks import refuse_unknown
 from hlsim.extras import require
 from hlsim.metrics import fidelity
-from hlsim.metrics.pyclarity import haspi, hasqi
+from hlsim.metrics.pyclarity import pyclarity_score
 
 
 class Measure(NamedTuple):
@@ -55,23 +56,11 @@ def measure_pesq(
     return _known(fidelity.pesq_wb(clean, processed, rate))
 
 
-def measure_haspi(
-    clean: np.ndarray, processed: np.ndarray, ear: Audiogram, rate: int, full_scale_spl: float, seed: int
-) -> float:
-    """HASPI v2; see ``haspi``."""
-    return haspi(clean, processed, ear, rate, full_scale_spl=full_scale_spl, seed=seed)
-
-
-def measure_hasqi(
-    clean: np.ndarray, processed: np.ndarray, ear: Audiogram, rate: int, full_scale_spl: float, seed: int
-) -> float:
-    """HASQI v2; see ``hasqi``."""
-    return hasqi(clean, processed, ear, rate, full_scale_spl=full_scale_spl, seed=seed)
-
+_CLARITY = ("pyclarity", "numpy", "scipy")
 
 MEASURES = {
-    "haspi": Measure("HASPI", "clarity", ("pyclarity", "numpy", "scipy"), True, True, measure_haspi),
-    "hasqi": Measure("HASQI", "clarity", ("pyclarity", "numpy", "scipy"), True, False, measure_hasqi),
+    "haspi": Measure("HASPI", "clarity", _CLARITY, True, True, partial(pyclarity_score, "haspi")),
+    "hasqi": Measure("HASQI", "clarity", _CLARITY, True, False, partial(pyclarity_score, "hasqi")),
     "stoi": Measure("STOI", "pystoi", ("pystoi", "numpy", "scipy"), False, False, measure_stoi),
     "pesq": Measure("PESQ", "pesq", ("pesq", "numpy", "torchaudio"), False, False, measure_pesq),
 }

@@ -13,7 +13,8 @@ from hlsim.audiogram import FREQUENCIES, Audiogram, AudiogramLike
 from hlsim.calibration import check_full_scale, level_spl
 from hlsim.checks import check_rate
 from hlsim.extras import require
-from hlsim.metrics.pyclarity import HaspiItem, check_pair, check_seed, haspi_many
+from hlsim.metrics.pyclarity import check_pair, check_seed, pyclarity_score
+from hlsim.parallel import check_parallel, run_parallel
 
 _Metric: Any = require("torchmetrics", "train").Metric
 
@@ -66,6 +67,7 @@ class HASPI(_Metric):
         require("clarity", "eval")
         if limit is not None and limit < 1:
             raise ValueError(f"limit is {limit}; allowed: 1 or more, or None")
+        check_parallel(jobs, "loky", None)
         self.sample_rate = check_rate(sample_rate)
         self.full_scale_spl = check_full_scale(full_scale_spl)
         self.seed, self.limit, self.jobs = check_seed(seed), limit, jobs
@@ -103,7 +105,7 @@ class HASPI(_Metric):
         )
         ears = _ears(audiogram, len(heard))
         ends = _ends(lengths, *heard.shape)
-        items, levels = [], []
+        tasks, levels = [], []
         for i, (signal, target, ear, end) in enumerate(zip(heard, reference, ears, ends, strict=True)):
             number = int(self.seen) + i
             if self.limit is not None and number >= self.limit:
@@ -114,12 +116,17 @@ class HASPI(_Metric):
                 self.failed += 1
                 warnings.warn(f"HASPI leaves out item {number}: {error}", stacklevel=2)
                 continue
-            items.append(HaspiItem(*pair, ear, self.sample_rate, (self.seed + number) % 2**32))
+            seed = (self.seed + number) % 2**32
+            tasks.append((number, (*pair, ear, self.sample_rate, self.full_scale_spl, seed)))
             levels.append(float(level_spl(signal[:end], self.full_scale_spl)))
-        scores = haspi_many(items, full_scale_spl=self.full_scale_spl, jobs=self.jobs)
+        scores = {}
+        for (number, _), score in run_parallel(_score, tasks, jobs=1 if len(tasks) < 2 else self.jobs):
+            if score is None:
+                raise ValueError(f"item {number}: the process that scored it died")
+            scores[number] = score
         self.seen += len(heard)
         self.count += len(scores)
-        self.total += sum(scores)
+        self.total += sum(scores[number] for number, _ in tasks)  # in one order
         self.total_level += sum(levels)
 
     def compute(self) -> Tensor:
@@ -130,6 +137,10 @@ class HASPI(_Metric):
     def level(self) -> Tensor:
         """Mean level in dB SPL of what was scored, of this process; NaN where nothing was."""
         return self.total_level / self.count
+
+
+def _score(task: tuple[int, tuple[Any, ...]]) -> float:
+    return pyclarity_score("haspi", *task[1])
 
 
 def _ends(lengths: Tensor | None, batch: int, time: int) -> list[int]:

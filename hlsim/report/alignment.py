@@ -11,8 +11,8 @@ from hlsim.audiogram import Audiogram
 from hlsim.calibration import dbfs
 from hlsim.checks import refuse_unknown
 from hlsim.data.teacher import Teacher
-from hlsim.extras import require
 from hlsim.msbg.ear import MSBG_RATE
+from hlsim.report.pictures import new_figure
 
 _SHOWN = 0.12  # s: a delay of 28 ms is plain to see
 
@@ -53,8 +53,7 @@ def draw_alignment(
     first = min(max(0, int(signal.abs().argmax()) - shown // 2), signal.shape[-1] - shown)
     times = torch.arange(first, first + shown) / sample_rate
 
-    figure = require("matplotlib.figure", "eval").Figure(figsize=(9.0, 5.0), layout="constrained")
-    require("matplotlib.backends.backend_agg", "eval").FigureCanvasAgg(figure)
+    figure = new_figure((9.0, 5.0))
     for axes, heard, title in zip(
         figure.subplots(2, 1, sharex=True),
         (before, after),

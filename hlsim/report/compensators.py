@@ -3,58 +3,52 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-from hlsim.evaluation.gain_curves import gain_section
-from hlsim.evaluation.scores import HaspiReport
-from hlsim.evaluation.steadiness import steadiness_sections
-from hlsim.files import write_whole
-from hlsim.report.compensator_tables import (
-    GROUPS,
-    failure_table,
-    gap_table,
-    loudness_table,
-    main_table,
-    peak_table,
-    severity_table,
-    severity_tests,
-    tests_table,
-)
-from hlsim.report.haspi_pictures import report_pictures
-from hlsim.report.haspi_text import GAIN_SENTENCE, markdown_table
-from hlsim.report.page import Section, Table, render_page
+import numpy as np
+
+from hlsim.audiogram import FREQUENCIES
+from hlsim.evaluation.compensator_result import HARD
+from hlsim.evaluation.gain_curves import UTTERANCES
+from hlsim.evaluation.haspi_report import GAIN_NOTE, HaspiReport
+from hlsim.evaluation.steadiness import DELAYS
+from hlsim.report.page import Picture, Section, render_markdown, render_page, write_files
+from hlsim.report.pictures import draw_svg, frequency_axis, plain, report_pictures
+from hlsim.report.tables import Table, change_name, number, paired_cells, spread
 
 FILES = ("compensators.json", "compensators.md", "compensators.html")
 
+GROUPS = {
+    "clean": "Clean speech",
+    "noisy": "Speech in noise",
+    "hard": f"Where unaided HASPI is under {HARD:g}, clean and noisy",
+}
 
-def write_compensators(
-    result: Mapping[str, Any], reports: Mapping[str, HaspiReport], out: str | Path
-) -> None:
-    """Write ``compensator_result`` with ``gain_curves``, ``steady_tones``, ``shifts`` and ``notes`` in it into a folder.
+Result = Mapping[str, Any]
 
-    Each file whole or not at all.
+_cells = partial(paired_cells, digits=2)
+
+
+def write_compensators(result: Result, reports: Mapping[str, HaspiReport], out: str | Path) -> None:
+    """Write what ``evaluate_compensators`` returns into a folder, each file whole or not at all.
 
     Raises:
         ValueError: a file cannot be written.
         MissingExtraError: matplotlib is not installed.
     """
-    title, lead = "Compensators", _lead(result)
-    sections = _sections(result, reports)
-    contents = {
-        "compensators.json": json.dumps(result, indent=1, ensure_ascii=False, allow_nan=False) + "\n",
-        "compensators.md": _markdown(title, lead, sections),
-        "compensators.html": render_page(title, sections, lead),
-    }
-    for name in FILES:
-        write_whole(Path(out) / name, contents[name])
+    page = ("Compensators", _sections(result, reports), _lead(result))
+    text = json.dumps(result, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+    contents = (text, render_markdown(*page), render_page(*page))
+    write_files(out, dict(zip(FILES, contents, strict=True)))
 
 
-def _lead(result: Mapping[str, Any]) -> str:
+def _lead(result: Result) -> str:
     levels = ", ".join(f"{level:g}" for level in result["levels"])
     # few items do not come to every ear
-    ears = len({own["name"] for own in (*result["rows"], *result["failures"])})
+    ears = len({row["name"] for row in (*result["rows"], *result["failures"])})
     about = (
         f"{result['items']} items of {result['seconds']:g} s, {ears} ears in turn, speech at {levels} "
         f"dB SPL in turn, seed {result['seed']}: {', '.join(result['limits'])}. HASPI v2 and HASQI v2 are pyclarity's, "
@@ -63,35 +57,44 @@ def _lead(result: Mapping[str, Any]) -> str:
     return " ".join([*result["notes"], about])
 
 
-def _sections(result: Mapping[str, Any], reports: Mapping[str, HaspiReport]) -> list[Section]:
-    sections = []
-    for name, report in reports.items():
-        tables = [main_table(result, name), tests_table(report)]
-        sections.append(Section(GROUPS[name], [GAIN_SENTENCE] if name == "clean" else [], tables))
-    sections += [
-        Section("As loud as a normal ear hears it?", [_LOUDNESS], _each(result, loudness_table)),
+def _sections(result: Result, reports: Mapping[str, HaspiReport]) -> list[Section]:
+    whole = [group for group in ("clean", "noisy") if group in reports]
+    sections = [
         Section(
-            "By degree of loss",
-            [_HASQI],
-            [
-                *_each(result, severity_table),
-                *(severity_tests(reports[group], group) for group in ("clean", "noisy") if group in reports),
-            ],
+            GROUPS[group],
+            [GAIN_NOTE] if group == "clean" else [],
+            [main_table(result, group), tests_table(report)],
+        )
+        for group, report in reports.items()
+    ]
+    by_severity = [severity_table(result, group) for group in whole]
+    by_severity += [severity_tests(reports[group], group) for group in whole]
+    shifts = _SHIFTS.format(len(result["shifts"][0]["items"]), " or ".join(map(str, DELAYS)))
+    curves = result["gain_curves"]
+    ears = dict.fromkeys(curve["ear"] for curve in curves)
+    sections += [
+        Section(
+            "As loud as a normal ear hears it?",
+            [_LOUDNESS],
+            [loudness_table(result, group) for group in whole],
         ),
+        Section("By degree of loss", [_HASQI], by_severity),
         Section("The surrogate gap", [_GAP.format(**result)], [gap_table(result)]),
         Section("Does any output pass the limit?", (), [peak_table(result)]),
-        gain_section(result["gain_curves"]),
-        *steadiness_sections(result["steady_tones"], result["shifts"]),
+        Section("Gain curves", [_GAINS], [gain_table(curves)], [_gain_picture(ear, curves) for ear in ears]),
+        Section("Steady tones", [_STEADY], [tone_table(result["steady_tones"])]),
+        Section("Does it matter where frames fall?", [shifts], [shift_table(result["shifts"])]),
     ]
-    for name in ("clean", "noisy"):
-        if name in reports:
-            pictures = report_pictures(reports[name])
-            sections.append(Section(f"Pictures: {GROUPS[name].lower()}", pictures=pictures))
+    sections += [
+        Section(f"Pictures: {GROUPS[group].lower()}", pictures=report_pictures(reports[group]))
+        for group in whole
+    ]
     if result["failures"]:
-        sections.append(Section("Failures", ["Items that count in no table."], [failure_table(result)]))
+        rows = [(str(f["item"]), f["compensator"], f["name"], f["reason"]) for f in result["failures"]]
+        table = Table("Outputs that could not be judged", ("Item", "Compensator", "Ear", "Reason"), rows)
+        sections.append(Section("Failures", ["Items that count in no table."], [table]))
     versions = ", ".join(f"{name} {version}" for name, version in result["versions"].items())
-    sections.append(Section("How the figures were made", [*_NOTES, f"{versions}."]))
-    return sections
+    return [*sections, Section("How the figures were made", [*_NOTES, f"{versions}."])]
 
 
 _LOUDNESS = (
@@ -99,12 +102,25 @@ _LOUDNESS = (
     "noise in it: what takes noise away is held against the speech alone as well."
 )
 _HASQI = (
-    "HASQI's own reference is the clean speech amplified by NAL-R, so that NAL-R is its ceiling: what is nearer to "
+    "HASQI's reference is the clean speech amplified by NAL-R, so that NAL-R is its ceiling: what is nearer to "
     "normal hearing than NAL-R loses HASQI by it."
 )
 _GAP = (
     "The loss is that of HearingLossLoss with the criterion bands, of the outputs above, with the Neuro-MSBG "
     "{simulator}. A compensator that has learned to fool the network has a lower loss under it than under the others."
+)
+_GAINS = (
+    f"Power out over power in, in ERB-wide bands, of {UTTERANCES} clips of speech. A linear prescription has one "
+    "curve for all levels; less gain for louder speech is compression."
+)
+_STEADY = (
+    "By the exact MSBG, all that is heard. A tone that the ear cannot hear under any output limit is far below 0 "
+    "whatever is done. Sidebands are the power of all that is further than 20 Hz from the tone, relative to the tone, in "
+    "what the ear is given: modulation, hiss, and the harmonics of a limiter."
+)
+_SHIFTS = (
+    "The clean speech of {} items is delayed by {} samples, and the output, shifted back, is compared with that of the "
+    "speech as it was, without 0.25 s at either end. A filter gives the same; what depends on where frames fall does not."
 )
 _NOTES = (
     "Bands: median absolute difference between the levels of 24 ERB-wide bands in frames of 32 ms of what the impaired "
@@ -117,15 +133,204 @@ _NOTES = (
 )
 
 
-def _each(result: Mapping[str, Any], table: Any) -> list[Table]:
-    return [table(result, group) for group in ("clean", "noisy") if group in result["groups"]]
+def main_table(result: Result, group: str) -> Table:
+    """A row a condition: scores, levels, and how far what is heard lies from what a normal ear hears."""
+    rows = [
+        {
+            "What the ear is given": name,
+            **_scores(row),
+            "Level (dB SPL)": f"{row['level_mean']:.1f}",
+            "Highest peak (dB SPL)": f"{row['peak_max']:.1f}",
+            "Heard, against normal (dB)": f"{row['heard_off']:+.1f}",
+            "the same, mean absolute": f"{row['heard_off_abs']:.1f}",
+            "Bands, against normal (dB)": f"{row['band_error_mean']:.1f}",
+        }
+        for name, row in result["groups"][group]["conditions"].items()
+    ]
+    return Table.of(f"{GROUPS[group]}: scores, output and what is heard", rows)
 
 
-def _markdown(title: str, lead: str, sections: list[Section]) -> str:
-    """The page without its pictures."""
-    blocks = [f"# {title}", lead]
-    for section in sections:
-        if section.paragraphs or section.tables:
-            blocks += [f"## {section.title}", *section.paragraphs]
-            blocks += [f"**{table.caption}**\n\n{markdown_table(table)}" for table in section.tables]
-    return "\n\n".join(blocks) + "\n"
+def tests_table(report: HaspiReport) -> Table:
+    """Each compensator against no aid and the prescription, and the latter against the former."""
+    rows = [
+        {
+            "Change": change_name(c),
+            "n": str(c.overall.n),
+            **_cells(c.overall, c.p_t_holm, c.p_w_holm),
+            "t over means of ears": "n/a" if c.listeners is None else _cells(c.listeners)["t-test (paired)"],
+        }
+        for c in report.comparisons
+        if c.before in report.conditions[:2]
+    ]
+    return Table.of("Paired tests, p adjusted by Holm within each measure", rows)
+
+
+def severity_tests(report: HaspiReport, group: str) -> Table:
+    """The same by degree of loss."""
+    rows = [
+        {"Change": f"{severity}, {change_name(c)}", "n": str(row.n), **_cells(row)}
+        for c in report.comparisons
+        if c.before in report.conditions[:2]
+        for severity, row in c.by_severity.items()
+    ]
+    return Table.of(f"{GROUPS[group]}: paired tests by degree of loss, p not adjusted", rows)
+
+
+def loudness_table(result: Result, group: str) -> Table:
+    """Level as heard against the normal ear's, a column an input level."""
+    rows = []
+    for name, row in result["groups"][group]["conditions"].items():
+        against = {name: "heard_off"}
+        if group == "noisy":
+            against[f"{name}, against the speech in it"] = "heard_off_clean"
+        rows += [
+            {
+                "What the ear is given": title,
+                **{
+                    f"Speech at {level} dB SPL": f"{cell[f'{key}_abs']:.1f} ({cell[key]:+.1f})"
+                    for level, cell in row["by_level"].items()
+                },
+            }
+            for title, key in against.items()
+        ]
+    return Table.of(f"{GROUPS[group]}: mean absolute difference in dB (mean difference)", rows)
+
+
+def severity_table(result: Result, group: str) -> Table:
+    """A row a degree of loss and condition."""
+    conditions = result["groups"][group]["conditions"]
+    first = next(iter(conditions.values()))["by_severity"]
+    rows = [
+        {
+            "Degree of loss": f"{severity}, {name}",
+            **_scores(row),
+            "HASPI over unaided": f"{row['haspi_mean'] - unaided['haspi_mean']:+.3f}",
+            "HASQI over unaided": f"{row['hasqi_mean'] - unaided['hasqi_mean']:+.3f}",
+            "Heard, mean absolute (dB)": f"{row['heard_off_abs']:.1f}",
+            "Bands (dB)": f"{row['band_error_mean']:.1f}",
+        }
+        for severity, unaided in first.items()
+        for name, condition in conditions.items()
+        for row in [condition["by_severity"][severity]]
+    ]
+    return Table.of(f"{GROUPS[group]}, by degree of loss", rows)
+
+
+def gap_table(result: Result) -> Table:
+    """The loss under the three simulators."""
+    titles = {"neuro": "Neuro-MSBG", "msbg": "exact MSBG", "pyclarity": "pyclarity"}
+    rows = [
+        {
+            "What the ear is given": f"{group}, {name}",
+            **{title: f"{row[f'loss_{simulator}']:.2f}" for simulator, title in titles.items()},
+            "Neuro to exact": _share(row["neuro_to_msbg"], "+.1%"),
+            "Neuro to pyclarity": _share(row["neuro_to_pyclarity"], "+.1%"),
+            "exact to pyclarity": _share(row["msbg_to_pyclarity"], "+.1%"),
+            "Neuro to pyclarity, median item": _share(row["item_median"], ".1%"),
+        }
+        for group, conditions in result["gap"].items()
+        for name, row in conditions.items()
+    ]
+    return Table.of("Mean loss in dB on the same utterances, and relative differences", rows)
+
+
+def peak_table(result: Result) -> Table:
+    """Highest peaks, and outputs beyond the limit."""
+    rows = [
+        {
+            "What the ear is given": name,
+            "Limit (dB SPL)": number(row["limit"], "g", "none"),
+            "Highest peak (dB SPL)": f"{row['highest']:.2f}",
+            "Outputs beyond": "n/a" if row["over"] is None else f"{row['over']} of {row['n']}",
+        }
+        for name, row in result["peaks"].items()
+    ]
+    return Table.of("Peaks of all outputs, a sample of 1.0 being 94 dB SPL", rows)
+
+
+def gain_table(curves: Sequence[Result]) -> Table:
+    """A row an ear, compensator and level; gains between the bands' centres go linearly over log frequency."""
+    shown = FREQUENCIES[:-1]  # 8 kHz is beyond the bands
+    rows = [
+        (
+            f"{curve['ear']}, {curve['compensator']}, {level:g} dB SPL",
+            *(f"{gain:+.1f}" for gain in _gains_at(shown, curve, gains)),
+        )
+        for curve in curves
+        for level, gains in zip(curve["levels"], curve["gain_db"], strict=True)
+    ]
+    return Table("Insertion gain in dB", ("Ear, compensator, input", *(f"{hz:g} Hz" for hz in shown)), rows)
+
+
+def tone_table(found: Sequence[Result]) -> Table:
+    """A row an ear, compensator and level, with the worst sidebands of the row."""
+    rows = []
+    for row in found:
+        for level, offs, sidebands in zip(
+            row["levels"], row["heard_off_db"], row["sidebands_db"], strict=True
+        ):
+            worst = int(np.argmax(sidebands))
+            rows.append(
+                {
+                    "Ear, compensator, input": f"{row['ear']}, {row['compensator']}, {level:g} dB SPL",
+                    **{f"{hz} Hz": f"{off:+.1f}" for hz, off in zip(row["frequencies"], offs, strict=True)},
+                    "Worst sidebands (of the tone)": f"{round(sidebands[worst])} ({row['frequencies'][worst]} Hz)",
+                }
+            )
+    return Table.of(
+        "Level heard less a normal ear's of the same tone, and sidebands of the output, in dB", rows
+    )
+
+
+def shift_table(found: Sequence[Result]) -> Table:
+    """A row a compensator."""
+    rows = [
+        {
+            "What the ear is given": row["compensator"],
+            "n": str(np.size(row["difference_db"])),
+            "Median": f"{np.median(row['difference_db']):.0f}",
+            "Worst": f"{np.max(row['difference_db']):.0f}",
+        }
+        for row in found
+    ]
+    return Table.of("Difference of the outputs relative to the output, in dB", rows)
+
+
+def _gain_picture(ear: str, curves: Sequence[Result]) -> Picture:
+    curves = [curve for curve in curves if curve["ear"] == ear]
+
+    def draw(axes: Any) -> None:
+        for k, curve in enumerate(curves):
+            for style, level, gains in zip(
+                ("-", "--", ":", "-."), curve["levels"], curve["gain_db"], strict=False
+            ):
+                label = plain(f"{curve['compensator'][:18]}, {level:g}")
+                axes.plot(curve["frequencies"], gains, style, color=f"C{k}", label=label)
+        axes.set(ylabel="insertion gain (dB)")
+        frequency_axis(axes, (250, 500, 1000, 2000, 4000))
+        axes.legend(fontsize="x-small")
+
+    at_2k = [
+        f"{curve['compensator']} "
+        + ", ".join(f"{_gains_at(2000.0, curve, row):.0f}" for row in curve["gain_db"])
+        for curve in curves
+    ]
+    levels = ", ".join(f"{level:g}" for level in curves[0]["levels"])
+    alt = f"Insertion gain for {ear} over frequency; at 2 kHz and {levels} dB SPL: {'; '.join(at_2k)} dB."
+    return Picture(draw_svg(draw), alt, f"{ear}; the legend tells the input level in dB SPL.")
+
+
+def _share(value: float | None, form: str) -> str:
+    return number(value, form).replace("%", " %")
+
+
+def _gains_at(hertz: Any, curve: Result, gains: Sequence[float]) -> Any:
+    return np.interp(np.log(hertz), np.log(curve["frequencies"]), gains)
+
+
+def _scores(row: Result) -> dict[str, str]:
+    means = {
+        f"{name.upper()} (mean ± std)": spread(row[f"{name}_mean"], row[f"{name}_std"])
+        for name in ("haspi", "hasqi")
+    }
+    return {"n": str(row["n"]), **means}

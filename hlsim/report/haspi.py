@@ -1,17 +1,18 @@
-"""A report's files, written whole or not at all."""
+"""A HASPI report as JSON, Markdown, LaTeX, one HTML page and a picture."""
 
 from __future__ import annotations
 
 import json
-import os
-import shutil
-import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 
-from hlsim.evaluation.scores import HaspiReport
-from hlsim.report.haspi_page import html
-from hlsim.report.haspi_text import latex
-from hlsim.report.pictures import draw_report
+from hlsim.audiogram import SEVERITIES
+from hlsim.evaluation.haspi_report import HaspiReport
+from hlsim.metrics.registry import MEASURES
+from hlsim.report.listening import listening_section
+from hlsim.report.page import Picture, Section, render_markdown, render_page, write_files
+from hlsim.report.pictures import draw_report, report_pictures
+from hlsim.report.tables import Table, comparisons_table, listener_table, number, paper_table, severity_table
 
 REPORT_FILES = ("report.json", "report.md", "report.tex", "report.html", "before-after.png")
 
@@ -19,8 +20,7 @@ REPORT_FILES = ("report.json", "report.md", "report.tex", "report.html", "before
 def write_report(report: HaspiReport, out_dir: str | Path, *, listen: int = 3) -> Path:
     """Write ``report.json``, ``.md``, ``.tex``, ``.html`` and ``before-after.png`` into a folder, there or not.
 
-    All are written into a hidden folder in it first and then moved, so that no file is ever half there. Reports of an
-    earlier run are replaced, other files stay.
+    Reports of an earlier run are replaced, other files stay.
 
     Args:
         listen: how many items the page shows with spectrograms and players, where their files are known.
@@ -32,43 +32,120 @@ def write_report(report: HaspiReport, out_dir: str | Path, *, listen: int = 3) -
             as NaN.
         MissingExtraError: matplotlib is not installed.
     """
-    out = check_out(out_dir)
     try:
         text = json.dumps(report.to_dict(), indent=2, ensure_ascii=False, allow_nan=False)
     except (TypeError, ValueError) as error:
         raise ValueError(f"report cannot be written as JSON: {error}") from error
-    texts = {
-        "report.json": text + "\n",
-        "report.md": report.to_markdown(),
-        "report.tex": latex(report),
-        "report.html": html(report, listen),
-    }
-    partial, there = None, out.exists()
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        # in it, not beside it: it may be the root of a drive
-        partial = Path(tempfile.mkdtemp(prefix=".report.", suffix=".part", dir=out))
-        for name, content in texts.items():
-            (partial / name).write_text(content, encoding="utf-8")
-        draw_report(report, partial / "before-after.png")
-        for name in REPORT_FILES:
-            (partial / name).replace(out / name)
-    except OSError as error:
-        raise ValueError(f"{out}: report cannot be written ({error})") from error
-    finally:
-        if partial is not None:
-            shutil.rmtree(partial, ignore_errors=True)
-        if not there and out.is_dir() and not any(out.iterdir()):
-            out.rmdir()
-    return out
+    contents = (text + "\n", markdown(report), latex(report), html(report, listen), draw_report(report))
+    return write_files(out_dir, dict(zip(REPORT_FILES, contents, strict=True)))
 
 
-def check_out(out_dir: str | Path) -> Path:
-    """The folder that a report goes to, or ValueError where it cannot be: to be known before hours of scoring."""
-    out = Path(out_dir).absolute()
-    there = next(path for path in (out, *out.parents) if path.exists())
-    if not there.is_dir():
-        raise ValueError(f"{there}: not a folder; a report needs a folder, there or not")
-    if not os.access(there, os.W_OK | os.X_OK):
-        raise ValueError(f"{there}: no permission to write a report there")
-    return out
+def markdown(report: HaspiReport) -> str:
+    """What ``report.md`` says: the page without its pictures, what is heard, and the table of all items."""
+    picture = f"![{report.headline.title} and level, before against after](before-after.png)"
+    return render_markdown(_title(report), _sections(report), f"{_lead(report)}\n\n{picture}")
+
+
+def html(report: HaspiReport, listen: int = 3) -> str:
+    """What ``report.html`` says.
+
+    Args:
+        listen: how many items have spectrograms and players, where their files are known.
+
+    Raises:
+        MissingExtraError: matplotlib is not installed.
+    """
+    sections = _sections(report, report_pictures(report), listening_section(report, listen))
+    return render_page(_title(report), sections, _lead(report))
+
+
+def latex(report: HaspiReport) -> str:
+    """What ``report.tex`` says: tables for ``\\input``, which need the package booktabs."""
+    comments = (f"{_title(report)}. Needs \\usepackage{{booktabs}}.", *_notes(report))
+    tables = [paper_table(report.headline), severity_table(report.headline), *_further(report)]
+    return "".join(f"% {line}\n" for line in comments) + "\n".join(table.latex() for table in tables)
+
+
+def _title(report: HaspiReport) -> str:
+    measures = ", ".join(MEASURES[name].title for name in report.measures)
+    if list(report.conditions) == ["before", "after"]:
+        return f"{measures} before and after"
+    return f"{measures}: {', '.join(report.conditions)}"
+
+
+def _lead(report: HaspiReport) -> str:
+    return f"{report.comparison.n} items. {report.note}".rstrip()
+
+
+def _sections(
+    report: HaspiReport, pictures: Sequence[Picture] = (), listening: Section | None = None
+) -> list[Section]:
+    headline = report.headline
+    sections = [Section("Result", [headline.in_words()], [paper_table(headline)])]
+    if pictures:
+        sections.append(Section("Pictures", pictures=pictures))
+    sections.append(Section("By degree of loss", tables=[severity_table(headline)]))
+    if further := _further(report):
+        others = [c.in_short() for c in report.comparisons if c is not headline]
+        sections.append(Section("Listeners and further comparisons", others, further))
+    if report.failures:
+        rows = [(f.file, f.condition, MEASURES[f.measure].title, f.reason) for f in report.failures]
+        table = Table("Scores that could not be made", ("Item", "Condition", "Measure", "Reason"), rows)
+        sections.append(Section("Failures", tables=[table]))
+    if listening is not None:
+        sections.append(listening)
+    sections.append(Section("How the figures were made", _notes(report)))
+    return [*sections, Section("All items", tables=[_items(report)], folded=True)]
+
+
+def _further(report: HaspiReport) -> list[Table]:
+    tables = [listener_table(report.headline)]
+    if len(report.comparisons) > 1:
+        tables.append(comparisons_table(report.comparisons))
+    return [table for table in tables if table is not None]
+
+
+def _items(report: HaspiReport) -> Table:
+    header = ["Item", "Loss", "Clean (dB SPL)", "Full scale (dB SPL)"]
+    for condition in report.conditions:
+        header += [f"{MEASURES[measure].title}, {condition}" for measure in report.measures]
+        header.append(f"dB SPL, {condition}")
+    rows = []
+    for item in report.items:
+        row = [item.file, item.severity, f"{item.clean_level:.1f}", f"{item.full_scale_spl:.1f}"]
+        for condition in report.conditions:
+            row += [number(item.scores.get(name, {}).get(condition), ".3f") for name in report.measures]
+            row.append(number(item.levels[condition], ".1f"))
+        rows.append(row)
+    return Table("Scores and levels of every item", header, rows)
+
+
+def _notes(report: HaspiReport) -> list[str]:
+    """How the figures were made, a sentence or two each."""
+    degrees = report.severities
+    ears = ", ".join(f"{name} {degrees.count(name)}" for name in SEVERITIES if name in degrees)
+    listeners = len({item.listener for item in report.items if item.listener})
+    scales = [item.full_scale_spl for item in report.items]
+    scale = f"{min(scales):.1f} to {max(scales):.1f} dB SPL, by item"
+    if report.full_scale_spl is not None:
+        scale = f"{report.full_scale_spl:g} dB SPL"
+    mixed = report.headline.mixed
+    versions = ", ".join(f"{name} {version}" for name, version in report.versions.items())
+    return [
+        f"Degrees of hearing loss: {ears}. {f'Listeners: {listeners}. ' if listeners else ''}"
+        f"Clean speech at {report.clean_level_mean:.1f} dB SPL on average. A signal of RMS 1.0 is taken as {scale}.",
+        "Changes are after minus before, so a gain is positive. Deviations with n - 1; tests two-sided; "
+        "d is the mean difference over the deviation of the differences, t / sqrt(n). "
+        "Intervals are percentiles of 9999 bootstrap resamples, expanded for few items (Hesterberg 2015); under six "
+        "there is none.",
+        f"Wilcoxon: zero differences dropped ({report.comparison.zeros} of {report.comparison.n}; scipy's zero_method "
+        '"wilcox"); W is the smaller rank sum.',
+        "Tests and intervals take the items as independent; where several share a talker or a listener, p is too small "
+        "and the interval too narrow.",
+        f"No mixed model: {mixed}."
+        if isinstance(mixed, str)
+        else "Mixed model: difference = mean + listener's deviation + residual, by REML, Wald test"
+        + (f" ({mixed.note})." if mixed.note else "."),
+        f"Numpy's seed {report.seed}; each item's seed is in report.json. {versions}.",
+        *(f"{name}: {value}" for name, value in report.extra.items() if isinstance(value, str | int | float)),
+    ]

@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-import io
-from typing import TYPE_CHECKING
-
+import numpy as np
 import torch
 from torch import Tensor
 
 from hlsim.audio import encode_flac
 from hlsim.calibration import gain_to_pascals, level_spl
+from hlsim.evaluation.haspi_report import HaspiReport
+from hlsim.evaluation.scores import ItemScore
 from hlsim.evaluation.scoring import read_channel
 from hlsim.msbg.model import MSBG
 from hlsim.report.page import Picture, Player, Section
 from hlsim.report.pictures import draw_spectrograms
-
-if TYPE_CHECKING:
-    from hlsim.evaluation.scores import HaspiReport, ItemScore
 
 LONGEST_SECONDS = 8.0
 """Of an item in a page: longer ones are cut there."""
@@ -26,19 +23,18 @@ _PEAK = 0.9
 
 def choose_items(report: HaspiReport, count: int) -> list[tuple[str, ItemScore]]:
     """Items spread over the headline's change, from the largest rise to the largest fall, with the reason for each."""
-    c = report.headline
-    changes = []
-    for item in report.items:
-        scores = item.scores.get(c.measure, {})
-        if c.before in scores and c.after in scores and item.clean is not None:
-            changes.append((scores[c.after] - scores[c.before], item))
+    scores = report.scores(report.headline.measure, (report.headline.before, report.headline.after))
+    changes = [
+        (after - before, item)
+        for (before, after), item in zip(scores.tolist(), report.items, strict=True)
+        if item.clean is not None and before == before and after == after
+    ]
     changes.sort(key=lambda pair: -pair[0])
-    count = min(count, len(changes))
-    if count < 1:
-        return []
-    places = [0] if count == 1 else [round(i * (len(changes) - 1) / (count - 1)) for i in range(count)]
-    chosen = [(place + 1, *changes[place]) for place in places]
-    return [(f"rank {rank} of {len(changes)}, change {change:+.3f}", item) for rank, change, item in chosen]
+    chosen = np.linspace(0, len(changes) - 1, max(0, min(count, len(changes)))).round().astype(int)
+    return [
+        (f"rank {place + 1} of {len(changes)}, change {changes[place][0]:+.3f}", changes[place][1])
+        for place in chosen
+    ]
 
 
 def heard(item: ItemScore) -> tuple[dict[str, Tensor], int]:
@@ -71,37 +67,9 @@ def listening_section(report: HaspiReport, count: int) -> Section | None:
     for reason, item in choose_items(report, count):
         title = f"{item.file} ({reason})"
         try:
-            signals, rate = heard(item)
+            sections.append(_item_section(title, item))
         except ValueError as error:
-            sections.append(Section(title, paragraphs=[f"Not to be heard here: {error}"]))
-            continue
-        peak = max(float(signal.abs().max()) for signal in signals.values())
-        if peak == 0.0:  # speech that begins later is scored, but cut away here
-            reason = f"the first {LONGEST_SECONDS:g} s are silent"
-            sections.append(Section(title, paragraphs=[f"Not to be heard here: {reason}"]))
-            continue
-        levels = {name: float(level_spl(signal)) for name, signal in signals.items()}
-        # one gain for all: what is softer in the ear is softer here
-        players = [
-            Player(encode_flac(signal * (_PEAK / peak), rate), f"{name} ({levels[name]:.0f} dB SPL)")
-            for name, signal in signals.items()
-        ]
-        picture = io.BytesIO()
-        draw_spectrograms(signals, rate, picture, width=5.0)
-        alt = f"Spectrograms of {item.file}: " + ", ".join(signals)
-        levels_text = ", ".join(f"{name} {level:.1f}" for name, level in levels.items())
-        sections.append(
-            Section(
-                title,
-                paragraphs=[
-                    f"{item.audiogram.severity} loss, thresholds "
-                    + ", ".join(f"{level:g}" for level in item.audiogram.levels)
-                    + f" dB HL. Levels in dB SPL: {levels_text}."
-                ],
-                pictures=[Picture(picture.getvalue(), alt)],
-                players=players,
-            )
-        )
+            sections.append(Section(title, [f"Not to be heard here: {error}"]))
     if not sections:
         return None
     return Section(
@@ -112,4 +80,24 @@ def listening_section(report: HaspiReport, count: int) -> Section | None:
             f"Items longer than {LONGEST_SECONDS:g} s are cut."
         ],
         sections=sections,
+    )
+
+
+def _item_section(title: str, item: ItemScore) -> Section:
+    signals, rate = heard(item)
+    peak = max(float(signal.abs().max()) for signal in signals.values())
+    if peak == 0.0:  # speech that begins later is scored, but cut away here
+        raise ValueError(f"the first {LONGEST_SECONDS:g} s are silent")
+    levels = {name: float(level_spl(signal)) for name, signal in signals.items()}
+    # one gain for all: what is softer in the ear is softer here
+    players = [
+        Player(encode_flac(signal * (_PEAK / peak), rate), f"{name} ({levels[name]:.0f} dB SPL)")
+        for name, signal in signals.items()
+    ]
+    told = ", ".join(f"{name} {level:.1f}" for name, level in levels.items())
+    thresholds = ", ".join(f"{level:g}" for level in item.audiogram.levels)
+    text = f"{item.severity} loss, thresholds {thresholds} dB HL. Levels in dB SPL: {told}."
+    alt = f"Spectrograms of {item.file}: {', '.join(signals)}"
+    return Section(
+        title, [text], pictures=[Picture(draw_spectrograms(signals, rate, width=5.0), alt)], players=players
     )

@@ -1,68 +1,45 @@
-"""Pictures: a HASPI report, and spectrograms."""
+"""Pictures: of a HASPI report, narrow enough to be read on a phone, and spectrograms.
+
+All raise MissingExtraError where matplotlib is not installed.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO
+import io
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from hlsim.audiogram import SEVERITIES
+from hlsim.audiogram import FREQUENCIES, SEVERITIES
 from hlsim.calibration import PASCAL_SPL
+from hlsim.evaluation.haspi_report import HaspiReport
+from hlsim.evaluation.statistics import FEWEST, bootstrap_interval
 from hlsim.extras import require
+from hlsim.report.page import Picture
+from hlsim.report.tables import loss_name
 
-if TYPE_CHECKING:
-    from hlsim.evaluation.scores import HaspiReport
+_MANY = 2000  # points beyond which they are drawn as pixels: the page stays small
 
 
-def draw_report(report: HaspiReport, path: str | Path) -> None:
-    """Write a PNG of score and level of the headline, after over before: a dashed line of no change, a colour a severity.
+def draw_svg(draw: Callable[[Any], None]) -> bytes:
+    """The SVG of what ``draw`` puts on a matplotlib axes."""
+    figure = new_figure((4.2, 3.5))
+    draw(figure.subplots())
+    data = io.BytesIO()
+    # the same figures give the same bytes
+    with require("matplotlib", "eval").rc_context({"svg.hashsalt": "hlsim"}):
+        figure.savefig(data, format="svg", dpi=150, metadata={"Date": None})
+    return data.getvalue()
 
-    Raises:
-        MissingExtraError: matplotlib is not installed.
-    """
-    # the figure by itself, drawn by Agg: without pyplot there is no window and no global state
-    figure = require("matplotlib.figure", "eval").Figure(figsize=(9.0, 4.8), layout="constrained")
+
+def new_figure(inches: tuple[float, float]) -> Any:
+    """A matplotlib figure by itself, drawn by Agg: without pyplot there is no window and no global state."""
+    figure = require("matplotlib.figure", "eval").Figure(figsize=inches, layout="constrained")
     require("matplotlib.backends.backend_agg", "eval").FigureCanvasAgg(figure)
-    first, last = report.headline.before, report.headline.after
-    items = [
-        item for item in report.items if {first, last} <= item.scores.get(report.headline.measure, {}).keys()
-    ]
-    name = report.headline.title
-    scores = [tuple(item.scores[report.headline.measure][end] for end in (first, last)) for item in items]
-    levels = [tuple(float(item.levels[end] or 0.0) for end in (first, last)) for item in items]
-    lowest, highest = min(map(min, levels)) - 3.0, max(map(max, levels)) + 3.0
-    c = report.comparison
-    panels = (
-        (
-            scores,
-            score_range(report.headline.measure),
-            name,
-            f"mean {c.before_mean:.3f} to {c.after_mean:.3f}",
-        ),
-        (
-            levels,
-            (lowest, highest),
-            "Level (dB SPL)",
-            f"mean {report.before_level_mean:.1f} to {report.after_level_mean:.1f} dB SPL",
-        ),
-    )
-    severities = [item.audiogram.severity for item in items]
-    for axes, (points, limits, what, title) in zip(figure.subplots(1, 2), panels, strict=True):
-        axes.plot(limits, limits, color="0.5", linewidth=1.0, linestyle="--", label="no change")
-        for number, severity in enumerate(SEVERITIES):
-            chosen = [point for point, own in zip(points, severities, strict=True) if own == severity]
-            if chosen:
-                before, after = zip(*chosen, strict=True)
-                label = "no loss" if severity == "none" else f"{severity} loss"
-                axes.scatter(before, after, s=18, alpha=0.7, color=f"C{number}", label=label)
-        axes.set(xlim=limits, ylim=limits, aspect="equal", title=title)
-        axes.set(xlabel=plain(f"{what}, {first}"), ylabel=plain(f"{what}, {last}"))
-        axes.legend(fontsize="small")
-    figure.suptitle(plain(f"{c.n} items, {first} and {last}"))
-    figure.savefig(path, dpi=150, format="png")
+    return figure
 
 
 def plain(text: str) -> str:
@@ -71,29 +48,35 @@ def plain(text: str) -> str:
     return f"\u200b{text}" if text.startswith("_") else text
 
 
-def score_range(measure: str) -> tuple[float, float]:
-    """The axis of a measure."""
-    return (0.9, 4.7) if measure == "pesq" else (-0.03, 1.03)
-
-
-def draw_spectrograms(
-    signals: Mapping[str, Tensor], sample_rate: int, path: str | Path | BinaryIO, *, width: float = 9.0
+def scatter(
+    axes: Any, x: np.ndarray, y: np.ndarray, severities: Sequence[str], same: str = "no change"
 ) -> None:
-    """Write a PNG of log-magnitude spectrograms, one a signal, on one scale of dB SPL.
+    """Points, a colour a degree of loss, and a dashed line where both are the same; NaN is not drawn."""
+    axes.axline((1.0, 1.0), slope=1.0, color="0.5", linewidth=1.0, linestyle="--", label=same)
+    there, degrees = np.isfinite(x + y), np.array(severities)
+    for number, severity in enumerate(SEVERITIES):
+        chosen = there & (degrees == severity)
+        if chosen.any():
+            style = {"color": f"C{number}", "label": loss_name(severity), "rasterized": chosen.sum() > _MANY}
+            axes.scatter(x[chosen], y[chosen], s=14, alpha=0.7, **style)
+    axes.legend(fontsize="small")
 
-    Args:
-        path: or an open binary file.
-        width: inches.
+
+def frequency_axis(axes: Any, hertz: Iterable[float]) -> None:
+    """A logarithmic axis in kHz."""
+    ticks = [*hertz]
+    axes.set(xscale="log", xlabel="frequency (kHz)")
+    axes.set_xticks(ticks, [f"{hz / 1000:g}" for hz in ticks])
+    axes.minorticks_off()
+    axes.grid(alpha=0.3)
+
+
+def draw_spectrograms(signals: Mapping[str, Tensor], sample_rate: int, *, width: float = 9.0) -> bytes:
+    """The PNG of log-magnitude spectrograms, one a signal, on one scale of dB SPL; ``width`` is in inches.
 
     Shape: (time,) each, in pascals.
-
-    Raises:
-        MissingExtraError: matplotlib is not installed.
     """
-    figure = require("matplotlib.figure", "eval").Figure(
-        figsize=(width, 2.2 * len(signals)), layout="constrained"
-    )
-    require("matplotlib.backends.backend_agg", "eval").FigureCanvasAgg(figure)
+    figure = new_figure((width, 2.2 * len(signals)))
     points = 2 * (sample_rate // 100)  # 20 ms
     window = torch.hann_window(points)
     panels = figure.subplots(len(signals), 1, sharex=True, sharey=True, squeeze=False)[:, 0]
@@ -112,4 +95,192 @@ def draw_spectrograms(
         axes.set(title=plain(name), ylabel="kHz", ylim=(0.0, min(10.0, sample_rate / 2000.0)))
     panels[-1].set(xlabel="s")
     figure.colorbar(image, ax=list(panels), label="dB SPL in a bin", aspect=40)
-    figure.savefig(path, dpi=110, format="png")
+    return _png(figure, 110)
+
+
+def draw_report(report: HaspiReport) -> bytes:
+    """The PNG of score and level of the headline, after over before."""
+    figure, c = new_figure((9.0, 4.8)), report.headline
+    scores, levels = report.scores(c.measure, (c.before, c.after)), report.levels((c.before, c.after))
+    levels[np.isnan(scores).any(1)] = np.nan
+    ends = (float(np.nanmin(levels)) - 3.0, float(np.nanmax(levels)) + 3.0)
+    left, right = figure.subplots(1, 2)
+    _draw_ends(left, report, scores, score_range(c.measure), c.title)
+    left.set(title=f"mean {c.overall.before_mean:.3f} to {c.overall.after_mean:.3f}")
+    _draw_ends(right, report, levels, ends, "Level (dB SPL)")
+    right.set(title=f"mean {report.before_level_mean:.1f} to {report.after_level_mean:.1f} dB SPL")
+    figure.suptitle(plain(f"{c.overall.n} items, {c.before} and {c.after}"))
+    return _png(figure, 150)
+
+
+def score_range(measure: str) -> tuple[float, float]:
+    """The axis of a measure."""
+    return (0.9, 4.7) if measure == "pesq" else (-0.03, 1.03)
+
+
+def report_pictures(report: HaspiReport) -> list[Picture]:
+    """Before against after, change of level, distributions, by severity, by SNR (where there are any), the audiograms."""
+    pictures = [_before_after(report), _levels(report), _distributions(report), _by_severity(report)]
+    if any(item.snr is not None for item in report.items):
+        pictures.append(_by_snr(report))
+    return [*pictures, _audiograms(report)]
+
+
+def _before_after(report: HaspiReport) -> Picture:
+    c = report.headline
+    scores = report.scores(c.measure, (c.before, c.after))
+    data = draw_svg(lambda axes: _draw_ends(axes, report, scores, score_range(c.measure), c.title))
+    alt = (
+        f"{c.title} {c.after} over {c.title} {c.before}, {c.overall.n} items: mean {c.overall.before_mean:.3f} to "
+        f"{c.overall.after_mean:.3f}."
+    )
+    return Picture(data, alt, "Each point is an item; above the dashed line the score rose.")
+
+
+def _draw_ends(
+    axes: Any, report: HaspiReport, values: np.ndarray, limits: tuple[float, float], what: str
+) -> None:
+    """The headline's conditions, after over before. Shape: (items, 2)."""
+    scatter(axes, values[:, 0], values[:, 1], report.severities)
+    axes.set(xlim=limits, ylim=limits, aspect="equal")
+    axes.set(
+        xlabel=plain(f"{what}, {report.headline.before}"), ylabel=plain(f"{what}, {report.headline.after}")
+    )
+
+
+def _levels(report: HaspiReport) -> Picture:
+    c, ends = report.headline, (report.headline.before, report.headline.after)
+    x, y = (np.diff(values)[:, 0] for values in (report.levels(ends), report.scores(c.measure, ends)))
+    there = np.isfinite(x + y)
+    x, y = x[there], y[there]
+
+    def draw(axes: Any) -> None:
+        axes.axhline(0.0, color="0.5", linewidth=1.0, linestyle="--")
+        axes.scatter(x, y, s=14, alpha=0.7, rasterized=len(x) > _MANY)
+        axes.set_xlim(min(x.min(), 0.0) - 1.0, max(x.max(), 0.0) + 1.0)
+        axes.set(xlabel="change of level (dB)", ylabel=f"change of {c.title}")
+
+    alt = f"Change of {c.title} over the change of level; the level changed by {x.min():+.1f} to {x.max():+.1f} dB."
+    return Picture(
+        draw_svg(draw), alt, "What gain may explain: the change of the score over that of the level."
+    )
+
+
+def _distributions(report: HaspiReport) -> Picture:
+    measure, title = report.measures[0], report.headline.title
+    values = [_known(column) for column in report.scores(measure).T]
+    labels = [plain(name if len(name) < 13 else name[:11] + "…") for name in report.conditions]
+
+    def draw(axes: Any) -> None:
+        generator = np.random.default_rng(0)
+        places = range(1, len(values) + 1)
+        axes.boxplot(values, positions=places, widths=0.5, showfliers=False, medianprops={"color": "black"})
+        for place, group in zip(places, values, strict=True):
+            shift = generator.uniform(-0.18, 0.18, len(group))
+            axes.scatter(place + shift, group, s=7, alpha=0.4, linewidths=0, rasterized=len(group) > _MANY)
+        axes.set_xticks(list(places), labels)
+        axes.set(ylim=score_range(measure), ylabel=title)
+
+    medians = ", ".join(
+        f"{name} {np.median(group):.3f}"
+        for name, group in zip(report.conditions, values, strict=True)
+        if len(group)
+    )
+    alt = f"{title} by condition; medians: {medians}."
+    return Picture(draw_svg(draw), alt, "Quartiles, median and every item.")
+
+
+def _by_severity(report: HaspiReport) -> Picture:
+    title = f"mean {report.headline.title}"
+    groups = _groups(report, report.severities, [name for name in SEVERITIES if name in report.severities])
+
+    def draw(axes: Any) -> None:
+        width = 0.8 / len(report.conditions)
+        for k, condition in enumerate(report.conditions):
+            at = np.arange(len(groups)) + (k - (len(report.conditions) - 1) / 2) * width
+            scores = [_known(group[:, k]) for group in groups.values()]
+            axes.bar(at, [_mean(group) for group in scores], width * 0.9, label=plain(condition))
+            for place, group in zip(at, scores, strict=True):
+                if len(group) >= FEWEST:
+                    axes.plot((place, place), bootstrap_interval(group), color="black", linewidth=1.0)
+        axes.set_xticks(range(len(groups)), [f"{name} ({len(group)})" for name, group in groups.items()])
+        axes.set(ylim=(0.0, score_range(report.measures[0])[1]), ylabel=title, xlabel="loss (items)")
+        axes.legend(fontsize="small")
+
+    caption = (
+        "By degree of loss, of the items that have each score, with 95 % bootstrap intervals of the means from "
+        f"{FEWEST} items on."
+    )
+    alt = f"Mean {report.headline.title} by degree of loss: {_in_words(report, groups)}."
+    return Picture(draw_svg(draw), alt, caption)
+
+
+def _by_snr(report: HaspiReport) -> Picture:
+    title, of_items = f"mean {report.headline.title}", [item.snr for item in report.items]
+    snrs = sorted({snr for snr in of_items if snr is not None})
+    groups = _groups(report, of_items, snrs)
+
+    def draw(axes: Any) -> None:
+        for k, condition in enumerate(report.conditions):
+            axes.plot(
+                snrs,
+                [_mean(_known(group[:, k])) for group in groups.values()],
+                marker="o",
+                label=plain(condition),
+            )
+        axes.set(xlabel="SNR (dB)", ylabel=title, ylim=score_range(report.measures[0]))
+        axes.legend(fontsize="small")
+
+    told = _in_words(report, {f"{snr:g} dB": group for snr, group in groups.items()})
+    alt = f"Mean {report.headline.title} by SNR: {told}."
+    return Picture(draw_svg(draw), alt, "By SNR, of the items that have each score.")
+
+
+def _audiograms(report: HaspiReport) -> Picture:
+    ears = list(dict.fromkeys(item.audiogram for item in report.items))
+
+    def draw(axes: Any) -> None:
+        for ear in ears:
+            axes.plot(ear.frequencies, ear.levels, color="C0", alpha=max(0.15, 1.0 / len(ears)), marker=".")
+        if len(ears) > 1:
+            axes.plot(
+                FREQUENCIES, np.mean([ear.thresholds for ear in ears], axis=0), color="black", label="mean"
+            )
+            axes.legend(fontsize="small")
+        axes.set(ylim=(125.0, -15.0), ylabel="threshold (dB HL)")
+        frequency_axis(axes, (250, 500, 1000, 2000, 4000, 8000))
+
+    return Picture(
+        draw_svg(draw), f"Audiograms of {len(ears)} ears.", f"Audiograms: {len(ears)} different ears."
+    )
+
+
+def _groups(report: HaspiReport, of_items: Sequence[Any], names: Sequence[Any]) -> dict[Any, np.ndarray]:
+    """Scores of the first measure by what the items are. Shape: (items, conditions) each."""
+    scores = report.scores(report.measures[0])
+    return {name: scores[[group == name for group in of_items]] for name in names}
+
+
+def _in_words(report: HaspiReport, groups: Mapping[str, np.ndarray]) -> str:
+    """Each condition's mean of each group."""
+    told = []
+    for name, group in groups.items():
+        means = zip(report.conditions, map(_mean, map(_known, group.T)), strict=True)
+        told.append(
+            f"{name}: " + ", ".join(f"{c} " + ("n/a" if np.isnan(m) else f"{m:.3f}") for c, m in means)
+        )
+    return "; ".join(told)
+
+
+def _known(values: np.ndarray) -> np.ndarray:
+    return values[np.isfinite(values)]
+
+
+def _mean(values: np.ndarray) -> float:
+    return float(values.mean()) if len(values) else float("nan")
+
+
+def _png(figure: Any, dpi: int) -> bytes:
+    data = io.BytesIO()
+    figure.savefig(data, dpi=dpi, format="png")
+    return data.getvalue()

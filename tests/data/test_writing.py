@@ -81,11 +81,11 @@ def test_workers_elsewhere_are_told_whole_paths(plan: Path, monkeypatch: pytest.
     monkeypatch.chdir(plan.parent)
     told: list[Any] = []
 
-    def keep(task: Any, numbers: Any, **_: Any) -> Any:
+    def keep(task: Any, *_: Any, **__: Any) -> dict[str, str]:
         told.extend(task.args[:2])
-        return iter(())
+        return {}
 
-    monkeypatch.setattr("hlsim.data.writing.run_parallel", keep)
+    monkeypatch.setattr("hlsim.data.writing.make_missing", keep)
     write_instances(plan.name, Recipe(), root="vbd")
     assert told == [str(plan), str(plan.parent / "vbd")]
 

@@ -18,21 +18,19 @@ from hlsim.criteria.bands import band_edges
 from hlsim.evaluation import compensators, judging, steadiness
 from hlsim.evaluation.compensators import evaluate_compensators
 from hlsim.evaluation.gain_curves import insertion_gain
+from hlsim.evaluation.items import INPUT_LEVELS, draw_judged_items, read_ears
 from hlsim.evaluation.judging import (
-    INPUT_LEVELS,
-    Judged,
-    Task,
+    Keys,
+    Trial,
     Unaided,
     band_error_db,
-    draw_judged_items,
     judge,
     peak_spl,
-    read_ears,
 )
 from hlsim.evaluation.statistics import paired_comparison
 from hlsim.metrics.pyclarity import haspi, hasqi
 from hlsim.pretrained import find_checkpoint, save_checkpoint
-from hlsim.report.compensators import FILES
+from hlsim.report.compensators import FILES, write_compensators
 
 pytest.importorskip("clarity")
 pytest.importorskip("matplotlib")
@@ -132,9 +130,10 @@ def test_figures_are_those_of_the_measures_and_the_loss(speech_dir: Path) -> Non
         speech_dir / "valid", speech_dir / "train", [("N3", ear)], items=2, seconds=0.8, seed=0
     )
     neuro = load_pretrained("neuro-msbg")
-    judged = judge(Task(0, item, {"NAL-R": NALR()}, neuro, 7))["NAL-R"]
-    figures, aided = judged.figures, NALR()(item.signal, ear)
-    assert figures is not None and judged.reason == ""
+    trial = Trial(item, {"NAL-R": NALR()}, neuro, 7, {"NAL-R": Keys("most", "of network")})
+    judged, aided = judge(trial, ["most", "of network"]), NALR()(item.signal, ear)
+    assert isinstance(judged["most"], dict) and [*judged["of network"]] == ["loss_neuro"]
+    figures = judged["most"] | judged["of network"]
     assert figures["haspi"] == haspi(item.clean, aided, ear, 16000, seed=7)
     assert figures["hasqi"] == hasqi(item.clean, aided, ear, 16000, seed=7)
     for name, simulator in (("neuro", neuro), ("msbg", "msbg")):
@@ -182,13 +181,20 @@ def test_gain_curves(speech: list[tuple[Tensor, int]]) -> None:
         insertion_gain(Gain(math.nan), ear, utterances, INPUT_LEVELS)
 
 
+def compare(modules: dict[str, nn.Module], out: Path, **options: Any) -> dict[str, Any]:
+    """Judged and written, as the command does it."""
+    done = evaluate_compensators(modules, store=out / "scores.jsonl", **options)
+    write_compensators(done.result, done.reports, out)
+    return done.result
+
+
 @pytest.mark.usefixtures("quick")
 def test_report(tmp_path: Path, speech_dir: Path, ears_csv: Path) -> None:
     out = tmp_path / "out"
     limited = Gain(40.0)
     limited.config = MappingConfig(limit_spl=100.0)  # type: ignore[assignment]
     shown: list[tuple[int, int]] = []
-    result = evaluate_compensators(
+    result = compare(
         {"loud": limited, "broken": Broken()},
         speech=speech_dir / "valid",
         noise=speech_dir / "train",
@@ -272,25 +278,25 @@ def test_a_stopped_run_goes_on_and_new_weights_are_judged_anew(
         "seconds": 0.3,
         "jobs": 1,
     }
-    whole = evaluate_compensators({"own": Gain()}, **options, out=tmp_path / "whole")
+    whole = compare({"own": Gain()}, **options, out=tmp_path / "whole")
     original, calls = judging.judge, []
 
-    def counted(task: Task) -> dict[str, Judged]:
+    def counted(trial: Trial, missing: list[str]) -> Any:
         if len(calls) == 2:
             raise KeyboardInterrupt
-        calls.append([*task.compensators])
-        return original(task)
+        calls.append([name for name, keys in trial.keys.items() if {*keys} & {*missing}])
+        return original(trial, missing)
 
     monkeypatch.setattr(compensators, "judge", counted)
     parts = tmp_path / "parts"
     with pytest.raises(KeyboardInterrupt):
-        evaluate_compensators({"own": Gain()}, **options, out=parts)
+        compare({"own": Gain()}, **options, out=parts)
     assert [path.name for path in parts.iterdir()] == ["scores.jsonl"]
     calls[:] = [[]]  # one more is left before it stops again
-    assert evaluate_compensators({"own": Gain()}, **options, out=parts) == whole
+    assert compare({"own": Gain()}, **options, out=parts) == whole
     calls.clear()
     with pytest.raises(KeyboardInterrupt):
-        evaluate_compensators({"own": Gain(10.0)}, **options, out=parts)
+        compare({"own": Gain(10.0)}, **options, out=parts)
     assert calls == [["own"]] * 2  # of the others all is known
 
     # under another simulator nothing is new but the surrogate gap
@@ -299,7 +305,7 @@ def test_a_stopped_run_goes_on_and_new_weights_are_judged_anew(
     monkeypatch.setattr(compensators, "judge", original)
     monkeypatch.setattr(judging, "_figures", lambda *arguments: measured.append(1))
     folder = find_checkpoint("neuro-msbg-cnn")
-    other = evaluate_compensators({"own": Gain()}, **options, simulator=folder, out=parts)
+    other = compare({"own": Gain()}, **options, simulator=folder, out=parts)
     assert not measured
     assert f"with the Neuro-MSBG {folder}." in (parts / "compensators.md").read_text()
     for before, after in zip(whole["rows"], other["rows"], strict=True):
@@ -320,9 +326,7 @@ class OneAtATime(Gain):
 @pytest.mark.usefixtures("quick")
 def test_an_ear_without_a_loss_and_a_module_for_one_signal(tmp_path: Path, speech_dir: Path) -> None:
     options: dict[str, Any] = {"speech": speech_dir / "valid", "items": 2, "seconds": 0.3, "jobs": 1}
-    result = evaluate_compensators(
-        {"own": OneAtATime()}, **options, audiogram=Audiogram.standard("NH"), out=tmp_path
-    )
+    result = compare({"own": OneAtATime()}, **options, audiogram=Audiogram.standard("NH"), out=tmp_path)
     # nothing is lost of clean speech as it is: no loss to be relative to
     unaided = result["gap"]["clean"]["unaided"]
     assert unaided["loss_msbg"] == 0.0 and unaided["neuro_to_msbg"] is None and unaided["item_median"] is None
@@ -333,14 +337,14 @@ def test_nothing_to_judge(tmp_path: Path, speech_dir: Path) -> None:
     ear, folder = Audiogram.standard("N3"), speech_dir / "valid"
     options: dict[str, Any] = {"speech": folder, "out": tmp_path / "out", "jobs": 1}
     with pytest.raises(ValueError, match="named 'NAL-R'; allowed: other names"):
-        evaluate_compensators({"NAL-R": Unaided()}, **options, audiogram=ear)
+        compare({"NAL-R": Unaided()}, **options, audiogram=ear)
     with pytest.raises(ValueError, match="either audiograms, a CSV file of ears, or audiogram"):
-        evaluate_compensators({"own": Unaided()}, **options)
+        compare({"own": Unaided()}, **options)
     with pytest.raises(ValueError, match="0 compensators; allowed: 1 or more"):
-        evaluate_compensators({}, **options, audiogram=ear)
+        compare({}, **options, audiogram=ear)
     # HASPI takes nothing under 0.7 s
     with pytest.raises(ValueError, match=r"none of 1 items could be judged; the first: .*needs 0.7 s"):
-        evaluate_compensators({"own": Unaided()}, **options, audiogram=ear, items=1, seconds=0.5)
+        compare({"own": Unaided()}, **options, audiogram=ear, items=1, seconds=0.5)
     assert not (tmp_path / "out").exists()
 
 

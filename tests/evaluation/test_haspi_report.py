@@ -17,6 +17,8 @@ from hlsim.audiogram import Audiogram
 from hlsim.evaluation import HaspiReport, haspi_report
 from hlsim.evaluation.store import content_hash
 from hlsim.metrics.pyclarity import haspi
+from hlsim.report.haspi import write_report
+from hlsim.report.page import check_out
 
 for module in ("clarity", "joblib", "matplotlib"):
     pytest.importorskip(module)
@@ -42,8 +44,17 @@ def corpus(tmp_path: Path, speech_dir: Path) -> Path:
     return tmp_path
 
 
-def run(corpus: Path, audiogram: Audiogram | None = N4, **options: object) -> HaspiReport:
-    return haspi_report(corpus / "clean", corpus / "before", corpus / "after", audiogram, jobs=1, **options)
+def run(
+    corpus: Path, audiogram: Audiogram | None = N4, out: Path | None = None, **options: object
+) -> HaspiReport:
+    """As the command does, which joins both where there is a folder for the files."""
+    if "manifest" not in options:
+        options |= {name: corpus / name for name in ("clean", "before", "after")} | {"audiogram": audiogram}
+    if out is None:
+        return haspi_report(**options, jobs=1)
+    report = haspi_report(**options, store=check_out(out) / "scores.jsonl", jobs=1)
+    write_report(report, out)
+    return report
 
 
 def signal(path: Path) -> Tensor:
@@ -249,12 +260,12 @@ L2,right,loud,clean/p2/c.flac,gone.wav,0,S2,65
 
 def test_manifest_from_files_to_report(corpus: Path, quick: list[int]) -> None:
     (corpus / "study.csv").write_text(MANIFEST)
-    report = haspi_report(
+    report = run(
+        corpus,
         manifest=corpus / "study.csv",
         measures=("haspi", "stoi"),
         baseline="aided",
         out=corpus / "out",
-        jobs=1,
     )
     assert report.conditions == ("aided", "unaided", "loud") and report.measures == ("haspi", "stoi")
     assert [(c.before, c.after, c.overall.n) for c in report.comparisons[:2]] == [

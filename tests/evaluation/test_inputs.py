@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from hlsim.audiogram import Audiogram
-from hlsim.evaluation.inputs import inside, read_manifest
+from hlsim.evaluation.inputs import below_root, read_manifest
 
 N3 = Audiogram.standard("N3")
 
@@ -113,7 +113,7 @@ def test_no_path_leaves_the_root(tmp_path: Path, name: str) -> None:
         with pytest.raises(ValueError, match=f"line 2: {column} is '.*(which leaves|a path relative to)"):
             read_manifest(path, root)
     with pytest.raises(ValueError):
-        inside(root, name, "clean")
+        below_root(root, name, "clean")
 
 
 HEADER = "listener,ear,condition,clean,processed,audiogram,spl,full_scale_spl,snr"

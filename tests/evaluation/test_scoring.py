@@ -16,7 +16,7 @@ import torch
 
 from hlsim.audio import read_audio, write_audio
 from hlsim.audiogram import FREQUENCIES, Audiogram
-from hlsim.evaluation.scoring import Item, Results, score_items
+from hlsim.evaluation.scoring import FileItem, HaspiItem, Results, haspi_many, score_items
 from hlsim.evaluation.store import ScoreStore, content_hash
 from hlsim.metrics import registry as measures_module
 from hlsim.metrics.pyclarity import haspi
@@ -29,7 +29,7 @@ ALL = ("haspi", "hasqi", "stoi", "pesq")
 
 
 @pytest.fixture
-def items(tmp_path: Path, speech_dir: Path) -> list[Item]:
+def items(tmp_path: Path, speech_dir: Path) -> list[FileItem]:
     """Two utterances of 0.8 s at 16 kHz in two ears, noisy and the same 12 dB louder."""
     out = []
     for name, ear in (("flite-slt-01", "N3"), ("flite-slt-02", "S2")):
@@ -46,7 +46,7 @@ def items(tmp_path: Path, speech_dir: Path) -> list[Item]:
             paths[folder] = tmp_path / folder / f"{name}.wav"
             write_audio(paths[folder], signal_, rate)
         clean_path = paths.pop("clean")
-        out.append(Item(name, clean_path, paths, Audiogram.standard(ear)))
+        out.append(FileItem(name, clean_path, paths, Audiogram.standard(ear)))
     return out
 
 
@@ -58,7 +58,7 @@ def scores(results: Results) -> list[dict[tuple[str, str], float | None]]:
     return [{key: result.score for key, result in own.items()} for own in results]
 
 
-def test_equal_the_libraries_called_one_by_one(items: list[Item]) -> None:
+def test_equal_the_libraries_called_one_by_one(items: list[FileItem]) -> None:
     import pesq
     import pystoi
     from clarity.evaluator.haspi import haspi_v2
@@ -87,7 +87,7 @@ def test_equal_the_libraries_called_one_by_one(items: list[Item]) -> None:
         assert results["stoi", condition].seconds == 0.8
 
 
-def test_a_stored_score_has_the_seed_of_this_run(items: list[Item], tmp_path: Path) -> None:
+def test_a_stored_score_has_the_seed_of_this_run(items: list[FileItem], tmp_path: Path) -> None:
     """STOI knows no seed, so that a score of another run serves."""
     store = tmp_path / "scores.jsonl"
     first, second = (
@@ -98,12 +98,12 @@ def test_a_stored_score_has_the_seed_of_this_run(items: list[Item], tmp_path: Pa
 
 
 @pytest.mark.slow
-def test_two_processes_give_the_same(items: list[Item]) -> None:
+def test_two_processes_give_the_same(items: list[FileItem]) -> None:
     given = [replace(item, processed={"noisy": item.processed["noisy"]}) for item in items]
     assert scores(score_items(given, ALL[::2], jobs=2)) == scores(score_items(given, ALL[::2], jobs=1))
 
 
-def test_two_threads_do_not_share_numpys_generator(items: list[Item]) -> None:
+def test_two_threads_do_not_share_numpys_generator(items: list[FileItem]) -> None:
     """As on a cluster's worker with several threads."""
     clean, heard = samples(items[0].clean), samples(items[0].processed["noisy"])
     alone = [haspi(clean, heard, N3, 16000, seed=seed) for seed in (1, 2)]
@@ -120,7 +120,7 @@ def test_two_threads_do_not_share_numpys_generator(items: list[Item]) -> None:
     assert together == alone and alone[0] != alone[1]
 
 
-def test_level_in_db_spl_is_the_full_scale_that_gives_it(items: list[Item]) -> None:
+def test_level_in_db_spl_is_the_full_scale_that_gives_it(items: list[FileItem]) -> None:
     item = items[1]
     level = 10 * np.log10(np.mean(samples(item.clean) ** 2))
     by_level = score_items([replace(item, spl=60.0)], jobs=1)[0]
@@ -131,7 +131,7 @@ def test_level_in_db_spl_is_the_full_scale_that_gives_it(items: list[Item]) -> N
         assert result.score != other[key].score
 
 
-def test_two_channels_are_the_two_ears(items: list[Item], tmp_path: Path) -> None:
+def test_two_channels_are_the_two_ears(items: list[FileItem], tmp_path: Path) -> None:
     waves = [torch.from_numpy(samples(path)) for path in items[0].processed.values()]
     write_audio(tmp_path / "both.wav", torch.stack(waves), 16000)
     conditions = {"noisy": tmp_path / "both.wav", "louder": tmp_path / "both.wav"}
@@ -144,13 +144,13 @@ def test_two_channels_are_the_two_ears(items: list[Item], tmp_path: Path) -> Non
 
 
 def test_known_scores_are_not_made_again(
-    items: list[Item], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    items: list[FileItem], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made = count_scores(monkeypatch)
     path = tmp_path / "scores.jsonl"
     seen: list[tuple[int, int]] = []
 
-    def run(given: list[Item], **options: object) -> Results:
+    def run(given: list[FileItem], **options: object) -> Results:
         seen.clear()
         progress = lambda done, total: seen.append((done, total))  # noqa: E731
         return score_items(given, ALL, store=ScoreStore(path), jobs=1, progress=progress, **options)
@@ -193,7 +193,7 @@ def count_scores(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return made
 
 
-def test_the_same_pair_twice_is_scored_once(items: list[Item], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_same_pair_twice_is_scored_once(items: list[FileItem], monkeypatch: pytest.MonkeyPatch) -> None:
     made = count_scores(monkeypatch)
     twins = [items[0], replace(items[0], name="twin", audiogram=Audiogram.standard("N1"))]
     results = score_items(twins, ("haspi", "stoi"), jobs=1)
@@ -201,7 +201,7 @@ def test_the_same_pair_twice_is_scored_once(items: list[Item], monkeypatch: pyte
     assert results[0]["stoi", "noisy"] == results[1]["stoi", "noisy"]
 
 
-def test_failures_have_a_reason_and_the_rest_go_on(items: list[Item], tmp_path: Path) -> None:
+def test_failures_have_a_reason_and_the_rest_go_on(items: list[FileItem], tmp_path: Path) -> None:
     bad = {}
     for name, waveform, rate in (
         ("silent", torch.zeros(12800), 16000),
@@ -234,7 +234,7 @@ def test_failures_have_a_reason_and_the_rest_go_on(items: list[Item], tmp_path: 
 
 
 def test_whatever_a_measure_raises_is_the_items_reason(
-    items: list[Item], monkeypatch: pytest.MonkeyPatch
+    items: list[FileItem], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def score(*_: object) -> float:
         raise ZeroDivisionError("by zero")
@@ -250,19 +250,19 @@ SCRIPT = """
 import sys, time
 from pathlib import Path
 from hlsim import Audiogram
-from hlsim.evaluation import Item, ScoreStore, score_items
-from hlsim.evaluation.measures import MEASURES
+from hlsim.evaluation import FileItem, ScoreStore, score_items
+from hlsim.metrics.registry import MEASURES
 score = MEASURES["stoi"].score
 MEASURES["stoi"] = MEASURES["stoi"]._replace(score=lambda *a: (time.sleep(0.2), score(*a))[1])
 root = Path(sys.argv[1])
 ear = Audiogram.standard("N3")
-items = [Item(p.stem, p, {"a": p, "b": p}, ear) for p in sorted((root / "many").iterdir())]
+items = [FileItem(p.stem, p, {"a": p, "b": p}, ear) for p in sorted((root / "many").iterdir())]
 score_items(items, ["stoi"], store=ScoreStore(root / "scores.jsonl"), jobs=1)
 """
 
 
 @pytest.mark.slow
-def test_a_killed_run_goes_on_where_it_was(items: list[Item], tmp_path: Path) -> None:
+def test_a_killed_run_goes_on_where_it_was(items: list[FileItem], tmp_path: Path) -> None:
     (tmp_path / "many").mkdir()
     clean = torch.from_numpy(samples(items[0].clean))
     for i in range(12):
@@ -279,7 +279,7 @@ def test_a_killed_run_goes_on_where_it_was(items: list[Item], tmp_path: Path) ->
     before = path.read_bytes()
     assert 3 <= before.count(b"\n") < 12
     # each file is its own reference, so that its two conditions are one score
-    many = [Item(p.stem, p, {"a": p, "b": p}, N3) for p in sorted((tmp_path / "many").iterdir())]
+    many = [FileItem(p.stem, p, {"a": p, "b": p}, N3) for p in sorted((tmp_path / "many").iterdir())]
     seen: list[int] = []
     store = ScoreStore(path)
     resumed = score_items(many, ("stoi",), store=store, jobs=1, progress=lambda done, _: seen.append(done))
@@ -289,7 +289,7 @@ def test_a_killed_run_goes_on_where_it_was(items: list[Item], tmp_path: Path) ->
     assert scores(resumed) == scores(score_items(many, ("stoi",), jobs=1))
 
 
-def test_bad_settings(items: list[Item]) -> None:
+def test_bad_settings(items: list[FileItem]) -> None:
     with pytest.raises(ValueError, match="unknown measures loudness; allowed: haspi, hasqi, stoi, pesq"):
         score_items(items, ("loudness",))
     with pytest.raises(ValueError, match="no measure; allowed: haspi"):
@@ -298,3 +298,49 @@ def test_bad_settings(items: list[Item]) -> None:
         score_items(items, seed=-1)
     with pytest.raises(ValueError, match="jobs is 0"):
         score_items(items, jobs=0)
+
+
+def test_many_do_not_depend_on_the_number_of_jobs(speech_dir: Path, tmp_path: Path) -> None:
+    clips = []
+    for name in ("train/flite-slt-01", "valid/espeak-us-annie-01"):
+        waveform, rate = read_audio(speech_dir / f"{name}.flac")
+        clips.append((waveform[0, rate // 2 : rate // 2 + rate], rate))
+    clean, rate = clips[0]
+    noise = torch.randn(clean.shape, generator=torch.Generator().manual_seed(1))
+    noisy = clean + noise * clean.square().mean().sqrt() * 10 ** (-5.0 / 20)
+    for name, waveform in (("clean", clean), ("noisy", noisy)):
+        write_audio(tmp_path / f"{name}.wav", waveform[None], rate)
+    items = [
+        HaspiItem(clean, noisy, N3, rate),
+        HaspiItem(clean, clean, N3, rate),
+        HaspiItem(tmp_path / "clean.wav", str(tmp_path / "noisy.wav"), N3),
+        HaspiItem(clips[1][0], clips[1][0], Audiogram.standard("S1"), clips[1][1], seed=99),
+    ]
+    seen: list[tuple[int, int]] = []
+    parallel = haspi_many(items, seed=5, jobs=2, progress=lambda done, total: seen.append((done, total)))
+    assert seen == [(1, 4), (2, 4), (3, 4), (4, 4)]
+    assert haspi_many(items, seed=5, jobs=1) == parallel
+    assert parallel[2] == haspi(clean, noisy, N3, rate, seed=7)
+    assert parallel[3] == haspi(clips[1][0], clips[1][0], Audiogram.standard("S1"), clips[1][1], seed=99)
+    assert parallel[0] != parallel[2]
+
+
+def test_many_errors_name_the_item(tmp_path: Path) -> None:
+    speech = torch.sin(torch.arange(16000) * 0.2) * 0.05
+    good = HaspiItem(speech, speech, N3, 16000)
+    write_audio(tmp_path / "stereo.wav", speech.expand(2, -1), 16000)
+    write_audio(tmp_path / "fast.wav", speech[None], 32000)
+    for bad, message in (
+        (HaspiItem(speech, speech * 0, N3, 16000), "item 0: processed is silent"),
+        (HaspiItem(speech, speech, N3), "item 0: no sample_rate"),
+        (HaspiItem(speech, tmp_path / "stereo.wav", N3, 16000), "stereo.wav: 2 channels; allowed: 1"),
+        (HaspiItem(speech, tmp_path / "fast.wav", N3, 16000), "fast.wav: .*equal rates"),
+        (HaspiItem(speech, tmp_path / "none.wav", N3, 16000), "none.wav: no such file"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            haspi_many([bad, good], jobs=1)
+    with pytest.raises(ValueError, match="item 1: processed is silent"):
+        haspi_many([good, HaspiItem(speech, speech * 0, N3, 16000)], jobs=2)
+    with pytest.raises(ValueError, match="jobs is 0"):
+        haspi_many([good], jobs=0)
+    assert haspi_many([]) == []

@@ -1,14 +1,14 @@
 """Items, truth and tables of the comparison of simulators."""
 
 import json
-from dataclasses import dataclass
-from functools import partial
+import math
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from scipy import stats
 from torch import Tensor
 
 from compensators import NALR
@@ -16,10 +16,10 @@ from hlsim import MSBG, Audiogram
 from hlsim.calibration import level_spl, set_level
 from hlsim.evaluation import simulators
 from hlsim.evaluation.items import LEVELS, draw_items, treat
-from hlsim.evaluation.simulators import evaluate_simulators, weights_hash
+from hlsim.evaluation.simulators import evaluate_simulators, summarise
 from hlsim.metrics.fidelity import snr_db
 from hlsim.metrics.reference import pyclarity_msbg
-from hlsim.pretrained import SIMULATOR, load_pretrained, shipped
+from hlsim.report.simulators import write_fidelity
 
 pytest.importorskip("clarity")
 pytest.importorskip("pesq")
@@ -95,6 +95,13 @@ def test_inputs_are_what_their_names_say(speech_dir: Path, ears: Path) -> None:
         next(treat(drawn, ["compensated"]))
 
 
+def compare(simulators: dict[str, torch.nn.Module], out: Path, **options: Any) -> dict[str, Any]:
+    """Evaluated and written, as the command does it."""
+    done = evaluate_simulators(simulators, store=out / "scores.jsonl", **options)
+    write_fidelity(done.result, done.heard, done.shown, out)
+    return done.result
+
+
 class Unimpaired(torch.nn.Module):
     def forward(self, waveform: Tensor, audiogram: Audiogram) -> Tensor:
         return waveform
@@ -102,7 +109,7 @@ class Unimpaired(torch.nn.Module):
 
 def test_files_and_an_identity_is_no_simulator(tmp_path: Path, speech_dir: Path, ears: Path) -> None:
     out = tmp_path / "out"
-    result = evaluate_simulators(
+    result = compare(
         {"exact": MSBG(sample_rate=16000), "identity": Unimpaired()},
         speech=speech_dir / "valid",
         audiograms=ears,
@@ -144,7 +151,7 @@ class FailsOnHardEars(torch.nn.Module):
 
 def test_what_a_simulator_fails_on_is_told(tmp_path: Path, speech_dir: Path, ears: Path) -> None:
     failing = {how: FailsOnHardEars(how) for how in ("raise", "nan", "silent")}
-    result = evaluate_simulators(
+    result = compare(
         {"identity": Unimpaired(), **failing},
         speech=speech_dir / "valid",
         audiograms=ears,
@@ -170,7 +177,7 @@ def test_what_a_simulator_fails_on_is_told(tmp_path: Path, speech_dir: Path, ear
 def test_what_the_truth_fails_on_is_told_and_is_no_picture(
     tmp_path: Path, speech_dir: Path, ears: Path
 ) -> None:
-    result = evaluate_simulators(
+    result = compare(
         {"identity": Unimpaired(), "exact": MSBG(sample_rate=16000)},
         speech=speech_dir / "valid",
         audiograms=ears,
@@ -187,7 +194,7 @@ def test_what_the_truth_fails_on_is_told_and_is_no_picture(
     assert text[text.index("## Failures") :].count("no truth: too soft for pyclarity's active level") == 4
     assert "20 dB louder, clean, 28 dB SPL" in (tmp_path / "fidelity.html").read_text()
     with pytest.raises(ValueError, match="no item has a truth: too soft for pyclarity's"):
-        evaluate_simulators(
+        compare(
             {"identity": Unimpaired()},
             speech=speech_dir / "valid",
             audiograms=ears,
@@ -202,7 +209,7 @@ def test_a_stopped_comparison_goes_on_and_a_new_simulator_is_scored_alone(
     tmp_path: Path, speech_dir: Path, ears: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     options = {"speech": speech_dir / "valid", "audiograms": ears, "teacher": "msbg", "seconds": 1.0}
-    whole = evaluate_simulators({"a": Unimpaired()}, **options, items=3, out=tmp_path / "whole")
+    whole = compare({"a": Unimpaired()}, **options, items=3, out=tmp_path / "whole")
     scored: list[int] = []
     original = simulators._scores
 
@@ -214,79 +221,20 @@ def test_a_stopped_comparison_goes_on_and_a_new_simulator_is_scored_alone(
 
     monkeypatch.setattr(simulators, "_scores", counted)
     with pytest.raises(KeyboardInterrupt):
-        evaluate_simulators({"a": Unimpaired()}, **options, items=3, out=tmp_path / "parts")
+        compare({"a": Unimpaired()}, **options, items=3, out=tmp_path / "parts")
     assert not (tmp_path / "parts" / "fidelity.json").exists()
     scored[:] = [1]  # one call is left before it stops again
-    assert evaluate_simulators({"a": Unimpaired()}, **options, items=3, out=tmp_path / "parts") == whole
+    assert compare({"a": Unimpaired()}, **options, items=3, out=tmp_path / "parts") == whole
     monkeypatch.setattr(simulators, "_scores", original)
     both = {"a": Unimpaired(), "b": MSBG(sample_rate=16000)}
-    result = evaluate_simulators(both, **options, items=3, out=tmp_path / "parts")
+    result = compare(both, **options, items=3, out=tmp_path / "parts")
     assert result["simulators"]["a"] == whole["simulators"]["a"]
     assert len((tmp_path / "parts" / "scores.jsonl").read_text().splitlines()) == 6
 
 
-def test_modules_that_differ_in_a_setting_differ_in_their_scores_name() -> None:
-    modules = [
-        MSBG(sample_rate=16000),
-        MSBG(sample_rate=16000, rescale_active=True),
-        MSBG(Audiogram.standard("N3"), sample_rate=16000),
-        NALR(sample_rate=16000),
-        NALR(Audiogram.standard("N3"), sample_rate=16000),
-    ]
-    assert len({weights_hash(module) for module in modules}) == len(modules)
-    assert weights_hash(MSBG(sample_rate=16000)) == weights_hash(modules[0])
-
-
-@dataclass
-class Options:
-    gain: float
-
-
-@pytest.mark.parametrize("name", [*shipped(SIMULATOR)])
-def test_a_checkpoint_is_the_same_whenever_it_is_loaded(name: str) -> None:
-    once, again = load_pretrained(name), load_pretrained(name)
-    again(torch.full((1600,), 0.01), Audiogram.standard("N3"))  # nor does use change it
-    assert weights_hash(once) == weights_hash(again)
-
-
-class Own(torch.nn.Module):
-    """A module whose settings are no numbers."""
-
-    def __init__(self, gains: Any) -> None:
-        super().__init__()
-        self._gains = gains
-
-
-def test_settings_of_any_kind_tell_modules_apart(monkeypatch: pytest.MonkeyPatch) -> None:
-    kinds = (
-        [1.0],
-        [2.0],
-        {"a": 1.0},
-        {"a": 2.0},
-        None,
-        np.ones(2),
-        np.zeros(2),
-        torch.ones(3),
-        torch.float32,
-        Options(0.0),
-        Options(20.0),
-        partial(max, 1.0),
-        partial(max, 2.0),
-        [torch.nn.Linear(1, 1)],
-    )
-    hashes = [weights_hash(Own(gains)) for gains in kinds]
-    assert len(set(hashes)) == len(hashes)
-    assert hashes == [weights_hash(Own(gains)) for gains in kinds]
-    # of what cannot be told, a function without a name, nothing that was scored counts
-    assert weights_hash(Own(lambda: 1.0)) != weights_hash(Own(lambda: 1.0))
-    # what a class of one's own does counts too
-    monkeypatch.setattr("inspect.getsource", lambda kind: "changed")
-    assert weights_hash(Own([1.0])) != hashes[0]
-
-
 def test_unknown_teacher(tmp_path: Path, speech_dir: Path, ears: Path) -> None:
     with pytest.raises(ValueError, match="allowed: pyclarity, msbg"):
-        evaluate_simulators({}, speech=speech_dir, audiograms=ears, out=tmp_path, teacher="nobody")
+        compare({}, speech=speech_dir, audiograms=ears, out=tmp_path, teacher="nobody")
 
 
 @pytest.mark.parametrize(
@@ -302,12 +250,12 @@ def test_what_would_fail_or_count_twice_is_refused_before_the_work(
     out = tmp_path / "out"
     call: dict[str, Any] = {"speech": speech_dir / "valid", "audiograms": ears, "teacher": "msbg", "items": 1}
     with pytest.raises(ValueError, match=said):
-        evaluate_simulators({"identity": Unimpaired()}, **call, out=out, **options)
+        compare({"identity": Unimpaired()}, **call, out=out, **options)
     assert not out.exists()
 
 
 def test_the_shortest_items_that_are_taken(tmp_path: Path, speech_dir: Path, ears: Path) -> None:
-    result = evaluate_simulators(
+    result = compare(
         {"identity": Unimpaired()},
         speech=speech_dir / "valid",
         audiograms=ears,
@@ -317,3 +265,56 @@ def test_the_shortest_items_that_are_taken(tmp_path: Path, speech_dir: Path, ear
         out=tmp_path / "out",
     )
     assert result["simulators"]["identity"]["inputs"]["as-is"]["overall"]["snr_n"] == 1
+
+
+def rows() -> list[dict[str, object]]:
+    rng = np.random.default_rng(1)
+    out: list[dict[str, object]] = []
+    for i in range(60):
+        s, p = rng.uniform(0.3, 1.0), rng.uniform(1.0, 4.5)
+        out.append(
+            {
+                "snr": float(rng.normal(18, 3)),
+                "raw_mse": float(rng.uniform(0, 0.1)),
+                "band_error": float(rng.uniform(0, 2)),
+                "stoi_true": s,
+                "stoi_sim": s + float(rng.normal(0, 0.02)),
+                "pesq_true": p,
+                "pesq_sim": None if i % 10 == 0 else p + float(rng.normal(0, 0.2)),
+                "severity": ("severe", "none", "mild")[i % 3],
+                "level": (80.0, 65)[i % 2],
+                "condition": "clean" if i < 40 else None,
+            }
+        )
+    return out
+
+
+def test_summary_is_of_its_rows() -> None:
+    data = rows()
+    summary = summarise(data)
+    overall = summary["overall"]
+    snr = [row["snr"] for row in data]
+    assert overall["n"] == 60 and overall["stoi_n"] == 60 and overall["pesq_n"] == 54
+    assert overall["snr_median"] == pytest.approx(np.median(snr))
+    assert overall["snr_worst_tenth"] == pytest.approx(np.percentile(snr, 10))
+    assert overall["raw_mse"] == pytest.approx(np.mean([row["raw_mse"] for row in data]))
+    assert overall["band_error_median"] == pytest.approx(np.median([row["band_error"] for row in data]))
+    scored = [row for row in data if row["pesq_sim"] is not None]
+    true, simulated = ([row[key] for row in scored] for key in ("pesq_true", "pesq_sim"))
+    assert overall["pesq_srcc"] == pytest.approx(stats.spearmanr(true, simulated)[0])
+    assert list(summary["severity"]) == ["none", "mild", "severe"]
+    assert list(summary["level"]) == ["65", "80"]
+    assert {key: figures["n"] for key, figures in summary["condition"].items()} == {"clean": 40}
+    assert summary["severity"]["mild"] == summarise([r for r in data if r["severity"] == "mild"])["overall"]
+    assert json.loads(json.dumps(summary, allow_nan=False)) == summary
+
+
+def test_summary_of_little() -> None:
+    summary = summarise([{"snr": 12.0, "severity": "mild"}])
+    assert summary["overall"]["snr_median"] == 12.0
+    assert summary["overall"]["stoi_lcc"] is None and summary["overall"]["raw_mse"] is None
+    assert summary["level"] == {} and summary["overall"]["stoi_n"] == 0
+    with pytest.raises(ValueError, match="no items"):
+        summarise([])
+    with pytest.raises(ValueError, match="snr holds NaN or infinity"):
+        summarise([{"snr": math.inf}])

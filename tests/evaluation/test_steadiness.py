@@ -11,13 +11,13 @@ from hlsim import MSBG, Audiogram
 from hlsim.calibration import level_spl
 from hlsim.evaluation.items import Item
 from hlsim.evaluation.judging import NORMAL, Unaided
-from hlsim.evaluation.steadiness import TONES, shift_differences, shift_table, steady_tones, tone_table, tones
+from hlsim.evaluation.steadiness import TONES, shift_differences, steady_tones, tones
 
 N3 = Audiogram.standard("N3")
 
 
 class Modulating(nn.Module):
-    """The waveform times 1 + depth cos(2 pi 80 t), whose phase hangs on where the signal begins."""
+    """The waveform times 1 + depth cos(2 pi 80 t), whose phase depends on where the signal begins."""
 
     def __init__(self, depth: float) -> None:
         super().__init__()
@@ -113,14 +113,3 @@ def test_samples_that_are_not_numbers(items: dict[int, Item]) -> None:
         steady_tones({"own": Unable()}, {"N3": N3}, (65.0,))
     with pytest.raises(ValueError, match="own, delayed speech of item 3: the output holds samples that are"):
         shift_differences({"own": Unable()}, items)
-
-
-def test_tables() -> None:
-    about = {"compensator": "own", "ear": "N3", "levels": [50.0, 65.0], "frequencies": [*TONES]}
-    offs = [[0.0, 1.0, 2.0, 3.0, 4.0, 5.0], [-1.0] * 6]
-    sidebands = [[-50.0, -40.0, -3.2, -10.0, -60.0, -60.0], [-120.0] * 5 + [6.0]]
-    first, second = tone_table([{**about, "heard_off_db": offs, "sidebands_db": sidebands}]).rows
-    assert first == ["N3, own, 50 dB SPL", "+0.0", "+1.0", "+2.0", "+3.0", "+4.0", "+5.0", "-3 (1000 Hz)"]
-    assert second[0] == "N3, own, 65 dB SPL" and second[-1] == "6 (4000 Hz)"
-    found = {"compensator": "own", "items": [0, 2], "difference_db": [[-30.0, -20.0], [-12.4, -20.0]]}
-    assert [*shift_table([found]).rows] == [["own", "4", "-20", "-12"]]

@@ -1,6 +1,5 @@
 """Fidelity measures against pystoi, pesq and scipy called directly, and against what is known of made-up errors."""
 
-import json
 import math
 import sys
 
@@ -12,7 +11,6 @@ from torch import Tensor
 
 from hlsim import extras
 from hlsim.dsp.resample import resample
-from hlsim.evaluation import fidelity_markdown, summarise
 from hlsim.metrics.fidelity import (
     Score,
     linear_correlation,
@@ -172,69 +170,3 @@ def test_correlations_that_are_undefined() -> None:
             measure([0.1, 0.2], [0.1])
         with pytest.raises(ValueError, match="NaN"):
             measure([0.1, math.nan], [0.1, 0.2])
-
-
-def rows() -> list[dict[str, object]]:
-    rng = np.random.default_rng(1)
-    out: list[dict[str, object]] = []
-    for i in range(60):
-        s, p = rng.uniform(0.3, 1.0), rng.uniform(1.0, 4.5)
-        out.append(
-            {
-                "snr": float(rng.normal(18, 3)),
-                "raw_mse": float(rng.uniform(0, 0.1)),
-                "band_error": float(rng.uniform(0, 2)),
-                "stoi_true": s,
-                "stoi_sim": s + float(rng.normal(0, 0.02)),
-                "pesq_true": p,
-                "pesq_sim": None if i % 10 == 0 else p + float(rng.normal(0, 0.2)),
-                "severity": ("severe", "none", "mild")[i % 3],
-                "level": (80.0, 65)[i % 2],
-                "condition": "clean" if i < 40 else None,
-            }
-        )
-    return out
-
-
-def test_summary_is_of_its_rows() -> None:
-    data = rows()
-    summary = summarise(data)
-    overall = summary["overall"]
-    snr = [row["snr"] for row in data]
-    assert overall["n"] == 60 and overall["stoi_n"] == 60 and overall["pesq_n"] == 54
-    assert overall["snr_median"] == pytest.approx(np.median(snr))
-    assert overall["snr_worst_tenth"] == pytest.approx(np.percentile(snr, 10))
-    assert overall["raw_mse"] == pytest.approx(np.mean([row["raw_mse"] for row in data]))
-    assert overall["band_error_median"] == pytest.approx(np.median([row["band_error"] for row in data]))
-    scored = [row for row in data if row["pesq_sim"] is not None]
-    true, simulated = ([row[key] for row in scored] for key in ("pesq_true", "pesq_sim"))
-    assert overall["pesq_srcc"] == pytest.approx(stats.spearmanr(true, simulated)[0])
-    assert list(summary["severity"]) == ["none", "mild", "severe"]
-    assert list(summary["level"]) == ["65", "80"]
-    assert {key: figures["n"] for key, figures in summary["condition"].items()} == {"clean": 40}
-    assert summary["severity"]["mild"] == summarise([r for r in data if r["severity"] == "mild"])["overall"]
-    assert json.loads(json.dumps(summary, allow_nan=False)) == summary
-
-
-def test_summary_of_little() -> None:
-    summary = summarise([{"snr": 12.0, "severity": "mild"}])
-    assert summary["overall"]["snr_median"] == 12.0
-    assert summary["overall"]["stoi_lcc"] is None and summary["overall"]["raw_mse"] is None
-    assert summary["level"] == {} and summary["overall"]["stoi_n"] == 0
-    with pytest.raises(ValueError, match="no items"):
-        summarise([])
-    with pytest.raises(ValueError, match="snr holds NaN or infinity"):
-        summarise([{"snr": math.inf}])
-
-
-def test_markdown_tables() -> None:
-    summary = summarise(rows())
-    text = fidelity_markdown(summary)
-    tables = [block for block in text.split("\n\n") if block.startswith("|")]
-    assert [len(table.splitlines()) for table in tables] == [3, 5, 4, 3]
-    assert len({line.count("|") for line in text.splitlines() if line.startswith("|")}) == 1
-    assert f"| mild | 20 | {summary['severity']['mild']['snr_median']:.1f} |" in text
-    assert "By level (dB SPL)" in text
-    assert "n/a" in fidelity_markdown(summarise([{"snr": 1.0}])) and "By level" not in fidelity_markdown(
-        summarise([{"snr": 1.0}])
-    )

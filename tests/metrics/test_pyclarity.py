@@ -1,4 +1,4 @@
-"""HASPI against pyclarity called directly, its seeds, its refusals, and many items at once."""
+"""HASPI against pyclarity called directly, its seeds, its refusals."""
 
 import sys
 from pathlib import Path
@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from hlsim import extras
-from hlsim.audio import read_audio, write_audio
+from hlsim.audio import read_audio
 from hlsim.audiogram import FREQUENCIES, Audiogram
-from hlsim.metrics.pyclarity import HaspiItem, haspi, haspi_many
+from hlsim.metrics.pyclarity import haspi
 
 clarity_haspi = pytest.importorskip("clarity.evaluator.haspi")
 clarity_audiogram = pytest.importorskip("clarity.utils.audiogram")
@@ -150,42 +150,3 @@ def test_missing_extra_names_the_command(monkeypatch: pytest.MonkeyPatch) -> Non
     monkeypatch.setitem(sys.modules, "clarity.evaluator.haspi", None)
     with pytest.raises(extras.MissingExtraError, match=r"pip install 'hlsim\[eval\]'"):
         haspi(SPEECH, SPEECH, N3, 16000)
-
-
-def test_many_do_not_depend_on_the_number_of_jobs(clips: list[tuple[Tensor, int]], tmp_path: Path) -> None:
-    clean, rate = clips[0]
-    for name, waveform in (("clean", clean), ("noisy", noisy(clean))):
-        write_audio(tmp_path / f"{name}.wav", waveform[None], rate)
-    items = [
-        HaspiItem(clean, noisy(clean), N3, rate),
-        HaspiItem(clean, clean, N3, rate),
-        HaspiItem(tmp_path / "clean.wav", str(tmp_path / "noisy.wav"), N3),
-        HaspiItem(clips[1][0], clips[1][0], Audiogram.standard("S1"), clips[1][1], seed=99),
-    ]
-    seen: list[tuple[int, int]] = []
-    parallel = haspi_many(items, seed=5, jobs=2, progress=lambda done, total: seen.append((done, total)))
-    assert seen == [(1, 4), (2, 4), (3, 4), (4, 4)]
-    assert haspi_many(items, seed=5, jobs=1) == parallel
-    assert parallel[2] == haspi(clean, noisy(clean), N3, rate, seed=7)
-    assert parallel[3] == haspi(clips[1][0], clips[1][0], Audiogram.standard("S1"), clips[1][1], seed=99)
-    assert parallel[0] != parallel[2]
-
-
-def test_many_errors_name_the_item(tmp_path: Path) -> None:
-    good = HaspiItem(SPEECH, SPEECH, N3, 16000)
-    write_audio(tmp_path / "stereo.wav", SPEECH.expand(2, -1), 16000)
-    write_audio(tmp_path / "fast.wav", SPEECH[None], 32000)
-    for bad, message in (
-        (HaspiItem(SPEECH, SPEECH * 0, N3, 16000), "item 0: processed is silent"),
-        (HaspiItem(SPEECH, SPEECH, N3), "item 0: no sample_rate"),
-        (HaspiItem(SPEECH, tmp_path / "stereo.wav", N3, 16000), "stereo.wav: 2 channels; allowed: 1"),
-        (HaspiItem(SPEECH, tmp_path / "fast.wav", N3, 16000), "fast.wav: .*equal rates"),
-        (HaspiItem(SPEECH, tmp_path / "none.wav", N3, 16000), "none.wav: no such file"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            haspi_many([bad, good], jobs=1)
-    with pytest.raises(ValueError, match="item 1: processed is silent"):
-        haspi_many([good, HaspiItem(SPEECH, SPEECH * 0, N3, 16000)], jobs=2)
-    with pytest.raises(ValueError, match="jobs is 0"):
-        haspi_many([good], jobs=0)
-    assert haspi_many([]) == []

@@ -16,7 +16,8 @@ import torch
 
 from hlsim.audio import read_audio, write_audio
 from hlsim.audiogram import Audiogram
-from hlsim.evaluation import Failure, HaspiReport, ItemScore, write_report
+from hlsim.evaluation import Failure, HaspiReport, ItemScore
+from hlsim.report.haspi import write_report
 
 pytestmark = pytest.mark.browser
 

@@ -14,11 +14,10 @@ import pytest
 from scipy import stats
 
 from hlsim.audiogram import Audiogram
-from hlsim.evaluation import Failure, HaspiReport, ItemScore, bootstrap_interval, write_report
-from hlsim.report import haspi as report_files
-from hlsim.report.haspi import REPORT_FILES
-from hlsim.report.haspi_page import html
-from hlsim.report.haspi_pictures import report_pictures
+from hlsim.evaluation import Failure, HaspiReport, ItemScore, bootstrap_interval
+from hlsim.files import Whole
+from hlsim.report.haspi import REPORT_FILES, html, markdown, write_report
+from hlsim.report.pictures import report_pictures
 
 for module in ("clarity", "joblib", "matplotlib"):
     pytest.importorskip(module)
@@ -78,7 +77,7 @@ def test_figures_are_scipys(tmp_path: Path) -> None:
 
 def test_markdown_is_the_papers_table() -> None:
     report = make_report(seed=3, extra={"nalr_mean": 0.5125})
-    text, c = report.to_markdown(), report.comparison
+    text, c = markdown(report), report.comparison
     assert "| Metric | Before | After | Change (Δ) |" in text
     assert f"| {c.before_mean:.3f} ± {c.before_std:.3f} | {c.after_mean:.3f} ± {c.after_std:.3f} | +" in text
     assert f"t = +{c.t:.3f}, p " in text and f"W = {c.w:.1f}, p " in text and f"d = +{c.cohens_d:.3f}" in text
@@ -87,7 +86,7 @@ def test_markdown_is_the_papers_table() -> None:
     assert "none 3, mild 3, severe 6" in text
     assert "seed 3" in text and "nalr_mean: 0.5125" in text
     large = make_report(400)
-    assert large.to_markdown().count("p < 0.00001") >= 2
+    assert markdown(large).count("p < 0.00001") >= 2
 
 
 def test_undefined_tests_are_said_and_never_nan(tmp_path: Path) -> None:
@@ -156,15 +155,15 @@ def test_files_are_replaced_and_others_stay(tmp_path: Path) -> None:
 
 def test_nothing_is_written_beside_the_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """It may be the root of a drive."""
-    original, seen = report_files.draw_report, []
+    original, seen = Whole.write, set()
 
-    def look(report: HaspiReport, path: Path) -> None:
-        seen.extend(own.name for own in tmp_path.iterdir())
-        original(report, path)
+    def look(file: Whole, data: str | bytes) -> None:
+        seen.update(own.name for own in tmp_path.iterdir())
+        original(file, data)
 
-    monkeypatch.setattr(report_files, "draw_report", look)
+    monkeypatch.setattr(Whole, "write", look)
     write_report(make_report(5), tmp_path / "out")
-    assert seen == ["out"] and sorted(p.name for p in (tmp_path / "out").iterdir()) == sorted(REPORT_FILES)
+    assert seen == {"out"} and sorted(p.name for p in (tmp_path / "out").iterdir()) == sorted(REPORT_FILES)
 
 
 @pytest.mark.parametrize("broken", ["picture", "nan"])
@@ -176,11 +175,14 @@ def test_a_failure_leaves_the_earlier_report_whole(
     earlier = {p.name: p.read_bytes() for p in out.iterdir()}
     report = make_report(5)
     if broken == "picture":
+        original = Whole.write
 
-        def fail(*_: object) -> None:
-            raise OSError("disk full")
+        def fail(file: Whole, data: str | bytes) -> None:
+            if file.path.suffix == ".png":
+                raise ValueError("disk full")
+            original(file, data)
 
-        monkeypatch.setattr("hlsim.report.haspi.draw_report", fail)
+        monkeypatch.setattr(Whole, "write", fail)
     else:
         report = make_report(5, extra={"nalr_mean": math.nan})
     for target in (out, tmp_path / "new"):
@@ -286,8 +288,8 @@ def test_texts_of_three_conditions(tmp_path: Path) -> None:
 def test_of_haspis_gain_only_where_it_is_a_measure() -> None:
     items = [replace(item, scores={"stoi": dict(item.scores["stoi"])}) for item in three_conditions().items]
     report = HaspiReport(items)
-    assert report.to_dict()["note"] == "" and "\n\n8 items.\n\n" in report.to_markdown()
-    assert "HASPI rewards" not in report.to_markdown() + html(report, 0)
+    assert report.to_dict()["note"] == "" and "\n\n8 items.\n\n" in markdown(report)
+    assert "HASPI rewards" not in markdown(report) + html(report, 0)
     both = three_conditions()
     assert both.to_dict()["note"].startswith("HASPI rewards") and "HASPI rewards" in html(both, 0)
 

@@ -3,7 +3,8 @@
 import re
 from html.parser import HTMLParser
 
-from hlsim.report.page import Picture, Player, Section, Table, render_page
+from hlsim.report.page import Picture, Player, Section, render_page
+from hlsim.report.tables import Table
 
 VOID = {"meta", "link", "img", "input", "br"}
 

@@ -1,0 +1,179 @@
+"""Tables of text, as Markdown and LaTeX write them (HTML: ``page``), their cells, and those of a paired comparison."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+from hlsim.evaluation.comparison import Comparison, p_text
+from hlsim.evaluation.statistics import PairedComparison
+
+_LATEX = str.maketrans(
+    {
+        "\\": r"\textbackslash{}",
+        "~": r"\textasciitilde{}",
+        "^": r"\textasciicircum{}",
+        "±": r"$\pm$",
+        "Δ": r"$\Delta$",
+        "<": "$<$",
+        ">": "$>$",
+        **{character: f"\\{character}" for character in "{}&%$#_"},
+    }
+)
+
+_CHANGE = "Δ [95 % interval]"
+
+
+@dataclass(frozen=True)
+class Table:
+    """Cells of text; the first column names the rows."""
+
+    caption: str
+    header: Sequence[str]
+    rows: Sequence[Sequence[str]]
+
+    @classmethod
+    def of(cls, caption: str, rows: Sequence[Mapping[str, str]]) -> Table:
+        """Of rows by title of the column, all alike."""
+        return cls(caption, [*rows[0]] if rows else [], [[*row.values()] for row in rows])
+
+    def markdown(self) -> str:
+        """Without the caption."""
+        lines = [self.header, ["---"] * len(self.header), *self.rows]
+        return "\n".join(
+            "| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines
+        )
+
+    def latex(self) -> str:
+        """For ``\\input``; needs the package booktabs."""
+        header, *rows = (
+            " & ".join(cell.translate(_LATEX) for cell in line) + r" \\" for line in (self.header, *self.rows)
+        )
+        columns, body = "l" + "r" * (len(self.header) - 1), "\n".join(rows)
+        return (
+            f"\\begin{{table}}\n\\centering\n\\caption{{{self.caption.translate(_LATEX)}.}}\n"
+            f"\\begin{{tabular}}{{{columns}}}\n\\toprule\n{header}\n\\midrule\n{body}\n\\bottomrule\n"
+            "\\end{tabular}\n\\end{table}\n"
+        )
+
+
+def number(value: float | None, form: str, none: str = "n/a") -> str:
+    """A figure, or what stands where there is none."""
+    return none if value is None else f"{value:{form}}"
+
+
+def spread(mean: float, deviation: float | None) -> str:
+    """A mean and its standard deviation, where there is one."""
+    return f"{mean:.3f}" if deviation is None else f"{mean:.3f} ± {deviation:.3f}"
+
+
+def loss_name(severity: str) -> str:
+    """A degree of loss in words."""
+    return "no loss" if severity == "none" else f"{severity} loss"
+
+
+def paper_table(comparison: Comparison) -> Table:
+    """The paper's last table, with the interval and the levels."""
+    c, name = comparison.overall, comparison.title
+    levels = (comparison.level_before_mean, comparison.level_after_mean)
+    _, t, w, d = paired_cells(c, none="not defined").values()
+    rows = [
+        (f"{name} (mean ± std)", *_means(c), f"{c.delta:+.3f}"),
+        ("95 % interval of Δ", "", "", _interval(c) or "not defined"),
+        ("t-test (paired)", "", "", t),
+        ("Wilcoxon signed-rank", "", "", w),
+        ("Cohen's d (paired)", "", "", d if c.cohens_d is None else f"d = {d}"),
+        ("Level (dB SPL, mean)", *(f"{level:.1f}" for level in levels), f"{levels[1] - levels[0]:+.1f}"),
+    ]
+    caption = f"{name}, {comparison.before} against {comparison.after}, {c.n} items"
+    return Table(caption, ("Metric", *_ends(comparison), "Change (Δ)"), rows)
+
+
+def severity_table(comparison: Comparison) -> Table:
+    """A row a degree of loss."""
+    rows = {loss_name(name): c for name, c in comparison.by_severity.items()}
+    return _paired_table(comparison, "by degree of loss", "Degree of loss", rows)
+
+
+def listener_table(comparison: Comparison) -> Table | None:
+    """Items, listener means and the mixed model side by side; None where listeners are not named."""
+    if comparison.listeners is None:
+        return None
+    rows = {"items": comparison.overall, "listener means": comparison.listeners}
+    table = _paired_table(comparison, "with items nested in listeners", "Unit", rows)
+    model = comparison.mixed
+    if isinstance(model, str):
+        return table
+    change = f"{model.delta:+.3f} [{model.ci_low:+.3f}, {model.ci_high:+.3f}]"
+    name, test = f"mixed model ({model.listeners} listeners)", f"z = {model.z:+.3f}, {p_text(model.p)}"
+    return replace(table, rows=[*table.rows, (name, str(model.n), "", "", change, test, "", "")])
+
+
+def comparisons_table(comparisons: Sequence[Comparison]) -> Table:
+    """A row a pair of conditions and measure, with p values adjusted by Holm."""
+    rows = []
+    for c in comparisons:
+        cells, tests = paired_cells(c.overall), {"t-test": c.p_t_holm, "Wilcoxon": c.p_w_holm}
+        rows.append(
+            {
+                "Comparison": change_name(c),
+                "n": str(c.overall.n),
+                "From": f"{c.overall.before_mean:.3f}",
+                "To": f"{c.overall.after_mean:.3f}",
+                _CHANGE: cells[_CHANGE],
+                **{f"{test}, Holm": "n/a" if p is None else p_text(p) for test, p in tests.items()},
+                "d": cells["d"],
+                "Level change (dB)": f"{c.level_after_mean - c.level_before_mean:+.1f}",
+            }
+        )
+    return Table.of("All comparisons, p adjusted by Holm within each measure", rows)
+
+
+def change_name(c: Comparison) -> str:
+    """Measure and conditions."""
+    return f"{c.title}: {c.before} to {c.after}"
+
+
+def paired_cells(
+    c: PairedComparison,
+    p_t: float | None = None,
+    p_w: float | None = None,
+    none: str = "n/a",
+    digits: int = 3,
+) -> dict[str, str]:
+    """Change and interval, both tests, and d.
+
+    Args:
+        p_t, p_w: in place of the comparison's, such as adjusted ones.
+        digits: of t and d.
+    """
+    return {
+        _CHANGE: f"{c.delta:+.3f} {_interval(c)}".rstrip(),
+        "t-test (paired)": _test(f"t = {number(c.t, f'+.{digits}f')}", c.p_t if p_t is None else p_t, none),
+        "Wilcoxon": _test(f"W = {number(c.w, '.1f')}", c.p_w if p_w is None else p_w, none),
+        "d": number(c.cohens_d, f"+.{digits}f", none),
+    }
+
+
+def _paired_table(comparison: Comparison, by: str, unit: str, rows: Mapping[str, PairedComparison]) -> Table:
+    # two conditions may differ in their capitals alone: no titles of a dictionary
+    header = (unit, "n", *_ends(comparison), *paired_cells(comparison.overall))
+    cells = [(name, str(c.n), *_means(c), *paired_cells(c).values()) for name, c in rows.items()]
+    caption = f"{comparison.title} {by}, {comparison.before} against {comparison.after}"
+    return Table(caption, header, cells)
+
+
+def _means(c: PairedComparison) -> tuple[str, str]:
+    return spread(c.before_mean, c.before_std), spread(c.after_mean, c.after_std)
+
+
+def _ends(comparison: Comparison) -> tuple[str, ...]:
+    return tuple(name[:1].upper() + name[1:] for name in (comparison.before, comparison.after))
+
+
+def _interval(c: PairedComparison) -> str:
+    return "" if c.ci_low is None else f"[{c.ci_low:+.3f}, {c.ci_high:+.3f}]"
+
+
+def _test(statistic: str, p: float | None, none: str) -> str:
+    return none if p is None else f"{statistic}, {p_text(p)}"
