@@ -8,8 +8,7 @@ pytest.importorskip("lightning")
 
 import yaml
 
-from hlsim.training.compensator import CompensatorRecipe
-from hlsim.training.simulator import SimulatorRecipe
+from hlsim.training.recipes import CompensatorRecipe, SimulatorRecipe
 
 
 @pytest.mark.parametrize("recipe", [SimulatorRecipe, CompensatorRecipe])

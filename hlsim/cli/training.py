@@ -54,7 +54,8 @@ def add(commands: Commands) -> None:
 def _train_simulator(options: argparse.Namespace) -> None:
     _require_extras()
     keep_freed_memory()
-    from hlsim.training.simulator import SimulatorRecipe, train_simulator
+    from hlsim.training.recipes import SimulatorRecipe
+    from hlsim.training.simulator import train_simulator
 
     if options.manifest is not None:
         _train_planned(options)
@@ -73,8 +74,9 @@ def _train_simulator(options: argparse.Namespace) -> None:
 
 
 def _train_planned(options: argparse.Namespace) -> None:
-    from hlsim.training.planned import PlannedSource, PlannedTraining
-    from hlsim.training.simulator import SimulatorRecipe, train_simulator
+    from hlsim.training.batches import PlannedSource
+    from hlsim.training.recipes import SimulatorRecipe
+    from hlsim.training.simulator import train_simulator
 
     if given := _given(options, FOLDERS):
         raise ValueError(
@@ -88,7 +90,6 @@ def _train_planned(options: argparse.Namespace) -> None:
             workers=1 if options.workers is None else options.workers,
         ),
         SimulatorRecipe.from_dict(recipe(options)),
-        kind=PlannedTraining,
         **training_arguments(options),
     )
     print(f"the best checkpoint is in {folder}")
@@ -99,7 +100,8 @@ def _train_compensator(options: argparse.Namespace) -> None:
     if options.audiogram and (given := _given(options, ("audiograms", "valid_audiograms"))):
         raise ValueError(f"--audiogram with {', '.join(given)}; allowed: one ear, or a CSV of ears, not both")
     keep_freed_memory()
-    from hlsim.training.compensator import CompensatorRecipe, train_compensator
+    from hlsim.training.compensator import train_compensator
+    from hlsim.training.recipes import CompensatorRecipe
 
     folder = train_compensator(
         training_data(options),
@@ -154,7 +156,7 @@ def recipe(options: argparse.Namespace) -> dict[str, Any]:
 
 
 def training_data(options: argparse.Namespace) -> Any:
-    from hlsim.training.sources import TrainingData
+    from hlsim.training.batches import TrainingData
 
     return TrainingData(**{name: getattr(options, name) for name in FOLDERS})
 

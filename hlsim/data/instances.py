@@ -12,6 +12,7 @@ import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save
 from torch import Tensor
+from torch.nn import functional
 
 from hlsim.audio import read_audio, read_stretch
 from hlsim.audiogram import FREQUENCIES, Audiogram
@@ -53,6 +54,16 @@ class Instance:
     signal: Tensor
     thresholds: Tensor
     impaired: Tensor | None = None
+
+    def clip(self, first: int, samples: int) -> Instance:
+        """``samples`` samples from ``first`` on, followed by silence where it is shorter."""
+
+        def cut(value: Tensor) -> Tensor:
+            piece = value[first : first + samples]
+            return functional.pad(piece, (0, samples - piece.shape[-1]))
+
+        impaired = None if self.impaired is None else cut(self.impaired)
+        return Instance(cut(self.clean), cut(self.signal), self.thresholds, impaired)
 
     def to_bytes(self) -> bytes:
         """A safetensors file; equal instances give equal bytes."""
