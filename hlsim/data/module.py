@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from functools import cached_property
 from itertools import count
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypedDict, Unpack
 
 import lightning as L
 import torch
@@ -20,7 +20,7 @@ from hlsim.audiogram import HIGHEST_SIMULATED, LOWEST_LEVEL
 from hlsim.calibration import level_spl, set_level
 from hlsim.data.augment import augment_speech
 from hlsim.data.instances import Instance, Plan
-from hlsim.data.teacher import Teacher, grid_of
+from hlsim.data.teacher import Teacher, check_grid
 from hlsim.data.writing import Recipe, claimed
 
 _ENDLESS = 10_000_000  # steps: time or steps end a training, not the data
@@ -30,6 +30,7 @@ Batch = dict[str, Tensor]
 """``clean``, ``signal``, ``impaired`` (items, time) in pascals, ``thresholds`` (items, 8) dB HL, ``lengths`` (items,).
 
 Drawn batches have no ``lengths``, for all items are as long, and no batch has ``impaired`` before a teacher was asked.
+``sounds`` marks the batches to validate on that are tones and clicks.
 """
 
 
@@ -146,7 +147,6 @@ class PlanItems(Dataset[Instance]):
 
     def __init__(self, plan: Plan, split: str, *, prepared: bool = False) -> None:
         self.plan = plan
-        self.split = split
         self.indices = plan.indices(split)
         self.prepared = prepared
         if not len(self.indices):
@@ -160,6 +160,26 @@ class PlanItems(Dataset[Instance]):
         return Instance.read(self.plan.path(index)) if self.prepared else self.plan.instance(index)
 
 
+class ClipOptions(TypedDict, total=False):
+    """Which clips a plan gives, and how they are changed.
+
+    Attributes:
+        batch: clips of a batch.
+        seconds: length of a clip; shorter utterances are followed by silence.
+        augment: change what is not prepared: another ear of the split, moved by up to 5 dB, another noise of the split
+            where noise is mixed in, and SNR, level, equalisation, amplification and compression as ``augment_speech``.
+        seed: of order and augmentation.
+        levels, treated: as ``augment_speech`` takes them.
+    """
+
+    batch: int
+    seconds: float
+    augment: bool
+    seed: int
+    levels: tuple[float, float]
+    treated: bool
+
+
 class PlannedBatches(Dataset[Batch]):
     """Clips of the instances of one split in an endless random order: clip p depends on the seed and p alone.
 
@@ -167,21 +187,17 @@ class PlannedBatches(Dataset[Batch]):
 
     Args:
         items: where they come from.
-        batch: clips.
-        seconds: length of the clips; shorter utterances are followed by silence.
-        augment: change what is not prepared: another ear of the split, moved by up to 5 dB, another noise of the split
-            where noise is mixed in, and SNR, level, equalisation, amplification and compression as ``augment_speech``.
-        levels, treated: as ``augment_speech`` takes them.
+        batch, seconds, augment, seed, levels, treated: see ``ClipOptions``.
     """
 
     def __init__(
         self,
         items: PlanItems,
         *,
-        seconds: float,
-        augment: bool,
-        seed: int,
-        batch: int = 1,
+        batch: int = 6,
+        seconds: float = 1.3,
+        augment: bool = True,
+        seed: int = 0,
         levels: tuple[float, float] = (40.0, 95.0),
         treated: bool = True,
     ) -> None:
@@ -189,7 +205,7 @@ class PlannedBatches(Dataset[Batch]):
         self.batch = batch
         self.samples = round(seconds * items.plan.rate)
         self.augment = augment and not items.prepared
-        self.grid = 1 if self.augment else grid_of(items.plan.rate)
+        self.grid = 1 if self.augment else check_grid(items.plan.rate)
         self.seed = seed
         self.levels, self.treated = levels, treated
         self._order = (-1, torch.empty(0))
@@ -222,8 +238,8 @@ class PlannedBatches(Dataset[Batch]):
         plan, indices = self.items.plan, self.items.indices
         clip = Instance(*plan.pair(int(indices[number])), instance.thresholds).clip(first, self.samples)
         other, another = indices[torch.randint(len(indices), (2,), generator=generator)].tolist()
-        mixed = plan.utterance(another).mixed
-        noise = plan.noise(another, self.samples) if mixed else clip.signal - clip.clean
+        donor = plan.utterance(another)
+        noise = plan.noise(donor, self.samples, plan.rate) if donor.mixed else clip.signal - clip.clean
         ear = plan.thresholds(other) + 10.0 * torch.rand((), generator=generator) - 5.0
         ear = ear.clamp(LOWEST_LEVEL, HIGHEST_SIMULATED)
         signal = augment_speech(
@@ -254,12 +270,8 @@ class PlanData(BatchData):
         root: where the audio lies, if not where it was prepared.
         prepared: read the instances that ``--write`` left there, instead of making them.
         recipe: alignment of targets made on the fly, or that of the prepared.
-        batch: items.
-        seconds: of a training clip.
-        augment: see ``PlannedBatches``.
         workers: processes that read and augment, beside the one that trains.
-        seed: of order and augmentation.
-        levels, treated: of the augmentation, as ``augment_speech`` takes them.
+        clips: see ``ClipOptions``; without them 6 clips of 1.3 s, augmented, 40 to 95 dB SPL.
 
     Raises:
         ValueError: the folder is no plan, or holds no instances where ``prepared``.
@@ -272,13 +284,8 @@ class PlanData(BatchData):
         root: str | Path | None = None,
         prepared: bool = False,
         recipe: Recipe | None = None,
-        batch: int = 6,
-        seconds: float = 1.3,
-        augment: bool = True,
         workers: int = 1,
-        seed: int = 0,
-        levels: tuple[float, float] = (40.0, 95.0),
-        treated: bool = True,
+        **clips: Unpack[ClipOptions],
     ) -> None:
         self.plan = Plan(folder, root)
         recipe = recipe or Recipe()
@@ -286,13 +293,11 @@ class PlanData(BatchData):
         super().__init__(teacher=teacher, workers=workers)
         self.prepared = prepared
         self.made_of = claimed(self.plan) if prepared else self.plan.digest
-        self.batch = batch
-        self.clips: dict[str, Any] = {"seconds": seconds, "augment": augment, "seed": seed}
-        self.clips |= {"levels": levels, "treated": treated}
+        self.clips = clips
 
     @cached_property
     def training(self) -> Dataset[Batch]:  # type: ignore[override]
-        return PlannedBatches(self.items("train"), batch=self.batch, **self.clips)
+        return PlannedBatches(self.items("train"), **self.clips)
 
     def items(self, split: str) -> PlanItems:
         """Raises ValueError where the plan has no such split."""
@@ -300,14 +305,13 @@ class PlanData(BatchData):
 
     def val_dataloader(self) -> DataLoader[Any]:
         """The validation split, or where there is none the test split."""
-        try:
-            items = self.items("valid")
-        except ValueError:
-            return self.test_dataloader()
-        return self._loader(items, batch_size=self.batch, collate_fn=collate)
+        return self._whole("valid" if len(self.plan.indices("valid")) else "test")
 
     def test_dataloader(self) -> DataLoader[Any]:
-        return self._loader(self.items("test"), batch_size=self.batch, collate_fn=collate)
+        return self._whole("test")
+
+    def _whole(self, split: str) -> TimedLoader:
+        return self._loader(self.items(split), batch_size=self.clips.get("batch", 6), collate_fn=collate)
 
 
 def collate(instances: list[Instance]) -> Batch:

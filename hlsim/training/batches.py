@@ -204,7 +204,7 @@ def compensator_data(data: TrainingData, recipe: CompensatorRecipe, ear: Audiogr
 def speech_to_validate(data: TrainingData, recipe: SimulatorRecipe) -> list[Batch]:
     """Fixed items: every second one noisy (0 to 20 dB); measured, standard and drawn ears in turn.
 
-    50 to 80 dB SPL, or the recipe's levels where it treats no clip.
+    50 to 80 dB SPL, or the recipe's levels where ``treated`` is off.
     """
     generator = torch.Generator().manual_seed(1_000 + recipe.seed)
     valid = SimulatorBatches(replace(recipe, seconds=_VALID_SECONDS), data.validation())

@@ -170,7 +170,7 @@ def run(
             ) from error
         claim(folder, recipe)  # now that the training can begin
         repair_checkpoint(folder / CHECKPOINT)
-        # SLURM's end of a job leaves its own, newer than the last validation's
+        # SLURM's end of a job leaves another state, newer than the last validation's
         left = [path for path in (last, *folder.glob("hpc_ckpt_*.ckpt")) if path.is_file()]
         newest = max(left, key=lambda path: path.stat().st_mtime_ns, default=None)
         state = str(newest) if newest else None
@@ -178,7 +178,7 @@ def run(
             trainer.fit(module, datamodule=data, ckpt_path=state, weights_only=True)
             trainer.validate(module, datamodule=data, verbose=False)
         except SystemExit as end:
-            # Lightning's answer to Ctrl-C, and, as a kind of its own and as if all were done, to SIGTERM
+            # Lightning's answer to Ctrl-C, and, as another kind and as if all were done, to SIGTERM
             if type(end) is not SystemExit:
                 raise SystemExit(128 + signal.SIGTERM) from None
             if trainer.interrupted:

@@ -2,6 +2,7 @@
 
 import itertools
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -13,7 +14,7 @@ import lightning as L
 from hlsim import MSBG
 from hlsim.calibration import level_spl
 from hlsim.data.instances import Instance, Plan
-from hlsim.data.module import Batch, PlanData, PlanItems, PlannedBatches, Step, collate
+from hlsim.data.module import Batch, BatchData, PlanData, PlanItems, PlannedBatches, Step, collate
 from hlsim.data.writing import Recipe, write_instances
 
 
@@ -164,6 +165,22 @@ def test_epochs_and_resumed_trainings_go_on_where_the_batches_were(plan: Path, t
     first, trainer = fit(2)
     trainer.save_checkpoint(tmp_path / "state.ckpt")
     assert first + fit(3, tmp_path / "state.ckpt")[0] == expected
+
+
+@pytest.mark.parametrize(
+    ("ready", "completed", "steps", "first"),
+    [(5, 4, 5, 5), (5, 4, 4, 4), (4, 4, 2, 4), (4, 4, 8, 4), (0, 0, 0, 0)],
+    ids=["stored after the step of a batch", "before it", "two batches a step", "two steps a batch", "new"],
+)
+def test_the_first_batch_is_the_one_after_the_last_step(
+    ready: int, completed: int, steps: int, first: int
+) -> None:
+    data = BatchData([])  # type: ignore[arg-type]
+    total = SimpleNamespace(ready=ready, completed=completed)
+    progress = SimpleNamespace(epoch_loop=SimpleNamespace(batch_progress=SimpleNamespace(total=total)))
+    data.trainer = SimpleNamespace(fit_loop=progress, global_step=steps, global_rank=1, world_size=2)
+    given = itertools.islice(iter(data.train_dataloader().sampler), 2)
+    assert list(given) == [(first, 1, 2), (first + 1, 1, 2)]
 
 
 def test_workers_go_on_too(plan: Path) -> None:

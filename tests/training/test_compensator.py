@@ -25,11 +25,6 @@ SMALL = {
 EVER = 1e6  # minutes, so that the learning rate does not fall within a test
 
 
-@pytest.fixture
-def data(speech_dir: Path) -> TrainingData:
-    return TrainingData(speech_dir / "train", valid_speech=speech_dir / "valid")
-
-
 def train(data: TrainingData, out: Path, **options: object) -> tuple[Path, list[str]]:
     """A few steps through the exact MSBG."""
     lines: list[str] = []

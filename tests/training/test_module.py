@@ -24,11 +24,6 @@ SHORT = {"batch": 1, "seconds": 0.25, "validate_every": 1, "validation_items": 4
 RUN = {"max_minutes": 1e6, "accelerator": "cpu", "progress": False, "report": lambda line: None}
 
 
-@pytest.fixture
-def data(speech_dir: Path) -> TrainingData:
-    return TrainingData(speech_dir / "train", valid_speech=speech_dir / "valid")
-
-
 def furthest(one: torch.nn.Module, other: torch.nn.Module) -> float:
     return max(float((a - b).abs().max()) for a, b in zip(one.parameters(), other.parameters(), strict=True))
 
