@@ -24,8 +24,9 @@ from hlsim.msbg import MSBG
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.report.haspi import markdown, write_report
 from hlsim.report.pictures import draw_spectrograms
-from hlsim.training.compensator import CompensatorRecipe, train_compensator
-from hlsim.training.sources import TrainingData
+from hlsim.training.batches import TrainingData
+from hlsim.training.compensator import train_compensator
+from hlsim.training.recipes import CompensatorRecipe
 
 SPEECH_LEVEL = 65.0
 """Level in dB SPL at which the utterances are given to the unaided ear and to the compensators."""

@@ -12,8 +12,7 @@ import torch
 import yaml
 
 from hlsim.checks import check_rate, check_waveform
-from hlsim.training.compensator import CompensatorRecipe
-from hlsim.training.simulator import SimulatorRecipe
+from hlsim.training.recipes import CompensatorRecipe, SimulatorRecipe
 
 
 @pytest.mark.parametrize("recipe", [SimulatorRecipe, CompensatorRecipe])

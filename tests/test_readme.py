@@ -47,7 +47,7 @@ def test_recipes_are_readable() -> None:
     yaml = pytest.importorskip("yaml")
     pytest.importorskip("lightning")
     from hlsim.neuro import NeuroConfig
-    from hlsim.training.simulator import SimulatorRecipe
+    from hlsim.training.recipes import SimulatorRecipe
 
     for path in (README.parent / "examples").glob("*.yaml"):
         if "compensator" not in path.name:

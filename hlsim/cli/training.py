@@ -67,14 +67,14 @@ def _train_simulator(options: argparse.Namespace) -> None:
     elif not options.manifest.exists():
         raise ValueError(f"{options.manifest}: not prepared (no such file); 'hlsim prepare' makes it")
     _check(options)
-    from hlsim.training.planned import PlannedSource, PlannedTraining
-    from hlsim.training.simulator import SimulatorRecipe, train_simulator
+    from hlsim.training.batches import PlannedSource
+    from hlsim.training.recipes import SimulatorRecipe
+    from hlsim.training.simulator import train_simulator
 
     arguments = _arguments(options, train_simulator)
     if options.manifest is not None:
         workers = 1 if options.workers is None else options.workers
         arguments["data"] = PlannedSource(options.manifest, options.root, options.prepared, workers=workers)
-        arguments["kind"] = PlannedTraining
     folder = train_simulator(recipe=SimulatorRecipe.from_dict(_recipe(options)), **arguments)
     print(f"the best checkpoint is in {folder}")
 
@@ -84,7 +84,8 @@ def _train_compensator(options: argparse.Namespace) -> None:
         raise ValueError(f"--audiogram with {given}; allowed: one ear, or a CSV of ears, not both")
     _check(options)
     ear = read_ear(options.audiogram) if options.audiogram else None
-    from hlsim.training.compensator import CompensatorRecipe, train_compensator
+    from hlsim.training.compensator import train_compensator
+    from hlsim.training.recipes import CompensatorRecipe
 
     recipe = CompensatorRecipe.from_dict(_recipe(options))
     folder = train_compensator(recipe=recipe, **_arguments(options, train_compensator, audiogram=ear))
@@ -112,10 +113,12 @@ def _recipe(options: argparse.Namespace) -> dict[str, Any]:
 
 def _arguments(options: argparse.Namespace, train: Callable[..., Path], **more: Any) -> dict[str, Any]:
     from hlsim.torchtools import keep_freed_memory
-    from hlsim.training.sources import TrainingData
+    from hlsim.training.batches import TrainingData
+    from hlsim.training.loop import RunOptions
 
     keep_freed_memory()
-    return passed(
+    running = {name: value for name, value in vars(options).items() if name in RunOptions.__annotations__}
+    return running | passed(
         options,
         train,
         data=None if options.speech is None else TrainingData(**passed(options, TrainingData)),

@@ -14,6 +14,10 @@ HIGHEST_LEVEL = 115.0
 """RMS level in dB SPL above which no training signal goes."""
 
 
+KNOTS = (100.0, 250.0, 600.0, 1500.0, 3500.0, 7000.0)
+"""Hz, of the random equaliser."""
+
+
 def mix(speech: Tensor, noise: Tensor, snr_db: Tensor) -> Tensor:
     """Add noise at a signal-to-noise ratio of RMS levels. Shape: (items, time) twice, (items,) dB -> (items, time)."""
     level = speech.square().mean(-1).clamp_min(1e-20).log10() * 10.0
@@ -47,7 +51,7 @@ def compress(waveform: Tensor, ratio: Tensor, sample_rate: int) -> Tensor:
     return waveform * ((power + 1e-3 * mean + 1e-20) / (mean + 1e-20)) ** exponent
 
 
-def vary(
+def augment_speech(
     speech: Tensor,
     noise: Tensor | None,
     ears: Tensor,
@@ -85,9 +89,8 @@ def vary(
     if not treated:
         return set_level(signal, loud)
     signal = set_level(some(1, 0.2, compress(signal, ratio, sample_rate), signal), loud)
-    knots = torch.tensor([100.0, 250.0, 600.0, 1500.0, 3500.0, 7000.0])
-    gains = uniform(-15.0, 15.0, len(knots))
-    signal = some(2, 0.4, equalise(signal, gains, knots, sample_rate), signal)
+    gains = uniform(-15.0, 15.0, len(KNOTS))
+    signal = some(2, 0.4, equalise(signal, gains, torch.tensor(KNOTS), sample_rate), signal)
     amplified = equalise(signal, ears * uniform(0.2, 0.8, 1), torch.tensor(FREQUENCIES), sample_rate)
     signal = some(3, 0.4, amplified, signal)
     excess = (10.0 * signal.square().mean(-1).clamp_min(1e-20).log10() + 94.0 - HIGHEST_LEVEL).clamp_min(0.0)

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from torch import Tensor
 
@@ -95,26 +96,17 @@ def examine(root: Path, found: Found, *, shortest: float, pairs: bool) -> Found:
 
 
 def examine_all(
-    items: Iterable[Found],
-    root: Path,
-    *,
-    shortest: float,
-    pairs: bool,
-    jobs: int | None = None,
-    backend: str = "loky",
-    scheduler: str | None = None,
+    items: Iterable[Found], root: Path, shortest: float, pairs: bool, **parallel: Any
 ) -> Iterator[Found]:
     """``examine`` of each item, in order; a process that dies is a fault of its file.
 
     Args:
-        jobs, backend, scheduler: see ``run_parallel``.
+        parallel: see ``run_parallel``.
     """
     task = partial(_numbered, root, shortest, pairs)
     waiting: dict[int, Found] = {}
     wanted = 0
-    for (number, item), found in run_parallel(
-        task, enumerate(items), jobs=jobs, backend=backend, scheduler=scheduler
-    ):
+    for (number, item), found in run_parallel(task, enumerate(items), **parallel):
         path = item.path if isinstance(item, Fault) else item.clean
         waiting[number] = found or Fault(path, "the process that read it died")
         while wanted in waiting:

@@ -20,7 +20,7 @@ LAYOUTS = ("voicebank-demand", "librispeech", "folder")
 
 _VOICEBANK = (("trainset_28spk", "train"), ("trainset_56spk", "train"), ("testset", "test"))
 _LIBRISPEECH = {"train": "train", "dev": "valid", "test": "test"}
-_SPLIT_FOLDERS = {"train": "train", "valid": "valid", "dev": "valid", "test": "test"}
+SPLIT_FOLDERS = {"train": "train", "valid": "valid", "dev": "valid", "test": "test"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,9 +58,8 @@ def find_utterances(corpus: Path, layout: str, table: Path | None = None) -> Ite
     """
     if table is not None:
         return _listed(corpus, table)
-    if layout == "voicebank-demand":
-        return _voicebank(corpus)
-    return _librispeech(corpus) if layout == "librispeech" else _folder(corpus)
+    layouts = {"voicebank-demand": _voicebank, "librispeech": _librispeech, "folder": _folder}
+    return _named_once(layouts[layout](corpus))
 
 
 def assign_splits(
@@ -87,7 +86,7 @@ def assign_splits(
     assigned = {speaker: max(splits) or "train" for speaker, splits in speakers.items()}
     given = any(splits != {""} for splits in speakers.values())
     for split, share in (("test", 0.0 if given else test_share), ("valid", valid_share)):
-        training = sorted(speaker for speaker, own in assigned.items() if own == "train")
+        training = sorted(speaker for speaker, given_to in assigned.items() if given_to == "train")
         count = min(max(1, round(share * len(training))), len(training) - 1) if share else 0
         for speaker in Random(f"{seed}:{split}").sample(training, count):
             assigned[speaker] = split
@@ -114,21 +113,18 @@ def linked_folders(folder: Path, prefix: str = "") -> Iterator[Fault]:
                 yield Fault(name, "a link to a folder; put the folder itself there")
 
 
-class _Names:
-    """Names in one folder after the other, without their endings."""
-
-    def __init__(self) -> None:
-        self.folder, self.names = "", set[str]()
-
-    def again(self, path: str) -> bool:
-        """Whether the path's folder has had the name already."""
-        folder = path.rpartition("/")[0]
-        if folder != self.folder:
-            self.folder, self.names = folder, set()
-        name = _stem(path)
-        known = name in self.names
-        self.names.add(name)
-        return known
+def _named_once(found: Iterator[Found]) -> Iterator[Found]:
+    """With a fault for a file whose folder has had its name already, with another ending."""
+    folder, names = "", set[str]()
+    for one in found:
+        if isinstance(one, Utterance):
+            place, _, name = _stem(one.clean).rpartition("/")
+            if place != folder:
+                folder, names = place, set()
+            if name in names:
+                one = Fault(one.clean, f"a second file of the name {one.id}")
+            names.add(name)
+        yield one
 
 
 def _stem(path: str) -> str:
@@ -137,7 +133,6 @@ def _stem(path: str) -> str:
 
 def _voicebank(corpus: Path) -> Iterator[Found]:
     """``clean_trainset_28spk_wav/p226_001.wav`` and so on; ``log_trainset_28spk.txt`` tells noise and SNR."""
-    names = _Names()
     for name, split in _VOICEBANK:
         clean, noisy = f"clean_{name}_wav", f"noisy_{name}_wav"
         if not (corpus / clean).is_dir():
@@ -148,12 +143,8 @@ def _voicebank(corpus: Path) -> Iterator[Found]:
                 yield Fault(f"{clean}/{path}", f"no noisy counterpart {noisy}/{path}")
                 continue
             key = Path(path).stem
-            if names.again(f"{clean}/{path}"):
-                yield Fault(f"{clean}/{path}", f"a second file of the name {key}")
-                continue
-            noise, snr = noises.get(key, ("", None))
-            speaker = key.split("_")[0]
-            yield Utterance(key, speaker, split, f"{clean}/{path}", f"{noisy}/{path}", noise, snr)
+            noise = noises.get(key, ("", None))
+            yield Utterance(key, key.split("_")[0], split, f"{clean}/{path}", f"{noisy}/{path}", *noise)
         for path in walk_audio(corpus / noisy):
             if not (corpus / clean / path).is_file():
                 yield Fault(f"{noisy}/{path}", f"no clean counterpart {clean}/{path}")
@@ -189,13 +180,9 @@ def _librispeech_parts(corpus: Path) -> list[tuple[str, str]]:
 
 def _librispeech(corpus: Path) -> Iterator[Found]:
     """``train-clean-100/<speaker>/<chapter>/<speaker>-<chapter>-<number>.flac`` and so on."""
-    names = _Names()
     for part, split in _librispeech_parts(corpus):
         for path in walk_audio(corpus / part):
             key = Path(path).stem
-            if names.again(f"{part}/{path}"):
-                yield Fault(f"{part}/{path}", f"a second file of the name {key}")
-                continue
             yield Utterance(key, key.split("-")[0], split, f"{part}/{path}")
         yield from linked_folders(corpus / part, part)
 
@@ -205,10 +192,9 @@ def _folder(corpus: Path) -> Iterator[Found]:
 
     Where a folder ``clean`` has a neighbour ``noisy``, files of equal names in them are pairs.
     """
-    names = _Names()
     for path in walk_audio(corpus):
         parts = path.split("/")
-        split = _SPLIT_FOLDERS.get(parts[0], "") if len(parts) > 1 else ""
+        split = SPLIT_FOLDERS.get(parts[0], "") if len(parts) > 1 else ""
         for side, other in (("clean", "noisy"), ("noisy", "clean")):
             place = parts.index(side) if side in parts[:-1] else -1
             if place >= 0 and corpus.joinpath(*parts[:place], other).is_dir():
@@ -219,14 +205,10 @@ def _folder(corpus: Path) -> Iterator[Found]:
         if counterpart and not (corpus / counterpart).is_file():
             yield Fault(path, f"no {other} counterpart {counterpart}")
         elif side != "noisy":
-            key = _stem(path)
-            if names.again(path):
-                yield Fault(path, f"a second file of the name {key}")
-                continue
             speaker = "/".join(
                 part for i, part in enumerate(parts[:-1]) if i != place and not (i == 0 and split)
             )
-            yield Utterance(key, speaker or _unknown(split), split, path, counterpart)
+            yield Utterance(_stem(path), speaker or _unknown(split), split, path, counterpart)
     yield from linked_folders(corpus)
 
 
@@ -271,29 +253,19 @@ def _listed(corpus: Path, table: Path) -> Iterator[Found]:
 def find_below(
     root: Path, corpus: str, layout: str, table: Path | None = None, noise: str | None = None
 ) -> Iterator[Found]:
-    """As ``find_utterances`` of ``root / corpus``, with paths below the root, and without what is in the folder noise."""
+    """As ``find_utterances`` of ``root / corpus``, with paths below the root, and without what is in the folder noise.
+
+    What has a name that does not fit a CSV file is a fault, with a name that does.
+    """
+    prefix = f"{corpus}/" if corpus else ""
     for found in find_utterances(root / corpus, layout, table):
-        placed = _below(found, corpus)
-        path = placed.path if isinstance(placed, Fault) else placed.clean
-        if noise is None or not path.startswith(f"{noise}/"):
-            yield _named(placed)
-
-
-def _named(found: Found) -> Found:
-    """What is found, or a fault with a name that fits a CSV file."""
-    if isinstance(found, Fault):
-        fits = storable(found.path) and storable(found.reason)
-        return found if fits else Fault(printable(found.path), printable(found.reason))
-    for path in (found.clean, found.noisy):
-        if not storable(path):
-            return Fault(printable(path), BAD_NAME)
-    return found
-
-
-def _below(found: Found, prefix: str) -> Found:
-    if not prefix:
-        return found
-    if isinstance(found, Fault):
-        return replace(found, path=f"{prefix}/{found.path}")
-    noisy = f"{prefix}/{found.noisy}" if found.noisy else ""
-    return replace(found, clean=f"{prefix}/{found.clean}", noisy=noisy)
+        path = prefix + (found.path if isinstance(found, Fault) else found.clean)
+        if noise is not None and path.startswith(f"{noise}/"):
+            continue
+        if isinstance(found, Fault):
+            fits = storable(path) and storable(found.reason)
+            yield Fault(path, found.reason) if fits else Fault(printable(path), printable(found.reason))
+            continue
+        noisy = found.noisy and prefix + found.noisy
+        wrong = next((name for name in (path, noisy) if not storable(name)), None)
+        yield replace(found, clean=path, noisy=noisy) if wrong is None else Fault(printable(wrong), BAD_NAME)

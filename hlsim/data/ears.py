@@ -20,7 +20,12 @@ from hlsim.data.manifest import SPLITS
 MILD_TO_SEVERE: Mapping[str, float] = {"mild": 1.0, "moderate": 1.0, "severe": 1.0}
 """Default proportions of MSBG's severities: the paper says no more than "from mild to severe"."""
 
-_SHARES = {"test": 2, "valid": 1}  # tenths of drawn ears, and of listeners in a file without splits
+_TENTHS = (
+    "test",
+    "test",
+    "valid",
+    *7 * ["train"],
+)  # of drawn ears, and of listeners in a file without splits
 _KEPT = 2048  # drawn ears of a severity that wait for their turn
 
 
@@ -112,19 +117,19 @@ def plan_ears(
     listeners = sorted({who for who, _ in groups[""]})
     Random(f"{seed}:listeners").shuffle(listeners)
     owner = dict.fromkeys(listeners, "train")
-    for split in _SHARES:
+    for split in ("test", "valid"):
         if split in splits and not groups[split]:
             # of one or two listeners a split gets none, and check says so
-            for _ in range(min(len(listeners), math.ceil(_SHARES[split] * len(owner) / 10))):
+            for _ in range(min(len(listeners), math.ceil(_TENTHS.count(split) * len(owner) / 10))):
                 owner[listeners.pop()] = split
     for who, ear in groups.pop(""):
         groups[owner[who]].append((who, ear))
     ears: dict[str, tuple[Audiogram, ...]] = {}
     taken: set[tuple[float, ...]] = set()
     for split in ("test", "valid", "train"):
-        own = {ear.levels: ear for _, ear in groups[split] if ear.levels not in taken}
-        ears[split] = tuple(own.values())
-        taken.update(own)
+        fresh = {ear.levels: ear for _, ear in groups[split] if ear.levels not in taken}
+        ears[split] = tuple(fresh.values())
+        taken.update(fresh)
     exact = check_shares(shares) if shares else {}
     for split in splits:
         if missing := sorted(set(exact) - {ear.severity for ear in ears[split]}):
@@ -180,14 +185,7 @@ class _Drawn:
             for levels in draw_thresholds(256, self.generator).tolist():
                 ear = _as_written(levels)
                 tenth = hashlib.sha256(repr(ear.levels).encode()).digest()[0] % 10
-                if _owner(tenth) == self.split and len(self.waiting[ear.severity]) < _KEPT:
+                if _TENTHS[tenth] == self.split and len(self.waiting[ear.severity]) < _KEPT:
                     self.waiting[ear.severity].append(ear)
         ear = waiting.pop()
         return ear if ear not in other_than else self.take(severity, other_than)
-
-
-def _owner(tenth: int) -> str:
-    """Whose the drawn ears of one tenth are."""
-    if tenth < _SHARES["test"]:
-        return "test"
-    return "valid" if tenth < _SHARES["test"] + _SHARES["valid"] else "train"

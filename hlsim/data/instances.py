@@ -12,6 +12,7 @@ import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save
 from torch import Tensor
+from torch.nn import functional
 
 from hlsim.audio import read_audio, read_stretch
 from hlsim.audiogram import FREQUENCIES, Audiogram
@@ -54,6 +55,16 @@ class Instance:
     thresholds: Tensor
     impaired: Tensor | None = None
 
+    def clip(self, first: int, samples: int) -> Instance:
+        """``samples`` samples from ``first`` on, followed by silence where it is shorter."""
+
+        def cut(value: Tensor) -> Tensor:
+            piece = value[first : first + samples]
+            return functional.pad(piece, (0, samples - piece.shape[-1]))
+
+        impaired = None if self.impaired is None else cut(self.impaired)
+        return Instance(cut(self.clean), cut(self.signal), self.thresholds, impaired)
+
     def to_bytes(self) -> bytes:
         """A safetensors file; equal instances give equal bytes."""
         assert self.impaired is not None
@@ -94,6 +105,7 @@ class Plan:
             raise ValueError(f"{self.folder}: not prepared ({error}); 'hlsim prepare' makes it") from error
         self.utterances = Rows(self.folder / MANIFEST, UTTERANCE_COLUMNS)
         self.rows = Rows(self.folder / INSTANCES, INSTANCE_COLUMNS)
+        self._splits: dict[str, Tensor] | None = None
         self._last = (-1, torch.empty(0))  # an utterance is wanted as often as it has instances, and in a row
         if len(self.rows) != len(self.utterances) * self.each:
             raise ValueError(
@@ -117,9 +129,12 @@ class Plan:
 
     def indices(self, split: str) -> Tensor:
         """Numbers of the instances of a split. Shape: -> (instances,), int64."""
-        return torch.tensor(
-            [i for i, row in enumerate(self.rows) if row["split"] == split], dtype=torch.int64
-        )
+        if self._splits is None:
+            places: dict[str, list[int]] = {}
+            for index, row in enumerate(self.rows):
+                places.setdefault(row["split"], []).append(index)
+            self._splits = {name: torch.tensor(found) for name, found in places.items()}
+        return self._splits.get(split, torch.empty(0, dtype=torch.int64))
 
     def utterance(self, index: int) -> Utterance:
         """Of an instance."""
@@ -158,7 +173,7 @@ class Plan:
         elif utterance.mixed:
             assert utterance.snr is not None
             noisy = mix_at(
-                clean, self._noise(utterance, len(clean), rate), utterance.snr, utterance.active_level
+                clean, self.noise(utterance, len(clean), rate), utterance.snr, utterance.active_level
             )
         else:
             noisy = clean
@@ -168,18 +183,12 @@ class Plan:
             raise ValueError(f"{inside(self.root, utterance.clean)}: has changed since it was prepared")
         return resample(torch.stack((clean, noisy)), rate, self.rate)
 
-    def noise(self, index: int, samples: int) -> Tensor:
-        """As long a piece as asked of the noise that an instance's utterance is mixed with, at the plan's rate.
-
-        Shape: -> (samples,).
-        """
-        return self._noise(self.utterance(index), samples, self.rate)
-
-    def _noise(self, utterance: Utterance, samples: int, rate: int) -> Tensor:
+    def noise(self, utterance: Utterance, samples: int, rate: int) -> Tensor:
+        """As long a piece as asked of the noise that an utterance is mixed with. Shape: -> (samples,)."""
         start = utterance.noise_start or 0.0
         # a little more, for resampling rounds
-        noise, own_rate = read_stretch(inside(self.root, utterance.noise), start, samples / rate + 0.01)
-        return resample(noise[0], own_rate, rate)[:samples]
+        noise, file_rate = read_stretch(inside(self.root, utterance.noise), start, samples / rate + 0.01)
+        return resample(noise[0], file_rate, rate)[:samples]
 
     def instance(self, index: int) -> Instance:
         """Without ``impaired``. Raises ValueError as ``pair``."""

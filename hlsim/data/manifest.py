@@ -6,13 +6,20 @@ import csv
 import io
 import os
 from array import array
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import lru_cache
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 SPLITS = ("train", "valid", "test")
+
+_READ: dict[str, Callable[[str], Any]] = {
+    "str": str,
+    "int": int,
+    "float": float,
+    "float | None": lambda text: float(text) if text else None,
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,19 +60,8 @@ class Utterance:
     def from_row(cls, row: Mapping[str, str]) -> Utterance:
         """Raises ValueError where a column is missing or holds what it cannot."""
         try:
-            utterance = cls(
-                id=row["id"],
-                speaker=row["speaker"],
-                split=row["split"],
-                clean=row["clean"],
-                noisy=row["noisy"],
-                noise=row["noise"],
-                snr=float(row["snr"]) if row["snr"] else None,
-                noise_start=float(row["noise_start"]) if row["noise_start"] else None,
-                rate=int(row["rate"]),
-                seconds=float(row["seconds"]),
-                active_level=float(row["active_level"]),
-            )
+            cells = {entry.name: _READ[str(entry.type)](row[entry.name]) for entry in fields(cls)}
+            utterance = cls(**cells)
         except (KeyError, TypeError, ValueError) as error:
             raise ValueError(
                 f"no row of a manifest ({error!r}); allowed: {', '.join(UTTERANCE_COLUMNS)}"

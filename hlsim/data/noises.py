@@ -13,7 +13,7 @@ from torch import Tensor
 from hlsim.audio import read_audio
 from hlsim.calibration import dbfs
 from hlsim.data.checking import silence
-from hlsim.data.corpora import BAD_NAME, Fault, linked_folders, walk_audio
+from hlsim.data.corpora import BAD_NAME, SPLIT_FOLDERS, Fault, linked_folders, walk_audio
 from hlsim.data.manifest import Utterance, inside, printable, storable
 
 TRAIN_SNRS_DB, TEST_SNRS_DB = (0.0, 5.0, 10.0, 15.0), (2.5, 7.5, 12.5, 17.5)
@@ -22,7 +22,6 @@ TRAIN_SNRS_DB, TEST_SNRS_DB = (0.0, 5.0, 10.0, 15.0), (2.5, 7.5, 12.5, 17.5)
 TRAIN_TYPES, TEST_TYPES = 8, 2
 """Types of noise, where there are as many."""
 
-_SPLIT_FOLDERS = {"train": "train", "valid": "valid", "dev": "valid", "test": "test"}
 _QUIET_DB = 30.0  # a stretch this far below its recording's level counts as a pause of the noise
 _STEP, _STRETCH = 0.1, 5  # s from one possible start to the next, and how many of these are no pause
 
@@ -72,7 +71,7 @@ def find_noises(
     faults = list(linked_folders(root / folder, folder))
     for path in walk_audio(root / folder):
         parts = path.split("/")
-        split = _SPLIT_FOLDERS.get(parts[0], "") if len(parts) > 1 else ""
+        split = SPLIT_FOLDERS.get(parts[0], "") if len(parts) > 1 else ""
         inner = parts[1:] if split else parts
         kind = "/".join(inner[:-1]) or Path(path).stem
         name = f"{folder}/{path}" if folder else path
@@ -113,7 +112,7 @@ def _drawn(
         test = min(test, round(len(names) / 5) or 1) if len(names) > 1 else 0
         train = len(names) - test
     chosen = {"train": names[:train], "test": names[train : train + test]}
-    return {split: {name: types[name] for name in own} for split, own in chosen.items() if own}
+    return {split: {name: types[name] for name in part} for split, part in chosen.items() if part}
 
 
 def _starts(noise: Tensor, rate: int) -> tuple[float, ...]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -23,8 +23,6 @@ from hlsim.files import PARTIAL, Whole, sha256, write_whole
 
 FAULTS = "faults.csv"
 FAULT_COLUMNS = ("path", "reason")
-
-Progress = Callable[[int, int], None]
 
 
 @dataclass
@@ -69,7 +67,7 @@ def prepare(
     jobs: int | None = None,
     backend: str = "loky",
     scheduler: str | None = None,
-    progress: Progress | None = None,
+    progress: Callable[[int, int], None] | None = None,
 ) -> Prepared:
     """Check a corpus file by file and write the plan of a data set.
 
@@ -99,7 +97,7 @@ def prepare(
     about: dict[str, Any] = {
         "root": str(root),
         "layout": layout,
-        "settings": {name: _plain(value) for name, value in asdict(settings).items()},
+        "settings": {n: str(v) if isinstance(v, Path) else v for n, v in asdict(settings).items()},
         "files_sha256": listing.digest(
             root / noise if settings.noise else None, settings.audiograms, settings.test_audiograms
         ),
@@ -135,15 +133,8 @@ def prepare(
 
         for fault in faults:
             tell(fault)
-        examined = examine_all(
-            find(),
-            root,
-            shortest=settings.shortest,
-            pairs=listing.paired > 0,
-            jobs=jobs,
-            backend=backend,
-            scheduler=scheduler,
-        )
+        where: dict[str, Any] = {"jobs": jobs, "backend": backend, "scheduler": scheduler}
+        examined = examine_all(find(), root, settings.shortest, listing.paired > 0, **where)
         for number, found in enumerate(examined, start=1):
             if isinstance(found, Fault):
                 tell(found)
@@ -177,21 +168,16 @@ def prepare(
 def _spare_what_is_not_ours(settings: PlanSettings, folder: Path) -> None:
     """Raises ValueError where a table of the user's would be written over."""
     tables = (settings.table, settings.audiograms, settings.test_audiograms)
-    for name, columns in (
-        (MANIFEST, UTTERANCE_COLUMNS),
-        (INSTANCES, INSTANCE_COLUMNS),
-        (FAULTS, FAULT_COLUMNS),
-        (SETTINGS, None),
-    ):
+    ours = {MANIFEST: UTTERANCE_COLUMNS, INSTANCES: INSTANCE_COLUMNS, FAULTS: FAULT_COLUMNS, SETTINGS: None}
+    for name, columns in ours.items():
         path = folder / name
         if not path.is_file():
             continue
         if any(table.exists() and table.samefile(path) for table in tables if table is not None):
             raise ValueError(f"{path}: would be written over, and is read from; choose another --out")
         with open(path, "rb") as file:
-            ours = columns is None or file.readline() == csv_line(columns).encode()
-        if not ours:
-            raise ValueError(f"{path}: not written by 'hlsim prepare'; choose another --out, or move it")
+            if columns is not None and file.readline() != csv_line(columns).encode():
+                raise ValueError(f"{path}: not written by 'hlsim prepare'; choose another --out, or move it")
 
 
 def _noises(
@@ -204,16 +190,8 @@ def _noises(
             f"{settings.corpus}: has noisy speech of its own; allowed: no folder of noise with it, or only the "
             "clean speech as the corpus"
         )
-    return find_noises(
-        root,
-        noise,
-        splits,
-        train_snrs=settings.train_snrs,
-        test_snrs=settings.test_snrs,
-        train_types=settings.train_types,
-        test_types=settings.test_types,
-        seed=settings.seed,
-    )
+    names = ("train_snrs", "test_snrs", "train_types", "test_types", "seed")
+    return find_noises(root, noise, splits, **{name: getattr(settings, name) for name in names})
 
 
 def _unchanged(folder: Path, about: Mapping[str, Any], strict: bool) -> Prepared | None:
@@ -245,26 +223,17 @@ def _write_instances(
     assigned = {
         split: ears.assign(split, count, settings.ears) for split, count in prepared.utterances.items()
     }
-    manifest = Rows(folder / MANIFEST, UTTERANCE_COLUMNS)
+    number = 0
     with Whole(folder / INSTANCES) as file:
         file.write(csv_line(INSTANCE_COLUMNS))
-        for number, cells in enumerate(_instances(manifest, assigned, inputs, settings)):
-            file.write(csv_line((number, *cells)))
-            prepared.instances[cells[1]] += 1
-            prepared.severities[f"{cells[1]} {cells[4]}"] += 1
+        for row in Rows(folder / MANIFEST, UTTERANCE_COLUMNS):
+            draw, split = Random(f"{settings.seed}:level:{row['id']}"), row["split"]
+            for ear in next(assigned[split]):
+                level = f"{draw.uniform(*settings.level):.2f}"
+                for name in inputs:
+                    cells = (number, row["id"], split, name, level, ear.severity)
+                    file.write(csv_line((*cells, *ear.to_row().values())))
+                    number += 1
+                    prepared.instances[split] += 1
+                    prepared.severities[f"{split} {ear.severity}"] += 1
         file.keep()
-
-
-def _instances(
-    manifest: Rows, assigned: Mapping[str, Iterator[list[Any]]], inputs: Sequence[str], settings: PlanSettings
-) -> Iterator[tuple[str, ...]]:
-    for row in manifest:
-        draw = Random(f"{settings.seed}:level:{row['id']}")
-        for ear in next(assigned[row["split"]]):
-            level = f"{draw.uniform(*settings.level):.2f}"
-            for name in inputs:
-                yield (row["id"], row["split"], name, level, ear.severity, *ear.to_row().values())
-
-
-def _plain(value: Any) -> Any:
-    return str(value) if isinstance(value, Path) else value

@@ -109,14 +109,13 @@ class Teacher(nn.Module):
         return functional.pad(heard, (-delay, delay))
 
 
-def grid_of(sample_rate: int) -> int:
-    """Samples from one place where a frame of MSBG's smearing starts to the next that falls on a sample."""
-    return _FRAME * sample_rate // math.gcd(_FRAME * sample_rate, MSBG_RATE)
-
-
 def check_grid(sample_rate: int) -> int:
-    """``grid_of`` a rate, or ValueError where it is too coarse for a teacher."""
-    grid = grid_of(sample_rate)
+    """Samples from one place where a frame of MSBG's smearing starts to the next that falls on a sample.
+
+    Raises:
+        ValueError: these are too many for a teacher.
+    """
+    grid = _FRAME * sample_rate // math.gcd(_FRAME * sample_rate, MSBG_RATE)
     if grid > 4 * sample_rate:
         raise ValueError(
             f"sample rate {sample_rate} Hz for a teacher; allowed: 16000, 22050, 24000, 32000, 44100, 48000"

@@ -43,7 +43,7 @@ class WholeStates(TorchCheckpointIO):
                     raise ValueError(f"{changed} is not what was written")
             state: dict[str, Any] = super().load_checkpoint(path, *options, **others)
             state["state_dict"]
-        except Exception as error:  # zip, pickle and torch have their own each
+        except Exception as error:  # zip, pickle and torch each have others
             raise ValueError(f"{path}: not readable as a state; remove it to start anew") from error
         return state
 

@@ -6,7 +6,7 @@ from torch import Tensor
 
 from hlsim.audiogram import FREQUENCIES, draw_thresholds
 from hlsim.calibration import level_spl, set_level
-from hlsim.data.augment import HIGHEST_LEVEL, compress, equalise, mix, vary
+from hlsim.data.augment import HIGHEST_LEVEL, augment_speech, compress, equalise, mix
 
 
 def tones(*hz: float, rate: int = 16000, seconds: float = 0.5) -> Tensor:
@@ -76,7 +76,7 @@ def drawn(items: int, seed: int, ears: Tensor | None = None, noise: bool = True)
     speech = torch.randn(items, 1600, generator=generator)
     noises = torch.randn(items, 1600, generator=generator) if noise else None
     ears = draw_thresholds(items, generator) if ears is None else ears
-    return vary(speech, noises, ears, 16000, generator)
+    return augment_speech(speech, noises, ears, 16000, generator)
 
 
 def test_vary_draws_from_the_generator_alone() -> None:
@@ -112,9 +112,9 @@ def test_two_in_five_are_amplified_for_the_ear() -> None:
 def test_silence_stays_finite() -> None:
     generator = torch.Generator().manual_seed(0)
     speech = torch.zeros(32, 1600)
-    out = vary(speech, torch.randn(32, 1600), draw_thresholds(32, generator), 16000, generator)
+    out = augment_speech(speech, torch.randn(32, 1600), draw_thresholds(32, generator), 16000, generator)
     assert bool(torch.isfinite(out).all())
-    assert not bool(vary(speech, None, torch.zeros(32, 8), 16000, generator).any())
+    assert not bool(augment_speech(speech, None, torch.zeros(32, 8), 16000, generator).any())
 
 
 def test_levels_of_items_do_not_depend_on_the_recordings() -> None:
@@ -123,5 +123,5 @@ def test_levels_of_items_do_not_depend_on_the_recordings() -> None:
     outs = []
     for gain in (1.0, 1e-3):
         generator.manual_seed(7)
-        outs.append(vary(set_level(speech, 60.0) * gain, None, torch.zeros(8, 8), 16000, generator))
+        outs.append(augment_speech(set_level(speech, 60.0) * gain, None, torch.zeros(8, 8), 16000, generator))
     torch.testing.assert_close(outs[0], outs[1], atol=1e-6, rtol=1e-3)

@@ -2,6 +2,7 @@
 
 import itertools
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -13,7 +14,7 @@ import lightning as L
 from hlsim import MSBG
 from hlsim.calibration import level_spl
 from hlsim.data.instances import Instance, Plan
-from hlsim.data.module import Batch, PlanData, PlanItems, TrainingItems, collate
+from hlsim.data.module import Batch, BatchData, PlanData, PlanItems, PlannedBatches, Step, collate
 from hlsim.data.writing import Recipe, write_instances
 
 
@@ -42,14 +43,14 @@ def test_whole_utterances_are_the_same_both_ways(written: Path) -> None:
 
 
 def test_clips_are_the_same_places_both_ways(written: Path) -> None:
-    options = {"seconds": 0.15, "augment": False, "seed": 3, "length": 40}
+    options = {"seconds": 0.15, "augment": False, "seed": 3}
     plan = Plan(written)
-    fly, disk = (TrainingItems(PlanItems(plan, "train", prepared=p), **options) for p in (False, True))  # type: ignore[arg-type]
+    fly, disk = (PlannedBatches(PlanItems(plan, "train", prepared=p), **options) for p in (False, True))  # type: ignore[arg-type]
     teacher = MSBG(sample_rate=16000)
     speech = [plan.instance(index).clean for index in range(0, 16, 4)]
     starts: set[int] = set()
     for place in range(16):
-        made, read = fly[place], disk[place]
+        made, read = fly.clip(place), disk.clip(place)
         assert made.impaired is None and read.impaired is not None
         assert torch.equal(made.signal, read.signal) and torch.equal(made.clean, read.clean)
         assert made.signal.shape == read.impaired.shape == (2400,)
@@ -63,25 +64,26 @@ def test_clips_are_the_same_places_both_ways(written: Path) -> None:
 
 def test_every_instance_comes_once_an_epoch_and_the_order_resumes(plan: Path) -> None:
     items = PlanItems(Plan(plan), "train")
-    options = {"seconds": 0.2, "seed": 1, "length": 100}
-    clips = TrainingItems(items, augment=False, **options)  # type: ignore[arg-type]
-    seen = [tuple(clips[i].signal[:50].tolist() + clips[i].thresholds.tolist()) for i in range(16)]
-    ears = [clips[i].thresholds.tolist() for i in range(32)]
+    options = {"seconds": 0.2, "seed": 1}
+    clips = PlannedBatches(items, augment=False, **options)  # type: ignore[arg-type]
+    seen = [tuple(clips.clip(i).signal[:50].tolist() + clips.clip(i).thresholds.tolist()) for i in range(16)]
+    ears = [clips.clip(i).thresholds.tolist() for i in range(32)]
     assert sorted(ears[:16]) == sorted(ears[16:]) and ears[:16] != ears[16:]
     assert len(set(seen)) == 16
     for augment in (False, True):
-        first = TrainingItems(items, augment=augment, **options)  # type: ignore[arg-type]
-        later = TrainingItems(items, augment=augment, start=10, **options)  # type: ignore[arg-type]
-        for i in range(12):
-            assert torch.equal(first[10 + i].signal, later[i].signal)
-    other = TrainingItems(items, augment=False, seconds=0.2, seed=2, length=100)
-    assert [other[i].thresholds.tolist() for i in range(16)] != ears[:16]
+        first = PlannedBatches(items, augment=augment, **options)  # type: ignore[arg-type]
+        later = PlannedBatches(items, augment=augment, batch=6, **options)  # type: ignore[arg-type]
+        for i in range(6):
+            assert torch.equal(first.clip(6 + i).signal, later[Step(1)]["signal"][i])
+            assert torch.equal(first.clip(13 + 2 * i).signal, later[Step(1, 1, 2)]["signal"][i])
+    other = PlannedBatches(items, augment=False, seconds=0.2, seed=2)
+    assert [other.clip(i).thresholds.tolist() for i in range(16)] != ears[:16]
 
 
 def test_training_varies_level_ear_noise_and_spectrum(plan: Path) -> None:
     items = PlanItems(Plan(plan), "train")
-    varied = TrainingItems(items, seconds=0.5, augment=True, seed=0, length=64)
-    drawn = [varied[i] for i in range(64)]
+    varied = PlannedBatches(items, seconds=0.5, augment=True, seed=0)
+    drawn = [varied.clip(i) for i in range(64)]
     levels = torch.stack([level_spl(one.signal) for one in drawn])
     assert float(levels.min()) < 55.0 and float(levels.max()) > 85.0
     assert all(
@@ -98,14 +100,14 @@ def test_training_varies_level_ear_noise_and_spectrum(plan: Path) -> None:
 def test_what_cannot_be_read_is_left_out_while_training(plan: Path, voicebank: Path) -> None:
     bad = voicebank / "clean_trainset_28spk_wav" / "p226_001.wav"
     bad.unlink()
-    clips = TrainingItems(PlanItems(Plan(plan), "train"), seconds=0.2, augment=True, seed=0, length=16)
+    clips = PlannedBatches(PlanItems(Plan(plan), "train"), seconds=0.2, augment=True, seed=0)
     with pytest.warns(UserWarning, match=r"left out: .*p226_001.wav: no such file"):
-        assert len([clips[i] for i in range(16)]) == 16
+        assert len([clips.clip(i) for i in range(16)]) == 16
     for path in (voicebank / "clean_trainset_28spk_wav").iterdir():
         path.unlink()
-    clips = TrainingItems(PlanItems(Plan(plan), "train"), seconds=0.2, augment=True, seed=0, length=16)
+    clips = PlannedBatches(PlanItems(Plan(plan), "train"), seconds=0.2, augment=True, seed=0)
     with pytest.warns(UserWarning), pytest.raises(ValueError, match="8 instances in a row cannot be read"):
-        clips[0]
+        clips[Step(0)]
 
 
 def test_workers_give_the_same_batches_and_the_wait_is_known(plan: Path) -> None:
@@ -163,6 +165,22 @@ def test_epochs_and_resumed_trainings_go_on_where_the_batches_were(plan: Path, t
     first, trainer = fit(2)
     trainer.save_checkpoint(tmp_path / "state.ckpt")
     assert first + fit(3, tmp_path / "state.ckpt")[0] == expected
+
+
+@pytest.mark.parametrize(
+    ("ready", "completed", "steps", "first"),
+    [(5, 4, 5, 5), (5, 4, 4, 4), (4, 4, 2, 4), (4, 4, 8, 4), (0, 0, 0, 0)],
+    ids=["stored after the step of a batch", "before it", "two batches a step", "two steps a batch", "new"],
+)
+def test_the_first_batch_is_the_one_after_the_last_step(
+    ready: int, completed: int, steps: int, first: int
+) -> None:
+    data = BatchData([])  # type: ignore[arg-type]
+    total = SimpleNamespace(ready=ready, completed=completed)
+    progress = SimpleNamespace(epoch_loop=SimpleNamespace(batch_progress=SimpleNamespace(total=total)))
+    data.trainer = SimpleNamespace(fit_loop=progress, global_step=steps, global_rank=1, world_size=2)
+    given = itertools.islice(iter(data.train_dataloader().sampler), 2)
+    assert list(given) == [(first, 1, 2), (first + 1, 1, 2)]
 
 
 def test_workers_go_on_too(plan: Path) -> None:

@@ -8,7 +8,7 @@ import torch
 from hlsim import Audiogram, NeuroMSBG
 from hlsim.audiogram import draw_thresholds
 from hlsim.neuro import NeuroConfig
-from hlsim.training.simulator import SimulatorRecipe
+from hlsim.training.recipes import SimulatorRecipe
 
 yaml = pytest.importorskip("yaml")
 

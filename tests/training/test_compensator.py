@@ -10,12 +10,9 @@ from compensators import MappingCompensator, load_compensator
 from hlsim import Audiogram
 from hlsim.neuro import NeuroConfig, NeuroMSBG
 from hlsim.pretrained import CONFIG, save_checkpoint
-from hlsim.training.compensator import (
-    CompensatorRecipe,
-    CompensatorTraining,
-    train_compensator,
-)
-from hlsim.training.sources import TrainingData
+from hlsim.training.batches import CompensatorBatches, TrainingData, compensator_data
+from hlsim.training.compensator import CompensatorTraining, train_compensator
+from hlsim.training.recipes import CompensatorRecipe
 
 SMALL = {
     "model": {"channels": 8, "blocks": 1, "stride": [4, 3]},
@@ -26,11 +23,6 @@ SMALL = {
     "validation_items": 4,
 }
 EVER = 1e6  # minutes, so that the learning rate does not fall within a test
-
-
-@pytest.fixture
-def data(speech_dir: Path) -> TrainingData:
-    return TrainingData(speech_dir / "train", valid_speech=speech_dir / "valid")
 
 
 def train(data: TrainingData, out: Path, **options: object) -> tuple[Path, list[str]]:
@@ -50,14 +42,14 @@ def test_twenty_steps_lower_the_loss(data: TrainingData, tmp_path: Path) -> None
     assert about["validation"]["valid_loss"] < 0.8 * about["start_valid_loss"]
     assert about["audiogram"] == ear.to_dict() and about["simulator"] == "msbg"
 
-    module = CompensatorTraining(
-        CompensatorRecipe.from_dict(SMALL), data, EVER, audiogram=ear, simulator="msbg"
-    )
-    assert module.validate()["valid_loss"] == pytest.approx(about["start_valid_loss"])
+    recipe = CompensatorRecipe.from_dict(SMALL)
+    module = CompensatorTraining(recipe, EVER, simulator="msbg")
+    valid = compensator_data(data, recipe, ear).validation
+    assert module.validate(valid)["valid_loss"] == pytest.approx(about["start_valid_loss"])
     loaded = load_compensator(folder)
     assert isinstance(loaded, MappingCompensator)
     module.compensator = loaded
-    assert module.validate()["valid_loss"] == pytest.approx(about["validation"]["valid_loss"])
+    assert module.validate(valid)["valid_loss"] == pytest.approx(about["validation"]["valid_loss"])
 
 
 def test_goes_on_where_it_was_stopped(data: TrainingData, tmp_path: Path) -> None:
@@ -117,17 +109,16 @@ def test_general_one_draws_ears_and_noise(data: TrainingData, tmp_path: Path) ->
     ears = tmp_path / "ears.csv"
     ears.write_text("\n".join(rows) + "\n")
     noise = data.speech
-    module = CompensatorTraining(
-        CompensatorRecipe.from_dict(SMALL | {"weights": {"bands": 1.0, "paper": 0.5}}),
-        TrainingData(data.speech, noise=noise, audiograms=ears),
-        EVER,
-        simulator="msbg",
-    )
-    speech, clean, drawn = module.training_items.draw(64, torch.Generator().manual_seed(0), None)
-    noisy = (speech != clean).any(-1).float().mean()
+    recipe = CompensatorRecipe.from_dict(SMALL | {"weights": {"bands": 1.0, "paper": 0.5}})
+    module = CompensatorTraining(recipe, EVER, simulator="msbg")
+    sources = TrainingData(data.speech, noise=noise, audiograms=ears)
+    batches = CompensatorBatches(recipe, sources, recipe.seconds, None)
+    batch = batches.draw(64, torch.Generator().manual_seed(0))
+    clean, drawn = batch["clean"], batch["thresholds"]
+    noisy = (batch["signal"] != clean).any(-1).float().mean()
     measured = (drawn.std(-1) < 1e-6).float().mean()
     assert 0.25 < noisy < 0.75 and 0.25 < measured < 0.75 and len(drawn.unique(dim=0)) > 20
-    loss = module.training_loss(torch.Generator().manual_seed(0))
+    loss = module.training_loss(batches.draw(recipe.batch, torch.Generator().manual_seed(0)))
     loss.backward()
     assert all(p.grad is not None and bool(p.grad.isfinite().all()) for p in module.trained_parameters())
     assert all(name.startswith("compensator.") for name in module.state_dict())
@@ -136,8 +127,8 @@ def test_general_one_draws_ears_and_noise(data: TrainingData, tmp_path: Path) ->
 def test_a_share_of_the_clips_are_tones_and_clicks(data: TrainingData) -> None:
     def clicks(sounds: float) -> int:
         recipe = CompensatorRecipe.from_dict(SMALL | {"equalised": 0.0, "sounds": sounds})
-        module = CompensatorTraining(recipe, data, EVER, simulator="msbg")
-        _, clean, _ = module.training_items.draw(64, torch.Generator().manual_seed(0), None)
+        batches = CompensatorBatches(recipe, data, recipe.seconds, None)
+        clean = batches.draw(64, torch.Generator().manual_seed(0))["clean"]
         return int((clean.count_nonzero(dim=-1) <= 8).sum())
 
     # every second sound is a few clicks
@@ -157,6 +148,6 @@ def test_a_share_of_the_clips_are_tones_and_clicks(data: TrainingData) -> None:
         ({"model": {"layers": 2}}, "unknown network settings layers"),
     ],
 )
-def test_bad_recipes(data: TrainingData, settings: dict[str, object], message: str) -> None:
+def test_bad_recipes(settings: dict[str, object], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        CompensatorTraining(CompensatorRecipe.from_dict(settings), data, EVER, simulator="msbg")
+        CompensatorTraining(CompensatorRecipe.from_dict(settings), EVER, simulator="msbg")

@@ -4,6 +4,7 @@ import json
 import math
 import os
 import signal
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +14,23 @@ from torch import Tensor
 
 pytest.importorskip("lightning")
 
-from hlsim.training.loop import TimedModule, run
+from hlsim.data.module import Batch, BatchData
+from hlsim.training.batches import DrawnBatches
+from hlsim.training.loop import run
+from hlsim.training.module import TimedModule
 from hlsim.training.state import BEST, CHECKPOINT, LAST
 
 EVER = 1e6  # minutes
+
+
+class Draws(DrawnBatches):
+    """Random vectors."""
+
+    def __init__(self, seed: int) -> None:
+        self.batch, self.seed = 1, seed
+
+    def draw(self, count: int, generator: torch.Generator) -> Batch:
+        return {"noise": torch.randn(4, generator=generator)}
 
 
 class Toy(TimedModule):
@@ -30,21 +44,25 @@ class Toy(TimedModule):
         scores: dict[int, float] | None = None,
         seed: int = 3,
     ) -> None:
-        super().__init__(learning_rate, max_minutes, seed)
+        super().__init__(learning_rate, max_minutes)
+        self.draws = Draws(seed)
         self.vector = torch.nn.Parameter(torch.zeros(4))
         self.scores = scores
         self.seen: list[int] = []
         self.rates: list[float] = []
 
-    def training_loss(self, generator: torch.Generator) -> Tensor:
+    def training_loss(self, batch: Batch) -> Tensor:
         self.seen.append(self.global_step)
         self.rates.append(self.optimizers().param_groups[0]["lr"])  # type: ignore[union-attr]
-        target = torch.arange(4.0) + 0.5 * torch.randn(4, generator=generator)
+        target = torch.arange(4.0) + 0.5 * batch["noise"]
         return (self.vector - target).square().mean()
 
-    def validate(self) -> dict[str, float]:
-        score = self.scores[self.global_step] if self.scores else -float(self.vector.detach().sum())
-        return {"score": score, "valid_sum": float(self.vector.detach().sum())}
+    def evaluate(self, batch: Batch) -> dict[str, Tensor]:
+        return {"valid_sum": self.vector.detach().sum()[None]}
+
+    def figures(self, values: Mapping[str, Tensor]) -> dict[str, float]:
+        total = float(values["valid_sum"])
+        return {"score": self.scores[self.global_step] if self.scores else -total, "valid_sum": total}
 
 
 def go(module: Toy, out: Path, max_steps: int = 6, **options: Any) -> tuple[list[dict[str, Any]], list[str]]:
@@ -64,7 +82,7 @@ def go(module: Toy, out: Path, max_steps: int = 6, **options: Any) -> tuple[list
         "report": lines.append,
         "progress": False,
     }
-    run(module, out=out, max_steps=max_steps, **(settings | options))
+    run(module, BatchData(module.draws, [{}]), out=out, max_steps=max_steps, **(settings | options))
     return written, lines
 
 
@@ -97,8 +115,8 @@ def test_steps_draw_by_seed_and_step_and_not_by_history(tmp_path: Path) -> None:
     for module, out, kept in ((one, "a", draws[0]), (other, "b", draws[1])):
         loss = module.training_loss
 
-        def keep(generator: torch.Generator, loss: Any = loss, kept: list[float] = kept) -> Tensor:
-            value: Tensor = loss(generator)
+        def keep(batch: Batch, loss: Any = loss, kept: list[float] = kept) -> Tensor:
+            value: Tensor = loss(batch)
             kept.append(float(value.detach()))
             return value
 
@@ -353,10 +371,10 @@ def test_a_checkpoint_that_was_removed_is_written_again(tmp_path: Path) -> None:
 
 def test_a_validation_that_was_cut_off_is_made_up_for(tmp_path: Path) -> None:
     class Stopped(Toy):
-        def validate(self) -> dict[str, float]:
+        def evaluate(self, batch: Batch) -> dict[str, Tensor]:
             if self.global_step == 4:
                 raise KeyboardInterrupt
-            return super().validate()
+            return super().evaluate(batch)
 
     scores = {2: 1.0, 4: 9.0, 6: 2.0, 8: 2.0}
     with pytest.raises(KeyboardInterrupt):
@@ -373,8 +391,8 @@ def test_a_validation_that_was_cut_off_is_made_up_for(tmp_path: Path) -> None:
 @pytest.mark.parametrize("value", [math.nan, math.inf])
 def test_a_loss_that_is_not_finite_stops_the_run_and_says_so(tmp_path: Path, value: float) -> None:
     class Broken(Toy):
-        def training_loss(self, generator: torch.Generator) -> Tensor:
-            loss = super().training_loss(generator)
+        def training_loss(self, batch: Batch) -> Tensor:
+            loss = super().training_loss(batch)
             return loss * value if self.global_step == 3 else loss
 
     with pytest.raises(ValueError, match=rf"the loss is {value} at step 3; a lower learning rate"):
@@ -383,7 +401,9 @@ def test_a_loss_that_is_not_finite_stops_the_run_and_says_so(tmp_path: Path, val
 
 
 def test_other_modules_say_that_they_are_unfinished() -> None:
-    module = TimedModule(0.1, 1.0, 0)
-    for method in (lambda: module.training_loss(torch.Generator()), module.validate):
+    module = TimedModule(0.1, 1.0)
+    for method in (module.training_loss, module.evaluate, module.figures):
         with pytest.raises(NotImplementedError):
-            method()
+            method({})
+    with pytest.raises(NotImplementedError):
+        module.released()

@@ -19,15 +19,16 @@ from hlsim.pretrained import load_pretrained
 
 pytest.importorskip("lightning")
 
-from hlsim.training.simulator import (
+from hlsim.data.module import Batch, Step
+from hlsim.training.batches import (
     MILDER,
-    SimulatorRecipe,
-    SimulatorTraining,
-    sound_set,
-    train_simulator,
-    validation_set,
+    TrainingData,
+    simulator_data,
+    sounds_to_validate,
+    speech_to_validate,
 )
-from hlsim.training.sources import TrainingData
+from hlsim.training.recipes import SimulatorRecipe
+from hlsim.training.simulator import SimulatorTraining, train_simulator
 
 TINY = {
     "model": {"channels": 4, "blocks": 1, "stride": [4, 3], "kernel": [3, 3]},
@@ -58,6 +59,17 @@ def train(data: TrainingData, out: Path, recipe: dict[str, Any] | None = None, *
     return lines
 
 
+def drawn(data: TrainingData, recipe: SimulatorRecipe, step: int = 0) -> Batch:
+    """A batch as a training step is given it."""
+    batches = simulator_data(data, recipe)
+    batch: Batch = batches.on_after_batch_transfer(batches.training[Step(step)], 0)
+    return batch
+
+
+def figures(module: SimulatorTraining, data: TrainingData) -> dict[str, float]:
+    return module.validate(simulator_data(data, module.recipe).val_dataloader())
+
+
 def state(out: Path) -> dict[str, Any]:
     loaded: dict[str, Any] = torch.load(out / "last.ckpt", weights_only=True)
     return loaded
@@ -76,9 +88,9 @@ def test_eight_steps_leave_a_checkpoint_that_loads_and_a_state(data: TrainingDat
     assert about["recipe"]["batch"] == 2 and about["steps"] in (4, 8)
     assert set(about["validation"]) >= {"valid_snr_median", "valid_snr_worst_tenth"}
     # what was written is what was validated
-    module = SimulatorTraining(SimulatorRecipe.from_dict(TINY), data, EVER)
+    module = SimulatorTraining(SimulatorRecipe.from_dict(TINY), EVER)
     module.kept.module = model
-    assert module.validate()["valid_snr_median"] == pytest.approx(
+    assert figures(module, data)["valid_snr_median"] == pytest.approx(
         about["validation"]["valid_snr_median"], abs=1e-3
     )
 
@@ -97,11 +109,11 @@ def test_a_short_training_on_synthetic_speech_beats_the_untrained_network(
         "validate_every": 60,
         "validation_items": 16,
     }
-    module = SimulatorTraining(SimulatorRecipe.from_dict(TINY | recipe), data, EVER)
-    untrained = module.validate()["valid_snr_median"]
+    module = SimulatorTraining(SimulatorRecipe.from_dict(TINY | recipe), EVER)
+    untrained = figures(module, data)["valid_snr_median"]
     train(data, tmp_path / "out", recipe, max_steps=60)
     module.kept.module = load_pretrained(tmp_path / "out" / "checkpoint")
-    assert module.validate()["valid_snr_median"] > untrained + 0.5
+    assert figures(module, data)["valid_snr_median"] > untrained + 0.5
 
 
 def test_averaged_weights_are_what_is_validated_and_kept(data: TrainingData, tmp_path: Path) -> None:
@@ -115,8 +127,9 @@ def test_averaged_weights_are_what_is_validated_and_kept(data: TrainingData, tmp
 def test_lower_precision_is_near_and_leaves_the_physics_alone(data: TrainingData) -> None:
     losses = []
     for precision in ("float32", "bfloat16"):
-        module = SimulatorTraining(SimulatorRecipe.from_dict(TINY | {"precision": precision}), data, EVER)
-        loss = module.training_loss(torch.Generator().manual_seed(0))
+        recipe = SimulatorRecipe.from_dict(TINY | {"precision": precision})
+        module = SimulatorTraining(recipe, EVER)
+        loss = module.training_loss(drawn(data, recipe))
         loss.backward()
         assert all(p.grad is not None and p.grad.dtype == torch.float32 for p in module.trained_parameters())
         losses.append(float(loss.detach()))
@@ -154,8 +167,9 @@ KILLED = """
 import sys
 from pathlib import Path
 import torch
-from hlsim.training.simulator import SimulatorRecipe, train_simulator
-from hlsim.training.sources import TrainingData
+from hlsim.training.batches import TrainingData
+from hlsim.training.recipes import SimulatorRecipe
+from hlsim.training.simulator import train_simulator
 
 torch.set_num_threads(1)
 train_simulator(
@@ -261,7 +275,7 @@ def test_files_trained_on_are_none_to_validate_on(speech_dir: Path, tmp_path: Pa
     ):
         data = TrainingData(**given)  # type: ignore[arg-type]
         with pytest.raises(ValueError, match=rf"^\d+ of \d+ files of the {name} to validate on are also"):
-            SimulatorTraining(SimulatorRecipe.from_dict(TINY), data, EVER)
+            simulator_data(data, SimulatorRecipe.from_dict(TINY))
 
 
 @pytest.fixture
@@ -280,46 +294,42 @@ def rich(speech_dir: Path, tmp_path: Path) -> TrainingData:
 
 def test_noise_ears_and_all_criteria_train(rich: TrainingData) -> None:
     weights = {"snr": 1.0, "log_spectrum": 0.5, "magnitude": 0.9, "phase": 0.3, "complex": 0.1, "time": 0.2}
-    module = SimulatorTraining(SimulatorRecipe.from_dict(TINY | {"weights": weights}), rich, EVER)
-    loss = module.training_loss(torch.Generator().manual_seed(0))
+    recipe = SimulatorRecipe.from_dict(TINY | {"weights": weights})
+    module = SimulatorTraining(recipe, EVER)
+    loss = module.training_loss(drawn(rich, recipe))
     assert bool(torch.isfinite(loss))
     loss.backward()
     assert all(p.grad is not None and bool(torch.isfinite(p.grad).all()) for p in module.trained_parameters())
     assert {id(p) for p in module.trained_parameters()} == {
         id(p) for p in module.parameters() if p.requires_grad
     }
-    first, again = (module.training_loss(torch.Generator().manual_seed(1)) for _ in range(2))
+    first, again = (module.training_loss(drawn(rich, recipe, 1)) for _ in range(2))
     assert torch.equal(first, again)
 
 
 def test_the_validation_set_is_fixed_and_as_described(rich: TrainingData) -> None:
     recipe = SimulatorRecipe.from_dict(TINY | {"validation_items": 24})
-    batches = validation_set(rich, recipe)
+    batches = speech_to_validate(rich, recipe)
     torch.rand(3)
-    for one, same in zip(batches, validation_set(rich, recipe), strict=True):
-        assert torch.equal(one[0], same[0]) and torch.equal(one[1], same[1])
-    signals = torch.cat([waves for waves, _ in batches])
-    ears = torch.cat([ears for _, ears in batches])
+    for one, same in zip(batches, speech_to_validate(rich, recipe), strict=True):
+        assert all(torch.equal(one[name], same[name]) for name in ("signal", "thresholds"))
+    signals = torch.cat([batch["signal"] for batch in batches])
+    ears = torch.cat([batch["thresholds"] for batch in batches])
     assert signals.shape == (24, 32000) and ears.shape == (24, 8)
     levels = level_spl(signals)
     assert float(levels.min()) >= 50.0 and float(levels.max()) <= 80.0 and float(levels.std()) > 5.0
     milder = [Audiogram.standard(name).thresholds for name in MILDER]
     assert all(tuple(ear) in milder for ear in ears[0::4].tolist())
     assert all(tuple(ear) == Audiogram.standard("N5").thresholds for ear in ears[1::2].tolist())
-    other = torch.cat(
-        [waves for waves, _ in validation_set(rich, SimulatorRecipe(validation_items=24, seed=1))]
-    )
+    again = speech_to_validate(rich, SimulatorRecipe(validation_items=24, seed=1))
+    other = torch.cat([batch["signal"] for batch in again])
     assert not torch.equal(other, signals)
 
 
-def test_sounds_take_the_place_of_a_share_of_the_clips(
-    data: TrainingData, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_sounds_take_the_place_of_a_share_of_the_clips(data: TrainingData) -> None:
     def clips(sounds: float) -> torch.Tensor:
         recipe = TINY | {"batch": 40, "sounds": sounds, "treated": False}
-        module = SimulatorTraining(SimulatorRecipe.from_dict(recipe), data, EVER)
-        monkeypatch.setattr(module, "loss_on", lambda signal, ears, truth: signal)
-        return module.training_loss(torch.Generator().manual_seed(0))
+        return simulator_data(data, SimulatorRecipe.from_dict(recipe)).training[Step(0)]["signal"]
 
     def clicks(signals: torch.Tensor) -> int:
         return int(((signals != 0.0).sum(-1) <= 8).sum())  # half of the sounds
@@ -328,11 +338,11 @@ def test_sounds_take_the_place_of_a_share_of_the_clips(
 
 
 def test_sounds_are_validated_by_their_share(data: TrainingData) -> None:
-    def figures(sounds: float) -> dict[str, float]:
+    def of_share(sounds: float) -> dict[str, float]:
         recipe = SimulatorRecipe.from_dict(TINY | {"sounds": sounds})
-        return SimulatorTraining(recipe, data, EVER).validate()
+        return figures(SimulatorTraining(recipe, EVER), data)
 
-    speech, both = figures(0.0), figures(0.25)
+    speech, both = of_share(0.0), of_share(0.25)
     median, low = both["valid_sounds_snr_median"], both["valid_sounds_snr_worst_tenth"]
     assert set(speech) == {"score", "valid_snr_median", "valid_snr_worst_tenth"}
     assert all(both[name] == speech[name] for name in speech if name != "score")
@@ -343,11 +353,11 @@ def test_sounds_are_validated_by_their_share(data: TrainingData) -> None:
 @pytest.mark.parametrize(("treated", "low", "high"), [(True, 50.0, 80.0), (False, 85.0, 90.0)])
 def test_sounds_have_the_levels_of_the_validation_set(treated: bool, low: float, high: float) -> None:
     recipe = SimulatorRecipe(sounds=0.1, treated=treated, levels=(85.0, 90.0))
-    levels = torch.cat([level_spl(signals) for signals, _ in sound_set(recipe)])
+    levels = torch.cat([level_spl(batch["signal"]) for batch in sounds_to_validate(recipe)])
     assert len(levels) == 16 and low - 0.01 <= float(levels.min()) < float(levels.max()) <= high + 0.01
 
 
 @pytest.mark.parametrize("sounds", [-0.1, 1.1])
 def test_shares_that_are_none(sounds: float) -> None:
-    with pytest.raises(ValueError, match=r"sounds .* in the recipe; allowed: from 0 to 1"):
+    with pytest.raises(ValueError, match=r"sounds .* in the recipe; allowed: 0 to 1"):
         SimulatorRecipe(sounds=sounds)

@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 import torch
+from torch import nn
 
 pytest.importorskip("lightning")
 
@@ -13,17 +14,14 @@ from compensators import MappingCompensator, load_compensator
 from hlsim import Audiogram, NeuroMSBG, load_pretrained
 from hlsim.cli.main import main
 from hlsim.pretrained import CONFIG, checkpoint_digest
-from hlsim.training.compensator import CompensatorRecipe, CompensatorTraining, train_compensator
-from hlsim.training.simulator import SimulatorRecipe, SimulatorTraining, train_simulator
-from hlsim.training.sources import TrainingData
+from hlsim.training.batches import TrainingData, compensator_data
+from hlsim.training.compensator import CompensatorTraining, train_compensator
+from hlsim.training.module import exponential_average
+from hlsim.training.recipes import CompensatorRecipe, SimulatorRecipe
+from hlsim.training.simulator import SimulatorTraining, train_simulator
 
 SHORT = {"batch": 1, "seconds": 0.25, "validate_every": 1, "validation_items": 4, "learning_rate": 1e-6}
 RUN = {"max_minutes": 1e6, "accelerator": "cpu", "progress": False, "report": lambda line: None}
-
-
-@pytest.fixture
-def data(speech_dir: Path) -> TrainingData:
-    return TrainingData(speech_dir / "train", valid_speech=speech_dir / "valid")
 
 
 def furthest(one: torch.nn.Module, other: torch.nn.Module) -> float:
@@ -45,8 +43,8 @@ def test_a_simulator_goes_on_from_a_checkpoint(data: TrainingData, tmp_path: Pat
         )
 
 
-def test_all_is_trained_that_is_trained_from_the_beginning(data: TrainingData) -> None:
-    started = SimulatorTraining(SimulatorRecipe.from_dict(SHORT | {"start": "neuro-msbg"}), data, 1.0)
+def test_all_is_trained_that_is_trained_from_the_beginning() -> None:
+    started = SimulatorTraining(SimulatorRecipe.from_dict(SHORT | {"start": "neuro-msbg"}), 1.0)
     anew = NeuroMSBG(started.student.config)
     names = [
         {name for name, parameter in model.named_parameters() if parameter.requires_grad}
@@ -58,12 +56,16 @@ def test_all_is_trained_that_is_trained_from_the_beginning(data: TrainingData) -
 
 def test_a_compensator_for_one_ear_starts_from_that_for_all(data: TrainingData, tmp_path: Path) -> None:
     ear = Audiogram.standard("N4")
-    options: dict[str, Any] = {"audiogram": ear, "simulator": "msbg"}
     recipes = [CompensatorRecipe.from_dict(SHORT | {"start": start}) for start in ("compensator-general", "")]
-    general, random = (CompensatorTraining(recipe, data, 1.0, **options).validate() for recipe in recipes)
+    valid = compensator_data(data, recipes[0], ear).validation
+    general, random = (
+        CompensatorTraining(recipe, 1.0, simulator="msbg").validate(valid) for recipe in recipes
+    )
     assert general["valid_loss"] < 0.7 * random["valid_loss"]
 
-    folder = train_compensator(data, recipes[0], out=tmp_path, max_steps=1, **options, **RUN)
+    folder = train_compensator(
+        data, recipes[0], out=tmp_path, max_steps=1, audiogram=ear, simulator="msbg", **RUN
+    )
     trained, start = load_compensator(folder), load_compensator("compensator-general")
     assert isinstance(trained, MappingCompensator) and furthest(trained, start) < 1e-5
     about = json.loads((folder / CONFIG).read_text())["about"]
@@ -93,15 +95,15 @@ def test_what_makes_the_start_worse_is_not_kept(data: TrainingData, tmp_path: Pa
         ({"start": 3}, "start 3 in the recipe; allowed: text"),
     ],
 )
-def test_what_cannot_be_started_from(data: TrainingData, settings: dict[str, Any], said: str) -> None:
+def test_what_cannot_be_started_from(settings: dict[str, Any], said: str) -> None:
     with pytest.raises(ValueError, match=said):
-        CompensatorTraining(CompensatorRecipe.from_dict(SHORT | settings), data, 1.0, simulator="msbg")
+        CompensatorTraining(CompensatorRecipe.from_dict(SHORT | settings), 1.0, simulator="msbg")
 
 
-def test_the_model_may_be_given_again(data: TrainingData) -> None:
+def test_the_model_may_be_given_again() -> None:
     model = load_compensator("compensator-general").config.to_dict()  # type: ignore[union-attr]
     recipe = CompensatorRecipe.from_dict(SHORT | {"start": "compensator-general", "model": model})
-    assert CompensatorTraining(recipe, data, 1.0, simulator="msbg").compensator.config.to_dict() == model
+    assert CompensatorTraining(recipe, 1.0, simulator="msbg").compensator.config.to_dict() == model
 
 
 def test_the_program_starts_from_a_checkpoint(
@@ -117,3 +119,31 @@ def test_the_program_starts_from_a_checkpoint(
     assert about["recipe"]["start"] == "compensator-general"
     assert main([*arguments, "missing"]) == 2
     assert "no checkpoint 'missing'" in capsys.readouterr().err
+
+
+def follow(decay: float, values: list[float]) -> float:
+    model = nn.Linear(1, 1, bias=False)
+    nn.init.constant_(model.weight, 5.0)
+    average = exponential_average(model, decay)
+    for value in values:
+        nn.init.constant_(model.weight, value)
+        average.update_parameters(model)
+    return float(average.module.weight)
+
+
+def test_is_an_exponential_average_that_forgets_its_start() -> None:
+    expected, values = 0.0, [1.0, 4.0, 2.0, 8.0]
+    for count, value in enumerate(values):
+        weight = 0.0 if count == 0 else min(0.2, (1.0 + count) / (10.0 + count))
+        expected = weight * expected + (1.0 - weight) * value
+    assert follow(0.2, values) == pytest.approx(expected, rel=1e-6)
+    assert follow(0.0, values) == 8.0
+    assert follow(0.99, [3.0] * 50) == pytest.approx(3.0)
+
+
+def test_asks_for_no_gradient_and_leaves_the_model_s() -> None:
+    model = nn.Linear(2, 2)
+    average = exponential_average(model, 0.9)
+    assert not any(parameter.requires_grad for parameter in average.parameters())
+    assert all(parameter.requires_grad for parameter in model.parameters())
+    assert torch.equal(average(torch.ones(2)), model(torch.ones(2)))

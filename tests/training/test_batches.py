@@ -17,8 +17,9 @@ from hlsim.data.plan import prepare
 from hlsim.data.plan_settings import PlanSettings
 from hlsim.data.writing import Recipe, write_instances
 from hlsim.pretrained import load_pretrained
-from hlsim.training.planned import PlannedSource, PlannedTraining
-from hlsim.training.simulator import SimulatorRecipe, train_simulator
+from hlsim.training.batches import PlannedData, PlannedSource
+from hlsim.training.recipes import SimulatorRecipe
+from hlsim.training.simulator import SimulatorTraining, train_simulator
 
 TINY = {
     "model": {"channels": 4, "blocks": 1, "stride": [4, 3], "kernel": [3, 3]},
@@ -53,7 +54,6 @@ def train(source: PlannedSource, out: Path, steps: int) -> list[str]:
         accelerator="cpu",
         progress=False,
         report=lines.append,
-        kind=PlannedTraining,
     )
     return lines
 
@@ -88,18 +88,19 @@ def test_prepared_validation_is_on_what_lies_on_disk_and_needs_no_corpus(plan: P
     write_instances(plan, Recipe(alignment="impulse"), jobs=1)
     (tmp_path / "speech").rename(tmp_path / "gone")
     source = PlannedSource(plan, prepared=True, workers=0)
-    training = PlannedTraining(SimulatorRecipe.from_dict(TINY), source, 1e6)
-    opened = training.batches.plan
+    data = PlannedData(source, SimulatorRecipe.from_dict(TINY))
+    (batch,) = data.val_dataloader()
+    opened = data.plan
     for place, index in enumerate(opened.indices("valid").tolist()):
         stored = Instance.read(opened.path(index))
         assert stored.impaired is not None
         for cut, whole in (
-            (training.valid[0][0][place], stored.signal),
-            (training.truth(0)[place], stored.impaired),
+            (batch["signal"][place], stored.signal),
+            (batch["impaired"][place], stored.impaired),
         ):
             assert torch.equal(cut[:9600], whole) and not bool(cut[9600:].any())  # shorter than 2 s
-    assert len(training.truths) == len(training.valid)
-    assert torch.equal(training.examples()["heard/truth"], training.truth(0)[-1])
+    examples = SimulatorTraining(SimulatorRecipe.from_dict(TINY), 1e6).examples(batch)
+    assert torch.equal(examples["heard/truth"], batch["impaired"][-1])
     train(source, tmp_path / "out", 1)
 
 
@@ -120,23 +121,23 @@ def test_another_plan_in_the_same_folder_is_another_training(plan: Path, tmp_pat
 
 
 def test_the_validation_split_is_used(plan: Path) -> None:
-    training = PlannedTraining(SimulatorRecipe.from_dict(TINY), PlannedSource(plan, workers=0), 1e6)
-    assert [(len(signals), ears.shape) for signals, ears in training.valid] == [(4, (4, 8))]
-    opened = training.batches.plan
+    data = PlannedData(PlannedSource(plan, workers=0), SimulatorRecipe.from_dict(TINY))
+    assert [(len(batch["signal"]), batch["thresholds"].shape) for batch in data.validation] == [(4, (4, 8))]
+    opened = data.plan
     expected = torch.stack([opened.thresholds(int(index)) for index in opened.indices("valid")])
-    assert torch.equal(training.valid[0][1], expected)
+    assert torch.equal(data.validation[0]["thresholds"], expected)
 
 
 def test_a_plan_has_no_sounds_but_its_own(plan: Path) -> None:
     recipe = SimulatorRecipe.from_dict(TINY | {"sounds": 0.1})
     with pytest.raises(ValueError, match=r"sounds 0\.1 in the recipe, with a manifest; allowed: 0"):
-        PlannedTraining(recipe, PlannedSource(plan, workers=0), 1e6)
+        PlannedData(PlannedSource(plan, workers=0), recipe)
 
 
 def test_a_plan_without_a_validation_split_says_what_it_is_chosen_on(plan: Path, tmp_path: Path) -> None:
     prepare(PlanSettings(tmp_path / "speech"), tmp_path / "other", jobs=1)
     with pytest.warns(UserWarning, match="chosen on 'test'"):
-        PlannedTraining(SimulatorRecipe.from_dict(TINY), PlannedSource(tmp_path / "other", workers=0), 1e6)
+        PlannedData(PlannedSource(tmp_path / "other", workers=0), SimulatorRecipe.from_dict(TINY))
 
 
 def test_bad_calls(plan: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -12,9 +12,10 @@ pytest.importorskip("tensorboard")
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from hlsim.calibration import set_level
-from hlsim.training.examples import spectrogram_image
-from hlsim.training.simulator import SimulatorRecipe, train_simulator
-from hlsim.training.sources import TrainingData
+from hlsim.training.batches import TrainingData
+from hlsim.training.callbacks import spectrogram_image
+from hlsim.training.recipes import SimulatorRecipe
+from hlsim.training.simulator import train_simulator
 
 
 def test_a_tone_is_a_line_at_its_frequency_and_silence_is_black() -> None:

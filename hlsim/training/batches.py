@@ -1,0 +1,282 @@
+"""Batches to train and validate on: drawn anew at every step from folders of audio, or from a prepared plan."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.utils.data import Dataset
+
+from hlsim.audio import find_audio
+from hlsim.audiogram import MILDER, Audiogram, draw_thresholds, read_audiograms
+from hlsim.calibration import level_spl, set_level
+from hlsim.data.augment import KNOTS, augment_speech, equalise, mix
+from hlsim.data.clips import Clips
+from hlsim.data.module import Batch, BatchData, PlanData, Step, collate
+from hlsim.data.sounds import draw_sounds
+from hlsim.data.teacher import Teacher
+from hlsim.neuro.config import NEURO_RATE
+from hlsim.training.recipes import CompensatorRecipe, SimulatorRecipe, TrainingRecipe
+
+_VALID_SECONDS = 2.0
+
+
+@dataclass(frozen=True)
+class TrainingData:
+    """Folders and files to train and validate on. Speech is all that is needed, a folder or a list of files.
+
+    Without ``valid_speech`` validation is on the training speech, and says nothing of other speakers; without the other
+    two it takes training's noise and ears. Ears from the CSV files join the drawn ones.
+    """
+
+    speech: Path | Sequence[Path]
+    noise: Path | None = None
+    audiograms: Path | None = None
+    valid_speech: Path | Sequence[Path] | None = None
+    valid_noise: Path | None = None
+    valid_audiograms: Path | None = None
+
+    def validation(self) -> TrainingData:
+        """The same, with what there is to validate on in the place of what there is to train on.
+
+        Raises:
+            ValueError: speech or noise to validate on is also trained on: the best checkpoint would be chosen on it.
+        """
+        for name in ("speech", "noise"):
+            training, validation = getattr(self, name), getattr(self, f"valid_{name}")
+            if not training or not validation:
+                continue
+            trained, validated = (
+                {
+                    path.resolve()
+                    for path in (find_audio(source) if isinstance(source, str | Path) else source)
+                }
+                for source in (training, validation)
+            )
+            if shared := len(trained & validated):
+                raise ValueError(
+                    f"{shared} of {len(validated)} files of the {name} to validate on are also trained on; give folders "
+                    f"that share none, or no {name} to validate on"
+                )
+        return TrainingData(
+            self.valid_speech or self.speech,
+            self.valid_noise or self.noise,
+            self.valid_audiograms or self.audiograms,
+        )
+
+
+@dataclass(frozen=True)
+class PlannedSource:
+    """A prepared plan to train and validate on.
+
+    Attributes:
+        manifest: ``manifest.csv`` of a prepared folder, or the folder.
+        root: where the audio lies, if not where it was prepared.
+        prepared: take the instances that ``hlsim prepare --write`` made, clips of them unchanged, instead of making and
+            augmenting them on the fly.
+        workers: processes that read and augment.
+    """
+
+    manifest: Path
+    root: Path | None = None
+    prepared: bool = False
+    workers: int = field(default=1, compare=False)  # a run may go on with others
+
+
+class DrawnBatches(Dataset[Batch]):
+    """Random speech, noise and ears; a batch depends on seed, step and rank alone.
+
+    Args:
+        seconds: length of a clip.
+    """
+
+    def __init__(self, recipe: TrainingRecipe, data: TrainingData, seconds: float) -> None:
+        self.batch, self.seed, self.sounds = recipe.batch, recipe.seed, recipe.sounds
+        options: dict[str, Any] = {"sample_rate": NEURO_RATE, "seconds": seconds}
+        self.speech = Clips(data.speech, **options)
+        self.noise = Clips(data.noise, repeat=True, **options) if data.noise else None
+        self.ears: Tensor | None = None  # measured ones. Shape: (ears, 8) dB HL
+        if data.audiograms is not None:
+            measured = read_audiograms(data.audiograms, simulated=True)
+            self.ears = torch.tensor([ear.thresholds for _, ear in measured])
+
+    def __getitem__(self, step: Step) -> Batch:
+        number = (self.seed * 1_000_003 + step.number) * 64 + step.rank
+        return self.draw(
+            self.batch, torch.Generator().manual_seed(number % 2**63)
+        )  # more are too many for it
+
+    def draw(self, count: int, generator: torch.Generator) -> Batch:
+        """``clean`` and ``signal`` (count, time) in pascals, ``thresholds`` (count, 8) dB HL."""
+        raise NotImplementedError
+
+    def join_measured(self, ears: Tensor, share: float, moved: float, generator: torch.Generator) -> Tensor:
+        """A share of the drawn ears, replaced by measured ones, where there are, moved by up to some dB either way."""
+        if self.ears is None:
+            return ears
+        measured = self.ears[torch.randint(len(self.ears), (len(ears),), generator=generator)]
+        if moved:
+            measured = measured + 2.0 * moved * torch.rand(len(ears), 1, generator=generator) - moved
+            measured = measured.clamp(-10.0, 100.0)
+        return torch.where(torch.rand(len(ears), 1, generator=generator) < share, measured, ears)
+
+    def join_sounds(self, clips: Tensor, generator: torch.Generator) -> Tensor:
+        """The recipe's share of the clips, replaced by tones and clicks."""
+        if not self.sounds:
+            return clips
+        others = draw_sounds(len(clips), clips.shape[-1], NEURO_RATE, generator)
+        return torch.where(torch.rand(len(clips), 1, generator=generator) < self.sounds, others, clips)
+
+
+class SimulatorBatches(DrawnBatches):
+    """What a simulator is to hear: speech, noise, tones and clicks as compensators emit them, at any level."""
+
+    def __init__(self, recipe: SimulatorRecipe, data: TrainingData) -> None:
+        super().__init__(recipe, data, recipe.seconds)
+        self.levels, self.treated = recipe.levels, recipe.treated
+
+    def draw(self, count: int, generator: torch.Generator) -> Batch:
+        ears = self.join_measured(draw_thresholds(count, generator), 0.4, 5.0, generator)
+        noise = self.noise.draw(count, generator) if self.noise is not None else None
+        clips = self.join_sounds(self.speech.draw(count, generator), generator)
+        signal = augment_speech(
+            clips, noise, ears, NEURO_RATE, generator, levels=self.levels, treated=self.treated
+        )
+        return {"clean": set_level(clips, level_spl(signal)), "signal": signal, "thresholds": ears}
+
+
+class CompensatorBatches(DrawnBatches):
+    """What a compensator is given: speech, clean or noisy, and the ears that it is for, ``ear`` or drawn ones."""
+
+    def __init__(
+        self, recipe: CompensatorRecipe, data: TrainingData, seconds: float, ear: Audiogram | None
+    ) -> None:
+        super().__init__(recipe, data, seconds)
+        self.recipe = recipe
+        self.ear = None if ear is None else torch.tensor(ear.thresholds)
+
+    def draw(self, count: int, generator: torch.Generator) -> Batch:
+        def uniform(low: float, high: float, *shape: int) -> Tensor:
+            return low + (high - low) * torch.rand(count, *shape, generator=generator)
+
+        clean = self.speech.draw(count, generator)
+        equalised = equalise(clean, uniform(-15.0, 15.0, len(KNOTS)), torch.tensor(KNOTS), NEURO_RATE)
+        clean = torch.where(uniform(0.0, 1.0, 1) < self.recipe.equalised, equalised, clean)
+        clean = set_level(self.join_sounds(clean, generator), uniform(*self.recipe.levels))
+        signal = clean
+        if self.noise is not None:
+            noisy = mix(clean, self.noise.draw(count, generator), uniform(*self.recipe.snr))
+            signal = torch.where(uniform(0.0, 1.0, 1) < self.recipe.noisy, noisy, clean)
+        if self.ear is not None:
+            ears = self.ear.expand(count, -1)
+        else:
+            ears = self.join_measured(draw_thresholds(count, generator), 0.5, 0.0, generator)
+        return {"clean": clean, "signal": signal, "thresholds": ears}
+
+
+def simulator_data(data: TrainingData | PlannedSource, recipe: SimulatorRecipe) -> BatchData:
+    """What a simulator is trained and validated on, with what is heard from the exact MSBG.
+
+    Raises:
+        ValueError: data that cannot be used; the message names it.
+    """
+    if isinstance(data, PlannedSource):
+        return PlannedData(data, recipe)
+    training = SimulatorBatches(recipe, data)
+    validation = [*speech_to_validate(data, recipe), *(sounds_to_validate(recipe) if recipe.sounds else [])]
+    return BatchData(training, validation, teacher=Teacher(NEURO_RATE))
+
+
+def compensator_data(data: TrainingData, recipe: CompensatorRecipe, ear: Audiogram | None) -> BatchData:
+    """What a compensator for an ear, or else for all, is trained and validated on. Raises ValueError as
+    ``simulator_data``."""
+    valid = CompensatorBatches(replace(recipe, equalised=0.0), data.validation(), _VALID_SECONDS, ear)
+    generator = torch.Generator().manual_seed(2_000 + recipe.seed)
+    validation = [valid.draw(4, generator) for _ in range(0, recipe.validation_items, 4)]
+    return BatchData(CompensatorBatches(recipe, data, recipe.seconds, ear), validation)
+
+
+def speech_to_validate(data: TrainingData, recipe: SimulatorRecipe) -> list[Batch]:
+    """Fixed items: every second one noisy (0 to 20 dB); measured, standard and drawn ears in turn.
+
+    50 to 80 dB SPL, or the recipe's levels where ``treated`` is off.
+    """
+    generator = torch.Generator().manual_seed(1_000 + recipe.seed)
+    valid = SimulatorBatches(replace(recipe, seconds=_VALID_SECONDS), data.validation())
+    standard = torch.tensor([Audiogram.standard(name).thresholds for name in MILDER])
+    batches = []
+    for _ in range(0, recipe.validation_items, 8):
+        signal = valid.speech.draw(8, generator)
+        if valid.noise is not None:
+            noisy = mix(signal, valid.noise.draw(8, generator), 20.0 * torch.rand(8, generator=generator))
+            signal = torch.where((torch.arange(8) % 2 == 1).unsqueeze(-1), noisy, signal)
+        signal = set_level(signal, _levels_to_validate(recipe, generator))
+        ears = draw_thresholds(8, generator)
+        ears[0:8:4] = standard[torch.randint(len(standard), (2,), generator=generator)]
+        if valid.ears is not None:
+            ears[1:8:2] = valid.ears[torch.randint(len(valid.ears), (4,), generator=generator)]
+        batches.append({"signal": signal, "thresholds": ears})
+    return batches
+
+
+def sounds_to_validate(recipe: SimulatorRecipe) -> list[Batch]:
+    """Fixed tones and clicks at the levels of ``speech_to_validate``, a third as many items, for drawn ears.
+
+    They are marked with ``sounds``.
+    """
+    generator = torch.Generator().manual_seed(2_000 + recipe.seed)
+    batches = []
+    for _ in range(0, recipe.validation_items, 24):
+        signal = draw_sounds(8, round(_VALID_SECONDS * NEURO_RATE), NEURO_RATE, generator)
+        signal = set_level(signal, _levels_to_validate(recipe, generator))
+        ears = draw_thresholds(8, generator)
+        batches.append({"signal": signal, "thresholds": ears, "sounds": torch.ones(8, dtype=torch.bool)})
+    return batches
+
+
+def _levels_to_validate(recipe: SimulatorRecipe, generator: torch.Generator) -> Tensor:
+    """Levels in dB SPL of a batch. Shape: -> (8,)."""
+    low, high = (50.0, 80.0) if recipe.treated else recipe.levels
+    return low + (high - low) * torch.rand(8, generator=generator)
+
+
+class PlannedData(PlanData):
+    """A plan's training split, validated on the middle 2 s of instances evenly spread over its validation split, or else
+    over test's, or training's.
+
+    What is prepared is heard as it lies on disk, in validation too, and needs no corpus.
+    """
+
+    def __init__(self, source: PlannedSource, recipe: SimulatorRecipe) -> None:
+        if recipe.sounds:
+            raise ValueError(f"sounds {recipe.sounds} in the recipe, with a manifest; allowed: 0")
+        names = ("batch", "seconds", "seed", "levels", "treated")
+        super().__init__(
+            source.manifest,
+            root=source.root,
+            prepared=source.prepared,
+            workers=source.workers,
+            **{name: getattr(recipe, name) for name in names},
+        )
+        if self.plan.rate != NEURO_RATE:
+            raise ValueError(f"{source.manifest}: prepared at {self.plan.rate} Hz; allowed: {NEURO_RATE}")
+        split = next(split for split in ("valid", "test", "train") if len(self.plan.indices(split)))
+        if split != "valid":
+            warnings.warn(
+                f"the plan has no split 'valid': the best checkpoint is chosen on {split!r}, whose figures then say too "
+                "much",
+                stacklevel=2,
+            )
+        items = self.items(split)
+        chosen = torch.linspace(0, len(items) - 1, min(recipe.validation_items, len(items))).round().int()
+        samples = round(_VALID_SECONDS * NEURO_RATE)
+        whole = [items[place] for place in chosen.tolist()]
+        clips = [one.clip(max(0, (len(one.signal) - samples) // 2), samples) for one in whole]
+        self.validation = [collate(clips[i : i + 8]) for i in range(0, len(clips), 8)]
+
+    val_dataloader = BatchData.val_dataloader

@@ -1,0 +1,163 @@
+"""What is trained: a network's first weights, its steps, its average over steps, and its figures in validation."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, TypeVar
+
+import lightning as L
+import torch
+from lightning.pytorch.callbacks import Timer
+from torch import Tensor, nn
+from torch.optim.swa_utils import AveragedModel
+
+from hlsim.data.module import Batch
+from hlsim.neuro.config import NetworkConfig
+from hlsim.pretrained import checkpoint_digest
+
+Network = TypeVar("Network", bound=nn.Module)
+
+
+class TimedModule(L.LightningModule):
+    """A module whose learning rate falls with the time spent, as half a cosine after a short rise.
+
+    Subclasses give ``training_loss``, ``evaluate``, ``figures`` and ``released``, and log whatever they like.
+
+    Args:
+        learning_rate: at its highest.
+        max_minutes: of training, all resumed parts together.
+    """
+
+    timer: Timer
+
+    def __init__(self, learning_rate: float, max_minutes: float) -> None:
+        super().__init__()
+        self.learning_rate = learning_rate
+        self.max_minutes = max_minutes
+        self.values: list[dict[str, Tensor]] = []  # of the validation under way
+
+    def training_loss(self, batch: Batch) -> Tensor:
+        raise NotImplementedError
+
+    def evaluate(self, batch: Batch) -> dict[str, Tensor]:
+        """Values of a validation batch by name, one an item or one a batch."""
+        raise NotImplementedError
+
+    def figures(self, values: Mapping[str, Tensor]) -> dict[str, float]:
+        """Figures of all values by name; ``score`` is what the best checkpoint has most of."""
+        raise NotImplementedError
+
+    def examples(self, batch: Batch) -> dict[str, Tensor]:
+        """Signals for TensorBoard by name, (time,) in pascals at 16 kHz."""
+        return {}
+
+    def released(self) -> nn.Module:
+        """The network that is kept in the checkpoint."""
+        raise NotImplementedError
+
+    def validate(self, batches: Iterable[Batch]) -> dict[str, float]:
+        """The figures on batches, without a Trainer."""
+        with torch.no_grad():
+            return self._figures(
+                [
+                    self.evaluate({name: value.to(self.device) for name, value in batch.items()})
+                    for batch in batches
+                ]
+            )
+
+    def trained_parameters(self) -> list[nn.Parameter]:
+        return [parameter for parameter in self.parameters() if parameter.requires_grad]
+
+    def training_step(self, batch: Batch, index: int) -> Tensor:
+        loss = self.training_loss(batch)
+        if not bool(torch.isfinite(loss)):
+            raise ValueError(
+                f"the loss is {float(loss.detach())} at step {self.global_step}; a lower learning rate may help"
+            )
+        self.log("loss", loss, prog_bar=True)
+        return loss
+
+    def on_train_batch_start(self, batch: Batch, index: int) -> None:
+        # one clock for all processes, whose weights would drift apart
+        spent = self.trainer.strategy.broadcast(self.timer.time_elapsed("train"))
+        share = min(1.0, spent / (60.0 * self.max_minutes))
+        rise = min(1.0, (self.global_step + 1) / 50.0)
+        for group in self.optimizers().param_groups:  # type: ignore[union-attr]
+            group["lr"] = self.learning_rate * rise * max(0.01, 0.5 * (1.0 + math.cos(math.pi * share)))
+
+    def on_validation_epoch_start(self) -> None:
+        self.values = []
+
+    def validation_step(self, batch: Batch, index: int) -> None:
+        self.values.append(self.evaluate(batch))
+
+    def on_validation_epoch_end(self) -> None:
+        self.log_dict(self._figures(self.values), prog_bar=True, batch_size=1, sync_dist=True)
+
+    def configure_optimizers(self) -> torch.optim.Optimizer:
+        return torch.optim.AdamW(self.trained_parameters(), lr=self.learning_rate, weight_decay=1e-4)
+
+    def _figures(self, values: Sequence[Mapping[str, Tensor]]) -> dict[str, float]:
+        names = dict.fromkeys(name for one in values for name in one)
+        return self.figures({name: torch.cat([one[name] for one in values if name in one]) for name in names})
+
+
+def exponential_average(model: nn.Module, decay: float) -> AveragedModel:
+    """A copy of a model that follows it as an exponential moving average (EMA); ``.module`` is the averaged model.
+
+    The first steps count as much as their number allows, (1 + n) / (10 + n), so that it does not keep its random start.
+
+    Args:
+        decay: weight of the past, 0 to below 1; 0 copies.
+    """
+
+    def follow(kept: Sequence[Tensor], new: Sequence[Tensor], count: Tensor | int) -> None:
+        weight = min(decay, (1.0 + float(count)) / (10.0 + float(count)))
+        for old, now in zip(kept, new, strict=True):
+            old.lerp_(now.to(old), 1.0 - weight)
+
+    average = AveragedModel(model, multi_avg_fn=follow)
+    average.requires_grad_(False)  # several processes would wait for its gradients
+    return average
+
+
+def initial_network(
+    start: str,
+    settings: Mapping[str, Any],
+    config_kind: type[NetworkConfig],
+    kind: type[Network],
+    load: Callable[[str], nn.Module],
+) -> Network:
+    """The network to train, with random weights or those of a checkpoint.
+
+    Args:
+        start: a checkpoint's name or folder; empty for random weights.
+        settings: of the network; with ``start`` those of the checkpoint, or none.
+        config_kind, kind: of the network.
+        load: what loads a checkpoint by name, frozen.
+
+    Raises:
+        ValueError: no such checkpoint, or one of another kind or with other settings.
+    """
+    config = config_kind.from_dict(settings)
+    if not start:
+        return kind(config)
+    network = load(start)
+    if not isinstance(network, kind):
+        raise ValueError(
+            f"start {start!r} in the recipe is none to be trained; allowed: a checkpoint's name or folder"
+        )
+    if settings and config != network.config:
+        ours, theirs = config.to_dict(), network.config.to_dict()  # type: ignore[operator,union-attr]
+        differing = ", ".join(name for name in ours if ours[name] != theirs[name])
+        raise ValueError(
+            f"start {start!r} in the recipe has other settings of the model than the recipe ({differing}); allowed: the "
+            "same, or no 'model' in the recipe"
+        )
+    return network.train().requires_grad_(True)
+
+
+def start_identity(start: str) -> dict[str, str]:
+    """Which weights these are, for a folder may hold others next time; empty without ``start``."""
+    return {"start_sha256": checkpoint_digest(start)} if start else {}

@@ -1,0 +1,155 @@
+"""Recipes: what a training of a simulator or a compensator is made of; a YAML file holds the same names."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from typing import Any, ClassVar, Self
+
+from hlsim.checks import refuse_other_kinds, refuse_seed, refuse_unknown, refuse_weights
+
+_WHERE = "in the recipe"
+PRECISIONS = ("float32", "bfloat16")
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainingRecipe:
+    """What both recipes have.
+
+    Attributes:
+        model: settings of the network.
+        start: checkpoint whose weights to start from, a name or a folder; its settings are the model's. It is
+            also what is kept until the training gives a better one. Without it they are random.
+        batch: clips a step.
+        seconds: length of a clip.
+        learning_rate: of AdamW at its highest.
+        weights: of the criteria.
+        levels: lowest and highest level of the speech in dB SPL.
+        sounds: share of clips that are tones or clicks instead of speech, 0 to 1.
+        validate_every: steps.
+        validation_items: how many.
+        seed: of every random draw.
+    """
+
+    model: dict[str, Any] = field(default_factory=dict)
+    start: str = ""
+    batch: int
+    seconds: float
+    learning_rate: float
+    weights: dict[str, float]
+    levels: tuple[float, float]
+    sounds: float
+    validate_every: int
+    validation_items: int
+    seed: int = 0
+
+    criteria: ClassVar[tuple[str, ...]]
+    shares: ClassVar[tuple[str, ...]] = ("sounds",)
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> Self:
+        """Raises ValueError where a name is unknown or a value is not allowed."""
+        refuse_unknown(data, (entry.name for entry in fields(cls)), "settings", _WHERE)
+        return cls(**data)
+
+    def __post_init__(self) -> None:
+        refuse_other_kinds(self, _WHERE)
+        refuse_weights(self.weights, self.criteria, _WHERE)
+        refuse_seed(self.seed, _WHERE)
+        for name, value in vars(self).items():
+            if isinstance(value, list):  # a pair, as YAML gives it
+                object.__setattr__(self, name, tuple(value))
+        counts, lengths = ("batch", "validate_every", "validation_items"), ("seconds", "learning_rate")
+        self._refuse(
+            min(getattr(self, name) for name in counts) < 1 or min(self.seconds, self.learning_rate) <= 0.0,
+            (*counts, *lengths),
+            "counts from 1 up, seconds and learning_rate above 0",
+        )
+        self._refuse(
+            not all(0.0 <= getattr(self, name) <= 1.0 for name in self.shares), self.shares, "0 to 1"
+        )
+
+    def _refuse(self, wrong: bool, names: tuple[str, ...], allowed: str) -> None:
+        if wrong:
+            found = ", ".join(f"{name} {getattr(self, name)!r}" for name in names)
+            raise ValueError(f"{found} {_WHERE}; allowed: {allowed}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class SimulatorRecipe(TrainingRecipe):
+    """What a training of a simulator is made of.
+
+    Attributes:
+        model: settings of ``NeuroConfig``.
+        weights: of ``snr`` (dB / 10), ``log_spectrum`` (dB / 10) and the paper's ``magnitude``, ``phase``, ``complex``,
+            ``time``.
+        unit_power: the signal that is scaled to unit power before the criteria, and all others with it: ``truth``, the
+            target, so that quiet items count as much as loud ones, or ``input``, as in MP-SENet. The paper's criteria on
+            a network without a prior want the latter: a severe ear's first errors are 50 dB above its target, and the
+            network learns to be silent.
+        levels: before amplification.
+        sounds: 0 with a manifest.
+        treated: whether clips are equalised, amplified and compressed at random, as compensators do.
+        precision: ``float32``, or ``bfloat16`` for the network's own layers: several times faster where the hardware has
+            matrix units for it. Transforms, physics, scans and criteria stay in float32.
+        average: weight of the past in the exponential moving average of the weights; the average is validated and kept. 0
+            for none.
+    """
+
+    batch: int = 6
+    seconds: float = 1.3
+    learning_rate: float = 1e-3
+    weights: dict[str, float] = field(default_factory=lambda: {"snr": 1.0, "log_spectrum": 0.5})
+    unit_power: str = "truth"
+    levels: tuple[float, float] = (40.0, 95.0)
+    sounds: float = 0.0
+    treated: bool = True
+    precision: str = "float32"
+    average: float = 0.99
+    validate_every: int = 200
+    validation_items: int = 48
+
+    criteria = ("complex", "log_spectrum", "magnitude", "phase", "snr", "time")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._refuse(self.unit_power not in ("truth", "input"), ("unit_power",), "truth or input")
+        self._refuse(
+            self.precision not in PRECISIONS or not 0.0 <= self.average < 1.0,
+            ("precision", "average"),
+            f"{' or '.join(PRECISIONS)}, and from 0 to below 1",
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class CompensatorRecipe(TrainingRecipe):
+    """What a training of a compensator is made of.
+
+    The defaults are for one ear and a few minutes: many small steps. All ears need larger batches and hours.
+
+    Attributes:
+        model: settings of ``MappingConfig``.
+        weights: of ``HearingLossLoss``'s criteria: ``bands`` (dB) and ``paper``.
+        reference: what the paper's criterion compares with, ``clean`` or ``normal-hearing``.
+        sounds: speech in noise alone teaches a network that what is steady is noise, to be taken away.
+        equalised: share of clips whose speech is equalised at random by up to 15 dB. Few voices teach few spectra, and
+            the gain for another can be 20 dB off.
+        noisy: share of noisy clips, where there is noise.
+        snr: lowest and highest signal-to-noise ratio in dB.
+    """
+
+    batch: int = 2
+    seconds: float = 0.6
+    learning_rate: float = 3e-3
+    weights: dict[str, float] = field(default_factory=lambda: {"bands": 1.0})
+    reference: str = "clean"
+    sounds: float = 0.2
+    levels: tuple[float, float] = (50.0, 80.0)
+    equalised: float = 0.7
+    noisy: float = 0.5
+    snr: tuple[float, float] = (0.0, 20.0)
+    validate_every: int = 50
+    validation_items: int = 8
+
+    criteria = ("bands", "paper")
+    shares = ("sounds", "equalised", "noisy")
