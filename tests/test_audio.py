@@ -235,7 +235,7 @@ def test_a_header_that_tells_of_more_than_memory_holds(
     path.write_bytes(data)
     assert soundfile.info(str(path)).frames == 2**36 - 1
 
-    def refuse(*args: object, **kwargs: object) -> None:  # whether the system would, hangs on its settings
+    def refuse(*args: object, **kwargs: object) -> None:  # whether the system would, depends on its settings
         raise MemoryError("Unable to allocate 256. GiB")
 
     monkeypatch.setattr(np, "empty", refuse)

@@ -62,11 +62,21 @@ def _functions() -> dict[str, Callable[..., Any]]:
     }
 
 
+def _parameters(function: Callable[..., Any]) -> dict[str, inspect.Parameter]:
+    """Also those that a training hands on to ``run``."""
+    from hlsim.training.loop import RunOptions, run
+
+    found = dict(inspect.signature(function).parameters)
+    if found.pop("options", None) is not None:
+        found |= {name: inspect.signature(run).parameters[name] for name in RunOptions.__annotations__}
+    return found
+
+
 def test_defaults_of_the_program_are_the_functions() -> None:
     compared = 0
     for command, function in _functions().items():
         parser = declared(command)
-        for name, parameter in inspect.signature(function).parameters.items():
+        for name, parameter in _parameters(function).items():
             default = parser.get_default({"train_snrs": "train_snr", "test_snrs": "test_snr"}.get(name, name))
             if default is None or parameter.default in (None, inspect.Parameter.empty):
                 continue  # required of one or the other, or read before it is passed on
@@ -98,7 +108,7 @@ def test_options_are_arguments_of_what_is_called_or_are_read() -> None:
     functions = _functions()
     for command, read in READ.items():
         found = {action.dest for action in declared(command)._actions} - {"help"}
-        assert found - set(inspect.signature(functions[command]).parameters) == set(read.split()), command
+        assert found - set(_parameters(functions[command])) == set(read.split()), command
 
 
 def test_required_options_are_shown_as_required() -> None:

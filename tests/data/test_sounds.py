@@ -1,4 +1,4 @@
-"""Tones and clicks: what they are, and that a seed is all they hang on."""
+"""Tones and clicks: what they are, and that a seed is all they depend on."""
 
 import torch
 
