@@ -91,6 +91,15 @@ def paper_parts(
     }
 
 
+def to_unit_power(estimate: Tensor, truth: Tensor) -> tuple[Tensor, Tensor]:
+    """Both scaled by the one factor that gives the truth RMS 1, as MP-SENet does. Shape: (items, time) twice -> twice.
+
+    A truth under -26 dB SPL is taken as one of that level.
+    """
+    factor = truth.square().mean(-1, keepdim=True).clamp_min(_TINY).rsqrt()
+    return estimate * factor, truth * factor
+
+
 def weighted_sum(parts: Mapping[str, Tensor], weights: Mapping[str, float]) -> Tensor:
     """Sum of parts times weights (Equation 9); parts without a weight do not count."""
     total = torch.zeros_like(next(iter(parts.values())))
