@@ -53,8 +53,9 @@ class HearingLossLoss(nn.Module):
     Levels matter, nothing is normalised: 65 dB SPL is RMS 0.035 at the default ``full_scale_spl``.
 
     It may be called in an autocast region and works in float32 there; call ``backward()`` outside of it, as torch says:
-    inside one of float16, gradients may be NaN. A compiled caller calls it as it is: ``torch.compile`` with
-    ``fullgraph=True``, ``torch.export``, ``torch.func.vmap`` and forward-mode ``jvp`` do not go through it.
+    inside one of float16, gradients may be NaN. A compiled caller calls it as it is, so that ``fullgraph=True`` and
+    ``torch.export`` refuse it. Of ``torch.func`` it takes ``grad``, and with the exact MSBG ``vmap`` (not of ``"bands"``)
+    and ``jvp``; the network does not.
 
     Args:
         audiogram: the ear or ears; may be given with each call instead. A tensor that is trained gets its gradient; it is
@@ -253,6 +254,10 @@ class HearingLossLoss(nn.Module):
         self, compensated: Tensor, clean: Tensor, audiogram: AudiogramLike | None, lengths: Lengths | None
     ) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
         """The speech in one precision and silent after its end, the ears' thresholds, and where each item ends."""
+        if torch.compiler.is_exporting():
+            raise ValueError(
+                "HearingLossLoss is for training, and not exported; allowed: the compensator alone"
+            )
         check_waveform(compensated, "compensated")
         check_waveform(clean, "clean")
         if compensated.shape != clean.shape:
@@ -306,7 +311,16 @@ class HearingLossLoss(nn.Module):
             name: value.to(waveform.device) if isinstance(value, Tensor) else value
             for name, value in (listener or {}).items()
         }
-        return _check_heard(self.simulator(waveform, thresholds, **more), "simulator", waveform, allowed)
+        try:
+            heard = self.simulator(waveform, thresholds, **more)
+        except (RuntimeError, NotImplementedError) as error:
+            if torch._C._functorch.maybe_current_level() is None:
+                raise
+            raise ValueError(
+                f"{type(self.simulator).__name__} does not go through this transform of torch.func; allowed: grad, and "
+                "with simulator='msbg' vmap and jvp"
+            ) from error
+        return _check_heard(heard, "simulator", waveform, allowed)
 
     def _reference(
         self, kind: str, clean: Tensor, ears: Tensor, batch: torch.Size, listener: Mapping[str, Any] | None

@@ -1029,10 +1029,29 @@ def test_the_gradient_is_zero_only_where_the_reference_is(simulator: str, clean:
 
 
 @both
-def test_no_sample_takes_the_gradient_over(simulator: str, clean: Tensor) -> None:
+def test_no_sample_takes_the_gradient_over(simulator: str, speech: list[tuple[Tensor, int]]) -> None:
+    clean = torch.cat([waveform[:, 8000:24000] for waveform, _ in speech[:2]])
     for ear in ("N1", "N3", "N4"):
         loss = HearingLossLoss(Audiogram.standard(ear), simulator=simulator)
         for spl in (40.0, 65.0, 100.0):
             speech = set_level(clean, spl)
             _, slope = gradient(loss, NALR(Audiogram.standard(ear))(speech), speech)
             assert bool((slope.abs().amax(-1) < 100.0 * slope.abs().median(-1).values).all())
+
+
+def test_transforms_work_or_say_so(clean: Tensor) -> None:
+    exact, network = (HearingLossLoss(N3, simulator=simulator) for simulator in SIMULATORS[::-1])
+    given = 3.0 * clean
+    for loss in (exact, network):
+        _, slope = gradient(loss, given, clean)
+        torch.testing.assert_close(torch.func.grad(lambda wave, loss=loss: loss(wave, clean))(given), slope)
+    each = torch.stack([exact(one, true) for one, true in zip(given, clean, strict=True)])
+    torch.testing.assert_close(torch.vmap(exact)(given, clean), each, rtol=1e-4, atol=1e-5)
+    along = torch.func.jvp(lambda wave: exact(wave, clean), (given,), (clean,))[1]
+    assert bool(along.isfinite())
+    with pytest.raises(
+        ValueError, match=r"NeuroMSBG does not go through this transform of torch.func; allowed: grad"
+    ):
+        torch.vmap(network)(given, clean)
+    with pytest.raises(ValueError, match="HearingLossLoss is for training, and not exported"):
+        torch.export.export(Host(network).loss, (given, clean))

@@ -35,9 +35,9 @@ from hlsim.dsp.stft import STFT
 from hlsim.torchtools import constant
 
 DEFAULT_WEIGHTS = {"incoherence": 1.0, "misalignment": 0.03, "levels": 0.015, "louder": 0.03, "peaks": 1.0}
-"""Noise alone in place of the speech costs as much as a level that is 850 dB short, or 30 dB too loud."""
+"""What follows nothing costs 1, what is heard 40 dB too softly 0.24, and 40 dB too loud some 1.4."""
 
-DEPTH = 42.0
+DEPTH = 41.0
 """dB under an item's loudest band, as a normal ear hears it, where the weight of a band has fallen to a half."""
 
 KNEE = 10.0
@@ -134,6 +134,10 @@ class _WithoutSpikes(torch.autograd.Function):
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Tensor], output: Tensor) -> None:
         pass
+
+    @staticmethod
+    def jvp(ctx: Any, tangent: Tensor) -> Tensor:
+        return tangent.view_as(tangent)
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> Tensor:
