@@ -4,6 +4,7 @@ import math
 import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -11,26 +12,37 @@ from torch import Tensor, nn
 from hlsim.audiogram import FREQUENCIES, AudiogramLike, as_thresholds, own_thresholds
 from hlsim.calibration import PASCAL_SPL, check_full_scale, gain_to_pascals
 from hlsim.checks import Lengths, check_lengths, check_rate, check_waveform, is_finite, silent_after
-from hlsim.criteria import paper
+from hlsim.criteria import coherent_bands, paper
 from hlsim.criteria.bands import HIGHEST, band_level_loss
 from hlsim.dsp.resample import resample
 from hlsim.msbg import MSBG
+from hlsim.msbg.normal import hear_normally
 from hlsim.msbg.response import with_phase_of_bank
 from hlsim.neuro import NeuroMSBG
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.pretrained import SIMULATOR, find_checkpoint, load_pretrained
 from hlsim.torchtools import not_compiled
 
-CRITERIA: dict[str, Mapping[str, float]] = {"paper": paper.DEFAULT_WEIGHTS, "bands": {"band_levels": 1.0}}
+CRITERIA: dict[str, Mapping[str, float]] = {
+    "coherent-bands": coherent_bands.DEFAULT_WEIGHTS,
+    "bands": {"band_levels": 1.0},
+    "paper": paper.DEFAULT_WEIGHTS,
+}
 """Criteria by name: their parts and the default weight of each."""
 
 REFERENCES = ("clean", "normal-hearing")
 
 REDUCTIONS = ("mean", "none")
 
+Criterion = str | Mapping[str, float] | Callable[[Tensor, Tensor], Tensor]
+"""A name, weights by name, or a callable: what is heard and the reference, (items, time) in pascals -> (items,)."""
+
+Hearing = Callable[[Tensor], Tensor]
+"""(..., time) -> (..., time), as a normal ear hears."""
+
 
 class HearingLossLoss(nn.Module):
-    """How far what an impaired ear hears of compensated speech is from the clean speech.
+    """How far what an impaired ear hears of compensated speech is from what a normal ear hears of the clean speech.
 
     The simulator is frozen: it stays in eval mode, has no trainable parameter, and is not registered, so that neither the
     parameters nor the checkpoint of a module that holds this loss know of it. It moves with ``.to()`` all the same, and
@@ -40,24 +52,36 @@ class HearingLossLoss(nn.Module):
     Levels matter, nothing is normalised: 65 dB SPL is RMS 0.035 at the default ``full_scale_spl``.
 
     It may be called in an autocast region and works in float32 there; call ``backward()`` outside of it, as torch says:
-    inside one of float16, the gradient of ``"bands"`` is NaN.
+    inside one of float16, gradients may be NaN. A compiled caller calls it as it is, so that ``fullgraph=True`` and
+    ``torch.export`` refuse it. Of ``torch.func`` it takes ``grad``, and with the exact MSBG ``vmap`` (not of ``"bands"``)
+    and ``jvp``; the network does not.
 
     Args:
         audiogram: the ear or ears; may be given with each call instead. A tensor that is trained gets its gradient; it is
             not registered either.
         simulator: ``"neuro-msbg"`` or another checkpoint's name or folder; ``"msbg"``, the exact model; or a module
-            called as they are, which is frozen as it stands (give a copy of one that still trains).
+            called as they are, ``(waveform, thresholds)``, which is frozen as it stands (give a copy of one that still
+            trains).
         sample_rate: of the speech in Hz, 16000 to 48000. Neuro-MSBG judges the band under 8 kHz, above 16000 that under
             7.5 kHz.
         full_scale_spl: level in dB SPL of RMS 1.0.
-        reference: what is heard is compared with ``"clean"``, the clean speech itself, or ``"normal-hearing"``, what the
-            same simulator makes of it at 0 dB HL. For the criterion ``"paper"`` either has the phase of MSBG's bank of
-            the ear's severity (``hlsim.msbg.response``), or speech turned over could be nearer than the speech. With a
-            module that neither is nor holds one of hlsim's simulators, it is compared as it is.
-        criterion: ``"paper"``, magnitude, phase, complex and time losses (Equations 2 to 9), or ``"bands"``, levels in
-            ERB-wide bands, always against what a normal ear hears.
+        reference: what ``"paper"``, a callable and ``heard`` compare with: ``"clean"``, the clean speech itself (the
+            default for ``"paper"``), or ``"normal-hearing"``, what a normal ear hears of it (the default else). Either
+            has the phase of MSBG's bank of the ear's severity (``hlsim.msbg.response``), or polarity-inverted speech
+            could be nearer than the speech; with a module that neither is nor holds one of hlsim's simulators, it is
+            compared as it is. The other criteria always compare with what a normal ear hears.
+        criterion: ``"coherent-bands"``, whether bands follow the reference and have its level
+            (``hlsim.criteria.coherent_bands``); ``"bands"``, levels in bands alone; ``"paper"``, Equations 2 to 9 of
+            Neuro-MSBG, not balanced between ears and levels (``hlsim.criteria.paper``); several by name,
+            ``{"bands": 1.0, "paper": 0.2}``, of one hearing; or a callable of what is heard and the reference, (items,
+            time) in pascals, that returns a value for each item, (items,).
         weights: of the parts by name; a part left out does not count.
         reduction: ``"mean"`` over the items, whatever their lengths, or ``"none"``, a value for each.
+        normal: the normal ear that belongs to the simulator, a module (frozen too) or callable, (..., time) -> (...,
+            time). By default hlsim's simulators have MSBG's at 0 dB HL, and another module is asked itself with 0 dB HL:
+            what it does to every ear, such as a low-pass filter, it then does to the reference, and it costs nothing.
+        unit_power: for ``"paper"``: both waveforms are scaled so that the reference has RMS 1, as in the papers that its
+            weights come from.
 
     Raises:
         ValueError: an unknown name, a value of another kind or out of range, a simulator made for another rate or level,
@@ -71,32 +95,49 @@ class HearingLossLoss(nn.Module):
         simulator: str | Path | nn.Module = "neuro-msbg",
         sample_rate: int = NEURO_RATE,
         full_scale_spl: float = PASCAL_SPL,
-        reference: str = "clean",
-        criterion: str = "paper",
+        reference: str | None = None,
+        criterion: Criterion = "coherent-bands",
         weights: Mapping[str, float] | None = None,
         reduction: str = "mean",
+        normal: Hearing | None = None,
+        unit_power: bool = False,
     ) -> None:
         super().__init__()
         self.sample_rate = check_rate(sample_rate)
         self.full_scale_spl = check_full_scale(full_scale_spl)
-        if not isinstance(reference, str) or reference not in REFERENCES:
+        if reference is not None and (not isinstance(reference, str) or reference not in REFERENCES):
             raise ValueError(f"reference is {reference!r}; allowed: {', '.join(REFERENCES)}")
-        if not isinstance(criterion, str) or criterion not in CRITERIA:
-            raise ValueError(f"criterion is {criterion!r}; allowed: {', '.join(CRITERIA)}")
         if not isinstance(reduction, str) or reduction not in REDUCTIONS:
             raise ValueError(f"reduction is {reduction!r}; allowed: {', '.join(REDUCTIONS)}")
-        self.reference, self.criterion, self.reduction = reference, criterion, reduction
-        self.weights = _check_weights(CRITERIA[criterion] if weights is None else weights, criterion)
+        if normal is not None and not callable(normal):
+            raise ValueError(
+                f"normal is {type(normal).__name__}; allowed: a module or callable (waveform) -> waveform"
+            )
+        self.reference, self.reduction, self.unit_power = reference, reduction, unit_power
+        self.criteria = _check_criterion(criterion)
+        self.weights = _check_weights(weights, self.criteria, criterion)
         with torch.device("cpu"):  # where the host is made on ``meta``, nobody gives the ear its values later
             thresholds = own_thresholds(audiogram)
-        built = _build(simulator, self.sample_rate, self.full_scale_spl)
+        built = _build(simulator, self.sample_rate, self.full_scale_spl).eval().requires_grad_(False)
+        if isinstance(normal, nn.Module):
+            normal.eval().requires_grad_(False)
         # in a tuple, nn.Module does not see them
-        self._unregistered = (built.eval().requires_grad_(False), thresholds)
+        self._unregistered = (built, thresholds, normal, criterion)
+
+    @property
+    def criterion(self) -> Criterion:
+        """The criterion, as it was given."""
+        return self._unregistered[3]
 
     @property
     def simulator(self) -> nn.Module:
         """The simulator, frozen."""
         return self._unregistered[0]
+
+    @property
+    def normal(self) -> Hearing | None:
+        """The normal ear given to the constructor."""
+        return self._unregistered[2]
 
     @property
     def thresholds(self) -> Tensor | None:
@@ -110,22 +151,29 @@ class HearingLossLoss(nn.Module):
         clean: Tensor,
         audiogram: AudiogramLike | None = None,
         lengths: Lengths | None = None,
+        *,
+        listener: Mapping[str, Any] | None = None,
     ) -> Tensor:
         """The loss: mean over the items, or of each.
 
         Shape: (..., time) twice, and one audiogram or (..., 8) that broadcasts over the leading dimensions -> (), or with
-            ``reduction="none"`` the leading dimensions.
+            ``reduction="none"`` the leading dimensions. (batch, 1, time) takes (batch, 8) and (batch,) lengths, too.
 
         Args:
-            lengths: samples of each item of a padded batch, (...). What follows an item's end is heard as silence,
-                whatever is there, and is not compared. With the exact MSBG an item counts much as it does alone; blocks
-                of a network that look at all of a signal (lstm, transformer, mamba) see the silence too.
+            lengths: samples of each item of a padded batch, (...), or shares of the longest above 0 to 1, as SpeechBrain
+                has them. What follows an item's end is heard as silence, whatever is there, and is not compared. With the
+                exact MSBG an item counts much as it does alone; blocks of a network that look at all of a signal (lstm,
+                transformer, mamba) see the silence too.
+            listener: what the simulator takes beyond the audiogram, by the names of its arguments; tensors come to the
+                speech's device.
 
         Raises:
             ValueError: shapes or devices that do not fit, no audiogram, levels outside -10 to 100 dB HL, lengths outside
-                1 to time, or a simulator that does not return a waveform of the shape it was given.
+                1 to time, or a simulator, normal ear or criterion that does not return the shape it should.
         """
-        return paper.weighted_sum(self.parts(compensated, clean, audiogram, lengths), self.weights)
+        return paper.weighted_sum(
+            self.parts(compensated, clean, audiogram, lengths, listener=listener), self.weights
+        )
 
     @not_compiled
     def parts(
@@ -134,13 +182,81 @@ class HearingLossLoss(nn.Module):
         clean: Tensor,
         audiogram: AudiogramLike | None = None,
         lengths: Lengths | None = None,
+        *,
+        listener: Mapping[str, Any] | None = None,
     ) -> dict[str, Tensor]:
-        """The parts of the loss by name, before their weights: magnitude, phase, complex and time, or band_levels (dB).
+        """The parts of the loss by name, before their weights.
 
-        Their sum, ``sum(weight * parts[name] for name, weight in loss.weights.items())``, is what ``forward`` gives.
+        Those of ``"coherent-bands"`` are incoherence, levels, louder and peaks, of ``"bands"`` band_levels (dB), of
+        ``"paper"`` magnitude, phase, complex and time, and of a callable criterion. Their sum, ``sum(weight * parts[name]
+        for name, weight in loss.weights.items())``, is what ``forward`` gives.
 
         Shape, arguments and errors: as ``forward``.
         """
+        given, clean, ears, ends = self._check(compensated, clean, audiogram, lengths)
+        with torch.autocast(given.device.type, enabled=False):
+            if "coherent-bands" in self.criteria:
+                given = coherent_bands.without_spikes(given)
+            heard = self._hear(given, ears, listener)
+            batch, time = heard.shape[:-1], heard.shape[-1]
+            signals = {"heard": heard, "given": given.expand_as(heard)}
+            for name in self.criteria:
+                signals[name] = self._reference(name, clean, ears, batch, listener)
+            gain = gain_to_pascals(self.full_scale_spl)
+            signals = {name: signal.reshape(-1, time) * gain for name, signal in signals.items()}
+            if ends is None or bool((ends == time).all()):
+                items = self._compare(signals)
+            else:
+                each = [
+                    self._compare({name: signal[item, None, :end] for name, signal in signals.items()})
+                    for item, end in enumerate(ends.expand(batch).flatten().tolist())
+                ]
+                items = {name: torch.cat([own[name] for own in each]) for name in each[0]}
+        if self.reduction == "none":
+            return {name: part.reshape(batch) for name, part in items.items()}
+        return {name: part.mean() for name, part in items.items()}
+
+    @not_compiled
+    def heard(
+        self,
+        compensated: Tensor,
+        clean: Tensor,
+        audiogram: AudiogramLike | None = None,
+        lengths: Lengths | None = None,
+        *,
+        listener: Mapping[str, Any] | None = None,
+    ) -> tuple[Tensor, Tensor]:
+        """What the ear hears of the compensated speech, and the reference: for a criterion of one's own.
+
+        Both are in pascals and aligned, silent after each item's end. The simulator is frozen, and the gradient flows.
+
+        Shape: (..., time) twice -> (..., time) twice, their leading dimensions broadcast with the ears'.
+
+        Args and errors: as ``forward``.
+        """
+        given, clean, ears, ends = self._check(compensated, clean, audiogram, lengths)
+        with torch.autocast(given.device.type, enabled=False):
+            heard = self._hear(given, ears, listener)
+            reference = self._reference("criterion", clean, ears, heard.shape[:-1], listener)
+            if ends is not None:
+                heard, reference = silent_after(heard, ends), silent_after(reference, ends)
+            gain = gain_to_pascals(self.full_scale_spl)
+            return heard * gain, reference * gain
+
+    def extra_repr(self) -> str:
+        return (
+            f"simulator={type(self.simulator).__name__}, sample_rate={self.sample_rate}, "
+            f"full_scale_spl={self.full_scale_spl:g}, reference={self.reference!r}, criterion={self.criterion!r}"
+        )
+
+    def _check(
+        self, compensated: Tensor, clean: Tensor, audiogram: AudiogramLike | None, lengths: Lengths | None
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
+        """The speech in one precision and silent after its end, the ears' thresholds, and where each item ends."""
+        if torch.compiler.is_exporting():
+            raise ValueError(
+                "HearingLossLoss is for training, and not exported; allowed: the compensator alone"
+            )
         check_waveform(compensated, "compensated")
         check_waveform(clean, "clean")
         if compensated.shape != clean.shape:
@@ -151,79 +267,100 @@ class HearingLossLoss(nn.Module):
             raise ValueError(
                 f"compensated is on {compensated.device} and clean on {clean.device}; allowed: the same device"
             )
-        ends = None if lengths is None else check_lengths(lengths, compensated.shape)
+        shape = compensated.shape
+        ends = None if lengths is None else check_lengths(_in_samples(lengths, shape), shape)
         ears = self.thresholds if audiogram is None else as_thresholds(audiogram)
         if ears is None:
             raise ValueError("no audiogram: give one when building the loss or with the call")
-        with torch.autocast(compensated.device.type, enabled=False):
-            dtype = torch.promote_types(torch.promote_types(compensated.dtype, clean.dtype), torch.float32)
-            compensated, clean = compensated.to(dtype), clean.to(dtype)
-            if ends is not None:
-                compensated, clean = silent_after(compensated, ends), silent_after(clean, ends)
-            heard = self._hear(compensated, ears.to(compensated.device))
-            aim = self._aim(clean).expand_as(heard)
-            batch, time = heard.shape[:-1], heard.shape[-1]
-            gain = gain_to_pascals(self.full_scale_spl)
-            heard, aim = heard.reshape(-1, time) * gain, aim.reshape(-1, time) * gain
-            if self.criterion == "paper" and self._holds(MSBG, NeuroMSBG):
-                own_ears = ears.to(aim.device).expand(*batch, -1).reshape(-1, len(FREQUENCIES))
-                normal = self.reference == "normal-hearing"
-                aim = with_phase_of_bank(aim, own_ears, self.sample_rate, normal=normal)
-            if ends is None or bool((ends == time).all()):
-                items = self._compare(heard, aim)
+        if len(shape) == 3 and shape[1] == 1 and ears.ndim == 2 and len(ears) == shape[0]:
+            ears = ears.unsqueeze(1)  # (batch, 1, time), one ear an item
+        dtype = torch.promote_types(torch.promote_types(compensated.dtype, clean.dtype), torch.float32)
+        compensated, clean = compensated.to(dtype), clean.to(dtype)
+        if ends is not None:
+            compensated, clean = silent_after(compensated, ends), silent_after(clean, ends)
+        return compensated, clean, ears.to(compensated.device), ends
+
+    def _compare(self, signals: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """The parts of each item. Shape: (items, time) each, in pascals -> (items,) each."""
+        heard = signals["heard"]
+        items: dict[str, Tensor] = {}
+        for name, criterion in self.criteria.items():
+            aim = signals[name]
+            if name == "coherent-bands":
+                items |= coherent_bands.coherent_band_parts(heard, aim, self.sample_rate)
+                items["peaks"] = coherent_bands.peak_excess(signals["given"])
+            elif name == "bands":
+                items["band_levels"] = band_level_loss(heard, aim, self.sample_rate)
+            elif name == "paper":
+                stft = paper.paper_stft(self.sample_rate)
+                both = paper.to_unit_power(heard, aim) if self.unit_power else (heard, aim)
+                items |= paper.paper_parts(*both, stft, self._frequencies(stft.fft))
             else:
-                each = [
-                    self._compare(heard[item, None, :end], aim[item, None, :end])
-                    for item, end in enumerate(ends.expand(batch).flatten().tolist())
-                ]
-                items = {name: torch.cat([own[name] for own in each]) for name in each[0]}
-        if self.reduction == "none":
-            return {name: part.reshape(batch) for name, part in items.items()}
-        return {name: part.mean() for name, part in items.items()}
+                items[name] = _check_values(criterion(heard, aim), len(heard))
+        return items
 
-    def extra_repr(self) -> str:
-        return (
-            f"simulator={type(self.simulator).__name__}, sample_rate={self.sample_rate}, "
-            f"full_scale_spl={self.full_scale_spl:g}, reference={self.reference!r}, criterion={self.criterion!r}"
-        )
-
-    def _compare(self, heard: Tensor, aim: Tensor) -> dict[str, Tensor]:
-        """The parts of each item. Shape: (items, time) twice, in pascals -> (items,) each."""
-        if self.criterion == "bands":
-            return {"band_levels": band_level_loss(heard, aim, self.sample_rate)}
-        stft = paper.paper_stft(self.sample_rate)
-        return paper.paper_parts(heard, aim, stft, self._frequencies(stft.fft))
-
-    def _hear(self, waveform: Tensor, thresholds: Tensor) -> Tensor:
+    def _hear(self, waveform: Tensor, thresholds: Tensor, listener: Mapping[str, Any] | None) -> Tensor:
         weight = next(self.simulator.parameters(), None)
         if weight is not None and weight.device != waveform.device:
             raise ValueError(
                 f"the speech is on {waveform.device} and the simulator on {weight.device}; move the loss with .to()"
             )
         allowed = _batches(waveform.shape[:-1], thresholds.shape[:-1])
-        heard = check_waveform(self.simulator(waveform, thresholds), "what the simulator returned")
-        if heard.shape[:-1] not in allowed:
+        more = {
+            name: value.to(waveform.device) if isinstance(value, Tensor) else value
+            for name, value in (listener or {}).items()
+        }
+        try:
+            heard = self.simulator(waveform, thresholds, **more)
+        except (RuntimeError, NotImplementedError) as error:
+            if torch._C._functorch.maybe_current_level() is None:
+                raise
             raise ValueError(
-                f"the simulator made shape {tuple(heard.shape)} of {tuple(waveform.shape)}; allowed: one that keeps the "
-                "shape, or broadcasts it with the audiograms'"
-            )
-        if heard.shape[-1] != waveform.shape[-1]:
-            raise ValueError(
-                f"the simulator made {heard.shape[-1]} samples of {waveform.shape[-1]}; allowed: one that keeps the "
-                "length, as MSBG(aligned=True)"
-            )
-        return heard
+                f"{type(self.simulator).__name__} does not go through this transform of torch.func; allowed: grad, and "
+                "with simulator='msbg' vmap and jvp"
+            ) from error
+        return _check_heard(heard, "simulator", waveform, allowed)
 
-    def _aim(self, clean: Tensor) -> Tensor:
-        """What the heard is compared with."""
-        if self.reference == "normal-hearing" or self.criterion == "bands":
-            with torch.set_grad_enabled(torch.is_grad_enabled() and clean.requires_grad):
-                return self._hear(clean, clean.new_zeros(len(FREQUENCIES)))
-        if self._narrow:  # the same band as what is heard
-            return resample(resample(clean, self.sample_rate, NEURO_RATE), NEURO_RATE, self.sample_rate)[
-                ..., : clean.shape[-1]
-            ]
-        return clean
+    def _reference(
+        self, kind: str, clean: Tensor, ears: Tensor, batch: torch.Size, listener: Mapping[str, Any] | None
+    ) -> Tensor:
+        """What the heard is compared with. Shape: (..., time), (..., 8) -> (*batch, time).
+
+        Args:
+            kind: ``bands``, ``paper``, ``coherent-bands``, or of another criterion.
+        """
+        time, ours, choice = clean.shape[-1], self._holds(MSBG, NeuroMSBG), self.reference
+        if kind in ("coherent-bands", "bands"):
+            choice = "normal-hearing"
+        elif choice is None:
+            choice = "clean" if kind == "paper" else "normal-hearing"
+        if ours:
+            ears = (
+                ears.expand(*batch, -1).reshape(-1, len(FREQUENCIES)) if ears.ndim > 1 else ears.unsqueeze(0)
+            )
+        with torch.set_grad_enabled(torch.is_grad_enabled() and clean.requires_grad):
+            if choice == "clean":
+                aim = self._narrowed(clean)
+            elif self.normal is not None:
+                aim = _check_heard(self.normal(clean), "normal ear", clean, [clean.shape[:-1]])
+                return aim.expand(*batch, time)
+            elif ours and kind not in ("bands", "paper"):
+                items = self._narrowed(clean).expand(*batch, time).reshape(-1, time)
+                return hear_normally(items, ears, self.sample_rate).reshape(*batch, time)
+            else:
+                aim = self._hear(clean, clean.new_zeros(len(FREQUENCIES)), listener)
+            if kind == "bands" or not ours:
+                return aim.expand(*batch, time)
+            aim = aim.expand(*batch, time).reshape(-1, time)
+            normal = choice == "normal-hearing"
+            return with_phase_of_bank(aim, ears, self.sample_rate, normal=normal).reshape(*batch, time)
+
+    def _narrowed(self, clean: Tensor) -> Tensor:
+        """In the same band as what is heard."""
+        if not self._narrow:
+            return clean
+        low = resample(clean, self.sample_rate, NEURO_RATE)
+        return resample(low, NEURO_RATE, self.sample_rate)[..., : clean.shape[-1]]
 
     def _holds(self, *kinds: type[nn.Module]) -> bool:
         """Whether the simulator is one of these or, compiled or in somebody's module, holds one."""
@@ -240,7 +377,9 @@ class HearingLossLoss(nn.Module):
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> "HearingLossLoss":
         super()._apply(fn, recurse)
-        self.simulator._apply(lambda tensor: _moved(fn, tensor))
+        for kept in self._unregistered:
+            if isinstance(kept, nn.Module):
+                kept._apply(lambda tensor: _moved(fn, tensor))
         return self
 
 
@@ -295,19 +434,84 @@ def _build(simulator: str | Path | nn.Module, sample_rate: int, full_scale_spl: 
     return load_pretrained(folder, sample_rate=sample_rate, full_scale_spl=full_scale_spl)
 
 
-def _check_weights(weights: Mapping[str, float], criterion: str) -> dict[str, float]:
-    allowed = CRITERIA[criterion]
-    if not isinstance(weights, Mapping):
-        raise ValueError(f"weights is {type(weights).__name__}; allowed: numbers by name, as {dict(allowed)}")
-    if unknown := sorted(map(str, set(weights) - set(allowed))):
+def _check_heard(heard: Any, what: str, waveform: Tensor, allowed: list[torch.Size]) -> Tensor:
+    """What a simulator or normal ear returned, or ValueError unless it is a waveform like the one that it was given."""
+    check_waveform(heard, f"what the {what} returned")
+    if heard.shape[:-1] not in allowed:
         raise ValueError(
-            f"unknown weights {', '.join(unknown)} for criterion {criterion!r}; allowed: {', '.join(allowed)}"
+            f"the {what} made shape {tuple(heard.shape)} of {tuple(waveform.shape)}; allowed: one that keeps the "
+            "shape, or broadcasts it with the audiograms'"
         )
+    if heard.shape[-1] != waveform.shape[-1]:
+        raise ValueError(
+            f"the {what} made {heard.shape[-1]} samples of {waveform.shape[-1]}; allowed: one that keeps the "
+            "length, as MSBG(aligned=True)"
+        )
+    return heard
+
+
+def _check_values(values: Any, items: int) -> Tensor:
+    """What a callable criterion returned, or ValueError unless it is a value for each item."""
+    if not isinstance(values, Tensor) or values.shape != (items,):
+        found = f"shape {tuple(values.shape)}" if isinstance(values, Tensor) else type(values).__name__
+        raise ValueError(
+            f"the criterion returned {found} for {items} items; allowed: a value for each, ({items},); one that gives "
+            "a mean goes on what loss.heard(...) returns"
+        )
+    return values
+
+
+def _in_samples(lengths: Any, shape: torch.Size) -> Any:
+    """Lengths in samples, of the batch's shape, where they may be relative, and (batch,) for (batch, 1, time)."""
+    try:
+        ends = torch.as_tensor(lengths, device="cpu")
+    except (TypeError, ValueError, RuntimeError):
+        return lengths  # to be refused
+    if ends.is_floating_point() and bool(((ends > 0.0) & (ends <= 1.0)).all()):
+        ends = (ends.double() * shape[-1]).round().long().clamp_min(1)
+    if len(shape) == 3 and shape[1] == 1 and ends.shape == shape[:1]:
+        ends = ends.unsqueeze(-1)
+    return ends
+
+
+def _check_criterion(criterion: Any) -> dict[str, Any]:
+    """The criteria by name, each with its weight; a callable as itself, under the name criterion."""
+    if callable(criterion) and not isinstance(criterion, type):
+        return {"criterion": criterion}
+    named = {criterion: 1.0} if isinstance(criterion, str) else criterion
+    if not isinstance(named, Mapping) or not named or not set(named) <= set(CRITERIA):
+        raise ValueError(
+            f"criterion is {criterion!r}; allowed: {', '.join(CRITERIA)}, weights by these names, or a callable "
+            "(heard, reference) -> (items,)"
+        )
+    return _check_numbers(named, "criterion")
+
+
+def _check_weights(
+    weights: Mapping[str, float] | None, criteria: Mapping[str, Any], criterion: Any
+) -> dict[str, float]:
+    """The weight of each part, times that of its criterion."""
+    of = {part: name for name in criteria for part in CRITERIA.get(name, {name: 1.0})}
+    if weights is None:
+        weights = {part: CRITERIA.get(name, {name: 1.0})[part] for part, name in of.items()}
+    if not isinstance(weights, Mapping):
+        allowed = {part: 1.0 for part in of}
+        raise ValueError(f"weights is {type(weights).__name__}; allowed: numbers by name, as {allowed}")
+    if unknown := sorted(map(str, set(weights) - set(of))):
+        raise ValueError(
+            f"unknown weights {', '.join(unknown)} for criterion {criterion!r}; allowed: {', '.join(of)}"
+        )
+    checked = _check_numbers(weights, "weights", of)
+    scales = {name: 1.0 if callable(scale) else scale for name, scale in criteria.items()}
+    return {part: weight * scales[of[part]] for part, weight in checked.items()}
+
+
+def _check_numbers(weights: Mapping[str, float], what: str, allowed: Any = CRITERIA) -> dict[str, float]:
     if not all(is_finite(weight) and weight >= 0.0 for weight in weights.values()):
-        raise ValueError(f"weights {dict(weights)}; allowed: finite numbers, 0 or more")
+        raise ValueError(f"{what} {dict(weights)}; allowed: finite numbers, 0 or more")
     checked = {name: float(weight) for name, weight in weights.items()}
     if not any(checked.values()):
         raise ValueError(
-            f"weights {checked} count nothing; allowed: one above 0 at least, of {', '.join(allowed)}"
+            f"{what} {checked} count nothing; allowed: one above 0 at least, of {', '.join(allowed)}"
         )
     return checked

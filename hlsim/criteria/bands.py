@@ -44,7 +44,7 @@ def band_levels(waveform: Tensor, sample_rate: int) -> Tensor:
     spectrum = stft.analyse(waveform.reshape(-1, waveform.shape[-1]))
     # both halves of the spectrum; the squares of a Hann window of n samples sum to 3 n / 8
     powers = power(spectrum) * (2.0 / (stft.fft * 0.375 * stft.window))
-    powers = powers @ constant(_bands, stft.fft, sample_rate, dtype=powers.dtype, device=powers.device)
+    powers = powers @ constant(band_shares, stft.fft, sample_rate, dtype=powers.dtype, device=powers.device)
     levels = 10.0 * torch.log10(powers + LOWEST_POWER) + PASCAL_SPL
     return levels.reshape(*waveform.shape[:-1], *levels.shape[-2:])
 
@@ -95,7 +95,7 @@ def band_edges() -> NDArray[np.float64]:
 
 
 @lru_cache(maxsize=16)
-def _bands(fft: int, sample_rate: int) -> NDArray[np.float64]:
+def band_shares(fft: int, sample_rate: int) -> NDArray[np.float64]:
     """Share of each frequency bin in each band. Returns (fft // 2 + 1, 24)."""
     spacing = sample_rate / fft
     centre = np.arange(fft // 2 + 1)[:, None] * spacing

@@ -1,0 +1,41 @@
+"""The examples of training through the loss run as they stand, a few steps."""
+
+import importlib.util
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+import torch
+
+EXAMPLES = Path(__file__).parents[1] / "examples" / "training"
+
+
+def load(name: str) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(Path(name).stem, EXAMPLES / name)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def losses(out: str) -> list[float]:
+    return [float(line.split(":")[1]) for line in out.splitlines()]
+
+
+def test_conv_tasnet_trains(tmp_path: Path, speech_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    load("conv_tasnet.py").main(str(speech_dir / "train"), str(tmp_path / "out.pt"), "N3", "2", 0.3)
+    assert all(0.0 < value < 5.0 for value in losses(capsys.readouterr().out))
+    assert torch.load(tmp_path / "out.pt")
+
+
+def test_a_criterion_of_ones_own_trains(capsys: pytest.CaptureFixture[str]) -> None:
+    load("your_criterion.py").main(6)
+    values = losses(capsys.readouterr().out)
+    assert values[-1] < values[0]
+
+
+def test_lightning_in_bf16(capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("lightning")
+    aid = load("lightning_bf16.py").main(2)
+    assert set(aid.state_dict()) == {"network.weight", "network.bias"}
+    assert float(aid.trainer.callback_metrics["loss"]) > 0.0
