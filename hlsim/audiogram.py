@@ -214,6 +214,9 @@ def as_thresholds(
 ) -> Tensor:
     """Thresholds that a simulator takes, or another ``taker``, up to ``highest`` dB HL.
 
+    A list of (8,) tensors holds an ear each, and one of eight (batch,) tensors a frequency each, as torch's
+    ``default_collate`` makes it of thresholds; a list of eight (8,) tensors may be either and is refused.
+
     Returns: (8,) for one ear, (batch, 8) for a sequence, the tensor itself otherwise; dB HL.
 
     Raises:
@@ -224,6 +227,8 @@ def as_thresholds(
         return torch.tensor(_taken(audiogram.thresholds, highest, taker))
     if isinstance(audiogram, Sequence) and audiogram and all(isinstance(ear, Audiogram) for ear in audiogram):
         return torch.tensor([_taken(ear.thresholds, highest, taker) for ear in audiogram])
+    if isinstance(audiogram, list | tuple):
+        audiogram = _stacked(audiogram)
     if not isinstance(audiogram, Tensor):
         raise ValueError(
             f"audiogram is {type(audiogram).__name__}; allowed: an Audiogram, a sequence of them, or a (..., 8) tensor"
@@ -303,6 +308,22 @@ def _place(hz: tuple[float, ...]) -> NDArray[np.float64]:
     points, right = np.array(FREQUENCIES), _right(hz)
     place: NDArray[np.float64] = (np.array(hz) - points[right - 1]) / (points[right] - points[right - 1])
     return place.clip(0.0, 1.0)
+
+
+def _stacked(tensors: Any) -> Any:
+    """One tensor of a list of (8,) tensors, an ear each, or of eight (batch,) ones, a frequency each; else as given."""
+    kinds = len(FREQUENCIES)
+    if not all(isinstance(one, Tensor) and one.ndim == 1 for one in tensors):
+        return tensors
+    if len({len(one) for one in tensors}) != 1:
+        return tensors
+    ears, frequencies = len(tensors[0]) == kinds, len(tensors) == kinds
+    if ears and frequencies:
+        raise ValueError(
+            "audiogram is eight tensors of 8 levels, an ear each or a frequency each; allowed: torch.stack(audiogram) of "
+            "ears, torch.stack(audiogram, -1) of frequencies"
+        )
+    return torch.stack(tuple(tensors), 0 if ears else -1) if ears or frequencies else tensors
 
 
 def _taken(levels: Sequence[float], highest: float, taker: str) -> Sequence[float]:

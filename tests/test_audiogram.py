@@ -381,7 +381,7 @@ def test_thresholds_for_a_simulator() -> None:
             r"is list; allowed: an Audiogram, a sequence of them, or a .* tensor; write torch\.tensor\(",
         ),
         ([[0.0] * 8], r"is list; allowed: .* tensor; write torch\.tensor\(\.\.\.\)$"),
-        ((torch.zeros(8), torch.zeros(8)), r"is tuple; allowed: .* tensor; write torch\.stack\(\.\.\.\)$"),
+        ((torch.zeros(7), torch.zeros(7)), r"is tuple; allowed: .* tensor; write torch\.stack\(\.\.\.\)$"),
         ([], "is list; allowed: .* tensor$"),
         ("N3", r"is str; allowed: .* tensor; write Audiogram\.standard\('N3'\)$"),
         (["N3", "N4"], r"is list; allowed: .* tensor; write \[Audiogram\.standard\('N3'\), \.\.\.\]$"),
@@ -467,3 +467,15 @@ def test_interpolation_is_linear_in_hz_and_flat_beyond() -> None:
     np.testing.assert_allclose(
         levels.reshape(6, 8).double().numpy() @ interpolation_weights(hz), expected, rtol=1e-12
     )
+
+
+def test_ears_as_lists_of_tensors_and_as_a_loader_collates_them() -> None:
+    ears = [Audiogram.standard(name).thresholds for name in ("N1", "N3", "S2")]
+    collated = torch.utils.data.default_collate(ears)  # eight tensors of shape (3,)
+    assert len(collated) == 8
+    assert torch.equal(as_thresholds(collated), torch.tensor(ears, dtype=torch.float64))
+    assert torch.equal(as_thresholds([torch.tensor(ear) for ear in ears]), torch.tensor(ears))
+    with pytest.raises(
+        ValueError, match=r"eight tensors of 8 levels.*allowed: torch\.stack\(audiogram\) of ears"
+    ):
+        as_thresholds(torch.utils.data.default_collate([ears[0]] * 8))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
-from typing import Any, Unpack
+from typing import Unpack
 
 import torch
 from torch import Tensor, nn
@@ -43,21 +43,13 @@ class CompensatorTraining(TimedModule):
         self.compensator = initial_network(
             recipe.start, recipe.model, MappingConfig, MappingCompensator, load_compensator
         )
-        self.criteria = nn.ModuleDict()
-        for name, weight in recipe.weights.items():
-            if weight > 0.0:
-                loss = HearingLossLoss(simulator=simulator, reference=recipe.reference, criterion=name)
-                simulator = loss.simulator  # the next criterion shares it
-                self.criteria[name] = loss
+        counted = {name: weight for name, weight in recipe.weights.items() if weight > 0.0}
+        self.loss = HearingLossLoss(simulator=simulator, reference=recipe.reference, criterion=counted)
 
     def training_loss(self, batch: Batch) -> Tensor:
         ears = batch["thresholds"]
-        aided = self.compensator(batch["signal"], ears)
-        parts = [
-            self.recipe.weights[name] * criterion(aided, batch["clean"], ears)
-            for name, criterion in self.criteria.items()
-        ]
-        return torch.stack(parts).sum()
+        value: Tensor = self.loss(self.compensator(batch["signal"], ears), batch["clean"], ears)
+        return value
 
     def evaluate(self, batch: Batch) -> dict[str, Tensor]:
         return {"valid_loss": self.training_loss(batch)[None]}
@@ -70,8 +62,7 @@ class CompensatorTraining(TimedModule):
     def examples(self, batch: Batch) -> dict[str, Tensor]:
         signal, ears = batch["signal"][:1], batch["thresholds"][:1]
         aided = self.compensator(signal, ears)
-        loss: Any = next(iter(self.criteria.values()))
-        return {"given": signal[0], "aided": aided[0], "heard": loss.simulator(aided, ears)[0]}
+        return {"given": signal[0], "aided": aided[0], "heard": self.loss.simulator(aided, ears)[0]}
 
     def released(self) -> nn.Module:
         return self.compensator

@@ -129,7 +129,7 @@ class CompensatorRecipe(TrainingRecipe):
 
     Attributes:
         model: settings of ``MappingConfig``.
-        weights: of ``HearingLossLoss``'s criteria: ``bands`` (dB) and ``paper``.
+        weights: of ``HearingLossLoss``'s criteria: ``coherent-bands``, ``bands`` (dB) and ``paper``, of one hearing.
         reference: what the paper's criterion compares with, ``clean`` or ``normal-hearing``.
         sounds: speech in noise alone teaches a network that what is steady is noise, to be taken away.
         equalised: share of clips whose speech is equalised at random by up to 15 dB. Few voices teach few spectra, and
@@ -151,5 +151,5 @@ class CompensatorRecipe(TrainingRecipe):
     validate_every: int = 50
     validation_items: int = 8
 
-    criteria = ("bands", "paper")
+    criteria = ("coherent-bands", "bands", "paper")
     shares = ("sounds", "equalised", "noisy")
