@@ -38,9 +38,7 @@ class MyNetwork(nn.Module):
 def main(folder: str, out: str, ear_name: str = "N3", steps: str = "200") -> None:
     torch.manual_seed(0)
     ear, network = Audiogram.standard(ear_name), MyNetwork()
-    loss = HearingLossLoss(
-        ear, criterion="bands", sample_rate=RATE
-    )  # frozen; simulator="msbg" is the exact one
+    loss = HearingLossLoss(ear, sample_rate=RATE)  # frozen; simulator="msbg" is the exact one
     optimiser = torch.optim.AdamW(network.parameters(), lr=1e-3)
     clips, generator = Clips(folder, sample_rate=RATE, seconds=1.0), torch.Generator().manual_seed(0)
     for step in range(int(steps)):
@@ -51,7 +49,7 @@ def main(folder: str, out: str, ear_name: str = "N3", steps: str = "200") -> Non
         value.backward()
         optimiser.step()
         if step % 20 == 0 or step + 1 == int(steps):
-            print(f"step {step}: {float(value.detach()):.2f} dB from what a normal ear hears", flush=True)
+            print(f"step {step}: loss {float(value.detach()):.3f}", flush=True)
     torch.save(network.state_dict(), out)
 
 

@@ -39,3 +39,15 @@ def test_lightning_in_bf16(capsys: pytest.CaptureFixture[str]) -> None:
     aid = load("lightning_bf16.py").main(2)
     assert set(aid.state_dict()) == {"network.weight", "network.bias"}
     assert float(aid.trainer.callback_metrics["loss"]) > 0.0
+
+
+def test_a_filter_bank_trains(speech_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    example = load("filter_bank.py")
+    ear = example.Audiogram.standard("N3")
+    aid = example.trained(str(speech_dir / "train"), ear, 8)
+    start, *_, end = losses(capsys.readouterr().err)
+    assert end < start
+    assert float(aid.gain.mean()) > 0.1  # of 10 dB
+    assert torch.equal(
+        example.FilterBank()(torch.ones(1, 500)).isfinite(), torch.ones(1, 500, dtype=torch.bool)
+    )
