@@ -134,15 +134,17 @@ def check_waveform(waveform: Tensor, name: str = "waveform") -> Tensor:
 
 
 def check_lengths(lengths: Lengths, shape: torch.Size) -> Tensor:
-    """The lengths as a tensor on the CPU.
+    """The lengths in samples as a tensor on the CPU.
 
     Args:
+        lengths: whole numbers of samples, or shares of ``time`` above 0 to 1, as SpeechBrain has them; (batch,) serves a
+            batch of shape (batch, 1, time), too.
         shape: of the batch, (..., time).
 
     Returns: (...), int64.
 
     Raises:
-        ValueError: not whole numbers, of another shape, or outside 1 to time.
+        ValueError: other numbers, of another shape, or outside 1 to time.
     """
     *items, time = shape
     allowed = f"allowed: whole numbers from 1 to {time} (samples) of shape {tuple(items)}, one an item"
@@ -150,6 +152,10 @@ def check_lengths(lengths: Lengths, shape: torch.Size) -> Tensor:
         ends = torch.as_tensor(lengths, device="cpu")
     except (TypeError, ValueError, RuntimeError):
         raise ValueError(f"lengths is {type(lengths).__name__}; {allowed}") from None
+    if ends.is_floating_point() and bool(((ends > 0.0) & (ends <= 1.0)).all()):
+        ends = (ends.double() * time).round().long().clamp_min(1)
+    if len(shape) == 3 and shape[1] == 1 and ends.shape == shape[:1]:
+        ends = ends.unsqueeze(-1)
     if ends.is_floating_point() or ends.is_complex() or ends.dtype == torch.bool:
         raise ValueError(f"lengths of {ends.dtype}; {allowed}")
     if ends.shape != shape[:-1]:

@@ -11,9 +11,10 @@ from torch import Tensor, nn
 
 from hlsim.audiogram import FREQUENCIES, AudiogramLike, as_thresholds, own_thresholds
 from hlsim.calibration import PASCAL_SPL, check_full_scale, gain_to_pascals
-from hlsim.checks import Lengths, check_lengths, check_rate, check_waveform, is_finite, silent_after
+from hlsim.checks import Lengths, check_lengths, check_rate, check_waveform, silent_after
 from hlsim.criteria import coherent_bands, paper
 from hlsim.criteria.bands import HIGHEST, band_level_loss
+from hlsim.criteria.choice import Criterion, check_criterion, check_values, check_weights
 from hlsim.dsp.resample import resample
 from hlsim.msbg import MSBG
 from hlsim.msbg.normal import hear_normally
@@ -23,19 +24,10 @@ from hlsim.neuro.config import NEURO_RATE
 from hlsim.pretrained import SIMULATOR, find_checkpoint, load_pretrained
 from hlsim.torchtools import not_compiled
 
-CRITERIA: dict[str, Mapping[str, float]] = {
-    "coherent-bands": coherent_bands.DEFAULT_WEIGHTS,
-    "bands": {"band_levels": 1.0},
-    "paper": paper.DEFAULT_WEIGHTS,
-}
-"""Criteria by name: their parts and the default weight of each."""
-
 REFERENCES = ("clean", "normal-hearing")
 
 REDUCTIONS = ("mean", "none")
 
-Criterion = str | Mapping[str, float] | Callable[[Tensor, Tensor], Tensor]
-"""A name, weights by name, or a callable: what is heard and the reference, (items, time) in pascals -> (items,)."""
 
 Hearing = Callable[[Tensor], Tensor]
 """(..., time) -> (..., time), as a normal ear hears."""
@@ -114,8 +106,8 @@ class HearingLossLoss(nn.Module):
                 f"normal is {type(normal).__name__}; allowed: a module or callable (waveform) -> waveform"
             )
         self.reference, self.reduction, self.unit_power = reference, reduction, unit_power
-        self.criteria = _check_criterion(criterion)
-        self.weights = _check_weights(weights, self.criteria, criterion)
+        self.criteria = check_criterion(criterion)
+        self.weights = check_weights(weights, self.criteria, criterion)
         with torch.device("cpu"):  # where the host is made on ``meta``, nobody gives the ear its values later
             thresholds = own_thresholds(audiogram)
         built = _build(simulator, self.sample_rate, self.full_scale_spl).eval().requires_grad_(False)
@@ -268,7 +260,7 @@ class HearingLossLoss(nn.Module):
                 f"compensated is on {compensated.device} and clean on {clean.device}; allowed: the same device"
             )
         shape = compensated.shape
-        ends = None if lengths is None else check_lengths(_in_samples(lengths, shape), shape)
+        ends = None if lengths is None else check_lengths(lengths, shape)
         ears = self.thresholds if audiogram is None else as_thresholds(audiogram)
         if ears is None:
             raise ValueError("no audiogram: give one when building the loss or with the call")
@@ -296,7 +288,7 @@ class HearingLossLoss(nn.Module):
                 both = paper.to_unit_power(heard, aim) if self.unit_power else (heard, aim)
                 items |= paper.paper_parts(*both, stft, self._frequencies(stft.fft))
             else:
-                items[name] = _check_values(criterion(heard, aim), len(heard))
+                items[name] = check_values(criterion(heard, aim), len(heard))
         return items
 
     def _hear(self, waveform: Tensor, thresholds: Tensor, listener: Mapping[str, Any] | None) -> Tensor:
@@ -448,70 +440,3 @@ def _check_heard(heard: Any, what: str, waveform: Tensor, allowed: list[torch.Si
             "length, as MSBG(aligned=True)"
         )
     return heard
-
-
-def _check_values(values: Any, items: int) -> Tensor:
-    """What a callable criterion returned, or ValueError unless it is a value for each item."""
-    if not isinstance(values, Tensor) or values.shape != (items,):
-        found = f"shape {tuple(values.shape)}" if isinstance(values, Tensor) else type(values).__name__
-        raise ValueError(
-            f"the criterion returned {found} for {items} items; allowed: a value for each, ({items},); one that gives "
-            "a mean goes on what loss.heard(...) returns"
-        )
-    return values
-
-
-def _in_samples(lengths: Any, shape: torch.Size) -> Any:
-    """Lengths in samples, of the batch's shape, where they may be relative, and (batch,) for (batch, 1, time)."""
-    try:
-        ends = torch.as_tensor(lengths, device="cpu")
-    except (TypeError, ValueError, RuntimeError):
-        return lengths  # to be refused
-    if ends.is_floating_point() and bool(((ends > 0.0) & (ends <= 1.0)).all()):
-        ends = (ends.double() * shape[-1]).round().long().clamp_min(1)
-    if len(shape) == 3 and shape[1] == 1 and ends.shape == shape[:1]:
-        ends = ends.unsqueeze(-1)
-    return ends
-
-
-def _check_criterion(criterion: Any) -> dict[str, Any]:
-    """The criteria by name, each with its weight; a callable as itself, under the name criterion."""
-    if callable(criterion) and not isinstance(criterion, type):
-        return {"criterion": criterion}
-    named = {criterion: 1.0} if isinstance(criterion, str) else criterion
-    if not isinstance(named, Mapping) or not named or not set(named) <= set(CRITERIA):
-        raise ValueError(
-            f"criterion is {criterion!r}; allowed: {', '.join(CRITERIA)}, weights by these names, or a callable "
-            "(heard, reference) -> (items,)"
-        )
-    return _check_numbers(named, "criterion")
-
-
-def _check_weights(
-    weights: Mapping[str, float] | None, criteria: Mapping[str, Any], criterion: Any
-) -> dict[str, float]:
-    """The weight of each part, times that of its criterion."""
-    of = {part: name for name in criteria for part in CRITERIA.get(name, {name: 1.0})}
-    if weights is None:
-        weights = {part: CRITERIA.get(name, {name: 1.0})[part] for part, name in of.items()}
-    if not isinstance(weights, Mapping):
-        allowed = {part: 1.0 for part in of}
-        raise ValueError(f"weights is {type(weights).__name__}; allowed: numbers by name, as {allowed}")
-    if unknown := sorted(map(str, set(weights) - set(of))):
-        raise ValueError(
-            f"unknown weights {', '.join(unknown)} for criterion {criterion!r}; allowed: {', '.join(of)}"
-        )
-    checked = _check_numbers(weights, "weights", of)
-    scales = {name: 1.0 if callable(scale) else scale for name, scale in criteria.items()}
-    return {part: weight * scales[of[part]] for part, weight in checked.items()}
-
-
-def _check_numbers(weights: Mapping[str, float], what: str, allowed: Any = CRITERIA) -> dict[str, float]:
-    if not all(is_finite(weight) and weight >= 0.0 for weight in weights.values()):
-        raise ValueError(f"{what} {dict(weights)}; allowed: finite numbers, 0 or more")
-    checked = {name: float(weight) for name, weight in weights.items()}
-    if not any(checked.values()):
-        raise ValueError(
-            f"{what} {checked} count nothing; allowed: one above 0 at least, of {', '.join(allowed)}"
-        )
-    return checked
