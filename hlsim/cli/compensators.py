@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 from hlsim.cli.inputs import check_there, need, other_ear, read_ear
-from hlsim.cli.options import EARS_TABLE, Parser, count, number, positive
+from hlsim.cli.options import EARS_TABLE, Parser, count, number, passed, positive
 from hlsim.cli.progress import show_progress
 
 GAIN_EARS = ["N3", "S2"]
@@ -51,23 +51,9 @@ def _evaluate_compensator(options: argparse.Namespace) -> None:
     notes = [line for label, name in named.items() for line in other_ear(label, name, ear)]
     for line in notes:
         print(f"hlsim: warning: {line}", file=sys.stderr)
-    done = evaluate_compensators(
-        loaded,
-        speech=options.speech,
-        audiograms=options.audiograms,
-        audiogram=ear,
-        noise=options.noise,
-        simulator=options.simulator,
-        store=check_out(options.out) / "scores.jsonl",
-        items=options.items,
-        seconds=options.seconds,
-        levels=options.levels,
-        gain_ears=options.gain_ears,
-        notes=notes,
-        seed=options.seed,
-        jobs=options.jobs,
-        progress=show_progress("outputs"),
-    )
+    store = check_out(options.out) / "scores.jsonl"
+    instead = {"audiogram": ear, "notes": notes, "store": store, "progress": show_progress("outputs")}
+    done = evaluate_compensators(loaded, **passed(options, evaluate_compensators, **instead))
     write_compensators(done.result, done.reports, options.out)
     print((options.out / "compensators.md").read_text(encoding="utf-8"))
     if done.result["failures"]:

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from hlsim.cli.inputs import check_there, need, read_simulator
-from hlsim.cli.options import EARS_TABLE, Parser, count, number, positive
+from hlsim.cli.options import EARS_TABLE, Parser, count, number, passed, positive
 from hlsim.cli.progress import show_progress
 
 
@@ -41,20 +41,12 @@ def _evaluate_simulator(options: argparse.Namespace) -> None:
     from hlsim.report.page import check_out
     from hlsim.report.simulators import write_fidelity
 
-    done = evaluate_simulators(
-        {name: read_simulator(name, NEURO_RATE) for name in options.names},
-        speech=options.speech,
-        audiograms=options.audiograms,
-        noise=options.noise,
-        store=check_out(options.out) / "scores.jsonl",
-        teacher=options.teacher,
-        items=options.items,
-        seconds=options.seconds,
-        levels=options.levels,
-        inputs=options.inputs,
-        compensator=load_compensator(options.compensator) if options.compensator else None,
-        seed=options.seed,
-        progress=show_progress("items"),
-    )
+    instead = {
+        "store": check_out(options.out) / "scores.jsonl",
+        "compensator": load_compensator(options.compensator) if options.compensator else None,
+        "progress": show_progress("items"),
+    }
+    simulators = {name: read_simulator(name, NEURO_RATE) for name in options.names}
+    done = evaluate_simulators(simulators, **passed(options, evaluate_simulators, **instead))
     write_fidelity(done.result, done.heard, done.shown, options.out)
     print((options.out / "fidelity.md").read_text(encoding="utf-8"))

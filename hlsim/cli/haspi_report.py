@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 from hlsim.cli.inputs import check_there, need, read_ear
-from hlsim.cli.options import EARS_TABLE, Parser, natural, positive
+from hlsim.cli.options import EARS_TABLE, Parser, natural, passed, positive
 from hlsim.cli.progress import show_progress
 
 
@@ -46,29 +46,17 @@ def _haspi_report(options: argparse.Namespace) -> None:
         folders=(options.clean, options.before, options.after, options.root),
         files=(options.manifest, options.audiograms),
     )
-    from hlsim.evaluation import haspi_report
+    from hlsim.evaluation import haspi_report, score_items
     from hlsim.report.haspi import markdown, write_report
     from hlsim.report.page import check_out
 
-    report = haspi_report(
-        options.clean,
-        options.before,
-        options.after,
-        read_ear(options.audiogram) if options.audiogram else None,
-        audiograms=options.audiograms,
-        manifest=options.manifest,
-        root=options.root,
-        measures=measures,
-        baseline=options.baseline,
-        store=options.scores or check_out(options.out) / "scores.jsonl",
-        full_scale_spl=options.full_scale_spl,
-        spl=options.spl,
-        seed=options.seed,
-        jobs=options.jobs,
-        backend=options.backend,
-        scheduler=options.scheduler,
-        progress=show_progress("scores"),
-    )
+    instead = {
+        "audiogram": read_ear(options.audiogram) if options.audiogram else None,
+        "measures": measures,
+        "store": options.scores or check_out(options.out) / "scores.jsonl",
+        "progress": show_progress("scores"),
+    }
+    report = haspi_report(**passed(options, haspi_report, score_items, **instead))
     write_report(report, options.out, listen=options.listen)
     print(markdown(report))
     if report.failures:

@@ -17,11 +17,11 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Container, Mapping
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path, PurePath, PurePosixPath
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from hlsim.audio import EXTENSIONS, find_audio
 from hlsim.audiogram import Audiogram, numbered_audiograms
@@ -48,7 +48,7 @@ def read_manifest(
     """The items of a manifest, in the order of their first rows.
 
     Args:
-        root: the folder that the paths are relative to, and that they may not leave; by default the manifest's own.
+        root: the folder that the paths are relative to, and that they may not leave; by default the manifest's.
         audiogram: the ear of all rows that bring none; or else
         audiograms: a CSV file with columns ``listener``, ``ear`` (where left and right differ) and ``hl_250``, ....
         full_scale_spl, spl: the level, as in ``FileItem``, of rows that bring none.
@@ -85,9 +85,8 @@ def read_manifest(
         and not any(used is ear for used in taken for ear in ears.values()),
         "spl": spl is not None and all(row.get("spl") or row.get("full_scale_spl") for _, row in rows),
     }
-    for what in idle:
-        if idle[what]:
-            raise ValueError(f"{path}: no row takes {what}, for each has its own; leave one of the two out")
+    for what in filter(idle.get, idle):
+        raise ValueError(f"{path}: no row takes {what}, for each has its own; leave one of the two out")
     return list(items.values())
 
 
@@ -119,7 +118,7 @@ def _item(
     row: Mapping[str, str],
     root: Path,
     ears: Mapping[tuple[str, str], Audiogram],
-    audiogram: Audiogram | None,
+    default: Audiogram | None,
     full_scale_spl: float,
     spl: float | None,
 ) -> tuple[tuple[str, ...], str, FileItem]:
@@ -135,13 +134,25 @@ def _item(
         full_scale_spl, spl = row_full_scale, None
     elif row_spl is not None:
         spl = row_spl
+    levels = {key: value for key, value in row.items() if key.lower().startswith("hl")}
+    if any(levels.values()):  # then all: a blank is no threshold, and not one like its neighbour's either
+        audiogram: Audiogram | None = Audiogram.from_row(levels)
+    elif row.get("audiogram"):
+        audiogram = Audiogram.standard(row["audiogram"])
+    else:
+        audiogram = ears.get((listener, ear)) or ears.get((listener, "")) or default
+    if audiogram is None:
+        raise ValueError(
+            f"no audiogram of listener {listener!r}, ear {ear!r}: neither in columns hl_250, hl_500, ... or audiogram "
+            "nor in a file of audiograms"
+        )
     parts = (listener, ear, row.get("item", "") or PurePosixPath(row["clean"]).with_suffix("").as_posix())
-    label = " ".join(part for part in parts if part)
+    label = " ".join(filter(None, parts))
     item = FileItem(
         name=label if snr is None else f"{label} {snr:g} dB",
         clean=clean,
         processed={condition: below_root(root, row["processed"], "processed")},
-        audiogram=_audiogram(row, ears, listener, ear, audiogram),
+        audiogram=audiogram,
         listener=listener,
         ear=ear,
         snr=snr,
@@ -149,27 +160,6 @@ def _item(
         spl=spl,
     )
     return (*parts, str(clean), str(snr)), condition, item
-
-
-def _audiogram(
-    row: Mapping[str, str],
-    ears: Mapping[tuple[str, str], Audiogram],
-    listener: str,
-    ear: str,
-    default: Audiogram | None,
-) -> Audiogram:
-    levels = {key: value for key, value in row.items() if key.lower().startswith("hl")}
-    if any(levels.values()):  # then all: a blank is no threshold, and not one like its neighbour's either
-        return Audiogram.from_row(levels)
-    if row.get("audiogram"):
-        return Audiogram.standard(row["audiogram"])
-    known = ears.get((listener, ear)) or ears.get((listener, "")) or default
-    if known is None:
-        raise ValueError(
-            f"no audiogram of listener {listener!r}, ear {ear!r}: neither in columns hl_250, hl_500, ... or audiogram "
-            "nor in a file of audiograms"
-        )
-    return known
 
 
 def _ears(
@@ -248,24 +238,24 @@ def read_folders(
         raise ValueError(
             "give either audiogram, one ear of all files, or audiograms, a CSV file with a row a file"
         )
-    folders = [_by_name(folder) for folder in (clean, before, after)]
-    names = _common_names((clean, before, after), folders)
+    roots = (clean, before, after)
+    folders = [_by_name(root) for root in roots]
+    names = sorted(set(chain(*folders)))
+    for root, files in zip(roots, folders, strict=True):
+        if lack := _lack(names, files):
+            raise ValueError(
+                f"{root}: {lack[0]} missing, {lack[1]}; clean, before and after need the same names"
+            )
     ears = dict.fromkeys(names, audiogram) if audiogram is not None else _ears(str(audiograms), _file)
-    if missing := [name for name in names if name not in ears]:
-        raise ValueError(
-            f"{audiograms}: no audiogram of {len(missing)} of {len(names)} files, {_listed(missing)}"
-        )
-    return [
-        FileItem(
-            name=name,
-            clean=folders[0][name].absolute(),
-            processed={"before": folders[1][name].absolute(), "after": folders[2][name].absolute()},
-            audiogram=ears[name],
-            full_scale_spl=full_scale_spl,
-            spl=spl,
-        )
-        for name in names
-    ]
+    if lack := _lack(names, ears):
+        raise ValueError(f"{audiograms}: no audiogram of {lack[0]}, {lack[1]}")
+    levels: dict[str, Any] = {"full_scale_spl": full_scale_spl, "spl": spl}
+    out = []
+    for name in names:
+        speech, *heard = (files[name].absolute() for files in folders)
+        processed = dict(zip(("before", "after"), heard, strict=True))
+        out.append(FileItem(name, speech, processed, ears[name], **levels))
+    return out
 
 
 def _name(path: PurePath) -> str:
@@ -283,18 +273,8 @@ def _by_name(folder: str | Path) -> dict[str, Path]:
     return files
 
 
-def _common_names(roots: Iterable[str | Path], folders: list[dict[str, Path]]) -> list[str]:
-    """The names, sorted, or ValueError naming the folder that lacks some."""
-    names = sorted(set(chain(*folders)))
-    for root, files in zip(roots, folders, strict=True):
-        missing = [name for name in names if name not in files]
-        if missing:
-            raise ValueError(
-                f"{root}: {len(missing)} of {len(names)} files missing, {_listed(missing)}; "
-                "clean, before and after need the same names"
-            )
-    return names
-
-
-def _listed(names: list[str]) -> str:
-    return ", ".join(names[:_NAMED]) + (", ..." if len(names) > _NAMED else "")
+def _lack(names: list[str], there: Container[str]) -> tuple[str, str] | None:
+    """How many of the names are missing, and the first few."""
+    missing = [name for name in names if name not in there]
+    few = ", ".join(missing[:_NAMED]) + (", ..." if len(missing) > _NAMED else "")
+    return (f"{len(missing)} of {len(names)} files", few) if missing else None

@@ -125,28 +125,19 @@ def score_items(
     hashes = cache(content_hash)
     versions = {name: versions_of([name]) for name in names}
     for index, item in enumerate(items):
+        scale = {"full_scale_spl": item.full_scale_spl if item.spl is None else None, "spl": item.spl}
         for condition, path in item.processed.items():
             try:
-                clean, processed = hashes(item.clean), hashes(path)
+                files = {"clean": hashes(item.clean), "processed": hashes(path), "ear": item.ear}
             except ValueError as error:
                 results[index] |= {(name, condition): Result(None, str(error)) for name in names}
                 continue
-            item_seed = (seed + int(clean[:8], 16)) % 2**32
+            item_seed = (seed + int(files["clean"][:8], 16)) % 2**32
+            of_an_ear = {"audiogram": list(item.audiogram.thresholds), **scale, "seed": item_seed}
             for name in names:
-                settings: dict[str, Any] = {
-                    "revision": _REVISION,
-                    "measure": name,
-                    "versions": versions[name],
-                    "clean": clean,
-                    "processed": processed,
-                    "ear": item.ear,
-                }
-                if MEASURES[name].of_an_ear:
-                    settings["audiogram"] = list(item.audiogram.thresholds)
-                    settings["full_scale_spl"] = item.full_scale_spl if item.spl is None else None
-                    settings["spl"] = item.spl
-                    settings["seed"] = item_seed
-                places.append((index, FileTask(item, condition, name, item_seed, key_of(settings))))
+                about = {"revision": _REVISION, "measure": name, "versions": versions[name], **files}
+                key = key_of(about | (of_an_ear if MEASURES[name].of_an_ear else {}))
+                places.append((index, FileTask(item, condition, name, item_seed, key)))
     counts = Counter(task.key for _, task in places)  # the same score may be wanted twice
     failed = make_missing(
         score_task,
@@ -159,10 +150,8 @@ def score_items(
         progress=progress,
     )
     for index, task in places:
-        known = store.get(task.key)
-        result = Result(None, failed.get(task.key))
-        if known is not None:
-            result = Result(**{name: known[name] for name in Result._fields})
+        known = store.get(task.key) or {"score": None, "reason": failed.get(task.key)}
+        result = Result(**{name: known[name] for name in Result._fields if name in known})
         # some measures know no seed: the stored one may be of another run
         results[index][task.measure, task.condition] = result._replace(seed=task.seed)
     return results
@@ -235,15 +224,11 @@ def haspi_many(
     jobs: int | None = None,
     progress: Progress | None = None,
 ) -> list[float]:
-    """HASPI of many items in parallel processes, the same whatever their number.
-
-    Each item has its seed, and each process one thread of linear algebra.
+    """HASPI of many items in parallel processes (``jobs``; None takes all cores), the same whatever their number.
 
     Args:
-        items: see ``HaspiItem``.
         full_scale_spl: level in dB SPL of RMS 1.0, of all signals.
         seed: item i, counted from 0, takes seed + i unless it brings one.
-        jobs: processes; None takes all cores.
         progress: called after each score.
 
     Raises:
