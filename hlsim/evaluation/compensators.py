@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -87,7 +88,7 @@ def evaluate_compensators(
         jobs: processes; None takes all cores. The figures do not depend on it.
         progress: called with the number of outputs judged and of all.
 
-    Returns: an evaluation. Items that failed are listed in its result with the reason, under ``failures``.
+    Returns: an evaluation; items that failed are listed with the reason under ``failures`` of its result.
 
     Raises:
         ValueError: data or settings that cannot be used, or no item could be judged.
@@ -117,22 +118,16 @@ def evaluate_compensators(
     aided = {name: module for name, module in conditions.items() if name != UNAIDED}
     curves = gain_curves(aided, shown, speech, levels, seed)  # first: what cannot be used shows at once
     steady = steady_tones(conditions, shown, levels)
-    judged = _judge_all(
-        drawn, conditions, load_pretrained(simulator), seed, ScoreStore(store), jobs, progress
-    )
-    result, reports = compensator_result(
-        drawn,
-        judged,
-        limits={name: _limit(module) for name, module in conditions.items()},
-        settings={
-            "items": items,
-            "seconds": seconds,
-            "seed": seed,
-            "levels": [*levels],
-            "ears": [name for name, _ in ears],
-            "simulator": str(simulator),
-        },
-    )
+    network = load_pretrained(simulator)
+    judged = _judge_all(drawn, conditions, network, seed, ScoreStore(store), jobs=jobs, progress=progress)
+    settings = {"items": items, "seconds": seconds, "seed": seed, "levels": [*levels]}
+    settings |= {"ears": [name for name, _ in ears], "simulator": str(simulator)}
+    # the peak in dB SPL that a compensator promises not to pass
+    limits = {
+        name: getattr(getattr(module, "config", None), "limit_spl", None)
+        for name, module in conditions.items()
+    }
+    result, reports = compensator_result(drawn, judged, limits=limits, settings=settings)
     shifted = sorted(result["rows"], key=lambda row: row["condition"] != "clean")[:_SHIFTED]
     shifts = shift_differences(aided, {row["item"]: drawn[row["item"]] for row in shifted})
     result |= {"gain_curves": curves, "steady_tones": steady, "shifts": shifts, "notes": [*notes]}
@@ -145,8 +140,9 @@ def _judge_all(
     simulator: nn.Module,
     seed: int,
     store: ScoreStore,
-    jobs: int | None,
+    *,
     progress: Progress | None,
+    **parallel: Any,
 ) -> list[dict[str, Judged]]:
     """Each item's figures by condition, those from the store among them."""
     weights = {name: weights_hash(module) for name, module in conditions.items()}
@@ -159,13 +155,10 @@ def _judge_all(
         of = {name: {**about, "weights": weights[name]} for name in conditions}
         keys = {name: Keys(key_of(it), key_of({**it, "simulator": network})) for name, it in of.items()}
         trials.append(Trial(item, conditions, simulator, trial_seed, keys))
+    if progress is not None:
+        parallel["progress"] = lambda done, total: progress(done // 2, total // 2)  # both of an output
     failed = make_missing(
-        judge,
-        trials,
-        lambda trial: [key for keys in trial.keys.values() for key in keys],
-        store,
-        jobs=jobs,
-        progress=progress and (lambda done, total: progress(done // 2, total // 2)),  # both of an output
+        judge, trials, lambda trial: [*chain.from_iterable(trial.keys.values())], store, **parallel
     )
 
     def judged(keys: Keys) -> Judged:
@@ -174,8 +167,3 @@ def _judge_all(
         return Judged(store.records[keys.most] | store.records[keys.of_network])
 
     return [{name: judged(keys) for name, keys in trial.keys.items()} for trial in trials]
-
-
-def _limit(compensator: nn.Module) -> float | None:
-    """Peak in dB SPL that a compensator promises not to pass, or None."""
-    return getattr(getattr(compensator, "config", None), "limit_spl", None)

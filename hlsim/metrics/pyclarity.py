@@ -55,7 +55,6 @@ def haspi(
     Args:
         reference: clean speech, not amplified, as a normal ear would hear it.
         processed: what the impaired ear is given.
-        audiogram: of that ear.
         sample_rate: Hz, 16000 to 48000.
         full_scale_spl: level in dB SPL of a signal with RMS 1.0 (pyclarity's ``level1``).
         seed: of the noise that HASPI adds (scores vary by up to 0.003).
@@ -79,9 +78,9 @@ def hasqi(
     full_scale_spl: float = 94.0,
     seed: int = 0,
 ) -> float:
-    """HASQI v2 of one ear, 0 to 1: pyclarity's ``hasqi_v2``, whose combined score it is, with numpy's global seed set.
+    """HASQI v2 of one ear, 0 to 1: pyclarity's ``hasqi_v2``, whose combined score it is; all else as ``haspi``.
 
-    HASQI itself adds NAL-R to ``reference``. Arguments, shapes and errors as ``haspi``.
+    HASQI itself adds NAL-R to ``reference``.
     """
     return pyclarity_score("hasqi", reference, processed, audiogram, sample_rate, full_scale_spl, seed)
 
@@ -105,8 +104,7 @@ def pyclarity_score(
     # at the eight frequencies: the same ear to both, which would log a warning of grids that lack one of their six
     ear = Audiogram(audiogram.thresholds).to_clarity()
     with numpy_seed(seed):
-        score = model(clean, sample_rate, heard, sample_rate, ear, level1=check_full_scale(full_scale_spl))[0]
-    return float(score)
+        return float(model(clean, sample_rate, heard, sample_rate, ear, level1=full_scale_spl)[0])
 
 
 def check_seed(seed: int) -> int:

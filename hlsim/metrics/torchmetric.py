@@ -29,8 +29,7 @@ class HASPI(_Metric):
     ``self.haspi.update(aided, clean, audiogram); self.log("haspi", self.haspi)``.
 
     Args:
-        sample_rate: Hz, 16000 to 48000.
-        full_scale_spl: level in dB SPL of a signal with RMS 1.0.
+        sample_rate, full_scale_spl: as ``haspi``.
         seed: item i since the last reset takes ``seed`` + i, so that epochs can be compared.
         limit: items scored since the last reset, in each process; the others are passed over. None scores all.
         jobs: processes; None takes all cores.
@@ -106,8 +105,8 @@ class HASPI(_Metric):
         ears = _ears(audiogram, len(heard))
         ends = _ends(lengths, *heard.shape)
         tasks, levels = [], []
-        for i, (signal, target, ear, end) in enumerate(zip(heard, reference, ears, ends, strict=True)):
-            number = int(self.seen) + i
+        items = zip(heard, reference, ears, ends, strict=True)
+        for number, (signal, target, ear, end) in enumerate(items, start=int(self.seen)):
             if self.limit is not None and number >= self.limit:
                 break
             try:
