@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 from hlsim.evaluation.comparison import Comparison, p_text
 from hlsim.evaluation.statistics import PairedComparison
@@ -60,6 +61,13 @@ class Table:
 def number(value: float | None, form: str, none: str = "n/a") -> str:
     """A figure, or what stands where there is none."""
     return none if value is None else f"{value:{form}}"
+
+
+def cells(
+    figures: Mapping[str, Any], columns: Mapping[str, tuple[str, str]], none: str = "n/a"
+) -> dict[str, str]:
+    """Figures by title of the column, of which is given the name of the figure and its format."""
+    return {title: number(figures[name], form, none) for title, (name, form) in columns.items()}
 
 
 def spread(mean: float, deviation: float | None) -> str:
