@@ -1,13 +1,16 @@
-"""The command ``evaluate-simulator``."""
+"""The commands ``evaluate-simulator`` and ``evaluate-compensator``."""
 
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 
-from hlsim.cli.inputs import check_there, need, read_simulator
+from hlsim.cli.inputs import check_there, need, other_ear, read_ear, read_simulator
 from hlsim.cli.options import EARS_TABLE, Parser, count, number, passed, positive
 from hlsim.cli.progress import show_progress
+
+GAIN_EARS = ["N3", "S2"]
 
 
 def evaluate_simulator(parser: Parser) -> None:
@@ -50,3 +53,57 @@ def _evaluate_simulator(options: argparse.Namespace) -> None:
     done = evaluate_simulators(simulators, **passed(options, evaluate_simulators, **instead))
     write_fidelity(done.result, done.heard, done.shown, options.out)
     print((options.out / "fidelity.md").read_text(encoding="utf-8"))
+
+
+def evaluate_compensator(parser: Parser) -> None:
+    parser.set_defaults(run=_evaluate_compensator)
+    option = parser.option
+    text = "compensators, by name or folder; LABEL=FOLDER is LABEL in the tables"
+    option("names", str, text, nargs="+", metavar="NAME")
+    option("--speech", Path, "folder of clean speech of unseen speakers", required=True)
+    option("--audiograms", Path, f"{EARS_TABLE}; its ears join Bisgaard's N2 to N6 and S1 to S3")
+    parser.audiogram(text="; one ear in place of all, for a compensator trained for it")
+    option("--noise", Path, "folder of noises; every second item is then noisy, at 2.5 to 17.5 dB")
+    option("--simulator", str, "Neuro-MSBG of the surrogate gap, by name or folder", "neuro-msbg")
+    option("--levels", number, "of the speech in dB SPL, in turn", [50, 65, 80], nargs="+")
+    option("--items", count, "how many in all", 400)
+    option("--seconds", positive, "length of an item", 3.0)
+    text = "standard ears of the gain curves and tones; with --audiogram that ear's are drawn"
+    option("--gain-ears", str.upper, text, GAIN_EARS, nargs="+", metavar="EAR")
+    parser.jobs()
+    parser.seed()
+    parser.out()
+
+
+def _evaluate_compensator(options: argparse.Namespace) -> None:
+    if options.audiogram and options.gain_ears != GAIN_EARS:
+        raise ValueError("--gain-ears with --audiogram; allowed: without it, for that ear's gains are drawn")
+    need("eval", "clarity", "matplotlib")
+    check_there(folders=(options.speech, options.noise), files=(options.audiograms,))
+    from compensators import load_compensator
+    from hlsim.evaluation.compensators import evaluate_compensators
+    from hlsim.report.compensators import write_compensators
+    from hlsim.report.page import check_out
+
+    named = dict(map(_labelled, options.names))
+    if len(named) < len(options.names):
+        raise ValueError(f"compensators {', '.join(options.names)}; allowed: one a label")
+    loaded = {label: load_compensator(name) for label, name in named.items()}
+    ear = read_ear(options.audiogram) if options.audiogram else None
+    notes = [line for label, name in named.items() for line in other_ear(label, name, ear)]
+    for line in notes:
+        print(f"hlsim: warning: {line}", file=sys.stderr)
+    store = check_out(options.out) / "scores.jsonl"
+    instead = {"audiogram": ear, "notes": notes, "store": store, "progress": show_progress("outputs")}
+    done = evaluate_compensators(loaded, **passed(options, evaluate_compensators, **instead))
+    write_compensators(done.result, done.reports, options.out)
+    text = options.out / "compensators.md"
+    print(text.read_text(encoding="utf-8"))
+    if failed := len(done.result["failures"]):
+        print(f"hlsim: {failed} outputs could not be judged; the reasons are in {text}", file=sys.stderr)
+
+
+def _labelled(text: str) -> tuple[str, str]:
+    """Label and name; a folder by itself is called by its path."""
+    label, sign, name = text.partition("=")
+    return (text, text) if Path(text).exists() or not (sign and label) else (label, name)

@@ -27,7 +27,7 @@ COMMANDS = {
     "train-compensator": ("training", "train a compensator through a frozen simulator"),
     "evaluate-simulator": ("evaluation", "compare simulators with MSBG: SNR, STOI, PESQ, bands"),
     "evaluate-compensator": (
-        "compensators",
+        "evaluation",
         "judge compensators beside no aid and NAL-R: HASPI, HASQI, loudness as heard, surrogate gap, gain curves, tones",
     ),
     "haspi-report": (

@@ -30,14 +30,11 @@ def compensator_result(
 ) -> tuple[dict[str, Any], dict[str, HaspiReport]]:
     """Summaries of what ``judge`` made, for JSON, and the reports of the groups that there are.
 
-    An item counts where every condition has figures, so that all rows are of the same items.
+    An item counts where every condition has figures, so that all rows are of the same items; ValueError where none has.
 
     Args:
         judged: figures of each item by condition.
         limits: the conditions in order, unaided first, and the peak in dB SPL that each keeps to, or None.
-
-    Raises:
-        ValueError: no item has figures of every condition.
     """
     conditions = [*limits]
     failures, rows = [], []

@@ -36,12 +36,8 @@ _REVISION = 2  # of what ``judge`` measures and how it is kept: raise it where t
 
 @dataclass(frozen=True)
 class CompensatorEvaluation:
-    """What a comparison of compensators comes to.
-
-    Attributes:
-        result: what ``compensators.json`` holds: ``compensator_result``'s, and ``gain_curves``, ``steady_tones``,
-            ``shifts`` and ``notes``.
-        reports: of each group of items that there is, ``clean``, ``noisy`` and ``hard``.
+    """What ``compensators.json`` holds: ``compensator_result``'s, and ``gain_curves``, ``steady_tones``, ``shifts`` and
+    ``notes``; and the reports of each group of items that there is, ``clean``, ``noisy`` and ``hard``.
     """
 
     result: dict[str, Any]
@@ -70,7 +66,7 @@ def evaluate_compensators(
 
     Figures are stored as they are made, by the samples, the ear and the weights that they are of: a run that was
     stopped goes on where it was, one with a compensator more scores that one alone, and one with another simulator
-    computes the surrogate gap alone.
+    computes the surrogate gap alone. What fails is listed with the reason under ``failures`` of the result.
 
     Args:
         compensators: by name, modules at 16 kHz and 94 dB SPL full scale, called with a waveform and an ear. One with a
@@ -78,17 +74,15 @@ def evaluate_compensators(
         speech, noise: folders of recordings; with ``noise`` every second item is noisy, at 2.5 to 17.5 dB.
         store: file of figures, there or not; None keeps nothing.
         audiograms: CSV file of ears that join Bisgaard's N2 to N6 and S1 to S3.
-        audiogram: one ear in place of all, for a compensator that was trained for it.
+        audiogram: one ear in place of all, also of the gain curves, for a compensator that was trained for it.
         simulator: the Neuro-MSBG of the surrogate gap, by name or folder.
         items: how many in all. 400 give each main row 200 pairs.
         seconds: length of an item; HASPI is not to be trusted much under 3.
         levels: of the clean speech in dB SPL, in turn.
-        gain_ears: standard ears of the gain curves and the steady tones; with ``audiogram``, that ear in their place.
+        gain_ears: standard ears of the gain curves and the steady tones.
         notes: sentences that the report begins with.
         jobs: processes; None takes all cores. The figures do not depend on it.
         progress: called with the number of outputs judged and of all.
-
-    Returns: an evaluation; items that failed are listed with the reason under ``failures`` of its result.
 
     Raises:
         ValueError: data or settings that cannot be used, or no item could be judged.

@@ -132,11 +132,7 @@ class HaspiReport:
 
     @property
     def table(self) -> Any:
-        """For pandas: a row an item and condition, its level (dB SPL) and a column a measure; NaN without a score.
-
-        Raises:
-            MissingExtraError: pandas is not installed.
-        """
+        """For pandas: a row an item and condition, its level (dB SPL) and a column a measure; NaN without a score."""
         facts = (
             "file",
             "listener",

@@ -38,10 +38,8 @@ compensator adds ``compensated``."""
 class Item:
     """A signal for an ear, in pascals at 16 kHz.
 
-    Attributes:
-        clean, signal: (time,); ``signal`` is what the ear gets, ``clean`` the speech in it, before treatment.
-        about: severity, level (dB SPL before treatment), condition (clean or noisy), noise_snr (dB; None where clean),
-            input, audiogram.
+    ``signal`` (time,) is what the ear gets, ``clean`` (time,) the speech in it, before treatment. ``about`` has severity,
+    level (dB SPL before treatment), condition (clean or noisy), noise_snr (dB; None where clean), input, audiogram.
     """
 
     clean: Tensor
@@ -158,14 +156,7 @@ def _about(ear: Audiogram, level: float, snr: float | None, name: str) -> dict[s
 def treat(
     items: Sequence[Item], inputs: Sequence[str], compensator: nn.Module | None = None
 ) -> Iterator[Item]:
-    """Each item under each input in turn.
-
-    Args:
-        inputs: of ``INPUTS``, and ``compensated`` where there is a compensator.
-
-    Raises:
-        ValueError: an input that is none of these.
-    """
+    """Each item under each input in turn: of ``INPUTS``, with a compensator ``compensated`` too; else ValueError."""
     treatments: dict[str, Callable[[Item], Tensor]] = {
         "as-is": lambda item: item.signal,
         "louder": lambda item: 10.0 * item.signal,

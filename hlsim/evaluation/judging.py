@@ -48,11 +48,8 @@ class Keys(NamedTuple):
 class Trial:
     """An item to be judged as each compensator gives it.
 
-    Args:
-        compensators: by name, at 16 kHz and 94 dB SPL full scale.
-        simulator: the network of ``neuro``, of the same rate and scale.
-        seed: of the noise that HASPI and HASQI add, the same for every compensator.
-        keys: of the figures, by compensator.
+    The compensators, by name, and the network are at 16 kHz and 94 dB SPL full scale; ``seed``, the same for all, is of
+    the noise that HASPI and HASQI add; ``keys`` are the figures', by compensator.
     """
 
     item: Item
@@ -69,6 +66,8 @@ class Judged(NamedTuple):
     reason: str = ""
 
 
+@one_thread()
+@torch.no_grad()
 def judge(trial: Trial, missing: Sequence[str]) -> dict[str, dict[str, float] | Failed]:
     """The figures whose keys are missing; what goes wrong is the reason.
 
@@ -80,11 +79,6 @@ def judge(trial: Trial, missing: Sequence[str]) -> dict[str, dict[str, float] | 
       hears and what a normal one hears of the clean speech, both by the exact MSBG, where the latter is audible.
     - ``loss_neuro``, ``loss_msbg``, ``loss_pyclarity``: what ``HearingLossLoss(criterion="bands")`` is under each.
     """
-    with one_thread(), torch.no_grad():
-        return _judge(trial, missing)
-
-
-def _judge(trial: Trial, missing: Sequence[str]) -> dict[str, dict[str, float] | Failed]:
     item = trial.item
     try:
         normal = {"neuro": _hear(trial, "neuro", item.clean, NORMAL)}
@@ -143,10 +137,7 @@ def peak_spl(waveform: Tensor) -> float:
 def band_error_db(heard: Tensor, normal: Tensor) -> float:
     """Median absolute difference of band levels in dB, over the bands and frames that a normal ear finds audible.
 
-    Shape: (time,) twice, in pascals at 16 kHz.
-
-    Raises:
-        ValueError: it finds none audible.
+    Shape: (time,) twice, in pascals at 16 kHz. ValueError where it finds none audible.
     """
     levels, truth = band_levels(heard, NEURO_RATE), band_levels(normal, NEURO_RATE)
     audible = audibility(truth, least_audible(truth)) > 0.0

@@ -20,18 +20,13 @@ class ItemScore:
     """Scores of one utterance in one ear, with the levels (dB SPL) of what was scored.
 
     Args:
-        file: what it is called.
         levels: of what the ear was given, by condition, in their order; None where a file could not be read.
-        scores: by measure and condition; what could not be scored is not in it.
-        clean_level: of the clean speech.
+        scores: by measure and condition; what could not be scored is not in it. Each needs a level, or ValueError.
         full_scale_spl: level in dB SPL that a file of RMS 1.0 was taken to have.
         seed: of the noise that HASPI and HASQI add, the same under every condition.
         listener, ear: whose ear and which; empty where unknown.
         snr: of the speech in noise in dB, where known.
         clean, processed: files, for players and spectrograms; not part of ``report.json``.
-
-    Raises:
-        ValueError: a score under a condition without a level.
     """
 
     file: str

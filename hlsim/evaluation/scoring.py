@@ -35,9 +35,7 @@ class FileItem:
 
     Args:
         name: what it is called in reports.
-        clean: file of the clean speech.
         processed: file of what the ear is given, by condition.
-        audiogram: of the ear.
         listener: whose ear; empty where unknown.
         ear: ``"left"``, ``"right"`` or empty. Of a file with two channels it is the channel; others have one.
         snr: of the speech in noise, in dB, where known.
@@ -181,11 +179,8 @@ def score_task(task: FileTask, _: Sequence[str] = ()) -> dict[str, dict[str, Any
 def read_channel(path: str | Path, ear: str = "") -> tuple[np.ndarray, int]:
     """Samples of what one ear is given, as they are: (time,) in float64, and the rate in Hz.
 
-    Args:
-        ear: ``"left"`` or ``"right"`` takes that channel of a file with two, the first or the second.
-
-    Raises:
-        ValueError: as ``read_audio``, or the file has several channels and no ear is named, or more than two.
+    Of a file with two channels, ``ear`` takes the first for ``"left"`` or the second for ``"right"``. ValueError as
+    ``read_audio``, or where it is silent, or has several channels and no ear is named, or more than two.
     """
     waveform, rate = read_audio(path)
     if waveform.shape[0] != 1 and not (ear and waveform.shape[0] == 2):
@@ -204,7 +199,6 @@ class HaspiItem:
     Args:
         reference, processed: clean and processed speech: (time,), or paths of one-channel audio files, which are
             read only when their turn comes.
-        audiogram: the ear that hears ``processed``.
         sample_rate: Hz; needed for signals, left out for files, which bring theirs.
         seed: of the noise that HASPI adds; by default that of ``haspi_many`` plus the place in the list.
     """

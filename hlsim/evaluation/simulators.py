@@ -49,13 +49,9 @@ _REVISION = 2  # of what is measured: raise it where that changes a figure
 
 @dataclass(frozen=True)
 class SimulatorEvaluation:
-    """What a comparison of simulators comes to.
-
-    Attributes:
-        result: what ``fidelity.json`` holds: the settings, and of each of ``simulators`` the ``items`` and, by each of
-            ``inputs``, their summary.
-        shown: the item of the spectrograms.
-        heard: of it, by the truth and by each simulator, by name: (time,), in pascals at 16 kHz.
+    """What ``fidelity.json`` holds: the settings, and of each of ``simulators`` the ``items`` and, by each of ``inputs``,
+    their summary; the item of the spectrograms; and what is heard of it by the truth and by each simulator, by name,
+    (time,) in pascals at 16 kHz.
     """
 
     result: dict[str, Any]
@@ -82,7 +78,8 @@ def evaluate_simulators(
     """Compare simulators with MSBG, side by side.
 
     Scores are stored as they are made, by the samples, the ear and the weights that they are of: a run that was stopped
-    goes on where it was, and one with a simulator more scores that one alone.
+    goes on where it was, and one with a simulator more scores that one alone. An item that a simulator or the truth fails
+    on, or that has no STOI or PESQ, is listed with the ``reasons`` and counts in no figure that it has no value for.
 
     Args:
         simulators: by name, at 16 kHz and 94 dB SPL full scale.
@@ -97,9 +94,6 @@ def evaluate_simulators(
         inputs: what is done to the signal before the ear gets it, of ``INPUTS`` and, with a compensator, ``compensated``.
         compensator: called with a waveform and an ear.
         progress: called with what is done and all.
-
-    Returns: an evaluation. An item that a simulator or the truth fails on, or that has no STOI or PESQ, is listed with
-        the ``reasons`` and counts in no figure that it has no value for.
 
     Raises:
         ValueError: data that cannot be used, an unknown teacher or input, or no item that the truth does not fail on.
@@ -221,20 +215,16 @@ def _shown(items: Sequence[Item], others: Iterable[Item], teacher: str) -> tuple
 
 
 def summarise(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Fidelity over many items: overall, and by each of severity, level and condition that rows have.
+    """Fidelity over many items: overall, and by each of severity, level (dB SPL) and condition that rows have.
 
     Args:
-        rows: one an item, with any of ``snr``, ``raw_mse``, ``band_error``, ``stoi_true``, ``stoi_sim``,
-            ``pesq_true``, ``pesq_sim`` (a number, or None: then it, or its pair, is left out) and any of ``severity``,
-            ``level`` (dB SPL), ``condition``.
+        rows: one an item, with any of ``snr``, ``raw_mse``, ``band_error``, ``stoi_true``, ``stoi_sim``, ``pesq_true``,
+            ``pesq_sim``: finite, or ValueError, or None, and then it, or its pair, is left out.
 
     Returns: ``{"overall": figures, "severity": {"mild": figures, ...}, "level": {"65": figures, ...}, "condition":
         {...}}``, for JSON. Figures are ``n``, ``snr_n`` (how many have one), ``snr_median``, ``snr_worst_tenth`` (10th
         percentile), ``raw_mse`` (mean), ``band_error_median`` and, for stoi and pesq, ``_n`` (pairs used), ``_lcc``,
         ``_srcc``, ``_mse``; None where undefined.
-
-    Raises:
-        ValueError: no rows, or a number that is not finite.
     """
     if not rows:
         raise ValueError("no items to summarise")

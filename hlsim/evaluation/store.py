@@ -31,12 +31,7 @@ class ScoreStore:
     """A file of JSON lines, ``{"key": ..., ...}``, that only ever grows; the last line of a key counts.
 
     Nothing is written before the first record. A line that a kill cut short is passed over, and the next begins anew.
-
-    Args:
-        path: the file, there or not; None keeps the records in memory.
-
-    Raises:
-        ValueError: the file cannot be read.
+    ``path`` is there or not; None keeps the records in memory. ValueError where it cannot be read.
     """
 
     def __init__(self, path: str | Path | None = None) -> None:
@@ -54,11 +49,7 @@ class ScoreStore:
         return self.records.get(key)
 
     def append(self, key: str, record: Mapping[str, Any]) -> None:
-        """Keep a record, and put it on the disk before returning.
-
-        Raises:
-            ValueError: the file cannot be written, or the record is nothing that JSON can hold.
-        """
+        """Keep a record, and put it on the disk before returning; ValueError where that fails, or JSON cannot hold it."""
         line = json.dumps({"key": key, **record}, ensure_ascii=False, allow_nan=False) + "\n"
         if self.path is not None:
             try:
@@ -92,11 +83,7 @@ class ScoreStore:
 
 
 def content_hash(path: str | Path) -> str:
-    """SHA-256 of a file's contents, in hexadecimal.
-
-    Raises:
-        ValueError: the file cannot be read.
-    """
+    """SHA-256 of a file's contents, in hexadecimal; ValueError where it cannot be read."""
     try:
         return sha256(Path(path))
     except OSError as error:

@@ -34,10 +34,7 @@ class Score(NamedTuple):
 def snr_db(truth: Signal, estimate: Signal) -> float:
     """Power of the truth over that of the error, in dB; at most 200.
 
-    Shape: (time,) and (time,).
-
-    Raises:
-        ValueError: shapes differ or are not (time,), a sample is not finite, or the truth is silent.
+    Shape: (time,) and (time,); ValueError for others, a sample that is not finite, or a silent truth.
     """
     return -10.0 * math.log10(max(raw_mse(truth, estimate), _FLOOR))
 
@@ -83,11 +80,7 @@ def third_octave_error_db(truth: Signal, estimate: Signal, sample_rate: int) -> 
 def stoi(clean: Signal, heard: Signal, sample_rate: int) -> Score:
     """STOI (Taal 2011) by pystoi, or the reason why there is none: silence, or less than 0.4 s of speech.
 
-    Shape: (time,) and (time,).
-
-    Raises:
-        ValueError: shapes differ or are not (time,).
-        MissingExtraError: pystoi is not installed.
+    Shape: (time,) and (time,); ValueError for others. MissingExtraError without pystoi.
     """
     run = require("pystoi", "eval").stoi
     return _score(lambda a, b: run(a, b, sample_rate), clean, heard)

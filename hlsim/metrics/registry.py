@@ -20,14 +20,10 @@ from hlsim.metrics.pyclarity import pyclarity_score
 class Measure(NamedTuple):
     """How a measure is named and computed.
 
-    Attributes:
-        title: as a table writes it.
-        module: what must be installed (extra ``eval``).
-        packages: those whose versions its scores depend on.
-        of_an_ear: whether audiogram, level and seed change the score. STOI and PESQ know none of them: they compare the
-            signal at the ear with the clean speech, and do not say what is heard.
-        rewards_gain: whether more level alone brings a higher score.
-        score: of (clean, processed, audiogram, rate in Hz, full_scale_spl, seed); raises ValueError where there is none.
+    ``module`` must be installed (extra ``eval``), and scores depend on the versions of ``packages``. Whether audiogram,
+    level and seed change the score is ``of_an_ear``: STOI and PESQ compare the signal at the ear with the clean speech,
+    and do not say what is heard. ``rewards_gain``: more level alone brings a higher score. ``score`` is of (clean,
+    processed, audiogram, rate in Hz, full_scale_spl, seed), and raises ValueError where there is none.
     """
 
     title: str

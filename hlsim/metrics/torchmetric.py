@@ -83,16 +83,11 @@ class HASPI(_Metric):
         An item of which there is no score (silence, NaN, less than 0.7 s) is left out, counted in ``failed``, and said.
 
         Args:
-            processed: what the impaired ear is given.
-            clean: clean speech.
             audiogram: one ear for all, one an item, or (batch, 8) dB HL.
             lengths: samples of each item, where the batch is padded.
 
-        Shape: (batch, time) or (time,), the same for both; ``lengths`` (batch,).
-
-        Raises:
-            ValueError: shapes differ, or the audiograms are none, or not one or one an item; the lengths are not one an
-                item, or beyond the signals.
+        Shape: (batch, time) or (time,), the same for both; ``lengths`` (batch,). ValueError for others, for audiograms
+        that are none, or not one or one an item, and for lengths beyond the signals.
         """
         if processed.shape != clean.shape or processed.ndim not in (1, 2):
             raise ValueError(

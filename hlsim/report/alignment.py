@@ -23,16 +23,13 @@ def draw_alignment(
     """Write a PNG of the 0.12 s about the loudest place: A as MSBG gives it, B aligned. Returns the delay in samples.
 
     What is heard is drawn raised to the input's level, for it is the time that is to be seen. The legend says how far.
+    ``method`` is ``impulse``, the paper's, or ``structural``.
 
     Shape: (time,) in pascals.
-
-    Args:
-        method: ``impulse``, the paper's, or ``structural``.
 
     Raises:
         ValueError: an unknown method, a path that does not end in .png, or a signal that is silent or shorter than
             0.12 s.
-        MissingExtraError: matplotlib is not installed.
     """
     if Path(path).suffix.lower() != ".png":
         raise ValueError(f"{path}: what is drawn is a PNG; allowed: a name that ends in .png")

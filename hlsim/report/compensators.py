@@ -33,12 +33,7 @@ _paired = partial(paired_cells, digits=2)
 
 
 def write_compensators(result: Result, reports: Mapping[str, HaspiReport], out: str | Path) -> None:
-    """Write what ``evaluate_compensators`` returns into a folder, each file whole or not at all.
-
-    Raises:
-        ValueError: a file cannot be written.
-        MissingExtraError: matplotlib is not installed.
-    """
+    """Write what ``evaluate_compensators`` returns into a folder, each file whole or not at all, or ValueError."""
     page = ("Compensators", _sections(result, reports), _lead(result))
     text = json.dumps(result, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
     contents = (text, render_markdown(*page), render_page(*page))

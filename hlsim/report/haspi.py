@@ -18,14 +18,10 @@ REPORT_FILES = ("report.json", "report.md", "report.tex", "report.html", "before
 
 
 def write_report(report: HaspiReport, out_dir: str | Path, *, listen: int = 3) -> Path:
-    """Write ``report.json``, ``.md``, ``.tex``, ``.html`` and ``before-after.png`` into a folder, there or not.
+    """Write ``report.json``, ``.md``, ``.tex``, ``.html`` and ``before-after.png`` into a folder; returns it.
 
-    Reports of an earlier run are replaced, other files stay.
-
-    Args:
-        listen: how many items the page shows with spectrograms and players, where their files are known.
-
-    Returns: the folder.
+    Reports of an earlier run are replaced, other files stay. ``listen`` items have spectrograms and players on the page,
+    where their files are known.
 
     Raises:
         ValueError: the path is no folder or cannot be written, or an extra value is nothing that JSON can hold, such
@@ -47,14 +43,7 @@ def markdown(report: HaspiReport) -> str:
 
 
 def html(report: HaspiReport, listen: int = 3) -> str:
-    """What ``report.html`` says.
-
-    Args:
-        listen: how many items have spectrograms and players, where their files are known.
-
-    Raises:
-        MissingExtraError: matplotlib is not installed.
-    """
+    """What ``report.html`` says, with spectrograms and players of ``listen`` items, where their files are known."""
     sections = _sections(report, report_pictures(report), listening_section(report, listen))
     return render_page(_title(report), sections, _lead(report))
 

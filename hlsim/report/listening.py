@@ -38,14 +38,10 @@ def choose_items(report: HaspiReport, count: int) -> list[tuple[str, ItemScore]]
 
 
 def heard(item: ItemScore) -> tuple[dict[str, Tensor], int]:
-    """The clean speech and what the ear hears of each condition, in pascals, and the rate in Hz.
+    """The clean speech and what the ear hears of each condition, in pascals, and the rate in Hz. Shape: (time,) each.
 
-    The exact MSBG of the item's audiogram, aligned. At most the first 8 s.
-
-    Shape: (time,) each.
-
-    Raises:
-        ValueError: a file cannot be read, or a threshold is above the 100 dB HL that MSBG takes.
+    By the exact MSBG of the item's audiogram, aligned; at most the first 8 s. ValueError where a file cannot be read, or
+    a threshold is above the 100 dB HL that MSBG takes.
     """
     if item.clean is None:
         raise ValueError(f"{item.file}: its files are not known")

@@ -81,12 +81,9 @@ def render_markdown(title: str, sections: Sequence[Section], lead: str = "") -> 
 
 
 def write_files(out: str | Path, contents: Mapping[str, str | bytes]) -> Path:
-    """Write files into a folder, there or not, by name; others in it stay. Returns the folder.
+    """Write files into a folder, there or not, by name; others in it stay. Returns the folder; ValueError if it cannot.
 
     All are written under hidden names in it before the first takes its name.
-
-    Raises:
-        ValueError: the path is no folder or cannot be written.
     """
     folder = check_out(out)
     there = folder.exists()

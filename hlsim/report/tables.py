@@ -149,12 +149,7 @@ def paired_cells(
     none: str = "n/a",
     digits: int = 3,
 ) -> dict[str, str]:
-    """Change and interval, both tests, and d.
-
-    Args:
-        p_t, p_w: in place of the comparison's, such as adjusted ones.
-        digits: of t and d.
-    """
+    """Change and interval, both tests, and d; ``p_t`` and ``p_w``, adjusted ones say, in place of the comparison's."""
     return {
         _CHANGE: f"{c.delta:+.3f} {_interval(c)}".rstrip(),
         "t-test (paired)": _test(f"t = {number(c.t, f'+.{digits}f')}", c.p_t if p_t is None else p_t, none),
