@@ -1,4 +1,4 @@
-"""The commands ``evaluate-simulator`` and ``evaluate-compensator``."""
+"""The commands ``evaluate-simulator``, ``evaluate-compensator`` and ``haspi-report``."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 from hlsim.cli.inputs import check_there, need, other_ear, read_ear, read_simulator
-from hlsim.cli.options import EARS_TABLE, Parser, count, number, passed, positive
+from hlsim.cli.options import EARS_TABLE, Parser, count, natural, number, passed, positive
 from hlsim.cli.progress import show_progress
 
 GAIN_EARS = ["N3", "S2"]
@@ -41,11 +41,10 @@ def _evaluate_simulator(options: argparse.Namespace) -> None:
     from compensators import load_compensator
     from hlsim.evaluation.simulators import evaluate_simulators
     from hlsim.neuro.config import NEURO_RATE
-    from hlsim.report.page import check_out
     from hlsim.report.simulators import write_fidelity
 
     instead = {
-        "store": check_out(options.out) / "scores.jsonl",
+        "store": options.out / "scores.jsonl",
         "compensator": load_compensator(options.compensator) if options.compensator else None,
         "progress": show_progress("items"),
     }
@@ -83,7 +82,6 @@ def _evaluate_compensator(options: argparse.Namespace) -> None:
     from compensators import load_compensator
     from hlsim.evaluation.compensators import evaluate_compensators
     from hlsim.report.compensators import write_compensators
-    from hlsim.report.page import check_out
 
     named = dict(map(_labelled, options.names))
     if len(named) < len(options.names):
@@ -93,7 +91,7 @@ def _evaluate_compensator(options: argparse.Namespace) -> None:
     notes = [line for label, name in named.items() for line in other_ear(label, name, ear)]
     for line in notes:
         print(f"hlsim: warning: {line}", file=sys.stderr)
-    store = check_out(options.out) / "scores.jsonl"
+    store = options.out / "scores.jsonl"
     instead = {"audiogram": ear, "notes": notes, "store": store, "progress": show_progress("outputs")}
     done = evaluate_compensators(loaded, **passed(options, evaluate_compensators, **instead))
     write_compensators(done.result, done.reports, options.out)
@@ -107,3 +105,56 @@ def _labelled(text: str) -> tuple[str, str]:
     """Label and name; a folder by itself is called by its path."""
     label, sign, name = text.partition("=")
     return (text, text) if Path(text).exists() or not (sign and label) else (label, name)
+
+
+def haspi_report(parser: Parser) -> None:
+    parser.set_defaults(run=_haspi_report)
+    option = parser.option
+    option("--clean", Path, "folder of clean speech; the file names are the same in all three")
+    option("--before", Path, "folder of what the ear was given")
+    option("--after", Path, "folder of what it is given now")
+    text = (
+        "in place of the folders: CSV with columns condition, clean, processed, and listener, ear, snr, hl_250, ... or "
+        "audiogram, spl or full_scale_spl where known"
+    )
+    option("--manifest", Path, text)
+    option("--root", Path, "folder of the manifest's paths; its own folder by default")
+    parser.audiogram(text=", for all files, or of a manifest for rows that bring none")
+    text = "; and a column file (folders) or columns listener and ear (manifest, for rows without)"
+    option("--audiograms", Path, EARS_TABLE + text)
+    option("--measures", str, "of haspi, hasqi, stoi, pesq, separated by commas; the first leads", "haspi")
+    option("--baseline", str, "condition that all others are compared with; all pairs by default")
+    level = parser.add_mutually_exclusive_group()
+    parser.full_scale(group=level)
+    text = "level of each clean file in dB SPL, in place of --full-scale-spl; of a manifest for rows that bring none"
+    option("--spl", positive, text, group=level)
+    option("--scores", Path, "file of scores made so far; OUT/scores.jsonl by default")
+    parser.parallel()
+    option("--listen", natural, "items with players in report.html", 3)
+    parser.seed()
+    parser.out()
+
+
+def _haspi_report(options: argparse.Namespace) -> None:
+    measures = [name.strip() for name in options.measures.split(",")]
+    need("eval", "joblib", "matplotlib", *(["clarity"] if {"haspi", "hasqi"} & {*measures} else []))
+    check_there(
+        folders=(options.clean, options.before, options.after, options.root),
+        files=(options.manifest, options.audiograms),
+    )
+    from hlsim.evaluation import haspi_report, score_items
+    from hlsim.report.haspi import markdown, write_report
+
+    instead = {
+        "audiogram": read_ear(options.audiogram) if options.audiogram else None,
+        "measures": measures,
+        "store": options.scores or options.out / "scores.jsonl",
+        "progress": show_progress("scores"),
+    }
+    report = haspi_report(**passed(options, haspi_report, score_items, **instead))
+    write_report(report, options.out, listen=options.listen)
+    print(markdown(report))
+    if failed := len(report.failures):
+        all_ = failed + sum(len(own) for item in report.items for own in item.scores.values())
+        text = f"{failed} of {all_} scores could not be made; the reasons are in {options.out / 'report.md'}"
+        print(f"hlsim: {text}", file=sys.stderr)

@@ -31,7 +31,7 @@ COMMANDS = {
         "judge compensators beside no aid and NAL-R: HASPI, HASQI, loudness as heard, surrogate gap, gain curves, tones",
     ),
     "haspi-report": (
-        "haspi_report",
+        "evaluation",
         "HASPI (HASQI, STOI, PESQ) before and after a treatment, with paired tests",
     ),
     "benchmark": ("benchmark", "time simulators, a training step and the scan side by side"),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import count
+from itertools import count, product
 from pathlib import Path
 from typing import Any
 
@@ -157,22 +157,19 @@ def treat(
     items: Sequence[Item], inputs: Sequence[str], compensator: nn.Module | None = None
 ) -> Iterator[Item]:
     """Each item under each input in turn: of ``INPUTS``, with a compensator ``compensated`` too; else ValueError."""
-    treatments: dict[str, Callable[[Item], Tensor]] = {
-        "as-is": lambda item: item.signal,
-        "louder": lambda item: 10.0 * item.signal,
-        "nal-r": lambda item: NALR(item.ear, sample_rate=NEURO_RATE)(item.signal),
-        "compressed": lambda item: compress(
-            item.signal.unsqueeze(0), torch.tensor([3.0]), NEURO_RATE
-        ).squeeze(0),
+    treatments: dict[str, Callable[[Tensor, Audiogram], Tensor]] = {
+        "as-is": lambda signal, ear: signal,
+        "louder": lambda signal, ear: 10.0 * signal,
+        "nal-r": NALR(sample_rate=NEURO_RATE),
+        "compressed": lambda signal, ear: compress(signal[None], torch.tensor([3.0]), NEURO_RATE)[0],
     }
     if compensator is not None:
-        treatments["compensated"] = lambda item: compensator(item.signal, item.ear)
+        treatments["compensated"] = compensator
     if unknown := [name for name in inputs if name not in treatments]:
         raise ValueError(
             f"input {unknown[0]!r}; allowed: {', '.join(treatments)}, and compensated with a compensator"
         )
-    for item in items:
-        for name in inputs:
-            with torch.no_grad():
-                signal = treatments[name](item)
-            yield Item(item.clean, signal, item.ear, {**item.about, "input": name})
+    for item, name in product(items, inputs):
+        with torch.no_grad():
+            signal = treatments[name](item.signal, item.ear)
+        yield Item(item.clean, signal, item.ear, {**item.about, "input": name})

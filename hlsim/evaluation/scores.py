@@ -27,6 +27,10 @@ class ItemScore:
         listener, ear: whose ear and which; empty where unknown.
         snr: of the speech in noise in dB, where known.
         clean, processed: files, for players and spectrograms; not part of ``report.json``.
+
+    Attributes:
+        before, after: the first measure's scores under the first and last condition, where there are any.
+        before_level, after_level: of these conditions.
     """
 
     file: str
@@ -44,41 +48,28 @@ class ItemScore:
     clean: Path | None = None
     processed: Mapping[str, Path] = field(default_factory=dict)
 
+    before: float | None = field(init=False)
+    after: float | None = field(init=False)
+    before_level: float | None = field(init=False)
+    after_level: float | None = field(init=False)
+    severity: str = field(init=False)
+
     def __post_init__(self) -> None:
         for condition in {name for found in self.scores.values() for name in found}:
             if self.levels.get(condition) is None:
                 raise ValueError(
                     f"{self.file}: a score under {condition!r} without its level; a score needs one"
                 )
-
-    @property
-    def before(self) -> float | None:
-        """The first measure's score under the first condition; None where there is none."""
-        return self._first_measure.get(next(iter(self.levels)))
-
-    @property
-    def after(self) -> float | None:
-        """The first measure's score under the last condition; None where there is none."""
-        return self._first_measure.get(list(self.levels)[-1])
-
-    @property
-    def before_level(self) -> float | None:
-        """Level of the first condition in dB SPL; None where its file could not be read."""
-        return next(iter(self.levels.values()))
-
-    @property
-    def after_level(self) -> float | None:
-        """Level of the last condition in dB SPL; None where its file could not be read."""
-        return list(self.levels.values())[-1]
-
-    @property
-    def _first_measure(self) -> Mapping[str, float]:
-        return next(iter(self.scores.values()), {})
-
-    @property
-    def severity(self) -> str:
-        """The degree of loss."""
-        return self.audiogram.severity
+        first: Mapping[str, float] = next(iter(self.scores.values()), {})
+        names = [*self.levels] or [""]
+        before, after = names[0], names[-1]
+        vars(self).update(  # of a frozen dataclass
+            before=first.get(before),
+            after=first.get(after),
+            before_level=self.levels.get(before),
+            after_level=self.levels.get(after),
+            severity=self.audiogram.severity,
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """A plain dictionary that JSON can hold."""

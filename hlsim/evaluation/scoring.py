@@ -232,16 +232,13 @@ def haspi_many(
     """
     check_parallel(jobs, "loky", None)
     check_seed(seed)
-    seeds = [(seed + i) % 2**32 if item.seed is None else item.seed for i, item in enumerate(items)]
     store = ScoreStore()
-    failed = make_missing(
-        _score_item,
-        [(str(i), item, full_scale_spl, seeds[i]) for i, item in enumerate(items)],
-        lambda task: [task[0]],
-        store,
-        jobs=1 if len(items) < 2 else jobs,
-        progress=progress,
-    )
+    tasks = [
+        (str(i), item, full_scale_spl, (seed + i) % 2**32 if item.seed is None else item.seed)
+        for i, item in enumerate(items)
+    ]
+    jobs = 1 if len(items) < 2 else jobs
+    failed = make_missing(_score_item, tasks, lambda task: [task[0]], store, jobs=jobs, progress=progress)
     for i, reason in failed.items():
         raise ValueError(f"item {i}: {reason}")
     return [store.records[str(i)]["score"] for i in range(len(items))]
@@ -249,21 +246,18 @@ def haspi_many(
 
 def _score_item(task: tuple[str, HaspiItem, float, int], _: Sequence[str]) -> dict[str, dict[str, float]]:
     key, item, full_scale_spl, seed = task
-    name = str(item.processed) if isinstance(item.processed, str | Path) else f"item {key}"
     try:
-        reference, reference_rate = _load(item.reference, item.sample_rate)
-        processed, rate = _load(item.processed, item.sample_rate)
+        signals = [
+            read_channel(signal) if isinstance(signal, str | Path) else (signal, item.sample_rate)
+            for signal in (item.reference, item.processed)
+        ]
+        (reference, reference_rate), (processed, rate) = signals
+        if rate is None or reference_rate is None:
+            raise ValueError("no sample_rate; signals that are not files need one")
         if rate != reference_rate:
             raise ValueError(f"rate {rate} Hz, its reference has {reference_rate}; allowed: equal rates")
         score = haspi(reference, processed, item.audiogram, rate, full_scale_spl=full_scale_spl, seed=seed)
     except ValueError as error:
+        name = item.processed if isinstance(item.processed, str | Path) else f"item {key}"
         raise ValueError(f"{name}: {error}") from error
     return {key: {"score": score}}
-
-
-def _load(signal: Signal | str | Path, sample_rate: int | None) -> tuple[Signal, int]:
-    if isinstance(signal, str | Path):
-        return read_channel(signal)
-    if sample_rate is None:
-        raise ValueError("no sample_rate; signals that are not files need one")
-    return signal, sample_rate

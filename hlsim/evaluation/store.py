@@ -119,24 +119,22 @@ def weights_hash(module: nn.Module) -> str:
 
 def setting(value: Any) -> Any:
     """What tells one value from another, the same in every process where it can be had."""
-    if isinstance(value, bool | int | float | complex | str | bytes | None):
-        return value
-    if isinstance(value, list | tuple):
-        return [setting(part) for part in value]
-    if isinstance(value, Mapping):
-        return sorted((repr(name), setting(part)) for name, part in value.items())
-    if isinstance(value, np.ndarray):
-        return (
-            value.shape,
-            str(value.dtype),
-            hashlib.sha256(np.ascontiguousarray(value).tobytes()).hexdigest(),
-        )
-    if isinstance(value, Tensor):
-        return setting(value.detach().cpu().numpy())
-    if isinstance(value, torch.dtype | torch.device):
-        return str(value)
-    if isinstance(value, weakref.ref):  # an LSTM holds some to its weights
-        return setting(value())
+    match value:
+        case bool() | int() | float() | complex() | str() | bytes() | None:
+            return value
+        case list() | tuple():
+            return [setting(part) for part in value]
+        case Mapping():
+            return sorted((repr(name), setting(part)) for name, part in value.items())
+        case np.ndarray():
+            held = np.ascontiguousarray(value).tobytes()
+            return (value.shape, str(value.dtype), hashlib.sha256(held).hexdigest())
+        case Tensor():
+            return setting(value.detach().cpu().numpy())
+        case torch.dtype() | torch.device():
+            return str(value)
+        case weakref.ref():  # an LSTM holds some to its weights
+            return setting(value())
     try:
         held = pickle.dumps(value, protocol=4).replace(*_FORMER_MODULE)
         return hashlib.sha256(held).hexdigest()

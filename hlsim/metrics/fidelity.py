@@ -135,8 +135,8 @@ def _values(true: Iterable[float], simulated: Iterable[float]) -> tuple[np.ndarr
 
 
 def _score(run: Callable[[np.ndarray, np.ndarray], float], clean: Signal, heard: Signal) -> Score:
-    a, b = _equal(clean, heard)
-    for name, signal in (("clean", a), ("heard", b)):
+    pair = _equal(clean, heard)
+    for name, signal in zip(("clean", "heard"), pair, strict=True):
         if not np.isfinite(signal).all():
             return Score(None, f"{name} holds samples that are NaN or infinite")
         if not signal.any():
@@ -145,27 +145,25 @@ def _score(run: Callable[[np.ndarray, np.ndarray], float], clean: Signal, heard:
         with warnings.catch_warnings():
             # pystoi's word, and its score is 1e-5
             warnings.filterwarnings("error", message="Not enough STFT frames")
-            value = float(run(a, b))
+            value = float(run(*pair))
     except Exception as error:  # whatever a third party's measure raises is that item's reason, no more
         text = error.args[0] if error.args else error
         return Score(None, text.decode() if isinstance(text, bytes) else str(text))
     return Score(value) if math.isfinite(value) else Score(None, f"the score is {value}")
 
 
-def _equal(first: Signal, second: Signal) -> tuple[np.ndarray, np.ndarray]:
-    a, b = (
-        (x.detach().cpu().numpy() if isinstance(x, Tensor) else np.asarray(x)).astype(np.float64)
-        for x in (first, second)
-    )
+def _equal(*signals: Signal) -> tuple[np.ndarray, ...]:
+    arrays = (x.detach().cpu().numpy() if isinstance(x, Tensor) else np.asarray(x) for x in signals)
+    a, b = (x.astype(np.float64) for x in arrays)
     if a.ndim != 1 or a.shape != b.shape or not len(a):
         raise ValueError(f"signals have shapes {a.shape} and {b.shape}; allowed: (time,) twice, equally long")
     return a, b
 
 
-def _pair(truth: Signal, estimate: Signal) -> tuple[np.ndarray, np.ndarray]:
-    true, found = _equal(truth, estimate)
-    if not (np.isfinite(true).all() and np.isfinite(found).all()):
+def _pair(truth: Signal, estimate: Signal) -> tuple[np.ndarray, ...]:
+    pair = _equal(truth, estimate)
+    if not np.isfinite(pair).all():
         raise ValueError("truth or estimate holds samples that are NaN or infinite")
-    if not true.any():
+    if not pair[0].any():
         raise ValueError("truth is silent; an error relative to it is not defined")
-    return true, found
+    return pair

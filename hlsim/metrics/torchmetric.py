@@ -156,15 +156,13 @@ def _ears(audiogram: AudiogramLike, batch: int) -> list[Audiogram]:
             raise ValueError(
                 f"audiogram of shape {tuple(audiogram.shape)}; allowed: (8,) or ({batch}, 8) dB HL"
             )
-        rows = torch.atleast_2d(audiogram.detach()).expand(batch, -1)
-        return [Audiogram(tuple(row.tolist())) for row in rows.double().cpu()]
+        rows = audiogram.detach().expand(batch, -1).double().tolist()
+        return [Audiogram(tuple(row)) for row in rows]
     if not isinstance(audiogram, Sequence) or not all(isinstance(ear, Audiogram) for ear in audiogram):
-        raise ValueError(
-            f"audiogram is {type(audiogram).__name__}; allowed: an Audiogram, one an item, or an (8,) or ({batch}, 8) "
-            "tensor"
-        )
+        found, tensor = type(audiogram).__name__, f"an (8,) or ({batch}, 8) tensor"
+        raise ValueError(f"audiogram is {found}; allowed: an Audiogram, one an item, or {tensor}")
     if len(audiogram) != batch:
         raise ValueError(
-            f"{len(audiogram)} audiograms of {batch} items; allowed: one Audiogram, or one an item"
+            f"{len(audiogram)} audiograms of {batch} items; allowed: one for all, or one an item"
         )
     return list(audiogram)

@@ -95,18 +95,17 @@ def _further(report: HaspiReport) -> list[Table]:
 
 
 def _items(report: HaspiReport) -> Table:
-    header = ["Item", "Loss", "Clean (dB SPL)", "Full scale (dB SPL)"]
-    for condition in report.conditions:
-        header += [f"{MEASURES[measure].title}, {condition}" for measure in report.measures]
-        header.append(f"dB SPL, {condition}")
+    titles = [MEASURES[name].title for name in report.measures]
     rows = []
     for item in report.items:
-        row = [item.file, item.severity, f"{item.clean_level:.1f}", f"{item.full_scale_spl:.1f}"]
+        row = {"Item": item.file, "Loss": item.severity, "Clean (dB SPL)": f"{item.clean_level:.1f}"}
+        row["Full scale (dB SPL)"] = f"{item.full_scale_spl:.1f}"
         for condition in report.conditions:
-            row += [number(item.scores.get(name, {}).get(condition), ".3f") for name in report.measures]
-            row.append(number(item.levels[condition], ".1f"))
+            for name, title in zip(report.measures, titles, strict=True):
+                row[f"{title}, {condition}"] = number(item.scores.get(name, {}).get(condition), ".3f")
+            row[f"dB SPL, {condition}"] = number(item.levels[condition], ".1f")
         rows.append(row)
-    return Table("Scores and levels of every item", header, rows)
+    return Table.of("Scores and levels of every item", rows)
 
 
 def _notes(report: HaspiReport) -> list[str]:

@@ -121,18 +121,13 @@ def comparisons_table(comparisons: Sequence[Comparison]) -> Table:
     """A row a pair of conditions and measure, with p values adjusted by Holm."""
     rows = []
     for c in comparisons:
-        cells, tests = paired_cells(c.overall), {"t-test": c.p_t_holm, "Wilcoxon": c.p_w_holm}
+        paired, tests = paired_cells(c.overall), {"t-test": c.p_t_holm, "Wilcoxon": c.p_w_holm}
         rows.append(
-            {
-                "Comparison": change_name(c),
-                "n": str(c.overall.n),
-                "From": f"{c.overall.before_mean:.3f}",
-                "To": f"{c.overall.after_mean:.3f}",
-                _CHANGE: cells[_CHANGE],
-                **{f"{test}, Holm": "n/a" if p is None else p_text(p) for test, p in tests.items()},
-                "d": cells["d"],
-                "Level change (dB)": f"{c.level_after_mean - c.level_before_mean:+.1f}",
-            }
+            {"Comparison": change_name(c), "n": str(c.overall.n)}
+            | {"From": f"{c.overall.before_mean:.3f}", "To": f"{c.overall.after_mean:.3f}"}
+            | {_CHANGE: paired[_CHANGE]}
+            | {f"{test}, Holm": "n/a" if p is None else p_text(p) for test, p in tests.items()}
+            | {"d": paired["d"], "Level change (dB)": f"{c.level_after_mean - c.level_before_mean:+.1f}"}
         )
     return Table.of("All comparisons, p adjusted by Holm within each measure", rows)
 
