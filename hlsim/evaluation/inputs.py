@@ -79,10 +79,10 @@ def read_manifest(
             items[name] = replace(known, processed={**known.processed, **item.processed})
         except ValueError as error:
             raise ValueError(f"{path}, line {line}: {error}") from error
+    used = {id(ear) for ear in taken}
     idle = {
-        "audiogram": audiogram is not None and all(ear is not audiogram for ear in taken),
-        "audiograms": audiograms is not None
-        and not any(used is ear for used in taken for ear in ears.values()),
+        "audiogram": audiogram is not None and id(audiogram) not in used,
+        "audiograms": audiograms is not None and used.isdisjoint(map(id, ears.values())),
         "spl": spl is not None and all(row.get("spl") or row.get("full_scale_spl") for _, row in rows),
     }
     for what in filter(idle.get, idle):
@@ -217,8 +217,7 @@ def read_folders(
     audiogram: Audiogram | None = None,
     *,
     audiograms: str | Path | None = None,
-    full_scale_spl: float = 94.0,
-    spl: float | None = None,
+    **levels: Any,
 ) -> list[FileItem]:
     """An item a name, with the conditions ``before`` and ``after``, sorted by name.
 
@@ -228,7 +227,7 @@ def read_folders(
         audiogram: the ear, of all files; or else
         audiograms: a CSV file with columns ``file`` (the name below the folder, with or without extension) and
             ``hl_250``, ``hl_500``, ... in dB HL, one row a file. Rows of other files are passed over.
-        full_scale_spl, spl: the level, as in ``FileItem``.
+        levels: ``full_scale_spl`` or ``spl``, as in ``FileItem``.
 
     Raises:
         ValueError: names differ between the folders, a file has no audiogram, or both or none of ``audiogram`` and
@@ -249,13 +248,11 @@ def read_folders(
     ears = dict.fromkeys(names, audiogram) if audiogram is not None else _ears(str(audiograms), _file)
     if lack := _lack(names, ears):
         raise ValueError(f"{audiograms}: no audiogram of {lack[0]}, {lack[1]}")
-    levels: dict[str, Any] = {"full_scale_spl": full_scale_spl, "spl": spl}
-    out = []
+    items = []
     for name in names:
-        speech, *heard = (files[name].absolute() for files in folders)
-        processed = dict(zip(("before", "after"), heard, strict=True))
-        out.append(FileItem(name, speech, processed, ears[name], **levels))
-    return out
+        speech, first, last = (files[name].absolute() for files in folders)
+        items.append(FileItem(name, speech, {"before": first, "after": last}, ears[name], **levels))
+    return items
 
 
 def _name(path: PurePath) -> str:

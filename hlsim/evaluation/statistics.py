@@ -119,10 +119,8 @@ def bootstrap_interval(
         raise ValueError(f"{len(data)} values; an interval needs {FEWEST} or more")
     generator = np.random.default_rng(seed)
     at_once = max(1, _DRAWS // len(data))
-    means = [
-        data[generator.integers(0, len(data), (min(at_once, resamples - start), len(data)))].mean(-1)
-        for start in range(0, resamples, at_once)
-    ]
+    sizes = [min(at_once, resamples - start) for start in range(0, resamples, at_once)]
+    means = [data[generator.integers(0, len(data), (size, len(data)))].mean(-1) for size in sizes]
     expanded = stats.t.ppf(0.5 + 0.5 * confidence, len(data) - 1) * math.sqrt(len(data) / (len(data) - 1))
     tail = 100.0 * stats.norm.cdf(-expanded)
     low, high = np.percentile(np.concatenate(means), [tail, 100.0 - tail])
@@ -225,11 +223,5 @@ def mixed_model(differences: Sequence[float], listeners: Sequence[str]) -> Mixed
         return "the fit has no standard error"
     complaints = [] if fit.converged else ["no convergence"]
     complaints += sorted({str(w.message) for w in caught if "boundary" in str(w.message)})
-    return MixedModel(
-        len(values),
-        groups,
-        *figures,
-        listener_variance=scale**2 * float(np.asarray(fit.cov_re)[0, 0]),
-        residual_variance=scale**2 * float(fit.scale),
-        note="; ".join(complaints),
-    )
+    between, within = (scale**2 * float(x) for x in (np.asarray(fit.cov_re)[0, 0], fit.scale))
+    return MixedModel(len(values), groups, *figures, between, within, "; ".join(complaints))

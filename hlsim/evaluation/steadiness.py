@@ -87,14 +87,12 @@ def shift_differences(
     for name, compensator in compensators.items():
         differences = []
         for number, item in items.items():
-            time = len(item.clean)
-            given = [functional.pad(item.clean, (delay, last - delay)) for delay in (0, *DELAYS)]
+            time, delays = len(item.clean), (0, *DELAYS)
+            given = [functional.pad(item.clean, (delay, last - delay)) for delay in delays]
             what = f"{name}, delayed speech of item {number}: the output"
-            aided = outputs(compensator, given, item.ear, what).double()
+            aided = zip(outputs(compensator, given, item.ear, what).double(), delays, strict=True)
             end = min(_END, time // 4)
-            first, *later = (
-                own[delay + end : delay + time - end] for own, delay in zip(aided, (0, *DELAYS), strict=True)
-            )
+            first, *later = (own[delay + end : delay + time - end] for own, delay in aided)
             apart = torch.stack([(own - first).square().mean() for own in later])
             differences.append(_ratio_db(apart, first.square().mean()).tolist())
         about = {"compensator": name, "items": [*items], "delays": [*DELAYS]}

@@ -54,14 +54,11 @@ class ScoreStore:
         if self.path is not None:
             try:
                 self.path.parent.mkdir(parents=True, exist_ok=True)
-                # one write of whole lines at the end: two runs may share a store
-                handle = os.open(self.path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
-                try:
+                with open(self.path, "ab", buffering=0) as file:
+                    # one write of whole lines at the end: two runs may share a store
                     data = ("\n" * self._torn + line).encode()
-                    self._torn = os.write(handle, data) < len(data)
-                    os.fsync(handle)
-                finally:
-                    os.close(handle)
+                    self._torn = file.write(data) < len(data)
+                    os.fsync(file.fileno())
             except OSError as error:
                 raise ValueError(f"{self.path}: scores cannot be stored ({error})") from error
             if self._torn:

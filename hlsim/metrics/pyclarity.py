@@ -21,6 +21,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from numbers import Integral
+from typing import Any
 
 import numpy as np
 from torch import Tensor
@@ -70,19 +71,13 @@ def haspi(
 
 
 def hasqi(
-    reference: Signal,
-    processed: Signal,
-    audiogram: Audiogram,
-    sample_rate: int,
-    *,
-    full_scale_spl: float = 94.0,
-    seed: int = 0,
+    reference: Signal, processed: Signal, audiogram: Audiogram, sample_rate: int, **options: Any
 ) -> float:
     """HASQI v2 of one ear, 0 to 1: pyclarity's ``hasqi_v2``, whose combined score it is; all else as ``haspi``.
 
     HASQI itself adds NAL-R to ``reference``.
     """
-    return pyclarity_score("hasqi", reference, processed, audiogram, sample_rate, full_scale_spl, seed)
+    return pyclarity_score("hasqi", reference, processed, audiogram, sample_rate, **options)
 
 
 def pyclarity_score(
@@ -91,8 +86,8 @@ def pyclarity_score(
     processed: Signal,
     audiogram: Audiogram,
     sample_rate: int,
-    full_scale_spl: float,
-    seed: int,
+    full_scale_spl: float = 94.0,
+    seed: int = 0,
 ) -> float:
     """Version 2 of pyclarity's ``haspi`` or ``hasqi``; arguments and errors as ``haspi``."""
     if not isinstance(audiogram, Audiogram):
