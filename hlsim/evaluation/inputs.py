@@ -54,9 +54,7 @@ def read_manifest(
         full_scale_spl, spl: the level, as in ``FileItem``, of rows that bring none.
 
     Raises:
-        ValueError: the file cannot be read, lacks a column, or a row is wrong: an ear other than left and right, a path
-            that leaves the root, no audiogram or level, a second row of a condition, or one unlike its item's others; or
-            no row takes ``audiogram``, ``audiograms`` or ``spl``.
+        ValueError: what is wrong, and in which line; or no row takes ``audiogram``, ``audiograms`` or ``spl``.
     """
     folder = (Path(path).parent if root is None else Path(root)).resolve()
     if not folder.is_dir():
@@ -223,15 +221,11 @@ def read_folders(
 
     Args:
         clean, before, after: folders of wav, flac or ogg files whose names below the folder, but for the extension, are
-            the same.
+            the same, or ValueError.
         audiogram: the ear, of all files; or else
         audiograms: a CSV file with columns ``file`` (the name below the folder, with or without extension) and
             ``hl_250``, ``hl_500``, ... in dB HL, one row a file. Rows of other files are passed over.
         levels: ``full_scale_spl`` or ``spl``, as in ``FileItem``.
-
-    Raises:
-        ValueError: names differ between the folders, a file has no audiogram, or both or none of ``audiogram`` and
-            ``audiograms`` are given.
     """
     if (audiogram is None) == (audiograms is None):
         raise ValueError(

@@ -75,8 +75,8 @@ def judge(trial: Trial, missing: Sequence[str]) -> dict[str, dict[str, float] | 
     - ``level``, ``peak``: of the output, RMS and largest sample in dB SPL (a sample of 1.0 is 94).
     - ``heard``: level in dB SPL after the exact MSBG; ``normal``: what a normal ear hears there of the same input, noise
       and all; ``normal_clean``: of the speech in it.
-    - ``band_error``: median absolute difference in dB between band levels (24 bands, 32 ms) of what the impaired ear
-      hears and what a normal one hears of the clean speech, both by the exact MSBG, where the latter is audible.
+    - ``band_error``: ``band_error_db`` (24 bands, 32 ms) of what the impaired ear hears and what a normal one hears of
+      the clean speech, both by the exact MSBG.
     - ``loss_neuro``, ``loss_msbg``, ``loss_pyclarity``: what ``HearingLossLoss(criterion="bands")`` is under each.
     """
     item = trial.item

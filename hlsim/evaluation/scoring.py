@@ -100,19 +100,17 @@ def score_items(
     A score is known by the contents of both files, the measure, the versions of what computes it and, where they
     matter, the audiogram, the level settings and the seed; known ones are not made again. An item's seed is ``seed``
     plus the first 32 bits of the SHA-256 of its clean file, modulo 2 ** 32: the same under every condition, whatever
-    other files there are. Failures have a reason in place of a score; they are not stored, but tried again.
+    other files there are. What is wrong with an item is its reason in place of a score, no error; that is not stored, but
+    tried again.
 
     Args:
         store: scores made earlier, to which new ones go; None keeps nothing.
-        jobs, backend, scheduler: as ``run_parallel``.
+        jobs, backend, scheduler: as ``run_parallel``, which raises what is wrong with them.
         progress: called with the number of scores there and of all: first where some were stored, and after each new one.
 
-    Returns: for each item its results by (measure, condition).
-
     Raises:
-        ValueError: an unknown measure or backend, ``jobs`` below 1, a seed that numpy does not take, the store cannot be
-            written. What is wrong with an item is its reason, no error.
-        MissingExtraError: a measure's package, joblib or distributed is not installed.
+        ValueError: an unknown measure, a seed that numpy does not take, or the store cannot be written.
+        MissingExtraError: a measure's package is not installed.
     """
     check_seed(seed)
     check_parallel(jobs, backend, scheduler)
@@ -220,15 +218,8 @@ def haspi_many(
 ) -> list[float]:
     """HASPI of many items in parallel processes (``jobs``; None takes all cores), the same whatever their number.
 
-    Args:
-        full_scale_spl: level in dB SPL of RMS 1.0, of all signals.
-        seed: item i, counted from 0, takes seed + i unless it brings one.
-        progress: called after each score.
-
-    Raises:
-        ValueError: as ``haspi``, beginning with the item's processed file or its place in the list; ``jobs`` is below
-            1, or the seed is none that numpy takes.
-        MissingExtraError: pyclarity or joblib is not installed.
+    Item i, counted from 0, takes ``seed`` + i unless it brings one; ``progress`` is called after each score. What
+    ``haspi`` raises begins with the item's processed file or its place in the list.
     """
     check_parallel(jobs, "loky", None)
     check_seed(seed)

@@ -13,6 +13,7 @@ import pickle
 import uuid
 import weakref
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -70,11 +71,10 @@ class ScoreStore:
             with open(path, encoding="utf-8", errors="replace") as file:
                 for line in file:
                     self._torn = not line.endswith("\n")
-                    try:
+                    # what is cut short, or not ours, is scored again
+                    with suppress(ValueError, KeyError, TypeError, AttributeError):
                         record = json.loads(line)
                         self.records[record.pop("key")] = record
-                    except (ValueError, KeyError, TypeError, AttributeError):
-                        continue  # cut short, or not ours: it is scored again
         except OSError as error:
             raise ValueError(f"{path}: stored scores cannot be read ({error})") from error
 

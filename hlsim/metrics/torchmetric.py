@@ -34,10 +34,6 @@ class HASPI(_Metric):
         limit: items scored since the last reset, in each process; the others are passed over. None scores all.
         jobs: processes; None takes all cores.
         options: of ``torchmetrics.Metric``.
-
-    Raises:
-        ValueError: rate, level, seed, limit or jobs is out of range.
-        MissingExtraError: pyclarity, joblib or torchmetrics is not installed.
     """
 
     is_differentiable = False

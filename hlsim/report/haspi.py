@@ -88,10 +88,9 @@ def _sections(
 
 
 def _further(report: HaspiReport) -> list[Table]:
-    tables = [listener_table(report.headline)]
-    if len(report.comparisons) > 1:
-        tables.append(comparisons_table(report.comparisons))
-    return [table for table in tables if table is not None]
+    listeners = listener_table(report.headline)
+    tables = [] if listeners is None else [listeners]
+    return [*tables, comparisons_table(report.comparisons)] if len(report.comparisons) > 1 else tables
 
 
 def _items(report: HaspiReport) -> Table:
