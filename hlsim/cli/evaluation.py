@@ -36,7 +36,7 @@ def _evaluate_simulator(options: argparse.Namespace) -> None:
         raise ValueError(f"simulators {', '.join(options.names)}; allowed: each once")
     if options.compensator and "compensated" not in options.inputs:
         raise ValueError("--compensator without --inputs compensated; allowed: only with it")
-    need("eval", "clarity", "pystoi", "pesq", "matplotlib")
+    need("eval", "clarity", "pystoi", "pesq", "pandas", "matplotlib")
     check_there(folders=(options.speech, options.noise), files=(options.audiograms,))
     from compensators import load_compensator
     from hlsim.evaluation.simulators import evaluate_simulators
@@ -77,7 +77,7 @@ def evaluate_compensator(parser: Parser) -> None:
 def _evaluate_compensator(options: argparse.Namespace) -> None:
     if options.audiogram and options.gain_ears != GAIN_EARS:
         raise ValueError("--gain-ears with --audiogram; allowed: without it, for that ear's gains are drawn")
-    need("eval", "clarity", "matplotlib")
+    need("eval", "clarity", "pandas", "matplotlib")
     check_there(folders=(options.speech, options.noise), files=(options.audiograms,))
     from compensators import load_compensator
     from hlsim.evaluation.compensators import evaluate_compensators

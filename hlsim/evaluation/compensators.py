@@ -88,7 +88,8 @@ def evaluate_compensators(
         ValueError: data or settings that cannot be used, or no item could be judged.
         MissingExtraError: pyclarity or joblib is not installed.
     """
-    require("clarity", "eval")
+    for module in ("clarity", "pandas"):
+        require(module, "eval")
     check_parallel(jobs, "loky", None)
     check_seed(seed)
     if items < 1 or not compensators or not levels:

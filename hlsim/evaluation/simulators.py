@@ -110,6 +110,7 @@ def evaluate_simulators(
         raise ValueError(f"inputs {', '.join(inputs)}; allowed: each once")
     if not seconds >= _SHORTEST:
         raise ValueError(f"items of {seconds:g} s; allowed: {_SHORTEST:g} or more, and 2 for PESQ and STOI")
+    require("pandas", "eval")  # to be known before hours of scoring
     drawn = draw_items(speech, noise, audiograms, items=items, seconds=seconds, seed=seed, levels=levels)
     scored = ScoreStore(store)
     # haspi's for pyclarity's, whose MSBG is the truth
