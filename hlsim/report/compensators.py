@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from hlsim.audiogram import FREQUENCIES
+from hlsim.evaluation.comparison import Comparison
 from hlsim.evaluation.compensator_result import HARD
 from hlsim.evaluation.gain_curves import UTTERANCES
 from hlsim.evaluation.haspi_report import GAIN_NOTE, HaspiReport
@@ -160,27 +161,26 @@ def _main_table(result: Result, group: str) -> Table:
 
 def _tests_table(report: HaspiReport) -> Table:
     """Each compensator against no aid and the prescription, and the latter against the former."""
-    rows = [
-        {
-            "Change": change_name(c),
-            "n": str(c.overall.n),
-            **_paired(c.overall, c.p_t_holm, c.p_w_holm),
-            "t over means of ears": "n/a" if c.listeners is None else _paired(c.listeners)["t-test (paired)"],
-        }
-        for c in report.comparisons
-        if c.before in report.conditions[:2]
-    ]
+    rows = []
+    for c in _against_both(report):
+        means = "n/a" if c.listeners is None else _paired(c.listeners)["t-test (paired)"]
+        paired = _paired(c.overall, c.p_t_holm, c.p_w_holm)
+        about = {"Change": change_name(c), "n": str(c.overall.n)}
+        rows.append({**about, **paired, "t over means of ears": means})
     return Table.of("Paired tests, p adjusted by Holm within each measure", rows)
 
 
 def _severity_tests(report: HaspiReport, group: str) -> Table:
     rows = [
         {"Change": f"{severity}, {change_name(c)}", "n": str(row.n), **_paired(row)}
-        for c in report.comparisons
-        if c.before in report.conditions[:2]
+        for c in _against_both(report)
         for severity, row in c.by_severity.items()
     ]
     return Table.of(f"{GROUPS[group]}: paired tests by degree of loss, p not adjusted", rows)
+
+
+def _against_both(report: HaspiReport) -> list[Comparison]:
+    return [c for c in report.comparisons if c.before in report.conditions[:2]]
 
 
 def _loudness_table(result: Result, group: str) -> Table:

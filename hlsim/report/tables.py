@@ -63,11 +63,9 @@ def number(value: float | None, form: str, none: str = "n/a") -> str:
     return none if value is None else f"{value:{form}}"
 
 
-def cells(
-    figures: Mapping[str, Any], columns: Mapping[str, tuple[str, str]], none: str = "n/a"
-) -> dict[str, str]:
+def cells(figures: Mapping[str, Any], columns: Mapping[str, tuple[str, str]]) -> dict[str, str]:
     """Figures by title of the column, of which is given the name of the figure and its format."""
-    return {title: number(figures[name], form, none) for title, (name, form) in columns.items()}
+    return {title: number(figures[name], form) for title, (name, form) in columns.items()}
 
 
 def spread(mean: float, deviation: float | None) -> str:
@@ -144,7 +142,7 @@ def paired_cells(
     none: str = "n/a",
     digits: int = 3,
 ) -> dict[str, str]:
-    """Change and interval, both tests, and d; ``p_t`` and ``p_w``, adjusted ones say, in place of the comparison's."""
+    """Change and interval, both tests, and d; where ``p_t`` or ``p_w`` is given, it is told, such as an adjusted one."""
     return {
         _CHANGE: f"{c.delta:+.3f} {_interval(c)}".rstrip(),
         "t-test (paired)": _test(f"t = {number(c.t, f'+.{digits}f')}", c.p_t if p_t is None else p_t, none),
