@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from statistics import fmean
 
@@ -22,8 +21,10 @@ from hlsim.evaluation.scoring import HaspiItem, haspi_many
 from hlsim.metrics.pyclarity import check_pair
 from hlsim.msbg import MSBG
 from hlsim.neuro.config import NEURO_RATE
+from hlsim.parallel import one_thread
 from hlsim.report.haspi import markdown, write_report
 from hlsim.report.pictures import draw_spectrograms
+from hlsim.report.tables import Table
 from hlsim.training.batches import TrainingData
 from hlsim.training.compensator import train_compensator
 from hlsim.training.recipes import CompensatorRecipe
@@ -33,6 +34,7 @@ SPEECH_LEVEL = 65.0
 
 FEWEST_SCORED = 8
 
+_HEARD = "level heard, against a normal ear (dB)"
 _EMBEDDED = Path(__file__).parent / "data" / "speech"
 _LONGEST = 5.0  # seconds of an utterance that are scored: HASPI takes half as long
 
@@ -46,17 +48,12 @@ def demo(
     seed: int = 0,
     report: Callable[[str], None] = print,
 ) -> str:
-    """Train, score, and write report, audio and pictures.
+    """Train, score, and write report, audio and pictures into a folder; returns the report as Markdown.
 
     Args:
-        out: folder for the report (as ``write_report``), ``spectrograms.png``, ``audio/`` and ``training/``.
-        audiogram: the ear.
         speech: folder to use instead of the embedded speech; every third file is scored and not trained on.
         minutes: of training.
-        seed: of training and scoring.
         report: called with a line of progress.
-
-    Returns: the report as Markdown.
 
     Raises:
         ValueError: unusable audio, one of under 0.7 s among the scored, or fewer than 22 files in ``speech``.
@@ -68,19 +65,11 @@ def demo(
         check_pair(utterance, utterance, NEURO_RATE, names=(str(path), str(path)))
     recipe = CompensatorRecipe(seed=seed)
     report(f"training on {len(training)} utterances for {minutes:g} minutes, ear {_name(audiogram)}")
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)  # the steps are small: on a busy machine two threads wait for each other
-    try:
+    data, where = TrainingData(speech=training), folder / "training"
+    with one_thread():  # the steps are small: on a busy machine two threads wait for each other
         checkpoint = train_compensator(
-            TrainingData(speech=training),
-            recipe,
-            out=folder / "training",
-            audiogram=audiogram,
-            max_minutes=minutes,
-            report=report,
+            data, recipe, out=where, audiogram=audiogram, max_minutes=minutes, report=report
         )
-    finally:
-        torch.set_num_threads(threads)
     torch.manual_seed(seed)
     conditions: dict[str, nn.Module] = {
         "unaided": Unaided(),
@@ -94,12 +83,9 @@ def demo(
     haspi: dict[str, list[float]] = {}
     levels: dict[str, list[float]] = {}
     with torch.no_grad():
-        heard_normally = _levels([normal(utterance) for utterance in clean])
-        extra: dict[str, object] = {"normal_heard_level_mean": fmean(heard_normally)}
-        table = [
-            "| what the ear is given | HASPI mean | level given (dB SPL) | level heard, against a normal ear (dB) |",
-            "|---|---|---|---|",
-        ]
+        normally = fmean(_levels([normal(utterance) for utterance in clean]))
+        extra: dict[str, object] = {"normal_heard_level_mean": normally}
+        rows = []
         for name, model in conditions.items():
             given = [model(utterance, audiogram) for utterance in clean]
             pairs = zip(clean, given, strict=True)
@@ -107,11 +93,11 @@ def demo(
             haspi[name], levels[name] = haspi_many(items, seed=seed % 2**32), _levels(given)
             heard[name] = [ear(signal) for signal in given]
             mean, level = fmean(haspi[name]), fmean(levels[name])
-            difference = fmean(_levels(heard[name])) - fmean(heard_normally)
+            off = fmean(_levels(heard[name])) - normally
             report(f"  {name}: mean HASPI {mean:.3f}")
-            table.append(f"| {name} | {mean:.3f} | {level:.1f} | {difference:+.1f} |")
+            rows.append((name, f"{mean:.3f}", f"{level:.1f}", f"{off:+.1f}"))
             extra |= {f"{name}_mean": mean, f"{name}_level_mean": level}
-            extra |= {f"{name}_heard_difference_db": difference, f"{name}_haspi": haspi[name]}
+            extra |= {f"{name}_heard_difference_db": off, f"{name}_haspi": haspi[name]}
 
     names = _names(scored, speech)
     ends = {"before": "unaided", "after": "compensated"}
@@ -128,14 +114,14 @@ def demo(
         )
         for i in range(len(scored))
     ]
-    result = replace(HaspiReport(items=scores, seed=seed), extra=extra)
+    result = HaspiReport(items=scores, seed=seed, extra=extra)
     write_report(result, folder)
-    text = f"# {_name(audiogram)}\n\n{markdown(result)}\n" + "\n".join(table) + "\n"
+    header = ("what the ear is given", "HASPI mean", "level given (dB SPL)", _HEARD)
+    text = f"# {_name(audiogram)}\n\n{markdown(result)}\n{Table('', header, rows).markdown()}\n"
     (folder / "report.md").write_text(text, encoding="utf-8")
     _write_audio(folder / "audio", names, clean, heard)
-    panel = {"original": clean[0]} | {
-        f"heard, {name}": heard[name][0] for name in ("unaided", "nalr", "compensated")
-    }
+    panel = {f"heard, {name}": heard[name][0] for name in ("unaided", "nalr", "compensated")}
+    panel = {"original": clean[0], **panel}
     (folder / "spectrograms.png").write_bytes(draw_spectrograms(panel, NEURO_RATE))
     report(f"report, audio and pictures are in {folder}")
     return text
@@ -169,11 +155,8 @@ def _write_audio(folder: Path, names: list[str], clean: list[Tensor], heard: dic
     """Three files an utterance, all by one gain, so that their loudness can be compared."""
     folder.mkdir(parents=True, exist_ok=True)
     for i, name in enumerate(names):
-        signals = {
-            "original": clean[i],
-            "heard-unaided": heard["unaided"][i],
-            "heard-compensated": heard["compensated"][i],
-        }
+        ends = {f"heard-{name}": heard[name][i] for name in ("unaided", "compensated")}
+        signals = {"original": clean[i], **ends}
         peak = max(float(signal.abs().max()) for signal in signals.values())
         for kind, signal in signals.items():
             write_audio(folder / f"{name}-{kind}.wav", 0.9 * signal / peak, NEURO_RATE)

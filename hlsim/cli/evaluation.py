@@ -1,13 +1,16 @@
-"""The command ``evaluate-simulator``."""
+"""The commands ``evaluate-simulator``, ``evaluate-compensator`` and ``haspi-report``."""
 
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 
-from hlsim.cli.inputs import check_there, need, read_simulator
-from hlsim.cli.options import EARS_TABLE, Parser, count, number, positive
+from hlsim.cli.inputs import check_there, need, other_ear, read_ear, read_simulator
+from hlsim.cli.options import EARS_TABLE, Parser, count, natural, number, passed, positive
 from hlsim.cli.progress import show_progress
+
+GAIN_EARS = ["N3", "S2"]
 
 
 def evaluate_simulator(parser: Parser) -> None:
@@ -33,28 +36,125 @@ def _evaluate_simulator(options: argparse.Namespace) -> None:
         raise ValueError(f"simulators {', '.join(options.names)}; allowed: each once")
     if options.compensator and "compensated" not in options.inputs:
         raise ValueError("--compensator without --inputs compensated; allowed: only with it")
-    need("eval", "clarity", "pystoi", "pesq", "matplotlib")
+    need("eval", "clarity", "pystoi", "pesq", "pandas", "matplotlib")
     check_there(folders=(options.speech, options.noise), files=(options.audiograms,))
     from compensators import load_compensator
     from hlsim.evaluation.simulators import evaluate_simulators
     from hlsim.neuro.config import NEURO_RATE
-    from hlsim.report.page import check_out
     from hlsim.report.simulators import write_fidelity
 
-    done = evaluate_simulators(
-        {name: read_simulator(name, NEURO_RATE) for name in options.names},
-        speech=options.speech,
-        audiograms=options.audiograms,
-        noise=options.noise,
-        store=check_out(options.out) / "scores.jsonl",
-        teacher=options.teacher,
-        items=options.items,
-        seconds=options.seconds,
-        levels=options.levels,
-        inputs=options.inputs,
-        compensator=load_compensator(options.compensator) if options.compensator else None,
-        seed=options.seed,
-        progress=show_progress("items"),
-    )
+    instead = {
+        "store": options.out / "scores.jsonl",
+        "compensator": load_compensator(options.compensator) if options.compensator else None,
+        "progress": show_progress("items"),
+    }
+    simulators = {name: read_simulator(name, NEURO_RATE) for name in options.names}
+    done = evaluate_simulators(simulators, **passed(options, evaluate_simulators, **instead))
     write_fidelity(done.result, done.heard, done.shown, options.out)
     print((options.out / "fidelity.md").read_text(encoding="utf-8"))
+
+
+def evaluate_compensator(parser: Parser) -> None:
+    parser.set_defaults(run=_evaluate_compensator)
+    option = parser.option
+    text = "compensators, by name or folder; LABEL=FOLDER is LABEL in the tables"
+    option("names", str, text, nargs="+", metavar="NAME")
+    option("--speech", Path, "folder of clean speech of unseen speakers", required=True)
+    option("--audiograms", Path, f"{EARS_TABLE}; its ears join Bisgaard's N2 to N6 and S1 to S3")
+    parser.audiogram(text="; one ear in place of all, for a compensator trained for it")
+    option("--noise", Path, "folder of noises; every second item is then noisy, at 2.5 to 17.5 dB")
+    option("--simulator", str, "Neuro-MSBG of the surrogate gap, by name or folder", "neuro-msbg")
+    option("--levels", number, "of the speech in dB SPL, in turn", [50, 65, 80], nargs="+")
+    option("--items", count, "how many in all", 400)
+    option("--seconds", positive, "length of an item", 3.0)
+    text = "standard ears of the gain curves and tones; with --audiogram that ear's are drawn"
+    option("--gain-ears", str.upper, text, GAIN_EARS, nargs="+", metavar="EAR")
+    parser.jobs()
+    parser.seed()
+    parser.out()
+
+
+def _evaluate_compensator(options: argparse.Namespace) -> None:
+    if options.audiogram and options.gain_ears != GAIN_EARS:
+        raise ValueError("--gain-ears with --audiogram; allowed: without it, for that ear's gains are drawn")
+    need("eval", "clarity", "pandas", "matplotlib")
+    check_there(folders=(options.speech, options.noise), files=(options.audiograms,))
+    from compensators import load_compensator
+    from hlsim.evaluation.compensators import evaluate_compensators
+    from hlsim.report.compensators import write_compensators
+
+    named = dict(map(_labelled, options.names))
+    if len(named) < len(options.names):
+        raise ValueError(f"compensators {', '.join(options.names)}; allowed: one a label")
+    loaded = {label: load_compensator(name) for label, name in named.items()}
+    ear = read_ear(options.audiogram) if options.audiogram else None
+    notes = [line for label, name in named.items() for line in other_ear(label, name, ear)]
+    for line in notes:
+        print(f"hlsim: warning: {line}", file=sys.stderr)
+    store = options.out / "scores.jsonl"
+    instead = {"audiogram": ear, "notes": notes, "store": store, "progress": show_progress("outputs")}
+    done = evaluate_compensators(loaded, **passed(options, evaluate_compensators, **instead))
+    write_compensators(done.result, done.reports, options.out)
+    text = options.out / "compensators.md"
+    print(text.read_text(encoding="utf-8"))
+    if failed := len(done.result["failures"]):
+        print(f"hlsim: {failed} outputs could not be judged; the reasons are in {text}", file=sys.stderr)
+
+
+def _labelled(text: str) -> tuple[str, str]:
+    """Label and name; a folder by itself is called by its path."""
+    label, sign, name = text.partition("=")
+    return (text, text) if Path(text).exists() or not (sign and label) else (label, name)
+
+
+def haspi_report(parser: Parser) -> None:
+    parser.set_defaults(run=_haspi_report)
+    option = parser.option
+    option("--clean", Path, "folder of clean speech; the file names are the same in all three")
+    option("--before", Path, "folder of what the ear was given")
+    option("--after", Path, "folder of what it is given now")
+    text = (
+        "in place of the folders: CSV with columns condition, clean, processed, and listener, ear, snr, hl_250, ... or "
+        "audiogram, spl or full_scale_spl where known"
+    )
+    option("--manifest", Path, text)
+    option("--root", Path, "folder of the manifest's paths; its own folder by default")
+    parser.audiogram(text=", for all files, or of a manifest for rows that bring none")
+    text = "; and a column file (folders) or columns listener and ear (manifest, for rows without)"
+    option("--audiograms", Path, EARS_TABLE + text)
+    option("--measures", str, "of haspi, hasqi, stoi, pesq, separated by commas; the first leads", "haspi")
+    option("--baseline", str, "condition that all others are compared with; all pairs by default")
+    level = parser.add_mutually_exclusive_group()
+    parser.full_scale(group=level)
+    text = "level of each clean file in dB SPL, in place of --full-scale-spl; of a manifest for rows that bring none"
+    option("--spl", positive, text, group=level)
+    option("--scores", Path, "file of scores made so far; OUT/scores.jsonl by default")
+    parser.parallel()
+    option("--listen", natural, "items with players in report.html", 3)
+    parser.seed()
+    parser.out()
+
+
+def _haspi_report(options: argparse.Namespace) -> None:
+    measures = [name.strip() for name in options.measures.split(",")]
+    need("eval", "joblib", "matplotlib", *(["clarity"] if {"haspi", "hasqi"} & {*measures} else []))
+    check_there(
+        folders=(options.clean, options.before, options.after, options.root),
+        files=(options.manifest, options.audiograms),
+    )
+    from hlsim.evaluation import haspi_report, score_items
+    from hlsim.report.haspi import markdown, write_report
+
+    instead = {
+        "audiogram": read_ear(options.audiogram) if options.audiogram else None,
+        "measures": measures,
+        "store": options.scores or options.out / "scores.jsonl",
+        "progress": show_progress("scores"),
+    }
+    report = haspi_report(**passed(options, haspi_report, score_items, **instead))
+    write_report(report, options.out, listen=options.listen)
+    print(markdown(report))
+    if failed := len(report.failures):
+        all_ = failed + sum(len(own) for item in report.items for own in item.scores.values())
+        text = f"{failed} of {all_} scores could not be made; the reasons are in {options.out / 'report.md'}"
+        print(f"hlsim: {text}", file=sys.stderr)

@@ -27,11 +27,11 @@ COMMANDS = {
     "train-compensator": ("training", "train a compensator through a frozen simulator"),
     "evaluate-simulator": ("evaluation", "compare simulators with MSBG: SNR, STOI, PESQ, bands"),
     "evaluate-compensator": (
-        "compensators",
+        "evaluation",
         "judge compensators beside no aid and NAL-R: HASPI, HASQI, loudness as heard, surrogate gap, gain curves, tones",
     ),
     "haspi-report": (
-        "haspi_report",
+        "evaluation",
         "HASPI (HASQI, STOI, PESQ) before and after a treatment, with paired tests",
     ),
     "benchmark": ("benchmark", "time simulators, a training step and the scan side by side"),

@@ -98,9 +98,9 @@ class Parser(argparse.ArgumentParser):
         self.option("--out", folder, "folder for the results", required=True)
 
 
-def passed(options: argparse.Namespace, function: Callable[..., Any], **instead: Any) -> dict[str, Any]:
-    """The options that are arguments of the function, by their names, and what it is given in the place of some."""
-    names = signature(function).parameters
+def passed(options: argparse.Namespace, *functions: Callable[..., Any], **instead: Any) -> dict[str, Any]:
+    """The options that are arguments of the functions, by their names, and what is given in the place of some."""
+    names = {name for function in functions for name in signature(function).parameters}
     return {name: value for name, value in vars(options).items() if name in names} | instead
 
 

@@ -34,14 +34,12 @@ class Comparison:
     """A measure under two conditions, of the items that have both.
 
     Attributes:
-        measure, before, after: names of the measure and of the conditions.
         overall: over all items.
         level_before_mean, level_after_mean: dB SPL of what the ear was given, of the same items.
         by_severity: by degree of loss, those that occur.
         listeners: the same tests of the means of each listener; None unless two or more are named.
         mixed: a mixed model with listeners as a random intercept, or the reason why there is none.
-        p_t_holm, p_w_holm: p values adjusted by Holm over the comparisons of this measure.
-        comparisons: how many those are.
+        p_t_holm, p_w_holm: p values adjusted by Holm over the comparisons of this measure, as many as ``comparisons``.
         unit: what ``listeners`` are called.
         left_out: how many items lack a score under one of the conditions or both.
     """
@@ -201,11 +199,6 @@ def _compare(items: Sequence[ItemScore], measure: str, before: str, after: str) 
         np.array([item.scores[measure][condition] for item in both]) for condition in (before, after)
     )
     severities = np.array([item.severity for item in both])
-    by_severity = {
-        name: paired_comparison(first[severities == name], second[severities == name])
-        for name in SEVERITIES
-        if name in severities
-    }
     listeners, means = [item.listener for item in both], None
     mixed: MixedModel | str = "listeners are not named"
     if all(listeners):
@@ -217,17 +210,17 @@ def _compare(items: Sequence[ItemScore], measure: str, before: str, after: str) 
         before=before,
         after=after,
         overall=paired_comparison(first, second),
-        level_before_mean=_mean_level(both, before),
-        level_after_mean=_mean_level(both, after),
-        by_severity=by_severity,
+        # what has a score has a level
+        level_before_mean=math.fsum(item.levels[before] or 0.0 for item in both) / len(both),
+        level_after_mean=math.fsum(item.levels[after] or 0.0 for item in both) / len(both),
+        by_severity={
+            name: paired_comparison(first[severities == name], second[severities == name])
+            for name in SEVERITIES
+            if name in severities
+        },
         listeners=means,
         mixed=mixed,
         p_t_holm=None,
         p_w_holm=None,
         left_out=len(items) - len(both),
     )
-
-
-def _mean_level(items: Sequence[ItemScore], condition: str) -> float:
-    levels = [level for item in items if (level := item.levels[condition]) is not None]
-    return math.fsum(levels) / len(levels)  # what has a score has a level

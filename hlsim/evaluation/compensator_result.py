@@ -5,17 +5,18 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import numpy as np
-
 from hlsim.audiogram import SEVERITIES
 from hlsim.evaluation.haspi_report import HaspiReport
 from hlsim.evaluation.items import Item
 from hlsim.evaluation.judging import SIMULATORS, Judged
 from hlsim.evaluation.scores import ItemScore
+from hlsim.extras import require
 from hlsim.neuro.config import NEURO_RATE
 
 HARD = 0.6
 """Unaided HASPI under which an item belongs to those that need help most."""
+
+MEASURES = ("haspi", "hasqi")
 
 Rows = Sequence[Mapping[str, Any]]
 
@@ -29,14 +30,11 @@ def compensator_result(
 ) -> tuple[dict[str, Any], dict[str, HaspiReport]]:
     """Summaries of what ``judge`` made, for JSON, and the reports of the groups that there are.
 
-    An item counts where every condition has figures, so that all rows are of the same items.
+    An item counts where every condition has figures, so that all rows are of the same items; ValueError where none has.
 
     Args:
         judged: figures of each item by condition.
         limits: the conditions in order, unaided first, and the peak in dB SPL that each keeps to, or None.
-
-    Raises:
-        ValueError: no item has figures of every condition.
     """
     conditions = [*limits]
     failures, rows = [], []
@@ -55,23 +53,24 @@ def compensator_result(
     groups["hard"] = [row for row in rows if row["figures"][conditions[0]]["haspi"] < HARD]
     groups = {name: group for name, group in groups.items() if group}
     reports = {name: _report(group, items, settings) for name, group in groups.items()}
+    frames = {name: {c: _frame(group, c) for c in conditions} for name, group in groups.items()}
     result = {
         **settings,
         "limits": dict(limits),
         "groups": {
             name: {
                 "n": len(group),
-                "conditions": {condition: _summary(group, condition) for condition in conditions},
+                "conditions": {c: _summary(frame) for c, frame in frames[name].items()},
                 "comparisons": [c.to_dict() for c in reports[name].comparisons],
             }
             for name, group in groups.items()
         },
         "gap": {
-            name: {condition: _gap(groups[name], condition) for condition in conditions}
+            name: {c: _gap(frame) for c, frame in frames[name].items()}
             for name in ("clean", "noisy")
             if name in groups
         },
-        "peaks": {name: _peaks(rows, name, limit) for name, limit in limits.items()},
+        "peaks": {name: _peaks(_frame(rows, name).peak, limit) for name, limit in limits.items()},
         "versions": next(iter(reports.values())).versions,
         "failures": failures,
         "rows": rows,
@@ -79,26 +78,17 @@ def compensator_result(
     return result, reports
 
 
-def gap(group: Mapping[str, float], one: str, other: str) -> float | None:
-    """Relative difference of one simulator's loss from another's; None where the other's is 0.
-
-    It is where nothing is lost: clean speech as it is, in an ear without a loss.
-    """
-    least = group[f"loss_{other}"]
-    return group[f"loss_{one}"] / least - 1.0 if least else None
-
-
 def _report(rows: Rows, items: Sequence[Item], settings: Mapping[str, Any]) -> HaspiReport:
+    def of(row: Mapping[str, Any], figure: str) -> dict[str, float]:
+        return {name: figures[figure] for name, figures in row["figures"].items()}
+
     scores = [
         ItemScore(
             file=f"item {row['item']}",
             audiogram=items[row["item"]].ear,
             clean_level=row["level"],
-            levels={name: figures["level"] for name, figures in row["figures"].items()},
-            scores={
-                measure: {name: figures[measure] for name, figures in row["figures"].items()}
-                for measure in ("haspi", "hasqi")
-            },
+            levels=of(row, "level"),
+            scores={measure: of(row, measure) for measure in MEASURES},
             sample_rate=NEURO_RATE,
             seconds=settings["seconds"],
             seed=(settings["seed"] + row["item"]) % 2**32,
@@ -107,66 +97,63 @@ def _report(rows: Rows, items: Sequence[Item], settings: Mapping[str, Any]) -> H
         )
         for row in rows
     ]
-    return HaspiReport(scores, measures=("haspi", "hasqi"), seed=settings["seed"], unit="ears")
+    return HaspiReport(scores, measures=MEASURES, seed=settings["seed"], unit="ears")
 
 
-def _summary(rows: Rows, condition: str) -> dict[str, Any]:
+def _frame(rows: Rows, condition: str) -> Any:
+    """For pandas: a row an item, with its severity, the level that it was given at, and the figures of a condition."""
+    about = [{"severity": row["severity"], "given": row["level"]} | row["figures"][condition] for row in rows]
+    return require("pandas", "eval").DataFrame(about)
+
+
+def _summary(frame: Any) -> dict[str, Any]:
     """Means over all, by input level and by degree of loss."""
-    by_level = {
-        f"{level:g}": [row for row in rows if row["level"] == level]
-        for level in sorted({row["level"] for row in rows})
-    }
-    by_severity = {severity: [row for row in rows if row["severity"] == severity] for severity in SEVERITIES}
+    by_severity = dict(list(frame.groupby("severity")))
     return {
-        **_means(rows, condition),
-        "by_level": {level: _means(part, condition) for level, part in by_level.items()},
-        "by_severity": {severity: _means(part, condition) for severity, part in by_severity.items() if part},
+        **_means(frame),
+        "by_level": {f"{level:g}": _means(part) for level, part in frame.groupby("given")},
+        "by_severity": {name: _means(by_severity[name]) for name in SEVERITIES if name in by_severity},
     }
 
 
-def _means(rows: Rows, condition: str) -> dict[str, Any]:
+def _means(frame: Any) -> dict[str, Any]:
     """Means and, of the scores, deviations with n - 1; levels in dB SPL.
 
     ``heard_off`` is the level heard less a normal ear's of the same input, ``heard_off_clean`` less its of the clean
     speech; ``_abs`` is the mean of the absolute differences.
     """
-    figures = _columns(rows, condition)
-    means: dict[str, Any] = {"n": len(rows)}
-    for name in ("haspi", "hasqi"):
-        means[f"{name}_mean"] = float(figures[name].mean())
-        means[f"{name}_std"] = float(figures[name].std(ddof=1)) if len(rows) > 1 else None
+    means: dict[str, Any] = {"n": len(frame)}
+    for name in MEASURES:
+        means[f"{name}_mean"] = float(frame[name].mean())
+        means[f"{name}_std"] = float(frame[name].std()) if len(frame) > 1 else None
     for name, normal in (("heard_off", "normal"), ("heard_off_clean", "normal_clean")):
-        off = figures["heard"] - figures[normal]
-        means |= {name: float(off.mean()), f"{name}_abs": float(np.abs(off).mean())}
+        off = frame.heard - frame[normal]
+        means |= {name: float(off.mean()), f"{name}_abs": float(off.abs().mean())}
     return means | {
-        "level_mean": float(figures["level"].mean()),
-        "peak_max": float(figures["peak"].max()),
-        "band_error_mean": float(figures["band_error"].mean()),
+        "level_mean": float(frame.level.mean()),
+        "peak_max": float(frame.peak.max()),
+        "band_error_mean": float(frame.band_error.mean()),
     }
 
 
-def _gap(rows: Rows, condition: str) -> dict[str, float | None]:
-    """Mean loss under each simulator, and the median over items of the network's relative distance from pyclarity's."""
-    figures = _columns(rows, condition)
-    losses = {f"loss_{name}": float(figures[f"loss_{name}"].mean()) for name in SIMULATORS}
-    apart = [gap(row["figures"][condition], "neuro", "pyclarity") for row in rows]
-    known = [abs(value) for value in apart if value is not None]
-    return {
-        **losses,
-        "neuro_to_msbg": gap(losses, "neuro", "msbg"),
-        "neuro_to_pyclarity": gap(losses, "neuro", "pyclarity"),
-        "msbg_to_pyclarity": gap(losses, "msbg", "pyclarity"),
-        "item_median": float(np.median(known)) if known else None,
+def _gap(frame: Any) -> dict[str, float | None]:
+    """Mean loss under each simulator, how far one's lies from another's relative to it, and the median over items.
+
+    None where the other's is 0. It is where nothing is lost: clean speech as it is, in an ear without a loss.
+    """
+    losses = {f"loss_{name}": float(frame[f"loss_{name}"].mean()) for name in SIMULATORS}
+    gaps = {
+        f"{one}_to_{other}": losses[f"loss_{one}"] / least - 1.0
+        if (least := losses[f"loss_{other}"])
+        else None
+        for one, other in (("neuro", "msbg"), ("neuro", "pyclarity"), ("msbg", "pyclarity"))
     }
+    known = frame[frame.loss_pyclarity != 0.0]
+    median = (known.loss_neuro / known.loss_pyclarity - 1.0).abs().median()
+    return {**losses, **gaps, "item_median": float(median) if len(known) else None}
 
 
-def _peaks(rows: Rows, condition: str, limit: float | None) -> dict[str, Any]:
-    peaks = _columns(rows, condition)["peak"]
+def _peaks(peaks: Any, limit: float | None) -> dict[str, Any]:
     # float32 rounds the limit itself by as little
     over = None if limit is None else int((peaks > limit + 1e-4).sum())
     return {"n": len(peaks), "limit": limit, "highest": float(peaks.max()), "over": over}
-
-
-def _columns(rows: Rows, condition: str) -> dict[str, np.ndarray]:
-    figures = [row["figures"][condition] for row in rows]
-    return {name: np.array([row[name] for row in figures]) for name in figures[0]}

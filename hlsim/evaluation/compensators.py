@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -35,12 +36,8 @@ _REVISION = 2  # of what ``judge`` measures and how it is kept: raise it where t
 
 @dataclass(frozen=True)
 class CompensatorEvaluation:
-    """What a comparison of compensators comes to.
-
-    Attributes:
-        result: what ``compensators.json`` holds: ``compensator_result``'s, and ``gain_curves``, ``steady_tones``,
-            ``shifts`` and ``notes``.
-        reports: of each group of items that there is, ``clean``, ``noisy`` and ``hard``.
+    """What ``compensators.json`` holds: ``compensator_result``'s, and ``gain_curves``, ``steady_tones``, ``shifts`` and
+    ``notes``; and the reports of each group of items that there is, ``clean``, ``noisy`` and ``hard``.
     """
 
     result: dict[str, Any]
@@ -69,7 +66,7 @@ def evaluate_compensators(
 
     Figures are stored as they are made, by the samples, the ear and the weights that they are of: a run that was
     stopped goes on where it was, one with a compensator more scores that one alone, and one with another simulator
-    computes the surrogate gap alone.
+    computes the surrogate gap alone. What fails is listed with the reason under ``failures`` of the result.
 
     Args:
         compensators: by name, modules at 16 kHz and 94 dB SPL full scale, called with a waveform and an ear. One with a
@@ -77,23 +74,22 @@ def evaluate_compensators(
         speech, noise: folders of recordings; with ``noise`` every second item is noisy, at 2.5 to 17.5 dB.
         store: file of figures, there or not; None keeps nothing.
         audiograms: CSV file of ears that join Bisgaard's N2 to N6 and S1 to S3.
-        audiogram: one ear in place of all, for a compensator that was trained for it.
+        audiogram: one ear in place of all, also of the gain curves, for a compensator that was trained for it.
         simulator: the Neuro-MSBG of the surrogate gap, by name or folder.
         items: how many in all. 400 give each main row 200 pairs.
         seconds: length of an item; HASPI is not to be trusted much under 3.
         levels: of the clean speech in dB SPL, in turn.
-        gain_ears: standard ears of the gain curves and the steady tones; with ``audiogram``, that ear in their place.
+        gain_ears: standard ears of the gain curves and the steady tones.
         notes: sentences that the report begins with.
         jobs: processes; None takes all cores. The figures do not depend on it.
         progress: called with the number of outputs judged and of all.
-
-    Returns: an evaluation. Items that failed are listed in its result with the reason, under ``failures``.
 
     Raises:
         ValueError: data or settings that cannot be used, or no item could be judged.
         MissingExtraError: pyclarity or joblib is not installed.
     """
-    require("clarity", "eval")
+    for module in ("clarity", "pandas"):
+        require(module, "eval")
     check_parallel(jobs, "loky", None)
     check_seed(seed)
     if items < 1 or not compensators or not levels:
@@ -117,22 +113,16 @@ def evaluate_compensators(
     aided = {name: module for name, module in conditions.items() if name != UNAIDED}
     curves = gain_curves(aided, shown, speech, levels, seed)  # first: what cannot be used shows at once
     steady = steady_tones(conditions, shown, levels)
-    judged = _judge_all(
-        drawn, conditions, load_pretrained(simulator), seed, ScoreStore(store), jobs, progress
-    )
-    result, reports = compensator_result(
-        drawn,
-        judged,
-        limits={name: _limit(module) for name, module in conditions.items()},
-        settings={
-            "items": items,
-            "seconds": seconds,
-            "seed": seed,
-            "levels": [*levels],
-            "ears": [name for name, _ in ears],
-            "simulator": str(simulator),
-        },
-    )
+    network = load_pretrained(simulator)
+    judged = _judge_all(drawn, conditions, network, seed, ScoreStore(store), jobs=jobs, progress=progress)
+    settings = {"items": items, "seconds": seconds, "seed": seed, "levels": [*levels]}
+    settings |= {"ears": [name for name, _ in ears], "simulator": str(simulator)}
+    # the peak in dB SPL that a compensator promises not to pass
+    limits = {
+        name: getattr(getattr(module, "config", None), "limit_spl", None)
+        for name, module in conditions.items()
+    }
+    result, reports = compensator_result(drawn, judged, limits=limits, settings=settings)
     shifted = sorted(result["rows"], key=lambda row: row["condition"] != "clean")[:_SHIFTED]
     shifts = shift_differences(aided, {row["item"]: drawn[row["item"]] for row in shifted})
     result |= {"gain_curves": curves, "steady_tones": steady, "shifts": shifts, "notes": [*notes]}
@@ -145,8 +135,9 @@ def _judge_all(
     simulator: nn.Module,
     seed: int,
     store: ScoreStore,
-    jobs: int | None,
+    *,
     progress: Progress | None,
+    **parallel: Any,
 ) -> list[dict[str, Judged]]:
     """Each item's figures by condition, those from the store among them."""
     weights = {name: weights_hash(module) for name, module in conditions.items()}
@@ -159,13 +150,10 @@ def _judge_all(
         of = {name: {**about, "weights": weights[name]} for name in conditions}
         keys = {name: Keys(key_of(it), key_of({**it, "simulator": network})) for name, it in of.items()}
         trials.append(Trial(item, conditions, simulator, trial_seed, keys))
+    if progress is not None:
+        parallel["progress"] = lambda done, total: progress(done // 2, total // 2)  # both of an output
     failed = make_missing(
-        judge,
-        trials,
-        lambda trial: [key for keys in trial.keys.values() for key in keys],
-        store,
-        jobs=jobs,
-        progress=progress and (lambda done, total: progress(done // 2, total // 2)),  # both of an output
+        judge, trials, lambda trial: [*chain.from_iterable(trial.keys.values())], store, **parallel
     )
 
     def judged(keys: Keys) -> Judged:
@@ -174,8 +162,3 @@ def _judge_all(
         return Judged(store.records[keys.most] | store.records[keys.of_network])
 
     return [{name: judged(keys) for name, keys in trial.keys.items()} for trial in trials]
-
-
-def _limit(compensator: nn.Module) -> float | None:
-    """Peak in dB SPL that a compensator promises not to pass, or None."""
-    return getattr(getattr(compensator, "config", None), "limit_spl", None)

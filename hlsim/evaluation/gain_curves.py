@@ -29,15 +29,10 @@ def insertion_gain(
 ) -> list[list[float]]:
     """Power out over power in, in dB, in 24 ERB-wide bands (``hlsim.criteria.bands``), over all of the speech.
 
-    Args:
-        speech: its spectrum is what a fitter's speech-shaped noise stands for; its pauses are in it, for a
-            compensator may take noise for noise.
-        levels: of each utterance in dB SPL.
+    Its spectrum is what a fitter's speech-shaped noise stands for; its pauses are in it, for a compensator may take noise
+    for noise. ``levels`` are of each utterance in dB SPL. ValueError as ``outputs``.
 
     Shape: (utterances, time) at 16 kHz -> (levels, 24).
-
-    Raises:
-        ValueError: the compensator gives samples that are NaN or infinite.
     """
     curves = []
     for level in levels:
@@ -54,10 +49,7 @@ def gain_curves(
     levels: Sequence[float],
     seed: int = 0,
 ) -> list[dict[str, Any]]:
-    """The curves of every compensator for every ear, on six clips of 3 s drawn from a folder.
-
-    Raises:
-        ValueError: a compensator gives samples that are NaN or infinite.
+    """The curves of every compensator for every ear, on six clips of 3 s drawn from a folder. ValueError as ``outputs``.
 
     Returns: for each ``{"compensator", "ear", "levels", "frequencies", "gain_db": (levels, 24)}``.
     """

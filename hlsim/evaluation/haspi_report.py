@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -20,10 +20,8 @@ from hlsim.evaluation.statistics import RESAMPLES, PairedComparison
 from hlsim.evaluation.store import ScoreStore
 from hlsim.extras import require
 from hlsim.metrics.registry import check_measures, version_of, versions_of
-from hlsim.parallel import Progress
 
-if TYPE_CHECKING:
-    import pandas
+_OF_ITEM = ("audiogram", "listener", "ear", "snr", "clean", "processed")
 
 GAIN_NOTE = (
     "HASPI rewards any gain, however loud, so the output level stands beside it: a higher score at a much higher level "
@@ -33,11 +31,11 @@ GAIN_NOTE = (
 
 @dataclass(frozen=True)
 class HaspiReport:
-    """Scores of the same items under two conditions or more.
+    """Scores of the same items under two conditions or more; the headline compares the last condition with the first.
 
     Args:
-        items: at least one with scores; the headline compares the last condition with the first.
-        measures: names of the measures, the headline's first; by default those of the first item's scores.
+        items: at least one with scores.
+        measures: their names, the headline's first; by default those of the first item's scores.
         seed: of the whole; each item has its own.
         failures: scores that could not be made.
         baseline: the first condition, where all others are to be compared with it alone; by default every later one is
@@ -48,9 +46,11 @@ class HaspiReport:
     Attributes:
         conditions: their names, in order, from the items' levels.
         comparisons: every pair of conditions by every measure, the headline among them.
-        headline: the last condition against the first, by the first measure.
         comparison: the headline's figures over all items.
-        clean_level_mean, before_level_mean, after_level_mean: means in dB SPL, before and after of the headline.
+        clean_level_mean, before_level_mean, after_level_mean: in dB SPL, before and after of the headline.
+        full_scale_spl: level in dB SPL that RMS 1.0 was taken as; None where the items differ, as by ``spl``.
+        note: what is to be known before the figures: that HASPI rewards gain, where it is among the measures.
+        severities: each item's degree of loss.
 
     Raises:
         ValueError: no items, or of unlike conditions, or fewer than two; a baseline that is not the first; a score
@@ -67,6 +67,13 @@ class HaspiReport:
     conditions: Sequence[str] = field(init=False)
     comparisons: Sequence[Comparison] = field(init=False)
     headline: Comparison = field(init=False)
+    comparison: PairedComparison = field(init=False)
+    clean_level_mean: float = field(init=False)
+    before_level_mean: float = field(init=False)
+    after_level_mean: float = field(init=False)
+    full_scale_spl: float | None = field(init=False)
+    note: str = field(init=False)
+    severities: Sequence[str] = field(init=False)
 
     def __post_init__(self) -> None:
         if not self.items:
@@ -87,54 +94,28 @@ class HaspiReport:
         if headline is None:
             why = f" ({self.failures[0].reason})" if self.failures else ""
             raise ValueError(f"no item has {measures[0]} under both {ends[1]} and {ends[2]}{why}")
-        # of a frozen dataclass
-        vars(self).update(
-            conditions=conditions, measures=measures, comparisons=comparisons, headline=headline
+        scales = {item.full_scale_spl for item in self.items}
+        vars(self).update(  # of a frozen dataclass
+            conditions=conditions,
+            measures=measures,
+            comparisons=comparisons,
+            headline=headline,
+            comparison=headline.overall,
+            clean_level_mean=math.fsum(item.clean_level for item in self.items) / len(self.items),
+            before_level_mean=headline.level_before_mean,
+            after_level_mean=headline.level_after_mean,
+            full_scale_spl=scales.pop() if len(scales) == 1 else None,
+            note=GAIN_NOTE if "haspi" in measures else "",
+            severities=[item.severity for item in self.items],
         )
         taken = sorted(set(self._own()) & set(self.extra))
         if taken:
             raise ValueError(f"extra keys {', '.join(taken)} are the report's own; allowed: other names")
 
     @property
-    def comparison(self) -> PairedComparison:
-        """The headline's figures over all items."""
-        return self.headline.overall
-
-    @property
-    def clean_level_mean(self) -> float:
-        """Mean level of the clean speech in dB SPL."""
-        return math.fsum(item.clean_level for item in self.items) / len(self.items)
-
-    @property
-    def before_level_mean(self) -> float:
-        """Mean level of the headline's first condition in dB SPL."""
-        return self.headline.level_before_mean
-
-    @property
-    def after_level_mean(self) -> float:
-        """Mean level of the headline's second condition in dB SPL."""
-        return self.headline.level_after_mean
-
-    @property
-    def full_scale_spl(self) -> float | None:
-        """Level in dB SPL that RMS 1.0 was taken as; None where the items differ, as where ``spl`` was given."""
-        levels = {item.full_scale_spl for item in self.items}
-        return levels.pop() if len(levels) == 1 else None
-
-    @property
     def versions(self) -> dict[str, str]:
         """Of the packages that the scores depend on."""
         return {"hlsim": version_of("hlsim"), **versions_of(self.measures), "scipy": version_of("scipy")}
-
-    @property
-    def note(self) -> str:
-        """What is to be known before the figures: that HASPI rewards gain, where it is among the measures."""
-        return GAIN_NOTE if "haspi" in self.measures else ""
-
-    @property
-    def severities(self) -> list[str]:
-        """Each item's degree of loss."""
-        return [item.severity for item in self.items]
 
     def scores(self, measure: str, conditions: Sequence[str] | None = None) -> np.ndarray:
         """Scores by item and condition (all of them by default), NaN where there is none. Shape: (items, conditions)."""
@@ -144,28 +125,31 @@ class HaspiReport:
         """Levels in dB SPL, as ``scores``."""
         return self._array([item.levels for item in self.items], conditions)
 
-    def _array(
-        self, rows: Sequence[Mapping[str, float | None]], conditions: Sequence[str] | None
-    ) -> np.ndarray:
+    def _array(self, rows: Sequence[Mapping[str, Any]], conditions: Sequence[str] | None) -> np.ndarray:
         names = self.conditions if conditions is None else conditions
         # None becomes NaN
         return np.array([[row.get(name) for name in names] for row in rows], dtype=np.float64)
 
     @property
-    def table(self) -> pandas.DataFrame:
-        """A row an item and condition, with its level (dB SPL) and a column a measure; NaN where there is no score.
-
-        Raises:
-            MissingExtraError: pandas is not installed.
-        """
-        facts = ("file", "listener", "ear", "severity", "snr", "clean_level")
-        scale = ("full_scale_spl", "seconds", "seed")
+    def table(self) -> Any:
+        """For pandas: a row an item and condition, its level (dB SPL) and a column a measure; NaN without a score."""
+        facts = (
+            "file",
+            "listener",
+            "ear",
+            "severity",
+            "snr",
+            "clean_level",
+            "full_scale_spl",
+            "seconds",
+            "seed",
+        )
         rows = [
-            {**{name: getattr(item, name) for name in (*facts, *scale)}, "condition": condition}
+            {**{name: getattr(item, name) for name in facts}, "condition": condition}
             for item in self.items
             for condition in self.conditions
         ]
-        frame: pandas.DataFrame = require("pandas", "eval").DataFrame(rows).astype({"snr": float})
+        frame = require("pandas", "eval").DataFrame(rows).astype({"snr": float})
         scores = {measure: self.scores(measure).ravel() for measure in self.measures}
         return frame.assign(level=self.levels().ravel(), **scores)
 
@@ -204,10 +188,7 @@ def haspi_report(
     full_scale_spl: float = 94.0,
     spl: float | None = None,
     seed: int = 0,
-    jobs: int | None = None,
-    backend: str = "loky",
-    scheduler: str | None = None,
-    progress: Progress | None = None,
+    **running: Any,
 ) -> HaspiReport:
     """HASPI v2 (and HASQI, STOI, PESQ) of speech under two conditions or more, with paired tests and levels.
 
@@ -216,13 +197,9 @@ def haspi_report(
     file) is listed in the report with its reason, and the rest go on.
 
     Args:
-        clean, before, after: folders of wav, flac or ogg files whose names below the folder, but for the extension, are
-            the same. Of one name, the three files have one rate and one length.
-        audiogram: the ear, of all files, or of a manifest's rows that bring none; or else
-        audiograms: for folders a CSV file with columns ``file`` and ``hl_250``,
-            ``hl_500``, ... in dB HL, one row a file; for a manifest with ``listener`` and ``ear`` in place of ``file``.
-        manifest: in place of the folders, a CSV file with a row a file, see ``hlsim.evaluation.inputs``.
-        root: the folder that the manifest's paths are relative to; by default the manifest's.
+        clean, before, after: folders, see ``read_folders``. Of one name, the three files have one rate and one length.
+        audiogram, audiograms: the ear of all files or a CSV file of ears, as in ``read_folders`` and ``read_manifest``.
+        manifest, root: in place of the folders, a CSV file with a row a file, see ``hlsim.evaluation.inputs``.
         measures: of ``haspi``, ``hasqi``, ``stoi``, ``pesq``; the first is the headline's.
         baseline: the condition that comes first and that all others are compared with; by default the manifest's first
             comes first, and all are compared with each other.
@@ -231,9 +208,7 @@ def haspi_report(
         spl: or else the level in dB SPL of every clean file, or of a manifest's rows that bring none; the processed ones
             are on the same scale.
         seed: of the noise that HASPI and HASQI add; each item has one from it.
-        jobs: processes; None takes all cores. The scores do not depend on it.
-        backend, scheduler: ``"loky"``, or ``"dask"`` with the address of a Dask scheduler.
-        progress: called with the number of scores there and the number of all.
+        running: ``jobs``, ``backend``, ``scheduler`` and ``progress``, as of ``score_items``.
 
     Raises:
         ValueError: names differ between the folders, a manifest's row is wrong, a file has no audiogram, settings
@@ -246,82 +221,64 @@ def haspi_report(
         raise ValueError(
             f"audiogram is {type(audiogram).__name__}; allowed: an Audiogram, one ear of all files"
         )
-    folders = (clean, before, after)
-    if manifest is not None and all(folder is None for folder in folders):
-        items = read_manifest(
-            manifest, root, audiogram=audiogram, audiograms=audiograms, full_scale_spl=full_scale_spl, spl=spl
-        )
+    ears_and_levels: dict[str, Any] = {
+        "audiogram": audiogram,
+        "audiograms": audiograms,
+        "full_scale_spl": full_scale_spl,
+        "spl": spl,
+    }
+    if manifest is not None and clean is None and before is None and after is None:
+        items = read_manifest(manifest, root, **ears_and_levels)
     elif manifest is None and root is None and clean is not None and before is not None and after is not None:
-        items = read_folders(
-            clean, before, after, audiogram, audiograms=audiograms, full_scale_spl=full_scale_spl, spl=spl
-        )
+        items = read_folders(clean, before, after, **ears_and_levels)
     else:
         raise ValueError("give either the folders clean, before and after, or a manifest (and its root)")
-    conditions = _conditions(items, baseline)
-    scored = score_items(
-        items,
-        names,
-        store=ScoreStore(store),
-        seed=seed,
-        jobs=jobs,
-        backend=backend,
-        scheduler=scheduler,
-        progress=progress,
-    )
-    scores, failures = _gather(items, scored, conditions, names)
+    conditions = list(dict.fromkeys(condition for item in items for condition in item.processed))
+    if len(conditions) < 2:
+        raise ValueError(f"one condition only, {conditions[0]}; allowed: two or more to compare")
+    if baseline is not None:
+        if baseline not in conditions:
+            raise ValueError(f"no condition {baseline!r}; allowed: {', '.join(conditions)}")
+        conditions = [baseline, *(name for name in conditions if name != baseline)]
+    scored = score_items(items, names, store=ScoreStore(store), seed=seed, **running)
+    pairs = [*zip(items, scored, strict=True)]
+    failures = [
+        Failure(item.name, condition, measure, str(result.reason))
+        for item, results in pairs
+        for (measure, condition), result in results.items()
+        if result.score is None
+    ]
+    scores = [made for pair in pairs if (made := _item_score(*pair, conditions, names))]
     if not scores:
         reasons = f"; the first, {failures[0].file}: {failures[0].reason}" if failures else ""
         raise ValueError(f"none of {len(items)} items could be scored{reasons}")
     return HaspiReport(scores, measures=names, seed=seed, failures=failures, baseline=baseline)
 
 
-def _conditions(items: Sequence[FileItem], baseline: str | None) -> list[str]:
-    found = list(dict.fromkeys(condition for item in items for condition in item.processed))
-    if len(found) < 2:
-        raise ValueError(f"one condition only, {found[0]}; allowed: two or more to compare")
-    if baseline is not None and baseline not in found:
-        raise ValueError(f"no condition {baseline!r}; allowed: {', '.join(found)}")
-    return found if baseline is None else [baseline, *(name for name in found if name != baseline)]
-
-
-def _gather(
-    items: Sequence[FileItem],
-    scored: Sequence[dict[tuple[str, str], Result]],
+def _item_score(
+    item: FileItem,
+    results: Mapping[tuple[str, str], Result],
     conditions: Sequence[str],
     measures: Sequence[str],
-) -> tuple[list[ItemScore], list[Failure]]:
-    scores, failures = [], []
-    for item, results in zip(items, scored, strict=True):
-        failures += [
-            Failure(item.name, condition, measure, str(result.reason))
-            for (measure, condition), result in results.items()
-            if result.score is None
-        ]
-        known = {key: float(result.score) for key, result in results.items() if result.score is not None}
-        if not known:
-            continue
-        fact = results[next(iter(known))]
-        full_scale = item.full_scale(fact.clean_dbfs)
-        levels = {condition: results[measure, condition].dbfs + full_scale for measure, condition in known}
-        scores.append(
-            ItemScore(
-                file=item.name,
-                audiogram=item.audiogram,
-                clean_level=fact.clean_dbfs + full_scale,
-                levels={name: levels.get(name) for name in conditions},
-                scores={
-                    measure: {name: known[measure, name] for name in conditions if (measure, name) in known}
-                    for measure in measures
-                },
-                sample_rate=fact.sample_rate,
-                seconds=fact.seconds,
-                seed=fact.seed,
-                full_scale_spl=full_scale,
-                listener=item.listener,
-                ear=item.ear,
-                snr=item.snr,
-                clean=item.clean,
-                processed=item.processed,
-            )
-        )
-    return scores, failures
+) -> ItemScore | None:
+    """None where nothing could be scored."""
+    known: dict[tuple[str, str], Any] = {
+        key: result for key, result in results.items() if result.score is not None
+    }
+    if not known:
+        return None
+    fact = next(iter(known.values()))
+    full_scale = item.full_scale(fact.clean_dbfs)
+    levels = {condition: result.dbfs + full_scale for (_, condition), result in known.items()}
+    return ItemScore(
+        file=item.name,
+        clean_level=fact.clean_dbfs + full_scale,
+        levels=dict.fromkeys(conditions) | levels,
+        scores={
+            measure: {name: known[measure, name].score for name in conditions if (measure, name) in known}
+            for measure in measures
+        },
+        full_scale_spl=full_scale,
+        **{name: getattr(fact, name) for name in ("sample_rate", "seconds", "seed")},
+        **{name: getattr(item, name) for name in _OF_ITEM},
+    )

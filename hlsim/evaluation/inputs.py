@@ -17,11 +17,11 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Container, Mapping
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path, PurePath, PurePosixPath
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from hlsim.audio import EXTENSIONS, find_audio
 from hlsim.audiogram import Audiogram, numbered_audiograms
@@ -48,15 +48,13 @@ def read_manifest(
     """The items of a manifest, in the order of their first rows.
 
     Args:
-        root: the folder that the paths are relative to, and that they may not leave; by default the manifest's own.
+        root: the folder that the paths are relative to, and that they may not leave; by default the manifest's.
         audiogram: the ear of all rows that bring none; or else
         audiograms: a CSV file with columns ``listener``, ``ear`` (where left and right differ) and ``hl_250``, ....
         full_scale_spl, spl: the level, as in ``FileItem``, of rows that bring none.
 
     Raises:
-        ValueError: the file cannot be read, lacks a column, or a row is wrong: an ear other than left and right, a path
-            that leaves the root, no audiogram or level, a second row of a condition, or one unlike its item's others; or
-            no row takes ``audiogram``, ``audiograms`` or ``spl``.
+        ValueError: what is wrong, and in which line; or no row takes ``audiogram``, ``audiograms`` or ``spl``.
     """
     folder = (Path(path).parent if root is None else Path(root)).resolve()
     if not folder.is_dir():
@@ -79,15 +77,14 @@ def read_manifest(
             items[name] = replace(known, processed={**known.processed, **item.processed})
         except ValueError as error:
             raise ValueError(f"{path}, line {line}: {error}") from error
+    used = {id(ear) for ear in taken}
     idle = {
-        "audiogram": audiogram is not None and all(ear is not audiogram for ear in taken),
-        "audiograms": audiograms is not None
-        and not any(used is ear for used in taken for ear in ears.values()),
+        "audiogram": audiogram is not None and id(audiogram) not in used,
+        "audiograms": audiograms is not None and used.isdisjoint(map(id, ears.values())),
         "spl": spl is not None and all(row.get("spl") or row.get("full_scale_spl") for _, row in rows),
     }
-    for what in idle:
-        if idle[what]:
-            raise ValueError(f"{path}: no row takes {what}, for each has its own; leave one of the two out")
+    for what in filter(idle.get, idle):
+        raise ValueError(f"{path}: no row takes {what}, for each has its own; leave one of the two out")
     return list(items.values())
 
 
@@ -119,7 +116,7 @@ def _item(
     row: Mapping[str, str],
     root: Path,
     ears: Mapping[tuple[str, str], Audiogram],
-    audiogram: Audiogram | None,
+    default: Audiogram | None,
     full_scale_spl: float,
     spl: float | None,
 ) -> tuple[tuple[str, ...], str, FileItem]:
@@ -135,13 +132,25 @@ def _item(
         full_scale_spl, spl = row_full_scale, None
     elif row_spl is not None:
         spl = row_spl
+    levels = {key: value for key, value in row.items() if key.lower().startswith("hl")}
+    if any(levels.values()):  # then all: a blank is no threshold, and not one like its neighbour's either
+        audiogram: Audiogram | None = Audiogram.from_row(levels)
+    elif row.get("audiogram"):
+        audiogram = Audiogram.standard(row["audiogram"])
+    else:
+        audiogram = ears.get((listener, ear)) or ears.get((listener, "")) or default
+    if audiogram is None:
+        raise ValueError(
+            f"no audiogram of listener {listener!r}, ear {ear!r}: neither in columns hl_250, hl_500, ... or audiogram "
+            "nor in a file of audiograms"
+        )
     parts = (listener, ear, row.get("item", "") or PurePosixPath(row["clean"]).with_suffix("").as_posix())
-    label = " ".join(part for part in parts if part)
+    label = " ".join(filter(None, parts))
     item = FileItem(
         name=label if snr is None else f"{label} {snr:g} dB",
         clean=clean,
         processed={condition: below_root(root, row["processed"], "processed")},
-        audiogram=_audiogram(row, ears, listener, ear, audiogram),
+        audiogram=audiogram,
         listener=listener,
         ear=ear,
         snr=snr,
@@ -149,27 +158,6 @@ def _item(
         spl=spl,
     )
     return (*parts, str(clean), str(snr)), condition, item
-
-
-def _audiogram(
-    row: Mapping[str, str],
-    ears: Mapping[tuple[str, str], Audiogram],
-    listener: str,
-    ear: str,
-    default: Audiogram | None,
-) -> Audiogram:
-    levels = {key: value for key, value in row.items() if key.lower().startswith("hl")}
-    if any(levels.values()):  # then all: a blank is no threshold, and not one like its neighbour's either
-        return Audiogram.from_row(levels)
-    if row.get("audiogram"):
-        return Audiogram.standard(row["audiogram"])
-    known = ears.get((listener, ear)) or ears.get((listener, "")) or default
-    if known is None:
-        raise ValueError(
-            f"no audiogram of listener {listener!r}, ear {ear!r}: neither in columns hl_250, hl_500, ... or audiogram "
-            "nor in a file of audiograms"
-        )
-    return known
 
 
 def _ears(
@@ -227,45 +215,38 @@ def read_folders(
     audiogram: Audiogram | None = None,
     *,
     audiograms: str | Path | None = None,
-    full_scale_spl: float = 94.0,
-    spl: float | None = None,
+    **levels: Any,
 ) -> list[FileItem]:
     """An item a name, with the conditions ``before`` and ``after``, sorted by name.
 
     Args:
         clean, before, after: folders of wav, flac or ogg files whose names below the folder, but for the extension, are
-            the same.
+            the same, or ValueError.
         audiogram: the ear, of all files; or else
         audiograms: a CSV file with columns ``file`` (the name below the folder, with or without extension) and
             ``hl_250``, ``hl_500``, ... in dB HL, one row a file. Rows of other files are passed over.
-        full_scale_spl, spl: the level, as in ``FileItem``.
-
-    Raises:
-        ValueError: names differ between the folders, a file has no audiogram, or both or none of ``audiogram`` and
-            ``audiograms`` are given.
+        levels: ``full_scale_spl`` or ``spl``, as in ``FileItem``.
     """
     if (audiogram is None) == (audiograms is None):
         raise ValueError(
             "give either audiogram, one ear of all files, or audiograms, a CSV file with a row a file"
         )
-    folders = [_by_name(folder) for folder in (clean, before, after)]
-    names = _common_names((clean, before, after), folders)
+    roots = (clean, before, after)
+    folders = [_by_name(root) for root in roots]
+    names = sorted(set(chain(*folders)))
+    for root, files in zip(roots, folders, strict=True):
+        if lack := _lack(names, files):
+            raise ValueError(
+                f"{root}: {lack[0]} missing, {lack[1]}; clean, before and after need the same names"
+            )
     ears = dict.fromkeys(names, audiogram) if audiogram is not None else _ears(str(audiograms), _file)
-    if missing := [name for name in names if name not in ears]:
-        raise ValueError(
-            f"{audiograms}: no audiogram of {len(missing)} of {len(names)} files, {_listed(missing)}"
-        )
-    return [
-        FileItem(
-            name=name,
-            clean=folders[0][name].absolute(),
-            processed={"before": folders[1][name].absolute(), "after": folders[2][name].absolute()},
-            audiogram=ears[name],
-            full_scale_spl=full_scale_spl,
-            spl=spl,
-        )
-        for name in names
-    ]
+    if lack := _lack(names, ears):
+        raise ValueError(f"{audiograms}: no audiogram of {lack[0]}, {lack[1]}")
+    items = []
+    for name in names:
+        speech, first, last = (files[name].absolute() for files in folders)
+        items.append(FileItem(name, speech, {"before": first, "after": last}, ears[name], **levels))
+    return items
 
 
 def _name(path: PurePath) -> str:
@@ -283,18 +264,8 @@ def _by_name(folder: str | Path) -> dict[str, Path]:
     return files
 
 
-def _common_names(roots: Iterable[str | Path], folders: list[dict[str, Path]]) -> list[str]:
-    """The names, sorted, or ValueError naming the folder that lacks some."""
-    names = sorted(set(chain(*folders)))
-    for root, files in zip(roots, folders, strict=True):
-        missing = [name for name in names if name not in files]
-        if missing:
-            raise ValueError(
-                f"{root}: {len(missing)} of {len(names)} files missing, {_listed(missing)}; "
-                "clean, before and after need the same names"
-            )
-    return names
-
-
-def _listed(names: list[str]) -> str:
-    return ", ".join(names[:_NAMED]) + (", ..." if len(names) > _NAMED else "")
+def _lack(names: list[str], there: Container[str]) -> tuple[str, str] | None:
+    """How many of the names are missing, and the first few."""
+    missing = [name for name in names if name not in there]
+    few = ", ".join(missing[:_NAMED]) + (", ..." if len(missing) > _NAMED else "")
+    return (f"{len(missing)} of {len(names)} files", few) if missing else None

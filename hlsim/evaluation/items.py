@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import count
+from itertools import count, product
 from pathlib import Path
 from typing import Any
 
@@ -38,10 +38,8 @@ compensator adds ``compensated``."""
 class Item:
     """A signal for an ear, in pascals at 16 kHz.
 
-    Attributes:
-        clean, signal: (time,); ``signal`` is what the ear gets, ``clean`` the speech in it, before treatment.
-        about: severity, level (dB SPL before treatment), condition (clean or noisy), noise_snr (dB; None where clean),
-            input, audiogram.
+    ``signal`` (time,) is what the ear gets, ``clean`` (time,) the speech in it, before treatment. ``about`` has severity,
+    level (dB SPL before treatment), condition (clean or noisy), noise_snr (dB; None where clean), input, audiogram.
     """
 
     clean: Tensor
@@ -158,30 +156,20 @@ def _about(ear: Audiogram, level: float, snr: float | None, name: str) -> dict[s
 def treat(
     items: Sequence[Item], inputs: Sequence[str], compensator: nn.Module | None = None
 ) -> Iterator[Item]:
-    """Each item under each input in turn.
-
-    Args:
-        inputs: of ``INPUTS``, and ``compensated`` where there is a compensator.
-
-    Raises:
-        ValueError: an input that is none of these.
-    """
-    treatments: dict[str, Callable[[Item], Tensor]] = {
-        "as-is": lambda item: item.signal,
-        "louder": lambda item: 10.0 * item.signal,
-        "nal-r": lambda item: NALR(item.ear, sample_rate=NEURO_RATE)(item.signal),
-        "compressed": lambda item: compress(
-            item.signal.unsqueeze(0), torch.tensor([3.0]), NEURO_RATE
-        ).squeeze(0),
+    """Each item under each input in turn: of ``INPUTS``, with a compensator ``compensated`` too; else ValueError."""
+    treatments: dict[str, Callable[[Tensor, Audiogram], Tensor]] = {
+        "as-is": lambda signal, ear: signal,
+        "louder": lambda signal, ear: 10.0 * signal,
+        "nal-r": NALR(sample_rate=NEURO_RATE),
+        "compressed": lambda signal, ear: compress(signal[None], torch.tensor([3.0]), NEURO_RATE)[0],
     }
     if compensator is not None:
-        treatments["compensated"] = lambda item: compensator(item.signal, item.ear)
+        treatments["compensated"] = compensator
     if unknown := [name for name in inputs if name not in treatments]:
         raise ValueError(
             f"input {unknown[0]!r}; allowed: {', '.join(treatments)}, and compensated with a compensator"
         )
-    for item in items:
-        for name in inputs:
-            with torch.no_grad():
-                signal = treatments[name](item)
-            yield Item(item.clean, signal, item.ear, {**item.about, "input": name})
+    for item, name in product(items, inputs):
+        with torch.no_grad():
+            signal = treatments[name](item.signal, item.ear)
+        yield Item(item.clean, signal, item.ear, {**item.about, "input": name})

@@ -48,11 +48,8 @@ class Keys(NamedTuple):
 class Trial:
     """An item to be judged as each compensator gives it.
 
-    Args:
-        compensators: by name, at 16 kHz and 94 dB SPL full scale.
-        simulator: the network of ``neuro``, of the same rate and scale.
-        seed: of the noise that HASPI and HASQI add, the same for every compensator.
-        keys: of the figures, by compensator.
+    The compensators, by name, and the network are at 16 kHz and 94 dB SPL full scale; ``seed``, the same for all, is of
+    the noise that HASPI and HASQI add; ``keys`` are the figures', by compensator.
     """
 
     item: Item
@@ -69,6 +66,8 @@ class Judged(NamedTuple):
     reason: str = ""
 
 
+@one_thread()
+@torch.no_grad()
 def judge(trial: Trial, missing: Sequence[str]) -> dict[str, dict[str, float] | Failed]:
     """The figures whose keys are missing; what goes wrong is the reason.
 
@@ -76,15 +75,10 @@ def judge(trial: Trial, missing: Sequence[str]) -> dict[str, dict[str, float] | 
     - ``level``, ``peak``: of the output, RMS and largest sample in dB SPL (a sample of 1.0 is 94).
     - ``heard``: level in dB SPL after the exact MSBG; ``normal``: what a normal ear hears there of the same input, noise
       and all; ``normal_clean``: of the speech in it.
-    - ``band_error``: median absolute difference in dB between band levels (24 bands, 32 ms) of what the impaired ear
-      hears and what a normal one hears of the clean speech, both by the exact MSBG, where the latter is audible.
+    - ``band_error``: ``band_error_db`` (24 bands, 32 ms) of what the impaired ear hears and what a normal one hears of
+      the clean speech, both by the exact MSBG.
     - ``loss_neuro``, ``loss_msbg``, ``loss_pyclarity``: what ``HearingLossLoss(criterion="bands")`` is under each.
     """
-    with one_thread(), torch.no_grad():
-        return _judge(trial, missing)
-
-
-def _judge(trial: Trial, missing: Sequence[str]) -> dict[str, dict[str, float] | Failed]:
     item = trial.item
     try:
         normal = {"neuro": _hear(trial, "neuro", item.clean, NORMAL)}
@@ -143,10 +137,7 @@ def peak_spl(waveform: Tensor) -> float:
 def band_error_db(heard: Tensor, normal: Tensor) -> float:
     """Median absolute difference of band levels in dB, over the bands and frames that a normal ear finds audible.
 
-    Shape: (time,) twice, in pascals at 16 kHz.
-
-    Raises:
-        ValueError: it finds none audible.
+    Shape: (time,) twice, in pascals at 16 kHz. ValueError where it finds none audible.
     """
     levels, truth = band_levels(heard, NEURO_RATE), band_levels(normal, NEURO_RATE)
     audible = audibility(truth, least_audible(truth)) > 0.0

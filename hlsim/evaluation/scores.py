@@ -20,18 +20,17 @@ class ItemScore:
     """Scores of one utterance in one ear, with the levels (dB SPL) of what was scored.
 
     Args:
-        file: what it is called.
         levels: of what the ear was given, by condition, in their order; None where a file could not be read.
-        scores: by measure and condition; what could not be scored is not in it.
-        clean_level: of the clean speech.
+        scores: by measure and condition; what could not be scored is not in it. Each needs a level, or ValueError.
         full_scale_spl: level in dB SPL that a file of RMS 1.0 was taken to have.
         seed: of the noise that HASPI and HASQI add, the same under every condition.
         listener, ear: whose ear and which; empty where unknown.
         snr: of the speech in noise in dB, where known.
         clean, processed: files, for players and spectrograms; not part of ``report.json``.
 
-    Raises:
-        ValueError: a score under a condition without a level.
+    Attributes:
+        before, after: the first measure's scores under the first and last condition, where there are any.
+        before_level, after_level: of these conditions.
     """
 
     file: str
@@ -49,41 +48,28 @@ class ItemScore:
     clean: Path | None = None
     processed: Mapping[str, Path] = field(default_factory=dict)
 
+    before: float | None = field(init=False)
+    after: float | None = field(init=False)
+    before_level: float | None = field(init=False)
+    after_level: float | None = field(init=False)
+    severity: str = field(init=False)
+
     def __post_init__(self) -> None:
         for condition in {name for found in self.scores.values() for name in found}:
             if self.levels.get(condition) is None:
                 raise ValueError(
                     f"{self.file}: a score under {condition!r} without its level; a score needs one"
                 )
-
-    @property
-    def before(self) -> float | None:
-        """The first measure's score under the first condition; None where there is none."""
-        return self._first_measure.get(next(iter(self.levels)))
-
-    @property
-    def after(self) -> float | None:
-        """The first measure's score under the last condition; None where there is none."""
-        return self._first_measure.get(list(self.levels)[-1])
-
-    @property
-    def before_level(self) -> float | None:
-        """Level of the first condition in dB SPL; None where its file could not be read."""
-        return next(iter(self.levels.values()))
-
-    @property
-    def after_level(self) -> float | None:
-        """Level of the last condition in dB SPL; None where its file could not be read."""
-        return list(self.levels.values())[-1]
-
-    @property
-    def _first_measure(self) -> Mapping[str, float]:
-        return next(iter(self.scores.values()), {})
-
-    @property
-    def severity(self) -> str:
-        """The degree of loss."""
-        return self.audiogram.severity
+        first: Mapping[str, float] = next(iter(self.scores.values()), {})
+        names = [*self.levels] or [""]
+        before, after = names[0], names[-1]
+        vars(self).update(  # of a frozen dataclass
+            before=first.get(before),
+            after=first.get(after),
+            before_level=self.levels.get(before),
+            after_level=self.levels.get(after),
+            severity=self.audiogram.severity,
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """A plain dictionary that JSON can hold."""

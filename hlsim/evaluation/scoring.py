@@ -35,9 +35,7 @@ class FileItem:
 
     Args:
         name: what it is called in reports.
-        clean: file of the clean speech.
         processed: file of what the ear is given, by condition.
-        audiogram: of the ear.
         listener: whose ear; empty where unknown.
         ear: ``"left"``, ``"right"`` or empty. Of a file with two channels it is the channel; others have one.
         snr: of the speech in noise, in dB, where known.
@@ -102,19 +100,17 @@ def score_items(
     A score is known by the contents of both files, the measure, the versions of what computes it and, where they
     matter, the audiogram, the level settings and the seed; known ones are not made again. An item's seed is ``seed``
     plus the first 32 bits of the SHA-256 of its clean file, modulo 2 ** 32: the same under every condition, whatever
-    other files there are. Failures have a reason in place of a score; they are not stored, but tried again.
+    other files there are. What is wrong with an item is its reason in place of a score, no error; that is not stored, but
+    tried again.
 
     Args:
         store: scores made earlier, to which new ones go; None keeps nothing.
-        jobs, backend, scheduler: as ``run_parallel``.
+        jobs, backend, scheduler: as ``run_parallel``, which raises what is wrong with them.
         progress: called with the number of scores there and of all: first where some were stored, and after each new one.
 
-    Returns: for each item its results by (measure, condition).
-
     Raises:
-        ValueError: an unknown measure or backend, ``jobs`` below 1, a seed that numpy does not take, the store cannot be
-            written. What is wrong with an item is its reason, no error.
-        MissingExtraError: a measure's package, joblib or distributed is not installed.
+        ValueError: an unknown measure, a seed that numpy does not take, or the store cannot be written.
+        MissingExtraError: a measure's package is not installed.
     """
     check_seed(seed)
     check_parallel(jobs, backend, scheduler)
@@ -125,28 +121,19 @@ def score_items(
     hashes = cache(content_hash)
     versions = {name: versions_of([name]) for name in names}
     for index, item in enumerate(items):
+        scale = {"full_scale_spl": item.full_scale_spl if item.spl is None else None, "spl": item.spl}
         for condition, path in item.processed.items():
             try:
-                clean, processed = hashes(item.clean), hashes(path)
+                files = {"clean": hashes(item.clean), "processed": hashes(path), "ear": item.ear}
             except ValueError as error:
                 results[index] |= {(name, condition): Result(None, str(error)) for name in names}
                 continue
-            item_seed = (seed + int(clean[:8], 16)) % 2**32
+            item_seed = (seed + int(files["clean"][:8], 16)) % 2**32
+            of_an_ear = {"audiogram": list(item.audiogram.thresholds), **scale, "seed": item_seed}
             for name in names:
-                settings: dict[str, Any] = {
-                    "revision": _REVISION,
-                    "measure": name,
-                    "versions": versions[name],
-                    "clean": clean,
-                    "processed": processed,
-                    "ear": item.ear,
-                }
-                if MEASURES[name].of_an_ear:
-                    settings["audiogram"] = list(item.audiogram.thresholds)
-                    settings["full_scale_spl"] = item.full_scale_spl if item.spl is None else None
-                    settings["spl"] = item.spl
-                    settings["seed"] = item_seed
-                places.append((index, FileTask(item, condition, name, item_seed, key_of(settings))))
+                about = {"revision": _REVISION, "measure": name, "versions": versions[name], **files}
+                key = key_of(about | (of_an_ear if MEASURES[name].of_an_ear else {}))
+                places.append((index, FileTask(item, condition, name, item_seed, key)))
     counts = Counter(task.key for _, task in places)  # the same score may be wanted twice
     failed = make_missing(
         score_task,
@@ -159,10 +146,8 @@ def score_items(
         progress=progress,
     )
     for index, task in places:
-        known = store.get(task.key)
-        result = Result(None, failed.get(task.key))
-        if known is not None:
-            result = Result(**{name: known[name] for name in Result._fields})
+        known = store.get(task.key) or {"score": None, "reason": failed.get(task.key)}
+        result = Result(**{name: known[name] for name in Result._fields if name in known})
         # some measures know no seed: the stored one may be of another run
         results[index][task.measure, task.condition] = result._replace(seed=task.seed)
     return results
@@ -192,11 +177,8 @@ def score_task(task: FileTask, _: Sequence[str] = ()) -> dict[str, dict[str, Any
 def read_channel(path: str | Path, ear: str = "") -> tuple[np.ndarray, int]:
     """Samples of what one ear is given, as they are: (time,) in float64, and the rate in Hz.
 
-    Args:
-        ear: ``"left"`` or ``"right"`` takes that channel of a file with two, the first or the second.
-
-    Raises:
-        ValueError: as ``read_audio``, or the file has several channels and no ear is named, or more than two.
+    Of a file with two channels, ``ear`` takes the first for ``"left"`` or the second for ``"right"``. ValueError as
+    ``read_audio``, or where it is silent, or has several channels and no ear is named, or more than two.
     """
     waveform, rate = read_audio(path)
     if waveform.shape[0] != 1 and not (ear and waveform.shape[0] == 2):
@@ -215,7 +197,6 @@ class HaspiItem:
     Args:
         reference, processed: clean and processed speech: (time,), or paths of one-channel audio files, which are
             read only when their turn comes.
-        audiogram: the ear that hears ``processed``.
         sample_rate: Hz; needed for signals, left out for files, which bring theirs.
         seed: of the noise that HASPI adds; by default that of ``haspi_many`` plus the place in the list.
     """
@@ -235,34 +216,20 @@ def haspi_many(
     jobs: int | None = None,
     progress: Progress | None = None,
 ) -> list[float]:
-    """HASPI of many items in parallel processes, the same whatever their number.
+    """HASPI of many items in parallel processes (``jobs``; None takes all cores), the same whatever their number.
 
-    Each item has its seed, and each process one thread of linear algebra.
-
-    Args:
-        items: see ``HaspiItem``.
-        full_scale_spl: level in dB SPL of RMS 1.0, of all signals.
-        seed: item i, counted from 0, takes seed + i unless it brings one.
-        jobs: processes; None takes all cores.
-        progress: called after each score.
-
-    Raises:
-        ValueError: as ``haspi``, beginning with the item's processed file or its place in the list; ``jobs`` is below
-            1, or the seed is none that numpy takes.
-        MissingExtraError: pyclarity or joblib is not installed.
+    Item i, counted from 0, takes ``seed`` + i unless it brings one; ``progress`` is called after each score. What
+    ``haspi`` raises begins with the item's processed file or its place in the list.
     """
     check_parallel(jobs, "loky", None)
     check_seed(seed)
-    seeds = [(seed + i) % 2**32 if item.seed is None else item.seed for i, item in enumerate(items)]
     store = ScoreStore()
-    failed = make_missing(
-        _score_item,
-        [(str(i), item, full_scale_spl, seeds[i]) for i, item in enumerate(items)],
-        lambda task: [task[0]],
-        store,
-        jobs=1 if len(items) < 2 else jobs,
-        progress=progress,
-    )
+    tasks = [
+        (str(i), item, full_scale_spl, (seed + i) % 2**32 if item.seed is None else item.seed)
+        for i, item in enumerate(items)
+    ]
+    jobs = 1 if len(items) < 2 else jobs
+    failed = make_missing(_score_item, tasks, lambda task: [task[0]], store, jobs=jobs, progress=progress)
     for i, reason in failed.items():
         raise ValueError(f"item {i}: {reason}")
     return [store.records[str(i)]["score"] for i in range(len(items))]
@@ -270,21 +237,18 @@ def haspi_many(
 
 def _score_item(task: tuple[str, HaspiItem, float, int], _: Sequence[str]) -> dict[str, dict[str, float]]:
     key, item, full_scale_spl, seed = task
-    name = str(item.processed) if isinstance(item.processed, str | Path) else f"item {key}"
     try:
-        reference, reference_rate = _load(item.reference, item.sample_rate)
-        processed, rate = _load(item.processed, item.sample_rate)
+        signals = [
+            read_channel(signal) if isinstance(signal, str | Path) else (signal, item.sample_rate)
+            for signal in (item.reference, item.processed)
+        ]
+        (reference, reference_rate), (processed, rate) = signals
+        if rate is None or reference_rate is None:
+            raise ValueError("no sample_rate; signals that are not files need one")
         if rate != reference_rate:
             raise ValueError(f"rate {rate} Hz, its reference has {reference_rate}; allowed: equal rates")
         score = haspi(reference, processed, item.audiogram, rate, full_scale_spl=full_scale_spl, seed=seed)
     except ValueError as error:
+        name = item.processed if isinstance(item.processed, str | Path) else f"item {key}"
         raise ValueError(f"{name}: {error}") from error
     return {key: {"score": score}}
-
-
-def _load(signal: Signal | str | Path, sample_rate: int | None) -> tuple[Signal, int]:
-    if isinstance(signal, str | Path):
-        return read_channel(signal)
-    if sample_rate is None:
-        raise ValueError("no sample_rate; signals that are not files need one")
-    return signal, sample_rate

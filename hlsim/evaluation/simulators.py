@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -10,14 +11,13 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
 from hlsim.audiogram import SEVERITIES
 from hlsim.evaluation.items import LEVELS, Item, draw_items, treat
 from hlsim.evaluation.store import ScoreStore, key_of, weights_hash
-from hlsim.extras import MissingExtraError
+from hlsim.extras import MissingExtraError, require
 from hlsim.metrics.fidelity import (
     linear_correlation,
     mean_squared_error,
@@ -34,7 +34,13 @@ from hlsim.msbg import MSBG
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.parallel import Failed, Progress, make_missing, reason_of
 
-_AGREEMENT = {"lcc": linear_correlation, "srcc": rank_correlation, "mse": mean_squared_error}
+_SCORES = ("snr", "raw_mse", "band_error", "stoi_true", "stoi_sim", "pesq_true", "pesq_sim")
+_KINDS = ("severity", "level", "condition")
+_AGREEMENT: dict[str, Callable[..., float | None]] = {
+    "lcc": linear_correlation,
+    "srcc": rank_correlation,
+    "mse": mean_squared_error,
+}
 
 _SHORTEST = 0.02  # s: a window of the spectrograms
 
@@ -43,13 +49,9 @@ _REVISION = 2  # of what is measured: raise it where that changes a figure
 
 @dataclass(frozen=True)
 class SimulatorEvaluation:
-    """What a comparison of simulators comes to.
-
-    Attributes:
-        result: what ``fidelity.json`` holds: the settings, and of each of ``simulators`` the ``items`` and, by each of
-            ``inputs``, their summary.
-        shown: the item of the spectrograms.
-        heard: of it, by the truth and by each simulator, by name: (time,), in pascals at 16 kHz.
+    """What ``fidelity.json`` holds: the settings, and of each of ``simulators`` the ``items`` and, by each of ``inputs``,
+    their summary; the item of the spectrograms; and what is heard of it by the truth and by each simulator, by name,
+    (time,) in pascals at 16 kHz.
     """
 
     result: dict[str, Any]
@@ -76,7 +78,8 @@ def evaluate_simulators(
     """Compare simulators with MSBG, side by side.
 
     Scores are stored as they are made, by the samples, the ear and the weights that they are of: a run that was stopped
-    goes on where it was, and one with a simulator more scores that one alone.
+    goes on where it was, and one with a simulator more scores that one alone. An item that a simulator or the truth fails
+    on, or that has no STOI or PESQ, is listed with the ``reasons`` and counts in no figure that it has no value for.
 
     Args:
         simulators: by name, at 16 kHz and 94 dB SPL full scale.
@@ -91,9 +94,6 @@ def evaluate_simulators(
         inputs: what is done to the signal before the ear gets it, of ``INPUTS`` and, with a compensator, ``compensated``.
         compensator: called with a waveform and an ear.
         progress: called with what is done and all.
-
-    Returns: an evaluation. An item that a simulator or the truth fails on, or that has no STOI or PESQ, is listed with
-        the ``reasons`` and counts in no figure that it has no value for.
 
     Raises:
         ValueError: data that cannot be used, an unknown teacher or input, or no item that the truth does not fail on.
@@ -110,52 +110,38 @@ def evaluate_simulators(
         raise ValueError(f"inputs {', '.join(inputs)}; allowed: each once")
     if not seconds >= _SHORTEST:
         raise ValueError(f"items of {seconds:g} s; allowed: {_SHORTEST:g} or more, and 2 for PESQ and STOI")
+    require("pandas", "eval")  # to be known before hours of scoring
     drawn = draw_items(speech, noise, audiograms, items=items, seconds=seconds, seed=seed, levels=levels)
     scored = ScoreStore(store)
-    settings = {
-        "teacher": teacher,
-        "revision": _REVISION,
-        # haspi's for pyclarity's, whose MSBG is the truth
-        "versions": {**versions_of(["stoi", "pesq", "haspi"]), "hlsim": version_of("hlsim")},
-    }
+    # haspi's for pyclarity's, whose MSBG is the truth
+    versions = {**versions_of(["stoi", "pesq", "haspi"]), "hlsim": version_of("hlsim")}
+    settings = {"teacher": teacher, "revision": _REVISION, "versions": versions}
     weights = {name: weights_hash(simulator) for name, simulator in simulators.items()}
     tasks = []
     for item in treat(drawn, inputs, compensator):
         about = settings | item.settings()
         tasks.append((item, {name: key_of({**about, "weights": weights[name]}) for name in simulators}))
+    many = len(simulators)
     failed = make_missing(
         partial(_score_item, simulators, teacher),
         tasks,
         lambda task: [*task[1].values()],
         scored,
         jobs=1,
-        progress=progress
-        and (lambda done, total: progress(done // len(simulators), total // len(simulators))),
+        progress=progress and (lambda done, total: progress(done // many, total // many)),
     )
-    rows = {
-        name: [
-            {
-                "item": number // len(inputs),
-                **item.about,
-                **(scored.get(keys[name]) or {"reasons": [failed[keys[name]]]}),
-            }
-            for number, (item, keys) in enumerate(tasks)
-        ]
-        for name in simulators
-    }
-    summaries = {
-        name: {given: summarise([row for row in table if row["input"] == given]) for given in inputs}
-        for name, table in rows.items()
-    }
-    result = {
-        "teacher": teacher,
-        "items": items,
-        "seconds": seconds,
-        "seed": seed,
-        "levels": [*levels],
-        "inputs": [*inputs],
-        "simulators": {name: {"inputs": summaries[name], "items": table} for name, table in rows.items()},
-    }
+
+    def row(number: int, item: Item, key: str) -> dict[str, Any]:
+        scores = scored.get(key) or {"reasons": [failed[key]]}
+        return {"item": number // len(inputs), **item.about, **scores}
+
+    entries = {}
+    for name in simulators:
+        rows = [row(number, item, keys[name]) for number, (item, keys) in enumerate(tasks)]
+        of = {given: [row for row in rows if row["input"] == given] for given in inputs}
+        entries[name] = {"inputs": {given: summarise(part) for given, part in of.items()}, "items": rows}
+    result = {"teacher": teacher, "items": items, "seconds": seconds, "seed": seed}
+    result |= {"levels": [*levels], "inputs": [*inputs], "simulators": entries}
     shown, truth = _shown(drawn, [item for item, _ in tasks], teacher)
     heard_of = {"truth": truth}
     for name, simulator in simulators.items():
@@ -181,17 +167,13 @@ def _score_item(
     except Exception as error:  # of this item alone: all simulators go without
         return dict.fromkeys(missing, Failed(f"no truth: {reason_of(error)}"))
     made: dict[str, dict[str, Any] | Failed] = {}
-    for name, key in keys.items():
-        if key not in missing:
-            continue
+    for name, key in ((name, key) for name, key in keys.items() if key in missing):
         try:
             with torch.no_grad():
-                heard = simulators[name](item.signal, item.ear).double()
-            scores = _scores(item.clean, truth, heard)
+                scores = _scores(item.clean, truth, simulators[name](item.signal, item.ear).double())
+            made[key] = true | scores | {"reasons": true["reasons"] + scores["reasons"]}
         except Exception as error:  # one simulator's; the others go on
             made[key] = Failed(reason_of(error))
-        else:
-            made[key] = true | scores | {"reasons": true["reasons"] + scores["reasons"]}
     return made
 
 
@@ -234,60 +216,51 @@ def _shown(items: Sequence[Item], others: Iterable[Item], teacher: str) -> tuple
 
 
 def summarise(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Fidelity over many items: overall, and by each of severity, level and condition that rows have.
+    """Fidelity over many items: overall, and by each of severity, level (dB SPL) and condition that rows have.
 
     Args:
-        rows: one an item, with any of ``snr``, ``raw_mse``, ``band_error``, ``stoi_true``, ``stoi_sim``,
-            ``pesq_true``, ``pesq_sim`` (a number, or None: then it, or its pair, is left out) and any of ``severity``,
-            ``level`` (dB SPL), ``condition``.
+        rows: one an item, with any of ``snr``, ``raw_mse``, ``band_error``, ``stoi_true``, ``stoi_sim``, ``pesq_true``,
+            ``pesq_sim``: finite, or ValueError, or None, and then it, or its pair, is left out.
 
     Returns: ``{"overall": figures, "severity": {"mild": figures, ...}, "level": {"65": figures, ...}, "condition":
         {...}}``, for JSON. Figures are ``n``, ``snr_n`` (how many have one), ``snr_median``, ``snr_worst_tenth`` (10th
         percentile), ``raw_mse`` (mean), ``band_error_median`` and, for stoi and pesq, ``_n`` (pairs used), ``_lcc``,
         ``_srcc``, ``_mse``; None where undefined.
-
-    Raises:
-        ValueError: no rows, or a number that is not finite.
     """
     if not rows:
         raise ValueError("no items to summarise")
-    summary: dict[str, Any] = {"overall": _figures(rows)}
-    for key in ("severity", "level", "condition"):
-        groups: dict[Any, list[Mapping[str, Any]]] = {}
-        for row in rows:
-            if row.get(key) is not None:
-                groups.setdefault(row[key], []).append(row)
+    for key in _SCORES:
+        if not all(math.isfinite(row[key]) for row in rows if row.get(key) is not None):
+            raise ValueError(
+                f"{key} holds NaN or infinity; allowed: finite numbers, or None where there is none"
+            )
+    pandas = require("pandas", "eval")
+    # None becomes NaN
+    frame = pandas.DataFrame(rows, columns=[*_SCORES, *_KINDS]).astype(dict.fromkeys(_SCORES, float))
+    summary: dict[str, Any] = {"overall": _figures(frame)}
+    for key in _KINDS:
         # degrees of loss in their order, levels as numbers, conditions by name
+        groups = dict(list(frame.groupby(key)))
         order = sorted(groups, key=lambda g: (SEVERITIES.index(g) if g in SEVERITIES else 0, g))
         summary[key] = {g if isinstance(g, str) else f"{g:g}": _figures(groups[g]) for g in order}
     return summary
 
 
-def _figures(rows: Sequence[Mapping[str, Any]]) -> dict[str, float | int | None]:
-    def column(key: str) -> np.ndarray:
-        values = np.array([row[key] for row in rows if row.get(key) is not None], dtype=np.float64)
-        if not np.isfinite(values).all():
-            raise ValueError(
-                f"{key} holds NaN or infinity; allowed: finite numbers, or None where there is none"
-            )
-        return values
-
-    def over(measure: Callable[[np.ndarray], Any], key: str) -> float | None:
-        values = column(key)
-        return float(measure(values)) if len(values) else None
+def _figures(frame: Any) -> dict[str, float | int | None]:
+    def over(measure: str, key: str, *options: float) -> float | None:
+        values = frame[key].dropna()
+        return float(getattr(values, measure)(*options)) if len(values) else None
 
     figures: dict[str, float | int | None] = {
-        "n": len(rows),
-        "snr_n": len(column("snr")),
-        "snr_median": over(np.median, "snr"),
-        "snr_worst_tenth": over(lambda v: np.percentile(v, 10), "snr"),
-        "raw_mse": over(np.mean, "raw_mse"),
-        "band_error_median": over(np.median, "band_error"),
+        "n": len(frame),
+        "snr_n": int(frame.snr.count()),
+        "snr_median": over("median", "snr"),
+        "snr_worst_tenth": over("quantile", "snr", 0.1),
+        "raw_mse": over("mean", "raw_mse"),
+        "band_error_median": over("median", "band_error"),
     }
     for name in ("stoi", "pesq"):
-        sides = ([row.get(f"{name}_{side}") for row in rows] for side in ("true", "sim"))
-        pairs = [pair for pair in zip(*sides, strict=True) if None not in pair]
-        true, simulated = ([pair[side] for pair in pairs] for side in (0, 1))
+        pairs = frame[[f"{name}_true", f"{name}_sim"]].dropna()
         figures[f"{name}_n"] = len(pairs)
-        figures |= {f"{name}_{key}": measure(true, simulated) for key, measure in _AGREEMENT.items()}
+        figures |= {f"{name}_{key}": agree(*pairs.to_numpy().T) for key, agree in _AGREEMENT.items()}
     return figures

@@ -37,9 +37,7 @@ def tones(hertz: Sequence[int], levels: Sequence[float]) -> Tensor:
 
 
 def sidebands_db(waveform: Tensor, hertz: Tensor) -> Tensor:
-    """Power of all that is further than 20 Hz from a tone, relative to what is nearer, in dB; at least -200.
-
-    Of one second in the middle, under a Hann window.
+    """Power further than 20 Hz from a tone relative to what is nearer, in dB, at least -200; of one second, Hann window.
 
     Shape: (items, 32000) and (items,) in Hz -> (items,).
     """
@@ -57,10 +55,7 @@ def steady_tones(
     """How loud the ear hears tones after each compensator, and what else the compensator adds to them.
 
     ``heard_off_db`` is the level after the exact MSBG less what a normal ear hears there of the tone itself, in the
-    middle second; ``sidebands_db`` is of the compensator's output.
-
-    Raises:
-        ValueError: a compensator gives samples that are NaN or infinite.
+    middle second; ``sidebands_db`` is of the compensator's output. ValueError as ``outputs``.
 
     Returns: for each ``{"compensator", "ear", "levels", "frequencies", "heard_off_db", "sidebands_db"}``, the last two
     (levels, frequencies).
@@ -82,14 +77,8 @@ def shift_differences(
 ) -> list[dict[str, Any]]:
     """How far the output for speech that comes later differs from the output that comes later, in dB relative to it.
 
-    Of the items' clean speech, without 0.25 s at either end (a quarter of one under 1 s); at least -200 dB. Silence
-    stands in for what a delay leaves.
-
-    Args:
-        items: by number.
-
-    Raises:
-        ValueError: a compensator gives samples that are NaN or infinite.
+    Of the clean speech of items, by number, without 0.25 s at either end (a quarter of one under 1 s); at least -200 dB.
+    Silence stands in for what a delay leaves. ValueError as ``outputs``.
 
     Returns: for each ``{"compensator", "items", "delays", "difference_db": (items, delays)}``.
     """
@@ -98,14 +87,12 @@ def shift_differences(
     for name, compensator in compensators.items():
         differences = []
         for number, item in items.items():
-            time = len(item.clean)
-            given = [functional.pad(item.clean, (delay, last - delay)) for delay in (0, *DELAYS)]
+            time, delays = len(item.clean), (0, *DELAYS)
+            given = [functional.pad(item.clean, (delay, last - delay)) for delay in delays]
             what = f"{name}, delayed speech of item {number}: the output"
-            aided = outputs(compensator, given, item.ear, what).double()
+            aided = zip(outputs(compensator, given, item.ear, what).double(), delays, strict=True)
             end = min(_END, time // 4)
-            first, *later = (
-                own[delay + end : delay + time - end] for own, delay in zip(aided, (0, *DELAYS), strict=True)
-            )
+            first, *later = (own[delay + end : delay + time - end] for own, delay in aided)
             apart = torch.stack([(own - first).square().mean() for own in later])
             differences.append(_ratio_db(apart, first.square().mean()).tolist())
         about = {"compensator": name, "items": [*items], "delays": [*DELAYS]}

@@ -13,6 +13,7 @@ import pickle
 import uuid
 import weakref
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -31,12 +32,7 @@ class ScoreStore:
     """A file of JSON lines, ``{"key": ..., ...}``, that only ever grows; the last line of a key counts.
 
     Nothing is written before the first record. A line that a kill cut short is passed over, and the next begins anew.
-
-    Args:
-        path: the file, there or not; None keeps the records in memory.
-
-    Raises:
-        ValueError: the file cannot be read.
+    ``path`` is there or not; None keeps the records in memory. ValueError where it cannot be read.
     """
 
     def __init__(self, path: str | Path | None = None) -> None:
@@ -54,23 +50,16 @@ class ScoreStore:
         return self.records.get(key)
 
     def append(self, key: str, record: Mapping[str, Any]) -> None:
-        """Keep a record, and put it on the disk before returning.
-
-        Raises:
-            ValueError: the file cannot be written, or the record is nothing that JSON can hold.
-        """
+        """Keep a record, and put it on the disk before returning; ValueError where that fails, or JSON cannot hold it."""
         line = json.dumps({"key": key, **record}, ensure_ascii=False, allow_nan=False) + "\n"
         if self.path is not None:
             try:
                 self.path.parent.mkdir(parents=True, exist_ok=True)
-                # one write of whole lines at the end: two runs may share a store
-                handle = os.open(self.path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
-                try:
+                with open(self.path, "ab", buffering=0) as file:
+                    # one write of whole lines at the end: two runs may share a store
                     data = ("\n" * self._torn + line).encode()
-                    self._torn = os.write(handle, data) < len(data)
-                    os.fsync(handle)
-                finally:
-                    os.close(handle)
+                    self._torn = file.write(data) < len(data)
+                    os.fsync(file.fileno())
             except OSError as error:
                 raise ValueError(f"{self.path}: scores cannot be stored ({error})") from error
             if self._torn:
@@ -82,21 +71,16 @@ class ScoreStore:
             with open(path, encoding="utf-8", errors="replace") as file:
                 for line in file:
                     self._torn = not line.endswith("\n")
-                    try:
+                    # what is cut short, or not ours, is scored again
+                    with suppress(ValueError, KeyError, TypeError, AttributeError):
                         record = json.loads(line)
                         self.records[record.pop("key")] = record
-                    except (ValueError, KeyError, TypeError, AttributeError):
-                        continue  # cut short, or not ours: it is scored again
         except OSError as error:
             raise ValueError(f"{path}: stored scores cannot be read ({error})") from error
 
 
 def content_hash(path: str | Path) -> str:
-    """SHA-256 of a file's contents, in hexadecimal.
-
-    Raises:
-        ValueError: the file cannot be read.
-    """
+    """SHA-256 of a file's contents, in hexadecimal; ValueError where it cannot be read."""
     try:
         return sha256(Path(path))
     except OSError as error:
@@ -132,24 +116,22 @@ def weights_hash(module: nn.Module) -> str:
 
 def setting(value: Any) -> Any:
     """What tells one value from another, the same in every process where it can be had."""
-    if isinstance(value, bool | int | float | complex | str | bytes | None):
-        return value
-    if isinstance(value, list | tuple):
-        return [setting(part) for part in value]
-    if isinstance(value, Mapping):
-        return sorted((repr(name), setting(part)) for name, part in value.items())
-    if isinstance(value, np.ndarray):
-        return (
-            value.shape,
-            str(value.dtype),
-            hashlib.sha256(np.ascontiguousarray(value).tobytes()).hexdigest(),
-        )
-    if isinstance(value, Tensor):
-        return setting(value.detach().cpu().numpy())
-    if isinstance(value, torch.dtype | torch.device):
-        return str(value)
-    if isinstance(value, weakref.ref):  # an LSTM holds some to its weights
-        return setting(value())
+    match value:
+        case bool() | int() | float() | complex() | str() | bytes() | None:
+            return value
+        case list() | tuple():
+            return [setting(part) for part in value]
+        case Mapping():
+            return sorted((repr(name), setting(part)) for name, part in value.items())
+        case np.ndarray():
+            held = np.ascontiguousarray(value).tobytes()
+            return (value.shape, str(value.dtype), hashlib.sha256(held).hexdigest())
+        case Tensor():
+            return setting(value.detach().cpu().numpy())
+        case torch.dtype() | torch.device():
+            return str(value)
+        case weakref.ref():  # an LSTM holds some to its weights
+            return setting(value())
     try:
         held = pickle.dumps(value, protocol=4).replace(*_FORMER_MODULE)
         return hashlib.sha256(held).hexdigest()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable, Iterable
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -33,10 +34,7 @@ class Score(NamedTuple):
 def snr_db(truth: Signal, estimate: Signal) -> float:
     """Power of the truth over that of the error, in dB; at most 200.
 
-    Shape: (time,) and (time,).
-
-    Raises:
-        ValueError: shapes differ or are not (time,), a sample is not finite, or the truth is silent.
+    Shape: (time,) and (time,); ValueError for others, a sample that is not finite, or a silent truth.
     """
     return -10.0 * math.log10(max(raw_mse(truth, estimate), _FLOOR))
 
@@ -82,11 +80,7 @@ def third_octave_error_db(truth: Signal, estimate: Signal, sample_rate: int) -> 
 def stoi(clean: Signal, heard: Signal, sample_rate: int) -> Score:
     """STOI (Taal 2011) by pystoi, or the reason why there is none: silence, or less than 0.4 s of speech.
 
-    Shape: (time,) and (time,).
-
-    Raises:
-        ValueError: shapes differ or are not (time,).
-        MissingExtraError: pystoi is not installed.
+    Shape: (time,) and (time,); ValueError for others. MissingExtraError without pystoi.
     """
     run = require("pystoi", "eval").stoi
     return _score(lambda a, b: run(a, b, sample_rate), clean, heard)
@@ -94,6 +88,9 @@ def stoi(clean: Signal, heard: Signal, sample_rate: int) -> Score:
 
 def pesq_wb(clean: Signal, heard: Signal, sample_rate: int) -> Score:
     """Wide-band PESQ (ITU-T P.862.2) by pesq, at 16 kHz, to which other rates are resampled; or why there is none.
+
+    The library (pesq 0.0.4) crashed on 90 s of noise in 90 bursts: score minutes of speech with two processes or more,
+    which outlive it.
 
     Shape: (time,) and (time,). Raises as ``stoi``, for pesq.
     """
@@ -106,22 +103,6 @@ def pesq_wb(clean: Signal, heard: Signal, sample_rate: int) -> Score:
     return _score(at_16k, clean, heard)
 
 
-def linear_correlation(true: Iterable[float], simulated: Iterable[float]) -> float | None:
-    """Pearson's correlation (LCC); None for fewer than two pairs or where either side does not vary."""
-    return _correlation(stats.pearsonr, true, simulated)
-
-
-def rank_correlation(true: Iterable[float], simulated: Iterable[float]) -> float | None:
-    """Spearman's correlation (SRCC), ties at their mean rank; None as ``linear_correlation``."""
-    return _correlation(stats.spearmanr, true, simulated)
-
-
-def mean_squared_error(true: Iterable[float], simulated: Iterable[float]) -> float | None:
-    """Mean squared difference of the scores; None without pairs."""
-    a, b = _values(true, simulated)
-    return float(np.mean((a - b) ** 2)) if len(a) else None
-
-
 def _correlation(
     measure: Callable[..., Any], true: Iterable[float], simulated: Iterable[float]
 ) -> float | None:
@@ -129,6 +110,19 @@ def _correlation(
     if len(a) < 2 or np.ptp(a) == 0.0 or np.ptp(b) == 0.0:
         return None
     return float(measure(a, b)[0])
+
+
+linear_correlation = partial(_correlation, stats.pearsonr)
+"""Pearson's correlation (LCC); None for fewer than two pairs or where either side does not vary."""
+
+rank_correlation = partial(_correlation, stats.spearmanr)
+"""Spearman's correlation (SRCC), ties at their mean rank; None as ``linear_correlation``."""
+
+
+def mean_squared_error(true: Iterable[float], simulated: Iterable[float]) -> float | None:
+    """Mean squared difference of the scores; None without pairs."""
+    a, b = _values(true, simulated)
+    return float(np.mean((a - b) ** 2)) if len(a) else None
 
 
 def _values(true: Iterable[float], simulated: Iterable[float]) -> tuple[np.ndarray, np.ndarray]:
@@ -141,8 +135,8 @@ def _values(true: Iterable[float], simulated: Iterable[float]) -> tuple[np.ndarr
 
 
 def _score(run: Callable[[np.ndarray, np.ndarray], float], clean: Signal, heard: Signal) -> Score:
-    a, b = _equal(clean, heard)
-    for name, signal in (("clean", a), ("heard", b)):
+    pair = _equal(clean, heard)
+    for name, signal in zip(("clean", "heard"), pair, strict=True):
         if not np.isfinite(signal).all():
             return Score(None, f"{name} holds samples that are NaN or infinite")
         if not signal.any():
@@ -151,27 +145,25 @@ def _score(run: Callable[[np.ndarray, np.ndarray], float], clean: Signal, heard:
         with warnings.catch_warnings():
             # pystoi's word, and its score is 1e-5
             warnings.filterwarnings("error", message="Not enough STFT frames")
-            value = float(run(a, b))
+            value = float(run(*pair))
     except Exception as error:  # whatever a third party's measure raises is that item's reason, no more
         text = error.args[0] if error.args else error
         return Score(None, text.decode() if isinstance(text, bytes) else str(text))
     return Score(value) if math.isfinite(value) else Score(None, f"the score is {value}")
 
 
-def _equal(first: Signal, second: Signal) -> tuple[np.ndarray, np.ndarray]:
-    a, b = (
-        (x.detach().cpu().numpy() if isinstance(x, Tensor) else np.asarray(x)).astype(np.float64)
-        for x in (first, second)
-    )
+def _equal(*signals: Signal) -> tuple[np.ndarray, ...]:
+    arrays = (x.detach().cpu().numpy() if isinstance(x, Tensor) else np.asarray(x) for x in signals)
+    a, b = (x.astype(np.float64) for x in arrays)
     if a.ndim != 1 or a.shape != b.shape or not len(a):
         raise ValueError(f"signals have shapes {a.shape} and {b.shape}; allowed: (time,) twice, equally long")
     return a, b
 
 
-def _pair(truth: Signal, estimate: Signal) -> tuple[np.ndarray, np.ndarray]:
-    true, found = _equal(truth, estimate)
-    if not (np.isfinite(true).all() and np.isfinite(found).all()):
+def _pair(truth: Signal, estimate: Signal) -> tuple[np.ndarray, ...]:
+    pair = _equal(truth, estimate)
+    if not np.isfinite(pair).all():
         raise ValueError("truth or estimate holds samples that are NaN or infinite")
-    if not true.any():
+    if not pair[0].any():
         raise ValueError("truth is silent; an error relative to it is not defined")
-    return true, found
+    return pair

@@ -21,6 +21,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from numbers import Integral
+from typing import Any
 
 import numpy as np
 from torch import Tensor
@@ -55,7 +56,6 @@ def haspi(
     Args:
         reference: clean speech, not amplified, as a normal ear would hear it.
         processed: what the impaired ear is given.
-        audiogram: of that ear.
         sample_rate: Hz, 16000 to 48000.
         full_scale_spl: level in dB SPL of a signal with RMS 1.0 (pyclarity's ``level1``).
         seed: of the noise that HASPI adds (scores vary by up to 0.003).
@@ -71,19 +71,13 @@ def haspi(
 
 
 def hasqi(
-    reference: Signal,
-    processed: Signal,
-    audiogram: Audiogram,
-    sample_rate: int,
-    *,
-    full_scale_spl: float = 94.0,
-    seed: int = 0,
+    reference: Signal, processed: Signal, audiogram: Audiogram, sample_rate: int, **options: Any
 ) -> float:
-    """HASQI v2 of one ear, 0 to 1: pyclarity's ``hasqi_v2``, whose combined score it is, with numpy's global seed set.
+    """HASQI v2 of one ear, 0 to 1: pyclarity's ``hasqi_v2``, whose combined score it is; all else as ``haspi``.
 
-    HASQI itself adds NAL-R to ``reference``. Arguments, shapes and errors as ``haspi``.
+    HASQI itself adds NAL-R to ``reference``.
     """
-    return pyclarity_score("hasqi", reference, processed, audiogram, sample_rate, full_scale_spl, seed)
+    return pyclarity_score("hasqi", reference, processed, audiogram, sample_rate, **options)
 
 
 def pyclarity_score(
@@ -92,8 +86,8 @@ def pyclarity_score(
     processed: Signal,
     audiogram: Audiogram,
     sample_rate: int,
-    full_scale_spl: float,
-    seed: int,
+    full_scale_spl: float = 94.0,
+    seed: int = 0,
 ) -> float:
     """Version 2 of pyclarity's ``haspi`` or ``hasqi``; arguments and errors as ``haspi``."""
     if not isinstance(audiogram, Audiogram):
@@ -105,8 +99,7 @@ def pyclarity_score(
     # at the eight frequencies: the same ear to both, which would log a warning of grids that lack one of their six
     ear = Audiogram(audiogram.thresholds).to_clarity()
     with numpy_seed(seed):
-        score = model(clean, sample_rate, heard, sample_rate, ear, level1=check_full_scale(full_scale_spl))[0]
-    return float(score)
+        return float(model(clean, sample_rate, heard, sample_rate, ear, level1=full_scale_spl)[0])
 
 
 def check_seed(seed: int) -> int:

@@ -22,13 +22,10 @@ def pyclarity_msbg(waveform: Tensor, audiogram: Audiogram, sample_rate: int) -> 
     """What pyclarity's ``Ear.process`` makes of a signal in pascals, as an aligned simulator would give it.
 
     The signal is resampled to 44.1 kHz and back by scipy, followed by silence, and scaled so that the reference's own
-    rescaling by active level ends at the level it had.
+    rescaling by active level ends at the level it had. One so soft, 30 dB SPL as a rule, that the reference finds no
+    active level in it is a ValueError.
 
     Shape: (time,) -> (time,), float64.
-
-    Raises:
-        ValueError: the signal is so soft, 30 dB SPL as a rule, that the reference finds no active level in it.
-        MissingExtraError: pyclarity is not installed.
     """
     msbg, utils = (require(f"clarity.evaluator.msbg.{name}", "eval") for name in ("msbg", "msbg_utils"))
     ear = msbg.Ear()  # RMS 1.0 is 120 dB SPL

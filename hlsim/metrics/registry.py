@@ -20,14 +20,10 @@ from hlsim.metrics.pyclarity import pyclarity_score
 class Measure(NamedTuple):
     """How a measure is named and computed.
 
-    Attributes:
-        title: as a table writes it.
-        module: what must be installed (extra ``eval``).
-        packages: those whose versions its scores depend on.
-        of_an_ear: whether audiogram, level and seed change the score. STOI and PESQ know none of them: they compare the
-            signal at the ear with the clean speech, and do not say what is heard.
-        rewards_gain: whether more level alone brings a higher score.
-        score: of (clean, processed, audiogram, rate in Hz, full_scale_spl, seed); raises ValueError where there is none.
+    ``module`` must be installed (extra ``eval``), and scores depend on the versions of ``packages``. Whether audiogram,
+    level and seed change the score is ``of_an_ear``: STOI and PESQ compare the signal at the ear with the clean speech,
+    and do not say what is heard. ``rewards_gain``: more level alone brings a higher score. ``score`` is of (clean,
+    processed, audiogram, rate in Hz, full_scale_spl, seed), and raises ValueError where there is none.
     """
 
     title: str
@@ -38,22 +34,14 @@ class Measure(NamedTuple):
     score: Callable[[np.ndarray, np.ndarray, Audiogram, int, float, int], float]
 
 
-def measure_stoi(
-    clean: np.ndarray, processed: np.ndarray, ear: Audiogram, rate: int, full_scale_spl: float, seed: int
+def _of_signals(
+    name: str, clean: np.ndarray, processed: np.ndarray, ear: Audiogram, rate: int, *level_and_seed: float
 ) -> float:
-    """STOI of the signal at the ear; see ``fidelity.stoi``."""
-    return _known(fidelity.stoi(clean, processed, rate))
-
-
-def measure_pesq(
-    clean: np.ndarray, processed: np.ndarray, ear: Audiogram, rate: int, full_scale_spl: float, seed: int
-) -> float:
-    """Wide-band PESQ of the signal at the ear, at 16 kHz; see ``fidelity.pesq_wb``.
-
-    The library (pesq 0.0.4) crashed on 90 s of noise in 90 bursts: score minutes of speech with two processes or more,
-    which outlive it.
-    """
-    return _known(fidelity.pesq_wb(clean, processed, rate))
+    """``stoi`` or ``pesq_wb`` of ``fidelity``, of the signal at the ear."""
+    value, reason = getattr(fidelity, name)(clean, processed, rate)
+    if value is None:
+        raise ValueError(reason)
+    return float(value)
 
 
 _CLARITY = ("pyclarity", "numpy", "scipy")
@@ -61,8 +49,12 @@ _CLARITY = ("pyclarity", "numpy", "scipy")
 MEASURES = {
     "haspi": Measure("HASPI", "clarity", _CLARITY, True, True, partial(pyclarity_score, "haspi")),
     "hasqi": Measure("HASQI", "clarity", _CLARITY, True, False, partial(pyclarity_score, "hasqi")),
-    "stoi": Measure("STOI", "pystoi", ("pystoi", "numpy", "scipy"), False, False, measure_stoi),
-    "pesq": Measure("PESQ", "pesq", ("pesq", "numpy", "torchaudio"), False, False, measure_pesq),
+    "stoi": Measure(
+        "STOI", "pystoi", ("pystoi", "numpy", "scipy"), False, False, partial(_of_signals, "stoi")
+    ),
+    "pesq": Measure(
+        "PESQ", "pesq", ("pesq", "numpy", "torchaudio"), False, False, partial(_of_signals, "pesq_wb")
+    ),
 }
 """By the names that options and files use. Higher is better in all: HASPI, HASQI and STOI end at 1, PESQ at 4.64."""
 
@@ -92,9 +84,3 @@ def version_of(package: str) -> str:
         return metadata.version(package)
     except metadata.PackageNotFoundError:
         return "not installed"
-
-
-def _known(score: fidelity.Score) -> float:
-    if score.value is None:
-        raise ValueError(score.reason)
-    return score.value

@@ -29,16 +29,11 @@ class HASPI(_Metric):
     ``self.haspi.update(aided, clean, audiogram); self.log("haspi", self.haspi)``.
 
     Args:
-        sample_rate: Hz, 16000 to 48000.
-        full_scale_spl: level in dB SPL of a signal with RMS 1.0.
+        sample_rate, full_scale_spl: as ``haspi``.
         seed: item i since the last reset takes ``seed`` + i, so that epochs can be compared.
         limit: items scored since the last reset, in each process; the others are passed over. None scores all.
         jobs: processes; None takes all cores.
         options: of ``torchmetrics.Metric``.
-
-    Raises:
-        ValueError: rate, level, seed, limit or jobs is out of range.
-        MissingExtraError: pyclarity, joblib or torchmetrics is not installed.
     """
 
     is_differentiable = False
@@ -84,16 +79,11 @@ class HASPI(_Metric):
         An item of which there is no score (silence, NaN, less than 0.7 s) is left out, counted in ``failed``, and said.
 
         Args:
-            processed: what the impaired ear is given.
-            clean: clean speech.
             audiogram: one ear for all, one an item, or (batch, 8) dB HL.
             lengths: samples of each item, where the batch is padded.
 
-        Shape: (batch, time) or (time,), the same for both; ``lengths`` (batch,).
-
-        Raises:
-            ValueError: shapes differ, or the audiograms are none, or not one or one an item; the lengths are not one an
-                item, or beyond the signals.
+        Shape: (batch, time) or (time,), the same for both; ``lengths`` (batch,). ValueError for others, for audiograms
+        that are none, or not one or one an item, and for lengths beyond the signals.
         """
         if processed.shape != clean.shape or processed.ndim not in (1, 2):
             raise ValueError(
@@ -106,8 +96,8 @@ class HASPI(_Metric):
         ears = _ears(audiogram, len(heard))
         ends = _ends(lengths, *heard.shape)
         tasks, levels = [], []
-        for i, (signal, target, ear, end) in enumerate(zip(heard, reference, ears, ends, strict=True)):
-            number = int(self.seen) + i
+        items = zip(heard, reference, ears, ends, strict=True)
+        for number, (signal, target, ear, end) in enumerate(items, start=int(self.seen)):
             if self.limit is not None and number >= self.limit:
                 break
             try:
@@ -162,15 +152,13 @@ def _ears(audiogram: AudiogramLike, batch: int) -> list[Audiogram]:
             raise ValueError(
                 f"audiogram of shape {tuple(audiogram.shape)}; allowed: (8,) or ({batch}, 8) dB HL"
             )
-        rows = torch.atleast_2d(audiogram.detach()).expand(batch, -1)
-        return [Audiogram(tuple(row.tolist())) for row in rows.double().cpu()]
+        rows = audiogram.detach().expand(batch, -1).double().tolist()
+        return [Audiogram(tuple(row)) for row in rows]
     if not isinstance(audiogram, Sequence) or not all(isinstance(ear, Audiogram) for ear in audiogram):
-        raise ValueError(
-            f"audiogram is {type(audiogram).__name__}; allowed: an Audiogram, one an item, or an (8,) or ({batch}, 8) "
-            "tensor"
-        )
+        found, tensor = type(audiogram).__name__, f"an (8,) or ({batch}, 8) tensor"
+        raise ValueError(f"audiogram is {found}; allowed: an Audiogram, one an item, or {tensor}")
     if len(audiogram) != batch:
         raise ValueError(
-            f"{len(audiogram)} audiograms of {batch} items; allowed: one Audiogram, or one an item"
+            f"{len(audiogram)} audiograms of {batch} items; allowed: one for all, or one an item"
         )
     return list(audiogram)

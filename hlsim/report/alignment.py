@@ -23,16 +23,13 @@ def draw_alignment(
     """Write a PNG of the 0.12 s about the loudest place: A as MSBG gives it, B aligned. Returns the delay in samples.
 
     What is heard is drawn raised to the input's level, for it is the time that is to be seen. The legend says how far.
+    ``method`` is ``impulse``, the paper's, or ``structural``.
 
     Shape: (time,) in pascals.
-
-    Args:
-        method: ``impulse``, the paper's, or ``structural``.
 
     Raises:
         ValueError: an unknown method, a path that does not end in .png, or a signal that is silent or shorter than
             0.12 s.
-        MissingExtraError: matplotlib is not installed.
     """
     if Path(path).suffix.lower() != ".png":
         raise ValueError(f"{path}: what is drawn is a PNG; allowed: a name that ends in .png")
@@ -42,24 +39,18 @@ def draw_alignment(
         raise ValueError(f"{signal.shape[-1]} samples to draw; allowed: {shown} or more, not all zero")
     thresholds = torch.tensor(ear.thresholds)
     impulse = Teacher(sample_rate, alignment=method)
-    before, after = (
-        teacher(signal[None], thresholds[None])[0]
-        for teacher in (Teacher(sample_rate, alignment="none"), impulse)
-    )
+    teachers = (Teacher(sample_rate, alignment="none"), impulse)
+    before, after = (teacher(signal[None], thresholds[None])[0] for teacher in teachers)
+    delay = impulse.msbg.delay(ear.severity) * sample_rate / MSBG_RATE
     if method == "impulse":
         delay = float(impulse.delay(thresholds))
-    else:
-        delay = impulse.msbg.delay(ear.severity) * sample_rate / MSBG_RATE
     first = min(max(0, int(signal.abs().argmax()) - shown // 2), signal.shape[-1] - shown)
     times = torch.arange(first, first + shown) / sample_rate
 
     figure = new_figure((9.0, 5.0))
-    for axes, heard, title in zip(
-        figure.subplots(2, 1, sharex=True),
-        (before, after),
-        (f"A. MSBG as it is, {1000.0 * delay / sample_rate:.1f} ms late", f"B. aligned, {method} method"),
-        strict=True,
-    ):
+    titles = (f"A. MSBG as it is, {1000.0 * delay / sample_rate:.1f} ms late", f"B. aligned, {method} method")
+    panels = figure.subplots(2, 1, sharex=True)
+    for axes, heard, title in zip(panels, (before, after), titles, strict=True):
         gain, label = _raised(signal, heard)
         axes.plot(times, signal[first : first + shown], color="tab:blue", label="input")
         axes.plot(times, gain * heard[first : first + shown], color="tab:red", label=label, alpha=0.8)

@@ -11,13 +11,14 @@ from typing import Any
 import numpy as np
 
 from hlsim.audiogram import FREQUENCIES
+from hlsim.evaluation.comparison import Comparison
 from hlsim.evaluation.compensator_result import HARD
 from hlsim.evaluation.gain_curves import UTTERANCES
 from hlsim.evaluation.haspi_report import GAIN_NOTE, HaspiReport
 from hlsim.evaluation.steadiness import DELAYS
 from hlsim.report.page import Picture, Section, render_markdown, render_page, write_files
 from hlsim.report.pictures import draw_svg, frequency_axis, plain, report_pictures
-from hlsim.report.tables import Table, change_name, number, paired_cells, spread
+from hlsim.report.tables import Table, cells, change_name, number, paired_cells, spread
 
 FILES = ("compensators.json", "compensators.md", "compensators.html")
 
@@ -29,16 +30,11 @@ GROUPS = {
 
 Result = Mapping[str, Any]
 
-_cells = partial(paired_cells, digits=2)
+_paired = partial(paired_cells, digits=2)
 
 
 def write_compensators(result: Result, reports: Mapping[str, HaspiReport], out: str | Path) -> None:
-    """Write what ``evaluate_compensators`` returns into a folder, each file whole or not at all.
-
-    Raises:
-        ValueError: a file cannot be written.
-        MissingExtraError: matplotlib is not installed.
-    """
+    """Write what ``evaluate_compensators`` returns into a folder, each file whole or not at all, or ValueError."""
     page = ("Compensators", _sections(result, reports), _lead(result))
     text = json.dumps(result, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
     contents = (text, render_markdown(*page), render_page(*page))
@@ -63,32 +59,28 @@ def _sections(result: Result, reports: Mapping[str, HaspiReport]) -> list[Sectio
         Section(
             GROUPS[group],
             [GAIN_NOTE] if group == "clean" else [],
-            [main_table(result, group), tests_table(report)],
+            [_main_table(result, group), _tests_table(report)],
         )
         for group, report in reports.items()
     ]
-    by_severity = [severity_table(result, group) for group in whole]
-    by_severity += [severity_tests(reports[group], group) for group in whole]
+    loudness = [_loudness_table(result, group) for group in whole]
+    by_severity = [_severity_table(result, group) for group in whole]
+    by_severity += [_severity_tests(reports[group], group) for group in whole]
     shifts = _SHIFTS.format(len(result["shifts"][0]["items"]), " or ".join(map(str, DELAYS)))
     curves = result["gain_curves"]
-    ears = dict.fromkeys(curve["ear"] for curve in curves)
+    gains = [_gain_picture(ear, curves) for ear in dict.fromkeys(curve["ear"] for curve in curves)]
     sections += [
-        Section(
-            "As loud as a normal ear hears it?",
-            [_LOUDNESS],
-            [loudness_table(result, group) for group in whole],
-        ),
+        Section("As loud as a normal ear hears it?", [_LOUDNESS], loudness),
         Section("By degree of loss", [_HASQI], by_severity),
-        Section("The surrogate gap", [_GAP.format(**result)], [gap_table(result)]),
-        Section("Does any output pass the limit?", (), [peak_table(result)]),
-        Section("Gain curves", [_GAINS], [gain_table(curves)], [_gain_picture(ear, curves) for ear in ears]),
+        Section("The surrogate gap", [_GAP.format(**result)], [_gap_table(result)]),
+        Section("Does any output pass the limit?", (), [_peak_table(result)]),
+        Section("Gain curves", [_GAINS], [_gain_table(curves)], gains),
         Section("Steady tones", [_STEADY], [tone_table(result["steady_tones"])]),
         Section("Does it matter where frames fall?", [shifts], [shift_table(result["shifts"])]),
     ]
-    sections += [
-        Section(f"Pictures: {GROUPS[group].lower()}", pictures=report_pictures(reports[group]))
-        for group in whole
-    ]
+    for group in whole:
+        title = f"Pictures: {GROUPS[group].lower()}"
+        sections.append(Section(title, pictures=report_pictures(reports[group])))
     if result["failures"]:
         rows = [(str(f["item"]), f["compensator"], f["name"], f["reason"]) for f in result["failures"]]
         table = Table("Outputs that could not be judged", ("Item", "Compensator", "Ear", "Reason"), rows)
@@ -133,112 +125,106 @@ _NOTES = (
 )
 
 
-def main_table(result: Result, group: str) -> Table:
-    """A row a condition: scores, levels, and how far what is heard lies from what a normal ear hears."""
-    rows = [
-        {
-            "What the ear is given": name,
-            **_scores(row),
-            "Level (dB SPL)": f"{row['level_mean']:.1f}",
-            "Highest peak (dB SPL)": f"{row['peak_max']:.1f}",
-            "Heard, against normal (dB)": f"{row['heard_off']:+.1f}",
-            "the same, mean absolute": f"{row['heard_off_abs']:.1f}",
-            "Bands, against normal (dB)": f"{row['band_error_mean']:.1f}",
-        }
-        for name, row in result["groups"][group]["conditions"].items()
-    ]
+_MAIN = {
+    "Level (dB SPL)": ("level_mean", ".1f"),
+    "Highest peak (dB SPL)": ("peak_max", ".1f"),
+    "Heard, against normal (dB)": ("heard_off", "+.1f"),
+    "the same, mean absolute": ("heard_off_abs", ".1f"),
+    "Bands, against normal (dB)": ("band_error_mean", ".1f"),
+}
+_BY_SEVERITY = {
+    "HASPI over unaided": ("haspi_mean", "+.3f"),
+    "HASQI over unaided": ("hasqi_mean", "+.3f"),
+    "Heard, mean absolute (dB)": ("heard_off_abs", ".1f"),
+    "Bands (dB)": ("band_error_mean", ".1f"),
+}
+_LOSSES = {
+    "Neuro-MSBG": ("loss_neuro", ".2f"),
+    "exact MSBG": ("loss_msbg", ".2f"),
+    "pyclarity": ("loss_pyclarity", ".2f"),
+}
+_GAPS = {
+    "Neuro to exact": ("neuro_to_msbg", "+.1%"),
+    "Neuro to pyclarity": ("neuro_to_pyclarity", "+.1%"),
+    "exact to pyclarity": ("msbg_to_pyclarity", "+.1%"),
+    "Neuro to pyclarity, median item": ("item_median", ".1%"),
+}
+_GIVEN = "What the ear is given"
+
+
+def _main_table(result: Result, group: str) -> Table:
+    """Scores, levels, and how far what is heard lies from what a normal ear hears."""
+    conditions = result["groups"][group]["conditions"].items()
+    rows = [{_GIVEN: name, **_scores(row), **cells(row, _MAIN)} for name, row in conditions]
     return Table.of(f"{GROUPS[group]}: scores, output and what is heard", rows)
 
 
-def tests_table(report: HaspiReport) -> Table:
+def _tests_table(report: HaspiReport) -> Table:
     """Each compensator against no aid and the prescription, and the latter against the former."""
-    rows = [
-        {
-            "Change": change_name(c),
-            "n": str(c.overall.n),
-            **_cells(c.overall, c.p_t_holm, c.p_w_holm),
-            "t over means of ears": "n/a" if c.listeners is None else _cells(c.listeners)["t-test (paired)"],
-        }
-        for c in report.comparisons
-        if c.before in report.conditions[:2]
-    ]
+    rows = []
+    for c in _against_both(report):
+        means = "n/a" if c.listeners is None else _paired(c.listeners)["t-test (paired)"]
+        paired = _paired(c.overall, c.p_t_holm, c.p_w_holm)
+        about = {"Change": change_name(c), "n": str(c.overall.n)}
+        rows.append({**about, **paired, "t over means of ears": means})
     return Table.of("Paired tests, p adjusted by Holm within each measure", rows)
 
 
-def severity_tests(report: HaspiReport, group: str) -> Table:
-    """The same by degree of loss."""
+def _severity_tests(report: HaspiReport, group: str) -> Table:
     rows = [
-        {"Change": f"{severity}, {change_name(c)}", "n": str(row.n), **_cells(row)}
-        for c in report.comparisons
-        if c.before in report.conditions[:2]
+        {"Change": f"{severity}, {change_name(c)}", "n": str(row.n), **_paired(row)}
+        for c in _against_both(report)
         for severity, row in c.by_severity.items()
     ]
     return Table.of(f"{GROUPS[group]}: paired tests by degree of loss, p not adjusted", rows)
 
 
-def loudness_table(result: Result, group: str) -> Table:
+def _against_both(report: HaspiReport) -> list[Comparison]:
+    return [c for c in report.comparisons if c.before in report.conditions[:2]]
+
+
+def _loudness_table(result: Result, group: str) -> Table:
     """Level as heard against the normal ear's, a column an input level."""
     rows = []
     for name, row in result["groups"][group]["conditions"].items():
         against = {name: "heard_off"}
         if group == "noisy":
             against[f"{name}, against the speech in it"] = "heard_off_clean"
-        rows += [
-            {
-                "What the ear is given": title,
-                **{
-                    f"Speech at {level} dB SPL": f"{cell[f'{key}_abs']:.1f} ({cell[key]:+.1f})"
-                    for level, cell in row["by_level"].items()
-                },
+        for title, key in against.items():
+            offs = {
+                f"Speech at {level} dB SPL": f"{cell[f'{key}_abs']:.1f} ({cell[key]:+.1f})"
+                for level, cell in row["by_level"].items()
             }
-            for title, key in against.items()
-        ]
+            rows.append({_GIVEN: title, **offs})
     return Table.of(f"{GROUPS[group]}: mean absolute difference in dB (mean difference)", rows)
 
 
-def severity_table(result: Result, group: str) -> Table:
-    """A row a degree of loss and condition."""
+def _severity_table(result: Result, group: str) -> Table:
     conditions = result["groups"][group]["conditions"]
     first = next(iter(conditions.values()))["by_severity"]
-    rows = [
-        {
-            "Degree of loss": f"{severity}, {name}",
-            **_scores(row),
-            "HASPI over unaided": f"{row['haspi_mean'] - unaided['haspi_mean']:+.3f}",
-            "HASQI over unaided": f"{row['hasqi_mean'] - unaided['hasqi_mean']:+.3f}",
-            "Heard, mean absolute (dB)": f"{row['heard_off_abs']:.1f}",
-            "Bands (dB)": f"{row['band_error_mean']:.1f}",
-        }
-        for severity, unaided in first.items()
-        for name, condition in conditions.items()
-        for row in [condition["by_severity"][severity]]
-    ]
+    rows = []
+    for severity, unaided in first.items():
+        for name, condition in conditions.items():
+            row = condition["by_severity"][severity]
+            over = {key: row[key] - unaided[key] for key in ("haspi_mean", "hasqi_mean")}
+            title = {"Degree of loss": f"{severity}, {name}"}
+            rows.append({**title, **_scores(row), **cells({**row, **over}, _BY_SEVERITY)})
     return Table.of(f"{GROUPS[group]}, by degree of loss", rows)
 
 
-def gap_table(result: Result) -> Table:
-    """The loss under the three simulators."""
-    titles = {"neuro": "Neuro-MSBG", "msbg": "exact MSBG", "pyclarity": "pyclarity"}
-    rows = [
-        {
-            "What the ear is given": f"{group}, {name}",
-            **{title: f"{row[f'loss_{simulator}']:.2f}" for simulator, title in titles.items()},
-            "Neuro to exact": _share(row["neuro_to_msbg"], "+.1%"),
-            "Neuro to pyclarity": _share(row["neuro_to_pyclarity"], "+.1%"),
-            "exact to pyclarity": _share(row["msbg_to_pyclarity"], "+.1%"),
-            "Neuro to pyclarity, median item": _share(row["item_median"], ".1%"),
-        }
-        for group, conditions in result["gap"].items()
-        for name, row in conditions.items()
-    ]
+def _gap_table(result: Result) -> Table:
+    rows = []
+    for group, conditions in result["gap"].items():
+        for name, row in conditions.items():
+            gaps = {title: cell.replace("%", " %") for title, cell in cells(row, _GAPS).items()}
+            rows.append({_GIVEN: f"{group}, {name}", **cells(row, _LOSSES), **gaps})
     return Table.of("Mean loss in dB on the same utterances, and relative differences", rows)
 
 
-def peak_table(result: Result) -> Table:
-    """Highest peaks, and outputs beyond the limit."""
+def _peak_table(result: Result) -> Table:
     rows = [
         {
-            "What the ear is given": name,
+            _GIVEN: name,
             "Limit (dB SPL)": number(row["limit"], "g", "none"),
             "Highest peak (dB SPL)": f"{row['highest']:.2f}",
             "Outputs beyond": "n/a" if row["over"] is None else f"{row['over']} of {row['n']}",
@@ -248,35 +234,29 @@ def peak_table(result: Result) -> Table:
     return Table.of("Peaks of all outputs, a sample of 1.0 being 94 dB SPL", rows)
 
 
-def gain_table(curves: Sequence[Result]) -> Table:
-    """A row an ear, compensator and level; gains between the bands' centres go linearly over log frequency."""
+def _gain_table(curves: Sequence[Result]) -> Table:
+    """Gains between the bands' centres go linearly over log frequency."""
     shown = FREQUENCIES[:-1]  # 8 kHz is beyond the bands
     rows = [
-        (
-            f"{curve['ear']}, {curve['compensator']}, {level:g} dB SPL",
-            *(f"{gain:+.1f}" for gain in _gains_at(shown, curve, gains)),
-        )
+        [_tone_name(curve, level), *(f"{gain:+.1f}" for gain in _gains_at(shown, curve, gains))]
         for curve in curves
         for level, gains in zip(curve["levels"], curve["gain_db"], strict=True)
     ]
-    return Table("Insertion gain in dB", ("Ear, compensator, input", *(f"{hz:g} Hz" for hz in shown)), rows)
+    return Table("Insertion gain in dB", (_TONE, *(f"{hz:g} Hz" for hz in shown)), rows)
 
 
 def tone_table(found: Sequence[Result]) -> Table:
     """A row an ear, compensator and level, with the worst sidebands of the row."""
     rows = []
     for row in found:
+        hertz = row["frequencies"]
         for level, offs, sidebands in zip(
             row["levels"], row["heard_off_db"], row["sidebands_db"], strict=True
         ):
             worst = int(np.argmax(sidebands))
-            rows.append(
-                {
-                    "Ear, compensator, input": f"{row['ear']}, {row['compensator']}, {level:g} dB SPL",
-                    **{f"{hz} Hz": f"{off:+.1f}" for hz, off in zip(row["frequencies"], offs, strict=True)},
-                    "Worst sidebands (of the tone)": f"{round(sidebands[worst])} ({row['frequencies'][worst]} Hz)",
-                }
-            )
+            heard = {f"{hz} Hz": f"{off:+.1f}" for hz, off in zip(hertz, offs, strict=True)}
+            sides = {"Worst sidebands (of the tone)": f"{round(sidebands[worst])} ({hertz[worst]} Hz)"}
+            rows.append({_TONE: _tone_name(row, level), **heard, **sides})
     return Table.of(
         "Level heard less a normal ear's of the same tone, and sidebands of the output, in dB", rows
     )
@@ -284,16 +264,19 @@ def tone_table(found: Sequence[Result]) -> Table:
 
 def shift_table(found: Sequence[Result]) -> Table:
     """A row a compensator."""
-    rows = [
-        {
-            "What the ear is given": row["compensator"],
-            "n": str(np.size(row["difference_db"])),
-            "Median": f"{np.median(row['difference_db']):.0f}",
-            "Worst": f"{np.max(row['difference_db']):.0f}",
-        }
-        for row in found
-    ]
+    rows = []
+    for row in found:
+        off = np.array(row["difference_db"])
+        figures = {"n": str(off.size), "Median": f"{np.median(off):.0f}", "Worst": f"{off.max():.0f}"}
+        rows.append({_GIVEN: row["compensator"], **figures})
     return Table.of("Difference of the outputs relative to the output, in dB", rows)
+
+
+_TONE = "Ear, compensator, input"
+
+
+def _tone_name(row: Result, level: float) -> str:
+    return f"{row['ear']}, {row['compensator']}, {level:g} dB SPL"
 
 
 def _gain_picture(ear: str, curves: Sequence[Result]) -> Picture:
@@ -310,18 +293,11 @@ def _gain_picture(ear: str, curves: Sequence[Result]) -> Picture:
         frequency_axis(axes, (250, 500, 1000, 2000, 4000))
         axes.legend(fontsize="x-small")
 
-    at_2k = [
-        f"{curve['compensator']} "
-        + ", ".join(f"{_gains_at(2000.0, curve, row):.0f}" for row in curve["gain_db"])
-        for curve in curves
-    ]
+    gains = [[f"{_gains_at(2000.0, curve, row):.0f}" for row in curve["gain_db"]] for curve in curves]
+    at_2k = [f"{curve['compensator']} {', '.join(own)}" for curve, own in zip(curves, gains, strict=True)]
     levels = ", ".join(f"{level:g}" for level in curves[0]["levels"])
     alt = f"Insertion gain for {ear} over frequency; at 2 kHz and {levels} dB SPL: {'; '.join(at_2k)} dB."
     return Picture(draw_svg(draw), alt, f"{ear}; the legend tells the input level in dB SPL.")
-
-
-def _share(value: float | None, form: str) -> str:
-    return number(value, form).replace("%", " %")
 
 
 def _gains_at(hertz: Any, curve: Result, gains: Sequence[float]) -> Any:

@@ -18,14 +18,10 @@ REPORT_FILES = ("report.json", "report.md", "report.tex", "report.html", "before
 
 
 def write_report(report: HaspiReport, out_dir: str | Path, *, listen: int = 3) -> Path:
-    """Write ``report.json``, ``.md``, ``.tex``, ``.html`` and ``before-after.png`` into a folder, there or not.
+    """Write ``report.json``, ``.md``, ``.tex``, ``.html`` and ``before-after.png`` into a folder; returns it.
 
-    Reports of an earlier run are replaced, other files stay.
-
-    Args:
-        listen: how many items the page shows with spectrograms and players, where their files are known.
-
-    Returns: the folder.
+    Reports of an earlier run are replaced, other files stay. ``listen`` items have spectrograms and players on the page,
+    where their files are known.
 
     Raises:
         ValueError: the path is no folder or cannot be written, or an extra value is nothing that JSON can hold, such
@@ -47,14 +43,7 @@ def markdown(report: HaspiReport) -> str:
 
 
 def html(report: HaspiReport, listen: int = 3) -> str:
-    """What ``report.html`` says.
-
-    Args:
-        listen: how many items have spectrograms and players, where their files are known.
-
-    Raises:
-        MissingExtraError: matplotlib is not installed.
-    """
+    """What ``report.html`` says, with spectrograms and players of ``listen`` items, where their files are known."""
     sections = _sections(report, report_pictures(report), listening_section(report, listen))
     return render_page(_title(report), sections, _lead(report))
 
@@ -99,25 +88,23 @@ def _sections(
 
 
 def _further(report: HaspiReport) -> list[Table]:
-    tables = [listener_table(report.headline)]
-    if len(report.comparisons) > 1:
-        tables.append(comparisons_table(report.comparisons))
-    return [table for table in tables if table is not None]
+    listeners = listener_table(report.headline)
+    tables = [] if listeners is None else [listeners]
+    return [*tables, comparisons_table(report.comparisons)] if len(report.comparisons) > 1 else tables
 
 
 def _items(report: HaspiReport) -> Table:
-    header = ["Item", "Loss", "Clean (dB SPL)", "Full scale (dB SPL)"]
-    for condition in report.conditions:
-        header += [f"{MEASURES[measure].title}, {condition}" for measure in report.measures]
-        header.append(f"dB SPL, {condition}")
+    titles = [MEASURES[name].title for name in report.measures]
     rows = []
     for item in report.items:
-        row = [item.file, item.severity, f"{item.clean_level:.1f}", f"{item.full_scale_spl:.1f}"]
+        row = {"Item": item.file, "Loss": item.severity, "Clean (dB SPL)": f"{item.clean_level:.1f}"}
+        row["Full scale (dB SPL)"] = f"{item.full_scale_spl:.1f}"
         for condition in report.conditions:
-            row += [number(item.scores.get(name, {}).get(condition), ".3f") for name in report.measures]
-            row.append(number(item.levels[condition], ".1f"))
+            for name, title in zip(report.measures, titles, strict=True):
+                row[f"{title}, {condition}"] = number(item.scores.get(name, {}).get(condition), ".3f")
+            row[f"dB SPL, {condition}"] = number(item.levels[condition], ".1f")
         rows.append(row)
-    return Table("Scores and levels of every item", header, rows)
+    return Table.of("Scores and levels of every item", rows)
 
 
 def _notes(report: HaspiReport) -> list[str]:

@@ -38,14 +38,10 @@ def choose_items(report: HaspiReport, count: int) -> list[tuple[str, ItemScore]]
 
 
 def heard(item: ItemScore) -> tuple[dict[str, Tensor], int]:
-    """The clean speech and what the ear hears of each condition, in pascals, and the rate in Hz.
+    """The clean speech and what the ear hears of each condition, in pascals, and the rate in Hz. Shape: (time,) each.
 
-    The exact MSBG of the item's audiogram, aligned. At most the first 8 s.
-
-    Shape: (time,) each.
-
-    Raises:
-        ValueError: a file cannot be read, or a threshold is above the 100 dB HL that MSBG takes.
+    By the exact MSBG of the item's audiogram, aligned; at most the first 8 s. ValueError where a file cannot be read, or
+    a threshold is above the 100 dB HL that MSBG takes.
     """
     if item.clean is None:
         raise ValueError(f"{item.file}: its files are not known")
@@ -70,17 +66,12 @@ def listening_section(report: HaspiReport, count: int) -> Section | None:
             sections.append(_item_section(title, item))
         except ValueError as error:
             sections.append(Section(title, [f"Not to be heard here: {error}"]))
-    if not sections:
-        return None
-    return Section(
-        "Listen",
-        paragraphs=[
-            "What the impaired ear hears, by MSBG, beside the clean speech. Within an item all players have one gain, so "
-            "that what is softer in that ear is softer here; set the volume by the original. "
-            f"Items longer than {LONGEST_SECONDS:g} s are cut."
-        ],
-        sections=sections,
+    text = (
+        "What the impaired ear hears, by MSBG, beside the clean speech. Within an item all players have one gain, so "
+        "that what is softer in that ear is softer here; set the volume by the original. "
+        f"Items longer than {LONGEST_SECONDS:g} s are cut."
     )
+    return Section("Listen", [text], sections=sections) if sections else None
 
 
 def _item_section(title: str, item: ItemScore) -> Section:
@@ -98,6 +89,5 @@ def _item_section(title: str, item: ItemScore) -> Section:
     thresholds = ", ".join(f"{level:g}" for level in item.audiogram.levels)
     text = f"{item.severity} loss, thresholds {thresholds} dB HL. Levels in dB SPL: {told}."
     alt = f"Spectrograms of {item.file}: {', '.join(signals)}"
-    return Section(
-        title, [text], pictures=[Picture(draw_spectrograms(signals, rate, width=5.0), alt)], players=players
-    )
+    picture = Picture(draw_spectrograms(signals, rate, width=5.0), alt)
+    return Section(title, [text], pictures=[picture], players=players)

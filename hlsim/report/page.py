@@ -29,11 +29,6 @@ class Picture:
     alt: str
     caption: str = ""
 
-    @property
-    def uri(self) -> str:
-        """Of the contents."""
-        return _uri("image/png" if self.data.startswith(b"\x89PNG") else "image/svg+xml", self.data)
-
 
 @dataclass(frozen=True)
 class Player:
@@ -41,11 +36,6 @@ class Player:
 
     data: bytes
     label: str
-
-    @property
-    def uri(self) -> str:
-        """Of the contents."""
-        return _uri("audio/flac" if self.data.startswith(b"fLaC") else "audio/wav", self.data)
 
 
 @dataclass(frozen=True)
@@ -81,12 +71,9 @@ def render_markdown(title: str, sections: Sequence[Section], lead: str = "") -> 
 
 
 def write_files(out: str | Path, contents: Mapping[str, str | bytes]) -> Path:
-    """Write files into a folder, there or not, by name; others in it stay. Returns the folder.
+    """Write files into a folder, there or not, by name; others in it stay. Returns the folder; ValueError if it cannot.
 
     All are written under hidden names in it before the first takes its name.
-
-    Raises:
-        ValueError: the path is no folder or cannot be written.
     """
     folder = check_out(out)
     there = folder.exists()
@@ -118,8 +105,12 @@ def check_out(out: str | Path) -> Path:
 def _template() -> Any:
     jinja2 = require("jinja2", "eval")
     source = Path(__file__).with_name("page.html").read_text(encoding="utf-8")
-    return jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined).from_string(source)
+    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
+    return environment.from_string(source, {"uri": _uri})
 
 
-def _uri(kind: str, data: bytes) -> str:
+def _uri(data: bytes) -> str:
+    """Of a file's contents, whose kind its first bytes tell."""
+    kinds = {b"\x89PNG": "image/png", b"fLaC": "audio/flac", b"RIFF": "audio/wav"}
+    kind = kinds.get(data[:4], "image/svg+xml")
     return f"data:{kind};base64,{base64.b64encode(data).decode('ascii')}"

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -120,21 +121,23 @@ def score_range(measure: str) -> tuple[float, float]:
 
 def report_pictures(report: HaspiReport) -> list[Picture]:
     """Before against after, change of level, distributions, by severity, by SNR (where there are any), the audiograms."""
-    pictures = [_before_after(report), _levels(report), _distributions(report), _by_severity(report)]
-    if any(item.snr is not None for item in report.items):
-        pictures.append(_by_snr(report))
-    return [*pictures, _audiograms(report)]
+    kinds = [_before_after, _levels, _distributions, _by_severity, _by_snr, _audiograms]
+    if all(item.snr is None for item in report.items):
+        kinds.remove(_by_snr)
+    return [Picture(draw_svg(draw), alt, caption) for draw, alt, caption in (kind(report) for kind in kinds)]
 
 
-def _before_after(report: HaspiReport) -> Picture:
+# what each draws on its axes, its words where it is not seen, and its caption
+_Drawn = tuple[Callable[[Any], None], str, str]
+
+
+def _before_after(report: HaspiReport) -> _Drawn:
     c = report.headline
     scores = report.scores(c.measure, (c.before, c.after))
-    data = draw_svg(lambda axes: _draw_ends(axes, report, scores, score_range(c.measure), c.title))
-    alt = (
-        f"{c.title} {c.after} over {c.title} {c.before}, {c.overall.n} items: mean {c.overall.before_mean:.3f} to "
-        f"{c.overall.after_mean:.3f}."
-    )
-    return Picture(data, alt, "Each point is an item; above the dashed line the score rose.")
+    means = f"mean {c.overall.before_mean:.3f} to {c.overall.after_mean:.3f}"
+    alt = f"{c.title} {c.after} over {c.title} {c.before}, {c.overall.n} items: {means}."
+    draw = partial(_draw_ends, report=report, values=scores, limits=score_range(c.measure), what=c.title)
+    return draw, alt, "Each point is an item; above the dashed line the score rose."
 
 
 def _draw_ends(
@@ -143,12 +146,11 @@ def _draw_ends(
     """The headline's conditions, after over before. Shape: (items, 2)."""
     scatter(axes, values[:, 0], values[:, 1], report.severities)
     axes.set(xlim=limits, ylim=limits, aspect="equal")
-    axes.set(
-        xlabel=plain(f"{what}, {report.headline.before}"), ylabel=plain(f"{what}, {report.headline.after}")
-    )
+    before, after = (plain(f"{what}, {name}") for name in (report.headline.before, report.headline.after))
+    axes.set(xlabel=before, ylabel=after)
 
 
-def _levels(report: HaspiReport) -> Picture:
+def _levels(report: HaspiReport) -> _Drawn:
     c, ends = report.headline, (report.headline.before, report.headline.after)
     x, y = (np.diff(values)[:, 0] for values in (report.levels(ends), report.scores(c.measure, ends)))
     there = np.isfinite(x + y)
@@ -161,12 +163,10 @@ def _levels(report: HaspiReport) -> Picture:
         axes.set(xlabel="change of level (dB)", ylabel=f"change of {c.title}")
 
     alt = f"Change of {c.title} over the change of level; the level changed by {x.min():+.1f} to {x.max():+.1f} dB."
-    return Picture(
-        draw_svg(draw), alt, "What gain may explain: the change of the score over that of the level."
-    )
+    return draw, alt, "What gain may explain: the change of the score over that of the level."
 
 
-def _distributions(report: HaspiReport) -> Picture:
+def _distributions(report: HaspiReport) -> _Drawn:
     measure, title = report.measures[0], report.headline.title
     values = [_known(column) for column in report.scores(measure).T]
     labels = [plain(name if len(name) < 13 else name[:11] + "…") for name in report.conditions]
@@ -181,95 +181,81 @@ def _distributions(report: HaspiReport) -> Picture:
         axes.set_xticks(list(places), labels)
         axes.set(ylim=score_range(measure), ylabel=title)
 
-    medians = ", ".join(
-        f"{name} {np.median(group):.3f}"
-        for name, group in zip(report.conditions, values, strict=True)
-        if len(group)
-    )
-    alt = f"{title} by condition; medians: {medians}."
-    return Picture(draw_svg(draw), alt, "Quartiles, median and every item.")
+    named = zip(report.conditions, values, strict=True)
+    medians = ", ".join(f"{name} {np.median(group):.3f}" for name, group in named if len(group))
+    return draw, f"{title} by condition; medians: {medians}.", "Quartiles, median and every item."
 
 
-def _by_severity(report: HaspiReport) -> Picture:
-    title = f"mean {report.headline.title}"
-    groups = _groups(report, report.severities, [name for name in SEVERITIES if name in report.severities])
+def _by_severity(report: HaspiReport) -> _Drawn:
+    names = [name for name in SEVERITIES if name in report.severities]
+    groups, alt = _groups(report, report.severities, names, "degree of loss")
 
     def draw(axes: Any) -> None:
         width = 0.8 / len(report.conditions)
         for k, condition in enumerate(report.conditions):
             at = np.arange(len(groups)) + (k - (len(report.conditions) - 1) / 2) * width
-            scores = [_known(group[:, k]) for group in groups.values()]
+            scores = [group[k] for group in groups.values()]
             axes.bar(at, [_mean(group) for group in scores], width * 0.9, label=plain(condition))
             for place, group in zip(at, scores, strict=True):
                 if len(group) >= FEWEST:
                     axes.plot((place, place), bootstrap_interval(group), color="black", linewidth=1.0)
-        axes.set_xticks(range(len(groups)), [f"{name} ({len(group)})" for name, group in groups.items()])
-        axes.set(ylim=(0.0, score_range(report.measures[0])[1]), ylabel=title, xlabel="loss (items)")
+        counts = [f"{name} ({report.severities.count(name)})" for name in groups]
+        axes.set_xticks(range(len(groups)), counts)
+        axes.set(ylim=(0.0, score_range(report.measures[0])[1]), xlabel="loss (items)")
+        axes.set(ylabel=f"mean {report.headline.title}")
         axes.legend(fontsize="small")
 
     caption = (
         "By degree of loss, of the items that have each score, with 95 % bootstrap intervals of the means from "
         f"{FEWEST} items on."
     )
-    alt = f"Mean {report.headline.title} by degree of loss: {_in_words(report, groups)}."
-    return Picture(draw_svg(draw), alt, caption)
+    return draw, alt, caption
 
 
-def _by_snr(report: HaspiReport) -> Picture:
-    title, of_items = f"mean {report.headline.title}", [item.snr for item in report.items]
-    snrs = sorted({snr for snr in of_items if snr is not None})
-    groups = _groups(report, of_items, snrs)
+def _by_snr(report: HaspiReport) -> _Drawn:
+    snrs = [item.snr for item in report.items]
+    groups, alt = _groups(report, snrs, sorted({snr for snr in snrs if snr is not None}), "SNR", " dB")
 
     def draw(axes: Any) -> None:
         for k, condition in enumerate(report.conditions):
-            axes.plot(
-                snrs,
-                [_mean(_known(group[:, k])) for group in groups.values()],
-                marker="o",
-                label=plain(condition),
-            )
-        axes.set(xlabel="SNR (dB)", ylabel=title, ylim=score_range(report.measures[0]))
+            means = [_mean(group[k]) for group in groups.values()]
+            axes.plot([*groups], means, marker="o", label=plain(condition))
+        axes.set(xlabel="SNR (dB)", ylabel=f"mean {report.headline.title}")
+        axes.set(ylim=score_range(report.measures[0]))
         axes.legend(fontsize="small")
 
-    told = _in_words(report, {f"{snr:g} dB": group for snr, group in groups.items()})
-    alt = f"Mean {report.headline.title} by SNR: {told}."
-    return Picture(draw_svg(draw), alt, "By SNR, of the items that have each score.")
+    return draw, alt, "By SNR, of the items that have each score."
 
 
-def _audiograms(report: HaspiReport) -> Picture:
+def _audiograms(report: HaspiReport) -> _Drawn:
     ears = list(dict.fromkeys(item.audiogram for item in report.items))
 
     def draw(axes: Any) -> None:
         for ear in ears:
             axes.plot(ear.frequencies, ear.levels, color="C0", alpha=max(0.15, 1.0 / len(ears)), marker=".")
         if len(ears) > 1:
-            axes.plot(
-                FREQUENCIES, np.mean([ear.thresholds for ear in ears], axis=0), color="black", label="mean"
-            )
+            mean = np.mean([ear.thresholds for ear in ears], axis=0)
+            axes.plot(FREQUENCIES, mean, color="black", label="mean")
             axes.legend(fontsize="small")
         axes.set(ylim=(125.0, -15.0), ylabel="threshold (dB HL)")
         frequency_axis(axes, (250, 500, 1000, 2000, 4000, 8000))
 
-    return Picture(
-        draw_svg(draw), f"Audiograms of {len(ears)} ears.", f"Audiograms: {len(ears)} different ears."
-    )
+    return draw, f"Audiograms of {len(ears)} ears.", f"Audiograms: {len(ears)} different ears."
 
 
-def _groups(report: HaspiReport, of_items: Sequence[Any], names: Sequence[Any]) -> dict[Any, np.ndarray]:
-    """Scores of the first measure by what the items are. Shape: (items, conditions) each."""
+def _groups(
+    report: HaspiReport, of_items: Sequence[Any], names: Sequence[Any], by: str, unit: str = ""
+) -> tuple[dict[Any, list[np.ndarray]], str]:
+    """Known scores of the first measure by what the items are, a list of conditions each, and their means in words."""
     scores = report.scores(report.measures[0])
-    return {name: scores[[group == name for group in of_items]] for name in names}
-
-
-def _in_words(report: HaspiReport, groups: Mapping[str, np.ndarray]) -> str:
-    """Each condition's mean of each group."""
+    chosen = {name: scores[[group == name for group in of_items]] for name in names}
+    groups = {name: [_known(column) for column in group.T] for name, group in chosen.items()}
     told = []
     for name, group in groups.items():
-        means = zip(report.conditions, map(_mean, map(_known, group.T)), strict=True)
-        told.append(
-            f"{name}: " + ", ".join(f"{c} " + ("n/a" if np.isnan(m) else f"{m:.3f}") for c, m in means)
-        )
-    return "; ".join(told)
+        pairs = zip(report.conditions, group, strict=True)
+        means = ", ".join(f"{c} {_mean(known):.3f}" if len(known) else f"{c} n/a" for c, known in pairs)
+        told.append(f"{name if isinstance(name, str) else f'{name:g}'}{unit}: {means}")
+    return groups, f"Mean {report.headline.title} by {by}: {'; '.join(told)}."
 
 
 def _known(values: np.ndarray) -> np.ndarray:

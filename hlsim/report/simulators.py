@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -48,14 +49,9 @@ Row = Mapping[str, Any]
 
 
 def write_fidelity(result: Row, panels: Mapping[str, Tensor], shown: Item, out: str | Path) -> None:
-    """Write the files into a folder, each whole or not at all.
+    """Write the files into a folder, each whole or not at all, or ValueError.
 
-    Args:
-        panels: what is heard of ``shown`` by name, in pascals at 16 kHz.
-
-    Raises:
-        ValueError: a file cannot be written.
-        MissingExtraError: matplotlib is not installed.
+    ``panels`` is what is heard of ``shown`` by name, in pascals at 16 kHz.
     """
     spectrograms = draw_spectrograms(panels, NEURO_RATE)
     page = ("Fidelity to MSBG", _sections(result, spectrograms, shown), _lead(result))
@@ -138,30 +134,28 @@ def column_cells(figures: Row) -> list[str]:
 
 def _pictures(rows: Sequence[Row]) -> list[Picture]:
     severities = [row["severity"] for row in rows]
-    pictures = []
-    for measure, title in (("stoi", "STOI"), ("pesq", "PESQ (wide band)")):
 
-        def points(axes: Any, measure: str = measure, title: str = title) -> None:
-            x, y = (
-                np.array(
-                    [row.get(f"{measure}_{whose}") for row in rows], dtype=np.float64
-                )  # None becomes NaN
-                for whose in ("true", "sim")
-            )
-            scatter(axes, x, y, severities, "equal")
-            axes.set(xlabel=f"{title}, reference", ylabel=f"{title}, simulated")
+    def points(axes: Any, key: str, title: str) -> None:
+        sides = ([row.get(f"{key}_{whose}") for row in rows] for whose in ("true", "sim"))
+        x, y = (np.array(side, dtype=np.float64) for side in sides)  # None becomes NaN
+        scatter(axes, x, y, severities, "equal")
+        axes.set(xlabel=f"{title}, reference", ylabel=f"{title}, simulated")
 
-        alt = f"{title} of the simulated against that of the reference, a point an item"
-        pictures.append(Picture(draw_svg(points), alt))
-    for key, title in (("snr", "Waveform SNR (dB)"), ("band_error", "Band level error (dB)")):
+    def boxes(axes: Any, key: str, title: str) -> None:
         groups = {s: [row[key] for row in rows if row["severity"] == s and key in row] for s in SEVERITIES}
-        there = {severity: values for severity, values in groups.items() if values}
+        if there := {severity: values for severity, values in groups.items() if values}:
+            axes.boxplot([*there.values()], tick_labels=[*there])
+        axes.set(ylabel=title)
 
-        def boxes(axes: Any, there: Mapping[str, list[float]] = there, title: str = title) -> None:
-            if there:
-                axes.boxplot([*there.values()], tick_labels=[*there])
-            axes.set(ylabel=title)
-
-        alt = f"{title} by degree of loss: quartiles, and the range within 1.5 of them"
-        pictures.append(Picture(draw_svg(boxes), alt))
-    return pictures
+    against = "against that of the reference, a point an item"
+    by_loss = "by degree of loss: quartiles, and the range within 1.5 of them"
+    kinds: list[tuple[Callable[..., None], str, str, str]] = [
+        (points, "stoi", "STOI", f"of the simulated {against}"),
+        (points, "pesq", "PESQ (wide band)", f"of the simulated {against}"),
+        (boxes, "snr", "Waveform SNR (dB)", by_loss),
+        (boxes, "band_error", "Band level error (dB)", by_loss),
+    ]
+    return [
+        Picture(draw_svg(partial(draw, key=key, title=title)), f"{title} {about}")
+        for draw, key, title, about in kinds
+    ]

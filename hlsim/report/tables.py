@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 from hlsim.evaluation.comparison import Comparison, p_text
 from hlsim.evaluation.statistics import PairedComparison
@@ -62,6 +63,11 @@ def number(value: float | None, form: str, none: str = "n/a") -> str:
     return none if value is None else f"{value:{form}}"
 
 
+def cells(figures: Mapping[str, Any], columns: Mapping[str, tuple[str, str]]) -> dict[str, str]:
+    """Figures by title of the column, of which is given the name of the figure and its format."""
+    return {title: number(figures[name], form) for title, (name, form) in columns.items()}
+
+
 def spread(mean: float, deviation: float | None) -> str:
     """A mean and its standard deviation, where there is one."""
     return f"{mean:.3f}" if deviation is None else f"{mean:.3f} ± {deviation:.3f}"
@@ -113,18 +119,13 @@ def comparisons_table(comparisons: Sequence[Comparison]) -> Table:
     """A row a pair of conditions and measure, with p values adjusted by Holm."""
     rows = []
     for c in comparisons:
-        cells, tests = paired_cells(c.overall), {"t-test": c.p_t_holm, "Wilcoxon": c.p_w_holm}
+        paired, tests = paired_cells(c.overall), {"t-test": c.p_t_holm, "Wilcoxon": c.p_w_holm}
         rows.append(
-            {
-                "Comparison": change_name(c),
-                "n": str(c.overall.n),
-                "From": f"{c.overall.before_mean:.3f}",
-                "To": f"{c.overall.after_mean:.3f}",
-                _CHANGE: cells[_CHANGE],
-                **{f"{test}, Holm": "n/a" if p is None else p_text(p) for test, p in tests.items()},
-                "d": cells["d"],
-                "Level change (dB)": f"{c.level_after_mean - c.level_before_mean:+.1f}",
-            }
+            {"Comparison": change_name(c), "n": str(c.overall.n)}
+            | {"From": f"{c.overall.before_mean:.3f}", "To": f"{c.overall.after_mean:.3f}"}
+            | {_CHANGE: paired[_CHANGE]}
+            | {f"{test}, Holm": "n/a" if p is None else p_text(p) for test, p in tests.items()}
+            | {"d": paired["d"], "Level change (dB)": f"{c.level_after_mean - c.level_before_mean:+.1f}"}
         )
     return Table.of("All comparisons, p adjusted by Holm within each measure", rows)
 
@@ -141,12 +142,7 @@ def paired_cells(
     none: str = "n/a",
     digits: int = 3,
 ) -> dict[str, str]:
-    """Change and interval, both tests, and d.
-
-    Args:
-        p_t, p_w: in place of the comparison's, such as adjusted ones.
-        digits: of t and d.
-    """
+    """Change and interval, both tests, and d; where ``p_t`` or ``p_w`` is given, it is told, such as an adjusted one."""
     return {
         _CHANGE: f"{c.delta:+.3f} {_interval(c)}".rstrip(),
         "t-test (paired)": _test(f"t = {number(c.t, f'+.{digits}f')}", c.p_t if p_t is None else p_t, none),

@@ -39,48 +39,46 @@ def test_names_that_are_written_twice_agree() -> None:
     assert choices("prepare", "--backend") == choices("haspi-report", "--backend") == BACKENDS
 
 
-def _functions() -> dict[str, Callable[..., Any]]:
+def _parameters() -> dict[str, dict[str, Any]]:
+    """Defaults by the names of the arguments that each command's functions take."""
     pytest.importorskip("clarity")
     pytest.importorskip("lightning")
     from hlsim.benchmark.run import benchmark
     from hlsim.demo import demo
-    from hlsim.evaluation import haspi_report
+    from hlsim.evaluation import haspi_report, score_items
     from hlsim.evaluation.compensators import evaluate_compensators
     from hlsim.evaluation.simulators import evaluate_simulators
     from hlsim.training.compensator import train_compensator
+    from hlsim.training.loop import RunOptions
     from hlsim.training.simulator import train_simulator
 
-    return {
-        "prepare": PlanSettings,
-        "demo": demo,
-        "benchmark": benchmark,
-        "haspi-report": haspi_report,
-        "evaluate-compensator": evaluate_compensators,
-        "evaluate-simulator": evaluate_simulators,
-        "train-compensator": train_compensator,
-        "train-simulator": train_simulator,
+    functions: dict[str, tuple[Callable[..., Any], ...]] = {
+        "prepare": (PlanSettings,),
+        "demo": (demo,),
+        "benchmark": (benchmark,),
+        "haspi-report": (haspi_report, score_items),
+        "evaluate-compensator": (evaluate_compensators,),
+        "evaluate-simulator": (evaluate_simulators,),
+        "train-compensator": (train_compensator,),
+        "train-simulator": (train_simulator,),
     }
-
-
-def _parameters(function: Callable[..., Any]) -> dict[str, inspect.Parameter]:
-    """Also those that a training hands on to ``run``."""
-    from hlsim.training.loop import RunOptions, run
-
-    found = dict(inspect.signature(function).parameters)
-    if found.pop("options", None) is not None:
-        found |= {name: inspect.signature(run).parameters[name] for name in RunOptions.__annotations__}
+    found: dict[str, dict[str, Any]] = {}
+    for command, several in functions.items():
+        signatures = [inspect.signature(function).parameters for function in several]
+        found[command] = {name: own[name].default for own in signatures for name in own}
+        if command.startswith("train-"):
+            found[command] |= dict.fromkeys(RunOptions.__annotations__)
     return found
 
 
 def test_defaults_of_the_program_are_the_functions() -> None:
     compared = 0
-    for command, function in _functions().items():
+    for command, parameters in _parameters().items():
         parser = declared(command)
-        for name, parameter in _parameters(function).items():
+        for name, expected in parameters.items():
             default = parser.get_default({"train_snrs": "train_snr", "test_snrs": "test_snr"}.get(name, name))
-            if default is None or parameter.default in (None, inspect.Parameter.empty):
+            if default is None or expected in (None, inspect.Parameter.empty):
                 continue  # required of one or the other, or read before it is passed on
-            expected = parameter.default
             if name == "level":
                 default = [default[0], default[-1]]
             if name == "measures":
@@ -99,16 +97,19 @@ READ = {
     "prepare": "out strict write teacher alignment jobs backend scheduler train_snr test_snr",
     "demo": "",
     "benchmark": "what simulator brief json",
+    "haspi-report": "scores listen out",
+    "evaluate-compensator": "names out",
+    "evaluate-simulator": "names out",
     "train-compensator": TRAINING,
     "train-simulator": f"{TRAINING} manifest root prepared workers",
 }
 
 
 def test_options_are_arguments_of_what_is_called_or_are_read() -> None:
-    functions = _functions()
+    parameters = _parameters()
     for command, read in READ.items():
         found = {action.dest for action in declared(command)._actions} - {"help"}
-        assert found - set(_parameters(functions[command])) == set(read.split()), command
+        assert found - parameters[command].keys() == set(read.split()), command
 
 
 def test_required_options_are_shown_as_required() -> None:

@@ -1,7 +1,11 @@
 """Fidelity as Markdown."""
 
+import pytest
+
 from hlsim.evaluation.simulators import summarise
 from hlsim.report.simulators import summary_tables
+
+pytest.importorskip("pandas")
 
 
 def test_markdown_tables() -> None:
