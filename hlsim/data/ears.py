@@ -20,12 +20,8 @@ from hlsim.data.manifest import SPLITS
 MILD_TO_SEVERE: Mapping[str, float] = {"mild": 1.0, "moderate": 1.0, "severe": 1.0}
 """Default proportions of MSBG's severities: the paper says no more than "from mild to severe"."""
 
-_TENTHS = (
-    "test",
-    "test",
-    "valid",
-    *7 * ["train"],
-)  # of drawn ears, and of listeners in a file without splits
+# of drawn ears, and of listeners in a file without splits
+_TENTHS = ("test", "test", "valid", *7 * ["train"])
 _KEPT = 2048  # drawn ears of a severity that wait for their turn
 
 
@@ -41,13 +37,7 @@ def check_shares(shares: Mapping[str, float]) -> dict[str, Fraction]:
 
 @dataclass(frozen=True)
 class Ears:
-    """What ``assign`` draws from.
-
-    Attributes:
-        shares: proportions of severities; empty: as they are in the file.
-        measured: ears of a file by split; empty: ears are drawn.
-        seed: of every draw.
-    """
+    """What ``assign`` draws from: shares of severities, or none for those of the file, and the file's ears by split."""
 
     shares: Mapping[str, Fraction]
     measured: Mapping[str, tuple[Audiogram, ...]]
@@ -56,10 +46,9 @@ class Ears:
     def check(self, splits: Iterable[str], ears: int) -> None:
         """Raises ValueError where a file has too few ears for a split."""
         for split in splits if self.measured else ():
-            if len(self.measured[split]) < ears:
+            if (found := len(self.measured[split])) < ears:
                 raise ValueError(
-                    f"{len(self.measured[split])} measured ears for {split}; allowed: {ears} or more, for each utterance "
-                    f"gets {ears}"
+                    f"{found} measured ears for {split}; allowed: {ears} or more, for each utterance gets {ears}"
                 )
 
     def assign(self, split: str, utterances: int, ears: int) -> Iterator[list[Audiogram]]:
@@ -68,7 +57,8 @@ class Ears:
         Over the split the proportions are met to one ear; as long as no share is above 1 / ``ears``, the ears of an
         utterance differ in severity.
         """
-        shares = self.shares or _as_found(self.measured[split])
+        found = [ear.severity for ear in self.measured.get(split, ())]
+        shares = self.shares or check_shares({name: found.count(name) for name in SEVERITIES})
         total = utterances * ears
         ends = [round(end * total) for end in accumulate(shares.values())]
         names = list(shares)
@@ -96,9 +86,7 @@ def plan_ears(
     thresholds) a fifth is for test, if it has no file of its own, and a tenth for validation. Of ears that two splits
     have alike the earlier of test, validation and training keeps them. Ears above 100 dB HL are passed over.
 
-    Args:
-        shares: proportions of severities; None for equal ones of mild to severe, or as they are in the file.
-        splits: those that the corpus has.
+    Args: as ``PlanSettings`` has them, and the splits of the corpus.
 
     Raises:
         ValueError: a file that cannot be used, or that lacks a severity asked for.
@@ -139,10 +127,6 @@ def plan_ears(
     return Ears(exact, ears, seed)
 
 
-def _as_found(ears: tuple[Audiogram, ...]) -> dict[str, Fraction]:
-    return check_shares({name: sum(ear.severity == name for ear in ears) for name in SEVERITIES})
-
-
 def _as_written(levels: Sequence[float]) -> Audiogram:
     """As a CSV file gives it back."""
     return Audiogram(tuple(float(f"{level:g}") + 0.0 for level in levels))  # no -0
@@ -152,9 +136,8 @@ class _Measured:
     """Ears of a file, each severity's in a random order, over and over."""
 
     def __init__(self, ears: tuple[Audiogram, ...], draw: Random) -> None:
-        self.all = ears
+        self.all, self.draw = ears, draw
         self.turns: dict[str, list[Audiogram]] = {}
-        self.draw = draw
 
     def take(self, severity: str, other_than: list[Audiogram]) -> Audiogram:
         alike = [ear for ear in self.all if ear.severity == severity and ear not in other_than]

@@ -8,9 +8,9 @@ import os
 from array import array
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Any, BinaryIO
 
 SPLITS = ("train", "valid", "test")
 
@@ -54,14 +54,16 @@ class Utterance:
 
     def to_row(self) -> dict[str, str]:
         row = {name: getattr(self, name) for name in UTTERANCE_COLUMNS}
-        return {name: _text(value) for name, value in row.items()}
+        return {
+            name: f"{value:.6g}" if isinstance(value, float) else "" if value is None else str(value)
+            for name, value in row.items()
+        }
 
     @classmethod
     def from_row(cls, row: Mapping[str, str]) -> Utterance:
         """Raises ValueError where a column is missing or holds what it cannot."""
         try:
-            cells = {entry.name: _READ[str(entry.type)](row[entry.name]) for entry in fields(cls)}
-            utterance = cls(**cells)
+            utterance = cls(**{entry.name: _READ[str(entry.type)](row[entry.name]) for entry in fields(cls)})
         except (KeyError, TypeError, ValueError) as error:
             raise ValueError(
                 f"no row of a manifest ({error!r}); allowed: {', '.join(UTTERANCE_COLUMNS)}"
@@ -83,7 +85,7 @@ def inside(root: str | Path, relative: str) -> Path:
     """The path ``root / relative``, or ValueError where it leads out of the root, be it through .. or a link."""
     path = PurePosixPath(relative)
     full = Path(root) / path
-    if path.is_absolute() or ".." in path.parts or not full.resolve().is_relative_to(_resolved(str(root))):
+    if path.is_absolute() or ".." in path.parts or not full.resolve().is_relative_to(_resolved(Path(root))):
         raise ValueError(
             f"{relative}: leads out of {root}; allowed: paths below it, without .. and links out"
         )
@@ -106,7 +108,6 @@ class Rows(Sequence[dict[str, str]]):
                     self._places.append(self._places[-1] + len(line))
         except OSError as error:
             raise ValueError(f"{path}: cannot be read ({error.strerror})") from error
-        self._open()
         self.columns = self._parse(0) if len(self._places) > 1 else []
         if missing := [name for name in columns if name not in self.columns]:
             raise ValueError(
@@ -131,12 +132,9 @@ class Rows(Sequence[dict[str, str]]):
     def __getstate__(self) -> dict[str, Any]:
         return {name: value for name, value in self.__dict__.items() if name != "_file"}
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state)
-        self._open()
-
-    def _open(self) -> None:
-        self._file = open(self.path, "rb")  # noqa: SIM115 - kept open for as long as the rows are wanted
+    @cached_property
+    def _file(self) -> BinaryIO:
+        return open(self.path, "rb")  # kept open for as long as the rows are wanted
 
     def _parse(self, line: int) -> list[str]:
         start, end = self._places[line], self._places[line + 1]
@@ -161,12 +159,4 @@ def printable(name: str) -> str:
     return "".join(char if char.isprintable() else char.encode("unicode_escape").decode() for char in name)
 
 
-@lru_cache(maxsize=16)
-def _resolved(root: str) -> Path:
-    return Path(root).resolve()
-
-
-def _text(value: object) -> str:
-    if value is None:
-        return ""
-    return f"{value:.6g}" if isinstance(value, float) else str(value)
+_resolved = lru_cache(maxsize=16)(Path.resolve)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
@@ -37,7 +37,7 @@ class Prepared:
     """
 
     utterances: Counter[str] = field(default_factory=Counter)
-    seconds: dict[str, float] = field(default_factory=dict)
+    seconds: dict[str, float] = field(default_factory=lambda: defaultdict(float))
     instances: Counter[str] = field(default_factory=Counter)
     severities: Counter[str] = field(default_factory=Counter)
     faults: int = 0
@@ -115,8 +115,16 @@ def prepare(
     used = set(splits.values())
     ears = plan_ears(settings.severities, settings.audiograms, settings.test_audiograms, used, settings.seed)
     ears.check(used, settings.ears)
-    noises, faults = _noises(settings, root, noise, used, listing.paired)
-
+    noises: Noises | None = None
+    faults: list[Fault] = []
+    if settings.noise is not None:
+        if listing.paired:
+            raise ValueError(
+                f"{settings.corpus}: has noisy speech of its own; allowed: no folder of noise with it, or only the clean "
+                "speech as the corpus"
+            )
+        names = ("train_snrs", "test_snrs", "train_types", "test_types", "seed")
+        noises, faults = find_noises(root, noise, used, **{name: getattr(settings, name) for name in names})
     folder.mkdir(parents=True, exist_ok=True)
     for leftover in folder.glob(f".*{PARTIAL}"):  # of a run that was killed
         leftover.unlink(missing_ok=True)
@@ -133,8 +141,8 @@ def prepare(
 
         for fault in faults:
             tell(fault)
-        where: dict[str, Any] = {"jobs": jobs, "backend": backend, "scheduler": scheduler}
-        examined = examine_all(find(), root, settings.shortest, listing.paired > 0, **where)
+        checks = (root, settings.shortest, listing.paired > 0)
+        examined = examine_all(find(), *checks, jobs=jobs, backend=backend, scheduler=scheduler)
         for number, found in enumerate(examined, start=1):
             if isinstance(found, Fault):
                 tell(found)
@@ -144,8 +152,7 @@ def prepare(
                     utterance = noises.choose(utterance, settings.seed)
                 manifest.write(csv_line(utterance.to_row().values()))
                 prepared.utterances[utterance.split] += 1
-                sums = prepared.seconds
-                sums[utterance.split] = sums.get(utterance.split, 0.0) + utterance.seconds
+                prepared.seconds[utterance.split] += utterance.seconds
             if progress is not None:
                 progress(number, listing.total)
         report.keep()
@@ -155,12 +162,7 @@ def prepare(
         manifest.keep()
     inputs = ["clean", "noisy"] if listing.paired or noises is not None else ["clean"]
     _write_instances(settings, folder, prepared, ears, inputs)
-    about |= {
-        "inputs": inputs,
-        "manifest_sha256": sha256(folder / MANIFEST),
-        "instances_sha256": sha256(folder / INSTANCES),
-        "prepared": vars(prepared),
-    }
+    about |= {"inputs": inputs, **_digests(folder), "prepared": vars(prepared)}
     write_whole(folder / SETTINGS, json.dumps(about, indent=2) + "\n")
     return prepared
 
@@ -180,33 +182,21 @@ def _spare_what_is_not_ours(settings: PlanSettings, folder: Path) -> None:
                 raise ValueError(f"{path}: not written by 'hlsim prepare'; choose another --out, or move it")
 
 
-def _noises(
-    settings: PlanSettings, root: Path, noise: str, splits: set[str], paired: int
-) -> tuple[Noises | None, list[Fault]]:
-    if settings.noise is None:
-        return None, []
-    if paired:
-        raise ValueError(
-            f"{settings.corpus}: has noisy speech of its own; allowed: no folder of noise with it, or only the "
-            "clean speech as the corpus"
-        )
-    names = ("train_snrs", "test_snrs", "train_types", "test_types", "seed")
-    return find_noises(root, noise, splits, **{name: getattr(settings, name) for name in names})
-
-
 def _unchanged(folder: Path, about: Mapping[str, Any], strict: bool) -> Prepared | None:
     """What an earlier run found, where it had the same settings and files; None where there is none."""
     try:
         kept = json.loads((folder / SETTINGS).read_text(encoding="utf-8"))
-        same = all(kept[name] == json.loads(json.dumps(value)) for name, value in about.items())
-        for name, file in (("manifest_sha256", MANIFEST), ("instances_sha256", INSTANCES)):
-            same = same and kept[name] == sha256(folder / file)
+        if kept != kept | json.loads(json.dumps(about)) | _digests(folder):
+            return None
         prepared = Prepared(**kept["prepared"])
     except (OSError, ValueError, KeyError, TypeError):
         return None
-    if same:
-        _refuse_faults(prepared, strict, folder)
-    return prepared if same else None
+    _refuse_faults(prepared, strict, folder)
+    return prepared
+
+
+def _digests(folder: Path) -> dict[str, str]:
+    return {f"{Path(name).stem}_sha256": sha256(folder / name) for name in (MANIFEST, INSTANCES)}
 
 
 def _refuse_faults(prepared: Prepared, strict: bool, folder: Path) -> None:
