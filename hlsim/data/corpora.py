@@ -8,6 +8,7 @@ from __future__ import annotations
 import csv
 import os
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from random import Random
@@ -95,18 +96,24 @@ def assign_splits(
 
 def walk_audio(folder: Path) -> Iterator[str]:
     """Paths of wav, flac and ogg files below a folder in POSIX form, folder by folder in order of names."""
+    for place, _, names in _walk(folder):
+        for name in names:
+            if Path(name).suffix.lower() in EXTENSIONS:
+                yield (Path(place).relative_to(folder) / name).as_posix()
+
+
+def _walk(folder: Path) -> Iterator[tuple[str, list[str], list[str]]]:
+    """As ``os.walk``, in order of names and without hidden ones."""
     for place, folders, names in os.walk(folder):
-        folders[:] = sorted(name for name in folders if not name.startswith("."))
-        below = Path(place).relative_to(folder)
-        for name in sorted(names):
-            if Path(name).suffix.lower() in EXTENSIONS and not name.startswith("."):
-                yield (below / name).as_posix()
+        folders[:], names[:] = (
+            sorted(n for n in found if not n.startswith(".")) for found in (folders, names)
+        )
+        yield place, folders, names
 
 
 def linked_folders(folder: Path, prefix: str = "") -> Iterator[Fault]:
     """The links to folders below a folder, which ``walk_audio`` does not follow."""
-    for place, folders, _ in os.walk(folder):
-        folders[:] = sorted(name for name in folders if not name.startswith("."))
+    for place, folders, _ in _walk(folder):
         for path in (Path(place, name) for name in folders):
             if path.is_symlink():
                 name = (prefix / path.relative_to(folder)).as_posix()
@@ -160,22 +167,21 @@ def _voicebank_log(corpus: Path, name: str) -> dict[str, tuple[str, float | None
             for line in place.read_text(encoding="utf-8", errors="replace").splitlines():
                 parts = line.split()
                 if len(parts) == 3:
-                    try:
+                    noises[parts[0]] = (parts[1], None)
+                    with suppress(ValueError):
                         noises[parts[0]] = (parts[1], float(parts[2]))
-                    except ValueError:
-                        noises[parts[0]] = (parts[1], None)
     return noises
 
 
 def _librispeech_parts(corpus: Path) -> list[tuple[str, str]]:
     """Folders such as ``train-clean-100`` with the split of each."""
     inner = "LibriSpeech/" if (corpus / "LibriSpeech").is_dir() else ""
-    parts = []
-    for place in sorted((corpus / inner).iterdir()):
-        head, dash, _ = place.name.partition("-")
-        if dash and head in _LIBRISPEECH and place.is_dir():
-            parts.append((inner + place.name, _LIBRISPEECH[head]))
-    return parts
+    return [
+        (inner + place.name, split)
+        for place in sorted((corpus / inner).iterdir())
+        for head, split in _LIBRISPEECH.items()
+        if place.name.startswith(f"{head}-") and place.is_dir()
+    ]
 
 
 def _librispeech(corpus: Path) -> Iterator[Found]:
@@ -235,17 +241,12 @@ def _listed(corpus: Path, table: Path) -> Iterator[Found]:
             if key in seen:
                 raise ValueError(f"{where}: a second row of {key}; allowed: one row an utterance")
             seen.add(key)
-            for name in filter(None, (path, row.get("noisy"))):
+            split, noisy = row.get("split", ""), row.get("noisy", "")
+            for name in filter(None, (path, noisy)):
                 inside(corpus, name)
-            yield Utterance(
-                key,
-                row.get("speaker") or "/".join(path.split("/")[:-1]) or _unknown(row.get("split", "")),
-                row.get("split", ""),
-                path,
-                row.get("noisy", ""),
-                row.get("noise", "") if row.get("noisy") else "",
-                snr if row.get("noisy") else None,
-            )
+            speaker = row.get("speaker") or path.rpartition("/")[0] or _unknown(split)
+            noise = (noisy, row.get("noise", ""), snr) if noisy else ()
+            yield Utterance(key, speaker, split, path, *noise)
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise ValueError(f"{table}: cannot be read as CSV ({error})") from error
 
@@ -267,5 +268,5 @@ def find_below(
             yield Fault(path, found.reason) if fits else Fault(printable(path), printable(found.reason))
             continue
         noisy = found.noisy and prefix + found.noisy
-        wrong = next((name for name in (path, noisy) if not storable(name)), None)
-        yield replace(found, clean=path, noisy=noisy) if wrong is None else Fault(printable(wrong), BAD_NAME)
+        wrong = [Fault(printable(name), BAD_NAME) for name in (path, noisy) if not storable(name)]
+        yield wrong[0] if wrong else replace(found, clean=path, noisy=noisy)

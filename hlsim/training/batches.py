@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -51,23 +51,18 @@ class TrainingData:
             training, validation = getattr(self, name), getattr(self, f"valid_{name}")
             if not training or not validation:
                 continue
-            trained, validated = (
-                {
-                    path.resolve()
-                    for path in (find_audio(source) if isinstance(source, str | Path) else source)
-                }
-                for source in (training, validation)
-            )
+            trained, validated = ({path.resolve() for path in _files(one)} for one in (training, validation))
             if shared := len(trained & validated):
                 raise ValueError(
                     f"{shared} of {len(validated)} files of the {name} to validate on are also trained on; give folders "
                     f"that share none, or no {name} to validate on"
                 )
-        return TrainingData(
-            self.valid_speech or self.speech,
-            self.valid_noise or self.noise,
-            self.valid_audiograms or self.audiograms,
-        )
+        speech, noise = self.valid_speech or self.speech, self.valid_noise or self.noise
+        return TrainingData(speech, noise, self.valid_audiograms or self.audiograms)
+
+
+def _files(source: Path | Sequence[Path]) -> Sequence[Path]:
+    return find_audio(source) if isinstance(source, str | Path) else source
 
 
 @dataclass(frozen=True)
@@ -88,12 +83,13 @@ class PlannedSource:
     workers: int = field(default=1, compare=False)  # a run may go on with others
 
 
-class DrawnBatches(Dataset[Batch]):
-    """Random speech, noise and ears; a batch depends on seed, step and rank alone.
+def identity_of(data: TrainingData | PlannedSource) -> dict[str, str]:
+    """What a training on them is told from others by."""
+    return {entry.name: str(getattr(data, entry.name)) for entry in fields(data) if entry.compare}
 
-    Args:
-        seconds: length of a clip.
-    """
+
+class DrawnBatches(Dataset[Batch]):
+    """Random speech, noise and ears in clips of so many seconds; a batch depends on seed, step and rank alone."""
 
     def __init__(self, recipe: TrainingRecipe, data: TrainingData, seconds: float) -> None:
         self.batch, self.seed, self.sounds = recipe.batch, recipe.seed, recipe.sounds
@@ -107,9 +103,7 @@ class DrawnBatches(Dataset[Batch]):
 
     def __getitem__(self, step: Step) -> Batch:
         number = (self.seed * 1_000_003 + step.number) * 64 + step.rank
-        return self.draw(
-            self.batch, torch.Generator().manual_seed(number % 2**63)
-        )  # more are too many for it
+        return self.draw(self.batch, torch.Generator().manual_seed(number % 2**63))  # which takes no more
 
     def draw(self, count: int, generator: torch.Generator) -> Batch:
         """``clean`` and ``signal`` (count, time) in pascals, ``thresholds`` (count, 8) dB HL."""
@@ -144,9 +138,8 @@ class SimulatorBatches(DrawnBatches):
         ears = self.join_measured(draw_thresholds(count, generator), 0.4, 5.0, generator)
         noise = self.noise.draw(count, generator) if self.noise is not None else None
         clips = self.join_sounds(self.speech.draw(count, generator), generator)
-        signal = augment_speech(
-            clips, noise, ears, NEURO_RATE, generator, levels=self.levels, treated=self.treated
-        )
+        given = (clips, noise, ears, NEURO_RATE, generator)
+        signal = augment_speech(*given, levels=self.levels, treated=self.treated)
         return {"clean": set_level(clips, level_spl(signal)), "signal": signal, "thresholds": ears}
 
 
@@ -167,15 +160,13 @@ class CompensatorBatches(DrawnBatches):
         clean = self.speech.draw(count, generator)
         equalised = equalise(clean, uniform(-15.0, 15.0, len(KNOTS)), torch.tensor(KNOTS), NEURO_RATE)
         clean = torch.where(uniform(0.0, 1.0, 1) < self.recipe.equalised, equalised, clean)
-        clean = set_level(self.join_sounds(clean, generator), uniform(*self.recipe.levels))
-        signal = clean
+        signal = clean = set_level(self.join_sounds(clean, generator), uniform(*self.recipe.levels))
         if self.noise is not None:
             noisy = mix(clean, self.noise.draw(count, generator), uniform(*self.recipe.snr))
             signal = torch.where(uniform(0.0, 1.0, 1) < self.recipe.noisy, noisy, clean)
         if self.ear is not None:
-            ears = self.ear.expand(count, -1)
-        else:
-            ears = self.join_measured(draw_thresholds(count, generator), 0.5, 0.0, generator)
+            return {"clean": clean, "signal": signal, "thresholds": self.ear.expand(count, -1)}
+        ears = self.join_measured(draw_thresholds(count, generator), 0.5, 0.0, generator)
         return {"clean": clean, "signal": signal, "thresholds": ears}
 
 
@@ -255,14 +246,9 @@ class PlannedData(PlanData):
     def __init__(self, source: PlannedSource, recipe: SimulatorRecipe) -> None:
         if recipe.sounds:
             raise ValueError(f"sounds {recipe.sounds} in the recipe, with a manifest; allowed: 0")
-        names = ("batch", "seconds", "seed", "levels", "treated")
-        super().__init__(
-            source.manifest,
-            root=source.root,
-            prepared=source.prepared,
-            workers=source.workers,
-            **{name: getattr(recipe, name) for name in names},
-        )
+        clips = {name: getattr(recipe, name) for name in ("batch", "seconds", "seed", "levels", "treated")}
+        where = {name: getattr(source, name) for name in ("root", "prepared", "workers")}
+        super().__init__(source.manifest, **where, **clips)
         if self.plan.rate != NEURO_RATE:
             raise ValueError(f"{source.manifest}: prepared at {self.plan.rate} Hz; allowed: {NEURO_RATE}")
         split = next(split for split in ("valid", "test", "train") if len(self.plan.indices(split)))
@@ -276,7 +262,7 @@ class PlannedData(PlanData):
         chosen = torch.linspace(0, len(items) - 1, min(recipe.validation_items, len(items))).round().int()
         samples = round(_VALID_SECONDS * NEURO_RATE)
         whole = [items[place] for place in chosen.tolist()]
-        clips = [one.clip(max(0, (len(one.signal) - samples) // 2), samples) for one in whole]
-        self.validation = [collate(clips[i : i + 8]) for i in range(0, len(clips), 8)]
+        middle = [one.clip(max(0, (len(one.signal) - samples) // 2), samples) for one in whole]
+        self.validation = [collate(middle[i : i + 8]) for i in range(0, len(middle), 8)]
 
     val_dataloader = BatchData.val_dataloader

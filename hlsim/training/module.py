@@ -14,7 +14,6 @@ from torch.optim.swa_utils import AveragedModel
 
 from hlsim.data.module import Batch
 from hlsim.neuro.config import NetworkConfig
-from hlsim.pretrained import checkpoint_digest
 
 Network = TypeVar("Network", bound=nn.Module)
 
@@ -25,7 +24,6 @@ class TimedModule(L.LightningModule):
     Subclasses give ``training_loss``, ``evaluate``, ``figures`` and ``released``, and log whatever they like.
 
     Args:
-        learning_rate: at its highest.
         max_minutes: of training, all resumed parts together.
     """
 
@@ -33,8 +31,7 @@ class TimedModule(L.LightningModule):
 
     def __init__(self, learning_rate: float, max_minutes: float) -> None:
         super().__init__()
-        self.learning_rate = learning_rate
-        self.max_minutes = max_minutes
+        self.learning_rate, self.max_minutes = learning_rate, max_minutes
         self.values: list[dict[str, Tensor]] = []  # of the validation under way
 
     def training_loss(self, batch: Batch) -> Tensor:
@@ -59,12 +56,8 @@ class TimedModule(L.LightningModule):
     def validate(self, batches: Iterable[Batch]) -> dict[str, float]:
         """The figures on batches, without a Trainer."""
         with torch.no_grad():
-            return self._figures(
-                [
-                    self.evaluate({name: value.to(self.device) for name, value in batch.items()})
-                    for batch in batches
-                ]
-            )
+            placed = ({name: value.to(self.device) for name, value in batch.items()} for batch in batches)
+            return self._figures([self.evaluate(batch) for batch in placed])
 
     def trained_parameters(self) -> list[nn.Parameter]:
         return [parameter for parameter in self.parameters() if parameter.requires_grad]
@@ -134,8 +127,7 @@ def initial_network(
     Args:
         start: a checkpoint's name or folder; empty for random weights.
         settings: of the network; with ``start`` those of the checkpoint, or none.
-        config_kind, kind: of the network.
-        load: what loads a checkpoint by name, frozen.
+        load: loads a checkpoint by name, frozen.
 
     Raises:
         ValueError: no such checkpoint, or one of another kind or with other settings.
@@ -156,8 +148,3 @@ def initial_network(
             "same, or no 'model' in the recipe"
         )
     return network.train().requires_grad_(True)
-
-
-def start_identity(start: str) -> dict[str, str]:
-    """Which weights these are, for a folder may hold others next time; empty without ``start``."""
-    return {"start_sha256": checkpoint_digest(start)} if start else {}

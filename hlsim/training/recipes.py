@@ -60,14 +60,12 @@ class TrainingRecipe:
             if isinstance(value, list):  # a pair, as YAML gives it
                 object.__setattr__(self, name, tuple(value))
         counts, lengths = ("batch", "validate_every", "validation_items"), ("seconds", "learning_rate")
-        self._refuse(
-            min(getattr(self, name) for name in counts) < 1 or min(self.seconds, self.learning_rate) <= 0.0,
-            (*counts, *lengths),
-            "counts from 1 up, seconds and learning_rate above 0",
+        wrong = (
+            min(getattr(self, name) for name in counts) < 1 or min(self.seconds, self.learning_rate) <= 0.0
         )
-        self._refuse(
-            not all(0.0 <= getattr(self, name) <= 1.0 for name in self.shares), self.shares, "0 to 1"
-        )
+        self._refuse(wrong, (*counts, *lengths), "counts from 1 up, seconds and learning_rate above 0")
+        wrong = not all(0.0 <= getattr(self, name) <= 1.0 for name in self.shares)
+        self._refuse(wrong, self.shares, "0 to 1")
 
     def _refuse(self, wrong: bool, names: tuple[str, ...], allowed: str) -> None:
         if wrong:
@@ -114,11 +112,8 @@ class SimulatorRecipe(TrainingRecipe):
     def __post_init__(self) -> None:
         super().__post_init__()
         self._refuse(self.unit_power not in ("truth", "input"), ("unit_power",), "truth or input")
-        self._refuse(
-            self.precision not in PRECISIONS or not 0.0 <= self.average < 1.0,
-            ("precision", "average"),
-            f"{' or '.join(PRECISIONS)}, and from 0 to below 1",
-        )
+        wrong = self.precision not in PRECISIONS or not 0.0 <= self.average < 1.0
+        self._refuse(wrong, ("precision", "average"), f"{' or '.join(PRECISIONS)}, and from 0 to below 1")
 
 
 @dataclass(frozen=True, kw_only=True)
