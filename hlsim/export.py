@@ -75,9 +75,9 @@ def export_onnx(simulator: nn.Module, path: str | Path, *, seconds: float = 1.0,
         MissingExtraError: onnx, onnxscript or onnxruntime is not installed.
     """
     target = Path(path)
-    if not target.parent.is_dir():  # the export takes minutes
+    if not (folder := target.parent).is_dir():  # the export takes minutes
         raise ValueError(
-            f"{target}: there is no folder {str(target.parent)!r}; allowed: a file in a folder that exists"
+            f"{target}: there is no folder {str(folder)!r}; allowed: a file in a folder that exists"
         )
     for module in ("onnx", "onnxscript", "onnxruntime"):
         require(module, "dev")
@@ -96,11 +96,7 @@ def export_onnx(simulator: nn.Module, path: str | Path, *, seconds: float = 1.0,
 
 
 def _check(path: Path, program: torch.export.ExportedProgram, level: float) -> None:
-    """Run the file as its user will, on noise: the exporter also writes what no runtime takes, or takes wrongly.
-
-    Raises:
-        ValueError: onnxruntime refuses it, or its output is not the program's.
-    """
+    """Run the file as its user will, on noise: the exporter also writes what no runtime takes, or takes wrongly."""
     runtime = require("onnxruntime", "dev")
     assert program.example_inputs is not None
     waveform, thresholds = program.example_inputs[0]
@@ -110,15 +106,11 @@ def _check(path: Path, program: torch.export.ExportedProgram, level: float) -> N
         quiet = runtime.SessionOptions()
         quiet.log_severity_level = 3  # errors
         session = runtime.InferenceSession(str(path), quiet, providers=["CPUExecutionProvider"])
-        names = [entry.name for entry in session.get_inputs()]
-        (heard,) = session.run(
-            None, {name: tensor.cpu().numpy() for name, tensor in zip(names, given, strict=True)}
-        )
+        inputs = zip(session.get_inputs(), given, strict=True)
+        (heard,) = session.run(None, {entry.name: tensor.cpu().numpy() for entry, tensor in inputs})
     except Exception as error:  # onnxruntime has a class for each kind of refusal
-        reason = str(error).split("failed:", 1)[-1].strip().splitlines()[0]
-        raise ValueError(
-            f"ONNX cannot take the simulator: onnxruntime refuses the file ({reason})"
-        ) from error
+        reason = f"refuses the file ({str(error).split('failed:', 1)[-1].strip().splitlines()[0]})"
+        raise ValueError(f"ONNX cannot take the simulator: onnxruntime {reason}") from error
     with torch.no_grad():
         expected = program.module()(*given)
     off = float((torch.from_numpy(heard).to(expected) - expected).abs().max() / expected.abs().max())

@@ -16,7 +16,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from itertools import zip_longest
 from pathlib import Path
-from types import TracebackType
 from typing import IO, Self
 
 try:
@@ -91,16 +90,11 @@ class Whole:
         except OSError as error:
             raise self.refusal(error) from error
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        try:
+    def __exit__(self, *raised: object) -> None:
+        with suppress(OSError):  # what could not be flushed is thrown away
             if self._file is not None:
                 self._file.close()
-        except OSError:
-            pass  # what could not be flushed is thrown away
-        finally:
-            self.partial.unlink(missing_ok=True)
+        self.partial.unlink(missing_ok=True)
 
     def refusal(self, error: Exception) -> ValueError:
         """What to raise where writing failed."""

@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 import safetensors
 import safetensors.torch
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 from hlsim.calibration import PASCAL_SPL
 from hlsim.files import whole_folder
@@ -21,6 +21,7 @@ from hlsim.torchtools import lasting
 
 Model = TypeVar("Model", bound=nn.Module)
 Config = TypeVar("Config", bound=NetworkConfig)
+Settings = Mapping[str, Any]
 
 WEIGHTS, CONFIG, CARD = "model.safetensors", "config.json", "README.md"
 
@@ -91,16 +92,15 @@ def read_checkpoint(
         config = config_kind.from_dict(settings)
     except (TypeError, ValueError) as error:
         raise ValueError(f"{folder / CONFIG}: {error}") from error
+    device = torch.get_default_device()
     try:
-        device = torch.get_default_device()
         # it may be trained through later, torch.device("meta") would keep no weights, and the random start is not kept
         with lasting(), torch.device("cpu"), torch.random.fork_rng(devices=[]):
             model = build(config)
             model.load_state_dict(safetensors.torch.load(weights))
     except (TypeError, RuntimeError, safetensors.SafetensorError) as error:
-        raise ValueError(
-            f"{folder}: weights and configuration do not fit ({str(error).splitlines()[0]})"
-        ) from error
+        reason = str(error).splitlines()[0]
+        raise ValueError(f"{folder}: weights and configuration do not fit ({reason})") from error
     with lasting():
         return model if device.type == "meta" else model.to(device)
 
@@ -155,12 +155,7 @@ def checkpoints_folder() -> Path:
 
 
 def save_checkpoint(
-    folder: str | Path,
-    kind: str,
-    model: nn.Module,
-    config: Mapping[str, Any],
-    about: Mapping[str, Any],
-    card: str = "",
+    folder: str | Path, kind: str, model: nn.Module, config: Settings, about: Settings, card: str = ""
 ) -> None:
     """Write a checkpoint folder, whole or not at all; an older one of the same name is replaced.
 
@@ -172,19 +167,13 @@ def save_checkpoint(
         ValueError: the folder holds something else.
     """
     target = Path(folder)
-    if not ((target / CONFIG).is_file() or _is_empty(target)):
+    empty = not any(target.iterdir()) if target.is_dir() else not target.exists()
+    if not ((target / CONFIG).is_file() or empty):
         raise ValueError(f"{target}: holds something else; allowed: a new folder, or that of a checkpoint")
-    state: dict[str, Tensor] = {
-        name: tensor.detach().cpu().contiguous() for name, tensor in model.state_dict().items()
-    }
-    weights = safetensors.torch.save(state)
-    record = {
-        "kind": kind,
-        "config": dict(config),
-        "sha256": hashlib.sha256(weights).hexdigest(),
-        "config_sha256": _digest(dict(config)),
-        "about": dict(about),
-    }
+    state = {name: tensor.detach().cpu().contiguous() for name, tensor in model.state_dict().items()}
+    weights, settings = safetensors.torch.save(state), dict(config)
+    hashes = {"sha256": hashlib.sha256(weights).hexdigest(), "config_sha256": _digest(settings)}
+    record = {"kind": kind, "config": settings, **hashes, "about": dict(about)}
     with whole_folder(target) as staging:
         (staging / WEIGHTS).write_bytes(weights)
         (staging / CONFIG).write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
@@ -192,10 +181,6 @@ def save_checkpoint(
             (staging / CARD).write_text(card, encoding="utf-8")
         elif (target / CARD).is_file():
             shutil.copy(target / CARD, staging / CARD)
-
-
-def _is_empty(folder: Path) -> bool:
-    return not any(folder.iterdir()) if folder.is_dir() else not folder.exists()
 
 
 def _record(folder: Path) -> Any:

@@ -21,19 +21,11 @@ _Step = Callable[[], Any]
 
 
 def selective_scan(
-    u: Tensor,
-    delta: Tensor,
-    A: Tensor,
-    B: Tensor,
-    C: Tensor,
-    D: Tensor | None = None,
-    z: Tensor | None = None,
-    delta_bias: Tensor | None = None,
-    delta_softplus: bool = False,
+    u: Tensor, delta: Tensor, A: Tensor, B: Tensor, C: Tensor, *more: Any, **named: Any
 ) -> Tensor:
     """y with h[t] = exp(delta[t] A) h[t-1] + delta[t] B[t] u[t] and y[t] = C[t] h[t] + D u[t], times silu(z).
 
-    The signature of ``mamba_ssm``'s function of that name, whose kernel does the work where it imports and the tensors
+    The arguments of ``mamba_ssm``'s function of that name, whose kernel does the work where it imports and the tensors
     are on a GPU. Here the recurrence is a tree: about log2(time) steps, each over all times at once; the states are
     computed again in the backward pass instead of being kept. It has a first derivative only; asked for a second, it
     raises RuntimeError.
@@ -43,7 +35,7 @@ def selective_scan(
 
     Args:
         A: negative, or the states grow.
-        delta_softplus: pass delta (+ delta_bias) through softplus.
+        more, named: D, z, delta_bias, and delta_softplus: pass delta (+ delta_bias) through softplus.
 
     Raises:
         ValueError: shapes that do not fit.
@@ -55,8 +47,7 @@ def selective_scan(
             f"u {[*u.shape]}, delta {[*delta.shape]}, A {[*A.shape]}, B {[*B.shape]}, C {[*C.shape]}; "
             "allowed: u and delta (items, channels, time), A (channels, states), B and C (items, states, time)"
         )
-    run = kernel_for(u) or torch_scan
-    output: Tensor = run(u, delta, A, B, C, D=D, z=z, delta_bias=delta_bias, delta_softplus=delta_softplus)
+    output: Tensor = (kernel_for(u) or torch_scan)(u, delta, A, B, C, *more, **named)
     return output
 
 
@@ -123,11 +114,6 @@ def _back(decay: Tensor, states: Tensor, spare: Tensor) -> list[_Step]:
         between = states[:, 1 - odd : -1 : 2]
         steps.append(partial(between.addcmul_, decay[:, 1 - odd :: 2], first[:, 1 - odd :]))
     return steps
-
-
-def _take(steps: list[_Step]) -> None:
-    for step in steps:
-        step()
 
 
 class _SelectiveScan(torch.autograd.Function):
@@ -202,7 +188,8 @@ class _Workspace:
         """Fill ``decay`` and ``states``."""
         torch.mul(delta.unsqueeze(-2), A, out=self.decay).exp_()
         torch.mul((delta * u).unsqueeze(-2), B.unsqueeze(-1), out=self.states)
-        _take(self.onward)
+        for step in self.onward:
+            step()
 
     @cached_property
     def back(self) -> list[_Step]:
@@ -211,7 +198,8 @@ class _Workspace:
     def run_back(self, grad: Tensor, C: Tensor) -> Tensor:
         """The gradient of the states: the same recurrence, backwards, with the next time's decay."""
         torch.mul(C.unsqueeze(-1), grad.unsqueeze(-2), out=self.slope)
-        _take(self.back)
+        for step in self.back:
+            step()
         return self.slope
 
 
