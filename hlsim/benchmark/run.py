@@ -20,8 +20,10 @@ from hlsim.neuro.config import NEURO_RATE
 LENGTHS = (1.0, 4.0, 16.0, 60.0)
 BATCHES = (1, 8, 64)
 
-TRAINING = (4.0, 64)
-"""Seconds and clips of a batch that the default network is trained or trained through with."""
+TRAINING = (
+    4.0,
+    64,
+)  # seconds and clips of a batch that the default network is trained or trained through with
 
 EARS = ("N1", "N2", "N3")
 """One ear of each degree of loss: mild, moderate and severe in MSBG's sense."""
@@ -57,12 +59,9 @@ def benchmark(
         repeats: counted rounds.
         limit: seconds that one timing of a longer clip or larger batch may take by what shorter ones took; others are
             left out.
-        lengths: seconds.
         training: seconds and clips of the batch to train on, left out on a CPU that would take longer than ``limit``.
-        simulators: the Neuro-MSBGs, by name or folder; by default all that ship.
-        only: parts of names: rows with none of them are left out.
-        progress: called with timings done, timings in all, and what comes.
-        keep: called with the result so far after each.
+        simulators, only: Neuro-MSBGs as ``rows`` takes them; parts of names: rows with none of them are left out.
+        progress: called with timings done, timings in all, and what comes; ``keep`` with the result so far after each.
 
     Returns: machine, ``rows`` and ``skipped``, what failed and why. A row has name, parameters and a list of ``cells``,
         each with sample rate, seconds, batch, direction, median, least and greatest milliseconds, peak memory in MiB,
@@ -161,11 +160,8 @@ class _Simulators(Timings):
     def size(self, row: Row, seconds: float, batch: int) -> None:
         """Another length or batch, forward at the row's own rate, where it does not take too long."""
         key = _Key(row.name, row.rates[0], seconds, batch, "forward")
-        same = {
-            k.seconds: median(t)
-            for k, t in self.times.items()
-            if k._replace(seconds=seconds) == key._replace(batch=1)
-        }
+        alone = key._replace(batch=1)
+        same = {k.seconds: median(t) for k, t in self.times.items() if k._replace(seconds=seconds) == alone}
         if 1.0 in same:
             self._repeat(key, same[1.0] * batch if batch > 1 else _expected(list(same.items()), seconds))
 

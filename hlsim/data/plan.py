@@ -27,14 +27,8 @@ FAULT_COLUMNS = ("path", "reason")
 
 @dataclass
 class Prepared:
-    """What ``prepare`` found.
-
-    Attributes:
-        utterances, seconds, instances: by split.
-        severities: instances by split and severity, as "train severe".
-        faults: files left out.
-        first_fault: path and reason of the first.
-    """
+    """What ``prepare`` found: by split, and instances also by split and severity, as "train severe"; files left out, and
+    path and reason of the first."""
 
     utterances: Counter[str] = field(default_factory=Counter)
     seconds: dict[str, float] = field(default_factory=lambda: defaultdict(float))
@@ -47,15 +41,11 @@ class Prepared:
         """A line a split."""
         lines = []
         for split in (split for split in SPLITS if self.utterances.get(split)):
-            shares = ", ".join(
-                f"{100.0 * self.severities[key] / self.instances[split]:.0f} % {name}"
-                for name in SEVERITIES
-                if self.severities.get(key := f"{split} {name}")
-            )
-            lines.append(
-                f"{split}: {self.utterances[split]} utterances, {self.seconds[split] / 3600.0:.2f} h, "
-                f"{self.instances[split]} instances; ears {shares}"
-            )
+            count = self.instances[split]
+            counts = {name: self.severities.get(f"{split} {name}") for name in SEVERITIES}
+            ears = ", ".join(f"{100.0 * n / count:.0f} % {name}" for name, n in counts.items() if n)
+            told = f"{self.utterances[split]} utterances, {self.seconds[split] / 3600.0:.2f} h"
+            lines.append(f"{split}: {told}, {count} instances; ears {ears}")
         return "\n".join(lines)
 
 
@@ -94,13 +84,12 @@ def prepare(
         listing.add(root, found)
     if not listing.total:
         raise ValueError(f"{root / corpus}: no audio in it that the layout {layout} knows")
+    tables = (settings.audiograms, settings.test_audiograms)
     about: dict[str, Any] = {
         "root": str(root),
         "layout": layout,
         "settings": {n: str(v) if isinstance(v, Path) else v for n, v in asdict(settings).items()},
-        "files_sha256": listing.digest(
-            root / noise if settings.noise else None, settings.audiograms, settings.test_audiograms
-        ),
+        "files_sha256": listing.digest(root / noise if settings.noise else None, *tables),
     }
     if prepared := _unchanged(folder, about, strict):
         return prepared
@@ -109,11 +98,10 @@ def prepare(
             f"{(folder / CLAIM).parent}: holds instances of another plan, with other settings or files; choose another "
             "--out, or remove it"
         )
-    splits = assign_splits(
-        listing.speakers, test_share=settings.test_share, valid_share=settings.valid_share, seed=settings.seed
-    )
+    shares = {"test_share": settings.test_share, "valid_share": settings.valid_share}
+    splits = assign_splits(listing.speakers, **shares, seed=settings.seed)
     used = set(splits.values())
-    ears = plan_ears(settings.severities, settings.audiograms, settings.test_audiograms, used, settings.seed)
+    ears = plan_ears(settings.severities, *tables, used, settings.seed)
     ears.check(used, settings.ears)
     noises: Noises | None = None
     faults: list[Fault] = []
@@ -169,13 +157,13 @@ def prepare(
 
 def _spare_what_is_not_ours(settings: PlanSettings, folder: Path) -> None:
     """Raises ValueError where a table of the user's would be written over."""
-    tables = (settings.table, settings.audiograms, settings.test_audiograms)
+    given = (settings.table, settings.audiograms, settings.test_audiograms)
+    tables = [table for table in given if table is not None and table.exists()]
     ours = {MANIFEST: UTTERANCE_COLUMNS, INSTANCES: INSTANCE_COLUMNS, FAULTS: FAULT_COLUMNS, SETTINGS: None}
-    for name, columns in ours.items():
-        path = folder / name
+    for path, columns in ((folder / name, columns) for name, columns in ours.items()):
         if not path.is_file():
             continue
-        if any(table.exists() and table.samefile(path) for table in tables if table is not None):
+        if any(map(path.samefile, tables)):
             raise ValueError(f"{path}: would be written over, and is read from; choose another --out")
         with open(path, "rb") as file:
             if columns is not None and file.readline() != csv_line(columns).encode():
@@ -210,9 +198,7 @@ def _refuse_faults(prepared: Prepared, strict: bool, folder: Path) -> None:
 def _write_instances(
     settings: PlanSettings, folder: Path, prepared: Prepared, ears: Ears, inputs: Sequence[str]
 ) -> None:
-    assigned = {
-        split: ears.assign(split, count, settings.ears) for split, count in prepared.utterances.items()
-    }
+    assigned = {split: ears.assign(split, n, settings.ears) for split, n in prepared.utterances.items()}
     number = 0
     with Whole(folder / INSTANCES) as file:
         file.write(csv_line(INSTANCE_COLUMNS))

@@ -56,8 +56,8 @@ class PlanSettings:
     def __post_init__(self) -> None:
         refuse_unknown([self.layout], ("auto", *LAYOUTS), "layouts")
         check_rate(self.rate)
-        for name, share in (("test_share", self.test_share), ("valid_share", self.valid_share)):
-            if not 0.0 <= share < 1.0:
+        for name in ("test_share", "valid_share"):
+            if not 0.0 <= (share := getattr(self, name)) < 1.0:
                 raise ValueError(f"{name} {share}; allowed: 0 to less than 1")
         if min(self.ears, self.train_types, self.test_types) < 1 or self.shortest < 0.1:
             raise ValueError(

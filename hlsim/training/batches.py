@@ -67,15 +67,7 @@ def _files(source: Path | Sequence[Path]) -> Sequence[Path]:
 
 @dataclass(frozen=True)
 class PlannedSource:
-    """A prepared plan to train and validate on.
-
-    Attributes:
-        manifest: ``manifest.csv`` of a prepared folder, or the folder.
-        root: where the audio lies, if not where it was prepared.
-        prepared: take the instances that ``hlsim prepare --write`` made, clips of them unchanged, instead of making and
-            augmenting them on the fly.
-        workers: processes that read and augment.
-    """
+    """A prepared plan, or its ``manifest.csv``, to train and validate on, as ``PlanData`` takes it."""
 
     manifest: Path
     root: Path | None = None
@@ -173,9 +165,7 @@ class CompensatorBatches(DrawnBatches):
 def simulator_data(data: TrainingData | PlannedSource, recipe: SimulatorRecipe) -> BatchData:
     """What a simulator is trained and validated on, with what is heard from the exact MSBG.
 
-    Raises:
-        ValueError: data that cannot be used; the message names it.
-    """
+    Raises ValueError of data that cannot be used; the message names it."""
     if isinstance(data, PlannedSource):
         return PlannedData(data, recipe)
     training = SimulatorBatches(recipe, data)
@@ -193,10 +183,7 @@ def compensator_data(data: TrainingData, recipe: CompensatorRecipe, ear: Audiogr
 
 
 def speech_to_validate(data: TrainingData, recipe: SimulatorRecipe) -> list[Batch]:
-    """Fixed items: every second one noisy (0 to 20 dB); measured, standard and drawn ears in turn.
-
-    50 to 80 dB SPL, or the recipe's levels where ``treated`` is off.
-    """
+    """Fixed items: every second one noisy (0 to 20 dB); measured, standard and drawn ears in turn."""
     generator = torch.Generator().manual_seed(1_000 + recipe.seed)
     valid = SimulatorBatches(replace(recipe, seconds=_VALID_SECONDS), data.validation())
     standard = torch.tensor([Audiogram.standard(name).thresholds for name in MILDER])
@@ -216,22 +203,19 @@ def speech_to_validate(data: TrainingData, recipe: SimulatorRecipe) -> list[Batc
 
 
 def sounds_to_validate(recipe: SimulatorRecipe) -> list[Batch]:
-    """Fixed tones and clicks at the levels of ``speech_to_validate``, a third as many items, for drawn ears.
-
-    They are marked with ``sounds``.
-    """
+    """Fixed tones and clicks, marked with ``sounds``, a third as many items as of speech, for drawn ears."""
     generator = torch.Generator().manual_seed(2_000 + recipe.seed)
     batches = []
     for _ in range(0, recipe.validation_items, 24):
         signal = draw_sounds(8, round(_VALID_SECONDS * NEURO_RATE), NEURO_RATE, generator)
         signal = set_level(signal, _levels_to_validate(recipe, generator))
-        ears = draw_thresholds(8, generator)
-        batches.append({"signal": signal, "thresholds": ears, "sounds": torch.ones(8, dtype=torch.bool)})
+        batch = {"signal": signal, "thresholds": draw_thresholds(8, generator)}
+        batches.append(batch | {"sounds": torch.ones(8, dtype=torch.bool)})
     return batches
 
 
 def _levels_to_validate(recipe: SimulatorRecipe, generator: torch.Generator) -> Tensor:
-    """Levels in dB SPL of a batch. Shape: -> (8,)."""
+    """50 to 80 dB SPL, or the recipe's levels where ``treated`` is off. Shape: -> (8,)."""
     low, high = (50.0, 80.0) if recipe.treated else recipe.levels
     return low + (high - low) * torch.rand(8, generator=generator)
 
