@@ -95,9 +95,7 @@ def inside(root: str | Path, relative: str) -> Path:
 class Rows(Sequence[dict[str, str]]):
     """Rows of a CSV file, read when asked for: only their places are kept, 8 bytes a row.
 
-    Raises:
-        ValueError: the file cannot be read, or lacks a column.
-    """
+    Raises ValueError where the file cannot be read, or lacks a column."""
 
     def __init__(self, path: str | Path, columns: Iterable[str]) -> None:
         self.path = Path(path)
@@ -109,10 +107,8 @@ class Rows(Sequence[dict[str, str]]):
         except OSError as error:
             raise ValueError(f"{path}: cannot be read ({error.strerror})") from error
         self.columns = self._parse(0) if len(self._places) > 1 else []
-        if missing := [name for name in columns if name not in self.columns]:
-            raise ValueError(
-                f"{path}: no column {', '.join(missing)}; allowed: a CSV file of 'hlsim prepare'"
-            )
+        if missing := ", ".join(name for name in columns if name not in self.columns):
+            raise ValueError(f"{path}: no column {missing}; allowed: a CSV file of 'hlsim prepare'")
 
     def __len__(self) -> int:
         return len(self._places) - 2
@@ -122,11 +118,10 @@ class Rows(Sequence[dict[str, str]]):
             return [self[i] for i in range(*index.indices(len(self)))]
         if not -len(self) <= index < len(self):
             raise IndexError(index)
-        cells = self._parse(index % len(self) + 1)
-        if len(cells) != len(self.columns):
-            raise ValueError(
-                f"{self.path}, line {index % len(self) + 2}: {len(cells)} cells; allowed: {len(self.columns)}"
-            )
+        line = index % len(self) + 1
+        cells, wanted = self._parse(line), len(self.columns)
+        if len(cells) != wanted:
+            raise ValueError(f"{self.path}, line {line + 1}: {len(cells)} cells; allowed: {wanted}")
         return dict(zip(self.columns, cells, strict=True))
 
     def __getstate__(self) -> dict[str, Any]:

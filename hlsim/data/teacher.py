@@ -56,10 +56,7 @@ class Teacher(nn.Module):
 
     @torch.no_grad()
     def forward(self, signals: Tensor, thresholds: Tensor, *, blocks: bool = True) -> Tensor:
-        """What each ear hears.
-
-        Args:
-            blocks: False asks for the signals in one piece, which is quicker where they are always as long.
+        """What each ear hears; without ``blocks`` in one piece, which is quicker where signals are always as long.
 
         Shape: (items, time) in pascals, (items, 8) dB HL -> (items, time).
         """
@@ -108,9 +105,7 @@ class Teacher(nn.Module):
 def check_grid(sample_rate: int) -> int:
     """Samples from one place where a frame of MSBG's smearing starts to the next that falls on a sample.
 
-    Raises:
-        ValueError: these are too many for a teacher.
-    """
+    Raises ValueError where these are too many for a teacher."""
     grid = _FRAME * sample_rate // math.gcd(_FRAME * sample_rate, MSBG_RATE)
     if grid > 4 * sample_rate:
         raise ValueError(

@@ -93,16 +93,13 @@ def write_instances(
 def make(
     folder: str, root: str, digest: str, recipe: Recipe, number: int, keys: Sequence[str]
 ) -> dict[str, dict[str, Any] | Failed]:
-    """Write the instances of one utterance that are missing; its key with what is at fault with its audio, if anything.
-
-    One at a time, for the last bits of a batch depend on what else is in it.
-    """
+    """Write the instances of one utterance that are missing; its key with what is at fault, if its audio is."""
     torch.set_num_threads(1)  # which sums in one order; for good, for a worker may have other threads
     plan, teacher = _opened(folder, root, digest, recipe)
     for index in range(number * plan.each, (number + 1) * plan.each):
         if is_whole(plan.path(index)):
             continue
-        try:
+        try:  # one at a time, for the last bits of a batch depend on what else is in it
             instance = plan.instance(index)
             heard = teacher(instance.signal[None], instance.thresholds[None])[0]
         except ValueError as error:

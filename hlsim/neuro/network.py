@@ -12,9 +12,9 @@ from hlsim.dsp.overlap import overlapping
 from hlsim.dsp.resample import resample
 from hlsim.neuro.config import NEURO_RATE, NetworkConfig
 
-# Values of the widest feature map of all items that run together on a CPU, and samples at 16 kHz that this is at least and
-# at most. Larger maps the C library gives back to the system, and pays for their pages anew with every one; of smaller
-# ones the steps from one to the next take longer than the sums.
+# Values of the widest feature map of all items that run together on a CPU, and the samples at 16 kHz that this is at
+# least and at most. Larger maps the C library gives back to the system, and pays for their pages anew with every one; of
+# smaller ones the steps from one to the next take longer than the sums.
 _CPU_VALUES, _CPU_SAMPLES = 1_800_000, (16_000, 256_000)
 _DEVICE_SAMPLES = 960_000  # of a long item that run together elsewhere
 
