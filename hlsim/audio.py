@@ -107,9 +107,8 @@ def check_extension(path: str | Path) -> str:
     """Return the extension in lower case, or raise ValueError unless it is one that ``write_audio`` writes."""
     suffix = Path(path).suffix.lower()
     if suffix not in EXTENSIONS:
-        raise ValueError(
-            f"{path}: cannot write {suffix or 'a file without extension'}; allowed: {', '.join(EXTENSIONS)}"
-        )
+        found = suffix or "a file without extension"
+        raise ValueError(f"{path}: cannot write {found}; allowed: {', '.join(EXTENSIONS)}")
     return suffix
 
 
@@ -148,10 +147,8 @@ def write_audio(path: str | Path, waveform: Tensor, sample_rate: int) -> None:
     samples = waveform.detach().to("cpu", torch.float32)
     if not bool(torch.isfinite(samples).all()):
         raise ValueError(f"{path}: samples are NaN or infinite, nothing written")
-    if suffix != ".wav" and float(samples.abs().max()) > 1.0:
-        raise ValueError(
-            f"{path}: samples reach {float(samples.abs().max()):.3g}, {suffix} holds 1.0; write .wav"
-        )
+    if suffix != ".wav" and (peak := float(samples.abs().max())) > 1.0:
+        raise ValueError(f"{path}: samples reach {peak:.3g}, {suffix} holds 1.0; write .wav")
     rows = samples.reshape(-1, samples.shape[-1]).mT.numpy()
     kind = {"subtype": _SUBTYPES[suffix], "format": suffix[1:].upper()}
     with Whole(path, new_folder=False) as file:

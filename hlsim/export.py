@@ -115,9 +115,8 @@ def _check(path: Path, program: torch.export.ExportedProgram, level: float) -> N
         expected = program.module()(*given)
     off = float((torch.from_numpy(heard).to(expected) - expected).abs().max() / expected.abs().max())
     if not off <= _TOLERANCE:
-        raise ValueError(
-            f"ONNX cannot take the simulator: onnxruntime's output is off by {off:.0e} of its peak; allowed: {_TOLERANCE}"
-        )
+        wrong = f"is off by {off:.0e} of its peak; allowed: {_TOLERANCE}"
+        raise ValueError(f"ONNX cannot take the simulator: onnxruntime's output {wrong}")
 
 
 def _reason(error: BaseException) -> str:

@@ -79,15 +79,12 @@ def read_checkpoint(
         found = record.get("kind") if isinstance(record, dict) else None
         hint = f" ({_LOADERS[found]} loads the former)" if found in _LOADERS else ""
         raise ValueError(f"{folder}: a checkpoint of kind {found!r}; needed here: {kind!r}{hint}")
-    if hashlib.sha256(weights).hexdigest() != record.get("sha256"):
-        raise ValueError(
-            f"{folder / WEIGHTS}: changed since it was saved, its SHA-256 differs from {CONFIG}'s; get it anew"
-        )
     settings: Any = record.get("config")
+    changed = "changed since it was saved"
+    if hashlib.sha256(weights).hexdigest() != record.get("sha256"):
+        raise ValueError(f"{folder / WEIGHTS}: {changed}, its SHA-256 differs from {CONFIG}'s; get it anew")
     if record.get("config_sha256", _digest(settings)) != _digest(settings):
-        raise ValueError(
-            f"{folder / CONFIG}: changed since it was saved, the SHA-256 of its 'config' is another; get it anew"
-        )
+        raise ValueError(f"{folder / CONFIG}: {changed}, the SHA-256 of its 'config' is another; get it anew")
     try:
         config = config_kind.from_dict(settings)
     except (TypeError, ValueError) as error:
@@ -121,14 +118,12 @@ def find_checkpoint(name: str | Path, kind: str | None = None, also: Sequence[st
         return Path(name)
     if str(name) in (ours := shipped()):
         return ours[str(name)]
-    names = [*also, *shipped(kind)]
+    names = ", ".join([*also, *shipped(kind)]) or "none ships"
     inner = Path(name) / "checkpoint"  # as a training leaves it
     hint = f", but {str(inner)!r} is one" if (inner / CONFIG).is_file() else ""
     if str(name) in _MODELS:
         hint = f": it is {_MODELS[str(name)]}"
-    raise ValueError(
-        f"no checkpoint {str(name)!r}{hint}; allowed: {', '.join(names) or 'none ships'}, or a folder with {CONFIG}"
-    )
+    raise ValueError(f"no checkpoint {str(name)!r}{hint}; allowed: {names}, or a folder with {CONFIG}")
 
 
 def checkpoint_digest(name: str | Path) -> str:

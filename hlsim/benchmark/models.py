@@ -62,12 +62,10 @@ def rows(simulators: list[str] | None = None) -> tuple[list[Row], list[str]]:
         count, default = _count(load_pretrained(name)), name == "neuro-msbg"
         title = f"Neuro-MSBG ({name})"
         found.append(Row(title, both, partial(_neuro, name), parameters=count, default=default))
-    name, connear = (
-        "CoNNear's shape (random weights, speed only)",
-        ConnearShape().eval().requires_grad_(False),
+    name, shape = "CoNNear's shape (random weights, speed only)", ConnearShape().eval().requires_grad_(False)
+    found.append(
+        Row(name, (CONNEAR_RATE,), lambda rate, ear, device: shape.to(device), parameters=_count(shape))
     )
-    count = _count(connear)
-    found.append(Row(name, (CONNEAR_RATE,), lambda rate, ear, device: connear.to(device), parameters=count))
     return found, skipped
 
 

@@ -20,10 +20,7 @@ from hlsim.neuro.config import NEURO_RATE
 LENGTHS = (1.0, 4.0, 16.0, 60.0)
 BATCHES = (1, 8, 64)
 
-TRAINING = (
-    4.0,
-    64,
-)  # seconds and clips of a batch that the default network is trained or trained through with
+TRAINING = (4.0, 64)  # seconds and clips of a batch that the default network is trained with
 
 EARS = ("N1", "N2", "N3")
 """One ear of each degree of loss: mild, moderate and severe in MSBG's sense."""

@@ -23,9 +23,8 @@ def benchmark_markdown(result: Row) -> str:
     rows = result.get("rows", [])
     tables = [_one_second(rows), _sizes(rows), _training(rows)]
     for name, title in (("training", "A training step"), ("scan", "Selective scan")):
-        tables.append(
-            [{title: row["name"]} | _both_ways(row["forward"], row["both"]) for row in result.get(name, [])]
-        )
+        parts = result.get(name, [])
+        tables.append([{title: part["name"], **_both_ways(part["forward"], part["both"])} for part in parts])
     texts = [Table.of("", table).markdown() + "\n" for table in tables if table]
     return "\n".join([head, "", *texts, *(f"skipped: {reason}" for reason in result["skipped"])]) + "\n"
 
@@ -34,11 +33,8 @@ def _one_second(rows: Sequence[Row]) -> list[dict[str, str]]:
     table = []
     most = max((cell["counted"] for row in rows for cell in row["cells"]), default=0)
     for row in rows:
-        single = {
-            (cell["sample_rate"], cell["direction"]): cell
-            for cell in row["cells"]
-            if cell["seconds"] == 1.0 and cell["batch"] == 1
-        }
+        cells = [cell for cell in row["cells"] if (cell["seconds"], cell["batch"]) == (1.0, 1)]
+        single = {(cell["sample_rate"], cell["direction"]): cell for cell in cells}
         for (rate, direction), forward in single.items():
             if direction == "forward":
                 slow = f" ({forward['counted']} calls)" if forward["counted"] < most else ""
@@ -108,7 +104,5 @@ def _times(cell: Row | None) -> str:
 
 
 def _peaks(*cells: Row | None) -> str:
-    return (
-        ", ".join(number(cell["peak_mib"], ".0f") for cell in cells if cell and cell["peak_mib"] is not None)
-        or "-"
-    )
+    known = [cell["peak_mib"] for cell in cells if cell and cell["peak_mib"] is not None]
+    return ", ".join(f"{peak:.0f}" for peak in known) or "-"

@@ -139,15 +139,12 @@ def about(device: str, repeats: int) -> dict[str, Any]:
 
 def _gpu(device: str) -> dict[str, Any]:
     backends: Any = torch.backends  # torch's own types know little of it
-    kinds = {
-        "products": backends.cuda.matmul,
-        "convolutions": backends.cudnn.conv,
-        "recurrent": backends.cudnn.rnn,
-    }
+    cudnn = backends.cudnn
+    kinds = {"products": backends.cuda.matmul, "convolutions": cudnn.conv, "recurrent": cudnn.rnn}
     return {
         "memory_mib": torch.cuda.get_device_properties(device).total_memory / 2**20,
         "cuda": torch.version.cuda,
-        "cudnn": backends.cudnn.version(),
+        "cudnn": cudnn.version(),
         "tf32": {name: kind.fp32_precision == "tf32" for name, kind in kinds.items()},
     }
 

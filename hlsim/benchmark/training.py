@@ -123,11 +123,12 @@ def _table(
             for direction, said in DIRECTIONS.items():
                 key = f"{name}, {said}"
                 timings.attempt(key, partial(take, key, partial(_run, part, direction), turn))
-    rows = [
-        {"name": name} | {way: timings.figures(f"{name}, {said}") for way, said in DIRECTIONS.items()}
-        for name in parts
-    ]
-    return [row for row in rows if row["forward"] or row["both"]], timings.skipped
+    rows = []
+    for name in parts:
+        figures = {direction: timings.figures(f"{name}, {said}") for direction, said in DIRECTIONS.items()}
+        if any(figures.values()):
+            rows.append({"name": name, **figures})
+    return rows, timings.skipped
 
 
 def _run(part: Callable[[], Tensor], direction: str) -> None:

@@ -89,10 +89,8 @@ def examine(root: Path, shortest: float, pairs: bool, task: tuple[int, Found]) -
             noisy, noisy_rate = read_sound(root, path)
             if noisy_rate != rate:
                 raise ValueError(f"{noisy_rate} Hz, its clean speech has {rate} Hz")
-            if noisy.shape[-1] != samples:
-                raise ValueError(
-                    f"{noisy.shape[-1]} samples, its clean speech has {samples}: unequal lengths"
-                )
+            if (found_samples := noisy.shape[-1]) != samples:
+                raise ValueError(f"{found_samples} samples, its clean speech has {samples}: unequal lengths")
     except ValueError as error:
         return fault_of(root, path, error)
     return replace(found, rate=rate, seconds=samples / rate, active_level=active_level_db(clean[0], rate))

@@ -105,9 +105,8 @@ def walk_audio(folder: Path) -> Iterator[str]:
 def _walk(folder: Path) -> Iterator[tuple[str, list[str], list[str]]]:
     """As ``os.walk``, in order of names and without hidden ones."""
     for place, folders, names in os.walk(folder):
-        folders[:], names[:] = (
-            sorted(n for n in found if not n.startswith(".")) for found in (folders, names)
-        )
+        for found in (folders, names):
+            found[:] = sorted(name for name in found if not name.startswith("."))
         yield place, folders, names
 
 
@@ -211,9 +210,8 @@ def _folder(corpus: Path) -> Iterator[Found]:
         if counterpart and not (corpus / counterpart).is_file():
             yield Fault(path, f"no {other} counterpart {counterpart}")
         elif side != "noisy":
-            speaker = "/".join(
-                part for i, part in enumerate(parts[:-1]) if i != place and not (i == 0 and split)
-            )
+            passed = {place, 0 if split else place}
+            speaker = "/".join(part for i, part in enumerate(parts[:-1]) if i not in passed)
             yield Utterance(_stem(path), speaker or _unknown(split), split, path, counterpart)
     yield from linked_folders(corpus)
 

@@ -100,15 +100,11 @@ class Plan:
         self.rows = Rows(self.folder / INSTANCES, INSTANCE_COLUMNS)
         self._last = (-1, torch.empty(0))  # an utterance is wanted as often as it has instances, and in a row
         if len(self.rows) != len(self.utterances) * self.each:
-            raise ValueError(
-                f"{self.folder}: {len(self.rows)} instances of {len(self.utterances)} utterances; "
-                f"allowed: {self.each} of each"
-            )
-        for name in (MANIFEST, INSTANCES):
-            if sha256(self.folder / name) != about[f"{Path(name).stem}_sha256"]:
-                raise ValueError(
-                    f"{self.folder / name}: has changed since it was prepared; 'hlsim prepare' makes it anew"
-                )
+            found = f"{len(self.rows)} instances of {len(self.utterances)} utterances"
+            raise ValueError(f"{self.folder}: {found}; allowed: {self.each} of each")
+        for path in (self.folder / MANIFEST, self.folder / INSTANCES):
+            if sha256(path) != about[f"{path.stem}_sha256"]:
+                raise ValueError(f"{path}: has changed since it was prepared; 'hlsim prepare' makes it anew")
 
     def __len__(self) -> int:
         return len(self.rows)

@@ -14,12 +14,8 @@ from typing import Any, BinaryIO
 
 SPLITS = ("train", "valid", "test")
 
-_READ: dict[str, Callable[[str], Any]] = {
-    "str": str,
-    "int": int,
-    "float": float,
-    "float | None": lambda text: float(text) if text else None,
-}
+_READ: dict[str, Callable[[str], Any]] = {"str": str, "int": int, "float": float}
+_READ["float | None"] = lambda text: float(text) if text else None
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,9 +61,8 @@ class Utterance:
         try:
             utterance = cls(**{entry.name: _READ[str(entry.type)](row[entry.name]) for entry in fields(cls)})
         except (KeyError, TypeError, ValueError) as error:
-            raise ValueError(
-                f"no row of a manifest ({error!r}); allowed: {', '.join(UTTERANCE_COLUMNS)}"
-            ) from None
+            allowed = ", ".join(UTTERANCE_COLUMNS)
+            raise ValueError(f"no row of a manifest ({error!r}); allowed: {allowed}") from None
         if utterance.split not in SPLITS:
             raise ValueError(f"split {utterance.split!r}; allowed: {', '.join(SPLITS)}")
         return utterance

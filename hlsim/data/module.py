@@ -218,13 +218,8 @@ class PlannedBatches(Dataset[Batch]):
         noise = plan.noise(donor, self.samples, plan.rate) if donor.mixed else clip.signal - clip.clean
         ear = plan.thresholds(other) + 10.0 * torch.rand((), generator=generator) - 5.0
         ear = ear.clamp(LOWEST_LEVEL, HIGHEST_SIMULATED)
-        given = (
-            clip.clean[None],
-            noise[None] if bool(noise.any()) else None,
-            ear[None],
-            plan.rate,
-            generator,
-        )
+        added = noise[None] if bool(noise.any()) else None
+        given = (clip.clean[None], added, ear[None], plan.rate, generator)
         (signal,) = augment_speech(*given, levels=self.levels, treated=self.treated)
         return Instance(set_level(clip.clean, level_spl(signal)), signal, ear)
 

@@ -65,10 +65,8 @@ def find_noises(
     Raises:
         ValueError: no noise that can be used, too few types, or types or SNRs that are not disjoint.
     """
-    if shared := sorted(set(train_snrs) & set(test_snrs)):
-        raise ValueError(
-            f"SNRs {', '.join(f'{snr:g}' for snr in shared)} dB for training and test; allowed: disjoint sets"
-        )
+    if shared := ", ".join(f"{snr:g}" for snr in sorted({*train_snrs} & {*test_snrs})):
+        raise ValueError(f"SNRs {shared} dB for training and test; allowed: disjoint sets")
     kinds: dict[str, dict[str, list[tuple[str, Sequence[float]]]]] = {}
     faults = list(linked_folders(root / folder, folder))
     for path in walk_audio(root / folder):

@@ -27,9 +27,8 @@ class ConvPath(nn.Module):
     def __init__(self, channels: int, axis: int, kernel: int, expansion: int) -> None:
         super().__init__()
         size = (kernel, 1) if axis == 0 else (1, kernel)
-        self.local = nn.Conv2d(
-            channels, channels, size, padding=(size[0] // 2, size[1] // 2), groups=channels
-        )
+        around = (size[0] // 2, size[1] // 2)
+        self.local = nn.Conv2d(channels, channels, size, padding=around, groups=channels)
         self.expand = nn.Linear(channels, channels * expansion)
         self.restore = nn.ConvTranspose1d(channels * expansion, channels, 1)
 

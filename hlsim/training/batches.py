@@ -81,11 +81,13 @@ def identity_of(data: TrainingData | PlannedSource) -> dict[str, str]:
 
 
 class DrawnBatches(Dataset[Batch]):
-    """Random speech, noise and ears in clips of so many seconds; a batch depends on seed, step and rank alone."""
+    """Random speech, noise and ears; a batch depends on seed, step and rank alone."""
 
-    def __init__(self, recipe: TrainingRecipe, data: TrainingData, seconds: float) -> None:
-        self.batch, self.seed, self.sounds = recipe.batch, recipe.seed, recipe.sounds
-        options: dict[str, Any] = {"sample_rate": NEURO_RATE, "seconds": seconds}
+    recipe: TrainingRecipe
+
+    def __init__(self, recipe: TrainingRecipe, data: TrainingData) -> None:
+        self.recipe, self.batch, self.seed = recipe, recipe.batch, recipe.seed
+        options: dict[str, Any] = {"sample_rate": NEURO_RATE, "seconds": recipe.seconds}
         self.speech = Clips(data.speech, **options)
         self.noise = Clips(data.noise, repeat=True, **options) if data.noise else None
         self.ears: Tensor | None = None  # measured ones. Shape: (ears, 8) dB HL
@@ -113,36 +115,33 @@ class DrawnBatches(Dataset[Batch]):
 
     def join_sounds(self, clips: Tensor, generator: torch.Generator) -> Tensor:
         """The recipe's share of the clips, replaced by tones and clicks."""
-        if not self.sounds:
+        if not (share := self.recipe.sounds):
             return clips
         others = draw_sounds(len(clips), clips.shape[-1], NEURO_RATE, generator)
-        return torch.where(torch.rand(len(clips), 1, generator=generator) < self.sounds, others, clips)
+        return torch.where(torch.rand(len(clips), 1, generator=generator) < share, others, clips)
 
 
 class SimulatorBatches(DrawnBatches):
     """What a simulator is to hear: speech, noise, tones and clicks as compensators emit them, at any level."""
 
-    def __init__(self, recipe: SimulatorRecipe, data: TrainingData) -> None:
-        super().__init__(recipe, data, recipe.seconds)
-        self.levels, self.treated = recipe.levels, recipe.treated
+    recipe: SimulatorRecipe
 
     def draw(self, count: int, generator: torch.Generator) -> Batch:
         ears = self.join_measured(draw_thresholds(count, generator), 0.4, 5.0, generator)
         noise = self.noise.draw(count, generator) if self.noise is not None else None
         clips = self.join_sounds(self.speech.draw(count, generator), generator)
         given = (clips, noise, ears, NEURO_RATE, generator)
-        signal = augment_speech(*given, levels=self.levels, treated=self.treated)
+        signal = augment_speech(*given, levels=self.recipe.levels, treated=self.recipe.treated)
         return {"clean": set_level(clips, level_spl(signal)), "signal": signal, "thresholds": ears}
 
 
 class CompensatorBatches(DrawnBatches):
     """What a compensator is given: speech, clean or noisy, and the ears that it is for, ``ear`` or drawn ones."""
 
-    def __init__(
-        self, recipe: CompensatorRecipe, data: TrainingData, seconds: float, ear: Audiogram | None
-    ) -> None:
-        super().__init__(recipe, data, seconds)
-        self.recipe = recipe
+    recipe: CompensatorRecipe
+
+    def __init__(self, recipe: CompensatorRecipe, data: TrainingData, ear: Audiogram | None) -> None:
+        super().__init__(recipe, data)
         self.ear = None if ear is None else torch.tensor(ear.thresholds)
 
     def draw(self, count: int, generator: torch.Generator) -> Batch:
@@ -176,10 +175,11 @@ def simulator_data(data: TrainingData | PlannedSource, recipe: SimulatorRecipe) 
 def compensator_data(data: TrainingData, recipe: CompensatorRecipe, ear: Audiogram | None) -> BatchData:
     """What a compensator for an ear, or else for all, is trained and validated on. Raises ValueError as
     ``simulator_data``."""
-    valid = CompensatorBatches(replace(recipe, equalised=0.0), data.validation(), _VALID_SECONDS, ear)
+    plain = replace(recipe, equalised=0.0, seconds=_VALID_SECONDS)
+    valid = CompensatorBatches(plain, data.validation(), ear)
     generator = torch.Generator().manual_seed(2_000 + recipe.seed)
     validation = [valid.draw(4, generator) for _ in range(0, recipe.validation_items, 4)]
-    return BatchData(CompensatorBatches(recipe, data, recipe.seconds, ear), validation)
+    return BatchData(CompensatorBatches(recipe, data, ear), validation)
 
 
 def speech_to_validate(data: TrainingData, recipe: SimulatorRecipe) -> list[Batch]:

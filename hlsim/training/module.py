@@ -64,9 +64,9 @@ class TimedModule(L.LightningModule):
 
     def training_step(self, batch: Batch, index: int) -> Tensor:
         loss = self.training_loss(batch)
-        if not bool(torch.isfinite(loss)):
+        if not math.isfinite(value := float(loss.detach())):
             raise ValueError(
-                f"the loss is {float(loss.detach())} at step {self.global_step}; a lower learning rate may help"
+                f"the loss is {value} at step {self.global_step}; a lower learning rate may help"
             )
         self.log("loss", loss, prog_bar=True)
         return loss
@@ -136,15 +136,14 @@ def initial_network(
     if not start:
         return kind(config)
     network = load(start)
+    what = f"start {start!r} in the recipe"
     if not isinstance(network, kind):
-        raise ValueError(
-            f"start {start!r} in the recipe is none to be trained; allowed: a checkpoint's name or folder"
-        )
+        raise ValueError(f"{what} is none to be trained; allowed: a checkpoint's name or folder")
     if settings and config != network.config:
         ours, theirs = config.to_dict(), network.config.to_dict()  # type: ignore[operator,union-attr]
         differing = ", ".join(name for name in ours if ours[name] != theirs[name])
         raise ValueError(
-            f"start {start!r} in the recipe has other settings of the model than the recipe ({differing}); allowed: the "
-            "same, or no 'model' in the recipe"
+            f"{what} has other settings of the model than the recipe ({differing}); allowed: the same, or no 'model' in "
+            "the recipe"
         )
     return network.train().requires_grad_(True)

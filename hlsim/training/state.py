@@ -67,8 +67,7 @@ def _differing(one: str, other: str) -> str:
     """Names of the settings that differ."""
     try:
         first, second = json.loads(one), json.loads(other)
-        return ", ".join(
-            name for name in sorted(first | second) if first.get(name, ...) != second.get(name, ...)
-        )
+        names = sorted(first | second)
+        return ", ".join(name for name in names if first.get(name, ...) != second.get(name, ...))
     except (ValueError, TypeError):
         return "settings"  # the file is broken
