@@ -60,15 +60,10 @@ def read_checkpoint(
     build: Callable[[Config], Model],
     also: Sequence[str] = (),
 ) -> Model:
-    """Build a model from a checkpoint's configuration and load its weights.
+    """A model built from a checkpoint's configuration, with its weights, on torch's default device, or the CPU where that
+    is ``meta``. A configuration without a hash, as older checkpoints have it, is taken as it is.
 
-    A configuration without a hash, as older checkpoints have it, is taken as it is.
-
-    Returns: the model on torch's default device, or the CPU where that is ``meta``.
-
-    Raises:
-        ValueError: as ``load_pretrained``.
-    """
+    Raises ValueError as ``load_pretrained``."""
     folder = find_checkpoint(name, kind, also)
     try:
         record = _record(folder)
@@ -105,12 +100,9 @@ def read_checkpoint(
 def find_checkpoint(name: str | Path, kind: str | None = None, also: Sequence[str] = ()) -> Path:
     """The folder of a checkpoint that ships with hlsim, or another.
 
-    Args:
-        kind: of those that the message lists; None lists all.
-        also: other names that the caller takes, for the message.
-
     Raises:
-        ValueError: there is none, or it is neither a name nor a path; the message lists those that ship.
+        ValueError: there is none, or it is neither a name nor a path; the message lists those of the kind that ship, and
+            what the caller takes ``also``.
     """
     if not isinstance(name, str | os.PathLike):
         raise ValueError(f"checkpoint is {type(name).__name__}; allowed: a name or a folder")

@@ -94,6 +94,15 @@ def assign_splits(
     return assigned
 
 
+def _stem(path: str) -> str:
+    return path.removesuffix(Path(path).suffix)
+
+
+def _unknown(split: str) -> str:
+    """A speaker: what the corpus has in two splits cannot be one."""
+    return f"unknown {split}".rstrip()
+
+
 def walk_audio(folder: Path) -> Iterator[str]:
     """Paths of wav, flac and ogg files below a folder in POSIX form, folder by folder in order of names."""
     for place, _, names in _walk(folder):
@@ -131,10 +140,6 @@ def _named_once(found: Iterator[Found]) -> Iterator[Found]:
                 one = Fault(one.clean, f"a second file of the name {one.id}")
             names.add(name)
         yield one
-
-
-def _stem(path: str) -> str:
-    return path.removesuffix(Path(path).suffix)
 
 
 def _voicebank(corpus: Path) -> Iterator[Found]:
@@ -175,12 +180,10 @@ def _voicebank_log(corpus: Path, name: str) -> dict[str, tuple[str, float | None
 def _librispeech_parts(corpus: Path) -> list[tuple[str, str]]:
     """Folders such as ``train-clean-100`` with the split of each."""
     inner = "LibriSpeech/" if (corpus / "LibriSpeech").is_dir() else ""
-    return [
-        (inner + place.name, split)
-        for place in sorted((corpus / inner).iterdir())
-        for head, split in _LIBRISPEECH.items()
-        if place.name.startswith(f"{head}-") and place.is_dir()
-    ]
+    heads = {
+        path: path.name.partition("-")[0] for path in sorted((corpus / inner).glob("*-*")) if path.is_dir()
+    }
+    return [(inner + path.name, _LIBRISPEECH[head]) for path, head in heads.items() if head in _LIBRISPEECH]
 
 
 def _librispeech(corpus: Path) -> Iterator[Found]:
@@ -198,12 +201,12 @@ def _folder(corpus: Path) -> Iterator[Found]:
     Where a folder ``clean`` has a neighbour ``noisy``, files of equal names in them are pairs.
     """
     for path in walk_audio(corpus):
-        parts = path.split("/")
-        split = SPLIT_FOLDERS.get(parts[0], "") if len(parts) > 1 else ""
+        *folders, name = path.split("/")
+        split = SPLIT_FOLDERS.get("".join(folders[:1]), "")
         for side, other in (("clean", "noisy"), ("noisy", "clean")):
-            place = parts.index(side) if side in parts[:-1] else -1
-            if place >= 0 and corpus.joinpath(*parts[:place], other).is_dir():
-                counterpart = "/".join([*parts[:place], other, *parts[place + 1 :]])
+            place = folders.index(side) if side in folders else -1
+            if place >= 0 and corpus.joinpath(*folders[:place], other).is_dir():
+                counterpart = "/".join([*folders[:place], other, *folders[place + 1 :], name])
                 break
         else:
             side, counterpart, place = "", "", -1
@@ -211,14 +214,9 @@ def _folder(corpus: Path) -> Iterator[Found]:
             yield Fault(path, f"no {other} counterpart {counterpart}")
         elif side != "noisy":
             passed = {place, 0 if split else place}
-            speaker = "/".join(part for i, part in enumerate(parts[:-1]) if i not in passed)
+            speaker = "/".join(part for i, part in enumerate(folders) if i not in passed)
             yield Utterance(_stem(path), speaker or _unknown(split), split, path, counterpart)
     yield from linked_folders(corpus)
-
-
-def _unknown(split: str) -> str:
-    """A speaker: what the corpus has in two splits cannot be one."""
-    return f"unknown {split}".rstrip()
 
 
 def _listed(corpus: Path, table: Path) -> Iterator[Found]:

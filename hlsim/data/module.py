@@ -68,9 +68,8 @@ class TimedLoader(DataLoader[Any]):
         while True:
             began = time.perf_counter()
             try:
-                batch = next(batches)
-            except StopIteration:
-                return
+                if (batch := next(batches, None)) is None:
+                    return
             except ValueError as error:  # a worker's has its traceback in its message
                 raise ValueError(str(error).rpartition("ValueError: ")[2].strip()) from error
             self.waited += time.perf_counter() - began
@@ -200,7 +199,7 @@ class PlannedBatches(Dataset[Batch]):
         raise ValueError(f"{_TRIES} instances in a row cannot be read, the last: {last}")
 
     def _clip(self, position: int, offset: int) -> Instance:
-        count = len(self.items)
+        plan, indices, count = self.items.plan, self.items.indices, len(self.items)
         epoch, place = divmod(position, count)
         if self._order[0] != epoch:
             self._order = (epoch, torch.randperm(count, generator=self._generator(-epoch - 1)))
@@ -211,7 +210,6 @@ class PlannedBatches(Dataset[Batch]):
         first = self.grid * int(torch.randint(spare // self.grid + 1, (), generator=generator))
         if not self.augment:
             return instance.clip(first, self.samples)
-        plan, indices = self.items.plan, self.items.indices
         clip = Instance(*plan.pair(int(indices[number])), instance.thresholds).clip(first, self.samples)
         other, another = indices[torch.randint(len(indices), (2,), generator=generator)].tolist()
         donor = plan.utterance(another)
@@ -259,9 +257,8 @@ class PlanData(BatchData):
     ) -> None:
         self.plan = Plan(folder, root)
         super().__init__(teacher=(recipe or Recipe()).teacher(self.plan.rate), workers=workers)
-        self.prepared = prepared
+        self.prepared, self.clips = prepared, clips
         self.made_of = claimed(self.plan) if prepared else self.plan.digest
-        self.clips = clips
 
     @cached_property
     def training(self) -> Dataset[Batch]:  # type: ignore[override]

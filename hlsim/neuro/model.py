@@ -101,7 +101,14 @@ class NeuroMSBG(EarNetwork):
         exponents = CATCH_UP_SPL / (CATCH_UP_SPL - interpolate(ears, self.config.hz)) - 1.0
         lower = self.autocast_dtype
         with torch.autocast(signals.device.type, lower or torch.bfloat16, enabled=lower is not None):
-            features = self._network(features, severity)
+            features = self.encoder(features.contiguous(memory_format=torch.channels_last)).permute(
+                0, 2, 3, 1
+            )
+            if self.severity is not None:
+                features = features + self.severity(severity)[:, None, None]
+            for block in self.blocks:
+                features = block(features)
+            features = features.permute(0, 3, 1, 2)
             log_mask = self.mask_decoder.log_mask(features, size, exponents).clamp(-12.0, 4.0)
             if self.phase_decoder is None:
                 correction = log_mask.exp()
@@ -111,15 +118,6 @@ class NeuroMSBG(EarNetwork):
             correction = factor * correction
         heard = self.stft.synthesise(spectrum * correction, signals.shape[-1])
         return heard if scale is None else heard * scale
-
-    def _network(self, features: Tensor, severity: Tensor) -> Tensor:
-        """Shape: (items, inputs, frames, rows), (items,) -> (items, channels, frames / stride, rows / stride)."""
-        features = self.encoder(features.contiguous(memory_format=torch.channels_last)).permute(0, 2, 3, 1)
-        if self.severity is not None:
-            features = features + self.severity(severity)[:, None, None]
-        for block in self.blocks:
-            features = block(features)
-        return features.permute(0, 3, 1, 2)
 
     def _features(self, spectrum: Tensor, squared: Tensor, ears: Tensor, factor: Tensor | None) -> Tensor:
         """The input channels.

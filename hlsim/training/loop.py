@@ -57,10 +57,9 @@ def train_network(
     about: Mapping[str, Any],
     **options: Unpack[RunOptions],
 ) -> Path:
-    """``run`` a recipe, keep the best network as a checkpoint, and return the checkpoint's folder.
+    """``run`` a recipe, keep the best network as a checkpoint of a kind, and return the checkpoint's folder.
 
     Args:
-        kind: of checkpoint.
         identity: what makes this training this one, beside recipe and time.
         about: what the checkpoint is to tell, beside recipe and figures.
     """
@@ -110,14 +109,9 @@ def run(
     accelerator, strategy = options.get("accelerator", "auto"), options.get("strategy", "auto")
     devices, nodes = options.get("devices", 1), options.get("nodes", 1)
     module.timer = Timer(timedelta(minutes=module.max_minutes), interval="step", verbose=False)
-    states = ModelCheckpoint(
-        dirpath=folder,
-        filename="last",
-        save_top_k=1,
-        enable_version_counter=False,
-        # at the end of each validation, not before it: a run that goes on from a state does not validate it
-        save_on_train_epoch_end=False,
-    )
+    # at the end of each validation, not before it: a run that goes on from a state does not validate it
+    how: dict[str, Any] = {"save_top_k": 1, "save_on_train_epoch_end": False, "enable_version_counter": False}
+    states = ModelCheckpoint(dirpath=folder, filename="last", **how)
     callbacks: list[Callback] = [
         module.timer,
         KeepBest(write, folder / BEST),
