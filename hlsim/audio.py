@@ -96,9 +96,8 @@ def _refuse_cut(path: str | Path) -> None:
             if chunk[:4] == b"data":
                 held = os.fstat(file.fileno()).st_size - file.tell()
                 if held < size < _STREAMED:
-                    raise ValueError(
-                        f"{path}: cut off, its header tells of {size} bytes of samples, {held} are there"
-                    )
+                    told = f"its header tells of {size} bytes of samples, {held} are there"
+                    raise ValueError(f"{path}: cut off, {told}")
                 return
             file.seek(size + size % 2, os.SEEK_CUR)
 

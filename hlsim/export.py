@@ -50,9 +50,8 @@ def export_program(
         )
     time = round(NEURO_RATE * seconds) if is_finite(seconds) else 0
     if time < 1 or not isinstance(items, int) or items < 1:
-        raise ValueError(
-            f"a program for {seconds!r} seconds of {items!r} items; allowed: more than 0 seconds, 1 item or more"
-        )
+        asked = f"a program for {seconds!r} seconds of {items!r} items"
+        raise ValueError(f"{asked}; allowed: more than 0 seconds, 1 item or more")
     weight = next(simulator.parameters())
     example = tuple(weight.new_zeros(items, length) for length in (time, len(FREQUENCIES)))
     modes = [(module, module.training) for module in simulator.modules()]

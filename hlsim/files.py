@@ -39,9 +39,8 @@ def file_lock(path: Path) -> Iterator[None]:
             if fcntl is not None:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            raise ValueError(
-                f"{path.parent}: another process is writing there; wait until it is done"
-            ) from None
+            where = path.parent
+            raise ValueError(f"{where}: another process is writing there; wait until it is done") from None
         except OSError:
             pass  # no locks on this drive
         yield
@@ -176,9 +175,7 @@ def read_rows(path: str | Path) -> Iterator[tuple[int, dict[str, str]]]:
                 raise ValueError(f"{path}, line {reader.line_num}: column {name} twice; allowed: once")
         for values in filter(None, reader):
             if any(value.strip() for value in values[len(header) :]):
-                raise ValueError(
-                    f"{path}, line {reader.line_num}: {len(values)} values; allowed: one for each of the "
-                    f"{len(header)} columns"
-                )
+                allowed = f"one for each of the {len(header)} columns"
+                raise ValueError(f"{path}, line {reader.line_num}: {len(values)} values; allowed: {allowed}")
             row = zip_longest(header, values[: len(header)], fillvalue="")
             yield reader.line_num, {name: value.strip() for name, value in row if name}

@@ -47,9 +47,8 @@ class Ears:
         """Raises ValueError where a file has too few ears for a split."""
         for split in splits if self.measured else ():
             if (found := len(self.measured[split])) < ears:
-                raise ValueError(
-                    f"{found} measured ears for {split}; allowed: {ears} or more, for each utterance gets {ears}"
-                )
+                allowed = f"{ears} or more, for each utterance gets {ears}"
+                raise ValueError(f"{found} measured ears for {split}; allowed: {allowed}")
 
     def assign(self, split: str, utterances: int, ears: int) -> Iterator[list[Audiogram]]:
         """The ears of each utterance of a split, all different.
@@ -120,10 +119,9 @@ def plan_ears(
         taken.update(fresh)
     exact = check_shares(shares) if shares else {}
     for split in splits:
-        if missing := sorted(set(exact) - {ear.severity for ear in ears[split]}):
-            raise ValueError(
-                f"{audiograms}: no {' or '.join(missing)} ears for {split}; allowed: proportions of what is there"
-            )
+        if missing := " or ".join(sorted(set(exact) - {ear.severity for ear in ears[split]})):
+            lacks = f"no {missing} ears for {split}"
+            raise ValueError(f"{audiograms}: {lacks}; allowed: proportions of what is there")
     return Ears(exact, ears, seed)
 
 
@@ -140,9 +138,8 @@ class _Measured:
         self.turns: dict[str, list[Audiogram]] = {}
 
     def take(self, severity: str, other_than: list[Audiogram]) -> Audiogram:
-        alike = [ear for ear in self.all if ear.severity == severity and ear not in other_than]
-        if not alike:  # a severity of one ear alone
-            alike = [ear for ear in self.all if ear not in other_than]
+        others = [ear for ear in self.all if ear not in other_than]
+        alike = [ear for ear in others if ear.severity == severity] or others  # where one ear alone has it
         waiting = self.turns.setdefault(severity, [])
         for ear in waiting:
             if ear in alike:

@@ -134,9 +134,7 @@ def claimed(plan: Plan) -> str:
     found = path.read_text(encoding="utf-8") if path.is_file() else ""
     if found.splitlines()[:1] != [plan.digest]:
         raise ValueError(f"{path.parent}: no instances of this plan; 'hlsim prepare --write' makes them")
-    missing = sum(not plan.path(index).is_file() for index in range(len(plan)))
-    if missing:
-        raise ValueError(
-            f"{path.parent}: {missing} of {len(plan)} instances missing; 'hlsim prepare --write' goes on with them"
-        )
+    if missing := sum(not plan.path(index).is_file() for index in range(len(plan))):
+        what = f"{missing} of {len(plan)} instances missing"
+        raise ValueError(f"{path.parent}: {what}; 'hlsim prepare --write' goes on with them")
     return found.strip()
