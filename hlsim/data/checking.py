@@ -14,6 +14,7 @@ from torch import Tensor
 from hlsim.audio import read_audio
 from hlsim.data.corpora import Fault, Found, walk_audio
 from hlsim.data.manifest import inside
+from hlsim.data.plan_settings import PlanSettings
 from hlsim.dsp.active_level import active_level_db
 from hlsim.parallel import run_parallel
 
@@ -38,11 +39,11 @@ class Listing:
         noisy = _state(root / found.noisy) if found.noisy else None
         self._digest.update(f"{found} {_state(root / found.clean)} {noisy}\n".encode())
 
-    def digest(self, noise: Path | None, *tables: Path | None) -> str:
-        if noise is not None:
+    def digest(self, noise: Path, settings: PlanSettings) -> str:
+        if settings.noise is not None:
             for path in walk_audio(noise):
                 self._digest.update(f"{path} {_state(noise / path)}\n".encode(errors="backslashreplace"))
-        for table in tables:
+        for table in (settings.audiograms, settings.test_audiograms):
             self._digest.update(f"{table and _state(table)}\n".encode())
         return self._digest.hexdigest()
 

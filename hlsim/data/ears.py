@@ -8,7 +8,6 @@ from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from itertools import accumulate
-from pathlib import Path
 from random import Random
 
 import torch
@@ -16,6 +15,7 @@ import torch
 from hlsim.audiogram import HIGHEST_SIMULATED, SEVERITIES, Audiogram, draw_thresholds, read_audiograms
 from hlsim.checks import refuse_unknown
 from hlsim.data.manifest import SPLITS
+from hlsim.data.plan_settings import PlanSettings
 
 MILD_TO_SEVERE: Mapping[str, float] = {"mild": 1.0, "moderate": 1.0, "severe": 1.0}
 """Default proportions of MSBG's severities: the paper says no more than "from mild to severe"."""
@@ -72,24 +72,21 @@ class Ears:
             yield chosen
 
 
-def plan_ears(
-    shares: Mapping[str, float] | None,
-    audiograms: Path | None,
-    test_audiograms: Path | None,
-    splits: Collection[str],
-    seed: int,
-) -> Ears:
+def plan_ears(settings: PlanSettings, splits: Collection[str]) -> Ears:
     """Ears from files, or else to be drawn.
 
     Of a file, rows with a column ``split`` go where it says. Of the other listeners (column ``listener``, or else equal
     thresholds) a fifth is for test, if it has no file of its own, and a tenth for validation. Of ears that two splits
     have alike the earlier of test, validation and training keeps them. Ears above 100 dB HL are passed over.
 
-    Args: as ``PlanSettings`` has them, and the splits of the corpus.
+    Args:
+        splits: those that the corpus has.
 
     Raises:
         ValueError: a file that cannot be used, or that lacks a severity asked for.
     """
+    shares, seed = settings.severities, settings.seed
+    audiograms, test_audiograms = settings.audiograms, settings.test_audiograms
     if audiograms is None:
         if test_audiograms is not None:
             raise ValueError(f"{test_audiograms}: ears for test alone; allowed: with ears for training")

@@ -14,12 +14,7 @@ from hlsim.calibration import dbfs
 from hlsim.data.checking import fault_of, read_sound
 from hlsim.data.corpora import BAD_NAME, SPLIT_FOLDERS, Fault, linked_folders, walk_audio
 from hlsim.data.manifest import Utterance, printable, storable
-
-TRAIN_SNRS_DB, TEST_SNRS_DB = (0.0, 5.0, 10.0, 15.0), (2.5, 7.5, 12.5, 17.5)
-"""Signal-to-noise ratios in dB by active speech level: VoiceBank-DEMAND's, and the paper's."""
-
-TRAIN_TYPES, TEST_TYPES = 8, 2
-"""Types of noise, where there are as many."""
+from hlsim.data.plan_settings import PlanSettings
 
 _QUIET_DB = 30.0  # a stretch this far below its recording's level counts as a pause of the noise
 _STEP, _STRETCH = 0.1, 5  # s from one possible start to the next, and how many of these are no pause
@@ -46,15 +41,7 @@ class Noises:
 
 
 def find_noises(
-    root: Path,
-    folder: str,
-    splits: Iterable[str],
-    *,
-    train_snrs: Sequence[float] = TRAIN_SNRS_DB,
-    test_snrs: Sequence[float] = TEST_SNRS_DB,
-    train_types: int = TRAIN_TYPES,
-    test_types: int = TEST_TYPES,
-    seed: int = 0,
+    root: Path, folder: str, splits: Iterable[str], settings: PlanSettings
 ) -> tuple[Noises, list[Fault]]:
     """Noises below ``root / folder``, and what is at fault there.
 
@@ -65,7 +52,8 @@ def find_noises(
     Raises:
         ValueError: no noise that can be used, too few types, or types or SNRs that are not disjoint.
     """
-    if shared := ", ".join(f"{snr:g}" for snr in sorted({*train_snrs} & {*test_snrs})):
+    snrs = {"train": settings.train_snrs, "valid": settings.train_snrs, "test": settings.test_snrs}
+    if shared := ", ".join(f"{snr:g}" for snr in sorted({*snrs["train"]} & {*snrs["test"]})):
         raise ValueError(f"SNRs {shared} dB for training and test; allowed: disjoint sets")
     kinds: dict[str, dict[str, list[tuple[str, Sequence[float]]]]] = {}
     faults = list(linked_folders(root / folder, folder))
@@ -87,7 +75,7 @@ def find_noises(
         raise ValueError(f"{root / folder}: no noise in it that can be used")
     files: dict[str, Types] = {**kinds}
     if set(kinds) == {""}:
-        files = _drawn(kinds[""], train_types, test_types, seed)
+        files = _drawn(kinds[""], settings.train_types, settings.test_types, settings.seed)
     if "valid" not in files and "train" in files:
         files["valid"] = files["train"]
     for split in splits:
@@ -98,7 +86,7 @@ def find_noises(
             )
     if both := sorted(set(files.get("train", ())) & set(files.get("test", ()))):
         raise ValueError(f"{root / folder}: {', '.join(both)} for training and test; allowed: disjoint types")
-    return Noises(files, {"train": train_snrs, "valid": train_snrs, "test": test_snrs}), faults
+    return Noises(files, snrs), faults
 
 
 def _drawn(types: Types, train: int, test: int, seed: int) -> dict[str, Types]:

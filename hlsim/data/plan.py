@@ -84,12 +84,11 @@ def prepare(
         listing.add(root, found)
     if not listing.total:
         raise ValueError(f"{root / corpus}: no audio in it that the layout {layout} knows")
-    tables = (settings.audiograms, settings.test_audiograms)
     about: dict[str, Any] = {
         "root": str(root),
         "layout": layout,
         "settings": {n: str(v) if isinstance(v, Path) else v for n, v in asdict(settings).items()},
-        "files_sha256": listing.digest(root / noise if settings.noise else None, *tables),
+        "files_sha256": listing.digest(root / noise, settings),
     }
     if prepared := _unchanged(folder, about, strict):
         return prepared
@@ -101,7 +100,7 @@ def prepare(
     shares = {"test_share": settings.test_share, "valid_share": settings.valid_share}
     splits = assign_splits(listing.speakers, **shares, seed=settings.seed)
     used = set(splits.values())
-    ears = plan_ears(settings.severities, *tables, used, settings.seed)
+    ears = plan_ears(settings, used)
     ears.check(used, settings.ears)
     noises: Noises | None = None
     faults: list[Fault] = []
@@ -111,8 +110,7 @@ def prepare(
                 f"{settings.corpus}: has noisy speech of its own; allowed: no folder of noise with it, or only the clean "
                 "speech as the corpus"
             )
-        names = ("train_snrs", "test_snrs", "train_types", "test_types", "seed")
-        noises, faults = find_noises(root, noise, used, **{name: getattr(settings, name) for name in names})
+        noises, faults = find_noises(root, noise, used, settings)
     folder.mkdir(parents=True, exist_ok=True)
     for leftover in folder.glob(f".*{PARTIAL}"):  # of a run that was killed
         leftover.unlink(missing_ok=True)
