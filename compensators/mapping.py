@@ -15,11 +15,10 @@ from hlsim.audiogram import interpolate
 from hlsim.calibration import PASCAL_SPL
 from hlsim.dsp.erb import erb_number
 from hlsim.dsp.fft import power
-from hlsim.neuro.audiogram_encoder import AudiogramEncoder
 from hlsim.neuro.blocks import DualPathBlock
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.neuro.decoders import Decoder, PhaseDecoder
-from hlsim.neuro.encoder import DenseEncoder, log_magnitude, sine_of_phase
+from hlsim.neuro.encoder import AudiogramEncoder, DenseEncoder, log_magnitude, sine_of_phase
 from hlsim.neuro.network import EarNetwork
 from hlsim.torchtools import constant_like
 
@@ -109,14 +108,10 @@ class MappingCompensator(EarNetwork):
         Shape: (items, channels, ...) -> (items, frames, frequencies).
         """
         bands = self.config.bands, self.config.fft
-        into, out_of = (
-            constant_like(features, _into_bands, *bands),
-            constant_like(features, _out_of_bands, *bands),
-        )
+        into, out_of = (constant_like(features, weights, *bands) for weights in (_into_bands, _out_of_bands))
         levels = self.magnitude_decoder(features, size).squeeze(1) @ into
-        return (
-            _steady(torch.tanh(levels), self.config.stride[0]) @ out_of * (self.config.reach_db / _NEPER_DB)
-        )
+        smooth = _steady(torch.tanh(levels), self.config.stride[0])
+        return smooth @ out_of * (self.config.reach_db / _NEPER_DB)
 
     def _features(self, spectrum: Tensor, ears: Tensor, start: Tensor) -> Tensor:
         """The input channels. Shape: (items, frames, frequencies), ... -> (items, 3 or 4, frames, frequencies)."""

@@ -2,6 +2,8 @@
 
 import io
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import soundfile
@@ -16,11 +18,7 @@ EXTENSIONS = (".wav", ".flac", ".ogg")
 _STREAMED = 0x7FFF0000  # sizes from here on were written before the length was known: 0x7FFFF000, 0xFFFFFFFF
 
 _HIGHEST_STORED = {".wav": 2**31 - 1, ".flac": 655_350, ".ogg": 200_000}  # in Hz; libvorbis crashes beyond
-_FORMATS = {
-    ".wav": ("FLOAT", None, "WAV"),
-    ".flac": ("PCM_24", None, "FLAC"),
-    ".ogg": ("VORBIS", None, "OGG"),
-}
+_SUBTYPES = {".wav": "FLOAT", ".flac": "PCM_24", ".ogg": "VORBIS"}
 
 
 def read_audio(path: str | Path, *, any_rate: bool = False) -> tuple[Tensor, int]:
@@ -38,12 +36,8 @@ def read_audio(path: str | Path, *, any_rate: bool = False) -> tuple[Tensor, int
     check_name(path)
     if not Path(path).is_file():
         raise ValueError(f"{path}: no such file")
-    try:
-        _refuse_cut(path)
+    with _told(path):
         samples, rate = soundfile.read(str(path), dtype="float32", always_2d=True)
-    except (OSError, soundfile.LibsndfileError, RuntimeError, MemoryError) as error:
-        # no memory is enough for the length that a broken header tells
-        raise ValueError(f"{path}: not readable as audio ({error}); allowed: wav, flac, ogg") from error
     if samples.shape[0] == 0:
         raise ValueError(f"{path}: empty, no samples")
     waveform = torch.from_numpy(samples.T.copy())
@@ -59,32 +53,36 @@ def read_audio(path: str | Path, *, any_rate: bool = False) -> tuple[Tensor, int
 
 
 def read_stretch(path: str | Path, start: float, seconds: float) -> tuple[Tensor, int]:
-    """Read a piece of a recording, which begins again where it ends.
-
-    Args:
-        start, seconds: where the piece begins and how long it is.
+    """Read so many seconds of a recording from a second on; it begins again where it ends.
 
     Returns: float32 samples (channels, time) and the rate in Hz; silence and any rate are let through.
 
     Raises:
         ValueError: the file is missing, broken, cut off (wav) or empty.
     """
+    with _told(path), soundfile.SoundFile(str(path)) as file:
+        rate, left = int(file.samplerate), max(1, round(seconds * file.samplerate))
+        file.seek(int(start * rate) % max(1, file.frames))
+        pieces = []
+        while left > 0:
+            piece = file.read(left, dtype="float32", always_2d=True)
+            if not len(piece) and file.tell() == 0:
+                raise ValueError(f"{path}: empty, no samples")
+            pieces.append(torch.from_numpy(piece.T.copy()))
+            left -= len(piece)
+            file.seek(0)
+    return torch.cat(pieces, -1), rate
+
+
+@contextmanager
+def _told(path: str | Path) -> Iterator[None]:
+    """Raises ValueError, with the path, where the file cannot be read."""
     try:
         _refuse_cut(path)
-        with soundfile.SoundFile(str(path)) as file:
-            rate, left = int(file.samplerate), max(1, round(seconds * file.samplerate))
-            file.seek(int(start * rate) % max(1, file.frames))
-            pieces = []
-            while left > 0:
-                piece = file.read(left, dtype="float32", always_2d=True)
-                if not len(piece) and file.tell() == 0:
-                    raise ValueError(f"{path}: empty, no samples")
-                pieces.append(torch.from_numpy(piece.T.copy()))
-                left -= len(piece)
-                file.seek(0)
+        yield
     except (OSError, soundfile.LibsndfileError, RuntimeError, MemoryError) as error:
+        # no memory is enough for the length that a broken header tells
         raise ValueError(f"{path}: not readable as audio ({error}); allowed: wav, flac, ogg") from error
-    return torch.cat(pieces, -1), rate
 
 
 def _refuse_cut(path: str | Path) -> None:
@@ -98,9 +96,8 @@ def _refuse_cut(path: str | Path) -> None:
             if chunk[:4] == b"data":
                 held = os.fstat(file.fileno()).st_size - file.tell()
                 if held < size < _STREAMED:
-                    raise ValueError(
-                        f"{path}: cut off, its header tells of {size} bytes of samples, {held} are there"
-                    )
+                    told = f"its header tells of {size} bytes of samples, {held} are there"
+                    raise ValueError(f"{path}: cut off, {told}")
                 return
             file.seek(size + size % 2, os.SEEK_CUR)
 
@@ -108,10 +105,9 @@ def _refuse_cut(path: str | Path) -> None:
 def check_extension(path: str | Path) -> str:
     """Return the extension in lower case, or raise ValueError unless it is one that ``write_audio`` writes."""
     suffix = Path(path).suffix.lower()
-    if suffix not in _FORMATS:
-        raise ValueError(
-            f"{path}: cannot write {suffix or 'a file without extension'}; allowed: {', '.join(EXTENSIONS)}"
-        )
+    if suffix not in EXTENSIONS:
+        found = suffix or "a file without extension"
+        raise ValueError(f"{path}: cannot write {found}; allowed: {', '.join(EXTENSIONS)}")
     return suffix
 
 
@@ -122,15 +118,12 @@ def check_channels(path: str | Path, channels: int) -> int:
     return channels
 
 
-def _check_stored_rate(sample_rate: int, suffix: str) -> int:
+def _check_stored_rate(rate: int, suffix: str) -> int:
     """Return the rate, or raise ValueError unless it is a whole number of Hz that such a file holds."""
     highest = _HIGHEST_STORED[suffix]
-    inside = is_finite(sample_rate) and 1 <= sample_rate <= highest
-    if not inside or int(sample_rate) != sample_rate:
-        raise ValueError(
-            f"sample rate {sample_rate!r} Hz; allowed in {suffix}: whole numbers up to {highest}"
-        )
-    return int(sample_rate)
+    if not is_finite(rate) or not 1 <= rate <= highest or int(rate) != rate:
+        raise ValueError(f"sample rate {rate!r} Hz; allowed in {suffix}: whole numbers up to {highest}")
+    return int(rate)
 
 
 def write_audio(path: str | Path, waveform: Tensor, sample_rate: int) -> None:
@@ -153,24 +146,20 @@ def write_audio(path: str | Path, waveform: Tensor, sample_rate: int) -> None:
     samples = waveform.detach().to("cpu", torch.float32)
     if not bool(torch.isfinite(samples).all()):
         raise ValueError(f"{path}: samples are NaN or infinite, nothing written")
-    if suffix != ".wav" and float(samples.abs().max()) > 1.0:
-        raise ValueError(
-            f"{path}: samples reach {float(samples.abs().max()):.3g}, {suffix} holds 1.0; write .wav"
-        )
+    if suffix != ".wav" and (peak := float(samples.abs().max())) > 1.0:
+        raise ValueError(f"{path}: samples reach {peak:.3g}, {suffix} holds 1.0; write .wav")
+    rows = samples.reshape(-1, samples.shape[-1]).mT.numpy()
+    kind = {"subtype": _SUBTYPES[suffix], "format": suffix[1:].upper()}
     with Whole(path, new_folder=False) as file:
         try:
-            soundfile.write(
-                str(file.partial), samples.reshape(-1, samples.shape[-1]).mT.numpy(), rate, *_FORMATS[suffix]
-            )
+            soundfile.write(str(file.partial), rows, rate, **kind)
         except (OSError, soundfile.LibsndfileError) as error:
             raise file.refusal(error) from error
         file.keep()
 
 
 def encode_flac(waveform: Tensor, sample_rate: int) -> bytes:
-    """The contents of a 16-bit flac file of samples up to 1.0, for a page to play.
-
-    Shape: (time,).
+    """The contents of a 16-bit flac file of samples up to 1.0, for a page to play. Shape: (time,).
 
     Raises:
         ValueError: another shape, a rate that flac cannot hold, or samples that are NaN, infinite or beyond 1.0.

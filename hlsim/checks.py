@@ -22,12 +22,7 @@ _KINDS = {int: "a whole number", float: "a number", bool: "true or false", str: 
 
 
 def refuse_unknown(found: Iterable[Any], allowed: Iterable[str], what: str, where: str = "") -> None:
-    """Raise ValueError unless every name is allowed.
-
-    Args:
-        what: what the names are of, for the message: "network settings".
-        where: where they stand: "in the recipe".
-    """
+    """Raise ValueError unless every name is allowed; ``what`` they are and ``where`` they stand is for the message."""
     allowed = list(allowed)
     if unknown := sorted({str(name) for name in found} - set(allowed)):
         place = f" {where}" if where else ""
@@ -35,12 +30,8 @@ def refuse_unknown(found: Iterable[Any], allowed: Iterable[str], what: str, wher
 
 
 def refuse_other_kinds(settings: Any, where: str) -> None:
-    """Raise ValueError unless every field of a dataclass holds what it is annotated with.
-
-    Args:
-        settings: with fields that are an int, a float, a bool, a str, a pair of floats (ascending) or a dict of them.
-        where: where they stand: "in the recipe".
-    """
+    """Raise ValueError unless every field of a dataclass holds what it is annotated with: an int, a float, a bool, a str,
+    a pair of floats (ascending) or a dict of them."""
     kinds = get_type_hints(type(settings))
     for name in (entry.name for entry in fields(settings)):
         kind, value = kinds[name], getattr(settings, name)
@@ -55,9 +46,8 @@ def refuse_other_kinds(settings: Any, where: str) -> None:
         elif origin is dict:
             if not isinstance(value, Mapping):
                 raise ValueError(f"{name} {value!r} {where}; allowed: 'name: value' lines below it")
-            if float in kind.__args__:
-                for key, one in value.items():
-                    _refuse(one, float, f"{name}: {key}", where)
+            for key, one in value.items() if float in kind.__args__ else ():
+                _refuse(one, float, f"{name}: {key}", where)
         else:
             _refuse(value, kind, name, where)
 
@@ -76,11 +66,7 @@ def refuse_seed(seed: int, where: str) -> None:
 
 
 def _refuse(value: Any, kind: type, name: str, where: str) -> None:
-    if kind is float:
-        fits = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-    else:
-        fits = type(value) is kind
-    if fits:
+    if is_finite(value) if kind is float else type(value) is kind:
         return
     wanted = f"allowed: {_KINDS[kind]}"
     if kind in (int, float) and isinstance(value, str) and (written := _as_number(value)):

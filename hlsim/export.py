@@ -50,9 +50,8 @@ def export_program(
         )
     time = round(NEURO_RATE * seconds) if is_finite(seconds) else 0
     if time < 1 or not isinstance(items, int) or items < 1:
-        raise ValueError(
-            f"a program for {seconds!r} seconds of {items!r} items; allowed: more than 0 seconds, 1 item or more"
-        )
+        asked = f"a program for {seconds!r} seconds of {items!r} items"
+        raise ValueError(f"{asked}; allowed: more than 0 seconds, 1 item or more")
     weight = next(simulator.parameters())
     example = tuple(weight.new_zeros(items, length) for length in (time, len(FREQUENCIES)))
     modes = [(module, module.training) for module in simulator.modules()]
@@ -75,9 +74,9 @@ def export_onnx(simulator: nn.Module, path: str | Path, *, seconds: float = 1.0,
         MissingExtraError: onnx, onnxscript or onnxruntime is not installed.
     """
     target = Path(path)
-    if not target.parent.is_dir():  # the export takes minutes
+    if not (folder := target.parent).is_dir():  # the export takes minutes
         raise ValueError(
-            f"{target}: there is no folder {str(target.parent)!r}; allowed: a file in a folder that exists"
+            f"{target}: there is no folder {str(folder)!r}; allowed: a file in a folder that exists"
         )
     for module in ("onnx", "onnxscript", "onnxruntime"):
         require(module, "dev")
@@ -96,11 +95,7 @@ def export_onnx(simulator: nn.Module, path: str | Path, *, seconds: float = 1.0,
 
 
 def _check(path: Path, program: torch.export.ExportedProgram, level: float) -> None:
-    """Run the file as its user will, on noise: the exporter also writes what no runtime takes, or takes wrongly.
-
-    Raises:
-        ValueError: onnxruntime refuses it, or its output is not the program's.
-    """
+    """Run the file as its user will, on noise: the exporter also writes what no runtime takes, or takes wrongly."""
     runtime = require("onnxruntime", "dev")
     assert program.example_inputs is not None
     waveform, thresholds = program.example_inputs[0]
@@ -110,22 +105,17 @@ def _check(path: Path, program: torch.export.ExportedProgram, level: float) -> N
         quiet = runtime.SessionOptions()
         quiet.log_severity_level = 3  # errors
         session = runtime.InferenceSession(str(path), quiet, providers=["CPUExecutionProvider"])
-        names = [entry.name for entry in session.get_inputs()]
-        (heard,) = session.run(
-            None, {name: tensor.cpu().numpy() for name, tensor in zip(names, given, strict=True)}
-        )
+        inputs = zip(session.get_inputs(), given, strict=True)
+        (heard,) = session.run(None, {entry.name: tensor.cpu().numpy() for entry, tensor in inputs})
     except Exception as error:  # onnxruntime has a class for each kind of refusal
-        reason = str(error).split("failed:", 1)[-1].strip().splitlines()[0]
-        raise ValueError(
-            f"ONNX cannot take the simulator: onnxruntime refuses the file ({reason})"
-        ) from error
+        reason = f"refuses the file ({str(error).split('failed:', 1)[-1].strip().splitlines()[0]})"
+        raise ValueError(f"ONNX cannot take the simulator: onnxruntime {reason}") from error
     with torch.no_grad():
         expected = program.module()(*given)
     off = float((torch.from_numpy(heard).to(expected) - expected).abs().max() / expected.abs().max())
     if not off <= _TOLERANCE:
-        raise ValueError(
-            f"ONNX cannot take the simulator: onnxruntime's output is off by {off:.0e} of its peak; allowed: {_TOLERANCE}"
-        )
+        wrong = f"is off by {off:.0e} of its peak; allowed: {_TOLERANCE}"
+        raise ValueError(f"ONNX cannot take the simulator: onnxruntime's output {wrong}")
 
 
 def _reason(error: BaseException) -> str:

@@ -16,7 +16,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from itertools import zip_longest
 from pathlib import Path
-from types import TracebackType
 from typing import IO, Self
 
 try:
@@ -40,9 +39,8 @@ def file_lock(path: Path) -> Iterator[None]:
             if fcntl is not None:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            raise ValueError(
-                f"{path.parent}: another process is writing there; wait until it is done"
-            ) from None
+            where = path.parent
+            raise ValueError(f"{where}: another process is writing there; wait until it is done") from None
         except OSError:
             pass  # no locks on this drive
         yield
@@ -91,16 +89,11 @@ class Whole:
         except OSError as error:
             raise self.refusal(error) from error
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        try:
+    def __exit__(self, *raised: object) -> None:
+        with suppress(OSError):  # what could not be flushed is thrown away
             if self._file is not None:
                 self._file.close()
-        except OSError:
-            pass  # what could not be flushed is thrown away
-        finally:
-            self.partial.unlink(missing_ok=True)
+        self.partial.unlink(missing_ok=True)
 
     def refusal(self, error: Exception) -> ValueError:
         """What to raise where writing failed."""
@@ -182,9 +175,7 @@ def read_rows(path: str | Path) -> Iterator[tuple[int, dict[str, str]]]:
                 raise ValueError(f"{path}, line {reader.line_num}: column {name} twice; allowed: once")
         for values in filter(None, reader):
             if any(value.strip() for value in values[len(header) :]):
-                raise ValueError(
-                    f"{path}, line {reader.line_num}: {len(values)} values; allowed: one for each of the "
-                    f"{len(header)} columns"
-                )
+                allowed = f"one for each of the {len(header)} columns"
+                raise ValueError(f"{path}, line {reader.line_num}: {len(values)} values; allowed: {allowed}")
             row = zip_longest(header, values[: len(header)], fillvalue="")
             yield reader.line_num, {name: value.strip() for name, value in row if name}

@@ -66,13 +66,14 @@ def make_missing(
             if missing:
                 yield task, missing
 
+    show = progress or (lambda done, total: None)
     total = sum(len(keys(task)) for task in tasks)
     done = total - sum(len(missing) for _, missing in left())
-    if progress is not None and 0 < done < total:
-        progress(done, total)
     failed: dict[str, str] = {}
     if done == total:
         return failed
+    if done:
+        show(done, total)
     for (_, missing), made in run_parallel(partial(_make, function), left(), **parallel):
         if made is None:
             made = dict.fromkeys(missing, Failed(_DIED))
@@ -82,10 +83,9 @@ def make_missing(
             elif store is not None:
                 store.append(key, record)
         done += len(missing)
-        if progress is not None:
-            progress(done, total)
-    if progress is not None and done < total:  # two tasks of one key
-        progress(total, total)
+        show(done, total)
+    if done < total:  # two tasks of one key
+        show(total, total)
     return failed
 
 
@@ -155,13 +155,11 @@ def run_parallel(
             yield task, function(task)
         return
     with ExitStack() as stack:
+        # each process one thread of linear algebra: the files are what is parallel
+        options: dict[str, Any] = {"inner_max_num_threads": 1}
         if backend == "dask":
-            client = stack.enter_context(_connect(str(scheduler)))
-            stack.enter_context(joblib.parallel_config(backend="dask", client=client))
-            processes = -1
-        else:
-            # each process one thread of linear algebra: the files are what is parallel
-            stack.enter_context(joblib.parallel_config(backend="loky", inner_max_num_threads=1))
+            processes, options = -1, {"client": stack.enter_context(_connect(str(scheduler)))}
+        stack.enter_context(joblib.parallel_config(backend=backend, **options))
         pending = enumerate(tasks)
         while True:
             under_way: dict[int, Task] = {}
@@ -172,14 +170,14 @@ def run_parallel(
             except Exception as error:
                 if not _died(error):
                     raise
-            for index, task in list(under_way.items()):
+            for one in list(under_way.items()):
+                outcome: Result | None = None
                 try:
-                    ((_, result),) = _pool(joblib, processes, function, [(index, task)], {})
-                    yield task, result
+                    ((_, outcome),) = _pool(joblib, processes, function, [one], {})
                 except Exception as error:
                     if not _died(error):
                         raise
-                    yield task, None
+                yield one[1], outcome
 
 
 def _pool(

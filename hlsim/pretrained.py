@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 import safetensors
 import safetensors.torch
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 from hlsim.calibration import PASCAL_SPL
 from hlsim.files import whole_folder
@@ -21,6 +21,7 @@ from hlsim.torchtools import lasting
 
 Model = TypeVar("Model", bound=nn.Module)
 Config = TypeVar("Config", bound=NetworkConfig)
+Settings = Mapping[str, Any]
 
 WEIGHTS, CONFIG, CARD = "model.safetensors", "config.json", "README.md"
 
@@ -59,15 +60,10 @@ def read_checkpoint(
     build: Callable[[Config], Model],
     also: Sequence[str] = (),
 ) -> Model:
-    """Build a model from a checkpoint's configuration and load its weights.
+    """A model built from a checkpoint's configuration, with its weights, on torch's default device, or the CPU where that
+    is ``meta``. A configuration without a hash, as older checkpoints have it, is taken as it is.
 
-    A configuration without a hash, as older checkpoints have it, is taken as it is.
-
-    Returns: the model on torch's default device, or the CPU where that is ``meta``.
-
-    Raises:
-        ValueError: as ``load_pretrained``.
-    """
+    Raises ValueError as ``load_pretrained``."""
     folder = find_checkpoint(name, kind, also)
     try:
         record = _record(folder)
@@ -78,29 +74,25 @@ def read_checkpoint(
         found = record.get("kind") if isinstance(record, dict) else None
         hint = f" ({_LOADERS[found]} loads the former)" if found in _LOADERS else ""
         raise ValueError(f"{folder}: a checkpoint of kind {found!r}; needed here: {kind!r}{hint}")
-    if hashlib.sha256(weights).hexdigest() != record.get("sha256"):
-        raise ValueError(
-            f"{folder / WEIGHTS}: changed since it was saved, its SHA-256 differs from {CONFIG}'s; get it anew"
-        )
     settings: Any = record.get("config")
+    changed = "changed since it was saved"
+    if hashlib.sha256(weights).hexdigest() != record.get("sha256"):
+        raise ValueError(f"{folder / WEIGHTS}: {changed}, its SHA-256 differs from {CONFIG}'s; get it anew")
     if record.get("config_sha256", _digest(settings)) != _digest(settings):
-        raise ValueError(
-            f"{folder / CONFIG}: changed since it was saved, the SHA-256 of its 'config' is another; get it anew"
-        )
+        raise ValueError(f"{folder / CONFIG}: {changed}, the SHA-256 of its 'config' is another; get it anew")
     try:
         config = config_kind.from_dict(settings)
     except (TypeError, ValueError) as error:
         raise ValueError(f"{folder / CONFIG}: {error}") from error
+    device = torch.get_default_device()
     try:
-        device = torch.get_default_device()
         # it may be trained through later, torch.device("meta") would keep no weights, and the random start is not kept
         with lasting(), torch.device("cpu"), torch.random.fork_rng(devices=[]):
             model = build(config)
             model.load_state_dict(safetensors.torch.load(weights))
     except (TypeError, RuntimeError, safetensors.SafetensorError) as error:
-        raise ValueError(
-            f"{folder}: weights and configuration do not fit ({str(error).splitlines()[0]})"
-        ) from error
+        reason = str(error).splitlines()[0]
+        raise ValueError(f"{folder}: weights and configuration do not fit ({reason})") from error
     with lasting():
         return model if device.type == "meta" else model.to(device)
 
@@ -108,12 +100,9 @@ def read_checkpoint(
 def find_checkpoint(name: str | Path, kind: str | None = None, also: Sequence[str] = ()) -> Path:
     """The folder of a checkpoint that ships with hlsim, or another.
 
-    Args:
-        kind: of those that the message lists; None lists all.
-        also: other names that the caller takes, for the message.
-
     Raises:
-        ValueError: there is none, or it is neither a name nor a path; the message lists those that ship.
+        ValueError: there is none, or it is neither a name nor a path; the message lists those of the kind that ship, and
+            what the caller takes ``also``.
     """
     if not isinstance(name, str | os.PathLike):
         raise ValueError(f"checkpoint is {type(name).__name__}; allowed: a name or a folder")
@@ -121,14 +110,12 @@ def find_checkpoint(name: str | Path, kind: str | None = None, also: Sequence[st
         return Path(name)
     if str(name) in (ours := shipped()):
         return ours[str(name)]
-    names = [*also, *shipped(kind)]
+    names = ", ".join([*also, *shipped(kind)]) or "none ships"
     inner = Path(name) / "checkpoint"  # as a training leaves it
     hint = f", but {str(inner)!r} is one" if (inner / CONFIG).is_file() else ""
     if str(name) in _MODELS:
         hint = f": it is {_MODELS[str(name)]}"
-    raise ValueError(
-        f"no checkpoint {str(name)!r}{hint}; allowed: {', '.join(names) or 'none ships'}, or a folder with {CONFIG}"
-    )
+    raise ValueError(f"no checkpoint {str(name)!r}{hint}; allowed: {names}, or a folder with {CONFIG}")
 
 
 def checkpoint_digest(name: str | Path) -> str:
@@ -155,12 +142,7 @@ def checkpoints_folder() -> Path:
 
 
 def save_checkpoint(
-    folder: str | Path,
-    kind: str,
-    model: nn.Module,
-    config: Mapping[str, Any],
-    about: Mapping[str, Any],
-    card: str = "",
+    folder: str | Path, kind: str, model: nn.Module, config: Settings, about: Settings, card: str = ""
 ) -> None:
     """Write a checkpoint folder, whole or not at all; an older one of the same name is replaced.
 
@@ -172,19 +154,13 @@ def save_checkpoint(
         ValueError: the folder holds something else.
     """
     target = Path(folder)
-    if not ((target / CONFIG).is_file() or _is_empty(target)):
+    empty = not any(target.iterdir()) if target.is_dir() else not target.exists()
+    if not ((target / CONFIG).is_file() or empty):
         raise ValueError(f"{target}: holds something else; allowed: a new folder, or that of a checkpoint")
-    state: dict[str, Tensor] = {
-        name: tensor.detach().cpu().contiguous() for name, tensor in model.state_dict().items()
-    }
-    weights = safetensors.torch.save(state)
-    record = {
-        "kind": kind,
-        "config": dict(config),
-        "sha256": hashlib.sha256(weights).hexdigest(),
-        "config_sha256": _digest(dict(config)),
-        "about": dict(about),
-    }
+    state = {name: tensor.detach().cpu().contiguous() for name, tensor in model.state_dict().items()}
+    weights, settings = safetensors.torch.save(state), dict(config)
+    hashes = {"sha256": hashlib.sha256(weights).hexdigest(), "config_sha256": _digest(settings)}
+    record = {"kind": kind, "config": settings, **hashes, "about": dict(about)}
     with whole_folder(target) as staging:
         (staging / WEIGHTS).write_bytes(weights)
         (staging / CONFIG).write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
@@ -192,10 +168,6 @@ def save_checkpoint(
             (staging / CARD).write_text(card, encoding="utf-8")
         elif (target / CARD).is_file():
             shutil.copy(target / CARD, staging / CARD)
-
-
-def _is_empty(folder: Path) -> bool:
-    return not any(folder.iterdir()) if folder.is_dir() else not folder.exists()
 
 
 def _record(folder: Path) -> Any:

@@ -27,13 +27,10 @@ Prepare = Callable[[int, Audiogram, torch.device], Call]
 
 @dataclass(frozen=True)
 class Row:
-    """A simulator.
+    """A simulator, timed at sample rates in Hz.
 
     Attributes:
-        name: with what is to be said of it.
-        rates: sample rates in Hz at which it is timed.
         prepare: rate, ear and device -> a call (batch, time) -> (batch, time).
-        differentiable: whether gradients pass.
         parameters: of the network; 0 where nothing is trained.
         default: whether it is the network that ``HearingLossLoss`` takes.
     """
@@ -47,11 +44,7 @@ class Row:
 
 
 def rows(simulators: list[str] | None = None) -> tuple[list[Row], list[str]]:
-    """All rows, and why some are missing.
-
-    Args:
-        simulators: Neuro-MSBGs by name or folder; by default all that ship.
-    """
+    """All rows, with these Neuro-MSBGs by name or folder, by default all that ship, and why some are missing."""
     both = (MSBG_RATE, NEURO_RATE)
     found = [Row("identity", both, lambda rate, ear, device: lambda wave: wave * 1.0)]
     skipped = []
@@ -69,8 +62,10 @@ def rows(simulators: list[str] | None = None) -> tuple[list[Row], list[str]]:
         count, default = _count(load_pretrained(name)), name == "neuro-msbg"
         title = f"Neuro-MSBG ({name})"
         found.append(Row(title, both, partial(_neuro, name), parameters=count, default=default))
-    name, count = "CoNNear's shape (random weights, speed only)", _count(ConnearShape())
-    found.append(Row(name, (CONNEAR_RATE,), _connear, parameters=count))
+    name, shape = "CoNNear's shape (random weights, speed only)", ConnearShape().eval().requires_grad_(False)
+    found.append(
+        Row(name, (CONNEAR_RATE,), lambda rate, ear, device: shape.to(device), parameters=_count(shape))
+    )
     return found, skipped
 
 
@@ -110,10 +105,6 @@ class ConnearShape(nn.Module):
 def _neuro(name: str, rate: int, ear: Audiogram, device: torch.device) -> Call:
     model = load_pretrained(name, sample_rate=rate).to(device)
     return lambda wave: model(wave, ear)
-
-
-def _connear(rate: int, ear: Audiogram, device: torch.device) -> Call:
-    return ConnearShape().eval().requires_grad_(False).to(device)
 
 
 def _pyclarity_ear(module: Any, rate: int, ear: Audiogram, device: torch.device) -> Call:

@@ -13,15 +13,14 @@ from torch import Tensor
 
 from hlsim.audiogram import Audiogram
 from hlsim.benchmark.models import Row, rows
-from hlsim.benchmark.timing import Timings, about, attempt, finish, peak_mib
+from hlsim.benchmark.timing import DIRECTIONS, Timings, about, attempt, finish, peak_mib
 from hlsim.calibration import set_level
 from hlsim.neuro.config import NEURO_RATE
 
 LENGTHS = (1.0, 4.0, 16.0, 60.0)
 BATCHES = (1, 8, 64)
 
-TRAINING = (4.0, 64)
-"""Seconds and clips of a batch that the default network is trained or trained through with."""
+TRAINING = (4.0, 64)  # seconds and clips of a batch that the default network is trained with
 
 EARS = ("N1", "N2", "N3")
 """One ear of each degree of loss: mild, moderate and severe in MSBG's sense."""
@@ -57,12 +56,9 @@ def benchmark(
         repeats: counted rounds.
         limit: seconds that one timing of a longer clip or larger batch may take by what shorter ones took; others are
             left out.
-        lengths: seconds.
         training: seconds and clips of the batch to train on, left out on a CPU that would take longer than ``limit``.
-        simulators: the Neuro-MSBGs, by name or folder; by default all that ship.
-        only: parts of names: rows with none of them are left out.
-        progress: called with timings done, timings in all, and what comes.
-        keep: called with the result so far after each.
+        simulators, only: Neuro-MSBGs as ``rows`` takes them; parts of names: rows with none of them are left out.
+        progress: called with timings done, timings in all, and what comes; ``keep`` with the result so far after each.
 
     Returns: machine, ``rows`` and ``skipped``, what failed and why. A row has name, parameters and a list of ``cells``,
         each with sample rate, seconds, batch, direction, median, least and greatest milliseconds, peak memory in MiB,
@@ -82,7 +78,9 @@ def benchmark(
             raise ValueError(f"only {' '.join(only)}: no such row; there are {', '.join(names)}")
     timings = _Simulators(torch.device(device), repeats, limit, skipped)
     for row in found:
-        timings.prepare(row)
+        for rate in row.rates:
+            what = f"{row.name}, {rate} Hz"
+            attempt(what, partial(timings.prepare, row, rate), timings.device, skipped)
     steps: list[tuple[str, Callable[[], None]]] = [
         (f"{row.name}, 1 s", partial(timings.second, row, rate, turn))
         for turn in range(repeats + 1)
@@ -96,15 +94,14 @@ def benchmark(
         if row.default and training is not None:
             what = f"{row.name}, {training[0]:g} s, batch {training[1]}, forward and backward"
             steps.append((what, partial(timings.training, row, *training)))
-    for done, (what, take) in enumerate(steps):
+    for done, (what, take) in enumerate([*steps, ("", lambda: None)]):
         if progress is not None:
             progress(done, len(steps), what)
         take()
+        result = machine | timings.result(found)
         if keep is not None:
-            keep(machine | timings.result(found))
-    if progress is not None:
-        progress(len(steps), len(steps), "")
-    return machine | timings.result(found)
+            keep(result)
+    return result
 
 
 class _Key(NamedTuple):
@@ -112,11 +109,11 @@ class _Key(NamedTuple):
     sample_rate: int
     seconds: float
     batch: int
-    direction: str  # "forward" or "both"
+    direction: str
 
     def __str__(self) -> str:
-        direction = "forward" if self.direction == "forward" else "forward and backward"
-        return f"{self.name}, {self.sample_rate} Hz, {self.seconds:g} s, batch {self.batch}, {direction}"
+        size = f"{self.seconds:g} s, batch {self.batch}"
+        return f"{self.name}, {self.sample_rate} Hz, {size}, {DIRECTIONS[self.direction]}"
 
 
 class _Simulators(Timings):
@@ -128,15 +125,9 @@ class _Simulators(Timings):
         self.calls: dict[tuple[str, int, str], Callable[[Tensor], Tensor]] = {}
         self.fastest: dict[tuple[str, int], float] = {}
 
-    def prepare(self, row: Row) -> None:
-        def make(rate: int) -> None:
-            made = {
-                (row.name, rate, ear): row.prepare(rate, Audiogram.standard(ear), self.device) for ear in EARS
-            }
-            self.calls.update(made)
-
-        for rate in row.rates:
-            attempt(f"{row.name}, {rate} Hz", partial(make, rate), self.device, self.skipped)
+    def prepare(self, row: Row, rate: int) -> None:
+        made = {ear: row.prepare(rate, Audiogram.standard(ear), self.device) for ear in EARS}
+        self.calls |= {(row.name, rate, ear): call for ear, call in made.items()}
 
     def second(self, row: Row, rate: int, turn: int) -> None:
         """One second at batch 1: with every ear in both directions, in round ``turn``, of which 0 does not count."""
@@ -166,11 +157,8 @@ class _Simulators(Timings):
     def size(self, row: Row, seconds: float, batch: int) -> None:
         """Another length or batch, forward at the row's own rate, where it does not take too long."""
         key = _Key(row.name, row.rates[0], seconds, batch, "forward")
-        same = {
-            k.seconds: median(t)
-            for k, t in self.times.items()
-            if k._replace(seconds=seconds) == key._replace(batch=1)
-        }
+        alone = key._replace(batch=1)
+        same = {k.seconds: median(t) for k, t in self.times.items() if k._replace(seconds=seconds) == alone}
         if 1.0 in same:
             self._repeat(key, same[1.0] * batch if batch > 1 else _expected(list(same.items()), seconds))
 
@@ -197,27 +185,23 @@ class _Simulators(Timings):
         return partial(_run, self.calls[key.name, key.sample_rate, ear], clip, key.direction)
 
     def result(self, found: list[Row]) -> dict[str, Any]:
-        reference = self.times.get(_Key("pyclarity Ear", 44100, 1.0, 1, "forward"))
         out = []
         for row in found:
-            cells = [
-                self._cell(key, median(reference) if reference else None)
-                for key in self.times
-                if key.name == row.name
-            ]
+            cells = [self._cell(key) for key in self.times if key.name == row.name]
             growth = {by: _growth(cells, by, row.rates[0]) for by in ("seconds", "batch")}
             if cells:
                 out.append({"name": row.name, "parameters": row.parameters, "cells": cells, "growth": growth})
         return {"rows": out, "skipped": list(self.skipped)}
 
-    def _cell(self, key: _Key, reference: float | None) -> dict[str, Any]:
-        cell = key._asdict() | self.figures(key)
+    def _cell(self, key: _Key) -> dict[str, Any]:
+        cell = key._asdict() | (self.figures(key) or {})
         del cell["name"]
+        reference = self.figures(_Key("pyclarity Ear", 44100, 1.0, 1, "forward"))
         single = key.seconds == 1.0 and key.batch == 1
         return cell | {
             "counted": len(self.times[key]),
             "times_real_time": 1000.0 * key.seconds * key.batch / cell["median_ms"],
-            "speedup": reference / cell["median_ms"] if reference and single else None,
+            "speedup": reference["median_ms"] / cell["median_ms"] if reference and single else None,
         }
 
 
@@ -233,11 +217,8 @@ def _expected(line: list[tuple[float, float]], seconds: float) -> float:
 def _growth(cells: list[dict[str, Any]], by: str, rate: int) -> float | None:
     """Exponent of the time over the largest range measured: 1.0 is proportional."""
     other = "batch" if by == "seconds" else "seconds"
-    line = [
-        (cell[by], cell["median_ms"])
-        for cell in cells
-        if cell[other] == 1 and cell["direction"] == "forward" and cell["sample_rate"] == rate
-    ]
+    alike = {other: 1, "direction": "forward", "sample_rate": rate}
+    line = [(cell[by], cell["median_ms"]) for cell in cells if alike.items() <= cell.items()]
     return _exponent(min(line), max(line)) if len(line) > 1 else None
 
 

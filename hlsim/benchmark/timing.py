@@ -20,6 +20,8 @@ import torch
 
 Call = Callable[[], Any]
 
+DIRECTIONS = {"forward": "forward", "both": "forward and backward"}
+
 
 def finish(call: Call, device: torch.device) -> None:
     """Call, and wait for the device to be done with it."""
@@ -83,11 +85,7 @@ def reason(error: Exception) -> str:
 
 
 class Timings:
-    """Milliseconds and peak memory by key, of the calls that did not fail.
-
-    Args:
-        skipped: what failed and why, added to.
-    """
+    """Milliseconds and peak memory by key, of the calls that did not fail; ``skipped`` gets what failed and why."""
 
     def __init__(self, device: torch.device, skipped: list[str]) -> None:
         self.device, self.skipped = device, skipped
@@ -109,14 +107,12 @@ class Timings:
             self.times.setdefault(key, []).append(elapsed)
         return elapsed
 
-    def figures(self, key: Hashable) -> dict[str, Any]:
-        times = self.times[key]
-        return {
-            "median_ms": statistics.median(times),
-            "least_ms": min(times),
-            "greatest_ms": max(times),
-            "peak_mib": self.peaks.get(key),
-        }
+    def figures(self, key: Hashable) -> dict[str, Any] | None:
+        """None of a key that was not timed."""
+        if not (times := self.times.get(key)):
+            return None
+        middle, peak = statistics.median(times), self.peaks.get(key)
+        return {"median_ms": middle, "least_ms": min(times), "greatest_ms": max(times), "peak_mib": peak}
 
 
 def about(device: str, repeats: int) -> dict[str, Any]:
@@ -129,10 +125,9 @@ def about(device: str, repeats: int) -> dict[str, Any]:
     if device not in (*found, *(["cuda"] if len(found) > 1 else ())):
         raise ValueError(f"device {device!r}: there is none that torch can use; allowed: {', '.join(found)}")
     on_gpu = device.startswith("cuda")
-    machine = torch.cuda.get_device_name(device) if on_gpu else _processor()
     return {
         "device": device,
-        "machine": machine,
+        "machine": torch.cuda.get_device_name(device) if on_gpu else _processor(),
         "cores": os.cpu_count(),
         "threads": torch.get_num_threads(),
         "torch": torch.__version__,
@@ -144,15 +139,13 @@ def about(device: str, repeats: int) -> dict[str, Any]:
 
 def _gpu(device: str) -> dict[str, Any]:
     backends: Any = torch.backends  # torch's own types know little of it
+    cudnn = backends.cudnn
+    kinds = {"products": backends.cuda.matmul, "convolutions": cudnn.conv, "recurrent": cudnn.rnn}
     return {
         "memory_mib": torch.cuda.get_device_properties(device).total_memory / 2**20,
         "cuda": torch.version.cuda,
-        "cudnn": torch.backends.cudnn.version(),
-        "tf32": {
-            "products": backends.cuda.matmul.fp32_precision == "tf32",
-            "convolutions": backends.cudnn.conv.fp32_precision == "tf32",
-            "recurrent": backends.cudnn.rnn.fp32_precision == "tf32",
-        },
+        "cudnn": cudnn.version(),
+        "tf32": {name: kind.fp32_precision == "tf32" for name, kind in kinds.items()},
     }
 
 

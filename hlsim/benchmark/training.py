@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from compensators import MappingCompensator
 from hlsim.audiogram import Audiogram
-from hlsim.benchmark.timing import Timings, peak_mib
+from hlsim.benchmark.timing import DIRECTIONS, Timings, peak_mib
 from hlsim.calibration import set_level
 from hlsim.loss import HearingLossLoss
 from hlsim.neuro.config import NEURO_RATE
@@ -30,10 +30,8 @@ def training_step(
     seconds: float = 2.0,
     repeats: int = 5,
 ) -> tuple[list[dict[str, Any]], list[str]]:
-    """Where a step's time goes: the compensator, the loss that judges it, its simulator alone, and the whole step.
-
-    Args:
-        compensator: called with speech at 16 kHz and an audiogram; by default an untrained ``MappingCompensator``.
+    """Where a step's time goes: the compensator, by default untrained, the loss that judges it, its simulator alone, and
+    the whole step.
 
     Returns: rows of name, forward, and forward plus backward: median, least and greatest milliseconds and, on a GPU, peak
         memory in MiB; and what failed, with its reason.
@@ -113,28 +111,24 @@ def _table(
     parts: dict[str, Callable[[], Tensor]], device: torch.device, repeats: int
 ) -> tuple[list[dict[str, Any]], list[str]]:
     timings = Timings(device, [])
-    keys = {name: {"forward": f"{name}, forward", "both": f"{name}, forward and backward"} for name in parts}
 
     def take(key: str, call: Callable[[], None], turn: int) -> None:
         timings.take(key, call, turn > 0)
-        if (
-            turn == 0 and device.type == "cuda"
-        ):  # on a CPU the first call leaves memory to the process for the second
+        # on a CPU the first call leaves memory to the process for the second
+        if turn == 0 and device.type == "cuda":
             timings.peaks[key] = peak_mib(call, device)
 
     for turn in range(repeats + 1):  # in turns, so that all see the same machine; the first does not count
         for name, part in parts.items():
-            for direction, key in keys[name].items():
+            for direction, said in DIRECTIONS.items():
+                key = f"{name}, {said}"
                 timings.attempt(key, partial(take, key, partial(_run, part, direction), turn))
-    rows = [
-        {"name": name}
-        | {
-            direction: timings.figures(key) if key in timings.times else None
-            for direction, key in own.items()
-        }
-        for name, own in keys.items()
-    ]
-    return [row for row in rows if row["forward"] or row["both"]], timings.skipped
+    rows = []
+    for name in parts:
+        figures = {direction: timings.figures(f"{name}, {said}") for direction, said in DIRECTIONS.items()}
+        if any(figures.values()):
+            rows.append({"name": name, **figures})
+    return rows, timings.skipped
 
 
 def _run(part: Callable[[], Tensor], direction: str) -> None:

@@ -10,12 +10,8 @@ from torch.nn import functional
 from hlsim.audiogram import FREQUENCIES
 from hlsim.calibration import set_level
 
-HIGHEST_LEVEL = 115.0
-"""RMS level in dB SPL above which no training signal goes."""
-
-
-KNOTS = (100.0, 250.0, 600.0, 1500.0, 3500.0, 7000.0)
-"""Hz, of the random equaliser."""
+HIGHEST_LEVEL = 115.0  # RMS level in dB SPL above which no training signal goes
+KNOTS = (100.0, 250.0, 600.0, 1500.0, 3500.0, 7000.0)  # Hz, of the random equaliser
 
 
 def mix(speech: Tensor, noise: Tensor, snr_db: Tensor) -> Tensor:
@@ -43,9 +39,8 @@ def equalise(waveform: Tensor, gains_db: Tensor, frequencies: Tensor, sample_rat
 def compress(waveform: Tensor, ratio: Tensor, sample_rate: int) -> Tensor:
     """Compress the level over 10 ms about its mean. Shape: (items, time), (items,) -> (items, time)."""
     width = 2 * (sample_rate // 200) + 1
-    power = functional.avg_pool1d(
-        waveform.square().unsqueeze(1), width, 1, width // 2, count_include_pad=False
-    ).squeeze(1)
+    squared = waveform.square().unsqueeze(1)
+    power = functional.avg_pool1d(squared, width, 1, width // 2, count_include_pad=False).squeeze(1)
     mean = power.mean(-1, keepdim=True)
     exponent = ((1.0 / ratio - 1.0) / 2.0).unsqueeze(-1)
     return waveform * ((power + 1e-3 * mean + 1e-20) / (mean + 1e-20)) ** exponent
@@ -63,14 +58,10 @@ def augment_speech(
 ) -> Tensor:
     """Random training signals in pascals.
 
-    Two in five items are noisy (-5 to 20 dB), two in five equalised by up to 15 dB, two in five amplified by 0.2 to 0.8
-    of the ear's loss, one in five compressed by 1.5 to 4.
+    Two in five items are noisy (-5 to 20 dB); where ``treated``, two in five equalised by up to 15 dB, two in five
+    amplified by 0.2 to 0.8 of the ear's loss, one in five compressed by 1.5 to 4. ``levels`` in dB SPL are before that.
 
     Shape: (items, time), (items, time) or None, (items, 8) dB HL -> (items, time).
-
-    Args:
-        levels: lowest and highest level in dB SPL before amplification.
-        treated: equalise, amplify and compress at all.
     """
     items = len(speech)
     chance = torch.rand(items, 5, generator=generator)

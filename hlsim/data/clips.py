@@ -24,7 +24,6 @@ class Clips:
         source: a folder, searched for wav, flac and ogg files, subfolders too; or the files.
         sample_rate: Hz.
         seconds: length of a clip; shorter recordings are repeated where ``repeat``, else followed by silence.
-        repeat: for noises.
 
     Raises:
         ValueError: no such folder, or no audio in it, or clips of no samples; when clips are drawn, too many files that
@@ -35,11 +34,10 @@ class Clips:
         self, source: str | Path | Sequence[Path], *, sample_rate: int, seconds: float, repeat: bool = False
     ) -> None:
         self.files = find_audio(source) if isinstance(source, str | Path) else list(source)
-        self.sample_rate = sample_rate
+        self.sample_rate, self.repeat = sample_rate, repeat
         self.samples = round(seconds * sample_rate)
         if self.samples < 1:
             raise ValueError(f"clips of {seconds} s; allowed: a sample or more, {1.0 / sample_rate:.2g} s")
-        self.repeat = repeat
         self._kept: dict[int, Tensor] = {}
         self._bad: dict[int, str] = {}
 
@@ -79,14 +77,11 @@ class Clips:
                 if failed == _TRIES:
                     raise ValueError(f"{self._bad[index]}; {_TRIES} files like it were drawn in a row")
                 continue
-            failed = 0
-            clip = self.clip(index, place)
+            failed, clip = 0, self.clip(index, place)
             if float(clip.square().mean()) > 1e-7:
-                clips.append(clip)
                 silent = 0
-                continue
-            silent += 1
-            if silent == _SILENT_TRIES:
+                clips.append(clip)
+            elif (silent := silent + 1) == _SILENT_TRIES:
                 raise ValueError(
                     f"{self.files[index]}: {silent} clips in a row were silent, this one the last; leave silent "
                     "recordings out, or take longer clips"

@@ -8,6 +8,7 @@ from __future__ import annotations
 import csv
 import os
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from random import Random
@@ -93,20 +94,34 @@ def assign_splits(
     return assigned
 
 
+def _stem(path: str) -> str:
+    return path.removesuffix(Path(path).suffix)
+
+
+def _unknown(split: str) -> str:
+    """A speaker: what the corpus has in two splits cannot be one."""
+    return f"unknown {split}".rstrip()
+
+
 def walk_audio(folder: Path) -> Iterator[str]:
     """Paths of wav, flac and ogg files below a folder in POSIX form, folder by folder in order of names."""
+    for place, _, names in _walk(folder):
+        for name in names:
+            if Path(name).suffix.lower() in EXTENSIONS:
+                yield (Path(place).relative_to(folder) / name).as_posix()
+
+
+def _walk(folder: Path) -> Iterator[tuple[str, list[str], list[str]]]:
+    """As ``os.walk``, in order of names and without hidden ones."""
     for place, folders, names in os.walk(folder):
-        folders[:] = sorted(name for name in folders if not name.startswith("."))
-        below = Path(place).relative_to(folder)
-        for name in sorted(names):
-            if Path(name).suffix.lower() in EXTENSIONS and not name.startswith("."):
-                yield (below / name).as_posix()
+        for found in (folders, names):
+            found[:] = sorted(name for name in found if not name.startswith("."))
+        yield place, folders, names
 
 
 def linked_folders(folder: Path, prefix: str = "") -> Iterator[Fault]:
     """The links to folders below a folder, which ``walk_audio`` does not follow."""
-    for place, folders, _ in os.walk(folder):
-        folders[:] = sorted(name for name in folders if not name.startswith("."))
+    for place, folders, _ in _walk(folder):
         for path in (Path(place, name) for name in folders):
             if path.is_symlink():
                 name = (prefix / path.relative_to(folder)).as_posix()
@@ -125,10 +140,6 @@ def _named_once(found: Iterator[Found]) -> Iterator[Found]:
                 one = Fault(one.clean, f"a second file of the name {one.id}")
             names.add(name)
         yield one
-
-
-def _stem(path: str) -> str:
-    return path.removesuffix(Path(path).suffix)
 
 
 def _voicebank(corpus: Path) -> Iterator[Found]:
@@ -160,22 +171,19 @@ def _voicebank_log(corpus: Path, name: str) -> dict[str, tuple[str, float | None
             for line in place.read_text(encoding="utf-8", errors="replace").splitlines():
                 parts = line.split()
                 if len(parts) == 3:
-                    try:
+                    noises[parts[0]] = (parts[1], None)
+                    with suppress(ValueError):
                         noises[parts[0]] = (parts[1], float(parts[2]))
-                    except ValueError:
-                        noises[parts[0]] = (parts[1], None)
     return noises
 
 
 def _librispeech_parts(corpus: Path) -> list[tuple[str, str]]:
     """Folders such as ``train-clean-100`` with the split of each."""
     inner = "LibriSpeech/" if (corpus / "LibriSpeech").is_dir() else ""
-    parts = []
-    for place in sorted((corpus / inner).iterdir()):
-        head, dash, _ = place.name.partition("-")
-        if dash and head in _LIBRISPEECH and place.is_dir():
-            parts.append((inner + place.name, _LIBRISPEECH[head]))
-    return parts
+    heads = {
+        path: path.name.partition("-")[0] for path in sorted((corpus / inner).glob("*-*")) if path.is_dir()
+    }
+    return [(inner + path.name, _LIBRISPEECH[head]) for path, head in heads.items() if head in _LIBRISPEECH]
 
 
 def _librispeech(corpus: Path) -> Iterator[Found]:
@@ -193,28 +201,22 @@ def _folder(corpus: Path) -> Iterator[Found]:
     Where a folder ``clean`` has a neighbour ``noisy``, files of equal names in them are pairs.
     """
     for path in walk_audio(corpus):
-        parts = path.split("/")
-        split = SPLIT_FOLDERS.get(parts[0], "") if len(parts) > 1 else ""
+        *folders, name = path.split("/")
+        split = SPLIT_FOLDERS.get("".join(folders[:1]), "")
         for side, other in (("clean", "noisy"), ("noisy", "clean")):
-            place = parts.index(side) if side in parts[:-1] else -1
-            if place >= 0 and corpus.joinpath(*parts[:place], other).is_dir():
-                counterpart = "/".join([*parts[:place], other, *parts[place + 1 :]])
+            place = folders.index(side) if side in folders else -1
+            if place >= 0 and corpus.joinpath(*folders[:place], other).is_dir():
+                counterpart = "/".join([*folders[:place], other, *folders[place + 1 :], name])
                 break
         else:
             side, counterpart, place = "", "", -1
         if counterpart and not (corpus / counterpart).is_file():
             yield Fault(path, f"no {other} counterpart {counterpart}")
         elif side != "noisy":
-            speaker = "/".join(
-                part for i, part in enumerate(parts[:-1]) if i != place and not (i == 0 and split)
-            )
+            passed = {place, 0 if split else place}
+            speaker = "/".join(part for i, part in enumerate(folders) if i not in passed)
             yield Utterance(_stem(path), speaker or _unknown(split), split, path, counterpart)
     yield from linked_folders(corpus)
-
-
-def _unknown(split: str) -> str:
-    """A speaker: what the corpus has in two splits cannot be one."""
-    return f"unknown {split}".rstrip()
 
 
 def _listed(corpus: Path, table: Path) -> Iterator[Found]:
@@ -235,17 +237,12 @@ def _listed(corpus: Path, table: Path) -> Iterator[Found]:
             if key in seen:
                 raise ValueError(f"{where}: a second row of {key}; allowed: one row an utterance")
             seen.add(key)
-            for name in filter(None, (path, row.get("noisy"))):
+            split, noisy = row.get("split", ""), row.get("noisy", "")
+            for name in filter(None, (path, noisy)):
                 inside(corpus, name)
-            yield Utterance(
-                key,
-                row.get("speaker") or "/".join(path.split("/")[:-1]) or _unknown(row.get("split", "")),
-                row.get("split", ""),
-                path,
-                row.get("noisy", ""),
-                row.get("noise", "") if row.get("noisy") else "",
-                snr if row.get("noisy") else None,
-            )
+            speaker = row.get("speaker") or path.rpartition("/")[0] or _unknown(split)
+            noise = (noisy, row.get("noise", ""), snr) if noisy else ()
+            yield Utterance(key, speaker, split, path, *noise)
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise ValueError(f"{table}: cannot be read as CSV ({error})") from error
 
@@ -267,5 +264,5 @@ def find_below(
             yield Fault(path, found.reason) if fits else Fault(printable(path), printable(found.reason))
             continue
         noisy = found.noisy and prefix + found.noisy
-        wrong = next((name for name in (path, noisy) if not storable(name)), None)
-        yield replace(found, clean=path, noisy=noisy) if wrong is None else Fault(printable(wrong), BAD_NAME)
+        wrong = [Fault(printable(name), BAD_NAME) for name in (path, noisy) if not storable(name)]
+        yield wrong[0] if wrong else replace(found, clean=path, noisy=noisy)

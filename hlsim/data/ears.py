@@ -8,7 +8,6 @@ from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from itertools import accumulate
-from pathlib import Path
 from random import Random
 
 import torch
@@ -16,16 +15,13 @@ import torch
 from hlsim.audiogram import HIGHEST_SIMULATED, SEVERITIES, Audiogram, draw_thresholds, read_audiograms
 from hlsim.checks import refuse_unknown
 from hlsim.data.manifest import SPLITS
+from hlsim.data.plan_settings import PlanSettings
 
 MILD_TO_SEVERE: Mapping[str, float] = {"mild": 1.0, "moderate": 1.0, "severe": 1.0}
 """Default proportions of MSBG's severities: the paper says no more than "from mild to severe"."""
 
-_TENTHS = (
-    "test",
-    "test",
-    "valid",
-    *7 * ["train"],
-)  # of drawn ears, and of listeners in a file without splits
+# of drawn ears, and of listeners in a file without splits
+_TENTHS = ("test", "test", "valid", *7 * ["train"])
 _KEPT = 2048  # drawn ears of a severity that wait for their turn
 
 
@@ -41,13 +37,7 @@ def check_shares(shares: Mapping[str, float]) -> dict[str, Fraction]:
 
 @dataclass(frozen=True)
 class Ears:
-    """What ``assign`` draws from.
-
-    Attributes:
-        shares: proportions of severities; empty: as they are in the file.
-        measured: ears of a file by split; empty: ears are drawn.
-        seed: of every draw.
-    """
+    """What ``assign`` draws from: shares of severities, or none for those of the file, and the file's ears by split."""
 
     shares: Mapping[str, Fraction]
     measured: Mapping[str, tuple[Audiogram, ...]]
@@ -56,11 +46,9 @@ class Ears:
     def check(self, splits: Iterable[str], ears: int) -> None:
         """Raises ValueError where a file has too few ears for a split."""
         for split in splits if self.measured else ():
-            if len(self.measured[split]) < ears:
-                raise ValueError(
-                    f"{len(self.measured[split])} measured ears for {split}; allowed: {ears} or more, for each utterance "
-                    f"gets {ears}"
-                )
+            if (found := len(self.measured[split])) < ears:
+                allowed = f"{ears} or more, for each utterance gets {ears}"
+                raise ValueError(f"{found} measured ears for {split}; allowed: {allowed}")
 
     def assign(self, split: str, utterances: int, ears: int) -> Iterator[list[Audiogram]]:
         """The ears of each utterance of a split, all different.
@@ -68,7 +56,8 @@ class Ears:
         Over the split the proportions are met to one ear; as long as no share is above 1 / ``ears``, the ears of an
         utterance differ in severity.
         """
-        shares = self.shares or _as_found(self.measured[split])
+        found = [ear.severity for ear in self.measured.get(split, ())]
+        shares = self.shares or check_shares({name: found.count(name) for name in SEVERITIES})
         total = utterances * ears
         ends = [round(end * total) for end in accumulate(shares.values())]
         names = list(shares)
@@ -83,13 +72,7 @@ class Ears:
             yield chosen
 
 
-def plan_ears(
-    shares: Mapping[str, float] | None,
-    audiograms: Path | None,
-    test_audiograms: Path | None,
-    splits: Collection[str],
-    seed: int,
-) -> Ears:
+def plan_ears(settings: PlanSettings, splits: Collection[str]) -> Ears:
     """Ears from files, or else to be drawn.
 
     Of a file, rows with a column ``split`` go where it says. Of the other listeners (column ``listener``, or else equal
@@ -97,12 +80,13 @@ def plan_ears(
     have alike the earlier of test, validation and training keeps them. Ears above 100 dB HL are passed over.
 
     Args:
-        shares: proportions of severities; None for equal ones of mild to severe, or as they are in the file.
         splits: those that the corpus has.
 
     Raises:
         ValueError: a file that cannot be used, or that lacks a severity asked for.
     """
+    shares, seed = settings.severities, settings.seed
+    audiograms, test_audiograms = settings.audiograms, settings.test_audiograms
     if audiograms is None:
         if test_audiograms is not None:
             raise ValueError(f"{test_audiograms}: ears for test alone; allowed: with ears for training")
@@ -132,15 +116,10 @@ def plan_ears(
         taken.update(fresh)
     exact = check_shares(shares) if shares else {}
     for split in splits:
-        if missing := sorted(set(exact) - {ear.severity for ear in ears[split]}):
-            raise ValueError(
-                f"{audiograms}: no {' or '.join(missing)} ears for {split}; allowed: proportions of what is there"
-            )
+        if missing := " or ".join(sorted(set(exact) - {ear.severity for ear in ears[split]})):
+            lacks = f"no {missing} ears for {split}"
+            raise ValueError(f"{audiograms}: {lacks}; allowed: proportions of what is there")
     return Ears(exact, ears, seed)
-
-
-def _as_found(ears: tuple[Audiogram, ...]) -> dict[str, Fraction]:
-    return check_shares({name: sum(ear.severity == name for ear in ears) for name in SEVERITIES})
 
 
 def _as_written(levels: Sequence[float]) -> Audiogram:
@@ -152,14 +131,12 @@ class _Measured:
     """Ears of a file, each severity's in a random order, over and over."""
 
     def __init__(self, ears: tuple[Audiogram, ...], draw: Random) -> None:
-        self.all = ears
+        self.all, self.draw = ears, draw
         self.turns: dict[str, list[Audiogram]] = {}
-        self.draw = draw
 
     def take(self, severity: str, other_than: list[Audiogram]) -> Audiogram:
-        alike = [ear for ear in self.all if ear.severity == severity and ear not in other_than]
-        if not alike:  # a severity of one ear alone
-            alike = [ear for ear in self.all if ear not in other_than]
+        others = [ear for ear in self.all if ear not in other_than]
+        alike = [ear for ear in others if ear.severity == severity] or others  # where one ear alone has it
         waiting = self.turns.setdefault(severity, [])
         for ear in waiting:
             if ear in alike:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import torch
-from safetensors import SafetensorError
+from safetensors import SafetensorError, safe_open
 from safetensors.torch import load_file, save
 from torch import Tensor
 from torch.nn import functional
@@ -28,15 +28,8 @@ MANIFEST, INSTANCES, SETTINGS = "manifest.csv", "instances.csv", "plan.json"
 CLAIM = "instances/made-of.txt"
 """What the instances in a prepared folder are made of: the plan's digest, and how."""
 
-INSTANCE_COLUMNS = (
-    "number",
-    "id",
-    "split",
-    "input",
-    "level",
-    "severity",
-    *(f"hl_{frequency:g}" for frequency in FREQUENCIES),
-)
+_EAR = (f"hl_{frequency:g}" for frequency in FREQUENCIES)
+INSTANCE_COLUMNS = ("number", "id", "split", "input", "level", "severity", *_EAR)
 
 
 @dataclass(frozen=True)
@@ -67,9 +60,7 @@ class Instance:
 
     def to_bytes(self) -> bytes:
         """A safetensors file; equal instances give equal bytes."""
-        assert self.impaired is not None
-        tensors = {name: value.clone().contiguous() for name, value in vars(self).items()}
-        return save(tensors)
+        return save({name: value.clone().contiguous() for name, value in vars(self).items()})
 
     @classmethod
     def read(cls, path: str | Path) -> Instance:
@@ -87,6 +78,9 @@ class Plan:
         folder: the folder, or its ``manifest.csv``.
         root: where the audio lies, if not where it was prepared.
 
+    Attributes:
+        each: instances of an utterance.
+
     Raises:
         ValueError: the folder is no such plan.
     """
@@ -97,47 +91,36 @@ class Plan:
             about = json.loads((self.folder / SETTINGS).read_text(encoding="utf-8"))
             self.root = Path(root if root is not None else about["root"])
             self.rate = int(about["settings"]["rate"])
-            self.inputs: list[str] = about["inputs"]
-            self.ears = int(about["settings"]["ears"])
+            self.each = len(about["inputs"]) * int(about["settings"]["ears"])
             # neither table has the rate
             self.digest: str = f"{about['manifest_sha256']}{about['instances_sha256']} at {self.rate} Hz"
         except (OSError, KeyError, TypeError, ValueError) as error:
             raise ValueError(f"{self.folder}: not prepared ({error}); 'hlsim prepare' makes it") from error
         self.utterances = Rows(self.folder / MANIFEST, UTTERANCE_COLUMNS)
         self.rows = Rows(self.folder / INSTANCES, INSTANCE_COLUMNS)
-        self._splits: dict[str, Tensor] | None = None
         self._last = (-1, torch.empty(0))  # an utterance is wanted as often as it has instances, and in a row
         if len(self.rows) != len(self.utterances) * self.each:
-            raise ValueError(
-                f"{self.folder}: {len(self.rows)} instances of {len(self.utterances)} utterances; "
-                f"allowed: {self.each} of each"
-            )
-        for name in (MANIFEST, INSTANCES):
-            if sha256(self.folder / name) != about[f"{Path(name).stem}_sha256"]:
-                raise ValueError(
-                    f"{self.folder / name}: has changed since it was prepared; 'hlsim prepare' makes it anew"
-                )
+            found = f"{len(self.rows)} instances of {len(self.utterances)} utterances"
+            raise ValueError(f"{self.folder}: {found}; allowed: {self.each} of each")
+        for path in (self.folder / MANIFEST, self.folder / INSTANCES):
+            if sha256(path) != about[f"{path.stem}_sha256"]:
+                raise ValueError(f"{path}: has changed since it was prepared; 'hlsim prepare' makes it anew")
 
     def __len__(self) -> int:
-        """How many instances."""
         return len(self.rows)
-
-    @property
-    def each(self) -> int:
-        """Instances of an utterance."""
-        return len(self.inputs) * self.ears
 
     def indices(self, split: str) -> Tensor:
         """Numbers of the instances of a split. Shape: -> (instances,), int64."""
-        if self._splits is None:
-            places: dict[str, list[int]] = {}
-            for index, row in enumerate(self.rows):
-                places.setdefault(row["split"], []).append(index)
-            self._splits = {name: torch.tensor(found) for name, found in places.items()}
         return self._splits.get(split, torch.empty(0, dtype=torch.int64))
 
+    @cached_property
+    def _splits(self) -> dict[str, Tensor]:
+        places: dict[str, list[int]] = {}
+        for index, row in enumerate(self.rows):
+            places.setdefault(row["split"], []).append(index)
+        return {name: torch.tensor(found) for name, found in places.items()}
+
     def utterance(self, index: int) -> Utterance:
-        """Of an instance."""
         return Utterance.from_row(self.utterances[index // self.each])
 
     def thresholds(self, index: int) -> Tensor:
@@ -155,32 +138,28 @@ class Plan:
         Raises:
             ValueError: a file that can no longer be used, or a path that leads out of the root.
         """
-        utterance = self.utterance(index)
-        key, both = self._last
-        if key != index // self.each:
-            both = self._read(utterance)
-            self._last = (index // self.each, both)
+        utterance, key = self.utterance(index), index // self.each
+        if self._last[0] != key:
+            self._last = (key, self._read(utterance))
         level = float(self.rows[index]["level"])
-        both = both * 10.0 ** ((level - PASCAL_SPL - utterance.active_level) / 20.0)
-        return both[0], both[1]
+        clean, noisy = self._last[1] * 10.0 ** ((level - PASCAL_SPL - utterance.active_level) / 20.0)
+        return clean, noisy
 
     def _read(self, utterance: Utterance) -> Tensor:
         """Clean and noisy as they are in the files. Shape: -> (2, time) at the plan's rate."""
-        clean, rate = read_audio(inside(self.root, utterance.clean))
-        clean = clean[0]
+        path = inside(self.root, utterance.clean)
+        (clean, *_), rate = read_audio(path)
+        noisy = clean
         if utterance.noisy:
             noisy = read_audio(inside(self.root, utterance.noisy))[0][0]
         elif utterance.mixed:
             assert utterance.snr is not None
-            noisy = mix_at(
-                clean, self.noise(utterance, len(clean), rate), utterance.snr, utterance.active_level
-            )
-        else:
-            noisy = clean
+            noise = self.noise(utterance, len(clean), rate)
+            noisy = mix_at(clean, noise, utterance.snr, utterance.active_level)
         # the manifest has six digits of the seconds
         same_length = math.isclose(len(clean) / rate, utterance.seconds, rel_tol=1e-5)
         if noisy.shape != clean.shape or rate != utterance.rate or not same_length:
-            raise ValueError(f"{inside(self.root, utterance.clean)}: has changed since it was prepared")
+            raise ValueError(f"{path}: has changed since it was prepared")
         return resample(torch.stack((clean, noisy)), rate, self.rate)
 
     def noise(self, utterance: Utterance, samples: int, rate: int) -> Tensor:
@@ -197,17 +176,13 @@ class Plan:
         return Instance(clean, signal, self.thresholds(index))
 
     def path(self, index: int) -> Path:
-        """Of a prepared instance."""
         return self.folder / "instances" / f"{index // 1000:05d}" / f"{index:08d}.safetensors"
 
 
 def is_whole(path: Path) -> bool:
     """Whether a file is an instance, as far as its head and its length tell."""
-    from safetensors import safe_open
-
     try:
         with safe_open(path, "pt") as file:
-            names: Any = file.keys()
-            return set(names) == {"clean", "signal", "thresholds", "impaired"}
+            return {*file.keys()} == {field.name for field in fields(Instance)}
     except (OSError, SafetensorError):
         return False

@@ -8,18 +8,14 @@ import os
 from array import array
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Any, BinaryIO
 
 SPLITS = ("train", "valid", "test")
 
-_READ: dict[str, Callable[[str], Any]] = {
-    "str": str,
-    "int": int,
-    "float": float,
-    "float | None": lambda text: float(text) if text else None,
-}
+_READ: dict[str, Callable[[str], Any]] = {"str": str, "int": int, "float": float}
+_READ["float | None"] = lambda text: float(text) if text else None
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,18 +50,19 @@ class Utterance:
 
     def to_row(self) -> dict[str, str]:
         row = {name: getattr(self, name) for name in UTTERANCE_COLUMNS}
-        return {name: _text(value) for name, value in row.items()}
+        return {
+            name: f"{value:.6g}" if isinstance(value, float) else "" if value is None else str(value)
+            for name, value in row.items()
+        }
 
     @classmethod
     def from_row(cls, row: Mapping[str, str]) -> Utterance:
         """Raises ValueError where a column is missing or holds what it cannot."""
         try:
-            cells = {entry.name: _READ[str(entry.type)](row[entry.name]) for entry in fields(cls)}
-            utterance = cls(**cells)
+            utterance = cls(**{entry.name: _READ[str(entry.type)](row[entry.name]) for entry in fields(cls)})
         except (KeyError, TypeError, ValueError) as error:
-            raise ValueError(
-                f"no row of a manifest ({error!r}); allowed: {', '.join(UTTERANCE_COLUMNS)}"
-            ) from None
+            allowed = ", ".join(UTTERANCE_COLUMNS)
+            raise ValueError(f"no row of a manifest ({error!r}); allowed: {allowed}") from None
         if utterance.split not in SPLITS:
             raise ValueError(f"split {utterance.split!r}; allowed: {', '.join(SPLITS)}")
         return utterance
@@ -83,7 +80,7 @@ def inside(root: str | Path, relative: str) -> Path:
     """The path ``root / relative``, or ValueError where it leads out of the root, be it through .. or a link."""
     path = PurePosixPath(relative)
     full = Path(root) / path
-    if path.is_absolute() or ".." in path.parts or not full.resolve().is_relative_to(_resolved(str(root))):
+    if path.is_absolute() or ".." in path.parts or not full.resolve().is_relative_to(_resolved(Path(root))):
         raise ValueError(
             f"{relative}: leads out of {root}; allowed: paths below it, without .. and links out"
         )
@@ -93,9 +90,7 @@ def inside(root: str | Path, relative: str) -> Path:
 class Rows(Sequence[dict[str, str]]):
     """Rows of a CSV file, read when asked for: only their places are kept, 8 bytes a row.
 
-    Raises:
-        ValueError: the file cannot be read, or lacks a column.
-    """
+    Raises ValueError where the file cannot be read, or lacks a column."""
 
     def __init__(self, path: str | Path, columns: Iterable[str]) -> None:
         self.path = Path(path)
@@ -106,12 +101,9 @@ class Rows(Sequence[dict[str, str]]):
                     self._places.append(self._places[-1] + len(line))
         except OSError as error:
             raise ValueError(f"{path}: cannot be read ({error.strerror})") from error
-        self._open()
         self.columns = self._parse(0) if len(self._places) > 1 else []
-        if missing := [name for name in columns if name not in self.columns]:
-            raise ValueError(
-                f"{path}: no column {', '.join(missing)}; allowed: a CSV file of 'hlsim prepare'"
-            )
+        if missing := ", ".join(name for name in columns if name not in self.columns):
+            raise ValueError(f"{path}: no column {missing}; allowed: a CSV file of 'hlsim prepare'")
 
     def __len__(self) -> int:
         return len(self._places) - 2
@@ -121,22 +113,18 @@ class Rows(Sequence[dict[str, str]]):
             return [self[i] for i in range(*index.indices(len(self)))]
         if not -len(self) <= index < len(self):
             raise IndexError(index)
-        cells = self._parse(index % len(self) + 1)
-        if len(cells) != len(self.columns):
-            raise ValueError(
-                f"{self.path}, line {index % len(self) + 2}: {len(cells)} cells; allowed: {len(self.columns)}"
-            )
+        line = index % len(self) + 1
+        cells, wanted = self._parse(line), len(self.columns)
+        if len(cells) != wanted:
+            raise ValueError(f"{self.path}, line {line + 1}: {len(cells)} cells; allowed: {wanted}")
         return dict(zip(self.columns, cells, strict=True))
 
     def __getstate__(self) -> dict[str, Any]:
         return {name: value for name, value in self.__dict__.items() if name != "_file"}
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state)
-        self._open()
-
-    def _open(self) -> None:
-        self._file = open(self.path, "rb")  # noqa: SIM115 - kept open for as long as the rows are wanted
+    @cached_property
+    def _file(self) -> BinaryIO:
+        return open(self.path, "rb")  # kept open for as long as the rows are wanted
 
     def _parse(self, line: int) -> list[str]:
         start, end = self._places[line], self._places[line + 1]
@@ -161,12 +149,4 @@ def printable(name: str) -> str:
     return "".join(char if char.isprintable() else char.encode("unicode_escape").decode() for char in name)
 
 
-@lru_cache(maxsize=16)
-def _resolved(root: str) -> Path:
-    return Path(root).resolve()
-
-
-def _text(value: object) -> str:
-    if value is None:
-        return ""
-    return f"{value:.6g}" if isinstance(value, float) else str(value)
+_resolved = lru_cache(maxsize=16)(Path.resolve)

@@ -5,10 +5,11 @@ from __future__ import annotations
 import time
 import warnings
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import count
 from pathlib import Path
-from typing import Any, NamedTuple, TypedDict, Unpack
+from typing import Any, NamedTuple
 
 import lightning as L
 import torch
@@ -42,11 +43,13 @@ class Step(NamedTuple):
     processes: int = 1
 
 
+@dataclass(eq=False)
 class Steps(Sampler[Step]):
     """The steps of one process without end, from ``first`` on."""
 
-    def __init__(self, first: int = 0, rank: int = 0, processes: int = 1) -> None:
-        self.first, self.rank, self.processes = first, rank, processes
+    first: int = 0
+    rank: int = 0
+    processes: int = 1
 
     def __len__(self) -> int:
         return _ENDLESS
@@ -65,9 +68,8 @@ class TimedLoader(DataLoader[Any]):
         while True:
             began = time.perf_counter()
             try:
-                batch = next(batches)
-            except StopIteration:
-                return
+                if (batch := next(batches, None)) is None:
+                    return
             except ValueError as error:  # a worker's has its traceback in its message
                 raise ValueError(str(error).rpartition("ValueError: ")[2].strip()) from error
             self.waited += time.perf_counter() - began
@@ -85,8 +87,7 @@ class BatchData(L.LightningDataModule):
 
     Args:
         training: the batch of a ``Step``.
-        validation: batches to validate on.
-        teacher: None where nothing is to be asked.
+        validation: batches.
         workers: processes that make batches, beside the one that trains.
     """
 
@@ -104,9 +105,7 @@ class BatchData(L.LightningDataModule):
         super().__init__()
         if training is not None:
             self.training = training
-        self.validation = validation
-        self.teacher = teacher
-        self.workers = workers
+        self.validation, self.teacher, self.workers = validation, teacher, workers
 
     def train_dataloader(self) -> DataLoader[Any]:
         steps = Steps()
@@ -139,16 +138,11 @@ class BatchData(L.LightningDataModule):
 
 
 class PlanItems(Dataset[Instance]):
-    """Instances of one split, in order, whole and as they are.
-
-    Args:
-        prepared: read them, targets included, from disk.
-    """
+    """Instances of one split, in order, whole and as they are; where ``prepared``, from disk, targets included."""
 
     def __init__(self, plan: Plan, split: str, *, prepared: bool = False) -> None:
-        self.plan = plan
+        self.plan, self.prepared = plan, prepared
         self.indices = plan.indices(split)
-        self.prepared = prepared
         if not len(self.indices):
             raise ValueError(f"{plan.folder}: has no instances for {split}")
 
@@ -160,10 +154,14 @@ class PlanItems(Dataset[Instance]):
         return Instance.read(self.plan.path(index)) if self.prepared else self.plan.instance(index)
 
 
-class ClipOptions(TypedDict, total=False):
-    """Which clips a plan gives, and how they are changed.
+@dataclass(eq=False)
+class PlannedBatches(Dataset[Batch]):
+    """Clips of the instances of one split in an endless random order: clip p depends on the seed and p alone.
 
-    Attributes:
+    Every instance comes once before any comes again. An instance that cannot be read is told of and replaced by the next.
+
+    Args:
+        items: where they come from.
         batch: clips of a batch.
         seconds: length of a clip; shorter utterances are followed by silence.
         augment: change what is not prepared: another ear of the split, moved by up to 5 dB, another noise of the split
@@ -172,42 +170,19 @@ class ClipOptions(TypedDict, total=False):
         levels, treated: as ``augment_speech`` takes them.
     """
 
-    batch: int
-    seconds: float
-    augment: bool
-    seed: int
-    levels: tuple[float, float]
-    treated: bool
+    items: PlanItems
+    batch: int = 6
+    seconds: float = 1.3
+    augment: bool = True
+    seed: int = 0
+    levels: tuple[float, float] = (40.0, 95.0)
+    treated: bool = True
 
-
-class PlannedBatches(Dataset[Batch]):
-    """Clips of the instances of one split in an endless random order: clip p depends on the seed and p alone.
-
-    Every instance comes once before any comes again. An instance that cannot be read is told of and replaced by the next.
-
-    Args:
-        items: where they come from.
-        batch, seconds, augment, seed, levels, treated: see ``ClipOptions``.
-    """
-
-    def __init__(
-        self,
-        items: PlanItems,
-        *,
-        batch: int = 6,
-        seconds: float = 1.3,
-        augment: bool = True,
-        seed: int = 0,
-        levels: tuple[float, float] = (40.0, 95.0),
-        treated: bool = True,
-    ) -> None:
-        self.items = items
-        self.batch = batch
-        self.samples = round(seconds * items.plan.rate)
-        self.augment = augment and not items.prepared
-        self.grid = 1 if self.augment else check_grid(items.plan.rate)
-        self.seed = seed
-        self.levels, self.treated = levels, treated
+    def __post_init__(self) -> None:
+        rate = self.items.plan.rate
+        self.samples = round(self.seconds * rate)
+        self.augment = self.augment and not self.items.prepared
+        self.grid = 1 if self.augment else check_grid(rate)
         self._order = (-1, torch.empty(0))
 
     def __getitem__(self, step: Step) -> Batch:
@@ -224,7 +199,7 @@ class PlannedBatches(Dataset[Batch]):
         raise ValueError(f"{_TRIES} instances in a row cannot be read, the last: {last}")
 
     def _clip(self, position: int, offset: int) -> Instance:
-        count = len(self.items)
+        plan, indices, count = self.items.plan, self.items.indices, len(self.items)
         epoch, place = divmod(position, count)
         if self._order[0] != epoch:
             self._order = (epoch, torch.randperm(count, generator=self._generator(-epoch - 1)))
@@ -235,22 +210,15 @@ class PlannedBatches(Dataset[Batch]):
         first = self.grid * int(torch.randint(spare // self.grid + 1, (), generator=generator))
         if not self.augment:
             return instance.clip(first, self.samples)
-        plan, indices = self.items.plan, self.items.indices
         clip = Instance(*plan.pair(int(indices[number])), instance.thresholds).clip(first, self.samples)
         other, another = indices[torch.randint(len(indices), (2,), generator=generator)].tolist()
         donor = plan.utterance(another)
         noise = plan.noise(donor, self.samples, plan.rate) if donor.mixed else clip.signal - clip.clean
         ear = plan.thresholds(other) + 10.0 * torch.rand((), generator=generator) - 5.0
         ear = ear.clamp(LOWEST_LEVEL, HIGHEST_SIMULATED)
-        signal = augment_speech(
-            clip.clean[None],
-            noise[None] if bool(noise.any()) else None,
-            ear[None],
-            plan.rate,
-            generator,
-            levels=self.levels,
-            treated=self.treated,
-        )[0]
+        added = noise[None] if bool(noise.any()) else None
+        given = (clip.clean[None], added, ear[None], plan.rate, generator)
+        (signal,) = augment_speech(*given, levels=self.levels, treated=self.treated)
         return Instance(set_level(clip.clean, level_spl(signal)), signal, ear)
 
     def _generator(self, number: int) -> torch.Generator:
@@ -271,7 +239,7 @@ class PlanData(BatchData):
         prepared: read the instances that ``--write`` left there, instead of making them.
         recipe: alignment of targets made on the fly, or that of the prepared.
         workers: processes that read and augment, beside the one that trains.
-        clips: see ``ClipOptions``; without them 6 clips of 1.3 s, augmented, 40 to 95 dB SPL.
+        clips: see ``PlannedBatches``.
 
     Raises:
         ValueError: the folder is no plan, or holds no instances where ``prepared``.
@@ -285,15 +253,12 @@ class PlanData(BatchData):
         prepared: bool = False,
         recipe: Recipe | None = None,
         workers: int = 1,
-        **clips: Unpack[ClipOptions],
+        **clips: Any,
     ) -> None:
         self.plan = Plan(folder, root)
-        recipe = recipe or Recipe()
-        teacher = Teacher(self.plan.rate, alignment=recipe.alignment, reference=recipe.reference)
-        super().__init__(teacher=teacher, workers=workers)
-        self.prepared = prepared
+        super().__init__(teacher=(recipe or Recipe()).teacher(self.plan.rate), workers=workers)
+        self.prepared, self.clips = prepared, clips
         self.made_of = claimed(self.plan) if prepared else self.plan.digest
-        self.clips = clips
 
     @cached_property
     def training(self) -> Dataset[Batch]:  # type: ignore[override]

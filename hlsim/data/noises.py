@@ -10,28 +10,25 @@ from random import Random
 import torch
 from torch import Tensor
 
-from hlsim.audio import read_audio
 from hlsim.calibration import dbfs
-from hlsim.data.checking import silence
+from hlsim.data.checking import fault_of, read_sound
 from hlsim.data.corpora import BAD_NAME, SPLIT_FOLDERS, Fault, linked_folders, walk_audio
-from hlsim.data.manifest import Utterance, inside, printable, storable
-
-TRAIN_SNRS_DB, TEST_SNRS_DB = (0.0, 5.0, 10.0, 15.0), (2.5, 7.5, 12.5, 17.5)
-"""Signal-to-noise ratios in dB by active speech level: VoiceBank-DEMAND's, and the paper's."""
-
-TRAIN_TYPES, TEST_TYPES = 8, 2
-"""Types of noise, where there are as many."""
+from hlsim.data.manifest import Utterance, printable, storable
+from hlsim.data.plan_settings import PlanSettings
 
 _QUIET_DB = 30.0  # a stretch this far below its recording's level counts as a pause of the noise
 _STEP, _STRETCH = 0.1, 5  # s from one possible start to the next, and how many of these are no pause
 
 
+Types = Mapping[str, list[tuple[str, Sequence[float]]]]
+"""Files of noise by type: the path below the root, and the places where one may start, in seconds."""
+
+
 @dataclass(frozen=True)
 class Noises:
-    """Files of noise by split and type, paths below the root, with the places where one may start, in seconds; and the
-    SNRs in dB by split."""
+    """Noises and their SNRs in dB by split."""
 
-    files: Mapping[str, Mapping[str, Sequence[tuple[str, Sequence[float]]]]]
+    files: Mapping[str, Types]
     snrs: Mapping[str, Sequence[float]]
 
     def choose(self, utterance: Utterance, seed: int) -> Utterance:
@@ -44,15 +41,7 @@ class Noises:
 
 
 def find_noises(
-    root: Path,
-    folder: str,
-    splits: Iterable[str],
-    *,
-    train_snrs: Sequence[float] = TRAIN_SNRS_DB,
-    test_snrs: Sequence[float] = TEST_SNRS_DB,
-    train_types: int = TRAIN_TYPES,
-    test_types: int = TEST_TYPES,
-    seed: int = 0,
+    root: Path, folder: str, splits: Iterable[str], settings: PlanSettings
 ) -> tuple[Noises, list[Fault]]:
     """Noises below ``root / folder``, and what is at fault there.
 
@@ -63,33 +52,30 @@ def find_noises(
     Raises:
         ValueError: no noise that can be used, too few types, or types or SNRs that are not disjoint.
     """
-    if shared := sorted(set(train_snrs) & set(test_snrs)):
-        raise ValueError(
-            f"SNRs {', '.join(f'{snr:g}' for snr in shared)} dB for training and test; allowed: disjoint sets"
-        )
+    snrs = {"train": settings.train_snrs, "valid": settings.train_snrs, "test": settings.test_snrs}
+    if shared := ", ".join(f"{snr:g}" for snr in sorted({*snrs["train"]} & {*snrs["test"]})):
+        raise ValueError(f"SNRs {shared} dB for training and test; allowed: disjoint sets")
     kinds: dict[str, dict[str, list[tuple[str, Sequence[float]]]]] = {}
     faults = list(linked_folders(root / folder, folder))
     for path in walk_audio(root / folder):
-        parts = path.split("/")
-        split = SPLIT_FOLDERS.get(parts[0], "") if len(parts) > 1 else ""
-        inner = parts[1:] if split else parts
-        kind = "/".join(inner[:-1]) or Path(path).stem
+        folders = path.split("/")[:-1]
+        split = SPLIT_FOLDERS.get("".join(folders[:1]), "")
+        kind = "/".join(folders[bool(split) :]) or Path(path).stem
         name = f"{folder}/{path}" if folder else path
         if not storable(name):
             faults.append(Fault(printable(name), BAD_NAME))
             continue
         try:
-            waveform, rate = read_audio(inside(root, name), any_rate=True)
+            waveform, rate = read_sound(root, name, any_rate=True)
         except ValueError as error:
-            faults.append(Fault(name, str(error).removeprefix(f"{root / name}: ")))
-            continue
-        if reason := silence(waveform[0]):
-            faults.append(Fault(name, reason))
+            faults.append(fault_of(root, name, error))
             continue
         kinds.setdefault(split, {}).setdefault(kind, []).append((name, _starts(waveform[0], rate)))
     if not kinds:
         raise ValueError(f"{root / folder}: no noise in it that can be used")
-    files = dict(kinds) if set(kinds) - {""} else _drawn(kinds[""], train_types, test_types, seed)
+    files: dict[str, Types] = {**kinds}
+    if set(kinds) == {""}:
+        files = _drawn(kinds[""], settings.train_types, settings.test_types, settings.seed)
     if "valid" not in files and "train" in files:
         files["valid"] = files["train"]
     for split in splits:
@@ -100,12 +86,10 @@ def find_noises(
             )
     if both := sorted(set(files.get("train", ())) & set(files.get("test", ()))):
         raise ValueError(f"{root / folder}: {', '.join(both)} for training and test; allowed: disjoint types")
-    return Noises(files, {"train": train_snrs, "valid": train_snrs, "test": test_snrs}), faults
+    return Noises(files, snrs), faults
 
 
-def _drawn(
-    types: Mapping[str, list[tuple[str, Sequence[float]]]], train: int, test: int, seed: int
-) -> dict[str, dict[str, list[tuple[str, Sequence[float]]]]]:
+def _drawn(types: Types, train: int, test: int, seed: int) -> dict[str, Types]:
     names = sorted(types)
     Random(f"{seed}:noise types").shuffle(names)
     if len(names) < train + test:
@@ -127,11 +111,7 @@ def _starts(noise: Tensor, rate: int) -> tuple[float, ...]:
 
 
 def mix_at(speech: Tensor, noise: Tensor, snr: float, active_db: float) -> Tensor:
-    """Speech with noise at an SNR by active speech level.
-
-    Args:
-        snr: dB, of the active speech level over the noise's RMS level.
-        active_db: active level of the speech in dB relative to RMS 1.0.
+    """Speech with noise at an SNR in dB of the speech's active level, in dB relative to RMS 1.0, over the noise's RMS.
 
     Shape: (time,) twice -> (time,).
     """

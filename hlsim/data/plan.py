@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
@@ -27,17 +27,11 @@ FAULT_COLUMNS = ("path", "reason")
 
 @dataclass
 class Prepared:
-    """What ``prepare`` found.
-
-    Attributes:
-        utterances, seconds, instances: by split.
-        severities: instances by split and severity, as "train severe".
-        faults: files left out.
-        first_fault: path and reason of the first.
-    """
+    """What ``prepare`` found: by split, and instances also by split and severity, as "train severe"; files left out, and
+    path and reason of the first."""
 
     utterances: Counter[str] = field(default_factory=Counter)
-    seconds: dict[str, float] = field(default_factory=dict)
+    seconds: dict[str, float] = field(default_factory=lambda: defaultdict(float))
     instances: Counter[str] = field(default_factory=Counter)
     severities: Counter[str] = field(default_factory=Counter)
     faults: int = 0
@@ -47,15 +41,11 @@ class Prepared:
         """A line a split."""
         lines = []
         for split in (split for split in SPLITS if self.utterances.get(split)):
-            shares = ", ".join(
-                f"{100.0 * self.severities[key] / self.instances[split]:.0f} % {name}"
-                for name in SEVERITIES
-                if self.severities.get(key := f"{split} {name}")
-            )
-            lines.append(
-                f"{split}: {self.utterances[split]} utterances, {self.seconds[split] / 3600.0:.2f} h, "
-                f"{self.instances[split]} instances; ears {shares}"
-            )
+            count = self.instances[split]
+            counts = {name: self.severities.get(f"{split} {name}") for name in SEVERITIES}
+            ears = ", ".join(f"{100.0 * n / count:.0f} % {name}" for name, n in counts.items() if n)
+            told = f"{self.utterances[split]} utterances, {self.seconds[split] / 3600.0:.2f} h"
+            lines.append(f"{split}: {told}, {count} instances; ears {ears}")
         return "\n".join(lines)
 
 
@@ -98,9 +88,7 @@ def prepare(
         "root": str(root),
         "layout": layout,
         "settings": {n: str(v) if isinstance(v, Path) else v for n, v in asdict(settings).items()},
-        "files_sha256": listing.digest(
-            root / noise if settings.noise else None, settings.audiograms, settings.test_audiograms
-        ),
+        "files_sha256": listing.digest(root / noise, settings),
     }
     if prepared := _unchanged(folder, about, strict):
         return prepared
@@ -109,14 +97,20 @@ def prepare(
             f"{(folder / CLAIM).parent}: holds instances of another plan, with other settings or files; choose another "
             "--out, or remove it"
         )
-    splits = assign_splits(
-        listing.speakers, test_share=settings.test_share, valid_share=settings.valid_share, seed=settings.seed
-    )
+    shares = {"test_share": settings.test_share, "valid_share": settings.valid_share}
+    splits = assign_splits(listing.speakers, **shares, seed=settings.seed)
     used = set(splits.values())
-    ears = plan_ears(settings.severities, settings.audiograms, settings.test_audiograms, used, settings.seed)
+    ears = plan_ears(settings, used)
     ears.check(used, settings.ears)
-    noises, faults = _noises(settings, root, noise, used, listing.paired)
-
+    noises: Noises | None = None
+    faults: list[Fault] = []
+    if settings.noise is not None:
+        if listing.paired:
+            raise ValueError(
+                f"{settings.corpus}: has noisy speech of its own; allowed: no folder of noise with it, or only the clean "
+                "speech as the corpus"
+            )
+        noises, faults = find_noises(root, noise, used, settings)
     folder.mkdir(parents=True, exist_ok=True)
     for leftover in folder.glob(f".*{PARTIAL}"):  # of a run that was killed
         leftover.unlink(missing_ok=True)
@@ -133,8 +127,8 @@ def prepare(
 
         for fault in faults:
             tell(fault)
-        where: dict[str, Any] = {"jobs": jobs, "backend": backend, "scheduler": scheduler}
-        examined = examine_all(find(), root, settings.shortest, listing.paired > 0, **where)
+        checks = (root, settings.shortest, listing.paired > 0)
+        examined = examine_all(find(), *checks, jobs=jobs, backend=backend, scheduler=scheduler)
         for number, found in enumerate(examined, start=1):
             if isinstance(found, Fault):
                 tell(found)
@@ -144,8 +138,7 @@ def prepare(
                     utterance = noises.choose(utterance, settings.seed)
                 manifest.write(csv_line(utterance.to_row().values()))
                 prepared.utterances[utterance.split] += 1
-                sums = prepared.seconds
-                sums[utterance.split] = sums.get(utterance.split, 0.0) + utterance.seconds
+                prepared.seconds[utterance.split] += utterance.seconds
             if progress is not None:
                 progress(number, listing.total)
         report.keep()
@@ -155,58 +148,41 @@ def prepare(
         manifest.keep()
     inputs = ["clean", "noisy"] if listing.paired or noises is not None else ["clean"]
     _write_instances(settings, folder, prepared, ears, inputs)
-    about |= {
-        "inputs": inputs,
-        "manifest_sha256": sha256(folder / MANIFEST),
-        "instances_sha256": sha256(folder / INSTANCES),
-        "prepared": vars(prepared),
-    }
+    about |= {"inputs": inputs, **_digests(folder), "prepared": vars(prepared)}
     write_whole(folder / SETTINGS, json.dumps(about, indent=2) + "\n")
     return prepared
 
 
 def _spare_what_is_not_ours(settings: PlanSettings, folder: Path) -> None:
     """Raises ValueError where a table of the user's would be written over."""
-    tables = (settings.table, settings.audiograms, settings.test_audiograms)
+    given = (settings.table, settings.audiograms, settings.test_audiograms)
+    tables = [table for table in given if table is not None and table.exists()]
     ours = {MANIFEST: UTTERANCE_COLUMNS, INSTANCES: INSTANCE_COLUMNS, FAULTS: FAULT_COLUMNS, SETTINGS: None}
-    for name, columns in ours.items():
-        path = folder / name
+    for path, columns in ((folder / name, columns) for name, columns in ours.items()):
         if not path.is_file():
             continue
-        if any(table.exists() and table.samefile(path) for table in tables if table is not None):
+        if any(map(path.samefile, tables)):
             raise ValueError(f"{path}: would be written over, and is read from; choose another --out")
         with open(path, "rb") as file:
             if columns is not None and file.readline() != csv_line(columns).encode():
                 raise ValueError(f"{path}: not written by 'hlsim prepare'; choose another --out, or move it")
 
 
-def _noises(
-    settings: PlanSettings, root: Path, noise: str, splits: set[str], paired: int
-) -> tuple[Noises | None, list[Fault]]:
-    if settings.noise is None:
-        return None, []
-    if paired:
-        raise ValueError(
-            f"{settings.corpus}: has noisy speech of its own; allowed: no folder of noise with it, or only the "
-            "clean speech as the corpus"
-        )
-    names = ("train_snrs", "test_snrs", "train_types", "test_types", "seed")
-    return find_noises(root, noise, splits, **{name: getattr(settings, name) for name in names})
-
-
 def _unchanged(folder: Path, about: Mapping[str, Any], strict: bool) -> Prepared | None:
     """What an earlier run found, where it had the same settings and files; None where there is none."""
     try:
         kept = json.loads((folder / SETTINGS).read_text(encoding="utf-8"))
-        same = all(kept[name] == json.loads(json.dumps(value)) for name, value in about.items())
-        for name, file in (("manifest_sha256", MANIFEST), ("instances_sha256", INSTANCES)):
-            same = same and kept[name] == sha256(folder / file)
+        if kept != kept | json.loads(json.dumps(about)) | _digests(folder):
+            return None
         prepared = Prepared(**kept["prepared"])
     except (OSError, ValueError, KeyError, TypeError):
         return None
-    if same:
-        _refuse_faults(prepared, strict, folder)
-    return prepared if same else None
+    _refuse_faults(prepared, strict, folder)
+    return prepared
+
+
+def _digests(folder: Path) -> dict[str, str]:
+    return {f"{Path(name).stem}_sha256": sha256(folder / name) for name in (MANIFEST, INSTANCES)}
 
 
 def _refuse_faults(prepared: Prepared, strict: bool, folder: Path) -> None:
@@ -220,9 +196,7 @@ def _refuse_faults(prepared: Prepared, strict: bool, folder: Path) -> None:
 def _write_instances(
     settings: PlanSettings, folder: Path, prepared: Prepared, ears: Ears, inputs: Sequence[str]
 ) -> None:
-    assigned = {
-        split: ears.assign(split, count, settings.ears) for split, count in prepared.utterances.items()
-    }
+    assigned = {split: ears.assign(split, n, settings.ears) for split, n in prepared.utterances.items()}
     number = 0
     with Whole(folder / INSTANCES) as file:
         file.write(csv_line(INSTANCE_COLUMNS))

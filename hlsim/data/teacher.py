@@ -46,33 +46,26 @@ class Teacher(nn.Module):
     ) -> None:
         super().__init__()
         refuse_unknown([alignment], ALIGNMENTS, "alignments")
-        self.sample_rate = sample_rate
-        self.alignment = alignment
-        self.reference = reference
+        self.sample_rate, self.alignment, self.reference = sample_rate, alignment, reference
         self.msbg = MSBG(sample_rate=sample_rate, aligned=alignment == "structural" or reference is not None)
         self.grid = check_grid(sample_rate)
-        self.body, self.context = (
-            self.grid * math.ceil(s * sample_rate / self.grid) for s in (_BODY, _CONTEXT)
-        )
+        self.body = self.grid * math.ceil(_BODY * sample_rate / self.grid)
+        self.context = self.grid * math.ceil(_CONTEXT * sample_rate / self.grid)
         self.tail = round(_TAIL * sample_rate)
         self._delays: dict[tuple[float, ...], int] = {}
 
     @torch.no_grad()
     def forward(self, signals: Tensor, thresholds: Tensor, *, blocks: bool = True) -> Tensor:
-        """What each ear hears.
-
-        Args:
-            blocks: False asks for the signals in one piece, which is quicker where they are always as long.
+        """What each ear hears; without ``blocks`` in one piece, which is quicker where signals are always as long.
 
         Shape: (items, time) in pascals, (items, 8) dB HL -> (items, time).
         """
         if self.reference is not None:
             return torch.stack([self._by_reference(*item) for item in zip(signals, thresholds, strict=True)])
         time = signals.shape[-1]
-        body = self.body if blocks else time
-        length = (
-            self.context + body + self.tail if blocks else time + self.tail * (self.alignment == "impulse")
-        )
+        body, length = self.body, self.context + self.body + self.tail
+        if not blocks:
+            body, length = time, time + self.tail * (self.alignment == "impulse")
         delays = [self.delay(ear) for ear in thresholds]
         heard = torch.empty_like(signals)
         done = 0
@@ -112,9 +105,7 @@ class Teacher(nn.Module):
 def check_grid(sample_rate: int) -> int:
     """Samples from one place where a frame of MSBG's smearing starts to the next that falls on a sample.
 
-    Raises:
-        ValueError: these are too many for a teacher.
-    """
+    Raises ValueError where these are too many for a teacher."""
     grid = _FRAME * sample_rate // math.gcd(_FRAME * sample_rate, MSBG_RATE)
     if grid > 4 * sample_rate:
         raise ValueError(

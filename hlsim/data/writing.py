@@ -26,6 +26,9 @@ class Recipe:
     alignment: str = "structural"
     reference: Reference | None = None
 
+    def teacher(self, rate: int) -> Teacher:
+        return Teacher(rate, alignment=self.alignment, reference=self.reference)
+
     def __str__(self) -> str:
         teacher = "msbg" if self.reference is None else getattr(self.reference, "__name__", "reference")
         return f"teacher {teacher}, alignment {self.alignment}"
@@ -58,48 +61,45 @@ def write_instances(
             ``write-faults.csv`` names the files.
     """
     plan = Plan(folder, root)
-    with file_lock(plan.folder / MANIFEST):  # what others have begun would look like leftovers
-        return _write(plan, recipe, jobs=jobs, backend=backend, scheduler=scheduler, progress=progress)
-
-
-def _write(plan: Plan, recipe: Recipe, **parallel: Any) -> int:
-    _claim(plan, recipe)
-    for leftover in (plan.folder / "instances").rglob(f".*{PARTIAL}"):
-        leftover.unlink(missing_ok=True)
-    # a worker on another machine has another working folder
-    folder, root = str(plan.folder.absolute()), str(plan.root.absolute())
-    task = partial(make, folder, root, plan.digest, recipe)
-    numbers = range(len(plan.utterances))
-    with one_thread():
-        # no store but the folder: whoever makes an utterance's instances looks which are there
-        failed = make_missing(task, numbers, lambda number: [str(number)] * plan.each, None, **parallel)
-    faults = [
-        (plan.utterance(number * plan.each).clean, failed[str(number)]) for number in sorted(map(int, failed))
-    ]
     report = plan.folder / WRITE_FAULTS
-    if faults:
-        write_whole(report, "".join(map(csv_line, [("path", "reason"), *faults])))
-        raise ValueError(
-            f"{len(faults)} of {len(plan.utterances)} utterances have no instances, the first {': '.join(faults[0])}; "
-            f"all are in {report}; the others are written"
+    # what others have begun would look like leftovers
+    with file_lock(plan.folder / MANIFEST), one_thread():
+        _claim(plan, recipe)
+        for leftover in (plan.folder / "instances").rglob(f".*{PARTIAL}"):
+            leftover.unlink(missing_ok=True)
+        # a worker on another machine has another working folder
+        task = partial(make, str(plan.folder.absolute()), str(plan.root.absolute()), plan.digest, recipe)
+        failed = make_missing(
+            task,
+            range(len(plan.utterances)),
+            lambda number: [str(number)] * plan.each,
+            None,  # but the folder: whoever makes an utterance's instances looks which are there
+            progress=progress,
+            jobs=jobs,
+            backend=backend,
+            scheduler=scheduler,
         )
-    report.unlink(missing_ok=True)
+        faults = [(plan.utterance(int(n) * plan.each).clean, failed[n]) for n in sorted(failed, key=int)]
+        if faults:
+            write_whole(report, "".join(map(csv_line, [("path", "reason"), *faults])))
+            raise ValueError(
+                f"{len(faults)} of {len(plan.utterances)} utterances have no instances, the first "
+                f"{': '.join(faults[0])}; all are in {report}; the others are written"
+            )
+        report.unlink(missing_ok=True)
     return len(plan)
 
 
 def make(
     folder: str, root: str, digest: str, recipe: Recipe, number: int, keys: Sequence[str]
 ) -> dict[str, dict[str, Any] | Failed]:
-    """Write the instances of one utterance that are missing; its key with what is at fault with its audio, if anything.
-
-    One at a time, for the last bits of a batch depend on what else is in it.
-    """
+    """Write the instances of one utterance that are missing; its key with what is at fault, if its audio is."""
     torch.set_num_threads(1)  # which sums in one order; for good, for a worker may have other threads
     plan, teacher = _opened(folder, root, digest, recipe)
     for index in range(number * plan.each, (number + 1) * plan.each):
         if is_whole(plan.path(index)):
             continue
-        try:
+        try:  # one at a time, for the last bits of a batch depend on what else is in it
             instance = plan.instance(index)
             heard = teacher(instance.signal[None], instance.thresholds[None])[0]
         except ValueError as error:
@@ -112,20 +112,17 @@ def make(
 def _opened(folder: str, root: str, digest: str, recipe: Recipe) -> tuple[Plan, Teacher]:
     """What lies in the folder may be another plan than before: the digest says which."""
     plan = Plan(folder, root)
-    return plan, Teacher(plan.rate, alignment=recipe.alignment, reference=recipe.reference)
+    return plan, recipe.teacher(plan.rate)
 
 
 def _claim(plan: Plan, recipe: Recipe) -> None:
-    path = plan.folder / CLAIM
-    text = f"{plan.digest}\n{recipe}\n"
-    if path.is_file():
-        if path.read_text(encoding="utf-8") != text:
-            raise ValueError(
-                f"{path.parent}: holds instances of another plan, teacher or alignment; choose another --out, or "
-                "remove it"
-            )
-        return
-    write_whole(path, text)
+    path, text = plan.folder / CLAIM, f"{plan.digest}\n{recipe}\n"
+    if not path.is_file():
+        write_whole(path, text)
+    elif path.read_text(encoding="utf-8") != text:
+        raise ValueError(
+            f"{path.parent}: holds instances of another plan, teacher or alignment; choose another --out, or remove it"
+        )
 
 
 def claimed(plan: Plan) -> str:
@@ -137,9 +134,7 @@ def claimed(plan: Plan) -> str:
     found = path.read_text(encoding="utf-8") if path.is_file() else ""
     if found.splitlines()[:1] != [plan.digest]:
         raise ValueError(f"{path.parent}: no instances of this plan; 'hlsim prepare --write' makes them")
-    missing = sum(not plan.path(index).is_file() for index in range(len(plan)))
-    if missing:
-        raise ValueError(
-            f"{path.parent}: {missing} of {len(plan)} instances missing; 'hlsim prepare --write' goes on with them"
-        )
+    if missing := sum(not plan.path(index).is_file() for index in range(len(plan))):
+        what = f"{missing} of {len(plan)} instances missing"
+        raise ValueError(f"{path.parent}: {what}; 'hlsim prepare --write' goes on with them")
     return found.strip()

@@ -16,7 +16,7 @@ from hlsim.audiogram import MILDER, Audiogram, draw_thresholds, read_audiograms
 from hlsim.calibration import level_spl, set_level
 from hlsim.data.augment import compress, mix
 from hlsim.data.clips import Clips
-from hlsim.data.noises import TEST_SNRS_DB
+from hlsim.data.plan_settings import TEST_SNRS_DB
 from hlsim.evaluation.store import samples_hash
 from hlsim.neuro.config import NEURO_RATE
 

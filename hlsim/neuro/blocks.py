@@ -27,9 +27,8 @@ class ConvPath(nn.Module):
     def __init__(self, channels: int, axis: int, kernel: int, expansion: int) -> None:
         super().__init__()
         size = (kernel, 1) if axis == 0 else (1, kernel)
-        self.local = nn.Conv2d(
-            channels, channels, size, padding=(size[0] // 2, size[1] // 2), groups=channels
-        )
+        around = (size[0] // 2, size[1] // 2)
+        self.local = nn.Conv2d(channels, channels, size, padding=around, groups=channels)
         self.expand = nn.Linear(channels, channels * expansion)
         self.restore = nn.ConvTranspose1d(channels * expansion, channels, 1)
 
@@ -127,29 +126,17 @@ def _path(config: NetworkConfig, axis: int) -> nn.Module:
     return SequencePath(channels, axis, core, width)
 
 
-class DualPathBlock(nn.Module):
-    """A path over time, then one over frequency. Shape: (items, time, frequency, channels) -> the same."""
+class DualPathBlock(nn.Sequential):
+    """A path over time, then one over frequency, or, for the monolithic baselines, over time alone.
 
-    def __init__(self, config: NetworkConfig) -> None:
+    Shape: (items, time, frequency, channels) -> the same.
+    """
+
+    def __init__(self, config: NetworkConfig, *, time_alone: bool = False) -> None:
         super().__init__()
         self.time = _path(config, 0)
-        self.frequency = _path(config, 1)
-
-    def forward(self, features: Tensor) -> Tensor:
-        output: Tensor = self.frequency(self.time(features))
-        return output
-
-
-class TimeBlock(nn.Module):
-    """A path over time alone, for the monolithic baselines. Shape: as ``DualPathBlock``."""
-
-    def __init__(self, config: NetworkConfig) -> None:
-        super().__init__()
-        self.time = _path(config, 0)
-
-    def forward(self, features: Tensor) -> Tensor:
-        output: Tensor = self.time(features)
-        return output
+        if not time_alone:
+            self.frequency = _path(config, 1)
 
 
 def _restore(layer: nn.ConvTranspose1d, hidden: Tensor) -> Tensor:

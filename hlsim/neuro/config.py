@@ -60,15 +60,13 @@ class NetworkConfig:
             if not isinstance(pair, list | tuple) or len(pair) != 2:
                 raise ValueError(f"{name} {pair!r}; allowed: two whole numbers, of time and of frequency")
             object.__setattr__(self, name, tuple(pair))
-        counts = {name: getattr(self, name) for name in _COUNTS}
-        for name, values in {**counts, "stride": self.stride, "kernel": self.kernel}.items():
-            least = 0 if name == "dense_depth" else 1
+        for name in (*_COUNTS, "stride", "kernel"):
+            values, least = getattr(self, name), 0 if name == "dense_depth" else 1
             for value in values if isinstance(values, tuple) else (values,):
                 if not isinstance(value, int) or isinstance(value, bool) or value < least:
                     raise ValueError(f"{name} {values!r}; allowed: whole numbers of {least} or more")
-        if any(k % 2 == 0 for k in self.kernel) or (
-            self.block == "transformer" and self.channels % self.heads
-        ):
+        uneven = self.block == "transformer" and self.channels % self.heads
+        if any(k % 2 == 0 for k in self.kernel) or uneven:
             raise ValueError(
                 f"kernel {self.kernel}, {self.heads} heads of {self.channels} channels; allowed: odd kernels, heads that "
                 "divide the channels"

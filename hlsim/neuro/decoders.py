@@ -17,12 +17,7 @@ class Decoder(nn.Module):
     """
 
     def __init__(
-        self,
-        channels: int,
-        outputs: int,
-        depth: int,
-        stride: tuple[int, int],
-        normalise: bool,
+        self, channels: int, outputs: int, depth: int, stride: tuple[int, int], normalise: bool
     ) -> None:
         super().__init__()
         self.stride = stride

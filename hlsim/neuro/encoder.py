@@ -1,4 +1,4 @@
-"""Input channels, and the dense encoder that turns them into feature maps."""
+"""Input channels, among them the encoded audiogram, and the dense encoder that turns them into feature maps."""
 
 import torch
 from torch import Tensor, nn
@@ -12,6 +12,27 @@ def log_magnitude(squared: Tensor) -> Tensor:
 def sine_of_phase(spectrum: Tensor, squared: Tensor) -> Tensor:
     """Faded out near silence: its gradient stays finite, and unlike the phase it has no jump at pi. Any shape."""
     return spectrum.imag * (squared + 1e-6).rsqrt()
+
+
+class AudiogramEncoder(nn.Module):
+    """Thresholds to one value a frequency: linear(flatten(average pool(ReLU(conv)))) (Equation 1).
+
+    Args:
+        frequencies: F, the frequencies of the transform.
+        channels: feature maps of the convolution.
+    """
+
+    def __init__(self, frequencies: int, channels: int = 16) -> None:
+        super().__init__()
+        self.conv = nn.Conv1d(1, channels, kernel_size=3, padding=1)
+        self.pool = nn.AvgPool1d(2)
+        self.project = nn.Linear(channels * 4, frequencies)
+
+    def forward(self, thresholds: Tensor) -> Tensor:
+        """Shape: (items, 8) dB HL -> (items, F)."""
+        features = torch.relu(self.conv(thresholds.unsqueeze(1) / 100.0))
+        encoded: Tensor = self.project(self.pool(features).flatten(1))
+        return encoded
 
 
 class Unit(nn.Sequential):

@@ -7,11 +7,10 @@ from hlsim.audiogram import FREQUENCIES, SEVERITIES, interpolate, severity_index
 from hlsim.calibration import PASCAL_SPL
 from hlsim.dsp.fft import power
 from hlsim.msbg.recruitment import CATCH_UP_SPL
-from hlsim.neuro.audiogram_encoder import AudiogramEncoder
-from hlsim.neuro.blocks import DualPathBlock, TimeBlock
+from hlsim.neuro.blocks import DualPathBlock
 from hlsim.neuro.config import NEURO_RATE, NeuroConfig
 from hlsim.neuro.decoders import MaskDecoder, PhaseDecoder
-from hlsim.neuro.encoder import DenseEncoder, FrameEncoder, log_magnitude, sine_of_phase
+from hlsim.neuro.encoder import AudiogramEncoder, DenseEncoder, FrameEncoder, log_magnitude, sine_of_phase
 from hlsim.neuro.network import EarNetwork
 from hlsim.neuro.prior import Prior
 
@@ -57,17 +56,16 @@ class NeuroMSBG(EarNetwork):
         depth = 0 if monolithic else config.dense_depth
         stride = (1, rows) if monolithic else config.stride
         self.audiogram_encoder = AudiogramEncoder(frequencies) if encoded else None
-        self.encoder: nn.Module = (
-            FrameEncoder(inputs, rows, channels)
-            if monolithic
-            else DenseEncoder(inputs, channels, depth, stride, normalise)
-        )
-        block = TimeBlock if monolithic else DualPathBlock
-        self.blocks = nn.ModuleList(block(config) for _ in range(config.blocks))
+        self.encoder: nn.Module
+        if monolithic:
+            self.encoder = FrameEncoder(inputs, rows, channels)
+        else:
+            self.encoder = DenseEncoder(inputs, channels, depth, stride, normalise)
+        blocks = (DualPathBlock(config, time_alone=monolithic) for _ in range(config.blocks))
+        self.blocks = nn.ModuleList(blocks)
         self.mask_decoder = MaskDecoder(channels, depth, stride, normalise, config.prior)
-        self.phase_decoder = (
-            PhaseDecoder(channels, depth, stride, normalise) if config.phase == "predicted" else None
-        )
+        predicted = config.phase == "predicted"
+        self.phase_decoder = PhaseDecoder(channels, depth, stride, normalise) if predicted else None
         self.prior = Prior(self.stft) if config.prior else None
         self.severity = nn.Embedding(len(SEVERITIES), channels) if config.prior else None
         if self.severity is not None:
@@ -99,28 +97,27 @@ class NeuroMSBG(EarNetwork):
         factor = self.prior(squared, ears, severity) if self.prior is not None else None
         features = self._features(spectrum, squared, ears, factor)
         size = (spectrum.shape[-2], spectrum.shape[-1])
-        exponents = self._exponents(ears)
+        # of recruitment, ratio - 1, at the transform's frequencies
+        exponents = CATCH_UP_SPL / (CATCH_UP_SPL - interpolate(ears, self.config.hz)) - 1.0
         lower = self.autocast_dtype
         with torch.autocast(signals.device.type, lower or torch.bfloat16, enabled=lower is not None):
-            features = self._network(features, severity)
+            features = self.encoder(features.contiguous(memory_format=torch.channels_last)).permute(
+                0, 2, 3, 1
+            )
+            if self.severity is not None:
+                features = features + self.severity(severity)[:, None, None]
+            for block in self.blocks:
+                features = block(features)
+            features = features.permute(0, 3, 1, 2)
             log_mask = self.mask_decoder.log_mask(features, size, exponents).clamp(-12.0, 4.0)
             if self.phase_decoder is None:
                 correction = log_mask.exp()
             else:
                 correction = self.phase_decoder.factor(features, size, log_mask)
-        heard = self.stft.synthesise(
-            spectrum * (correction if factor is None else factor * correction), signals.shape[-1]
-        )
+        if factor is not None:
+            correction = factor * correction
+        heard = self.stft.synthesise(spectrum * correction, signals.shape[-1])
         return heard if scale is None else heard * scale
-
-    def _network(self, features: Tensor, severity: Tensor) -> Tensor:
-        """Shape: (items, inputs, frames, rows), (items,) -> (items, channels, frames / stride, rows / stride)."""
-        features = self.encoder(features.contiguous(memory_format=torch.channels_last)).permute(0, 2, 3, 1)
-        if self.severity is not None:
-            features = features + self.severity(severity)[:, None, None]
-        for block in self.blocks:
-            features = block(features)
-        return features.permute(0, 3, 1, 2)
 
     def _features(self, spectrum: Tensor, squared: Tensor, ears: Tensor, factor: Tensor | None) -> Tensor:
         """The input channels.
@@ -140,7 +137,3 @@ class NeuroMSBG(EarNetwork):
             return features
         levels = (ears / 100.0)[:, None, None].expand(*features.shape[:3], -1)
         return torch.cat((features, levels), -1)
-
-    def _exponents(self, ears: Tensor) -> Tensor:
-        """Recruitment exponents, ratio - 1, at the transform's frequencies. Shape: (items, 8) -> (items, frequencies)."""
-        return CATCH_UP_SPL / (CATCH_UP_SPL - interpolate(ears, self.config.hz)) - 1.0

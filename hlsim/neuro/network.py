@@ -12,13 +12,11 @@ from hlsim.dsp.overlap import overlapping
 from hlsim.dsp.resample import resample
 from hlsim.neuro.config import NEURO_RATE, NetworkConfig
 
-# Values of the widest feature map of all items that run together on a CPU, and the samples at 16 kHz that this may be at
-# most. Larger maps the C library gives back to the system, and pays for their pages anew with every one; of smaller ones
-# the steps from one to the next take longer than the sums.
-_CPU_VALUES = 1_800_000
-_CPU_SAMPLES = (16_000, 256_000)
-# samples of a long item that run together elsewhere
-_DEVICE_SAMPLES = 960_000
+# Values of the widest feature map of all items that run together on a CPU, and the samples at 16 kHz that this is at
+# least and at most. Larger maps the C library gives back to the system, and pays for their pages anew with every one; of
+# smaller ones the steps from one to the next take longer than the sums.
+_CPU_VALUES, _CPU_SAMPLES = 1_800_000, (16_000, 256_000)
+_DEVICE_SAMPLES = 960_000  # of a long item that run together elsewhere
 
 
 class EarNetwork(nn.Module):
@@ -67,17 +65,12 @@ class EarNetwork(nn.Module):
             batch = torch.broadcast_shapes(waveform.shape[:-1], thresholds.shape[:-1])
             signals = waveform.to(dtype).expand(*batch, -1).reshape(-1, waveform.shape[-1])
             ears = thresholds.to(dtype).expand(*batch, -1).reshape(-1, len(FREQUENCIES))
-            together = self._together(signals)
+            together = len(signals)
+            if signals.device.type == "cpu" and not torch.compiler.is_compiling():
+                together = max(1, self._at_once * self.sample_rate // (NEURO_RATE * signals.shape[-1]))
             parts = zip(signals.split(together), ears.split(together), strict=True)
             result = torch.cat([self._run(some, theirs) for some, theirs in parts])
             return result.reshape(*batch, -1).to(waveform.dtype)
-
-    def _together(self, signals: Tensor) -> int:
-        """How many items run together. Shape: (items, time)."""
-        items, samples = signals.shape
-        if signals.device.type != "cpu" or torch.compiler.is_compiling():
-            return items
-        return max(1, self._at_once * self.sample_rate // (NEURO_RATE * samples))
 
     def _run(self, signals: Tensor, ears: Tensor) -> Tensor:
         """``_process`` at the waveform's rate and level. Shape: (items, time), (items, 8) -> (items, time)."""

@@ -61,8 +61,8 @@ class Prior(nn.Module):
         banks = [BANKS[severity] for severity in SEVERITIES]
         ear = np.abs(np.fft.rfft(ear_filter(), points * 441 // 160)[coarse]) ** 2
         self.register_buffer("ear_power", torch.tensor(ear, dtype=torch.float32))
-        responses = [_sum_response(bank) for bank in banks]
-        self.register_buffer("response", torch.tensor(np.stack(responses), dtype=torch.float32))
+        responses = np.stack([_sum_response(bank) for bank in banks])
+        self.register_buffer("response", torch.tensor(responses, dtype=torch.float32))
 
         excitation, relative, smoothing = [], [], []
         for severity, bank in zip(SEVERITIES, banks, strict=True):
@@ -89,10 +89,8 @@ class Prior(nn.Module):
     def _corrected(self, name: str) -> Tensor:
         known, learned = getattr(self, f"{name}_known"), getattr(self, f"{name}_learned")
         if name == "relative":  # a complex factor 1 + learned
-            real, imaginary = (
-                known[0] * learned[0] - known[1] * learned[1],
-                known[0] * learned[1] + known[1] * learned[0],
-            )
+            real = known[0] * learned[0] - known[1] * learned[1]
+            imaginary = known[0] * learned[1] + known[1] * learned[0]
             return known + torch.stack((real, imaginary))
         return known * learned.exp()
 
@@ -118,15 +116,12 @@ class Prior(nn.Module):
         level = level.reshape(items, channels, frames).clamp_min(1e-7)
 
         catch_up = 10.0 ** ((CATCH_UP_SPL - PASCAL_SPL) / 20.0)
-        exponents = self._exponents(thresholds, severity).unsqueeze(-1)
+        # 0 where a bank has fewer channels
+        weights = constant_like(thresholds, _threshold_weights)[severity]
+        exponents = (expansion_ratios(thresholds, weights) - 1.0).unsqueeze(-1)
         gain = ((level / catch_up).log().clamp_max(0.0) * exponents).exp().mT
         relative = self._corrected("relative")[:, severity]
         return torch.complex(gain @ relative[0], gain @ relative[1]) * widened
-
-    def _exponents(self, thresholds: Tensor, severity: Tensor) -> Tensor:
-        """Shape: (items, 8), (items,) -> (items, channels); 0 where a bank has fewer."""
-        weights = constant_like(thresholds, _threshold_weights)
-        return expansion_ratios(thresholds, weights[severity]) - 1.0
 
 
 def _widening(smeared: Tensor, given: Tensor) -> Tensor:
@@ -159,9 +154,8 @@ def _smearing(severity: str, stft: STFT) -> NDArray[np.float64]:
     """MSBG's smearing matrix on the transform's frequencies."""
     spacing = NEURO_RATE / stft.fft
     count = round(20000.0 / spacing / 4.0) * 4
-    matrix = smearing_from_filters(
-        *(roex_filters(*sides, count, spacing) for sides in ((1.0, 1.0), BROADENING[severity]))
-    )
+    filters = (roex_filters(*sides, count, spacing) for sides in ((1.0, 1.0), BROADENING[severity]))
+    matrix = smearing_from_filters(*filters)
     return matrix[: stft.frequencies, : stft.frequencies]
 
 

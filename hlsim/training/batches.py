@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -51,36 +51,23 @@ class TrainingData:
             training, validation = getattr(self, name), getattr(self, f"valid_{name}")
             if not training or not validation:
                 continue
-            trained, validated = (
-                {
-                    path.resolve()
-                    for path in (find_audio(source) if isinstance(source, str | Path) else source)
-                }
-                for source in (training, validation)
-            )
+            trained, validated = ({path.resolve() for path in _files(one)} for one in (training, validation))
             if shared := len(trained & validated):
                 raise ValueError(
                     f"{shared} of {len(validated)} files of the {name} to validate on are also trained on; give folders "
                     f"that share none, or no {name} to validate on"
                 )
-        return TrainingData(
-            self.valid_speech or self.speech,
-            self.valid_noise or self.noise,
-            self.valid_audiograms or self.audiograms,
-        )
+        speech, noise = self.valid_speech or self.speech, self.valid_noise or self.noise
+        return TrainingData(speech, noise, self.valid_audiograms or self.audiograms)
+
+
+def _files(source: Path | Sequence[Path]) -> Sequence[Path]:
+    return find_audio(source) if isinstance(source, str | Path) else source
 
 
 @dataclass(frozen=True)
 class PlannedSource:
-    """A prepared plan to train and validate on.
-
-    Attributes:
-        manifest: ``manifest.csv`` of a prepared folder, or the folder.
-        root: where the audio lies, if not where it was prepared.
-        prepared: take the instances that ``hlsim prepare --write`` made, clips of them unchanged, instead of making and
-            augmenting them on the fly.
-        workers: processes that read and augment.
-    """
+    """A prepared plan, or its ``manifest.csv``, to train and validate on, as ``PlanData`` takes it."""
 
     manifest: Path
     root: Path | None = None
@@ -88,16 +75,19 @@ class PlannedSource:
     workers: int = field(default=1, compare=False)  # a run may go on with others
 
 
+def identity_of(data: TrainingData | PlannedSource) -> dict[str, str]:
+    """What a training on them is told from others by."""
+    return {entry.name: str(getattr(data, entry.name)) for entry in fields(data) if entry.compare}
+
+
 class DrawnBatches(Dataset[Batch]):
-    """Random speech, noise and ears; a batch depends on seed, step and rank alone.
+    """Random speech, noise and ears; a batch depends on seed, step and rank alone."""
 
-    Args:
-        seconds: length of a clip.
-    """
+    recipe: TrainingRecipe
 
-    def __init__(self, recipe: TrainingRecipe, data: TrainingData, seconds: float) -> None:
-        self.batch, self.seed, self.sounds = recipe.batch, recipe.seed, recipe.sounds
-        options: dict[str, Any] = {"sample_rate": NEURO_RATE, "seconds": seconds}
+    def __init__(self, recipe: TrainingRecipe, data: TrainingData) -> None:
+        self.recipe, self.batch, self.seed = recipe, recipe.batch, recipe.seed
+        options: dict[str, Any] = {"sample_rate": NEURO_RATE, "seconds": recipe.seconds}
         self.speech = Clips(data.speech, **options)
         self.noise = Clips(data.noise, repeat=True, **options) if data.noise else None
         self.ears: Tensor | None = None  # measured ones. Shape: (ears, 8) dB HL
@@ -107,9 +97,7 @@ class DrawnBatches(Dataset[Batch]):
 
     def __getitem__(self, step: Step) -> Batch:
         number = (self.seed * 1_000_003 + step.number) * 64 + step.rank
-        return self.draw(
-            self.batch, torch.Generator().manual_seed(number % 2**63)
-        )  # more are too many for it
+        return self.draw(self.batch, torch.Generator().manual_seed(number % 2**63))  # which takes no more
 
     def draw(self, count: int, generator: torch.Generator) -> Batch:
         """``clean`` and ``signal`` (count, time) in pascals, ``thresholds`` (count, 8) dB HL."""
@@ -127,37 +115,33 @@ class DrawnBatches(Dataset[Batch]):
 
     def join_sounds(self, clips: Tensor, generator: torch.Generator) -> Tensor:
         """The recipe's share of the clips, replaced by tones and clicks."""
-        if not self.sounds:
+        if not (share := self.recipe.sounds):
             return clips
         others = draw_sounds(len(clips), clips.shape[-1], NEURO_RATE, generator)
-        return torch.where(torch.rand(len(clips), 1, generator=generator) < self.sounds, others, clips)
+        return torch.where(torch.rand(len(clips), 1, generator=generator) < share, others, clips)
 
 
 class SimulatorBatches(DrawnBatches):
     """What a simulator is to hear: speech, noise, tones and clicks as compensators emit them, at any level."""
 
-    def __init__(self, recipe: SimulatorRecipe, data: TrainingData) -> None:
-        super().__init__(recipe, data, recipe.seconds)
-        self.levels, self.treated = recipe.levels, recipe.treated
+    recipe: SimulatorRecipe
 
     def draw(self, count: int, generator: torch.Generator) -> Batch:
         ears = self.join_measured(draw_thresholds(count, generator), 0.4, 5.0, generator)
         noise = self.noise.draw(count, generator) if self.noise is not None else None
         clips = self.join_sounds(self.speech.draw(count, generator), generator)
-        signal = augment_speech(
-            clips, noise, ears, NEURO_RATE, generator, levels=self.levels, treated=self.treated
-        )
+        given = (clips, noise, ears, NEURO_RATE, generator)
+        signal = augment_speech(*given, levels=self.recipe.levels, treated=self.recipe.treated)
         return {"clean": set_level(clips, level_spl(signal)), "signal": signal, "thresholds": ears}
 
 
 class CompensatorBatches(DrawnBatches):
     """What a compensator is given: speech, clean or noisy, and the ears that it is for, ``ear`` or drawn ones."""
 
-    def __init__(
-        self, recipe: CompensatorRecipe, data: TrainingData, seconds: float, ear: Audiogram | None
-    ) -> None:
-        super().__init__(recipe, data, seconds)
-        self.recipe = recipe
+    recipe: CompensatorRecipe
+
+    def __init__(self, recipe: CompensatorRecipe, data: TrainingData, ear: Audiogram | None) -> None:
+        super().__init__(recipe, data)
         self.ear = None if ear is None else torch.tensor(ear.thresholds)
 
     def draw(self, count: int, generator: torch.Generator) -> Batch:
@@ -167,24 +151,20 @@ class CompensatorBatches(DrawnBatches):
         clean = self.speech.draw(count, generator)
         equalised = equalise(clean, uniform(-15.0, 15.0, len(KNOTS)), torch.tensor(KNOTS), NEURO_RATE)
         clean = torch.where(uniform(0.0, 1.0, 1) < self.recipe.equalised, equalised, clean)
-        clean = set_level(self.join_sounds(clean, generator), uniform(*self.recipe.levels))
-        signal = clean
+        signal = clean = set_level(self.join_sounds(clean, generator), uniform(*self.recipe.levels))
         if self.noise is not None:
             noisy = mix(clean, self.noise.draw(count, generator), uniform(*self.recipe.snr))
             signal = torch.where(uniform(0.0, 1.0, 1) < self.recipe.noisy, noisy, clean)
         if self.ear is not None:
-            ears = self.ear.expand(count, -1)
-        else:
-            ears = self.join_measured(draw_thresholds(count, generator), 0.5, 0.0, generator)
+            return {"clean": clean, "signal": signal, "thresholds": self.ear.expand(count, -1)}
+        ears = self.join_measured(draw_thresholds(count, generator), 0.5, 0.0, generator)
         return {"clean": clean, "signal": signal, "thresholds": ears}
 
 
 def simulator_data(data: TrainingData | PlannedSource, recipe: SimulatorRecipe) -> BatchData:
     """What a simulator is trained and validated on, with what is heard from the exact MSBG.
 
-    Raises:
-        ValueError: data that cannot be used; the message names it.
-    """
+    Raises ValueError of data that cannot be used; the message names it."""
     if isinstance(data, PlannedSource):
         return PlannedData(data, recipe)
     training = SimulatorBatches(recipe, data)
@@ -195,17 +175,15 @@ def simulator_data(data: TrainingData | PlannedSource, recipe: SimulatorRecipe) 
 def compensator_data(data: TrainingData, recipe: CompensatorRecipe, ear: Audiogram | None) -> BatchData:
     """What a compensator for an ear, or else for all, is trained and validated on. Raises ValueError as
     ``simulator_data``."""
-    valid = CompensatorBatches(replace(recipe, equalised=0.0), data.validation(), _VALID_SECONDS, ear)
+    plain = replace(recipe, equalised=0.0, seconds=_VALID_SECONDS)
+    valid = CompensatorBatches(plain, data.validation(), ear)
     generator = torch.Generator().manual_seed(2_000 + recipe.seed)
     validation = [valid.draw(4, generator) for _ in range(0, recipe.validation_items, 4)]
-    return BatchData(CompensatorBatches(recipe, data, recipe.seconds, ear), validation)
+    return BatchData(CompensatorBatches(recipe, data, ear), validation)
 
 
 def speech_to_validate(data: TrainingData, recipe: SimulatorRecipe) -> list[Batch]:
-    """Fixed items: every second one noisy (0 to 20 dB); measured, standard and drawn ears in turn.
-
-    50 to 80 dB SPL, or the recipe's levels where ``treated`` is off.
-    """
+    """Fixed items: every second one noisy (0 to 20 dB); measured, standard and drawn ears in turn."""
     generator = torch.Generator().manual_seed(1_000 + recipe.seed)
     valid = SimulatorBatches(replace(recipe, seconds=_VALID_SECONDS), data.validation())
     standard = torch.tensor([Audiogram.standard(name).thresholds for name in MILDER])
@@ -225,22 +203,19 @@ def speech_to_validate(data: TrainingData, recipe: SimulatorRecipe) -> list[Batc
 
 
 def sounds_to_validate(recipe: SimulatorRecipe) -> list[Batch]:
-    """Fixed tones and clicks at the levels of ``speech_to_validate``, a third as many items, for drawn ears.
-
-    They are marked with ``sounds``.
-    """
+    """Fixed tones and clicks, marked with ``sounds``, a third as many items as of speech, for drawn ears."""
     generator = torch.Generator().manual_seed(2_000 + recipe.seed)
     batches = []
     for _ in range(0, recipe.validation_items, 24):
         signal = draw_sounds(8, round(_VALID_SECONDS * NEURO_RATE), NEURO_RATE, generator)
         signal = set_level(signal, _levels_to_validate(recipe, generator))
-        ears = draw_thresholds(8, generator)
-        batches.append({"signal": signal, "thresholds": ears, "sounds": torch.ones(8, dtype=torch.bool)})
+        batch = {"signal": signal, "thresholds": draw_thresholds(8, generator)}
+        batches.append(batch | {"sounds": torch.ones(8, dtype=torch.bool)})
     return batches
 
 
 def _levels_to_validate(recipe: SimulatorRecipe, generator: torch.Generator) -> Tensor:
-    """Levels in dB SPL of a batch. Shape: -> (8,)."""
+    """50 to 80 dB SPL, or the recipe's levels where ``treated`` is off. Shape: -> (8,)."""
     low, high = (50.0, 80.0) if recipe.treated else recipe.levels
     return low + (high - low) * torch.rand(8, generator=generator)
 
@@ -255,14 +230,9 @@ class PlannedData(PlanData):
     def __init__(self, source: PlannedSource, recipe: SimulatorRecipe) -> None:
         if recipe.sounds:
             raise ValueError(f"sounds {recipe.sounds} in the recipe, with a manifest; allowed: 0")
-        names = ("batch", "seconds", "seed", "levels", "treated")
-        super().__init__(
-            source.manifest,
-            root=source.root,
-            prepared=source.prepared,
-            workers=source.workers,
-            **{name: getattr(recipe, name) for name in names},
-        )
+        clips = {name: getattr(recipe, name) for name in ("batch", "seconds", "seed", "levels", "treated")}
+        where = {name: getattr(source, name) for name in ("root", "prepared", "workers")}
+        super().__init__(source.manifest, **where, **clips)
         if self.plan.rate != NEURO_RATE:
             raise ValueError(f"{source.manifest}: prepared at {self.plan.rate} Hz; allowed: {NEURO_RATE}")
         split = next(split for split in ("valid", "test", "train") if len(self.plan.indices(split)))
@@ -276,7 +246,7 @@ class PlannedData(PlanData):
         chosen = torch.linspace(0, len(items) - 1, min(recipe.validation_items, len(items))).round().int()
         samples = round(_VALID_SECONDS * NEURO_RATE)
         whole = [items[place] for place in chosen.tolist()]
-        clips = [one.clip(max(0, (len(one.signal) - samples) // 2), samples) for one in whole]
-        self.validation = [collate(clips[i : i + 8]) for i in range(0, len(clips), 8)]
+        middle = [one.clip(max(0, (len(one.signal) - samples) // 2), samples) for one in whole]
+        self.validation = [collate(middle[i : i + 8]) for i in range(0, len(middle), 8)]
 
     val_dataloader = BatchData.val_dataloader

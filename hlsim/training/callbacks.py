@@ -30,9 +30,7 @@ class KeepBest(Callback):
     """
 
     def __init__(self, write: Callable[[dict[str, Any]], None], note: Path) -> None:
-        self.write = write
-        self.note = note
-        self.best = -math.inf
+        self.write, self.note, self.best = write, note, -math.inf
 
     def state_dict(self) -> dict[str, Any]:
         return {"best": self.best}
@@ -73,28 +71,20 @@ class TimeProgress(Callback):
     """A line that shows the share of the time spent, every two seconds: the number of steps is not known beforehand."""
 
     def __init__(self, max_minutes: float) -> None:
-        self.max_minutes = max_minutes
-        self.shown = 0.0
+        self.max_minutes, self.shown = max_minutes, 0.0
 
-    def on_train_batch_end(
-        self, trainer: L.Trainer, module: L.LightningModule, outputs: Any, batch: Any, batch_idx: int
-    ) -> None:
+    def on_train_batch_end(self, trainer: L.Trainer, module: L.LightningModule, *of_batch: Any) -> None:
         if not trainer.is_global_zero or time.monotonic() - self.shown < 2.0:
             return
         self.shown = time.monotonic()
         share = min(100.0, 100.0 * _minutes(module) / self.max_minutes)
         loss = float(trainer.callback_metrics.get("loss", math.nan))
-        self._print(
-            f"{share:3.0f} % of {self.max_minutes:g} min, step {trainer.global_step}, loss {loss:.3f}"
-        )
+        line = f"{share:3.0f} % of {self.max_minutes:g} min, step {trainer.global_step}, loss {loss:.3f}"
+        print(f"\r{line:<60}", end="", file=sys.stderr, flush=True)
 
     def on_validation_start(self, trainer: L.Trainer, module: L.LightningModule) -> None:
         if trainer.is_global_zero:
-            self._print("", "\r")
-
-    @staticmethod
-    def _print(line: str, end: str = "") -> None:
-        print(f"\r{line:<60}", end=end, file=sys.stderr, flush=True)
+            print(f"\r{'':<60}", end="\r", file=sys.stderr, flush=True)
 
 
 class DataWait(Callback):
@@ -103,9 +93,7 @@ class DataWait(Callback):
     def __init__(self) -> None:
         self.marks: list[tuple[float, float]] = []
 
-    def on_train_batch_end(
-        self, trainer: L.Trainer, module: L.LightningModule, outputs: Any, batch: Any, batch_idx: int
-    ) -> None:
+    def on_train_batch_end(self, trainer: L.Trainer, module: L.LightningModule, *of_batch: Any) -> None:
         # from the second step on, for the first one waits until the workers have started
         waited = trainer.datamodule.loader.waited  # type: ignore[attr-defined]
         self.marks = [*self.marks[-_WINDOW:], (time.perf_counter(), waited)]
@@ -128,7 +116,7 @@ class ShowExamples(Callback):
         outputs: Any,
         batch: Any,
         batch_idx: int,
-        dataloader_idx: int = 0,
+        *more: int,
     ) -> None:
         writer: Any = getattr(trainer.logger, "experiment", None)
         if batch_idx or not trainer.is_global_zero or not hasattr(writer, "add_audio"):

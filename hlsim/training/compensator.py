@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import fields
 from pathlib import Path
-from typing import Unpack
+from typing import Any, Unpack
 
 import torch
 from torch import Tensor, nn
@@ -17,32 +16,25 @@ from hlsim.audiogram import Audiogram
 from hlsim.data.module import Batch
 from hlsim.loss import HearingLossLoss
 from hlsim.pretrained import checkpoint_digest
-from hlsim.training.batches import TrainingData, compensator_data
+from hlsim.training.batches import TrainingData, compensator_data, identity_of
 from hlsim.training.loop import RunOptions, train_network
-from hlsim.training.module import TimedModule, initial_network, start_identity
+from hlsim.training.module import TimedModule, initial_network
 from hlsim.training.recipes import CompensatorRecipe
+
+Simulator = str | Path | nn.Module
 
 
 class CompensatorTraining(TimedModule):
-    """Hears the compensator's output through the frozen simulator.
-
-    Args:
-        simulator: as ``HearingLossLoss`` takes it.
-    """
+    """Hears the compensator's output through the simulator, as ``HearingLossLoss`` takes it, frozen."""
 
     def __init__(
-        self,
-        recipe: CompensatorRecipe,
-        max_minutes: float,
-        *,
-        simulator: str | Path | nn.Module = "neuro-msbg",
+        self, recipe: CompensatorRecipe, max_minutes: float, *, simulator: Simulator = "neuro-msbg"
     ) -> None:
         super().__init__(recipe.learning_rate, max_minutes)
         torch.manual_seed(recipe.seed)
         self.recipe = recipe
-        self.compensator = initial_network(
-            recipe.start, recipe.model, MappingConfig, MappingCompensator, load_compensator
-        )
+        network = (MappingConfig, MappingCompensator, load_compensator)
+        self.compensator = initial_network(recipe.start, recipe.model, *network)
         counted = {name: weight for name, weight in recipe.weights.items() if weight > 0.0}
         self.loss = HearingLossLoss(simulator=simulator, reference=recipe.reference, criterion=counted)
 
@@ -67,9 +59,6 @@ class CompensatorTraining(TimedModule):
     def released(self) -> nn.Module:
         return self.compensator
 
-    def trained_parameters(self) -> list[nn.Parameter]:
-        return list(self.compensator.parameters())
-
 
 def train_compensator(
     data: TrainingData,
@@ -77,7 +66,7 @@ def train_compensator(
     *,
     out: str | Path,
     audiogram: Audiogram | None = None,
-    simulator: str | Path | nn.Module = "neuro-msbg",
+    simulator: Simulator = "neuro-msbg",
     max_minutes: float,
     **options: Unpack[RunOptions],
 ) -> Path:
@@ -102,14 +91,6 @@ def train_compensator(
     }
     if isinstance(simulator, str | Path) and str(simulator) != "msbg":
         trained["simulator_sha256"] = checkpoint_digest(simulator)  # a folder may hold another one next time
-    trained |= start_identity(recipe.start)
-    return train_network(
-        module,
-        batches,
-        recipe,
-        KIND,
-        out=out,
-        identity={entry.name: str(getattr(data, entry.name)) for entry in fields(data)} | trained,
-        about=trained | {"start_valid_loss": start},
-        **options,
-    )
+    about = trained | {"start_valid_loss": start}
+    how: dict[str, Any] = {"out": out, "identity": identity_of(data) | trained, "about": about}
+    return train_network(module, batches, recipe, KIND, **how, **options)

@@ -16,9 +16,10 @@ from lightning.pytorch.callbacks import Callback, ModelCheckpoint, Timer
 from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
+from hlsim import __version__
 from hlsim.data.module import BatchData
 from hlsim.files import repair_folder
-from hlsim.pretrained import save_checkpoint
+from hlsim.pretrained import checkpoint_digest, save_checkpoint
 from hlsim.training.callbacks import DataWait, History, KeepBest, ShowExamples, TimeProgress
 from hlsim.training.module import TimedModule
 from hlsim.training.recipes import TrainingRecipe
@@ -29,11 +30,11 @@ class RunOptions(TypedDict, total=False):
     """How a training runs.
 
     Attributes:
-        max_steps: stop earlier, -1 for no such limit.
-        accelerator, devices, nodes, strategy: as Lightning's Trainer takes them; each process has batches of its own, so
-            that the batch grows with their number.
-        report: is given a line a validation.
-        progress: show a line that tells how far it is.
+        max_steps: stop earlier; -1, the default, for no such limit.
+        accelerator, devices, nodes, strategy: as Lightning's Trainer takes them, by default "auto" and 1; each process
+            has batches of its own, so that the batch grows with their number.
+        report: is given a line a validation; by default it is printed.
+        progress: show a line that tells how far it is, the default.
     """
 
     max_steps: int
@@ -56,32 +57,24 @@ def train_network(
     about: Mapping[str, Any],
     **options: Unpack[RunOptions],
 ) -> Path:
-    """``run`` a recipe, keep the best network as a checkpoint, and return the checkpoint's folder.
+    """``run`` a recipe, keep the best network as a checkpoint of a kind, and return the checkpoint's folder.
 
     Args:
-        kind: of checkpoint.
         identity: what makes this training this one, beside recipe and time.
         about: what the checkpoint is to tell, beside recipe and figures.
     """
     folder = Path(out) / CHECKPOINT
+    # a folder may hold other weights next time
+    start = {"start_sha256": checkpoint_digest(recipe.start)} if recipe.start else {}
 
     def write(figures: dict[str, Any]) -> None:
-        from hlsim import __version__
-
         network: Any = module.released()
-        told = {"hlsim": __version__, "recipe": asdict(recipe), **about, **figures}
+        told = {"hlsim": __version__, "recipe": asdict(recipe), **start, **about, **figures}
         save_checkpoint(folder, kind, network, network.config.to_dict(), told)
 
-    run(
-        module,
-        data,
-        out=out,
-        recipe=asdict(recipe) | {"max_minutes": module.max_minutes} | dict(identity),
-        write=write,
-        validate_every=recipe.validate_every,
-        begun=bool(recipe.start),
-        **options,
-    )
+    what = asdict(recipe) | {"max_minutes": module.max_minutes} | dict(identity) | start
+    how: dict[str, Any] = {"validate_every": recipe.validate_every, "begun": bool(recipe.start)}
+    run(module, data, out=out, recipe=what, write=write, **how, **options)
     return folder
 
 
@@ -94,13 +87,7 @@ def run(
     write: Callable[[dict[str, Any]], None],
     validate_every: int,
     begun: bool = False,
-    max_steps: int = -1,
-    accelerator: str = "auto",
-    devices: int = 1,
-    nodes: int = 1,
-    strategy: str = "auto",
-    report: Callable[[str], None] = print,
-    progress: bool = True,
+    **options: Unpack[RunOptions],
 ) -> None:
     """Train until the time is up; go on from ``out`` where a run of the same recipe lies there.
 
@@ -110,34 +97,29 @@ def run(
         write: stores the released form of the model, given the figures of its validation.
         validate_every: steps from validation to validation; a kill loses no more than these and their validation.
         begun: with weights that are worth keeping: they are validated too, and the best until others are better.
-        max_steps, accelerator, devices, nodes, strategy, report, progress: see ``RunOptions``.
 
     Raises:
         ValueError: ``out`` holds a run of another recipe or a broken state, there is no such device, the loss is not
             finite, or the disk is full.
         KeyboardInterrupt: it was stopped; the state is that of the last validation.
     """
-    if max_steps < -1:
+    if (max_steps := options.get("max_steps", -1)) < -1:
         raise ValueError(f"max_steps {max_steps}; allowed: whole numbers from 0 up, or -1 for no such limit")
-    folder = Path(out)
-    last = folder / LAST
+    folder, last = Path(out), Path(out) / LAST
+    accelerator, strategy = options.get("accelerator", "auto"), options.get("strategy", "auto")
+    devices, nodes = options.get("devices", 1), options.get("nodes", 1)
     module.timer = Timer(timedelta(minutes=module.max_minutes), interval="step", verbose=False)
-    states = ModelCheckpoint(
-        dirpath=folder,
-        filename="last",
-        save_top_k=1,
-        enable_version_counter=False,
-        # at the end of each validation, not before it: a run that goes on from a state does not validate it
-        save_on_train_epoch_end=False,
-    )
+    # at the end of each validation, not before it: a run that goes on from a state does not validate it
+    how: dict[str, Any] = {"save_top_k": 1, "save_on_train_epoch_end": False, "enable_version_counter": False}
+    states = ModelCheckpoint(dirpath=folder, filename="last", **how)
     callbacks: list[Callback] = [
         module.timer,
         KeepBest(write, folder / BEST),
-        History(report),
+        History(options.get("report", print)),
         ShowExamples(),
         DataWait(),
         states,
-        *([TimeProgress(module.max_minutes)] if progress else []),
+        *([TimeProgress(module.max_minutes)] if options.get("progress", True) else []),
     ]
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
     with warnings.catch_warnings():
@@ -174,9 +156,8 @@ def run(
         # SLURM's end of a job leaves another state, newer than the last validation's
         left = [path for path in (last, *folder.glob("hpc_ckpt_*.ckpt")) if path.is_file()]
         newest = max(left, key=lambda path: path.stat().st_mtime_ns, default=None)
-        state = str(newest) if newest else None
         try:
-            trainer.fit(module, datamodule=data, ckpt_path=state, weights_only=True)
+            trainer.fit(module, datamodule=data, ckpt_path=newest, weights_only=True)
             trainer.validate(module, datamodule=data, verbose=False)
         except SystemExit as end:
             # Lightning's answer to Ctrl-C, and, as another kind and as if all were done, to SIGTERM

@@ -14,7 +14,6 @@ from torch.optim.swa_utils import AveragedModel
 
 from hlsim.data.module import Batch
 from hlsim.neuro.config import NetworkConfig
-from hlsim.pretrained import checkpoint_digest
 
 Network = TypeVar("Network", bound=nn.Module)
 
@@ -25,7 +24,6 @@ class TimedModule(L.LightningModule):
     Subclasses give ``training_loss``, ``evaluate``, ``figures`` and ``released``, and log whatever they like.
 
     Args:
-        learning_rate: at its highest.
         max_minutes: of training, all resumed parts together.
     """
 
@@ -33,8 +31,7 @@ class TimedModule(L.LightningModule):
 
     def __init__(self, learning_rate: float, max_minutes: float) -> None:
         super().__init__()
-        self.learning_rate = learning_rate
-        self.max_minutes = max_minutes
+        self.learning_rate, self.max_minutes = learning_rate, max_minutes
         self.values: list[dict[str, Tensor]] = []  # of the validation under way
 
     def training_loss(self, batch: Batch) -> Tensor:
@@ -59,21 +56,17 @@ class TimedModule(L.LightningModule):
     def validate(self, batches: Iterable[Batch]) -> dict[str, float]:
         """The figures on batches, without a Trainer."""
         with torch.no_grad():
-            return self._figures(
-                [
-                    self.evaluate({name: value.to(self.device) for name, value in batch.items()})
-                    for batch in batches
-                ]
-            )
+            placed = ({name: value.to(self.device) for name, value in batch.items()} for batch in batches)
+            return self._figures([self.evaluate(batch) for batch in placed])
 
     def trained_parameters(self) -> list[nn.Parameter]:
         return [parameter for parameter in self.parameters() if parameter.requires_grad]
 
     def training_step(self, batch: Batch, index: int) -> Tensor:
         loss = self.training_loss(batch)
-        if not bool(torch.isfinite(loss)):
+        if not math.isfinite(value := float(loss.detach())):
             raise ValueError(
-                f"the loss is {float(loss.detach())} at step {self.global_step}; a lower learning rate may help"
+                f"the loss is {value} at step {self.global_step}; a lower learning rate may help"
             )
         self.log("loss", loss, prog_bar=True)
         return loss
@@ -134,8 +127,7 @@ def initial_network(
     Args:
         start: a checkpoint's name or folder; empty for random weights.
         settings: of the network; with ``start`` those of the checkpoint, or none.
-        config_kind, kind: of the network.
-        load: what loads a checkpoint by name, frozen.
+        load: loads a checkpoint by name, frozen.
 
     Raises:
         ValueError: no such checkpoint, or one of another kind or with other settings.
@@ -144,20 +136,14 @@ def initial_network(
     if not start:
         return kind(config)
     network = load(start)
+    what = f"start {start!r} in the recipe"
     if not isinstance(network, kind):
-        raise ValueError(
-            f"start {start!r} in the recipe is none to be trained; allowed: a checkpoint's name or folder"
-        )
+        raise ValueError(f"{what} is none to be trained; allowed: a checkpoint's name or folder")
     if settings and config != network.config:
         ours, theirs = config.to_dict(), network.config.to_dict()  # type: ignore[operator,union-attr]
         differing = ", ".join(name for name in ours if ours[name] != theirs[name])
         raise ValueError(
-            f"start {start!r} in the recipe has other settings of the model than the recipe ({differing}); allowed: the "
-            "same, or no 'model' in the recipe"
+            f"{what} has other settings of the model than the recipe ({differing}); allowed: the same, or no 'model' in "
+            "the recipe"
         )
     return network.train().requires_grad_(True)
-
-
-def start_identity(start: str) -> dict[str, str]:
-    """Which weights these are, for a folder may hold others next time; empty without ``start``."""
-    return {"start_sha256": checkpoint_digest(start)} if start else {}

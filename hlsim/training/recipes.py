@@ -14,7 +14,7 @@ PRECISIONS = ("float32", "bfloat16")
 
 @dataclass(frozen=True, kw_only=True)
 class TrainingRecipe:
-    """What both recipes have.
+    """What both recipes have, with a simulator's defaults.
 
     Attributes:
         model: settings of the network.
@@ -33,14 +33,14 @@ class TrainingRecipe:
 
     model: dict[str, Any] = field(default_factory=dict)
     start: str = ""
-    batch: int
-    seconds: float
-    learning_rate: float
+    batch: int = 6
+    seconds: float = 1.3
+    learning_rate: float = 1e-3
     weights: dict[str, float]
-    levels: tuple[float, float]
-    sounds: float
-    validate_every: int
-    validation_items: int
+    levels: tuple[float, float] = (40.0, 95.0)
+    sounds: float = 0.0
+    validate_every: int = 200
+    validation_items: int = 48
     seed: int = 0
 
     criteria: ClassVar[tuple[str, ...]]
@@ -59,15 +59,12 @@ class TrainingRecipe:
         for name, value in vars(self).items():
             if isinstance(value, list):  # a pair, as YAML gives it
                 object.__setattr__(self, name, tuple(value))
-        counts, lengths = ("batch", "validate_every", "validation_items"), ("seconds", "learning_rate")
-        self._refuse(
-            min(getattr(self, name) for name in counts) < 1 or min(self.seconds, self.learning_rate) <= 0.0,
-            (*counts, *lengths),
-            "counts from 1 up, seconds and learning_rate above 0",
-        )
-        self._refuse(
-            not all(0.0 <= getattr(self, name) <= 1.0 for name in self.shares), self.shares, "0 to 1"
-        )
+        names = ("batch", "validate_every", "validation_items", "seconds", "learning_rate")
+        wrong = min(self.batch, self.validate_every, self.validation_items) < 1
+        wrong = wrong or min(self.seconds, self.learning_rate) <= 0.0
+        self._refuse(wrong, names, "counts from 1 up, seconds and learning_rate above 0")
+        wrong = not all(0.0 <= getattr(self, name) <= 1.0 for name in self.shares)
+        self._refuse(wrong, self.shares, "0 to 1")
 
     def _refuse(self, wrong: bool, names: tuple[str, ...], allowed: str) -> None:
         if wrong:
@@ -96,29 +93,19 @@ class SimulatorRecipe(TrainingRecipe):
             for none.
     """
 
-    batch: int = 6
-    seconds: float = 1.3
-    learning_rate: float = 1e-3
     weights: dict[str, float] = field(default_factory=lambda: {"snr": 1.0, "log_spectrum": 0.5})
     unit_power: str = "truth"
-    levels: tuple[float, float] = (40.0, 95.0)
-    sounds: float = 0.0
     treated: bool = True
     precision: str = "float32"
     average: float = 0.99
-    validate_every: int = 200
-    validation_items: int = 48
 
     criteria = ("complex", "log_spectrum", "magnitude", "phase", "snr", "time")
 
     def __post_init__(self) -> None:
         super().__post_init__()
         self._refuse(self.unit_power not in ("truth", "input"), ("unit_power",), "truth or input")
-        self._refuse(
-            self.precision not in PRECISIONS or not 0.0 <= self.average < 1.0,
-            ("precision", "average"),
-            f"{' or '.join(PRECISIONS)}, and from 0 to below 1",
-        )
+        wrong = self.precision not in PRECISIONS or not 0.0 <= self.average < 1.0
+        self._refuse(wrong, ("precision", "average"), f"{' or '.join(PRECISIONS)}, and from 0 to below 1")
 
 
 @dataclass(frozen=True, kw_only=True)

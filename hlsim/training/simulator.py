@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import fields
 from pathlib import Path
 from typing import Any, Unpack
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from hlsim.criteria.paper import paper_parts, weighted_sum
 from hlsim.criteria.waveform import log_spectral_distance_db, noise_to_signal_db
 from hlsim.data.module import Batch
 from hlsim.neuro import NeuroConfig, NeuroMSBG
 from hlsim.pretrained import SIMULATOR, load_pretrained
-from hlsim.training.batches import PlannedData, PlannedSource, TrainingData, simulator_data
+from hlsim.training.batches import PlannedData, PlannedSource, TrainingData, identity_of, simulator_data
 from hlsim.training.loop import RunOptions, train_network
-from hlsim.training.module import TimedModule, exponential_average, initial_network, start_identity
+from hlsim.training.module import TimedModule, exponential_average, initial_network
 from hlsim.training.recipes import SimulatorRecipe
 
 
@@ -69,18 +68,11 @@ class SimulatorTraining(TimedModule):
 
     def examples(self, batch: Batch) -> dict[str, Tensor]:
         heard = self.kept.module(batch["signal"][-1:], batch["thresholds"][-1:])
-        return {
-            "given": batch["signal"][-1],
-            "heard/truth": batch["impaired"][-1],
-            "heard/network": heard[0],
-        }
+        signal, target = batch["signal"][-1], batch["impaired"][-1]
+        return {"given": signal, "heard/truth": target, "heard/network": heard[0]}
 
-    def released(self) -> nn.Module:
-        network: nn.Module = self.kept.module
-        return network
-
-    def trained_parameters(self) -> list[nn.Parameter]:
-        return list(self.student.parameters())
+    def released(self) -> Any:
+        return self.kept.module
 
     def on_train_batch_end(self, *arguments: Any) -> None:
         self.kept.update_parameters(self.student)
@@ -106,10 +98,6 @@ def train_simulator(
     """
     module = SimulatorTraining(recipe, max_minutes)
     batches = simulator_data(data, recipe)
-    start = start_identity(recipe.start)
-    identity = {entry.name: str(getattr(data, entry.name)) for entry in fields(data) if entry.compare} | start
-    if isinstance(batches, PlannedData):
-        identity["instances"] = batches.made_of
-    return train_network(
-        module, batches, recipe, SIMULATOR, out=out, identity=identity, about=start, **options
-    )
+    made_of = {"instances": batches.made_of} if isinstance(batches, PlannedData) else {}
+    how: dict[str, Any] = {"out": out, "identity": identity_of(data) | made_of, "about": {}}
+    return train_network(module, batches, recipe, SIMULATOR, **how, **options)

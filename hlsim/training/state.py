@@ -12,17 +12,9 @@ from lightning.pytorch.plugins.io import TorchCheckpointIO
 
 from hlsim.files import PARTIAL, write_whole
 
-CHECKPOINT = "checkpoint"
-"""Name of the folder with the best model, in its released form."""
-
-LAST = "last.ckpt"
-"""Name of the state that a killed training goes on from."""
-
-BEST = "best.json"
-"""Name of the file with the best score so far."""
-
-RECIPE = "recipe.json"
-"""Name of the file that says what the training is made of."""
+CHECKPOINT, LAST, BEST, RECIPE = "checkpoint", "last.ckpt", "best.json", "recipe.json"
+"""The folder with the best model in its released form; the state that a killed training goes on from; the best score so
+far; and what the training is made of."""
 
 
 class WholeStates(TorchCheckpointIO):
@@ -75,8 +67,7 @@ def _differing(one: str, other: str) -> str:
     """Names of the settings that differ."""
     try:
         first, second = json.loads(one), json.loads(other)
-        return ", ".join(
-            name for name in sorted(first | second) if first.get(name, ...) != second.get(name, ...)
-        )
+        names = sorted(first | second)
+        return ", ".join(name for name in names if first.get(name, ...) != second.get(name, ...))
     except (ValueError, TypeError):
         return "settings"  # the file is broken

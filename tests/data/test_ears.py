@@ -6,9 +6,22 @@ from pathlib import Path
 import pytest
 
 from hlsim.audiogram import Audiogram
-from hlsim.data.ears import check_shares, plan_ears
+from hlsim.data import ears as module
+from hlsim.data.ears import Ears, check_shares
+from hlsim.data.plan_settings import PlanSettings
 
 SPLITS = ("train", "valid", "test")
+
+
+def plan_ears(
+    shares: dict[str, float] | None,
+    first: Path | None,
+    second: Path | None,
+    splits: tuple[str, ...],
+    seed: int,
+) -> Ears:
+    tables = {"audiograms": first, "test_audiograms": second}
+    return module.plan_ears(PlanSettings(Path(), severities=shares, seed=seed, **tables), splits)  # type: ignore[arg-type]
 
 
 def table(path: Path, ears: list[tuple[str, tuple[float, ...]]], **columns: list[str]) -> Path:

@@ -1,6 +1,7 @@
 """Noises: disjoint types and SNRs, one draw an utterance, and an SNR that is what it says."""
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 import soundfile
@@ -9,9 +10,18 @@ from torch import Tensor
 
 from hlsim.audio import read_stretch, write_audio
 from hlsim.calibration import dbfs
+from hlsim.data import noises as module
+from hlsim.data.corpora import Fault
 from hlsim.data.manifest import Utterance
-from hlsim.data.noises import find_noises, mix_at
+from hlsim.data.noises import Noises, mix_at
+from hlsim.data.plan_settings import PlanSettings
 from hlsim.dsp.active_level import active_level_db
+
+
+def find_noises(
+    root: Path, folder: str, splits: tuple[str, ...], **options: Any
+) -> tuple[Noises, list[Fault]]:
+    return module.find_noises(root, folder, splits, PlanSettings(root, **options))
 
 
 def many(root: Path, *names: str) -> Path:

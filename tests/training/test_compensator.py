@@ -112,7 +112,7 @@ def test_general_one_draws_ears_and_noise(data: TrainingData, tmp_path: Path) ->
     recipe = CompensatorRecipe.from_dict(SMALL | {"weights": {"bands": 1.0, "paper": 0.5}})
     module = CompensatorTraining(recipe, EVER, simulator="msbg")
     sources = TrainingData(data.speech, noise=noise, audiograms=ears)
-    batches = CompensatorBatches(recipe, sources, recipe.seconds, None)
+    batches = CompensatorBatches(recipe, sources, None)
     batch = batches.draw(64, torch.Generator().manual_seed(0))
     clean, drawn = batch["clean"], batch["thresholds"]
     noisy = (batch["signal"] != clean).any(-1).float().mean()
@@ -127,7 +127,7 @@ def test_general_one_draws_ears_and_noise(data: TrainingData, tmp_path: Path) ->
 def test_a_share_of_the_clips_are_tones_and_clicks(data: TrainingData) -> None:
     def clicks(sounds: float) -> int:
         recipe = CompensatorRecipe.from_dict(SMALL | {"equalised": 0.0, "sounds": sounds})
-        batches = CompensatorBatches(recipe, data, recipe.seconds, None)
+        batches = CompensatorBatches(recipe, data, None)
         clean = batches.draw(64, torch.Generator().manual_seed(0))["clean"]
         return int((clean.count_nonzero(dim=-1) <= 8).sum())
 
