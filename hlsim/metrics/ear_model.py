@@ -16,7 +16,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -26,7 +25,7 @@ from torch import Tensor
 
 from hlsim.audiogram import FREQUENCIES
 from hlsim.dsp.fft import fft_length
-from hlsim.metrics.ear_recursions import BLOCK, RATE, Recursion, adaptation, gain_lowpass, gammatone
+from hlsim.metrics.ear_recursions import BLOCK, RATE, Recursion, adaptation, gain_lowpass, gammatone, kept
 from hlsim.torchtools import constant
 
 CHANNELS = 32
@@ -107,7 +106,7 @@ def _interpolation() -> NDArray[np.float64]:
     return np.stack([np.interp(centre_frequencies(), AUDIOMETRIC_HZ, row) for row in np.eye(6)])
 
 
-@lru_cache(maxsize=8)
+@kept
 def _widest(device: torch.device) -> Tensor:
     """Bandwidth of the control filters. Shape: (32,)."""
     return hair_cells(torch.full((8,), _WIDEST_LOSS, device=device)).bandwidth
@@ -158,7 +157,7 @@ def channel_chunks(items: int, samples: int, device: torch.device) -> Iterator[s
 # -- filters and compression -------------------------------------------------------------------------------------------
 
 
-@lru_cache(maxsize=16)
+@kept
 def _control_filters(channels: tuple[int, int], device: torch.device, dtype: torch.dtype) -> Recursion:
     chosen = slice(*channels)
     decay = constant(_decay_of_normal, dtype=torch.float64, device=device)[chosen] * _widest(device)[chosen]
@@ -186,7 +185,7 @@ def control_power(signal: Tensor, channels: slice) -> Tensor:
     """Power of the control filters' envelopes. Shape: (items, padded) -> (items, channels, padded)."""
     filters = _control_filters((channels.start, channels.stop), signal.device, signal.dtype)
     if (items := len(signal)) > 1:
-        filters = Recursion(*(part.repeat(items, 1, 1) for part in filters[:4]), filters.memory)
+        filters = filters.repeated(items)
     return _power(*_filtered(filters, signal))
 
 
@@ -255,6 +254,15 @@ def compression_gain(control: Tensor, cells: HairCells) -> Tensor:
     neper = math.log(10.0) / 20.0
     gain = torch.addcmul(-neper * (loss + 2.0 * exponent * knee), level, exponent).exp()
     return gain_lowpass(control.device, control.dtype)(gain).flatten(-2)
+
+
+def mean_level(heard: Heard, cells: HairCells) -> Tensor:
+    """Long-term level over threshold in dB, by the means of envelope and control. Returns (items, channels)."""
+    knee = 10.0 ** (cells.knee / 10.0)
+    control = torch.maximum(heard.mean_control.double().clamp_max(10.0 ** (_CEILING / 10.0)), knee)
+    gain = -cells.attenuation - (10.0 * torch.log10(control) - cells.knee) * (1.0 - 1.0 / cells.ratio)
+    level = 10.0 * torch.log10(heard.mean_power.double().clamp_min(1.0))
+    return (level + gain - cells.inner).clamp_min(0.0).to(heard.power.dtype)
 
 
 # -- alignment of channels ---------------------------------------------------------------------------------------------

@@ -8,8 +8,9 @@ That is exact, fast on any device, and differentiable in the signal and in the f
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from functools import lru_cache
-from typing import NamedTuple
+from typing import NamedTuple, ParamSpec, TypeVar, cast
 
 import numpy as np
 import torch
@@ -28,6 +29,19 @@ RATE = 24000
 """Sample rate in Hz at which the ear is defined."""
 
 Array = NDArray[np.float64]
+P = ParamSpec("P")
+Made = TypeVar("Made")
+
+
+def kept(make: Callable[P, Made]) -> Callable[P, Made]:
+    """Made once for the same arguments, and for use in any mode."""
+
+    @lru_cache(maxsize=16)
+    def call(*arguments: P.args, **settings: P.kwargs) -> Made:
+        with lasting():
+            return make(*arguments, **settings)
+
+    return cast(Callable[P, Made], call)
 
 
 class Recursion(NamedTuple):
@@ -63,13 +77,22 @@ class Recursion(NamedTuple):
             return output[1] + before @ self.outward
         return torch.baddbmm(output[1], before, self.outward)
 
+    def repeated(self, items: int) -> Recursion:
+        """The same filters for each of several items."""
+        through, inward, outward, step = (part.repeat(items, 1, 1) for part in self[:4])
+        return Recursion(through, inward, outward, step, self.memory)
+
     def to(self, device: torch.device, dtype: torch.dtype) -> Recursion:
         """The same on a device."""
-        return Recursion(*(part.to(device, dtype) for part in self[:4]), self.memory)
+        through, inward, outward, step = (part.to(device, dtype) for part in self[:4])
+        return Recursion(through, inward, outward, step, self.memory)
 
 
 def _accumulated(inputs: Tensor, step: Tensor, memory: int) -> Tensor:
-    """States after each block, by doubling stretches. Shape: (..., blocks, states), (..., states, states) -> the first."""
+    """States after each block, by doubling stretches.
+
+    Shape: (..., blocks, states), (..., states, states) -> (..., blocks, states).
+    """
     states, reach = inputs, 1
     while reach < min(inputs.shape[-2], memory + 1):
         states = states + functional.pad(states[..., :-reach, :] @ step, (0, 0, reach, 0))
@@ -95,14 +118,11 @@ def _recursion(a: Array, b: Array, c: Array, d: float, memory: int) -> Recursion
     through = np.where(lag >= 0, impulse[np.maximum(lag, 0)], 0.0)
     inward = np.stack([(powers[BLOCK - 1 - i] @ b)[:, 0] for i in range(BLOCK)])
     outward = np.stack([(c @ powers[i])[0] for i in range(BLOCK)], -1)
-    with lasting():
-        parts = (
-            torch.from_numpy(np.ascontiguousarray(x)) for x in (through, inward, outward, powers[BLOCK].T)
-        )
-        return Recursion(*parts, memory)
+    parts = [torch.from_numpy(np.ascontiguousarray(x)) for x in (through, inward, outward, powers[BLOCK].T)]
+    return Recursion(parts[0], parts[1], parts[2], parts[3], memory)
 
 
-@lru_cache(maxsize=8)
+@kept
 def middle_ear(device: torch.device, dtype: torch.dtype) -> Recursion:
     """A low-pass of first order at 5 kHz and a high-pass of second order at 350 Hz, both Butterworth (Kates 2013)."""
     low, high = butter(1, 5000 / (RATE / 2)), butter(2, 350 / (RATE / 2), "high")
@@ -110,7 +130,7 @@ def middle_ear(device: torch.device, dtype: torch.dtype) -> Recursion:
     return _recursion(a, b, c, float(d[0, 0]), 2048).to(device, dtype)
 
 
-@lru_cache(maxsize=8)
+@kept
 def gain_lowpass(device: torch.device, dtype: torch.dtype) -> Recursion:
     """The 0.2 ms that a compressive gain takes: a Butterworth low-pass of first order at 800 Hz."""
     a, b, c, d = tf2ss(*butter(1, 800 / (RATE / 2)))
@@ -120,7 +140,7 @@ def gain_lowpass(device: torch.device, dtype: torch.dtype) -> Recursion:
 _OVERSHOOT, _RAPID, _SHORT_TERM = 2.0, 0.002, 0.060
 
 
-@lru_cache(maxsize=8)
+@kept
 def adaptation(device: torch.device, dtype: torch.dtype) -> Recursion:
     """Rapid (2 ms) and short-term (60 ms) adaptation of the inner hair cell, with an onset of twice the steady output.
 
@@ -188,5 +208,5 @@ def gammatone(decay: Tensor, angle: Tensor, dtype: torch.dtype) -> Recursion:
     whole = torch.exp(-BLOCK * decay)[:, None, None] * binomials
     cosine, sine = (whole * wave(BLOCK * angle)[:, None, None] for wave in (torch.cos, torch.sin))
     step = torch.cat((torch.cat((cosine, sine), -1), torch.cat((-sine, cosine), -1)), -2)
-    parts = (torch.cat(inward, -1), outward, step)
-    return Recursion(through.transpose(-1, -2).flatten(-2), *(part.to(dtype) for part in parts), _MEMORY)
+    through = through.transpose(-1, -2).flatten(-2)
+    return Recursion(through, torch.cat(inward, -1).to(dtype), outward.to(dtype), step.to(dtype), _MEMORY)

@@ -8,6 +8,7 @@ in five cosines over frequency; ten band-passes of the cosines' course in time, 
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -158,13 +159,13 @@ def expected_correlation(reference: Modulation, processed: Modulation) -> Tensor
     """
     x, y = reference.filtered, processed.filtered
     kept = x.shape[-1]
-    fixed = {"dtype": x.dtype, "device": x.device}
+    fixed = partial(constant, dtype=x.dtype, device=x.device)
     variance = NOISE_DB**2
-    noise = variance * constant(_noise_energy, kept, **fixed)[:, None]
+    noise = variance * fixed(_noise_energy, kept)[:, None]
     xx, yy, xy = x.square().sum(-1) + noise, y.square().sum(-1) + noise, (x * y).sum(-1)
     # energies of the filtered cosines filtered again: how far noise of the filters' colour goes along with them
     points = _points(kept)
-    twice = constant(_twice_filtered, points, **fixed)
+    twice = fixed(_twice_filtered, points)
     a, b = torch.view_as_real(reference.spectrum), torch.view_as_real(processed.spectrum)
     xx2, yy2, xy2 = (twice @ product.sum(-1).mT for product in (a.square(), b.square(), a * b))
     own = variance**2 * kept * twice.sum(-1, keepdim=True)

@@ -19,7 +19,7 @@ import json
 from collections.abc import Iterator, Sequence
 from functools import lru_cache
 from pathlib import Path
-from typing import Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 import torch
@@ -33,7 +33,7 @@ from hlsim.checks import Lengths
 from hlsim.metrics import ear_model
 from hlsim.metrics import envelope_modulation as envelopes
 from hlsim.metrics.clean_speech import CleanItem, CleanSpeech
-from hlsim.metrics.ear_model import Extent
+from hlsim.metrics.ear_model import CHANNELS, Extent
 from hlsim.metrics.pyclarity import check_seed
 from hlsim.torchtools import constant
 
@@ -169,7 +169,6 @@ class _Group:
         self._signals, self._items = signals, items
         self._extent = Extent(tuple(len(item.heard) for item in items))
         self._kept: list[_Channels] | None = None
-        self._states: dict[int, dict[str, object]] = {}
         with torch.no_grad():
             self._ear = ear_model.hair_cells(torch.zeros(8, device=signals.device))
             self._heard = signals.through_middle_ear([item.heard for item in items], self._extent)
@@ -219,14 +218,11 @@ class _Group:
         if noise == "expected":
             return envelopes.expected_correlation(envelopes.modulation(x), envelopes.modulation(y))
         if noise == "seeded":
-            random = generator_after(seed, 2 * ear_model.CHANNELS * end)
+            random = generator_after(seed, 2 * CHANNELS * end)
+            drawn = (torch.from_numpy(random.standard_normal((len(kept), CHANNELS))).to(x).mT for _ in (x, y))
             x, y = (
-                cosines
-                + envelopes.cepstra(
-                    torch.from_numpy(random.standard_normal((len(kept), ear_model.CHANNELS))).to(cosines).mT
-                )
-                * envelopes.NOISE_DB
-                for cosines in (x, y)
+                cosines + envelopes.NOISE_DB * envelopes.cepstra(noise)
+                for cosines, noise in zip((x, y), drawn, strict=True)
             )
         return envelopes.correlation(envelopes.modulation(x), envelopes.modulation(y))
 
@@ -237,7 +233,7 @@ _DRAWN = 2**18
 
 
 @lru_cache(maxsize=4)
-def _state_after(seed: int, count: int) -> tuple[object, ...]:
+def _state_after(seed: int, count: int) -> Any:
     """State of numpy's legacy generator after an even number of normal deviates, none of which is computed.
 
     It draws pairs of numbers in a square until one lies in the circle, which gives two deviates.
@@ -248,8 +244,7 @@ def _state_after(seed: int, count: int) -> tuple[object, ...]:
         pairs = 2.0 * random.random_sample((min(left, _DRAWN), 2)) - 1.0
         square = np.square(pairs).sum(-1)
         left -= int(((square < 1.0) & (square != 0.0)).sum())
-    state: tuple[object, ...] = random.get_state()
-    return state
+    return random.get_state()
 
 
 def generator_after(seed: int, count: int) -> np.random.RandomState:

@@ -1,0 +1,381 @@
+"""HASQI version 2 in torch: pyclarity 0.9.0's score, differentiable, on any device, many times as fast.
+
+Kates and Arehart 2014, "The hearing-aid speech quality index (HASQI) version 2", J. Audio Eng. Soc. 62(3), 99-117. Both
+signals are heard by the impaired ear, the clean one with NAL-R: what is scored is distortion, noise and colour, not
+whether enough is heard. Of what HASPI's page says of rates, lengths, levels and alignment the same holds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Literal, NamedTuple, get_args, overload
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.signal.windows import hamming
+from torch import Tensor
+
+from hlsim.audio import check_waveform
+from hlsim.audiogram import FREQUENCIES, AudiogramLike
+from hlsim.calibration import PASCAL_SPL, check_full_scale
+from hlsim.checks import Lengths
+from hlsim.dsp.fft import fft_length
+from hlsim.dsp.fir import frequency_sampling_fir
+from hlsim.metrics import ear_model, fine_structure
+from hlsim.metrics.clean_speech import CleanItem, CleanSpeech
+from hlsim.metrics.ear_model import AUDIOMETRIC_HZ, CHANNELS, Extent
+from hlsim.metrics.ear_recursions import RATE
+from hlsim.metrics.haspi import Noise, generator_after, item_seeds
+from hlsim.torchtools import constant
+
+_NALR_ORDER = 140
+_NALR_BIAS = np.array([-17.0, -8.0, 1.0, -1.0, -2.0, -2.0])
+
+_THRESHOLD_NOISE = -10.0  # dB over threshold, of the noise on the motion
+
+_FROZEN = 2**17  # samples of noise that all channels take theirs from
+_APART = 4001
+
+
+_Source = Callable[[int, slice, int], Tensor]
+"""Noise of the clean (0) or the processed signal (1), of some channels and so many samples; by ascending channels."""
+
+
+class HasqiParts(NamedTuple):
+    """HASQI and what it is the product of. Shape of all: (...,).
+
+    Attributes:
+        combined: the score, 0 to 1.
+        nonlinear: envelopes and fine structure: noise and distortion.
+        linear: long-term spectra: colour.
+    """
+
+    combined: Tensor
+    nonlinear: Tensor
+    linear: Tensor
+
+
+@overload
+def hasqi(
+    processed: Tensor,
+    clean: Tensor,
+    audiogram: AudiogramLike,
+    *,
+    sample_rate: int = ...,
+    full_scale_spl: float = ...,
+    lengths: Lengths | None = ...,
+    noise: Noise = ...,
+    seed: int | Sequence[int] = ...,
+    whole_khz: bool = ...,
+    parts: Literal[False] = ...,
+) -> Tensor: ...
+
+
+@overload
+def hasqi(
+    processed: Tensor,
+    clean: Tensor,
+    audiogram: AudiogramLike,
+    *,
+    sample_rate: int = ...,
+    full_scale_spl: float = ...,
+    lengths: Lengths | None = ...,
+    noise: Noise = ...,
+    seed: int | Sequence[int] = ...,
+    whole_khz: bool = ...,
+    parts: bool,
+) -> Tensor | HasqiParts: ...
+
+
+def hasqi(
+    processed: Tensor,
+    clean: Tensor,
+    audiogram: AudiogramLike,
+    *,
+    sample_rate: int = 16000,
+    full_scale_spl: float = PASCAL_SPL,
+    lengths: Lengths | None = None,
+    noise: Noise = "expected",
+    seed: int | Sequence[int] = 0,
+    whole_khz: bool = False,
+    parts: bool = False,
+) -> Tensor | HasqiParts:
+    """HASQI v2 of each item: how good the processed speech sounds to this ear beside the clean with NAL-R, 0 to 1.
+
+    Args:
+        processed, clean, audiogram, sample_rate, full_scale_spl, lengths, seed, whole_khz: as ``haspi``.
+        noise: at the threshold of hearing; it counts where nothing is heard of the processed speech. "expected" takes the
+            same noise each time, "seeded" draws what pyclarity draws under ``seed``, "none" leaves it out.
+        parts: return ``HasqiParts``.
+
+    Shape: (..., time) twice and one audiogram or (..., 8) dB HL -> (...,).
+
+    Raises:
+        ValueError: as ``haspi``.
+    """
+    check_waveform(processed, "processed")
+    reference = HasqiReference(
+        clean.to(torch.promote_types(clean.dtype, processed.dtype)) if isinstance(clean, Tensor) else clean,
+        audiogram,
+        sample_rate=sample_rate,
+        full_scale_spl=full_scale_spl,
+        lengths=lengths,
+        whole_khz=whole_khz,
+        keep=False,
+    )
+    return reference.score(processed, noise=noise, seed=seed, parts=parts)
+
+
+class HasqiReference:
+    """Clean speech as an impaired ear hears it with NAL-R, prepared to score many processed signals against.
+
+    It holds about 11 MB a second of speech in float32.
+
+    Args:
+        clean, audiogram, sample_rate, full_scale_spl, lengths, whole_khz: as ``hasqi``; dtype and device are those of
+            ``clean``, whose gradient is not followed.
+        keep: what the ear makes of it; without, it is computed with each score, in less memory.
+
+    Raises:
+        ValueError: as ``haspi``.
+    """
+
+    def __init__(
+        self,
+        clean: Tensor,
+        audiogram: AudiogramLike,
+        *,
+        sample_rate: int = 16000,
+        full_scale_spl: float = PASCAL_SPL,
+        lengths: Lengths | None = None,
+        whole_khz: bool = False,
+        keep: bool = True,
+    ) -> None:
+        self._signals = CleanSpeech(clean, sample_rate, full_scale_spl, lengths, whole_khz, "HASQI")
+        thresholds = self._signals.thresholds(audiogram)
+        noise_db = _THRESHOLD_NOISE - check_full_scale(full_scale_spl)
+        self._groups = [
+            _Group(self._signals, items, thresholds, 10.0 ** (noise_db / 20.0))
+            for items in self._signals.groups()
+        ]
+        if keep:
+            for group in self._groups:
+                group.keep()
+
+    @overload
+    def score(
+        self,
+        processed: Tensor,
+        *,
+        noise: Noise = ...,
+        seed: int | Sequence[int] = ...,
+        parts: Literal[False] = ...,
+    ) -> Tensor: ...
+
+    @overload
+    def score(
+        self, processed: Tensor, *, noise: Noise = ..., seed: int | Sequence[int] = ..., parts: bool
+    ) -> Tensor | HasqiParts: ...
+
+    def score(
+        self,
+        processed: Tensor,
+        *,
+        noise: Noise = "expected",
+        seed: int | Sequence[int] = 0,
+        parts: bool = False,
+    ) -> Tensor | HasqiParts:
+        """``hasqi`` of processed signals of the clean ones' shape, rate and scale."""
+        if noise not in get_args(Noise):
+            raise ValueError(f"noise {noise!r}; allowed: {', '.join(get_args(Noise))}")
+        given = self._signals.check(processed)
+        seeds = item_seeds(seed, self._signals.shape)
+        with torch.autocast(processed.device.type, enabled=False):
+            scores = [score for group in self._groups for score in group.compare(given, noise, seeds)]
+        nonlinear, linear = torch.stack(scores).reshape(*self._signals.shape, 2).unbind(-1)
+        return HasqiParts(nonlinear * linear, nonlinear, linear) if parts else nonlinear * linear
+
+
+# -- items that are worked on together ---------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Channels:
+    """Some channels of the clean speech.
+
+    Attributes:
+        chosen: the channels.
+        envelope, motion: spectra for the lags of the processed ones.
+        delays: that match the filters' group delays. Shape: (items, channels).
+        smoothed: levels of each item. Shape: (channels, segments).
+        moving: the adapted motion. Shape: (items, channels, padded).
+        level: long-term, in dB over threshold. Shape: (items, channels).
+    """
+
+    chosen: slice
+    envelope: Tensor
+    motion: Tensor
+    delays: Tensor
+    smoothed: list[Tensor]
+    moving: Tensor
+    level: Tensor
+
+
+class _Group:
+    """Items that are worked on together, each with what the ear makes of the clean speech."""
+
+    def __init__(
+        self, signals: CleanSpeech, items: list[CleanItem], thresholds: Tensor, noise: float
+    ) -> None:
+        self._signals, self._items, self._noise = signals, items, noise
+        self._extent = Extent(tuple(len(item.heard) for item in items))
+        self._kept: list[_Channels] | None = None
+        chosen = thresholds[[item.index for item in items]]
+        with torch.no_grad():
+            self._ear = ear_model.hair_cells(chosen)
+            taps = [_nalr(ear) for ear in chosen.double().cpu().numpy()]
+            amplified = [_amplified(item.heard, fir) for item, fir in zip(items, taps, strict=True)]
+            self._heard = signals.through_middle_ear(amplified, self._extent)
+            self._latest = ear_model.longest_group_delay(self._heard, self._ear, self._extent)
+
+    def keep(self) -> None:
+        """Compute all channels now."""
+        self._kept = list(self._channels())
+
+    def _channels(self) -> Iterator[_Channels]:
+        if self._kept is not None:
+            yield from self._kept
+            return
+        extent = self._extent
+        for chosen in ear_model.channel_chunks(len(self._items), extent.padded, self._signals.device):
+            with torch.no_grad():
+                cells = self._ear[chosen]
+                heard = ear_model.listen(self._heard, self._ear, chosen, extent, motion=True)
+                assert heard.motion is not None
+                envelope = ear_model.lag_spectrum(heard.power.sqrt(), extent)
+                motion = ear_model.lag_spectrum(heard.motion, extent)
+                delays = self._latest - ear_model.group_delays(heard.bandwidth, chosen)
+                levels = ear_model.adapted(ear_model.sensation(heard.power, cells.inner))
+                yield _Channels(
+                    chosen,
+                    envelope,
+                    motion,
+                    delays,
+                    self._smoothed(levels, delays),
+                    _moving(heard.motion, heard.power, levels),
+                    ear_model.mean_level(heard, cells),
+                )
+
+    def _smoothed(self, levels: Tensor, delays: Tensor) -> list[Tensor]:
+        return [fine_structure.smoothed(late) for late in self._late(levels, delays)]
+
+    def _late(self, signal: Tensor, delays: Tensor) -> list[Tensor]:
+        """Delayed to match, item by item. Shape: (items, channels, padded) -> (channels, end) each."""
+        ends = self._extent.ends
+        late = ear_model.shift(signal, delays, ends, ends, self._extent.longest)
+        return [late[i, :, :end] for i, end in enumerate(ends)]
+
+    def compare(self, processed: Tensor, noise: Noise, seeds: list[int]) -> list[Tensor]:
+        """Nonlinear and linear part of each item. Shape: (items, time) of the whole batch -> (2,) each."""
+        extent, signals = self._extent, self._signals
+        places = [item.index for item in self._items]
+        sound = signals.through_middle_ear(
+            [signals.matched(processed[item.index], item) for item in self._items], extent
+        )
+        sources: list[_Source] | None = None if noise == "none" else [_frozen for _ in places]
+        if noise == "seeded":
+            sources = [_drawn(seeds[place], end) for place, end in zip(places, extent.ends, strict=True)]
+        found: list[list[tuple[Tensor, ...]]] = [[] for _ in places]
+        for part in self._channels():
+            cells = self._ear[part.chosen]
+            heard = ear_model.listen(sound, self._ear, part.chosen, extent, motion=True)
+            assert heard.motion is not None
+            lags = ear_model.channel_lags(part.envelope, heard.power.detach().sqrt(), extent)
+            power = ear_model.shift(heard.power, lags, extent.ends, extent.ends, extent.padded)
+            lags = ear_model.channel_lags(part.motion, heard.motion.detach(), extent)
+            motion = ear_model.shift(heard.motion, lags, extent.ends, extent.ends, extent.padded)
+            levels = ear_model.adapted(ear_model.sensation(power, cells.inner))
+            smoothed = self._smoothed(levels, part.delays)
+            moving = self._late(
+                self._noisy(_moving(motion, power, levels), part.chosen, sources, 1), part.delays
+            )
+            still = self._late(self._noisy(part.moving, part.chosen, sources, 0), part.delays)
+            level = ear_model.mean_level(heard, cells)
+            for i, rows in enumerate(found):
+                x = fine_structure.segment_spectra(still[i])
+                both = fine_structure.coherence(x, fine_structure.segment_spectra(moving[i]))
+                rows.append((part.smoothed[i], smoothed[i], both, x[1], part.level[i], level[i]))
+        return [self._score(*(torch.cat(column) for column in zip(*rows, strict=True))) for rows in found]
+
+    def _score(
+        self, clean: Tensor, heard: Tensor, coherence: Tensor, energy: Tensor, before: Tensor, after: Tensor
+    ) -> Tensor:
+        envelopes = fine_structure.envelope_correlation(clean, heard)
+        fine = fine_structure.synchrony(coherence, energy)
+        return torch.stack((envelopes.square() * fine, fine_structure.spectral_likeness(before, after)))
+
+    def _noisy(self, moving: Tensor, chosen: slice, sources: Sequence[_Source] | None, which: int) -> Tensor:
+        """With noise at the threshold of hearing. Shape: (items, channels, padded) -> the same."""
+        if sources is None:
+            return moving
+        rows = torch.zeros_like(moving)
+        for row, end, source in zip(rows, self._extent.ends, sources, strict=True):
+            row[:, :end] = source(which, chosen, end).to(moving)
+        return moving + self._noise * rows
+
+
+def _drawn(seed: int, end: int) -> _Source:
+    """As pyclarity draws it."""
+    generators = [generator_after(seed, start * CHANNELS * end) for start in (0, 1)]
+
+    def source(which: int, chosen: slice, end: int) -> Tensor:
+        return torch.from_numpy(generators[which].standard_normal((chosen.stop - chosen.start, end)))
+
+    return source
+
+
+def _frozen(which: int, chosen: slice, end: int) -> Tensor:
+    """The same each time: every channel takes its part of one stretch of noise."""
+    table = constant(_frozen_noise, dtype=torch.float32, device=torch.device("cpu"))
+    starts = [(CHANNELS * which + channel) * _APART % _FROZEN for channel in range(chosen.start, chosen.stop)]
+    long = table.repeat(-(-(end + _FROZEN) // _FROZEN))
+    return torch.stack([long[start : start + end] for start in starts])
+
+
+def _frozen_noise() -> NDArray[np.float64]:
+    return np.random.RandomState(0).standard_normal(_FROZEN)
+
+
+def _moving(motion: Tensor, power: Tensor, levels: Tensor) -> Tensor:
+    """The motion with the adapted level as its envelope, in dB over threshold. Shape: (items, channels, padded) each."""
+    return motion * levels * power.clamp_min(1.0).rsqrt()  # under 0 dB SPL the level is 0
+
+
+# -- NAL-R -------------------------------------------------------------------------------------------------------------
+
+
+def _nalr(thresholds: NDArray[np.float64]) -> NDArray[np.float64]:
+    """NAL-R's filter at 24 kHz (Byrne and Dillon 1986), linear in dB between the audiometric frequencies.
+
+    Shape: (8,) dB HL -> (141,).
+    """
+    loss = thresholds[[FREQUENCIES.index(hz) for hz in AUDIOMETRIC_HZ]]
+    if loss.max() <= 0.0:
+        return np.eye(_NALR_ORDER + 1)[_NALR_ORDER // 2]
+    three = float(loss[1:4].sum())  # at 500, 1000 and 2000 Hz
+    common = 0.05 * three if three <= 180.0 else 9.0 + 0.116 * (three - 180.0)
+    gains = np.maximum(common + 0.31 * loss + _NALR_BIAS, 0.0)
+    grid = np.arange(_NALR_ORDER + 1) / _NALR_ORDER
+    decibels = np.interp(grid * RATE / 2, AUDIOMETRIC_HZ, gains)
+    return frequency_sampling_fir(len(grid), grid, 10.0 ** (decibels / 20.0), hamming(len(grid)))
+
+
+def _amplified(signal: Tensor, taps: NDArray[np.float64]) -> Tensor:
+    """Filtered, from the filter's last sample on, as pyclarity takes it. Shape: (time,) -> (time,)."""
+    time = signal.shape[-1]
+    points = fft_length(time + _NALR_ORDER, 2)
+    fir = torch.from_numpy(taps).to(signal)
+    filtered = torch.fft.irfft(torch.fft.rfft(signal, points) * torch.fft.rfft(fir, points), points)
+    return filtered[_NALR_ORDER : _NALR_ORDER + time]
