@@ -182,14 +182,16 @@ class _Group:
         if self._kept is not None:
             yield from self._kept
             return
-        extent = self._extent
-        for chosen in ear_model.channel_chunks(len(self._items), extent.padded, self._signals.device):
-            with torch.no_grad():
-                heard = ear_model.listen(self._heard, self._ear, chosen, extent)
-                spectrum = ear_model.lag_spectrum(heard.power.sqrt(), extent)
-                delays = self._latest - ear_model.group_delays(heard.bandwidth, chosen)
-                levels = ear_model.adapted(ear_model.sensation(heard.power, self._ear.inner[chosen]))
-                yield _Channels(chosen, spectrum, delays, envelopes.frames(levels, delays, extent))
+        for chosen in ear_model.channel_chunks(len(self._items), self._extent.padded, self._signals.device):
+            yield self._hear(chosen)
+
+    @torch.no_grad()
+    def _hear(self, chosen: slice) -> _Channels:
+        heard = ear_model.listen(self._heard, self._ear, chosen, self._extent)
+        spectrum = ear_model.lag_spectrum(heard.power.sqrt(), self._extent)
+        delays = self._latest - ear_model.group_delays(heard.bandwidth, chosen)
+        levels = ear_model.adapted(ear_model.sensation(heard.power, self._ear.inner[chosen]))
+        return _Channels(chosen, spectrum, delays, envelopes.frames(levels, delays, self._extent))
 
     def compare(
         self, processed: Tensor, ears: ear_model.HairCells, noise: Noise, seeds: list[int]

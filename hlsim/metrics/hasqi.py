@@ -248,25 +248,25 @@ class _Group:
         if self._kept is not None:
             yield from self._kept
             return
-        extent = self._extent
-        for chosen in ear_model.channel_chunks(len(self._items), extent.padded, self._signals.device):
-            with torch.no_grad():
-                cells = self._ear[chosen]
-                heard = ear_model.listen(self._heard, self._ear, chosen, extent, motion=True)
-                assert heard.motion is not None
-                envelope = ear_model.lag_spectrum(heard.power.sqrt(), extent)
-                motion = ear_model.lag_spectrum(heard.motion, extent)
-                delays = self._latest - ear_model.group_delays(heard.bandwidth, chosen)
-                levels = ear_model.adapted(ear_model.sensation(heard.power, cells.inner))
-                yield _Channels(
-                    chosen,
-                    envelope,
-                    motion,
-                    delays,
-                    self._smoothed(levels, delays),
-                    _moving(heard.motion, heard.power, levels),
-                    ear_model.mean_level(heard, cells),
-                )
+        for chosen in ear_model.channel_chunks(len(self._items), self._extent.padded, self._signals.device):
+            yield self._hear(chosen)
+
+    @torch.no_grad()
+    def _hear(self, chosen: slice) -> _Channels:
+        extent, cells = self._extent, self._ear[chosen]
+        heard = ear_model.listen(self._heard, self._ear, chosen, extent, motion=True)
+        assert heard.motion is not None
+        delays = self._latest - ear_model.group_delays(heard.bandwidth, chosen)
+        levels = ear_model.adapted(ear_model.sensation(heard.power, cells.inner))
+        return _Channels(
+            chosen,
+            ear_model.lag_spectrum(heard.power.sqrt(), extent),
+            ear_model.lag_spectrum(heard.motion, extent),
+            delays,
+            self._smoothed(levels, delays),
+            _moving(heard.motion, heard.power, levels),
+            ear_model.mean_level(heard, cells),
+        )
 
     def _smoothed(self, levels: Tensor, delays: Tensor) -> list[Tensor]:
         return [fine_structure.smoothed(late) for late in self._late(levels, delays)]
