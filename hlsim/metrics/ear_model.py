@@ -161,7 +161,12 @@ def channel_chunks(items: int, samples: int, device: torch.device) -> Iterator[s
 def _control_filters(channels: tuple[int, int], device: torch.device, dtype: torch.dtype) -> Recursion:
     chosen = slice(*channels)
     decay = constant(_decay_of_normal, dtype=torch.float64, device=device)[chosen] * _widest(device)[chosen]
-    return gammatone(decay, _angles(device)[chosen], dtype)
+    return gammatone(decay, _angles(device)[chosen], _memory(chosen), dtype)
+
+
+def _memory(channels: slice) -> int:
+    """Samples after which filters of normal bandwidth, and wider ones, have nothing left in double precision."""
+    return math.ceil(50.0 / float(_decay_of_normal()[channels.start]))
 
 
 def _angles(device: torch.device) -> Tensor:
@@ -233,7 +238,7 @@ def listen(signal: Tensor, ear: HairCells, channels: slice, extent: Extent, *, m
     width = bandwidths(control, cells, channels, extent)
     decay = width * constant(_decay_of_normal, dtype=torch.float64, device=signal.device)[channels]
     angle = _angles(signal.device)[channels].expand_as(decay)
-    filters = gammatone(decay.flatten(), angle.flatten(), signal.dtype)
+    filters = gammatone(decay.flatten(), angle.flatten(), _memory(channels), signal.dtype)
     real, imaginary = _filtered(filters, signal)
     power = _power(real, imaginary)
     gain = compression_gain(control, cells)
@@ -248,7 +253,8 @@ def compression_gain(control: Tensor, cells: HairCells) -> Tensor:
     knee, ratio, loss = (
         field.to(control).unsqueeze(-1) for field in (cells.knee, cells.ratio, cells.attenuation)
     )
-    level = torch.maximum(control.clamp_max(10.0 ** (_CEILING / 10.0)), 10.0 ** (knee / 10.0)).log()
+    highest = knee.new_full((), 10.0 ** (_CEILING / 10.0))
+    level = control.clamp(10.0 ** (knee / 10.0), highest).log()
     # in nepers: -loss - (level - knee) (1 - 1 / ratio)
     exponent = 0.5 * (1.0 / ratio - 1.0)
     neper = math.log(10.0) / 20.0

@@ -134,7 +134,7 @@ def middle_ear(device: torch.device, dtype: torch.dtype) -> Recursion:
 def gain_lowpass(device: torch.device, dtype: torch.dtype) -> Recursion:
     """The 0.2 ms that a compressive gain takes: a Butterworth low-pass of first order at 800 Hz."""
     a, b, c, d = tf2ss(*butter(1, 800 / (RATE / 2)))
-    return _recursion(a, b, c, float(d[0, 0]), 512).to(device, dtype)
+    return _recursion(a, b, c, float(d[0, 0]), 192).to(device, dtype)
 
 
 _OVERSHOOT, _RAPID, _SHORT_TERM = 2.0, 0.002, 0.060
@@ -159,13 +159,12 @@ def adaptation(device: torch.device, dtype: torch.dtype) -> Recursion:
 
 # -- gammatone filters -------------------------------------------------------------------------------------------------
 
-_MEMORY = 8192  # of the narrowest filter, at 80 Hz, nothing is left after that even in double precision
 _ORDER = 4
 # C(d, e) in row e: how the powers of a distance grow by a block
 _BINOMIALS = [[math.comb(d, e) for d in range(_ORDER)] for e in range(_ORDER)]
 
 
-def gammatone(decay: Tensor, angle: Tensor, dtype: torch.dtype) -> Recursion:
+def gammatone(decay: Tensor, angle: Tensor, memory: int, dtype: torch.dtype) -> Recursion:
     """Gammatone filters of fourth order as complex band-passes.
 
     The impulse response at sample n is g p(n) exp(n (i angle - decay)) with p(n) = (n + 1)(3 n^2 + 3 n + 2) / 2: four
@@ -176,6 +175,7 @@ def gammatone(decay: Tensor, angle: Tensor, dtype: torch.dtype) -> Recursion:
     Args:
         decay: per sample, 2 pi 1.019 ERB / rate times the bandwidth in normal ones. Shape: (rows,).
         angle: 2 pi centre frequency / rate. Shape: (rows,).
+        memory: samples after which nothing is left: 50 over the least decay.
         dtype: of the matrices; they are computed in that of ``decay``.
     """
     n = torch.arange(BLOCK, dtype=decay.dtype, device=decay.device)
@@ -209,4 +209,4 @@ def gammatone(decay: Tensor, angle: Tensor, dtype: torch.dtype) -> Recursion:
     cosine, sine = (whole * wave(BLOCK * angle)[:, None, None] for wave in (torch.cos, torch.sin))
     step = torch.cat((torch.cat((cosine, sine), -1), torch.cat((-sine, cosine), -1)), -2)
     through = through.transpose(-1, -2).flatten(-2)
-    return Recursion(through, torch.cat(inward, -1).to(dtype), outward.to(dtype), step.to(dtype), _MEMORY)
+    return Recursion(through, torch.cat(inward, -1).to(dtype), outward.to(dtype), step.to(dtype), memory)

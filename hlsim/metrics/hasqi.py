@@ -39,8 +39,8 @@ _FROZEN = 2**17  # samples of noise that all channels take theirs from
 _APART = 4001
 
 
-_Source = Callable[[int, slice, int], Tensor]
-"""Noise of the clean (0) or the processed signal (1), of some channels and so many samples; by ascending channels."""
+_Source = Callable[[int, int], Tensor]
+"""Noise of the next so many channels, each so many samples long."""
 
 
 class HasqiParts(NamedTuple):
@@ -131,7 +131,7 @@ def hasqi(
 class HasqiReference:
     """Clean speech as an impaired ear hears it with NAL-R, prepared to score many processed signals against.
 
-    It holds about 11 MB a second of speech in float32.
+    It holds about 18 MB a second of speech in float32.
 
     Args:
         clean, audiogram, sample_rate, full_scale_spl, lengths, whole_khz: as ``hasqi``; dtype and device are those of
@@ -211,6 +211,7 @@ class _Channels:
         delays: that match the filters' group delays. Shape: (items, channels).
         smoothed: levels of each item. Shape: (channels, segments).
         moving: the adapted motion. Shape: (items, channels, padded).
+        segments: of that, of each item.
         level: long-term, in dB over threshold. Shape: (items, channels).
     """
 
@@ -220,6 +221,7 @@ class _Channels:
     delays: Tensor
     smoothed: list[Tensor]
     moving: Tensor
+    segments: list[tuple[Tensor, Tensor]]
     level: Tensor
 
 
@@ -258,35 +260,43 @@ class _Group:
         assert heard.motion is not None
         delays = self._latest - ear_model.group_delays(heard.bandwidth, chosen)
         levels = ear_model.adapted(ear_model.sensation(heard.power, cells.inner))
+        moving = _moving(heard.motion, heard.power, levels)
         return _Channels(
             chosen,
             ear_model.lag_spectrum(heard.power.sqrt(), extent),
             ear_model.lag_spectrum(heard.motion, extent),
             delays,
             self._smoothed(levels, delays),
-            _moving(heard.motion, heard.power, levels),
+            moving,
+            self._segments(moving, delays),
             ear_model.mean_level(heard, cells),
         )
 
     def _smoothed(self, levels: Tensor, delays: Tensor) -> list[Tensor]:
-        return [fine_structure.smoothed(late) for late in self._late(levels, delays)]
-
-    def _late(self, signal: Tensor, delays: Tensor) -> list[Tensor]:
-        """Delayed to match, item by item. Shape: (items, channels, padded) -> (channels, end) each."""
         ends = self._extent.ends
-        late = ear_model.shift(signal, delays, ends, ends, self._extent.longest)
-        return [late[i, :, :end] for i, end in enumerate(ends)]
+        late = ear_model.shift(levels, delays, ends, ends, self._extent.longest)
+        return [fine_structure.smoothed(late[i, :, :end]) for i, end in enumerate(ends)]
+
+    def _segments(
+        self, moving: Tensor, delays: Tensor, sources: Sequence[_Source] | None = None
+    ) -> list[tuple[Tensor, Tensor]]:
+        """``segment_spectra`` of each item, delayed to match, with noise at the threshold of hearing."""
+        made = []
+        for i, end in enumerate(self._extent.ends):
+            item = moving[i : i + 1, :, :end]
+            if sources is not None:
+                item = item + self._noise * sources[i](item.shape[1], end).to(item)
+            late = ear_model.shift(item, delays[i : i + 1], (end,), (end,), end)
+            made.append(fine_structure.segment_spectra(late[0]))
+        return made
 
     def compare(self, processed: Tensor, noise: Noise, seeds: list[int]) -> list[Tensor]:
         """Nonlinear and linear part of each item. Shape: (items, time) of the whole batch -> (2,) each."""
         extent, signals = self._extent, self._signals
         places = [item.index for item in self._items]
-        sound = signals.through_middle_ear(
-            [signals.matched(processed[item.index], item) for item in self._items], extent
-        )
-        sources: list[_Source] | None = None if noise == "none" else [_frozen for _ in places]
-        if noise == "seeded":
-            sources = [_drawn(seeds[place], end) for place, end in zip(places, extent.ends, strict=True)]
+        given = [signals.matched(processed[item.index], item) for item in self._items]
+        sound = signals.through_middle_ear(given, extent)
+        first, second = _sources(noise, [seeds[place] for place in places], extent)
         found: list[list[tuple[Tensor, ...]]] = [[] for _ in places]
         for part in self._channels():
             cells = self._ear[part.chosen]
@@ -298,15 +308,12 @@ class _Group:
             motion = ear_model.shift(heard.motion, lags, extent.ends, extent.ends, extent.padded)
             levels = ear_model.adapted(ear_model.sensation(power, cells.inner))
             smoothed = self._smoothed(levels, part.delays)
-            moving = self._late(
-                self._noisy(_moving(motion, power, levels), part.chosen, sources, 1), part.delays
-            )
-            still = self._late(self._noisy(part.moving, part.chosen, sources, 0), part.delays)
+            y = self._segments(_moving(motion, power, levels), part.delays, second)
+            x = part.segments if first is None else self._segments(part.moving, part.delays, first)
             level = ear_model.mean_level(heard, cells)
             for i, rows in enumerate(found):
-                x = fine_structure.segment_spectra(still[i])
-                both = fine_structure.coherence(x, fine_structure.segment_spectra(moving[i]))
-                rows.append((part.smoothed[i], smoothed[i], both, x[1], part.level[i], level[i]))
+                both = fine_structure.coherence(x[i], y[i])
+                rows.append((part.smoothed[i], smoothed[i], both, x[i][1], part.level[i], level[i]))
         return [self._score(*(torch.cat(column) for column in zip(*rows, strict=True))) for rows in found]
 
     def _score(
@@ -316,32 +323,43 @@ class _Group:
         fine = fine_structure.synchrony(coherence, energy)
         return torch.stack((envelopes.square() * fine, fine_structure.spectral_likeness(before, after)))
 
-    def _noisy(self, moving: Tensor, chosen: slice, sources: Sequence[_Source] | None, which: int) -> Tensor:
-        """With noise at the threshold of hearing. Shape: (items, channels, padded) -> the same."""
-        if sources is None:
-            return moving
-        rows = torch.zeros_like(moving)
-        for row, end, source in zip(rows, self._extent.ends, sources, strict=True):
-            row[:, :end] = source(which, chosen, end).to(moving)
-        return moving + self._noise * rows
+
+# -- noise -------------------------------------------------------------------------------------------------------------
 
 
-def _drawn(seed: int, end: int) -> _Source:
+def _sources(
+    noise: Noise, seeds: list[int], extent: Extent
+) -> tuple[list[_Source] | None, list[_Source] | None]:
+    """Noise of the clean signals, where it is drawn, and of the processed ones."""
+    if noise == "none":
+        return None, None
+    if noise == "expected":  # only what is heard of the clean signal counts, and there noise is nothing
+        return None, [_frozen() for _ in seeds]
+    drawn = [
+        [_drawn(seed, start * CHANNELS * end) for seed, end in zip(seeds, extent.ends, strict=True)]
+        for start in (0, 1)
+    ]
+    return drawn[0], drawn[1]
+
+
+def _drawn(seed: int, start: int) -> _Source:
     """As pyclarity draws it."""
-    generators = [generator_after(seed, start * CHANNELS * end) for start in (0, 1)]
-
-    def source(which: int, chosen: slice, end: int) -> Tensor:
-        return torch.from_numpy(generators[which].standard_normal((chosen.stop - chosen.start, end)))
-
-    return source
+    generator = generator_after(seed, start)
+    return lambda channels, end: torch.from_numpy(generator.standard_normal((channels, end)))
 
 
-def _frozen(which: int, chosen: slice, end: int) -> Tensor:
+def _frozen() -> _Source:
     """The same each time: every channel takes its part of one stretch of noise."""
     table = constant(_frozen_noise, dtype=torch.float32, device=torch.device("cpu"))
-    starts = [(CHANNELS * which + channel) * _APART % _FROZEN for channel in range(chosen.start, chosen.stop)]
-    long = table.repeat(-(-(end + _FROZEN) // _FROZEN))
-    return torch.stack([long[start : start + end] for start in starts])
+    taken = 0
+
+    def source(channels: int, end: int) -> Tensor:
+        nonlocal taken
+        starts = range(taken * _APART, (taken + channels) * _APART, _APART)
+        taken += channels
+        return table.repeat(-(-(starts[-1] + end) // _FROZEN))[starts[0] :].unfold(0, end, _APART)[:channels]
+
+    return source
 
 
 def _frozen_noise() -> NDArray[np.float64]:
