@@ -120,6 +120,11 @@ class CleanSpeech:
         """Of each item. Returns (items, 8) dB HL."""
         probe = torch.empty((*self.shape, 1), device=self.device)
         ears = resolve_thresholds(None, audiogram, probe, highest=HIGHEST_LEVEL, taker=self._name)
+        if ears.ndim > len(self.shape) + 1:
+            raise ValueError(
+                f"audiograms of shape {tuple(ears.shape)} for signals of shape {(*self.shape, self.time)}; allowed: one, or "
+                "leading dimensions that broadcast"
+            )
         return ears.expand(*self.shape, 8).reshape(-1, 8)
 
     def matched(self, processed: Tensor, item: CleanItem) -> Tensor:

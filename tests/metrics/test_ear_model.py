@@ -72,7 +72,7 @@ def test_middle_ear_and_adaptation(pair: tuple[Tensor, Tensor], dtype: torch.dty
     np.testing.assert_allclose(ours, expected, rtol=0, atol=100 * error)
 
 
-@pytest.mark.parametrize(("dtype", "error"), [(torch.float64, 1e-7), (torch.float32, 1e-6)])
+@pytest.mark.parametrize(("dtype", "error"), [(torch.float64, 1e-7), (torch.float32, 3e-6)])
 def test_gammatones(pair: tuple[Tensor, Tensor], dtype: torch.dtype, error: float) -> None:
     eb = of_clarity()
     signal = blocks(pair[1])
@@ -138,7 +138,7 @@ def test_the_ear_as_a_whole(pair: tuple[Tensor, Tensor], name: str) -> None:
         for heard, cells, wanted in pairs:
             level = ear_model.adapted(ear_model.sensation(heard, cells.inner[chosen]))
             level = ear_model.shift(level, delays, extent.ends, extent.ends, extent.longest)
-            np.testing.assert_allclose(level[0].numpy(), wanted[chosen], rtol=0, atol=1e-6)
+            np.testing.assert_allclose(level[0].numpy(), wanted[chosen], rtol=0, atol=1e-5)
         for heard, cells, wanted in ((a, normal, expected[4]), (b, ours, expected[5])):
             level = ear_model.mean_level(heard, cells[chosen])
             np.testing.assert_allclose(level[0].numpy(), wanted[chosen], rtol=0, atol=1e-8)
