@@ -122,7 +122,7 @@ class CleanSpeech:
         ears = resolve_thresholds(None, audiogram, probe, highest=HIGHEST_LEVEL, taker=self._name)
         if ears.ndim > len(self.shape) + 1:
             raise ValueError(
-                f"audiograms of shape {tuple(ears.shape)} for signals of shape {(*self.shape, self.time)}; allowed: one, or "
+                f"audiograms of shape {tuple(ears.shape)} for signals of {(*self.shape, self.time)}; allowed: one, or "
                 "leading dimensions that broadcast"
             )
         return ears.expand(*self.shape, 8).reshape(-1, 8)
