@@ -8,6 +8,7 @@ in five cosines over frequency; ten band-passes of the cosines' course in time, 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from functools import partial
 from typing import NamedTuple
 
@@ -62,22 +63,45 @@ def _smoothing() -> NDArray[np.float64]:
     return padded.reshape(_SPAN, STRIDE).T
 
 
-def audible_frames(reference: Tensor) -> Tensor:
-    """Places of the frames that count. Shape: (32, frames) -> (kept,).
+class Course(NamedTuple):
+    """What is made of frames over the channels; that of all channels is the sum over some at a time.
+
+    Attributes:
+        loudness: mean over the channels of the amplitude over threshold. Shape: (items, frames).
+        cosines: five cosines over frequency. Shape: (items, 5, frames).
+    """
+
+    loudness: Tensor
+    cosines: Tensor
+
+
+def course(levels: Tensor, channels: slice) -> Course:
+    """Of the frames of some channels. Shape: (items, channels, frames)."""
+    loudness = (levels.detach() * (math.log(10.0) / 20.0)).exp().sum(-2) / CHANNELS
+    return Course(loudness, cosines(levels, channels))
+
+
+def cosines(levels: Tensor, channels: slice = slice(None)) -> Tensor:
+    """Five cosines over frequency. Shape: (..., channels, frames) -> (..., 5, frames)."""
+    return constant(_cosines, dtype=levels.dtype, device=levels.device)[:, channels] @ levels
+
+
+def added(parts: Iterable[Course]) -> Course:
+    """The sum over chunks of channels."""
+    loudness, waves = zip(*parts, strict=True)
+    return Course(sum(loudness[1:], start=loudness[0]), sum(waves[1:], start=waves[0]))
+
+
+def audible_frames(loudness: Tensor) -> Tensor:
+    """Places of the frames that count. Shape: (frames,) -> (kept,).
 
     Raises:
         ValueError: there are none or one.
     """
-    loudness = (reference * (math.log(10.0) / 20.0)).exp().mean(0)
     places = (loudness > 10.0 ** (_SILENCE / 20.0)).nonzero()[:, 0]
     if len(places) < 2:
-        raise ValueError("clean is below the threshold of hearing in every channel")
+        raise ValueError("clean is below the threshold of hearing")
     return places
-
-
-def cepstra(levels: Tensor) -> Tensor:
-    """Five cosines over frequency. Shape: (32, frames) -> (5, frames)."""
-    return constant(_cosines, dtype=levels.dtype, device=levels.device) @ levels
 
 
 def _cosines() -> NDArray[np.float64]:
@@ -89,26 +113,34 @@ def _cosines() -> NDArray[np.float64]:
 # -- modulation filters ------------------------------------------------------------------------------------------------
 
 
-class Modulation(NamedTuple):
-    """One signal's cosines through the modulation filters.
+class Agreement(NamedTuple):
+    """How the filtered cosines of two signals go together.
 
     Attributes:
-        filtered: without their means. Shape: (10, 5, kept).
-        spectrum: of the cosines before the filters. Shape: (5, bins).
+        xx, yy, xy: energies of both and their product, without the means. Shape: (10, 5).
+        spectra: of the cosines before the filters. Shape: (5, bins) twice.
+        kept: frames.
     """
 
-    filtered: Tensor
-    spectrum: Tensor
+    xx: Tensor
+    yy: Tensor
+    xy: Tensor
+    spectra: tuple[Tensor, Tensor]
+    kept: int
 
 
-def modulation(cosines: Tensor) -> Modulation:
-    """Filter the cosines' course in time by ten band-passes without delay. Shape: (5, kept)."""
-    kept = cosines.shape[-1]
+def agreement(reference: Tensor, processed: Tensor) -> Agreement:
+    """Filter the cosines' course in time by ten band-passes without delay and compare. Shape: (5, kept) twice."""
+    kept = reference.shape[-1]
     points = _points(kept)
-    spectrum = torch.fft.rfft(cosines - cosines.mean(-1, keepdim=True), points)
-    response = constant(_responses, points, dtype=cosines.dtype, device=cosines.device)
-    filtered = torch.fft.irfft(spectrum * response[:, None], points)[..., :kept]
-    return Modulation(filtered - filtered.mean(-1, keepdim=True), spectrum)
+    a, b = (torch.fft.rfft(waves - waves.mean(-1, keepdim=True), points) for waves in (reference, processed))
+    sums = []
+    for response in constant(_responses, points, dtype=reference.dtype, device=reference.device):
+        x, y = (torch.fft.irfft(spectrum * response, points)[..., :kept] for spectrum in (a, b))
+        x, y = (filtered - filtered.mean(-1, keepdim=True) for filtered in (x, y))
+        sums.append(torch.stack((x.square().sum(-1), y.square().sum(-1), (x * y).sum(-1))))
+    xx, yy, xy = torch.stack(sums, 1)
+    return Agreement(xx, yy, xy, (a, b), kept)
 
 
 def _points(kept: int) -> int:
@@ -141,32 +173,28 @@ def _responses(points: int) -> NDArray[np.float64]:
 # -- correlation -------------------------------------------------------------------------------------------------------
 
 
-def correlation(reference: Modulation, processed: Modulation) -> Tensor:
+def correlation(found: Agreement) -> Tensor:
     """Magnitude of the correlation by rate, mean over the cosines; 0 where one of them is constant. Returns (10,)."""
-    x, y = reference.filtered, processed.filtered
-    xx, yy, xy = x.square().sum(-1), y.square().sum(-1), (x * y).sum(-1)
-    there = (xx >= _NOTHING) & (yy >= _NOTHING)
-    norm = torch.where(there, xx, 1.0).sqrt() * torch.where(there, yy, 1.0).sqrt()
-    return torch.where(there, xy.abs() / norm, 0.0).mean(-1)
+    there = (found.xx >= _NOTHING) & (found.yy >= _NOTHING)
+    norm = torch.where(there, found.xx, 1.0).sqrt() * torch.where(there, found.yy, 1.0).sqrt()
+    return torch.where(there, found.xy.abs() / norm, 0.0).mean(-1)
 
 
-def expected_correlation(reference: Modulation, processed: Modulation) -> Tensor:
+def expected_correlation(found: Agreement) -> Tensor:
     """Mean of ``correlation`` over the noise that the hair cells add to both, without drawing it. Returns (10,).
 
     The noise adds to the energies that the correlation is divided by, and what it adds to the product is as often
     negative: the mean and the variance of the quotient are taken to second order, and that of a magnitude is the folded
     normal distribution's mean.
     """
-    x, y = reference.filtered, processed.filtered
-    kept = x.shape[-1]
-    fixed = partial(constant, dtype=x.dtype, device=x.device)
+    kept, xy = found.kept, found.xy
+    fixed = partial(constant, dtype=xy.dtype, device=xy.device)
     variance = NOISE_DB**2
     noise = variance * fixed(_noise_energy, kept)[:, None]
-    xx, yy, xy = x.square().sum(-1) + noise, y.square().sum(-1) + noise, (x * y).sum(-1)
+    xx, yy = found.xx + noise, found.yy + noise
     # energies of the filtered cosines filtered again: how far noise of the filters' colour goes along with them
-    points = _points(kept)
-    twice = fixed(_twice_filtered, points)
-    a, b = torch.view_as_real(reference.spectrum), torch.view_as_real(processed.spectrum)
+    twice = fixed(_twice_filtered, _points(kept))
+    a, b = (torch.view_as_real(spectrum) for spectrum in found.spectra)
     xx2, yy2, xy2 = (twice @ product.sum(-1).mT for product in (a.square(), b.square(), a * b))
     own = variance**2 * kept * twice.sum(-1, keepdim=True)
     spread_x = (4.0 * variance * xx2 + 2.0 * own) / xx.square()

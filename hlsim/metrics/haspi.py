@@ -94,7 +94,7 @@ def haspi(
 class HaspiReference:
     """Clean speech as a normal ear hears it, prepared to score many processed signals against.
 
-    It depends on no audiogram. It holds about 6 MB a second of speech in float32.
+    It depends on no audiogram. It holds about 4 MB a second of speech in float32.
 
     Args:
         clean, sample_rate, full_scale_spl, lengths, whole_khz: as ``haspi``; the dtype and the device are those of
@@ -153,13 +153,13 @@ class _Channels(NamedTuple):
         chosen: the channels.
         spectrum: of their envelopes, for the lags of the processed ones.
         delays: that match the filters' group delays. Shape: (items, channels).
-        frames: their smoothed levels. Shape: (items, channels, frames).
+        course: of their frames.
     """
 
     chosen: slice
     spectrum: Tensor
     delays: Tensor
-    frames: Tensor
+    course: envelopes.Course
 
 
 class _Group:
@@ -191,7 +191,8 @@ class _Group:
         spectrum = ear_model.lag_spectrum(heard.power.sqrt(), self._extent)
         delays = self._latest - ear_model.group_delays(heard.bandwidth, chosen)
         levels = ear_model.adapted(ear_model.sensation(heard.power, self._ear.inner[chosen]))
-        return _Channels(chosen, spectrum, delays, envelopes.frames(levels, delays, self._extent))
+        frames = envelopes.frames(levels, delays, self._extent)
+        return _Channels(chosen, spectrum, delays, envelopes.course(frames, chosen))
 
     def compare(
         self, processed: Tensor, ears: ear_model.HairCells, noise: Noise, seeds: list[int]
@@ -202,36 +203,43 @@ class _Group:
         ear = ears.items(places)
         given = [signals.matched(processed[item.index], item) for item in self._items]
         sound = signals.through_middle_ear(given, extent)
-        clean, heard = [], []
+        clean: list[envelopes.Course] = []
+        heard: list[envelopes.Course] = []
         for part in self._channels():
             cells = ear_model.listen(sound, ear, part.chosen, extent)
             lags = ear_model.channel_lags(part.spectrum, cells.power.detach().sqrt(), extent)
             power = ear_model.shift(cells.power, lags, extent.ends, extent.ends, extent.padded)
             levels = ear_model.adapted(ear_model.sensation(power, ear.inner[:, part.chosen]))
-            clean.append(part.frames)
-            heard.append(envelopes.frames(levels, part.delays, extent))
-        pairs = zip(torch.cat(clean, 1), torch.cat(heard, 1), places, extent.ends, strict=True)
-        return [self._features(x, y, noise, seeds[place], end) for x, y, place, end in pairs]
-
-    def _features(self, clean: Tensor, heard: Tensor, noise: Noise, seed: int, end: int) -> Tensor:
-        count = -(-end // envelopes.STRIDE)
-        kept = envelopes.audible_frames(clean[:, :count])
-        x, y = (envelopes.cepstra(frames[:, kept]) for frames in (clean, heard))
-        if noise == "expected":
-            return envelopes.expected_correlation(envelopes.modulation(x), envelopes.modulation(y))
-        if noise == "seeded":
-            random = generator_after(seed, 2 * CHANNELS * end)
-            drawn = (torch.from_numpy(random.standard_normal((len(kept), CHANNELS))).to(x).mT for _ in (x, y))
-            x, y = (
-                cosines + envelopes.NOISE_DB * envelopes.cepstra(noise)
-                for cosines, noise in zip((x, y), drawn, strict=True)
-            )
-        return envelopes.correlation(envelopes.modulation(x), envelopes.modulation(y))
+            clean.append(part.course)
+            heard.append(envelopes.course(envelopes.frames(levels, part.delays, extent), part.chosen))
+        x, y = envelopes.added(clean), envelopes.added(heard)
+        features = []
+        for loudness, *waves, place, end in zip(
+            x.loudness, x.cosines, y.cosines, places, extent.ends, strict=True
+        ):
+            kept = envelopes.audible_frames(loudness[: -(-end // envelopes.STRIDE)])
+            pair = [cosines[:, kept] for cosines in waves]
+            if noise == "seeded":
+                random = generator_after(seeds[place], 2 * CHANNELS * end)
+                pair = [cosines + _drawn(random, cosines) for cosines in pair]
+            found = envelopes.agreement(*pair)
+            mean = envelopes.expected_correlation if noise == "expected" else envelopes.correlation
+            features.append(mean(found))
+        return features
 
 
 # -- noise -------------------------------------------------------------------------------------------------------------
 
-_DRAWN = 2**18
+_DRAWN = 2**18  # deviates, about, that are drawn at once
+
+
+def _drawn(random: np.random.RandomState, like: Tensor) -> Tensor:
+    """Cosines of noise on all channels, frame by frame. Shape: (5, kept) -> the same."""
+    parts = []
+    for start in range(0, like.shape[-1], _DRAWN // CHANNELS):
+        frames = min(_DRAWN // CHANNELS, like.shape[-1] - start)
+        parts.append(torch.from_numpy(random.standard_normal((frames, CHANNELS))).to(like))
+    return envelopes.NOISE_DB * torch.cat([envelopes.cosines(part.mT) for part in parts], -1)
 
 
 @lru_cache(maxsize=4)

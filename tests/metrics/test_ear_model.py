@@ -153,25 +153,29 @@ def test_frames_and_modulation() -> None:
     expected, _ = ebm.env_filter(levels, levels, 320.0, 2560.0, 24000.0)
     np.testing.assert_allclose(ours.numpy(), expected.T, rtol=0, atol=1e-10)
     y = ours + torch.from_numpy(random.standard_normal(ours.shape))
-    x, y = (envelopes.cepstra(one) for one in (ours, y))
+    x, y = (envelopes.cosines(one) for one in (ours, y))
     six = [
         np.concatenate((np.zeros((1, one.shape[-1])), one - one.mean(-1, keepdims=True))).T
         for one in (x.numpy(), y.numpy())
     ]
     before = ebm.fir_modulation_filter(*six, 2560.0)
     wanted = ebm.modulation_cross_correlation(before[0].copy(), before[1].copy())
-    filtered = envelopes.modulation(x), envelopes.modulation(y)
-    np.testing.assert_allclose(envelopes.correlation(*filtered).numpy(), wanted, rtol=0, atol=1e-12)
+    found = envelopes.agreement(x, y)
+    np.testing.assert_allclose(envelopes.correlation(found).numpy(), wanted, rtol=0, atol=1e-12)
+
+
+def test_channels_may_come_in_chunks() -> None:
+    levels = 10.0 * torch.randn(1, 32, 500, dtype=torch.float64).abs()
+    whole = envelopes.course(levels, slice(0, 32))
+    parts = envelopes.added(envelopes.course(levels[:, c], c) for c in (slice(0, 5), slice(5, 32)))
+    torch.testing.assert_close(parts.loudness, whole.loudness)
+    torch.testing.assert_close(parts.cosines, whole.cosines)
 
 
 def test_expected_noise_adds_what_noise_has_on_average() -> None:
-    energy = [
-        envelopes.modulation(torch.randn(5, 900, dtype=torch.float64)).filtered.square().sum(-1).mean(-1)
-        for _ in range(300)
-    ]
-    torch.testing.assert_close(
-        torch.stack(energy).mean(0), torch.from_numpy(envelopes._noise_energy(900)), rtol=0.05, atol=0.0
-    )
+    noise = torch.randn(300, 5, 900, dtype=torch.float64)
+    energy = torch.stack([envelopes.agreement(one, one).xx.mean(-1) for one in noise]).mean(0)
+    torch.testing.assert_close(energy, torch.from_numpy(envelopes._noise_energy(900)), rtol=0.05, atol=0.0)
 
 
 def test_shift_of_several_items_and_its_gradient() -> None:
