@@ -115,11 +115,12 @@ class HaspiReference:
         whole_khz: bool = False,
         keep: bool = True,
     ) -> None:
-        self.signals = CleanSpeech(clean, sample_rate, full_scale_spl, lengths, whole_khz, "HASPI")
-        self._groups = [_Group(self.signals, items) for items in self.signals.groups()]
-        if keep:
-            for group in self._groups:
-                group.keep()
+        self._signals = CleanSpeech(clean, sample_rate, full_scale_spl, lengths, whole_khz, "HASPI")
+        with torch.autocast(clean.device.type, enabled=False):
+            self._groups = [_Group(self._signals, items) for items in self._signals.groups()]
+            if keep:
+                for group in self._groups:
+                    group.keep()
 
     def score(
         self,
@@ -132,7 +133,7 @@ class HaspiReference:
         """``haspi`` of processed signals of the clean ones' shape, rate and scale. Returns (...,)."""
         if noise not in get_args(Noise):
             raise ValueError(f"noise {noise!r}; allowed: {', '.join(get_args(Noise))}")
-        signals = self.signals
+        signals = self._signals
         given = signals.check(processed)
         ears = ear_model.hair_cells(signals.thresholds(audiogram))
         seeds = item_seeds(seed, signals.shape)
@@ -230,7 +231,7 @@ class _Group:
 
 # -- noise -------------------------------------------------------------------------------------------------------------
 
-_DRAWN = 2**18  # deviates, about, that are drawn at once
+_DRAWN = 2**16  # deviates, about, that are drawn at once
 
 
 def _drawn(random: np.random.RandomState, like: Tensor) -> Tensor:
@@ -251,9 +252,12 @@ def _state_after(seed: int, count: int) -> Any:
     random = np.random.RandomState(seed)
     left = count // 2
     while left:
-        pairs = 2.0 * random.random_sample((min(left, _DRAWN), 2)) - 1.0
-        square = np.square(pairs).sum(-1)
-        left -= int(((square < 1.0) & (square != 0.0)).sum())
+        place = random.random_sample(2 * min(left, _DRAWN))
+        place *= 2.0
+        place -= 1.0
+        place *= place
+        square = place[::2] + place[1::2]
+        left -= np.count_nonzero(square < 1.0) - np.count_nonzero(square == 0.0)
     return random.get_state()
 
 

@@ -156,13 +156,14 @@ class HasqiReference:
         self._signals = CleanSpeech(clean, sample_rate, full_scale_spl, lengths, whole_khz, "HASQI")
         thresholds = self._signals.thresholds(audiogram)
         noise_db = _THRESHOLD_NOISE - check_full_scale(full_scale_spl)
-        self._groups = [
-            _Group(self._signals, items, thresholds, 10.0 ** (noise_db / 20.0))
-            for items in self._signals.groups()
-        ]
-        if keep:
-            for group in self._groups:
-                group.keep()
+        noise = 10.0 ** (noise_db / 20.0)
+        with torch.autocast(clean.device.type, enabled=False):
+            self._groups = [
+                _Group(self._signals, items, thresholds, noise) for items in self._signals.groups()
+            ]
+            if keep:
+                for group in self._groups:
+                    group.keep()
 
     @overload
     def score(

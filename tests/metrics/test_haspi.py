@@ -122,6 +122,12 @@ def test_what_inference_mode_keeps_serves_training(clean: Tensor, noisy: Tensor)
     assert given.grad is not None and bool(given.grad.any())
 
 
+def test_autocast_changes_nothing(clean: Tensor, noisy: Tensor) -> None:
+    plain = haspi(noisy[0], clean[0], N3)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        assert torch.equal(haspi(noisy[0], clean[0], N3), plain)
+
+
 # -- noise -------------------------------------------------------------------------------------------------------------
 
 
