@@ -257,7 +257,7 @@ def _state_after(seed: int, count: int) -> Any:
         place -= 1.0
         place *= place
         square = place[::2] + place[1::2]
-        left -= np.count_nonzero(square < 1.0) - np.count_nonzero(square == 0.0)
+        left -= int(np.count_nonzero(square < 1.0) - np.count_nonzero(square == 0.0))
     return random.get_state()
 
 

@@ -85,8 +85,8 @@ def hasqi(
     noise: Noise = ...,
     seed: int | Sequence[int] = ...,
     whole_khz: bool = ...,
-    parts: bool,
-) -> Tensor | HasqiParts: ...
+    parts: Literal[True],
+) -> HasqiParts: ...
 
 
 def hasqi(
@@ -125,7 +125,8 @@ def hasqi(
         whole_khz=whole_khz,
         keep=False,
     )
-    return reference.score(processed, noise=noise, seed=seed, parts=parts)
+    found = reference.parts(processed, noise=noise, seed=seed)
+    return found if parts else found.combined
 
 
 class HasqiReference:
@@ -165,38 +166,22 @@ class HasqiReference:
                 for group in self._groups:
                     group.keep()
 
-    @overload
-    def score(
-        self,
-        processed: Tensor,
-        *,
-        noise: Noise = ...,
-        seed: int | Sequence[int] = ...,
-        parts: Literal[False] = ...,
-    ) -> Tensor: ...
+    def score(self, processed: Tensor, *, noise: Noise = "expected", seed: int | Sequence[int] = 0) -> Tensor:
+        """``hasqi`` of processed signals of the clean ones' shape, rate and scale. Returns (...,)."""
+        return self.parts(processed, noise=noise, seed=seed).combined
 
-    @overload
-    def score(
-        self, processed: Tensor, *, noise: Noise = ..., seed: int | Sequence[int] = ..., parts: bool
-    ) -> Tensor | HasqiParts: ...
-
-    def score(
-        self,
-        processed: Tensor,
-        *,
-        noise: Noise = "expected",
-        seed: int | Sequence[int] = 0,
-        parts: bool = False,
-    ) -> Tensor | HasqiParts:
-        """``hasqi`` of processed signals of the clean ones' shape, rate and scale."""
+    def parts(
+        self, processed: Tensor, *, noise: Noise = "expected", seed: int | Sequence[int] = 0
+    ) -> HasqiParts:
+        """As ``score``, with what it is the product of."""
         if noise not in get_args(Noise):
             raise ValueError(f"noise {noise!r}; allowed: {', '.join(get_args(Noise))}")
         given = self._signals.check(processed)
         seeds = item_seeds(seed, self._signals.shape)
         with torch.autocast(processed.device.type, enabled=False):
             scores = [score for group in self._groups for score in group.compare(given, noise, seeds)]
-        nonlinear, linear = torch.stack(scores).reshape(*self._signals.shape, 2).unbind(-1)
-        return HasqiParts(nonlinear * linear, nonlinear, linear) if parts else nonlinear * linear
+            nonlinear, linear = torch.stack(scores).reshape(*self._signals.shape, 2).unbind(-1)
+            return HasqiParts(nonlinear * linear, nonlinear, linear)
 
 
 # -- items that are worked on together ---------------------------------------------------------------------------------
