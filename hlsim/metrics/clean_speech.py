@@ -64,10 +64,9 @@ class CleanSpeech:
             ends = check_lengths(lengths, clean.shape).flatten().tolist()
         self._rate = 1000 * round(rate / 1000) if whole_khz else rate
         self._gain = 10.0 ** (full_scale / 20.0)
-        # on 24 kHz a sample more or less at an end moves all frames: double precision where there is one
-        self._precise = self.dtype if self.device.type == "mps" else torch.float64
         with torch.no_grad():
-            rows = clean.detach().reshape(-1, self.time)
+            # in double precision, for a sample more or less at an end would move all frames
+            rows = clean.detach().double().reshape(-1, self.time)
             self.items = [self._item(i, rows[i, :end], end, full_scale, rate) for i, end in enumerate(ends)]
 
     def _item(self, index: int, signal: Tensor, length: int, full_scale: float, rate: int) -> CleanItem:
@@ -76,7 +75,6 @@ class CleanSpeech:
             raise ValueError(
                 f"{name} lasts {length / rate:.2g} s; {self._name} needs {SHORTEST_SECONDS} s or more to mean anything"
             )
-        signal = signal.to(self._precise)
         if not bool(signal.isfinite().all()):
             raise ValueError(f"{name} holds samples that are NaN or infinite")
         if not bool(signal.any()):
@@ -129,7 +127,7 @@ class CleanSpeech:
 
     def matched(self, processed: Tensor, item: CleanItem) -> Tensor:
         """The part of a processed signal that the clean one's is compared with, at 24 kHz. Shape: (time,) -> (part,)."""
-        at_ear = ear_input.to_ear_rate(processed[: item.length].to(self._precise), self._rate) * self._gain
+        at_ear = ear_input.to_ear_rate(processed[: item.length].double(), self._rate) * self._gain
         delay = ear_input.bulk_delay(item.spectrum, at_ear.detach().to(self.dtype))
         return ear_input.moved(at_ear, delay, item.part)
 

@@ -22,6 +22,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+from torch.nn import functional
 
 from hlsim.audiogram import FREQUENCIES
 from hlsim.dsp.fft import fft_length
@@ -274,9 +275,21 @@ def mean_level(heard: Heard, cells: HairCells) -> Tensor:
 # -- alignment of channels ---------------------------------------------------------------------------------------------
 
 
-def lag_spectrum(signal: Tensor, extent: Extent) -> Tensor:
-    """For ``channel_lags``. Shape: (items, channels, padded) -> (items, channels, bins)."""
-    return torch.fft.rfft(extent.cut(signal), _lag_points(extent))
+def lag_spectrum(reference: Tensor, extent: Extent) -> Tensor:
+    """For ``channel_lags``: of each sample's step to the next.
+
+    Around its maximum the correlation hardly changes from lag to lag: single precision tells its steps, not its values.
+
+    Shape: (items, channels, padded) -> (items, channels, bins).
+    """
+    points = _lag_points(extent)
+    step = constant(_step, points, dtype=reference.dtype.to_complex(), device=reference.device)
+    return torch.fft.rfft(extent.cut(reference), points) * step
+
+
+def _step(points: int) -> NDArray[np.complex128]:
+    step: NDArray[np.complex128] = np.expm1(2j * np.pi * np.arange(points // 2 + 1) / points)
+    return step
 
 
 def _lag_points(extent: Extent) -> int:
@@ -294,9 +307,11 @@ def channel_lags(reference: Tensor, processed: Tensor, extent: Extent) -> Tensor
     """
     with torch.no_grad():
         points, most = _lag_points(extent), min(_LONGEST_LAG, extent.longest)
-        correlation = torch.fft.irfft(reference * lag_spectrum(processed, extent).conj(), points)
-        near = torch.cat((correlation[..., points - most + 1 :], correlation[..., : most + 1]), -1)
-        return near.argmax(-1) - (most - 1)
+        spectrum = torch.fft.rfft(extent.cut(processed), points)
+        steps = torch.fft.irfft(reference * spectrum.conj(), points)
+        near = torch.cat((steps[..., points - most + 1 :], steps[..., :most]), -1)
+        correlation = functional.pad(near.double().cumsum(-1), (1, 0))
+        return correlation.argmax(-1) - (most - 1)
 
 
 def shift(signal: Tensor, delays: Tensor, ends: Sequence[int], stops: Sequence[int], size: int) -> Tensor:
