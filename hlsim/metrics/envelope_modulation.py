@@ -8,7 +8,6 @@ in five cosines over frequency; ten band-passes of the cosines' course in time, 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
 from functools import partial
 from typing import NamedTuple
 
@@ -86,10 +85,11 @@ def cosines(levels: Tensor, channels: slice = slice(None)) -> Tensor:
     return constant(_cosines, dtype=levels.dtype, device=levels.device)[:, channels] @ levels
 
 
-def added(parts: Iterable[Course]) -> Course:
+def added(sum_so_far: Course | None, part: Course) -> Course:
     """The sum over chunks of channels."""
-    loudness, waves = zip(*parts, strict=True)
-    return Course(sum(loudness[1:], start=loudness[0]), sum(waves[1:], start=waves[0]))
+    if sum_so_far is None:
+        return part
+    return Course(sum_so_far.loudness + part.loudness, sum_so_far.cosines + part.cosines)
 
 
 def audible_frames(loudness: Tensor) -> Tensor:

@@ -204,16 +204,17 @@ class _Group:
         ear = ears.items(places)
         given = [signals.matched(processed[item.index], item) for item in self._items]
         sound = signals.through_middle_ear(given, extent)
-        clean: list[envelopes.Course] = []
-        heard: list[envelopes.Course] = []
+        x: envelopes.Course | None = None
+        y: envelopes.Course | None = None
         for part in self._channels():
             cells = ear_model.listen(sound, ear, part.chosen, extent)
             lags = ear_model.channel_lags(part.spectrum, cells.power.detach().sqrt(), extent)
             power = ear_model.shift(cells.power, lags, extent.ends, extent.ends, extent.padded)
             levels = ear_model.adapted(ear_model.sensation(power, ear.inner[:, part.chosen]))
-            clean.append(part.course)
-            heard.append(envelopes.course(envelopes.frames(levels, part.delays, extent), part.chosen))
-        x, y = envelopes.added(clean), envelopes.added(heard)
+            x = envelopes.added(x, part.course)
+            frames = envelopes.frames(levels, part.delays, extent)
+            y = envelopes.added(y, envelopes.course(frames, part.chosen))
+        assert x is not None and y is not None
         features = []
         for loudness, *waves, place, end in zip(
             x.loudness, x.cosines, y.cosines, places, extent.ends, strict=True
