@@ -156,11 +156,10 @@ class HasqiReference:
     ) -> None:
         self._signals = CleanSpeech(clean, sample_rate, full_scale_spl, lengths, whole_khz, "HASQI")
         thresholds = self._signals.thresholds(audiogram)
-        noise_db = _THRESHOLD_NOISE - check_full_scale(full_scale_spl)
-        noise = 10.0 ** (noise_db / 20.0)
+        unit = 10.0 ** (-check_full_scale(full_scale_spl) / 20.0)
         with torch.autocast(clean.device.type, enabled=False):
             self._groups = [
-                _Group(self._signals, items, thresholds, noise) for items in self._signals.groups()
+                _Group(self._signals, items, thresholds, unit) for items in self._signals.groups()
             ]
             if keep:
                 for group in self._groups:
@@ -214,10 +213,9 @@ class _Channels:
 class _Group:
     """Items that are worked on together, each with what the ear makes of the clean speech."""
 
-    def __init__(
-        self, signals: CleanSpeech, items: list[CleanItem], thresholds: Tensor, noise: float
-    ) -> None:
-        self._signals, self._items, self._noise = signals, items, noise
+    def __init__(self, signals: CleanSpeech, items: list[CleanItem], thresholds: Tensor, unit: float) -> None:
+        self._signals, self._items, self._unit = signals, items, unit
+        self._noise = unit * 10.0 ** (_THRESHOLD_NOISE / 20.0)
         self._extent = Extent(tuple(len(item.heard) for item in items))
         self._kept: list[_Channels] | None = None
         chosen = thresholds[[item.index for item in items]]
@@ -246,7 +244,7 @@ class _Group:
         assert heard.motion is not None
         delays = self._latest - ear_model.group_delays(heard.bandwidth, chosen)
         levels = ear_model.adapted(ear_model.sensation(heard.power, cells.inner))
-        moving = _moving(heard.motion, heard.power, levels)
+        moving = _moving(heard.motion, heard.power, levels, self._unit)
         return _Channels(
             chosen,
             ear_model.lag_spectrum(heard.power.sqrt(), extent),
@@ -294,7 +292,7 @@ class _Group:
             motion = ear_model.shift(heard.motion, lags, extent.ends, extent.ends, extent.padded)
             levels = ear_model.adapted(ear_model.sensation(power, cells.inner))
             smoothed = self._smoothed(levels, part.delays)
-            y = self._segments(_moving(motion, power, levels), part.delays, second)
+            y = self._segments(_moving(motion, power, levels, self._unit), part.delays, second)
             x = part.segments if first is None else self._segments(part.moving, part.delays, first)
             level = ear_model.mean_level(heard, cells)
             for i, rows in enumerate(found):
@@ -352,9 +350,14 @@ def _frozen_noise() -> NDArray[np.float64]:
     return np.random.RandomState(0).standard_normal(_FROZEN)
 
 
-def _moving(motion: Tensor, power: Tensor, levels: Tensor) -> Tensor:
-    """The motion with the adapted level as its envelope, in dB over threshold. Shape: (items, channels, padded) each."""
-    return motion * levels * power.clamp_min(1.0).rsqrt()  # under 0 dB SPL the level is 0
+def _moving(motion: Tensor, power: Tensor, levels: Tensor, unit: float) -> Tensor:
+    """The motion with the adapted level as its envelope, in dB over threshold. Shape: (items, channels, padded) each.
+
+    Envelope and motion are aligned each by itself. Where the shift of the envelope leaves nothing at all, pyclarity keeps
+    the motion as it is, in the signals' ``unit``.
+    """
+    scaled = motion * levels * power.clamp_min(1.0).rsqrt()  # under 0 dB SPL the level is 0
+    return torch.where(power > 0.0, scaled, unit * motion)
 
 
 # -- NAL-R -------------------------------------------------------------------------------------------------------------

@@ -11,7 +11,7 @@ from hlsim.audio import read_audio
 from hlsim.audiogram import Audiogram
 from hlsim.dsp.resample import resample
 from hlsim.metrics import clean_speech, ear_model, fine_structure
-from hlsim.metrics.hasqi import HasqiParts, HasqiReference, _nalr, hasqi
+from hlsim.metrics.hasqi import HasqiParts, HasqiReference, _moving, _nalr, hasqi
 from hlsim.metrics.pyclarity import numpy_seed
 
 N1, N3, N6 = (Audiogram.standard(name) for name in ("N1", "N3", "N6"))
@@ -78,6 +78,15 @@ def test_segments_stage_by_stage(time: int) -> None:
     mean, _ = eb.mel_cepstrum_correlation(*smooth, 2.5, 0.0)
     ours = fine_structure.envelope_correlation(*(torch.from_numpy(one) for one in smooth))
     assert float(ours) == pytest.approx(mean, abs=1e-12)
+
+
+def test_motion_where_the_envelopes_shift_leaves_nothing() -> None:
+    motion, power, levels = (
+        torch.tensor([4.0, 4.0, 4.0]),
+        torch.tensor([0.0, 0.5, 100.0]),
+        torch.tensor([0.0, 0.0, 20.0]),
+    )
+    assert _moving(motion, power, levels, 0.25).tolist() == [1.0, 0.0, pytest.approx(8.0)]
 
 
 def test_a_batch_is_its_items(clean: Tensor, noisy: Tensor, monkeypatch: pytest.MonkeyPatch) -> None:
