@@ -1,0 +1,232 @@
+"""How the envelopes of two signals agree, by rate of modulation: HASPI's features.
+
+Kates and Arehart 2021, "The hearing-aid speech perception index (HASPI) version 2", Speech Communication 131, 35-46. The
+levels of 32 channels are smoothed and taken 2667 times a second, freed of what is silent in the reference, and summed up
+in five cosines over frequency; ten band-passes of the cosines' course in time, reference and processed, are correlated.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from hlsim.dsp.fft import fft_length
+from hlsim.metrics.ear_model import CHANNELS, Extent, shift
+from hlsim.torchtools import constant
+
+STRIDE = 9
+"""Samples at 24 kHz from one frame to the next."""
+
+_TAPS = 52  # of the smoothing window, which ends 26 samples after its frame
+_SPAN = -(-(_TAPS + 2) // STRIDE)
+_LEAD = _SPAN * STRIDE - _TAPS // 2 - 1
+
+_SILENCE = 2.5  # dB over threshold that the reference's frames are to exceed
+_COSINES = 5
+
+RATES = (2.0, 6.0, 10.0, 16.0, 25.0, 40.0, 64.0, 100.0, 160.0, 256.0)
+"""Centres of the modulation filters in Hz."""
+
+_FRAME_RATE = 2560.0  # what the modulation filters take 24000 / 9 for
+_LONGEST = 0.24  # seconds of the filters up to 10 Hz; others have the same number of periods
+
+NOISE_DB = 0.1
+"""Standard deviation of the noise on the firing rate, in dB."""
+
+_NOTHING = 1e-30
+
+
+def frames(levels: Tensor, delays: Tensor, extent: Extent) -> Tensor:
+    """Smoothed levels of channels at 24000 / 9 Hz, delayed to match.
+
+    Shape: (items, channels, padded), (items, channels) samples -> (items, channels, ceil(longest / 9)).
+    """
+    count = -(-extent.longest // STRIDE)
+    stops = [end + _LEAD for end in extent.ends]
+    late = shift(levels, delays + _LEAD, extent.ends, stops, STRIDE * (count + _SPAN - 1))
+    window = constant(_smoothing, dtype=levels.dtype, device=levels.device)
+    parts = late.unflatten(-1, (-1, STRIDE)) @ window
+    return sum((parts[..., i : i + count, i] for i in range(1, _SPAN)), start=parts[..., :count, 0])
+
+
+def _smoothing() -> NDArray[np.float64]:
+    """A Hann window without its zeros, by phase: (STRIDE, _SPAN)."""
+    window = np.hanning(_TAPS + 2)[1:-1]
+    padded = np.concatenate((np.zeros(_SPAN * STRIDE - _TAPS), window / window.sum()))
+    return padded.reshape(_SPAN, STRIDE).T
+
+
+class Course(NamedTuple):
+    """What is made of frames over the channels; that of all channels is the sum over some at a time.
+
+    Attributes:
+        loudness: mean over the channels of the amplitude over threshold. Shape: (items, frames).
+        cosines: five cosines over frequency. Shape: (items, 5, frames).
+    """
+
+    loudness: Tensor
+    cosines: Tensor
+
+
+def course(levels: Tensor, channels: slice) -> Course:
+    """Of the frames of some channels. Shape: (items, channels, frames)."""
+    loudness = (levels.detach() * (math.log(10.0) / 20.0)).exp().sum(-2) / CHANNELS
+    return Course(loudness, cosines(levels, channels))
+
+
+def cosines(levels: Tensor, channels: slice = slice(None)) -> Tensor:
+    """Five cosines over frequency. Shape: (..., channels, frames) -> (..., 5, frames)."""
+    return constant(_cosines, dtype=levels.dtype, device=levels.device)[:, channels] @ levels
+
+
+def added(sum_so_far: Course | None, part: Course) -> Course:
+    """The sum over chunks of channels."""
+    if sum_so_far is None:
+        return part
+    return Course(sum_so_far.loudness + part.loudness, sum_so_far.cosines + part.cosines)
+
+
+def audible_frames(loudness: Tensor) -> Tensor:
+    """Places of the frames that count. Shape: (frames,) -> (kept,).
+
+    Raises:
+        ValueError: there are none or one.
+    """
+    places = (loudness > 10.0 ** (_SILENCE / 20.0)).nonzero()[:, 0]
+    if len(places) < 2:
+        raise ValueError("clean is below the threshold of hearing")
+    return places
+
+
+def _cosines() -> NDArray[np.float64]:
+    place = np.pi * np.arange(CHANNELS) / (CHANNELS - 1)
+    waves = np.cos(np.arange(1, _COSINES + 1)[:, None] * place)
+    return waves / np.linalg.norm(waves, axis=1, keepdims=True)
+
+
+# -- modulation filters ------------------------------------------------------------------------------------------------
+
+
+class Agreement(NamedTuple):
+    """How the filtered cosines of two signals go together.
+
+    Attributes:
+        xx, yy, xy: energies of both and their product, without the means. Shape: (10, 5).
+        spectra: of the cosines before the filters. Shape: (5, bins) twice.
+        kept: frames.
+    """
+
+    xx: Tensor
+    yy: Tensor
+    xy: Tensor
+    spectra: tuple[Tensor, Tensor]
+    kept: int
+
+
+def agreement(reference: Tensor, processed: Tensor) -> Agreement:
+    """Filter the cosines' course in time by ten band-passes without delay and compare. Shape: (5, kept) twice."""
+    kept = reference.shape[-1]
+    points = _points(kept)
+    a, b = (torch.fft.rfft(waves - waves.mean(-1, keepdim=True), points) for waves in (reference, processed))
+    sums = []
+    for response in constant(_responses, points, dtype=reference.dtype, device=reference.device):
+        x, y = (torch.fft.irfft(spectrum * response, points)[..., :kept] for spectrum in (a, b))
+        x, y = (filtered - filtered.mean(-1, keepdim=True) for filtered in (x, y))
+        sums.append(torch.stack((x.square().sum(-1), y.square().sum(-1), (x * y).sum(-1))))
+    xx, yy, xy = torch.stack(sums, 1)
+    return Agreement(xx, yy, xy, (a, b), kept)
+
+
+def _points(kept: int) -> int:
+    return fft_length(kept + len(_filters()[0]) // 2, 256)
+
+
+def _filters() -> list[NDArray[np.float64]]:
+    """A Hann window on a cosine for each rate, symmetric about the middle."""
+    filters = []
+    for k, rate in enumerate(RATES):
+        seconds = _LONGEST if k < 2 else _LONGEST * RATES[2] / rate
+        half = math.floor(seconds * _FRAME_RATE / 2)
+        window = np.hanning(2 * half + 1)
+        window /= window.sum()
+        if k:
+            window *= 2.0 * np.cos(2.0 * np.pi * rate / _FRAME_RATE * np.arange(-half, half + 1))
+        filters.append(window)
+    return filters
+
+
+def _responses(points: int) -> NDArray[np.float64]:
+    """Real, for the filters are symmetric: (10, points // 2 + 1)."""
+    centred = np.zeros((len(RATES), points))
+    for row, taps in zip(centred, _filters(), strict=True):
+        row[: len(taps)] = taps
+        row[:] = np.roll(row, -(len(taps) // 2))
+    return np.fft.rfft(centred).real
+
+
+# -- correlation -------------------------------------------------------------------------------------------------------
+
+
+def correlation(found: Agreement) -> Tensor:
+    """Magnitude of the correlation by rate, mean over the cosines; 0 where one of them is constant. Returns (10,)."""
+    there = (found.xx >= _NOTHING) & (found.yy >= _NOTHING)
+    norm = torch.where(there, found.xx, 1.0).sqrt() * torch.where(there, found.yy, 1.0).sqrt()
+    return torch.where(there, found.xy.abs() / norm, 0.0).mean(-1)
+
+
+def expected_correlation(found: Agreement) -> Tensor:
+    """Mean of ``correlation`` over the noise that the hair cells add to both, without drawing it. Returns (10,).
+
+    The noise adds to the energies that the correlation is divided by, and what it adds to the product is as often
+    negative: the mean and the variance of the quotient are taken to second order, and that of a magnitude is the folded
+    normal distribution's mean.
+    """
+    kept, xy = found.kept, found.xy
+    fixed = partial(constant, dtype=xy.dtype, device=xy.device)
+    variance = NOISE_DB**2
+    noise = variance * fixed(_noise_energy, kept)[:, None]
+    xx, yy = found.xx + noise, found.yy + noise
+    # energies of the filtered cosines filtered again: how far noise of the filters' colour goes along with them
+    twice = fixed(_twice_filtered, _points(kept))
+    a, b = (torch.view_as_real(spectrum) for spectrum in found.spectra)
+    xx2, yy2, xy2 = (twice @ product.sum(-1).mT for product in (a.square(), b.square(), a * b))
+    own = variance**2 * kept * twice.sum(-1, keepdim=True)
+    spread_x = (4.0 * variance * xx2 + 2.0 * own) / xx.square()
+    spread_y = (4.0 * variance * yy2 + 2.0 * own) / yy.square()
+    norm = xx.sqrt() * yy.sqrt()
+    both = 2.0 * variance * xy2 / norm
+    plain = xy / norm
+    mean = plain * (1.0 + 0.375 * (spread_x + spread_y)) - 0.5 * both * (1.0 / xx + 1.0 / yy)
+    product = (variance * (xx2 + yy2) + own) / norm.square()
+    spread = product + 0.25 * plain.square() * (spread_x + spread_y) - plain * both * (1.0 / xx + 1.0 / yy)
+    spread = spread.clamp_min(1e-12)
+    folded = (2.0 / math.pi * spread).sqrt() * torch.exp(-0.5 * mean.square() / spread)
+    return (folded + mean * torch.erf(mean / (2.0 * spread).sqrt())).mean(-1)
+
+
+def _noise_energy(kept: int) -> NDArray[np.float64]:
+    """Energy of each filter's output for white noise of variance 1, both without their means. Returns (10,)."""
+    energies = []
+    for taps in _filters():
+        half = min(len(taps) // 2, kept - 1)
+        lags = np.arange(-half, half + 1)
+        taps = taps[len(taps) // 2 + lags]
+        sums, place = np.concatenate(([0.0], np.cumsum(taps))), np.arange(half, half + kept)
+        # a constant, filtered
+        steady = sums[np.minimum(place + 1, len(taps))] - sums[np.maximum(place + 1 - kept, 0)]
+        energy = (taps**2 * (kept - np.abs(lags))).sum()
+        energies.append(energy - (steady**2).mean() - steady.var())
+    return np.array(energies)
+
+
+def _twice_filtered(points: int) -> NDArray[np.float64]:
+    """Weights of a half spectrum's squares in the energy of what was filtered twice: (10, points // 2 + 1)."""
+    sides = np.full(points // 2 + 1, 2.0)
+    sides[[0, -1]] = 1.0
+    return _responses(points) ** 4 * sides / points

@@ -1,0 +1,300 @@
+"""HASPI version 2 in torch: pyclarity 0.9.0's score, differentiable, on any device, many times as fast.
+
+Kates and Arehart 2021, "The hearing-aid speech perception index (HASPI) version 2", Speech Communication 131, 35-46,
+doi 10.1016/j.specom.2020.05.001. What to know of it:
+
+- It rewards gain: 20 dB of it took one utterance from 0.53 to 0.99. Always give the level beside the score.
+- White noise in place of the processed speech should score 0. It does, to 0.05, on utterances of 3 s and more, but gets
+  up to 0.3 on 1.2 s, 0.45 on 0.7 s and 0.99 on 0.2 s. Shorter signals than 0.7 s are refused.
+- With the reference under the threshold of hearing it gives any signal the same score: references under 20 dB SPL are
+  refused; a DC offset, which nobody hears, does not count.
+- Its ear spans 80 to 8000 Hz: against 48 kHz, 16 kHz moved scores by up to 0.008. Compare within one rate.
+- It aligns signals and channels by whole samples: one sample in one channel moves a score by up to 0.006, where two
+  delays match equally well, and in single precision such a choice can differ from double precision's.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, Literal, NamedTuple, get_args
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from hlsim.audio import check_waveform
+from hlsim.audiogram import AudiogramLike
+from hlsim.calibration import PASCAL_SPL
+from hlsim.checks import Lengths
+from hlsim.metrics import ear_model
+from hlsim.metrics import envelope_modulation as envelopes
+from hlsim.metrics.clean_speech import CleanItem, CleanSpeech
+from hlsim.metrics.ear_model import CHANNELS, Extent
+from hlsim.metrics.pyclarity import check_seed
+from hlsim.torchtools import constant
+
+Noise = Literal["expected", "seeded", "none"]
+"""Of the hair cells' firing: its mean effect, what pyclarity draws under a seed, or none."""
+
+
+def haspi(
+    processed: Tensor,
+    clean: Tensor,
+    audiogram: AudiogramLike,
+    *,
+    sample_rate: int = 16000,
+    full_scale_spl: float = PASCAL_SPL,
+    lengths: Lengths | None = None,
+    noise: Noise = "expected",
+    seed: int | Sequence[int] = 0,
+    whole_khz: bool = False,
+) -> Tensor:
+    """HASPI v2 of each item: how much of clean speech is understood as this ear hears the processed, 0 to 1.
+
+    A delay of ``processed`` of its own is allowed for. Differentiable in ``processed``, with the delays that align it
+    held; an ear that hears nothing of a band gives it no gradient. A silent ``processed`` has a score, of noise alone.
+    Clean speech that is scored against often is prepared once: see ``HaspiReference``.
+
+    Args:
+        processed: what the impaired ear is given.
+        clean: clean speech, not amplified, as a normal ear would hear it.
+        audiogram: of the impaired ear, -10 to 120 dB HL; one, or one an item.
+        sample_rate: Hz, 16000 to 48000.
+        full_scale_spl: level in dB SPL of a signal with RMS 1.0 (pyclarity's ``level1``).
+        lengths: samples of each item, where they are padded.
+        noise: "expected" gives the mean over seeds, smooth and the same every time; "seeded" draws what pyclarity draws
+            under ``seed`` (scores vary by up to 0.007); "none" leaves it out.
+        seed: of every item, or one an item.
+        whole_khz: take the rate rounded to whole kHz, as pyclarity does: 44.1 kHz as 44, which moved scores by up to
+            0.005.
+
+    Shape: (..., time) twice and one audiogram or (..., 8) dB HL -> (...,); at least 0.7 s. Computed in float64 if either
+        is, in float32 otherwise; on CUDA leave ``torch.backends.cuda.matmul.allow_tf32`` off, as it is by default.
+
+    Raises:
+        ValueError: signals of other shapes, too short, not finite; the clean one silent or below 20 dB SPL; rate, level,
+            audiogram, lengths or seed out of range.
+    """
+    check_waveform(processed, "processed")
+    reference = HaspiReference(
+        clean.to(torch.promote_types(clean.dtype, processed.dtype)) if isinstance(clean, Tensor) else clean,
+        sample_rate=sample_rate,
+        full_scale_spl=full_scale_spl,
+        lengths=lengths,
+        whole_khz=whole_khz,
+        keep=False,
+    )
+    return reference.score(processed, audiogram, noise=noise, seed=seed)
+
+
+class HaspiReference:
+    """Clean speech as a normal ear hears it, prepared to score many processed signals against.
+
+    It depends on no audiogram. It holds about 4 MB a second of speech in float32.
+
+    Args:
+        clean, sample_rate, full_scale_spl, lengths, whole_khz: as ``haspi``; the dtype and the device are those of
+            ``clean``, whose gradient is not followed.
+        keep: what the normal ear makes of it; without, it is computed with each score, in less memory.
+
+    Raises:
+        ValueError: as ``haspi``.
+    """
+
+    def __init__(
+        self,
+        clean: Tensor,
+        *,
+        sample_rate: int = 16000,
+        full_scale_spl: float = PASCAL_SPL,
+        lengths: Lengths | None = None,
+        whole_khz: bool = False,
+        keep: bool = True,
+    ) -> None:
+        self._signals = CleanSpeech(clean, sample_rate, full_scale_spl, lengths, whole_khz, "HASPI")
+        with torch.autocast(clean.device.type, enabled=False):
+            self._groups = [_Group(self._signals, items) for items in self._signals.groups()]
+            if keep:
+                for group in self._groups:
+                    group.keep()
+
+    def score(
+        self,
+        processed: Tensor,
+        audiogram: AudiogramLike,
+        *,
+        noise: Noise = "expected",
+        seed: int | Sequence[int] = 0,
+    ) -> Tensor:
+        """``haspi`` of processed signals of the clean ones' shape, rate and scale. Returns (...,)."""
+        if noise not in get_args(Noise):
+            raise ValueError(f"noise {noise!r}; allowed: {', '.join(get_args(Noise))}")
+        signals = self._signals
+        given = signals.check(processed)
+        ears = ear_model.hair_cells(signals.thresholds(audiogram))
+        seeds = item_seeds(seed, signals.shape)
+        with torch.autocast(processed.device.type, enabled=False):
+            features = [
+                features for group in self._groups for features in group.compare(given, ears, noise, seeds)
+            ]
+            return understood(torch.stack(features)).reshape(signals.shape)
+
+
+# -- items that are worked on together --------------------------------------------------------------------------------
+
+
+class _Channels(NamedTuple):
+    """Some channels of the clean speech in a normal ear.
+
+    Attributes:
+        chosen: the channels.
+        spectrum: of their envelopes, for the lags of the processed ones.
+        delays: that match the filters' group delays. Shape: (items, channels).
+        course: of their frames.
+    """
+
+    chosen: slice
+    spectrum: Tensor
+    delays: Tensor
+    course: envelopes.Course
+
+
+class _Group:
+    """Items that are worked on together, each with what a normal ear makes of the clean speech."""
+
+    def __init__(self, signals: CleanSpeech, items: list[CleanItem]) -> None:
+        self._signals, self._items = signals, items
+        self._extent = Extent(tuple(len(item.heard) for item in items))
+        self._kept: list[_Channels] | None = None
+        with torch.no_grad():
+            self._ear = ear_model.hair_cells(torch.zeros(8, device=signals.device))
+            self._heard = signals.through_middle_ear([item.heard for item in items], self._extent)
+            self._latest = ear_model.longest_group_delay(self._heard, self._ear, self._extent)
+
+    def keep(self) -> None:
+        """Compute all channels now."""
+        self._kept = list(self._channels())
+
+    def _channels(self) -> Iterator[_Channels]:
+        if self._kept is not None:
+            yield from self._kept
+            return
+        for chosen in ear_model.channel_chunks(len(self._items), self._extent.padded, self._signals.device):
+            yield self._hear(chosen)
+
+    @torch.no_grad()
+    def _hear(self, chosen: slice) -> _Channels:
+        heard = ear_model.listen(self._heard, self._ear, chosen, self._extent)
+        spectrum = ear_model.lag_spectrum(heard.power.sqrt(), self._extent)
+        delays = self._latest - ear_model.group_delays(heard.bandwidth, chosen)
+        levels = ear_model.adapted(ear_model.sensation(heard.power, self._ear.inner[chosen]))
+        frames = envelopes.frames(levels, delays, self._extent)
+        return _Channels(chosen, spectrum, delays, envelopes.course(frames, chosen))
+
+    def compare(
+        self, processed: Tensor, ears: ear_model.HairCells, noise: Noise, seeds: list[int]
+    ) -> list[Tensor]:
+        """Features of each item. Shape: (items, time) and (items, 32) of the whole batch -> (10,) each."""
+        extent, signals = self._extent, self._signals
+        places = [item.index for item in self._items]
+        ear = ears.items(places)
+        given = [signals.matched(processed[item.index], item) for item in self._items]
+        sound = signals.through_middle_ear(given, extent)
+        x: envelopes.Course | None = None
+        y: envelopes.Course | None = None
+        for part in self._channels():
+            cells = ear_model.listen(sound, ear, part.chosen, extent)
+            lags = ear_model.channel_lags(part.spectrum, cells.power.detach().sqrt(), extent)
+            power = ear_model.shift(cells.power, lags, extent.ends, extent.ends, extent.padded)
+            levels = ear_model.adapted(ear_model.sensation(power, ear.inner[:, part.chosen]))
+            x = envelopes.added(x, part.course)
+            frames = envelopes.frames(levels, part.delays, extent)
+            y = envelopes.added(y, envelopes.course(frames, part.chosen))
+        assert x is not None and y is not None
+        features = []
+        for loudness, *waves, place, end in zip(
+            x.loudness, x.cosines, y.cosines, places, extent.ends, strict=True
+        ):
+            kept = envelopes.audible_frames(loudness[: -(-end // envelopes.STRIDE)])
+            pair = [cosines[:, kept] for cosines in waves]
+            if noise == "seeded":
+                random = generator_after(seeds[place], 2 * CHANNELS * end)
+                pair = [cosines + _drawn(random, cosines) for cosines in pair]
+            found = envelopes.agreement(*pair)
+            mean = envelopes.expected_correlation if noise == "expected" else envelopes.correlation
+            features.append(mean(found))
+        return features
+
+
+# -- noise -------------------------------------------------------------------------------------------------------------
+
+_DRAWN = 2**16  # deviates, about, that are drawn at once
+
+
+def _drawn(random: np.random.RandomState, like: Tensor) -> Tensor:
+    """Cosines of noise on all channels, frame by frame. Shape: (5, kept) -> the same."""
+    parts = []
+    for start in range(0, like.shape[-1], _DRAWN // CHANNELS):
+        frames = min(_DRAWN // CHANNELS, like.shape[-1] - start)
+        parts.append(torch.from_numpy(random.standard_normal((frames, CHANNELS))).to(like))
+    return envelopes.NOISE_DB * torch.cat([envelopes.cosines(part.mT) for part in parts], -1)
+
+
+@lru_cache(maxsize=4)
+def _state_after(seed: int, count: int) -> Any:
+    """State of numpy's legacy generator after an even number of normal deviates, none of which is computed.
+
+    It draws pairs of numbers in a square until one lies in the circle, which gives two deviates.
+    """
+    random = np.random.RandomState(seed)
+    left = count // 2
+    while left:
+        place = random.random_sample(2 * min(left, _DRAWN))
+        place *= 2.0
+        place -= 1.0
+        place *= place
+        square = place[::2] + place[1::2]
+        left -= int(np.count_nonzero(square < 1.0) - np.count_nonzero(square == 0.0))
+    return random.get_state()
+
+
+def generator_after(seed: int, count: int) -> np.random.RandomState:
+    """Numpy's legacy generator under a seed, ``count`` normal deviates on (an even number)."""
+    random = np.random.RandomState()
+    random.set_state(_state_after(seed, count))
+    return random
+
+
+def item_seeds(seed: int | Sequence[int], shape: torch.Size) -> list[int]:
+    """One an item, or ValueError."""
+    items = shape.numel()
+    seeds = [seed] * items if isinstance(seed, int | np.integer) else list(seed)
+    if len(seeds) != items:
+        raise ValueError(f"{len(seeds)} seeds for {items} items; allowed: one, or one an item")
+    return [check_seed(one) for one in seeds]
+
+
+# -- networks ----------------------------------------------------------------------------------------------------------
+
+
+def understood(features: Tensor) -> Tensor:
+    """Mean of ten small networks, scaled to end at 1. Shape: (..., 10) -> (...,)."""
+    hidden, output, normalisation = (
+        constant(_network, part, dtype=features.dtype, device=features.device)
+        for part in ("hidden", "output", "normalisation")
+    )
+    middle = (features[..., None, None, :] * hidden[..., 1:]).sum(-1) + hidden[..., 0]
+    last = (torch.sigmoid(middle) * output[:, 1:]).sum(-1) + output[:, 0]
+    return torch.sigmoid(last).mean(-1) / normalisation
+
+
+def _network(part: str) -> NDArray[np.float64]:
+    """(10, 4, 11) of the hidden units, (10, 5) of the outputs, biases first, or () of the scale."""
+    stored = json.loads((Path(__file__).parent / "haspi_networks.json").read_text())
+    if part == "normalisation":
+        return np.array(stored[part])
+    return np.array([network[part] for network in stored["networks"]])

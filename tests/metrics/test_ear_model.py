@@ -1,0 +1,212 @@
+"""Kates' ear stage by stage against pyclarity, the recursions against scipy, and shifts against slices."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from scipy.signal import lfilter
+from torch import Tensor
+
+from hlsim.audio import read_audio
+from hlsim.audiogram import Audiogram
+from hlsim.metrics import ear_input, ear_model
+from hlsim.metrics import ear_recursions as recursions
+from hlsim.metrics import envelope_modulation as envelopes
+
+CPU = torch.device("cpu")
+CHANNELS = (0, 9, 31)
+SPL = 94.0
+
+
+@pytest.fixture(scope="module")
+def pair(speech_dir: Path) -> tuple[Tensor, Tensor]:
+    """0.8 s of speech at 16 kHz between silences, and the same with noise, late, float64."""
+    clean = read_audio(speech_dir / "valid" / "flite-rms-01.flac")[0][0, 8000:20800].double()
+    clean = torch.cat((torch.zeros(300), clean, torch.zeros(200)))
+    noise = torch.randn(clean.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    late = torch.cat((torch.zeros(77), clean[:-77]))
+    return clean, late + 0.3 * clean.square().mean().sqrt() * noise
+
+
+def blocks(signal: Tensor) -> Tensor:
+    """A whole number of blocks of it. Shape: (time,) -> (1, padded)."""
+    return signal[: len(signal) // recursions.BLOCK * recursions.BLOCK][None]
+
+
+def of_clarity(name: str = "eb") -> object:
+    return pytest.importorskip(f"clarity.evaluator.haspi.{name}")
+
+
+@pytest.mark.parametrize("rate", [16000, 24000, 32000, 44000, 48000])
+def test_rate_and_alignment_are_those_of_pyclarity(pair: tuple[Tensor, Tensor], rate: int) -> None:
+    eb = of_clarity()
+    clean, late = (ear_input.to_ear_rate(signal, rate) for signal in pair)
+    before = [eb.resample_24khz(signal.numpy(), rate)[0] for signal in pair]
+    np.testing.assert_allclose(clean.numpy(), before[0], rtol=0, atol=1e-12)
+    expected = eb.input_align(*before)
+    part = ear_input.audible_part(clean)
+    delay = ear_input.bulk_delay(ear_input.spectrum_for_alignment(clean), -late)  # the sign does not count
+    np.testing.assert_allclose(clean[part].numpy(), expected[0], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(ear_input.moved(late, delay, part).numpy(), expected[1], rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("delay", [-5000, -7, 0, 3, 5000])
+def test_moved_is_a_slice_of_what_is_there(delay: int) -> None:
+    signal = torch.arange(1.0, 101.0)
+    moved = ear_input.moved(signal, delay, slice(10, 90))
+    wanted = [signal[t - delay].item() if 0 <= t - delay < 100 else 0.0 for t in range(10, 90)]
+    assert moved.tolist() == wanted
+
+
+@pytest.mark.parametrize(("dtype", "error"), [(torch.float64, 1e-12), (torch.float32, 1e-6)])
+def test_middle_ear_and_adaptation(pair: tuple[Tensor, Tensor], dtype: torch.dtype, error: float) -> None:
+    eb = of_clarity()
+    signal = blocks(pair[0])
+    ours = recursions.middle_ear(CPU, dtype)(signal.to(dtype)).flatten(-2)[0].double().numpy()
+    np.testing.assert_allclose(ours, eb.middle_ear(signal[0].numpy(), 24000.0), rtol=0, atol=error)
+    level = 60.0 * (signal.abs() / signal.abs().max())
+    level[level < 10.0] = 0.0
+    expected, _ = eb.inner_hair_cell_adaptation(level[0].numpy(), level[0].numpy(), 2.0, 24000.0)
+    ours = ear_model.adapted(level.to(dtype))[0].double().numpy()
+    np.testing.assert_allclose(ours, expected, rtol=0, atol=100 * error)
+
+
+@pytest.mark.parametrize(("dtype", "error"), [(torch.float64, 1e-7), (torch.float32, 3e-6)])
+def test_gammatones(pair: tuple[Tensor, Tensor], dtype: torch.dtype, error: float) -> None:
+    eb = of_clarity()
+    signal = blocks(pair[1])
+    centres = eb.center_frequency(32)
+    np.testing.assert_allclose(ear_model.centre_frequencies(), centres, rtol=1e-12)
+    width = np.linspace(1.0, 4.0, 32)
+    decay = 2.0 * np.pi / 24000 * 1.019 * (24.7 + centres / 9.26449) * width
+    angle = torch.from_numpy(2.0 * np.pi * centres / 24000)
+    filters = recursions.gammatone(torch.from_numpy(decay), angle, 8192, dtype)
+    real, imaginary = filters(signal.to(dtype)).double().split(recursions.BLOCK, -1)
+    for channel in CHANNELS:
+        x = signal[0].numpy()
+        envelope, motion, _, _ = eb.gammatone_basilar_membrane(
+            x, width[channel], x, width[channel], 24000.0, centres[channel]
+        )
+        ours = torch.hypot(real, imaginary)[channel].flatten().numpy()
+        np.testing.assert_allclose(ours, envelope, rtol=0, atol=error * envelope.max())
+        np.testing.assert_allclose(
+            real[channel].flatten().numpy(), motion, rtol=0, atol=error * envelope.max()
+        )
+
+
+def test_a_recursion_is_the_filter_whatever_the_block() -> None:
+    signal = torch.randn(3, 40 * recursions.BLOCK, dtype=torch.float64)
+    ours = recursions.gain_lowpass(CPU, torch.float64)(signal).flatten(-2)
+    pole = (1.0 - np.tan(np.pi / 30)) / (1.0 + np.tan(np.pi / 30))
+    expected = lfilter([(1.0 - pole) / 2.0] * 2, [1.0, -pole], signal.numpy())
+    np.testing.assert_allclose(ours.numpy(), expected, rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize("name", ["NH", "N1", "N4", "S3", "N7"])
+def test_hair_cells(name: str) -> None:
+    eb = of_clarity()
+    ear = Audiogram.standard(name)
+    six = np.array([ear.thresholds[i] for i in (0, 1, 2, 3, 5, 6)])
+    expected = eb.loss_parameters(six, eb.center_frequency(32))
+    ours = ear_model.hair_cells(torch.tensor(ear.thresholds))
+    fields = (ours.attenuation, ours.bandwidth, ours.knee, ours.ratio, ours.inner)
+    for field, wanted in zip(fields, expected, strict=True):
+        np.testing.assert_allclose(field.numpy(), wanted, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["N2", "S3"])
+def test_the_ear_as_a_whole(pair: tuple[Tensor, Tensor], name: str) -> None:
+    eb, ear = of_clarity(), Audiogram.standard(name)
+    six = np.array([ear.thresholds[i] for i in (0, 1, 2, 3, 5, 6)])
+    clean, late = (signal.numpy() for signal in pair)
+    expected = eb.ear_model(clean, 24000, late, 24000, six, 0, SPL, shift=None)
+    clean, late = eb.input_align(clean, late)
+    extent = ear_model.Extent((len(clean),))
+    gain = 10.0 ** (SPL / 20.0)
+    x, y = (ear_input.stacked([torch.tensor(one)], extent.padded) * gain for one in (clean, late))
+    x, y = (recursions.middle_ear(CPU, torch.float64)(one).flatten(-2) for one in (x, y))
+    normal, ours = (ear_model.hair_cells(torch.tensor(a.thresholds)) for a in (Audiogram.standard("NH"), ear))
+    latest = ear_model.longest_group_delay(x, normal, extent)
+    for chosen in (slice(0, 3), slice(20, 22)):
+        a = ear_model.listen(x, normal, chosen, extent, motion=True)
+        b = ear_model.listen(y, ours, chosen, extent, motion=True)
+        lags = ear_model.channel_lags(ear_model.lag_spectrum(a.power.sqrt(), extent), b.power.sqrt(), extent)
+        power = ear_model.shift(b.power, lags, extent.ends, extent.ends, extent.padded)
+        delays = latest - ear_model.group_delays(a.bandwidth, chosen)
+        pairs = ((a.power, normal, expected[0]), (power, ours, expected[2]))
+        for heard, cells, wanted in pairs:
+            level = ear_model.adapted(ear_model.sensation(heard, cells.inner[chosen]))
+            level = ear_model.shift(level, delays, extent.ends, extent.ends, extent.longest)
+            np.testing.assert_allclose(level[0].numpy(), wanted[chosen], rtol=0, atol=1e-5)
+        for heard, cells, wanted in ((a, normal, expected[4]), (b, ours, expected[5])):
+            level = ear_model.mean_level(heard, cells[chosen])
+            np.testing.assert_allclose(level[0].numpy(), wanted[chosen], rtol=0, atol=1e-5)
+
+
+def test_frames_and_modulation() -> None:
+    ebm = of_clarity("ebm")
+    random = np.random.RandomState(0)
+    levels = np.cumsum(random.standard_normal((32, 9000)), -1)
+    extent = ear_model.Extent((9000,))
+    ours = envelopes.frames(torch.tensor(levels)[None], torch.zeros(1, 32, dtype=torch.int64), extent)[0]
+    expected, _ = ebm.env_filter(levels, levels, 320.0, 2560.0, 24000.0)
+    np.testing.assert_allclose(ours.numpy(), expected.T, rtol=0, atol=1e-10)
+    y = ours + torch.from_numpy(random.standard_normal(ours.shape))
+    x, y = (envelopes.cosines(one) for one in (ours, y))
+    six = [
+        np.concatenate((np.zeros((1, one.shape[-1])), one - one.mean(-1, keepdims=True))).T
+        for one in (x.numpy(), y.numpy())
+    ]
+    before = ebm.fir_modulation_filter(*six, 2560.0)
+    wanted = ebm.modulation_cross_correlation(before[0].copy(), before[1].copy())
+    found = envelopes.agreement(x, y)
+    np.testing.assert_allclose(envelopes.correlation(found).numpy(), wanted, rtol=0, atol=1e-12)
+
+
+def test_channels_may_come_in_chunks() -> None:
+    levels = 10.0 * torch.randn(1, 32, 500, dtype=torch.float64).abs()
+    whole = envelopes.course(levels, slice(0, 32))
+    first, second = (envelopes.course(levels[:, c], c) for c in (slice(0, 5), slice(5, 32)))
+    parts = envelopes.added(envelopes.added(None, first), second)
+    torch.testing.assert_close(parts.loudness, whole.loudness)
+    torch.testing.assert_close(parts.cosines, whole.cosines)
+
+
+def test_expected_noise_adds_what_noise_has_on_average() -> None:
+    noise = torch.randn(300, 5, 900, dtype=torch.float64)
+    energy = torch.stack([envelopes.agreement(one, one).xx.mean(-1) for one in noise]).mean(0)
+    torch.testing.assert_close(energy, torch.from_numpy(envelopes._noise_energy(900)), rtol=0.05, atol=0.0)
+
+
+def test_shift_of_several_items_and_its_gradient() -> None:
+    signal = torch.randn(2, 3, 50, dtype=torch.float64, requires_grad=True)
+    delays = torch.tensor([[0, 7, -9], [60, -60, 3]])
+    ends, stops = (50, 31), (40, 31)
+
+    def shifted(values: Tensor) -> Tensor:
+        return ear_model.shift(values, delays, ends, stops, 45)
+
+    output = shifted(signal)
+    for i, c in np.ndindex(2, 3):
+        for t in range(45):
+            source = t - int(delays[i, c])
+            inside = 0 <= source < ends[i] and t < stops[i]
+            assert output[i, c, t] == (signal[i, c, source] if inside else 0.0)
+    assert torch.autograd.gradcheck(shifted, (signal,))
+    together = ear_model._gathered(signal, delays, ends, stops, 45)  # as on a GPU
+    assert torch.equal(together, output)
+
+
+def test_extent_takes_each_item_to_its_end() -> None:
+    extent = ear_model.Extent((100, 30))
+    assert (extent.longest, extent.padded) == (100, 128)
+    signal = torch.ones(2, 4, 128)
+    assert extent.cut(signal).sum((1, 2)).tolist() == [400.0, 120.0]
+    assert torch.equal(extent.mean(signal), torch.ones(2, 4))
+
+
+def test_channels_in_chunks_are_all_of_them() -> None:
+    for samples in (100, 72000, 10**8):
+        chunks = list(ear_model.channel_chunks(1, samples, CPU))
+        assert [c for chunk in chunks for c in range(chunk.start, chunk.stop)] == list(range(32))

@@ -1,0 +1,251 @@
+"""HASPI in torch against pyclarity, its batches, its noise, its gradient and its refusals."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from hlsim.audio import read_audio
+from hlsim.audiogram import FREQUENCIES, Audiogram
+from hlsim.dsp.resample import resample
+from hlsim.metrics import clean_speech, ear_model
+from hlsim.metrics import pyclarity as reference
+from hlsim.metrics.haspi import HaspiReference, generator_after, haspi
+
+N2, N3, N6 = (Audiogram.standard(name) for name in ("N2", "N3", "N6"))
+
+
+@pytest.fixture(scope="module")
+def clean(speech_dir: Path) -> Tensor:
+    """Two clips of 1 s at 16 kHz, 68 dB SPL, (2, time)."""
+    clips = [read_audio(speech_dir / "valid" / f"flite-rms-0{i}.flac")[0][0, 8000:24000] for i in (1, 2)]
+    return torch.stack(clips)
+
+
+@pytest.fixture(scope="module")
+def noisy(clean: Tensor) -> Tensor:
+    noise = torch.randn(clean.shape, generator=torch.Generator().manual_seed(1))
+    return clean + 0.5 * noise * clean.square().mean(-1, keepdim=True).sqrt()
+
+
+def amplified(signal: Tensor, gains_db: Tensor) -> Tensor:
+    """With a gain at each audiometric frequency, straight between them."""
+    spectrum = torch.fft.rfft(signal)
+    hz = torch.linspace(0.0, 8000.0, spectrum.shape[-1])
+    points = torch.tensor(FREQUENCIES)
+    hats = torch.from_numpy(np.stack([np.interp(hz, points, row) for row in np.eye(8)])).to(signal)
+    return torch.fft.irfft(spectrum * 10.0 ** (gains_db.to(signal) @ hats / 20.0), signal.shape[-1])
+
+
+CASES: dict[str, tuple[Audiogram, int, Callable[[Tensor], Tensor]]] = {
+    "noisy": (N2, 16000, lambda signal: signal),
+    "amplified, 48 kHz": (N3, 48000, lambda signal: 10.0 * signal),
+    "clipped, 44.1 kHz": (Audiogram.standard("S2"), 44100, lambda signal: signal.clamp(-0.02, 0.02)),
+    "nearly inaudible": (Audiogram.standard("N5"), 24000, lambda signal: 0.3 * signal),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_equals_pyclarity_under_its_seed(clean: Tensor, noisy: Tensor, case: str) -> None:
+    pytest.importorskip("clarity")
+    ear, rate, change = CASES[case]
+    x, y = (resample(signal[0], 16000, rate) for signal in (clean, noisy))
+    y = change(y)
+    expected = reference.haspi(x, y, ear, rate, seed=7)
+    settings = {"sample_rate": rate, "noise": "seeded", "seed": 7, "whole_khz": True}
+    assert float(haspi(y.double(), x.double(), ear, **settings)) == pytest.approx(expected, abs=1e-7)
+    assert float(haspi(y, x, ear, **settings)) == pytest.approx(expected, abs=1e-4)
+
+
+def test_full_scale_is_pyclaritys_level1(clean: Tensor, noisy: Tensor) -> None:
+    gain = 10.0 ** (20.0 / 20.0)
+    soft, loud = (
+        haspi(noisy[0].double() * g, clean[0].double() * g, N3, full_scale_spl=spl)
+        for g, spl in ((1.0, 94.0), (gain, 74.0))
+    )
+    assert float(soft) == pytest.approx(float(loud), abs=1e-10)
+
+
+def test_odd_rates_are_taken_as_they_are_unless_asked(clean: Tensor, noisy: Tensor) -> None:
+    x, y = (resample(signal[0], 16000, 44100).double() for signal in (clean, noisy))
+    exact, rounded = (float(haspi(y, x, N2, sample_rate=44100, whole_khz=whole)) for whole in (False, True))
+    low = float(haspi(noisy[0].double(), clean[0].double(), N2))
+    assert abs(exact - low) < abs(rounded - low)
+
+
+def test_a_batch_is_its_items(clean: Tensor, noisy: Tensor) -> None:
+    short = [16000, 12345]
+    x, y = clean.double(), noisy.double()
+    alone = [haspi(y[i, :n], x[i, :n], ear) for i, (n, ear) in enumerate(zip(short, (N2, N3), strict=True))]
+    padded = torch.where(torch.arange(16000) < torch.tensor(short)[:, None], y, 0.7)
+    ears = torch.tensor([N2.levels, N3.levels], dtype=torch.float64)
+    for given in ([N2, N3], ears):
+        together = haspi(padded, x, given, lengths=short)
+        torch.testing.assert_close(together, torch.stack(alone), rtol=0, atol=1e-13)
+    shaped = haspi(padded[:, None], x[:, None], N2, lengths=[[16000], [12345]])
+    assert shaped.shape == (2, 1)
+    assert float(shaped[0, 0]) == float(alone[0])
+
+
+@pytest.mark.parametrize("gather", [False, True])
+def test_a_gpus_way_through_a_batch_is_a_cpus(
+    clean: Tensor, noisy: Tensor, monkeypatch: pytest.MonkeyPatch, gather: bool
+) -> None:
+    given = noisy.double().requires_grad_()
+    settings = {"lengths": [16000, 12345], "noise": "seeded", "seed": [3, 4]}
+    one_by_one = haspi(given, clean.double(), [N2, N3], **settings)
+    gradient = torch.autograd.grad(one_by_one.sum(), given)[0]
+    monkeypatch.setattr(clean_speech.CleanSpeech, "groups", lambda self: [self.items])
+    if gather:
+        monkeypatch.setattr(ear_model, "_shifted", ear_model._gathered)
+    together = haspi(given, clean.double(), [N2, N3], **settings)
+    torch.testing.assert_close(together, one_by_one, rtol=0, atol=1e-13)
+    torch.testing.assert_close(torch.autograd.grad(together.sum(), given)[0], gradient)
+
+
+def test_a_prepared_reference_is_the_same(clean: Tensor, noisy: Tensor) -> None:
+    prepared = HaspiReference(clean, lengths=[16000, 14000])
+    for noise in ("expected", "seeded", "none"):
+        direct = haspi(noisy, clean, N3, lengths=[16000, 14000], noise=noise, seed=5)
+        assert torch.equal(prepared.score(noisy, N3, noise=noise, seed=5), direct)
+
+
+def test_what_inference_mode_keeps_serves_training(clean: Tensor, noisy: Tensor) -> None:
+    with torch.inference_mode():
+        haspi(noisy[0], clean[0], N3)
+    given = noisy[0].clone().requires_grad_()
+    haspi(given, clean[0], N3).backward()
+    assert given.grad is not None and bool(given.grad.any())
+
+
+def test_autocast_changes_nothing(clean: Tensor, noisy: Tensor) -> None:
+    plain = haspi(noisy[0], clean[0], N3)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        assert torch.equal(haspi(noisy[0], clean[0], N3), plain)
+
+
+# -- noise -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("count", [0, 2, 64, 2 * 10**6])
+def test_the_generator_skips_what_is_not_needed(count: int) -> None:
+    random = np.random.RandomState(11)
+    random.standard_normal(count)
+    np.testing.assert_array_equal(generator_after(11, count).standard_normal(5), random.standard_normal(5))
+
+
+@pytest.mark.parametrize(("ear", "gain"), [(N2, 1.0), (N3, 3.0)])
+def test_expected_noise_is_the_mean_over_seeds(
+    clean: Tensor, noisy: Tensor, ear: Audiogram, gain: float
+) -> None:
+    prepared = HaspiReference(clean[0].double())
+    given = gain * noisy[0].double()
+    scores = [float(prepared.score(given, ear, noise="seeded", seed=seed)) for seed in range(24)]
+    error = 3.0 * np.std(scores) / 24**0.5
+    assert float(prepared.score(given, ear)) == pytest.approx(np.mean(scores), abs=max(error, 2e-4))
+    assert len(set(scores)) == 24
+
+
+# -- gradient ----------------------------------------------------------------------------------------------------------
+
+
+def test_gradient_is_that_of_finite_differences(clean: Tensor, noisy: Tensor) -> None:
+    prepared = HaspiReference(clean[0].double())
+    given = noisy[0].double()
+    gains = torch.full((8,), 10.0, dtype=torch.float64, requires_grad=True)
+    prepared.score(amplified(given, gains), N3).backward()
+    assert gains.grad is not None
+    step = 1e-3
+    for place in (1, 3, 5):
+        with torch.no_grad():
+            ends = []
+            for sign in (1.0, -1.0):
+                moved = gains.detach().clone()
+                moved[place] += sign * step
+                ends.append(float(prepared.score(amplified(given, moved), N3)))
+        assert float(gains.grad[place]) == pytest.approx((ends[0] - ends[1]) / (2 * step), rel=0.01)
+
+
+@pytest.mark.parametrize("noise", ["expected", "none"])
+@pytest.mark.parametrize("given", ["silence", "equal", "inaudible", "denormal", "loud", "click"])
+def test_gradient_is_finite(clean: Tensor, given: str, noise: str) -> None:
+    x = clean[0, :12000]
+    click = torch.zeros_like(x)
+    click[6000] = 1.0
+    signals = {
+        "silence": 0.0 * x,
+        "equal": x,
+        "inaudible": 1e-4 * x,
+        "denormal": 1e-37 * x,
+        "loud": 1e3 * x,
+        "click": click,
+    }
+    y = signals[given].clone().requires_grad_()
+    score = haspi(y, x, N6, noise=noise)
+    score.backward()
+    assert 0.0 <= float(score.detach()) <= 1.0
+    assert y.grad is not None and bool(y.grad.isfinite().all())
+
+
+def test_ascent_on_gains_raises_pyclaritys_score(clean: Tensor, noisy: Tensor) -> None:
+    pytest.importorskip("clarity")
+    prepared = HaspiReference(clean[0])
+    gains = torch.zeros(8, requires_grad=True)
+    climb = torch.optim.Adam([gains], lr=4.0)
+    for _ in range(8):
+        climb.zero_grad()
+        (-prepared.score(amplified(noisy[0], gains), N3)).backward()
+        climb.step()
+    after = amplified(noisy[0], gains.detach())
+    scores = [reference.haspi(clean[0], signal, N3, 16000) for signal in (noisy[0], after)]
+    assert scores[1] > scores[0] + 0.05
+
+
+# -- properties and refusals -------------------------------------------------------------------------------------------
+
+
+def test_less_noise_is_better(clean: Tensor) -> None:
+    noise = torch.randn(clean.shape[-1], generator=torch.Generator().manual_seed(2)) * clean[0].std()
+    scores = [float(haspi(clean[0] + gain * noise, clean[0], N2)) for gain in (3.0, 1.0, 0.3, 0.0)]
+    assert scores == sorted(scores)
+
+
+def test_a_delay_does_not_count(clean: Tensor, noisy: Tensor) -> None:
+    x, y = (functional.pad(signal[0].double(), (0, 2000)) for signal in (clean, noisy))
+    scores = [float(haspi(y.roll(delay), x, N2)) for delay in (0, 100, 800)]
+    assert scores[1] == pytest.approx(scores[2], abs=1e-9)
+    assert scores[0] == pytest.approx(scores[2], abs=1e-3)  # its first samples are not there any more
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"clean": torch.ones(8000) * 0.01}, "lasts 0.5 s"),
+        ({"clean": torch.zeros(16000)}, "clean is silent"),
+        ({"clean": torch.full((16000,), torch.nan)}, "NaN or infinite"),
+        ({"clean": 1e-5 * torch.randn(16000)}, "HASPI needs 20 or more"),
+        ({"processed": torch.full((16000,), torch.inf)}, "processed holds samples that are NaN"),
+        ({"processed": torch.zeros(2, 16000)}, "allowed: equal shapes"),
+        ({"processed": torch.zeros(16000, dtype=torch.int64)}, "floating-point"),
+        ({"audiogram": "N3"}, "audiogram is str"),
+        ({"audiogram": torch.full((8,), 130.0)}, "HASPI takes -10 to 120"),
+        ({"audiogram": [N3, N3]}, "broadcast"),
+        ({"sample_rate": 8000}, "sample rate 8000"),
+        ({"full_scale_spl": -1.0}, "full_scale_spl"),
+        ({"lengths": 17000}, "lengths"),
+        ({"lengths": 9000}, "lasts 0.56 s"),
+        ({"noise": "loud"}, "noise 'loud'; allowed: expected, seeded, none"),
+        ({"seed": [1, 2]}, "2 seeds for 1 items"),
+        ({"seed": -1}, "seed is -1"),
+    ],
+)
+def test_refusals(clean: Tensor, change: dict[str, object], message: str) -> None:
+    settings = {"processed": clean[0], "clean": clean[0], "audiogram": N3, **change}
+    if "clean" in change and "processed" not in change:
+        settings["processed"] = settings["clean"]
+    with pytest.raises(ValueError, match=message):
+        haspi(settings.pop("processed"), settings.pop("clean"), settings.pop("audiogram"), **settings)
