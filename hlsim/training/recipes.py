@@ -128,7 +128,7 @@ class CompensatorRecipe(TrainingRecipe):
     batch: int = 2
     seconds: float = 0.6
     learning_rate: float = 3e-3
-    weights: dict[str, float] = field(default_factory=lambda: {"bands": 1.0})
+    weights: dict[str, float] = field(default_factory=lambda: {"coherent-bands": 1.0})
     reference: str = "clean"
     sounds: float = 0.2
     levels: tuple[float, float] = (50.0, 80.0)
