@@ -26,6 +26,7 @@ from hlsim.files import sha256
 # scores of networks were stored when these had other names
 _FORMER = {"receptive_field": "reach"}
 _FORMER_MODULE = b"hlsim.dsp.stft", b"hlsim.spectrum"
+_FORMER_KIND = {"hlsim.neuro.encoder.AudiogramEncoder": "hlsim.neuro.audiogram_encoder.AudiogramEncoder"}
 
 
 class ScoreStore:
@@ -106,7 +107,8 @@ def weights_hash(module: nn.Module) -> str:
         if name not in torchs
     ]
     kinds = {type(part): None for part in module.modules()}
-    about = [f"{kind.__module__}.{kind.__qualname__} {_source(kind)}" for kind in kinds]
+    named = {kind: f"{kind.__module__}.{kind.__qualname__}" for kind in kinds}
+    about = [f"{_FORMER_KIND.get(name, name)} {_source(kind)}" for kind, name in named.items()]
     state = hashlib.sha256(f"{about} {settings}".encode())
     for name, tensor in (*module.named_parameters(), *module.named_buffers()):
         state.update(name.encode())

@@ -1,5 +1,6 @@
 """The store of scores: what it keeps, what a torn line costs, and what its keys depend on."""
 
+import copy
 import json
 import math
 from dataclasses import dataclass
@@ -15,6 +16,7 @@ from compensators import NALR
 from hlsim import MSBG, Audiogram
 from hlsim.dsp.stft import STFT
 from hlsim.evaluation.store import ScoreStore, content_hash, key_of, setting, weights_hash
+from hlsim.neuro.encoder import AudiogramEncoder
 from hlsim.pretrained import SIMULATOR, load_pretrained, shipped
 
 
@@ -146,3 +148,9 @@ def test_what_was_stored_under_former_names_is_still_known() -> None:
     now, then = torch.nn.Module(), torch.nn.Module()
     now.receptive_field = then.reach = 1664
     assert weights_hash(now) == weights_hash(then)
+    encoder = AudiogramEncoder(16)
+    former = copy.deepcopy(encoder)
+    former.__class__ = type(
+        "AudiogramEncoder", (AudiogramEncoder,), {"__module__": "hlsim.neuro.audiogram_encoder"}
+    )
+    assert weights_hash(encoder) == weights_hash(former)
