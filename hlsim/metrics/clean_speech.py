@@ -9,10 +9,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from hlsim.audio import check_rate, check_waveform
 from hlsim.audiogram import HIGHEST_LEVEL, AudiogramLike, resolve_thresholds
 from hlsim.calibration import check_full_scale
-from hlsim.checks import Lengths, check_lengths
+from hlsim.checks import Lengths, check_lengths, check_rate, check_waveform
 from hlsim.metrics import ear_input
 from hlsim.metrics.ear_model import CHANNELS, Extent
 from hlsim.metrics.ear_recursions import middle_ear

@@ -26,10 +26,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from hlsim.audio import check_waveform
 from hlsim.audiogram import AudiogramLike
 from hlsim.calibration import PASCAL_SPL
-from hlsim.checks import Lengths
+from hlsim.checks import Lengths, check_waveform
 from hlsim.metrics import ear_model
 from hlsim.metrics import envelope_modulation as envelopes
 from hlsim.metrics.clean_speech import CleanItem, CleanSpeech

@@ -17,10 +17,9 @@ from numpy.typing import NDArray
 from scipy.signal.windows import hamming
 from torch import Tensor
 
-from hlsim.audio import check_waveform
 from hlsim.audiogram import FREQUENCIES, AudiogramLike
 from hlsim.calibration import PASCAL_SPL, check_full_scale
-from hlsim.checks import Lengths
+from hlsim.checks import Lengths, check_waveform
 from hlsim.dsp.fft import fft_length
 from hlsim.dsp.fir import frequency_sampling_fir
 from hlsim.metrics import ear_model, fine_structure
