@@ -13,8 +13,7 @@ from torch import Tensor
 
 from hlsim.audiogram import Audiogram
 from hlsim.benchmark.models import Row, rows
-from hlsim.benchmark.timing import DIRECTIONS, Timings, about, attempt, finish, peak_mib
-from hlsim.calibration import set_level
+from hlsim.benchmark.timing import DIRECTIONS, Timings, about, attempt, clip, finish, peak_mib
 from hlsim.neuro.config import NEURO_RATE
 
 LENGTHS = (1.0, 4.0, 16.0, 60.0)
@@ -181,8 +180,8 @@ class _Simulators(Timings):
             self.attempt(key, take)
 
     def _call(self, key: _Key, ear: str) -> Callable[[], None]:
-        clip = _clip(key.sample_rate, key.seconds, key.batch).to(self.device)
-        return partial(_run, self.calls[key.name, key.sample_rate, ear], clip, key.direction)
+        sound = clip(key.sample_rate, key.seconds, key.batch).to(self.device)
+        return partial(_run, self.calls[key.name, key.sample_rate, ear], sound, key.direction)
 
     def result(self, found: list[Row]) -> dict[str, Any]:
         out = []
@@ -224,13 +223,6 @@ def _growth(cells: list[dict[str, Any]], by: str, rate: int) -> float | None:
 
 def _exponent(low: tuple[float, float], high: tuple[float, float]) -> float:
     return math.log(high[1] / low[1]) / math.log(high[0] / low[0])
-
-
-def _clip(rate: int, seconds: float, batch: int) -> Tensor:
-    generator = torch.Generator().manual_seed(0)
-    samples = round(rate * seconds)
-    syllables = torch.sin(torch.arange(samples) * (2.0 * torch.pi * 4.0 / rate)).clamp_min(0.05)
-    return set_level(torch.randn(batch, samples, generator=generator) * syllables, 65.0)
 
 
 def _run(call: Callable[[Tensor], Tensor], clip: Tensor, direction: str) -> None:

@@ -13,7 +13,7 @@ _PEAK = "peak memory (MiB)"
 
 
 def benchmark_markdown(result: Row) -> str:
-    """One second at batch 1; longer clips and larger batches; the training step and the scan where they were timed."""
+    """One second at batch 1; longer clips and larger batches; step, scan and metrics where they were timed."""
     head = (
         f"{result['device']} ({result['machine']}, {result['cores']} cores, {result['threads']} threads), torch "
         f"{result['torch']}{_gpu(result['gpu'])}, {result['date']}; "
@@ -22,9 +22,12 @@ def benchmark_markdown(result: Row) -> str:
     )
     rows = result.get("rows", [])
     tables = [_one_second(rows), _sizes(rows), _training(rows)]
-    for name, title in (("training", "A training step"), ("scan", "Selective scan")):
-        parts = result.get(name, [])
-        tables.append([{title: part["name"], **_both_ways(part["forward"], part["both"])} for part in parts])
+    for name, title in (
+        ("training", "A training step"),
+        ("scan", "Selective scan"),
+        ("metrics", "3 s at 16 kHz, one thread"),
+    ):
+        tables.append([_part(title, part) for part in result.get(name, [])])
     texts = [Table.of("", table).markdown() + "\n" for table in tables if table]
     return "\n".join([head, "", *texts, *(f"skipped: {reason}" for reason in result["skipped"])]) + "\n"
 
@@ -80,6 +83,11 @@ def _training(rows: Sequence[Row]) -> list[dict[str, str]]:
         for cell in row["cells"]
         if cell["direction"] == "both" and (cell["seconds"], cell["batch"]) != (1.0, 1)
     ]
+
+
+def _part(title: str, part: Row) -> dict[str, str]:
+    line = {title: part["name"], **_both_ways(part["forward"], part["both"])}
+    return line | ({"times pyclarity": number(part["speedup"], ".1f", "-")} if "speedup" in part else {})
 
 
 def _gpu(gpu: Row | None) -> str:

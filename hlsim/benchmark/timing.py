@@ -12,11 +12,15 @@ import platform
 import statistics
 import threading
 import time
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Container, Hashable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
+
+from hlsim.calibration import set_level
 
 Call = Callable[[], Any]
 
@@ -113,6 +117,53 @@ class Timings:
             return None
         middle, peak = statistics.median(times), self.peaks.get(key)
         return {"median_ms": middle, "least_ms": min(times), "greatest_ms": max(times), "peak_mib": peak}
+
+
+def rows_by_turns(
+    parts: Mapping[str, Callable[[], Tensor]],
+    device: torch.device,
+    repeats: int,
+    forward_only: Container[str] = (),
+) -> tuple[list[dict[str, Any]], list[str]]:
+    """Time calls that return a scalar, forward and with the backward pass, in turns, so that all see the same machine.
+
+    Returns: rows of name, forward and both, ``figures`` or None; and what failed, with its reason.
+    """
+    timings = Timings(device, [])
+
+    def take(key: str, call: Call, turn: int) -> None:
+        timings.take(key, call, turn > 0)
+        # on a CPU the first call leaves memory to the process for the second
+        if turn == 0 and device.type == "cuda":
+            timings.peaks[key] = peak_mib(call, device)
+
+    for turn in range(repeats + 1):  # the first does not count
+        for name, part in parts.items():
+            for direction, said in DIRECTIONS.items():
+                if direction == "forward" or name not in forward_only:
+                    key = f"{name}, {said}"
+                    timings.attempt(key, partial(take, key, partial(_run, part, direction), turn))
+    rows = []
+    for name in parts:
+        figures = {direction: timings.figures(f"{name}, {said}") for direction, said in DIRECTIONS.items()}
+        if any(figures.values()):
+            rows.append({"name": name, **figures})
+    return rows, timings.skipped
+
+
+def _run(part: Callable[[], Tensor], direction: str) -> None:
+    with torch.set_grad_enabled(direction == "both"):
+        value = part()
+    if direction == "both":
+        value.backward()
+
+
+def clip(rate: int, seconds: float, batch: int) -> Tensor:
+    """Noise at 65 dB SPL with the rhythm of syllables, seed 0. Shape: (batch, time)."""
+    generator = torch.Generator().manual_seed(0)
+    samples = round(rate * seconds)
+    syllables = torch.sin(torch.arange(samples) * (2.0 * torch.pi * 4.0 / rate)).clamp_min(0.05)
+    return set_level(torch.randn(batch, samples, generator=generator) * syllables, 65.0)
 
 
 def about(device: str, repeats: int) -> dict[str, Any]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import torch
@@ -12,7 +11,7 @@ from torch import Tensor, nn
 
 from compensators import MappingCompensator
 from hlsim.audiogram import Audiogram
-from hlsim.benchmark.timing import DIRECTIONS, Timings, peak_mib
+from hlsim.benchmark.timing import rows_by_turns
 from hlsim.calibration import set_level
 from hlsim.loss import HearingLossLoss
 from hlsim.neuro.config import NEURO_RATE
@@ -52,7 +51,7 @@ def training_step(
         "whole step (neuro-msbg)": lambda: loss(compensator(clean, ear), clean),
         "whole step (msbg)": lambda: exact(compensator(clean, ear), clean),
     }
-    return _table(parts, place, repeats)
+    return rows_by_turns(parts, place, repeats)
 
 
 def scan_rows(*, device: str = "cpu", repeats: int = 5) -> tuple[list[dict[str, Any]], list[str]]:
@@ -92,7 +91,7 @@ def scan_rows(*, device: str = "cpu", repeats: int = 5) -> tuple[list[dict[str, 
         parts["mambapy"] = mambapy
     except ImportError as error:
         skipped.append(f"mambapy: {error}")
-    rows, failed = _table(parts, place, repeats)
+    rows, failed = rows_by_turns(parts, place, repeats)
     return rows, skipped + failed
 
 
@@ -105,34 +104,3 @@ def scan_loop(u: Tensor, delta: Tensor, A: Tensor, B: Tensor, C: Tensor) -> Tens
         state = (step * A).exp() * state + step * u[..., t, None] * B[:, None, :, t]
         outputs.append((state * C[:, None, :, t]).sum(-1))
     return torch.stack(outputs, -1)
-
-
-def _table(
-    parts: dict[str, Callable[[], Tensor]], device: torch.device, repeats: int
-) -> tuple[list[dict[str, Any]], list[str]]:
-    timings = Timings(device, [])
-
-    def take(key: str, call: Callable[[], None], turn: int) -> None:
-        timings.take(key, call, turn > 0)
-        # on a CPU the first call leaves memory to the process for the second
-        if turn == 0 and device.type == "cuda":
-            timings.peaks[key] = peak_mib(call, device)
-
-    for turn in range(repeats + 1):  # in turns, so that all see the same machine; the first does not count
-        for name, part in parts.items():
-            for direction, said in DIRECTIONS.items():
-                key = f"{name}, {said}"
-                timings.attempt(key, partial(take, key, partial(_run, part, direction), turn))
-    rows = []
-    for name in parts:
-        figures = {direction: timings.figures(f"{name}, {said}") for direction, said in DIRECTIONS.items()}
-        if any(figures.values()):
-            rows.append({"name": name, **figures})
-    return rows, timings.skipped
-
-
-def _run(part: Callable[[], Tensor], direction: str) -> None:
-    with torch.set_grad_enabled(direction == "both"):
-        value = part()
-    if direction == "both":
-        value.backward()

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from hlsim.audiogram import Audiogram
+from hlsim.benchmark import metrics as benchmark_metrics
 from hlsim.benchmark import run as benchmark_module
 from hlsim.benchmark import training as benchmark_training
 from hlsim.benchmark.models import Row
@@ -140,6 +141,16 @@ def test_a_table_without_what_fails(monkeypatch: pytest.MonkeyPatch) -> None:
     assert scan[0]["name"] == "hlsim (plain torch)" and "step by step" not in str(scan)
     table = benchmark_markdown(about("cpu", 1) | {"scan": scan, "skipped": skipped})
     assert "| Selective scan | forward | forward + backward | peak memory (MiB) |" in table
+
+
+def test_metrics_stand_beside_the_reference(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(benchmark_metrics, "SECONDS", 0.8)
+    assert main(["benchmark", "--what", "metrics", "--repeats", "1"]) == 0
+    lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("| HAS")]
+    assert len(lines) == 8 and all(line.split("|")[5].strip() not in ("", "-") for line in lines)
+    assert lines[0].startswith("| HASPI (pyclarity) |") and lines[0].rstrip(" |").endswith("1.0")
 
 
 def test_the_scan_by_a_kernel_has_a_row_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
