@@ -20,6 +20,7 @@ from hlsim.evaluation.statistics import RESAMPLES, PairedComparison
 from hlsim.evaluation.store import ScoreStore
 from hlsim.extras import require
 from hlsim.metrics.registry import check_measures, version_of, versions_of
+from hlsim.metrics.words import WordsChange, words_change
 
 _OF_ITEM = ("audiogram", "listener", "ear", "snr", "clean", "processed")
 
@@ -51,6 +52,7 @@ class HaspiReport:
         full_scale_spl: level in dB SPL that RMS 1.0 was taken as; None where the items differ, as by ``spl``.
         note: what is to be known before the figures: that HASPI rewards gain, where it is among the measures.
         severities: each item's degree of loss.
+        words: where the headline is HASPI's, what it says of the words that a listener would understand; else None.
 
     Raises:
         ValueError: no items, or of unlike conditions, or fewer than two; a baseline that is not the first; a score
@@ -74,6 +76,7 @@ class HaspiReport:
     full_scale_spl: float | None = field(init=False)
     note: str = field(init=False)
     severities: Sequence[str] = field(init=False)
+    words: WordsChange | None = field(init=False)
 
     def __post_init__(self) -> None:
         if not self.items:
@@ -107,10 +110,19 @@ class HaspiReport:
             full_scale_spl=scales.pop() if len(scales) == 1 else None,
             note=GAIN_NOTE if "haspi" in measures else "",
             severities=[item.severity for item in self.items],
+            words=self._words(*ends),
         )
         taken = sorted(set(self._own()) & set(self.extra))
         if taken:
             raise ValueError(f"extra keys {', '.join(taken)} are the report's own; allowed: other names")
+
+    def _words(self, measure: str, before: str, after: str) -> WordsChange | None:
+        if measure != "haspi":
+            return None
+        both = [found for item in self.items if {before, after} <= (found := item.scores[measure]).keys()]
+        # a score may end a little above 1
+        first, second = (np.clip([found[name] for found in both], 0.0, 1.0) for name in (before, after))
+        return words_change(first, second)
 
     @property
     def versions(self) -> dict[str, str]:
@@ -162,6 +174,7 @@ class HaspiReport:
         return {
             **self.comparison.to_dict(),
             "in_words": self.headline.in_words(),
+            "words": None if self.words is None else self.words._asdict(),
             "conditions": list(self.conditions),
             "measures": list(self.measures),
             "wilcoxon_zero_method": "wilcox",

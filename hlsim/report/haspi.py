@@ -9,6 +9,7 @@ from pathlib import Path
 from hlsim.audiogram import SEVERITIES
 from hlsim.evaluation.haspi_report import HaspiReport
 from hlsim.metrics.registry import MEASURES
+from hlsim.metrics.words import WordsChange
 from hlsim.report.listening import listening_section
 from hlsim.report.page import Picture, Section, render_markdown, render_page, write_files
 from hlsim.report.pictures import draw_report, report_pictures
@@ -70,7 +71,8 @@ def _sections(
     report: HaspiReport, pictures: Sequence[Picture] = (), listening: Section | None = None
 ) -> list[Section]:
     headline = report.headline
-    sections = [Section("Result", [headline.in_words()], [paper_table(headline)])]
+    texts = [headline.in_words(), *([] if report.words is None else [_in_words_understood(report.words)])]
+    sections = [Section("Result", texts, [paper_table(headline)])]
     if pictures:
         sections.append(Section("Pictures", pictures=pictures))
     sections.append(Section("By degree of loss", tables=[severity_table(headline)]))
@@ -85,6 +87,17 @@ def _sections(
         sections.append(listening)
     sections.append(Section("How the figures were made", _notes(report)))
     return [*sections, Section("All items", tables=[_items(report)], folded=True)]
+
+
+def _in_words_understood(words: WordsChange) -> str:
+    share = f"{100.0 * words.before:.0f} % of the words before and {100.0 * words.after:.0f} % after"
+    change, low, high = (f"{100.0 * value:+.0f}" for value in (words.change, words.low, words.high))
+    return (
+        f"In words: a listener who hears these sentences would understand {share}, a change of {change} points, nine "
+        f"of ten listeners one between {low} and {high}. That is a curve fitted to 22 hearing-impaired listeners of ten "
+        "aids and HASPI of their better ears (hlsim.metrics.words). HASPI ranks aids, not people: how listeners differ "
+        "it hardly tells."
+    )
 
 
 def _further(report: HaspiReport) -> list[Table]:

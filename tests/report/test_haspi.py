@@ -75,6 +75,17 @@ def test_figures_are_scipys(tmp_path: Path) -> None:
     assert data["items"][2]["severity"] == "severe" and data["items"][2]["file"] == "p1/02"
 
 
+def test_the_change_is_told_in_words_where_haspi_is_the_headlines() -> None:
+    report = make_report()
+    words = report.words
+    assert words is not None and words.low < words.change < words.high and words.before < words.after
+    said = f"{100 * words.after:.0f} % after, a change of {100 * words.change:+.0f} points"
+    assert said in markdown(report) and said in html(report)
+    assert report.to_dict()["words"] == words._asdict()
+    items = [replace(item, scores={"stoi": item.scores["haspi"]}) for item in report.items]
+    assert HaspiReport(items).words is None and "In words" not in markdown(HaspiReport(items))
+
+
 def test_markdown_is_the_papers_table() -> None:
     report = make_report(seed=3, extra={"nalr_mean": 0.5125})
     text, c = markdown(report), report.comparison
