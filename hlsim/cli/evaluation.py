@@ -124,6 +124,9 @@ def haspi_report(parser: Parser) -> None:
     option("--audiograms", Path, EARS_TABLE + text)
     option("--measures", str, "of haspi, hasqi, stoi, pesq, separated by commas; the first leads", "haspi")
     option("--baseline", str, "condition that all others are compared with; all pairs by default")
+    parser.flag(
+        "--better-ear", "of a manifest with both ears of each utterance, take the better ear's scores"
+    )
     level = parser.add_mutually_exclusive_group()
     parser.full_scale(group=level)
     text = "level of each clean file in dB SPL, in place of --full-scale-spl; of a manifest for rows that bring none"

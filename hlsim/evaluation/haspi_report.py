@@ -12,6 +12,7 @@ import numpy as np
 
 from hlsim.audiogram import Audiogram
 from hlsim.calibration import check_full_scale
+from hlsim.evaluation.better_ear import better_ears
 from hlsim.evaluation.comparison import Comparison, compare_conditions
 from hlsim.evaluation.inputs import read_folders, read_manifest
 from hlsim.evaluation.scores import Failure, ItemScore
@@ -43,6 +44,7 @@ class HaspiReport:
             with every earlier one.
         extra: further keys for ``report.json`` beside the others, such as ``nalr_mean``; what JSON can hold.
         unit: what the items' listeners are called in sentences, such as ``ears``.
+        ears: where the items are the better ears', each ear's.
 
     Attributes:
         conditions: their names, in order, from the items' levels.
@@ -66,6 +68,7 @@ class HaspiReport:
     baseline: str | None = None
     extra: Mapping[str, Any] = field(default_factory=dict)
     unit: str = "listeners"
+    ears: Sequence[ItemScore] = ()
     conditions: Sequence[str] = field(init=False)
     comparisons: Sequence[Comparison] = field(init=False)
     headline: Comparison = field(init=False)
@@ -183,6 +186,7 @@ class HaspiReport:
             "comparisons": [c.to_dict() for c in self.comparisons],
             "failures": [vars(failure).copy() for failure in self.failures],
             "items": [item.to_dict() for item in self.items],
+            "ears": [item.to_dict() for item in self.ears],
         }
 
 
@@ -197,6 +201,7 @@ def haspi_report(
     root: str | Path | None = None,
     measures: Iterable[str] = ("haspi",),
     baseline: str | None = None,
+    better_ear: bool = False,
     store: str | Path | None = None,
     full_scale_spl: float = 94.0,
     spl: float | None = None,
@@ -216,6 +221,7 @@ def haspi_report(
         measures: of ``haspi``, ``hasqi``, ``stoi``, ``pesq``; the first is the headline's.
         baseline: the condition that comes first and that all others are compared with; by default the manifest's first
             comes first, and all are compared with each other.
+        better_ear: of a manifest with both ears of each utterance, the better ear's scores are the items'.
         store: file of scores, made where there is none; None keeps them nowhere.
         full_scale_spl: level in dB SPL of a file with RMS 1.0.
         spl: or else the level in dB SPL of every clean file, or of a manifest's rows that bring none; the processed ones
@@ -225,7 +231,7 @@ def haspi_report(
 
     Raises:
         ValueError: names differ between the folders, a manifest's row is wrong, a file has no audiogram, settings
-            contradict each other, or no item could be scored.
+            contradict each other, an ear lacks, or no item could be scored.
         MissingExtraError: a measure's package, joblib or distributed is not installed.
     """
     names = check_measures(measures)
@@ -265,7 +271,9 @@ def haspi_report(
     if not scores:
         reasons = f"; the first, {failures[0].file}: {failures[0].reason}" if failures else ""
         raise ValueError(f"none of {len(items)} items could be scored{reasons}")
-    return HaspiReport(scores, measures=names, seed=seed, failures=failures, baseline=baseline)
+    ears = scores if better_ear else []
+    scores = better_ears(scores) if better_ear else scores
+    return HaspiReport(scores, names, seed, failures, baseline, ears=ears)
 
 
 def _item_score(

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from hlsim.audiogram import SEVERITIES
 from hlsim.evaluation.haspi_report import HaspiReport
+from hlsim.evaluation.scores import ItemScore
 from hlsim.metrics.registry import MEASURES
 from hlsim.metrics.words import WordsChange
 from hlsim.report.listening import listening_section
@@ -64,7 +65,8 @@ def _title(report: HaspiReport) -> str:
 
 
 def _lead(report: HaspiReport) -> str:
-    return f"{report.comparison.n} items. {report.note}".rstrip()
+    ears = " Each is the better ear's." if report.ears else ""
+    return f"{report.comparison.n} items.{ears} {report.note}".rstrip()
 
 
 def _sections(
@@ -86,7 +88,10 @@ def _sections(
     if listening is not None:
         sections.append(listening)
     sections.append(Section("How the figures were made", _notes(report)))
-    return [*sections, Section("All items", tables=[_items(report)], folded=True)]
+    tables = [_items(report, report.items, "Scores and levels of every item")]
+    if report.ears:
+        tables.append(_items(report, report.ears, "Scores and levels of each ear"))
+    return [*sections, Section("All items", tables=tables, folded=True)]
 
 
 def _in_words_understood(words: WordsChange) -> str:
@@ -106,18 +111,18 @@ def _further(report: HaspiReport) -> list[Table]:
     return [*tables, comparisons_table(report.comparisons)] if len(report.comparisons) > 1 else tables
 
 
-def _items(report: HaspiReport) -> Table:
+def _items(report: HaspiReport, items: Sequence[ItemScore], title: str) -> Table:
     titles = [MEASURES[name].title for name in report.measures]
     rows = []
-    for item in report.items:
+    for item in items:
         row = {"Item": item.file, "Loss": item.severity, "Clean (dB SPL)": f"{item.clean_level:.1f}"}
         row["Full scale (dB SPL)"] = f"{item.full_scale_spl:.1f}"
         for condition in report.conditions:
-            for name, title in zip(report.measures, titles, strict=True):
-                row[f"{title}, {condition}"] = number(item.scores.get(name, {}).get(condition), ".3f")
+            for name, measure in zip(report.measures, titles, strict=True):
+                row[f"{measure}, {condition}"] = number(item.scores.get(name, {}).get(condition), ".3f")
             row[f"dB SPL, {condition}"] = number(item.levels[condition], ".1f")
         rows.append(row)
-    return Table.of("Scores and levels of every item", rows)
+    return Table.of(title, rows)
 
 
 def _notes(report: HaspiReport) -> list[str]:
