@@ -174,8 +174,8 @@ class Audiogram:
         return cls(tuple(points.values()), tuple(points))
 
     def to_clarity(self) -> Any:
-        """The same ear as pyclarity's ``Audiogram`` (needs the extra ``eval``)."""
-        clarity = require("clarity.utils.audiogram", "eval")
+        """The same ear as pyclarity's ``Audiogram`` (needs the extra ``pyclarity``)."""
+        clarity = require("clarity.utils.audiogram", "pyclarity")
         return clarity.Audiogram(levels=np.array(self.levels), frequencies=np.array(self.frequencies))
 
     @classmethod

@@ -18,7 +18,7 @@ from hlsim.dsp.resample import resample
 from hlsim.evaluation import HaspiReport, ItemScore
 from hlsim.evaluation.judging import NORMAL, Unaided
 from hlsim.evaluation.scoring import HaspiItem, haspi_many
-from hlsim.metrics.pyclarity import check_pair
+from hlsim.metrics.pair import check_pair
 from hlsim.msbg import MSBG
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.parallel import one_thread

@@ -118,7 +118,8 @@ def check_parallel(jobs: int | None, backend: str, scheduler: str | None) -> Non
         raise ValueError(
             "backend dask needs the scheduler's address, such as tcp://host:8786, and no other does"
         )
-    require("joblib", "eval")
+    if jobs != 1 or backend == "dask":
+        require("joblib", "eval")
     if backend == "dask":
         require("distributed", "cluster")
 
@@ -145,15 +146,15 @@ def run_parallel(
 
     Raises:
         ValueError: ``jobs`` or ``backend`` is none that is allowed, or no scheduler answers.
-        MissingExtraError: joblib (eval) or distributed (cluster) is not installed.
+        MissingExtraError: joblib (eval), which one process does without, or distributed (cluster) is not installed.
     """
     check_parallel(jobs, backend, scheduler)
-    joblib = require("joblib", "eval")
-    processes = jobs or int(joblib.cpu_count())
+    processes = jobs or int(require("joblib", "eval").cpu_count())
     if backend == "loky" and processes == 1:
         for task in tasks:
             yield task, function(task)
         return
+    joblib = require("joblib", "eval")
     with ExitStack() as stack:
         # each process one thread of linear algebra: the files are what is parallel
         options: dict[str, Any] = {"inner_max_num_threads": 1}

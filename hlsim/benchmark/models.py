@@ -53,7 +53,7 @@ def rows(simulators: list[str] | None = None) -> tuple[list[Row], list[str]]:
         ("pyclarity torch_msbg", "clarity.predictor.torch_msbg", _pyclarity_torch, True),
     ):
         try:
-            prepare = partial(prepare, require(module, "eval"))
+            prepare = partial(prepare, require(module, "pyclarity"))
             found.append(Row(name, (MSBG_RATE,), prepare, differentiable))
         except MissingExtraError as error:
             skipped.append(f"{name}: {error}")

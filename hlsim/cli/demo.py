@@ -22,7 +22,7 @@ def demo(parser: Parser) -> None:
 
 def _demo(options: argparse.Namespace) -> None:
     need("train", "lightning", "tensorboard")
-    need("eval", "clarity", "matplotlib")
+    need("eval", "joblib", "matplotlib")
     check_there(folders=(options.speech,))
     ear = read_ear(options.audiogram)
     require("lightning", "train")  # one that is there may be broken

@@ -36,7 +36,9 @@ def _evaluate_simulator(options: argparse.Namespace) -> None:
         raise ValueError(f"simulators {', '.join(options.names)}; allowed: each once")
     if options.compensator and "compensated" not in options.inputs:
         raise ValueError("--compensator without --inputs compensated; allowed: only with it")
-    need("eval", "clarity", "pystoi", "pesq", "pandas", "matplotlib")
+    need("eval", "pystoi", "pesq", "pandas", "matplotlib")
+    if options.teacher == "pyclarity":
+        need("pyclarity", "clarity")
     check_there(folders=(options.speech, options.noise), files=(options.audiograms,))
     from compensators import load_compensator
     from hlsim.evaluation.simulators import evaluate_simulators
@@ -69,6 +71,7 @@ def evaluate_compensator(parser: Parser) -> None:
     option("--seconds", positive, "length of an item", 3.0)
     text = "standard ears of the gain curves and tones; with --audiogram that ear's are drawn"
     option("--gain-ears", str.upper, text, GAIN_EARS, nargs="+", metavar="EAR")
+    parser.engine()
     parser.jobs()
     parser.seed()
     parser.out()
@@ -77,7 +80,8 @@ def evaluate_compensator(parser: Parser) -> None:
 def _evaluate_compensator(options: argparse.Namespace) -> None:
     if options.audiogram and options.gain_ears != GAIN_EARS:
         raise ValueError("--gain-ears with --audiogram; allowed: without it, for that ear's gains are drawn")
-    need("eval", "clarity", "pandas", "matplotlib")
+    need("eval", "pandas", "matplotlib")
+    _need_engine(options.engine)
     check_there(folders=(options.speech, options.noise), files=(options.audiograms,))
     from compensators import load_compensator
     from hlsim.evaluation.compensators import evaluate_compensators
@@ -99,6 +103,11 @@ def _evaluate_compensator(options: argparse.Namespace) -> None:
     print(text.read_text(encoding="utf-8"))
     if failed := len(done.result["failures"]):
         print(f"hlsim: {failed} outputs could not be judged; the reasons are in {text}", file=sys.stderr)
+
+
+def _need_engine(engine: str) -> None:
+    if engine == "pyclarity":
+        need("pyclarity", "clarity")
 
 
 def _labelled(text: str) -> tuple[str, str]:
@@ -123,6 +132,7 @@ def haspi_report(parser: Parser) -> None:
     text = "; and a column file (folders) or columns listener and ear (manifest, for rows without)"
     option("--audiograms", Path, EARS_TABLE + text)
     option("--measures", str, "of haspi, hasqi, stoi, pesq, separated by commas; the first leads", "haspi")
+    parser.engine()
     option("--baseline", str, "condition that all others are compared with; all pairs by default")
     parser.flag(
         "--better-ear", "of a manifest with both ears of each utterance, take the better ear's scores"
@@ -140,7 +150,9 @@ def haspi_report(parser: Parser) -> None:
 
 def _haspi_report(options: argparse.Namespace) -> None:
     measures = [name.strip() for name in options.measures.split(",")]
-    need("eval", "joblib", "matplotlib", *(["clarity"] if {"haspi", "hasqi"} & {*measures} else []))
+    need("eval", "joblib", "matplotlib")
+    if {"haspi", "hasqi"} & {*measures}:
+        _need_engine(options.engine)
     check_there(
         folders=(options.clean, options.before, options.after, options.root),
         files=(options.manifest, options.audiograms),

@@ -83,6 +83,10 @@ class Parser(argparse.ArgumentParser):
     def full_scale(self, **more: Any) -> None:
         self.option("--full-scale-spl", number, "level in dB SPL of a file whose RMS is 1.0", 94.0, **more)
 
+    def engine(self) -> None:
+        text = "what computes HASPI and HASQI: hlsim, with pyclarity's figures, or pyclarity itself, which is slower"
+        self.option("--engine", str, text, "hlsim", choices=("hlsim", "pyclarity"))
+
     def jobs(self) -> None:
         self.option("--jobs", count, "processes; all cores by default")
 

@@ -119,7 +119,7 @@ def _refuse_without(
 def _reference(teacher: str) -> Reference | None:
     if teacher == "msbg":
         return None
-    need("eval", "clarity")
+    need("pyclarity", "clarity")
     from hlsim.metrics.reference import pyclarity_msbg
 
     return pyclarity_msbg

@@ -31,9 +31,8 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    # needs torchmetrics, which the rest does not
-    if name == "HASPI":
-        from hlsim.metrics.torchmetric import HASPI
+    if name == "HASPI":  # of hlsim.metrics; torchmetrics is an extra
+        from hlsim.metrics import HASPI
 
         return HASPI
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -97,7 +97,8 @@ def _report(rows: Rows, items: Sequence[Item], settings: Mapping[str, Any]) -> H
         )
         for row in rows
     ]
-    return HaspiReport(scores, measures=MEASURES, seed=settings["seed"], unit="ears")
+    about = {"seed": settings["seed"], "engine": settings["engine"]}
+    return HaspiReport(scores, measures=MEASURES, unit="ears", **about)
 
 
 def _frame(rows: Rows, condition: str) -> Any:
@@ -139,15 +140,19 @@ def _means(frame: Any) -> dict[str, Any]:
 def _gap(frame: Any) -> dict[str, float | None]:
     """Mean loss under each simulator, how far one's lies from another's relative to it, and the median over items.
 
-    None where the other's is 0. It is where nothing is lost: clean speech as it is, in an ear without a loss.
+    None where the other's is 0. It is where nothing is lost: clean speech as it is, in an ear without a loss. Nothing of
+    pyclarity's where that was not installed.
     """
-    losses = {f"loss_{name}": float(frame[f"loss_{name}"].mean()) for name in SIMULATORS}
+    losses = {name: float(frame[name].mean()) for name in map("loss_{}".format, SIMULATORS) if name in frame}
     gaps = {
         f"{one}_to_{other}": losses[f"loss_{one}"] / least - 1.0
         if (least := losses[f"loss_{other}"])
         else None
         for one, other in (("neuro", "msbg"), ("neuro", "pyclarity"), ("msbg", "pyclarity"))
+        if f"loss_{other}" in losses
     }
+    if "loss_pyclarity" not in losses:
+        return {**losses, **gaps}
     known = frame[frame.loss_pyclarity != 0.0]
     median = (known.loss_neuro / known.loss_pyclarity - 1.0).abs().median()
     return {**losses, **gaps, "item_median": float(median) if len(known) else None}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from importlib.util import find_spec
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -12,16 +13,16 @@ from torch import nn
 
 from compensators.nalr import NALR
 from hlsim.audiogram import Audiogram, as_thresholds
-from hlsim.evaluation.compensator_result import compensator_result
+from hlsim.evaluation.compensator_result import MEASURES, compensator_result
 from hlsim.evaluation.gain_curves import gain_curves
 from hlsim.evaluation.haspi_report import HaspiReport
 from hlsim.evaluation.items import INPUT_LEVELS, Item, draw_judged_items, read_ears
-from hlsim.evaluation.judging import Judged, Keys, Trial, Unaided, judge
+from hlsim.evaluation.judging import EXACT, Judged, Keys, Trial, Unaided, judge
 from hlsim.evaluation.steadiness import shift_differences, steady_tones
 from hlsim.evaluation.store import ScoreStore, key_of, weights_hash
 from hlsim.extras import require
-from hlsim.metrics.pyclarity import check_seed
-from hlsim.metrics.registry import version_of, versions_of
+from hlsim.metrics.pair import check_seed
+from hlsim.metrics.registry import check_measures, measure_by, version_of, versions_of
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.parallel import Progress, check_parallel, make_missing
 from hlsim.pretrained import load_pretrained
@@ -53,6 +54,7 @@ def evaluate_compensators(
     audiogram: Audiogram | None = None,
     noise: str | Path | None = None,
     simulator: str | Path = "neuro-msbg",
+    engine: str = "hlsim",
     items: int = 400,
     seconds: float = 3.0,
     levels: Sequence[float] = INPUT_LEVELS,
@@ -66,7 +68,8 @@ def evaluate_compensators(
 
     Figures are stored as they are made, by the samples, the ear and the weights that they are of: a run that was
     stopped goes on where it was, one with a compensator more scores that one alone, and one with another simulator
-    computes the surrogate gap alone. What fails is listed with the reason under ``failures`` of the result.
+    computes the surrogate gap alone. Without pyclarity installed the gap under its
+    MSBG is left out. What fails is listed with the reason under ``failures`` of the result.
 
     Args:
         compensators: by name, modules at 16 kHz and 94 dB SPL full scale, called with a waveform and an ear. One with a
@@ -76,6 +79,7 @@ def evaluate_compensators(
         audiograms: CSV file of ears that join Bisgaard's N2 to N6 and S1 to S3.
         audiogram: one ear in place of all, also of the gain curves, for a compensator that was trained for it.
         simulator: the Neuro-MSBG of the surrogate gap, by name or folder.
+        engine: of HASPI and HASQI, see ``haspi_report``.
         items: how many in all. 400 give each main row 200 pairs.
         seconds: length of an item; HASPI is not to be trusted much under 3.
         levels: of the clean speech in dB SPL, in turn.
@@ -86,10 +90,10 @@ def evaluate_compensators(
 
     Raises:
         ValueError: data or settings that cannot be used, or no item could be judged.
-        MissingExtraError: pyclarity or joblib is not installed.
+        MissingExtraError: pandas, joblib or, for its engine, pyclarity is not installed.
     """
-    for module in ("clarity", "pandas"):
-        require(module, "eval")
+    require("pandas", "eval")
+    check_measures(MEASURES, engine)
     check_parallel(jobs, "loky", None)
     check_seed(seed)
     if items < 1 or not compensators or not levels:
@@ -114,8 +118,10 @@ def evaluate_compensators(
     curves = gain_curves(aided, shown, speech, levels, seed)  # first: what cannot be used shows at once
     steady = steady_tones(conditions, shown, levels)
     network = load_pretrained(simulator)
-    judged = _judge_all(drawn, conditions, network, seed, ScoreStore(store), jobs=jobs, progress=progress)
-    settings = {"items": items, "seconds": seconds, "seed": seed, "levels": [*levels]}
+    judged = _judge_all(
+        drawn, conditions, network, engine, seed, ScoreStore(store), jobs=jobs, progress=progress
+    )
+    settings = {"items": items, "seconds": seconds, "seed": seed, "engine": engine, "levels": [*levels]}
     settings |= {"ears": [name for name, _ in ears], "simulator": str(simulator)}
     # the peak in dB SPL that a compensator promises not to pass
     limits = {
@@ -133,6 +139,7 @@ def _judge_all(
     items: Sequence[Item],
     conditions: Mapping[str, nn.Module],
     simulator: nn.Module,
+    engine: str,
     seed: int,
     store: ScoreStore,
     *,
@@ -142,14 +149,19 @@ def _judge_all(
     """Each item's figures by condition, those from the store among them."""
     weights = {name: weights_hash(module) for name, module in conditions.items()}
     network = weights_hash(simulator)
-    versions = {**versions_of(["haspi", "hasqi"]), "hlsim": version_of("hlsim")}
+    # of pyclarity's MSBG, too
+    versions = {**versions_of(MEASURES, "pyclarity"), "hlsim": version_of("hlsim")}
+    # figures by pyclarity were stored when there was no other engine
+    revisions = {name: measure_by(engine, name).revision for name in MEASURES}
+    by = {} if engine == "pyclarity" else {"engine": engine, "revisions": revisions}
+    exact = EXACT if find_spec("clarity") else EXACT[:1]
     trials = []
     for number, item in enumerate(items):
         trial_seed = (seed + number) % 2**32
-        about = {"revision": _REVISION, "versions": versions, "seed": trial_seed, **item.settings()}
+        about = {"revision": _REVISION, "versions": versions, "seed": trial_seed, **item.settings(), **by}
         of = {name: {**about, "weights": weights[name]} for name in conditions}
         keys = {name: Keys(key_of(it), key_of({**it, "simulator": network})) for name, it in of.items()}
-        trials.append(Trial(item, conditions, simulator, trial_seed, keys))
+        trials.append(Trial(item, conditions, simulator, trial_seed, keys, engine, exact))
     if progress is not None:
         parallel["progress"] = lambda done, total: progress(done // 2, total // 2)  # both of an output
     failed = make_missing(
@@ -159,6 +171,7 @@ def _judge_all(
     def judged(keys: Keys) -> Judged:
         if reasons := [failed[key] for key in keys if key in failed]:
             return Judged(None, reasons[0])
-        return Judged(store.records[keys.most] | store.records[keys.of_network])
+        figures = store.records[keys.most] | store.records[keys.of_network]
+        return Judged({name: value for name, value in figures.items() if name != "engine"})
 
     return [{name: judged(keys) for name, keys in trial.keys.items()} for trial in trials]

@@ -45,6 +45,7 @@ class HaspiReport:
         extra: further keys for ``report.json`` beside the others, such as ``nalr_mean``; what JSON can hold.
         unit: what the items' listeners are called in sentences, such as ``ears``.
         ears: where the items are the better ears', each ear's.
+        engine: what computed HASPI and HASQI, see ``haspi_report``.
 
     Attributes:
         conditions: their names, in order, from the items' levels.
@@ -69,6 +70,7 @@ class HaspiReport:
     extra: Mapping[str, Any] = field(default_factory=dict)
     unit: str = "listeners"
     ears: Sequence[ItemScore] = ()
+    engine: str = "hlsim"
     conditions: Sequence[str] = field(init=False)
     comparisons: Sequence[Comparison] = field(init=False)
     headline: Comparison = field(init=False)
@@ -130,7 +132,8 @@ class HaspiReport:
     @property
     def versions(self) -> dict[str, str]:
         """Of the packages that the scores depend on."""
-        return {"hlsim": version_of("hlsim"), **versions_of(self.measures), "scipy": version_of("scipy")}
+        used = versions_of(self.measures, self.engine)
+        return {"hlsim": version_of("hlsim"), **used, "scipy": version_of("scipy")}
 
     def scores(self, measure: str, conditions: Sequence[str] | None = None) -> np.ndarray:
         """Scores by item and condition (all of them by default), NaN where there is none. Shape: (items, conditions)."""
@@ -180,6 +183,7 @@ class HaspiReport:
             "words": None if self.words is None else self.words._asdict(),
             "conditions": list(self.conditions),
             "measures": list(self.measures),
+            "engine": self.engine,
             "wilcoxon_zero_method": "wilcox",
             "bootstrap": {"resamples": RESAMPLES, "method": "expanded percentile", "seed": 0},
             **{name: getattr(self, name) for name in (*facts, "versions", "note")},
@@ -200,6 +204,7 @@ def haspi_report(
     manifest: str | Path | None = None,
     root: str | Path | None = None,
     measures: Iterable[str] = ("haspi",),
+    engine: str = "hlsim",
     baseline: str | None = None,
     better_ear: bool = False,
     store: str | Path | None = None,
@@ -219,6 +224,8 @@ def haspi_report(
         audiogram, audiograms: the ear of all files or a CSV file of ears, as in ``read_folders`` and ``read_manifest``.
         manifest, root: in place of the folders, a CSV file with a row a file, see ``hlsim.evaluation.inputs``.
         measures: of ``haspi``, ``hasqi``, ``stoi``, ``pesq``; the first is the headline's.
+        engine: of HASPI and HASQI: ``"hlsim"``, which computes what pyclarity 0.9.0 does under the same seed, a rate of
+            44.1 kHz taken as 44 with it, and is equal to 1e-7; or ``"pyclarity"`` itself, slower, to check.
         baseline: the condition that comes first and that all others are compared with; by default the manifest's first
             comes first, and all are compared with each other.
         better_ear: of a manifest with both ears of each utterance, the better ear's scores are the items'.
@@ -232,9 +239,9 @@ def haspi_report(
     Raises:
         ValueError: names differ between the folders, a manifest's row is wrong, a file has no audiogram, settings
             contradict each other, an ear lacks, or no item could be scored.
-        MissingExtraError: a measure's package, joblib or distributed is not installed.
+        MissingExtraError: a measure's or the engine's package, joblib or distributed is not installed.
     """
-    names = check_measures(measures)
+    names = check_measures(measures, engine)
     check_full_scale(full_scale_spl if spl is None else spl)
     if audiogram is not None and not isinstance(audiogram, Audiogram):
         raise ValueError(
@@ -259,7 +266,7 @@ def haspi_report(
         if baseline not in conditions:
             raise ValueError(f"no condition {baseline!r}; allowed: {', '.join(conditions)}")
         conditions = [baseline, *(name for name in conditions if name != baseline)]
-    scored = score_items(items, names, store=ScoreStore(store), seed=seed, **running)
+    scored = score_items(items, names, engine=engine, store=ScoreStore(store), seed=seed, **running)
     pairs = [*zip(items, scored, strict=True)]
     failures = [
         Failure(item.name, condition, measure, str(result.reason))
@@ -273,7 +280,7 @@ def haspi_report(
         raise ValueError(f"none of {len(items)} items could be scored{reasons}")
     ears = scores if better_ear else []
     scores = better_ears(scores) if better_ear else scores
-    return HaspiReport(scores, names, seed, failures, baseline, ears=ears)
+    return HaspiReport(scores, names, seed, failures, baseline, ears=ears, engine=engine)
 
 
 def _item_score(

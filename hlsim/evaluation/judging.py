@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -14,15 +14,15 @@ from hlsim.audiogram import Audiogram
 from hlsim.calibration import PASCAL_SPL, level_spl
 from hlsim.criteria.bands import audibility, band_level_loss, band_levels, least_audible
 from hlsim.evaluation.items import Item
-from hlsim.metrics.pyclarity import haspi, hasqi
 from hlsim.metrics.reference import pyclarity_msbg
+from hlsim.metrics.registry import measure_by
 from hlsim.msbg import MSBG
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.parallel import Failed, one_thread, reason_of
 
 EXACT = ("msbg", "pyclarity")
 SIMULATORS = ("neuro", *EXACT)
-"""Under which a compensator's loss is told: the named network, hlsim's exact MSBG, pyclarity's."""
+"""Under which a compensator's loss is told: the named network, hlsim's exact MSBG, pyclarity's where it is installed."""
 
 OF_NETWORK = "loss_neuro"
 """The figure that depends on the named network; no other does."""
@@ -49,7 +49,8 @@ class Trial:
     """An item to be judged as each compensator gives it.
 
     The compensators, by name, and the network are at 16 kHz and 94 dB SPL full scale; ``seed``, the same for all, is of
-    the noise that HASPI and HASQI add; ``keys`` are the figures', by compensator.
+    the noise that HASPI and HASQI add; ``keys`` are the figures', by compensator. ``engine`` computes HASPI and HASQI;
+    ``exact`` are those of ``EXACT`` that the loss is told under.
     """
 
     item: Item
@@ -57,6 +58,8 @@ class Trial:
     simulator: nn.Module
     seed: int
     keys: Mapping[str, Keys]
+    engine: str = "hlsim"
+    exact: Sequence[str] = EXACT
 
 
 class Judged(NamedTuple):
@@ -68,8 +71,8 @@ class Judged(NamedTuple):
 
 @one_thread()
 @torch.no_grad()
-def judge(trial: Trial, missing: Sequence[str]) -> dict[str, dict[str, float] | Failed]:
-    """The figures whose keys are missing; what goes wrong is the reason.
+def judge(trial: Trial, missing: Sequence[str]) -> dict[str, dict[str, Any] | Failed]:
+    """The figures whose keys are missing, and with most of them the ``engine``; what goes wrong is the reason.
 
     - ``haspi``, ``hasqi``: v2, of the output against the clean speech, in noise too.
     - ``level``, ``peak``: of the output, RMS and largest sample in dB SPL (a sample of 1.0 is 94).
@@ -83,22 +86,26 @@ def judge(trial: Trial, missing: Sequence[str]) -> dict[str, dict[str, float] | 
     try:
         normal = {"neuro": _hear(trial, "neuro", item.clean, NORMAL)}
         if any(keys.most in missing for keys in trial.keys.values()):
-            normal |= {name: _hear(trial, name, item.clean, NORMAL) for name in EXACT}
+            normal |= {name: _hear(trial, name, item.clean, NORMAL) for name in trial.exact}
             normal["msbg, of the input"] = _hear(trial, "msbg", item.signal, NORMAL)
     except Exception as error:  # whatever it is, it is this item's reason, and the others go on
         return dict.fromkeys(missing, Failed(reason_of(error)))
-    made: dict[str, dict[str, float] | Failed] = {}
+    made: dict[str, dict[str, Any] | Failed] = {}
     for name, keys in trial.keys.items():
         if not (wanted := set(keys) & set(missing)):
             continue
         try:
             aided = trial.compensators[name](item.signal, item.ear)
-            records = {keys.most: _figures(trial, aided, normal)} if keys.most in wanted else {}
+            records: dict[str, dict[str, Any]] = {}
+            if keys.most in wanted:
+                records[keys.most] = _figures(trial, aided, normal)
             of_network = _loss(_hear(trial, "neuro", aided, item.ear), normal["neuro"])
             records[keys.of_network] = {OF_NETWORK: of_network}
             figures = {figure: value for record in records.values() for figure, value in record.items()}
             if unknown := [figure for figure, value in figures.items() if not math.isfinite(value)]:
                 raise ValueError(f"{', '.join(unknown)}: not finite")
+            if keys.most in wanted:
+                records[keys.most] |= {"engine": trial.engine}
             made |= records
         except Exception as error:
             made |= dict.fromkeys(wanted, Failed(reason_of(error)))
@@ -108,11 +115,9 @@ def judge(trial: Trial, missing: Sequence[str]) -> dict[str, dict[str, float] | 
 def _figures(trial: Trial, aided: Tensor, normal: Mapping[str, Tensor]) -> dict[str, float]:
     """All but ``OF_NETWORK``."""
     item = trial.item
-    scores = {
-        name: measure(item.clean, aided, item.ear, NEURO_RATE, full_scale_spl=PASCAL_SPL, seed=trial.seed)
-        for name, measure in (("haspi", haspi), ("hasqi", hasqi))
-    }
-    heard = {name: _hear(trial, name, aided, item.ear) for name in EXACT}
+    of_pair = (item.clean, aided, item.ear, NEURO_RATE, PASCAL_SPL, trial.seed)
+    scores = {name: measure_by(trial.engine, name).score(*of_pair) for name in ("haspi", "hasqi")}
+    heard = {name: _hear(trial, name, aided, item.ear) for name in trial.exact}
     return {
         **scores,
         "level": float(level_spl(aided)),
@@ -121,7 +126,7 @@ def _figures(trial: Trial, aided: Tensor, normal: Mapping[str, Tensor]) -> dict[
         "normal": float(level_spl(normal["msbg, of the input"])),
         "normal_clean": float(level_spl(normal["msbg"])),
         "band_error": band_error_db(heard["msbg"], normal["msbg"]),
-        **{f"loss_{name}": _loss(heard[name], normal[name]) for name in EXACT},
+        **{f"loss_{name}": _loss(heard[name], normal[name]) for name in trial.exact},
     }
 
 

@@ -20,13 +20,11 @@ from hlsim.audio import read_audio
 from hlsim.audiogram import Audiogram
 from hlsim.calibration import check_full_scale, dbfs
 from hlsim.evaluation.store import ScoreStore, content_hash, key_of
-from hlsim.metrics.pyclarity import Signal, check_seed, haspi
-from hlsim.metrics.registry import MEASURES, check_measures, versions_of
-from hlsim.parallel import Failed, Progress, check_parallel, make_missing, reason_of
+from hlsim.metrics.pair import Signal, check_seed
+from hlsim.metrics.registry import check_measures, measure_by, versions_of
+from hlsim.parallel import Failed, Progress, check_parallel, make_missing, one_thread, reason_of
 
 EARS = ("left", "right")
-
-_REVISION = 1  # of how hlsim calls the measures: raise it where that changes a score
 
 
 @dataclass(frozen=True)
@@ -76,6 +74,7 @@ class FileTask(NamedTuple):
     item: FileItem
     condition: str
     measure: str
+    engine: str
     seed: int
     key: str
 
@@ -88,6 +87,7 @@ def score_items(
     items: Sequence[FileItem],
     measures: Iterable[str] = ("haspi",),
     *,
+    engine: str = "hlsim",
     store: ScoreStore | None = None,
     seed: int = 0,
     jobs: int | None = None,
@@ -97,29 +97,30 @@ def score_items(
 ) -> Results:
     """Score every item by every measure under every condition; the same whatever the number of processes.
 
-    A score is known by the contents of both files, the measure, the versions of what computes it and, where they
+    A score is known by the contents of both files, the measure, what computes it in which version and, where they
     matter, the audiogram, the level settings and the seed; known ones are not made again. An item's seed is ``seed``
     plus the first 32 bits of the SHA-256 of its clean file, modulo 2 ** 32: the same under every condition, whatever
     other files there are. What is wrong with an item is its reason in place of a score, no error; that is not stored, but
     tried again.
 
     Args:
+        engine: of HASPI and HASQI, see ``haspi_report``.
         store: scores made earlier, to which new ones go; None keeps nothing.
         jobs, backend, scheduler: as ``run_parallel``, which raises what is wrong with them.
         progress: called with the number of scores there and of all: first where some were stored, and after each new one.
 
     Raises:
-        ValueError: an unknown measure, a seed that numpy does not take, or the store cannot be written.
+        ValueError: an unknown measure or engine, a seed that numpy does not take, or the store cannot be written.
         MissingExtraError: a measure's package is not installed.
     """
     check_seed(seed)
     check_parallel(jobs, backend, scheduler)
-    names = check_measures(measures)
+    names = check_measures(measures, engine)
     store = ScoreStore() if store is None else store
     results: Results = [{} for _ in items]
     places: list[tuple[int, FileTask]] = []
     hashes = cache(content_hash)
-    versions = {name: versions_of([name]) for name in names}
+    about_measures = {name: _about(name, engine) for name in names}
     for index, item in enumerate(items):
         scale = {"full_scale_spl": item.full_scale_spl if item.spl is None else None, "spl": item.spl}
         for condition, path in item.processed.items():
@@ -131,9 +132,9 @@ def score_items(
             item_seed = (seed + int(files["clean"][:8], 16)) % 2**32
             of_an_ear = {"audiogram": list(item.audiogram.thresholds), **scale, "seed": item_seed}
             for name in names:
-                about = {"revision": _REVISION, "measure": name, "versions": versions[name], **files}
-                key = key_of(about | (of_an_ear if MEASURES[name].of_an_ear else {}))
-                places.append((index, FileTask(item, condition, name, item_seed, key)))
+                about = about_measures[name] | files
+                key = key_of(about | (of_an_ear if measure_by(engine, name).of_an_ear else {}))
+                places.append((index, FileTask(item, condition, name, engine, item_seed, key)))
     counts = Counter(task.key for _, task in places)  # the same score may be wanted twice
     failed = make_missing(
         score_task,
@@ -153,9 +154,19 @@ def score_items(
     return results
 
 
+def _about(name: str, engine: str) -> dict[str, Any]:
+    """What computes a measure, for its scores' keys."""
+    measure = measure_by(engine, name)
+    about = {"revision": measure.revision, "measure": name, "versions": versions_of([name], engine)}
+    # scores by pyclarity were stored when there was no other engine
+    return about | ({"engine": "hlsim"} if measure.engine == "hlsim" else {})
+
+
+@one_thread()
 def score_task(task: FileTask, _: Sequence[str] = ()) -> dict[str, dict[str, Any] | Failed]:
     """One score by its key; what goes wrong is the reason."""
     item, processed = task.item, task.item.processed[task.condition]
+    measure = measure_by(task.engine, task.measure)
     try:
         (clean, rate), (heard, other) = (read_channel(path, item.ear) for path in (item.clean, processed))
         if other != rate:
@@ -166,11 +177,12 @@ def score_task(task: FileTask, _: Sequence[str] = ()) -> dict[str, dict[str, Any
             )
         levels = [float(dbfs(torch.from_numpy(signal))) for signal in (clean, heard)]
         full_scale = check_full_scale(item.full_scale(levels[0]))
-        score = MEASURES[task.measure].score(clean, heard, item.audiogram, rate, full_scale, task.seed)
+        score = measure.score(clean, heard, item.audiogram, rate, full_scale, task.seed)
     except Exception as error:  # whatever it is, it is this item's reason, and the others go on
         return {task.key: Failed(reason_of(error))}
     result = Result(score, None, task.seed, rate, len(clean) / rate, *levels)
     about = {"file": item.name, "condition": task.condition, "measure": task.measure}
+    about |= {"engine": measure.engine} if measure.engine else {}
     return {task.key: about | result._asdict()}
 
 
@@ -211,6 +223,7 @@ class HaspiItem:
 def haspi_many(
     items: Sequence[HaspiItem],
     *,
+    engine: str = "hlsim",
     full_scale_spl: float = 94.0,
     seed: int = 0,
     jobs: int | None = None,
@@ -218,14 +231,15 @@ def haspi_many(
 ) -> list[float]:
     """HASPI of many items in parallel processes (``jobs``; None takes all cores), the same whatever their number.
 
-    Item i, counted from 0, takes ``seed`` + i unless it brings one; ``progress`` is called after each score. What
-    ``haspi`` raises begins with the item's processed file or its place in the list.
+    Item i, counted from 0, takes ``seed`` + i unless it brings one; ``progress`` is called after each score; ``engine``
+    is that of ``haspi_report``. The ValueError of an item without a score begins with its processed file or its place.
     """
+    check_measures(["haspi"], engine)
     check_parallel(jobs, "loky", None)
     check_seed(seed)
     store = ScoreStore()
     tasks = [
-        (str(i), item, full_scale_spl, (seed + i) % 2**32 if item.seed is None else item.seed)
+        (str(i), item, engine, full_scale_spl, (seed + i) % 2**32 if item.seed is None else item.seed)
         for i, item in enumerate(items)
     ]
     jobs = 1 if len(items) < 2 else jobs
@@ -235,8 +249,11 @@ def haspi_many(
     return [store.records[str(i)]["score"] for i in range(len(items))]
 
 
-def _score_item(task: tuple[str, HaspiItem, float, int], _: Sequence[str]) -> dict[str, dict[str, float]]:
-    key, item, full_scale_spl, seed = task
+@one_thread()
+def _score_item(
+    task: tuple[str, HaspiItem, str, float, int], _: Sequence[str]
+) -> dict[str, dict[str, float]]:
+    key, item, engine, full_scale_spl, seed = task
     try:
         signals = [
             read_channel(signal) if isinstance(signal, str | Path) else (signal, item.sample_rate)
@@ -247,7 +264,8 @@ def _score_item(task: tuple[str, HaspiItem, float, int], _: Sequence[str]) -> di
             raise ValueError("no sample_rate; signals that are not files need one")
         if rate != reference_rate:
             raise ValueError(f"rate {rate} Hz, its reference has {reference_rate}; allowed: equal rates")
-        score = haspi(reference, processed, item.audiogram, rate, full_scale_spl=full_scale_spl, seed=seed)
+        measure = measure_by(engine, "haspi")
+        score = measure.score(reference, processed, item.audiogram, rate, full_scale_spl, seed)
     except ValueError as error:
         name = item.processed if isinstance(item.processed, str | Path) else f"item {key}"
         raise ValueError(f"{name}: {error}") from error

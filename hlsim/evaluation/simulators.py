@@ -113,8 +113,8 @@ def evaluate_simulators(
     require("pandas", "eval")  # to be known before hours of scoring
     drawn = draw_items(speech, noise, audiograms, items=items, seconds=seconds, seed=seed, levels=levels)
     scored = ScoreStore(store)
-    # haspi's for pyclarity's, whose MSBG is the truth
-    versions = {**versions_of(["stoi", "pesq", "haspi"]), "hlsim": version_of("hlsim")}
+    own = {name: version_of(name) for name in ("pyclarity", "hlsim")}  # whose MSBG is the truth
+    versions = {**versions_of(["stoi", "pesq"]), **own}
     settings = {"teacher": teacher, "revision": _REVISION, "versions": versions}
     weights = {name: weights_hash(simulator) for name, simulator in simulators.items()}
     tasks = []

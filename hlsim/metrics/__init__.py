@@ -5,12 +5,12 @@ from typing import Any
 from hlsim.metrics.haspi import HaspiReference, haspi
 from hlsim.metrics.hasqi import HasqiParts, HasqiReference, hasqi
 
-__all__ = ["HASPI", "HaspiReference", "HasqiParts", "HasqiReference", "haspi", "hasqi"]
+__all__ = ["HASPI", "HASQI", "HaspiReference", "HasqiParts", "HasqiReference", "haspi", "hasqi"]
 
 
 def __getattr__(name: str) -> Any:
-    if name == "HASPI":  # torchmetrics is an extra
-        from hlsim.metrics.torchmetric import HASPI
+    if name in ("HASPI", "HASQI"):  # torchmetrics is an extra
+        from hlsim.metrics import torchmetric
 
-        return HASPI
+        return getattr(torchmetric, name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -15,7 +15,7 @@ from hlsim.checks import Lengths, check_lengths, check_rate, check_waveform
 from hlsim.metrics import ear_input
 from hlsim.metrics.ear_model import CHANNELS, Extent
 from hlsim.metrics.ear_recursions import middle_ear
-from hlsim.metrics.pyclarity import LOWEST_REFERENCE_SPL, SHORTEST_SECONDS
+from hlsim.metrics.pair import LOWEST_REFERENCE_SPL, SHORTEST_SECONDS
 
 _TOGETHER = 2**27  # samples of all channels that a GPU works on at once
 

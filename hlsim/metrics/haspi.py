@@ -33,7 +33,7 @@ from hlsim.metrics import ear_model
 from hlsim.metrics import envelope_modulation as envelopes
 from hlsim.metrics.clean_speech import CleanItem, CleanSpeech
 from hlsim.metrics.ear_model import CHANNELS, Extent
-from hlsim.metrics.pyclarity import check_seed
+from hlsim.metrics.pair import check_seed
 from hlsim.torchtools import constant
 
 Noise = Literal["expected", "seeded", "none"]

@@ -27,7 +27,7 @@ def pyclarity_msbg(waveform: Tensor, audiogram: Audiogram, sample_rate: int) -> 
 
     Shape: (time,) -> (time,), float64.
     """
-    msbg, utils = (require(f"clarity.evaluator.msbg.{name}", "eval") for name in ("msbg", "msbg_utils"))
+    msbg, utils = (require(f"clarity.evaluator.msbg.{name}", "pyclarity") for name in ("msbg", "msbg_utils"))
     ear = msbg.Ear()  # RMS 1.0 is 120 dB SPL
     logging.disable(logging.WARNING)
     try:

@@ -1,41 +1,71 @@
-"""The measures that a report can hold: HASPI v2, HASQI v2, STOI and PESQ, each by the library that defines it."""
+"""The measures that a report can hold: HASPI v2 and HASQI v2, by hlsim or by pyclarity, and STOI and PESQ."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from functools import partial
 from importlib import metadata
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-import numpy as np
+import torch
+from torch import Tensor
 
 import hlsim
 from hlsim.audiogram import Audiogram
 from hlsim.checks import refuse_unknown
 from hlsim.extras import require
 from hlsim.metrics import fidelity
+from hlsim.metrics.haspi import haspi
+from hlsim.metrics.hasqi import hasqi
+from hlsim.metrics.pair import Signal, check_pair
 from hlsim.metrics.pyclarity import pyclarity_score
+
+ENGINES = ("hlsim", "pyclarity")
+"""What computes HASPI and HASQI: hlsim in torch, with pyclarity's figures, or pyclarity itself."""
 
 
 class Measure(NamedTuple):
     """How a measure is named and computed.
 
-    ``module`` must be installed (extra ``eval``), and scores depend on the versions of ``packages``. Whether audiogram,
-    level and seed change the score is ``of_an_ear``: STOI and PESQ compare the signal at the ear with the clean speech,
-    and do not say what is heard. ``rewards_gain``: more level alone brings a higher score. ``score`` is of (clean,
-    processed, audiogram, rate in Hz, full_scale_spl, seed), and raises ValueError where there is none.
+    ``needs``, a module and its extra, must be installed, and scores depend on the versions of ``packages`` and on the
+    ``revision`` of hlsim's part: to be raised where that changes a score. Whether audiogram, level and seed change it is
+    ``of_an_ear``: STOI and PESQ compare the signal at the ear with the clean speech, and do not say what is heard.
+    ``rewards_gain``: more level alone brings a higher score. ``score`` is of (clean, processed, audiogram, rate in Hz,
+    full_scale_spl, seed), and raises ValueError where there is none. ``engine`` is the one of ``ENGINES`` that computes
+    it, empty where there is no choice.
     """
 
     title: str
-    module: str
+    needs: tuple[str, str] | None
     packages: tuple[str, ...]
     of_an_ear: bool
     rewards_gain: bool
-    score: Callable[[np.ndarray, np.ndarray, Audiogram, int, float, int], float]
+    score: Callable[[Signal, Signal, Audiogram, int, float, int], float]
+    engine: str = ""
+    revision: int = 1
+
+
+def _of_ear(
+    score: Callable[..., Tensor],
+    clean: Signal,
+    processed: Signal,
+    ear: Audiogram,
+    rate: int,
+    full_scale_spl: float,
+    seed: int,
+) -> float:
+    """``haspi`` or ``hasqi`` with pyclarity's noise and its rates in whole kHz.
+
+    In double precision: single precision takes half the time, but may align a channel by another sample.
+    """
+    reference, given = map(torch.from_numpy, check_pair(clean, processed, rate, full_scale_spl))
+    options: dict[str, Any] = {"sample_rate": rate, "full_scale_spl": full_scale_spl, "seed": seed}
+    with torch.no_grad():
+        return float(score(given, reference, ear, **options, noise="seeded", whole_khz=True))
 
 
 def _of_signals(
-    name: str, clean: np.ndarray, processed: np.ndarray, ear: Audiogram, rate: int, *level_and_seed: float
+    name: str, clean: Signal, processed: Signal, ear: Audiogram, rate: int, *level_and_seed: float
 ) -> float:
     """``stoi`` or ``pesq_wb`` of ``fidelity``, of the signal at the ear."""
     value, reason = getattr(fidelity, name)(clean, processed, rate)
@@ -44,35 +74,52 @@ def _of_signals(
     return float(value)
 
 
-_CLARITY = ("pyclarity", "numpy", "scipy")
+# numpy draws the noise
+_HASPI = Measure("HASPI", None, ("numpy",), True, True, partial(_of_ear, haspi), "hlsim")
+_HASQI = Measure("HASQI", None, ("numpy",), True, False, partial(_of_ear, hasqi), "hlsim")
+_STOI, _PESQ = ("pystoi", "numpy", "scipy"), ("pesq", "numpy", "torchaudio")
 
 MEASURES = {
-    "haspi": Measure("HASPI", "clarity", _CLARITY, True, True, partial(pyclarity_score, "haspi")),
-    "hasqi": Measure("HASQI", "clarity", _CLARITY, True, False, partial(pyclarity_score, "hasqi")),
-    "stoi": Measure(
-        "STOI", "pystoi", ("pystoi", "numpy", "scipy"), False, False, partial(_of_signals, "stoi")
-    ),
-    "pesq": Measure(
-        "PESQ", "pesq", ("pesq", "numpy", "torchaudio"), False, False, partial(_of_signals, "pesq_wb")
-    ),
+    "haspi": _HASPI,
+    "hasqi": _HASQI,
+    "stoi": Measure("STOI", ("pystoi", "eval"), _STOI, False, False, partial(_of_signals, "stoi")),
+    "pesq": Measure("PESQ", ("pesq", "eval"), _PESQ, False, False, partial(_of_signals, "pesq_wb")),
 }
 """By the names that options and files use. Higher is better in all: HASPI, HASQI and STOI end at 1, PESQ at 4.64."""
 
+_PYCLARITYS = {
+    name: measure._replace(
+        needs=("clarity", "pyclarity"),
+        packages=("pyclarity", "numpy", "scipy"),
+        score=partial(pyclarity_score, name),
+        engine="pyclarity",
+    )
+    for name, measure in (("haspi", _HASPI), ("hasqi", _HASQI))
+}
 
-def check_measures(names: Iterable[str]) -> tuple[str, ...]:
+
+def measure_by(engine: str, name: str) -> Measure:
+    """A measure of ``MEASURES``; HASPI and HASQI by this engine."""
+    return _PYCLARITYS.get(name, MEASURES[name]) if engine == "pyclarity" else MEASURES[name]
+
+
+def check_measures(names: Iterable[str], engine: str = "hlsim") -> tuple[str, ...]:
     """The names, each once, or ValueError with those that are allowed; MissingExtraError where a package lacks."""
     chosen = tuple(dict.fromkeys(names))
     refuse_unknown(chosen, MEASURES, "measures")
     if not chosen:
         raise ValueError(f"no measure; allowed: {', '.join(MEASURES)}")
+    if engine not in ENGINES:
+        raise ValueError(f"engine {engine!r}; allowed: {', '.join(ENGINES)}")
     for name in chosen:
-        require(MEASURES[name].module, "eval")
+        if needs := measure_by(engine, name).needs:
+            require(*needs)
     return chosen
 
 
-def versions_of(names: Iterable[str]) -> dict[str, str]:
+def versions_of(names: Iterable[str], engine: str = "hlsim") -> dict[str, str]:
     """Versions of the packages that the scores of these measures depend on."""
-    packages = dict.fromkeys(package for name in names for package in MEASURES[name].packages)
+    packages = dict.fromkeys(package for name in names for package in measure_by(engine, name).packages)
     return {package: version_of(package) for package in packages}
 
 

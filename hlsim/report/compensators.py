@@ -16,6 +16,7 @@ from hlsim.evaluation.compensator_result import HARD
 from hlsim.evaluation.gain_curves import UTTERANCES
 from hlsim.evaluation.haspi_report import GAIN_NOTE, HaspiReport
 from hlsim.evaluation.steadiness import DELAYS
+from hlsim.report.haspi import scored_by
 from hlsim.report.page import Picture, Section, render_markdown, render_page, write_files
 from hlsim.report.pictures import draw_svg, frequency_axis, plain, report_pictures
 from hlsim.report.tables import Table, cells, change_name, number, paired_cells, spread
@@ -45,10 +46,11 @@ def _lead(result: Result) -> str:
     levels = ", ".join(f"{level:g}" for level in result["levels"])
     # few items do not come to every ear
     ears = len({row["name"] for row in (*result["rows"], *result["failures"])})
+    made_by = scored_by(result["engine"], result["versions"])
     about = (
         f"{result['items']} items of {result['seconds']:g} s, {ears} ears in turn, speech at {levels} "
-        f"dB SPL in turn, seed {result['seed']}: {', '.join(result['limits'])}. HASPI v2 and HASQI v2 are pyclarity's, "
-        "against the clean speech, in noise too."
+        f"dB SPL in turn, seed {result['seed']}: {', '.join(result['limits'])}. HASPI v2 and HASQI v2, {made_by}, "
+        "are against the clean speech, in noise too."
     )
     return " ".join([*result["notes"], about])
 
@@ -72,7 +74,7 @@ def _sections(result: Result, reports: Mapping[str, HaspiReport]) -> list[Sectio
     sections += [
         Section("As loud as a normal ear hears it?", [_LOUDNESS], loudness),
         Section("By degree of loss", [_HASQI], by_severity),
-        Section("The surrogate gap", [_GAP.format(**result)], [_gap_table(result)]),
+        _gap_section(result),
         Section("Does any output pass the limit?", (), [_peak_table(result)]),
         Section("Gain curves", [_GAINS], [_gain_table(curves)], gains),
         Section("Steady tones", [_STEADY], [tone_table(result["steady_tones"])]),
@@ -100,6 +102,9 @@ _HASQI = (
 _GAP = (
     "The loss is that of HearingLossLoss with the criterion bands, of the outputs above, with the Neuro-MSBG "
     "{simulator}. A compensator that has learned to fool the network has a lower loss under it than under the others."
+)
+_NO_PYCLARITY = (
+    " pyclarity was not installed (pip install 'hlsim[pyclarity]'): the loss under its MSBG is left out."
 )
 _GAINS = (
     f"Power out over power in, in ERB-wide bands, of {UTTERANCES} clips of speech. A linear prescription has one "
@@ -212,12 +217,19 @@ def _severity_table(result: Result, group: str) -> Table:
     return Table.of(f"{GROUPS[group]}, by degree of loss", rows)
 
 
+def _gap_section(result: Result) -> Section:
+    table = _gap_table(result)
+    unknown = "" if "pyclarity" in table.header else _NO_PYCLARITY
+    return Section("The surrogate gap", [_GAP.format(**result) + unknown], [table])
+
+
 def _gap_table(result: Result) -> Table:
     rows = []
     for group, conditions in result["gap"].items():
         for name, row in conditions.items():
-            gaps = {title: cell.replace("%", " %") for title, cell in cells(row, _GAPS).items()}
-            rows.append({_GIVEN: f"{group}, {name}", **cells(row, _LOSSES), **gaps})
+            columns = {title: column for title, column in (_LOSSES | _GAPS).items() if column[0] in row}
+            found = {title: cell.replace("%", " %") for title, cell in cells(row, columns).items()}
+            rows.append({_GIVEN: f"{group}, {name}", **found})
     return Table.of("Mean loss in dB on the same utterances, and relative differences", rows)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from hlsim.audiogram import SEVERITIES
@@ -105,6 +105,12 @@ def _in_words_understood(words: WordsChange) -> str:
     )
 
 
+def scored_by(engine: str, versions: Mapping[str, str]) -> str:
+    """What computed HASPI and HASQI, of ``ENGINES``."""
+    made = f"by {engine} {versions[engine]}"
+    return made if engine == "pyclarity" else f"{made} as pyclarity 0.9 computes them"
+
+
 def _further(report: HaspiReport) -> list[Table]:
     listeners = listener_table(report.headline)
     tables = [] if listeners is None else [listeners]
@@ -136,7 +142,12 @@ def _notes(report: HaspiReport) -> list[str]:
         scale = f"{report.full_scale_spl:g} dB SPL"
     mixed = report.headline.mixed
     versions = ", ".join(f"{name} {version}" for name, version in report.versions.items())
+    of_ear = [MEASURES[name].title for name in report.measures if MEASURES[name].engine]
+    engine = f"{' and '.join(of_ear)} (v2) {scored_by(report.engine, report.versions)}"
+    if any(item.sample_rate % 1000 for item in report.items):
+        engine += ", the rates rounded to whole kHz (44.1 to 44)"
     return [
+        *([f"{engine}."] if of_ear else []),
         f"Degrees of hearing loss: {ears}. {f'Listeners: {listeners}. ' if listeners else ''}"
         f"Clean speech at {report.clean_level_mean:.1f} dB SPL on average. A signal of RMS 1.0 is taken as {scale}.",
         "Changes are after minus before, so a gain is positive. Deviations with n - 1; tests two-sided; "

@@ -16,6 +16,7 @@ from hlsim.cli.options import Parser
 from hlsim.data.corpora import LAYOUTS
 from hlsim.data.plan_settings import PlanSettings
 from hlsim.data.teacher import ALIGNMENTS, TEACHERS
+from hlsim.metrics.registry import ENGINES
 from hlsim.parallel import BACKENDS
 
 
@@ -36,12 +37,12 @@ def test_names_that_are_written_twice_agree() -> None:
     assert choices("prepare", "--layout") == ("auto", *LAYOUTS)
     assert choices("prepare", "--teacher") == TEACHERS
     assert choices("prepare", "--alignment") == choices("draw-alignment", "--alignment") == ALIGNMENTS[:2]
+    assert choices("haspi-report", "--engine") == choices("evaluate-compensator", "--engine") == ENGINES
     assert choices("prepare", "--backend") == choices("haspi-report", "--backend") == BACKENDS
 
 
 def _parameters() -> dict[str, dict[str, Any]]:
     """Defaults by the names of the arguments that each command's functions take."""
-    pytest.importorskip("clarity")
     pytest.importorskip("lightning")
     from hlsim.benchmark.run import benchmark
     from hlsim.demo import demo

@@ -2,6 +2,7 @@
 
 import json
 import math
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,12 +29,13 @@ from hlsim.evaluation.judging import (
     peak_spl,
 )
 from hlsim.evaluation.statistics import paired_comparison
-from hlsim.metrics.pyclarity import haspi, hasqi
+from hlsim.metrics import registry
+from hlsim.metrics.pyclarity import pyclarity_score
 from hlsim.pretrained import find_checkpoint, save_checkpoint
 from hlsim.report.compensators import FILES, write_compensators
 
-pytest.importorskip("clarity")
 pytest.importorskip("matplotlib")
+pytest.importorskip("joblib")
 
 
 class Gain(nn.Module):
@@ -68,14 +70,16 @@ def ears_csv(tmp_path: Path) -> Path:
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """Scores of no meaning in place of HASPI and HASQI, the exact MSBG in pyclarity's, one tone: seconds, not minutes."""
 
-    def score(clean: Tensor, aided: Tensor, ear: Audiogram, rate: int, **options: Any) -> float:
+    def score(share: float, clean: Tensor, aided: Tensor, *ear_and_settings: Any) -> float:
         if not torch.isfinite(aided).all():
             raise ValueError("processed holds samples that are NaN or infinite")
-        return float(aided.abs().mean() / (aided.abs().mean() + 0.1))
+        return share * float(aided.abs().mean() / (aided.abs().mean() + 0.1))
 
     monkeypatch.setattr(steadiness, "TONES", (1000,))
-    monkeypatch.setattr(judging, "haspi", score)
-    monkeypatch.setattr(judging, "hasqi", lambda *signals, **options: 0.5 * score(*signals, **options))
+    for name, share in (("haspi", 1.0), ("hasqi", 0.5)):
+        measure = registry.MEASURES[name]._replace(score=partial(score, share))
+        monkeypatch.setitem(registry.MEASURES, name, measure)
+    monkeypatch.setattr(compensators, "find_spec", lambda module: True)
     monkeypatch.setattr(judging, "pyclarity_msbg", lambda x, ear, rate: MSBG(ear, sample_rate=rate)(x))
 
 
@@ -125,6 +129,7 @@ def test_speech_has_its_level_and_noise_comes_on_top(speech_dir: Path) -> None:
 
 
 def test_figures_are_those_of_the_measures_and_the_loss(speech_dir: Path) -> None:
+    pytest.importorskip("clarity")
     ear = Audiogram.standard("N3")
     (_, item) = draw_judged_items(
         speech_dir / "valid", speech_dir / "train", [("N3", ear)], items=2, seconds=0.8, seed=0
@@ -134,8 +139,10 @@ def test_figures_are_those_of_the_measures_and_the_loss(speech_dir: Path) -> Non
     judged, aided = judge(trial, ["most", "of network"]), NALR()(item.signal, ear)
     assert isinstance(judged["most"], dict) and [*judged["of network"]] == ["loss_neuro"]
     figures = judged["most"] | judged["of network"]
-    assert figures["haspi"] == haspi(item.clean, aided, ear, 16000, seed=7)
-    assert figures["hasqi"] == hasqi(item.clean, aided, ear, 16000, seed=7)
+    assert figures["engine"] == "hlsim"
+    for name in ("haspi", "hasqi"):
+        theirs = pyclarity_score(name, item.clean, aided, ear, 16000, seed=7)
+        assert figures[name] == pytest.approx(theirs, abs=1e-6)
     for name, simulator in (("neuro", neuro), ("msbg", "msbg")):
         loss = HearingLossLoss(ear, criterion="bands", simulator=simulator)
         assert figures[f"loss_{name}"] == pytest.approx(float(loss(aided, item.clean)), rel=1e-4)
@@ -315,6 +322,40 @@ def test_a_stopped_run_goes_on_and_new_weights_are_judged_anew(
             }
     assert whole["ears"] == ["55 55 55 65 70 75 80 80 dB HL"] and whole["groups"].keys() <= {"clean", "hard"}
     assert {curve["ear"] for curve in whole["gain_curves"]} == {*whole["ears"]}
+
+
+@pytest.mark.usefixtures("quick")
+def test_engines_are_kept_apart_and_without_pyclarity_its_gap_is_left_out(
+    tmp_path: Path, speech_dir: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    options: dict[str, Any] = {"speech": speech_dir / "valid", "items": 2, "seconds": 0.3, "jobs": 1}
+    options |= {"audiogram": Audiogram.standard("N4"), "out": tmp_path}
+    both = compare({"own": Gain()}, **options)
+    assert both["engine"] == "hlsim" and "HASQI v2, by hlsim " in (tmp_path / "compensators.md").read_text()
+    assert "neuro_to_pyclarity" in both["gap"]["clean"]["own"]
+
+    measured: list[str] = []
+    original = judging.measure_by
+    monkeypatch.setattr(
+        judging, "measure_by", lambda *by: (measured.append(by[0]), original("hlsim", by[1]))[1]
+    )
+    monkeypatch.setattr(compensators, "check_measures", lambda *names: None)
+    assert compare({"own": Gain()}, **options)["rows"] == both["rows"] and not measured
+    theirs = compare({"own": Gain()}, **options, engine="pyclarity")
+    assert {*measured} == {"pyclarity"} and theirs["rows"] == both["rows"] and theirs["engine"] == "pyclarity"
+
+    def missing(*signal: object) -> Tensor:
+        raise AssertionError("pyclarity's MSBG is not there")
+
+    monkeypatch.setattr(judging, "pyclarity_msbg", missing)
+    monkeypatch.setattr(compensators, "find_spec", lambda module: None)
+    monkeypatch.setattr(compensators, "version_of", lambda package: "other")  # as one that is not installed
+    without = compare({"own": Gain()}, **options)
+    gap = without["gap"]["clean"]["own"]
+    assert set(gap) == {"loss_neuro", "loss_msbg", "neuro_to_msbg"}
+    assert gap["loss_msbg"] == both["gap"]["clean"]["own"]["loss_msbg"]
+    text = (tmp_path / "compensators.md").read_text()
+    assert "pip install 'hlsim[pyclarity]'" in text and "Neuro to pyclarity" not in text
 
 
 class OneAtATime(Gain):

@@ -1,11 +1,11 @@
 """Reports of folders and of a manifest, from files to files."""
 
-import importlib
 import json
 import math
 import re
 import shutil
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -16,11 +16,12 @@ from hlsim.audio import read_audio, write_audio
 from hlsim.audiogram import Audiogram
 from hlsim.evaluation import HaspiReport, haspi_report
 from hlsim.evaluation.store import content_hash
-from hlsim.metrics.pyclarity import haspi
-from hlsim.report.haspi import write_report
+from hlsim.metrics import registry
+from hlsim.metrics.pyclarity import pyclarity_score
+from hlsim.report.haspi import markdown, write_report
 from hlsim.report.page import check_out
 
-for module in ("clarity", "joblib", "matplotlib"):
+for module in ("joblib", "matplotlib"):
     pytest.importorskip(module)
 
 N4 = Audiogram.standard("N4")
@@ -62,6 +63,7 @@ def signal(path: Path) -> Tensor:
 
 
 def test_folders_are_scored_one_by_one(corpus: Path) -> None:
+    pytest.importorskip("clarity")
     seen: list[tuple[int, int]] = []
     report = run(
         corpus,
@@ -81,8 +83,8 @@ def test_folders_are_scored_one_by_one(corpus: Path) -> None:
             ("after", item.after, item.after_level),
         ):
             heard = signal(corpus / folder / f"{item.file}.wav")
-            ours = haspi(clean, heard, N4, item.sample_rate, full_scale_spl=90.0, seed=item.seed)
-            assert score == pytest.approx(ours, abs=1e-12)
+            theirs = pyclarity_score("haspi", clean, heard, N4, item.sample_rate, 90.0, item.seed)
+            assert score == pytest.approx(theirs, abs=1e-6)
             assert level == pytest.approx(
                 90.0 + 10 * math.log10(float(heard.double().square().mean())), abs=1e-6
             )
@@ -93,6 +95,29 @@ def test_folders_are_scored_one_by_one(corpus: Path) -> None:
     assert json.loads((corpus / "out" / "report.json").read_text()) == report.to_dict()
 
 
+def test_both_engines_make_one_report(corpus: Path) -> None:
+    """At 16 and 22.05 kHz, which pyclarity takes as 22."""
+    pytest.importorskip("clarity")
+    store, measures = corpus / "scores.jsonl", ("haspi", "hasqi")
+    ours, theirs = (
+        run(corpus, measures=measures, engine=engine, store=store) for engine in ("hlsim", "pyclarity")
+    )
+    for measure in measures:
+        assert ours.scores(measure) == pytest.approx(theirs.scores(measure), abs=1e-6)
+    assert [report.to_dict()["engine"] for report in (ours, theirs)] == ["hlsim", "pyclarity"]
+    said = (
+        "(v2) by hlsim ",
+        f"(v2) by pyclarity {theirs.versions['pyclarity']}, the rates rounded to whole kHz",
+    )
+    for report, text in zip((ours, theirs), said, strict=True):
+        assert f"HASPI and HASQI {text}" in markdown(report)
+    assert "pyclarity" not in ours.versions
+    # each engine's own
+    assert store.read_text().count("\n") == 2 * 2 * 4
+    assert store.read_text().count('"engine": "hlsim"') == 2 * 4
+    assert run(corpus, measures=measures, engine="hlsim", store=store) == ours
+
+
 def test_audiograms_of_a_csv(corpus: Path) -> None:
     header = "file," + ",".join(N4.to_row())
     rows = {"a.b.wav": Audiogram.standard("S3"), "p2/c": N4, "not/here.flac": N4}
@@ -101,13 +126,9 @@ def test_audiograms_of_a_csv(corpus: Path) -> None:
     report = run(corpus, None, audiograms=corpus / "ears.csv")
     assert [item.audiogram for item in report.items] == [Audiogram.standard("S3"), N4]
     clean = signal(corpus / "clean" / "a.b.flac")
-    ours = haspi(
-        clean,
-        signal(corpus / "after" / "a.b.wav"),
-        Audiogram.standard("S3"),
-        16000,
-        seed=report.items[0].seed,
-    )
+    engine = registry.measure_by("hlsim", "haspi")
+    after = signal(corpus / "after" / "a.b.wav")
+    ours = engine.score(clean, after, Audiogram.standard("S3"), 16000, 94.0, report.items[0].seed)
     assert report.items[0].after == pytest.approx(ours, abs=1e-12)
 
 
@@ -165,14 +186,15 @@ def empty(corpus: Path) -> None:
 
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """pyclarity's HASPI replaced by one that takes no time; the list has an entry a call."""
+    """HASPI replaced by one that takes no time; the list has an entry a call."""
     calls: list[int] = []
 
-    def score(*_: object, **__: object) -> tuple[float, None]:
+    def score(*_: object, **__: object) -> float:
         calls.append(1)
-        return 0.25 + 0.5 * (len(calls) % 2), None
+        return 0.25 + 0.5 * (len(calls) % 2)
 
-    monkeypatch.setattr(importlib.import_module("clarity.evaluator.haspi"), "haspi_v2", score)
+    measure = registry.MEASURES["haspi"]._replace(score=partial(registry._of_ear, score))
+    monkeypatch.setitem(registry.MEASURES, "haspi", measure)
     return calls
 
 

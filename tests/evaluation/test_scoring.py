@@ -8,6 +8,8 @@ import sys
 import threading
 import time
 from dataclasses import replace
+from functools import partial
+from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
@@ -17,15 +19,16 @@ import torch
 from hlsim.audio import read_audio, write_audio
 from hlsim.audiogram import FREQUENCIES, Audiogram
 from hlsim.evaluation.scoring import FileItem, HaspiItem, Results, haspi_many, score_items
-from hlsim.evaluation.store import ScoreStore, content_hash
+from hlsim.evaluation.store import ScoreStore, content_hash, key_of
 from hlsim.metrics import registry as measures_module
-from hlsim.metrics.pyclarity import haspi
+from hlsim.metrics.pyclarity import pyclarity_score
 
 for module in ("clarity", "joblib", "pystoi", "pesq"):
     pytest.importorskip(module)
 
 N3 = Audiogram.standard("N3")
 ALL = ("haspi", "hasqi", "stoi", "pesq")
+haspi = partial(pyclarity_score, "haspi")
 
 
 @pytest.fixture
@@ -66,7 +69,11 @@ def test_equal_the_libraries_called_one_by_one(items: list[FileItem]) -> None:
     from clarity.utils.audiogram import Audiogram as ClarityAudiogram
 
     item = replace(items[0], full_scale_spl=91.0, processed={"noisy": items[0].processed["noisy"]})
-    results = score_items([item], ALL, seed=11, jobs=1)[0]
+    store = ScoreStore()
+    results, pyclaritys = (
+        score_items([item], ALL, seed=11, jobs=1, engine=engine, store=store)[0]
+        for engine in ("hlsim", "pyclarity")
+    )
     assert set(results) == {(measure, condition) for measure in ALL for condition in ("noisy",)}
     ear = ClarityAudiogram(levels=np.array(N3.levels), frequencies=np.array(FREQUENCIES))
     clean = samples(item.clean)
@@ -81,10 +88,37 @@ def test_equal_the_libraries_called_one_by_one(items: list[FileItem]) -> None:
         expected["stoi"] = pystoi.stoi(clean, heard, 16000)
         expected["pesq"] = pesq.pesq(16000, clean, heard, "wb")
         for measure, value in expected.items():
-            assert results[measure, condition].score == pytest.approx(float(value), abs=1e-12)
+            assert pyclaritys[measure, condition].score == pytest.approx(float(value), abs=1e-12)
+            assert results[measure, condition].score == pytest.approx(float(value), abs=1e-6)
         level = 10 * np.log10(np.mean(heard**2))
         assert results["stoi", condition].dbfs == pytest.approx(level, abs=1e-9)
         assert results["stoi", condition].seconds == 0.8
+    # HASPI and HASQI are kept by engine, for STOI and PESQ there is but one
+    kept = sorted((record["measure"], record.get("engine", "")) for record in store.records.values())
+    of_ear = [(measure, engine) for measure in ("haspi", "hasqi") for engine in ("hlsim", "pyclarity")]
+    assert kept == [*of_ear, ("pesq", ""), ("stoi", "")]
+
+
+def test_scores_stored_before_there_were_engines_are_pyclaritys(items: list[FileItem]) -> None:
+    item = replace(items[0], processed={"noisy": items[0].processed["noisy"]})
+    clean, noisy = content_hash(item.clean), content_hash(item.processed["noisy"])
+    former = {
+        "revision": 1,
+        "measure": "haspi",
+        "versions": {name: version(name) for name in ("pyclarity", "numpy", "scipy")},
+        "clean": clean,
+        "processed": noisy,
+        "ear": "",
+        "audiogram": list(N3.levels),
+        "full_scale_spl": 94.0,
+        "spl": None,
+        "seed": int(clean[:8], 16),
+    }
+    store = ScoreStore()
+    store.append(key_of(former), {"score": 0.125})
+    for engine, known in (("pyclarity", True), ("hlsim", False)):
+        (result,) = score_items([item], store=store, jobs=1, engine=engine)[0].values()
+        assert (result.score == 0.125) == known
 
 
 def test_a_stored_score_has_the_seed_of_this_run(items: list[FileItem], tmp_path: Path) -> None:
@@ -175,7 +209,7 @@ def test_known_scores_are_not_made_again(
     run(items[:1])
     assert sorted(made) == sorted(ALL)
     made.clear()
-    monkeypatch.setattr("hlsim.evaluation.scoring.versions_of", lambda names: {"pesq": "another"})
+    monkeypatch.setattr("hlsim.evaluation.scoring.versions_of", lambda *_: {"pesq": "another"})
     run(items[:1])
     assert len(made) == 8
 
@@ -292,6 +326,8 @@ def test_a_killed_run_goes_on_where_it_was(items: list[FileItem], tmp_path: Path
 def test_bad_settings(items: list[FileItem]) -> None:
     with pytest.raises(ValueError, match="unknown measures loudness; allowed: haspi, hasqi, stoi, pesq"):
         score_items(items, ("loudness",))
+    with pytest.raises(ValueError, match="engine 'matlab'; allowed: hlsim, pyclarity"):
+        score_items(items, engine="matlab")
     with pytest.raises(ValueError, match="no measure; allowed: haspi"):
         score_items(items, ())
     with pytest.raises(ValueError, match="seed is -1"):
@@ -320,8 +356,13 @@ def test_many_do_not_depend_on_the_number_of_jobs(speech_dir: Path, tmp_path: Pa
     parallel = haspi_many(items, seed=5, jobs=2, progress=lambda done, total: seen.append((done, total)))
     assert seen == [(1, 4), (2, 4), (3, 4), (4, 4)]
     assert haspi_many(items, seed=5, jobs=1) == parallel
-    assert parallel[2] == haspi(clean, noisy, N3, rate, seed=7)
-    assert parallel[3] == haspi(clips[1][0], clips[1][0], Audiogram.standard("S1"), clips[1][1], seed=99)
+    expected = haspi(clean, noisy, N3, rate, seed=7)
+    assert parallel[2] == pytest.approx(expected, abs=1e-6)
+    expected = haspi(clips[1][0], clips[1][0], Audiogram.standard("S1"), clips[1][1], seed=99)
+    assert parallel[3] == pytest.approx(expected, abs=1e-6)
+    assert haspi_many(items[:1], seed=5, jobs=1, engine="pyclarity") == [
+        haspi(clean, noisy, N3, rate, seed=5)
+    ]
     assert parallel[0] != parallel[2]
 
 

@@ -1,6 +1,7 @@
 """HASPI against pyclarity called directly, its seeds, its refusals."""
 
 import sys
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -11,12 +12,13 @@ from torch import Tensor
 from hlsim import extras
 from hlsim.audio import read_audio
 from hlsim.audiogram import FREQUENCIES, Audiogram
-from hlsim.metrics.pyclarity import haspi
+from hlsim.metrics.pyclarity import pyclarity_score
 
 clarity_haspi = pytest.importorskip("clarity.evaluator.haspi")
 clarity_audiogram = pytest.importorskip("clarity.utils.audiogram")
 
 N3 = Audiogram.standard("N3")
+haspi = partial(pyclarity_score, "haspi")
 
 
 @pytest.fixture(scope="module")
@@ -148,5 +150,5 @@ def test_bad_input(reference: Tensor, processed: Tensor, options: dict[str, obje
 
 def test_missing_extra_names_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "clarity.evaluator.haspi", None)
-    with pytest.raises(extras.MissingExtraError, match=r"pip install 'hlsim\[eval\]'"):
+    with pytest.raises(extras.MissingExtraError, match=r"pip install 'hlsim\[pyclarity\]'"):
         haspi(SPEECH, SPEECH, N3, 16000)

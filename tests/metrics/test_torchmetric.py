@@ -1,6 +1,9 @@
-"""The HASPI metric against HASPI itself, alone and in a Lightning validation loop."""
+"""The HASPI and HASQI metrics against pyclarity, alone and in a Lightning validation loop."""
 
+import sys
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -8,15 +11,16 @@ from torch import Tensor
 
 from hlsim.audio import read_audio
 from hlsim.audiogram import Audiogram
-from hlsim.metrics.pyclarity import haspi
+from hlsim.extras import MissingExtraError
+from hlsim.metrics.pyclarity import pyclarity_score
 
 pytest.importorskip("torchmetrics")
 pytest.importorskip("clarity")
-pytest.importorskip("joblib")
 
-from hlsim.evaluation import HASPI
+from hlsim.metrics import HASPI, HASQI
 
 N3, S2 = Audiogram.standard("N3"), Audiogram.standard("S2")
+haspi = partial(pyclarity_score, "haspi")
 
 
 @pytest.fixture(scope="module")
@@ -30,8 +34,10 @@ def noisy(clean: Tensor) -> Tensor:
     return clean + 0.003 * torch.randn(clean.shape, generator=torch.Generator().manual_seed(0))
 
 
-def test_mean_over_batches(clean: Tensor) -> None:
-    metric = HASPI(16000, seed=3, full_scale_spl=96.0)
+@pytest.mark.parametrize(("kind", "name"), [(HASPI, "haspi"), (HASQI, "hasqi")])
+def test_mean_over_batches(clean: Tensor, kind: type[Any], name: str) -> None:
+    haspi = partial(pyclarity_score, name)
+    metric = kind(16000, seed=3, full_scale_spl=96.0)
     metric.update(noisy(clean), clean, [N3, S2])
     metric.update(clean[0], clean[0], N3)
     expected = [
@@ -66,6 +72,26 @@ def test_what_cannot_be_scored_is_left_out_and_said(clean: Tensor) -> None:
     assert (int(metric.failed), int(metric.count)) == (1, 1)
     # the second item's seed does not depend on the first one's fate
     assert float(metric.compute()) == pytest.approx(haspi(clean[1], clean[1], N3, 16000, seed=1), abs=1e-6)
+
+
+@pytest.mark.slow
+def test_several_processes_give_the_same(clean: Tensor) -> None:
+    pytest.importorskip("joblib")
+    means = []
+    for jobs in (1, 2):
+        metric = HASQI(16000, jobs=jobs)
+        metric.update(noisy(clean), clean, N3)
+        means.append(float(metric.compute()))
+    assert means[0] == means[1]
+
+
+def test_one_process_needs_no_joblib(clean: Tensor, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "joblib", None)
+    metric = HASPI(16000)
+    metric.update(clean, clean, N3)
+    assert int(metric.count) == 2
+    with pytest.raises(MissingExtraError, match=r"pip install 'hlsim\[eval\]'"):
+        HASPI(16000, jobs=2)
 
 
 def test_bad_input(clean: Tensor) -> None:
