@@ -9,7 +9,7 @@ import soundfile
 from hlsim import Audiogram
 
 pytest.importorskip("lightning")
-pytest.importorskip("clarity")
+pytest.importorskip("joblib")
 
 from hlsim.demo import _names, demo
 

@@ -40,7 +40,7 @@ def test_own_network_trains(tmp_path: Path, speech_dir: Path, capsys: pytest.Cap
 
 
 def test_the_papers_last_table(tmp_path: Path, speech_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for module in ("clarity", "matplotlib", "joblib"):
+    for module in ("matplotlib", "joblib"):
         pytest.importorskip(module)
     clean, rate = read_audio(speech_dir / "valid" / "flite-rms-01.flac")
     clean = clean[:, rate // 2 : rate // 2 + rate]

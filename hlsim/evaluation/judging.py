@@ -96,16 +96,16 @@ def judge(trial: Trial, missing: Sequence[str]) -> dict[str, dict[str, Any] | Fa
             continue
         try:
             aided = trial.compensators[name](item.signal, item.ear)
-            records: dict[str, dict[str, Any]] = {}
-            if keys.most in wanted:
-                records[keys.most] = _figures(trial, aided, normal)
+            records: dict[str, dict[str, Any]] = (
+                {keys.most: _figures(trial, aided, normal)} if keys.most in wanted else {}
+            )
             of_network = _loss(_hear(trial, "neuro", aided, item.ear), normal["neuro"])
             records[keys.of_network] = {OF_NETWORK: of_network}
             figures = {figure: value for record in records.values() for figure, value in record.items()}
             if unknown := [figure for figure, value in figures.items() if not math.isfinite(value)]:
                 raise ValueError(f"{', '.join(unknown)}: not finite")
-            if keys.most in wanted:
-                records[keys.most] |= {"engine": trial.engine}
+            if keys.most in records:
+                records[keys.most]["engine"] = trial.engine
             made |= records
         except Exception as error:
             made |= dict.fromkeys(wanted, Failed(reason_of(error)))
