@@ -34,8 +34,8 @@ from hlsim.dsp.fft import power
 from hlsim.dsp.stft import STFT
 from hlsim.torchtools import constant
 
-DEFAULT_WEIGHTS = {"incoherence": 1.0, "misalignment": 0.03, "levels": 0.015, "louder": 0.03, "peaks": 1.0}
-"""What follows nothing costs 1, what is heard 40 dB too softly 0.24, and 40 dB too loud some 1.4."""
+DEFAULT_WEIGHTS = {"incoherence": 1.0, "misalignment": 0.03, "levels": 0.03, "louder": 0.03, "peaks": 1.0}
+"""What follows nothing costs 1, what is heard 40 dB too softly 0.48, and 40 dB too loud some 1.6."""
 
 DEPTH = 41.0
 """dB under an item's loudest band, as a normal ear hears it, where the weight of a band has fallen to a half."""
