@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 import torch
 
-from hlsim import MSBG, Audiogram
+from hlsim import MSBG, Audiogram, HearingLossLoss
 from hlsim.audio import read_audio, write_audio
+from hlsim.calibration import level_spl, set_level
 from hlsim.msbg.ear import MSBG_RATE
 from hlsim.msbg.filterbank import BANKS, gammatone_response
 
@@ -119,3 +120,28 @@ def test_other_sounds(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFix
     example.main()
     table = capsys.readouterr().out.splitlines()
     assert len(table) == 3 and all(line.count("|") == 8 for line in table) and table[2].startswith("| N3 |")
+
+
+def test_the_default_criterion_is_valid(speech: list[tuple[torch.Tensor, int]]) -> None:
+    """Some of the degradations, of one synthetic voice, as the example judges them."""
+    example = load("validity.py")
+    ear, generator = Audiogram.standard("N3"), torch.Generator().manual_seed(0)
+    clean = set_level(speech[0][0][0, 8000:28000], 65.0)
+    noise = set_level(example.shaped(clean, generator), 65.0)
+    signals = example.degraded(clean, noise, generator)
+    assert len(signals) == 18 and all(signal.shape == clean.shape for signal in signals.values())
+    few = {
+        name: signals[name] for name in (*example.NOISY, "low-pass 1000 Hz", "reverberation of 1 s", "sign")
+    }
+    gain_db = example.equaliser(clean, ear)
+    exact, given = MSBG(sample_rate=16000), example.filtered(clean, 10.0 ** (gain_db / 20.0))
+    normal = level_spl(exact(clean, Audiogram.standard("NH")))
+    assert float(level_spl(exact(given, ear))) == pytest.approx(float(normal), abs=1.0)
+    loss = HearingLossLoss(simulator="msbg", reduction="none")
+    for share in example.GAINS.values():
+        found = example.judged(few, share * gain_db, ear, {"default": loss})
+        haspi, hasqi, ordered, nearest = example.summary(found, "default")
+        assert ordered and nearest
+        assert haspi > 0.5 and hasqi > 0.5
+    worst = {name: -value for name, value in found["default"].items()}
+    assert not example.summary({**found, "upside down": worst}, "upside down")[2]
