@@ -51,3 +51,9 @@ def test_a_filter_bank_trains(speech_dir: Path, capsys: pytest.CaptureFixture[st
     assert torch.equal(
         example.FilterBank()(torch.ones(1, 500)).isfinite(), torch.ones(1, 500, dtype=torch.bool)
     )
+    speech = example.Clips(str(speech_dir / "valid"), sample_rate=16000, seconds=1.0).draw(
+        1, torch.Generator().manual_seed(0)
+    )
+    nothing, louder = (example.judged(lambda wave, g=gain: g * wave, ear, speech) for gain in (1.0, 10.0))
+    assert "gives 65.0 dB SPL" in nothing and "gives 85.0 dB SPL" in louder
+    assert nothing < louder  # HASPI comes first

@@ -2,10 +2,12 @@
 
     python examples/training/filter_bank.py TRAIN_SPEECH VALID_SPEECH [EAR] [STEPS] [CRITERION]
 
-It prints HASPI (at 65 dB SPL) and the level that the exact MSBG hears against a normal ear at 50, 65 and 80 dB SPL.
+It prints HASPI and HASQI and the level given (all at 65 dB SPL), and the level that the exact MSBG hears against a normal
+ear at 50, 65 and 80 dB SPL. HASPI rises with level: NAL-R is judged once more at the level that the trained aid gives.
 """
 
 import sys
+from collections.abc import Callable
 
 import torch
 from torch import Tensor, nn
@@ -16,7 +18,7 @@ from hlsim import MSBG, Audiogram, HearingLossLoss
 from hlsim.calibration import level_spl, set_level
 from hlsim.data.clips import Clips
 from hlsim.dsp.stft import STFT
-from hlsim.metrics import haspi
+from hlsim.metrics import haspi, hasqi
 
 RATE = 16000
 CENTRES = (250.0, 500.0, 1000.0, 2000.0, 3000.0, 4000.0, 6000.0, 8000.0)
@@ -63,8 +65,8 @@ def trained(folder: str, ear: Audiogram, steps: int, criterion: str = "coherent-
 
 
 @torch.no_grad()
-def judged(aid: nn.Module, ear: Audiogram, speech: Tensor) -> str:
-    """HASPI, and the levels heard. Shape: (items, time)."""
+def judged(aid: Callable[[Tensor], Tensor], ear: Audiogram, speech: Tensor) -> str:
+    """Scores, and the levels given and heard. Shape: (items, time)."""
     exact, differences = MSBG(sample_rate=RATE), []
     for spl in (50.0, 65.0, 80.0):
         clean = set_level(speech, spl)
@@ -72,9 +74,12 @@ def judged(aid: nn.Module, ear: Audiogram, speech: Tensor) -> str:
         heard, normal = (level_spl(exact(w, e)) for w, e in ((aided, ear), (clean, Audiogram.standard("NH"))))
         differences.append(f"{float((heard - normal).mean()):+.1f}")
         if spl == 65.0:
-            # as pyclarity has it
-            score = float(haspi(aided.double(), clean.double(), ear, noise="seeded").mean())
-    return f"HASPI {score:.3f}, heard at 50 / 65 / 80 dB SPL {' / '.join(differences)} dB"
+            scores = [float(score(aided, clean, ear).mean()) for score in (haspi, hasqi)]
+            given = float(level_spl(aided).mean())
+    return (
+        f"HASPI {scores[0]:.3f}, HASQI {scores[1]:.3f}, gives {given:.1f} dB SPL, "
+        f"heard at 50 / 65 / 80 dB SPL {' / '.join(differences)} dB"
+    )
 
 
 def main(
@@ -82,12 +87,19 @@ def main(
 ) -> None:
     ear = Audiogram.standard(name)
     speech = Clips(valid, sample_rate=RATE, seconds=2.0).draw(8, torch.Generator().manual_seed(0))
-    for title, aid in (
-        ("unaided", nn.Identity()),
-        ("NAL-R", NALR(ear)),
-        (criterion, trained(train, ear, int(steps), criterion)),
-    ):
-        print(f"{name}, {title}: {judged(aid, ear, speech)}", flush=True)
+    nalr, aid = NALR(ear), trained(train, ear, int(steps), criterion)
+
+    def as_loud(waveform: Tensor) -> Tensor:
+        return set_level(nalr(waveform), level_spl(aid(waveform)))
+
+    aids: dict[str, Callable[[Tensor], Tensor]] = {
+        "unaided": nn.Identity(),
+        "NAL-R": nalr,
+        "NAL-R at the level of the trained": as_loud,
+        f"trained, {criterion}": aid,
+    }
+    for title, candidate in aids.items():
+        print(f"{name}, {title}: {judged(candidate, ear, speech)}", flush=True)
 
 
 if __name__ == "__main__":
