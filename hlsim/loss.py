@@ -16,6 +16,7 @@ from hlsim.criteria import coherent_bands, paper
 from hlsim.criteria.bands import HIGHEST, band_level_loss
 from hlsim.criteria.choice import Criterion, check_criterion, check_values, check_weights
 from hlsim.dsp.resample import resample
+from hlsim.metrics.objective import SCORES, missing_score
 from hlsim.msbg import MSBG
 from hlsim.msbg.normal import hear_normally
 from hlsim.msbg.response import with_phase_of_bank
@@ -64,9 +65,10 @@ class HearingLossLoss(nn.Module):
             compared as it is. The other criteria always compare with what a normal ear hears.
         criterion: ``"coherent-bands"``, whether bands follow the reference and have its level
             (``hlsim.criteria.coherent_bands``); ``"bands"``, levels in bands alone; ``"paper"``, Equations 2 to 9 of
-            Neuro-MSBG, not balanced between ears and levels (``hlsim.criteria.paper``); several by name,
-            ``{"bands": 1.0, "paper": 0.2}``, of one hearing; or a callable of what is heard and the reference, (items,
-            time) in pascals, that returns a value for each item, (items,).
+            Neuro-MSBG, not balanced between ears and levels (``hlsim.criteria.paper``); ``"haspi"`` and ``"hasqi"``, 1
+            less the score of what the ear is given (``hlsim.metrics.objective``), which say nothing of its level and go
+            beside another, ``{"coherent-bands": 1.0, "haspi": 0.3}``; several by name, of one hearing; or a callable of
+            what is heard and the reference, (items, time) in pascals, that returns a value for each item, (items,).
         weights: of the parts by name; a part left out does not count.
         reduction: ``"mean"`` over the items, whatever their lengths, or ``"none"``, a value for each.
         normal: the normal ear that belongs to the simulator, a module (frozen too) or callable, (..., time) -> (...,
@@ -161,7 +163,8 @@ class HearingLossLoss(nn.Module):
 
         Raises:
             ValueError: shapes or devices that do not fit, no audiogram, levels outside -10 to 100 dB HL, lengths outside
-                1 to time, or a simulator, normal ear or criterion that does not return the shape it should.
+                1 to time, or a simulator, normal ear or criterion that does not return the shape it should; with
+                ``"haspi"`` or ``"hasqi"`` items shorter than 0.7 s.
         """
         return paper.weighted_sum(
             self.parts(compensated, clean, audiogram, lengths, listener=listener), self.weights
@@ -180,19 +183,20 @@ class HearingLossLoss(nn.Module):
         """The parts of the loss by name, before their weights.
 
         Those of ``"coherent-bands"`` are incoherence, levels, louder and peaks, of ``"bands"`` band_levels (dB), of
-        ``"paper"`` magnitude, phase, complex and time, and of a callable criterion. Their sum, ``sum(weight * parts[name]
+        ``"paper"`` magnitude, phase, complex and time, and of a callable criterion; of ``"haspi"`` and ``"hasqi"``
+        themselves. Their sum, ``sum(weight * parts[name]
         for name, weight in loss.weights.items())``, is what ``forward`` gives.
 
         Shape, arguments and errors: as ``forward``.
         """
         given, clean, ears, ends = self._check(compensated, clean, audiogram, lengths)
         with torch.autocast(given.device.type, enabled=False):
-            if "coherent-bands" in self.criteria:
+            if {"coherent-bands", *SCORES} & self.criteria.keys():
                 given = coherent_bands.without_spikes(given)
             heard = self._hear(given, ears, listener)
             batch, time = heard.shape[:-1], heard.shape[-1]
             signals = {"heard": heard, "given": given.expand_as(heard)}
-            for name in self.criteria:
+            for name in self.criteria.keys() - SCORES.keys():
                 signals[name] = self._reference(name, clean, ears, batch, listener)
             gain = gain_to_pascals(self.full_scale_spl)
             signals = {name: signal.reshape(-1, time) * gain for name, signal in signals.items()}
@@ -204,6 +208,11 @@ class HearingLossLoss(nn.Module):
                     for item, end in enumerate(ends.expand(batch).flatten().tolist())
                 ]
                 items = {name: torch.cat([own[name] for own in each]) for name in each[0]}
+            for name in SCORES.keys() & self.criteria.keys():
+                pair = (signals["given"], clean.expand_as(heard).reshape(-1, time) * gain)
+                each_ear = ears.expand(*batch, -1).reshape(-1, len(FREQUENCIES))
+                each_end = [time] * len(each_ear) if ends is None else ends.expand(batch).flatten().tolist()
+                items[name] = missing_score(name, *pair, each_ear, each_end, self.sample_rate)
         if self.reduction == "none":
             return {name: part.reshape(batch) for name, part in items.items()}
         return {name: part.mean() for name, part in items.items()}
@@ -277,6 +286,8 @@ class HearingLossLoss(nn.Module):
         heard = signals["heard"]
         items: dict[str, Tensor] = {}
         for name, criterion in self.criteria.items():
+            if name in SCORES:  # of what is given, not heard
+                continue
             aim = signals[name]
             if name == "coherent-bands":
                 items |= coherent_bands.coherent_band_parts(heard, aim, self.sample_rate)

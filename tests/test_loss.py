@@ -664,7 +664,7 @@ def test_simulator_by_folder_and_as_a_module(clean: Tensor) -> None:
         ({"reference": ["clean"]}, r"reference is \['clean'\]; allowed: clean, normal-hearing"),
         (
             {"criterion": ["paper"]},
-            r"criterion is \['paper'\]; allowed: coherent-bands, bands, paper, weights",
+            r"criterion is \['paper'\]; allowed: coherent-bands, bands, paper, haspi, hasqi, weights",
         ),
         ({"criterion": nn.L1Loss}, "criterion is <class .*; allowed: .* a callable"),
         ({"criterion": {}}, r"criterion is \{\}; allowed: coherent-bands"),

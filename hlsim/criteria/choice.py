@@ -12,6 +12,8 @@ CRITERIA: dict[str, Mapping[str, float]] = {
     "coherent-bands": coherent_bands.DEFAULT_WEIGHTS,
     "bands": {"band_levels": 1.0},
     "paper": paper.DEFAULT_WEIGHTS,
+    "haspi": {"haspi": 1.0},
+    "hasqi": {"hasqi": 1.0},
 }
 """Criteria by name: their parts and the default weight of each."""
 

@@ -14,10 +14,16 @@ from hlsim.calibration import check_full_scale
 from hlsim.checks import Lengths, check_lengths, check_rate, check_waveform
 from hlsim.metrics import ear_input
 from hlsim.metrics.ear_model import CHANNELS, Extent
-from hlsim.metrics.ear_recursions import middle_ear
+from hlsim.metrics.ear_recursions import RATE, middle_ear
 from hlsim.metrics.pair import LOWEST_REFERENCE_SPL, SHORTEST_SECONDS
 
+_LEAST = 384  # samples at 24 kHz: HASQI's segment
+
 _TOGETHER = 2**27  # samples of all channels that a GPU works on at once
+
+
+class UnscorableError(ValueError):
+    """A clean signal of which no score means anything, for nobody hears enough of it."""
 
 
 @dataclass(frozen=True)
@@ -76,15 +82,20 @@ class CleanSpeech:
         if not bool(signal.isfinite().all()):
             raise ValueError(f"{name} holds samples that are NaN or infinite")
         if not bool(signal.any()):
-            raise ValueError(f"{name} is silent, every sample is zero")
+            raise UnscorableError(f"{name} is silent, every sample is zero")
         level = 10.0 * math.log10(max(float(signal.var(correction=0)), 1e-30)) + full_scale
         if level < LOWEST_REFERENCE_SPL:
-            raise ValueError(
+            raise UnscorableError(
                 f"{name} is at {level:.1f} dB SPL with full_scale_spl {full_scale:g}; {self._name} needs "
                 f"{LOWEST_REFERENCE_SPL:g} or more to mean anything"
             )
         at_ear = ear_input.to_ear_rate(signal, self._rate) * self._gain
         part = ear_input.audible_part(at_ear)
+        if (lasts := part.stop - part.start) < _LEAST:
+            raise UnscorableError(
+                f"{name} sounds for {1000.0 * lasts / RATE:.2g} ms alone; {self._name} needs "
+                f"{1000.0 * _LEAST / RATE:g} ms or more to be defined"
+            )
         return CleanItem(
             index, length, part, ear_input.spectrum_for_alignment(at_ear.to(self.dtype)), at_ear[part]
         )

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from hlsim.dsp.fft import fft_length
+from hlsim.metrics.clean_speech import UnscorableError
 from hlsim.metrics.ear_model import CHANNELS, Extent, shift
 from hlsim.torchtools import constant
 
@@ -96,11 +97,11 @@ def audible_frames(loudness: Tensor) -> Tensor:
     """Places of the frames that count. Shape: (frames,) -> (kept,).
 
     Raises:
-        ValueError: there are none or one.
+        UnscorableError: there are none or one.
     """
     places = (loudness > 10.0 ** (_SILENCE / 20.0)).nonzero()[:, 0]
     if len(places) < 2:
-        raise ValueError("clean is below the threshold of hearing")
+        raise UnscorableError("clean is below the threshold of hearing")
     return places
 
 

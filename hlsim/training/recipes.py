@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, fields
 from typing import Any, ClassVar, Self
 
 from hlsim.checks import refuse_other_kinds, refuse_seed, refuse_unknown, refuse_weights
+from hlsim.metrics.pair import SHORTEST_SECONDS
 
 _WHERE = "in the recipe"
 PRECISIONS = ("float32", "bfloat16")
@@ -116,7 +117,8 @@ class CompensatorRecipe(TrainingRecipe):
 
     Attributes:
         model: settings of ``MappingConfig``.
-        weights: of ``HearingLossLoss``'s criteria: ``coherent-bands``, ``bands`` (dB) and ``paper``, of one hearing.
+        weights: of ``HearingLossLoss``'s criteria: ``coherent-bands``, ``bands`` (dB), ``paper``, and ``haspi``
+            and ``hasqi`` (1 less the score; clips of 0.7 s and more).
         reference: what the paper's criterion compares with, ``clean`` or ``normal-hearing``.
         sounds: speech in noise alone teaches a network that what is steady is noise, to be taken away.
         equalised: share of clips whose speech is equalised at random by up to 15 dB. Few voices teach few spectra, and
@@ -138,5 +140,11 @@ class CompensatorRecipe(TrainingRecipe):
     validate_every: int = 50
     validation_items: int = 8
 
-    criteria = ("coherent-bands", "bands", "paper")
+    criteria = ("coherent-bands", "bands", "paper", "haspi", "hasqi")
     shares = ("sounds", "equalised", "noisy")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        scored = self.weights.get("haspi", 0.0) or self.weights.get("hasqi", 0.0)
+        wrong = bool(scored) and self.seconds < SHORTEST_SECONDS
+        self._refuse(wrong, ("seconds",), f"{SHORTEST_SECONDS} or more with haspi or hasqi")

@@ -124,6 +124,19 @@ def test_general_one_draws_ears_and_noise(data: TrainingData, tmp_path: Path) ->
     assert all(name.startswith("compensator.") for name in module.state_dict())
 
 
+def test_haspi_joins_the_criteria(data: TrainingData) -> None:
+    """Of speech, tones and clicks, of which there is no score; its clips last a second."""
+    settings = {"weights": {"coherent-bands": 1.0, "haspi": 0.3}, "seconds": 1.0, "sounds": 0.6, "batch": 6}
+    recipe = CompensatorRecipe.from_dict(SMALL | settings)
+    module = CompensatorTraining(recipe, EVER, simulator="msbg")
+    batch = CompensatorBatches(recipe, data, None).draw(6, torch.Generator().manual_seed(1))
+    assert bool((batch["clean"].count_nonzero(dim=-1) <= 8).any())
+    loss = module.training_loss(batch)
+    loss.backward()
+    assert bool(loss.isfinite())
+    assert all(p.grad is not None and bool(p.grad.isfinite().all()) for p in module.trained_parameters())
+
+
 def test_a_share_of_the_clips_are_tones_and_clicks(data: TrainingData) -> None:
     def clicks(sounds: float) -> int:
         recipe = CompensatorRecipe.from_dict(SMALL | {"equalised": 0.0, "sounds": sounds})
@@ -140,7 +153,8 @@ def test_a_share_of_the_clips_are_tones_and_clicks(data: TrainingData) -> None:
     [
         ({"sounds": 1.5}, "sounds 1.5, equalised 0.7, noisy 0.5 in the recipe; allowed: 0 to 1"),
         ({"lr": 0.1}, "unknown settings lr"),
-        ({"weights": {"haspi": 1.0}}, "unknown criteria haspi"),
+        ({"weights": {"loudness": 1.0}}, "unknown criteria loudness"),
+        ({"weights": {"haspi": 1.0}}, "seconds 0.6 in the recipe; allowed: 0.7 or more with haspi or hasqi"),
         ({"levels": [80.0, 50.0]}, "a lowest and a highest"),
         ({"batch": 0}, "counts from 1 up"),
         ({"seed": -(2**62)}, "seed -4611686018427387904 in the recipe; allowed: whole numbers between"),
