@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from hlsim.audiogram import Audiogram
+    from hlsim.haspi_loss import HASPILoss
     from hlsim.loss import HearingLossLoss
     from hlsim.msbg import MSBG, estimate_delay
     from hlsim.neuro import NeuroMSBG
@@ -14,12 +15,21 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 
-__all__ = ["MSBG", "Audiogram", "HearingLossLoss", "NeuroMSBG", "estimate_delay", "load_pretrained"]
+__all__ = [
+    "MSBG",
+    "Audiogram",
+    "HASPILoss",
+    "HearingLossLoss",
+    "NeuroMSBG",
+    "estimate_delay",
+    "load_pretrained",
+]
 
 # imported when asked for, so that the program's help and its refusals do not wait for torch
 _MODULES = {
     "MSBG": "hlsim.msbg",
     "Audiogram": "hlsim.audiogram",
+    "HASPILoss": "hlsim.haspi_loss",
     "HearingLossLoss": "hlsim.loss",
     "NeuroMSBG": "hlsim.neuro",
     "estimate_delay": "hlsim.msbg",

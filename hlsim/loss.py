@@ -47,7 +47,7 @@ class HearingLossLoss(nn.Module):
     It may be called in an autocast region and works in float32 there; call ``backward()`` outside of it, as torch says:
     inside one of float16, gradients may be NaN. A compiled caller calls it as it is, so that ``fullgraph=True`` and
     ``torch.export`` refuse it. Of ``torch.func`` it takes ``grad``, and with the exact MSBG ``vmap`` (not of ``"bands"``)
-    and ``jvp``; the network does not.
+    and ``jvp``; the network does not, and ``"haspi"`` and ``"hasqi"`` take none.
 
     Args:
         audiogram: the ear or ears; may be given with each call instead. A tensor that is trained gets its gradient; it is
@@ -183,9 +183,9 @@ class HearingLossLoss(nn.Module):
         """The parts of the loss by name, before their weights.
 
         Those of ``"coherent-bands"`` are incoherence, levels, louder and peaks, of ``"bands"`` band_levels (dB), of
-        ``"paper"`` magnitude, phase, complex and time, and of a callable criterion; of ``"haspi"`` and ``"hasqi"``
-        themselves. Their sum, ``sum(weight * parts[name]
-        for name, weight in loss.weights.items())``, is what ``forward`` gives.
+        ``"paper"`` magnitude, phase, complex and time, of ``"haspi"`` and ``"hasqi"`` themselves, and of a callable
+        criterion. Their sum, ``sum(weight * parts[name] for name, weight in loss.weights.items())``, is what ``forward``
+        gives.
 
         Shape, arguments and errors: as ``forward``.
         """
@@ -196,7 +196,7 @@ class HearingLossLoss(nn.Module):
             heard = self._hear(given, ears, listener)
             batch, time = heard.shape[:-1], heard.shape[-1]
             signals = {"heard": heard, "given": given.expand_as(heard)}
-            for name in self.criteria.keys() - SCORES.keys():
+            for name in [name for name in self.criteria if name not in SCORES]:
                 signals[name] = self._reference(name, clean, ears, batch, listener)
             gain = gain_to_pascals(self.full_scale_spl)
             signals = {name: signal.reshape(-1, time) * gain for name, signal in signals.items()}
@@ -208,7 +208,7 @@ class HearingLossLoss(nn.Module):
                     for item, end in enumerate(ends.expand(batch).flatten().tolist())
                 ]
                 items = {name: torch.cat([own[name] for own in each]) for name in each[0]}
-            for name in SCORES.keys() & self.criteria.keys():
+            for name in [name for name in self.criteria if name in SCORES]:
                 pair = (signals["given"], clean.expand_as(heard).reshape(-1, time) * gain)
                 each_ear = ears.expand(*batch, -1).reshape(-1, len(FREQUENCIES))
                 each_end = [time] * len(each_ear) if ends is None else ends.expand(batch).flatten().tolist()

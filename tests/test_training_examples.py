@@ -57,3 +57,18 @@ def test_a_filter_bank_trains(speech_dir: Path, capsys: pytest.CaptureFixture[st
     nothing, louder = (example.judged(lambda wave, g=gain: g * wave, ear, speech) for gain in (1.0, 10.0))
     assert "gives 65.0 dB SPL" in nothing and "gives 85.0 dB SPL" in louder
     assert nothing < louder  # HASPI comes first
+
+
+def test_haspi_trains_with_the_level_and_without(
+    speech_dir: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(EXAMPLES)
+    example = load("haspi_objective.py")
+    ear = example.Audiogram.standard("N3")
+    for name in ("HASPILoss", "HASPI alone"):
+        aid = example.trained(str(speech_dir / "train"), ear, 3, name)
+        start, *_, end = losses(capsys.readouterr().err.replace(f"{name}, ", ""))
+        assert end < start and bool(aid.gain.isfinite().all())
+    speech = example.Clips(speech_dir / "valid", sample_rate=16000, seconds=1.0)
+    told = example.judged(aid, ear, speech.draw(1, torch.Generator().manual_seed(0)))
+    assert 0.0 < float(told.split("HASPI ")[1].split(",")[0]) <= 1.0 and told.endswith("dB SPL")

@@ -26,8 +26,8 @@ def missing_score(
 ) -> Tensor:
     """What a score lacks of 1, of each item, with the hair cells' noise as expected.
 
-    An item whose clean signal nobody hears (silent, under 20 dB SPL, or all of it under the threshold) counts 0 and has
-    no gradient, for any score of it means nothing. One that is processed to NaN or infinity gives NaN.
+    An item whose clean signal nobody hears enough of (silent, under 20 dB SPL, a click, for HASPI under the threshold of
+    hearing) counts 0 and has no gradient, for no score of it means anything. One processed to NaN or infinity gives NaN.
 
     Args:
         name: of ``SCORES``.
@@ -38,8 +38,10 @@ def missing_score(
     Returns: (items,). The gradient of ``clean`` is not followed.
 
     Raises:
-        ValueError: an item is shorter than 0.7 s.
+        ValueError: an item is shorter than 0.7 s, or it is called in a transform of ``torch.func``.
     """
+    if torch._C._functorch.maybe_current_level() is not None:
+        raise ValueError(f"{name} goes through no transform of torch.func; allowed: backward()")
     sound = processed.detach().isfinite().all(-1)
     given = torch.where(sound.unsqueeze(-1), processed, 0.0)
     missing = _missing(SCORES[name], given, clean, ears, ends, sample_rate=sample_rate)

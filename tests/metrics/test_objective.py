@@ -1,0 +1,77 @@
+"""What a score lacks of 1, in batches that hold silence and clicks."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from hlsim.audio import read_audio
+from hlsim.audiogram import Audiogram
+from hlsim.metrics.objective import SCORES, missing_score
+
+N3, N4 = (torch.tensor(Audiogram.standard(name).thresholds) for name in ("N3", "N4"))
+TIME = 12000
+
+
+@pytest.fixture(scope="module")
+def clean(speech_dir: Path) -> Tensor:
+    """0.75 s of speech at 68 dB SPL. Shape: (1, time)."""
+    return read_audio(speech_dir / "valid" / "flite-rms-01.flac")[0][:, 8000 : 8000 + TIME]
+
+
+@pytest.mark.parametrize("name", SCORES)
+def test_it_is_1_less_the_score(clean: Tensor, name: str) -> None:
+    pair, ears = torch.cat((2.0 * clean, clean + 0.02)), torch.stack((N3, N4))
+    found = missing_score(name, pair, clean.expand(2, -1), ears, [TIME, 11500], 16000)
+    for item, end in enumerate((TIME, 11500)):
+        alone = SCORES[name](pair[item, :end], clean[0, :end], ears[item])
+        assert float(found[item]) == pytest.approx(1.0 - float(alone), abs=1e-6)
+
+
+@pytest.mark.parametrize("name", SCORES)
+def test_what_nobody_hears_counts_nothing(clean: Tensor, name: str) -> None:
+    """Beside an item that does: silence, faint speech, a click, and a rumble under the threshold of hearing."""
+    click = torch.zeros_like(clean)
+    click[:, 5000] = 0.1
+    rumble = 3e-3 * torch.sin(torch.arange(TIME) * (2.0 * torch.pi * 20.0 / 16000)).expand(1, -1)
+    truth = torch.cat((clean, 0.0 * clean, 1e-4 * clean, click, rumble))
+    given = truth.expand(5, -1).clone().add_(0.001).requires_grad_()
+    found = missing_score(name, given, truth, N3.expand(5, -1), [TIME] * 5, 16000)
+    (slope,) = torch.autograd.grad(found.sum(), given)
+    unheard = slice(1, 5 if name == "haspi" else 4)
+    assert float(found[0].detach()) > 0.0 and not bool(found[unheard].any())
+    assert bool(found.isfinite().all()) and bool(slope.isfinite().all())
+    assert bool(slope[0].any()) and not bool(slope[unheard].any())
+
+
+def test_nan_stays_with_its_item(clean: Tensor) -> None:
+    given = clean.repeat(2, 1)
+    given[0, 300] = torch.nan
+    found = missing_score("haspi", given, clean.expand(2, -1), N3.expand(2, -1), [TIME] * 2, 16000)
+    assert found.isnan().tolist() == [True, False]
+
+
+def test_a_short_item_is_refused(clean: Tensor) -> None:
+    with pytest.raises(ValueError, match=r"clean lasts 0.5 s; HASPI needs 0.7 s or more"):
+        missing_score("haspi", clean, clean, N3[None], [8000], 16000)
+
+
+@pytest.mark.parametrize("name", SCORES)
+def test_gradient_is_that_of_finite_differences(clean: Tensor, name: str) -> None:
+    """Of a gain below and one above 1.4 kHz, in double precision."""
+    truth = clean.double()
+    noise = torch.randn(clean.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(3))
+    spectrum = torch.fft.rfft(truth + 0.3 * noise * truth.square().mean().sqrt())
+    above = (torch.arange(spectrum.shape[-1]) * 16000 / TIME > 1400.0).long()
+
+    def missing(gains: Tensor) -> Tensor:
+        given = torch.fft.irfft(spectrum * 10.0 ** (gains[above] / 20.0), TIME)
+        return missing_score(name, given, truth, N3[None].double(), [TIME], 16000)
+
+    gains = torch.tensor([5.0, 15.0], dtype=torch.float64, requires_grad=True)
+    (slope,) = torch.autograd.grad(missing(gains), gains)
+    with torch.no_grad():
+        for place, step in enumerate(1e-3 * torch.eye(2, dtype=torch.float64)):
+            difference = (missing(gains + step) - missing(gains - step)) / 2e-3
+            assert float(slope[place]) == pytest.approx(float(difference), rel=0.01)
