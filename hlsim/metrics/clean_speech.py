@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Generic, TypeVar
 
 import torch
 from torch import Tensor
@@ -12,7 +13,7 @@ from torch import Tensor
 from hlsim.audiogram import HIGHEST_LEVEL, AudiogramLike, resolve_thresholds
 from hlsim.calibration import check_full_scale
 from hlsim.checks import Lengths, check_lengths, check_rate, check_waveform
-from hlsim.metrics import ear_input
+from hlsim.metrics import ear_input, ear_model
 from hlsim.metrics.ear_model import CHANNELS, Extent
 from hlsim.metrics.ear_recursions import RATE, middle_ear
 from hlsim.metrics.pair import LOWEST_REFERENCE_SPL, SHORTEST_SECONDS
@@ -144,3 +145,30 @@ class CleanSpeech:
         """Shape: (time,) each -> (items, padded)."""
         rows = ear_input.stacked(signals, extent.padded).to(self.dtype)
         return middle_ear(self.device, self.dtype)(rows).flatten(-2)
+
+
+Channels = TypeVar("Channels")
+"""What an ear makes of the clean speech in some channels."""
+
+
+class ItemGroup(Generic[Channels]):
+    """Items that are worked on together, some channels at a time."""
+
+    def __init__(self, signals: CleanSpeech, items: list[CleanItem]) -> None:
+        self._signals, self._items = signals, items
+        self._extent = Extent(tuple(len(item.heard) for item in items))
+        self._kept: list[Channels] | None = None
+
+    def keep(self) -> None:
+        """Compute all channels now."""
+        self._kept = list(self._channels())
+
+    def _channels(self) -> Iterator[Channels]:
+        if self._kept is not None:
+            yield from self._kept
+            return
+        for chosen in ear_model.channel_chunks(len(self._items), self._extent.padded, self._signals.device):
+            yield self._hear(chosen)
+
+    def _hear(self, chosen: slice) -> Channels:
+        raise NotImplementedError

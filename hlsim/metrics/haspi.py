@@ -16,7 +16,7 @@ doi 10.1016/j.specom.2020.05.001. What to know of it:
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
@@ -31,8 +31,8 @@ from hlsim.calibration import PASCAL_SPL
 from hlsim.checks import Lengths, check_waveform
 from hlsim.metrics import ear_model
 from hlsim.metrics import envelope_modulation as envelopes
-from hlsim.metrics.clean_speech import CleanItem, CleanSpeech
-from hlsim.metrics.ear_model import CHANNELS, Extent
+from hlsim.metrics.clean_speech import CleanItem, CleanSpeech, ItemGroup
+from hlsim.metrics.ear_model import CHANNELS
 from hlsim.metrics.pair import check_seed
 from hlsim.torchtools import constant
 
@@ -162,28 +162,15 @@ class _Channels(NamedTuple):
     course: envelopes.Course
 
 
-class _Group:
+class _Group(ItemGroup[_Channels]):
     """Items that are worked on together, each with what a normal ear makes of the clean speech."""
 
     def __init__(self, signals: CleanSpeech, items: list[CleanItem]) -> None:
-        self._signals, self._items = signals, items
-        self._extent = Extent(tuple(len(item.heard) for item in items))
-        self._kept: list[_Channels] | None = None
+        super().__init__(signals, items)
         with torch.no_grad():
             self._ear = ear_model.hair_cells(torch.zeros(8, device=signals.device))
             self._heard = signals.through_middle_ear([item.heard for item in items], self._extent)
             self._latest = ear_model.longest_group_delay(self._heard, self._ear, self._extent)
-
-    def keep(self) -> None:
-        """Compute all channels now."""
-        self._kept = list(self._channels())
-
-    def _channels(self) -> Iterator[_Channels]:
-        if self._kept is not None:
-            yield from self._kept
-            return
-        for chosen in ear_model.channel_chunks(len(self._items), self._extent.padded, self._signals.device):
-            yield self._hear(chosen)
 
     @torch.no_grad()
     def _hear(self, chosen: slice) -> _Channels:

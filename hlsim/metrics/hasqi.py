@@ -7,7 +7,7 @@ whether enough is heard. Of what HASPI's page says of rates, lengths, levels and
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple, get_args, overload
 
@@ -23,7 +23,7 @@ from hlsim.checks import Lengths, check_waveform
 from hlsim.dsp.fft import fft_length
 from hlsim.dsp.fir import frequency_sampling_fir
 from hlsim.metrics import ear_model, fine_structure
-from hlsim.metrics.clean_speech import CleanItem, CleanSpeech
+from hlsim.metrics.clean_speech import CleanItem, CleanSpeech, ItemGroup
 from hlsim.metrics.ear_model import AUDIOMETRIC_HZ, CHANNELS, Extent
 from hlsim.metrics.ear_recursions import RATE
 from hlsim.metrics.haspi import Noise, generator_after, item_seeds
@@ -209,14 +209,12 @@ class _Channels:
     level: Tensor
 
 
-class _Group:
+class _Group(ItemGroup[_Channels]):
     """Items that are worked on together, each with what the ear makes of the clean speech."""
 
     def __init__(self, signals: CleanSpeech, items: list[CleanItem], thresholds: Tensor, unit: float) -> None:
-        self._signals, self._items, self._unit = signals, items, unit
-        self._noise = unit * 10.0 ** (_THRESHOLD_NOISE / 20.0)
-        self._extent = Extent(tuple(len(item.heard) for item in items))
-        self._kept: list[_Channels] | None = None
+        super().__init__(signals, items)
+        self._unit, self._noise = unit, unit * 10.0 ** (_THRESHOLD_NOISE / 20.0)
         chosen = thresholds[[item.index for item in items]]
         with torch.no_grad():
             self._ear = ear_model.hair_cells(chosen)
@@ -224,17 +222,6 @@ class _Group:
             amplified = [_amplified(item.heard, fir) for item, fir in zip(items, taps, strict=True)]
             self._heard = signals.through_middle_ear(amplified, self._extent)
             self._latest = ear_model.longest_group_delay(self._heard, self._ear, self._extent)
-
-    def keep(self) -> None:
-        """Compute all channels now."""
-        self._kept = list(self._channels())
-
-    def _channels(self) -> Iterator[_Channels]:
-        if self._kept is not None:
-            yield from self._kept
-            return
-        for chosen in ear_model.channel_chunks(len(self._items), self._extent.padded, self._signals.device):
-            yield self._hear(chosen)
 
     @torch.no_grad()
     def _hear(self, chosen: slice) -> _Channels:
