@@ -1,6 +1,7 @@
 """The examples of training through the loss run as they stand, a few steps."""
 
 import importlib.util
+import math
 from pathlib import Path
 from types import ModuleType
 
@@ -66,9 +67,9 @@ def test_haspi_trains_with_the_level_and_without(
     example = load("haspi_objective.py")
     ear = example.Audiogram.standard("N3")
     for name in ("HASPILoss", "HASPI alone"):
-        aid = example.trained(str(speech_dir / "train"), ear, 3, name)
+        aid = example.trained(str(speech_dir / "train"), ear, 3, math.inf, name)
         assert len(capsys.readouterr().err.splitlines()) == 2  # the first step and the last
         assert float(aid.gain.detach().mean()) > 0.05  # of 10 dB: speech is heard too softly
     speech = example.Clips(speech_dir / "valid", sample_rate=16000, seconds=1.0)
-    told = example.judged(aid, ear, speech.draw(1, torch.Generator().manual_seed(0)))
+    told = example.judged(aid, ear, speech.draw(1, torch.Generator().manual_seed(0)), math.inf)
     assert 0.0 < float(told.split("HASPI ")[1].split(",")[0]) <= 1.0 and told.endswith("dB SPL")
