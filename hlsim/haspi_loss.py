@@ -10,7 +10,7 @@ from hlsim.loss import Hearing, HearingLossLoss
 from hlsim.neuro.config import NEURO_RATE
 
 _LEVEL = {"levels": 0.03, "louder": 0.06, "peaks": 1.0}
-"""Twice the default criterion's: a dB too much costs more than HASPI ever gives for it."""
+"""Twice the default criterion's weights, for HASPI rewards gain."""
 
 
 class HASPILoss(HearingLossLoss):
@@ -23,7 +23,7 @@ class HASPILoss(HearingLossLoss):
 
     It is a ``HearingLossLoss`` and is called as one, ``loss(compensated, clean, audiogram=None, lengths=None)``, with its
     shapes, conventions and errors; items last 0.7 s or more, and no gradient of HASPI reaches ``clean``. A step costs
-    some 9 times the default loss's, with HASQI some 25 times.
+    some 10 times the default loss's, with HASQI some 23 times.
 
     Args:
         quality: weight of 1 less HASQI, beside 1 of 1 less HASPI.
