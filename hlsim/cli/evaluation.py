@@ -20,7 +20,7 @@ def evaluate_simulator(parser: Parser) -> None:
     option("--speech", Path, "folder of clean speech", required=True)
     option("--audiograms", Path, EARS_TABLE, required=True)
     option("--noise", Path, "folder of noises; every second item is then noisy")
-    option("--teacher", str, "what counts as the reference", "pyclarity", choices=("pyclarity", "msbg"))
+    parser.teacher("what counts as the reference", "pyclarity")
     option("--levels", number, "dB SPL that items take in turn", [50, 60, 65, 70, 80], nargs="+")
     text = "what the ear is given: as-is, louder (20 dB), nal-r, compressed (3:1), compensated"
     option("--inputs", str, text, ["as-is"], nargs="+", metavar="INPUT")

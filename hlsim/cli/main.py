@@ -23,9 +23,12 @@ COMMANDS = {
         "prepare",
         "draw an utterance and what an ear hears of it, raised to the utterance's level, before and after alignment",
     ),
-    "train-simulator": ("training", "train a Neuro-MSBG on targets from the exact MSBG"),
+    "train-simulator": ("training", "train a Neuro-MSBG on targets from the exact MSBG or another teacher"),
     "train-compensator": ("training", "train a compensator through a frozen simulator"),
-    "evaluate-simulator": ("evaluation", "compare simulators with MSBG: SNR, STOI, PESQ, bands"),
+    "evaluate-simulator": (
+        "evaluation",
+        "compare simulators with MSBG or another teacher: SNR, STOI, PESQ, bands",
+    ),
     "evaluate-compensator": (
         "evaluation",
         "judge compensators beside no aid and NAL-R: HASPI, HASQI, loudness as heard, surrogate gap, gain curves, tones",

@@ -14,6 +14,8 @@ from typing import Any, NoReturn
 
 STANDARD_EARS = ("NH", "N1", "N2", "N3", "N4", "N5", "N6", "N7", "S1", "S2", "S3")
 
+TEACHERS = ("msbg", "pyclarity")
+
 EARS_TABLE = (
     "CSV with columns hl_250, hl_500, ... hl_8000 in dB HL; where one of the eight is missing its level is interpolated "
     "over log frequency, flat beyond the ends"
@@ -73,6 +75,14 @@ class Parser(argparse.ArgumentParser):
 
     # what several commands take
 
+    def teacher(self, text: str, default: str) -> None:
+        help_ = (
+            f"{text}: msbg (exact), pyclarity, or anyone's simulator, package.module:name, found from the working "
+            "directory too: a callable (waveform, audiogram) -> waveform or its class, time-aligned, of (items, time) in "
+            "pascals and (items, 8) in dB HL, at its attribute sample_rate or else 16000 Hz"
+        )
+        self.option("--teacher", teacher_name, help_, default, metavar="NAME")
+
     def audiogram(self, default: str | None = None, text: str = "", **more: Any) -> None:
         help_ = (
             "NH, N1 to N7 (simulators and trained compensators take up to N6), S1 to S3, or eight levels in dB HL at "
@@ -125,6 +135,11 @@ positive = kind(float, lambda value: 0 < value < math.inf, "numbers above 0")
 integer = kind(int, lambda value: True, "whole numbers")
 count = kind(int, lambda value: value >= 1, "whole numbers from 1 up")
 natural = kind(int, lambda value: value >= 0, "whole numbers from 0 up")
+teacher_name = kind(
+    str,
+    lambda text: text in TEACHERS or bool(re.fullmatch(r"\w+(\.\w+)*:\w+", text)),
+    f"{', '.join(TEACHERS)}, or package.module:name",
+)
 numbers = kind(
     lambda text: tuple(map(float, text.split(","))),
     lambda values: all(map(math.isfinite, values)),

@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from hlsim.cli.inputs import check_files, check_there, need, read_ear
 from hlsim.cli.options import EARS_TABLE, Parser, count, integer, number, numbers, passed, positive, shares
 from hlsim.cli.progress import show_progress
 from hlsim.parallel import run_parallel
-
-if TYPE_CHECKING:
-    from hlsim.data.teacher import Reference
 
 ALIGNMENTS = ("structural", "impulse")
 
@@ -55,8 +52,7 @@ def prepare(parser: Parser) -> None:
     option("--shortest", positive, "seconds; shorter files are left out", 0.5)
     parser.flag("--strict", "make a fault an error")
     parser.flag("--write", "make the instances too, 12 bytes a sample")
-    text = "that says what is heard, with --write"
-    option("--teacher", str, text, MAKING["teacher"], choices=("msbg", "pyclarity"))
+    parser.teacher("that says what is heard, with --write", MAKING["teacher"])
     text = "impulse is the paper's, with --write"
     option("--alignment", str, text, MAKING["alignment"], choices=ALIGNMENTS)
     parser.parallel()
@@ -84,15 +80,17 @@ def _prepare(options: argparse.Namespace) -> None:
     )
     from hlsim.data.plan import FAULTS, prepare
     from hlsim.data.plan_settings import PlanSettings
-    from hlsim.data.teacher import check_grid
+    from hlsim.data.teacher import check_grid, find_teacher
     from hlsim.data.writing import Recipe, write_instances
 
     levels = (options.level[0], options.level[-1])
     snrs = {"train_snrs": options.train_snr, "test_snrs": options.test_snr}
     settings = PlanSettings(**passed(options, PlanSettings, level=levels, **snrs))
+    if options.teacher == "pyclarity":
+        need("pyclarity", "clarity")
     if options.write:
         check_grid(options.rate)  # before hours of checking files
-    recipe = Recipe(options.alignment, _reference(options.teacher)) if options.write else None
+    recipe = Recipe(options.alignment, find_teacher(options.teacher)) if options.write else None
     prepared = prepare(settings, **passed(options, prepare, progress=show_progress("utterances")))
     print(prepared.to_text())
     if prepared.faults:
@@ -114,15 +112,6 @@ def _refuse_without(
     ]
     if given and not there:
         raise ValueError(f"{', '.join(given)} without {needed}; allowed: only with it")
-
-
-def _reference(teacher: str) -> Reference | None:
-    if teacher == "msbg":
-        return None
-    need("pyclarity", "clarity")
-    from hlsim.metrics.reference import pyclarity_msbg
-
-    return pyclarity_msbg
 
 
 def _draw_alignment(options: argparse.Namespace) -> None:

@@ -21,6 +21,7 @@ def train_simulator(parser: Parser) -> None:
     parser.option("--manifest", Path, text)
     parser.option("--root", Path, "folder of the manifest's paths, if not where it was prepared")
     parser.flag("--prepared", "train on what 'hlsim prepare --write' wrote")
+    parser.teacher("that says what is heard", "msbg")
     parser.option("--workers", natural, "processes that read the manifest's files; 1 by default")
     _training_options(parser, minutes=60.0)
 

@@ -11,14 +11,16 @@ from torch.nn import functional
 
 from hlsim.audiogram import Audiogram
 from hlsim.checks import refuse_unknown
+from hlsim.data.foreign_teacher import ForeignTeacher, load_teacher
+from hlsim.metrics.reference import pyclarity_msbg
 from hlsim.msbg import MSBG, estimate_delay
 from hlsim.msbg.ear import MSBG_RATE
 
 TEACHERS = ("msbg", "pyclarity")
 ALIGNMENTS = ("structural", "impulse", "none")
 
-Reference = Callable[[Tensor, Audiogram, int], Tensor]
-"""An aligned simulator of one item, as ``pyclarity_msbg``: signal, ear, rate -> signal."""
+Reference = Callable[[Tensor, Audiogram, int], Tensor] | ForeignTeacher
+"""An aligned simulator of one item, as ``pyclarity_msbg``: signal, ear, rate -> signal; or anyone's of many."""
 
 _FRAME = 64  # samples at 44.1 kHz from one frame of MSBG's smearing to the next
 _BODY, _CONTEXT, _TAIL = 1.9, 0.3, 0.2  # s at least: of a block, heard before it, heard after it
@@ -35,10 +37,10 @@ class Teacher(nn.Module):
         sample_rate: Hz: 16000, 22050, 24000, 32000, 44100, 48000, and others whose grid of blocks is 4 s or less.
         alignment: ``structural``: by MSBG's own delay, to a fraction of a sample; ``impulse``: by the paper's method,
             whole samples, see ``estimate_delay``; ``none``: the delay stays in.
-        reference: another simulator instead, one item at a time.
+        reference: another simulator instead, asked for whole utterances.
 
     Raises:
-        ValueError: an unknown alignment or a rate with a coarser grid.
+        ValueError: an unknown alignment, MSBG's impulse method for another simulator, or a rate with a coarser grid.
     """
 
     def __init__(
@@ -46,6 +48,10 @@ class Teacher(nn.Module):
     ) -> None:
         super().__init__()
         refuse_unknown([alignment], ALIGNMENTS, "alignments")
+        if isinstance(reference, ForeignTeacher) and alignment != "structural":
+            raise ValueError(
+                f"alignment {alignment!r} of {reference.name}; allowed: structural, for it is aligned"
+            )
         self.sample_rate, self.alignment, self.reference = sample_rate, alignment, reference
         self.msbg = MSBG(sample_rate=sample_rate, aligned=alignment == "structural" or reference is not None)
         self.grid = check_grid(sample_rate)
@@ -60,6 +66,8 @@ class Teacher(nn.Module):
 
         Shape: (items, time) in pascals, (items, 8) dB HL -> (items, time).
         """
+        if isinstance(self.reference, ForeignTeacher):
+            return self.reference(signals, thresholds, self.sample_rate)
         if self.reference is not None:
             return torch.stack([self._by_reference(*item) for item in zip(signals, thresholds, strict=True)])
         time = signals.shape[-1]
@@ -95,11 +103,26 @@ class Teacher(nn.Module):
         return self._delays[ear]
 
     def _by_reference(self, signal: Tensor, thresholds: Tensor) -> Tensor:
-        assert self.reference is not None
+        assert self.reference is not None and not isinstance(self.reference, ForeignTeacher)
         ear = Audiogram(tuple(thresholds.tolist()))
         heard = self.reference(signal.cpu(), ear, self.sample_rate).to(signal)
         delay = self.delay(thresholds)
         return functional.pad(heard, (-delay, delay))
+
+
+def find_teacher(name: str) -> Reference | None:
+    """The reference that a name means: None for ``msbg``, the exact one, ``pyclarity``'s, or ``package.module:name``.
+
+    Raises ValueError where there is none."""
+    if ":" not in name:
+        refuse_unknown([name], (*TEACHERS, "package.module:name"), "teachers")
+        return None if name == "msbg" else pyclarity_msbg
+    return load_teacher(name)
+
+
+def name_of(reference: Reference | None) -> str:
+    """What tells targets of one teacher from those of another."""
+    return "msbg" if reference is None else str(getattr(reference, "__name__", reference))
 
 
 def check_grid(sample_rate: int) -> int:

@@ -12,7 +12,7 @@ import torch
 
 from hlsim.data.instances import CLAIM, MANIFEST, Plan, is_whole
 from hlsim.data.manifest import csv_line
-from hlsim.data.teacher import Reference, Teacher
+from hlsim.data.teacher import Reference, Teacher, name_of
 from hlsim.files import PARTIAL, file_lock, write_whole
 from hlsim.parallel import Failed, Progress, make_missing, one_thread
 
@@ -30,8 +30,7 @@ class Recipe:
         return Teacher(rate, alignment=self.alignment, reference=self.reference)
 
     def __str__(self) -> str:
-        teacher = "msbg" if self.reference is None else getattr(self.reference, "__name__", "reference")
-        return f"teacher {teacher}, alignment {self.alignment}"
+        return f"teacher {name_of(self.reference)}, alignment {self.alignment}"
 
 
 def write_instances(

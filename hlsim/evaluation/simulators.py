@@ -1,4 +1,4 @@
-"""How faithful simulators are to MSBG: the same items through the truth and each of them."""
+"""How faithful simulators are to MSBG, or another teacher: the same items through the truth and each of them."""
 
 from __future__ import annotations
 
@@ -15,6 +15,8 @@ import torch
 from torch import Tensor, nn
 
 from hlsim.audiogram import SEVERITIES
+from hlsim.data.foreign_teacher import ForeignTeacher
+from hlsim.data.teacher import Reference, find_teacher
 from hlsim.evaluation.items import LEVELS, Item, draw_items, treat
 from hlsim.evaluation.store import ScoreStore, key_of, weights_hash
 from hlsim.extras import MissingExtraError, require
@@ -28,7 +30,6 @@ from hlsim.metrics.fidelity import (
     stoi,
     third_octave_error_db,
 )
-from hlsim.metrics.reference import pyclarity_msbg
 from hlsim.metrics.registry import version_of, versions_of
 from hlsim.msbg import MSBG
 from hlsim.neuro.config import NEURO_RATE
@@ -75,7 +76,7 @@ def evaluate_simulators(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> SimulatorEvaluation:
-    """Compare simulators with MSBG, side by side.
+    """Compare simulators with MSBG, or another teacher, side by side.
 
     Scores are stored as they are made, by the samples, the ear and the weights that they are of: a run that was stopped
     goes on where it was, and one with a simulator more scores that one alone. An item that a simulator or the truth fails
@@ -87,7 +88,8 @@ def evaluate_simulators(
         audiograms: CSV file of ears, half of those used; the milder standard ones (NH, N1, N2, S1) and drawn ones are
             a quarter each.
         store: file of scores, there or not; None keeps nothing.
-        teacher: ``"pyclarity"``, the reference itself, or ``"msbg"``, hlsim's exact one.
+        teacher: what counts as the truth: ``"pyclarity"``, the reference itself, ``"msbg"``, hlsim's exact one, or
+            anyone's simulator, ``package.module:name``, as ``hlsim.data.foreign_teacher.load_teacher`` takes it.
         items: how many; each is scored under each of ``inputs``.
         seconds: length of an item; PESQ and STOI want 2 or more.
         levels: dB SPL that the items take in turn.
@@ -99,8 +101,8 @@ def evaluate_simulators(
         ValueError: data that cannot be used, an unknown teacher or input, or no item that the truth does not fail on.
         MissingExtraError: pyclarity, pystoi or pesq is not installed.
     """
-    if teacher not in ("pyclarity", "msbg"):
-        raise ValueError(f"teacher {teacher!r}; allowed: pyclarity, msbg")
+    reference = find_teacher(teacher)
+    told = str(reference) if isinstance(reference, ForeignTeacher) else teacher
     if items < 1 or not simulators or not inputs or not levels:
         raise ValueError(
             f"{items} items of {len(inputs)} inputs at {len(levels)} levels for {len(simulators)} simulators; allowed: "
@@ -115,7 +117,7 @@ def evaluate_simulators(
     scored = ScoreStore(store)
     own = {name: version_of(name) for name in ("pyclarity", "hlsim")}  # whose MSBG is the truth
     versions = {**versions_of(["stoi", "pesq"]), **own}
-    settings = {"teacher": teacher, "revision": _REVISION, "versions": versions}
+    settings = {"teacher": told, "revision": _REVISION, "versions": versions}
     weights = {name: weights_hash(simulator) for name, simulator in simulators.items()}
     tasks = []
     for item in treat(drawn, inputs, compensator):
@@ -123,7 +125,7 @@ def evaluate_simulators(
         tasks.append((item, {name: key_of({**about, "weights": weights[name]}) for name in simulators}))
     many = len(simulators)
     failed = make_missing(
-        partial(_score_item, simulators, teacher),
+        partial(_score_item, simulators, reference),
         tasks,
         lambda task: [*task[1].values()],
         scored,
@@ -140,9 +142,9 @@ def evaluate_simulators(
         rows = [row(number, item, keys[name]) for number, (item, keys) in enumerate(tasks)]
         of = {given: [row for row in rows if row["input"] == given] for given in inputs}
         entries[name] = {"inputs": {given: summarise(part) for given, part in of.items()}, "items": rows}
-    result = {"teacher": teacher, "items": items, "seconds": seconds, "seed": seed}
+    result = {"teacher": told, "items": items, "seconds": seconds, "seed": seed}
     result |= {"levels": [*levels], "inputs": [*inputs], "simulators": entries}
-    shown, truth = _shown(drawn, [item for item, _ in tasks], teacher)
+    shown, truth = _shown(drawn, [item for item, _ in tasks], reference)
     heard_of = {"truth": truth}
     for name, simulator in simulators.items():
         with contextlib.suppress(Exception), torch.no_grad():  # its failure is in the tables
@@ -153,14 +155,14 @@ def evaluate_simulators(
 
 def _score_item(
     simulators: Mapping[str, nn.Module],
-    teacher: str,
+    reference: Reference | None,
     task: tuple[Item, Mapping[str, str]],
     missing: Sequence[str],
 ) -> dict[str, dict[str, Any] | Failed]:
     """The scores of an item by each simulator whose key is missing."""
     item, keys = task
     try:
-        truth = _truth(item, teacher)
+        truth = _truth(item, reference)
         true = _both(item.clean, truth, "true")
     except MissingExtraError:
         raise
@@ -177,9 +179,11 @@ def _score_item(
     return made
 
 
-def _truth(item: Item, teacher: str) -> Tensor:
-    if teacher == "pyclarity":
-        return pyclarity_msbg(item.signal, item.ear, NEURO_RATE)
+def _truth(item: Item, reference: Reference | None) -> Tensor:
+    if isinstance(reference, ForeignTeacher):
+        return reference(item.signal[None], torch.tensor([item.ear.thresholds]), NEURO_RATE)[0]
+    if reference is not None:
+        return reference(item.signal, item.ear, NEURO_RATE)
     with torch.no_grad():
         heard: Tensor = MSBG(sample_rate=NEURO_RATE)(item.signal, item.ear)
     return heard
@@ -204,12 +208,12 @@ def _both(clean: Tensor, heard: Tensor, whose: str) -> dict[str, Any]:
     return {name: score.value for name, score in scores.items()} | {"reasons": reasons}
 
 
-def _shown(items: Sequence[Item], others: Iterable[Item], teacher: str) -> tuple[Item, Tensor]:
+def _shown(items: Sequence[Item], others: Iterable[Item], reference: Reference | None) -> tuple[Item, Tensor]:
     """The item of the spectrograms and its truth: the first of moderate loss, or of all, or of the others, with one."""
     reason: Exception | None = None
     for item in chain(sorted(items, key=lambda item: item.about["severity"] != "moderate"), others):
         try:
-            return item, _truth(item, teacher)
+            return item, _truth(item, reference)
         except Exception as error:
             reason = reason or error
     raise ValueError(f"no item has a truth: {reason}")

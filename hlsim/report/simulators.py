@@ -37,6 +37,8 @@ COLUMNS = {
 
 _GROUPS = {"severity": "By degree of loss", "level": "By level (dB SPL)", "condition": "By condition"}
 
+_TEACHERS = {"pyclarity": "pyclarity's MSBG", "msbg": "hlsim's exact MSBG"}
+
 _INPUT_TITLES = {
     "as-is": "Speech as it is",
     "louder": "20 dB louder",
@@ -54,13 +56,17 @@ def write_fidelity(result: Row, panels: Mapping[str, Tensor], shown: Item, out: 
     ``panels`` is what is heard of ``shown`` by name, in pascals at 16 kHz.
     """
     spectrograms = draw_spectrograms(panels, NEURO_RATE)
-    page = ("Fidelity to MSBG", _sections(result, spectrograms, shown), _lead(result))
+    page = (
+        "Fidelity to MSBG" if result["teacher"] in _TEACHERS else "Fidelity",
+        _sections(result, spectrograms, shown),
+        _lead(result),
+    )
     contents = (json.dumps(result, indent=1), render_markdown(*page), render_page(*page), spectrograms)
     write_files(out, dict(zip(FILES, contents, strict=True)))
 
 
 def _lead(result: Row) -> str:
-    reference = "pyclarity's MSBG" if result["teacher"] == "pyclarity" else "hlsim's exact MSBG"
+    reference = _TEACHERS.get(result["teacher"], result["teacher"])
     levels = ", ".join(f"{level:g}" for level in result["levels"])
     return (
         f"Against {reference}: {result['items']} items of {result['seconds']:g} s at {levels} dB SPL in turn, seed "

@@ -19,7 +19,8 @@ from hlsim.data.augment import KNOTS, augment_speech, equalise, mix
 from hlsim.data.clips import Clips
 from hlsim.data.module import Batch, BatchData, PlanData, Step, collate
 from hlsim.data.sounds import draw_sounds
-from hlsim.data.teacher import Teacher
+from hlsim.data.teacher import Reference, Teacher
+from hlsim.data.writing import Recipe
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.training.recipes import CompensatorRecipe, SimulatorRecipe, TrainingRecipe
 
@@ -161,15 +162,17 @@ class CompensatorBatches(DrawnBatches):
         return {"clean": clean, "signal": signal, "thresholds": ears}
 
 
-def simulator_data(data: TrainingData | PlannedSource, recipe: SimulatorRecipe) -> BatchData:
-    """What a simulator is trained and validated on, with what is heard from the exact MSBG.
+def simulator_data(
+    data: TrainingData | PlannedSource, recipe: SimulatorRecipe, reference: Reference | None = None
+) -> BatchData:
+    """What a simulator is trained and validated on, with what is heard from the exact MSBG, or another reference.
 
     Raises ValueError of data that cannot be used; the message names it."""
     if isinstance(data, PlannedSource):
-        return PlannedData(data, recipe)
+        return PlannedData(data, recipe, reference)
     training = SimulatorBatches(recipe, data)
     validation = [*speech_to_validate(data, recipe), *(sounds_to_validate(recipe) if recipe.sounds else [])]
-    return BatchData(training, validation, teacher=Teacher(NEURO_RATE))
+    return BatchData(training, validation, teacher=Teacher(NEURO_RATE, reference=reference))
 
 
 def compensator_data(data: TrainingData, recipe: CompensatorRecipe, ear: Audiogram | None) -> BatchData:
@@ -227,12 +230,15 @@ class PlannedData(PlanData):
     What is prepared is heard as it lies on disk, in validation too, and needs no corpus.
     """
 
-    def __init__(self, source: PlannedSource, recipe: SimulatorRecipe) -> None:
+    def __init__(
+        self, source: PlannedSource, recipe: SimulatorRecipe, reference: Reference | None = None
+    ) -> None:
         if recipe.sounds:
             raise ValueError(f"sounds {recipe.sounds} in the recipe, with a manifest; allowed: 0")
         clips = {name: getattr(recipe, name) for name in ("batch", "seconds", "seed", "levels", "treated")}
         where = {name: getattr(source, name) for name in ("root", "prepared", "workers")}
-        super().__init__(source.manifest, **where, **clips)
+        making = Recipe(reference=reference)
+        super().__init__(source.manifest, recipe=making, **where, **clips)
         if self.plan.rate != NEURO_RATE:
             raise ValueError(f"{source.manifest}: prepared at {self.plan.rate} Hz; allowed: {NEURO_RATE}")
         split = next(split for split in ("valid", "test", "train") if len(self.plan.indices(split)))

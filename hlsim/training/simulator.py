@@ -1,4 +1,4 @@
-"""Training a Neuro-MSBG on what the exact MSBG says is heard."""
+"""Training a Neuro-MSBG on what the exact MSBG, or another teacher, says is heard."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from torch import Tensor
 from hlsim.criteria.paper import paper_parts, weighted_sum
 from hlsim.criteria.waveform import log_spectral_distance_db, noise_to_signal_db
 from hlsim.data.module import Batch
+from hlsim.data.teacher import find_teacher, name_of
 from hlsim.neuro import NeuroConfig, NeuroMSBG
 from hlsim.pretrained import SIMULATOR, load_pretrained
 from hlsim.training.batches import PlannedData, PlannedSource, TrainingData, identity_of, simulator_data
@@ -84,20 +85,30 @@ def train_simulator(
     *,
     out: str | Path,
     max_minutes: float,
+    teacher: str = "msbg",
     **options: Unpack[RunOptions],
 ) -> Path:
     """Train, resume, and keep the best checkpoint.
 
     Args:
         data: folders to draw batches from, or a prepared plan.
+        teacher: ``"msbg"``, the exact one, ``"pyclarity"``'s, or anyone's simulator, ``package.module:name``, as
+            ``hlsim.data.foreign_teacher.load_teacher`` takes it.
 
     Returns: the folder that ``load_pretrained`` takes, ``out/checkpoint``.
 
     Raises:
-        ValueError: data or recipe that cannot be used; the message names them.
+        ValueError: data, recipe or teacher that cannot be used; the message names them.
     """
     module = SimulatorTraining(recipe, max_minutes)
-    batches = simulator_data(data, recipe)
+    if teacher != "msbg" and isinstance(data, PlannedSource) and data.prepared:
+        raise ValueError(
+            f"teacher {teacher} for what is prepared; allowed: none, for it has been heard already"
+        )
+    reference = find_teacher(teacher)
+    # nothing of hlsim's own: trainings that began before there were others go on
+    told = {} if reference is None else {"teacher": name_of(reference)}
+    batches = simulator_data(data, recipe, reference)
     made_of = {"instances": batches.made_of} if isinstance(batches, PlannedData) else {}
-    how: dict[str, Any] = {"out": out, "identity": identity_of(data) | made_of, "about": {}}
+    how: dict[str, Any] = {"out": out, "identity": identity_of(data) | made_of | told, "about": told}
     return train_network(module, batches, recipe, SIMULATOR, **how, **options)

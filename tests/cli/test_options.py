@@ -35,7 +35,7 @@ def test_names_that_are_written_twice_agree() -> None:
     assert tuple(STANDARD) == options.STANDARD_EARS
     assert files.ENDINGS == EXTENSIONS
     assert choices("prepare", "--layout") == ("auto", *LAYOUTS)
-    assert choices("prepare", "--teacher") == TEACHERS
+    assert options.TEACHERS == TEACHERS
     assert choices("prepare", "--alignment") == choices("draw-alignment", "--alignment") == ALIGNMENTS[:2]
     assert choices("haspi-report", "--engine") == choices("evaluate-compensator", "--engine") == ENGINES
     assert choices("prepare", "--backend") == choices("haspi-report", "--backend") == BACKENDS

@@ -75,6 +75,7 @@ def test_options_reach_the_plan(corpus: Path, tmp_path: Path, capsys: pytest.Cap
         (["--train-snr", "5,10", "--test-snr", "5", "--noise", "NOISE"], "SNRs 5 dB for training and test"),
         (["--train-snr", "5", "--test-types", "1"], "--train-snr, --test-types without --noise; allowed"),
         (["--teacher", "pyclarity"], "--teacher without --write; allowed: only with it"),
+        (["--teacher", "nobody:hears", "--write"], "teacher nobody:hears: cannot be had"),
         (["--rate", "44101", "--write"], "44101 Hz for a teacher; allowed: 16000"),
         (["--alignment", "impulse"], "--alignment without --write; allowed: only with it"),
     ],

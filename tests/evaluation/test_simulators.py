@@ -232,8 +232,30 @@ def test_a_stopped_comparison_goes_on_and_a_new_simulator_is_scored_alone(
     assert len((tmp_path / "parts" / "scores.jsonl").read_text().splitlines()) == 6
 
 
+def test_teachers_share_no_stored_scores(
+    tmp_path: Path, speech_dir: Path, ears: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(Path(__file__).parents[2] / "examples" / "training")
+    options = {
+        "speech": speech_dir / "valid",
+        "audiograms": ears,
+        "items": 2,
+        "seconds": 1.0,
+        "out": tmp_path,
+    }
+    given = {"identity": Unimpaired()}
+    exact = compare(given, teacher="msbg", **options)
+    other = compare(given, teacher="dead_region:DeadRegion", **options)
+    assert len((tmp_path / "scores.jsonl").read_text().splitlines()) == 4
+    assert other["teacher"].startswith("dead_region:DeadRegion (sha256 ") and exact["teacher"] == "msbg"
+    text = (tmp_path / "fidelity.md").read_text()
+    assert text.startswith("# Fidelity\n") and f"Against {other['teacher']}: 2 items" in text
+    snr = [[item["snr"] for item in result["simulators"]["identity"]["items"]] for result in (exact, other)]
+    assert snr[0] != snr[1]
+
+
 def test_unknown_teacher(tmp_path: Path, speech_dir: Path, ears: Path) -> None:
-    with pytest.raises(ValueError, match="allowed: pyclarity, msbg"):
+    with pytest.raises(ValueError, match="unknown teachers nobody; allowed: msbg, pyclarity, package"):
         compare({}, speech=speech_dir, audiograms=ears, out=tmp_path, teacher="nobody")
 
 

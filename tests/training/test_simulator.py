@@ -19,9 +19,11 @@ from hlsim.pretrained import load_pretrained
 
 pytest.importorskip("lightning")
 
+from hlsim.data.foreign_teacher import load_teacher
 from hlsim.data.module import Batch, Step
 from hlsim.training.batches import (
     MILDER,
+    PlannedSource,
     TrainingData,
     simulator_data,
     sounds_to_validate,
@@ -242,6 +244,27 @@ def test_another_recipe_or_other_data_need_another_folder(data: TrainingData, tm
 def test_unknown_names_in_a_recipe(recipe: dict[str, Any], said: str) -> None:
     with pytest.raises(ValueError, match=said):
         SimulatorRecipe.from_dict(recipe)
+
+
+def test_another_teacher_is_told_and_needs_another_folder(
+    data: TrainingData, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(Path(__file__).parents[2] / "examples" / "training")
+    train(data, tmp_path / "out", max_steps=1, teacher="dead_region:DeadRegion")
+    about = json.loads((tmp_path / "out" / "checkpoint" / "config.json").read_text())["about"]
+    assert about["teacher"].startswith("dead_region:DeadRegion (sha256 ")
+    with pytest.raises(ValueError, match=r"another recipe \(other teacher"):
+        train(data, tmp_path / "out", max_steps=2)
+    train(data, tmp_path / "out", max_steps=2, teacher="dead_region:DeadRegion")
+    heard = []
+    for teacher in (None, load_teacher("dead_region:DeadRegion")):
+        batches = simulator_data(data, SimulatorRecipe.from_dict(TINY), teacher)
+        heard.append(batches.on_after_batch_transfer(batches.training[Step(0)], 0))
+    assert torch.equal(heard[0]["signal"], heard[1]["signal"])
+    assert not torch.allclose(heard[0]["impaired"], heard[1]["impaired"])
+    prepared = PlannedSource(tmp_path, prepared=True)
+    with pytest.raises(ValueError, match=r"teacher a:b for what is prepared; allowed: none"):
+        train_simulator(prepared, SimulatorRecipe(), out=tmp_path / "b", max_minutes=1.0, teacher="a:b")
 
 
 def test_unknown_settings_of_the_network(data: TrainingData, tmp_path: Path) -> None:
