@@ -179,9 +179,43 @@ class Audiogram:
         return clarity.Audiogram(levels=np.array(self.levels), frequencies=np.array(self.frequencies))
 
     @classmethod
-    def from_clarity(cls, audiogram: Any) -> Audiogram:
-        """From pyclarity's ``Audiogram``."""
-        return cls(tuple(map(float, audiogram.levels)), tuple(map(float, audiogram.frequencies)))
+    def from_clarity(cls, given: Any, ear: str | None = None) -> Audiogram:
+        """From pyclarity's ``Audiogram``, or one ear of its ``Listener`` or of an entry of Clarity's ``listeners.json``.
+
+        Args:
+            ear: ``"left"`` or ``"right"``, of a listener.
+
+        Raises:
+            ValueError: none of these, a listener without ``ear``, or an audiogram with it.
+        """
+        two = _has_two_ears(given)
+        if ear not in (("left", "right") if two else (None,)):
+            allowed = (
+                "ear='left' or ear='right', for a listener has two" if two else "None, for it is one ear"
+            )
+            raise ValueError(f"ear is {ear!r}; allowed: {allowed}")
+        if two and isinstance(given, Mapping):
+            return cls(given[f"audiogram_levels_{ear[0]}"], given["audiogram_cfs"])  # type: ignore[index]
+        if two:
+            given = getattr(given, f"audiogram_{ear}")
+        if not _is_claritys(given):
+            raise ValueError(
+                f"{type(given).__name__} is none of pyclarity's; allowed: its Audiogram or Listener, or an entry of "
+                "listeners.json"
+            )
+        return cls(given.levels, given.frequencies)
+
+
+def _is_claritys(given: Any) -> bool:
+    """Whether it is pyclarity's ``Audiogram``, without importing it."""
+    return hasattr(given, "levels") and hasattr(given, "frequencies")
+
+
+def _has_two_ears(given: Any) -> bool:
+    """Whether it is pyclarity's ``Listener`` or an entry of ``listeners.json``."""
+    if isinstance(given, Mapping):
+        return {"audiogram_cfs", "audiogram_levels_l", "audiogram_levels_r"} <= given.keys()
+    return hasattr(given, "audiogram_left") and hasattr(given, "audiogram_right")
 
 
 # numbers alone: checkpoints that hold ears as hyperparameters load as those of plain tensors do
@@ -206,7 +240,7 @@ def severity_index(thresholds: Tensor) -> Tensor:
 
 
 AudiogramLike = Audiogram | Sequence[Audiogram] | Tensor
-"""One ear, one a batch item, or a (..., 8) tensor of dB HL."""
+"""One ear, one a batch item, or a (..., 8) tensor of dB HL. pyclarity's ``Audiogram`` is taken as ours is."""
 
 
 def as_thresholds(
@@ -223,10 +257,12 @@ def as_thresholds(
         ValueError: not an audiogram, a complex or bool tensor, a last dimension other than 8, NaN, or levels outside -10
             to ``highest`` dB HL.
     """
-    if isinstance(audiogram, Audiogram):
-        return torch.tensor(_taken(audiogram.thresholds, highest, taker))
-    if isinstance(audiogram, Sequence) and audiogram and all(isinstance(ear, Audiogram) for ear in audiogram):
-        return torch.tensor([_taken(ear.thresholds, highest, taker) for ear in audiogram])
+    if (ear := _one_ear(audiogram)) is not None:
+        return torch.tensor(_taken(ear.thresholds, highest, taker))
+    if isinstance(audiogram, Sequence) and audiogram:
+        ears = [_one_ear(one) for one in audiogram]
+        if all(ear is not None for ear in ears):
+            return torch.tensor([_taken(ear.thresholds, highest, taker) for ear in ears if ear is not None])
     if isinstance(audiogram, list | tuple):
         audiogram = _stacked(audiogram)
     if not isinstance(audiogram, Tensor):
@@ -310,6 +346,13 @@ def _place(hz: tuple[float, ...]) -> NDArray[np.float64]:
     return place.clip(0.0, 1.0)
 
 
+def _one_ear(given: Any) -> Audiogram | None:
+    """An audiogram, ours or pyclarity's, as ours."""
+    if isinstance(given, Audiogram):
+        return given
+    return Audiogram.from_clarity(given) if _is_claritys(given) else None
+
+
 def _stacked(tensors: Any) -> Any:
     """One tensor of a list of (8,) tensors, an ear each, or of eight (batch,) ones, a frequency each; else as given."""
     kinds = len(FREQUENCIES)
@@ -342,10 +385,12 @@ def _instead(given: object) -> str:
     first: Any = given[0] if several else given  # type: ignore[index]
     if isinstance(first, str) and first in STANDARD:
         make = f"Audiogram.standard({first!r})"
+    elif _has_two_ears(first):
+        return (
+            "; of a listener's two ears write Audiogram.from_clarity(listener, 'left') or (listener, 'right')"
+        )
     elif isinstance(first, Mapping):
         make = "Audiogram.from_dict(...)"
-    elif hasattr(first, "levels") and hasattr(first, "frequencies"):  # pyclarity's, without importing it
-        make = "hlsim.Audiogram.from_clarity(...)"
     elif several and isinstance(first, Tensor):
         return "; write torch.stack(...)"
     elif isinstance(first, np.ndarray) or (several and isinstance(first, float | int | list | tuple)):

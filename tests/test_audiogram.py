@@ -347,11 +347,37 @@ def test_pyclarity_round_trip() -> None:
     mild = Audiogram.from_clarity(clarity.AUDIOGRAM_MILD)
     assert (mild.frequencies[0], mild.levels[0], mild.levels[-1]) == (125.0, 5.0, 50.0)
     assert mild.thresholds == (10, 15, 19, 25, 28, 31, 35, 38)
-    for given in (theirs, [theirs, theirs]):
+    # taken as it is wherever an ear is
+    assert torch.equal(as_thresholds(theirs), as_thresholds(ear))
+    assert torch.equal(as_thresholds([theirs, ear, clarity.AUDIOGRAM_MILD]), as_thresholds([ear, ear, mild]))
+
+
+def test_an_ear_of_pyclaritys_listeners() -> None:
+    clarity = pytest.importorskip("clarity.utils.audiogram")
+    entry = {
+        "name": "L0001",
+        "audiogram_cfs": [250, 500, 1000, 2000, 3000, 4000, 6000, 8000],
+        "audiogram_levels_l": [45, 45, 35, 45, 60, 65, 70, 65],
+        "audiogram_levels_r": [40, 40, 30, 40, 55, 60, 65, 60],
+    }
+    listener = clarity.Listener.from_dict(entry)
+    for given in (entry, listener):
+        for side in ("left", "right"):
+            ear = Audiogram.from_clarity(given, side)
+            assert list(ear.levels) == entry[f"audiogram_levels_{side[0]}"]
         with pytest.raises(
-            ValueError, match=r"allowed: .* tensor; write \[?hlsim\.Audiogram\.from_clarity\("
+            ValueError, match=r"ear is None; allowed: ear='left' or ear='right', for a listener"
         ):
-            as_thresholds(given)
+            Audiogram.from_clarity(given)
+        with pytest.raises(ValueError, match=r"ear is 'l'; allowed: ear='left' or ear='right'"):
+            Audiogram.from_clarity(given, "l")
+        for several in (given, [given, given]):
+            with pytest.raises(ValueError, match=r"two ears write .*'left'\) or \(listener, 'right'\)"):
+                as_thresholds(several)
+    with pytest.raises(ValueError, match="ear is 'left'; allowed: None, for it is one ear"):
+        Audiogram.from_clarity(listener.audiogram_left, "left")
+    with pytest.raises(ValueError, match="float is none of pyclarity's; allowed: its Audiogram or Listener"):
+        Audiogram.from_clarity(65.0)
 
 
 def test_thresholds_for_a_simulator() -> None:
