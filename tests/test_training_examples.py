@@ -2,11 +2,14 @@
 
 import importlib.util
 import math
+import sys
 from pathlib import Path
 from types import ModuleType
 
 import pytest
 import torch
+
+from hlsim.cli.main import main
 
 EXAMPLES = Path(__file__).parents[1] / "examples" / "training"
 
@@ -30,9 +33,76 @@ def test_conv_tasnet_trains(tmp_path: Path, speech_dir: Path, capsys: pytest.Cap
 
 
 def test_a_criterion_of_ones_own_trains(capsys: pytest.CaptureFixture[str]) -> None:
-    load("your_criterion.py").main(6)
+    load("your_criterion.py").main(steps=6)
     values = losses(capsys.readouterr().out)
     assert values[-1] < values[0]
+
+
+@pytest.mark.parametrize("package", ["auraloss", "torch-stoi"])
+def test_criteria_of_other_packages_on_what_is_heard(
+    package: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip(package.replace("-", "_"))
+    example = load("your_criterion.py")
+    example.main(package, steps=6)
+    values = losses(capsys.readouterr().out)
+    assert values[-1] < values[0]
+    # it has a gradient of its own, and the reference itself costs least
+    measure, reference = example.from_elsewhere(package), example.set_level(torch.randn(2, 16000), 65.0)
+    heard = (reference + 0.02 * torch.randn(2, 16000)).requires_grad_()
+    worse = measure(heard, reference)
+    worse.backward()
+    assert float(measure(reference, reference)) < worse.item() and bool(heard.grad.any())
+
+
+def test_a_loop_of_accelerate(capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("accelerate")
+    aid = load("accelerate_loop.py").main(3)
+    values = losses(capsys.readouterr().out)
+    assert values[-1] < values[0]
+    assert set(aid.state_dict()) == {"weight", "bias"}
+
+
+def test_an_aid_learns_through_a_network_that_learned_another_simulator(
+    tmp_path: Path, speech_dir: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """examples/any-teacher.md, a few steps."""
+    for module in ("lightning", "yaml", "clarity", "pystoi", "pesq", "matplotlib"):
+        pytest.importorskip(module)
+    monkeypatch.chdir(EXAMPLES.parents[1])
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    train, valid, out = speech_dir / "train", speech_dir / "valid", tmp_path / "ear"
+    teacher = ("--teacher", "examples.training.dead_region:DeadRegion")
+    recipe = tmp_path / "recipe.yaml"
+    shorter = ("batch: 2", "seconds: 0.3", "validate_every: 2", "validation_items: 8")
+    lines = (EXAMPLES.parent / "any-teacher.yaml").read_text().splitlines()
+    for change in shorter:
+        lines = [change if line.startswith(change.split()[0]) else line for line in lines]
+    recipe.write_text("\n".join(lines))
+    common = ("--out", str(out), "--device", "cpu", "--quiet", "--max-steps", "2", "--max-minutes", "10")
+    assert main(["train-simulator", *teacher, "--config", str(recipe), "--speech", str(train), *common]) == 0
+    ears = tmp_path / "ears.csv"
+    ears.write_text("hl_250,hl_1000,hl_4000\n20,30,75\n")
+    given = (*teacher, "--speech", str(valid), "--audiograms", str(ears), "--items", "2", "--seconds", "0.5")
+    assert main(["evaluate-simulator", str(out / "checkpoint"), *given, "--out", str(tmp_path / "of")]) == 0
+    assert "Against examples.training.dead_region:DeadRegion (sha256" in capsys.readouterr().out
+    example = importlib.import_module("examples.training.dead_region_aid")
+    for simulator in (str(out / "checkpoint"), ""):
+        example.main(str(train), str(valid), simulator, "S2", "2")
+        text = capsys.readouterr().out
+        assert text.count(" dB ") == 9 and text.startswith("heard without the aid: -")
+
+
+def test_a_dead_region_is_silent_and_the_rest_is_attenuated() -> None:
+    ear, rate = torch.tensor([20.0, 20.0, 25.0, 55.0, 75.0, 95.0, 95.0, 95.0]), 16000
+    time = torch.arange(rate) / rate
+    tones = torch.stack([torch.sin(2 * torch.pi * hz * time) for hz in (500.0, 1000.0, 2000.0, 3500.0)])
+    heard = load("dead_region.py").DeadRegion()(tones, ear)[:, 1000:-1000]
+    levels = 20.0 * (heard.std(-1) / tones[:, 1000:-1000].std(-1)).log10()
+    torch.testing.assert_close(levels[:3], torch.tensor([-20.0, -25.0, -55.0]), atol=0.5, rtol=0.0)
+    assert float(levels[3]) < -75.0
+    # in phase: nothing is delayed
+    assert float(torch.nn.functional.cosine_similarity(heard[0], tones[0, 1000:-1000], dim=0)) > 0.9999
 
 
 def test_lightning_in_bf16(capsys: pytest.CaptureFixture[str]) -> None:
