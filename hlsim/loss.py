@@ -46,8 +46,8 @@ class HearingLossLoss(nn.Module):
 
     It may be called in an autocast region and works in float32 there; call ``backward()`` outside of it, as torch says:
     inside one of float16, gradients may be NaN. A compiled caller calls it as it is, so that ``fullgraph=True`` and
-    ``torch.export`` refuse it. Of ``torch.func`` it takes ``grad``, and with the exact MSBG ``vmap`` (not of ``"bands"``)
-    and ``jvp``; the network does not, and ``"haspi"`` and ``"hasqi"`` take none.
+    ``torch.export`` refuse it; compile or export the network alone. Of ``torch.func`` it takes ``grad``, and with the
+    exact MSBG ``vmap`` (not of ``"bands"``) and ``jvp``; the network does not, and ``"haspi"`` and ``"hasqi"`` take none.
 
     Args:
         audiogram: the ear or ears; may be given with each call instead. A tensor that is trained gets its gradient; it is
@@ -320,7 +320,7 @@ class HearingLossLoss(nn.Module):
                 raise
             raise ValueError(
                 f"{type(self.simulator).__name__} does not go through this transform of torch.func; allowed: grad, and "
-                "with simulator='msbg' vmap and jvp"
+                "with simulator='msbg' jvp and, of all criteria but 'bands', vmap"
             ) from error
         return _check_heard(heard, "simulator", waveform, allowed)
 

@@ -16,16 +16,17 @@ P = ParamSpec("P")
 Result = TypeVar("Result")
 
 
-_EAGER = "hlsim runs eagerly here: leave fullgraph out, or compile the network alone"
-
-
 def not_compiled(method: Callable[P, Result]) -> Callable[P, Result]:
     """``torch.compiler.disable``, but asked for only by a compiler: it takes longer to import than all of hlsim."""
 
     @wraps(method)
     def call(*args: P.args, **kwargs: P.kwargs) -> Result:
         if torch.compiler.is_compiling():
-            return torch.compiler.disable(method, reason=_EAGER)(*args, **kwargs)
+            # with fullgraph=True this is the error, and the next one's would not tell its reason
+            torch._dynamo.graph_break(
+                msg="hlsim runs eagerly here: leave fullgraph out, or compile the network alone"
+            )
+            return torch.compiler.disable(method)(*args, **kwargs)
         return method(*args, **kwargs)
 
     return call

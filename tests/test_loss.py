@@ -1055,3 +1055,5 @@ def test_transforms_work_or_say_so(clean: Tensor) -> None:
         torch.vmap(network)(given, clean)
     with pytest.raises(ValueError, match="HearingLossLoss is for training, and not exported"):
         torch.export.export(Host(network).loss, (given, clean))
+    with pytest.raises(RuntimeError, match="hlsim runs eagerly here: leave fullgraph out"):
+        torch.compile(lambda wave: network(wave, clean), backend="eager", fullgraph=True)(given)
