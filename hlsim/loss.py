@@ -182,10 +182,10 @@ class HearingLossLoss(nn.Module):
     ) -> dict[str, Tensor]:
         """The parts of the loss by name, before their weights.
 
-        Those of ``"coherent-bands"`` are incoherence, levels, louder and peaks, of ``"bands"`` band_levels (dB), of
-        ``"paper"`` magnitude, phase, complex and time, of ``"haspi"`` and ``"hasqi"`` themselves, and of a callable
-        criterion. Their sum, ``sum(weight * parts[name] for name, weight in loss.weights.items())``, is what ``forward``
-        gives.
+        Those of ``"coherent-bands"`` are incoherence, misalignment, levels, louder and peaks, of ``"bands"`` band_levels
+        (dB), of ``"paper"`` magnitude, phase, complex and time, of ``"haspi"`` and ``"hasqi"`` themselves, and of a
+        callable criterion. Their sum, ``sum(weight * parts[name] for name, weight in loss.weights.items())``, is what
+        ``forward`` gives.
 
         Shape, arguments and errors: as ``forward``.
         """

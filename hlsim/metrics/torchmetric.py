@@ -34,7 +34,9 @@ class _MeanScore(_Metric):
 
     total: Tensor
     total_level: Tensor
+    total_ears: Tensor
     count: Tensor
+    count_ears: Tensor
     seen: Tensor
     failed: Tensor
 
@@ -59,6 +61,8 @@ class _MeanScore(_Metric):
             self.add_state(name, torch.tensor(0.0), dist_reduce_fx="sum")
         for name in ("count", "seen", "failed"):
             self.add_state(name, torch.tensor(0), dist_reduce_fx="sum")
+        for name in ("total_ears", "count_ears"):
+            self.add_state(name, torch.zeros(2), dist_reduce_fx="sum")
 
     def update(
         self, processed: Tensor, clean: Tensor, audiogram: AudiogramLike, lengths: Tensor | None = None
@@ -66,49 +70,77 @@ class _MeanScore(_Metric):
         """Score a batch.
 
         An item of which there is no score (silence, NaN, less than 0.7 s) is left out, counted in ``failed``, and said.
+        Of two channels, left and right, the better ear's score and level count, and ``ears`` tells each ear's.
 
         Args:
-            audiogram: one ear for all, one an item, or (batch, 8) dB HL.
+            audiogram: one ear for all, one an item, or (batch, 8) dB HL; of two channels a pair of left and right, (2, 8)
+                or (batch, 2, 8) dB HL.
             lengths: samples of each item, where the batch is padded.
 
-        Shape: (batch, time) or (time,), the same for both; ``lengths`` (batch,). ValueError for others, for audiograms
-        that are none, or not one or one an item, and for lengths beyond the signals.
+        Shape: (batch, time) or (time,), or (batch, 2, time), the same for both; ``lengths`` (batch,). ValueError for
+        others, for audiograms that are none, or not one or one an item, and for lengths beyond the signals.
         """
-        if processed.shape != clean.shape or processed.ndim not in (1, 2):
+        shape = processed.shape
+        if shape != clean.shape or len(shape) not in (1, 2, 3) or (len(shape) == 3 and shape[1] != 2):
             raise ValueError(
-                f"processed {tuple(processed.shape)} and clean {tuple(clean.shape)}; allowed: (batch, time) or (time,), "
-                "the same for both"
+                f"processed {tuple(shape)} and clean {tuple(clean.shape)}; allowed: (batch, time), (time,) or (batch, 2, "
+                "time), the same for both"
             )
         device = processed.device
         precision = torch.float32 if device.type == "mps" else torch.float64
+        sides = 2 if len(shape) == 3 else 1
         heard, reference = (
-            torch.atleast_2d(signal.detach()).to(device, precision) for signal in (processed, clean)
+            torch.atleast_2d(signal.detach()).to(device, precision).reshape(-1, sides, shape[-1])
+            for signal in (processed, clean)
         )
-        ears = _ears(audiogram, len(heard))
-        ends = _ends(lengths, *heard.shape)
-        items, levels = [], []
+        ears = _ears(audiogram, len(heard), sides)
+        ends = _ends(lengths, len(heard), shape[-1])
+        items: list[_Item] = []
         pairs = zip(heard, reference, ears, ends, strict=True)
-        for number, (signal, target, ear, end) in enumerate(pairs, start=int(self.seen)):
+        for number, (signals, targets, own, end) in enumerate(pairs, start=int(self.seen)):
             if self.limit is not None and number >= self.limit:
                 break
-            item = _Item(signal[:end], target[:end], ear, (self.seed + number) % 2**32)
-            try:
-                check_pair(item.clean, item.processed, self.sample_rate, self.full_scale_spl)
-            except ValueError as error:
+            reasons = []
+            for side in range(sides):
+                item = _Item(
+                    number,
+                    side,
+                    signals[side, :end],
+                    targets[side, :end],
+                    own[side],
+                    (self.seed + number) % 2**32,
+                )
+                try:
+                    check_pair(item.clean, item.processed, self.sample_rate, self.full_scale_spl)
+                    items.append(item)
+                except ValueError as error:
+                    reasons.append(error)
+            if len(reasons) == sides:
                 self.failed += 1
                 name = self.score.__name__.upper()
-                warnings.warn(f"{name} leaves out item {number}: {error}", stacklevel=2)
-                continue
-            items.append(item)
-            levels.append(float(level_spl(item.processed, self.full_scale_spl)))
+                warnings.warn(f"{name} leaves out item {number}: {reasons[0]}", stacklevel=2)
         self.seen += len(heard)
-        self.count += len(items)
-        self.total += sum(self._scores(items))
-        self.total_level += sum(levels)
+        best: dict[int, tuple[float, _Item]] = {}
+        for item, score in zip(items, self._scores(items), strict=True):
+            if sides == 2:
+                self.total_ears[item.side] += score
+                self.count_ears[item.side] += 1
+            if item.number not in best or score > best[item.number][0]:
+                best[item.number] = score, item
+        self.count += len(best)
+        self.total += sum(score for score, _ in best.values())
+        self.total_level += sum(
+            float(level_spl(item.processed, self.full_scale_spl)) for _, item in best.values()
+        )
 
     def compute(self) -> Tensor:
         """Mean score, float32; NaN where nothing was scored."""
         return self.total / self.count
+
+    @property
+    def ears(self) -> Tensor:
+        """Mean score of the left and of the right ear, of this process; NaN without two channels. Shape: (2,)."""
+        return self.total_ears / self.count_ears
 
     @property
     def level(self) -> Tensor:
@@ -163,8 +195,10 @@ class HASQI(_MeanScore):
 
 
 class _Item(NamedTuple):
-    """(time,) each."""
+    """One ear of an item, (time,) each; ``side`` is 0 or, of a right ear, 1."""
 
+    number: int
+    side: int
     processed: Tensor
     clean: Tensor
     ear: Audiogram
@@ -184,7 +218,7 @@ class _Task(NamedTuple):
 @one_thread()
 @torch.no_grad()
 def _score(task: _Task) -> list[float]:
-    processed, clean, ears, seeds = zip(*task.items, strict=True)
+    _, _, processed, clean, ears, seeds = zip(*task.items, strict=True)
     pad = torch.nn.utils.rnn.pad_sequence
     scores = task.score(
         pad(list(processed), batch_first=True),
@@ -211,21 +245,26 @@ def _ends(lengths: Tensor | None, batch: int, time: int) -> list[int]:
     return ends
 
 
-def _ears(audiogram: AudiogramLike, batch: int) -> list[Audiogram]:
-    if isinstance(audiogram, Audiogram):
-        return [audiogram] * batch
+def _ears(audiogram: AudiogramLike, batch: int, sides: int) -> list[list[Audiogram]]:
+    """Each item's ears: one, or left and right."""
+    one = () if sides == 1 else (2,)
+    if isinstance(audiogram, Audiogram) and sides == 1:
+        return [[audiogram]] * batch
     if isinstance(audiogram, Tensor):
-        if audiogram.shape not in ((len(FREQUENCIES),), (batch, len(FREQUENCIES))):
+        width = len(FREQUENCIES)
+        if audiogram.shape not in ((*one, width), (batch, *one, width)):
             raise ValueError(
-                f"audiogram of shape {tuple(audiogram.shape)}; allowed: (8,) or ({batch}, 8) dB HL"
+                f"audiogram of shape {tuple(audiogram.shape)}; allowed: {(*one, width)} or {(batch, *one, width)} dB HL"
             )
-        rows = audiogram.detach().expand(batch, -1).double().tolist()
-        return [Audiogram(tuple(row)) for row in rows]
+        rows = audiogram.detach().expand(batch, *one, width).reshape(batch, sides, width).double().tolist()
+        return [[Audiogram(tuple(row)) for row in rows_of_item] for rows_of_item in rows]
     if not isinstance(audiogram, Sequence) or not all(isinstance(ear, Audiogram) for ear in audiogram):
-        found, tensor = type(audiogram).__name__, f"an (8,) or ({batch}, 8) tensor"
-        raise ValueError(f"audiogram is {found}; allowed: an Audiogram, one an item, or {tensor}")
-    if len(audiogram) != batch:
-        raise ValueError(
-            f"{len(audiogram)} audiograms of {batch} items; allowed: one for all, or one an item"
+        found, tensor = type(audiogram).__name__, f"an {(*one, 8)} or {(batch, *one, 8)} tensor"
+        each = "an Audiogram, one an item" if sides == 1 else "a left and a right Audiogram"
+        raise ValueError(f"audiogram is {found}; allowed: {each}, or {tensor}")
+    if len(audiogram) != (batch if sides == 1 else 2):
+        each = (
+            f"{batch} items; allowed: one for all, or one an item" if sides == 1 else "two ears; allowed: two"
         )
-    return list(audiogram)
+        raise ValueError(f"{len(audiogram)} audiograms of {each}")
+    return [[ear] for ear in audiogram] if sides == 1 else [list(audiogram)] * batch

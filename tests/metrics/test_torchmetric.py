@@ -55,6 +55,28 @@ def test_mean_over_batches(clean: Tensor, kind: type[Any], name: str) -> None:
     assert float(metric.compute()) == pytest.approx(expected[0], abs=1e-6)
 
 
+def test_of_two_channels_the_better_ear_counts(clean: Tensor) -> None:
+    both = torch.stack([clean, clean], 1)
+    given = torch.stack([noisy(clean), 3.0 * noisy(clean)], 1)  # (batch, left and right, time)
+    metric, each = HASPI(16000), []
+    for side, ear in enumerate((N3, S2)):
+        each.append([haspi(clean[i], given[i, side], ear, 16000, seed=i) for i in range(2)])
+    expected = torch.tensor(each, dtype=torch.float64)
+    for ears in ([N3, S2], torch.tensor([N3.levels, S2.levels]), torch.tensor([[N3.levels, S2.levels]] * 2)):
+        metric.reset()
+        metric.update(given, both, ears)
+        assert float(metric.compute()) == pytest.approx(float(expected.amax(0).mean()), abs=1e-6)
+        torch.testing.assert_close(metric.ears.double(), expected.mean(1), atol=1e-6, rtol=0)
+    metric.reset()
+    given[:, 0] = 0.0  # an ear without a score loses
+    metric.update(given, both, [N3, S2])
+    assert float(metric.compute()) == pytest.approx(float(expected[1].mean()), abs=1e-6)
+    assert int(metric.failed) == 0 and bool(metric.ears.isnan()[0])
+    for wrong in (N3, [N3], torch.zeros(2, 8, 1)):
+        with pytest.raises(ValueError, match=r"audiogram"):
+            metric.update(given, both, wrong)
+
+
 def test_limit_and_lengths(clean: Tensor) -> None:
     metric = HASPI(16000, limit=1)
     padded = torch.nn.functional.pad(clean, (0, 4000))
