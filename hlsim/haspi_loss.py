@@ -10,7 +10,7 @@ from hlsim.loss import Hearing, HearingLossLoss
 from hlsim.neuro.config import NEURO_RATE
 
 _LEVEL = {"levels": 0.03, "louder": 0.06, "peaks": 1.0}
-"""Twice the default criterion's weights, for HASPI rewards gain."""
+"""What is too loud costs twice what it costs by default, for HASPI rewards gain."""
 
 
 class HASPILoss(HearingLossLoss):

@@ -29,10 +29,10 @@ from torch import Tensor
 from hlsim.audiogram import AudiogramLike
 from hlsim.calibration import PASCAL_SPL
 from hlsim.checks import Lengths, check_waveform
-from hlsim.metrics import ear_model
-from hlsim.metrics import envelope_modulation as envelopes
-from hlsim.metrics.clean_speech import CleanItem, CleanSpeech, ItemGroup
-from hlsim.metrics.ear_model import CHANNELS
+from hlsim.metrics.ear import envelope_modulation as envelopes
+from hlsim.metrics.ear import model as ear_model
+from hlsim.metrics.ear.clean_speech import CleanItem, CleanSpeech, ItemGroup
+from hlsim.metrics.ear.model import CHANNELS
 from hlsim.metrics.pair import check_seed
 from hlsim.torchtools import constant
 

@@ -22,10 +22,11 @@ from hlsim.calibration import PASCAL_SPL, check_full_scale
 from hlsim.checks import Lengths, check_waveform
 from hlsim.dsp.fft import fft_length
 from hlsim.dsp.fir import frequency_sampling_fir
-from hlsim.metrics import ear_model, fine_structure
-from hlsim.metrics.clean_speech import CleanItem, CleanSpeech, ItemGroup
-from hlsim.metrics.ear_model import AUDIOMETRIC_HZ, CHANNELS, Extent
-from hlsim.metrics.ear_recursions import RATE
+from hlsim.metrics.ear import fine_structure
+from hlsim.metrics.ear import model as ear_model
+from hlsim.metrics.ear.clean_speech import CleanItem, CleanSpeech, ItemGroup
+from hlsim.metrics.ear.model import AUDIOMETRIC_HZ, CHANNELS, Extent
+from hlsim.metrics.ear.recursions import RATE
 from hlsim.metrics.haspi import Noise, generator_after, item_seeds
 from hlsim.torchtools import constant
 

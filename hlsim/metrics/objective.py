@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from hlsim.metrics.clean_speech import UnscorableError
+from hlsim.metrics.ear.clean_speech import UnscorableError
 from hlsim.metrics.haspi import haspi
 from hlsim.metrics.hasqi import hasqi
 

@@ -12,8 +12,9 @@ from torch.nn import functional
 from hlsim.audio import read_audio
 from hlsim.audiogram import FREQUENCIES, Audiogram
 from hlsim.dsp.resample import resample
-from hlsim.metrics import clean_speech, ear_model
 from hlsim.metrics import pyclarity as reference
+from hlsim.metrics.ear import clean_speech
+from hlsim.metrics.ear import model as ear_model
 from hlsim.metrics.haspi import HaspiReference, generator_after, haspi
 
 N2, N3, N6 = (Audiogram.standard(name) for name in ("N2", "N3", "N6"))

@@ -10,7 +10,8 @@ from torch import Tensor
 from hlsim.audio import read_audio
 from hlsim.audiogram import Audiogram
 from hlsim.dsp.resample import resample
-from hlsim.metrics import clean_speech, ear_model, fine_structure
+from hlsim.metrics.ear import clean_speech, fine_structure
+from hlsim.metrics.ear import model as ear_model
 from hlsim.metrics.hasqi import HasqiParts, HasqiReference, _moving, _nalr, hasqi
 from hlsim.metrics.pyclarity import numpy_seed
 

@@ -10,9 +10,10 @@ from torch import Tensor
 
 from hlsim.audio import read_audio
 from hlsim.audiogram import Audiogram
-from hlsim.metrics import ear_input, ear_model
-from hlsim.metrics import ear_recursions as recursions
-from hlsim.metrics import envelope_modulation as envelopes
+from hlsim.metrics.ear import envelope_modulation as envelopes
+from hlsim.metrics.ear import input as ear_input
+from hlsim.metrics.ear import model as ear_model
+from hlsim.metrics.ear import recursions as recursions
 
 CPU = torch.device("cpu")
 CHANNELS = (0, 9, 31)

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
-from hlsim.metrics.ear_model import CHANNELS, centre_frequencies
-from hlsim.metrics.ear_recursions import RATE
+from hlsim.metrics.ear.model import CHANNELS, centre_frequencies
+from hlsim.metrics.ear.recursions import RATE
 from hlsim.torchtools import constant
 
 SEGMENT = 384

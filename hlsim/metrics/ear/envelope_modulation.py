@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from hlsim.dsp.fft import fft_length
-from hlsim.metrics.clean_speech import UnscorableError
-from hlsim.metrics.ear_model import CHANNELS, Extent, shift
+from hlsim.metrics.ear.clean_speech import UnscorableError
+from hlsim.metrics.ear.model import CHANNELS, Extent, shift
 from hlsim.torchtools import constant
 
 STRIDE = 9

@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from hlsim.dsp.fft import fft_length
-from hlsim.metrics.ear_recursions import RATE
+from hlsim.metrics.ear.recursions import RATE
 from hlsim.torchtools import constant
 
 _ZEROS, _BETA = 10, 5.0  # of the resampling filter: scipy's ``resample_poly``

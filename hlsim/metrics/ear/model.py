@@ -26,7 +26,7 @@ from torch.nn import functional
 
 from hlsim.audiogram import FREQUENCIES
 from hlsim.dsp.fft import fft_length
-from hlsim.metrics.ear_recursions import BLOCK, RATE, Recursion, adaptation, gain_lowpass, gammatone, kept
+from hlsim.metrics.ear.recursions import BLOCK, RATE, Recursion, adaptation, gain_lowpass, gammatone, kept
 from hlsim.torchtools import constant
 
 CHANNELS = 32

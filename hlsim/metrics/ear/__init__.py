@@ -1,0 +1,1 @@
+"""Kates' ear, which HASPI and HASQI hear with: from clean and processed speech to what they compare."""
