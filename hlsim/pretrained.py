@@ -15,12 +15,12 @@ from torch import nn
 
 from hlsim.calibration import PASCAL_SPL
 from hlsim.files import whole_folder
-from hlsim.neuro.config import NEURO_RATE, NetworkConfig, NeuroConfig
+from hlsim.neuro.config import NEURO_RATE, ModelConfig, NeuroConfig
 from hlsim.neuro.model import NeuroMSBG
 from hlsim.torchtools import lasting
 
 Model = TypeVar("Model", bound=nn.Module)
-Config = TypeVar("Config", bound=NetworkConfig)
+Config = TypeVar("Config", bound=ModelConfig)
 Settings = Mapping[str, Any]
 
 WEIGHTS, CONFIG, CARD = "model.safetensors", "config.json", "README.md"
@@ -28,8 +28,9 @@ WEIGHTS, CONFIG, CARD = "model.safetensors", "config.json", "README.md"
 SIMULATOR = "neuro-msbg"
 """What ``config.json`` of a checkpoint of a simulator calls it."""
 
-_LOADERS = {SIMULATOR: "hlsim.load_pretrained", "mapping-compensator": "compensators.load_compensator"}
-_MODELS = {"msbg": "hlsim.MSBG", "nalr": "compensators.NALR"}  # that need no checkpoint
+_LOADERS = {SIMULATOR: "hlsim.load_pretrained"}
+_LOADERS |= dict.fromkeys(("mapping-compensator", "hearing-aid"), "compensators.load_compensator")
+_MODELS = {"msbg": "hlsim.MSBG", "nalr": "compensators.NALR", "wdrc": "compensators.WDRC"}  # that need no checkpoint
 
 
 def load_pretrained(
