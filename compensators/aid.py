@@ -60,7 +60,7 @@ class HearingAid(Wearable):
         self.bands, self.limit_spl = config.bands, config.limit_spl
         self.encode_ear = nn.Linear(2 * config.bands, config.width)
         self.enter = nn.Linear(config.bands + config.bins, config.width)
-        self.recur = nn.GRU(config.width, config.hidden, batch_first=True)
+        self.recur = nn.LSTM(config.width, config.hidden, batch_first=True)
         self.leave = nn.Linear(config.hidden + config.width, 2 * config.bands)
         with torch.no_grad():
             self.leave.weight[: config.bands] = 0.0
@@ -103,7 +103,7 @@ class HearingAid(Wearable):
             "levels": zeros(items, 3, bands + 1),
             "correction": zeros(items, bands),
             "attenuation": zeros(items, 3, bands),
-            "hidden": zeros(items, self.config.hidden),
+            "hidden": zeros(items, 2, self.config.hidden),
         }
 
     def control(
@@ -116,7 +116,7 @@ class HearingAid(Wearable):
         levels = level_db(torch.cat((by_band, powers.sum(-1, keepdim=True), powers[..., 1 : config.bins + 1]), -1))
         seen = torch.cat((levels[..., : self.bands], levels[..., self.bands + 1 :]), -1)
         entered = torch.tanh(self.enter((seen - 40.0) / 20.0) + code.unsqueeze(1))
-        recalled, hidden = self.recur(entered, state["hidden"].unsqueeze(0).contiguous())
+        recalled, hidden = self.recur(entered, state["hidden"].movedim(1, 0).contiguous().unsqueeze(1).unbind())
         correction, logit = self.leave(torch.cat((recalled, entered), -1)).chunk(2, -1)
 
         slow = decay(config.attack), decay(config.release)
@@ -133,7 +133,7 @@ class HearingAid(Wearable):
             "levels": kept,
             "correction": correction[:, -1],
             "attenuation": quickly,
-            "hidden": hidden.squeeze(0),
+            "hidden": torch.cat(hidden).movedim(0, 1),
         }
         return amplification * gain + noise_reduction * taken, after
 

@@ -62,7 +62,7 @@ class HearingAidConfig(ModelConfig):
     bands: int = 20
     bins: int = 40
     width: int = 64
-    hidden: int = 96
+    hidden: int = 128
     reach_db: float = 20.0
     reduction_db: float = 20.0
     attack: float = 0.005

@@ -9,9 +9,7 @@ from typing import Any, Unpack
 import torch
 from torch import Tensor, nn
 
-from compensators.config import MappingConfig
-from compensators.mapping import MappingCompensator
-from compensators.pretrained import KIND, load_compensator
+from compensators.pretrained import CONFIGS, build_compensator, load_compensator
 from hlsim.audiogram import Audiogram
 from hlsim.data.module import Batch
 from hlsim.loss import HearingLossLoss
@@ -33,14 +31,21 @@ class CompensatorTraining(TimedModule):
         super().__init__(recipe.learning_rate, max_minutes)
         torch.manual_seed(recipe.seed)
         self.recipe = recipe
-        network = (MappingConfig, MappingCompensator, load_compensator)
+        network = (CONFIGS[recipe.kind], build_compensator, load_compensator)
         self.compensator = initial_network(recipe.start, recipe.model, *network)
         counted = {name: weight for name, weight in recipe.weights.items() if weight > 0.0}
         self.loss = HearingLossLoss(simulator=simulator, reference=recipe.reference, criterion=counted)
 
     def training_loss(self, batch: Batch) -> Tensor:
-        ears = batch["thresholds"]
-        value: Tensor = self.loss(self.compensator(batch["signal"], ears), batch["clean"], ears)
+        signal, clean, ears = (batch[name] for name in ("signal", "clean", "thresholds"))
+        if "sliders" not in batch:
+            value: Tensor = self.loss(self.compensator(signal, ears), clean, ears)
+            return value
+        # what is to be heard: the mixture as far as noise is not to be reduced; by a normal ear that is not to be amplified
+        noise_reduction, amplification = batch["sliders"].unbind(-1)
+        given = self.compensator(signal, ears, noise_reduction, amplification)
+        aim = signal + noise_reduction.unsqueeze(-1) * (clean - signal)
+        value = self.loss(given, aim, ears * amplification.unsqueeze(-1))
         return value
 
     def evaluate(self, batch: Batch) -> dict[str, Tensor]:
@@ -93,4 +98,4 @@ def train_compensator(
         trained["simulator_sha256"] = checkpoint_digest(simulator)  # a folder may hold another one next time
     about = trained | {"start_valid_loss": start}
     how: dict[str, Any] = {"out": out, "identity": identity_of(data) | trained, "about": about}
-    return train_network(module, batches, recipe, KIND, **how, **options)
+    return train_network(module, batches, recipe, recipe.kind, **how, **options)

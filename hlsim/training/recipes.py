@@ -9,6 +9,7 @@ from typing import Any, ClassVar, Self
 from hlsim.checks import refuse_other_kinds, refuse_seed, refuse_unknown, refuse_weights
 
 _WHERE = "in the recipe"
+KINDS = ("mapping-compensator", "hearing-aid")
 PRECISIONS = ("float32", "bfloat16")
 
 
@@ -115,7 +116,8 @@ class CompensatorRecipe(TrainingRecipe):
     The defaults are for one ear and a few minutes: many small steps. All ears need larger batches and hours.
 
     Attributes:
-        model: settings of ``MappingConfig``.
+        kind: ``mapping-compensator`` or ``hearing-aid``.
+        model: settings of its ``MappingConfig`` or ``HearingAidConfig``.
         weights: of ``HearingLossLoss``'s criteria: ``coherent-bands``, ``bands`` (dB) and ``paper``, of one hearing.
         reference: what the paper's criterion compares with, ``clean`` or ``normal-hearing``.
         sounds: speech in noise alone teaches a network that what is steady is noise, to be taken away.
@@ -123,8 +125,11 @@ class CompensatorRecipe(TrainingRecipe):
             the gain for another can be 20 dB off.
         noisy: share of noisy clips, where there is noise.
         snr: lowest and highest signal-to-noise ratio in dB.
+        single: share of items of a hearing aid with one of its two sliders at 0: without amplification, what it gives is to
+            be the clean speech to a normal ear, and without noise reduction the ear is to hear the noisy speech.
     """
 
+    kind: str = "mapping-compensator"
     batch: int = 2
     seconds: float = 0.6
     learning_rate: float = 3e-3
@@ -135,8 +140,14 @@ class CompensatorRecipe(TrainingRecipe):
     equalised: float = 0.7
     noisy: float = 0.5
     snr: tuple[float, float] = (0.0, 20.0)
+    single: float = 0.0
     validate_every: int = 50
     validation_items: int = 8
 
     criteria = ("coherent-bands", "bands", "paper")
-    shares = ("sounds", "equalised", "noisy")
+    shares = ("sounds", "equalised", "noisy", "single")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._refuse(self.kind not in KINDS, ("kind",), " or ".join(KINDS))
+        self._refuse(self.single > 0.0 and self.kind != "hearing-aid", ("single", "kind"), "0 without sliders")
