@@ -7,13 +7,7 @@ from torch import Tensor, nn
 
 from compensators.bands import FRAME, level_db, shares
 from compensators.config import HearingAidConfig
-from compensators.prescription import (
-    above_speech,
-    compression_ratios,
-    compressive_gains,
-    losses,
-    prescribed_gains,
-)
+from compensators.prescription import losses, prescribed_gains, restoring_gains
 from compensators.smoothing import average, decay, follow_peaks
 from compensators.stream import Slider, State, Stream
 from compensators.wearable import Wearable
@@ -21,7 +15,6 @@ from hlsim.audiogram import AudiogramLike
 from hlsim.calibration import PASCAL_SPL
 from hlsim.torchtools import constant_like
 
-_KNEE = -25.0  # dB from average speech of 65 dB SPL: under it the prescribed gain grows no more
 _FADE = 15.0  # dB of level over which the gain of what is quiet fades
 _RARELY = -3.0  # start of the logit of noise reduction: 1 dB of 20
 
@@ -30,10 +23,10 @@ class HearingAid(Wearable):
     """Waveform and audiogram to what the impaired ear is to be given, 4 ms late, whole or in chunks as it comes.
 
     Levels of frames and the encoded ear go through a causal recurrent network with two heads. One corrects the gain that
-    NAL-R prescribes at 65 dB SPL, with compression about it (``prescription``); the correction is 0 before training, and
-    where there is no loss. The other takes noise off. In dB, a band's gain is
+    would restore loudness band by band (``prescription.restoring_gains``); the correction is 0 before training, and where
+    there is no loss. The other takes noise off. In dB, a band's gain is
 
-        amplification * (prescribed + correction) - noise_reduction * attenuation,
+        amplification * (restoring + correction) - noise_reduction * attenuation,
 
     so that at 0 and 0 the input passes unchanged. The gain has a cap, and fades for what is quieter than
     ``config.quiet_spl``; the output is softly limited at ``config.limit_spl``.
@@ -95,7 +88,7 @@ class HearingAid(Wearable):
         loss, prescribed = losses(thresholds, self.bands), prescribed_gains(thresholds, self.bands)
         reach = self.config.reach_db * loss.clamp_min(0.0) / (loss.clamp_min(0.0) + 10.0)
         code = self.encode_ear(torch.cat((loss / 50.0, prescribed / 20.0), -1))
-        return torch.cat((prescribed, compression_ratios(loss), reach, code), -1)
+        return torch.cat((loss, reach, code), -1)
 
     def start(self, items: int, like: Tensor) -> dict[str, Tensor]:
         zeros, bands = like.new_zeros, self.bands
@@ -110,25 +103,33 @@ class HearingAid(Wearable):
         self, powers: Tensor, fitted: Tensor, sliders: Tensor, state: State
     ) -> tuple[Tensor, dict[str, Tensor]]:
         config = self.config
-        prescribed, ratios, reach, code = fitted.split((*(self.bands,) * 3, config.width), -1)
+        loss, reach, code = fitted.split((self.bands, self.bands, config.width), -1)
         noise_reduction, amplification = sliders.split(1, -1)
         by_band = powers @ constant_like(powers, shares, self.bands, FRAME)
-        levels = level_db(torch.cat((by_band, powers.sum(-1, keepdim=True), powers[..., 1 : config.bins + 1]), -1))
+        levels = level_db(
+            torch.cat((by_band, powers.sum(-1, keepdim=True), powers[..., 1 : config.bins + 1]), -1)
+        )
         seen = torch.cat((levels[..., : self.bands], levels[..., self.bands + 1 :]), -1)
         entered = torch.tanh(self.enter((seen - 40.0) / 20.0) + code.unsqueeze(1))
-        recalled, hidden = self.recur(entered, state["hidden"].movedim(1, 0).contiguous().unsqueeze(1).unbind())
+        recalled, hidden = self.recur(
+            entered, state["hidden"].movedim(1, 0).contiguous().unsqueeze(1).unbind()
+        )
         correction, logit = self.leave(torch.cat((recalled, entered), -1)).chunk(2, -1)
 
         slow = decay(config.attack), decay(config.release)
         followed, kept = follow_peaks(levels[..., : self.bands + 1], state["levels"], *slow)
         level, total = followed.split((self.bands, 1), -1)
-        correction = average(reach.unsqueeze(1) * torch.tanh(correction), state["correction"], decay(config.smoothing))
-        gain = compressive_gains(above_speech(level), prescribed, ratios, _KNEE) + correction
+        correction = average(
+            reach.unsqueeze(1) * torch.tanh(correction), state["correction"], decay(config.smoothing)
+        )
+        gain = restoring_gains(level, loss) + correction
         audible = ((total - config.quiet_spl) / _FADE + 1.0).clamp(0.0, 1.0)
         gain = audible * gain.clamp(0.0, config.cap_db)
 
         quick = decay(config.opening), decay(config.closing)
-        taken, quickly = follow_peaks(-config.reduction_db * torch.sigmoid(logit), state["attenuation"], *quick)
+        taken, quickly = follow_peaks(
+            -config.reduction_db * torch.sigmoid(logit), state["attenuation"], *quick
+        )
         after = {
             "levels": kept,
             "correction": correction[:, -1],

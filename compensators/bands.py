@@ -34,9 +34,47 @@ _LEAST = 10.0 ** (-PASCAL_SPL / 10.0)  # power at 0 dB SPL, under which no level
 _GRID = 4096
 
 # Long-term average of speech at 70 dB SPL in thirds of an octave, men's and women's: Byrne et al. 1994, JASA 96(4)
-_SPEECH_HZ = (63, 80, 100, 125, 160, 200, 250, 315, 400, 500, 630, 800, 1000, 1250, 1600, 2000, 2500, 3150, 4000)
+_SPEECH_HZ = (
+    63,
+    80,
+    100,
+    125,
+    160,
+    200,
+    250,
+    315,
+    400,
+    500,
+    630,
+    800,
+    1000,
+    1250,
+    1600,
+    2000,
+    2500,
+    3150,
+    4000,
+)
 _SPEECH_HZ += (5000, 6300, 8000)
-_SPEECH_DB = (38.6, 43.5, 54.4, 57.7, 56.8, 60.2, 60.3, 59.0, 62.1, 62.1, 60.5, 56.8, 53.7, 53.0, 52.0, 48.7, 48.1)
+_SPEECH_DB = (
+    38.6,
+    43.5,
+    54.4,
+    57.7,
+    56.8,
+    60.2,
+    60.3,
+    59.0,
+    62.1,
+    62.1,
+    60.5,
+    56.8,
+    53.7,
+    53.0,
+    52.0,
+    48.7,
+    48.1,
+)
 _SPEECH_DB += (46.8, 45.6, 44.5, 44.3, 43.7)
 
 
@@ -87,7 +125,9 @@ def apply_gains(padded: Tensor, gains: Tensor, first: int = 0) -> Tensor:
     """
     time, count = padded.shape[-1] - 2 * DELAY, gains.shape[-1]
     length = min(time, HOP)
-    taps = constant_like(padded, _for_a_hop, count).unflatten(1, (count, HOP))[: length + 2 * DELAY, :, :length]
+    taps = constant_like(padded, _for_a_hop, count).unflatten(1, (count, HOP))[
+        : length + 2 * DELAY, :, :length
+    ]
     ramp = constant_like(padded, _ramp)[:, first : first + length]
     hops = padded.unfold(-1, length + 2 * DELAY, length)
     bands = (hops @ taps.flatten(1)).unflatten(-1, (count, length))

@@ -49,7 +49,7 @@ class HearingAidConfig(ModelConfig):
         bins: frequencies of a frame, 62.5 Hz apart from the first, whose levels the network sees beside the bands'.
         width: of the layer before the recurrent one.
         hidden: of the recurrent layer.
-        reach_db: largest correction of the prescribed gain up or down.
+        reach_db: largest correction of the restoring gain up or down.
         reduction_db: most that noise reduction takes off a band.
         attack, release: of the levels that the gain follows, time constants in seconds.
         opening, closing: of noise reduction.
@@ -69,7 +69,7 @@ class HearingAidConfig(ModelConfig):
     release: float = 0.1
     opening: float = 0.0
     closing: float = 0.03
-    smoothing: float = 0.02
+    smoothing: float = 0.05
     cap_db: float = 45.0
     quiet_spl: float = 40.0
     limit_spl: float = 110.0
@@ -77,7 +77,9 @@ class HearingAidConfig(ModelConfig):
     def __post_init__(self) -> None:
         for name, low, high in (("bands", 4, 40), ("bins", 0, 128), ("width", 1, 4096), ("hidden", 1, 4096)):
             if type(getattr(self, name)) is not int:
-                raise ValueError(f"{name} is {getattr(self, name)!r}; allowed: whole numbers from {low} to {high}")
+                raise ValueError(
+                    f"{name} is {getattr(self, name)!r}; allowed: whole numbers from {low} to {high}"
+                )
             refuse_outside({name: (getattr(self, name), low, high)})
         refuse_outside(
             {

@@ -1,4 +1,4 @@
-"""Gains that follow from ear and level alone: NAL-R for average speech, and compression about it."""
+"""Gains that follow from ear and level alone: NAL-R for average speech with compression about it, and normal loudness."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ from compensators.bands import centres, speech_levels
 from compensators.nalr import nalr_gains_db
 from hlsim.audiogram import interpolate
 from hlsim.torchtools import constant
+
+_CATCH_UP, _NO_GAIN, _SOFTEST = 105.0, 100.0, 20.0  # dB SPL
 
 
 def losses(thresholds: Tensor, count: int) -> Tensor:
@@ -43,3 +45,15 @@ def compressive_gains(levels: Tensor, prescribed: Tensor, ratios: Tensor, knee: 
     """
     slope = (1.0 / ratios - 1.0).unsqueeze(1)
     return torch.clamp(prescribed.unsqueeze(1) + slope * levels.clamp_min(knee), min=0.0)
+
+
+def restoring_gains(levels: Tensor, loss: Tensor) -> Tensor:
+    """Gain that undoes recruitment as MSBG has it: what lies ``loss`` under 105 dB SPL is heard 105 dB under it.
+
+    Bands here are wider than MSBG's, and what they hold is louder than each part of it: of 95, 100, 105 and 110 dB SPL as
+    the level that needs no gain, 100 came nearest to normal hearing of speech.
+
+    Shape: (items, frames, bands) dB SPL, (items, bands) dB HL -> (items, frames, bands) dB, 0 or more.
+    """
+    share = (loss.clamp_min(0.0) / _CATCH_UP).unsqueeze(1)
+    return share * (_NO_GAIN - levels.clamp_min(_SOFTEST)).clamp_min(0.0)

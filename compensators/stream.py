@@ -53,9 +53,7 @@ class Stream:
         ValueError: as the aid's call, or other leading dimensions than before.
     """
 
-    def __init__(
-        self, aid: Worn, audiogram: AudiogramLike | None, sliders: Mapping[str, Slider]
-    ) -> None:
+    def __init__(self, aid: Worn, audiogram: AudiogramLike | None, sliders: Mapping[str, Slider]) -> None:
         self._aid, self._audiogram = aid, audiogram
         for name, slider in sliders.items():
             setattr(self, name, slider)
@@ -67,7 +65,9 @@ class Stream:
         with torch.no_grad(), torch.autocast(chunk.device.type, enabled=False):
             self._begin(chunk)
             gain = gain_to_pascals(self._aid.full_scale_spl)
-            samples = chunk.to(self._fitted.dtype).expand(*self._batch, -1).reshape(len(self._fitted), -1) * gain
+            samples = (
+                chunk.to(self._fitted.dtype).expand(*self._batch, -1).reshape(len(self._fitted), -1) * gain
+            )
             outputs = []
             while left := samples.shape[-1]:
                 if self._under_way.shape[-1] or left < HOP:

@@ -122,9 +122,7 @@ class Wearable(nn.Module):
                 result = self.finish(resample(result, RATE, self.sample_rate)[:, :time])
             return (result / gain).reshape(*batch, time).to(waveform.dtype)
 
-    def streamed(
-        self, audiogram: AudiogramLike | None, sliders: Sequence[Slider]
-    ) -> Stream:
+    def streamed(self, audiogram: AudiogramLike | None, sliders: Sequence[Slider]) -> Stream:
         if self.sample_rate != RATE:
             raise ValueError(
                 f"a stream at {self.sample_rate} Hz; allowed: {RATE}, for resampling looks 8.5 ms ahead, beyond the 5 ms"
@@ -162,7 +160,9 @@ def check_slider(name: str, slider: Slider, batch: torch.Size) -> Tensor:
     if setting.ndim > len(batch) or any(
         own not in (1, size) for own, size in zip(setting.shape[::-1], batch[::-1], strict=False)
     ):
-        raise ValueError(f"{name} has shape {tuple(setting.shape)} for items {tuple(batch)}; allowed: one, or one an item")
+        raise ValueError(
+            f"{name} has shape {tuple(setting.shape)} for items {tuple(batch)}; allowed: one, or one an item"
+        )
     return setting
 
 

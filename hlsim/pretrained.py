@@ -30,7 +30,11 @@ SIMULATOR = "neuro-msbg"
 
 _LOADERS = {SIMULATOR: "hlsim.load_pretrained"}
 _LOADERS |= dict.fromkeys(("mapping-compensator", "hearing-aid"), "compensators.load_compensator")
-_MODELS = {"msbg": "hlsim.MSBG", "nalr": "compensators.NALR", "wdrc": "compensators.WDRC"}  # that need no checkpoint
+_MODELS = {
+    "msbg": "hlsim.MSBG",
+    "nalr": "compensators.NALR",
+    "wdrc": "compensators.WDRC",
+}  # that need no checkpoint
 
 
 def load_pretrained(
@@ -76,7 +80,9 @@ def read_checkpoint(
     found = record.get("kind") if isinstance(record, dict) else None
     if found not in kinds:
         hint = f" ({_LOADERS[found]} loads the former)" if found in _LOADERS else ""
-        raise ValueError(f"{folder}: a checkpoint of kind {found!r}; needed here: {' or '.join(map(repr, kinds))}{hint}")
+        raise ValueError(
+            f"{folder}: a checkpoint of kind {found!r}; needed here: {' or '.join(map(repr, kinds))}{hint}"
+        )
     settings: Any = record.get("config")
     changed = "changed since it was saved"
     if hashlib.sha256(weights).hexdigest() != record.get("sha256"):
@@ -100,9 +106,7 @@ def read_checkpoint(
         return model if device.type == "meta" else model.to(device)
 
 
-def find_checkpoint(
-    name: str | Path, kinds: Collection[str] | None = None, also: Sequence[str] = ()
-) -> Path:
+def find_checkpoint(name: str | Path, kinds: Collection[str] | None = None, also: Sequence[str] = ()) -> Path:
     """The folder of a checkpoint that ships with hlsim, or another.
 
     Raises:
@@ -136,7 +140,9 @@ def checkpoint_about(name: str | Path) -> dict[str, Any]:
 def shipped(kinds: Collection[str] | None = None) -> dict[str, Path]:
     """The checkpoints that ship with hlsim, name and folder; all kinds by default."""
     folders = (path.parent for path in sorted(checkpoints_folder().glob(f"*/{CONFIG}")))
-    return {folder.name: folder for folder in folders if kinds is None or _record(folder).get("kind") in kinds}
+    return {
+        folder.name: folder for folder in folders if kinds is None or _record(folder).get("kind") in kinds
+    }
 
 
 def checkpoints_folder() -> Path:

@@ -150,4 +150,6 @@ class CompensatorRecipe(TrainingRecipe):
     def __post_init__(self) -> None:
         super().__post_init__()
         self._refuse(self.kind not in KINDS, ("kind",), " or ".join(KINDS))
-        self._refuse(self.single > 0.0 and self.kind != "hearing-aid", ("single", "kind"), "0 without sliders")
+        self._refuse(
+            self.single > 0.0 and self.kind != "hearing-aid", ("single", "kind"), "0 without sliders"
+        )
