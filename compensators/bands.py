@@ -34,48 +34,11 @@ _LEAST = 10.0 ** (-PASCAL_SPL / 10.0)  # power at 0 dB SPL, under which no level
 _GRID = 4096
 
 # Long-term average of speech at 70 dB SPL in thirds of an octave, men's and women's: Byrne et al. 1994, JASA 96(4)
-_SPEECH_HZ = (
-    63,
-    80,
-    100,
-    125,
-    160,
-    200,
-    250,
-    315,
-    400,
-    500,
-    630,
-    800,
-    1000,
-    1250,
-    1600,
-    2000,
-    2500,
-    3150,
-    4000,
-)
-_SPEECH_HZ += (5000, 6300, 8000)
-_SPEECH_DB = (
-    38.6,
-    43.5,
-    54.4,
-    57.7,
-    56.8,
-    60.2,
-    60.3,
-    59.0,
-    62.1,
-    62.1,
-    60.5,
-    56.8,
-    53.7,
-    53.0,
-    52.0,
-    48.7,
-    48.1,
-)
-_SPEECH_DB += (46.8, 45.6, 44.5, 44.3, 43.7)
+_SPEECH = {
+    63: 38.6, 80: 43.5, 100: 54.4, 125: 57.7, 160: 56.8, 200: 60.2, 250: 60.3, 315: 59.0, 400: 62.1, 500: 62.1,
+    630: 60.5, 800: 56.8, 1000: 53.7, 1250: 53.0, 1600: 52.0, 2000: 48.7, 2500: 48.1, 3150: 46.8, 4000: 45.6,
+    5000: 44.5, 6300: 44.3, 8000: 43.7,
+}  # fmt: skip
 
 
 @lru_cache(maxsize=8)
@@ -88,7 +51,7 @@ def centres(count: int) -> tuple[float, ...]:
             places.append(places[-1] + max(_NARROWEST, erbs * float(erb(np.array(places[-1])))))
         return places
 
-    low, high = 0.0, 20.0
+    low, high = 0.0, 100.0
     for _ in range(60):
         middle = 0.5 * (low + high)
         low, high = (middle, high) if made(middle)[-1] < RATE / 2.0 else (low, middle)
@@ -155,8 +118,9 @@ def speech_levels(count: int, spl: float = 65.0) -> tuple[float, ...]:
     """Level in dB SPL of average speech of a level in each band."""
     hz = np.arange(1, _GRID // 2 + 1) * RATE / _GRID
     width = 10.0 * np.log10(2.0 ** (1.0 / 6.0) - 2.0 ** (-1.0 / 6.0))
-    density = np.array(_SPEECH_DB) - 10.0 * np.log10(_SPEECH_HZ) - width
-    powers = 10.0 ** (np.interp(np.log(hz), np.log(_SPEECH_HZ), density) / 10.0)
+    thirds = np.array(list(_SPEECH), dtype=float)
+    density = np.array(list(_SPEECH.values())) - 10.0 * np.log10(thirds) - width
+    powers = 10.0 ** (np.interp(np.log(hz), np.log(thirds), density) / 10.0)
     bands = powers @ shares(count, _GRID)[1:]
     return tuple((10.0 * np.log10(bands / bands.sum()) + spl).tolist())
 

@@ -59,6 +59,8 @@ class Stream:
             setattr(self, name, slider)
         self._state: dict[str, Tensor] = {}  # empty before the first chunk
         self._set: list[Slider] = []
+        self._shape = self._batch = torch.Size()
+        self._under_way = self._fitted = self._sliders = torch.empty(0)
 
     def __call__(self, chunk: Tensor) -> Tensor:
         check_waveform(chunk)

@@ -23,10 +23,10 @@ from hlsim.torchtools import constant_like
 
 
 class WDRC(Wearable):
-    """NAL-R's gains for speech of 65 dB SPL, less for what is louder and more for what is softer, in each band.
+    """NAL-R's gains for speech of 65 dB SPL, less for what is louder and more for what is softer in its band.
 
-    The level of a band, of frames of 16 ms, rises with ``attack`` and falls with ``release``; above the knee, ``ratio`` dB
-    of input make one of output, ``ratio`` 1 up to 10 dB HL, 1 more for every 40 dB, and 3 at most.
+    A band's level, of frames of 16 ms, rises with ``attack`` and falls with ``release``. Above the knee, ``ratio`` dB
+    more make one dB more of output; ``ratio`` is 1 up to 10 dB HL, 1 more for every 40 dB, and 3 at most.
 
     Args:
         sample_rate, full_scale_spl: as ``Wearable``.

@@ -78,7 +78,7 @@ def read_checkpoint(
     except (OSError, ValueError) as error:
         raise ValueError(f"{folder}: not readable as a checkpoint ({error})") from error
     found = record.get("kind") if isinstance(record, dict) else None
-    if found not in kinds:
+    if not isinstance(found, str) or found not in kinds:
         hint = f" ({_LOADERS[found]} loads the former)" if found in _LOADERS else ""
         raise ValueError(
             f"{folder}: a checkpoint of kind {found!r}; needed here: {' or '.join(map(repr, kinds))}{hint}"

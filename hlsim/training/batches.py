@@ -160,11 +160,8 @@ class CompensatorBatches(DrawnBatches):
         else:
             ears = self.join_measured(draw_thresholds(count, generator), 0.5, 0.0, generator)
         batch = {"clean": clean, "signal": signal, "thresholds": ears}
-        if self.recipe.single:
-            chance = uniform(0.0, 2.0, 1)
-            least = torch.cat((chance - 1.0, 1.0 - chance), -1)  # one or the other is below 0
-            on = (chance % 1.0 >= self.recipe.single) | (least >= 0.0)
-            batch["sliders"] = on.to(clean.dtype)
+        if self.recipe.unreduced:
+            batch["noise_reduction"] = (uniform(0.0, 1.0) >= self.recipe.unreduced).to(clean.dtype)
         return batch
 
 
@@ -182,7 +179,7 @@ def simulator_data(data: TrainingData | PlannedSource, recipe: SimulatorRecipe) 
 def compensator_data(data: TrainingData, recipe: CompensatorRecipe, ear: Audiogram | None) -> BatchData:
     """What a compensator for an ear, or else for all, is trained and validated on. Raises ValueError as
     ``simulator_data``."""
-    plain = replace(recipe, equalised=0.0, single=0.0, seconds=_VALID_SECONDS)
+    plain = replace(recipe, equalised=0.0, unreduced=0.0, seconds=_VALID_SECONDS)
     valid = CompensatorBatches(plain, data.validation(), ear)
     generator = torch.Generator().manual_seed(2_000 + recipe.seed)
     validation = [valid.draw(4, generator) for _ in range(0, recipe.validation_items, 4)]

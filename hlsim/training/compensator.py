@@ -9,8 +9,10 @@ from typing import Any, Unpack
 import torch
 from torch import Tensor, nn
 
+from compensators.aid import HearingAid
 from compensators.pretrained import CONFIGS, build_compensator, load_compensator
 from hlsim.audiogram import Audiogram
+from hlsim.criteria.waveform import compressed_spectrum_error
 from hlsim.data.module import Batch
 from hlsim.loss import HearingLossLoss
 from hlsim.pretrained import checkpoint_digest
@@ -38,15 +40,17 @@ class CompensatorTraining(TimedModule):
 
     def training_loss(self, batch: Batch) -> Tensor:
         signal, clean, ears = (batch[name] for name in ("signal", "clean", "thresholds"))
-        if "sliders" not in batch:
+        if not isinstance(self.compensator, HearingAid):
             value: Tensor = self.loss(self.compensator(signal, ears), clean, ears)
             return value
-        # what is to be heard: the mixture as far as noise is not to be reduced; by a normal ear that is not to be amplified
-        noise_reduction, amplification = batch["sliders"].unbind(-1)
-        given = self.compensator(signal, ears, noise_reduction, amplification)
-        aim = signal + noise_reduction.unsqueeze(-1) * (clean - signal)
-        value = self.loss(given, aim, ears * amplification.unsqueeze(-1))
-        return value
+        # both at once: for the ear, and as it takes noise off without amplification
+        reduced = batch.get("noise_reduction", torch.ones(len(signal), device=signal.device))
+        on = torch.ones_like(reduced)
+        sliders = torch.cat((reduced, on)), torch.cat((on, 0.0 * on))
+        given, denoised = self.compensator(signal.repeat(2, 1), ears.repeat(2, 1), *sliders).chunk(2)
+        aim = signal + reduced.unsqueeze(-1) * (clean - signal)
+        heard: Tensor = self.loss(given, aim, ears)
+        return heard + self.recipe.denoising * compressed_spectrum_error(denoised, clean).mean()
 
     def evaluate(self, batch: Batch) -> dict[str, Tensor]:
         return {"valid_loss": self.training_loss(batch)[None]}

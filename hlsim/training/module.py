@@ -136,15 +136,16 @@ def initial_network(
     config = config_kind.from_dict(settings)
     if not start:
         return build(config)
-    network = load(start)
+    network: Any = load(start)
     what = f"start {start!r} in the recipe"
     if not isinstance(getattr(network, "config", None), config_kind):
         raise ValueError(f"{what} is none to be trained; allowed: a checkpoint's name or folder")
     if settings and config != network.config:
-        ours, theirs = config.to_dict(), network.config.to_dict()  # type: ignore[operator,union-attr]
+        ours, theirs = config.to_dict(), network.config.to_dict()
         differing = ", ".join(name for name in ours if ours[name] != theirs[name])
         raise ValueError(
             f"{what} has other settings of the model than the recipe ({differing}); allowed: the same, or no 'model' in "
             "the recipe"
         )
-    return network.train().requires_grad_(True)
+    trained: Network = network.train().requires_grad_(True)
+    return trained

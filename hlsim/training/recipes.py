@@ -125,8 +125,9 @@ class CompensatorRecipe(TrainingRecipe):
             the gain for another can be 20 dB off.
         noisy: share of noisy clips, where there is noise.
         snr: lowest and highest signal-to-noise ratio in dB.
-        single: share of items of a hearing aid with one of its two sliders at 0: without amplification, what it gives is to
-            be the clean speech to a normal ear, and without noise reduction the ear is to hear the noisy speech.
+        unreduced: share of items of a hearing aid without noise reduction: the ear is to hear the noisy speech.
+        denoising: weight of ``compressed_spectrum_error``: what a hearing aid gives without amplification is to be the
+            clean speech.
     """
 
     kind: str = "mapping-compensator"
@@ -140,16 +141,16 @@ class CompensatorRecipe(TrainingRecipe):
     equalised: float = 0.7
     noisy: float = 0.5
     snr: tuple[float, float] = (0.0, 20.0)
-    single: float = 0.0
+    unreduced: float = 0.0
+    denoising: float = 0.0
     validate_every: int = 50
     validation_items: int = 8
 
     criteria = ("coherent-bands", "bands", "paper")
-    shares = ("sounds", "equalised", "noisy", "single")
+    shares = ("sounds", "equalised", "noisy", "unreduced")
 
     def __post_init__(self) -> None:
         super().__post_init__()
         self._refuse(self.kind not in KINDS, ("kind",), " or ".join(KINDS))
-        self._refuse(
-            self.single > 0.0 and self.kind != "hearing-aid", ("single", "kind"), "0 without sliders"
-        )
+        wrong = self.denoising < 0.0 or (self.kind != "hearing-aid" and self.unreduced + self.denoising > 0.0)
+        self._refuse(wrong, ("unreduced", "denoising", "kind"), "0 or more, and 0 without noise reduction")
