@@ -1,12 +1,17 @@
 """Compensators: modules that turn a waveform and an audiogram into what the ear is to be given."""
 
-from compensators.config import MappingConfig
+from compensators.aid import HearingAid
+from compensators.config import HearingAidConfig, MappingConfig
 from compensators.mapping import MappingCompensator
 from compensators.nalr import NALR
 from compensators.pretrained import load_compensator, save_compensator, trained_for
+from compensators.wdrc import WDRC
 
 __all__ = [
     "NALR",
+    "WDRC",
+    "HearingAid",
+    "HearingAidConfig",
     "MappingCompensator",
     "MappingConfig",
     "load_compensator",

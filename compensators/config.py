@@ -1,11 +1,12 @@
-"""What a MappingCompensator is made of, as JSON can hold it."""
+"""What trained compensators are made of, as JSON can hold it."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from hlsim.checks import is_finite
-from hlsim.neuro.config import NetworkConfig
+from hlsim.neuro.config import ModelConfig, NetworkConfig
 
 
 @dataclass(frozen=True)
@@ -37,3 +38,67 @@ class MappingConfig(NetworkConfig):
             raise ValueError(f"reach_db is {self.reach_db!r}; allowed: more than 0, to 60 dB")
         if not (is_finite(self.limit_spl) and 60.0 <= self.limit_spl <= 140.0):
             raise ValueError(f"limit_spl is {self.limit_spl!r}; allowed: 60 to 140 dB SPL")
+
+
+@dataclass(frozen=True)
+class HearingAidConfig(ModelConfig):
+    """Sizes and choices of a ``HearingAid``.
+
+    Attributes:
+        bands: whose gains it sets, an equal number of ERBs apart but no less than 125 Hz, 4 to 40.
+        bins: frequencies of a frame, 62.5 Hz apart from the first, whose levels the network sees beside the bands'.
+        width: of the layer before the recurrent one.
+        hidden: of the recurrent layer.
+        reach_db: largest correction of the restoring gain up or down.
+        reduction_db: most that noise reduction takes off a band.
+        attack, release: of the levels that the gain follows, time constants in seconds.
+        opening, closing: of noise reduction.
+        smoothing: of the correction.
+        cap_db: most gain of a band.
+        quiet_spl: level under which the gain fades, to none 15 dB lower.
+        limit_spl: peak of the output in dB SPL that no sample passes.
+    """
+
+    bands: int = 20
+    bins: int = 40
+    width: int = 64
+    hidden: int = 128
+    reach_db: float = 20.0
+    reduction_db: float = 20.0
+    attack: float = 0.005
+    release: float = 0.1
+    opening: float = 0.0
+    closing: float = 0.03
+    smoothing: float = 0.05
+    cap_db: float = 45.0
+    quiet_spl: float = 40.0
+    limit_spl: float = 110.0
+
+    def __post_init__(self) -> None:
+        for name, low, high in (("bands", 4, 40), ("bins", 0, 128), ("width", 1, 4096), ("hidden", 1, 4096)):
+            if type(getattr(self, name)) is not int:
+                raise ValueError(
+                    f"{name} is {getattr(self, name)!r}; allowed: whole numbers from {low} to {high}"
+                )
+            refuse_outside({name: (getattr(self, name), low, high)})
+        refuse_outside(
+            {
+                "reach_db": (self.reach_db, 0.0, 60.0),
+                "reduction_db": (self.reduction_db, 0.0, 60.0),
+                "attack": (self.attack, 0.0, 1.0),
+                "release": (self.release, 0.01, 2.0),
+                "opening": (self.opening, 0.0, 1.0),
+                "closing": (self.closing, 0.01, 2.0),
+                "smoothing": (self.smoothing, 0.0, 1.0),
+                "cap_db": (self.cap_db, 0.0, 80.0),
+                "quiet_spl": (self.quiet_spl, 0.0, 80.0),
+                "limit_spl": (self.limit_spl, 60.0, 140.0),
+            }
+        )
+
+
+def refuse_outside(ranges: Mapping[str, tuple[float, float, float]]) -> None:
+    """Raise ValueError unless each value is a number from its lowest to its highest: (value, lowest, highest) by name."""
+    for name, (value, low, high) in ranges.items():
+        if not (is_finite(value) and low <= value <= high):
+            raise ValueError(f"{name} is {value!r}; allowed: {low:g} to {high:g}")

@@ -2,43 +2,64 @@
 
 from pathlib import Path
 
-from compensators.config import MappingConfig
+from compensators.aid import HearingAid
+from compensators.config import HearingAidConfig, MappingConfig
 from compensators.mapping import MappingCompensator
 from compensators.nalr import NALR
+from compensators.wdrc import WDRC
 from hlsim import __version__
 from hlsim.audiogram import Audiogram
 from hlsim.calibration import PASCAL_SPL
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.pretrained import checkpoint_about, read_checkpoint, save_checkpoint
 
-KIND = "mapping-compensator"
-"""What ``config.json`` of a checkpoint of such a compensator calls it."""
+Trained = MappingCompensator | HearingAid
+
+CONFIGS: dict[str, type[MappingConfig | HearingAidConfig]] = {
+    "mapping-compensator": MappingConfig,
+    "hearing-aid": HearingAidConfig,
+}
+"""What ``config.json`` of a checkpoint calls the kind of compensator, and what it is made of."""
+
+_UNTRAINED = {"nalr": NALR, "wdrc": WDRC}
+
+
+def build_compensator(
+    config: MappingConfig | HearingAidConfig,
+    *,
+    sample_rate: int = NEURO_RATE,
+    full_scale_spl: float = PASCAL_SPL,
+) -> Trained:
+    """The compensator that a configuration is of, untrained."""
+    if isinstance(config, HearingAidConfig):
+        return HearingAid(config, sample_rate=sample_rate, full_scale_spl=full_scale_spl)
+    return MappingCompensator(config, sample_rate=sample_rate, full_scale_spl=full_scale_spl)
 
 
 def load_compensator(
     name: str | Path, *, sample_rate: int = NEURO_RATE, full_scale_spl: float = PASCAL_SPL
-) -> MappingCompensator | NALR:
+) -> Trained | NALR | WDRC:
     """A compensator, frozen and in eval mode. Nothing is downloaded.
 
     Args:
-        name: ``"nalr"``, the prescription; a checkpoint that ships with hlsim; or a checkpoint folder. One that was
-            trained for one ear is meant for no other: see ``trained_for``.
+        name: ``"nalr"``, the prescription; ``"wdrc"``, compression about it; a checkpoint that ships with hlsim; or a
+            checkpoint folder. One that was trained for one ear is meant for no other: see ``trained_for``.
         sample_rate: of its inputs and outputs in Hz, 16000 to 48000.
         full_scale_spl: level in dB SPL of RMS 1.0.
 
     Raises:
         ValueError: no such checkpoint, one of another kind, or one that has changed since it was saved.
     """
-    if str(name) == "nalr":
-        return NALR(sample_rate=sample_rate, full_scale_spl=full_scale_spl).eval()
+    if kind := _UNTRAINED.get(str(name)):
+        return kind(sample_rate=sample_rate, full_scale_spl=full_scale_spl).eval()
 
-    def build(config: MappingConfig) -> MappingCompensator:
-        return MappingCompensator(config, sample_rate=sample_rate, full_scale_spl=full_scale_spl)
+    def build(config: MappingConfig | HearingAidConfig) -> Trained:
+        return build_compensator(config, sample_rate=sample_rate, full_scale_spl=full_scale_spl)
 
-    return read_checkpoint(name, KIND, MappingConfig, build, also=("nalr",)).eval().requires_grad_(False)
+    return read_checkpoint(name, CONFIGS, build, also=tuple(_UNTRAINED)).eval().requires_grad_(False)
 
 
-def save_compensator(model: MappingCompensator, folder: str | Path) -> None:
+def save_compensator(model: Trained, folder: str | Path) -> None:
     """Write a checkpoint that ``load_compensator`` reads, whole or not at all; an older one there is replaced.
 
     Rate and level are no part of it: ``load_compensator`` is told them.
@@ -46,9 +67,11 @@ def save_compensator(model: MappingCompensator, folder: str | Path) -> None:
     Raises:
         ValueError: another kind of model, or a folder that holds something else.
     """
-    if not isinstance(model, MappingCompensator):
-        raise ValueError(f"{type(model).__name__} cannot be saved; allowed: a MappingCompensator")
-    save_checkpoint(folder, KIND, model, model.config.to_dict(), {"hlsim": __version__})
+    if not isinstance(model, Trained):
+        allowed = "a MappingCompensator or HearingAid"
+        raise ValueError(f"{type(model).__name__} cannot be saved; allowed: {allowed}")
+    kind = next(kind for kind, config in CONFIGS.items() if isinstance(model.config, config))
+    save_checkpoint(folder, kind, model, model.config.to_dict(), {"hlsim": __version__})
 
 
 def trained_for(name: str | Path) -> Audiogram | None:
@@ -57,5 +80,5 @@ def trained_for(name: str | Path) -> Audiogram | None:
     Raises:
         ValueError: no such checkpoint, or what it tells is no ear.
     """
-    told = None if str(name) == "nalr" else checkpoint_about(name).get("audiogram")
+    told = None if str(name) in _UNTRAINED else checkpoint_about(name).get("audiogram")
     return None if told is None else Audiogram.from_dict(told)

@@ -433,7 +433,7 @@ def _build(simulator: str | Path | nn.Module, sample_rate: int, full_scale_spl: 
         )
     if str(simulator) == "msbg":
         return MSBG(sample_rate=sample_rate, full_scale_spl=full_scale_spl)
-    folder = find_checkpoint(simulator, SIMULATOR, ("msbg",))
+    folder = find_checkpoint(simulator, [SIMULATOR], ("msbg",))
     return load_pretrained(folder, sample_rate=sample_rate, full_scale_spl=full_scale_spl)
 
 

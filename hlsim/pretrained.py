@@ -4,7 +4,7 @@ import hashlib
 import json
 import os
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -15,12 +15,12 @@ from torch import nn
 
 from hlsim.calibration import PASCAL_SPL
 from hlsim.files import whole_folder
-from hlsim.neuro.config import NEURO_RATE, NetworkConfig, NeuroConfig
+from hlsim.neuro.config import NEURO_RATE, ModelConfig, NeuroConfig
 from hlsim.neuro.model import NeuroMSBG
 from hlsim.torchtools import lasting
 
 Model = TypeVar("Model", bound=nn.Module)
-Config = TypeVar("Config", bound=NetworkConfig)
+Config = TypeVar("Config", bound=ModelConfig)
 Settings = Mapping[str, Any]
 
 WEIGHTS, CONFIG, CARD = "model.safetensors", "config.json", "README.md"
@@ -28,8 +28,13 @@ WEIGHTS, CONFIG, CARD = "model.safetensors", "config.json", "README.md"
 SIMULATOR = "neuro-msbg"
 """What ``config.json`` of a checkpoint of a simulator calls it."""
 
-_LOADERS = {SIMULATOR: "hlsim.load_pretrained", "mapping-compensator": "compensators.load_compensator"}
-_MODELS = {"msbg": "hlsim.MSBG", "nalr": "compensators.NALR"}  # that need no checkpoint
+_LOADERS = {SIMULATOR: "hlsim.load_pretrained"}
+_LOADERS |= dict.fromkeys(("mapping-compensator", "hearing-aid"), "compensators.load_compensator")
+_MODELS = {
+    "msbg": "hlsim.MSBG",
+    "nalr": "compensators.NALR",
+    "wdrc": "compensators.WDRC",
+}  # that need no checkpoint
 
 
 def load_pretrained(
@@ -49,31 +54,35 @@ def load_pretrained(
     def build(config: NeuroConfig) -> NeuroMSBG:
         return NeuroMSBG(config, sample_rate=sample_rate, full_scale_spl=full_scale_spl)
 
-    model = read_checkpoint(name, SIMULATOR, NeuroConfig, build)
+    model = read_checkpoint(name, {SIMULATOR: NeuroConfig}, build)
     return model.eval().requires_grad_(False)
 
 
 def read_checkpoint(
     name: str | Path,
-    kind: str,
-    config_kind: type[Config],
+    kinds: Mapping[str, type[Config]],
     build: Callable[[Config], Model],
     also: Sequence[str] = (),
 ) -> Model:
     """A model built from a checkpoint's configuration, with its weights, on torch's default device, or the CPU where that
     is ``meta``. A configuration without a hash, as older checkpoints have it, is taken as it is.
 
+    Args:
+        kinds: the configuration of each kind that is taken.
+
     Raises ValueError as ``load_pretrained``."""
-    folder = find_checkpoint(name, kind, also)
+    folder = find_checkpoint(name, kinds, also)
     try:
         record = _record(folder)
         weights = (folder / WEIGHTS).read_bytes()
     except (OSError, ValueError) as error:
         raise ValueError(f"{folder}: not readable as a checkpoint ({error})") from error
-    if not isinstance(record, dict) or record.get("kind") != kind:
-        found = record.get("kind") if isinstance(record, dict) else None
+    found = record.get("kind") if isinstance(record, dict) else None
+    if not isinstance(found, str) or found not in kinds:
         hint = f" ({_LOADERS[found]} loads the former)" if found in _LOADERS else ""
-        raise ValueError(f"{folder}: a checkpoint of kind {found!r}; needed here: {kind!r}{hint}")
+        raise ValueError(
+            f"{folder}: a checkpoint of kind {found!r}; needed here: {' or '.join(map(repr, kinds))}{hint}"
+        )
     settings: Any = record.get("config")
     changed = "changed since it was saved"
     if hashlib.sha256(weights).hexdigest() != record.get("sha256"):
@@ -81,7 +90,7 @@ def read_checkpoint(
     if record.get("config_sha256", _digest(settings)) != _digest(settings):
         raise ValueError(f"{folder / CONFIG}: {changed}, the SHA-256 of its 'config' is another; get it anew")
     try:
-        config = config_kind.from_dict(settings)
+        config = kinds[found].from_dict(settings)
     except (TypeError, ValueError) as error:
         raise ValueError(f"{folder / CONFIG}: {error}") from error
     device = torch.get_default_device()
@@ -97,11 +106,11 @@ def read_checkpoint(
         return model if device.type == "meta" else model.to(device)
 
 
-def find_checkpoint(name: str | Path, kind: str | None = None, also: Sequence[str] = ()) -> Path:
+def find_checkpoint(name: str | Path, kinds: Collection[str] | None = None, also: Sequence[str] = ()) -> Path:
     """The folder of a checkpoint that ships with hlsim, or another.
 
     Raises:
-        ValueError: there is none, or it is neither a name nor a path; the message lists those of the kind that ship, and
+        ValueError: there is none, or it is neither a name nor a path; the message lists those of the kinds that ship, and
             what the caller takes ``also``.
     """
     if not isinstance(name, str | os.PathLike):
@@ -110,7 +119,7 @@ def find_checkpoint(name: str | Path, kind: str | None = None, also: Sequence[st
         return Path(name)
     if str(name) in (ours := shipped()):
         return ours[str(name)]
-    names = ", ".join([*also, *shipped(kind)]) or "none ships"
+    names = ", ".join([*also, *shipped(kinds)]) or "none ships"
     inner = Path(name) / "checkpoint"  # as a training leaves it
     hint = f", but {str(inner)!r} is one" if (inner / CONFIG).is_file() else ""
     if str(name) in _MODELS:
@@ -128,10 +137,12 @@ def checkpoint_about(name: str | Path) -> dict[str, Any]:
     return dict(_record(find_checkpoint(name)).get("about") or {})
 
 
-def shipped(kind: str | None = None) -> dict[str, Path]:
+def shipped(kinds: Collection[str] | None = None) -> dict[str, Path]:
     """The checkpoints that ship with hlsim, name and folder; all kinds by default."""
     folders = (path.parent for path in sorted(checkpoints_folder().glob(f"*/{CONFIG}")))
-    return {folder.name: folder for folder in folders if kind is None or _record(folder).get("kind") == kind}
+    return {
+        folder.name: folder for folder in folders if kinds is None or _record(folder).get("kind") in kinds
+    }
 
 
 def checkpoints_folder() -> Path:

@@ -46,10 +46,14 @@ def test_linked_files_exist(path: str) -> None:
 def test_recipes_are_readable() -> None:
     yaml = pytest.importorskip("yaml")
     pytest.importorskip("lightning")
+    from compensators.pretrained import CONFIGS
     from hlsim.neuro import NeuroConfig
-    from hlsim.training.recipes import SimulatorRecipe
+    from hlsim.training.recipes import CompensatorRecipe, SimulatorRecipe
 
     for path in (README.parent / "examples").glob("*.yaml"):
-        if "compensator" not in path.name:
-            recipe = SimulatorRecipe.from_dict(yaml.safe_load(path.read_text(encoding="utf-8")))
-            NeuroConfig.from_dict(recipe.model)
+        settings = yaml.safe_load(path.read_text(encoding="utf-8"))
+        if path.name.startswith("neuro-msbg"):
+            NeuroConfig.from_dict(SimulatorRecipe.from_dict(settings).model)
+        else:
+            recipe = CompensatorRecipe.from_dict(settings)
+            CONFIGS[recipe.kind].from_dict(recipe.model)

@@ -58,7 +58,7 @@ def rows(simulators: list[str] | None = None) -> tuple[list[Row], list[str]]:
         except MissingExtraError as error:
             skipped.append(f"{name}: {error}")
     found.append(Row("MSBG (exact)", both, lambda rate, ear, device: MSBG(ear, sample_rate=rate).to(device)))
-    for name in shipped(SIMULATOR) if simulators is None else simulators:
+    for name in shipped([SIMULATOR]) if simulators is None else simulators:
         count, default = _count(load_pretrained(name)), name == "neuro-msbg"
         title = f"Neuro-MSBG ({name})"
         found.append(Row(title, both, partial(_neuro, name), parameters=count, default=default))

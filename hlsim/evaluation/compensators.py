@@ -73,7 +73,7 @@ def evaluate_compensators(
 
     Args:
         compensators: by name, modules at 16 kHz and 94 dB SPL full scale, called with a waveform and an ear. One with a
-            ``config.limit_spl`` is held to it.
+            ``config.limit_spl``, or ``limit_spl``, is held to it.
         speech, noise: folders of recordings; with ``noise`` every second item is noisy, at 2.5 to 17.5 dB.
         store: file of figures, there or not; None keeps nothing.
         audiograms: CSV file of ears that join Bisgaard's N2 to N6 and S1 to S3.
@@ -125,7 +125,7 @@ def evaluate_compensators(
     settings |= {"ears": [name for name, _ in ears], "simulator": str(simulator)}
     # the peak in dB SPL that a compensator promises not to pass
     limits = {
-        name: getattr(getattr(module, "config", None), "limit_spl", None)
+        name: getattr(getattr(module, "config", module), "limit_spl", None)
         for name, module in conditions.items()
     }
     result, reports = compensator_result(drawn, judged, limits=limits, settings=settings)

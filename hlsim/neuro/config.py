@@ -24,7 +24,30 @@ _COUNTS = ("fft", "window", "hop", "channels", "dense_depth", "blocks", "expansi
 
 
 @dataclass(frozen=True)
-class NetworkConfig:
+class ModelConfig:
+    """What a model is made of, as a dataclass that JSON can hold."""
+
+    @classmethod
+    def given(cls, config: Self | None) -> Self:
+        """What a network was given, or the default. Raises ValueError where it is of another kind."""
+        if config is not None and not isinstance(config, cls):
+            raise ValueError(f"config is {type(config).__name__}; allowed: a {cls.__name__}")
+        return config or cls()
+
+    def to_dict(self) -> dict[str, Any]:
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> Self:
+        """Read what ``to_dict`` wrote. Raises ValueError where a name is unknown, or a value none that is allowed."""
+        if not isinstance(data, Mapping):
+            raise ValueError(f"network settings {data!r}; allowed: names with values")
+        refuse_unknown(data, (field.name for field in fields(cls)), "network settings")
+        return cls(**dict(data))
+
+
+@dataclass(frozen=True)
+class NetworkConfig(ModelConfig):
     """Sizes that simulators and compensators share.
 
     Attributes:
@@ -107,24 +130,6 @@ class NetworkConfig:
         # by blocks, dense encoder and decoder, and the patches into which the encoder's and the decoders' strides cut
         steps = self.blocks * (self.kernel[0] // 2) + 2 * (2**self.dense_depth - 1) + 2
         return self.step * steps + self.window
-
-    @classmethod
-    def given(cls, config: Self | None) -> Self:
-        """What a network was given, or the default. Raises ValueError where it is of another kind."""
-        if config is not None and not isinstance(config, cls):
-            raise ValueError(f"config is {type(config).__name__}; allowed: a {cls.__name__}")
-        return config or cls()
-
-    def to_dict(self) -> dict[str, Any]:
-        return asdict(self)
-
-    @classmethod
-    def from_dict(cls, data: Mapping[str, Any]) -> Self:
-        """Read what ``to_dict`` wrote. Raises ValueError where a name is unknown, or a value none that is allowed."""
-        if not isinstance(data, Mapping):
-            raise ValueError(f"network settings {data!r}; allowed: names with values")
-        refuse_unknown(data, (field.name for field in fields(cls)), "network settings")
-        return cls(**dict(data))
 
 
 @dataclass(frozen=True)

@@ -157,9 +157,13 @@ class CompensatorBatches(DrawnBatches):
             noisy = mix(clean, self.noise.draw(count, generator), uniform(*self.recipe.snr))
             signal = torch.where(uniform(0.0, 1.0, 1) < self.recipe.noisy, noisy, clean)
         if self.ear is not None:
-            return {"clean": clean, "signal": signal, "thresholds": self.ear.expand(count, -1)}
-        ears = self.join_measured(draw_thresholds(count, generator), 0.5, 0.0, generator)
-        return {"clean": clean, "signal": signal, "thresholds": ears}
+            ears = self.ear.expand(count, -1)
+        else:
+            ears = self.join_measured(draw_thresholds(count, generator), 0.5, 0.0, generator)
+        batch = {"clean": clean, "signal": signal, "thresholds": ears}
+        if self.recipe.unreduced:
+            batch["noise_reduction"] = (uniform(0.0, 1.0) >= self.recipe.unreduced).to(clean.dtype)
+        return batch
 
 
 def simulator_data(
@@ -178,7 +182,7 @@ def simulator_data(
 def compensator_data(data: TrainingData, recipe: CompensatorRecipe, ear: Audiogram | None) -> BatchData:
     """What a compensator for an ear, or else for all, is trained and validated on. Raises ValueError as
     ``simulator_data``."""
-    plain = replace(recipe, equalised=0.0, seconds=_VALID_SECONDS)
+    plain = replace(recipe, equalised=0.0, unreduced=0.0, seconds=_VALID_SECONDS)
     valid = CompensatorBatches(plain, data.validation(), ear)
     generator = torch.Generator().manual_seed(2_000 + recipe.seed)
     validation = [valid.draw(4, generator) for _ in range(0, recipe.validation_items, 4)]

@@ -9,10 +9,10 @@ from typing import Any, Unpack
 import torch
 from torch import Tensor, nn
 
-from compensators.config import MappingConfig
-from compensators.mapping import MappingCompensator
-from compensators.pretrained import KIND, load_compensator
+from compensators.aid import HearingAid
+from compensators.pretrained import CONFIGS, build_compensator, load_compensator
 from hlsim.audiogram import Audiogram
+from hlsim.criteria.waveform import compressed_spectrum_error
 from hlsim.data.module import Batch
 from hlsim.loss import HearingLossLoss
 from hlsim.pretrained import checkpoint_digest
@@ -33,15 +33,24 @@ class CompensatorTraining(TimedModule):
         super().__init__(recipe.learning_rate, max_minutes)
         torch.manual_seed(recipe.seed)
         self.recipe = recipe
-        network = (MappingConfig, MappingCompensator, load_compensator)
+        network = (CONFIGS[recipe.kind], build_compensator, load_compensator)
         self.compensator = initial_network(recipe.start, recipe.model, *network)
         counted = {name: weight for name, weight in recipe.weights.items() if weight > 0.0}
         self.loss = HearingLossLoss(simulator=simulator, reference=recipe.reference, criterion=counted)
 
     def training_loss(self, batch: Batch) -> Tensor:
-        ears = batch["thresholds"]
-        value: Tensor = self.loss(self.compensator(batch["signal"], ears), batch["clean"], ears)
-        return value
+        signal, clean, ears = (batch[name] for name in ("signal", "clean", "thresholds"))
+        if not isinstance(self.compensator, HearingAid):
+            value: Tensor = self.loss(self.compensator(signal, ears), clean, ears)
+            return value
+        # both at once: for the ear, and as it takes noise off without amplification
+        reduced = batch.get("noise_reduction", torch.ones(len(signal), device=signal.device))
+        on = torch.ones_like(reduced)
+        sliders = torch.cat((reduced, on)), torch.cat((on, 0.0 * on))
+        given, denoised = self.compensator(signal.repeat(2, 1), ears.repeat(2, 1), *sliders).chunk(2)
+        aim = signal + reduced.unsqueeze(-1) * (clean - signal)
+        heard: Tensor = self.loss(given, aim, ears)
+        return heard + self.recipe.denoising * compressed_spectrum_error(denoised, clean).mean()
 
     def evaluate(self, batch: Batch) -> dict[str, Tensor]:
         return {"valid_loss": self.training_loss(batch)[None]}
@@ -93,4 +102,4 @@ def train_compensator(
         trained["simulator_sha256"] = checkpoint_digest(simulator)  # a folder may hold another one next time
     about = trained | {"start_valid_loss": start}
     how: dict[str, Any] = {"out": out, "identity": identity_of(data) | trained, "about": about}
-    return train_network(module, batches, recipe, KIND, **how, **options)
+    return train_network(module, batches, recipe, recipe.kind, **how, **options)

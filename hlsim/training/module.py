@@ -13,9 +13,10 @@ from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel
 
 from hlsim.data.module import Batch
-from hlsim.neuro.config import NetworkConfig
+from hlsim.neuro.config import ModelConfig
 
 Network = TypeVar("Network", bound=nn.Module)
+Config = TypeVar("Config", bound=ModelConfig)
 
 
 class TimedModule(L.LightningModule):
@@ -118,8 +119,8 @@ def exponential_average(model: nn.Module, decay: float) -> AveragedModel:
 def initial_network(
     start: str,
     settings: Mapping[str, Any],
-    config_kind: type[NetworkConfig],
-    kind: type[Network],
+    config_kind: type[Config],
+    build: Callable[[Config], Network],
     load: Callable[[str], nn.Module],
 ) -> Network:
     """The network to train, with random weights or those of a checkpoint.
@@ -134,16 +135,17 @@ def initial_network(
     """
     config = config_kind.from_dict(settings)
     if not start:
-        return kind(config)
-    network = load(start)
+        return build(config)
+    network: Any = load(start)
     what = f"start {start!r} in the recipe"
-    if not isinstance(network, kind):
+    if not isinstance(getattr(network, "config", None), config_kind):
         raise ValueError(f"{what} is none to be trained; allowed: a checkpoint's name or folder")
     if settings and config != network.config:
-        ours, theirs = config.to_dict(), network.config.to_dict()  # type: ignore[operator,union-attr]
+        ours, theirs = config.to_dict(), network.config.to_dict()
         differing = ", ".join(name for name in ours if ours[name] != theirs[name])
         raise ValueError(
             f"{what} has other settings of the model than the recipe ({differing}); allowed: the same, or no 'model' in "
             "the recipe"
         )
-    return network.train().requires_grad_(True)
+    trained: Network = network.train().requires_grad_(True)
+    return trained

@@ -10,6 +10,7 @@ from hlsim.checks import refuse_other_kinds, refuse_seed, refuse_unknown, refuse
 from hlsim.metrics.pair import SHORTEST_SECONDS
 
 _WHERE = "in the recipe"
+KINDS = ("mapping-compensator", "hearing-aid")
 PRECISIONS = ("float32", "bfloat16")
 
 
@@ -116,7 +117,8 @@ class CompensatorRecipe(TrainingRecipe):
     The defaults are for one ear and a few minutes: many small steps. All ears need larger batches and hours.
 
     Attributes:
-        model: settings of ``MappingConfig``.
+        kind: ``mapping-compensator`` or ``hearing-aid``.
+        model: settings of its ``MappingConfig`` or ``HearingAidConfig``.
         weights: of ``HearingLossLoss``'s criteria: ``coherent-bands``, ``bands`` (dB), ``paper``, and ``haspi``
             and ``hasqi`` (1 less the score; clips of 0.7 s and more).
         reference: what the paper's criterion compares with, ``clean`` or ``normal-hearing``.
@@ -125,8 +127,12 @@ class CompensatorRecipe(TrainingRecipe):
             the gain for another can be 20 dB off.
         noisy: share of noisy clips, where there is noise.
         snr: lowest and highest signal-to-noise ratio in dB.
+        unreduced: share of items of a hearing aid without noise reduction: the ear is to hear the noisy speech.
+        denoising: weight of ``compressed_spectrum_error``: what a hearing aid gives without amplification is to be the
+            clean speech.
     """
 
+    kind: str = "mapping-compensator"
     batch: int = 2
     seconds: float = 0.6
     learning_rate: float = 3e-3
@@ -137,14 +143,19 @@ class CompensatorRecipe(TrainingRecipe):
     equalised: float = 0.7
     noisy: float = 0.5
     snr: tuple[float, float] = (0.0, 20.0)
+    unreduced: float = 0.0
+    denoising: float = 0.0
     validate_every: int = 50
     validation_items: int = 8
 
     criteria = ("coherent-bands", "bands", "paper", "haspi", "hasqi")
-    shares = ("sounds", "equalised", "noisy")
+    shares = ("sounds", "equalised", "noisy", "unreduced")
 
     def __post_init__(self) -> None:
         super().__post_init__()
         scored = self.weights.get("haspi", 0.0) or self.weights.get("hasqi", 0.0)
         wrong = bool(scored) and self.seconds < SHORTEST_SECONDS
         self._refuse(wrong, ("seconds",), f"{SHORTEST_SECONDS} or more with haspi or hasqi")
+        self._refuse(self.kind not in KINDS, ("kind",), " or ".join(KINDS))
+        wrong = self.denoising < 0.0 or (self.kind != "hearing-aid" and self.unreduced + self.denoising > 0.0)
+        self._refuse(wrong, ("unreduced", "denoising", "kind"), "0 or more, and 0 without noise reduction")

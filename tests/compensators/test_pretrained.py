@@ -61,7 +61,7 @@ def test_the_ear_that_a_compensator_was_trained_for(tmp_path: Path) -> None:
 
 def test_unknown_name_and_other_kind(tmp_path: Path) -> None:
     with pytest.raises(
-        ValueError, match="no checkpoint 'nobody'; allowed: nalr, compensator-general, "
+        ValueError, match="no checkpoint 'nobody'; allowed: nalr, wdrc, compensator-general, "
     ) as caught:
         load_compensator("nobody")
     assert "neuro-msbg" not in str(caught.value)

@@ -101,7 +101,7 @@ class Options:
     gain: float
 
 
-@pytest.mark.parametrize("name", [*shipped(SIMULATOR)])
+@pytest.mark.parametrize("name", [*shipped([SIMULATOR])])
 def test_a_checkpoint_is_the_same_whenever_it_is_loaded(name: str) -> None:
     once, again = load_pretrained(name), load_pretrained(name)
     again(torch.full((1600,), 0.01), Audiogram.standard("N3"))  # nor does use change it

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from compensators import MappingCompensator, load_compensator
+from compensators import HearingAid, MappingCompensator, load_compensator
 from hlsim import Audiogram
 from hlsim.neuro import NeuroConfig, NeuroMSBG
 from hlsim.pretrained import CONFIG, save_checkpoint
@@ -137,6 +137,26 @@ def test_haspi_joins_the_criteria(data: TrainingData) -> None:
     assert all(p.grad is not None and bool(p.grad.isfinite().all()) for p in module.trained_parameters())
 
 
+def test_a_hearing_aid_learns_to_amplify_and_to_take_noise_off(data: TrainingData, tmp_path: Path) -> None:
+    noisy = TrainingData(data.speech, noise=data.speech, valid_speech=data.valid_speech)
+    settings = {
+        "kind": "hearing-aid",
+        "model": {"width": 16, "hidden": 16},
+        "seconds": 0.5,
+        "learning_rate": 0.01,
+    }
+    settings |= {"denoising": 1.0, "unreduced": 0.5, "noisy": 1.0}
+    folder, _ = train(noisy, tmp_path, max_steps=40, recipe=settings)
+    about = json.loads((folder / CONFIG).read_text())["about"]
+    assert about["validation"]["valid_loss"] < 0.9 * about["start_valid_loss"]
+    assert isinstance(load_compensator(folder), HearingAid)
+
+    recipe = CompensatorRecipe.from_dict(SMALL | settings)
+    batches = CompensatorBatches(recipe, noisy, None)
+    drawn = [batches.draw(8, torch.Generator().manual_seed(i))["noise_reduction"] for i in range(8)]
+    assert set(torch.cat(drawn).tolist()) == {0.0, 1.0} and 0.3 < torch.cat(drawn).mean() < 0.7
+
+
 def test_a_share_of_the_clips_are_tones_and_clicks(data: TrainingData) -> None:
     def clicks(sounds: float) -> int:
         recipe = CompensatorRecipe.from_dict(SMALL | {"equalised": 0.0, "sounds": sounds})
@@ -151,7 +171,10 @@ def test_a_share_of_the_clips_are_tones_and_clicks(data: TrainingData) -> None:
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"sounds": 1.5}, "sounds 1.5, equalised 0.7, noisy 0.5 in the recipe; allowed: 0 to 1"),
+        (
+            {"sounds": 1.5},
+            "sounds 1.5, equalised 0.7, noisy 0.5, unreduced 0.0 in the recipe; allowed: 0 to 1",
+        ),
         ({"lr": 0.1}, "unknown settings lr"),
         ({"weights": {"loudness": 1.0}}, "unknown criteria loudness"),
         ({"weights": {"haspi": 1.0}}, "seconds 0.6 in the recipe; allowed: 0.7 or more with haspi or hasqi"),
@@ -160,6 +183,12 @@ def test_a_share_of_the_clips_are_tones_and_clicks(data: TrainingData) -> None:
         ({"seed": -(2**62)}, "seed -4611686018427387904 in the recipe; allowed: whole numbers between"),
         ({"weights": {"bands": 0.0}}, "above 0"),
         ({"model": {"layers": 2}}, "unknown network settings layers"),
+        ({"kind": "vocoder"}, "kind 'vocoder' in the recipe; allowed: mapping-compensator or hearing-aid"),
+        (
+            {"denoising": 1.0},
+            "denoising 1.0, kind 'mapping-compensator' in the recipe; allowed: 0 or more, and 0 without",
+        ),
+        ({"kind": "hearing-aid", "model": {"channels": 2}}, "unknown network settings channels"),
     ],
 )
 def test_bad_recipes(settings: dict[str, object], message: str) -> None:

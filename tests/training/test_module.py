@@ -86,7 +86,7 @@ def test_what_makes_the_start_worse_is_not_kept(data: TrainingData, tmp_path: Pa
     ("settings", "said"),
     [
         ({"start": "nalr"}, "start 'nalr' in the recipe is none to be trained"),
-        ({"start": "none"}, "no checkpoint 'none'; allowed: nalr, compensator-general"),
+        ({"start": "none"}, "no checkpoint 'none'; allowed: nalr, wdrc, compensator-general"),
         ({"start": "neuro-msbg"}, "a checkpoint of kind 'neuro-msbg'; needed here"),
         (
             {"start": "compensator-general", "model": {"channels": 8}},

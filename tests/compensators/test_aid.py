@@ -1,0 +1,107 @@
+"""The hearing aid's sliders, gains and settings."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from compensators import HearingAid, HearingAidConfig, load_compensator, save_compensator
+from hlsim import Audiogram
+from hlsim.audiogram import draw_thresholds
+from hlsim.calibration import level_spl, set_level
+from hlsim.dsp.resample import resample
+from tests.compensators.test_wearable import EAR, trained
+
+
+@pytest.fixture
+def utterance(speech: list[tuple[torch.Tensor, int]]) -> torch.Tensor:
+    """1.5 s of speech at 65 dB SPL. Shape: (time,) at 16 kHz."""
+    waveform, rate = speech[0]
+    return set_level(resample(waveform, rate, 16000)[0, 8000:32000], 65.0)
+
+
+def test_at_0_and_0_the_input_passes_unchanged(utterance: torch.Tensor) -> None:
+    aid = trained()
+    assert torch.equal(aid(utterance, EAR, 0.0, 0.0), utterance)
+    stream = aid.stream(EAR, noise_reduction=0.0, amplification=0.0)
+    assert torch.equal(stream(utterance)[64:], utterance[:-64])
+
+
+def test_each_slider_does_its_own_and_more_does_more(utterance: torch.Tensor) -> None:
+    aid, normal = trained(), Audiogram.standard("NH")
+    steps = torch.linspace(0.0, 1.0, 5)
+    five = utterance.expand(5, -1)
+    louder = level_spl(aid(five, EAR, 0.0, steps)).diff()
+    softer = level_spl(aid(five, EAR, steps, 0.0)).diff()
+    assert (louder > 1.0).all() and (softer < -0.1).all()
+    # without loss there is nothing to amplify
+    assert torch.equal(aid(utterance, normal, 0.0, 1.0), utterance)
+    single = torch.stack([aid(utterance, EAR, 0.0, float(step)) for step in steps])
+    assert (aid(five, EAR, 0.0, steps) - single).abs().max() < 1e-4
+
+
+def test_sliders_move_in_a_stream_without_a_click() -> None:
+    """On a tone, what is further than 100 Hz away stays 40 dB below it, whatever the slider does."""
+    aid: Any = trained()
+    tone = set_level(torch.sin(2.0 * torch.pi * 1000.0 * torch.arange(32000) / 16000.0), 60.0)
+    stream, outputs = aid.stream(EAR, 0.0, 0.0), []
+    for number, chunk in enumerate(tone.split(160)):
+        if number == 100:
+            stream.amplification = 1.0
+        outputs.append(stream(chunk))
+    heard = torch.cat(outputs)
+    assert level_spl(heard[24000:]) > level_spl(heard[8000:15000]) + 10.0
+    power = torch.fft.rfft(heard[14000:22000] * torch.hann_window(8000)).abs().square()
+    hertz = torch.arange(4001) * 2.0
+    near = (hertz - 1000.0).abs() < 100.0
+    assert 10.0 * torch.log10(power[~near].sum() / power[near].sum()) < -40.0
+
+
+def test_one_slider_an_item_and_what_is_refused(utterance: torch.Tensor) -> None:
+    aid: Any = trained()
+    both = utterance.expand(2, -1)
+    assert torch.equal(aid(both, EAR, 0.0, torch.tensor([0.0, 1.0]))[0], utterance)
+    for wrong in (1.5, -0.1, float("nan"), "loud", torch.tensor([0.0, 2.0])):
+        with pytest.raises(ValueError, match=r"amplification is .*; allowed: "):
+            aid(both, EAR, 1.0, wrong)
+    with pytest.raises(ValueError, match=r"noise_reduction has shape \(3,\) for items \(2,\)"):
+        aid(both, EAR, torch.ones(3))
+
+
+def test_gain_has_a_cap() -> None:
+    quiet = set_level(torch.randn(32000), 42.0)
+    deaf = torch.full((8,), 100.0)
+    for cap in (20.0, 45.0):
+        aid = HearingAid(HearingAidConfig(cap_db=cap)).eval()
+        gain = float(level_spl(aid(quiet, deaf, 0.0)[16000:]) - 42.0)
+        assert cap - 12.0 < gain < cap + 0.5
+
+
+def test_gradients_reach_every_weight(utterance: torch.Tensor) -> None:
+    aid = trained().train().requires_grad_(True)
+    signal = utterance[:8000].expand(4, -1).clone().requires_grad_(True)
+    aid(signal, draw_thresholds(4)).square().mean().backward()
+    for name, weight in aid.named_parameters():
+        assert weight.grad is not None and weight.grad.isfinite().all() and weight.grad.any(), name
+    assert signal.grad is not None and signal.grad.isfinite().all()
+    silent = torch.zeros(1, 4000, requires_grad=True)
+    aid(silent, EAR).sum().backward()
+    assert silent.grad is not None and silent.grad.isfinite().all()
+
+
+def test_saved_and_loaded_is_the_same_to_the_bit(tmp_path: Path, utterance: torch.Tensor) -> None:
+    aid = trained(config=HearingAidConfig(hidden=32, cap_db=40.0))
+    save_compensator(aid, tmp_path / "mine")
+    loaded: Any = load_compensator(tmp_path / "mine")
+    assert isinstance(loaded, HearingAid) and loaded.config == aid.config and not loaded.training
+    assert torch.equal(loaded(utterance, EAR, 0.5, 0.7), aid(utterance, EAR, 0.5, 0.7))
+
+
+@pytest.mark.parametrize(
+    "nonsense",
+    [{"bands": 3}, {"bands": 20.0}, {"cap_db": -1.0}, {"release": 0.0}, {"hidden": 0}, {"limit_spl": "loud"}],
+)
+def test_settings_are_checked(nonsense: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match=f"{next(iter(nonsense))} is .*; allowed: "):
+        HearingAidConfig(**nonsense)

@@ -1,0 +1,164 @@
+"""What both wearable aids must do: 5 ms, chunks as the whole, batches as items, limits, and silence."""
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+
+from compensators import WDRC, HearingAid
+from compensators.wearable import Wearable
+from hlsim import Audiogram
+from hlsim.audiogram import draw_thresholds
+from hlsim.calibration import level_spl, set_level
+
+EAR = Audiogram.standard("N3")
+FIVE_MS = 80
+
+
+def trained(**options: Any) -> HearingAid:
+    """An aid whose gains move: the heads' weights are not small."""
+    torch.manual_seed(5)
+    aid = HearingAid(**options)
+    torch.nn.init.normal_(aid.leave.weight, std=0.1)
+    return aid.eval().requires_grad_(False)
+
+
+AIDS = pytest.mark.parametrize("make", [trained, WDRC], ids=["aid", "wdrc"])
+Make = Callable[..., Wearable]
+
+
+@pytest.fixture
+def noise() -> torch.Tensor:
+    """Steps of level from 20 to 90 dB SPL. Shape: (2, 12345) at 16 kHz."""
+    steps = torch.tensor([20.0, 70.0, 50.0, 90.0, 60.0]).repeat_interleave(2469)
+    return torch.randn(2, 12345) * 10.0 ** ((steps - 94.0) / 20.0)
+
+
+@AIDS
+def test_looks_five_milliseconds_ahead_and_no_farther(make: Make, noise: torch.Tensor) -> None:
+    aid, signal = make(), noise[0, 2000:6000]
+    before, nearest = aid(signal, EAR), []
+    for place in (
+        torch.linspace(100, 3900, 200).long().tolist()
+    ):  # one by one, for a batch rounds in its own way
+        moved = torch.cat((signal[:place], 0.3 * torch.randn(len(signal) - place)))
+        nearest.append(place - int((aid(moved, EAR) != before).nonzero()[0]))
+    assert max(nearest) <= aid.latency < FIVE_MS and min(nearest) > 0
+
+
+@AIDS
+@pytest.mark.parametrize("sizes", [[1], [7], [64], [1000], None])
+def test_chunks_give_what_the_whole_gives(make: Make, noise: torch.Tensor, sizes: list[int] | None) -> None:
+    aid: Any = make()
+    ears = torch.tensor([EAR.thresholds, Audiogram.standard("S2").thresholds])
+    signal = noise[:, :1500] if sizes == [1] else noise
+    sizes = sizes or torch.randint(1, 300, (20,)).tolist()
+    stream, outputs, place = aid.stream(ears), [], 0
+    while place < signal.shape[-1]:
+        chunk = signal[:, place : place + sizes[len(outputs) % len(sizes)]]
+        outputs.append(stream(chunk))
+        assert outputs[-1].shape == chunk.shape
+        place += chunk.shape[-1]
+    found = torch.cat([*outputs, stream.flush()], -1)[:, aid.latency :]
+    whole = aid(signal, ears)
+    assert (found - whole).abs().max() < 1e-5 * whole.abs().max()
+    # and then begins anew
+    assert (stream(signal)[:, 64:] - whole[:, :-64]).abs().max() < 1e-5 * whole.abs().max()
+
+
+@AIDS
+def test_a_batch_is_its_items(make: Make, noise: torch.Tensor) -> None:
+    aid, ears = make(), draw_thresholds(3)
+    signals = noise[0, :6000] * torch.tensor([[0.1], [1.0], [3.0]])
+    together = aid(signals, ears)
+    for item in range(3):
+        alone = aid(signals[item], ears[item])
+        assert alone.shape == (6000,) and (together[item] - alone).abs().max() < 1e-5 * alone.abs().max()
+    assert torch.equal(aid(signals.unsqueeze(1), ears.unsqueeze(1)), together.unsqueeze(1))
+    assert aid(signals[0], ears).shape == (3, 6000)
+
+
+@AIDS
+def test_blocks_of_a_long_signal_are_the_whole(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    aid, signal = make(), 0.03 * torch.randn(1, 9000)
+    whole = aid(signal, EAR)
+    monkeypatch.setattr("compensators.wearable._BLOCK", 1000)
+    assert (aid(signal, EAR) - whole).abs().max() < 1e-5 * whole.abs().max()
+
+
+@AIDS
+def test_level_and_precision_of_the_caller(make: Make, noise: torch.Tensor) -> None:
+    aid, signal = make(), noise[:1, :5000]
+    whole = aid(signal, EAR)
+    quieter = make(full_scale_spl=114.0)
+    assert (quieter(signal / 10.0, EAR) * 10.0 - whole).abs().max() < 1e-5 * whole.abs().max()
+    assert aid(signal.half(), EAR).dtype == torch.float16
+    exact = make().double()(signal.double(), EAR)
+    assert (exact - whole).abs().max() < 1e-4 * whole.abs().max()
+
+
+@AIDS
+def test_other_rates_go_through_whole_and_say_what_they_cost(make: Make) -> None:
+    fast: Any = make(sample_rate=44100)
+    tone = torch.sin(2.0 * torch.pi * 1000.0 * torch.arange(44100) / 44100.0)
+    slow = set_level(torch.sin(2.0 * torch.pi * 1000.0 * torch.arange(16000) / 16000.0), 60.0)
+    difference = level_spl(fast(set_level(tone, 60.0), EAR)[20000:30000]) - level_spl(
+        make()(slow, EAR)[7256:10884]
+    )
+    assert difference.abs() < 0.1
+    assert fast.latency == 552  # 12.5 ms, of which resampling takes 8.5
+    with pytest.raises(ValueError, match="a stream at 44100 Hz; allowed: 16000"):
+        fast.stream(EAR)
+
+
+@AIDS
+def test_a_silent_room_stays_silent(make: Make) -> None:
+    aid = make()
+    assert not aid(torch.zeros(8000), EAR).any()
+    room = set_level(torch.randn(32000), 25.0)
+    gain = float(level_spl(aid(room, EAR)[8000:]) - 25.0)
+    assert gain < (3.0 if isinstance(aid, HearingAid) else 50.0)
+
+
+@AIDS
+def test_no_sample_passes_the_limit(make: Make) -> None:
+    slam = set_level(torch.randn(16000), 115.0)
+    for ear in ("N2", "N5"):
+        loud = make()(slam, Audiogram.standard(ear))
+        assert float(loud.abs().max()) <= 1.000001 * 10.0 ** (16.0 / 20.0) and loud.isfinite().all()
+
+
+@AIDS
+@pytest.mark.parametrize("what", ["slam", "click"])
+def test_recovers_within_three_tenths_of_a_second(make: Make, what: str) -> None:
+    """The gain is back within 3 dB of what it is without."""
+    aid: Any = make()
+    steady = set_level(torch.randn(24000), 60.0)
+    struck = steady.clone()
+    if what == "slam":
+        struck[8000:8800] = set_level(torch.randn(800), 115.0)
+    else:
+        struck[8000] = 20.0
+    end = (8800 if what == "slam" else 8001) + 4800
+    levels = [level_spl(aid(signal, EAR)[end : end + 1600]) for signal in (steady, struck)]
+    assert (levels[0] - levels[1]).abs() < 3.0
+
+
+@AIDS
+def test_refuses_what_it_cannot_do(make: Make) -> None:
+    aid: Any = make()
+    with pytest.raises(ValueError, match="no audiogram"):
+        aid(torch.randn(100))
+    with pytest.raises(ValueError, match="takes -10 to 100"):
+        aid(torch.randn(100), Audiogram.standard("N7"))
+    with pytest.raises(ValueError, match="leading dimensions that broadcast"):
+        aid(torch.randn(3, 100), draw_thresholds(2))
+    stream = aid.stream(EAR)
+    with pytest.raises(ValueError, match="flush of a stream that was given nothing"):
+        stream.flush()
+    stream(torch.randn(2, 100))
+    with pytest.raises(ValueError, match="allowed: the same leading dimensions"):
+        stream(torch.randn(3, 100))
+    with pytest.raises(ValueError, match="at least one sample"):
+        stream(torch.randn(2, 0))
