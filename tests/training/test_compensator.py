@@ -146,7 +146,7 @@ def test_a_hearing_aid_learns_to_amplify_and_to_take_noise_off(data: TrainingDat
         "learning_rate": 0.01,
     }
     settings |= {"denoising": 1.0, "unreduced": 0.5, "noisy": 1.0}
-    folder, _ = train(noisy, tmp_path, max_steps=40, recipe=settings)
+    folder, _ = train(noisy, tmp_path, max_steps=100, recipe=settings)
     about = json.loads((folder / CONFIG).read_text())["about"]
     assert about["validation"]["valid_loss"] < 0.9 * about["start_valid_loss"]
     assert isinstance(load_compensator(folder), HearingAid)
