@@ -5,14 +5,15 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hlsim.cli.inputs import check_files, other_ear, read_ear, read_simulator
-from hlsim.cli.options import Parser
+from hlsim.cli.options import Parser, slider
 
 if TYPE_CHECKING:
-    from torch import nn
+    from torch import Tensor
 
 ENDINGS = (".wav", ".flac", ".ogg")
 
@@ -24,8 +25,10 @@ def simulate(parser: Parser) -> None:
 
 def compensate(parser: Parser) -> None:
     _in_and_out(parser, _compensate)
-    text = "nalr (the prescription), or a checkpoint's name or folder; one of one ear alone warns of another"
-    parser.option("--compensator", str, text, "nalr")
+    text = "nalr (the prescription), wdrc (compression in bands), or a checkpoint's name or folder; one of one ear alone "
+    parser.option("--compensator", str, text + "warns of another", "nalr")
+    parser.option("--noise-reduction", slider, "of a hearing aid, 0 to 1; 1 by default")
+    parser.option("--amplification", slider, "of a hearing aid, 0 to 1; 1 by default")
 
 
 def _in_and_out(parser: Parser, run: Callable[[argparse.Namespace], None]) -> None:
@@ -41,14 +44,20 @@ def _simulate(options: argparse.Namespace) -> None:
 
 
 def _compensate(options: argparse.Namespace) -> None:
-    def build(rate: int) -> nn.Module:
+    def build(rate: int) -> Callable[..., Tensor]:
         from compensators import load_compensator
 
         name = options.compensator
         compensator = load_compensator(name, sample_rate=rate, full_scale_spl=options.full_scale_spl)
         for line in other_ear(name, name, read_ear(options.audiogram)):
             print(f"hlsim: warning: {line}", file=sys.stderr)
-        return compensator
+        names = ("noise_reduction", "amplification")
+        sliders = {given: value for given in names if (value := getattr(options, given)) is not None}
+        if idle := sorted(sliders.keys() - getattr(compensator, "SLIDERS", ())):
+            raise ValueError(
+                f"{', '.join(idle)} of {name}, which has no such slider; allowed: with a hearing aid"
+            )
+        return partial(compensator, **sliders)
 
     _pass_through(options, build)
 
@@ -60,7 +69,7 @@ def _check_ending(path: Path) -> None:
         raise ValueError(f"{path}: cannot write {found}; allowed: {', '.join(ENDINGS)}")
 
 
-def _pass_through(options: argparse.Namespace, build: Callable[[int], nn.Module]) -> None:
+def _pass_through(options: argparse.Namespace, build: Callable[[int], Callable[..., Tensor]]) -> None:
     """Read, run what ``build`` makes for a sample rate, and write at the file's own rate."""
     _check_ending(options.output)
     check_files(options.input, options.output)

@@ -132,6 +132,7 @@ def kind(read: Callable[[str], Any], fits: Callable[[Any], bool], allowed: str) 
 
 number = kind(float, math.isfinite, "numbers such as 65 or 2.5")
 positive = kind(float, lambda value: 0 < value < math.inf, "numbers above 0")
+slider = kind(float, lambda value: 0 <= value <= 1, "0 to 1")
 integer = kind(int, lambda value: True, "whole numbers")
 count = kind(int, lambda value: value >= 1, "whole numbers from 1 up")
 natural = kind(int, lambda value: value >= 0, "whole numbers from 0 up")

@@ -8,8 +8,9 @@ import pytest
 import soundfile
 import torch
 
-from compensators import NALR, MappingCompensator, MappingConfig
+from compensators import NALR, HearingAid, MappingCompensator, MappingConfig, save_compensator
 from hlsim import MSBG, Audiogram
+from hlsim.audio import read_audio
 from hlsim.cli.main import main
 from hlsim.pretrained import save_checkpoint
 
@@ -94,6 +95,23 @@ def test_simulate_is_the_model(tmp_path: Path, utterance: Path) -> None:
     expected = MSBG(ear, sample_rate=rate, full_scale_spl=100.0)(torch.from_numpy(samples))
     heard, _ = soundfile.read(out, dtype="float32")
     np.testing.assert_allclose(heard, expected.numpy(), atol=1e-7)
+
+
+def test_the_sliders_of_a_hearing_aid(
+    tmp_path: Path, utterance: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    waveform, rate = read_audio(utterance)
+    aid = HearingAid(sample_rate=rate).eval()
+    save_compensator(aid, tmp_path / "aid")
+    call = ["compensate", str(utterance), str(tmp_path / "out.wav"), "--audiogram", "N3"]
+    own = ["--compensator", str(tmp_path / "aid"), "--noise-reduction", "0.5", "--amplification", "0"]
+    assert main([*call, *own]) == 0
+    expected = aid(waveform, Audiogram.standard("N3"), 0.5, 0.0).detach()
+    torch.testing.assert_close(read_audio(tmp_path / "out.wav")[0], expected, atol=1e-6, rtol=1e-5)
+    assert "noise_reduction of nalr, which has no such slider" in fails(
+        capsys, *call, "--noise-reduction", "1"
+    )
+    assert "allowed: 0 to 1" in refused(capsys, *call, *own[:2], "--amplification", "2")
 
 
 def test_compensate_is_the_compensator(tmp_path: Path, utterance: Path) -> None:
