@@ -52,7 +52,7 @@ def test_recipes_are_readable() -> None:
 
     for path in (README.parent / "examples").glob("*.yaml"):
         settings = yaml.safe_load(path.read_text(encoding="utf-8"))
-        if path.name.startswith("neuro-msbg"):
+        if path.name.startswith(("neuro-msbg", "any-teacher")):
             NeuroConfig.from_dict(SimulatorRecipe.from_dict(settings).model)
         else:
             recipe = CompensatorRecipe.from_dict(settings)
