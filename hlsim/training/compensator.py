@@ -12,11 +12,11 @@ from torch import Tensor, nn
 from compensators.aid import HearingAid
 from compensators.pretrained import CONFIGS, build_compensator, load_compensator
 from hlsim.audiogram import Audiogram
-from hlsim.criteria.waveform import compressed_spectrum_error
 from hlsim.data.module import Batch
 from hlsim.loss import HearingLossLoss
 from hlsim.pretrained import checkpoint_digest
 from hlsim.training.batches import TrainingData, compensator_data, identity_of
+from hlsim.training.denoising import attenuation_error
 from hlsim.training.loop import RunOptions, train_network
 from hlsim.training.module import TimedModule, initial_network
 from hlsim.training.recipes import CompensatorRecipe
@@ -36,21 +36,24 @@ class CompensatorTraining(TimedModule):
         network = (CONFIGS[recipe.kind], build_compensator, load_compensator)
         self.compensator = initial_network(recipe.start, recipe.model, *network)
         counted = {name: weight for name, weight in recipe.weights.items() if weight > 0.0}
-        self.loss = HearingLossLoss(simulator=simulator, reference=recipe.reference, criterion=counted)
+        self.denoising = counted.pop("denoising", 0.0)
+        criterion = counted or "coherent-bands"  # for the examples, where nothing is learned through it
+        self.loss = HearingLossLoss(simulator=simulator, reference=recipe.reference, criterion=criterion)
+        self.hears = bool(counted)
 
     def training_loss(self, batch: Batch) -> Tensor:
         signal, clean, ears = (batch[name] for name in ("signal", "clean", "thresholds"))
-        if not isinstance(self.compensator, HearingAid):
-            value: Tensor = self.loss(self.compensator(signal, ears), clean, ears)
+        value = signal.new_zeros(())
+        if self.denoising:
+            assert isinstance(self.compensator, HearingAid)
+            value = value + self.denoising * attenuation_error(self.compensator, signal, clean, ears).mean()
+        if not self.hears:
             return value
-        # both at once: for the ear, and as it takes noise off without amplification
-        reduced = batch.get("noise_reduction", torch.ones(len(signal), device=signal.device))
-        on = torch.ones_like(reduced)
-        sliders = torch.cat((reduced, on)), torch.cat((on, 0.0 * on))
-        given, denoised = self.compensator(signal.repeat(2, 1), ears.repeat(2, 1), *sliders).chunk(2)
-        aim = signal + reduced.unsqueeze(-1) * (clean - signal)
-        heard: Tensor = self.loss(given, aim, ears)
-        return heard + self.recipe.denoising * compressed_spectrum_error(denoised, clean).mean()
+        if "noise_reduction" not in batch:
+            return value + self.loss(self.compensator(signal, ears), clean, ears)
+        given = self.compensator(signal, ears, batch["noise_reduction"])
+        aim = signal + batch["noise_reduction"].unsqueeze(-1) * (clean - signal)
+        return value + self.loss(given, aim, ears)
 
     def evaluate(self, batch: Batch) -> dict[str, Tensor]:
         return {"valid_loss": self.training_loss(batch)[None]}

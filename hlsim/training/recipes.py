@@ -120,7 +120,8 @@ class CompensatorRecipe(TrainingRecipe):
         kind: ``mapping-compensator`` or ``hearing-aid``.
         model: settings of its ``MappingConfig`` or ``HearingAidConfig``.
         weights: of ``HearingLossLoss``'s criteria: ``coherent-bands``, ``bands`` (dB), ``paper``, and ``haspi``
-            and ``hasqi`` (1 less the score; clips of 0.7 s and more).
+            and ``hasqi`` (1 less the score; clips of 0.7 s and more); and of ``denoising``, the error of a hearing aid's
+            noise reduction (``hlsim.training.denoising``).
         reference: what the paper's criterion compares with, ``clean`` or ``normal-hearing``.
         sounds: speech in noise alone teaches a network that what is steady is noise, to be taken away.
         equalised: share of clips whose speech is equalised at random by up to 15 dB. Few voices teach few spectra, and
@@ -128,8 +129,6 @@ class CompensatorRecipe(TrainingRecipe):
         noisy: share of noisy clips, where there is noise.
         snr: lowest and highest signal-to-noise ratio in dB.
         unreduced: share of items of a hearing aid without noise reduction: the ear is to hear the noisy speech.
-        denoising: weight of ``compressed_spectrum_error``: what a hearing aid gives without amplification is to be the
-            clean speech.
     """
 
     kind: str = "mapping-compensator"
@@ -144,11 +143,10 @@ class CompensatorRecipe(TrainingRecipe):
     noisy: float = 0.5
     snr: tuple[float, float] = (0.0, 20.0)
     unreduced: float = 0.0
-    denoising: float = 0.0
     validate_every: int = 50
     validation_items: int = 8
 
-    criteria = ("coherent-bands", "bands", "paper", "haspi", "hasqi")
+    criteria = ("coherent-bands", "bands", "paper", "haspi", "hasqi", "denoising")
     shares = ("sounds", "equalised", "noisy", "unreduced")
 
     def __post_init__(self) -> None:
@@ -157,5 +155,5 @@ class CompensatorRecipe(TrainingRecipe):
         wrong = bool(scored) and self.seconds < SHORTEST_SECONDS
         self._refuse(wrong, ("seconds",), f"{SHORTEST_SECONDS} or more with haspi or hasqi")
         self._refuse(self.kind not in KINDS, ("kind",), " or ".join(KINDS))
-        wrong = self.denoising < 0.0 or (self.kind != "hearing-aid" and self.unreduced + self.denoising > 0.0)
-        self._refuse(wrong, ("unreduced", "denoising", "kind"), "0 or more, and 0 without noise reduction")
+        wrong = self.kind != "hearing-aid" and self.unreduced + self.weights.get("denoising", 0.0) > 0.0
+        self._refuse(wrong, ("unreduced", "weights", "kind"), "no denoising but a hearing-aid's")

@@ -145,7 +145,7 @@ def test_a_hearing_aid_learns_to_amplify_and_to_take_noise_off(data: TrainingDat
         "seconds": 0.5,
         "learning_rate": 0.01,
     }
-    settings |= {"denoising": 1.0, "unreduced": 0.5, "noisy": 1.0}
+    settings |= {"weights": {"coherent-bands": 1.0, "denoising": 10.0}, "unreduced": 0.5, "noisy": 1.0}
     folder, _ = train(noisy, tmp_path, max_steps=100, recipe=settings)
     about = json.loads((folder / CONFIG).read_text())["about"]
     assert about["validation"]["valid_loss"] < 0.9 * about["start_valid_loss"]
@@ -185,8 +185,8 @@ def test_a_share_of_the_clips_are_tones_and_clicks(data: TrainingData) -> None:
         ({"model": {"layers": 2}}, "unknown network settings layers"),
         ({"kind": "vocoder"}, "kind 'vocoder' in the recipe; allowed: mapping-compensator or hearing-aid"),
         (
-            {"denoising": 1.0},
-            "denoising 1.0, kind 'mapping-compensator' in the recipe; allowed: 0 or more, and 0 without",
+            {"weights": {"denoising": 1.0}},
+            "kind 'mapping-compensator' in the recipe; allowed: no denoising but a hearing-aid's",
         ),
         ({"kind": "hearing-aid", "model": {"channels": 2}}, "unknown network settings channels"),
     ],
