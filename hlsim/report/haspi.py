@@ -98,10 +98,10 @@ def _in_words_understood(words: WordsChange) -> str:
     share = f"{100.0 * words.before:.0f} % of the words before and {100.0 * words.after:.0f} % after"
     change, low, high = (f"{100.0 * value:+.0f}" for value in (words.change, words.low, words.high))
     return (
-        f"In words: a listener who hears these sentences would understand {share}, a change of {change} points, nine "
-        f"of ten listeners one between {low} and {high}. That is a curve fitted to 22 hearing-impaired listeners of ten "
-        "aids and HASPI of their better ears (hlsim.metrics.words). HASPI ranks aids, not people: how listeners differ "
-        "it hardly tells."
+        f"In words: a listener who hears these sentences would understand {share}, a change of {change} points; for nine "
+        f"of ten listeners it lies between {low} and {high}. That is a curve fitted to 22 hearing-impaired listeners of "
+        "ten aids and HASPI of their better ears (hlsim.metrics.words). HASPI ranks aids, not people: how listeners "
+        "differ it hardly tells."
     )
 
 
