@@ -13,7 +13,7 @@ from hlsim.training.recipes import SimulatorRecipe
 yaml = pytest.importorskip("yaml")
 
 RECIPES = sorted((Path(__file__).parents[2] / "examples").glob("**/*.yaml"))
-SIMULATORS = {path.stem: path for path in RECIPES if not path.stem.startswith("compensator")}
+SIMULATORS = {path.stem: path for path in RECIPES if not path.stem.startswith(("compensator", "hearing-aid"))}
 MILLIONS = {
     "mamba": 1.45,
     "transformer": 1.45,
