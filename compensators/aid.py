@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from compensators.bands import FRAME, level_db, shares
 from compensators.config import HearingAidConfig
 from compensators.prescription import losses, prescribed_gains, restoring_gains
-from compensators.smoothing import average, decay, follow_peaks
+from compensators.smoothing import decay, follow_peaks
 from compensators.stream import Slider, State, Stream
 from compensators.wearable import Wearable
 from hlsim.audiogram import AudiogramLike
@@ -22,9 +22,10 @@ _RARELY = -3.0  # start of the logit of noise reduction: 1 dB of 20
 class HearingAid(Wearable):
     """Waveform and audiogram to what the impaired ear is to be given, 4 ms late, whole or in chunks as it comes.
 
-    Levels of frames and the encoded ear go through a causal recurrent network with two heads. One corrects the gain that
-    would restore loudness band by band (``prescription.restoring_gains``); the correction is 0 before training, and where
-    there is no loss. The other takes noise off. In dB, a band's gain is
+    Two networks that know nothing of one another set its gains. One, without memory, sees the ear and the level that each
+    band has had of late, and corrects the gain that would restore loudness band by band
+    (``prescription.restoring_gains``); the correction is 0 before training, and where there is no loss. The other, causal
+    and recurrent, sees the levels of frames, not the ear, and takes noise off. In dB, a band's gain is
 
         amplification * (restoring + correction) - noise_reduction * attenuation,
 
@@ -51,13 +52,16 @@ class HearingAid(Wearable):
         super().__init__(sample_rate, full_scale_spl)
         self.config = config = HearingAidConfig.given(config)
         self.bands, self.limit_spl = config.bands, config.limit_spl
-        self.encode_ear = nn.Linear(2 * config.bands, config.width)
-        self.enter = nn.Linear(config.bands + config.bins, config.width)
-        self.recur = nn.LSTM(config.width, config.hidden, batch_first=True)
-        self.leave = nn.Linear(config.hidden + config.width, 2 * config.bands)
+        width, corrections = config.width, nn.Linear(config.width, config.bands)
+        seen = nn.Linear(3 * config.bands + 1, width)
+        self.correct = nn.Sequential(seen, nn.Tanh(), nn.Linear(width, width), nn.Tanh(), corrections)
+        self.enter = nn.Linear(config.bands + config.bins, width)
+        self.recur = nn.LSTM(width, config.hidden, batch_first=True)
+        self.leave = nn.Linear(config.hidden + width, config.bands)
         with torch.no_grad():
-            self.leave.weight[: config.bands] = 0.0
-            self.leave.bias.copy_(torch.tensor([0.0, _RARELY]).repeat_interleave(config.bands))
+            corrections.weight.zero_()
+            corrections.bias.zero_()
+            self.leave.bias.fill_(_RARELY)
 
     def forward(
         self,
@@ -85,16 +89,13 @@ class HearingAid(Wearable):
         return self.streamed(audiogram, (noise_reduction, amplification))
 
     def fit(self, thresholds: Tensor) -> Tensor:
-        loss, prescribed = losses(thresholds, self.bands), prescribed_gains(thresholds, self.bands)
-        reach = self.config.reach_db * loss.clamp_min(0.0) / (loss.clamp_min(0.0) + 10.0)
-        code = self.encode_ear(torch.cat((loss / 50.0, prescribed / 20.0), -1))
-        return torch.cat((loss, reach, code), -1)
+        return torch.cat((losses(thresholds, self.bands), prescribed_gains(thresholds, self.bands)), -1)
 
     def start(self, items: int, like: Tensor) -> dict[str, Tensor]:
         zeros, bands = like.new_zeros, self.bands
         return {
             "levels": zeros(items, 3, bands + 1),
-            "correction": zeros(items, bands),
+            "recovering": zeros(items, 3, bands + 1),
             "attenuation": zeros(items, 3, bands),
             "hidden": zeros(items, 2, self.config.hidden),
         }
@@ -102,41 +103,43 @@ class HearingAid(Wearable):
     def control(
         self, powers: Tensor, fitted: Tensor, sliders: Tensor, state: State
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        config = self.config
-        loss, reach, code = fitted.split((self.bands, self.bands, config.width), -1)
         noise_reduction, amplification = sliders.split(1, -1)
         by_band = powers @ constant_like(powers, shares, self.bands, FRAME)
-        levels = level_db(
-            torch.cat((by_band, powers.sum(-1, keepdim=True), powers[..., 1 : config.bins + 1]), -1)
+        bins = powers[..., 1 : self.config.bins + 1]
+        levels = level_db(torch.cat((by_band, powers.sum(-1, keepdim=True), bins), -1))
+        gain, followed = self._amplification(levels[..., : self.bands + 1], fitted, state)
+        taken, recalled = self._reduction(
+            torch.cat((levels[..., : self.bands], levels[..., self.bands + 1 :]), -1), state
         )
-        seen = torch.cat((levels[..., : self.bands], levels[..., self.bands + 1 :]), -1)
-        entered = torch.tanh(self.enter((seen - 40.0) / 20.0) + code.unsqueeze(1))
-        recalled, hidden = self.recur(
-            entered, state["hidden"].movedim(1, 0).contiguous().unsqueeze(1).unbind()
-        )
-        correction, logit = self.leave(torch.cat((recalled, entered), -1)).chunk(2, -1)
+        return amplification * gain + noise_reduction * taken, followed | recalled
 
-        slow = decay(config.attack), decay(config.release)
-        followed, kept = follow_peaks(levels[..., : self.bands + 1], state["levels"], *slow)
-        level, total = followed.split((self.bands, 1), -1)
-        correction = average(
-            reach.unsqueeze(1) * torch.tanh(correction), state["correction"], decay(config.smoothing)
-        )
-        gain = restoring_gains(level, loss) + correction
+    def _amplification(
+        self, levels: Tensor, fitted: Tensor, state: State
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """Shape: (items, frames, bands + 1), of bands and of all, (items, n) -> (items, frames, bands) dB."""
+        config = self.config
+        attack, release, recovery = decay(config.attack), decay(config.release), decay(config.recovery)
+        slow, kept = follow_peaks(levels, state["levels"], attack, release)
+        quick, recovering = follow_peaks(levels, state["recovering"], attack, recovery)
+        level, total = torch.minimum(slow, quick + config.headroom_db).split((self.bands, 1), -1)
+        loss, prescribed = fitted.chunk(2, -1)
+        ear = torch.cat((loss / 50.0, prescribed / 20.0), -1).unsqueeze(1).expand(-1, level.shape[1], -1)
+        reach = config.reach_db * loss.clamp_min(0.0) / (loss.clamp_min(0.0) + 10.0)
+        seen = (torch.cat((level, total), -1) - 40.0) / 20.0
+        correction = reach.unsqueeze(1) * torch.tanh(self.correct(torch.cat((ear, seen), -1)))
+        gain = (restoring_gains(level, loss) + correction).clamp(0.0, config.cap_db)
         audible = ((total - config.quiet_spl) / _FADE + 1.0).clamp(0.0, 1.0)
-        gain = audible * gain.clamp(0.0, config.cap_db)
+        return audible * gain, {"levels": kept, "recovering": recovering}
 
-        quick = decay(config.opening), decay(config.closing)
-        taken, quickly = follow_peaks(
-            -config.reduction_db * torch.sigmoid(logit), state["attenuation"], *quick
-        )
-        after = {
-            "levels": kept,
-            "correction": correction[:, -1],
-            "attenuation": quickly,
-            "hidden": torch.cat(hidden).movedim(0, 1),
-        }
-        return amplification * gain + noise_reduction * taken, after
+    def _reduction(self, levels: Tensor, state: State) -> tuple[Tensor, dict[str, Tensor]]:
+        """Shape: (items, frames, bands + bins) -> (items, frames, bands) dB, 0 or less."""
+        config = self.config
+        entered = torch.tanh(self.enter((levels - 40.0) / 20.0))
+        hidden, cell = state["hidden"].movedim(1, 0).contiguous().unsqueeze(1).unbind()
+        recalled, (hidden, cell) = self.recur(entered, (hidden, cell))
+        taken = -config.reduction_db * torch.sigmoid(self.leave(torch.cat((recalled, entered), -1)))
+        taken, kept = follow_peaks(taken, state["attenuation"], decay(config.opening), decay(config.closing))
+        return taken, {"attenuation": kept, "hidden": torch.cat((hidden, cell)).movedim(0, 1)}
 
     def extra_repr(self) -> str:
         return f"sample_rate={self.sample_rate}, full_scale_spl={self.full_scale_spl:g}"

@@ -46,14 +46,15 @@ class HearingAidConfig(ModelConfig):
 
     Attributes:
         bands: whose gains it sets, an equal number of ERBs apart but no less than 125 Hz, 4 to 40.
-        bins: frequencies of a frame, 62.5 Hz apart from the first, whose levels the network sees beside the bands'.
-        width: of the layer before the recurrent one.
+        bins: frequencies of a frame, 62.5 Hz apart from the first, whose levels noise reduction sees beside the bands'.
+        width: of the layers before noise reduction's recurrent one, and of the correction.
         hidden: of the recurrent layer.
         reach_db: largest correction of the restoring gain up or down.
         reduction_db: most that noise reduction takes off a band.
         attack, release: of the levels that the gain follows, time constants in seconds.
+        recovery, headroom_db: those levels are never further above ones with this shorter release, in dB, so that what
+            is loud and short does not leave the ear without gain.
         opening, closing: of noise reduction.
-        smoothing: of the correction.
         cap_db: most gain of a band.
         quiet_spl: level under which the gain fades, to none 15 dB lower.
         limit_spl: peak of the output in dB SPL that no sample passes.
@@ -61,15 +62,16 @@ class HearingAidConfig(ModelConfig):
 
     bands: int = 20
     bins: int = 40
-    width: int = 64
-    hidden: int = 128
+    width: int = 96
+    hidden: int = 256
     reach_db: float = 20.0
     reduction_db: float = 20.0
     attack: float = 0.005
-    release: float = 0.1
+    release: float = 1.0
+    recovery: float = 0.06
+    headroom_db: float = 6.0
     opening: float = 0.0
     closing: float = 0.03
-    smoothing: float = 0.05
     cap_db: float = 45.0
     quiet_spl: float = 40.0
     limit_spl: float = 110.0
@@ -87,9 +89,10 @@ class HearingAidConfig(ModelConfig):
                 "reduction_db": (self.reduction_db, 0.0, 60.0),
                 "attack": (self.attack, 0.0, 1.0),
                 "release": (self.release, 0.01, 2.0),
+                "recovery": (self.recovery, 0.01, 2.0),
+                "headroom_db": (self.headroom_db, 0.0, 60.0),
                 "opening": (self.opening, 0.0, 1.0),
                 "closing": (self.closing, 0.01, 2.0),
-                "smoothing": (self.smoothing, 0.0, 1.0),
                 "cap_db": (self.cap_db, 0.0, 80.0),
                 "quiet_spl": (self.quiet_spl, 0.0, 80.0),
                 "limit_spl": (self.limit_spl, 60.0, 140.0),

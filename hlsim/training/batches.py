@@ -25,6 +25,7 @@ from hlsim.neuro.config import NEURO_RATE
 from hlsim.training.recipes import CompensatorRecipe, SimulatorRecipe, TrainingRecipe
 
 _VALID_SECONDS = 2.0
+_VOICES = 4  # of babble, at most
 
 
 @dataclass(frozen=True)
@@ -149,13 +150,21 @@ class CompensatorBatches(DrawnBatches):
         def uniform(low: float, high: float, *shape: int) -> Tensor:
             return low + (high - low) * torch.rand(count, *shape, generator=generator)
 
-        clean = self.speech.draw(count, generator)
-        equalised = equalise(clean, uniform(-15.0, 15.0, len(KNOTS)), torch.tensor(KNOTS), NEURO_RATE)
-        clean = torch.where(uniform(0.0, 1.0, 1) < self.recipe.equalised, equalised, clean)
-        signal = clean = set_level(self.join_sounds(clean, generator), uniform(*self.recipe.levels))
+        def equalised(clips: Tensor) -> Tensor:
+            changed = equalise(clips, uniform(-15.0, 15.0, len(KNOTS)), torch.tensor(KNOTS), NEURO_RATE)
+            return torch.where(uniform(0.0, 1.0, 1) < self.recipe.equalised, changed, clips)
+
+        voices = equalised(self.speech.draw(count, generator))
+        sounds = self.join_sounds(voices, generator)
+        signal = clean = set_level(sounds, uniform(*self.recipe.levels))
         if self.noise is not None:
-            noisy = mix(clean, self.noise.draw(count, generator), uniform(*self.recipe.snr))
-            signal = torch.where(uniform(0.0, 1.0, 1) < self.recipe.noisy, noisy, clean)
+            noise = equalised(self.noise.draw(count, generator))
+            if self.recipe.babble and count > 1:
+                others = [voices.roll(apart, 0) for apart in range(1, min(count, _VOICES + 1))]
+                babble = torch.stack([set_level(one, 65.0) for one in others]).sum(0)
+                noise = torch.where(uniform(0.0, 1.0, 1) < self.recipe.babble, babble, noise)
+            noisy = (uniform(0.0, 1.0, 1) < self.recipe.noisy) & (sounds == voices).all(-1, keepdim=True)
+            signal = torch.where(noisy, mix(clean, noise, uniform(*self.recipe.snr)), clean)
         if self.ear is not None:
             ears = self.ear.expand(count, -1)
         else:

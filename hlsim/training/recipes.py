@@ -124,9 +124,10 @@ class CompensatorRecipe(TrainingRecipe):
             noise reduction (``hlsim.training.denoising``).
         reference: what the paper's criterion compares with, ``clean`` or ``normal-hearing``.
         sounds: speech in noise alone teaches a network that what is steady is noise, to be taken away.
-        equalised: share of clips whose speech is equalised at random by up to 15 dB. Few voices teach few spectra, and
-            the gain for another can be 20 dB off.
-        noisy: share of noisy clips, where there is noise.
+        equalised: share of clips whose speech is equalised at random by up to 15 dB, and of those whose noise is. Few
+            voices teach few spectra, and the gain for another can be 20 dB off.
+        noisy: share of noisy clips of speech, where there is noise; sounds have none.
+        babble: share of these whose noise is up to four other voices.
         snr: lowest and highest signal-to-noise ratio in dB.
         unreduced: share of items of a hearing aid without noise reduction: the ear is to hear the noisy speech.
     """
@@ -141,13 +142,14 @@ class CompensatorRecipe(TrainingRecipe):
     levels: tuple[float, float] = (50.0, 80.0)
     equalised: float = 0.7
     noisy: float = 0.5
+    babble: float = 0.0
     snr: tuple[float, float] = (0.0, 20.0)
     unreduced: float = 0.0
     validate_every: int = 50
     validation_items: int = 8
 
     criteria = ("coherent-bands", "bands", "paper", "haspi", "hasqi", "denoising")
-    shares = ("sounds", "equalised", "noisy", "unreduced")
+    shares = ("sounds", "equalised", "noisy", "babble", "unreduced")
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -100,7 +100,15 @@ def test_saved_and_loaded_is_the_same_to_the_bit(tmp_path: Path, utterance: torc
 
 @pytest.mark.parametrize(
     "nonsense",
-    [{"bands": 3}, {"bands": 20.0}, {"cap_db": -1.0}, {"release": 0.0}, {"hidden": 0}, {"limit_spl": "loud"}],
+    [
+        {"bands": 3},
+        {"bands": 20.0},
+        {"cap_db": -1.0},
+        {"release": 0.0},
+        {"headroom_db": -1.0},
+        {"hidden": 0},
+        {"limit_spl": "loud"},
+    ],
 )
 def test_settings_are_checked(nonsense: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match=f"{next(iter(nonsense))} is .*; allowed: "):

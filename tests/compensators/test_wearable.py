@@ -20,7 +20,8 @@ def trained(**options: Any) -> HearingAid:
     """An aid whose gains move: the heads' weights are not small."""
     torch.manual_seed(5)
     aid = HearingAid(**options)
-    torch.nn.init.normal_(aid.leave.weight, std=0.1)
+    for last in (aid.leave, aid.correct[-1]):
+        torch.nn.init.normal_(last.weight, std=0.05)
     return aid.eval().requires_grad_(False)
 
 

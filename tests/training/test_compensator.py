@@ -8,6 +8,7 @@ import torch
 
 from compensators import HearingAid, MappingCompensator, load_compensator
 from hlsim import Audiogram
+from hlsim.data.module import Batch
 from hlsim.neuro import NeuroConfig, NeuroMSBG
 from hlsim.pretrained import CONFIG, save_checkpoint
 from hlsim.training.batches import CompensatorBatches, TrainingData, compensator_data
@@ -168,12 +169,26 @@ def test_a_share_of_the_clips_are_tones_and_clicks(data: TrainingData) -> None:
     assert clicks(0.0) == 0 and 5 < clicks(0.4) < 21 and clicks(1.0) == 32
 
 
+def test_sounds_have_no_noise_and_babble_is_the_others_voices(data: TrainingData) -> None:
+    noisy = TrainingData(data.speech, noise=data.speech)
+
+    def drawn(**settings: float) -> Batch:
+        recipe = CompensatorRecipe.from_dict(SMALL | {"equalised": 0.0, "noisy": 1.0} | settings)
+        return CompensatorBatches(recipe, noisy, None).draw(2, torch.Generator().manual_seed(0))
+
+    sounds = drawn(sounds=1.0)
+    assert torch.equal(sounds["signal"], sounds["clean"])
+    speech = drawn(sounds=0.0, babble=1.0)
+    noise, others = speech["signal"] - speech["clean"], speech["clean"].flip(0)
+    assert (torch.cosine_similarity(noise, others, -1) > 0.999).all()
+
+
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
         (
             {"sounds": 1.5},
-            "sounds 1.5, equalised 0.7, noisy 0.5, unreduced 0.0 in the recipe; allowed: 0 to 1",
+            "sounds 1.5, equalised 0.7, noisy 0.5, babble 0.0, unreduced 0.0 in the recipe; allowed: 0 to 1",
         ),
         ({"lr": 0.1}, "unknown settings lr"),
         ({"weights": {"loudness": 1.0}}, "unknown criteria loudness"),
