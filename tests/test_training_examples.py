@@ -115,7 +115,7 @@ def test_lightning_in_bf16(capsys: pytest.CaptureFixture[str]) -> None:
 def test_a_filter_bank_trains(speech_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
     example = load("filter_bank.py")
     ear = example.Audiogram.standard("N3")
-    aid = example.trained(str(speech_dir / "train"), ear, 8)
+    aid = example.trained(str(speech_dir / "train"), example.HearingLossLoss(ear), 8)
     start, *_, end = losses(capsys.readouterr().err)
     assert end < start
     assert float(aid.gain.mean()) > 0.1  # of 10 dB
@@ -137,7 +137,7 @@ def test_haspi_trains_with_the_level_and_without(
     example = load("haspi_objective.py")
     ear = example.Audiogram.standard("N3")
     for name in ("HASPILoss", "HASPI alone"):
-        aid = example.trained(str(speech_dir / "train"), ear, 3, math.inf, name)
+        aid = example.trained(str(speech_dir / "train"), example.LOSSES[name](ear), 3, clips=2)
         assert len(capsys.readouterr().err.splitlines()) == 2  # the first step and the last
         assert float(aid.gain.detach().mean()) > 0.05  # of 10 dB: speech is heard too softly
     speech = example.Clips(speech_dir / "valid", sample_rate=16000, seconds=1.0)

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from examples.training.dead_region import DeadRegion
-from examples.training.filter_bank import RATE, FilterBank
+from examples.training.filter_bank import RATE, trained
 from hlsim import Audiogram, HearingLossLoss
 from hlsim.calibration import set_level
 from hlsim.data.clips import Clips
@@ -25,21 +25,6 @@ def loss_through(simulator: str, ear: Audiogram) -> HearingLossLoss:
         return HearingLossLoss(ear)
     # a network knows no normal ear but MSBG's; this simulator changes nothing where there is no loss
     return HearingLossLoss(ear, simulator=simulator or DeadRegion(), normal=nn.Identity())
-
-
-def trained(folder: str, loss: HearingLossLoss, steps: int, seconds: float = 1.0) -> FilterBank:
-    aid = FilterBank()
-    optimiser = torch.optim.Adam(aid.parameters(), lr=0.05)
-    clips, generator = Clips(folder, sample_rate=RATE, seconds=seconds), torch.Generator().manual_seed(0)
-    for step in range(steps):
-        speech = set_level(clips.draw(4, generator), 50.0 + 30.0 * torch.rand(4, generator=generator))
-        value = loss(aid(speech), speech)
-        optimiser.zero_grad()
-        value.backward()
-        optimiser.step()
-        if step % 50 == 0 or step + 1 == steps:
-            print(f"step {step}: {value.item():.3f}", file=sys.stderr, flush=True)
-    return aid
 
 
 def differences(signal: Tensor, clean: Tensor) -> str:

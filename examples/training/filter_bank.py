@@ -49,13 +49,17 @@ class FilterBank(nn.Module):
         return self.stft.synthesise(spectrum * gains, waveform.shape[-1])
 
 
-def trained(folder: str, ear: Audiogram, steps: int, criterion: str = "coherent-bands") -> FilterBank:
-    aid, loss = FilterBank(), HearingLossLoss(ear, criterion=criterion)
+def trained(
+    folder: str, loss: nn.Module, steps: int, clips: int = 4, given: Callable[[Tensor], Tensor] | None = None
+) -> FilterBank:
+    """From zero, on speech of 50 to 80 dB SPL, ``clips`` at a time; ``given`` makes of it what the aid is given."""
+    aid = FilterBank()
     optimiser = torch.optim.Adam(aid.parameters(), lr=0.05)
-    clips, generator = Clips(folder, sample_rate=RATE, seconds=1.0), torch.Generator().manual_seed(0)
+    source, generator = Clips(folder, sample_rate=RATE, seconds=1.0), torch.Generator().manual_seed(0)
     for step in range(steps):
-        speech = set_level(clips.draw(4, generator), 50.0 + 30.0 * torch.rand(4, generator=generator))
-        value = loss(aid(speech), speech)
+        speech = source.draw(clips, generator)
+        speech = set_level(speech, 50.0 + 30.0 * torch.rand(clips, generator=generator))
+        value = loss(aid(given(speech) if given else speech), speech)
         optimiser.zero_grad()
         value.backward()
         optimiser.step()
@@ -87,7 +91,7 @@ def main(
 ) -> None:
     ear = Audiogram.standard(name)
     speech = Clips(valid, sample_rate=RATE, seconds=2.0).draw(8, torch.Generator().manual_seed(0))
-    nalr, aid = NALR(ear), trained(train, ear, int(steps), criterion)
+    nalr, aid = NALR(ear), trained(train, HearingLossLoss(ear, criterion=criterion), int(steps))
 
     def as_loud(waveform: Tensor) -> Tensor:
         return set_level(nalr(waveform), level_spl(aid(waveform)))

@@ -9,9 +9,10 @@ Of each aid it prints what filter_bank.py does, and the highest peak that the ea
 import math
 import sys
 from collections.abc import Callable
+from functools import partial
 
 import torch
-from filter_bank import RATE, FilterBank, judged
+from filter_bank import RATE, judged, trained
 from torch import Tensor, nn
 
 from compensators import NALR
@@ -28,21 +29,6 @@ LOSSES: dict[str, Callable[[Audiogram], HearingLossLoss]] = {
 
 def in_noise(speech: Tensor, snr: float, generator: torch.Generator) -> Tensor:
     return speech + set_level(torch.randn(speech.shape, generator=generator), level_spl(speech) - snr)
-
-
-def trained(folder: str, ear: Audiogram, steps: int, snr: float, name: str) -> FilterBank:
-    aid, loss = FilterBank(), LOSSES[name](ear)
-    optimiser = torch.optim.Adam(aid.parameters(), lr=0.05)
-    clips, generator = Clips(folder, sample_rate=RATE, seconds=1.0), torch.Generator().manual_seed(0)
-    for step in range(steps):
-        speech = set_level(clips.draw(2, generator), 50.0 + 30.0 * torch.rand(2, generator=generator))
-        value = loss(aid(in_noise(speech, snr, generator)), speech)
-        optimiser.zero_grad()
-        value.backward()
-        optimiser.step()
-        if step % 50 == 0 or step + 1 == steps:
-            print(f"{name}, step {step}: {value.item():.3f}", file=sys.stderr, flush=True)
-    return aid
 
 
 @torch.no_grad()
@@ -63,7 +49,9 @@ def main(train: str, valid: str, name: str = "N3", steps: str = "200", snr: str 
     for title, aid in (("unaided", nn.Identity()), ("NAL-R", NALR(ear))):
         print(f"{name}, {title}: {told(aid, ear, speech, float(snr))}", flush=True)
     for title in names or LOSSES:
-        aid = trained(train, ear, int(steps), float(snr), title)
+        generator = torch.Generator().manual_seed(0)
+        noisy = partial(in_noise, snr=float(snr), generator=generator)
+        aid = trained(train, LOSSES[title](ear), int(steps), clips=2, given=noisy)
         print(f"{name}, {title}: {told(aid, ear, speech, float(snr))}", flush=True)
 
 
