@@ -142,7 +142,7 @@ def run(
                 default_root_dir=str(folder),  # for what SLURM's end of a job makes Lightning store
                 logger=TensorBoardLogger(str(folder), name="", version="events"),
                 val_check_interval=validate_every,
-                num_sanity_val_steps=int(begun),  # not where a run goes on
+                num_sanity_val_steps=-int(begun),  # -1: all of it, as later ones; not where a run goes on
                 log_every_n_steps=10,
                 enable_progress_bar=False,
                 enable_model_summary=False,

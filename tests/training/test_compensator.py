@@ -53,6 +53,14 @@ def test_twenty_steps_lower_the_loss(data: TrainingData, tmp_path: Path) -> None
     assert module.validate(valid)["valid_loss"] == pytest.approx(about["validation"]["valid_loss"])
 
 
+def test_what_it_starts_with_is_validated_as_all_that_follows(data: TrainingData, tmp_path: Path) -> None:
+    first, _ = train(data, tmp_path / "first", max_steps=1)
+    settings = {"start": str(first), "validation_items": 12}  # three batches
+    _, lines = train(data, tmp_path / "second", max_steps=1, recipe=settings)
+    start, begun = (line.split("valid_loss ")[1] for line in lines[:2])
+    assert lines[1].startswith("step 0") and begun == start
+
+
 def test_goes_on_where_it_was_stopped(data: TrainingData, tmp_path: Path) -> None:
     options = {"recipe": {"validate_every": 2, "seconds": 0.2}}
     whole, _ = train(data, tmp_path / "whole", max_steps=6, **options)
