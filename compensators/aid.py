@@ -95,7 +95,6 @@ class HearingAid(Wearable):
         zeros, bands = like.new_zeros, self.bands
         return {
             "levels": zeros(items, 3, bands + 1),
-            "recovering": zeros(items, 3, bands + 1),
             "attenuation": zeros(items, 3, bands),
             "hidden": zeros(items, 2, self.config.hidden),
         }
@@ -118,18 +117,16 @@ class HearingAid(Wearable):
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """Shape: (items, frames, bands + 1), of bands and of all, (items, n) -> (items, frames, bands) dB."""
         config = self.config
-        attack, release, recovery = decay(config.attack), decay(config.release), decay(config.recovery)
-        slow, kept = follow_peaks(levels, state["levels"], attack, release)
-        quick, recovering = follow_peaks(levels, state["recovering"], attack, recovery)
-        level, total = torch.minimum(slow, quick + config.headroom_db).split((self.bands, 1), -1)
+        levels, kept = follow_peaks(levels, state["levels"], decay(config.attack), decay(config.release))
+        level, total = levels.split((self.bands, 1), -1)
         loss, prescribed = fitted.chunk(2, -1)
         ear = torch.cat((loss / 50.0, prescribed / 20.0), -1).unsqueeze(1).expand(-1, level.shape[1], -1)
         reach = config.reach_db * loss.clamp_min(0.0) / (loss.clamp_min(0.0) + 10.0)
-        seen = (torch.cat((level, total), -1) - 40.0) / 20.0
-        correction = reach.unsqueeze(1) * torch.tanh(self.correct(torch.cat((ear, seen), -1)))
+        seen = torch.cat((ear, (levels - 40.0) / 20.0), -1)
+        correction = reach.unsqueeze(1) * torch.tanh(self.correct(seen))
         gain = (restoring_gains(level, loss) + correction).clamp(0.0, config.cap_db)
         audible = ((total - config.quiet_spl) / _FADE + 1.0).clamp(0.0, 1.0)
-        return audible * gain, {"levels": kept, "recovering": recovering}
+        return audible * gain, {"levels": kept}
 
     def _reduction(self, levels: Tensor, state: State) -> tuple[Tensor, dict[str, Tensor]]:
         """Shape: (items, frames, bands + bins) -> (items, frames, bands) dB, 0 or less."""

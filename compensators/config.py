@@ -52,8 +52,6 @@ class HearingAidConfig(ModelConfig):
         reach_db: largest correction of the restoring gain up or down.
         reduction_db: most that noise reduction takes off a band.
         attack, release: of the levels that the gain follows, time constants in seconds.
-        recovery, headroom_db: those levels are never further above ones with this shorter release, in dB, so that what
-            is loud and short does not leave the ear without gain.
         opening, closing: of noise reduction.
         cap_db: most gain of a band.
         quiet_spl: level under which the gain fades, to none 15 dB lower.
@@ -65,11 +63,9 @@ class HearingAidConfig(ModelConfig):
     width: int = 96
     hidden: int = 256
     reach_db: float = 20.0
-    reduction_db: float = 20.0
+    reduction_db: float = 12.0
     attack: float = 0.005
-    release: float = 1.0
-    recovery: float = 0.06
-    headroom_db: float = 6.0
+    release: float = 0.1
     opening: float = 0.0
     closing: float = 0.03
     cap_db: float = 45.0
@@ -89,8 +85,6 @@ class HearingAidConfig(ModelConfig):
                 "reduction_db": (self.reduction_db, 0.0, 60.0),
                 "attack": (self.attack, 0.0, 1.0),
                 "release": (self.release, 0.01, 2.0),
-                "recovery": (self.recovery, 0.01, 2.0),
-                "headroom_db": (self.headroom_db, 0.0, 60.0),
                 "opening": (self.opening, 0.0, 1.0),
                 "closing": (self.closing, 0.01, 2.0),
                 "cap_db": (self.cap_db, 0.0, 80.0),

@@ -12,8 +12,12 @@ _LOWEST, _HIGHEST = 100.0, 7500.0  # Hz
 _TONES, _CLICKS = 4, 8
 
 
-def draw_sounds(items: int, samples: int, sample_rate: int, generator: torch.Generator) -> Tensor:
+def draw_sounds(
+    items: int, samples: int, sample_rate: int, generator: torch.Generator, begun: float = 0.0
+) -> Tensor:
     """Every second item one to four tones that begin anywhere in its first half, the others one to eight clicks.
+
+    With ``begun``, as many samples more in which tones may have begun before the item does, as a share of its first half.
 
     Half of the tones have multiples of 250 Hz, as those of audiometry have: whole periods from frame to frame are a phase
     that stands still, which a network never sees at random frequencies.
@@ -32,7 +36,7 @@ def draw_sounds(items: int, samples: int, sample_rate: int, generator: torch.Gen
     # in double precision: in single, thousands of turns are noise 50 dB below the tone
     turns = uniform(0.0, 1.0, _TONES).unsqueeze(-1) + hertz.double().unsqueeze(-1) * time / sample_rate
     tones = (10.0 ** (levels_db / 20.0)).unsqueeze(-1) * torch.sin(2.0 * math.pi * turns).float()
-    begins = uniform(0.0, 0.5 * samples, 1)
+    begins = uniform(-begun * 0.5 * samples, 0.5 * samples, 1)
     rise = ((time - begins) / (0.01 * sample_rate)).clamp(0.0, 1.0)  # 10 ms
 
     places = (uniform(0.0, 1.0, _CLICKS) * samples).long().clamp_max(samples - 1)

@@ -115,11 +115,11 @@ class DrawnBatches(Dataset[Batch]):
             measured = measured.clamp(-10.0, 100.0)
         return torch.where(torch.rand(len(ears), 1, generator=generator) < share, measured, ears)
 
-    def join_sounds(self, clips: Tensor, generator: torch.Generator) -> Tensor:
+    def join_sounds(self, clips: Tensor, generator: torch.Generator, begun: float = 0.0) -> Tensor:
         """The recipe's share of the clips, replaced by tones and clicks."""
         if not (share := self.recipe.sounds):
             return clips
-        others = draw_sounds(len(clips), clips.shape[-1], NEURO_RATE, generator)
+        others = draw_sounds(len(clips), clips.shape[-1], NEURO_RATE, generator, begun)
         return torch.where(torch.rand(len(clips), 1, generator=generator) < share, others, clips)
 
 
@@ -155,7 +155,8 @@ class CompensatorBatches(DrawnBatches):
             return torch.where(uniform(0.0, 1.0, 1) < self.recipe.equalised, changed, clips)
 
         voices = equalised(self.speech.draw(count, generator))
-        sounds = self.join_sounds(voices, generator)
+        # or a hearing aid learns that a tone is one only if it was silent before
+        sounds = self.join_sounds(voices, generator, begun=1.0)
         signal = clean = set_level(sounds, uniform(*self.recipe.levels))
         if self.noise is not None:
             noise = equalised(self.noise.draw(count, generator))

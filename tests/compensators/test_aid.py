@@ -105,7 +105,7 @@ def test_saved_and_loaded_is_the_same_to_the_bit(tmp_path: Path, utterance: torc
         {"bands": 20.0},
         {"cap_db": -1.0},
         {"release": 0.0},
-        {"headroom_db": -1.0},
+        {"cap_db": -1.0},
         {"hidden": 0},
         {"limit_spl": "loud"},
     ],
