@@ -1,4 +1,4 @@
-"""Anyone's simulator as the teacher: found by ``package.module:name``, asked at its own rate, checked."""
+"""Anyone's simulator or enhancer: found by ``package.module:name``, asked at its own rate, checked."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from hlsim.audio import read_audio
 from hlsim.audiogram import FREQUENCIES
 from hlsim.calibration import set_level
 from hlsim.checks import check_rate
@@ -23,10 +24,59 @@ from hlsim.dsp.resample import resample
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.parallel import reason_of
 
-_LATEST = 2e-3  # s by which noise may be heard late or early
+_LATEST = 2e-3  # s by which a sound may come late or early
+_SPEECH = Path(__file__).parent / "speech" / "valid" / "flite-rms-01.flac"
 
 
-class ForeignTeacher:
+class _Foreign:
+    """Somebody's callable that makes a waveform of a waveform, and what it is called in errors."""
+
+    KIND, FORM = "teacher", "(waveform, audiogram) -> waveform"
+
+    def __init__(self, call: Callable[..., Tensor], name: str, digest: str) -> None:
+        if not callable(call):
+            raise ValueError(f"{self.KIND} {name} is {type(call).__name__}; allowed: a callable {self.FORM}")
+        self.call, self.name, self.digest = call, name, digest
+        self.who = f"{self.KIND} {name}"
+        if isinstance(call, nn.Module):
+            call.eval()
+
+    def __str__(self) -> str:
+        return f"{self.name} (sha256 {self.digest[:12]})"
+
+    def _ask(self, given: Tensor, *more: Any) -> Tensor:
+        """What it makes. Raises ValueError where it fails, or makes no waveform like the one that it was given."""
+        if isinstance(self.call, nn.Module):
+            self.call.to(given.device)
+        try:
+            made = self.call(given, *more)
+        except Exception as error:  # whatever somebody's code raises is to be one line, and say where
+            place = inspect.getinnerframes(error.__traceback__)[-1] if error.__traceback__ else None
+            where = f" ({Path(place.filename).name}, line {place.lineno})" if place else ""
+            raise ValueError(f"{self.who}: {reason_of(error)}{where}") from error
+        if not isinstance(made, Tensor) or made.is_complex() or made.shape != given.shape:
+            shape = f"shape {tuple(made.shape)}" if isinstance(made, Tensor) else type(made).__name__
+            kind = f"complex {shape}" if isinstance(made, Tensor) and made.is_complex() else shape
+            raise ValueError(
+                f"{self.who} made {kind} of {tuple(given.shape)}; allowed: a real tensor of the same shape"
+            )
+        if not bool(made.isfinite().all()):
+            raise ValueError(f"{self.who} made NaN or infinity; allowed: finite samples")
+        return made
+
+    def _refuse_late(self, made: Tensor, given: Tensor, rate: int) -> None:
+        """Shape: (time,) twice."""
+        points = 2 * given.shape[-1]
+        first, second = (torch.fft.rfft(signal.float(), points) for signal in (made, given))
+        late = int(torch.fft.irfft(first * second.conj(), points).abs().argmax())
+        late -= points if late > points // 2 else 0
+        if abs(late) > _LATEST * rate:
+            raise ValueError(
+                f"{self.who} delays by {1000 * late / rate:.1f} ms; allowed: time-aligned with its input"
+            )
+
+
+class ForeignTeacher(_Foreign):
     """A simulator ``(waveform, audiogram) -> waveform`` that is not hlsim's.
 
     It is called without gradients with (items, time) in pascals and (items, 8) dB HL, -10 to 100, on the device that the
@@ -44,21 +94,14 @@ class ForeignTeacher:
     """
 
     def __init__(self, simulator: Callable[[Tensor, Tensor], Tensor], name: str, digest: str) -> None:
-        if not callable(simulator):
-            raise ValueError(
-                f"teacher {name} is {type(simulator).__name__}; allowed: a callable (waveform, audiogram) -> waveform"
-            )
-        self.simulator, self.name, self.digest = simulator, name, digest
-        if isinstance(simulator, nn.Module):
-            simulator.eval()
+        super().__init__(simulator, name, digest)
         try:
-            self.sample_rate = check_rate(getattr(simulator, "sample_rate", NEURO_RATE))
+            self.sample_rate = rate = check_rate(getattr(simulator, "sample_rate", NEURO_RATE))
         except ValueError as error:
-            raise ValueError(f"teacher {name}: {error}") from error
-        self._refuse_late()
-
-    def __str__(self) -> str:
-        return f"{self.name} (sha256 {self.digest[:12]})"
+            raise ValueError(f"{self.who}: {error}") from error
+        noise = torch.randn(1, rate // 2, generator=torch.Generator().manual_seed(0))
+        noise = set_level(noise, 65.0)
+        self._refuse_late(self(noise, torch.zeros(1, len(FREQUENCIES)), rate)[0], noise[0], rate)
 
     def __reduce__(self) -> Any:
         return load_teacher, (self.name,)  # another process finds it as this one did
@@ -68,37 +111,35 @@ class ForeignTeacher:
         """What each ear hears. Shape: (items, time) in pascals, (items, 8) dB HL -> (items, time).
 
         Raises ValueError where it fails, or what it returns is no waveform like the one that it was given."""
-        given = resample(signals, sample_rate, self.sample_rate)
-        if isinstance(self.simulator, nn.Module):
-            self.simulator.to(given.device)
-        try:
-            heard = self.simulator(given, thresholds)
-        except Exception as error:  # whatever somebody's code raises is to be one line, and say where
-            place = inspect.getinnerframes(error.__traceback__)[-1] if error.__traceback__ else None
-            where = f" ({Path(place.filename).name}, line {place.lineno})" if place else ""
-            raise ValueError(f"teacher {self.name}: {reason_of(error)}{where}") from error
-        if not isinstance(heard, Tensor) or heard.is_complex() or heard.shape != given.shape:
-            shape = f"shape {tuple(heard.shape)}" if isinstance(heard, Tensor) else type(heard).__name__
-            kind = f"complex {shape}" if isinstance(heard, Tensor) and heard.is_complex() else shape
-            raise ValueError(
-                f"teacher {self.name} made {kind} of {tuple(given.shape)}; allowed: a real tensor of the same shape"
-            )
-        if not bool(heard.isfinite().all()):
-            raise ValueError(f"teacher {self.name} made NaN or infinity; allowed: finite samples")
+        heard = self._ask(resample(signals, sample_rate, self.sample_rate), thresholds)
         return resample(heard.to(signals), self.sample_rate, sample_rate)[..., : signals.shape[-1]]
 
-    def _refuse_late(self) -> None:
-        rate = self.sample_rate
-        noise = torch.randn(1, rate // 2, generator=torch.Generator().manual_seed(0))
-        noise = set_level(noise, 65.0)
-        heard = self(noise, torch.zeros(1, len(FREQUENCIES)), rate)
-        spectra = (torch.fft.rfft(functional.pad(signal, (0, rate // 2))) for signal in (heard, noise))
-        late = int(torch.fft.irfft(next(spectra) * next(spectra).conj()).abs().argmax())
-        late -= rate if late > rate // 2 else 0
-        if abs(late) > _LATEST * rate:
-            raise ValueError(
-                f"teacher {self.name} delays by {1000 * late / rate:.1f} ms; allowed: time-aligned with its input"
-            )
+
+class ForeignEnhancer(_Foreign):
+    """What takes noise off before an aid: ``(waveform, sample_rate) -> waveform``.
+
+    It is called without gradients with (..., time) in pascals, where RMS 1.0 is 94 dB SPL, and the rate in Hz. What it
+    returns is as long, finite, and time-aligned: what delays has to look ahead instead, which its latency then tells.
+
+    Raises:
+        ValueError: as ``ForeignTeacher``; late or early is told of speech at 65 dB SPL.
+    """
+
+    KIND, FORM = "enhancer", "(waveform, sample_rate) -> waveform"
+
+    def __init__(self, enhancer: Callable[[Tensor, int], Tensor], name: str, digest: str) -> None:
+        super().__init__(enhancer, name, digest)
+        waveform, rate = read_audio(_SPEECH)
+        speech = set_level(resample(waveform[0], rate, NEURO_RATE)[: 2 * NEURO_RATE], 65.0)
+        self._refuse_late(self(speech, NEURO_RATE), speech, NEURO_RATE)
+
+    def __reduce__(self) -> Any:
+        return load_enhancer, (self.name,)
+
+    @torch.no_grad()
+    def __call__(self, waveform: Tensor, sample_rate: int) -> Tensor:
+        """Shape: (..., time) -> (..., time). Raises ValueError as ``ForeignTeacher``."""
+        return self._ask(waveform, sample_rate).to(waveform)
 
 
 @lru_cache(maxsize=8)  # for each process, that what it has opened for a teacher is found again
@@ -111,23 +152,34 @@ def load_teacher(name: str) -> ForeignTeacher:
     Raises:
         ValueError: the module cannot be imported or has no such name, or as ``ForeignTeacher``.
     """
+    return ForeignTeacher(*_found(name, ForeignTeacher.KIND))
+
+
+@lru_cache(maxsize=8)
+def load_enhancer(name: str) -> ForeignEnhancer:
+    """The enhancer ``package.module:name``, found as ``load_teacher`` finds a teacher; ValueError too."""
+    return ForeignEnhancer(*_found(name, ForeignEnhancer.KIND))
+
+
+def _found(name: str, kind: str) -> tuple[Any, str, str]:
+    """What a name means, its name, and its digest."""
     module_name, _, attribute = name.partition(":")
     if os.getcwd() not in sys.path:
         sys.path.insert(0, os.getcwd())
     try:
         module = importlib.import_module(module_name)
-        found = getattr(module, attribute)
-        simulator = found() if isinstance(found, type) else found
+        thing = getattr(module, attribute)
+        made = thing() if isinstance(thing, type) else thing
     except Exception as error:
-        raise ValueError(f"teacher {name}: cannot be had ({reason_of(error)})") from error
+        raise ValueError(f"{kind} {name}: cannot be had ({reason_of(error)})") from error
     digest = hashlib.sha256()
-    kind = simulator if inspect.isroutine(simulator) else type(simulator)
-    for path in sorted({*_sources(module), *_sources(kind)}):
+    source = made if inspect.isroutine(made) else type(made)
+    for path in sorted({*_sources(module), *_sources(source)}):
         digest.update(Path(path).read_bytes())
-    if isinstance(simulator, nn.Module):
-        for key, tensor in simulator.state_dict().items():
+    if isinstance(made, nn.Module):
+        for key, tensor in made.state_dict().items():
             digest.update(key.encode() + tensor.detach().cpu().contiguous().numpy().tobytes())
-    return ForeignTeacher(simulator, name, digest.hexdigest())
+    return made, name, digest.hexdigest()
 
 
 def _sources(thing: Any) -> list[str]:
