@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 from hlsim.cli.inputs import check_there, need, other_ear, read_ear, read_simulator
-from hlsim.cli.options import EARS_TABLE, Parser, count, natural, number, passed, positive
+from hlsim.cli.options import EARS_TABLE, Parser, count, foreign_name, natural, number, passed, positive
 from hlsim.cli.progress import show_progress
 
 GAIN_EARS = ["N3", "S2"]
@@ -65,6 +65,11 @@ def evaluate_compensator(parser: Parser) -> None:
     option("--audiograms", Path, f"{EARS_TABLE}; its ears join Bisgaard's N2 to N6 and S1 to S3")
     parser.audiogram(text="; one ear in place of all, for a compensator trained for it")
     option("--noise", Path, "folder of noises; every second item is then noisy, at 2.5 to 17.5 dB")
+    text = (
+        "what takes noise off before each aid, package.module:name, found from the working directory too: a callable "
+        "(waveform, sample_rate) -> waveform or its class, of (..., time) in pascals, time-aligned"
+    )
+    option("--enhancer", foreign_name, text, [], nargs="+", metavar="NAME", dest="enhancers")
     option("--simulator", str, "Neuro-MSBG of the surrogate gap, by name or folder", "neuro-msbg")
     option("--levels", number, "of the speech in dB SPL, in turn", [50, 65, 80], nargs="+")
     option("--items", count, "how many in all", 400)

@@ -136,9 +136,11 @@ slider = kind(float, lambda value: 0 <= value <= 1, "0 to 1")
 integer = kind(int, lambda value: True, "whole numbers")
 count = kind(int, lambda value: value >= 1, "whole numbers from 1 up")
 natural = kind(int, lambda value: value >= 0, "whole numbers from 0 up")
+_FOREIGN = re.compile(r"\w+(\.\w+)*:\w+")
+foreign_name = kind(str, lambda text: bool(_FOREIGN.fullmatch(text)), "package.module:name")
 teacher_name = kind(
     str,
-    lambda text: text in TEACHERS or bool(re.fullmatch(r"\w+(\.\w+)*:\w+", text)),
+    lambda text: text in TEACHERS or bool(_FOREIGN.fullmatch(text)),
     f"{', '.join(TEACHERS)}, or package.module:name",
 )
 numbers = kind(

@@ -94,6 +94,13 @@ def band_edges() -> NDArray[np.float64]:
     return erb_frequency(np.linspace(lowest, highest, BANDS + 1))
 
 
+def band_centres() -> NDArray[np.float64]:
+    """Geometric middles of the bands in Hz. Returns (24,)."""
+    edges = band_edges()
+    middles: NDArray[np.float64] = np.sqrt(edges[1:] * edges[:-1])
+    return middles
+
+
 @lru_cache(maxsize=16)
 def band_shares(fft: int, sample_rate: int) -> NDArray[np.float64]:
     """Share of each frequency bin in each band. Returns (fft // 2 + 1, 24)."""

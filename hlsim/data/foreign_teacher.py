@@ -14,7 +14,6 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional
 
 from hlsim.audio import read_audio
 from hlsim.audiogram import FREQUENCIES

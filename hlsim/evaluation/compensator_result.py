@@ -18,6 +18,9 @@ HARD = 0.6
 
 MEASURES = ("haspi", "hasqi")
 
+NOISIER_DB = 8.0
+"""SNR under which speech in noise is told apart."""
+
 Rows = Sequence[Mapping[str, Any]]
 
 
@@ -102,18 +105,21 @@ def _report(rows: Rows, items: Sequence[Item], settings: Mapping[str, Any]) -> H
 
 
 def _frame(rows: Rows, condition: str) -> Any:
-    """For pandas: a row an item, with its severity, the level that it was given at, and the figures of a condition."""
-    about = [{"severity": row["severity"], "given": row["level"]} | row["figures"][condition] for row in rows]
-    return require("pandas", "eval").DataFrame(about)
+    """For pandas: a row an item, with its severity, given level, SNR (NaN without noise) and a condition's figures."""
+    names = {"severity": "severity", "level": "given", "snr": "snr"}
+    about = [{new: row[old] for old, new in names.items()} | row["figures"][condition] for row in rows]
+    return require("pandas", "eval").DataFrame(about).astype({"snr": float})
 
 
 def _summary(frame: Any) -> dict[str, Any]:
-    """Means over all, by input level and by degree of loss."""
+    """Means over all, by input level, by degree of loss and, of what is noisy, by SNR."""
     by_severity = dict(list(frame.groupby("severity")))
+    by_snr = {"under": frame[frame.snr < NOISIER_DB], "over": frame[frame.snr >= NOISIER_DB]}
     return {
         **_means(frame),
         "by_level": {f"{level:g}": _means(part) for level, part in frame.groupby("given")},
         "by_severity": {name: _means(by_severity[name]) for name in SEVERITIES if name in by_severity},
+        "by_snr": {name: _means(part) for name, part in by_snr.items() if len(part)},
     }
 
 

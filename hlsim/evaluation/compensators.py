@@ -1,24 +1,41 @@
-"""Compensators judged beside no aid and NAL-R, on the same speech, ears, levels and noise."""
+"""Compensators judged beside what a user would pick, on the same speech, ears, levels and noise."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from importlib.util import find_spec
 from itertools import chain
 from pathlib import Path
 from typing import Any
 
-from torch import nn
+import numpy as np
+from torch import Tensor, nn
 
 from compensators.nalr import NALR
+from compensators.wdrc import WDRC
 from hlsim.audiogram import Audiogram, as_thresholds
+from hlsim.criteria.bands import BANDS
+from hlsim.data.foreign_teacher import load_enhancer
 from hlsim.evaluation.compensator_result import MEASURES, compensator_result
-from hlsim.evaluation.gain_curves import gain_curves
+from hlsim.evaluation.gain_curves import draw_utterances, gain_curves, insertion_gain
 from hlsim.evaluation.haspi_report import HaspiReport
 from hlsim.evaluation.items import INPUT_LEVELS, Item, draw_judged_items, read_ears
-from hlsim.evaluation.judging import EXACT, Judged, Keys, Trial, Unaided, judge
-from hlsim.evaluation.steadiness import shift_differences, steady_tones
+from hlsim.evaluation.judging import (
+    EXACT,
+    AtLevelOf,
+    Enhanced,
+    Equaliser,
+    Judged,
+    Keys,
+    Trial,
+    Unaided,
+    judge,
+    limit_of,
+)
+from hlsim.evaluation.steadiness import shift_differences, steady_tones, wearing
 from hlsim.evaluation.store import ScoreStore, key_of, weights_hash
 from hlsim.extras import require
 from hlsim.metrics.pair import check_seed
@@ -27,8 +44,10 @@ from hlsim.neuro.config import NEURO_RATE
 from hlsim.parallel import Progress, check_parallel, make_missing
 from hlsim.pretrained import load_pretrained
 
-UNAIDED, PRESCRIBED = "unaided", "NAL-R"
+UNAIDED, PRESCRIBED, COMPRESSED = "unaided", "NAL-R", "WDRC"
 """The conditions that every compensator is compared with."""
+
+_EQUALISED = "equaliser at {}'s level"
 
 _SHIFTED = 6  # items, of which every condition has figures
 
@@ -37,8 +56,9 @@ _REVISION = 2  # of what ``judge`` measures and how it is kept: raise it where t
 
 @dataclass(frozen=True)
 class CompensatorEvaluation:
-    """What ``compensators.json`` holds: ``compensator_result``'s, and ``gain_curves``, ``steady_tones``, ``shifts`` and
-    ``notes``; and the reports of each group of items that there is, ``clean``, ``noisy`` and ``hard``.
+    """What ``compensators.json`` holds: ``compensator_result``'s, and ``gain_curves``, ``steady_tones``, ``shifts``,
+    ``wearing``, ``notes`` and ``beside``, the conditions that a compensator is compared with beside those that all are;
+    and the reports of each group of items that there is, ``clean``, ``noisy`` and ``hard``.
     """
 
     result: dict[str, Any]
@@ -53,6 +73,7 @@ def evaluate_compensators(
     audiograms: str | Path | None = None,
     audiogram: Audiogram | None = None,
     noise: str | Path | None = None,
+    enhancers: Sequence[str] = (),
     simulator: str | Path = "neuro-msbg",
     engine: str = "hlsim",
     items: int = 400,
@@ -64,7 +85,10 @@ def evaluate_compensators(
     jobs: int | None = None,
     progress: Progress | None = None,
 ) -> CompensatorEvaluation:
-    """Judge compensators beside no aid and NAL-R.
+    """Judge compensators beside no aid, NAL-R and WDRC, and each beside NAL-R and an equaliser at its own output level.
+
+    The equaliser is for each ear a fixed filter with the compensator's mean gain on speech at ``levels``. An enhancer is
+    judged before each aid, under conditions such as ``gtcrn + NAL-R``.
 
     Figures are stored as they are made, by the samples, the ear and the weights that they are of: a run that was
     stopped goes on where it was, one with a compensator more scores that one alone, and one with another simulator
@@ -76,6 +100,7 @@ def evaluate_compensators(
             ``config.limit_spl``, or ``limit_spl``, is held to it.
         speech, noise: folders of recordings; with ``noise`` every second item is noisy, at 2.5 to 17.5 dB.
         store: file of figures, there or not; None keeps nothing.
+        enhancers: ``package.module:name`` of what takes noise off before an aid, see ``ForeignEnhancer``.
         audiograms: CSV file of ears that join Bisgaard's N2 to N6 and S1 to S3.
         audiogram: one ear in place of all, also of the gain curves, for a compensator that was trained for it.
         simulator: the Neuro-MSBG of the surrogate gap, by name or folder.
@@ -100,7 +125,7 @@ def evaluate_compensators(
         raise ValueError(
             f"{items} items at {len(levels)} levels for {len(compensators)} compensators; allowed: 1 or more of each"
         )
-    if taken := sorted({UNAIDED, PRESCRIBED} & set(compensators)):
+    if taken := sorted({UNAIDED, PRESCRIBED, COMPRESSED} & set(compensators)):
         raise ValueError(f"a compensator named {taken[0]!r}; allowed: other names, that one is there anyway")
     if (audiograms is None) == (audiogram is None):
         raise ValueError("give either audiograms, a CSV file of ears, or audiogram, one ear in place of all")
@@ -111,33 +136,84 @@ def evaluate_compensators(
         ears = [*shown.items()]
     for ear in shown.values():
         as_thresholds(ear)  # to be known before hours of judging
-    conditions = {UNAIDED: Unaided(), PRESCRIBED: NALR(sample_rate=NEURO_RATE), **compensators}
-    conditions = {name: module.eval() for name, module in conditions.items()}
+    before = {name.partition(":")[2]: load_enhancer(name) for name in enhancers}
+    if len(before) < len(enhancers):
+        raise ValueError(f"enhancers {', '.join(enhancers)}; allowed: one a name after the colon")
+    aids = {
+        PRESCRIBED: NALR(sample_rate=NEURO_RATE),
+        COMPRESSED: WDRC(sample_rate=NEURO_RATE),
+        **compensators,
+    }
+    aids = {name: module.eval() for name, module in aids.items()}
+    enhanced = {
+        name: {f"{prefix} + {name}": Enhanced(enhancer, aid).eval() for prefix, enhancer in before.items()}
+        for name, aid in aids.items()
+    }
     drawn = draw_judged_items(speech, noise, ears, items=items, seconds=seconds, seed=seed, levels=levels)
-    aided = {name: module for name, module in conditions.items() if name != UNAIDED}
-    curves = gain_curves(aided, shown, speech, levels, seed)  # first: what cannot be used shows at once
-    steady = steady_tones(conditions, shown, levels)
+    utterances = draw_utterances(speech, seed)
+    curves = gain_curves(aids, shown, utterances, levels)  # first: what cannot be used shows at once
+    whole = {**aids, **dict(chain.from_iterable(own.items() for own in enhanced.values()))}
+    steady = steady_tones({UNAIDED: Unaided(), **whole}, shown, levels)
+    worn = wearing(whole, shown, utterances[0])
+    conditions, beside = _conditions(aids, compensators, enhanced)
+    by_ear = {}
+    for ear in dict.fromkeys(item.ear for item in drawn):
+        gains = {name: _mean_gains(aid, ear, utterances, levels) for name, aid in compensators.items()}
+        own = {
+            _EQUALISED.format(name): AtLevelOf(Equaliser(gains[name]), aid)
+            for name, aid in compensators.items()
+        }
+        by_ear[ear] = conditions | own
     network = load_pretrained(simulator)
-    judged = _judge_all(
-        drawn, conditions, network, engine, seed, ScoreStore(store), jobs=jobs, progress=progress
-    )
+    judged = _judge_all(drawn, by_ear, network, engine, seed, ScoreStore(store), jobs=jobs, progress=progress)
     settings = {"items": items, "seconds": seconds, "seed": seed, "engine": engine, "levels": [*levels]}
     settings |= {"ears": [name for name, _ in ears], "simulator": str(simulator)}
-    # the peak in dB SPL that a compensator promises not to pass
-    limits = {
-        name: getattr(getattr(module, "config", module), "limit_spl", None)
-        for name, module in conditions.items()
-    }
+    settings |= {"enhancers": [str(enhancer) for enhancer in before.values()]}
+    limits = {name: limit_of(module) for name, module in conditions.items()}
     result, reports = compensator_result(drawn, judged, limits=limits, settings=settings)
     shifted = sorted(result["rows"], key=lambda row: row["condition"] != "clean")[:_SHIFTED]
-    shifts = shift_differences(aided, {row["item"]: drawn[row["item"]] for row in shifted})
-    result |= {"gain_curves": curves, "steady_tones": steady, "shifts": shifts, "notes": [*notes]}
+    shifts = shift_differences(whole, {row["item"]: drawn[row["item"]] for row in shifted})
+    result |= {"gain_curves": curves, "steady_tones": steady, "shifts": shifts, "wearing": worn}
+    result |= {"beside": beside, "notes": [*notes]}
     return CompensatorEvaluation(result, reports)
+
+
+def _conditions(
+    aids: Mapping[str, nn.Module],
+    compensators: Mapping[str, nn.Module],
+    enhanced: Mapping[str, Mapping[str, nn.Module]],
+) -> tuple[dict[str, nn.Module], dict[str, list[str]]]:
+    """All conditions, each after those that it is compared with, and the names of these; equalisers are flat as yet."""
+    conditions: dict[str, nn.Module] = {UNAIDED: Unaided().eval()}
+    beside: dict[str, list[str]] = {}
+    for name, aid in aids.items():
+        if name in compensators:
+            as_loud = {
+                f"{PRESCRIBED} at {name}'s level": AtLevelOf(aids[PRESCRIBED], aid),
+                _EQUALISED.format(name): AtLevelOf(Unaided(), aid),
+            }
+            rivals = [UNAIDED, PRESCRIBED, COMPRESSED, *enhanced[PRESCRIBED], *as_loud, *enhanced[name]]
+            conditions |= {**as_loud, **enhanced[name], name: aid}
+        else:
+            rivals = [UNAIDED] if name == PRESCRIBED else [UNAIDED, PRESCRIBED]
+            conditions |= {name: aid, **enhanced[name]}
+            beside |= {own: [name] for own in enhanced[name]}
+        beside[name] = rivals
+    return conditions, beside
+
+
+def _mean_gains(aid: nn.Module, ear: Audiogram, utterances: Tensor, levels: Sequence[float]) -> list[float]:
+    """Insertion gain in dB by band, the mean over the levels; NaN where there is none, and no score then."""
+    try:
+        gains = np.mean(insertion_gain(aid, ear, utterances, levels), 0).clip(-100.0, None)
+    except Exception:  # whatever it is, it is told of the aid's own items
+        return [math.nan] * BANDS
+    return [round(gain, 1) for gain in gains.tolist()]  # the same from machine to machine, for it is in keys
 
 
 def _judge_all(
     items: Sequence[Item],
-    conditions: Mapping[str, nn.Module],
+    conditions: Mapping[Audiogram, Mapping[str, nn.Module]],
     simulator: nn.Module,
     engine: str,
     seed: int,
@@ -146,8 +222,9 @@ def _judge_all(
     progress: Progress | None,
     **parallel: Any,
 ) -> list[dict[str, Judged]]:
-    """Each item's figures by condition, those from the store among them."""
-    weights = {name: weights_hash(module) for name, module in conditions.items()}
+    """Each item's figures by condition, those from the store among them; the conditions are by ear."""
+    hashed = cache(weights_hash)
+    weights = {ear: {name: hashed(module) for name, module in own.items()} for ear, own in conditions.items()}
     network = weights_hash(simulator)
     # of pyclarity's MSBG, too
     versions = {**versions_of(MEASURES, "pyclarity"), "hlsim": version_of("hlsim")}
@@ -159,9 +236,9 @@ def _judge_all(
     for number, item in enumerate(items):
         trial_seed = (seed + number) % 2**32
         about = {"revision": _REVISION, "versions": versions, "seed": trial_seed, **item.settings(), **by}
-        of = {name: {**about, "weights": weights[name]} for name in conditions}
+        of = {name: {**about, "weights": found} for name, found in weights[item.ear].items()}
         keys = {name: Keys(key_of(it), key_of({**it, "simulator": network})) for name, it in of.items()}
-        trials.append(Trial(item, conditions, simulator, trial_seed, keys, engine, exact))
+        trials.append(Trial(item, conditions[item.ear], simulator, trial_seed, keys, engine, exact))
     if progress is not None:
         parallel["progress"] = lambda done, total: progress(done // 2, total // 2)  # both of an output
     failed = make_missing(

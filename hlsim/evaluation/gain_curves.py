@@ -7,13 +7,12 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
 from hlsim.audiogram import Audiogram
 from hlsim.calibration import set_level
-from hlsim.criteria.bands import band_edges, band_levels
+from hlsim.criteria.bands import band_centres, band_levels
 from hlsim.data.clips import Clips
 from hlsim.evaluation.steadiness import outputs
 from hlsim.neuro.config import NEURO_RATE
@@ -42,29 +41,30 @@ def insertion_gain(
     return curves
 
 
+def draw_utterances(speech: str | Path, seed: int) -> Tensor:
+    """Six clips of 3 s from a folder, drawn from the seed. Shape: -> (6, 48000) at 16 kHz."""
+    clips = Clips(speech, sample_rate=NEURO_RATE, seconds=_SECONDS)
+    return clips.draw(UTTERANCES, torch.Generator().manual_seed(seed))
+
+
 def gain_curves(
     compensators: Mapping[str, nn.Module],
     ears: Mapping[str, Audiogram],
-    speech: str | Path,
+    utterances: Tensor,
     levels: Sequence[float],
-    seed: int = 0,
 ) -> list[dict[str, Any]]:
-    """The curves of every compensator for every ear, on six clips of 3 s drawn from a folder. ValueError as ``outputs``.
+    """The curves of every compensator for every ear. Shape: (utterances, time) at 16 kHz. ValueError as ``outputs``.
 
     Returns: for each ``{"compensator", "ear", "levels", "frequencies", "gain_db": (levels, 24)}``.
     """
-    clips = Clips(speech, sample_rate=NEURO_RATE, seconds=_SECONDS)
-    drawn = clips.draw(UTTERANCES, torch.Generator().manual_seed(seed))
-    edges = band_edges()
-    centres = np.sqrt(edges[1:] * edges[:-1]).tolist()
     curves = []
     for (ear_name, ear), (name, compensator) in product(ears.items(), compensators.items()):
         try:
-            gains = insertion_gain(compensator, ear, drawn, levels)
+            gains = insertion_gain(compensator, ear, utterances, levels)
         except ValueError as error:
             raise ValueError(f"{name}, ear {ear_name}: {error}") from error
         about = {"compensator": name, "ear": ear_name, "levels": [*levels]}
-        curves.append({**about, "frequencies": centres, "gain_db": gains})
+        curves.append({**about, "frequencies": band_centres().tolist(), "gain_db": gains})
     return curves
 
 

@@ -7,12 +7,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
+from scipy.signal import firwin2
 from torch import Tensor, nn
 
 from hlsim.audiogram import Audiogram
-from hlsim.calibration import PASCAL_SPL, level_spl
-from hlsim.criteria.bands import audibility, band_level_loss, band_levels, least_audible
+from hlsim.calibration import PASCAL_SPL, level_spl, set_level
+from hlsim.criteria.bands import audibility, band_centres, band_level_loss, band_levels, least_audible
+from hlsim.data.foreign_teacher import ForeignEnhancer
+from hlsim.dsp.fir import filter_centred
 from hlsim.evaluation.items import Item
 from hlsim.metrics.reference import pyclarity_msbg
 from hlsim.metrics.registry import measure_by
@@ -29,12 +33,59 @@ OF_NETWORK = "loss_neuro"
 
 NORMAL = Audiogram.standard("NH")
 
+_TAPS = 513  # of an equaliser: 31 Hz at 16 kHz
+
 
 class Unaided(nn.Module):
     """What an ear without a hearing aid is given: the signal as it is."""
 
     def forward(self, waveform: Tensor, audiogram: Audiogram) -> Tensor:
         return waveform
+
+
+class Equaliser(nn.Module):
+    """A fixed filter without delay, of linear phase: gains in dB at ``band_centres``, whatever the ear."""
+
+    def __init__(self, gains_db: Sequence[float]) -> None:
+        super().__init__()
+        self.gains_db = tuple(gains_db)
+
+    def forward(self, waveform: Tensor, audiogram: Audiogram) -> Tensor:
+        hertz = np.linspace(0.0, NEURO_RATE / 2.0, _TAPS)
+        gains_db = np.interp(np.log(hertz.clip(1.0)), np.log(band_centres()), self.gains_db)
+        taps = firwin2(_TAPS, hertz, 10.0 ** (gains_db / 20.0), fs=NEURO_RATE)
+        return filter_centred(waveform, torch.from_numpy(taps).to(waveform))
+
+
+class AtLevelOf(nn.Module):
+    """An aid's output at the RMS level of what another makes of the same input."""
+
+    def __init__(self, aid: nn.Module, other: nn.Module) -> None:
+        super().__init__()
+        self.aid, self.other = aid, other
+
+    def forward(self, waveform: Tensor, audiogram: Audiogram) -> Tensor:
+        return set_level(self.aid(waveform, audiogram), level_spl(self.other(waveform, audiogram)))
+
+
+class Enhanced(nn.Module):
+    """An aid that is given what an enhancer makes of the input."""
+
+    def __init__(self, enhancer: ForeignEnhancer, aid: nn.Module) -> None:
+        super().__init__()
+        # the digest is a setting, which tells this one's scores from those of a changed enhancer
+        self.enhancer, self.digest, self.aid = enhancer, enhancer.digest, aid
+        self.limit_spl = limit_of(aid)
+
+    def forward(self, waveform: Tensor, audiogram: Audiogram) -> Tensor:
+        aided: Tensor = self.aid(self.enhancer(waveform, NEURO_RATE), audiogram)
+        return aided
+
+
+def limit_of(aid: nn.Module) -> float | None:
+    """The peak in dB SPL that an aid promises not to pass."""
+    limit: float | None = getattr(getattr(aid, "config", aid), "limit_spl", None)
+    return limit
 
 
 class Keys(NamedTuple):

@@ -1,7 +1,8 @@
-"""What scores of speech do not show: what a compensator makes of steady tones, and of speech a few samples later."""
+"""What scores of speech do not show: tones, speech a few samples later, quiet noise, latency and cost."""
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import product
 from typing import Any
@@ -16,6 +17,7 @@ from hlsim.evaluation.items import Item
 from hlsim.evaluation.judging import NORMAL
 from hlsim.msbg import MSBG
 from hlsim.neuro.config import NEURO_RATE
+from hlsim.parallel import one_thread
 
 TONES = (250, 500, 1000, 2000, 3001, 4000)
 """In Hz. Frames that are multiples of 4 ms apart all find the others in one phase, but not 3001 Hz."""
@@ -23,6 +25,11 @@ TONES = (250, 500, 1000, 2000, 3001, 4000)
 DELAYS = (7, 30)
 """In samples, no multiples of a usual hop."""
 
+QUIET = (25.0, 40.0)
+"""Levels in dB SPL of the noise of a room where nobody speaks."""
+
+_CHANGES = range(8000, 40000, 2003)  # samples from which on the input is another, at many places of any hop
+_CHANGED = 1e-4  # of the output's peak: Fourier transforms round by less
 _NEAR_HZ = 20.0
 _MIDDLE = slice(NEURO_RATE // 2, -NEURO_RATE // 2)  # one second: every tone has whole periods in it
 _END = NEURO_RATE // 4  # left out at either end of speech
@@ -97,6 +104,39 @@ def shift_differences(
             differences.append(_ratio_db(apart, first.square().mean()).tolist())
         about = {"compensator": name, "items": [*items], "delays": [*DELAYS]}
         found.append({**about, "difference_db": differences})
+    return found
+
+
+def wearing(
+    compensators: Mapping[str, nn.Module], ears: Mapping[str, Audiogram], speech: Tensor
+) -> list[dict[str, Any]]:
+    """Whether a compensator could be worn: how far it looks ahead, how loud it makes quiet rooms, what it costs.
+
+    ``latency_ms`` is how long before the input becomes another sound the output changes by more than 1e-4 of its peak,
+    the longest of 16 places; ``quiet_gain_db`` the level gained by white noise at ``QUIET``, in the middle second;
+    ``cpu_ms`` the processor's time for a second of sound, on one thread. ValueError as ``outputs``.
+
+    Shape: (time,) of 3 s at 16 kHz.
+    """
+    speech = set_level(speech, 65.0)
+    noise = torch.randn(len(speech), generator=torch.Generator().manual_seed(0))
+    other, *quiet = (set_level(noise, level) for level in (65.0, *QUIET))
+    given = [speech, *(torch.cat((speech[:at], other[at:])) for at in _CHANGES), *quiet]
+    found = []
+    for (ear_name, ear), (name, compensator) in product(ears.items(), compensators.items()):
+        with one_thread():
+            start = time.process_time()
+            aided = outputs(compensator, given, ear, f"{name}, ear {ear_name}, changed speech: the output")
+            seconds = time.process_time() - start
+        changed = (aided[1 : -len(quiet)] - aided[0]).abs() > _CHANGED * aided[0].abs().max()
+        ahead = [at - int(row.int().argmax()) for at, row in zip(_CHANGES, changed, strict=True) if row.any()]
+        gains = [
+            float(level_spl(own[_MIDDLE]) - level_spl(sound[_MIDDLE]))
+            for own, sound in zip(aided[-len(quiet) :], quiet, strict=True)
+        ]
+        figures = {"latency_ms": 1000.0 * max(0, *ahead, 0) / NEURO_RATE, "quiet_gain_db": gains}
+        cost = {"cpu_ms": 1000.0 * seconds * NEURO_RATE / (len(given) * len(speech))}
+        found.append({"compensator": name, "ear": ear_name, **figures, **cost})
     return found
 
 

@@ -12,10 +12,10 @@ import numpy as np
 
 from hlsim.audiogram import FREQUENCIES
 from hlsim.evaluation.comparison import Comparison
-from hlsim.evaluation.compensator_result import HARD
+from hlsim.evaluation.compensator_result import HARD, NOISIER_DB
 from hlsim.evaluation.gain_curves import UTTERANCES
 from hlsim.evaluation.haspi_report import GAIN_NOTE, HaspiReport
-from hlsim.evaluation.steadiness import DELAYS
+from hlsim.evaluation.steadiness import DELAYS, QUIET
 from hlsim.report.haspi import scored_by
 from hlsim.report.page import Picture, Section, render_markdown, render_page, write_files
 from hlsim.report.pictures import draw_svg, frequency_axis, plain, report_pictures
@@ -30,6 +30,7 @@ GROUPS = {
 }
 
 Result = Mapping[str, Any]
+Beside = Mapping[str, Sequence[str]]
 
 _paired = partial(paired_cells, digits=2)
 
@@ -61,13 +62,13 @@ def _sections(result: Result, reports: Mapping[str, HaspiReport]) -> list[Sectio
         Section(
             GROUPS[group],
             [GAIN_NOTE] if group == "clean" else [],
-            [_main_table(result, group), _tests_table(report)],
+            [_main_table(result, group), _tests_table(report, result["beside"])],
         )
         for group, report in reports.items()
     ]
     loudness = [_loudness_table(result, group) for group in whole]
     by_severity = [_severity_table(result, group) for group in whole]
-    by_severity += [_severity_tests(reports[group], group) for group in whole]
+    by_severity += [_severity_tests(reports[group], group, result["beside"]) for group in whole]
     shifts = _SHIFTS.format(len(result["shifts"][0]["items"]), " or ".join(map(str, DELAYS)))
     curves = result["gain_curves"]
     gains = [_gain_picture(ear, curves) for ear in dict.fromkeys(curve["ear"] for curve in curves)]
@@ -78,6 +79,7 @@ def _sections(result: Result, reports: Mapping[str, HaspiReport]) -> list[Sectio
         Section("Does any output pass the limit?", (), [_peak_table(result)]),
         Section("Gain curves", [_GAINS], [_gain_table(curves)], gains),
         Section("Steady tones", [_STEADY], [tone_table(result["steady_tones"])]),
+        Section("Could it be worn?", [_WEARING], [wearing_table(result["wearing"], result["steady_tones"])]),
         Section("Does it matter where frames fall?", [shifts], [shift_table(result["shifts"])]),
     ]
     for group in whole:
@@ -88,7 +90,8 @@ def _sections(result: Result, reports: Mapping[str, HaspiReport]) -> list[Sectio
         table = Table("Outputs that could not be judged", ("Item", "Compensator", "Ear", "Reason"), rows)
         sections.append(Section("Failures", ["Items that count in no table."], [table]))
     versions = ", ".join(f"{name} {version}" for name, version in result["versions"].items())
-    return [*sections, Section("How the figures were made", [*_NOTES, f"{versions}."])]
+    notes = [*_NOTES, *(f"Enhancer {name}." for name in result["enhancers"])]
+    return [*sections, Section("How the figures were made", [*notes, f"{versions}."])]
 
 
 _LOUDNESS = (
@@ -119,7 +122,15 @@ _SHIFTS = (
     "The clean speech of {} items is delayed by {} samples, and the output, shifted back, is compared with that of the "
     "speech as it was, without 0.25 s at either end. A filter gives the same; what depends on where frames fall does not."
 )
+_WEARING = (
+    "Latency: how long before the input becomes another sound the output changes, by more than 1e-4 of its peak; the "
+    "longest of 16 places. Gain: of white noise, as soft as a room where nobody speaks. Sidebands: the worst of the "
+    "steady tones. Time: of the processor for a second of sound, one thread, whole signals of 3 s; machines differ."
+)
 _NOTES = (
+    "At a compensator's level: what NAL-R, or an equaliser, makes of an item, at the RMS level of what the compensator "
+    "made of it. The equaliser is, for each ear, a fixed filter with the compensator's mean insertion gain in 24 bands,"
+    f" of {UTTERANCES} clips of speech at the input levels: what is left between the two is not gain.",
     "Bands: median absolute difference between the levels of 24 ERB-wide bands in frames of 32 ms of what the impaired "
     "ear hears and what a normal ear hears of the clean speech, both by the exact MSBG, where the latter is audible; "
     "mean over items.",
@@ -160,14 +171,22 @@ _GIVEN = "What the ear is given"
 def _main_table(result: Result, group: str) -> Table:
     """Scores, levels, and how far what is heard lies from what a normal ear hears."""
     conditions = result["groups"][group]["conditions"].items()
-    rows = [{_GIVEN: name, **_scores(row), **cells(row, _MAIN)} for name, row in conditions]
+    rows = [
+        {_GIVEN: name, **_scores(row), **(_by_snr(row) if group == "noisy" else {}), **cells(row, _MAIN)}
+        for name, row in conditions
+    ]
     return Table.of(f"{GROUPS[group]}: scores, output and what is heard", rows)
 
 
-def _tests_table(report: HaspiReport) -> Table:
-    """Each compensator against no aid and the prescription, and the latter against the former."""
+def _by_snr(row: Result) -> dict[str, str]:
+    parts = [row["by_snr"].get(name, {}).get("haspi_mean") for name in ("under", "over")]
+    return {f"HASPI under / over {NOISIER_DB:g} dB SNR": " / ".join(number(part, ".3f") for part in parts)}
+
+
+def _tests_table(report: HaspiReport, beside: Beside) -> Table:
+    """Each condition against those that a user would pick instead."""
     rows = []
-    for c in _against_both(report):
+    for c in _against(report, beside):
         means = "n/a" if c.listeners is None else _paired(c.listeners)["t-test (paired)"]
         paired = _paired(c.overall, c.p_t_holm, c.p_w_holm)
         about = {"Change": change_name(c), "n": str(c.overall.n)}
@@ -175,17 +194,17 @@ def _tests_table(report: HaspiReport) -> Table:
     return Table.of("Paired tests, p adjusted by Holm within each measure", rows)
 
 
-def _severity_tests(report: HaspiReport, group: str) -> Table:
+def _severity_tests(report: HaspiReport, group: str, beside: Beside) -> Table:
     rows = [
         {"Change": f"{severity}, {change_name(c)}", "n": str(row.n), **_paired(row)}
-        for c in _against_both(report)
+        for c in _against(report, beside)
         for severity, row in c.by_severity.items()
     ]
     return Table.of(f"{GROUPS[group]}: paired tests by degree of loss, p not adjusted", rows)
 
 
-def _against_both(report: HaspiReport) -> list[Comparison]:
-    return [c for c in report.comparisons if c.before in report.conditions[:2]]
+def _against(report: HaspiReport, beside: Beside) -> list[Comparison]:
+    return [c for c in report.comparisons if c.before in beside.get(c.after, ())]
 
 
 def _loudness_table(result: Result, group: str) -> Table:
@@ -272,6 +291,25 @@ def tone_table(found: Sequence[Result]) -> Table:
     return Table.of(
         "Level heard less a normal ear's of the same tone, and sidebands of the output, in dB", rows
     )
+
+
+def wearing_table(found: Sequence[Result], tones: Sequence[Result]) -> Table:
+    """A row an ear and aid."""
+    worst = {(row["ear"], row["compensator"]): max(map(max, row["sidebands_db"])) for row in tones}
+    rows = [
+        {
+            "Ear, aid": f"{row['ear']}, {row['compensator']}",
+            "Latency (ms)": f"{row['latency_ms']:.1f}",
+            **{
+                f"Gain for noise at {level:g} dB SPL (dB)": f"{gain:+.1f}"
+                for level, gain in zip(QUIET, row["quiet_gain_db"], strict=True)
+            },
+            "Worst sidebands (dB)": f"{worst[row['ear'], row['compensator']]:.0f}",
+            "Time for a second (ms)": f"{row['cpu_ms']:.1f}",
+        }
+        for row in found
+    ]
+    return Table.of("Latency, gain for quiet noise, sidebands and cost", rows)
 
 
 def shift_table(found: Sequence[Result]) -> Table:
