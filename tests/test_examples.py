@@ -2,6 +2,7 @@
 
 import csv
 import importlib.util
+import sys
 from pathlib import Path
 from types import ModuleType
 
@@ -12,6 +13,7 @@ import torch
 from hlsim import MSBG, Audiogram, HearingLossLoss
 from hlsim.audio import read_audio, write_audio
 from hlsim.calibration import level_spl, set_level
+from hlsim.data.foreign_teacher import load_enhancer
 from hlsim.msbg.ear import MSBG_RATE
 from hlsim.msbg.filterbank import BANKS, gammatone_response
 
@@ -61,6 +63,19 @@ def test_the_papers_last_table(tmp_path: Path, speech_dir: Path, capsys: pytest.
     # one utterance, two different ears of the file, two conditions
     assert len(table) == 4 and len({row["hl_1000"] for row in table}) == 2
     assert (out / "report" / "report.json").is_file()
+
+
+def test_rnnoise_takes_noise_off_and_does_not_delay(
+    speech: list[tuple[torch.Tensor, int]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("pyrnnoise")
+    monkeypatch.chdir(EXAMPLES.parent)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    enhancer = load_enhancer("examples.enhancers:RNNoise")  # which refuses what is late
+    clean = set_level(speech[0][0][:, :48000], 65.0)
+    noise = set_level(torch.randn_like(clean), 60.0)
+    apart = [float(level_spl(made - clean)) for made in (clean + noise, enhancer(clean + noise, 16000))]
+    assert apart[1] < apart[0] - 5.0
 
 
 def test_delay_by_frequency(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

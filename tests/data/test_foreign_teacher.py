@@ -12,7 +12,7 @@ from torch import Tensor
 
 from hlsim import Audiogram
 from hlsim.calibration import set_level
-from hlsim.data.foreign_teacher import ForeignTeacher, load_teacher
+from hlsim.data.foreign_teacher import ForeignTeacher, load_enhancer, load_teacher
 from hlsim.data.teacher import Teacher, find_teacher
 from hlsim.data.writing import Recipe
 
@@ -120,6 +120,29 @@ def test_a_silent_ear_is_allowed_and_later_faults_are_told() -> None:
     some = ForeignTeacher(fails_for_some, "a:b", "")
     with pytest.raises(ValueError, match="teacher a:b made NaN or infinity"):
         some(torch.ones(1, 100), torch.tensor([Audiogram.standard("N5").thresholds]), 16000)
+
+
+@pytest.mark.parametrize(
+    ("body", "said"),
+    [
+        ("return waveform[..., 1:]", r"made shape \(\d+,\) of \(\d+,\); allowed: a real tensor of the same"),
+        ("return waveform / 0", "made NaN or infinity"),
+        ("return waveform.roll(320, -1)", r"delays by 20\.0 ms; allowed: time-aligned"),
+        ("return waveform @ nobody", r"NameError: .* \(somebodys_ears_\d+\.py, line 2\)"),
+    ],
+)
+def test_an_enhancer_is_checked_too(write: Write, body: str, said: str) -> None:
+    module = write(f"def enhance(waveform, sample_rate):\n    {body}\n")
+    with pytest.raises(ValueError, match=f"enhancer {module}:enhance:? {said}"):
+        load_enhancer(f"{module}:enhance")
+
+
+def test_an_enhancer_is_found_as_a_teacher_is(write: Write) -> None:
+    text = "class Softer:\n    def __call__(self, waveform, sample_rate):\n        return waveform / sample_rate\n"
+    first, other = (load_enhancer(f"{write(own)}:Softer") for own in (text, text + "# changed"))
+    assert torch.equal(first(torch.ones(2, 100), 16000), torch.ones(2, 100) / 16000)
+    assert first.digest != other.digest and first.digest[:12] in str(first)
+    assert pickle.loads(pickle.dumps(first)) is first
 
 
 def test_what_is_no_teacher_is_refused(write: Write) -> None:

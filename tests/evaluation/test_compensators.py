@@ -1,7 +1,9 @@
 """Judging compensators: the items, what is measured of each, gain curves, and the report."""
 
+import contextlib
 import json
 import math
+import sys
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -21,6 +23,7 @@ from hlsim.evaluation.compensators import evaluate_compensators
 from hlsim.evaluation.gain_curves import insertion_gain
 from hlsim.evaluation.items import INPUT_LEVELS, draw_judged_items, read_ears
 from hlsim.evaluation.judging import (
+    Equaliser,
     Keys,
     Trial,
     Unaided,
@@ -195,6 +198,11 @@ def compare(modules: dict[str, nn.Module], out: Path, **options: Any) -> dict[st
     return done.result
 
 
+def without_times(result: dict[str, Any]) -> dict[str, Any]:
+    """All but what the machine's speed decides."""
+    return {**result, "wearing": [{**own, "cpu_ms": 0.0} for own in result["wearing"]]}
+
+
 @pytest.mark.usefixtures("quick")
 def test_report(tmp_path: Path, speech_dir: Path, ears_csv: Path) -> None:
     out = tmp_path / "out"
@@ -213,9 +221,12 @@ def test_report(tmp_path: Path, speech_dir: Path, ears_csv: Path) -> None:
         jobs=1,
         progress=lambda done, total: shown.append((done, total)),
     )
-    assert shown[-1] == (56, 56)
-    # both items of S1 and of S2 are left out, with the reason
-    reasons = [(failure["name"], failure["reason"]) for failure in result["failures"]]
+    # without aid, with two prescriptions, and each compensator beside two at its level
+    assert shown[-1] == (126, 126)
+    # both items of S1 and of S2 are left out, with the reason; the two at the level of what failed fail too
+    own = [failure for failure in result["failures"] if failure["compensator"] == "broken"]
+    assert len(result["failures"]) == 3 * len(own) == 12
+    reasons = [(failure["name"], failure["reason"]) for failure in own]
     assert reasons[:2] == [("S1", "RuntimeError: no such ear")] * 2
     assert [name for name, _ in reasons[2:]] == ["S2"] * 2 and "NaN" in reasons[2][1]
     assert {row["name"] for row in result["rows"]}.isdisjoint({"S1", "S2"})
@@ -260,7 +271,11 @@ def test_report(tmp_path: Path, speech_dir: Path, ears_csv: Path) -> None:
     assert "RuntimeError: no such ear" in text and "| N2, loud, 50 dB SPL | +40.0 |" in text
     # the worst of tones and of shifted speech; a gain does nothing else, and the noisy fill up where the clean are few
     tones = {own["compensator"]: own for own in result["steady_tones"]}
-    assert [*tones] == ["unaided", "NAL-R", "loud", "broken"] and tones["loud"]["levels"] == [50, 65, 80]
+    assert [*tones] == ["unaided", "NAL-R", "WDRC", "loud", "broken"] and tones["loud"]["levels"] == [
+        50,
+        65,
+        80,
+    ]
     assert tones["broken"]["heard_off_db"] == tones["unaided"]["heard_off_db"]
     off = tones["loud"]["heard_off_db"][0][0]
     assert off > tones["unaided"]["heard_off_db"][0][0] + 40.0  # recruitment
@@ -268,7 +283,31 @@ def test_report(tmp_path: Path, speech_dir: Path, ears_csv: Path) -> None:
     assert len(rows) == 2 and rows[1][1] == f"{off:+.1f}"
     assert "| loud | 12 | -200 | -200 |" in text and "The clean speech of 6 items is delayed" in text
     numbers = [row["item"] for row in clean]
-    assert [own["items"][:5] for own in result["shifts"]] == [numbers] * 3
+    assert [own["items"][:5] for own in result["shifts"]] == [numbers] * 4
+    # as loud as the compensator; a gain without a filter is the flat equaliser, but for its ends
+    for row in result["rows"]:
+        figures = row["figures"]
+        at_level = [figures[f"{aid} at loud's level"] for aid in ("NAL-R", "equaliser")]
+        assert [own["level"] for own in at_level] == pytest.approx([figures["loud"]["level"]] * 2, abs=1e-3)
+        assert at_level[1]["peak"] == pytest.approx(figures["loud"]["peak"], abs=0.1)
+    # each is compared with what a user would pick instead, and with nothing else
+    assert result["beside"]["loud"] == [
+        *("unaided", "NAL-R", "WDRC", "NAL-R at loud's level", "equaliser at loud's level")
+    ]
+    assert "| HASPI: equaliser at loud's level to loud |" in text
+    assert "to equaliser" not in text and "loud to broken" not in text
+    noisy = [row for row in result["rows"] if row["condition"] == "noisy"]
+    under = [row["figures"]["loud"]["haspi"] for row in noisy if row["snr"] < 8.0]
+    over = [row["figures"]["loud"]["haspi"] for row in noisy if row["snr"] > 8.0]
+    by_snr = result["groups"]["noisy"]["conditions"]["loud"]["by_snr"]
+    for part, scores in (("under", under), ("over", over)):
+        assert (by_snr[part]["n"], by_snr[part]["haspi_mean"]) == (
+            len(scores),
+            pytest.approx(np.mean(scores)),
+        )
+    assert f"| {np.mean(under):.3f} / {np.mean(over):.3f} |" in text
+    worn = [own["compensator"] for own in result["wearing"]]
+    assert worn == ["NAL-R", "WDRC", "loud", "broken"] and "| N2, loud | 0.0 | +40.0 | +40.0 | -" in text
     page = (out / "compensators.html").read_text()
     assert "Steady tones" in page and "where frames fall" in page
     assert page.count("data:image/svg+xml") > 2 and "Paired tests" in page and "Gain curves" in page
@@ -300,11 +339,12 @@ def test_a_stopped_run_goes_on_and_new_weights_are_judged_anew(
         compare({"own": Gain()}, **options, out=parts)
     assert [path.name for path in parts.iterdir()] == ["scores.jsonl"]
     calls[:] = [[]]  # one more is left before it stops again
-    assert compare({"own": Gain()}, **options, out=parts) == whole
+    assert without_times(compare({"own": Gain()}, **options, out=parts)) == without_times(whole)
     calls.clear()
     with pytest.raises(KeyboardInterrupt):
         compare({"own": Gain(10.0)}, **options, out=parts)
-    assert calls == [["own"]] * 2  # of the others all is known
+    # of the others all is known
+    assert calls == [["NAL-R at own's level", "equaliser at own's level", "own"]] * 2
 
     # under another simulator nothing is new but the surrogate gap
     calls.clear()
@@ -374,6 +414,63 @@ def test_an_ear_without_a_loss_and_a_module_for_one_signal(tmp_path: Path, speec
     assert "n/a" in (tmp_path / "compensators.md").read_text()
 
 
+ENHANCER = """
+def half(waveform, sample_rate):
+    assert sample_rate == 16000
+    return waveform / 2
+"""
+
+
+@pytest.mark.usefixtures("quick")
+def test_an_enhancer_before_each_aid(
+    tmp_path: Path, speech_dir: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    for name, text in (("my_enhancer", ENHANCER), ("my_enhancer_2", ENHANCER.replace("2", "4"))):
+        (tmp_path / f"{name}.py").write_text(text)
+    options: dict[str, Any] = {"speech": speech_dir / "valid", "audiogram": Audiogram.standard("N3")}
+    options |= {"items": 1, "seconds": 0.3, "jobs": 1, "out": tmp_path / "out"}
+    result = compare({"own": Gain(20.0)}, enhancers=["my_enhancer:half"], **options)
+    (row,) = result["rows"]
+    for aid in ("NAL-R", "own"):
+        difference = row["figures"][f"half + {aid}"]["level"] - row["figures"][aid]["level"]
+        assert difference == pytest.approx(20.0 * math.log10(0.5), abs=1e-3)
+    assert "half + NAL-R" in result["beside"]["own"] and result["beside"]["half + NAL-R"] == ["NAL-R"]
+    text = (tmp_path / "out" / "compensators.md").read_text()
+    assert "Enhancer my_enhancer:half (sha256 " in text and "| HASPI: half + own to own |" in text
+    # one of another source has scores of its own
+    stored = len((tmp_path / "out" / "scores.jsonl").read_text().splitlines())
+    compare({"own": Gain(20.0)}, enhancers=["my_enhancer_2:half"], **options)
+    assert len((tmp_path / "out" / "scores.jsonl").read_text().splitlines()) == stored + 2 * 3
+    command = ["evaluate-compensator", "nalr", "--speech", str(speech_dir / "valid"), "--audiogram", "N3"]
+    command += ["--out", str(tmp_path / "none"), "--enhancer"]
+    for name, said in (
+        ("my_enhancer", "allowed: package.module:name"),
+        ("my_enhancer:nobody", "enhancer my_enhancer:nobody: cannot be had"),
+    ):
+        with contextlib.suppress(SystemExit):
+            assert main([*command, name]) == 2
+        assert said in capsys.readouterr().err
+    with pytest.raises(ValueError, match="one a name after the colon"):
+        compare({"own": Gain()}, enhancers=["my_enhancer:half", "my_enhancer_2:half"], **options)
+
+
+def test_an_equaliser_has_the_gains_that_it_is_given() -> None:
+    edges = band_edges()
+    gains = np.interp(np.linspace(0.0, 1.0, len(edges) - 1), [0.0, 0.4, 1.0], [0.0, 10.0, 40.0])
+    noise = torch.randn(1, 48000)
+    made = insertion_gain(Equaliser(gains.tolist()), Audiogram.standard("N3"), noise, (65.0,))
+    # a band is as loud as its loudest part where the gain rises steeply
+    np.testing.assert_allclose(made[0], gains, atol=1.0)
+    again = Equaliser(gains.tolist())(noise.roll(800, -1), Audiogram.standard("N5"))
+    np.testing.assert_allclose(
+        again[0, 2000:-2000],
+        Equaliser(gains.tolist())(noise, Audiogram.standard("N3"))[0, 1200:-2800],
+        atol=1e-3,
+    )
+
+
 def test_nothing_to_judge(tmp_path: Path, speech_dir: Path) -> None:
     ear, folder = Audiogram.standard("N3"), speech_dir / "valid"
     options: dict[str, Any] = {"speech": folder, "out": tmp_path / "out", "jobs": 1}
@@ -395,7 +492,7 @@ def test_command(tmp_path: Path, speech_dir: Path, capsys: pytest.CaptureFixture
     command += ["--items", "2", "--seconds", "0.3", "--out", str(tmp_path / "out")]
     assert main([*command, "--audiogram", "N3"]) == 0
     said = capsys.readouterr()
-    assert "| mine | 2 |" in said.out and "6 of 6 outputs" in said.err
+    assert "| mine | 2 |" in said.out and "12 of 12 outputs" in said.err
     assert "trained for one ear" not in said.out + said.err
     model = MappingCompensator(MappingConfig(channels=8, blocks=1))
     about = {"audiogram": Audiogram.standard("N4").to_dict()}

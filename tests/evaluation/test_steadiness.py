@@ -11,7 +11,7 @@ from hlsim import MSBG, Audiogram
 from hlsim.calibration import level_spl
 from hlsim.evaluation.items import Item
 from hlsim.evaluation.judging import NORMAL, Unaided
-from hlsim.evaluation.steadiness import TONES, shift_differences, steady_tones, tones
+from hlsim.evaluation.steadiness import TONES, shift_differences, steady_tones, tones, wearing
 
 N3 = Audiogram.standard("N3")
 
@@ -100,12 +100,42 @@ def test_muting_of_steady_sounds_is_caught() -> None:
         assert muted["heard_off_db"][level] == pytest.approx([-40.0] * len(TONES), abs=1e-3)
 
 
+class LookingAhead(nn.Module):
+    """The sound of so many samples later, twice as loud; soft sounds ten times as loud."""
+
+    def __init__(self, samples: int) -> None:
+        super().__init__()
+        self.samples = samples
+
+    def forward(self, waveform: Tensor, audiogram: Audiogram) -> Tensor:
+        gain = 2.0 if float(level_spl(waveform)) > 50.0 else 10.0
+        return gain * torch.cat((waveform[self.samples :], waveform[: self.samples]))
+
+
+def test_what_wearing_it_would_be_like() -> None:
+    speech = torch.randn(48000, generator=torch.Generator().manual_seed(1))
+    aids = {"own": LookingAhead(80), "none": Unaided(), "NAL-R": NALR()}
+    own, none, prescribed = wearing(aids, {"N3": N3}, speech)
+    assert own["latency_ms"] == pytest.approx(5.0) and none["latency_ms"] == 0.0
+    assert own["quiet_gain_db"] == pytest.approx([20.0, 20.0], abs=0.1)
+    assert none["quiet_gain_db"] == [0.0, 0.0]
+    # its filter has 110 samples before the middle, the first of them small
+    assert 3.0 < prescribed["latency_ms"] <= 1000.0 * 110 / 16000
+    assert all(found["cpu_ms"] > 0.0 for found in (own, prescribed))
+    with pytest.raises(
+        ValueError, match="own, ear N3, changed speech: the output holds samples that are NaN"
+    ):
+        wearing({"own": Unable()}, {"N3": N3}, speech)
+
+
 def test_silence_has_figures(items: dict[int, Item]) -> None:
     silent = {"own": lambda waveform, ear: 0.0 * waveform}
     (found,) = steady_tones(silent, {"NH": NORMAL}, (65.0,))  # type: ignore[arg-type]
     assert found["sidebands_db"] == [[-200.0] * len(TONES)] and found["heard_off_db"][0][2] < -140.0
     (shifts,) = shift_differences(silent, items)  # type: ignore[arg-type]
     assert shifts["difference_db"] == [[-200.0, -200.0]] * 2
+    (worn,) = wearing(silent, {"NH": NORMAL}, items[3].clean.repeat(2))  # type: ignore[arg-type]
+    assert worn["latency_ms"] == 0.0 and max(worn["quiet_gain_db"]) < -100.0
 
 
 def test_samples_that_are_not_numbers(items: dict[int, Item]) -> None:
