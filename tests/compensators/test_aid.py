@@ -132,5 +132,7 @@ def test_tones_are_heard_at_nearly_the_level_that_a_normal_ear_hears(name: str, 
     ear, aid = Audiogram.standard(name), load_compensator("hearing-aid")
     found = steady_tones({"aid": aid}, {name: ear}, [65.0])[0]
     off, sidebands = found["heard_off_db"][0], found["sidebands_db"][0]
-    assert max(map(abs, off[:5])) < within  # up to 3 kHz; at 4 kHz they are up to 9 dB too soft, as the card says
+    assert (
+        max(map(abs, off[:5])) < within
+    )  # up to 3 kHz; at 4 kHz they are up to 9 dB too soft, as the card says
     assert max(sidebands) < -80.0
