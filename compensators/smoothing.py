@@ -56,7 +56,8 @@ def follow_peaks(values: Tensor, state: Tensor, attack: float, release: float) -
     done = []
     for over in (values - slow).split(_BLOCK, 1):
         fading = constant_like(values, _fading, over.shape[1], release)
-        highest = torch.cummax(over / fading, 1).values
+        # one frame is its own largest: ONNX has no cummax, and a stream saves the call
+        highest = over / fading if over.shape[1] == 1 else torch.cummax(over / fading, 1).values
         done.append(fading * torch.maximum(highest, excess.unsqueeze(1)))
         excess = done[-1][:, -1]
     peaks = slow + (done[0] if len(done) == 1 else torch.cat(done, 1))

@@ -73,7 +73,7 @@ class Wearable(nn.Module):
         """The state after silence. Shape: (items, sliders) -> (items, ...) each."""
         items = len(sliders)
         past, gains = sliders.new_zeros(items, HISTORY), sliders.new_zeros(items, 2, self.bands)
-        return {"past": past, "gains": gains, "sliders": sliders, **self.start(items, sliders)}
+        return {"past": past, "gains": gains, "gliding": sliders, **self.start(items, sliders)}
 
     def advance(self, samples: Tensor, fitted: Tensor, sliders: Tensor, state: State) -> dict[str, Tensor]:
         """The state after whole hops; its ``gains`` are all that the hops had, and the next one's.
@@ -82,10 +82,10 @@ class Wearable(nn.Module):
         """
         padded = torch.cat((state["past"], samples), -1)
         powers = frame_power(padded)
-        gliding = _glide(state["sliders"], sliders, powers.shape[1])
+        gliding = _glide(state["gliding"], sliders, powers.shape[1])
         gains_db, kept = self.control(powers, fitted, gliding, state)
         gains = torch.cat((state["gains"], 10.0 ** (gains_db / 20.0) - 1.0), 1)
-        return {"past": padded[:, -HISTORY:], "gains": gains, "sliders": gliding[:, -1], **kept}
+        return {"past": padded[:, -HISTORY:], "gains": gains, "gliding": gliding[:, -1], **kept}
 
     def step(
         self, samples: Tensor, fitted: Tensor, sliders: Tensor, state: State

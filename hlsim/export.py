@@ -1,12 +1,14 @@
-"""Simulators as ``torch.export`` programs and ONNX files, for one number of items and one length."""
+"""Simulators as ``torch.export`` programs and ONNX files, for one number of items and one length; ONNX of any program."""
 
 from __future__ import annotations
 
 import re
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import torch
 from torch import Tensor, nn
+from torch.utils._pytree import tree_flatten
 
 from hlsim.audiogram import FREQUENCIES
 from hlsim.calibration import gain_to_pascals
@@ -73,6 +75,35 @@ def export_onnx(simulator: nn.Module, path: str | Path, *, seconds: float = 1.0,
             message names; or onnxruntime's output is not the simulator's to 1e-4 of its peak, for noise at 64 dB SPL.
         MissingExtraError: onnx, onnxscript or onnxruntime is not installed.
     """
+
+    def make() -> tuple[torch.export.ExportedProgram, dict[str, Tensor]]:
+        program = export_program(simulator, seconds=seconds, items=items)
+        assert isinstance(simulator, NeuroMSBG) and program.example_inputs is not None
+        waveform, thresholds = program.example_inputs[0]
+        noise = torch.randn(waveform.shape, generator=torch.Generator().manual_seed(0)).to(waveform)
+        ears = thresholds + torch.linspace(20.0, 90.0, len(FREQUENCIES)).to(thresholds)
+        level = 0.03 / gain_to_pascals(simulator.full_scale_spl)
+        return program, {"waveform": level * noise, "thresholds": ears}
+
+    write_onnx("the simulator", path, make, ["heard"])
+
+
+def write_onnx(
+    what: str,
+    path: str | Path,
+    make: Callable[[], tuple[torch.export.ExportedProgram, dict[str, Tensor]]],
+    outputs: Sequence[str],
+) -> None:
+    """Write a program as an ONNX file, whole or not at all, once onnxruntime has given its outputs.
+
+    Args:
+        what: it is, for errors.
+        make: gives the program, and inputs by name, in its order, to compare outputs on.
+        outputs: their names in the file.
+
+    Raises:
+        ValueError, MissingExtraError: as ``export_onnx``.
+    """
     target = Path(path)
     if not (folder := target.parent).is_dir():  # the export takes minutes
         raise ValueError(
@@ -80,42 +111,43 @@ def export_onnx(simulator: nn.Module, path: str | Path, *, seconds: float = 1.0,
         )
     for module in ("onnx", "onnxscript", "onnxruntime"):
         require(module, "dev")
-    program = export_program(simulator, seconds=seconds, items=items)
-    assert isinstance(simulator, NeuroMSBG)  # others are refused there
+    program, given = make()
     try:
         with Whole(target) as file:
             # not optimised: onnxscript's rules take a constant under 1e-8 for zero, and log(x + 1e-12) for log(x)
-            converted = torch.onnx.export(program, dynamo=True, verbose=False, optimize=False)
+            converted = torch.onnx.export(
+                program, dynamo=True, verbose=False, optimize=False, output_names=outputs
+            )
             assert converted is not None
             converted.save(str(file.partial), external_data=False)
-            _check(file.partial, program, 0.03 / gain_to_pascals(simulator.full_scale_spl))
+            _check(what, file.partial, program, given)
             file.keep()
     except torch.onnx.errors.OnnxExporterError as error:
-        raise ValueError(f"ONNX cannot take the simulator: {_reason(error)}") from error
+        raise ValueError(f"ONNX cannot take {what}: {_reason(error)}") from error
 
 
-def _check(path: Path, program: torch.export.ExportedProgram, level: float) -> None:
-    """Run the file as its user will, on noise: the exporter also writes what no runtime takes, or takes wrongly."""
+def _check(what: str, path: Path, program: torch.export.ExportedProgram, given: Mapping[str, Tensor]) -> None:
+    """Run the file as its user will: the exporter also writes what no runtime takes, or takes wrongly."""
     runtime = require("onnxruntime", "dev")
-    assert program.example_inputs is not None
-    waveform, thresholds = program.example_inputs[0]
-    noise = level * torch.randn(waveform.shape, generator=torch.Generator().manual_seed(0))
-    given = (noise.to(waveform), thresholds + torch.linspace(20.0, 90.0, len(FREQUENCIES)).to(thresholds))
     try:
         quiet = runtime.SessionOptions()
         quiet.log_severity_level = 3  # errors
         session = runtime.InferenceSession(str(path), quiet, providers=["CPUExecutionProvider"])
-        inputs = zip(session.get_inputs(), given, strict=True)
-        (heard,) = session.run(None, {entry.name: tensor.cpu().numpy() for entry, tensor in inputs})
+        results = session.run(None, {name: tensor.cpu().numpy() for name, tensor in given.items()})
     except Exception as error:  # onnxruntime has a class for each kind of refusal
         reason = f"refuses the file ({str(error).split('failed:', 1)[-1].strip().splitlines()[0]})"
-        raise ValueError(f"ONNX cannot take the simulator: onnxruntime {reason}") from error
+        raise ValueError(f"ONNX cannot take {what}: onnxruntime {reason}") from error
+    assert program.example_inputs is not None
+    positional, _ = program.example_inputs
     with torch.no_grad():
-        expected = program.module()(*given)
-    off = float((torch.from_numpy(heard).to(expected) - expected).abs().max() / expected.abs().max())
-    if not off <= _TOLERANCE:
-        wrong = f"is off by {off:.0e} of its peak; allowed: {_TOLERANCE}"
-        raise ValueError(f"ONNX cannot take the simulator: onnxruntime's output {wrong}")
+        call = program.module()
+        expected, _ = tree_flatten(call(*given.values()) if positional else call(**given))
+    for result, wanted in zip(results, expected, strict=True):
+        apart = (torch.from_numpy(result).to(wanted) - wanted).abs().max()
+        off = float(apart / wanted.abs().max().clamp_min(torch.finfo(wanted.dtype).tiny))
+        if not off <= _TOLERANCE:
+            wrong = f"is off by {off:.0e} of its peak; allowed: {_TOLERANCE}"
+            raise ValueError(f"ONNX cannot take {what}: onnxruntime's output {wrong}")
 
 
 def _reason(error: BaseException) -> str:
