@@ -21,8 +21,10 @@ def pytest_configure(config: pytest.Config) -> None:
 
 def pytest_report_header(config: pytest.Config) -> str | None:
     """Say what a plain run leaves out."""
-    if config.option.markexpr == "not install and not browser":
-        return "left out: tests of an installation (pytest -m install) and of a browser (pytest -m browser)"
+    if config.option.markexpr == "not install and not browser and not audio":
+        return (
+            "left out: tests of an installation, of a browser and of sound: pytest -m install, browser, audio"
+        )
     return None
 
 

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from hlsim.cli.inputs import check_files, other_ear, read_ear, read_simulator
-from hlsim.cli.options import Parser, slider
+from hlsim.cli.inputs import check_files, read_compensator, read_ear, read_simulator
+from hlsim.cli.options import Parser
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -27,8 +26,7 @@ def compensate(parser: Parser) -> None:
     _in_and_out(parser, _compensate)
     text = "nalr (the prescription), wdrc (compression in bands), or a checkpoint's name or folder; one of one ear alone "
     parser.option("--compensator", str, text + "warns of another", "nalr")
-    parser.option("--noise-reduction", slider, "of a hearing aid, 0 to 1; 1 by default")
-    parser.option("--amplification", slider, "of a hearing aid, 0 to 1; 1 by default")
+    parser.sliders()
 
 
 def _in_and_out(parser: Parser, run: Callable[[argparse.Namespace], None]) -> None:
@@ -45,18 +43,7 @@ def _simulate(options: argparse.Namespace) -> None:
 
 def _compensate(options: argparse.Namespace) -> None:
     def build(rate: int) -> Callable[..., Tensor]:
-        from compensators import load_compensator
-
-        name = options.compensator
-        compensator = load_compensator(name, sample_rate=rate, full_scale_spl=options.full_scale_spl)
-        for line in other_ear(name, name, read_ear(options.audiogram)):
-            print(f"hlsim: warning: {line}", file=sys.stderr)
-        names = ("noise_reduction", "amplification")
-        sliders = {given: value for given in names if (value := getattr(options, given)) is not None}
-        if idle := sorted(sliders.keys() - getattr(compensator, "SLIDERS", ())):
-            raise ValueError(
-                f"{', '.join(idle)} of {name}, which has no such slider; allowed: with a hearing aid"
-            )
+        compensator, sliders = read_compensator(options, rate)
         return partial(compensator, **sliders)
 
     _pass_through(options, build)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import argparse
+import sys
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -76,6 +78,23 @@ def other_ear(label: str, name: str, ear: Audiogram | None) -> list[str]:
         return []
     levels = ", ".join(f"{level:g}" for level in own.thresholds)
     return [f"{label} was trained for one ear, {levels} dB HL, and is meant for no other."]
+
+
+def read_compensator(options: argparse.Namespace, sample_rate: int) -> tuple[Any, dict[str, float]]:
+    """The compensator that is asked for, and its sliders; on stderr, that it was trained for another ear."""
+    from compensators import load_compensator
+
+    name = options.compensator
+    compensator = load_compensator(name, sample_rate=sample_rate, full_scale_spl=options.full_scale_spl)
+    for line in other_ear(name, name, read_ear(options.audiogram)):
+        print(f"hlsim: warning: {line}", file=sys.stderr)
+    names = ("noise_reduction", "amplification")
+    sliders = {given: value for given in names if (value := getattr(options, given)) is not None}
+    if idle := sorted(sliders.keys() - getattr(compensator, "SLIDERS", ())):
+        raise ValueError(
+            f"{', '.join(idle)} of {name}, which has no such slider; allowed: with a hearing aid"
+        )
+    return compensator, sliders
 
 
 def read_simulator(name: str, sample_rate: int, full_scale_spl: float = 94.0) -> torch.nn.Module:

@@ -15,6 +15,7 @@ COMMANDS = {
     "demo": ("demo", "train a compensator for one ear on the embedded speech and score it by HASPI"),
     "simulate": ("files", "write what an impaired ear hears of a file"),
     "compensate": ("files", "write what an impaired ear is to be given of a file"),
+    "live": ("live", "give an impaired ear what it needs, or hear as it does: microphone to headphones"),
     "prepare": (
         "prepare",
         "check a corpus and plan training instances: utterances, noise, ears, levels; with --write make them",

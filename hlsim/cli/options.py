@@ -93,6 +93,10 @@ class Parser(argparse.ArgumentParser):
     def full_scale(self, **more: Any) -> None:
         self.option("--full-scale-spl", number, "level in dB SPL of a file whose RMS is 1.0", 94.0, **more)
 
+    def sliders(self) -> None:
+        for name in ("--noise-reduction", "--amplification"):
+            self.option(name, slider, "of a hearing aid, 0 to 1; 1 by default")
+
     def engine(self) -> None:
         text = "what computes HASPI and HASQI: hlsim, with pyclarity's figures, or pyclarity itself, which is slower"
         self.option("--engine", str, text, "hlsim", choices=("hlsim", "pyclarity"))

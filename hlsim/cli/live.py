@@ -1,0 +1,85 @@
+"""The command ``live``: microphone to headphones."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from types import ModuleType
+
+from hlsim.cli.inputs import read_compensator, read_ear, read_simulator
+from hlsim.cli.options import STANDARD_EARS, Parser, kind, number, positive
+from hlsim.extras import require
+
+_RATE = 16000
+_device = kind(
+    lambda text: int(text) if text.isdecimal() else text,
+    lambda device: device != "",
+    "a number or part of a name",
+)
+
+
+def live(parser: Parser) -> None:
+    parser.set_defaults(run=_live)
+    parser.audiogram(text="; needed but for --list-devices")
+    either = parser.add_mutually_exclusive_group()
+    text = (
+        "what runs chunk by chunk: wdrc (compression in bands), or a hearing aid's checkpoint, name or folder"
+    )
+    parser.option("--compensator", str, text, "wdrc", group=either)
+    text = "hear what that ear hears instead, by neuro-msbg, in blocks of 96 ms and 200 ms late"
+    either.add_argument("--simulate", action="store_true", help=text)
+    parser.sliders()
+    text = "level in dB SPL of samples whose RMS is 1.0, of microphone and headphones alike; to be measured"
+    parser.option("--full-scale-spl", number, text, 100.0)
+    parser.option("--input", _device, "microphone: number or part of its name; the system's by default")
+    parser.option("--output", _device, "headphones: number or part of their name; the system's by default")
+    parser.option("--block-ms", positive, "of an aid", 4.0)
+    parser.option(
+        "--buffer-ms", positive, "that each device is asked to hold: more, where there are drop-outs", 20.0
+    )
+    parser.option("--seconds", positive, "until it ends by itself")
+    parser.flag("--list-devices", "show what there is, and end")
+
+
+def _live(options: argparse.Namespace) -> None:
+    if not options.list_devices:
+        if options.audiogram is None:
+            raise ValueError(f"no --audiogram; allowed: {', '.join(STANDARD_EARS)}, or eight levels in dB HL")
+        ear = read_ear(options.audiogram)
+    sounddevice = _sounddevice()
+    if options.list_devices:
+        print(sounddevice.query_devices() or "no devices")
+        return
+    import torch
+
+    from hlsim.live import Live, Simulated, play
+
+    torch.set_num_threads(1)  # others would only wait for one another in 4 ms
+    block = max(1, round(options.block_ms * _RATE / 1000))
+    if options.simulate:
+        if options.noise_reduction is not None or options.amplification is not None:
+            raise ValueError("sliders with --simulate; allowed: with a hearing aid")
+        stream = Simulated(read_simulator("neuro-msbg", _RATE, options.full_scale_spl), ear)
+        block = 12 * stream.block
+    else:
+        aid, sliders = read_compensator(options, _RATE)
+        if not hasattr(aid, "stream"):
+            raise ValueError(f"{options.compensator} takes whole signals; allowed: wdrc, or a hearing aid")
+        stream = aid.stream(ear, **sliders)
+    play(
+        Live(stream, options.full_scale_spl),
+        sounddevice,
+        devices=(options.input, options.output),
+        block=block,
+        buffer=options.buffer_ms / 1000.0,
+        seconds=options.seconds or math.inf,
+    )
+
+
+def _sounddevice() -> ModuleType:
+    try:
+        return require("sounddevice", "live")
+    except OSError as error:  # of its own, where the wheel brings no PortAudio
+        raise ValueError(
+            f"no PortAudio ({error}); allowed: with it, on Debian apt install libportaudio2"
+        ) from error
