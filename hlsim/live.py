@@ -134,7 +134,6 @@ def play(
         live.stream(torch.zeros(block))
     shown, every = ("\r{:<100}", 0.2) if sys.stdout.isatty() else ("{}\n", 1.0)
     options = {"device": devices, "channels": (1, min(2, checked[1])), "dtype": "float32", "latency": buffer}
-    gone = False
     try:
         with (
             suppress(KeyboardInterrupt),
@@ -144,15 +143,18 @@ def play(
             late = 1000.0 * sum(audio.latency)
             print(f"blocks of {1000 * block / NEURO_RATE:g} ms, {late:.0f} ms late; q or Ctrl-C ends it")
             end, pressed = time.monotonic() + seconds, ""
-            while pressed != "q" and not (live.error or gone) and (left := end - time.monotonic()) > 0.0:
+            while pressed != "q" and not live.error and (left := end - time.monotonic()) > 0.0:
                 live.press(pressed := key(min(every, left)))
                 print(shown.format(live.told()), end="", flush=True)
-                gone = not audio.active
+                if not audio.active:  # as PortAudio's ALSA may after a drop-out
+                    live.drop_outs += 1
+                    audio.stop()
+                    audio.start()
     except sounddevice.PortAudioError as error:
-        raise ValueError(f"the devices cannot be opened ({error}); {_ALLOWED}") from error
+        raise ValueError(f"the devices do not play ({error}); {_ALLOWED}") from error
     print(f"\nstopped, drop-outs {live.drop_outs}")
-    if live.error or gone:
-        raise ValueError(live.error or "the devices have stopped; allowed: ones that stay connected")
+    if live.error:
+        raise ValueError(live.error)
 
 
 def _check(sounddevice: ModuleType, kind: str, device: int | str | None) -> int:

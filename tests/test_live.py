@@ -74,6 +74,8 @@ class _Open:
     def __exit__(self, *_: object) -> None:
         pass
 
+    start = stop = __exit__
+
 
 @pytest.fixture
 def recording() -> torch.Tensor:
@@ -138,7 +140,7 @@ def test_what_a_stream_raises_ends_it(recording: torch.Tensor, capsys: pytest.Ca
     assert not devices.played[64:].any() and "stopped" in capsys.readouterr().out
 
 
-def test_ctrl_c_ends_it_and_a_device_that_goes_away_is_told(
+def test_ctrl_c_ends_it_and_devices_that_stop_are_started_again_or_told(
     recording: torch.Tensor, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     devices: Any = Devices(recording)
@@ -150,10 +152,19 @@ def test_ctrl_c_ends_it_and_a_device_that_goes_away_is_told(
         patch.setattr("hlsim.live.time.sleep", interrupted)
         play(Live(WDRC().stream(EAR), 94.0), devices)
     assert capsys.readouterr().out.endswith("stopped, drop-outs 0\n")
+    starts: list[Any] = [None, Devices.PortAudioError("Device unavailable [PaErrorCode -9985]")]
+
+    def start(self: _Open) -> None:
+        if error := starts.pop(0):
+            raise error
+
     monkeypatch.setattr(_Open, "active", False)
+    monkeypatch.setattr(_Open, "start", start)
     monkeypatch.setattr("hlsim.live.time.sleep", lambda seconds: None)
-    with pytest.raises(ValueError, match="the devices have stopped"):
-        play(Live(WDRC().stream(EAR), 94.0), devices)
+    live = Live(WDRC().stream(EAR), 94.0)
+    with pytest.raises(ValueError, match=r"do not play \(Device unavailable"):
+        play(live, devices)
+    assert live.drop_outs == 2 and not starts
 
 
 def test_a_terminal_gives_its_keys_and_is_left_as_it_was(monkeypatch: pytest.MonkeyPatch) -> None:
