@@ -134,7 +134,7 @@ def wearing(
             float(level_spl(own[_MIDDLE]) - level_spl(sound[_MIDDLE]))
             for own, sound in zip(aided[-len(quiet) :], quiet, strict=True)
         ]
-        figures = {"latency_ms": 1000.0 * max(0, *ahead, 0) / NEURO_RATE, "quiet_gain_db": gains}
+        figures = {"latency_ms": 1000.0 * max([0, *ahead]) / NEURO_RATE, "quiet_gain_db": gains}
         cost = {"cpu_ms": 1000.0 * seconds * NEURO_RATE / (len(given) * len(speech))}
         found.append({"compensator": name, "ear": ear_name, **figures, **cost})
     return found
