@@ -1,4 +1,4 @@
-"""Draws examples/delay.png, the paper's impulse method against the structural delay, and prints the delay by frequency.
+"""Draws docs/delay.png, the paper's impulse method against the structural delay, and prints the delay by frequency.
 
 Each figure of the table is what is left of the delay in aligned output, in samples at 44.1 kHz (negative: it comes
 early), by the cross-correlation of a tone burst of 65 dB SPL with what is heard of it.
@@ -56,7 +56,7 @@ def main() -> None:
         ear = Audiogram.standard(name)
         left = left_of_the_delay(MSBG(ear)(bursts()), bursts())
         print(f"| {name} | {ear.severity} |" + "".join(f" {samples:+d} |" for samples in left))
-    draw(Path(__file__).with_suffix(".png"))
+    draw(Path(__file__).parents[1] / "docs" / "delay.png")
 
 
 if __name__ == "__main__":

@@ -96,7 +96,7 @@ def test_delay_by_frequency(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Capt
     example.main()
     table = capsys.readouterr().out.splitlines()
     assert table[2] == "| NH | none |" + "".join(f" {samples:+d} |" for samples in left)
-    assert len(table) == 2 + len(example.TABLED) and drawn == [EXAMPLES / "delay.png"]
+    assert len(table) == 2 + len(example.TABLED) and drawn == [EXAMPLES.parent / "docs" / "delay.png"]
 
 
 def test_parity(
