@@ -12,7 +12,6 @@ SHOWN = (
     "examples/**/*.py",
     "examples/**/*.yaml",
     "examples/*.sh",
-    "hlsim/data/speech/README.md",
     "CHANGELOG.md",
     "CONTRIBUTING.md",
 )

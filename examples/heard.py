@@ -33,7 +33,9 @@ def level(waveform: Tensor) -> Tensor:
 
 
 def draw(signals: dict[str, Tensor], to: Path) -> None:
-    figure, panels = pyplot.subplots(1, len(signals), figsize=(10.0, 2.9), dpi=100, sharey=True, layout="constrained")
+    figure, panels = pyplot.subplots(
+        1, len(signals), figsize=(10.0, 2.9), dpi=100, sharey=True, layout="constrained"
+    )
     for axes, (name, signal) in zip(panels, signals.items(), strict=True):
         seconds = len(signal) / RATE
         image = axes.imshow(

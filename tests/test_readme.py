@@ -1,4 +1,4 @@
-"""The README's example runs as it stands there, and its commands exist."""
+"""README, documentation and cards: their examples run as they stand there, their commands exist, their links lead somewhere."""
 
 import re
 import shlex
@@ -8,39 +8,73 @@ import pytest
 
 from hlsim.cli.main import _parser
 
-README = Path(__file__).parent.parent / "README.md"
+ROOT = Path(__file__).parent.parent
+README = ROOT / "README.md"
+PAGES = [
+    *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "SECURITY.md")),
+    *sorted((ROOT / "docs").rglob("*.md")),
+    *sorted((ROOT / "checkpoints").glob("*/README.md")),
+]
 
 
-def _block(marker: str) -> str:
-    found = re.search(rf"<!-- {marker} -->\n```\w+\n(.*?)```", README.read_text(encoding="utf-8"), re.DOTALL)
-    assert found is not None
-    return found[1]
+def _examples(page: Path) -> list[str]:
+    text = page.read_text(encoding="utf-8")
+    return re.findall(r"<!-- example -->\n```python\n(.*?)```", text, re.DOTALL)
+
+
+def _commands(page: Path) -> list[str]:
+    blocks = re.findall(r"```sh\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
+    text = re.sub(r"\\\n\s*", "", "".join(blocks))
+    return re.findall(r"(?:^|&& |^time )(?:\.venv/bin/)?hlsim (.*)$", text, re.MULTILINE)
+
+
+def _named(page: Path) -> str:
+    return page.relative_to(ROOT).as_posix()
 
 
 def test_example_trains() -> None:
     names: dict[str, object] = {}
-    exec(compile(_block("example"), str(README), "exec"), names)
+    [example] = _examples(README)
+    exec(compile(example, str(README), "exec"), names)
     assert float(names["value"]) > 0  # type: ignore[arg-type]
     gradients = [parameter.grad for parameter in names["compensator"].parameters()]  # type: ignore[attr-defined]
     assert any(gradient is not None and bool(gradient.abs().sum() > 0) for gradient in gradients)
+    assert len([line for line in example.splitlines() if line.strip()]) <= 13
 
 
-def test_example_is_about_ten_lines() -> None:
-    assert len([line for line in _block("example").splitlines() if line.strip()]) <= 13
+@pytest.mark.parametrize("page", [page for page in PAGES[1:] if _examples(page)], ids=_named)
+def test_examples_run(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    if "metrics" in page.stem:
+        pytest.importorskip("torchmetrics")
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, object] = {}
+    for example in _examples(page):  # each goes on from the one before it
+        exec(compile(example, str(page), "exec"), names)
 
 
-def test_commands_parse() -> None:
-    blocks = re.findall(r"```sh\n(.*?)```", README.read_text(encoding="utf-8"), re.DOTALL)
-    text = re.sub(r"\\\n\s*", "", "".join(blocks))
-    commands = re.findall(r"^(?:\.venv/bin/)?hlsim (.*)$", text, re.MULTILINE)
-    assert len(commands) >= 3
-    for command in commands:
-        _parser().parse_args(shlex.split(command))
+@pytest.mark.parametrize("page", [page for page in PAGES if _commands(page)], ids=_named)
+def test_commands_parse(page: Path) -> None:
+    for command in _commands(page):
+        _parser().parse_args(shlex.split(command, comments=True))
 
 
-@pytest.mark.parametrize("path", re.findall(r"\]\(([\w/.-]+)\)", README.read_text(encoding="utf-8")))
-def test_linked_files_exist(path: str) -> None:
-    assert (README.parent / path).is_file()
+def test_demo_and_tests_are_one_line_each() -> None:
+    for marker, last in (("demo", "hlsim demo"), ("tests", "pytest")):
+        found = re.search(rf"<!-- {marker} -->\n```sh\n(.*)\n```", README.read_text(encoding="utf-8"))
+        assert found is not None and found[1].endswith(f"&& .venv/bin/{last}")
+
+
+@pytest.mark.parametrize("page", PAGES, ids=_named)
+def test_linked_files_exist(page: Path) -> None:
+    text = re.sub(r"```.*?```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
+    for path in re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", text):
+        assert (page.parent / path).is_file(), path
+
+
+@pytest.mark.parametrize("card", sorted((ROOT / "checkpoints").glob("*/README.md")), ids=_named)
+def test_cards_are_short(card: Path) -> None:
+    text = card.read_text(encoding="utf-8")
+    assert len(text.splitlines()) <= 120 and "CC BY 4.0" in text
 
 
 def test_recipes_are_readable() -> None:
@@ -50,7 +84,7 @@ def test_recipes_are_readable() -> None:
     from hlsim.neuro import NeuroConfig
     from hlsim.training.recipes import CompensatorRecipe, SimulatorRecipe
 
-    for path in (README.parent / "examples").glob("*.yaml"):
+    for path in (ROOT / "examples").glob("*.yaml"):
         settings = yaml.safe_load(path.read_text(encoding="utf-8"))
         if path.name.startswith(("neuro-msbg", "any-teacher")):
             NeuroConfig.from_dict(SimulatorRecipe.from_dict(settings).model)
