@@ -9,7 +9,7 @@ One call takes one hop, ``HOP`` = 64 samples, 4 ms at 16 kHz, of each item (left
   next call takes as ``past``.
 
 ``first_inputs`` gives all of them for the first hop: fitted to an ear, in the state after silence, with samples of 0.
-On a machine without torch, numpy and onnxruntime do (``np.savez`` keeps the inputs)::
+On a machine without torch, numpy and onnxruntime do (``np.savez`` keeps the inputs):
 
     export_aid(aid, "aid.onnx")
     inputs = {name: tensor.numpy() for name, tensor in first_inputs(aid, Audiogram.standard("N3")).items()}

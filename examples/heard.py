@@ -1,4 +1,4 @@
-"""Draws docs/heard.png: an utterance, what an N4 ear hears of it unaided, and what it hears through compensator-general."""
+"""Draws docs/heard.png: an utterance, what an N4 ear hears of it without an aid, and with compensator-general."""
 
 from pathlib import Path
 

@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # The paper's Tables I, III and IV, and the comparison of normalisations: trains every row for the same time on one
-# thread, and compares them. Killed, it goes on with the same command. The results of one such run are in tables.md.
+# thread, and compares them. Killed, it goes on with the same command. The results of one such run are in docs/paper-tables.md.
 #
 #   examples/tables.sh CORPORA OUT [MINUTES A ROW] [ITEMS]
 #

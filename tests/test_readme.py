@@ -1,4 +1,4 @@
-"""README, documentation and cards: their examples run as they stand there, their commands exist, their links lead somewhere."""
+"""README, documentation and cards: examples run as they stand there, commands exist, links lead to files."""
 
 import re
 import shlex

@@ -66,7 +66,7 @@ def test_a_loop_of_accelerate(capsys: pytest.CaptureFixture[str]) -> None:
 def test_an_aid_learns_through_a_network_that_learned_another_simulator(
     tmp_path: Path, speech_dir: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """examples/any-teacher.md, a few steps."""
+    """docs/guide/any-teacher.md, a few steps."""
     for module in ("lightning", "yaml", "pystoi", "pesq", "pandas", "matplotlib"):
         pytest.importorskip(module)
     monkeypatch.chdir(EXAMPLES.parents[1])
