@@ -1,20 +1,25 @@
-"""The commands ``simulate`` and ``compensate``: a file in, a file out."""
+"""The commands ``simulate`` and ``compensate``: a file in, a file out, or a folder of them."""
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Iterator
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from hlsim.cli.inputs import check_files, read_compensator, read_ear, read_simulator
+from hlsim.cli.inputs import check_files, check_folders, read_compensator, read_ear, read_simulator
 from hlsim.cli.options import Parser
 
 if TYPE_CHECKING:
     from torch import Tensor
 
 ENDINGS = (".wav", ".flac", ".ogg")
+
+_UPPER_BAND = 8500.0  # Hz, from where on nothing of a model at 16 kHz comes
+_HEARD, _LOST = 1e-6, 1e-3  # share of the upper band in the power, and what of that share counts as gone
 
 
 def simulate(parser: Parser) -> None:
@@ -31,8 +36,10 @@ def compensate(parser: Parser) -> None:
 
 def _in_and_out(parser: Parser, run: Callable[[argparse.Namespace], None]) -> None:
     parser.set_defaults(run=run)
-    parser.option("input", Path, "wav, flac or ogg, 16 kHz or more, any number of channels", metavar="IN")
-    parser.option("output", Path, "wav (32-bit float), flac, or ogg, which takes two channels", metavar="OUT")
+    text = "wav, flac or ogg, 16 kHz or more, any number of channels; or a folder of them, with those in it"
+    parser.option("input", Path, text, metavar="IN")
+    text = "wav (32-bit float), flac, or ogg, which takes two channels; for a folder one that takes wav files alike"
+    parser.option("output", Path, text, metavar="OUT")
     parser.audiogram(required=True)
     parser.full_scale()
 
@@ -51,26 +58,88 @@ def _compensate(options: argparse.Namespace) -> None:
 
 def _check_ending(path: Path) -> None:
     """As ``hlsim.audio.check_extension``, without torch."""
+    if path.is_dir():
+        raise ValueError(f"{path}: a folder; allowed: a file, for IN is one")
     if (ending := path.suffix.lower()) not in ENDINGS:
         found = ending or "a file without extension"
         raise ValueError(f"{path}: cannot write {found}; allowed: {', '.join(ENDINGS)}")
 
 
 def _pass_through(options: argparse.Namespace, build: Callable[[int], Callable[..., Tensor]]) -> None:
-    """Read, run what ``build`` makes for a sample rate, and write at the file's own rate."""
-    _check_ending(options.output)
-    check_files(options.input, options.output)
+    """Read, run what ``build`` makes for a sample rate, write at each file's own rate, and say how loud it is."""
+    whole = options.input.is_dir()
+    if whole:
+        check_folders(options.input, options.output)
+    else:
+        _check_ending(options.output)
+        check_files(options.input, options.output)
     ear = read_ear(options.audiogram)
     import torch
 
     from hlsim.audio import check_channels, read_audio, write_audio
-    from hlsim.checks import HIGHEST_RATE
+    from hlsim.checks import HIGHEST_RATE, LOWEST_RATE
     from hlsim.dsp.resample import resample
 
-    waveform, rate = read_audio(options.input, any_rate=True)
-    check_channels(options.output, waveform.shape[0])
-    inner = min(rate, HIGHEST_RATE)
-    module = build(inner)
-    with torch.no_grad():
-        result = module(resample(waveform, rate, inner), ear)
-    write_audio(options.output, resample(result, inner, rate)[..., : waveform.shape[-1]], rate)
+    pairs = _pairs(options.input, options.output) if whole else [(options.input, options.output)]
+    # one that cannot be loaded is no fault of a file
+    models = {LOWEST_RATE: build(LOWEST_RATE)} if whole else {}
+    left_out = 0
+    for done, (source, target) in enumerate(pairs, 1):
+        try:
+            waveform, rate = read_audio(source, any_rate=True)
+            check_channels(target, waveform.shape[0])
+            inner = min(rate, HIGHEST_RATE)
+            if inner not in models:
+                models[inner] = build(inner)
+            with torch.no_grad():
+                result = models[inner](resample(waveform, rate, inner), ear)
+            result = resample(result, inner, rate)[..., : waveform.shape[-1]]
+            if whole:
+                target.parent.mkdir(parents=True, exist_ok=True)
+            write_audio(target, result, rate)
+        except ValueError as error:
+            if not whole:
+                raise
+            left_out += 1
+            print(f"hlsim: warning: left out: {error}", file=sys.stderr)
+            continue
+        count = f"{done} of {len(pairs)}: " if whole else ""
+        print(f"{count}{target}: {_levels(waveform, result, options.full_scale_spl)}", flush=True)
+        for line in _surprises(waveform, result, rate):
+            print(f"hlsim: warning: {target}: {line}", file=sys.stderr)
+    if left_out:
+        raise ValueError(
+            f"{left_out} of {len(pairs)} files were left out, each told above; the others are written"
+        )
+
+
+def _pairs(source: Path, target: Path) -> list[tuple[Path, Path]]:
+    """Each file under a folder, and its place under the other as wav, which holds what is over full scale."""
+    from hlsim.audio import find_audio
+
+    pairs = [(path, (target / path.relative_to(source)).with_suffix(".wav")) for path in find_audio(source)]
+    for (path, one), (other, two) in pairwise(pairs):
+        if one == two:
+            raise ValueError(f"{other} and {path} would both be {one}; rename one")
+    return pairs
+
+
+def _levels(before: Tensor, after: Tensor, full_scale_spl: float) -> str:
+    from hlsim.calibration import level_spl
+
+    given, made = (float(level_spl(one.flatten(), full_scale_spl)) for one in (before, after))
+    peak = float(level_spl(after.abs().max().reshape(1), full_scale_spl))
+    return f"{given:.1f} dB SPL in, {made:.1f} out, peak {peak:.1f}"
+
+
+def _surprises(before: Tensor, after: Tensor, rate: int) -> Iterator[str]:
+    """What a listener would not expect of the file."""
+    import torch
+
+    if (peak := float(after.abs().max())) > 1.0:
+        yield f"reaches {peak:.3g} of full scale; a player clips it, unless it is turned down first"
+    first = round(_UPPER_BAND / rate * before.shape[-1])
+    powers = [torch.fft.rfft(one.double()).abs().square().sum(0) for one in (before, after)]
+    given, made = (float(power[first:].sum() / power.sum()) for power in powers)
+    if given > _HEARD and made < _LOST * given:
+        yield "what IN has above 8 kHz is missing; nalr, or --simulator msbg, keeps it"

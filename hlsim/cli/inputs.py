@@ -36,8 +36,6 @@ def check_there(*, folders: tuple[Path | None, ...] = (), files: tuple[Path | No
 
 def check_files(source: Path, target: Path) -> None:
     """Refuse an IN and OUT that would end in nothing after the work, or in the loss of IN."""
-    if source.is_dir():
-        raise ValueError(f"{source}: a folder; allowed: one file, wav, flac or ogg")
     if not target.parent.is_dir():
         found = "not a folder" if target.parent.exists() else "no such folder"
         raise ValueError(f"{target.parent}: {found}; allowed: an OUT in a folder that is there")
@@ -45,6 +43,14 @@ def check_files(source: Path, target: Path) -> None:
         raise ValueError(f"{source}: no such file")
     if target.exists() and target.samefile(source):
         raise ValueError(f"{target}: OUT is IN itself; allowed: another file, for IN would be lost")
+
+
+def check_folders(source: Path, target: Path) -> None:
+    """Refuse an OUT that cannot be a folder, or in which the files of IN would be lost or found again."""
+    if target.exists() and not target.is_dir():
+        raise ValueError(f"{target}: not a folder; allowed: a folder, there or not, for IN is one")
+    if target.resolve().is_relative_to(source.resolve()):
+        raise ValueError(f"{target}: in IN itself; allowed: another folder")
 
 
 def read_ear(text: str) -> Audiogram:

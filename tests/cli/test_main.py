@@ -108,6 +108,7 @@ def test_the_sliders_of_a_hearing_aid(
     assert main([*call, *own]) == 0
     expected = aid(waveform, Audiogram.standard("N3"), 0.5, 0.0).detach()
     torch.testing.assert_close(read_audio(tmp_path / "out.wav")[0], expected, atol=1e-6, rtol=1e-5)
+    capsys.readouterr()
     assert "noise_reduction of nalr, which has no such slider" in fails(
         capsys, *call, "--noise-reduction", "1"
     )
@@ -195,20 +196,71 @@ def test_levels_below_zero_need_no_sign_of_equality(tmp_path: Path, utterance: P
 def test_files_that_cannot_be_in_and_out(
     tmp_path: Path, utterance: Path, capsys: pytest.CaptureFixture[str], command: str
 ) -> None:
-    given, plain, out = tmp_path / "in.flac", tmp_path / "plain", tmp_path / "out.wav"
+    given, plain = tmp_path / "in.flac", tmp_path / "plain"
     given.write_bytes(utterance.read_bytes())
     plain.touch()
     for source, target, said in (
         (given, plain / "o.wav", f"{plain}: not a folder; allowed"),
         (given, tmp_path / "none" / "o.wav", f"{tmp_path / 'none'}: no such folder; allowed"),
         (given, given, f"{given}: OUT is IN itself"),
-        (tmp_path, out, f"{tmp_path}: a folder; allowed: one file"),
+        (given, tmp_path, f"{tmp_path}: a folder; allowed: a file, for IN is one"),
+        (tmp_path, plain, f"{plain}: not a folder; allowed: a folder, there or not"),
+        (tmp_path, tmp_path / "new", f"{tmp_path / 'new'}: in IN itself; allowed: another folder"),
         (tmp_path / "missing.wav", tmp_path / "missing.wav", "missing.wav: no such file"),
         (tmp_path / "missing.wav", tmp_path / "o.mp3", "o.mp3: cannot write .mp3; allowed: .wav"),
     ):
         assert said in fails(capsys, command, source, target, "--audiogram", "N3")
     assert given.read_bytes() == utterance.read_bytes()
     assert {path.name for path in tmp_path.iterdir()} == {"in.flac", "plain"}
+
+
+def test_folders_keep_their_tree_and_what_cannot_be_read_is_told(
+    tmp_path: Path, utterance: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "in" / "a").mkdir(parents=True)
+    for name in ("one.flac", "a/two.flac"):
+        (tmp_path / "in" / name).write_bytes(utterance.read_bytes())
+    (tmp_path / "in" / "a" / "broken.wav").write_text("this is no audio")
+    call = ["compensate", str(tmp_path / "in"), str(tmp_path / "out"), "--audiogram", "N3"]
+    assert main([*call, "--compensator", "nobody"]) == 2
+    assert "no checkpoint 'nobody'" in capsys.readouterr().err and not (tmp_path / "out").exists()
+    assert main(call) == 2
+    told = capsys.readouterr()
+    assert "left out" in told.err and "1 of 3 files were left out" in told.err
+    assert main([*call[:1], str(utterance), str(tmp_path / "alone.wav"), *call[3:]]) == 0
+    alone = (tmp_path / "alone.wav").read_bytes()
+    written = {path.relative_to(tmp_path / "out").as_posix() for path in (tmp_path / "out").rglob("*.wav")}
+    assert written == {"one.wav", "a/two.wav"}
+    assert all((tmp_path / "out" / name).read_bytes() == alone for name in written)
+    samples, _ = soundfile.read(utterance)
+    level = 94.0 + 10.0 * np.log10(np.mean(samples**2))
+    assert f"2 of 3: {tmp_path / 'out' / 'one.wav'}: {level:.1f} dB SPL in, " in told.out.replace(
+        "3 of 3", "2 of 3"
+    )
+    (tmp_path / "in" / "one.wav").write_bytes(utterance.read_bytes())
+    capsys.readouterr()
+    assert "would both be" in fails(capsys, *call)
+
+
+def test_what_a_listener_would_not_expect_of_a_file_is_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    noise = np.random.default_rng(0).standard_normal(48000)
+    call = [
+        "compensate",
+        str(tmp_path / "in.wav"),
+        str(tmp_path / "out.wav"),
+        "--audiogram",
+        "N3",
+        "--compensator",
+    ]
+    for level, compensator, clipped, dull in (
+        (0.001, "nalr", False, False), (0.001, "wdrc", False, True), (1.0, "nalr", True, False)
+    ):  # fmt: skip
+        soundfile.write(tmp_path / "in.wav", level * noise, 48000, subtype="FLOAT")
+        assert main([*call, compensator]) == 0
+        told = capsys.readouterr().err
+        assert ("a player clips it" in told, "what IN has above 8 kHz is missing" in told) == (clipped, dull)
 
 
 @pytest.mark.parametrize("command", ["simulate", "compensate"])
