@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional
 
-from compensators.bands import FRAME, level_db, shares
+from compensators.bands import FRAME, HISTORY, frame_power, level_db, shares
 from compensators.config import HearingAidConfig
 from compensators.prescription import losses, prescribed_gains, restoring_gains
 from compensators.smoothing import decay, follow_peaks
@@ -103,14 +104,24 @@ class HearingAid(Wearable):
         self, powers: Tensor, fitted: Tensor, sliders: Tensor, state: State
     ) -> tuple[Tensor, dict[str, Tensor]]:
         noise_reduction, amplification = sliders.split(1, -1)
+        levels = self._levels(powers)
+        gain, followed = self._amplification(levels[..., : self.bands + 1], fitted, state)
+        taken, recalled = self._reduction(levels, state)
+        return amplification * gain + noise_reduction * taken, followed | recalled
+
+    def attenuation(self, samples: Tensor) -> Tensor:
+        """What noise reduction adds to each band's gain at the end of each frame, in dB, 0 or less; it knows no ear.
+
+        Shape: (items, hops * HOP) pascals -> (items, hops, bands).
+        """
+        levels = self._levels(frame_power(functional.pad(samples, (HISTORY, 0))))
+        return self._reduction(levels, self.start(len(samples), samples))[0]
+
+    def _levels(self, powers: Tensor) -> Tensor:
+        """Levels of the bands, of all, and of single frequencies. Shape: as ``control`` -> (..., bands + 1 + bins) dB SPL."""
         by_band = powers @ constant_like(powers, shares, self.bands, FRAME)
         bins = powers[..., 1 : self.config.bins + 1]
-        levels = level_db(torch.cat((by_band, powers.sum(-1, keepdim=True), bins), -1))
-        gain, followed = self._amplification(levels[..., : self.bands + 1], fitted, state)
-        taken, recalled = self._reduction(
-            torch.cat((levels[..., : self.bands], levels[..., self.bands + 1 :]), -1), state
-        )
-        return amplification * gain + noise_reduction * taken, followed | recalled
+        return level_db(torch.cat((by_band, powers.sum(-1, keepdim=True), bins), -1))
 
     def _amplification(
         self, levels: Tensor, fitted: Tensor, state: State
@@ -129,9 +140,10 @@ class HearingAid(Wearable):
         return audible * gain, {"levels": kept}
 
     def _reduction(self, levels: Tensor, state: State) -> tuple[Tensor, dict[str, Tensor]]:
-        """Shape: (items, frames, bands + bins) -> (items, frames, bands) dB, 0 or less."""
+        """Shape: (items, frames, bands + 1 + bins) -> (items, frames, bands) dB, 0 or less."""
         config = self.config
-        entered = torch.tanh(self.enter((levels - 40.0) / 20.0))
+        seen = torch.cat((levels[..., : self.bands], levels[..., self.bands + 1 :]), -1)
+        entered = torch.tanh(self.enter((seen - 40.0) / 20.0))
         hidden, cell = state["hidden"].movedim(1, 0).contiguous().unsqueeze(1).unbind()
         recalled, (hidden, cell) = self.recur(entered, (hidden, cell))
         taken = -config.reduction_db * torch.sigmoid(self.leave(torch.cat((recalled, entered), -1)))

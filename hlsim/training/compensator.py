@@ -16,7 +16,7 @@ from hlsim.data.module import Batch
 from hlsim.loss import HearingLossLoss
 from hlsim.pretrained import checkpoint_digest
 from hlsim.training.batches import TrainingData, compensator_data, identity_of
-from hlsim.training.denoising import attenuation_error
+from hlsim.training.denoising import attenuation_error, missing_intelligibility
 from hlsim.training.loop import RunOptions, train_network
 from hlsim.training.module import TimedModule, initial_network
 from hlsim.training.recipes import CompensatorRecipe
@@ -36,17 +36,25 @@ class CompensatorTraining(TimedModule):
         network = (CONFIGS[recipe.kind], build_compensator, load_compensator)
         self.compensator = initial_network(recipe.start, recipe.model, *network)
         counted = {name: weight for name, weight in recipe.weights.items() if weight > 0.0}
-        self.denoising = counted.pop("denoising", 0.0)
+        self.denoising, self.intelligibility = (
+            counted.pop(name, 0.0) for name in ("denoising", "intelligibility")
+        )
         criterion = counted or "coherent-bands"  # for the examples, where nothing is learned through it
         self.loss = HearingLossLoss(simulator=simulator, reference=recipe.reference, criterion=criterion)
         self.hears = bool(counted)
+        if isinstance(self.compensator, HearingAid) and not self.hears:
+            self.compensator.correct.requires_grad_(False)  # or HASPI would amplify
 
     def training_loss(self, batch: Batch) -> Tensor:
         signal, clean, ears = (batch[name] for name in ("signal", "clean", "thresholds"))
         value = signal.new_zeros(())
         if self.denoising:
             assert isinstance(self.compensator, HearingAid)
-            value = value + self.denoising * attenuation_error(self.compensator, signal, clean, ears).mean()
+            value = value + self.denoising * attenuation_error(self.compensator, signal, clean).mean()
+        if self.intelligibility:
+            assert isinstance(self.compensator, HearingAid)
+            missing = missing_intelligibility(self.compensator, signal, clean, ears)
+            value = value + self.intelligibility * missing.mean()
         if not self.hears:
             return value
         if "noise_reduction" not in batch:

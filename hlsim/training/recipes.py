@@ -120,8 +120,9 @@ class CompensatorRecipe(TrainingRecipe):
         kind: ``mapping-compensator`` or ``hearing-aid``.
         model: settings of its ``MappingConfig`` or ``HearingAidConfig``.
         weights: of ``HearingLossLoss``'s criteria: ``coherent-bands``, ``bands`` (dB), ``paper``, and ``haspi``
-            and ``hasqi`` (1 less the score; clips of 0.7 s and more); and of ``denoising``, the error of a hearing aid's
-            noise reduction (``hlsim.training.denoising``).
+            and ``hasqi`` (1 less the score; clips of 0.7 s and more); and of what a hearing aid's noise reduction is
+            trained for (``hlsim.training.denoising``): ``denoising``, the error of its gains, and ``intelligibility``, what
+            HASPI lacks of 1 at equal level. Without one of the others its amplification stays as it is.
         reference: what the paper's criterion compares with, ``clean`` or ``normal-hearing``.
         sounds: speech in noise alone teaches a network that what is steady is noise, to be taken away.
         equalised: share of clips whose speech is equalised at random by up to 15 dB, and of those whose noise is. Few
@@ -148,14 +149,15 @@ class CompensatorRecipe(TrainingRecipe):
     validate_every: int = 50
     validation_items: int = 8
 
-    criteria = ("coherent-bands", "bands", "paper", "haspi", "hasqi", "denoising")
+    criteria = ("coherent-bands", "bands", "paper", "haspi", "hasqi", "denoising", "intelligibility")
     shares = ("sounds", "equalised", "noisy", "babble", "unreduced")
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        scored = self.weights.get("haspi", 0.0) or self.weights.get("hasqi", 0.0)
-        wrong = bool(scored) and self.seconds < SHORTEST_SECONDS
-        self._refuse(wrong, ("seconds",), f"{SHORTEST_SECONDS} or more with haspi or hasqi")
+        scored = sum(self.weights.get(name, 0.0) for name in ("haspi", "hasqi", "intelligibility"))
+        wrong = scored > 0.0 and self.seconds < SHORTEST_SECONDS
+        self._refuse(wrong, ("seconds",), f"{SHORTEST_SECONDS} or more with haspi, hasqi or intelligibility")
         self._refuse(self.kind not in KINDS, ("kind",), " or ".join(KINDS))
-        wrong = self.kind != "hearing-aid" and self.unreduced + self.weights.get("denoising", 0.0) > 0.0
-        self._refuse(wrong, ("unreduced", "weights", "kind"), "no denoising but a hearing-aid's")
+        reduced = sum(self.weights.get(name, 0.0) for name in ("denoising", "intelligibility"))
+        wrong = self.kind != "hearing-aid" and self.unreduced + reduced > 0.0
+        self._refuse(wrong, ("unreduced", "weights", "kind"), "no noise reduction but a hearing-aid's")

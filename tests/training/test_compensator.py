@@ -166,6 +166,21 @@ def test_a_hearing_aid_learns_to_amplify_and_to_take_noise_off(data: TrainingDat
     assert set(torch.cat(drawn).tolist()) == {0.0, 1.0} and 0.3 < torch.cat(drawn).mean() < 0.7
 
 
+def test_noise_reduction_alone_leaves_amplification_as_it_is(data: TrainingData) -> None:
+    settings = {"kind": "hearing-aid", "model": {"width": 8, "hidden": 8}, "seconds": 0.8, "noisy": 1.0}
+    recipe = CompensatorRecipe.from_dict(
+        SMALL | settings | {"weights": {"denoising": 1.0, "intelligibility": 1.0}}
+    )
+    module = CompensatorTraining(recipe, EVER, simulator="msbg")
+    noisy = TrainingData(data.speech, noise=data.speech)
+    loss = module.training_loss(
+        CompensatorBatches(recipe, noisy, None).draw(2, torch.Generator().manual_seed(0))
+    )
+    loss.backward()
+    untouched = {name for name, one in module.compensator.named_parameters() if one.grad is None}
+    assert untouched == {f"correct.{layer}.{kind}" for layer in (0, 2, 4) for kind in ("weight", "bias")}
+
+
 def test_a_share_of_the_clips_are_tones_and_clicks(data: TrainingData) -> None:
     def clicks(sounds: float) -> int:
         recipe = CompensatorRecipe.from_dict(SMALL | {"equalised": 0.0, "sounds": sounds})
@@ -200,7 +215,11 @@ def test_sounds_have_no_noise_and_babble_is_the_others_voices(data: TrainingData
         ),
         ({"lr": 0.1}, "unknown settings lr"),
         ({"weights": {"loudness": 1.0}}, "unknown criteria loudness"),
-        ({"weights": {"haspi": 1.0}}, "seconds 0.6 in the recipe; allowed: 0.7 or more with haspi or hasqi"),
+        ({"weights": {"haspi": 1.0}}, "seconds 0.6 in the recipe; allowed: 0.7 or more with haspi, hasqi or"),
+        (
+            {"kind": "hearing-aid", "weights": {"intelligibility": 1.0}, "seconds": 0.5},
+            "0.7 or more with haspi, hasqi or intelligibility",
+        ),
         ({"levels": [80.0, 50.0]}, "a lowest and a highest"),
         ({"batch": 0}, "counts from 1 up"),
         ({"seed": -(2**62)}, "seed -4611686018427387904 in the recipe; allowed: whole numbers between"),
@@ -209,7 +228,7 @@ def test_sounds_have_no_noise_and_babble_is_the_others_voices(data: TrainingData
         ({"kind": "vocoder"}, "kind 'vocoder' in the recipe; allowed: mapping-compensator or hearing-aid"),
         (
             {"weights": {"denoising": 1.0}},
-            "kind 'mapping-compensator' in the recipe; allowed: no denoising but a hearing-aid's",
+            "kind 'mapping-compensator' in the recipe; allowed: no noise reduction but a hearing-aid's",
         ),
         ({"kind": "hearing-aid", "model": {"channels": 2}}, "unknown network settings channels"),
     ],
