@@ -118,7 +118,7 @@ class HearingAid(Wearable):
         return self._reduction(levels, self.start(len(samples), samples))[0]
 
     def _levels(self, powers: Tensor) -> Tensor:
-        """Levels of the bands, of all, and of single frequencies. Shape: as ``control`` -> (..., bands + 1 + bins) dB SPL."""
+        """Levels of the bands, of all, and of single frequencies. Shape: as ``control`` -> (..., bands + 1 + bins)."""
         by_band = powers @ constant_like(powers, shares, self.bands, FRAME)
         bins = powers[..., 1 : self.config.bins + 1]
         return level_db(torch.cat((by_band, powers.sum(-1, keepdim=True), bins), -1))

@@ -41,9 +41,9 @@ def attenuation_error(aid: HearingAid, signal: Tensor, clean: Tensor) -> Tensor:
 def missing_intelligibility(aid: HearingAid, signal: Tensor, clean: Tensor, ears: Tensor) -> Tensor:
     """What HASPI of the aid's output lacks of 1, at the level that the aid gives the clean speech.
 
-    HASPI rewards gain, and noise reduction lowers the level; at equal level it can win only by what it takes off. Wiener's
-    gains do not know that a syllable's onset matters more than the noise before it: a causal estimate of them comes late,
-    and costs what it gains.
+    HASPI rewards gain, and noise reduction lowers the level; at equal level it can win only by what it takes off.
+    Wiener's gains do not know that a syllable's onset matters more than the noise before it: a causal estimate of them
+    comes late there, and loses much of what it won.
 
     Shape: (items, time) twice, in pascals, and (items, 8) dB HL -> (items,).
     """

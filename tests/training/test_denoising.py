@@ -3,7 +3,6 @@
 import torch
 
 from compensators import HearingAid, HearingAidConfig
-from hlsim.audiogram import draw_thresholds
 from hlsim.calibration import level_spl, set_level
 from hlsim.dsp.resample import resample
 from hlsim.metrics import haspi
