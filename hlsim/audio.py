@@ -15,7 +15,14 @@ from hlsim.files import Whole
 
 EXTENSIONS = (".wav", ".flac", ".ogg")
 
+_LARGEST_PAGE, _ENDS = 65_307, 4  # of Ogg: bytes of a page, and the flag of a stream's last one (RFC 3533, 6)
 _STREAMED = 0x7FFF0000  # sizes from here on were written before the length was known: 0x7FFFF000, 0xFFFFFFFF
+
+_HIGHEST_READ, _MOST_CHANNELS = (
+    384_000,
+    64,
+)  # what a header may tell, beyond which it is believed to be broken
+_LOUDEST = 1e9  # a sample, 274 dB SPL where RMS 1.0 is 94: beyond it powers overflow in single precision
 
 _HIGHEST_STORED = {".wav": 2**31 - 1, ".flac": 655_350, ".ogg": 200_000}  # in Hz; libvorbis crashes beyond
 _SUBTYPES = {".wav": "FLOAT", ".flac": "PCM_24", ".ogg": "VORBIS"}
@@ -30,26 +37,31 @@ def read_audio(path: str | Path, *, any_rate: bool = False) -> tuple[Tensor, int
     Returns: float32 samples as they are in the file, (channels, time), and the rate in Hz.
 
     Raises:
-        ValueError: the file is missing, broken, cut off (wav), empty, silent or holds NaN or infinity, or its rate is
-            below 16 kHz or above 48 kHz. The message starts with the path.
+        ValueError: the file is missing, broken, cut off, empty, silent or holds NaN, infinity or samples over 1e9, it has
+            more than 64 channels, or its rate is below 16 kHz or above 48 kHz (384 kHz with ``any_rate``). The message
+            starts with the path.
     """
     check_name(path)
     if not Path(path).is_file():
         raise ValueError(f"{path}: no such file")
-    with _told(path):
-        samples, rate = soundfile.read(str(path), dtype="float32", always_2d=True)
+    with _told(path), soundfile.SoundFile(str(path)) as file:
+        rate = int(file.samplerate)
+        _refuse_header(path, rate, file.channels)
+        samples = file.read(dtype="float32", always_2d=True)
     if samples.shape[0] == 0:
         raise ValueError(f"{path}: empty, no samples")
     waveform = torch.from_numpy(samples.T.copy())
     if not bool(torch.isfinite(waveform).all()):
         raise ValueError(f"{path}: holds samples that are NaN or infinite")
-    if not bool(waveform.any()):
+    if not (peak := float(waveform.abs().max())):
         raise ValueError(f"{path}: silent, every sample is zero")
+    if peak > _LOUDEST:
+        raise ValueError(f"{path}: samples reach {peak:.3g}; allowed: up to {_LOUDEST:g}")
     try:
         check_rate(min(rate, HIGHEST_RATE) if any_rate else rate)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
-    return waveform, int(rate)
+    return waveform, rate
 
 
 def read_stretch(path: str | Path, start: float, seconds: float) -> tuple[Tensor, int]:
@@ -62,6 +74,7 @@ def read_stretch(path: str | Path, start: float, seconds: float) -> tuple[Tensor
     """
     with _told(path), soundfile.SoundFile(str(path)) as file:
         rate, left = int(file.samplerate), max(1, round(seconds * file.samplerate))
+        _refuse_header(path, rate, file.channels)
         file.seek(int(start * rate) % max(1, file.frames))
         pieces = []
         while left > 0:
@@ -85,10 +98,27 @@ def _told(path: str | Path) -> Iterator[None]:
         raise ValueError(f"{path}: not readable as audio ({error}); allowed: wav, flac, ogg") from error
 
 
+def _refuse_header(path: str | Path, rate: int, channels: int) -> None:
+    """Raise ValueError where reading and resampling what a header tells of would take all memory."""
+    if rate > _HIGHEST_READ or channels > _MOST_CHANNELS:
+        raise ValueError(
+            f"{path}: its header tells of {rate} Hz and {channels} channels; allowed: up to {_HIGHEST_READ} Hz and "
+            f"{_MOST_CHANNELS} channels"
+        )
+
+
 def _refuse_cut(path: str | Path) -> None:
-    """Raise ValueError where a wav file holds less than its header tells; libsndfile would read what there is."""
+    """Raise ValueError where a wav file holds less than its header tells, or an Ogg file's last page does not end it;
+    libsndfile would read what there is."""
     with open(path, "rb") as file:
         start = file.read(12)
+        if start[:4] == b"OggS":
+            file.seek(max(0, os.fstat(file.fileno()).st_size - _LARGEST_PAGE))
+            end = file.read()
+            page = end[end.rfind(b"OggS") :]
+            segments = page[27 : 27 + page[26]] if len(page) > 26 else b""
+            if not (segments and page[5] & _ENDS and len(page) >= 27 + len(segments) + sum(segments)):
+                raise ValueError(f"{path}: cut off, its last page does not end the stream")
         if start[:4] != b"RIFF" or start[8:] != b"WAVE":
             return
         while len(chunk := file.read(8)) == 8:

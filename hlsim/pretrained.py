@@ -75,7 +75,7 @@ def read_checkpoint(
     try:
         record = _record(folder)
         weights = (folder / WEIGHTS).read_bytes()
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise ValueError(f"{folder}: not readable as a checkpoint ({error})") from error
     found = record.get("kind") if isinstance(record, dict) else None
     if not isinstance(found, str) or found not in kinds:
@@ -134,7 +134,8 @@ def checkpoint_digest(name: str | Path) -> str:
 
 def checkpoint_about(name: str | Path) -> dict[str, Any]:
     """How a checkpoint was trained, as it tells it. Raises ValueError where there is no such checkpoint."""
-    return dict(_record(find_checkpoint(name)).get("about") or {})
+    about = _record(find_checkpoint(name)).get("about")
+    return dict(about) if isinstance(about, dict) else {}
 
 
 def shipped(kinds: Collection[str] | None = None) -> dict[str, Path]:
@@ -164,10 +165,7 @@ def save_checkpoint(
     Raises:
         ValueError: the folder holds something else.
     """
-    target = Path(folder)
-    empty = not any(target.iterdir()) if target.is_dir() else not target.exists()
-    if not ((target / CONFIG).is_file() or empty):
-        raise ValueError(f"{target}: holds something else; allowed: a new folder, or that of a checkpoint")
+    target = check_replaceable(folder)
     state = {name: tensor.detach().cpu().contiguous() for name, tensor in model.state_dict().items()}
     weights, settings = safetensors.torch.save(state), dict(config)
     hashes = {"sha256": hashlib.sha256(weights).hexdigest(), "config_sha256": _digest(settings)}
@@ -179,6 +177,19 @@ def save_checkpoint(
             (staging / CARD).write_text(card, encoding="utf-8")
         elif (target / CARD).is_file():
             shutil.copy(target / CARD, staging / CARD)
+
+
+def check_replaceable(folder: str | Path) -> Path:
+    """The folder, or ValueError where it is a file or holds anything but a checkpoint: it will be replaced as a whole."""
+    target = Path(folder)
+    if target.exists() and not target.is_dir():
+        raise ValueError(f"{target}: not a folder; allowed: a new folder, or that of a checkpoint")
+    found = {path.name for path in target.iterdir()} if target.is_dir() else set()
+    if others := sorted(found - {WEIGHTS, CONFIG, CARD}):
+        raise ValueError(
+            f"{target}: holds something else ({others[0]}); allowed: a new folder, or that of a checkpoint alone"
+        )
+    return target
 
 
 def _record(folder: Path) -> Any:

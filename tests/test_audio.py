@@ -305,3 +305,34 @@ def test_encoded_flac_is_the_signal_to_16_bits(tmp_path: Path) -> None:
     for bad in (signal * 2, torch.zeros(2, 10), signal / 0):
         with pytest.raises(ValueError, match=r"allowed: \(time,\), samples from -1\.0 to 1\.0"):
             encode_flac(bad, 16000)
+
+
+@pytest.mark.parametrize("ending", [".ogg", ".wav"])
+@pytest.mark.parametrize("share", [0.5, 0.99])
+def test_a_file_that_was_cut_off_is_refused(tmp_path: Path, ending: str, share: float) -> None:
+    path = tmp_path / f"a{ending}"
+    soundfile.write(path, np.random.default_rng(0).uniform(-0.1, 0.1, 48000), 16000)
+    read_audio(path)
+    data = path.read_bytes()
+    path.write_bytes(data[: int(share * len(data))])
+    for read in (read_audio, lambda path: read_stretch(path, 0.0, 1.0)):
+        with pytest.raises(ValueError, match=r"a\.\w+: cut off"):
+            read(path)
+
+
+@pytest.mark.parametrize(("rate", "channels"), [(1_000_000_000, 1), (16000, 250)])
+def test_a_header_that_would_fill_the_memory_is_not_believed(
+    tmp_path: Path, rate: int, channels: int
+) -> None:
+    path = tmp_path / "a.wav"
+    soundfile.write(path, np.full((1000, channels), 0.1), rate)
+    with pytest.raises(
+        ValueError, match=f"a.wav: its header tells of {rate} Hz and {channels} channels; allowed"
+    ):
+        read_audio(path, any_rate=True)
+
+
+def test_samples_whose_powers_overflow_are_refused(tmp_path: Path) -> None:
+    soundfile.write(tmp_path / "a.wav", np.full(1000, 1e18), 16000, subtype="FLOAT")
+    with pytest.raises(ValueError, match=r"a\.wav: samples reach 1e\+18; allowed: up to 1e\+09"):
+        read_audio(tmp_path / "a.wav")

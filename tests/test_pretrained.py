@@ -13,7 +13,7 @@ from compensators import load_compensator
 from hlsim import NeuroMSBG, load_pretrained
 from hlsim.files import repair_folder
 from hlsim.neuro import NeuroConfig
-from hlsim.pretrained import checkpoints_folder, find_checkpoint, save_checkpoint, shipped
+from hlsim.pretrained import checkpoint_about, checkpoints_folder, find_checkpoint, save_checkpoint, shipped
 
 SMALL = NeuroConfig(channels=4, blocks=1)
 
@@ -77,6 +77,29 @@ def test_saving_again_keeps_the_card_and_replaces_the_rest(folder: Path) -> None
     save_checkpoint(folder, "neuro-msbg", NeuroMSBG(SMALL), SMALL.to_dict(), {"seed": 1})
     assert (folder / "README.md").read_text() == "# small\n"
     assert json.loads((folder / "config.json").read_text())["about"] == {"seed": 1}
+    load_pretrained(folder)
+
+
+def test_a_file_of_the_users_own_is_not_deleted(folder: Path) -> None:
+    (folder / "notes.txt").write_text("mine")
+    with pytest.raises(ValueError, match=r"small: holds something else \(notes.txt\); allowed"):
+        save_checkpoint(folder, "neuro-msbg", NeuroMSBG(SMALL), SMALL.to_dict(), {"seed": 1})
+    assert (folder / "notes.txt").read_text() == "mine" and json.loads((folder / "config.json").read_text())
+
+
+def test_configurations_that_would_fill_memory_or_time(folder: Path) -> None:
+    record = json.loads((folder / "config.json").read_text())
+    for name, value in (("fft", 100_000), ("blocks", 200_000), ("channels", 10**9)):
+        changed = {key: one for key, one in record.items() if key != "config_sha256"}
+        changed["config"] = record["config"] | {name: value}
+        (folder / "config.json").write_text(json.dumps(changed))
+        with pytest.raises(ValueError, match=f"{name} {value}; allowed: whole numbers from"):
+            load_pretrained(folder)
+    (folder / "config.json").write_text("[" * 200_000)
+    with pytest.raises(ValueError, match="not readable as a checkpoint"):
+        load_pretrained(folder)
+    (folder / "config.json").write_text(json.dumps(record | {"about": 7}))
+    assert checkpoint_about(folder) == {}
     load_pretrained(folder)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from importlib.util import find_spec
 from pathlib import Path
@@ -15,6 +16,9 @@ if TYPE_CHECKING:
     import torch
 
     from hlsim.audiogram import Audiogram
+
+
+_LONGEST_NAME = 220  # bytes: 255, less what a file is called until it is whole
 
 
 def need(extra: str, *modules: str) -> None:
@@ -41,6 +45,8 @@ def check_files(source: Path, target: Path) -> None:
         raise ValueError(f"{target.parent}: {found}; allowed: an OUT in a folder that is there")
     if not source.exists():
         raise ValueError(f"{source}: no such file")
+    if len(os.fsencode(target.name)) > _LONGEST_NAME:
+        raise ValueError(f"{target}: a name of more than {_LONGEST_NAME} bytes; allowed: a shorter OUT")
     if target.exists() and target.samefile(source):
         raise ValueError(f"{target}: OUT is IN itself; allowed: another file, for IN would be lost")
 
@@ -111,13 +117,26 @@ def read_simulator(name: str, sample_rate: int, full_scale_spl: float = 94.0) ->
 
 
 def read_recipe(path: Path | None) -> dict[str, Any]:
+    """The settings in a YAML file. Raises ValueError where it cannot be read, or names one twice."""
     if path is None:
         return {}
     yaml = require("yaml", "train")
     try:
-        data = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        text = path.read_text(encoding="utf-8")
+        twice = _named_twice(yaml.compose(text, yaml.SafeLoader))
+        data = yaml.safe_load(text)
+    except (OSError, UnicodeDecodeError, RecursionError, yaml.YAMLError) as error:
         raise ValueError(f"{path}: not readable as YAML ({error})") from error
+    if twice:
+        raise ValueError(f"{path}: {twice} is there twice; allowed: once")
     if not isinstance(data, dict):
         raise ValueError(f"{path}: holds no settings; allowed: 'name: value' lines")
     return data
+
+
+def _named_twice(node: Any) -> str | None:
+    """The first name that a node of YAML, or one under it, has twice: YAML's own reader takes the last."""
+    pairs = node.value if getattr(node, "id", "") == "mapping" else []
+    names = [name.value for name, _ in pairs if isinstance(name.value, str)]
+    twice = next((name for name in names if names.count(name) > 1), None)
+    return twice or next(filter(None, (_named_twice(value) for _, value in pairs)), None)

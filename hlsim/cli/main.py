@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import signal
 import sys
+import threading
 from collections.abc import Sequence
 from functools import partial
 from importlib import import_module
@@ -45,6 +47,14 @@ COMMANDS = {
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the program; returns its exit status."""
+    terminated: list[int] = []
+
+    def end(number: int, frame: object) -> None:
+        terminated.append(number)
+        raise KeyboardInterrupt
+
+    main_thread = threading.current_thread() is threading.main_thread()
+    before = signal.signal(signal.SIGTERM, end) if main_thread else None
     try:
         options = _parser().parse_args(arguments)
         options.run(options)
@@ -56,7 +66,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
             "hlsim: stopped; what was finished is kept, and training and reports go on from there with the same command",
             file=sys.stderr,
         )
-        return 130
+        return 128 + (terminated[0] if terminated else signal.SIGINT)
+    finally:
+        if main_thread:
+            signal.signal(signal.SIGTERM, before)
     return 0
 
 

@@ -20,7 +20,17 @@ CHOICES = {
 }
 
 
-_COUNTS = ("fft", "window", "hop", "channels", "dense_depth", "blocks", "expansion", "states", "heads")
+_COUNTS = {
+    "fft": 1024,
+    "window": 1024,
+    "hop": 1024,
+    "channels": 1024,
+    "dense_depth": 8,
+    "blocks": 64,
+    "expansion": 16,
+}
+_COUNTS |= {"states": 256, "heads": 64, "stride": 64, "kernel": 127}
+"""The most of each: beyond, a configuration is a mistake, or is to fill the memory."""
 
 
 @dataclass(frozen=True)
@@ -83,11 +93,11 @@ class NetworkConfig(ModelConfig):
             if not isinstance(pair, list | tuple) or len(pair) != 2:
                 raise ValueError(f"{name} {pair!r}; allowed: two whole numbers, of time and of frequency")
             object.__setattr__(self, name, tuple(pair))
-        for name in (*_COUNTS, "stride", "kernel"):
+        for name, most in _COUNTS.items():
             values, least = getattr(self, name), 0 if name == "dense_depth" else 1
             for value in values if isinstance(values, tuple) else (values,):
-                if not isinstance(value, int) or isinstance(value, bool) or value < least:
-                    raise ValueError(f"{name} {values!r}; allowed: whole numbers of {least} or more")
+                if not isinstance(value, int) or isinstance(value, bool) or not least <= value <= most:
+                    raise ValueError(f"{name} {values!r}; allowed: whole numbers from {least} to {most}")
         uneven = self.block == "transformer" and self.channels % self.heads
         if any(k % 2 == 0 for k in self.kernel) or uneven:
             raise ValueError(

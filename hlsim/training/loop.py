@@ -18,12 +18,11 @@ from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
 from hlsim import __version__
 from hlsim.data.module import BatchData
-from hlsim.files import repair_folder
 from hlsim.pretrained import checkpoint_digest, save_checkpoint
 from hlsim.training.callbacks import DataWait, History, KeepBest, ShowExamples, TimeProgress
 from hlsim.training.module import TimedModule
 from hlsim.training.recipes import TrainingRecipe
-from hlsim.training.state import BEST, CHECKPOINT, LAST, WholeStates, claim
+from hlsim.training.state import BEST, CHECKPOINT, LAST, WholeStates, claimed
 
 
 class RunOptions(TypedDict, total=False):
@@ -151,19 +150,18 @@ def run(
             raise ValueError(
                 f"cannot train with device {accelerator}, devices {devices}, nodes {nodes}, strategy {strategy}: {error}"
             ) from error
-        claim(folder, recipe)  # now that the training can begin
-        repair_folder(folder / CHECKPOINT)
-        # SLURM's end of a job leaves another state, newer than the last validation's
-        left = [path for path in (last, *folder.glob("hpc_ckpt_*.ckpt")) if path.is_file()]
-        newest = max(left, key=lambda path: path.stat().st_mtime_ns, default=None)
-        try:
-            trainer.fit(module, datamodule=data, ckpt_path=newest, weights_only=True)
-            trainer.validate(module, datamodule=data, verbose=False)
-        except SystemExit as end:
-            # Lightning's answer to Ctrl-C, and, as another kind and as if all were done, to SIGTERM
-            if type(end) is not SystemExit:
-                raise SystemExit(128 + signal.SIGTERM) from None
-            if trainer.interrupted:
-                raise KeyboardInterrupt from None
-            raise
-    trainer.save_checkpoint(last)
+        with claimed(folder, recipe, first=trainer.is_global_zero):  # now that the training can begin
+            # SLURM's end of a job leaves another state, newer than the last validation's
+            left = [path for path in (last, *folder.glob("hpc_ckpt_*.ckpt")) if path.is_file()]
+            newest = max(left, key=lambda path: path.stat().st_mtime_ns, default=None)
+            try:
+                trainer.fit(module, datamodule=data, ckpt_path=newest, weights_only=True)
+                trainer.validate(module, datamodule=data, verbose=False)
+            except SystemExit as end:
+                # Lightning's answer to Ctrl-C, and, as another kind and as if all were done, to SIGTERM
+                if type(end) is not SystemExit:
+                    raise SystemExit(128 + signal.SIGTERM) from None
+                if trainer.interrupted:
+                    raise KeyboardInterrupt from None
+                raise
+            trainer.save_checkpoint(last)

@@ -3,18 +3,22 @@
 import io
 import json
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
 import torch
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 
-from hlsim.files import PARTIAL, write_whole
+from hlsim.files import PARTIAL, file_lock, repair_folder, write_whole
+from hlsim.pretrained import check_replaceable
 
 CHECKPOINT, LAST, BEST, RECIPE = "checkpoint", "last.ckpt", "best.json", "recipe.json"
 """The folder with the best model in its released form; the state that a killed training goes on from; the best score so
 far; and what the training is made of."""
+
+_LOCK = "lock"
 
 
 class WholeStates(TorchCheckpointIO):
@@ -40,13 +44,24 @@ class WholeStates(TorchCheckpointIO):
         return state
 
 
-def claim(folder: Path, recipe: Mapping[str, Any]) -> None:
-    """Make a folder this training's, with its recipe in it.
+@contextmanager
+def claimed(folder: Path, recipe: Mapping[str, Any], *, first: bool) -> Iterator[None]:
+    """Make a folder this training's, with its recipe in it, and the first of its processes the only one there.
 
     Raises:
-        ValueError: it holds the state of a training of another recipe.
+        ValueError: another training is running in it, it holds the state of one of another recipe, or its checkpoint's
+            folder holds something else.
     """
     folder.mkdir(parents=True, exist_ok=True)
+    (folder / _LOCK).touch()
+    with file_lock(folder / _LOCK) if first else nullcontext():
+        _claim(folder, recipe)
+        repair_folder(folder / CHECKPOINT)
+        check_replaceable(folder / CHECKPOINT)
+        yield
+
+
+def _claim(folder: Path, recipe: Mapping[str, Any]) -> None:
     for leftover in folder.glob(f".{LAST}.*{PARTIAL}"):  # of a run that was killed
         leftover.unlink(missing_ok=True)
     text = json.dumps(recipe, indent=2, sort_keys=True, default=str)

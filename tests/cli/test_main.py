@@ -1,6 +1,7 @@
 """The program: what it writes, and that bad input ends with status 2, one line and nothing half-written."""
 
 import json
+import signal
 from pathlib import Path
 
 import numpy as np
@@ -228,10 +229,10 @@ def test_folders_keep_their_tree_and_what_cannot_be_read_is_told(
     told = capsys.readouterr()
     assert "left out" in told.err and "1 of 3 files were left out" in told.err
     assert main([*call[:1], str(utterance), str(tmp_path / "alone.wav"), *call[3:]]) == 0
-    alone = (tmp_path / "alone.wav").read_bytes()
+    alone, _ = read_audio(tmp_path / "alone.wav")
     written = {path.relative_to(tmp_path / "out").as_posix() for path in (tmp_path / "out").rglob("*.wav")}
     assert written == {"one.wav", "a/two.wav"}
-    assert all((tmp_path / "out" / name).read_bytes() == alone for name in written)
+    assert all(torch.equal(read_audio(tmp_path / "out" / name)[0], alone) for name in written)
     samples, _ = soundfile.read(utterance)
     level = 94.0 + 10.0 * np.log10(np.mean(samples**2))
     assert f"2 of 3: {tmp_path / 'out' / 'one.wav'}: {level:.1f} dB SPL in, " in told.out.replace(
@@ -484,3 +485,42 @@ def test_haspi_report_of_a_manifest(
         (["--clean", tmp_path], "either the folders clean, before and after, or a manifest"),
     ):
         assert says in fails(capsys, *call, *extra)
+
+
+def test_a_recipe_of_brackets_or_with_a_name_twice(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recipe = tmp_path / "recipe.yaml"
+    call = ["train-compensator", "--speech", tmp_path, "--out", tmp_path / "out", "--config", recipe]
+    recipe.write_text("[" * 3000)
+    assert "not readable as YAML" in fails(capsys, *call)
+    recipe.write_text("batch: 2\nweights:\n  bands: 1.0\n  bands: 2.0\n")
+    assert "recipe.yaml: bands is there twice; allowed: once" in fails(capsys, *call)
+
+
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
+def test_a_stopped_command_says_how_to_go_on(
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    utterance: Path,
+    tmp_path: Path,
+    number: int,
+    status: int,
+) -> None:
+    def stopped(*_: object, **__: object) -> None:
+        signal.raise_signal(number)
+
+    before = signal.getsignal(signal.SIGTERM)
+    monkeypatch.setattr("hlsim.audio.read_audio", stopped)
+    assert main(["compensate", str(utterance), str(tmp_path / "out.wav"), "--audiogram", "N3"]) == status
+    assert "stopped; what was finished is kept" in capsys.readouterr().err
+    assert signal.getsignal(signal.SIGTERM) is before
+
+
+def test_a_name_that_no_disk_takes_is_refused_first(
+    tmp_path: Path, utterance: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / ("a" * 240 + ".wav")
+    assert "a name of more than" in fails(
+        capsys, "simulate", utterance, out, "--audiogram", "N3", "--simulator", "none"
+    )

@@ -163,6 +163,31 @@ def test_being_told_to_end_is_no_interruption(tmp_path: Path) -> None:
     assert signal.getsignal(signal.SIGINT) is before
 
 
+def test_a_second_training_in_the_folder_is_refused_until_the_first_is_over(tmp_path: Path) -> None:
+    refused = []
+
+    def meanwhile(line: str) -> None:
+        if not refused:
+            refused.append(line)
+            with pytest.raises(ValueError, match="another process is writing there"):
+                go(Toy(), tmp_path, max_steps=2)
+
+    go(Toy(), tmp_path, max_steps=4, report=meanwhile)
+    assert refused
+    second = Toy()
+    go(second, tmp_path, max_steps=6)
+    assert second.seen == [4, 5]
+
+
+def test_a_file_of_the_users_in_the_checkpoints_folder_is_told_before_the_training(tmp_path: Path) -> None:
+    (tmp_path / CHECKPOINT).mkdir()
+    (tmp_path / CHECKPOINT / "mine.txt").touch()
+    module = Toy()
+    with pytest.raises(ValueError, match=r"checkpoint: holds something else \(mine.txt\)"):
+        go(module, tmp_path, max_steps=2)
+    assert not module.seen
+
+
 def test_another_recipe_in_the_same_folder_is_refused_and_changes_nothing(tmp_path: Path) -> None:
     go(Toy(), tmp_path, max_steps=2)
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir() if path.is_file()}
