@@ -88,7 +88,8 @@ def test_what_is_played_is_what_the_aid_gives(
 ) -> None:
     devices = Devices(recording, lost=(3, 9))
     monkeypatch.setitem(sys.modules, "sounddevice", devices)
-    assert main(["live", "--audiogram", "n3", "--seconds", "0.05", "--block-ms", "5"]) == 0
+    call = ["live", "--audiogram", "n3", "--seconds", "0.05", "--block-ms", "5"]
+    assert main([*call, "--compensator", "wdrc"]) == 0
     stream = WDRC(full_scale_spl=100.0).stream(EAR)
     stream(torch.zeros(20 * 80))  # before the devices open
     expected = stream(recording).clamp(-1.0, 1.0).numpy()
@@ -202,7 +203,10 @@ def test_simulated_blocks_are_what_is_heard_of_the_whole() -> None:
         (["--audiogram", "N3", "--output", "Phones"], "--output Phones: no such device (No output device"),
         (["--audiogram", "N3", "--compensator", "nalr"], "nalr takes whole signals; allowed: wdrc, or a"),
         (["--audiogram", "N3", "--simulate", "--amplification", "1"], "sliders with --simulate"),
-        (["--audiogram", "N3", "--amplification", "1"], "amplification of wdrc, which has no such slider"),
+        (
+            ["--audiogram", "N3", "--compensator", "wdrc", "--amplification", "1"],
+            "amplification of wdrc, which has no such slider",
+        ),
         (["--audiogram", "N7"], "100"),
     ],
 )
@@ -267,6 +271,7 @@ def test_through_an_audio_server(server: dict[str, str], tmp_path: Path) -> None
     tone = set_level(torch.sin(2.0 * torch.pi * 1000.0 * torch.arange(16000 * 60) / 16000.0), 65.0, 100.0)
     soundfile.write(tmp_path / "tone.wav", tone.numpy(), 16000)
     command = [sys.executable, "-m", "hlsim", "live", "--audiogram", "N3", "--seconds", "6"]
+    command += ["--compensator", "wdrc"]
     command += ["--input", "pulse", "--output", "pulse", "--buffer-ms", "100"]
     # both ask for little at a time: a sink without anybody takes up to two seconds at once
     spoken = ["paplay", "--latency-msec=10", "--device=room", str(tmp_path / "tone.wav")]

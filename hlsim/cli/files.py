@@ -29,8 +29,11 @@ def simulate(parser: Parser) -> None:
 
 def compensate(parser: Parser) -> None:
     _in_and_out(parser, _compensate)
-    text = "nalr (the prescription), wdrc (compression in bands), or a checkpoint's name or folder; one of one ear alone "
-    parser.option("--compensator", str, text + "warns of another", "nalr")
+    text = (
+        "a checkpoint's name or folder (one of one ear alone warns of another), wdrc (compression in bands), or nalr "
+        "(the prescription, which keeps what is above 8 kHz)"
+    )
+    parser.option("--compensator", str, text, "hearing-aid")
     parser.sliders()
 
 

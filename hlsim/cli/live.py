@@ -23,9 +23,9 @@ def live(parser: Parser) -> None:
     parser.audiogram(text="; needed but for --list-devices")
     either = parser.add_mutually_exclusive_group()
     text = (
-        "what runs chunk by chunk: wdrc (compression in bands), or a hearing aid's checkpoint, name or folder"
+        "what runs chunk by chunk: a hearing aid's checkpoint, name or folder, or wdrc (compression in bands)"
     )
-    parser.option("--compensator", str, text, "wdrc", group=either)
+    parser.option("--compensator", str, text, "hearing-aid", group=either)
     text = "hear what that ear hears instead, by neuro-msbg, in blocks of 96 ms and 200 ms late"
     either.add_argument("--simulate", action="store_true", help=text)
     parser.sliders()

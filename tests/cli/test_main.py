@@ -9,7 +9,14 @@ import pytest
 import soundfile
 import torch
 
-from compensators import NALR, HearingAid, MappingCompensator, MappingConfig, save_compensator
+from compensators import (
+    NALR,
+    HearingAid,
+    MappingCompensator,
+    MappingConfig,
+    load_compensator,
+    save_compensator,
+)
 from hlsim import MSBG, Audiogram
 from hlsim.audio import read_audio
 from hlsim.cli.main import main
@@ -105,28 +112,31 @@ def test_the_sliders_of_a_hearing_aid(
     aid = HearingAid(sample_rate=rate).eval()
     save_compensator(aid, tmp_path / "aid")
     call = ["compensate", str(utterance), str(tmp_path / "out.wav"), "--audiogram", "N3"]
+    assert main([*call, "--noise-reduction", "0", "--amplification", "0"]) == 0  # of the default
+    default = load_compensator("hearing-aid", sample_rate=rate)
+    expected = default(waveform, Audiogram.standard("N3"), 0.0, 0.0)
+    torch.testing.assert_close(read_audio(tmp_path / "out.wav")[0], expected, atol=1e-6, rtol=1e-5)
     own = ["--compensator", str(tmp_path / "aid"), "--noise-reduction", "0.5", "--amplification", "0"]
     assert main([*call, *own]) == 0
     expected = aid(waveform, Audiogram.standard("N3"), 0.5, 0.0).detach()
     torch.testing.assert_close(read_audio(tmp_path / "out.wav")[0], expected, atol=1e-6, rtol=1e-5)
     capsys.readouterr()
     assert "noise_reduction of nalr, which has no such slider" in fails(
-        capsys, *call, "--noise-reduction", "1"
+        capsys, *call, "--compensator", "nalr", "--noise-reduction", "1"
     )
     assert "allowed: 0 to 1" in refused(capsys, *call, *own[:2], "--amplification", "2")
 
 
 def test_compensate_is_the_compensator(tmp_path: Path, utterance: Path) -> None:
     out = tmp_path / "out.wav"
-    assert main(["compensate", str(utterance), str(out), "--audiogram", "N3", "--full-scale-spl", "100"]) == 0
+    call = ["compensate", str(utterance), str(out), "--compensator", "nalr", "--audiogram"]
+    assert main([*call, "N3", "--full-scale-spl", "100"]) == 0
     samples, rate = soundfile.read(utterance, dtype="float32")
     expected = NALR(Audiogram.standard("N3"), sample_rate=rate)(torch.from_numpy(samples))
     aided, _ = soundfile.read(out, dtype="float32")
     np.testing.assert_allclose(aided, expected.numpy(), atol=1e-7)
     assert np.std(aided) > 1.5 * np.std(samples)
-    assert (
-        main(["compensate", str(utterance), str(out), "--audiogram", "N7"]) == 0
-    )  # which no simulator takes
+    assert main([*call, "N7"]) == 0  # which no simulator takes
 
 
 @pytest.mark.parametrize(("ear", "warned"), [("N4", False), ("N3", True)])
@@ -223,7 +233,8 @@ def test_folders_keep_their_tree_and_what_cannot_be_read_is_told(
         (tmp_path / "in" / name).write_bytes(utterance.read_bytes())
     (tmp_path / "in" / "a" / "broken.wav").write_text("this is no audio")
     call = ["compensate", str(tmp_path / "in"), str(tmp_path / "out"), "--audiogram", "N3"]
-    assert main([*call, "--compensator", "nobody"]) == 2
+    call += ["--compensator", "nalr"]
+    assert main([*call[:-1], "nobody"]) == 2
     assert "no checkpoint 'nobody'" in capsys.readouterr().err and not (tmp_path / "out").exists()
     assert main(call) == 2
     told = capsys.readouterr()
