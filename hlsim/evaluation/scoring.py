@@ -39,6 +39,10 @@ class FileItem:
         snr: of the speech in noise, in dB, where known.
         full_scale_spl: level in dB SPL of a file whose RMS is 1.0.
         spl: or else the level of the clean file in dB SPL; the processed files are on the same scale.
+
+    Raises:
+        ValueError: a name, condition or listener with characters that do not print: reports in LaTeX, Markdown and HTML
+            would take line breaks and changes of direction for more than text.
     """
 
     name: str
@@ -50,6 +54,13 @@ class FileItem:
     snr: float | None = None
     full_scale_spl: float = 94.0
     spl: float | None = None
+
+    def __post_init__(self) -> None:
+        for text in (self.name, self.listener, *self.processed):
+            if not text.isprintable():
+                raise ValueError(
+                    f"{text!r} holds characters that do not print; allowed: names of one line that do"
+                )
 
     def full_scale(self, clean_dbfs: float) -> float:
         """Level in dB SPL of RMS 1.0, from that of the clean file relative to RMS 1.0."""

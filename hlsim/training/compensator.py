@@ -42,8 +42,12 @@ class CompensatorTraining(TimedModule):
         criterion = counted or "coherent-bands"  # for the examples, where nothing is learned through it
         self.loss = HearingLossLoss(simulator=simulator, reference=recipe.reference, criterion=criterion)
         self.hears = bool(counted)
-        if isinstance(self.compensator, HearingAid) and not self.hears:
-            self.compensator.correct.requires_grad_(False)  # or HASPI would amplify
+        if isinstance(aid := self.compensator, HearingAid):
+            if not self.hears:
+                aid.correct.requires_grad_(False)  # or HASPI would amplify
+            elif recipe.unreduced == 1.0 and not (self.denoising or self.intelligibility):
+                for part in (aid.enter, aid.recur, aid.leave):  # or weight decay would go on
+                    part.requires_grad_(False)
 
     def training_loss(self, batch: Batch) -> Tensor:
         signal, clean, ears = (batch[name] for name in ("signal", "clean", "thresholds"))

@@ -124,6 +124,14 @@ HEADER = "listener,ear,condition,clean,processed,audiogram,spl,full_scale_spl,sn
     [
         ((HEADER, "L1,both,u,c.wav,u.wav,N3,,,"), "line 2: ear is 'both'; allowed: left, right"),
         ((HEADER, "L1,l,,c.wav,u.wav,N3,,,"), "line 2: no condition"),
+        (
+            (HEADER, 'L1,l,"a\n\\input{/etc/passwd}",c.wav,u.wav,N3,,,'),
+            "holds characters that do not print; allowed",
+        ),
+        (
+            (HEADER, "L1\u202e,l,a,c.wav,u.wav,N3,,,"),
+            r"'L1\\u202e.*' holds characters",
+        ),
         ((HEADER, "L1,l,u,c.wav,u.wav,N9,,,"), "line 2: no standard audiogram 'N9'"),
         ((HEADER, "L1,l,u,c.wav,u.wav,N3,65,94,"), "line 2: both spl and full_scale_spl"),
         ((HEADER, "L1,l,u,c.wav,u.wav,N3,loud,,"), "line 2: spl is 'loud'; allowed: a number of dB"),
