@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from hlsim.loss import HearingLossLoss
     from hlsim.msbg import MSBG, estimate_delay
     from hlsim.neuro import NeuroMSBG
-    from hlsim.pretrained import load_pretrained
+    from hlsim.pretrained import list_pretrained, load_pretrained
 
 __version__ = "0.1.0"
 
@@ -22,6 +22,7 @@ __all__ = [
     "HearingLossLoss",
     "NeuroMSBG",
     "estimate_delay",
+    "list_pretrained",
     "load_pretrained",
 ]
 
@@ -33,6 +34,7 @@ _MODULES = {
     "HearingLossLoss": "hlsim.loss",
     "NeuroMSBG": "hlsim.neuro",
     "estimate_delay": "hlsim.msbg",
+    "list_pretrained": "hlsim.pretrained",
     "load_pretrained": "hlsim.pretrained",
 }
 

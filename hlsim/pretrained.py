@@ -58,6 +58,11 @@ def load_pretrained(
     return model.eval().requires_grad_(False)
 
 
+def list_pretrained() -> dict[str, str]:
+    """The checkpoints that ship with hlsim, and the function that loads each."""
+    return {name: _LOADERS[_record(folder)["kind"]] for name, folder in shipped().items()}
+
+
 def read_checkpoint(
     name: str | Path,
     kinds: Mapping[str, type[Config]],

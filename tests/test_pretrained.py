@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from compensators import load_compensator
-from hlsim import NeuroMSBG, load_pretrained
+from hlsim import NeuroMSBG, list_pretrained, load_pretrained
 from hlsim.files import repair_folder
 from hlsim.neuro import NeuroConfig
 from hlsim.pretrained import checkpoint_about, checkpoints_folder, find_checkpoint, save_checkpoint, shipped
@@ -213,6 +213,14 @@ def test_folder_of_a_training_names_the_checkpoint_in_it(folder: Path) -> None:
     folder.rename(folder.with_name("checkpoint"))
     with pytest.raises(ValueError, match=r"no checkpoint '.*', but '.*checkpoint' is one; allowed: "):
         load_pretrained(folder.parent)
+
+
+def test_what_ships_is_listed_with_what_loads_it() -> None:
+    loaders = {"hlsim.load_pretrained": load_pretrained, "compensators.load_compensator": load_compensator}
+    listed = list_pretrained()
+    assert {"neuro-msbg", "neuro-msbg-lstm", "compensator-general", "hearing-aid"} <= set(listed)
+    for name, loader in listed.items():
+        loaders[loader](name)
 
 
 def test_shipped_checkpoint() -> None:
