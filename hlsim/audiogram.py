@@ -127,6 +127,22 @@ class Audiogram:
         """MSBG's degree of loss: none, mild, moderate or severe, by the mean threshold from 2 to 8 kHz."""
         return severity_of(self.thresholds)
 
+    def plot(self, axes: Any = None, **style: Any) -> Any:
+        """Draw it: dB HL downwards over octaves, with MSBG's degrees of loss (``SEVERITY_LIMITS``) as bands.
+
+        Args:
+            axes: matplotlib's, which may hold other ears; by default those of a new figure of pyplot.
+            style: of the line, such as ``color="tab:red"`` and ``label="right"``.
+
+        Returns: the axes.
+
+        Raises:
+            MissingExtraError: matplotlib is not installed.
+        """
+        from hlsim.audiogram_plot import plot_audiogram
+
+        return plot_audiogram(self, axes, **style)
+
     def to_dict(self) -> dict[str, list[float]]:
         """A plain dictionary that JSON can hold."""
         return {"levels": list(self.levels), "frequencies": list(self.frequencies)}

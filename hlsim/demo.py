@@ -16,15 +16,25 @@ from hlsim.audiogram import Audiogram
 from hlsim.calibration import level_spl, set_level
 from hlsim.dsp.resample import resample
 from hlsim.evaluation import HaspiReport, ItemScore
-from hlsim.evaluation.judging import NORMAL, Unaided
+from hlsim.evaluation.gain_curves import gain_curves
+from hlsim.evaluation.items import INPUT_LEVELS
+from hlsim.evaluation.judging import NORMAL, AtLevelOf, Unaided
 from hlsim.evaluation.scoring import HaspiItem, haspi_many
 from hlsim.metrics.pair import check_pair
 from hlsim.msbg import MSBG
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.parallel import one_thread
-from hlsim.report.haspi import markdown, write_report
-from hlsim.report.pictures import draw_spectrograms
-from hlsim.report.tables import Table
+from hlsim.report.demo import (
+    AS_LOUD,
+    NORMAL_EAR,
+    PRESCRIBED,
+    TRAINED,
+    UNAIDED,
+    Sounds,
+    demo_front,
+    result_table,
+)
+from hlsim.report.haspi import write_report
 from hlsim.training.batches import TrainingData
 from hlsim.training.compensator import train_compensator
 from hlsim.training.recipes import CompensatorRecipe
@@ -34,7 +44,6 @@ SPEECH_LEVEL = 65.0
 
 FEWEST_SCORED = 8
 
-_HEARD = "level heard, against a normal ear (dB)"
 _EMBEDDED = Path(__file__).parent / "data" / "speech"
 _LONGEST = 5.0  # seconds of an utterance that are scored: HASPI takes half as long
 
@@ -48,7 +57,7 @@ def demo(
     seed: int = 0,
     report: Callable[[str], None] = print,
 ) -> str:
-    """Train, score, and write report, audio and pictures into a folder; returns the report as Markdown.
+    """Train, score, and write report, audio and pictures into a folder; returns the result in short, for a terminal.
 
     Args:
         speech: folder to use instead of the embedded speech; every third file is scored and not trained on.
@@ -71,42 +80,43 @@ def demo(
             data, recipe, out=where, audiogram=audiogram, max_minutes=minutes, report=report
         )
     torch.manual_seed(seed)
-    conditions: dict[str, nn.Module] = {
-        "unaided": Unaided(),
-        "nalr": NALR(),
-        "initial": MappingCompensator(MappingConfig.from_dict(recipe.model)).eval(),
-        "compensated": load_compensator(checkpoint),
+    trained, nalr = load_compensator(checkpoint), NALR()
+    start = MappingCompensator(MappingConfig.from_dict(recipe.model)).eval()
+    # each with the name of its keys in report.json
+    conditions: dict[str, tuple[str, nn.Module]] = {
+        UNAIDED: ("unaided", Unaided()),
+        PRESCRIBED: ("nalr", nalr),
+        AS_LOUD: ("nalr_as_loud", AtLevelOf(nalr, trained)),
+        "untrained start": ("initial", start),
+        TRAINED: ("compensated", trained),
     }
     report(f"scoring {len(scored)} other utterances by HASPI, {len(conditions)} conditions")
     ear, normal = (MSBG(a, sample_rate=NEURO_RATE) for a in (audiogram, NORMAL))
-    heard: dict[str, list[Tensor]] = {}
-    haspi: dict[str, list[float]] = {}
-    levels: dict[str, list[float]] = {}
     with torch.no_grad():
-        normally = fmean(_levels([normal(utterance) for utterance in clean]))
-        extra: dict[str, object] = {"normal_heard_level_mean": normally}
-        rows = []
-        for name, model in conditions.items():
-            given = [model(utterance, audiogram) for utterance in clean]
-            pairs = zip(clean, given, strict=True)
-            items = [HaspiItem(utterance, aided, audiogram, NEURO_RATE) for utterance, aided in pairs]
-            haspi[name], levels[name] = haspi_many(items, seed=seed % 2**32), _levels(given)
-            heard[name] = [ear(signal) for signal in given]
-            mean, level = fmean(haspi[name]), fmean(levels[name])
-            off = fmean(_levels(heard[name])) - normally
-            report(f"  {name}: mean HASPI {mean:.3f}")
-            rows.append((name, f"{mean:.3f}", f"{level:.1f}", f"{off:+.1f}"))
-            extra |= {f"{name}_mean": mean, f"{name}_level_mean": level}
-            extra |= {f"{name}_heard_difference_db": off, f"{name}_haspi": haspi[name]}
-
+        given = {name: [model(one, audiogram) for one in clean] for name, (_, model) in conditions.items()}
+        heard = {name: [ear(signal) for signal in signals] for name, signals in given.items()}
+        heard[NORMAL_EAR] = [normal(utterance) for utterance in clean]
+    haspi: dict[str, list[float]] = {}
+    for name, signals in given.items():
+        pairs = zip(clean, signals, strict=True)
+        haspi[name] = haspi_many(
+            [HaspiItem(*pair, audiogram, NEURO_RATE) for pair in pairs], seed=seed % 2**32
+        )
+        report(f"  {name}: mean HASPI {fmean(haspi[name]):.3f}")
+    levels, heard_levels = ({name: _levels(own) for name, own in of.items()} for of in (given, heard))
+    normally = fmean(heard_levels[NORMAL_EAR])
+    heard_off = {name: fmean(heard_levels[name]) - normally for name in conditions}
+    extra: dict[str, object] = {"normal_heard_level_mean": normally}
+    for name, (key, _) in conditions.items():
+        extra |= {f"{key}_mean": fmean(haspi[name]), f"{key}_level_mean": fmean(levels[name])}
+        extra[f"{key}_heard_difference_db"] = heard_off[name]
     names = _names(scored, speech)
-    ends = {"before": "unaided", "after": "compensated"}
     scores = [
         ItemScore(
             file=names[i],
-            scores={"haspi": {end: haspi[name][i] for end, name in ends.items()}},
+            scores={"haspi": {name: haspi[name][i] for name in conditions}},
             clean_level=float(level_spl(clean[i])),
-            levels={end: levels[name][i] for end, name in ends.items()},
+            levels={name: levels[name][i] for name in conditions},
             audiogram=audiogram,
             sample_rate=NEURO_RATE,
             seconds=len(clean[i]) / NEURO_RATE,
@@ -115,16 +125,16 @@ def demo(
         for i in range(len(scored))
     ]
     result = HaspiReport(items=scores, seed=seed, extra=extra)
-    write_report(result, folder)
-    header = ("what the ear is given", "HASPI mean", "level given (dB SPL)", _HEARD)
-    text = f"# {_name(audiogram)}\n\n{markdown(result)}\n{Table('', header, rows).markdown()}\n"
-    (folder / "report.md").write_text(text, encoding="utf-8")
-    _write_audio(folder / "audio", names, clean, heard)
-    panel = {f"heard, {name}": heard[name][0] for name in ("unaided", "nalr", "compensated")}
-    panel = {"original": clean[0], **panel}
-    (folder / "spectrograms.png").write_bytes(draw_spectrograms(panel, NEURO_RATE))
-    report(f"report, audio and pictures are in {folder}")
-    return text
+    shortest = torch.stack([utterance[: min(map(len, clean))] for utterance in clean])
+    curves = gain_curves(
+        {PRESCRIBED: nalr, TRAINED: trained}, {_name(audiogram): audiogram}, shortest, INPUT_LEVELS
+    )
+    table = result_table(result, heard_off)
+    front, picture = demo_front(result, table, Sounds(names, clean, given, heard), curves)
+    write_report(result, folder, front=front)
+    (folder / "spectrograms.png").write_bytes(picture)
+    _write_audio(folder / "audio", names, clean, {key: heard[name] for name, (key, _) in conditions.items()})
+    return f"\n{front.lead}\n\n{table.text()}\n\nThe page: {folder / 'report.html'}"
 
 
 def _split(speech: str | Path | None) -> tuple[list[Path], list[Path]]:
@@ -152,11 +162,10 @@ def _names(files: list[Path], speech: str | Path | None) -> list[str]:
 
 
 def _write_audio(folder: Path, names: list[str], clean: list[Tensor], heard: dict[str, list[Tensor]]) -> None:
-    """Three files an utterance, all by one gain, so that their loudness can be compared."""
+    """The original and what is heard of each condition, by one gain an utterance, so that their loudness can be compared."""
     folder.mkdir(parents=True, exist_ok=True)
     for i, name in enumerate(names):
-        ends = {f"heard-{name}": heard[name][i] for name in ("unaided", "compensated")}
-        signals = {"original": clean[i], **ends}
+        signals = {"original": clean[i], **{f"heard-{name}": own[i] for name, own in heard.items()}}
         peak = max(float(signal.abs().max()) for signal in signals.values())
         for kind, signal in signals.items():
             write_audio(folder / f"{name}-{kind}.wav", 0.9 * signal / peak, NEURO_RATE)

@@ -79,7 +79,11 @@ class Comparison:
 
     def in_words(self) -> str:
         """What the figures show, and what they do not, in plain sentences."""
-        return " ".join((self.in_short(), self._level(), self._nesting(), self._reach()))
+        return f"{self.in_short()} {self.limits()}"
+
+    def limits(self) -> str:
+        """What the figures do not show."""
+        return " ".join((self._level(), self._nesting(), self._reach()))
 
     def in_short(self) -> str:
         """The change, and whether chance explains it."""
@@ -99,21 +103,37 @@ class Comparison:
         return text
 
     def _chance(self) -> str:
-        defined = [
-            (n, p) for n, p in (("t-test", self.p_t_holm), ("Wilcoxon", self.p_w_holm)) if p is not None
-        ]
+        defined = self._defined()
         if not defined:
             return "Neither test is defined for these figures, so they do not tell a change from chance."
         named = ", ".join(f"{name} {p_text(p)}" for name, p in defined)
         if self.comparisons > 1:
             named += f", Holm-adjusted for {self.comparisons} comparisons"
-        against = [p < ALPHA for name, p in defined if name == "t-test" or self._wilcoxon_can()]
+        against = self._against_chance()
         few = "" if self._wilcoxon_can() else f"; with so few Wilcoxon's cannot fall below {ALPHA:g}"
         if against and all(against):
             return f"Chance alone hardly explains it ({named}{few})."
         if any(against):
             return f"The tests disagree on whether chance explains it ({named})."
         return f"It cannot be told from chance ({named}{few}), which does not show that there is no change."
+
+    @property
+    def sure(self) -> bool:
+        """Whether every test that could tell the change from chance does."""
+        against = self._against_chance()
+        return bool(against) and all(against)
+
+    @property
+    def level_alike(self) -> bool:
+        """Whether the mean levels differ by less than what is held to explain a score."""
+        return abs(self.level_after_mean - self.level_before_mean) < _AUDIBLE
+
+    def _defined(self) -> list[tuple[str, float]]:
+        tests = (("t-test", self.p_t_holm), ("Wilcoxon", self.p_w_holm))
+        return [(name, p) for name, p in tests if p is not None]
+
+    def _against_chance(self) -> list[bool]:
+        return [p < ALPHA for name, p in self._defined() if name == "t-test" or self._wilcoxon_can()]
 
     def _wilcoxon_can(self) -> bool:
         """Whether its adjusted p is below ``ALPHA``, or would be if all pairs changed the same way."""
@@ -127,7 +147,7 @@ class Comparison:
         if not measure.of_an_ear:
             return f"{self.title} knows neither loss nor level: it rates the signal at the ear, not what is heard."
         louder = self.level_after_mean - self.level_before_mean
-        if abs(louder) < _AUDIBLE:
+        if self.level_alike:
             return (
                 f"The mean level changed by {louder:+.1f} dB only, so that gain overall does not explain it."
             )

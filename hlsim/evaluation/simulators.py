@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -144,7 +143,7 @@ def evaluate_simulators(
         entries[name] = {"inputs": {given: summarise(part) for given, part in of.items()}, "items": rows}
     result = {"teacher": told, "items": items, "seconds": seconds, "seed": seed}
     result |= {"levels": [*levels], "inputs": [*inputs], "simulators": entries}
-    shown, truth = _shown(drawn, [item for item, _ in tasks], reference)
+    shown, truth = _shown([item for item, _ in tasks], reference)
     heard_of = {"truth": truth}
     for name, simulator in simulators.items():
         with contextlib.suppress(Exception), torch.no_grad():  # its failure is in the tables
@@ -208,10 +207,17 @@ def _both(clean: Tensor, heard: Tensor, whose: str) -> dict[str, Any]:
     return {name: score.value for name, score in scores.items()} | {"reasons": reasons}
 
 
-def _shown(items: Sequence[Item], others: Iterable[Item], reference: Reference | None) -> tuple[Item, Tensor]:
-    """The item of the spectrograms and its truth: the first of moderate loss, or of all, or of the others, with one."""
-    reason: Exception | None = None
-    for item in chain(sorted(items, key=lambda item: item.about["severity"] != "moderate"), others):
+def _shown(items: Sequence[Item], reference: Reference | None) -> tuple[Item, Tensor]:
+    """The item of the spectrograms and its truth: of the first input, a moderate loss, loud and clean where there is one,
+    for much is lost of it and much still heard."""
+    first, reason = items[0].about["input"], None
+
+    def rank(item: Item) -> tuple[Any, ...]:
+        about = item.about
+        degree = ("moderate", "mild", "severe", "none").index(about["severity"])
+        return about["input"] != first, degree, -about["level"], about["condition"]
+
+    for item in sorted(items, key=rank):
         try:
             return item, _truth(item, reference)
         except Exception as error:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,10 +17,11 @@ from hlsim.evaluation.compensator_result import HARD, NOISIER_DB
 from hlsim.evaluation.gain_curves import UTTERANCES
 from hlsim.evaluation.haspi_report import GAIN_NOTE, HaspiReport
 from hlsim.evaluation.steadiness import DELAYS, QUIET
+from hlsim.report.gain_pictures import gain_picture, gains_at, input_output_picture, tone_picture
 from hlsim.report.haspi import scored_by
-from hlsim.report.page import Picture, Section, render_markdown, render_page, write_files
-from hlsim.report.pictures import draw_svg, frequency_axis, plain, report_pictures
-from hlsim.report.tables import Table, cells, change_name, number, paired_cells, spread
+from hlsim.report.page import Section, render_markdown, render_page, write_files
+from hlsim.report.pictures import report_pictures
+from hlsim.report.tables import Table, cells, change_name, number, paired_cells, spread, verdict
 
 FILES = ("compensators.json", "compensators.md", "compensators.html")
 
@@ -37,54 +39,73 @@ _paired = partial(paired_cells, digits=2)
 
 def write_compensators(result: Result, reports: Mapping[str, HaspiReport], out: str | Path) -> None:
     """Write what ``evaluate_compensators`` returns into a folder, each file whole or not at all, or ValueError."""
-    page = ("Compensators", _sections(result, reports), _lead(result))
+    title, sections, lead = "Compensators", _sections(result, reports), " ".join(result["notes"])
     text = json.dumps(result, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
-    contents = (text, render_markdown(*page), render_page(*page))
+    flat = [replace(section, folded=False) for section in sections]
+    contents = (text, render_markdown(title, flat, lead), render_page(title, sections, lead))
     write_files(out, dict(zip(FILES, contents, strict=True)))
 
 
-def _lead(result: Result) -> str:
+def _in_short(result: Result, reports: Mapping[str, HaspiReport]) -> list[str]:
+    """Each compensator against NAL-R at its own level, and what all is of."""
+    told = []
+    for group, speech in (("clean", "clean speech"), ("noisy", "speech in noise")):
+        for c in reports[group].comparisons if group in reports else ():
+            if (c.measure, c.before) == ("haspi", f"NAL-R at {c.after}{_AT_LEVEL}"):
+                told.append(f"On {speech} {verdict(c, c.after, 'NAL-R made as loud')}.")
+    return [*told, _about(result)]
+
+
+def _about(result: Result) -> str:
     levels = ", ".join(f"{level:g}" for level in result["levels"])
     # few items do not come to every ear
     ears = len({row["name"] for row in (*result["rows"], *result["failures"])})
     made_by = scored_by(result["engine"], result["versions"])
-    about = (
+    return (
         f"{result['items']} items of {result['seconds']:g} s, {ears} ears in turn, speech at {levels} "
         f"dB SPL in turn, seed {result['seed']}: {', '.join(result['limits'])}. HASPI v2 and HASQI v2, {made_by}, "
         "are against the clean speech, in noise too."
     )
-    return " ".join([*result["notes"], about])
 
 
 def _sections(result: Result, reports: Mapping[str, HaspiReport]) -> list[Section]:
     whole = [group for group in ("clean", "noisy") if group in reports]
-    sections = [
-        Section(
-            GROUPS[group],
-            [GAIN_NOTE] if group == "clean" else [],
-            [_main_table(result, group), _tests_table(report, result["beside"])],
-        )
-        for group, report in reports.items()
+    sections = [Section("In short", _in_short(result, reports))]
+    sections += [
+        Section(GROUPS[group], [GAIN_NOTE] if group == "clean" else [], [_main_table(result, group)])
+        for group in reports
     ]
     loudness = [_loudness_table(result, group) for group in whole]
     by_severity = [_severity_table(result, group) for group in whole]
-    by_severity += [_severity_tests(reports[group], group, result["beside"]) for group in whole]
     shifts = _SHIFTS.format(len(result["shifts"][0]["items"]), " or ".join(map(str, DELAYS)))
     curves = result["gain_curves"]
-    gains = [_gain_picture(ear, curves) for ear in dict.fromkeys(curve["ear"] for curve in curves)]
+    shown = dict.fromkeys(curve["ear"] for curve in curves)
+    gains, tones = [gain_picture(ear, curves) for ear in shown], result["steady_tones"]
+    as_heard = [tone_picture(ear, tones) for ear in shown]
+    if "clean" in reports:
+        own = result["groups"]["clean"]["conditions"].items()
+        gains.append(input_output_picture({name: row for name, row in own if not name.endswith(_AT_LEVEL)}))
     sections += [
         Section("As loud as a normal ear hears it?", [_LOUDNESS], loudness),
         Section("By degree of loss", [_HASQI], by_severity),
         _gap_section(result),
         Section("Does any output pass the limit?", (), [_peak_table(result)]),
         Section("Gain curves", [_GAINS], [_gain_table(curves)], gains),
-        Section("Steady tones", [_STEADY], [tone_table(result["steady_tones"])]),
-        Section("Could it be worn?", [_WEARING], [wearing_table(result["wearing"], result["steady_tones"])]),
+        Section("Steady tones", [_STEADY], [tone_table(tones)], as_heard),
+        Section("Could it be worn?", [_WEARING], [wearing_table(result["wearing"], tones)]),
         Section("Does it matter where frames fall?", [shifts], [shift_table(result["shifts"])]),
     ]
     for group in whole:
         title = f"Pictures: {GROUPS[group].lower()}"
         sections.append(Section(title, pictures=report_pictures(reports[group])))
+    sections += [
+        Section(
+            f"Paired tests: {GROUPS[group].lower()}", tables=_tests(report, result["beside"]), folded=True
+        )
+        for group, report in reports.items()
+    ]
+    by_degree = [_severity_tests(reports[group], group, result["beside"]) for group in whole]
+    sections.append(Section("Paired tests by degree of loss", tables=by_degree, folded=True))
     if result["failures"]:
         rows = [(str(f["item"]), f["compensator"], f["name"], f["reason"]) for f in result["failures"]]
         table = Table("Outputs that could not be judged", ("Item", "Compensator", "Ear", "Reason"), rows)
@@ -166,6 +187,7 @@ _GAPS = {
     "Neuro to pyclarity, median item": ("item_median", ".1%"),
 }
 _GIVEN = "What the ear is given"
+_AT_LEVEL = "'s level"  # ends the names of what is as loud as a compensator
 
 
 def _main_table(result: Result, group: str) -> Table:
@@ -183,15 +205,17 @@ def _by_snr(row: Result) -> dict[str, str]:
     return {f"HASPI under / over {NOISIER_DB:g} dB SNR": " / ".join(number(part, ".3f") for part in parts)}
 
 
-def _tests_table(report: HaspiReport, beside: Beside) -> Table:
-    """Each condition against those that a user would pick instead."""
-    rows = []
+def _tests(report: HaspiReport, beside: Beside) -> list[Table]:
+    """A table a condition: against those that a user would pick instead."""
+    rows: dict[str, list[dict[str, str]]] = {}
     for c in _against(report, beside):
         means = "n/a" if c.listeners is None else _paired(c.listeners)["t-test (paired)"]
+        about = {"Against": f"{c.before.replace(c.after + _AT_LEVEL, 'its level')}, {c.title}"}
         paired = _paired(c.overall, c.p_t_holm, c.p_w_holm)
-        about = {"Change": change_name(c), "n": str(c.overall.n)}
-        rows.append({**about, **paired, "t over means of ears": means})
-    return Table.of("Paired tests, p adjusted by Holm within each measure", rows)
+        own = {**about, "n": str(c.overall.n), **paired, "t over means of ears": means}
+        rows.setdefault(c.after, []).append(own)
+    title = "{}: change, and paired tests with p adjusted by Holm within each measure"
+    return [Table.of(title.format(name), own) for name, own in rows.items()]
 
 
 def _severity_tests(report: HaspiReport, group: str, beside: Beside) -> Table:
@@ -266,10 +290,9 @@ def _peak_table(result: Result) -> Table:
 
 
 def _gain_table(curves: Sequence[Result]) -> Table:
-    """Gains between the bands' centres go linearly over log frequency."""
     shown = FREQUENCIES[:-1]  # 8 kHz is beyond the bands
     rows = [
-        [_tone_name(curve, level), *(f"{gain:+.1f}" for gain in _gains_at(shown, curve, gains))]
+        [_tone_name(curve, level), *(f"{gain:+.1f}" for gain in gains_at(shown, curve, gains))]
         for curve in curves
         for level, gains in zip(curve["levels"], curve["gain_db"], strict=True)
     ]
@@ -327,31 +350,6 @@ _TONE = "Ear, compensator, input"
 
 def _tone_name(row: Result, level: float) -> str:
     return f"{row['ear']}, {row['compensator']}, {level:g} dB SPL"
-
-
-def _gain_picture(ear: str, curves: Sequence[Result]) -> Picture:
-    curves = [curve for curve in curves if curve["ear"] == ear]
-
-    def draw(axes: Any) -> None:
-        for k, curve in enumerate(curves):
-            for style, level, gains in zip(
-                ("-", "--", ":", "-."), curve["levels"], curve["gain_db"], strict=False
-            ):
-                label = plain(f"{curve['compensator'][:18]}, {level:g}")
-                axes.plot(curve["frequencies"], gains, style, color=f"C{k}", label=label)
-        axes.set(ylabel="insertion gain (dB)")
-        frequency_axis(axes, (250, 500, 1000, 2000, 4000))
-        axes.legend(fontsize="x-small")
-
-    gains = [[f"{_gains_at(2000.0, curve, row):.0f}" for row in curve["gain_db"]] for curve in curves]
-    at_2k = [f"{curve['compensator']} {', '.join(own)}" for curve, own in zip(curves, gains, strict=True)]
-    levels = ", ".join(f"{level:g}" for level in curves[0]["levels"])
-    alt = f"Insertion gain for {ear} over frequency; at 2 kHz and {levels} dB SPL: {'; '.join(at_2k)} dB."
-    return Picture(draw_svg(draw), alt, f"{ear}; the legend tells the input level in dB SPL.")
-
-
-def _gains_at(hertz: Any, curve: Result, gains: Sequence[float]) -> Any:
-    return np.interp(np.log(hertz), np.log(curve["frequencies"]), gains)
 
 
 def _scores(row: Result) -> dict[str, str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from hlsim.audiogram import SEVERITIES
@@ -19,7 +20,18 @@ from hlsim.report.tables import Table, comparisons_table, listener_table, number
 REPORT_FILES = ("report.json", "report.md", "report.tex", "report.html", "before-after.png")
 
 
-def write_report(report: HaspiReport, out_dir: str | Path, *, listen: int = 3) -> Path:
+@dataclass(frozen=True)
+class Front:
+    """What a page begins with in place of the report's title and lead; the report's own sections follow, folded."""
+
+    title: str
+    lead: str
+    sections: Sequence[Section]
+
+
+def write_report(
+    report: HaspiReport, out_dir: str | Path, *, listen: int = 3, front: Front | None = None
+) -> Path:
     """Write ``report.json``, ``.md``, ``.tex``, ``.html`` and ``before-after.png`` into a folder; returns it.
 
     Reports of an earlier run are replaced, other files stay. ``listen`` items have spectrograms and players on the page,
@@ -34,20 +46,25 @@ def write_report(report: HaspiReport, out_dir: str | Path, *, listen: int = 3) -
         text = json.dumps(report.to_dict(), indent=2, ensure_ascii=False, allow_nan=False)
     except (TypeError, ValueError) as error:
         raise ValueError(f"report cannot be written as JSON: {error}") from error
-    contents = (text + "\n", markdown(report), latex(report), html(report, listen), draw_report(report))
+    pages = markdown(report, front), latex(report), html(report, listen, front)
+    contents = (text + "\n", *pages, draw_report(report))
     return write_files(out_dir, dict(zip(REPORT_FILES, contents, strict=True)))
 
 
-def markdown(report: HaspiReport) -> str:
+def markdown(report: HaspiReport, front: Front | None = None) -> str:
     """What ``report.md`` says: the page without its pictures, what is heard, and the table of all items."""
+    front = front or Front(_title(report), report.headline.in_short(), [])
     picture = f"![{report.headline.title} and level, before against after](before-after.png)"
-    return render_markdown(_title(report), _sections(report), f"{_lead(report)}\n\n{picture}")
+    return render_markdown(front.title, [*front.sections, *_sections(report)], f"{front.lead}\n\n{picture}")
 
 
-def html(report: HaspiReport, listen: int = 3) -> str:
+def html(report: HaspiReport, listen: int = 3, front: Front | None = None) -> str:
     """What ``report.html`` says, with spectrograms and players of ``listen`` items, where their files are known."""
     sections = _sections(report, report_pictures(report), listening_section(report, listen))
-    return render_page(_title(report), sections, _lead(report))
+    if front is None:
+        return render_page(_title(report), sections, report.headline.in_short())
+    details = Section("Details", sections=sections, folded=True)
+    return render_page(front.title, [*front.sections, details], front.lead)
 
 
 def latex(report: HaspiReport) -> str:
@@ -64,17 +81,20 @@ def _title(report: HaspiReport) -> str:
     return f"{measures}: {', '.join(report.conditions)}"
 
 
-def _lead(report: HaspiReport) -> str:
-    ears = " Each is the better ear's." if report.ears else ""
-    return f"{report.comparison.n} items.{ears} {report.note}".rstrip()
-
-
 def _sections(
     report: HaspiReport, pictures: Sequence[Picture] = (), listening: Section | None = None
 ) -> list[Section]:
     headline = report.headline
-    texts = [headline.in_words(), *([] if report.words is None else [_in_words_understood(report.words)])]
+    ears = " Each is the better ear's." if report.ears else ""
+    about = f"{report.comparison.n} items.{ears} {report.note}".rstrip()
+    texts = [
+        about,
+        headline.limits(),
+        *([] if report.words is None else [_in_words_understood(report.words)]),
+    ]
     sections = [Section("Result", texts, [paper_table(headline)])]
+    if listening is not None:
+        sections.append(listening)
     if pictures:
         sections.append(Section("Pictures", pictures=pictures))
     sections.append(Section("By degree of loss", tables=[severity_table(headline)]))
@@ -85,8 +105,6 @@ def _sections(
         rows = [(f.file, f.condition, MEASURES[f.measure].title, f.reason) for f in report.failures]
         table = Table("Scores that could not be made", ("Item", "Condition", "Measure", "Reason"), rows)
         sections.append(Section("Failures", tables=[table]))
-    if listening is not None:
-        sections.append(listening)
     sections.append(Section("How the figures were made", _notes(report)))
     tables = [_items(report, report.items, "Scores and levels of every item")]
     if report.ears:
@@ -163,5 +181,6 @@ def _notes(report: HaspiReport) -> list[str]:
         else "Mixed model: difference = mean + listener's deviation + residual, by REML, Wald test"
         + (f" ({mixed.note})." if mixed.note else "."),
         f"Numpy's seed {report.seed}; each item's seed is in report.json. {versions}.",
-        *(f"{name}: {value}" for name, value in report.extra.items() if isinstance(value, str | int | float)),
+        *(f"{name}: {value}" for name, value in report.extra.items() if isinstance(value, str | int)),
+        *(f"{name}: {value:.6g}" for name, value in report.extra.items() if isinstance(value, float)),
     ]

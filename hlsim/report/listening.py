@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -12,8 +14,8 @@ from hlsim.evaluation.haspi_report import HaspiReport
 from hlsim.evaluation.scores import ItemScore
 from hlsim.evaluation.scoring import read_channel
 from hlsim.msbg.model import MSBG
-from hlsim.report.page import Picture, Player, Section
-from hlsim.report.pictures import draw_spectrograms
+from hlsim.report.page import Player, Section
+from hlsim.report.spectrograms import panels, pictures
 
 LONGEST_SECONDS = 8.0
 """Of an item in a page: longer ones are cut there."""
@@ -76,18 +78,20 @@ def listening_section(report: HaspiReport, count: int) -> Section | None:
 
 def _item_section(title: str, item: ItemScore) -> Section:
     signals, rate = heard(item)
-    peak = max(float(signal.abs().max()) for signal in signals.values())
-    if peak == 0.0:  # speech that begins later is scored, but cut away here
+    if not any(
+        bool(signal.any()) for signal in signals.values()
+    ):  # speech that begins later is scored, but cut here
         raise ValueError(f"the first {LONGEST_SECONDS:g} s are silent")
-    levels = {name: float(level_spl(signal)) for name, signal in signals.items()}
-    # one gain for all: what is softer in the ear is softer here
-    players = [
-        Player(encode_flac(signal * (_PEAK / peak), rate), f"{name} ({levels[name]:.0f} dB SPL)")
+    thresholds = ", ".join(f"{level:g}" for level in item.audiogram.levels)
+    text = f"{item.severity} loss, thresholds {thresholds} dB HL."
+    drawn = pictures(panels(signals, rate))
+    return Section(title, [text], pictures=drawn, players=players(signals, rate))
+
+
+def players(signals: Mapping[str, Tensor], rate: int) -> list[Player]:
+    """All at one gain: what is softer in the ear is softer here. Shape: (time,) each, in pascals, not all silent."""
+    gain = _PEAK / max(float(signal.abs().max()) for signal in signals.values())
+    return [
+        Player(encode_flac(signal * gain, rate), f"{name} ({float(level_spl(signal)):.0f} dB SPL)")
         for name, signal in signals.items()
     ]
-    told = ", ".join(f"{name} {level:.1f}" for name, level in levels.items())
-    thresholds = ", ".join(f"{level:g}" for level in item.audiogram.levels)
-    text = f"{item.severity} loss, thresholds {thresholds} dB HL. Levels in dB SPL: {told}."
-    alt = f"Spectrograms of {item.file}: {', '.join(signals)}"
-    picture = Picture(draw_spectrograms(signals, rate, width=5.0), alt)
-    return Section(title, [text], pictures=[picture], players=players)

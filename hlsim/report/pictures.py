@@ -1,4 +1,4 @@
-"""Pictures: of a HASPI report, narrow enough to be read on a phone, and spectrograms.
+"""Pictures of a HASPI report, narrow enough to be read on a phone.
 
 All raise MissingExtraError where matplotlib is not installed.
 """
@@ -6,16 +6,13 @@ All raise MissingExtraError where matplotlib is not installed.
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from functools import partial
+from collections.abc import Callable, Sequence
+from textwrap import fill
 from typing import Any
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from hlsim.audiogram import FREQUENCIES, SEVERITIES
-from hlsim.calibration import PASCAL_SPL
 from hlsim.evaluation.haspi_report import HaspiReport
 from hlsim.evaluation.statistics import FEWEST, bootstrap_interval
 from hlsim.extras import require
@@ -23,16 +20,29 @@ from hlsim.report.page import Picture
 from hlsim.report.tables import loss_name
 
 _MANY = 2000  # points beyond which they are drawn as pixels: the page stays small
+_LABELLED = 40  # listeners up to which each is named
 
 
 def draw_svg(draw: Callable[[Any], None]) -> bytes:
     """The SVG of what ``draw`` puts on a matplotlib axes."""
     figure = new_figure((4.2, 3.5))
     draw(figure.subplots())
+    return svg(figure)
+
+
+def svg(figure: Any) -> bytes:
+    """A figure's SVG."""
     data = io.BytesIO()
     # the same figures give the same bytes
     with require("matplotlib", "eval").rc_context({"svg.hashsalt": "hlsim"}):
         figure.savefig(data, format="svg", dpi=150, metadata={"Date": None})
+    return data.getvalue()
+
+
+def png(figure: Any, dpi: int) -> bytes:
+    """A figure's PNG."""
+    data = io.BytesIO()
+    figure.savefig(data, dpi=dpi, format="png")
     return data.getvalue()
 
 
@@ -49,6 +59,15 @@ def plain(text: str) -> str:
     return f"\u200b{text}" if text.startswith("_") else text
 
 
+def legend(axes: Any) -> None:
+    """Under the axes, where it covers nothing; the figure grows by it."""
+    handles, labels = axes.get_legend_handles_labels()
+    columns = 2 if max(map(len, labels)) < 24 else 1
+    axes.figure.set_figheight(axes.figure.get_figheight() + 0.21 * -(-len(labels) // columns))
+    about = {"ncols": columns, "fontsize": "small", "frameon": False}
+    axes.figure.legend(handles, labels, loc="outside lower left", **about)
+
+
 def scatter(
     axes: Any, x: np.ndarray, y: np.ndarray, severities: Sequence[str], same: str = "no change"
 ) -> None:
@@ -60,43 +79,6 @@ def scatter(
         if chosen.any():
             style = {"color": f"C{number}", "label": loss_name(severity), "rasterized": chosen.sum() > _MANY}
             axes.scatter(x[chosen], y[chosen], s=14, alpha=0.7, **style)
-    axes.legend(fontsize="small")
-
-
-def frequency_axis(axes: Any, hertz: Iterable[float]) -> None:
-    """A logarithmic axis in kHz."""
-    ticks = [*hertz]
-    axes.set(xscale="log", xlabel="frequency (kHz)")
-    axes.set_xticks(ticks, [f"{hz / 1000:g}" for hz in ticks])
-    axes.minorticks_off()
-    axes.grid(alpha=0.3)
-
-
-def draw_spectrograms(signals: Mapping[str, Tensor], sample_rate: int, *, width: float = 9.0) -> bytes:
-    """The PNG of log-magnitude spectrograms, one a signal, on one scale of dB SPL; ``width`` is in inches.
-
-    Shape: (time,) each, in pascals.
-    """
-    figure = new_figure((width, 2.2 * len(signals)))
-    points = 2 * (sample_rate // 100)  # 20 ms
-    window = torch.hann_window(points)
-    panels = figure.subplots(len(signals), 1, sharex=True, sharey=True, squeeze=False)[:, 0]
-    for axes, (name, signal) in zip(panels, signals.items(), strict=True):
-        spectrum = torch.stft(signal.float().cpu(), points, points // 4, window=window, return_complex=True)
-        level = 20.0 * torch.log10(spectrum.abs() * 2.0**0.5 / window.sum() + 1e-7) + PASCAL_SPL
-        image = axes.imshow(
-            level.numpy(),
-            origin="lower",
-            aspect="auto",
-            vmin=-20.0,
-            vmax=70.0,
-            extent=(0.0, len(signal) / sample_rate, 0.0, sample_rate / 2000.0),
-        )
-        # MSBG and HASPI end at 8 kHz
-        axes.set(title=plain(name), ylabel="kHz", ylim=(0.0, min(10.0, sample_rate / 2000.0)))
-    panels[-1].set(xlabel="s")
-    figure.colorbar(image, ax=list(panels), label="dB SPL in a bin", aspect=40)
-    return _png(figure, 110)
 
 
 def draw_report(report: HaspiReport) -> bytes:
@@ -111,7 +93,8 @@ def draw_report(report: HaspiReport) -> bytes:
     _draw_ends(right, report, levels, ends, "Level (dB SPL)")
     right.set(title=f"mean {report.before_level_mean:.1f} to {report.after_level_mean:.1f} dB SPL")
     figure.suptitle(plain(f"{c.overall.n} items, {c.before} and {c.after}"))
-    return _png(figure, 150)
+    legend(left)
+    return png(figure, 150)
 
 
 def score_range(measure: str) -> tuple[float, float]:
@@ -120,10 +103,13 @@ def score_range(measure: str) -> tuple[float, float]:
 
 
 def report_pictures(report: HaspiReport) -> list[Picture]:
-    """Before against after, change of level, distributions, by severity, by SNR (where there are any), the audiograms."""
-    kinds = [_before_after, _levels, _distributions, _by_severity, _by_snr, _audiograms]
+    """Before against after, change of level, distributions, by severity, by SNR and by listener (where there are any),
+    the audiograms."""
+    kinds = [_before_after, _levels, _distributions, _by_severity, _by_snr, _by_listener, _audiograms]
     if all(item.snr is None for item in report.items):
         kinds.remove(_by_snr)
+    if report.headline.listeners is None:
+        kinds.remove(_by_listener)
     return [Picture(draw_svg(draw), alt, caption) for draw, alt, caption in (kind(report) for kind in kinds)]
 
 
@@ -136,7 +122,11 @@ def _before_after(report: HaspiReport) -> _Drawn:
     scores = report.scores(c.measure, (c.before, c.after))
     means = f"mean {c.overall.before_mean:.3f} to {c.overall.after_mean:.3f}"
     alt = f"{c.title} {c.after} over {c.title} {c.before}, {c.overall.n} items: {means}."
-    draw = partial(_draw_ends, report=report, values=scores, limits=score_range(c.measure), what=c.title)
+
+    def draw(axes: Any) -> None:
+        _draw_ends(axes, report, scores, score_range(c.measure), c.title)
+        legend(axes)
+
     return draw, alt, "Each point is an item; above the dashed line the score rose."
 
 
@@ -169,17 +159,23 @@ def _levels(report: HaspiReport) -> _Drawn:
 def _distributions(report: HaspiReport) -> _Drawn:
     measure, title = report.measures[0], report.headline.title
     values = [_known(column) for column in report.scores(measure).T]
-    labels = [plain(name if len(name) < 13 else name[:11] + "…") for name in report.conditions]
+    labels = [plain(fill(name, 18)) for name in report.conditions]
 
     def draw(axes: Any) -> None:
         generator = np.random.default_rng(0)
-        places = range(1, len(values) + 1)
-        axes.boxplot(values, positions=places, widths=0.5, showfliers=False, medianprops={"color": "black"})
-        for place, group in zip(places, values, strict=True):
+        axes.figure.set_figheight(1.0 + 0.45 * len(values))
+        for place, group in enumerate(values):
+            if len(group):
+                low, middle, high = np.percentile(group, (25, 50, 75))
+                axes.barh(place, high - low, 0.56, low, color="0.85")
+                axes.plot((middle, middle), (place - 0.28, place + 0.28), color="black")
             shift = generator.uniform(-0.18, 0.18, len(group))
-            axes.scatter(place + shift, group, s=7, alpha=0.4, linewidths=0, rasterized=len(group) > _MANY)
-        axes.set_xticks(list(places), labels)
-        axes.set(ylim=score_range(measure), ylabel=title)
+            axes.scatter(
+                group, place + shift, s=7, alpha=0.4, linewidths=0, rasterized=len(group) > _MANY, color="C0"
+            )
+        axes.set_yticks(range(len(values)), labels, fontsize="small")
+        axes.invert_yaxis()
+        axes.set(xlim=score_range(measure), xlabel=title)
 
     named = zip(report.conditions, values, strict=True)
     medians = ", ".join(f"{name} {np.median(group):.3f}" for name, group in named if len(group))
@@ -203,7 +199,7 @@ def _by_severity(report: HaspiReport) -> _Drawn:
         axes.set_xticks(range(len(groups)), counts)
         axes.set(ylim=(0.0, score_range(report.measures[0])[1]), xlabel="loss (items)")
         axes.set(ylabel=f"mean {report.headline.title}")
-        axes.legend(fontsize="small")
+        legend(axes)
 
     caption = (
         "By degree of loss, of the items that have each score, with 95 % bootstrap intervals of the means from "
@@ -222,25 +218,52 @@ def _by_snr(report: HaspiReport) -> _Drawn:
             axes.plot([*groups], means, marker="o", label=plain(condition))
         axes.set(xlabel="SNR (dB)", ylabel=f"mean {report.headline.title}")
         axes.set(ylim=score_range(report.measures[0]))
-        axes.legend(fontsize="small")
+        legend(axes)
 
     return draw, alt, "By SNR, of the items that have each score."
 
 
+def _by_listener(report: HaspiReport) -> _Drawn:
+    c = report.headline
+    scores = report.scores(c.measure, (c.before, c.after))
+    listeners = np.array([item.listener for item in report.items])
+    both = np.isfinite(scores).all(1)
+    names = np.unique(listeners[both])
+    means = np.array([scores[both & (listeners == name)].mean(0) for name in names])
+    order = means[:, 0].argsort()
+    names, means = names[order], means[order]
+
+    def draw(axes: Any) -> None:
+        few, places = len(names) <= _LABELLED, np.arange(len(names))
+        axes.figure.set_figheight(1.2 + 0.19 * len(names) if few else 5.0)
+        axes.hlines(places, means[:, 0], means[:, 1], color="0.6", linewidth=1.0)
+        axes.scatter(
+            means[:, 0], places, s=16, facecolor="white", edgecolor="0.3", label=plain(c.before), zorder=2
+        )
+        axes.scatter(means[:, 1], places, s=16, color="C0", label=plain(c.after), zorder=2)
+        axes.set_yticks(places if few else [], map(plain, names) if few else [], fontsize="small")
+        axes.set(xlim=score_range(c.measure), xlabel=f"mean {c.title}")
+        legend(axes)
+
+    rose = int((means[:, 1] > means[:, 0]).sum())
+    alt = f"Mean {c.title} of each of {len(names)} {report.unit}; it rose for {rose}."
+    return draw, alt, f"A line for each of {len(names)} {report.unit}."
+
+
 def _audiograms(report: HaspiReport) -> _Drawn:
     ears = list(dict.fromkeys(item.audiogram for item in report.items))
+    many = len(ears) > 1
 
     def draw(axes: Any) -> None:
         for ear in ears:
-            axes.plot(ear.frequencies, ear.levels, color="C0", alpha=max(0.15, 1.0 / len(ears)), marker=".")
-        if len(ears) > 1:
+            ear.plot(axes, color="C0", alpha=max(0.15, 1.0 / len(ears)), marker="." if many else "o")
+        if many:
             mean = np.mean([ear.thresholds for ear in ears], axis=0)
             axes.plot(FREQUENCIES, mean, color="black", label="mean")
-            axes.legend(fontsize="small")
-        axes.set(ylim=(125.0, -15.0), ylabel="threshold (dB HL)")
-        frequency_axis(axes, (250, 500, 1000, 2000, 4000, 8000))
+            legend(axes)
 
-    return draw, f"Audiograms of {len(ears)} ears.", f"Audiograms: {len(ears)} different ears."
+    told = f"Audiograms of {len(ears)} ears." if many else "The ear's audiogram."
+    return draw, told, f"{told} The bands are MSBG's degrees of loss."
 
 
 def _groups(
@@ -264,9 +287,3 @@ def _known(values: np.ndarray) -> np.ndarray:
 
 def _mean(values: np.ndarray) -> float:
     return float(values.mean()) if len(values) else float("nan")
-
-
-def _png(figure: Any, dpi: int) -> bytes:
-    data = io.BytesIO()
-    figure.savefig(data, dpi=dpi, format="png")
-    return data.getvalue()

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,8 +17,9 @@ from hlsim.audiogram import SEVERITIES
 from hlsim.evaluation.items import Item
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.report.page import Picture, Section, render_markdown, render_page, write_files
-from hlsim.report.pictures import draw_spectrograms, draw_svg, scatter
-from hlsim.report.tables import Table, number
+from hlsim.report.pictures import draw_svg, legend, scatter
+from hlsim.report.spectrograms import composite, panels, pictures
+from hlsim.report.tables import Table, loss_name, number
 
 FILES = ("fidelity.json", "fidelity.md", "fidelity.html", "spectrograms.png")
 
@@ -50,22 +53,35 @@ _INPUT_TITLES = {
 Row = Mapping[str, Any]
 
 
-def write_fidelity(result: Row, panels: Mapping[str, Tensor], shown: Item, out: str | Path) -> None:
+def write_fidelity(result: Row, heard: Mapping[str, Tensor], shown: Item, out: str | Path) -> None:
     """Write the files into a folder, each whole or not at all, or ValueError.
 
-    ``panels`` is what is heard of ``shown`` by name, in pascals at 16 kHz.
+    ``heard`` is what is heard of ``shown``, the truth first, by name, in pascals at 16 kHz.
     """
-    spectrograms = draw_spectrograms(panels, NEURO_RATE)
+    truth, *others = heard
+    named = {"original": shown.signal, "reference": heard[truth], **{name: heard[name] for name in others}}
+    drawn = panels(named, NEURO_RATE, {f"{name} less reference": (name, "reference") for name in others})
     page = (
         "Fidelity to MSBG" if result["teacher"] in _TEACHERS else "Fidelity",
-        _sections(result, spectrograms, shown),
+        _sections(result, pictures(drawn), shown),
         _lead(result),
     )
-    contents = (json.dumps(result, indent=1), render_markdown(*page), render_page(*page), spectrograms)
+    contents = (json.dumps(result, indent=1), render_markdown(*page), render_page(*page), composite(drawn))
     write_files(out, dict(zip(FILES, contents, strict=True)))
 
 
 def _lead(result: Row) -> str:
+    """Each simulator's SNR, the best first."""
+    given = result["inputs"][0]
+    found = {name: entry["inputs"][given]["overall"] for name, entry in result["simulators"].items()}
+    told = [
+        f"{name} {number(own['snr_median'], '.1f')} ({number(own['snr_worst_tenth'], '.1f')})"
+        for name, own in sorted(found.items(), key=lambda pair: -(pair[1]["snr_median"] or -math.inf))
+    ]
+    return f"SNR in dB against the reference, median item (worst tenth): {', '.join(told)}."
+
+
+def _about(result: Row) -> str:
     reference = _TEACHERS.get(result["teacher"], result["teacher"])
     levels = ", ".join(f"{level:g}" for level in result["levels"])
     return (
@@ -76,23 +92,23 @@ def _lead(result: Row) -> str:
     )
 
 
-def _sections(result: Row, spectrograms: bytes, shown: Item) -> list[Section]:
+def _sections(result: Row, spectrograms: Sequence[Picture], shown: Item) -> list[Section]:
     sections = [
         Section(_INPUT_TITLES[given], tables=[side_by_side(result, given)]) for given in result["inputs"]
     ]
     about = (
         f"{_INPUT_TITLES[shown.about['input']]}, {shown.about['condition']}, {shown.about['level']:g} dB SPL, "
-        f"{shown.about['severity']} loss"
+        f"{loss_name(shown.about['severity'])}. A difference is drawn where either is loud enough to be seen."
     )
-    alt = "Log-magnitude spectrograms of the reference and each simulator"
-    sections.append(Section("Spectrograms", pictures=[Picture(spectrograms, alt, about)]))
+    sections[0] = replace(sections[0], paragraphs=[_about(result)])
+    sections.append(Section("Spectrograms", [about], pictures=spectrograms))
     for name, entry in result["simulators"].items():
         for given, summary in entry["inputs"].items():
             rows = [row for row in entry["items"] if row["input"] == given]
-            pictures = _pictures(rows) if given == result["inputs"][0] else []
-            sections.append(
-                Section(f"{name}: {_INPUT_TITLES[given].lower()}", (), summary_tables(summary), pictures)
-            )
+            drawn = _pictures(rows) if given == result["inputs"][0] else []
+            title = _INPUT_TITLES[given]
+            title = f"{name}: {title[0].lower()}{title[1:]}"
+            sections.append(Section(title, (), summary_tables(summary), drawn))
     failures = [
         (name, str(row["item"]), _INPUT_TITLES[row["input"]], row["severity"], reason)
         for name, entry in result["simulators"].items()
@@ -146,6 +162,7 @@ def _pictures(rows: Sequence[Row]) -> list[Picture]:
         x, y = (np.array(side, dtype=np.float64) for side in sides)  # None becomes NaN
         scatter(axes, x, y, severities, "equal")
         axes.set(xlabel=f"{title}, reference", ylabel=f"{title}, simulated")
+        legend(axes)
 
     def boxes(axes: Any, key: str, title: str) -> None:
         groups = {s: [row[key] for row in rows if row["severity"] == s and key in row] for s in SEVERITIES}

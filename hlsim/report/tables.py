@@ -45,6 +45,15 @@ class Table:
             "| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines
         )
 
+    def text(self) -> str:
+        """For a terminal: columns of one width each, the first one's cells at the left. Without the caption."""
+        lines = [self.header, *self.rows]
+        widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+        return "\n".join(
+            "  ".join(cell.rjust(width) if i else cell.ljust(width) for i, (cell, width) in enumerate(pairs))
+            for pairs in ([*zip(line, widths, strict=True)] for line in lines)
+        )
+
     def latex(self) -> str:
         """For ``\\input``; needs the package booktabs."""
         header, *rows = (
@@ -133,6 +142,21 @@ def comparisons_table(comparisons: Sequence[Comparison]) -> Table:
 def change_name(c: Comparison) -> str:
     """Measure and conditions."""
     return f"{c.title}: {c.before} to {c.after}"
+
+
+def verdict(c: Comparison, aid: str, rival: str) -> str:
+    """What the later condition is against the earlier one, in one clause: better or worse at one level alone."""
+    o, louder = c.overall, c.level_after_mean - c.level_before_mean
+    if not c.sure:
+        told = f"{aid} cannot be told from {rival}"
+    elif c.level_alike:
+        told = f"{aid} is {'better' if o.delta > 0 else 'worse'} than {rival}"
+    else:
+        told = f"{aid} scores {'higher' if o.delta > 0 else 'lower'} than {rival}"
+    if not c.level_alike:
+        told += f", and is {abs(louder):.1f} dB {'louder' if louder > 0 else 'softer'}"
+    interval = f" (change {paired_cells(c.overall)[_CHANGE]})"
+    return f"{told}: {c.title} {o.after_mean:.3f} against {o.before_mean:.3f} over {o.n} items{interval}"
 
 
 def paired_cells(
