@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from compensators import NALR, MappingCompensator, load_compensator
 from compensators.config import MappingConfig
 from hlsim.audio import find_audio, read_audio, write_audio
-from hlsim.audiogram import Audiogram
+from hlsim.audiogram import STANDARD, Audiogram
 from hlsim.calibration import level_spl, set_level
 from hlsim.dsp.resample import resample
 from hlsim.evaluation import HaspiReport, ItemScore
@@ -35,6 +35,7 @@ from hlsim.report.demo import (
     result_table,
 )
 from hlsim.report.haspi import write_report
+from hlsim.report.tables import loss_name
 from hlsim.training.batches import TrainingData
 from hlsim.training.compensator import train_compensator
 from hlsim.training.recipes import CompensatorRecipe
@@ -162,7 +163,7 @@ def _names(files: list[Path], speech: str | Path | None) -> list[str]:
 
 
 def _write_audio(folder: Path, names: list[str], clean: list[Tensor], heard: dict[str, list[Tensor]]) -> None:
-    """The original and what is heard of each condition, by one gain an utterance, so that their loudness can be compared."""
+    """The original and what is heard of each condition, by one gain, so that their loudness can be compared."""
     folder.mkdir(parents=True, exist_ok=True)
     for i, name in enumerate(names):
         signals = {"original": clean[i], **{f"heard-{name}": own[i] for name, own in heard.items()}}
@@ -173,7 +174,8 @@ def _write_audio(folder: Path, names: list[str], clean: list[Tensor], heard: dic
 
 def _name(audiogram: Audiogram) -> str:
     levels = ", ".join(f"{level:g}" for level in audiogram.levels)
-    return f"{levels} dB HL ({audiogram.severity})"
+    standard = [name for name, own in STANDARD.items() if audiogram == Audiogram(own)]
+    return f"{standard[0] if standard else f'{levels} dB HL'} ({loss_name(audiogram.severity)})"
 
 
 def _levels(signals: list[Tensor]) -> list[float]:

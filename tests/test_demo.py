@@ -34,9 +34,16 @@ def test_demo_writes_report_audio_and_pictures(tmp_path: Path, short_speech: Pat
     assert report["n"] == len(report["items"]) == 8
     # after numpy's last seed comes its first
     assert [item["seed"] for item in report["items"]] == [seed, seed + 1, 0, 1, 2, 3, 4, 5]
-    for name in ("unaided", "nalr", "initial", "compensated"):
-        assert 0.0 <= report[f"{name}_mean"] <= 1.0
-        assert f"| {name} | {report[f'{name}_mean']:.3f} |" in text
+    names = {"unaided": "unaided", "nalr": "NAL-R", "nalr_as_loud": "NAL-R as loud as trained"}
+    names |= {"initial": "untrained start", "compensated": "trained"}
+    rows = {line[:24].strip(): line[24:].split() for line in text.splitlines()}
+    for key, name in names.items():
+        assert 0.0 <= report[f"{key}_mean"] <= 1.0
+        assert rows[name][:2] == [f"{report[f'{key}_mean']:.3f}", f"{report[f'{key}_level_mean']:.1f}"]
+    assert report["nalr_as_loud_level_mean"] == pytest.approx(report["compensated_level_mean"], abs=1e-3)
+    page = (out / "report.html").read_text()
+    assert text.startswith("\nThe trained aid ") and text.endswith(f"\n\nThe page: {out / 'report.html'}")
+    assert text.splitlines()[1] in page and page.count("<audio") == 5 and "N4 (severe loss)" in page
     assert report["before_mean"] == pytest.approx(report["unaided_mean"])
     assert report["after_mean"] == pytest.approx(report["compensated_mean"])
     # NAL-R and what starts from it make speech louder and easier to understand for this ear
@@ -51,7 +58,7 @@ def test_demo_writes_report_audio_and_pictures(tmp_path: Path, short_speech: Pat
         "training/checkpoint/model.safetensors",
     ):
         assert (out / name).stat().st_size > 0
-    assert len(list((out / "audio").glob("*.wav"))) == 3 * 8
+    assert len(list((out / "audio").glob("*.wav"))) == 6 * 8
     assert any(line.startswith("step") for line in lines)
 
 

@@ -54,6 +54,7 @@ def _evaluate_simulator(options: argparse.Namespace) -> None:
     done = evaluate_simulators(simulators, **passed(options, evaluate_simulators, **instead))
     write_fidelity(done.result, done.heard, done.shown, options.out)
     print((options.out / "fidelity.md").read_text(encoding="utf-8"))
+    _tell_page(options.out / "fidelity.html")
 
 
 def evaluate_compensator(parser: Parser) -> None:
@@ -108,6 +109,11 @@ def _evaluate_compensator(options: argparse.Namespace) -> None:
     print(text.read_text(encoding="utf-8"))
     if failed := len(done.result["failures"]):
         print(f"hlsim: {failed} outputs could not be judged; the reasons are in {text}", file=sys.stderr)
+    _tell_page(options.out / "compensators.html")
+
+
+def _tell_page(path: Path) -> None:
+    print(f"The page: {path}")
 
 
 def _need_engine(engine: str) -> None:
@@ -178,3 +184,4 @@ def _haspi_report(options: argparse.Namespace) -> None:
         all_ = failed + sum(len(own) for item in report.items for own in item.scores.values())
         text = f"{failed} of {all_} scores could not be made; the reasons are in {options.out / 'report.md'}"
         print(f"hlsim: {text}", file=sys.stderr)
+    _tell_page(options.out / "report.html")

@@ -26,7 +26,8 @@ from hlsim.metrics.registry import MEASURES
 ALPHA = 0.05
 """Below which a p value is said to speak against chance."""
 
-_AUDIBLE = 1.0  # dB: a smaller change of level is not held to explain a score
+EQUAL_DB = 1.0
+"""A smaller change of level is not held to explain a score."""
 
 
 @dataclass(frozen=True)
@@ -103,13 +104,15 @@ class Comparison:
         return text
 
     def _chance(self) -> str:
-        defined = self._defined()
+        defined = [
+            (n, p) for n, p in (("t-test", self.p_t_holm), ("Wilcoxon", self.p_w_holm)) if p is not None
+        ]
         if not defined:
             return "Neither test is defined for these figures, so they do not tell a change from chance."
         named = ", ".join(f"{name} {p_text(p)}" for name, p in defined)
         if self.comparisons > 1:
             named += f", Holm-adjusted for {self.comparisons} comparisons"
-        against = self._against_chance()
+        against = [p < ALPHA for name, p in defined if name == "t-test" or self._wilcoxon_can()]
         few = "" if self._wilcoxon_can() else f"; with so few Wilcoxon's cannot fall below {ALPHA:g}"
         if against and all(against):
             return f"Chance alone hardly explains it ({named}{few})."
@@ -118,22 +121,9 @@ class Comparison:
         return f"It cannot be told from chance ({named}{few}), which does not show that there is no change."
 
     @property
-    def sure(self) -> bool:
-        """Whether every test that could tell the change from chance does."""
-        against = self._against_chance()
-        return bool(against) and all(against)
-
-    @property
     def level_alike(self) -> bool:
         """Whether the mean levels differ by less than what is held to explain a score."""
-        return abs(self.level_after_mean - self.level_before_mean) < _AUDIBLE
-
-    def _defined(self) -> list[tuple[str, float]]:
-        tests = (("t-test", self.p_t_holm), ("Wilcoxon", self.p_w_holm))
-        return [(name, p) for name, p in tests if p is not None]
-
-    def _against_chance(self) -> list[bool]:
-        return [p < ALPHA for name, p in self._defined() if name == "t-test" or self._wilcoxon_can()]
+        return abs(self.level_after_mean - self.level_before_mean) < EQUAL_DB
 
     def _wilcoxon_can(self) -> bool:
         """Whether its adjusted p is below ``ALPHA``, or would be if all pairs changed the same way."""

@@ -21,7 +21,7 @@ from hlsim.report.gain_pictures import gain_picture, gains_at, input_output_pict
 from hlsim.report.haspi import scored_by
 from hlsim.report.page import Section, render_markdown, render_page, write_files
 from hlsim.report.pictures import report_pictures
-from hlsim.report.tables import Table, cells, change_name, number, paired_cells, spread, verdict
+from hlsim.report.tables import Table, cells, change_name, inner, number, paired_cells, spread, verdict
 
 FILES = ("compensators.json", "compensators.md", "compensators.html")
 
@@ -52,7 +52,8 @@ def _in_short(result: Result, reports: Mapping[str, HaspiReport]) -> list[str]:
     for group, speech in (("clean", "clean speech"), ("noisy", "speech in noise")):
         for c in reports[group].comparisons if group in reports else ():
             if (c.measure, c.before) == ("haspi", f"NAL-R at {c.after}{_AT_LEVEL}"):
-                told.append(f"On {speech} {verdict(c, c.after, 'NAL-R made as loud')}.")
+                clause = verdict(reports[group].items, c.before, c.after, c.after, "NAL-R made as loud")
+                told.append(f"On {speech} {clause}.")
     return [*told, _about(result)]
 
 
@@ -87,7 +88,7 @@ def _sections(result: Result, reports: Mapping[str, HaspiReport]) -> list[Sectio
         gains.append(input_output_picture({name: row for name, row in own if not name.endswith(_AT_LEVEL)}))
     sections += [
         Section("As loud as a normal ear hears it?", [_LOUDNESS], loudness),
-        Section("By degree of loss", [_HASQI], by_severity),
+        Section("By degree of loss", [_HASQI], by_severity, folded=True),
         _gap_section(result),
         Section("Does any output pass the limit?", (), [_peak_table(result)]),
         Section("Gain curves", [_GAINS], [_gain_table(curves)], gains),
@@ -96,12 +97,10 @@ def _sections(result: Result, reports: Mapping[str, HaspiReport]) -> list[Sectio
         Section("Does it matter where frames fall?", [shifts], [shift_table(result["shifts"])]),
     ]
     for group in whole:
-        title = f"Pictures: {GROUPS[group].lower()}"
+        title = f"Pictures: {inner(GROUPS[group])}"
         sections.append(Section(title, pictures=report_pictures(reports[group])))
     sections += [
-        Section(
-            f"Paired tests: {GROUPS[group].lower()}", tables=_tests(report, result["beside"]), folded=True
-        )
+        Section(f"Paired tests: {inner(GROUPS[group])}", tables=_tests(report, result["beside"]), folded=True)
         for group, report in reports.items()
     ]
     by_degree = [_severity_tests(reports[group], group, result["beside"]) for group in whole]

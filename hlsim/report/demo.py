@@ -13,6 +13,7 @@ from torch import Tensor
 from hlsim.audiogram import Audiogram
 from hlsim.audiogram_plot import frequency_axis
 from hlsim.criteria.bands import band_centres, band_levels, threshold_in_quiet
+from hlsim.evaluation.comparison import EQUAL_DB
 from hlsim.evaluation.haspi_report import HaspiReport
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.report import spectrograms
@@ -29,7 +30,6 @@ UNAIDED, PRESCRIBED, AS_LOUD, TRAINED = "unaided", "NAL-R", "NAL-R as loud as tr
 NORMAL_EAR = "a normal ear"
 
 _SHOWN = (UNAIDED, PRESCRIBED, TRAINED)
-_FLOOR = 10.0  # dB under the normal ear's softest band: nothing is heard there
 
 _RESULT = (
     "HASPI predicts from 0 to 1 how much of the speech is understood. It rewards any gain, so the aid is held against "
@@ -43,8 +43,11 @@ _LISTEN = (
 )
 _EAR = (
     "Speech at {level:g} dB SPL in this audiogram: its levels in bands 1.25 ERB wide, the mean, and shaded from the 30th "
-    "to the 99th percentile of frames of 32 ms, in dB above a normal ear's threshold (Terhardt 1979). What lies above the "
-    "line of the thresholds, towards the top, is not heard."
+    "to the 99th percentile of frames of 32 ms, in dB above a normal ear's threshold (Terhardt 1979). What lies above "
+    "the line of the thresholds, towards the top, is not heard."
+)
+_GAIN = (
+    "A prescription such as NAL-R has one curve for all levels; less gain for louder speech is compression."
 )
 
 
@@ -73,15 +76,19 @@ def result_table(report: HaspiReport, heard_off: Mapping[str, float]) -> Table:
 
 def demo_verdict(report: HaspiReport) -> str:
     """One sentence: the trained aid against NAL-R, at one level."""
-    found = {c.before: c for c in report.comparisons if c.after == TRAINED}
-    as_is, as_loud = found[PRESCRIBED], found[AS_LOUD]
-    unaided = f"no aid has {found[UNAIDED].overall.before_mean:.3f}"
-    if as_is.level_alike:
-        return f"{verdict(as_is, 'The trained aid', PRESCRIBED)}; {unaided}."
-    louder = as_is.level_after_mean - as_is.level_before_mean
-    nalr = f"NAL-R as prescribed, {abs(louder):.1f} dB {'softer' if louder > 0 else 'louder'}"
-    nalr += f", has {as_is.overall.before_mean:.3f}"
-    return f"{verdict(as_loud, 'The trained aid', 'NAL-R made as loud')}; {nalr}, and {unaided}."
+    haspi, level = (
+        dict(zip(report.conditions, of.mean(0), strict=True))
+        for of in (report.scores("haspi"), report.levels())
+    )
+    softer = level[TRAINED] - level[PRESCRIBED]
+    rival, known = (AS_LOUD, "NAL-R made as loud"), ""
+    if abs(softer) < EQUAL_DB:
+        rival = PRESCRIBED, PRESCRIBED
+    else:
+        known = f"NAL-R as prescribed, {abs(softer):.1f} dB {'softer' if softer > 0 else 'louder'}, has "
+        known += f"{haspi[PRESCRIBED]:.3f} and "
+    told = verdict(report.items, rival[0], TRAINED, "The trained aid", rival[1])
+    return f"{told}; {known}the unaided ear {'' if known else 'has '}{haspi[UNAIDED]:.3f}."
 
 
 def demo_front(
@@ -89,31 +96,26 @@ def demo_front(
 ) -> tuple[Front, bytes]:
     """The page's beginning, and the PNG of all its spectrograms."""
     ear, level = report.items[0].audiogram, report.items[0].clean_level
-    panels = spectrograms.panels(
-        {
-            f"{name}, {what}": signals[name][0]
-            for name in _SHOWN
-            for what, signals in (("given", sounds.given), ("heard", sounds.heard))
-        },
-        NEURO_RATE,
-    )
-    heard = {f"heard, {name}": sounds.heard[name][0] for name in (*_SHOWN[:2], AS_LOUD, TRAINED)}
+    both = (("given", sounds.given), ("heard", sounds.heard))
+    shown = {f"{name}, {what}": signals[name][0] for name in _SHOWN for what, signals in both}
+    panels = spectrograms.panels(shown, NEURO_RATE)
+    heard = {f"heard, {name}": sounds.heard[name][0] for name in (UNAIDED, PRESCRIBED, AS_LOUD, TRAINED)}
     sections = [
         Section("Result", [_RESULT], [table]),
-        Section(
-            "Listen",
-            [_LISTEN.format(name=sounds.names[0])],
-            players=players({"original": sounds.clean[0], **heard}, NEURO_RATE),
-        ),
         Section(
             "The ear and the speech",
             [_EAR.format(level=level)],
             pictures=[_ear_picture(ear, sounds), _heard_picture(sounds)],
         ),
         Section("What is given, and what is heard of it", pictures=spectrograms.pictures(panels)),
-        Section("Gain", pictures=[gain_picture(curves[0]["ear"], curves)]),
+        Section(
+            "Listen",
+            [_LISTEN.format(name=sounds.names[0])],
+            players=players({"original": sounds.clean[0], **heard}, NEURO_RATE),
+        ),
+        Section("Gain", [_GAIN], pictures=[gain_picture(curves[0]["ear"], curves)]),
     ]
-    title = f"A hearing aid trained for one ear ({ear.severity} loss)"
+    title = f"A hearing aid trained for one ear: {curves[0]['ear']}"
     return Front(title, demo_verdict(report), sections), spectrograms.composite(panels)
 
 
@@ -147,11 +149,15 @@ def _heard_picture(sounds: Sounds) -> Picture:
         for color, (name, level) in zip(colors, levels.items(), strict=True):
             style = "--" if name == NORMAL_EAR else "-"
             axes.plot(band_centres(), level, style, color=color, label=name)
-        axes.set(ylabel="level heard (dB SPL in a band)", ylim=(levels[NORMAL_EAR].min() - _FLOOR, None))
+        axes.set(ylabel="level heard (dB SPL in a band)", ylim=(0.0, None))
         frequency_axis(axes, (250, 500, 1000, 2000, 4000))
         legend(axes)
 
     off = {name: np.abs(levels[name] - levels[NORMAL_EAR]).mean() for name in _SHOWN}
     told = ", ".join(f"{name} {value:.1f}" for name, value in off.items())
     alt = f"Level heard by band; mean absolute distance from a normal ear's in dB: {told}."
-    return Picture(draw_svg(draw), alt, "Speech as heard, by band; the nearer to the dashed line the better.")
+    return Picture(
+        draw_svg(draw),
+        alt,
+        "Speech as heard, by band; the nearer to the dashed line the better. Under 0 dB SPL nothing is drawn.",
+    )

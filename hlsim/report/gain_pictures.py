@@ -52,7 +52,7 @@ def input_output_picture(conditions: Mapping[str, Mapping[str, Any]]) -> Picture
     def draw(axes: Any) -> None:
         for name, curve in curves.items():
             axes.plot([*curve], [*curve.values()], marker="o", label=plain(name))
-        axes.set(xlabel="speech (dB SPL)", ylabel="output (dB SPL)", aspect="equal")
+        axes.set(xlabel="speech (dB SPL)", ylabel="output (dB SPL)")
         axes.grid(alpha=0.3)
         legend(axes)
 
@@ -72,7 +72,7 @@ def tone_picture(ear: str, found: Sequence[Mapping[str, Any]]) -> Picture:
             offs = np.maximum(row["heard_off_db"][middle], _LOWEST_DB)
             axes.plot(row["frequencies"], offs, marker="o", label=plain(row["compensator"]))
         axes.set(ylabel="heard, against a normal ear (dB)")
-        frequency_axis(axes, rows[0]["frequencies"])
+        frequency_axis(axes, (250, 500, 1000, 2000, 4000))
         legend(axes)
 
     level = f"{rows[0]['levels'][middle]:g} dB SPL"

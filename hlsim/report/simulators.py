@@ -19,7 +19,7 @@ from hlsim.neuro.config import NEURO_RATE
 from hlsim.report.page import Picture, Section, render_markdown, render_page, write_files
 from hlsim.report.pictures import draw_svg, legend, scatter
 from hlsim.report.spectrograms import composite, panels, pictures
-from hlsim.report.tables import Table, loss_name, number
+from hlsim.report.tables import Table, inner, loss_name, number
 
 FILES = ("fidelity.json", "fidelity.md", "fidelity.html", "spectrograms.png")
 
@@ -60,6 +60,8 @@ def write_fidelity(result: Row, heard: Mapping[str, Tensor], shown: Item, out: s
     """
     truth, *others = heard
     named = {"original": shown.signal, "reference": heard[truth], **{name: heard[name] for name in others}}
+    end = int(shown.signal.nonzero().max()) + NEURO_RATE // 10  # a short clip is filled up with silence
+    named = {name: signal[:end] for name, signal in named.items()}
     drawn = panels(named, NEURO_RATE, {f"{name} less reference": (name, "reference") for name in others})
     page = (
         "Fidelity to MSBG" if result["teacher"] in _TEACHERS else "Fidelity",
@@ -78,7 +80,8 @@ def _lead(result: Row) -> str:
         f"{name} {number(own['snr_median'], '.1f')} ({number(own['snr_worst_tenth'], '.1f')})"
         for name, own in sorted(found.items(), key=lambda pair: -(pair[1]["snr_median"] or -math.inf))
     ]
-    return f"SNR in dB against the reference, median item (worst tenth): {', '.join(told)}."
+    reference = _TEACHERS.get(result["teacher"], result["teacher"])
+    return f"SNR in dB against {reference}, median item (worst tenth): {', '.join(told)}."
 
 
 def _about(result: Row) -> str:
@@ -106,8 +109,7 @@ def _sections(result: Row, spectrograms: Sequence[Picture], shown: Item) -> list
         for given, summary in entry["inputs"].items():
             rows = [row for row in entry["items"] if row["input"] == given]
             drawn = _pictures(rows) if given == result["inputs"][0] else []
-            title = _INPUT_TITLES[given]
-            title = f"{name}: {title[0].lower()}{title[1:]}"
+            title = f"{name}: {inner(_INPUT_TITLES[given])}"
             sections.append(Section(title, (), summary_tables(summary), drawn))
     failures = [
         (name, str(row["item"]), _INPUT_TITLES[row["input"]], row["severity"], reason)

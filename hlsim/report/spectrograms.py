@@ -13,7 +13,7 @@ from hlsim.calibration import PASCAL_SPL
 from hlsim.report.page import Picture
 from hlsim.report.pictures import new_figure, plain, png, svg
 
-RANGE_DB = 70.0
+RANGE_DB = 75.0
 """What is drawn of levels, from the loudest bin down: speech and the noise in its pauses."""
 
 _APART_DB = 15.0  # a difference beyond is drawn as this one
@@ -32,12 +32,12 @@ def panels(
     Differences are where either is within the range that is drawn. Shape: (time,) each, in pascals.
     """
     levels = {name: _levels(signal, sample_rate) for name, signal in signals.items()}
-    top = 5.0 * round(max(float(level.quantile(0.9999)) for level in levels.values()) / 5.0 + 0.5)
+    top = 5.0 * round(max(float(level.quantile(0.999)) for level in levels.values()) / 5.0 + 0.5)
     seconds = max(len(signal) for signal in signals.values()) / sample_rate
     extent = (0.0, seconds, 0.0, sample_rate / 2.0e3)
     found: dict[str, Callable[[Any, Any], None]] = {}
     for name, level in levels.items():
-        scale = {"vmin": top - RANGE_DB, "vmax": top, "cmap": "magma_r", "extent": extent}
+        scale = {"vmin": top - RANGE_DB, "vmax": top, "cmap": "gist_heat_r", "extent": extent}
         found[name] = partial(_draw, image=level, title=name, unit="dB SPL in a bin", scale=scale)
         for title, (one, other) in (differences or {}).items():
             if one == name:

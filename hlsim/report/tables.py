@@ -6,7 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from hlsim.evaluation.comparison import Comparison, p_text
+from hlsim.evaluation.comparison import ALPHA, Comparison, compare_conditions, p_text
+from hlsim.evaluation.scores import ItemScore
 from hlsim.evaluation.statistics import PairedComparison
 
 _LATEX = str.maketrans(
@@ -82,6 +83,11 @@ def spread(mean: float, deviation: float | None) -> str:
     return f"{mean:.3f}" if deviation is None else f"{mean:.3f} ± {deviation:.3f}"
 
 
+def inner(title: str) -> str:
+    """A title within another."""
+    return title[:1].lower() + title[1:]
+
+
 def loss_name(severity: str) -> str:
     """A degree of loss in words."""
     return "no loss" if severity == "none" else f"{severity} loss"
@@ -144,19 +150,29 @@ def change_name(c: Comparison) -> str:
     return f"{c.title}: {c.before} to {c.after}"
 
 
-def verdict(c: Comparison, aid: str, rival: str) -> str:
-    """What the later condition is against the earlier one, in one clause: better or worse at one level alone."""
+def verdict(items: Sequence[ItemScore], before: str, after: str, aid: str, rival: str) -> str:
+    """What the condition ``after`` is against ``before`` by HASPI, in one clause: better or worse at one level alone.
+
+    A question asked beforehand, so that p values are not adjusted for other comparisons.
+    """
+    (c,) = compare_conditions(items, ["haspi"], [before, after])
     o, louder = c.overall, c.level_after_mean - c.level_before_mean
-    if not c.sure:
-        told = f"{aid} cannot be told from {rival}"
+    by_chance = [p < ALPHA for p in (o.p_t, o.p_w) if p is not None]
+    is_, scores = ("is", "scores") if all(by_chance) else ("may be", "may score")
+    if not any(by_chance):
+        told = f"cannot be told from {rival}"
     elif c.level_alike:
-        told = f"{aid} is {'better' if o.delta > 0 else 'worse'} than {rival}"
+        told = f"{is_} {'better' if o.delta > 0 else 'worse'} than {rival}"
     else:
-        told = f"{aid} scores {'higher' if o.delta > 0 else 'lower'} than {rival}"
+        told = f"{scores} {'higher' if o.delta > 0 else 'lower'} than {rival}"
     if not c.level_alike:
-        told += f", and is {abs(louder):.1f} dB {'louder' if louder > 0 else 'softer'}"
-    interval = f" (change {paired_cells(c.overall)[_CHANGE]})"
-    return f"{told}: {c.title} {o.after_mean:.3f} against {o.before_mean:.3f} over {o.n} items{interval}"
+        told += f", which is {abs(louder):.1f} dB {'softer' if louder > 0 else 'louder'}"
+    facts = f"{o.n} items, change {o.delta:+.3f}"
+    if o.ci_low is not None:
+        facts += f", 95 % interval {o.ci_low:+.3f} to {o.ci_high:+.3f}"
+    if any(by_chance) and not all(by_chance):
+        facts += ", the tests disagree"
+    return f"{aid} {told}: HASPI {o.after_mean:.3f} against {o.before_mean:.3f} ({facts})"
 
 
 def paired_cells(

@@ -267,7 +267,7 @@ def test_report(tmp_path: Path, speech_dir: Path, ears_csv: Path) -> None:
     # clean and noisy for each ear; those of which all failed were met too, three of the ten were not
     assert "14 items of 0.3 s, 7 ears in turn" in text
     assert f"| loud | 100 | {max(peaks):.2f} | {result['peaks']['loud']['over']} of 10 |" in text
-    assert "| severe, HASQI: NAL-R to loud |" in text and "| HASPI: unaided to broken |" in text
+    assert "| severe, HASQI: NAL-R to loud |" in text and "**broken: change, and paired tests" in text
     assert "RuntimeError: no such ear" in text and "| N2, loud, 50 dB SPL | +40.0 |" in text
     # the worst of tones and of shifted speech; a gain does nothing else, and the noisy fill up where the clean are few
     tones = {own["compensator"]: own for own in result["steady_tones"]}
@@ -294,8 +294,12 @@ def test_report(tmp_path: Path, speech_dir: Path, ears_csv: Path) -> None:
     assert result["beside"]["loud"] == [
         *("unaided", "NAL-R", "WDRC", "NAL-R at loud's level", "equaliser at loud's level")
     ]
-    assert "| HASPI: equaliser at loud's level to loud |" in text
+    start = text.index("**loud: change, and paired tests")
+    rivals = [line.split(" | ")[0] for line in text[start:].splitlines()[4:14]]
+    names = ("unaided", "NAL-R", "WDRC", "NAL-R at its level", "equaliser at its level")
+    assert rivals == [f"| {name}, {measure}" for measure in ("HASPI", "HASQI") for name in names]
     assert "to equaliser" not in text and "loud to broken" not in text
+    assert "On clean speech loud " in text and " NAL-R made as loud" in text
     noisy = [row for row in result["rows"] if row["condition"] == "noisy"]
     under = [row["figures"]["loud"]["haspi"] for row in noisy if row["snr"] < 8.0]
     over = [row["figures"]["loud"]["haspi"] for row in noisy if row["snr"] > 8.0]
@@ -438,7 +442,7 @@ def test_an_enhancer_before_each_aid(
         assert difference == pytest.approx(20.0 * math.log10(0.5), abs=1e-3)
     assert "half + NAL-R" in result["beside"]["own"] and result["beside"]["half + NAL-R"] == ["NAL-R"]
     text = (tmp_path / "out" / "compensators.md").read_text()
-    assert "Enhancer my_enhancer:half (sha256 " in text and "| HASPI: half + own to own |" in text
+    assert "Enhancer my_enhancer:half (sha256 " in text and "| half + own, HASPI |" in text
     # one of another source has scores of its own
     stored = len((tmp_path / "out" / "scores.jsonl").read_text().splitlines())
     compare({"own": Gain(20.0)}, enhancers=["my_enhancer_2:half"], **options)

@@ -131,9 +131,14 @@ def test_files_and_an_identity_is_no_simulator(tmp_path: Path, speech_dir: Path,
         "scores.jsonl",
     }
     text = (out / "fidelity.md").read_text()
-    assert "## Speech as it is" in text and "| exact | 4 |" in text and "## identity: 20 db louder" in text
+    assert "## Speech as it is" in text and "| exact | 4 |" in text and "## identity: 20 dB louder" in text
+    assert text.splitlines()[2].startswith(
+        "SNR in dB against hlsim's exact MSBG, median item (worst tenth): exact "
+    )
     page = (out / "fidelity.html").read_text()
-    assert "data:image/png" in page and page.count("<svg") + page.count("svg+xml") == 8
+    # four a simulator; the original, the reference, and two a simulator
+    assert page.count("data:image/svg+xml") == 2 * 4 + 2 + 2 * 2
+    assert 'alt="Spectrogram: identity less reference"' in page
 
 
 class FailsOnHardEars(torch.nn.Module):

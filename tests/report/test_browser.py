@@ -6,7 +6,7 @@ system, found by name or in the environment variable ``CHROMIUM``.
 
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ from hlsim.audio import read_audio, write_audio
 from hlsim.audiogram import Audiogram
 from hlsim.evaluation import Failure, HaspiReport, ItemScore
 from hlsim.report.haspi import write_report
+from tests.report.test_demo import made_up_page
 
 pytestmark = pytest.mark.browser
 
@@ -70,9 +71,9 @@ def chromium() -> Iterator[Any]:
         browser.close()
 
 
-@pytest.fixture(params=[(360, 740), (1280, 900)], ids=["phone", "desk"])
-def page(request: pytest.FixtureRequest, chromium: Any, page_file: Path) -> Iterator[Any]:
-    """The page, opened; fails afterwards where it said anything or asked for anything but itself."""
+@pytest.fixture(params=[(400, 740), (1400, 900)], ids=["phone", "desk"])
+def opened(request: pytest.FixtureRequest, chromium: Any) -> Iterator[Callable[[Path], Any]]:
+    """Opens a page; fails afterwards where it said anything or asked for anything but itself."""
     width, height = request.param
     page = chromium.new_page(viewport={"width": width, "height": height})
     said: list[str] = []
@@ -80,16 +81,45 @@ def page(request: pytest.FixtureRequest, chromium: Any, page_file: Path) -> Iter
     page.on("console", lambda message: said.append(message.text))
     page.on("pageerror", lambda error: said.append(str(error)))
     page.on("request", lambda one: asked.append(one.url))
-    page.goto(page_file.as_uri())
-    yield page
+
+    def open_page(path: Path) -> Any:
+        page.goto(path.as_uri())
+        return page
+
+    yield open_page
+    url = page.url.partition("#")[0]
     page.close()
     assert said == []
-    assert [url for url in asked if not url.startswith("data:")] == [page_file.as_uri()]
+    assert [one for one in asked if not one.startswith("data:")] == [url]
+
+
+@pytest.fixture
+def page(opened: Callable[[Path], Any], page_file: Path) -> Any:
+    return opened(page_file)
+
+
+def test_the_demos_pictures_and_players_load(opened: Callable[[Path], Any], tmp_path: Path) -> None:
+    report, front = made_up_page()
+    page = opened(write_report(report, tmp_path, front=front) / "report.html")
+    page.locator("summary").first.click()
+    look = "e => [e.naturalWidth, e.getBoundingClientRect().width]"
+    widths = page.evaluate(f"[...document.images].map({look})")
+    inner = page.viewport_size["width"]
+    # of the ear, of what is heard, three pairs of spectrograms, gains; in the report folded below, five
+    assert len(widths) == 2 + 6 + 1 + 5
+    assert all(natural > 0 and 150 < shown <= inner for natural, shown in widths)
+    assert page.evaluate("document.documentElement.scrollWidth") <= inner
+    ready = (
+        "[...document.querySelectorAll('audio')].map(e => e.readyState > 0 && e.error === null && e.duration)"
+    )
+    page.wait_for_function(f"{ready}.every(Boolean)")
+    assert page.evaluate(ready) == pytest.approx([1.0] * 5, abs=0.02)
 
 
 def test_pictures_are_drawn_and_nothing_is_wider_than_the_screen(page: Any) -> None:
     widths = page.evaluate("[...document.images].map(i => [i.naturalWidth, i.getBoundingClientRect().width])")
-    assert len(widths) == 6 + 2
+    # seven of the report, and of each of two items the original and three as heard
+    assert len(widths) == 7 + 2 * 4
     inner = page.viewport_size["width"]
     assert all(natural > 0 and 150 < shown <= inner for natural, shown in widths)
     assert page.evaluate("document.documentElement.scrollWidth") <= inner

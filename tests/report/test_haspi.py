@@ -275,7 +275,10 @@ def test_texts_of_three_conditions(tmp_path: Path) -> None:
     report = three_conditions()
     write_report(report, tmp_path)
     text = (tmp_path / "report.md").read_text(encoding="utf-8")
-    assert text.startswith("# HASPI, STOI: unaided, NAL-R, new_one\n\n9 items. HASPI rewards any gain")
+    assert text.startswith(
+        "# HASPI, STOI: unaided, NAL-R, new_one\n\nFrom unaided to new_one, HASPI rose by "
+    )
+    assert "## Result\n\n9 items. HASPI rewards any gain" in text
     assert "| Metric | Unaided | New_one | Change (Δ) |" in text
     assert "| s4 | new_one | STOI | a\\|b & 100 % |" in text
     assert "| listener means | 3 |" in text and "| HASPI: NAL-R to new_one | 9 |" in text

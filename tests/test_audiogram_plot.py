@@ -1,0 +1,33 @@
+"""An audiogram as drawn: the axes, the bands, the line."""
+
+import sys
+
+import pytest
+
+from hlsim import Audiogram
+from hlsim.audiogram import SEVERITIES, SEVERITY_LIMITS
+from hlsim.extras import MissingExtraError
+
+
+def test_axes_are_the_fields_and_are_made_once() -> None:
+    figure = pytest.importorskip("matplotlib.figure")
+    axes = figure.Figure().subplots()
+    right, left = Audiogram.standard("N3"), Audiogram((10, 40), (500, 3000))
+    assert right.plot(axes, color="tab:red", label="right") is axes
+    assert left.plot(axes, marker="x") is axes
+    low, high = axes.get_ylim()
+    assert low == 120.0 and high == -10.0 and axes.get_xscale() == "log"
+    assert [label.get_text() for label in axes.get_xticklabels()] == ["0.25", "0.5", "1", "2", "4", "6", "8"]
+    first, second = axes.get_lines()
+    assert tuple(first.get_ydata()) == right.levels and first.get_label() == "right"
+    assert first.get_color() == "tab:red" and first.get_marker() == "o" and second.get_marker() == "x"
+    assert tuple(second.get_xdata()) == (500, 3000)
+    assert [text.get_text() for text in axes.texts] == [*SEVERITIES]
+    bounds = [sorted({patch.get_y(), patch.get_y() + patch.get_height()}) for patch in axes.patches]
+    assert [pair[1] for pair in bounds] == [*SEVERITY_LIMITS, 120.0]
+
+
+def test_without_matplotlib_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "matplotlib.pyplot", None)
+    with pytest.raises(MissingExtraError, match=r"hlsim\[eval\]"):
+        Audiogram.standard("N3").plot()
