@@ -80,15 +80,13 @@ def demo_verdict(report: HaspiReport) -> str:
         dict(zip(report.conditions, of.mean(0), strict=True))
         for of in (report.scores("haspi"), report.levels())
     )
-    softer = level[TRAINED] - level[PRESCRIBED]
-    rival, known = (AS_LOUD, "NAL-R made as loud"), ""
-    if abs(softer) < EQUAL_DB:
-        rival = PRESCRIBED, PRESCRIBED
-    else:
-        known = f"NAL-R as prescribed, {abs(softer):.1f} dB {'softer' if softer > 0 else 'louder'}, has "
-        known += f"{haspi[PRESCRIBED]:.3f} and "
-    told = verdict(report.items, rival[0], TRAINED, "The trained aid", rival[1])
-    return f"{told}; {known}the unaided ear {'' if known else 'has '}{haspi[UNAIDED]:.3f}."
+    aid, unaided = "The trained aid", f"the unaided ear has {haspi[UNAIDED]:.3f}."
+    louder = level[TRAINED] - level[PRESCRIBED]
+    if abs(louder) < EQUAL_DB:
+        return f"{verdict(report.items, PRESCRIBED, TRAINED, aid, PRESCRIBED)}; {unaided}"
+    told = verdict(report.items, AS_LOUD, TRAINED, aid, "NAL-R made as loud")
+    off = f"{abs(louder):.1f} dB {'softer' if louder > 0 else 'louder'}"
+    return f"{told}; NAL-R as prescribed, {off}, has {haspi[PRESCRIBED]:.3f}, and {unaided}"
 
 
 def demo_front(

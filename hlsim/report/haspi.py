@@ -159,6 +159,11 @@ def _notes(report: HaspiReport) -> list[str]:
     if report.full_scale_spl is not None:
         scale = f"{report.full_scale_spl:g} dB SPL"
     mixed = report.headline.mixed
+    extra = [
+        f"{name}: {f'{value:.5g}' if isinstance(value, float) else value}"
+        for name, value in report.extra.items()
+        if isinstance(value, str | int | float)
+    ]
     versions = ", ".join(f"{name} {version}" for name, version in report.versions.items())
     of_ear = [MEASURES[name].title for name in report.measures if MEASURES[name].engine]
     engine = f"{' and '.join(of_ear)} (v2) {scored_by(report.engine, report.versions)}"
@@ -181,6 +186,5 @@ def _notes(report: HaspiReport) -> list[str]:
         else "Mixed model: difference = mean + listener's deviation + residual, by REML, Wald test"
         + (f" ({mixed.note})." if mixed.note else "."),
         f"Numpy's seed {report.seed}; each item's seed is in report.json. {versions}.",
-        *(f"{name}: {value}" for name, value in report.extra.items() if isinstance(value, str | int)),
-        *(f"{name}: {value:.6g}" for name, value in report.extra.items() if isinstance(value, float)),
+        *([f"{'; '.join(extra)}."] if extra else []),
     ]

@@ -242,7 +242,7 @@ def _by_listener(report: HaspiReport) -> _Drawn:
         )
         axes.scatter(means[:, 1], places, s=16, color="C0", label=plain(c.after), zorder=2)
         axes.set_yticks(places if few else [], map(plain, names) if few else [], fontsize="small")
-        axes.set(xlim=score_range(c.measure), xlabel=f"mean {c.title}")
+        axes.set(xlim=score_range(c.measure), ylim=(-0.6, len(names) - 0.4), xlabel=f"mean {c.title}")
         legend(axes)
 
     rose = int((means[:, 1] > means[:, 0]).sum())

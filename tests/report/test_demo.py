@@ -54,7 +54,7 @@ def made_up(changes: Sequence[float], louder: float = 6.0) -> HaspiReport:
 def test_the_verdict_is_at_one_level(changes: Sequence[float], said: str) -> None:
     text = demo_verdict(made_up(changes))
     assert text.startswith(said)
-    assert text.endswith("; NAL-R as prescribed, 6.0 dB softer, has 0.650 and the unaided ear 0.200.")
+    assert text.endswith("; NAL-R as prescribed, 6.0 dB softer, has 0.650, and the unaided ear has 0.200.")
     assert ("the tests disagree" in text) == (changes is SKEWED)
 
 
