@@ -55,7 +55,8 @@ def markdown(report: HaspiReport, front: Front | None = None) -> str:
     """What ``report.md`` says: the page without its pictures, what is heard, and the table of all items."""
     front = front or Front(_title(report), report.headline.in_short(), [])
     picture = f"![{report.headline.title} and level, before against after](before-after.png)"
-    return render_markdown(front.title, [*front.sections, *_sections(report)], f"{front.lead}\n\n{picture}")
+    told = [section for section in front.sections if section.tables]
+    return render_markdown(front.title, [*told, *_sections(report)], f"{front.lead}\n\n{picture}")
 
 
 def html(report: HaspiReport, listen: int = 3, front: Front | None = None) -> str:
