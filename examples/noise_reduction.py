@@ -8,11 +8,12 @@ pyrnnoise is installed; it looks 20 ms ahead and more, the aid 4.
 """
 
 import math
+import statistics
 import sys
 from collections.abc import Callable
 
 import torch
-from pesq import pesq
+from pesq import PesqError, pesq
 from pystoi import stoi
 from scipy.signal import fftconvolve
 from torch import Tensor
@@ -82,7 +83,9 @@ def main() -> None:
         for name, reduce in before.items():
             reduced = reduce(signal)
             pairs = list(zip(clean.numpy(), reduced.numpy(), strict=True))
-            quality = sum(pesq(RATE, *pair, "wb") for pair in pairs) / items
+            # below 0 where PESQ finds no utterance in the clip
+            rated = [pesq(RATE, *pair, "wb", on_error=PesqError.RETURN_VALUES) for pair in pairs]
+            quality = statistics.mean(value for value in rated if value > 0.0)
             intelligible = sum(stoi(*pair, RATE) for pair in pairs) / items
             given = aid(signal, ears) if name == "hearing-aid" else aid(reduced, ears, 0.0)
             scores = haspi(set_level(given, level), clean, ears)
