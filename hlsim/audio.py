@@ -18,10 +18,8 @@ EXTENSIONS = (".wav", ".flac", ".ogg")
 _LARGEST_PAGE, _ENDS = 65_307, 4  # of Ogg: bytes of a page, and the flag of a stream's last one (RFC 3533, 6)
 _STREAMED = 0x7FFF0000  # sizes from here on were written before the length was known: 0x7FFFF000, 0xFFFFFFFF
 
-_HIGHEST_READ, _MOST_CHANNELS = (
-    384_000,
-    64,
-)  # what a header may tell, beyond which it is believed to be broken
+# what a header may tell, beyond which it is believed to be broken; of samples 16 GB
+_HIGHEST_READ, _MOST_CHANNELS, _MOST_SAMPLES = 384_000, 64, 2**32
 _LOUDEST = 1e9  # a sample, 274 dB SPL where RMS 1.0 is 94: beyond it powers overflow in single precision
 
 _HIGHEST_STORED = {".wav": 2**31 - 1, ".flac": 655_350, ".ogg": 200_000}  # in Hz; libvorbis crashes beyond
@@ -42,11 +40,13 @@ def read_audio(path: str | Path, *, any_rate: bool = False) -> tuple[Tensor, int
             starts with the path.
     """
     check_name(path)
-    if not Path(path).is_file():
+    if not os.path.isfile(path):
         raise ValueError(f"{path}: no such file")
     with _told(path), soundfile.SoundFile(str(path)) as file:
         rate = int(file.samplerate)
         _refuse_header(path, rate, file.channels)
+        if (told := file.frames * file.channels) > _MOST_SAMPLES:
+            raise ValueError(f"{path}: its header tells of {told} samples; allowed: up to {_MOST_SAMPLES}")
         samples = file.read(dtype="float32", always_2d=True)
     if samples.shape[0] == 0:
         raise ValueError(f"{path}: empty, no samples")

@@ -151,6 +151,11 @@ def _old(folder: Path) -> Path:
     return folder.with_name(f".{folder.name}.old")
 
 
+def resolved(path: str | Path) -> Path:
+    """Links followed; one that leads to itself stays, at which ``Path.resolve`` raises RuntimeError up to Python 3.12."""
+    return Path(os.path.realpath(path))
+
+
 def sha256(path: Path) -> str:
     """Of what a file holds."""
     with path.open("rb") as file:

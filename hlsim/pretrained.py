@@ -77,14 +77,14 @@ def read_checkpoint(
 
     Raises ValueError as ``load_pretrained``."""
     folder = find_checkpoint(name, kinds, also)
+    record = _record(folder)
     try:
-        record = _record(folder)
         weights = (folder / WEIGHTS).read_bytes()
-    except (OSError, ValueError, RecursionError) as error:
+    except OSError as error:
         raise ValueError(f"{folder}: not readable as a checkpoint ({error})") from error
-    found = record.get("kind") if isinstance(record, dict) else None
+    found = record.get("kind")
     if not isinstance(found, str) or found not in kinds:
-        hint = f" ({_LOADERS[found]} loads the former)" if found in _LOADERS else ""
+        hint = f" ({_LOADERS[str(found)]} loads the former)" if str(found) in _LOADERS else ""
         raise ValueError(
             f"{folder}: a checkpoint of kind {found!r}; needed here: {' or '.join(map(repr, kinds))}{hint}"
         )
@@ -133,12 +133,12 @@ def find_checkpoint(name: str | Path, kinds: Collection[str] | None = None, also
 
 
 def checkpoint_digest(name: str | Path) -> str:
-    """The SHA-256 of a checkpoint's weights, as it tells it. Raises ValueError where there is no such checkpoint."""
-    return str(_record(find_checkpoint(name))["sha256"])
+    """The SHA-256 of a checkpoint's weights, as it tells it. Raises ValueError where there is none, or it is broken."""
+    return str(_record(find_checkpoint(name)).get("sha256"))
 
 
 def checkpoint_about(name: str | Path) -> dict[str, Any]:
-    """How a checkpoint was trained, as it tells it. Raises ValueError where there is no such checkpoint."""
+    """How a checkpoint was trained, as it tells it. Raises ValueError where there is none, or it is broken."""
     about = _record(find_checkpoint(name)).get("about")
     return dict(about) if isinstance(about, dict) else {}
 
@@ -197,8 +197,14 @@ def check_replaceable(folder: str | Path) -> Path:
     return target
 
 
-def _record(folder: Path) -> Any:
-    return json.loads((folder / CONFIG).read_text(encoding="utf-8"))
+def _record(folder: Path) -> dict[str, Any]:
+    try:
+        record = json.loads((folder / CONFIG).read_text(encoding="utf-8"))
+        if not isinstance(record, dict):
+            raise ValueError(f"{CONFIG} holds no names with values")
+    except (OSError, ValueError, RecursionError) as error:
+        raise ValueError(f"{folder}: not readable as a checkpoint ({error})") from error
+    return record
 
 
 def _digest(config: Any) -> str:

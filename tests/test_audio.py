@@ -332,6 +332,16 @@ def test_a_header_that_would_fill_the_memory_is_not_believed(
         read_audio(path, any_rate=True)
 
 
+def test_a_flac_header_of_more_samples_than_memory(tmp_path: Path) -> None:
+    path = tmp_path / "a.flac"
+    soundfile.write(path, np.full((4000, 2), 0.1), 16000)
+    data = bytearray(path.read_bytes())
+    data[21] |= 0x0F  # the highest of the 36 bits of its length in samples
+    path.write_bytes(data)
+    with pytest.raises(ValueError, match=r"a\.flac: its header tells of \d{12} samples; allowed: up to"):
+        read_audio(path)
+
+
 def test_samples_whose_powers_overflow_are_refused(tmp_path: Path) -> None:
     soundfile.write(tmp_path / "a.wav", np.full(1000, 1e18), 16000, subtype="FLOAT")
     with pytest.raises(ValueError, match=r"a\.wav: samples reach 1e\+18; allowed: up to 1e\+09"):

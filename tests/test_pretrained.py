@@ -13,7 +13,14 @@ from compensators import load_compensator
 from hlsim import NeuroMSBG, list_pretrained, load_pretrained
 from hlsim.files import repair_folder
 from hlsim.neuro import NeuroConfig
-from hlsim.pretrained import checkpoint_about, checkpoints_folder, find_checkpoint, save_checkpoint, shipped
+from hlsim.pretrained import (
+    checkpoint_about,
+    checkpoint_digest,
+    checkpoints_folder,
+    find_checkpoint,
+    save_checkpoint,
+    shipped,
+)
 
 SMALL = NeuroConfig(channels=4, blocks=1)
 
@@ -95,9 +102,15 @@ def test_configurations_that_would_fill_memory_or_time(folder: Path) -> None:
         (folder / "config.json").write_text(json.dumps(changed))
         with pytest.raises(ValueError, match=f"{name} {value}; allowed: whole numbers from"):
             load_pretrained(folder)
-    (folder / "config.json").write_text("[" * 200_000)
-    with pytest.raises(ValueError, match="not readable as a checkpoint"):
-        load_pretrained(folder)
+    for text in ("[" * 200_000, "7", "\xff", "{"):
+        (folder / "config.json").write_text(text, encoding="latin-1")
+        for read in (load_pretrained, checkpoint_about, checkpoint_digest):
+            with pytest.raises(ValueError, match=r"small: not readable as a checkpoint \("):
+                read(folder)
+    for kind in ([], {"x": 1}):
+        (folder / "config.json").write_text(json.dumps(record | {"kind": kind}))
+        with pytest.raises(ValueError, match="a checkpoint of kind"):
+            load_pretrained(folder)
     (folder / "config.json").write_text(json.dumps(record | {"about": 7}))
     assert checkpoint_about(folder) == {}
     load_pretrained(folder)

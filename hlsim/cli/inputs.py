@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from hlsim.cli.options import STANDARD_EARS
 from hlsim.extras import require
+from hlsim.files import resolved
 
 if TYPE_CHECKING:
     import torch
@@ -53,9 +54,9 @@ def check_files(source: Path, target: Path) -> None:
 
 def check_folders(source: Path, target: Path) -> None:
     """Refuse an OUT that cannot be a folder, or in which the files of IN would be lost or found again."""
-    if target.exists() and not target.is_dir():
+    if os.path.lexists(target) and not target.is_dir():
         raise ValueError(f"{target}: not a folder; allowed: a folder, there or not, for IN is one")
-    if target.resolve().is_relative_to(source.resolve()):
+    if resolved(target).is_relative_to(resolved(source)):
         raise ValueError(f"{target}: in IN itself; allowed: another folder")
 
 
@@ -123,7 +124,11 @@ def read_recipe(path: Path | None) -> dict[str, Any]:
     yaml = require("yaml", "train")
     try:
         text = path.read_text(encoding="utf-8")
-        twice = _named_twice(yaml.compose(text, yaml.SafeLoader))
+        node = yaml.compose(text, yaml.SafeLoader)
+        # a few lines of aliases of aliases stand for more values than any memory holds
+        if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text, yaml.SafeLoader)):
+            raise ValueError(f"{path}: has an alias (*name); allowed: values written out")
+        twice = _named_twice(node)
         data = yaml.safe_load(text)
     except (OSError, UnicodeDecodeError, RecursionError, yaml.YAMLError) as error:
         raise ValueError(f"{path}: not readable as YAML ({error})") from error

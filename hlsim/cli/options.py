@@ -164,7 +164,7 @@ shares = kind(
 def folder(text: str) -> Path:
     """Where results go, there or not: one that cannot be is to be known before hours of work."""
     path = Path(text)
-    there = next(part for part in (path.absolute(), *path.absolute().parents) if part.exists())
+    there = next(part for part in (path.absolute(), *path.absolute().parents) if os.path.lexists(part))
     if not there.is_dir():
         raise argparse.ArgumentTypeError(f"{there}: not a folder; allowed: a folder, there or not")
     if not os.access(there, os.W_OK | os.X_OK):

@@ -17,6 +17,7 @@ from torch.nn import functional
 from hlsim.audio import read_audio, read_stretch
 from hlsim.audiogram import FREQUENCIES, Audiogram
 from hlsim.calibration import PASCAL_SPL
+from hlsim.checks import check_rate
 from hlsim.data.manifest import UTTERANCE_COLUMNS, Rows, Utterance, inside
 from hlsim.data.noises import mix_at
 from hlsim.dsp.resample import resample
@@ -90,11 +91,11 @@ class Plan:
         try:
             about = json.loads((self.folder / SETTINGS).read_text(encoding="utf-8"))
             self.root = Path(root if root is not None else about["root"])
-            self.rate = int(about["settings"]["rate"])
+            self.rate = check_rate(about["settings"]["rate"])
             self.each = len(about["inputs"]) * int(about["settings"]["ears"])
             # neither table has the rate
             self.digest: str = f"{about['manifest_sha256']}{about['instances_sha256']} at {self.rate} Hz"
-        except (OSError, KeyError, TypeError, ValueError) as error:
+        except (OSError, KeyError, TypeError, ValueError, OverflowError, RecursionError) as error:
             raise ValueError(f"{self.folder}: not prepared ({error}); 'hlsim prepare' makes it") from error
         self.utterances = Rows(self.folder / MANIFEST, UTTERANCE_COLUMNS)
         self.rows = Rows(self.folder / INSTANCES, INSTANCE_COLUMNS)

@@ -12,6 +12,8 @@ from functools import cached_property, lru_cache
 from pathlib import Path, PurePosixPath
 from typing import Any, BinaryIO
 
+from hlsim.files import resolved
+
 SPLITS = ("train", "valid", "test")
 
 _READ: dict[str, Callable[[str], Any]] = {"str": str, "int": int, "float": float}
@@ -80,7 +82,7 @@ def inside(root: str | Path, relative: str) -> Path:
     """The path ``root / relative``, or ValueError where it leads out of the root, be it through .. or a link."""
     path = PurePosixPath(relative)
     full = Path(root) / path
-    if path.is_absolute() or ".." in path.parts or not full.resolve().is_relative_to(_resolved(Path(root))):
+    if path.is_absolute() or ".." in path.parts or not resolved(full).is_relative_to(_resolved(Path(root))):
         raise ValueError(
             f"{relative}: leads out of {root}; allowed: paths below it, without .. and links out"
         )
@@ -128,8 +130,11 @@ class Rows(Sequence[dict[str, str]]):
 
     def _parse(self, line: int) -> list[str]:
         start, end = self._places[line], self._places[line + 1]
-        text = os.pread(self._file.fileno(), end - start, start).decode("utf-8-sig")  # safe after a fork
-        return next(csv.reader([text]), [])
+        line_bytes = os.pread(self._file.fileno(), end - start, start)  # safe after a fork
+        try:
+            return next(csv.reader([line_bytes.decode("utf-8-sig")]), [])
+        except (UnicodeDecodeError, csv.Error) as error:
+            raise ValueError(f"{self.path}, line {line + 1}: cannot be read as CSV ({error})") from error
 
 
 def csv_line(cells: Iterable[object]) -> str:
@@ -137,6 +142,11 @@ def csv_line(cells: Iterable[object]) -> str:
     line = io.StringIO()
     csv.writer(line, lineterminator="\n").writerow([" ".join(str(cell).splitlines()) for cell in cells])
     return line.getvalue()
+
+
+def no_formula(path: str) -> str:
+    """The same relative path, which no spreadsheet takes for a formula."""
+    return f"./{path}" if path.startswith(("=", "+", "-", "@")) else path
 
 
 def storable(name: str) -> bool:
@@ -149,4 +159,4 @@ def printable(name: str) -> str:
     return "".join(char if char.isprintable() else char.encode("unicode_escape").decode() for char in name)
 
 
-_resolved = lru_cache(maxsize=16)(Path.resolve)
+_resolved = lru_cache(maxsize=16)(resolved)

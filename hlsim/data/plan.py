@@ -16,7 +16,7 @@ from hlsim.data.checking import Listing, examine_all
 from hlsim.data.corpora import Fault, assign_splits, detect_layout, find_below
 from hlsim.data.ears import Ears, plan_ears
 from hlsim.data.instances import CLAIM, INSTANCE_COLUMNS, INSTANCES, MANIFEST, SETTINGS
-from hlsim.data.manifest import SPLITS, UTTERANCE_COLUMNS, Rows, csv_line
+from hlsim.data.manifest import SPLITS, UTTERANCE_COLUMNS, Rows, csv_line, no_formula
 from hlsim.data.noises import Noises, find_noises
 from hlsim.data.plan_settings import PlanSettings
 from hlsim.files import PARTIAL, Whole, sha256, write_whole
@@ -121,7 +121,7 @@ def prepare(
         manifest.write(csv_line(UTTERANCE_COLUMNS))
 
         def tell(fault: Fault) -> None:
-            report.write(csv_line((fault.path, fault.reason)))
+            report.write(csv_line((no_formula(fault.path), fault.reason)))
             prepared.faults += 1
             prepared.first_fault = prepared.first_fault or f"{fault.path}: {fault.reason}"
 

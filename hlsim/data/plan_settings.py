@@ -9,6 +9,7 @@ from pathlib import Path
 
 from hlsim.checks import check_rate, refuse_unknown
 from hlsim.data.corpora import LAYOUTS
+from hlsim.files import resolved
 
 TRAIN_SNRS_DB, TEST_SNRS_DB = (0.0, 5.0, 10.0, 15.0), (2.5, 7.5, 12.5, 17.5)
 """Signal-to-noise ratios in dB by active speech level: VoiceBank-DEMAND's, and the paper's."""
@@ -72,7 +73,7 @@ class PlanSettings:
 
     def places(self) -> tuple[Path, str, str]:
         """Root, and corpus and noise below it. Raises ValueError where they cannot be used."""
-        folders = [folder.resolve() for folder in (self.corpus, self.noise) if folder is not None]
+        folders = [resolved(folder) for folder in (self.corpus, self.noise) if folder is not None]
         for folder in folders:
             if not folder.is_dir():
                 raise ValueError(f"{folder}: no such folder")
@@ -80,7 +81,7 @@ class PlanSettings:
             raise ValueError(
                 f"noise {folders[1]}: holds the corpus, and its speech would be noise; allowed: a folder of noise alone"
             )
-        root = self.root.resolve() if self.root else Path(os.path.commonpath(folders))
+        root = resolved(self.root) if self.root else Path(os.path.commonpath(folders))
         if root == Path(root.anchor):
             raise ValueError(f"{folders[0]} and {folders[-1]} have only {root} in common; allowed: a --root")
         for folder in folders:

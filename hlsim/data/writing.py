@@ -11,7 +11,7 @@ from typing import Any
 import torch
 
 from hlsim.data.instances import CLAIM, MANIFEST, Plan, is_whole
-from hlsim.data.manifest import csv_line
+from hlsim.data.manifest import csv_line, no_formula
 from hlsim.data.teacher import Reference, Teacher, name_of
 from hlsim.files import PARTIAL, file_lock, write_whole
 from hlsim.parallel import Failed, Progress, make_missing, one_thread
@@ -78,7 +78,9 @@ def write_instances(
             backend=backend,
             scheduler=scheduler,
         )
-        faults = [(plan.utterance(int(n) * plan.each).clean, failed[n]) for n in sorted(failed, key=int)]
+        faults = [
+            (no_formula(plan.utterance(int(n) * plan.each).clean), failed[n]) for n in sorted(failed, key=int)
+        ]
         if faults:
             write_whole(report, "".join(map(csv_line, [("path", "reason"), *faults])))
             raise ValueError(

@@ -27,7 +27,7 @@ from hlsim.audio import EXTENSIONS, find_audio
 from hlsim.audiogram import Audiogram, numbered_audiograms
 from hlsim.calibration import check_full_scale
 from hlsim.evaluation.scoring import EARS, FileItem
-from hlsim.files import read_rows
+from hlsim.files import read_rows, resolved
 
 _Name = TypeVar("_Name")
 
@@ -56,7 +56,7 @@ def read_manifest(
     Raises:
         ValueError: what is wrong, and in which line; or no row takes ``audiogram``, ``audiograms`` or ``spl``.
     """
-    folder = (Path(path).parent if root is None else Path(root)).resolve()
+    folder = resolved(Path(path).parent if root is None else root)
     if not folder.is_dir():
         raise ValueError(f"{folder}: no such folder; the manifest's paths are relative to it")
     ears = {} if audiograms is None else _ears(audiograms, _listener)
@@ -90,7 +90,7 @@ def read_manifest(
 
 def below_root(root: Path, name: str, column: str) -> Path:
     """A path below a root, links followed, or ValueError where it leaves it."""
-    path = (root / name).resolve()
+    path = resolved(root / name)
     if not name or PurePosixPath(name).is_absolute() or Path(name).is_absolute():
         raise ValueError(f"{column} is {name!r}; allowed: a path relative to {root}")
     if not path.is_relative_to(root):

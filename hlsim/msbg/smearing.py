@@ -27,6 +27,7 @@ SKIRT_HZ = 800.0
 """How far above what it is given smearing reaches, by the skirts of its frames' spectra."""
 
 _TINY = 1e-24  # Pa^2
+_MOST = 1e30
 _NEVER = 1e-36  # Pa^2, keeps a division from one by 0
 _CACHED = 1200  # frames
 
@@ -133,8 +134,8 @@ def _spread(spectrum: Tensor, matrix: Tensor) -> tuple[Tensor, Tensor, Tensor, T
     given = power(spectrum)
     smeared, given = (given @ matrix.T).add_(_TINY), given.add_(_TINY)
     quotient = smeared / given
-    # the square root of a negative power is imaginary; of 0 it takes long
-    real, imaginary = quotient.clamp_min(_TINY).sqrt_(), quotient.neg().clamp_min_(_TINY).sqrt_()
+    # the square root of a negative power is imaginary; of 0 it takes long, and beside 1e9 Pa silence counts as nothing
+    real, imaginary = quotient.clamp(_TINY, _MOST).sqrt_(), quotient.neg().clamp_(_TINY, _MOST).sqrt_()
     factor = torch.complex(real, imaginary)
     return spectrum * factor, factor, given, smeared
 

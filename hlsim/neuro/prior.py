@@ -31,6 +31,7 @@ RESPONSE_HALF_LENGTH = 1024
 _CHANNELS = max(bank.channels for bank in BANKS.values())
 _ENVELOPE_HALF_LENGTH = 20  # frames
 _TINY = 1e-14
+_WIDEST = 1e16  # of powers, by smearing
 
 # By how much MSBG's envelope of speech is lower than a sinusoid's of the same power, since it fluctuates and smeared
 # frames partly cancel where they overlap: dB, read off the channels of 32 clips to about 0.5 dB.
@@ -126,7 +127,9 @@ class Prior(nn.Module):
 
 def _widening(smeared: Tensor, given: Tensor) -> Tensor:
     """Square root of the quotient of two powers, imaginary where the first is negative, as in MSBG."""
-    root = ((smeared.abs() + _TINY) / (given + _TINY)).sqrt()
+    size = smeared.abs() + _TINY
+    # of a constant or a pure tone at 200 dB SPL some powers are 0, and the gradient of such a quotient infinite
+    root = (size / torch.maximum(given + _TINY, size / _WIDEST)).sqrt()
     imaginary = root * (smeared < 0.0)
     return torch.complex(root - imaginary, imaginary)
 

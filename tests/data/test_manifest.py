@@ -34,6 +34,9 @@ def test_what_is_no_manifest_is_named(tmp_path: Path) -> None:
     path.write_text(csv_line(UTTERANCE_COLUMNS) + "a,b\n")
     with pytest.raises(ValueError, match="line 2: 2 cells"):
         Rows(path, UTTERANCE_COLUMNS)[0]
+    path.write_bytes(csv_line(UTTERANCE_COLUMNS).encode() + b"\xff\n")
+    with pytest.raises(ValueError, match="line 2: cannot be read as CSV"):
+        Rows(path, UTTERANCE_COLUMNS)[0]
     row = Utterance("a", "b", "train", "c", rate=1).to_row()
     for changed, said in (
         ({"rate": "fast"}, "no row of a manifest"),
@@ -51,6 +54,8 @@ def test_no_path_leads_out_of_the_root(tmp_path: Path) -> None:
     (root / "link.wav").symlink_to(outside / "x.wav")
     (root / "folder").symlink_to(outside)
     (root / "within.wav").symlink_to(root / "a" / "x.wav")
+    (root / "loop.wav").symlink_to(root / "loop.wav")
+    assert inside(root, "loop.wav") == root / "loop.wav"  # to be refused as a file that is not there
     (tmp_path / "root2").mkdir()
     assert inside(root, "a/x.wav") == root / "a" / "x.wav"
     assert inside(root, "within.wav").read_text() == "x"
