@@ -234,9 +234,15 @@ def test_a_header_that_tells_of_more_than_memory_holds(
     data[21:26] = bytes([data[21] | 0x0F, *[0xFF] * 4])  # the number of samples
     path.write_bytes(data)
     assert soundfile.info(str(path)).frames == 2**36 - 1
+    with pytest.raises(
+        ValueError, match=r"its header tells of 68719476735 samples; allowed: up to 4294967296"
+    ):
+        read_audio(path)
+    data[21] &= 0xF0
+    path.write_bytes(data)
 
     def refuse(*args: object, **kwargs: object) -> None:  # whether the system would, depends on its settings
-        raise MemoryError("Unable to allocate 256. GiB")
+        raise MemoryError("Unable to allocate 16. GiB")
 
     monkeypatch.setattr(np, "empty", refuse)
     with pytest.raises(ValueError, match=r"long\.flac: not readable as audio \(Unable to allocate"):
@@ -330,16 +336,6 @@ def test_a_header_that_would_fill_the_memory_is_not_believed(
         ValueError, match=f"a.wav: its header tells of {rate} Hz and {channels} channels; allowed"
     ):
         read_audio(path, any_rate=True)
-
-
-def test_a_flac_header_of_more_samples_than_memory(tmp_path: Path) -> None:
-    path = tmp_path / "a.flac"
-    soundfile.write(path, np.full((4000, 2), 0.1), 16000)
-    data = bytearray(path.read_bytes())
-    data[21] |= 0x0F  # the highest of the 36 bits of its length in samples
-    path.write_bytes(data)
-    with pytest.raises(ValueError, match=r"a\.flac: its header tells of \d{12} samples; allowed: up to"):
-        read_audio(path)
 
 
 def test_samples_whose_powers_overflow_are_refused(tmp_path: Path) -> None:

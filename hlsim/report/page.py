@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import base64
 import os
+import re
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -61,13 +62,13 @@ def render_page(title: str, sections: Sequence[Section], lead: str = "") -> str:
 
 
 def render_markdown(title: str, sections: Sequence[Section], lead: str = "") -> str:
-    """Text and tables; what is drawn, played, folded or in parts of parts is on the page alone."""
+    """Text and tables; what is drawn, played, folded or in parts of parts is on the page alone. Tags stay text."""
     blocks = [f"# {title}", *([lead] if lead else [])]
     for section in sections:
         if (section.paragraphs or section.tables) and not (section.sections or section.folded):
             blocks += [f"## {section.title}", *section.paragraphs]
             blocks += [f"**{table.caption}**\n\n{table.markdown()}" for table in section.tables]
-    return "\n\n".join(blocks) + "\n"
+    return re.sub(r"<(?=[A-Za-z/!?])", "&lt;", "\n\n".join(blocks)) + "\n"
 
 
 def write_files(out: str | Path, contents: Mapping[str, str | bytes]) -> Path:

@@ -212,6 +212,17 @@ def test_names_that_fit_no_csv_file_are_faults(
     assert run(voicebank, tmp_path / "vbd-out").faults == 3  # here without a noisy counterpart
 
 
+def test_paths_of_faults_are_no_formulas(tmp_path: Path, pieces: list[Tensor]) -> None:
+    names = ["=1+1.wav", "+1.wav", "-1.wav", "@a.wav", "a=1.wav"]
+    (tmp_path / "speech").mkdir()
+    write_audio(tmp_path / "speech" / "good.wav", pieces[0], 16000)
+    for name in names:
+        (tmp_path / "speech" / name).touch()
+    assert run(tmp_path / "speech", tmp_path / "out").faults == 5
+    listed = [row["path"] for row in rows(tmp_path / "out" / "faults.csv")]
+    assert sorted(listed) == sorted([*(f"./{name}" for name in names[:4]), "a=1.wav"])
+
+
 def test_strict_makes_a_fault_an_error(voicebank: Path, tmp_path: Path) -> None:
     faulty(voicebank)
     for _ in range(2):

@@ -48,6 +48,7 @@ def test_conditions_may_be_called_anything(names: tuple[str, str]) -> None:
 
 def test_markdown_leaves_to_the_page_what_is_folded_or_nested() -> None:
     table = Table("t", ("a", "b"), [("1", "2")])
+    assert "p < .1, &lt;b> &lt;/b>" in render_markdown("T", [Section("S", ["p < .1, <b> </b>"])])
     sections = [
         Section("One", ["text"], [table]),
         Section("Folded", tables=[table], folded=True),
