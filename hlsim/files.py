@@ -169,7 +169,8 @@ def read_rows(path: str | Path) -> Iterator[tuple[int, dict[str, str]]]:
 
     Raises:
         OSError, UnicodeDecodeError, csv.Error: the file cannot be read.
-        ValueError: a column twice, or a row of more values than columns; the message names file and line.
+        ValueError: a column twice, or a row of more values than columns or with a null character; the message names file
+            and line.
     """
     # spreadsheets put a byte order mark first, which would hide the first column
     with open(path, newline="", encoding="utf-8-sig") as file:
@@ -179,6 +180,8 @@ def read_rows(path: str | Path) -> Iterator[tuple[int, dict[str, str]]]:
             if header.count(name) > 1:
                 raise ValueError(f"{path}, line {reader.line_num}: column {name} twice; allowed: once")
         for values in filter(None, reader):
+            if "\0" in "".join(values):
+                raise ValueError(f"{path}, line {reader.line_num}: holds a null character; allowed: text")
             if any(value.strip() for value in values[len(header) :]):
                 allowed = f"one for each of the {len(header)} columns"
                 raise ValueError(f"{path}, line {reader.line_num}: {len(values)} values; allowed: {allowed}")

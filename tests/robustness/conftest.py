@@ -1,6 +1,6 @@
 """How trials are run: seeded, with limits of time and memory, counted by kind, and told so that one can be run again.
 
-``pytest tests/robustness --trials 2000`` runs more of each kind; ``--trials 1 --first-seed 137`` runs one of them again.
+``pytest tests/robustness --trials 2000`` runs more of each kind; ``--trials 1 --first-seed 137 -k recipes`` one again.
 """
 
 import linecache
@@ -13,14 +13,13 @@ from random import Random
 from types import FrameType
 from typing import Any, NoReturn
 
-import numpy as np
 import pytest
 import torch
 
 from hlsim.audio import write_audio
 
 ROOT = Path(__file__).parents[2]
-OURS = (str(ROOT / "hlsim"), str(ROOT / "compensators"))
+OURS = tuple(str(ROOT / name) for name in ("hlsim", "compensators"))
 TALLY = pytest.StashKey[dict[str, list[int]]]()
 MOST_MEMORY = 4 << 30  # bytes more than before the trial
 LONGEST_MESSAGE = 16_000  # it quotes what was given
@@ -44,52 +43,15 @@ class Overtime(BaseException):
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     group = parser.getgroup("robustness")
-    group.addoption("--trials", type=int, default=None, help="trials of a quick kind (default: 25)")
-    group.addoption("--first-seed", type=int, default=None, help="of the trials of each kind (default: 0)")
+    group.addoption(
+        "--trials", type=int, help="trials of a kind; some have a multiple or a share (default: 25)"
+    )
+    group.addoption("--first-seed", type=int, help="of the trials of each kind (default: 0)")
 
 
 def pytest_terminal_summary(terminalreporter: Any, config: pytest.Config) -> None:
     for kind, (tried, failed) in config.stash.get(TALLY, {}).items():
         terminalreporter.write_line(f"robustness: {kind}: {tried} tried, {failed} failed")
-
-
-def damage(draw: Random, data: bytes) -> bytes:
-    """A file's bytes with some flipped, cut off, left out, put in or twice there; headers more than the rest."""
-    data = bytearray(data)
-    for _ in range(draw.choice((1, 1, 2, 8))):
-        place = draw.randrange(max(1, min(len(data), draw.choice((64, 256, len(data))))))
-        piece, way = draw.randrange(1, 65), draw.randrange(6)
-        if way == 0:
-            data[place : place + 1] = bytes([draw.randrange(256)])
-        elif way == 1:
-            data[place : place + 1] = bytes(
-                byte ^ (1 << draw.randrange(8)) for byte in data[place : place + 1]
-            )
-        elif way == 2:
-            data[place : place + 4] = draw.choice((0, 1, 2**31 - 1, 2**31, 2**32 - 1)).to_bytes(4, "little")
-        elif way == 3:
-            del data[place : place + piece]
-        elif way == 4:
-            data[place:place] = draw.choice((draw.randbytes(piece), bytes(data[place : place + piece])))
-        elif draw.random() < 0.5:
-            del data[draw.randrange(len(data) + 1) :]
-    return bytes(data)
-
-
-def own_words(error: BaseException) -> bool:
-    """Whether it is a ValueError that hlsim itself raised, not what it calls, with a message that fits a terminal."""
-    kind = type(error)
-    if not isinstance(error, ValueError) or (
-        kind is not ValueError and not kind.__module__.startswith("hlsim")
-    ):
-        return False
-    trace = error.__traceback__
-    while trace is not None and trace.tb_next is not None:
-        trace = trace.tb_next
-    if trace is None or not trace.tb_frame.f_code.co_filename.startswith(OURS):
-        return False
-    line = linecache.getline(trace.tb_frame.f_code.co_filename, trace.tb_lineno).strip()
-    return line.startswith("raise ") and 10 < len(str(error)) < LONGEST_MESSAGE
 
 
 @contextmanager
@@ -99,10 +61,10 @@ def limited(seconds: float) -> Iterator[None]:
     def end(number: int, frame: FrameType | None) -> NoReturn:
         raise Overtime(f"longer than {seconds:g} s")
 
-    pages = int(Path("/proc/self/statm").read_text().split()[0]) if Path("/proc/self/statm").exists() else 0
     kept, before = resource.getrlimit(resource.RLIMIT_AS), signal.signal(signal.SIGALRM, end)
-    if pages:
-        resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + MOST_MEMORY, kept[1]))
+    if (counts := Path("/proc/self/statm")).exists():
+        used = int(counts.read_text().split()[0]) * resource.getpagesize()
+        resource.setrlimit(resource.RLIMIT_AS, (used + MOST_MEMORY, kept[1]))
     signal.setitimer(signal.ITIMER_REAL, seconds)
     try:
         yield
@@ -116,7 +78,6 @@ class Bench:
     """Runs trials of a kind; see ``run``."""
 
     texts, values = TEXTS, VALUES
-    damage, own_words, limited = staticmethod(damage), staticmethod(own_words), staticmethod(limited)
 
     def __init__(self, config: pytest.Config) -> None:
         self.trials = config.getoption("trials", None) or 25
@@ -131,31 +92,65 @@ class Bench:
         *,
         share: float = 1.0,
         count: int | None = None,
-        seconds: float = 30.0,
     ) -> None:
         """Make an input from each seed and try it: it passes, or raises a ValueError of hlsim's own.
 
         Args:
-            share: trials over those of a quick kind; one at least.
+            share: of the trials asked for; one at least.
             count: or else how many, whatever was asked for.
-            seconds: that one may take.
         """
-        failures = []
-        first = 0 if count else self.first
+        first, failures = 0 if count else self.first, []
         seeds = range(first, first + (count or max(1, round(share * self.trials))))
         for seed in seeds:
             given = make(Random(f"{kind}:{seed}"))
             try:
-                with limited(seconds):
+                with limited(60.0):
                     attempt(given)
             except (Exception, Overtime) as error:
-                if not own_words(error):
+                if not self.own_words(error):
                     said = f"{type(error).__name__}: {str(error)[:300]}"
                     failures.append(f"{kind}, seed {seed}: {said}\n  input: {repr(given)[:600]}")
         tried, failed = self.tally.get(kind, (0, 0))
         self.tally[kind] = [tried + len(seeds), failed + len(failures)]
         if failures:
             pytest.fail("\n".join([f"{len(failures)} of {len(seeds)} failed", *failures[:10]]), pytrace=False)
+
+    @staticmethod
+    def own_words(error: BaseException) -> bool:
+        """Whether it is a ValueError that hlsim itself raised, not what it calls, with a message that says something."""
+        trace, kind = error.__traceback__, type(error)
+        while trace is not None and trace.tb_next is not None:
+            trace = trace.tb_next
+        assert trace is not None
+        file = trace.tb_frame.f_code.co_filename
+        raised = linecache.getline(file, trace.tb_lineno).strip().startswith("raise ")
+        own = kind is ValueError or (isinstance(error, ValueError) and kind.__module__.startswith("hlsim"))
+        return own and raised and file.startswith(OURS) and 10 < len(str(error)) < LONGEST_MESSAGE
+
+    @staticmethod
+    def damage(draw: Random, whole: bytes) -> bytes:
+        """Bytes flipped, cut off, left out, put in or twice there; in the header more than in the rest."""
+        data = bytearray(whole)
+        for _ in range(draw.choice((1, 1, 2, 8))):
+            place = draw.randrange(max(1, min(len(data), draw.choice((64, 256, len(data))))))
+            piece, way = draw.randrange(1, 65), draw.randrange(6)
+            if way == 0:
+                data[place : place + 1] = draw.randbytes(1)
+            elif way == 1:
+                data[place : place + 1] = bytes(
+                    byte ^ (1 << draw.randrange(8)) for byte in data[place : place + 1]
+                )
+            elif way == 2:
+                data[place : place + 4] = draw.choice((0, 1, 2**31 - 1, 2**31, 2**32 - 1)).to_bytes(
+                    4, "little"
+                )
+            elif way == 3:
+                del data[place : place + piece]
+            elif way == 4:
+                data[place:place] = draw.choice((draw.randbytes(piece), bytes(data[place : place + piece])))
+            elif draw.random() < 0.5:
+                del data[draw.randrange(len(data) + 1) :]
+        return bytes(data)
 
 
 @pytest.fixture(scope="session")
@@ -166,10 +161,8 @@ def bench(pytestconfig: pytest.Config) -> Bench:
 @pytest.fixture
 def corpus(tmp_path: Path) -> Path:
     """Three speakers of three utterances of 0.8 s each, and two files of noise."""
-    generator = torch.Generator().manual_seed(0)
+    generator, envelope = torch.Generator().manual_seed(0), torch.linspace(0.0, 9.0, 12800).sin()
     for name in (*(f"speech/s{n // 3}/{n}.wav" for n in range(9)), "noise/hum/1.wav", "noise/hiss/2.wav"):
-        path = tmp_path / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        envelope = torch.from_numpy(np.sin(np.linspace(0.0, 9.0, 12800))).float()
-        write_audio(path, 0.1 * envelope * torch.randn(12800, generator=generator), 16000)
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        write_audio(tmp_path / name, 0.1 * envelope * torch.randn(12800, generator=generator), 16000)
     return tmp_path

@@ -29,12 +29,13 @@ from hlsim.neuro import NeuroConfig
 from hlsim.pretrained import checkpoint_about, checkpoint_digest, save_checkpoint
 from hlsim.training.recipes import CompensatorRecipe, SimulatorRecipe
 
-ROOT = Path(__file__).parents[2]
-
-
-def written(path: Path, data: bytes) -> Path:
-    path.write_bytes(data)
-    return path
+EXAMPLES = Path(__file__).parents[2] / "examples"
+CORPUS = "file,id,speaker,split,noisy,noise,snr\na.wav,1,s,train,b.wav,hum,5\nc.wav,2,t,test,,,\n"
+LEVELS = "hl_250,hl_500,hl_1000,hl_2000,hl_3000,hl_4000,hl_6000,hl_8000\n", "35,35,40,50,55,60,65,65\n"
+EARS = f"listener,ear,split,{LEVELS[0]}L1,left,train,{LEVELS[1]}L1,right,test,{LEVELS[1]}"
+MANIFEST = f"listener,ear,condition,clean,processed,snr,spl,{LEVELS[0]}" + "".join(
+    f"L{n},left,{name},c/{n}.wav,{name}/{n}.wav,5,65,{LEVELS[1]}" for n in (1, 2) for name in "ab"
+)
 
 
 def all_of(bench: Any, *readers: Callable[[], Any]) -> None:
@@ -50,32 +51,27 @@ def all_of(bench: Any, *readers: Callable[[], Any]) -> None:
 @pytest.mark.parametrize("ending", ["wav", "flac", "ogg"])
 def test_audio(bench: Any, tmp_path: Path, ending: str) -> None:
     path = tmp_path / f"a.{ending}"
-    samples = np.random.default_rng(0).uniform(-0.1, 0.1, (8000, 2))
-    soundfile.write(path, samples, 16000, subtype={"wav": "FLOAT"}.get(ending))
+    soundfile.write(path, np.random.default_rng(0).uniform(-0.1, 0.1, (8000, 2)), 16000)
     whole = path.read_bytes()
 
+    def read() -> None:
+        waveform, rate = read_audio(path, any_rate=True)
+        assert 16000 <= rate <= 384_000 and bool(torch.isfinite(waveform).all())
+
     def attempt(data: bytes) -> None:
-        written(path, data)
-        waveform = None
-
-        def read() -> None:
-            nonlocal waveform
-            waveform, rate = read_audio(path, any_rate=True)
-            assert 16000 <= rate <= 384_000 and bool(torch.isfinite(waveform).all())
-
+        path.write_bytes(data)
         all_of(bench, read, lambda: read_stretch(path, 0.2, 0.5))
 
     bench.run(f"{ending} bytes", lambda draw: bench.damage(draw, whole), attempt, share=4.0)
 
 
 def damaged_table(bench: Any, draw: Random, text: str) -> bytes:
-    """A CSV file with bytes damaged, or with cells of another kind, rows and columns gone or twice."""
+    """Bytes damaged, or cells of another kind, rows and columns gone or twice."""
     if draw.random() < 0.4:
         return bench.damage(draw, text.encode())
-    rows = [row[:] for row in csv.reader(io.StringIO(text))]
+    rows = list(csv.reader(io.StringIO(text)))
     for _ in range(draw.randrange(1, 4)):
-        row = draw.randrange(len(rows))
-        way = draw.randrange(5)
+        row, way = draw.randrange(len(rows)), draw.randrange(5)
         if way < 3 and rows[row]:
             rows[row][draw.randrange(len(rows[row]))] = draw.choice(bench.texts)
         elif way == 3:
@@ -87,146 +83,124 @@ def damaged_table(bench: Any, draw: Random, text: str) -> bytes:
     return table.getvalue().encode(draw.choice(("utf-8", "utf-8", "utf-8-sig", "utf-16")), "replace")
 
 
-def test_tables(bench: Any, tmp_path: Path) -> None:
-    hz = (250, 500, 1000, 2000, 3000, 4000, 6000, 8000)
-    head, levels = ",".join(f"hl_{f}" for f in hz), "35,35,40,50,55,60,65,65"
-    ears = f"listener,ear,split,{head}\nL1,left,train,{levels}\nL1,right,test,{levels}\n"
-    manifest = f"listener,ear,condition,clean,processed,snr,spl,{head}\n" + "".join(
-        f"L{n},left,{condition},c/{n}.wav,{condition}/{n}.wav,5,65,{levels}\n"
-        for n in (1, 2)
-        for condition in "ab"
-    )
-    corpus = "file,id,speaker,split,noisy,noise,snr\na.wav,1,s,train,b.wav,hum,5\nc.wav,2,t,test,,,\n"
+@pytest.mark.parametrize("kind", ["audiogram tables", "report manifests", "corpus tables"])
+def test_tables(bench: Any, tmp_path: Path, kind: str) -> None:
     path = tmp_path / "t.csv"
-    kinds: dict[str, tuple[str, Callable[[], Any]]] = {
-        "audiogram tables": (ears, lambda: read_audiograms(path, simulated=True)),
-        "report manifests": (manifest, lambda: read_manifest(path)),
-        "corpus tables": (corpus, lambda: list(find_utterances(tmp_path, "folder", path))),
-    }
-    for kind, (text, read) in kinds.items():
+    text, read = {
+        "audiogram tables": (EARS, lambda: read_audiograms(path, simulated=True)),
+        "report manifests": (MANIFEST, lambda: read_manifest(path)),
+        "corpus tables": (CORPUS, lambda: list(find_utterances(tmp_path, "folder", path))),
+    }[kind]
 
-        def attempt(data: bytes, read: Callable[[], Any] = read) -> None:
-            written(path, data)
-            read()
+    def attempt(data: bytes) -> None:
+        path.write_bytes(data)
+        read()
 
-        bench.run(kind, lambda draw, text=text: damaged_table(bench, draw, text), attempt, share=4.0)
+    bench.run(kind, lambda draw: damaged_table(bench, draw, text), attempt, share=4.0)
 
 
 def damaged_values(bench: Any, draw: Random, value: Any) -> Any:
-    """A tree of settings with one leaf, or more, of another kind, or gone."""
-    if isinstance(value, dict) and value and draw.random() < 0.9:
-        key = draw.choice(sorted(value))
-        way = draw.random()
-        rest = {name: one for name, one in value.items() if way < 0.9 or name != key}
-        return rest | ({key: damaged_values(bench, draw, value[key])} if way < 0.9 else {})
-    return draw.choice(bench.values)
+    """A tree of settings with a leaf or a branch of another kind, or gone."""
+    if not (isinstance(value, dict) and value) or draw.random() < 0.1:
+        return draw.choice(bench.values)
+    key = draw.choice(sorted(value))
+    changed = {} if draw.random() < 0.1 else {key: damaged_values(bench, draw, value[key])}
+    return {name: one for name, one in value.items() if name != key} | changed
 
 
 def test_recipes(bench: Any, tmp_path: Path) -> None:
     yaml = pytest.importorskip("yaml")
-    texts = [path.read_text() for path in sorted((ROOT / "examples").glob("*.yaml"))]
+    texts = [path.read_text() for path in sorted(EXAMPLES.glob("*.yaml"))]
     path = tmp_path / "r.yaml"
 
     def make(draw: Random) -> bytes:
         text = draw.choice(texts)
         if draw.random() < 0.4:
             return bench.damage(draw, text.encode())
-        return str(
-            yaml.safe_dump(damaged_values(bench, draw, yaml.safe_load(text)), allow_unicode=True)
-        ).encode()
+        return yaml.safe_dump(damaged_values(bench, draw, yaml.safe_load(text)), allow_unicode=True).encode()
 
     def attempt(data: bytes) -> None:
-        settings = read_recipe(written(path, data))
+        path.write_bytes(data)
+        settings = read_recipe(path)
         all_of(
-            bench, lambda: SimulatorRecipe.from_dict(settings), lambda: CompensatorRecipe.from_dict(settings)
+            bench,
+            *(lambda kind=kind: kind.from_dict(settings) for kind in (SimulatorRecipe, CompensatorRecipe)),
         )
 
     bench.run("YAML recipes", make, attempt, share=4.0)
 
 
-@pytest.fixture
-def simulator(tmp_path: Path) -> Path:
-    config = NeuroConfig(channels=4, blocks=1)
-    save_checkpoint(
-        tmp_path / "s", "neuro-msbg", NeuroMSBG(config), config.to_dict(), {"audiogram": {"levels": [0] * 8}}
-    )
-    return tmp_path / "s"
-
-
-def test_checkpoints(bench: Any, tmp_path: Path, simulator: Path) -> None:
+def test_checkpoints(bench: Any, tmp_path: Path) -> None:
+    config, about = NeuroConfig(channels=4, blocks=1), {"audiogram": {"levels": [0] * 8}}
+    save_checkpoint(tmp_path / "s", "neuro-msbg", NeuroMSBG(config), config.to_dict(), about)
     save_compensator(HearingAid(HearingAidConfig(bands=4, bins=0, width=4, hidden=4)), tmp_path / "a")
-    folders = {"s": simulator, "a": tmp_path / "a"}
-    records = {name: (folder / "config.json").read_text() for name, folder in folders.items()}
-    weights = {name: (folder / "model.safetensors").read_bytes() for name, folder in folders.items()}
+    loaders = {tmp_path / "s": load_pretrained, tmp_path / "a": load_compensator}
+    whole = {
+        folder: [(folder / name).read_bytes() for name in ("config.json", "model.safetensors")]
+        for folder in loaders
+    }
 
-    def load(name: str, record: bytes, data: bytes) -> None:
-        written(folders[name] / "config.json", record)
-        written(folders[name] / "model.safetensors", data)
-        loader = load_pretrained if name == "s" else load_compensator
-        about = (checkpoint_about, checkpoint_digest, trained_for)
-        all_of(
-            bench, *(lambda read=read: read(folders[name]) for read in about), lambda: loader(folders[name])
-        )
-
-    def make_record(draw: Random) -> tuple[str, bytes]:
-        name = draw.choice("sa")
+    def make_record(draw: Random) -> tuple[Path, bytes, bytes]:
+        folder = draw.choice(sorted(whole))
+        record, weights = whole[folder]
         if draw.random() < 0.4:
-            return name, bench.damage(draw, records[name].encode())
-        record = json.loads(records[name])
-        changed = damaged_values(bench, draw, record)
+            return folder, bench.damage(draw, record), weights
+        changed = damaged_values(bench, draw, json.loads(record))
         if isinstance(changed, dict) and draw.random() < 0.8:
             changed.pop("config_sha256", None)  # as of a person who knows how to
-        return name, json.dumps(changed).encode()
+        return folder, json.dumps(changed).encode(), weights
 
-    bench.run("JSON configurations", make_record, lambda x: load(*x, weights[x[0]]), share=4.0)
+    def make_weights(draw: Random) -> tuple[Path, bytes, bytes]:
+        folder = draw.choice(sorted(whole))
+        weights = bench.damage(draw, whole[folder][1])
+        record = json.loads(whole[folder][0]) | {"sha256": hashlib.sha256(weights).hexdigest()}
+        return folder, json.dumps(record).encode(), weights
 
-    def make_weights(draw: Random) -> tuple[str, bytes]:
-        name = draw.choice("sa")
-        return name, bench.damage(draw, weights[name])
+    def load(given: tuple[Path, bytes, bytes]) -> None:
+        folder, record, weights = given
+        (folder / "config.json").write_bytes(record)
+        (folder / "model.safetensors").write_bytes(weights)
+        readers = (checkpoint_about, checkpoint_digest, trained_for, loaders[folder])
+        all_of(bench, *(lambda read=read: read(folder) for read in readers))
 
-    def load_weights(given: tuple[str, bytes]) -> None:
-        name, data = given
-        record = json.loads(records[name]) | {"sha256": hashlib.sha256(data).hexdigest()}
-        load(name, json.dumps(record).encode(), data)
-
-    bench.run("safetensors of checkpoints", make_weights, load_weights, share=4.0)
+    bench.run("JSON configurations", make_record, load, share=4.0)
+    bench.run("safetensors of checkpoints", make_weights, load, share=4.0)
 
 
-def test_instances_plans_and_scores(bench: Any, corpus: Path, tmp_path: Path) -> None:
+def test_instances_and_scores(bench: Any, tmp_path: Path) -> None:
     tensors = {name: torch.randn(800) for name in ("clean", "signal", "impaired")}
     instance = Instance(**tensors, thresholds=torch.zeros(8)).to_bytes()
+    scores = 5 * (json.dumps({"key": "k", "score": 0.5, "seed": 1, "seconds": 2.0}) + "\n").encode()
     path = tmp_path / "x"
 
     def read_instance(data: bytes) -> None:
-        written(path, data)
+        path.write_bytes(data)
         if is_whole(path):
-            found = Instance.read(path)
-            assert {len(found.clean), len(found.signal)} <= {800} or found.clean.ndim > 0
+            Instance.read(path)
+
+    def read_scores(data: bytes) -> None:
+        path.write_bytes(data)
+        ScoreStore(path).append("new", {"score": 1.0})
+        assert ScoreStore(path).get("new") == {"score": 1.0}
 
     bench.run("safetensors of instances", lambda draw: bench.damage(draw, instance), read_instance, share=4.0)
-    folder = tmp_path / "plan"
-    prepare(PlanSettings(corpus / "speech"), folder, jobs=1)
-    names = ("plan.json", "manifest.csv", "instances.csv")
-    whole = {name: (folder / name).read_bytes() for name in names}
+    bench.run("stored scores", lambda draw: bench.damage(draw, scores), read_scores, share=2.0)
 
-    def make_plan(draw: Random) -> tuple[str, bytes]:
-        name = draw.choice(names)
+
+def test_plans(bench: Any, corpus: Path) -> None:
+    folder = corpus / "plan"
+    prepare(PlanSettings(corpus / "speech"), folder, jobs=1)
+    whole = {name: (folder / name).read_bytes() for name in ("plan.json", "manifest.csv", "instances.csv")}
+
+    def make(draw: Random) -> tuple[str, bytes]:
+        name = draw.choice(list(whole))
         if name == "plan.json" and draw.random() < 0.7:
             return name, json.dumps(damaged_values(bench, draw, json.loads(whole[name]))).encode()
         return name, bench.damage(draw, whole[name])
 
-    def open_plan(given: tuple[str, bytes]) -> None:
-        for name in names:
-            written(folder / name, whole[name])
-        written(folder / given[0], given[1])
+    def attempt(given: tuple[str, bytes]) -> None:
+        for name, data in (whole | dict([given])).items():
+            (folder / name).write_bytes(data)
         Plan(folder).instance(0)
 
-    bench.run("prepared plans", make_plan, open_plan, share=2.0)
-    line = json.dumps({"key": "k", "score": 0.5, "seed": 1, "seconds": 2.0, "clean_dbfs": -20.0}) + "\n"
-
-    def read_scores(data: bytes) -> None:
-        store = ScoreStore(written(path, data))
-        store.append("new", {"score": 1.0})
-        assert ScoreStore(path).get("new") == {"score": 1.0}
-
-    bench.run("stored scores", lambda draw: bench.damage(draw, 5 * line.encode()), read_scores, share=2.0)
+    bench.run("prepared plans", make, attempt, share=2.0)

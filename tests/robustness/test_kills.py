@@ -3,6 +3,7 @@
 import hashlib
 import multiprocessing
 import os
+import shutil
 import signal
 import sys
 import time
@@ -43,58 +44,64 @@ def results(folder: Path) -> dict[str, str]:
 class Command:
     """A command, what it gives undisturbed, and how many seconds that takes."""
 
-    def __init__(self, arguments: list[str], out: Path) -> None:
-        self.arguments, self.out = arguments, out
-        assert main([*arguments, "--out", str(out / "warm")]) == 0
-        before = time.monotonic()
-        assert main([*arguments, "--out", str(out / "whole")]) == 0
-        self.seconds, self.whole = time.monotonic() - before, results(out / "whole")
+    def __init__(self, words: list[str], folder: Path) -> None:
+        self.words, self.folder = words, folder
+        for name in ("warm", "whole"):
+            before = time.monotonic()
+            assert main([*words, "--out", str(folder / name)]) == 0
+        self.seconds, self.whole = time.monotonic() - before, results(folder / "whole")
 
-    def disturbed(self, given: list[float]) -> None:
+    def killed(self, shares: list[float]) -> None:
         """Kill it after each share of its time, and let it end."""
-        target = self.out / f"killed-{time.monotonic_ns()}"
-        arguments = [*self.arguments, "--out", str(target)]
-        for share in given:
+        arguments, target = self._anew()
+        for share in shares:
             process = start(arguments)
             process.join(share * self.seconds)
             process.kill()
             process.join()
             assert process.exitcode in (0, -signal.SIGKILL), f"ended with {process.exitcode}"
-        assert main(arguments) == 0
-        assert results(target) == self.whole, "another result"
+        self._same(arguments, target)
 
-    def twice(self, given: list[float]) -> None:
+    def twice(self, shares: list[float]) -> None:
         """Start it again beside the first after a share of its time: one of them may be refused."""
-        target = self.out / f"twice-{time.monotonic_ns()}"
-        arguments = [*self.arguments, "--out", str(target)]
+        arguments, target = self._anew()
         first = start(arguments)
-        time.sleep(given[0] * self.seconds)
+        time.sleep(shares[0] * self.seconds)
         second = start(arguments)
-        first.join()
-        second.join()
+        for process in (first, second):
+            process.join()
         statuses = {first.exitcode, second.exitcode}
         assert 0 in statuses and statuses <= {0, 2}, f"ended with {first.exitcode} and {second.exitcode}"
+        self._same(arguments, target)
+
+    def _anew(self) -> tuple[list[str], Path]:
+        target = self.folder / f"out-{time.monotonic_ns()}"
+        return [*self.words, "--out", str(target)], target
+
+    def _same(self, arguments: list[str], target: Path) -> None:
         assert main(arguments) == 0
         assert results(target) == self.whole, "another result"
+        shutil.rmtree(target)
 
 
-def shares(draw: Random) -> list[float]:
+def moments(draw: Random) -> list[float]:
+    """Shares of the time that a command takes."""
     return [round(draw.uniform(0.0, 1.1), 3) for _ in range(draw.choice((1, 1, 3)))]
 
 
 def test_prepare(bench: Any, corpus: Path) -> None:
     options = ["--noise", str(corpus / "noise"), "--write", "--jobs", "1"]
     command = Command(["prepare", str(corpus / "speech"), *options], corpus)
-    bench.run("kills of prepare --write", shares, command.disturbed, share=0.2)
-    bench.run("two prepares at once", shares, command.twice, share=0.2)
+    bench.run("kills of prepare --write", moments, command.killed, share=0.2)
+    bench.run("two prepares at once", moments, command.twice, share=0.2)
 
 
 def test_haspi_report(bench: Any, corpus: Path) -> None:
     pytest.importorskip("matplotlib")
-    folders = [word for name in ("clean", "before", "after") for word in (f"--{name}", str(corpus / name))]
+    words = ["haspi-report", "--audiogram", "N3", "--jobs", "1", "--listen", "1"]
     for name in ("clean", "before", "after"):
         (corpus / name).symlink_to(corpus / "speech" / "s0")
-    options = ["--audiogram", "N3", "--jobs", "1", "--listen", "1"]
-    command = Command(["haspi-report", *folders, *options], corpus)
-    bench.run("kills of haspi-report", shares, command.disturbed, share=0.12)
-    bench.run("two reports at once", shares, command.twice, share=0.08)
+        words += [f"--{name}", str(corpus / name)]
+    command = Command(words, corpus)
+    bench.run("kills of haspi-report", moments, command.killed, share=0.08)
+    bench.run("two reports at once", moments, command.twice, share=0.04)
