@@ -152,7 +152,11 @@ def _old(folder: Path) -> Path:
 
 
 def resolved(path: str | Path) -> Path:
-    """Links followed; one that leads to itself stays, at which ``Path.resolve`` raises RuntimeError up to Python 3.12."""
+    """Links followed; one that leads to itself stays, at which ``Path.resolve`` raises RuntimeError up to Python 3.12.
+
+    ValueError for a null character."""
+    if "\0" in str(path):
+        raise ValueError(f"{str(path)!r}: holds a null character; allowed: a path")
     return Path(os.path.realpath(path))
 
 

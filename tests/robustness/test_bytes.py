@@ -51,7 +51,12 @@ def all_of(bench: Any, *readers: Callable[[], Any]) -> None:
 @pytest.mark.parametrize("ending", ["wav", "flac", "ogg"])
 def test_audio(bench: Any, tmp_path: Path, ending: str) -> None:
     path = tmp_path / f"a.{ending}"
-    soundfile.write(path, np.random.default_rng(0).uniform(-0.1, 0.1, (8000, 2)), 16000)
+    soundfile.write(
+        path,
+        np.random.default_rng(0).uniform(-0.1, 0.1, (8000, 2)),
+        16000,
+        "FLOAT" if ending == "wav" else None,
+    )
     whole = path.read_bytes()
 
     def read() -> None:
