@@ -139,7 +139,8 @@ class Wearable(nn.Module):
         if audiogram is None:
             raise ValueError(f"no audiogram: give one with each call, {type(self).__name__} holds none")
         thresholds = resolve_thresholds(None, audiogram, waveform, taker=type(self).__name__)
-        dtype = torch.promote_types(waveform.dtype, torch.float32)
+        own = next((weight.dtype for weight in self.parameters()), waveform.dtype)
+        dtype = torch.promote_types(own, torch.float32)
         batch = torch.broadcast_shapes(waveform.shape[:-1], thresholds.shape[:-1])
         settings = [
             check_slider(name, slider, batch).to(thresholds).expand(batch)
