@@ -20,6 +20,7 @@ from hlsim.evaluation.gain_curves import gain_curves
 from hlsim.evaluation.items import INPUT_LEVELS
 from hlsim.evaluation.judging import NORMAL, AtLevelOf, Unaided
 from hlsim.evaluation.scoring import HaspiItem, haspi_many
+from hlsim.files import write_whole
 from hlsim.metrics.pair import check_pair
 from hlsim.msbg import MSBG
 from hlsim.neuro.config import NEURO_RATE
@@ -133,7 +134,7 @@ def demo(
     table = result_table(result, heard_off)
     front, picture = demo_front(result, table, Sounds(names, clean, given, heard), curves)
     write_report(result, folder, front=front)
-    (folder / "spectrograms.png").write_bytes(picture)
+    write_whole(folder / "spectrograms.png", picture)
     _write_audio(folder / "audio", names, clean, {key: heard[name] for name, (key, _) in conditions.items()})
     return f"\n{front.lead}\n\n{table.text()}\n\nThe page: {folder / 'report.html'}"
 
