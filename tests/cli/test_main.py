@@ -519,6 +519,8 @@ def test_a_stopped_command_says_how_to_go_on(
     status: int,
 ) -> None:
     def stopped(*_: object, **__: object) -> None:
+        if number == signal.SIGINT:  # which a job in the background ignores
+            raise KeyboardInterrupt
         signal.raise_signal(number)
 
     before = signal.getsignal(signal.SIGTERM)

@@ -36,7 +36,7 @@ def test_saving_takes_nothing_else_away(tmp_path: Path) -> None:
     save_compensator(MappingCompensator(MappingConfig(channels=4, blocks=1)), tmp_path / "runs")
     (tmp_path / "runs" / "config.json").rename(tmp_path / "runs" / "notes.txt")
     for name in ("runs", "file", "."):
-        with pytest.raises(ValueError, match="holds something else; allowed: a new folder"):
+        with pytest.raises(ValueError, match=r"holds something else \(notes.txt\); allowed: a new folder"):
             save_compensator(MappingCompensator(), tmp_path / name)
     assert (tmp_path / "file").read_text() == "kept" and (tmp_path / "runs" / "notes.txt").is_file()
     with pytest.raises(ValueError, match="NALR cannot be saved; allowed: a MappingCompensator"):
