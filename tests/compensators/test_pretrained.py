@@ -35,8 +35,13 @@ def test_saving_takes_nothing_else_away(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("kept")
     save_compensator(MappingCompensator(MappingConfig(channels=4, blocks=1)), tmp_path / "runs")
     (tmp_path / "runs" / "config.json").rename(tmp_path / "runs" / "notes.txt")
-    for name in ("runs", "file", "."):
-        with pytest.raises(ValueError, match=r"holds something else \(notes.txt\); allowed: a new folder"):
+    found = {
+        "runs": r"holds something else \(notes.txt\)",
+        "file": "not a folder",
+        ".": "holds something else",
+    }
+    for name, said in found.items():
+        with pytest.raises(ValueError, match=f"{said}.*; allowed: a new folder"):
             save_compensator(MappingCompensator(), tmp_path / name)
     assert (tmp_path / "file").read_text() == "kept" and (tmp_path / "runs" / "notes.txt").is_file()
     with pytest.raises(ValueError, match="NALR cannot be saved; allowed: a MappingCompensator"):
