@@ -192,7 +192,7 @@ def simulator_data(
 def compensator_data(data: TrainingData, recipe: CompensatorRecipe, ear: Audiogram | None) -> BatchData:
     """What a compensator for an ear, or else for all, is trained and validated on. Raises ValueError as
     ``simulator_data``."""
-    plain = replace(recipe, equalised=0.0, unreduced=0.0, seconds=_VALID_SECONDS)
+    plain = replace(recipe, equalised=0.0, seconds=_VALID_SECONDS)
     valid = CompensatorBatches(plain, data.validation(), ear)
     generator = torch.Generator().manual_seed(2_000 + recipe.seed)
     validation = [valid.draw(4, generator) for _ in range(0, recipe.validation_items, 4)]

@@ -166,6 +166,13 @@ def test_a_hearing_aid_learns_to_amplify_and_to_take_noise_off(data: TrainingDat
     assert set(torch.cat(drawn).tolist()) == {0.0, 1.0} and 0.3 < torch.cat(drawn).mean() < 0.7
 
 
+def test_without_noise_reduction_it_is_trained_and_validated(data: TrainingData) -> None:
+    settings = {"kind": "hearing-aid", "model": {"width": 8, "hidden": 8}, "unreduced": 1.0}
+    recipe = CompensatorRecipe.from_dict(SMALL | settings)
+    for batch in compensator_data(data, recipe, None).validation:
+        assert batch["noise_reduction"].count_nonzero() == 0
+
+
 @pytest.mark.parametrize(
     ("weights", "unreduced", "kept"),
     [
