@@ -3,14 +3,15 @@
     python examples/noise_reduction.py speech/valid noise/valid audiograms/valid.csv [ITEMS]
 
 Prints, for each scene, PESQ (wide band) and STOI for a normal ear, without amplification, and HASPI of the aid for
-measured ears with noise reduction on and off, at the level that the clean speech is given. RNNoise stands beside it where
-pyrnnoise is installed; it looks 20 ms ahead and more, the aid 4.
+measured ears with noise reduction on and off, at the level that the clean speech is given. RNNoise, DeepFilterNet3 and
+GTCRN stand beside it where they are installed (examples/enhancers.py); they look 20 ms ahead and more, the aid 4.
 """
 
 import math
 import statistics
 import sys
 from collections.abc import Callable
+from functools import partial
 
 import torch
 from pesq import PesqError, pesq
@@ -19,6 +20,7 @@ from scipy.signal import fftconvolve
 from torch import Tensor
 
 from compensators import load_compensator
+from examples.enhancers import GTCRN, DeepFilterNet3, RNNoise
 from hlsim import Audiogram
 from hlsim.audiogram import read_audiograms
 from hlsim.calibration import level_spl, set_level
@@ -67,13 +69,14 @@ def main() -> None:
         "none": lambda signal: signal,
         "hearing-aid": lambda signal: aid(signal, normal, 1.0, 0.0),
     }
-    try:
-        from examples.enhancers import RNNoise
-
-        before["RNNoise"] = lambda signal: RNNoise()(signal, RATE)
-        before["RNNoise"](torch.zeros(1, RATE))
-    except ImportError:
-        before.pop("RNNoise", None)
+    for other in (RNNoise, DeepFilterNet3, GTCRN):
+        enhance = other()
+        try:
+            enhance(torch.zeros(1, RATE), RATE)
+        except ImportError as error:
+            print(error, file=sys.stderr)
+        else:
+            before[other.__name__] = partial(enhance, sample_rate=RATE)
     print(
         "| scene | noise reduction | PESQ | STOI | HASPI | interval of the change |\n|---|---|---|---|---|---|"
     )
