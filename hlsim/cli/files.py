@@ -31,7 +31,7 @@ def compensate(parser: Parser) -> None:
     _in_and_out(parser, _compensate)
     text = (
         "a checkpoint's name or folder (one of one ear alone warns of another), wdrc (compression in bands), or nalr "
-        "(the prescription, which keeps what is above 8 kHz)"
+        "(the prescription)"
     )
     parser.option("--compensator", str, text, "hearing-aid")
     parser.sliders()
@@ -145,4 +145,4 @@ def _surprises(before: Tensor, after: Tensor, rate: int) -> Iterator[str]:
     powers = [torch.fft.rfft(one.double()).abs().square().sum(0) for one in (before, after)]
     given, made = (float(power[first:].sum() / power.sum()) for power in powers)
     if given > _HEARD and made < _LOST * given:
-        yield "what IN has above 8 kHz is missing; nalr, or --simulator msbg, keeps it"
+        yield "what IN has above 8 kHz is missing; hearing-aid, wdrc, nalr, or --simulator msbg keep it"

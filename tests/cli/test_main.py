@@ -267,7 +267,7 @@ def test_what_a_listener_would_not_expect_of_a_file_is_told(
         "--compensator",
     ]
     for level, compensator, clipped, dull in (
-        (0.001, "nalr", False, False), (0.001, "wdrc", False, True), (1.0, "nalr", True, False)
+        (0.001, "wdrc", False, False), (0.001, "compensator-general", False, True), (1.0, "nalr", True, False)
     ):  # fmt: skip
         soundfile.write(tmp_path / "in.wav", level * noise, 48000, subtype="FLOAT")
         assert main([*call, compensator]) == 0
