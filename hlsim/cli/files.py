@@ -23,12 +23,22 @@ _HEARD, _LOST = 1e-6, 1e-3  # share of the upper band in the power, and what of 
 
 
 def simulate(parser: Parser) -> None:
-    _in_and_out(parser, _simulate)
+    _in_and_out(
+        parser,
+        _simulate,
+        "speech.wav heard.wav --audiogram N3",
+        "speech heard --audiogram 20,25,30,40,50,55,60,65 --simulator msbg",
+    )
     parser.option("--simulator", str, "msbg (exact), or a checkpoint's name or folder", "neuro-msbg")
 
 
 def compensate(parser: Parser) -> None:
-    _in_and_out(parser, _compensate)
+    _in_and_out(
+        parser,
+        _compensate,
+        "speech.wav aided.wav --audiogram N3 --noise-reduction 0.5",
+        "speech aided --audiogram N4 --compensator nalr",
+    )
     text = (
         "a checkpoint's name or folder (one of one ear alone warns of another), wdrc (compression in bands), or nalr "
         "(the prescription)"
@@ -37,8 +47,8 @@ def compensate(parser: Parser) -> None:
     parser.sliders()
 
 
-def _in_and_out(parser: Parser, run: Callable[[argparse.Namespace], None]) -> None:
-    parser.set_defaults(run=run)
+def _in_and_out(parser: Parser, run: Callable[[argparse.Namespace], None], *examples: str) -> None:
+    parser.runs(run, *examples)
     text = "wav, flac or ogg, 16 kHz or more, any number of channels; or a folder of them, with those in it"
     parser.option("input", Path, text, metavar="IN")
     text = "wav (32-bit float), flac, or ogg, which takes two channels; for a folder one that takes wav files alike"

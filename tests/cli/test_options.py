@@ -3,6 +3,7 @@
 import inspect
 from collections.abc import Callable
 from importlib import import_module
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -29,6 +30,18 @@ def declared(command: str) -> Parser:
 def choices(command: str, option: str) -> tuple[str, ...]:
     (action,) = (action for action in declared(command)._actions if option in action.option_strings)
     return tuple(action.choices or ())
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_ends_with_two_examples_that_the_command_takes(command: str) -> None:
+    parser = declared(command)
+    text, examples = parser.format_help().split("\nexamples:\n")
+    assert text.startswith(f"usage: {command}")
+    one, two = (example.split() for example in examples.splitlines())
+    for words in (one, two):
+        assert words[0] == command and parser.parse_args(words[1:]).run
+        recipes = [word for word in words if word.endswith(".yaml")]
+        assert all((Path(__file__).parents[2] / recipe).is_file() for recipe in recipes)
 
 
 def test_names_that_are_written_twice_agree() -> None:
