@@ -99,6 +99,19 @@ def apply_gains(padded: Tensor, gains: Tensor, first: int = 0) -> Tensor:
     return padded[:, DELAY : DELAY + time] + added
 
 
+def gain_at_rate(gains: Tensor, rate: int, time: int) -> Tensor:
+    """One band's gains as ``apply_gains`` has them, linear from hop to hop, at the samples of another rate.
+
+    Args:
+        gains: before the first sample and at the last one of each hop.
+
+    Shape: (items, hops + 1) -> (items, time).
+    """
+    place = (torch.arange(time, device=gains.device) * RATE + rate).double() / (HOP * rate)
+    hop = place.long()
+    return torch.lerp(gains[:, hop], gains[:, hop + 1], (place - hop).to(gains))
+
+
 def frame_power(padded: Tensor) -> Tensor:
     """Power of each frequency in frames of 16 ms every 4 ms, whose sum is the mean square.
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from hlsim.checks import is_finite
-from hlsim.neuro.config import ModelConfig, NetworkConfig
+from hlsim.neuro.config import ModelConfig, NetworkConfig, Phase
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,7 @@ class MappingConfig(NetworkConfig):
     """
 
     start: str | float = "nalr"
-    phase: str = "input"
+    phase: Phase = "input"
     bands: int = 20
     reach_db: float = 40.0
     limit_spl: float = 110.0

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from compensators.bands import DELAY, HISTORY, HOP, RATE, apply_gains, frame_power
+from compensators.bands import DELAY, HISTORY, HOP, RATE, apply_gains, frame_power, gain_at_rate
 from compensators.limiter import soft_limit
 from compensators.stream import Slider, State, Stream
 from hlsim.audiogram import FREQUENCIES, AudiogramLike, resolve_thresholds
@@ -29,8 +29,8 @@ class Wearable(nn.Module):
     stream run the same ``step``.
 
     Args:
-        sample_rate: of inputs and outputs in Hz, 16000 to 48000; inside it is 16000, so that only the band under 8 kHz of
-            faster input comes back, and only whole signals go through: resampling looks 8.5 ms farther ahead.
+        sample_rate: of inputs and outputs in Hz, 16000 to 48000. The bands end at 8 kHz; what faster input has above gets
+            the gain of the highest, and only whole signals go through: resampling looks 8.5 ms farther ahead.
         full_scale_spl: level in dB SPL of RMS 1.0.
 
     Raises:
@@ -94,10 +94,17 @@ class Wearable(nn.Module):
 
         Shape: (items, hops * HOP) pascals, (items, n), (items, sliders) -> (items, hops * HOP).
         """
+        output, _, after = self._amplified(samples, fitted, sliders, state)
+        return self.finish(output), after
+
+    def _amplified(
+        self, samples: Tensor, fitted: Tensor, sliders: Tensor, state: State
+    ) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
+        """As ``step`` without the limit, and the highest band's gains, less 1. Shape: ... -> ..., (items, hops)."""
         after = self.advance(samples, fitted, sliders, state)
         gains = after["gains"]
         padded = torch.cat((state["past"][:, -2 * DELAY :], samples), -1)
-        return self.finish(apply_gains(padded, gains[:, :-1])), after | {"gains": gains[:, -2:]}
+        return apply_gains(padded, gains[:, :-1]), gains[:, 2:, -1], after | {"gains": gains[:, -2:]}
 
     def finish(self, samples: Tensor) -> Tensor:
         """The last step, in pascals, sample by sample. Any shape."""
@@ -110,16 +117,20 @@ class Wearable(nn.Module):
             batch, fitted, settings = self.prepare(waveform, audiogram, sliders)
             time, gain = waveform.shape[-1], gain_to_pascals(self.full_scale_spl)
             signals = waveform.to(fitted.dtype).expand(*batch, -1).reshape(-1, time) * gain
-            signals = resample(signals, self.sample_rate, RATE)
-            ours = signals.shape[-1]
-            signals = nn.functional.pad(signals, (0, DELAY + -(ours + DELAY) % HOP))
-            state, outputs = self.initial(settings), []
-            for block in signals.split(max(1, _BLOCK // (len(signals) * HOP)) * HOP, -1):
-                output, state = self.step(block, fitted, settings, state)
+            low = resample(signals, self.sample_rate, RATE)
+            ours = low.shape[-1]
+            state, outputs, highest = self.initial(settings), [], [low.new_zeros(len(low), 1)]
+            padded = nn.functional.pad(low, (0, DELAY + -(ours + DELAY) % HOP))
+            for block in padded.split(max(1, _BLOCK // (len(low) * HOP)) * HOP, -1):
+                output, gains, state = self._amplified(block, fitted, settings, state)
                 outputs.append(output)
-            result = torch.cat(outputs, -1)[:, DELAY : DELAY + ours]
-            if self.sample_rate != RATE:  # which can overshoot
-                result = self.finish(resample(result, RATE, self.sample_rate)[:, :time])
+                highest.append(gains)
+            result = resample(torch.cat(outputs, -1)[:, DELAY : DELAY + ours], RATE, self.sample_rate)
+            if self.sample_rate != RATE:
+                above = signals - resample(low, RATE, self.sample_rate)[:, :time]
+                gains = gain_at_rate(torch.cat(highest, -1), self.sample_rate, time)
+                result = result[:, :time] + (1.0 + gains) * above
+            result = self.finish(result)
             return (result / gain).reshape(*batch, time).to(waveform.dtype)
 
     def streamed(self, audiogram: AudiogramLike | None, sliders: Sequence[Slider]) -> Stream:

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields
 from decimal import Decimal, InvalidOperation
 from numbers import Real
-from typing import Any, get_type_hints
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import torch
 from torch import Tensor
@@ -29,14 +29,23 @@ def refuse_unknown(found: Iterable[Any], allowed: Iterable[str], what: str, wher
         raise ValueError(f"unknown {what} {', '.join(unknown)}{place}; allowed: {', '.join(allowed)}")
 
 
+def check_choice(name: str, value: Any, choice: Any, where: str = "") -> None:
+    """Raise ValueError unless a value is one of those of a ``Literal``."""
+    if not isinstance(value, str) or value not in get_args(choice):
+        place = f" {where}" if where else ""
+        raise ValueError(f"{name} {value!r}{place}; allowed: {', '.join(get_args(choice))}")
+
+
 def refuse_other_kinds(settings: Any, where: str) -> None:
     """Raise ValueError unless every field of a dataclass holds what it is annotated with: an int, a float, a bool, a str,
-    a pair of floats (ascending) or a dict of them."""
+    one of a few, a pair of floats (ascending) or a dict of them."""
     kinds = get_type_hints(type(settings))
     for name in (entry.name for entry in fields(settings)):
         kind, value = kinds[name], getattr(settings, name)
-        origin = getattr(kind, "__origin__", None)
-        if origin is tuple:
+        origin = get_origin(kind)
+        if origin is Literal:
+            check_choice(name, value, kind, where)
+        elif origin is tuple:
             if not isinstance(value, tuple | list) or len(value) != 2:
                 raise ValueError(f"{name} {value!r} {where}; allowed: a lowest and a highest, as [0, 20]")
             for one in value:

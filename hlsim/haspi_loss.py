@@ -6,7 +6,7 @@ from torch import nn
 
 from hlsim.audiogram import AudiogramLike
 from hlsim.calibration import PASCAL_SPL
-from hlsim.loss import Hearing, HearingLossLoss
+from hlsim.loss import Hearing, HearingLossLoss, Reduction
 from hlsim.neuro.config import NEURO_RATE
 
 _LEVEL = {"levels": 0.03, "louder": 0.06, "peaks": 1.0}
@@ -43,7 +43,7 @@ class HASPILoss(HearingLossLoss):
         simulator: str | Path | nn.Module = "neuro-msbg",
         sample_rate: int = NEURO_RATE,
         full_scale_spl: float = PASCAL_SPL,
-        reduction: str = "mean",
+        reduction: Reduction = "mean",
         normal: Hearing | None = None,
     ) -> None:
         criterion = {"haspi": 1.0, "hasqi": quality, "coherent-bands": level}

@@ -4,14 +4,14 @@ import math
 import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
 
 from hlsim.audiogram import FREQUENCIES, AudiogramLike, as_thresholds, own_thresholds
 from hlsim.calibration import PASCAL_SPL, check_full_scale, gain_to_pascals
-from hlsim.checks import Lengths, check_lengths, check_rate, check_waveform, silent_after
+from hlsim.checks import Lengths, check_choice, check_lengths, check_rate, check_waveform, silent_after
 from hlsim.criteria import coherent_bands, paper
 from hlsim.criteria.bands import HIGHEST, band_level_loss
 from hlsim.criteria.choice import Criterion, check_criterion, check_values, check_weights
@@ -25,10 +25,9 @@ from hlsim.neuro.config import NEURO_RATE
 from hlsim.pretrained import SIMULATOR, find_checkpoint, load_pretrained
 from hlsim.torchtools import not_compiled
 
-REFERENCES = ("clean", "normal-hearing")
+ReferenceName = Literal["clean", "normal-hearing"]
 
-REDUCTIONS = ("mean", "none")
-
+Reduction = Literal["mean", "none"]
 
 Hearing = Callable[[Tensor], Tensor]
 """(..., time) -> (..., time), as a normal ear hears."""
@@ -89,20 +88,19 @@ class HearingLossLoss(nn.Module):
         simulator: str | Path | nn.Module = "neuro-msbg",
         sample_rate: int = NEURO_RATE,
         full_scale_spl: float = PASCAL_SPL,
-        reference: str | None = None,
+        reference: ReferenceName | None = None,
         criterion: Criterion = "coherent-bands",
         weights: Mapping[str, float] | None = None,
-        reduction: str = "mean",
+        reduction: Reduction = "mean",
         normal: Hearing | None = None,
         unit_power: bool = False,
     ) -> None:
         super().__init__()
         self.sample_rate = check_rate(sample_rate)
         self.full_scale_spl = check_full_scale(full_scale_spl)
-        if reference is not None and (not isinstance(reference, str) or reference not in REFERENCES):
-            raise ValueError(f"reference is {reference!r}; allowed: {', '.join(REFERENCES)}")
-        if not isinstance(reduction, str) or reduction not in REDUCTIONS:
-            raise ValueError(f"reduction is {reduction!r}; allowed: {', '.join(REDUCTIONS)}")
+        if reference is not None:
+            check_choice("reference", reference, ReferenceName)
+        check_choice("reduction", reduction, Reduction)
         if normal is not None and not callable(normal):
             raise ValueError(
                 f"normal is {type(normal).__name__}; allowed: a module or callable (waveform) -> waveform"

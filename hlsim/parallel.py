@@ -6,11 +6,11 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from functools import partial
 from itertools import chain
-from typing import Any, NamedTuple, Protocol, TypeVar
+from typing import Any, Literal, NamedTuple, Protocol, TypeVar, get_args
 
 from hlsim.extras import require
 
-BACKENDS = ("loky", "dask")
+Backend = Literal["loky", "dask"]
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
@@ -108,12 +108,12 @@ def one_thread() -> Iterator[None]:
         torch.set_num_threads(threads)
 
 
-def check_parallel(jobs: int | None, backend: str, scheduler: str | None) -> None:
+def check_parallel(jobs: int | None, backend: Backend, scheduler: str | None) -> None:
     """Raise ValueError unless ``run_parallel`` can take these, and MissingExtraError where a package lacks."""
     if jobs is not None and jobs < 1:
         raise ValueError(f"jobs is {jobs}; allowed: 1 or more")
-    if backend not in BACKENDS:
-        raise ValueError(f"no backend {backend!r}; allowed: {', '.join(BACKENDS)}")
+    if backend not in get_args(Backend):
+        raise ValueError(f"no backend {backend!r}; allowed: {', '.join(get_args(Backend))}")
     if (backend == "dask") != (scheduler is not None):
         raise ValueError(
             "backend dask needs the scheduler's address, such as tcp://host:8786, and no other does"
@@ -129,7 +129,7 @@ def run_parallel(
     tasks: Iterable[Task],
     *,
     jobs: int | None = None,
-    backend: str = "loky",
+    backend: Backend = "loky",
     scheduler: str | None = None,
 ) -> Iterator[tuple[Task, Result | None]]:
     """Yield each task with its result, in the order in which they are done; tasks are drawn as they are needed.

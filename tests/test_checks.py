@@ -66,7 +66,7 @@ def test_other_names() -> None:
         CompensatorRecipe.from_dict({"snr": 5})
     with pytest.raises(ValueError, match=r"treated 'no way' in the recipe; allowed: true or false"):
         SimulatorRecipe.from_dict({"treated": "no way"})
-    with pytest.raises(ValueError, match=r"precision 16 in the recipe; allowed: text"):
+    with pytest.raises(ValueError, match=r"precision 16 in the recipe; allowed: float32, bfloat16"):
         SimulatorRecipe.from_dict({"precision": 16})
 
 

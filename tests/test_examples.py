@@ -199,3 +199,10 @@ def test_the_default_criterion_is_valid(speech: list[tuple[torch.Tensor, int]]) 
         assert haspi > 0.5 and hasqi > 0.5
     worst = {name: -value for name, value in found["default"].items()}
     assert not example.summary({**found, "upside down": worst}, "upside down")[2]
+
+
+def test_pictures_of_what_is_heard_are_small(tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    load("heard.py").main(tmp_path)
+    sizes = {path.name: path.stat().st_size for path in tmp_path.iterdir()}
+    assert set(sizes) == {"heard.png", "family.png"} and max(sizes.values()) < 300_000

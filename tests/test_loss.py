@@ -661,7 +661,7 @@ def test_simulator_by_folder_and_as_a_module(clean: Tensor) -> None:
         ({"sample_rate": "16k"}, "sample rate '16k' Hz; allowed: 16000 to 48000"),
         ({"full_scale_spl": 300}, "allowed: 0 to 200"),
         ({"full_scale_spl": None}, "full_scale_spl is None; allowed: 0 to 200"),
-        ({"reference": ["clean"]}, r"reference is \['clean'\]; allowed: clean, normal-hearing"),
+        ({"reference": ["clean"]}, r"reference \['clean'\]; allowed: clean, normal-hearing"),
         (
             {"criterion": ["paper"]},
             r"criterion is \['paper'\]; allowed: coherent-bands, bands, paper, haspi, hasqi, weights",
@@ -684,9 +684,9 @@ def test_simulator_by_folder_and_as_a_module(clean: Tensor) -> None:
             "'magnitude': 'a'.*allowed: finite numbers, 0 or more",
         ),
         ({"criterion": "paper", "weights": {"magnitude": True}}, "allowed: finite numbers, 0 or more"),
-        ({"reference": "noisy"}, "reference is 'noisy'; allowed: clean, normal-hearing"),
-        ({"reduction": "sum"}, "reduction is 'sum'; allowed: mean, none"),
-        ({"reduction": None}, "reduction is None; allowed: mean, none"),
+        ({"reference": "noisy"}, "reference 'noisy'; allowed: clean, normal-hearing"),
+        ({"reduction": "sum"}, "reduction 'sum'; allowed: mean, none"),
+        ({"reduction": None}, "reduction None; allowed: mean, none"),
         ({"criterion": "l1"}, "criterion is 'l1'; allowed: coherent-bands, bands, paper"),
         (
             {"criterion": "paper", "weights": {"pitch": 1.0}},

@@ -18,7 +18,11 @@ Measure = Callable[..., tuple[list[dict[str, Any]], list[str]]]
 
 
 def benchmark(parser: Parser) -> None:
-    parser.set_defaults(run=_benchmark)
+    parser.runs(
+        _benchmark,
+        "--brief",
+        "--what training metrics --json figures.json",
+    )
     option = parser.option
     option("--device", str, "cpu, cuda or cuda:1; pyclarity's Ear runs on the CPU always", "cpu")
     text = (

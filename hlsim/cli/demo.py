@@ -11,7 +11,11 @@ from hlsim.extras import require
 
 
 def demo(parser: Parser) -> None:
-    parser.set_defaults(run=_demo)
+    parser.runs(
+        _demo,
+        "",
+        "--audiogram S2 --minutes 1 --out s2",
+    )
     parser.option("--out", folder, "folder for report, audio and pictures", Path("hlsim-demo"))
     parser.audiogram("N4")
     text = "folder of 22 files or more instead of the embedded speech; a third is scored"

@@ -14,7 +14,11 @@ GAIN_EARS = ["N3", "S2"]
 
 
 def evaluate_simulator(parser: Parser) -> None:
-    parser.set_defaults(run=_evaluate_simulator)
+    parser.runs(
+        _evaluate_simulator,
+        "neuro-msbg neuro-msbg-cnn --speech speech/valid --audiograms ears.csv --out judged",
+        "runs/simulator/checkpoint --teacher msbg --speech speech/valid --audiograms ears.csv --out judged",
+    )
     option = parser.option
     option("names", str, "checkpoints, by name or folder, or msbg (exact)", nargs="+", metavar="NAME")
     option("--speech", Path, "folder of clean speech", required=True)
@@ -58,7 +62,11 @@ def _evaluate_simulator(options: argparse.Namespace) -> None:
 
 
 def evaluate_compensator(parser: Parser) -> None:
-    parser.set_defaults(run=_evaluate_compensator)
+    parser.runs(
+        _evaluate_compensator,
+        "hearing-aid --audiograms ears.csv --speech speech/valid --noise noise/valid --out judged",
+        "mine=runs/n3/checkpoint --audiogram N3 --speech speech/valid --items 40 --out judged",
+    )
     option = parser.option
     text = "compensators, by name or folder; LABEL=FOLDER is LABEL in the tables"
     option("names", str, text, nargs="+", metavar="NAME")
@@ -128,7 +136,11 @@ def _labelled(text: str) -> tuple[str, str]:
 
 
 def haspi_report(parser: Parser) -> None:
-    parser.set_defaults(run=_haspi_report)
+    parser.runs(
+        _haspi_report,
+        "--clean clean --before noisy --after enhanced --audiogram N3 --out report",
+        "--manifest items.csv --measures haspi,hasqi --baseline unaided --out report",
+    )
     option = parser.option
     option("--clean", Path, "folder of clean speech; the file names are the same in all three")
     option("--before", Path, "folder of what the ear was given")

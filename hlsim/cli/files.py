@@ -23,22 +23,32 @@ _HEARD, _LOST = 1e-6, 1e-3  # share of the upper band in the power, and what of 
 
 
 def simulate(parser: Parser) -> None:
-    _in_and_out(parser, _simulate)
+    _in_and_out(
+        parser,
+        _simulate,
+        "speech.wav heard.wav --audiogram N3",
+        "speech heard --audiogram 20,25,30,40,50,55,60,65 --simulator msbg",
+    )
     parser.option("--simulator", str, "msbg (exact), or a checkpoint's name or folder", "neuro-msbg")
 
 
 def compensate(parser: Parser) -> None:
-    _in_and_out(parser, _compensate)
+    _in_and_out(
+        parser,
+        _compensate,
+        "speech.wav aided.wav --audiogram N3 --noise-reduction 0.5",
+        "speech aided --audiogram N4 --compensator nalr",
+    )
     text = (
         "a checkpoint's name or folder (one of one ear alone warns of another), wdrc (compression in bands), or nalr "
-        "(the prescription, which keeps what is above 8 kHz)"
+        "(the prescription)"
     )
     parser.option("--compensator", str, text, "hearing-aid")
     parser.sliders()
 
 
-def _in_and_out(parser: Parser, run: Callable[[argparse.Namespace], None]) -> None:
-    parser.set_defaults(run=run)
+def _in_and_out(parser: Parser, run: Callable[[argparse.Namespace], None], *examples: str) -> None:
+    parser.runs(run, *examples)
     text = "wav, flac or ogg, 16 kHz or more, any number of channels; or a folder of them, with those in it"
     parser.option("input", Path, text, metavar="IN")
     text = "wav (32-bit float), flac, or ogg, which takes two channels; for a folder one that takes wav files alike"
@@ -48,15 +58,19 @@ def _in_and_out(parser: Parser, run: Callable[[argparse.Namespace], None]) -> No
 
 
 def _simulate(options: argparse.Namespace) -> None:
-    _pass_through(options, lambda rate: read_simulator(options.simulator, rate, options.full_scale_spl))
+    def build(rate: int, _: bool) -> Callable[..., Tensor]:
+        return read_simulator(options.simulator, rate, options.full_scale_spl)
+
+    # above 8 kHz msbg leaves little to many ears, and all that they hear
+    _pass_through(options, build, "" if options.simulator == "msbg" else "--simulator msbg keeps it")
 
 
 def _compensate(options: argparse.Namespace) -> None:
-    def build(rate: int) -> Callable[..., Tensor]:
-        compensator, sliders = read_compensator(options, rate)
+    def build(rate: int, first: bool) -> Callable[..., Tensor]:
+        compensator, sliders = read_compensator(options, rate, warn=first)
         return partial(compensator, **sliders)
 
-    _pass_through(options, build)
+    _pass_through(options, build, "--compensator hearing-aid, wdrc and nalr keep it")
 
 
 def _check_ending(path: Path) -> None:
@@ -68,8 +82,13 @@ def _check_ending(path: Path) -> None:
         raise ValueError(f"{path}: cannot write {found}; allowed: {', '.join(ENDINGS)}")
 
 
-def _pass_through(options: argparse.Namespace, build: Callable[[int], Callable[..., Tensor]]) -> None:
-    """Read, run what ``build`` makes for a sample rate, write at each file's own rate, and say how loud it is."""
+def _pass_through(
+    options: argparse.Namespace, build: Callable[[int, bool], Callable[..., Tensor]], keeper: str
+) -> None:
+    """Read, run what ``build`` makes for a rate, the first or not, write at each file's own, and say how loud it is.
+
+    ``keeper`` says what keeps the band above 8 kHz; empty where its loss is no surprise.
+    """
     whole = options.input.is_dir()
     if whole:
         check_folders(options.input, options.output)
@@ -85,7 +104,7 @@ def _pass_through(options: argparse.Namespace, build: Callable[[int], Callable[.
 
     pairs = _pairs(options.input, options.output) if whole else [(options.input, options.output)]
     # one that cannot be loaded is no fault of a file
-    models = {LOWEST_RATE: build(LOWEST_RATE)} if whole else {}
+    models = {LOWEST_RATE: build(LOWEST_RATE, True)} if whole else {}
     left_out = 0
     for done, (source, target) in enumerate(pairs, 1):
         try:
@@ -93,7 +112,7 @@ def _pass_through(options: argparse.Namespace, build: Callable[[int], Callable[.
             check_channels(target, waveform.shape[0])
             inner = min(rate, HIGHEST_RATE)
             if inner not in models:
-                models[inner] = build(inner)
+                models[inner] = build(inner, not models)
             with torch.no_grad():
                 result = models[inner](resample(waveform, rate, inner), ear)
             result = resample(result, inner, rate)[..., : waveform.shape[-1]]
@@ -108,7 +127,7 @@ def _pass_through(options: argparse.Namespace, build: Callable[[int], Callable[.
             continue
         count = f"{done} of {len(pairs)}: " if whole else ""
         print(f"{count}{target}: {_levels(waveform, result, options.full_scale_spl)}", flush=True)
-        for line in _surprises(waveform, result, rate):
+        for line in _surprises(waveform, result, rate, keeper):
             print(f"hlsim: warning: {target}: {line}", file=sys.stderr)
     if left_out:
         raise ValueError(
@@ -135,7 +154,7 @@ def _levels(before: Tensor, after: Tensor, full_scale_spl: float) -> str:
     return f"{given:.1f} dB SPL in, {made:.1f} out, peak {peak:.1f}"
 
 
-def _surprises(before: Tensor, after: Tensor, rate: int) -> Iterator[str]:
+def _surprises(before: Tensor, after: Tensor, rate: int, keeper: str) -> Iterator[str]:
     """What a listener would not expect of the file."""
     import torch
 
@@ -144,5 +163,5 @@ def _surprises(before: Tensor, after: Tensor, rate: int) -> Iterator[str]:
     first = round(_UPPER_BAND / rate * before.shape[-1])
     powers = [torch.fft.rfft(one.double()).abs().square().sum(0) for one in (before, after)]
     given, made = (float(power[first:].sum() / power.sum()) for power in powers)
-    if given > _HEARD and made < _LOST * given:
-        yield "what IN has above 8 kHz is missing; nalr, or --simulator msbg, keeps it"
+    if keeper and given > _HEARD and made < _LOST * given:
+        yield f"what IN has above 8 kHz is missing; {keeper}"

@@ -93,13 +93,15 @@ def other_ear(label: str, name: str, ear: Audiogram | None) -> list[str]:
     return [f"{label} was trained for one ear, {levels} dB HL, and is meant for no other."]
 
 
-def read_compensator(options: argparse.Namespace, sample_rate: int) -> tuple[Any, dict[str, float]]:
-    """The compensator that is asked for, and its sliders; on stderr, that it was trained for another ear."""
+def read_compensator(
+    options: argparse.Namespace, sample_rate: int, *, warn: bool = True
+) -> tuple[Any, dict[str, float]]:
+    """The compensator that is asked for, and its sliders; on stderr, with ``warn``, that it is for another ear."""
     from compensators import load_compensator
 
     name = options.compensator
     compensator = load_compensator(name, sample_rate=sample_rate, full_scale_spl=options.full_scale_spl)
-    for line in other_ear(name, name, read_ear(options.audiogram)):
+    for line in other_ear(name, name, read_ear(options.audiogram)) if warn else ():
         print(f"hlsim: warning: {line}", file=sys.stderr)
     names = ("noise_reduction", "amplification")
     sliders = {given: value for given in names if (value := getattr(options, given)) is not None}
@@ -118,30 +120,30 @@ def read_simulator(name: str, sample_rate: int, full_scale_spl: float = 94.0) ->
 
 
 def read_recipe(path: Path | None) -> dict[str, Any]:
-    """The settings in a YAML file. Raises ValueError where it cannot be read, or names one twice."""
+    """The settings in a YAML file. Raises ValueError where it cannot be read, has an alias, or names one twice."""
     if path is None:
         return {}
-    yaml = require("yaml", "train")
+    yaml: Any = require("yaml", "train")
+
+    class Loader(yaml.SafeLoader):
+        def compose_node(self, parent: Any, index: Any) -> Any:
+            # a few lines of aliases of aliases stand for more values than any memory holds
+            if self.check_event(yaml.AliasEvent):
+                raise ValueError("has an alias (*name); allowed: values written out")
+            return super().compose_node(parent, index)
+
+        def construct_mapping(self, node: Any, deep: bool = False) -> Any:
+            names = [name.value for name, _ in node.value if isinstance(name.value, str)]
+            if twice := next((name for name in names if names.count(name) > 1), None):
+                raise ValueError(f"{twice} is there twice; allowed: once")
+            return super().construct_mapping(node, deep)
+
     try:
-        text = path.read_text(encoding="utf-8")
-        node = yaml.compose(text, yaml.SafeLoader)
-        # a few lines of aliases of aliases stand for more values than any memory holds
-        if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text, yaml.SafeLoader)):
-            raise ValueError(f"{path}: has an alias (*name); allowed: values written out")
-        twice = _named_twice(node)
-        data = yaml.safe_load(text)
+        data = yaml.load(path.read_text(encoding="utf-8"), Loader)
     except (OSError, UnicodeDecodeError, RecursionError, yaml.YAMLError) as error:
         raise ValueError(f"{path}: not readable as YAML ({error})") from error
-    if twice:
-        raise ValueError(f"{path}: {twice} is there twice; allowed: once")
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
     if not isinstance(data, dict):
         raise ValueError(f"{path}: holds no settings; allowed: 'name: value' lines")
     return data
-
-
-def _named_twice(node: Any) -> str | None:
-    """The first name that a node of YAML, or one under it, has twice: YAML's own reader takes the last."""
-    pairs = node.value if getattr(node, "id", "") == "mapping" else []
-    names = [name.value for name, _ in pairs if isinstance(name.value, str)]
-    twice = next((name for name in names if names.count(name) > 1), None)
-    return twice or next(filter(None, (_named_twice(value) for _, value in pairs)), None)

@@ -19,7 +19,11 @@ _device = kind(
 
 
 def live(parser: Parser) -> None:
-    parser.set_defaults(run=_live)
+    parser.runs(
+        _live,
+        "--audiogram N3",
+        "--audiogram N4 --simulate --seconds 60",
+    )
     parser.audiogram(text="; needed but for --list-devices")
     either = parser.add_mutually_exclusive_group()
     text = (

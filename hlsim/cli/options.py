@@ -34,6 +34,16 @@ class Parser(argparse.ArgumentParser):
         # as from Python 3.14 on: no option begins with a digit, so that -10,0 and -2.5e1 are values
         self._negative_number_matcher = re.compile(r"-\.?\d")
         self._declare = declare
+        self._examples: tuple[str, ...] = ()
+
+    def runs(self, run: Callable[[argparse.Namespace], None], *examples: str) -> None:
+        """What the command does with its options, and arguments that the help ends with."""
+        self.set_defaults(run=run)
+        self._examples = examples
+
+    def format_help(self) -> str:
+        lines = [f"  {self.prog} {example}".rstrip() + "\n" for example in self._examples]
+        return super().format_help() + "".join(["\nexamples:\n", *lines] if lines else [])
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         if self._declare is not None:

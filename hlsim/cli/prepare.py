@@ -24,7 +24,11 @@ MAKING: dict[str, Any] = {"teacher": "msbg", "alignment": "structural"}
 
 
 def prepare(parser: Parser) -> None:
-    parser.set_defaults(run=_prepare)
+    parser.runs(
+        _prepare,
+        "VoiceBank-DEMAND --out plan",
+        "speech --noise noise --ears 1 --write --out plan",
+    )
     option = parser.option
     option("corpus", Path, "folder: VoiceBank-DEMAND's, LibriSpeech's, or any with wav, flac or ogg files")
     layouts = ("auto", "voicebank-demand", "librispeech", "folder")
@@ -61,7 +65,11 @@ def prepare(parser: Parser) -> None:
 
 
 def draw_alignment(parser: Parser) -> None:
-    parser.set_defaults(run=_draw_alignment)
+    parser.runs(
+        _draw_alignment,
+        "speech.wav alignment.png",
+        "speech.wav alignment.png --audiogram N4 --alignment structural",
+    )
     parser.option("input", Path, "wav, flac or ogg, 16 to 48 kHz; its first channel", metavar="IN")
     parser.option("output", Path, "png", metavar="OUT")
     parser.audiogram("N3")

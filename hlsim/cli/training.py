@@ -15,7 +15,11 @@ FOLDERS = ("speech", "noise", "audiograms", "valid_speech", "valid_noise", "vali
 
 
 def train_simulator(parser: Parser) -> None:
-    parser.set_defaults(run=_train_simulator)
+    parser.runs(
+        _train_simulator,
+        "--config examples/neuro-msbg.yaml --speech speech/train --valid-speech speech/valid --out runs/simulator",
+        "--config examples/neuro-msbg.yaml --manifest plan/manifest.csv --max-minutes 600 --out runs/simulator",
+    )
     parser.option("--config", Path, "recipe, a YAML file (examples/neuro-msbg.yaml)", required=True)
     text = "manifest.csv that 'hlsim prepare' wrote, instead of folders and files"
     parser.option("--manifest", Path, text)
@@ -27,7 +31,11 @@ def train_simulator(parser: Parser) -> None:
 
 
 def train_compensator(parser: Parser) -> None:
-    parser.set_defaults(run=_train_compensator)
+    parser.runs(
+        _train_compensator,
+        "--speech speech/train --valid-speech speech/valid --audiogram N3 --out runs/n3",
+        "--config examples/hearing-aid.yaml --start hearing-aid --speech speech --noise noise --out runs/aid",
+    )
     parser.option("--config", Path, "recipe, a YAML file (examples/compensator.yaml)")
     parser.audiogram(text="; without it one compensator for all ears is trained")
     parser.option("--simulator", str, "msbg (exact), or a checkpoint's name or folder", "neuro-msbg")

@@ -1,12 +1,14 @@
 """Which criterion a loss has: by name, several weighed by name, or a callable, and the weights of their parts."""
 
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, Literal
 
 from torch import Tensor
 
 from hlsim.checks import is_finite
 from hlsim.criteria import coherent_bands, paper
+
+CriterionName = Literal["coherent-bands", "bands", "paper", "haspi", "hasqi"]
 
 CRITERIA: dict[str, Mapping[str, float]] = {
     "coherent-bands": coherent_bands.DEFAULT_WEIGHTS,
@@ -18,7 +20,7 @@ CRITERIA: dict[str, Mapping[str, float]] = {
 """Criteria by name: their parts and the default weight of each."""
 
 
-Criterion = str | Mapping[str, float] | Callable[[Tensor, Tensor], Tensor]
+Criterion = CriterionName | Mapping[str, float] | Callable[[Tensor, Tensor], Tensor]
 """A name, weights by name, or a callable: what is heard and the reference, (items, time) in pascals -> (items,)."""
 
 

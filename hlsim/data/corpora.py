@@ -12,12 +12,13 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from random import Random
+from typing import Literal
 
 from hlsim.audio import EXTENSIONS
 from hlsim.data.manifest import SPLITS, Utterance, inside, printable, storable
 from hlsim.files import read_rows
 
-LAYOUTS = ("voicebank-demand", "librispeech", "folder")
+Layout = Literal["auto", "voicebank-demand", "librispeech", "folder"]
 
 _VOICEBANK = (("trainset_28spk", "train"), ("trainset_56spk", "train"), ("testset", "test"))
 _LIBRISPEECH = {"train": "train", "dev": "valid", "test": "test"}
@@ -37,7 +38,7 @@ Found = Utterance | Fault
 BAD_NAME = "its name is not UTF-8 or has a line break in it; rename it"
 
 
-def detect_layout(corpus: Path) -> str:
+def detect_layout(corpus: Path) -> Layout:
     """Which layout a folder has. Raises ValueError where there is no such folder."""
     if not corpus.is_dir():
         raise ValueError(f"{corpus}: no such folder")
@@ -46,11 +47,11 @@ def detect_layout(corpus: Path) -> str:
     return "librispeech" if _librispeech_parts(corpus) else "folder"
 
 
-def find_utterances(corpus: Path, layout: str, table: Path | None = None) -> Iterator[Found]:
+def find_utterances(corpus: Path, layout: Layout, table: Path | None = None) -> Iterator[Found]:
     """Utterances with paths below ``corpus``, and what is at fault; split is empty where the corpus does not say.
 
     Args:
-        layout: one of ``LAYOUTS``.
+        layout: the corpus's.
         table: CSV file with a column ``file`` (path below the corpus) and any of ``id``, ``speaker``, ``split``,
             ``noisy``, ``noise``, ``snr``; then only what it lists is taken.
 
@@ -248,7 +249,7 @@ def _listed(corpus: Path, table: Path) -> Iterator[Found]:
 
 
 def find_below(
-    root: Path, corpus: str, layout: str, table: Path | None = None, noise: str | None = None
+    root: Path, corpus: str, layout: Layout, table: Path | None = None, noise: str | None = None
 ) -> Iterator[Found]:
     """As ``find_utterances`` of ``root / corpus``, with paths below the root, and without what is in the folder noise.
 

@@ -20,6 +20,7 @@ from hlsim.data.manifest import SPLITS, UTTERANCE_COLUMNS, Rows, csv_line, no_fo
 from hlsim.data.noises import Noises, find_noises
 from hlsim.data.plan_settings import PlanSettings
 from hlsim.files import PARTIAL, Whole, sha256, write_whole
+from hlsim.parallel import Backend
 
 FAULTS = "faults.csv"
 FAULT_COLUMNS = ("path", "reason")
@@ -55,7 +56,7 @@ def prepare(
     *,
     strict: bool = False,
     jobs: int | None = None,
-    backend: str = "loky",
+    backend: Backend = "loky",
     scheduler: str | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Prepared:

@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from hlsim.checks import check_rate, refuse_unknown
-from hlsim.data.corpora import LAYOUTS
+from hlsim.checks import check_choice, check_rate
+from hlsim.data.corpora import Layout
 from hlsim.files import resolved
 
 TRAIN_SNRS_DB, TEST_SNRS_DB = (0.0, 5.0, 10.0, 15.0), (2.5, 7.5, 12.5, 17.5)
@@ -22,7 +22,7 @@ class PlanSettings:
     Attributes:
         corpus, noise: folders; the noises are mixed into clean speech.
         root: folder that holds both; by default the corpus, or with noise their common parent.
-        layout: ``auto``, or one of ``LAYOUTS``.
+        layout: the corpus's.
         table: CSV file that lists the corpus.
         train_snrs, test_snrs: dB by active speech level.
         train_types, test_types: how many types of noise, where there are as many.
@@ -39,7 +39,7 @@ class PlanSettings:
     corpus: Path
     noise: Path | None = None
     root: Path | None = None
-    layout: str = "auto"
+    layout: Layout = "auto"
     table: Path | None = None
     train_snrs: Sequence[float] = TRAIN_SNRS_DB
     test_snrs: Sequence[float] = TEST_SNRS_DB
@@ -57,7 +57,7 @@ class PlanSettings:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        refuse_unknown([self.layout], ("auto", *LAYOUTS), "layouts")
+        check_choice("layout", self.layout, Layout)
         check_rate(self.rate)
         for name in ("test_share", "valid_share"):
             if not 0.0 <= (share := getattr(self, name)) < 1.0:

@@ -4,20 +4,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
 from hlsim.audiogram import Audiogram
-from hlsim.checks import refuse_unknown
+from hlsim.checks import check_choice, refuse_unknown
 from hlsim.data.foreign_teacher import ForeignTeacher, load_teacher
 from hlsim.metrics.reference import pyclarity_msbg
 from hlsim.msbg import MSBG, estimate_delay
 from hlsim.msbg.ear import MSBG_RATE
 
 TEACHERS = ("msbg", "pyclarity")
-ALIGNMENTS = ("structural", "impulse", "none")
+Alignment = Literal["structural", "impulse", "none"]
 
 Reference = Callable[[Tensor, Audiogram, int], Tensor] | ForeignTeacher
 """An aligned simulator of one item, as ``pyclarity_msbg``: signal, ear, rate -> signal; or anyone's of many."""
@@ -44,10 +45,10 @@ class Teacher(nn.Module):
     """
 
     def __init__(
-        self, sample_rate: int, *, alignment: str = "structural", reference: Reference | None = None
+        self, sample_rate: int, *, alignment: Alignment = "structural", reference: Reference | None = None
     ) -> None:
         super().__init__()
-        refuse_unknown([alignment], ALIGNMENTS, "alignments")
+        check_choice("alignment", alignment, Alignment)
         if isinstance(reference, ForeignTeacher) and alignment != "structural":
             raise ValueError(
                 f"alignment {alignment!r} of {reference.name}; allowed: structural, for it is aligned"

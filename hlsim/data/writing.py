@@ -12,9 +12,9 @@ import torch
 
 from hlsim.data.instances import CLAIM, MANIFEST, Plan, is_whole
 from hlsim.data.manifest import csv_line, no_formula
-from hlsim.data.teacher import Reference, Teacher, name_of
+from hlsim.data.teacher import Alignment, Reference, Teacher, name_of
 from hlsim.files import PARTIAL, file_lock, write_whole
-from hlsim.parallel import Failed, Progress, make_missing, one_thread
+from hlsim.parallel import Backend, Failed, Progress, make_missing, one_thread
 
 WRITE_FAULTS = "write-faults.csv"
 
@@ -23,7 +23,7 @@ WRITE_FAULTS = "write-faults.csv"
 class Recipe:
     """How the targets are made."""
 
-    alignment: str = "structural"
+    alignment: Alignment = "structural"
     reference: Reference | None = None
 
     def teacher(self, rate: int) -> Teacher:
@@ -39,7 +39,7 @@ def write_instances(
     *,
     root: str | Path | None = None,
     jobs: int | None = None,
-    backend: str = "loky",
+    backend: Backend = "loky",
     scheduler: str | None = None,
     progress: Progress | None = None,
 ) -> int:

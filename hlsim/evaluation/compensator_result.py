@@ -11,12 +11,13 @@ from hlsim.evaluation.items import Item
 from hlsim.evaluation.judging import SIMULATORS, Judged
 from hlsim.evaluation.scores import ItemScore
 from hlsim.extras import require
+from hlsim.metrics.registry import MeasureName
 from hlsim.neuro.config import NEURO_RATE
 
 HARD = 0.6
 """Unaided HASPI under which an item belongs to those that need help most."""
 
-MEASURES = ("haspi", "hasqi")
+MEASURES: tuple[MeasureName, ...] = ("haspi", "hasqi")
 
 NOISIER_DB = 8.0
 """SNR under which speech in noise is told apart."""
@@ -133,9 +134,9 @@ def _means(frame: Any) -> dict[str, Any]:
     for name in MEASURES:
         means[f"{name}_mean"] = float(frame[name].mean())
         means[f"{name}_std"] = float(frame[name].std()) if len(frame) > 1 else None
-    for name, normal in (("heard_off", "normal"), ("heard_off_clean", "normal_clean")):
+    for key, normal in (("heard_off", "normal"), ("heard_off_clean", "normal_clean")):
         off = frame.heard - frame[normal]
-        means |= {name: float(off.mean()), f"{name}_abs": float(off.abs().mean())}
+        means |= {key: float(off.mean()), f"{key}_abs": float(off.abs().mean())}
     return means | {
         "level_mean": float(frame.level.mean()),
         "peak_max": float(frame.peak.max()),

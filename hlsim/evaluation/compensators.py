@@ -39,7 +39,7 @@ from hlsim.evaluation.steadiness import shift_differences, steady_tones, wearing
 from hlsim.evaluation.store import ScoreStore, key_of, weights_hash
 from hlsim.extras import require
 from hlsim.metrics.pair import check_seed
-from hlsim.metrics.registry import check_measures, measure_by, version_of, versions_of
+from hlsim.metrics.registry import Engine, check_measures, measure_by, version_of, versions_of
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.parallel import Progress, check_parallel, make_missing
 from hlsim.pretrained import load_pretrained
@@ -75,7 +75,7 @@ def evaluate_compensators(
     noise: str | Path | None = None,
     enhancers: Sequence[str] = (),
     simulator: str | Path = "neuro-msbg",
-    engine: str = "hlsim",
+    engine: Engine = "hlsim",
     items: int = 400,
     seconds: float = 3.0,
     levels: Sequence[float] = INPUT_LEVELS,
@@ -166,7 +166,13 @@ def evaluate_compensators(
         by_ear[ear] = conditions | own
     network = load_pretrained(simulator)
     judged = _judge_all(drawn, by_ear, network, engine, seed, ScoreStore(store), jobs=jobs, progress=progress)
-    settings = {"items": items, "seconds": seconds, "seed": seed, "engine": engine, "levels": [*levels]}
+    settings: dict[str, Any] = {
+        "items": items,
+        "seconds": seconds,
+        "seed": seed,
+        "engine": engine,
+        "levels": [*levels],
+    }
     settings |= {"ears": [name for name, _ in ears], "simulator": str(simulator)}
     settings |= {"enhancers": [str(enhancer) for enhancer in before.values()]}
     limits = {name: limit_of(module) for name, module in conditions.items()}
@@ -215,7 +221,7 @@ def _judge_all(
     items: Sequence[Item],
     conditions: Mapping[Audiogram, Mapping[str, nn.Module]],
     simulator: nn.Module,
-    engine: str,
+    engine: Engine,
     seed: int,
     store: ScoreStore,
     *,

@@ -20,7 +20,7 @@ from hlsim.evaluation.scoring import FileItem, Result, score_items
 from hlsim.evaluation.statistics import RESAMPLES, PairedComparison
 from hlsim.evaluation.store import ScoreStore
 from hlsim.extras import require
-from hlsim.metrics.registry import check_measures, version_of, versions_of
+from hlsim.metrics.registry import Engine, MeasureName, check_measures, version_of, versions_of
 from hlsim.metrics.words import WordsChange, words_change
 
 _OF_ITEM = ("audiogram", "listener", "ear", "snr", "clean", "processed")
@@ -70,7 +70,7 @@ class HaspiReport:
     extra: Mapping[str, Any] = field(default_factory=dict)
     unit: str = "listeners"
     ears: Sequence[ItemScore] = ()
-    engine: str = "hlsim"
+    engine: Engine = "hlsim"
     conditions: Sequence[str] = field(init=False)
     comparisons: Sequence[Comparison] = field(init=False)
     headline: Comparison = field(init=False)
@@ -203,8 +203,8 @@ def haspi_report(
     audiograms: str | Path | None = None,
     manifest: str | Path | None = None,
     root: str | Path | None = None,
-    measures: Iterable[str] = ("haspi",),
-    engine: str = "hlsim",
+    measures: Iterable[MeasureName] = ("haspi",),
+    engine: Engine = "hlsim",
     baseline: str | None = None,
     better_ear: bool = False,
     store: str | Path | None = None,

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import count, product
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
@@ -29,7 +29,7 @@ INPUT_LEVELS = (50.0, 65.0, 80.0)
 STANDARD_EARS = ("N2", "N3", "N4", "N5", "N6", "S1", "S2", "S3")
 """Bisgaard's audiograms that are in every comparison of compensators."""
 
-INPUTS = ("as-is", "louder", "nal-r", "compressed")
+Input = Literal["as-is", "louder", "nal-r", "compressed", "compensated"]
 """What may be done to a signal before the ear gets it: nothing, 20 dB more, NAL-R for the ear, compression 3:1. A
 compensator adds ``compensated``."""
 
@@ -154,9 +154,9 @@ def _about(ear: Audiogram, level: float, snr: float | None, name: str) -> dict[s
 
 
 def treat(
-    items: Sequence[Item], inputs: Sequence[str], compensator: nn.Module | None = None
+    items: Sequence[Item], inputs: Sequence[Input], compensator: nn.Module | None = None
 ) -> Iterator[Item]:
-    """Each item under each input in turn: of ``INPUTS``, with a compensator ``compensated`` too; else ValueError."""
+    """Each item under each input in turn: ValueError for ``compensated`` without a compensator."""
     treatments: dict[str, Callable[[Tensor, Audiogram], Tensor]] = {
         "as-is": lambda signal, ear: signal,
         "louder": lambda signal, ear: 10.0 * signal,

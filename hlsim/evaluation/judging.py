@@ -19,7 +19,7 @@ from hlsim.data.foreign_teacher import ForeignEnhancer
 from hlsim.dsp.fir import filter_centred
 from hlsim.evaluation.items import Item
 from hlsim.metrics.reference import pyclarity_msbg
-from hlsim.metrics.registry import measure_by
+from hlsim.metrics.registry import Engine, measure_by
 from hlsim.msbg import MSBG
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.parallel import Failed, one_thread, reason_of
@@ -109,7 +109,7 @@ class Trial:
     simulator: nn.Module
     seed: int
     keys: Mapping[str, Keys]
-    engine: str = "hlsim"
+    engine: Engine = "hlsim"
     exact: Sequence[str] = EXACT
 
 

@@ -21,8 +21,8 @@ from hlsim.audiogram import Audiogram
 from hlsim.calibration import check_full_scale, dbfs
 from hlsim.evaluation.store import ScoreStore, content_hash, key_of
 from hlsim.metrics.pair import Signal, check_seed
-from hlsim.metrics.registry import check_measures, measure_by, versions_of
-from hlsim.parallel import Failed, Progress, check_parallel, make_missing, one_thread, reason_of
+from hlsim.metrics.registry import Engine, MeasureName, check_measures, measure_by, versions_of
+from hlsim.parallel import Backend, Failed, Progress, check_parallel, make_missing, one_thread, reason_of
 
 EARS = ("left", "right")
 
@@ -85,7 +85,7 @@ class FileTask(NamedTuple):
     item: FileItem
     condition: str
     measure: str
-    engine: str
+    engine: Engine
     seed: int
     key: str
 
@@ -96,13 +96,13 @@ Results = list[dict[tuple[str, str], Result]]
 
 def score_items(
     items: Sequence[FileItem],
-    measures: Iterable[str] = ("haspi",),
+    measures: Iterable[MeasureName] = ("haspi",),
     *,
-    engine: str = "hlsim",
+    engine: Engine = "hlsim",
     store: ScoreStore | None = None,
     seed: int = 0,
     jobs: int | None = None,
-    backend: str = "loky",
+    backend: Backend = "loky",
     scheduler: str | None = None,
     progress: Progress | None = None,
 ) -> Results:
@@ -165,7 +165,7 @@ def score_items(
     return results
 
 
-def _about(name: str, engine: str) -> dict[str, Any]:
+def _about(name: str, engine: Engine) -> dict[str, Any]:
     """What computes a measure, for its scores' keys."""
     measure = measure_by(engine, name)
     about = {"revision": measure.revision, "measure": name, "versions": versions_of([name], engine)}
@@ -234,7 +234,7 @@ class HaspiItem:
 def haspi_many(
     items: Sequence[HaspiItem],
     *,
-    engine: str = "hlsim",
+    engine: Engine = "hlsim",
     full_scale_spl: float = 94.0,
     seed: int = 0,
     jobs: int | None = None,
@@ -262,7 +262,7 @@ def haspi_many(
 
 @one_thread()
 def _score_item(
-    task: tuple[str, HaspiItem, str, float, int], _: Sequence[str]
+    task: tuple[str, HaspiItem, Engine, float, int], _: Sequence[str]
 ) -> dict[str, dict[str, float]]:
     key, item, engine, full_scale_spl, seed = task
     try:

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from hlsim.audiogram import SEVERITIES
 from hlsim.data.foreign_teacher import ForeignTeacher
 from hlsim.data.teacher import Reference, find_teacher
-from hlsim.evaluation.items import LEVELS, Item, draw_items, treat
+from hlsim.evaluation.items import LEVELS, Input, Item, draw_items, treat
 from hlsim.evaluation.store import ScoreStore, key_of, weights_hash
 from hlsim.extras import MissingExtraError, require
 from hlsim.metrics.fidelity import (
@@ -70,7 +70,7 @@ def evaluate_simulators(
     items: int = 240,
     seconds: float = 3.0,
     levels: Sequence[float] = LEVELS,
-    inputs: Sequence[str] = ("as-is",),
+    inputs: Sequence[Input] = ("as-is",),
     compensator: nn.Module | None = None,
     seed: int = 0,
     progress: Progress | None = None,
@@ -92,7 +92,7 @@ def evaluate_simulators(
         items: how many; each is scored under each of ``inputs``.
         seconds: length of an item; PESQ and STOI want 2 or more.
         levels: dB SPL that the items take in turn.
-        inputs: what is done to the signal before the ear gets it, of ``INPUTS`` and, with a compensator, ``compensated``.
+        inputs: what is done to the signal before the ear gets it, ``compensated`` with a compensator.
         compensator: called with a waveform and an ear.
         progress: called with what is done and all.
 

@@ -19,7 +19,7 @@ import json
 from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -28,7 +28,7 @@ from torch import Tensor
 
 from hlsim.audiogram import AudiogramLike
 from hlsim.calibration import PASCAL_SPL
-from hlsim.checks import Lengths, check_waveform
+from hlsim.checks import Lengths, check_choice, check_waveform
 from hlsim.metrics.ear import envelope_modulation as envelopes
 from hlsim.metrics.ear import model as ear_model
 from hlsim.metrics.ear.clean_speech import CleanItem, CleanSpeech, ItemGroup
@@ -130,8 +130,7 @@ class HaspiReference:
         seed: int | Sequence[int] = 0,
     ) -> Tensor:
         """``haspi`` of processed signals of the clean ones' shape, rate and scale. Returns (...,)."""
-        if noise not in get_args(Noise):
-            raise ValueError(f"noise {noise!r}; allowed: {', '.join(get_args(Noise))}")
+        check_choice("noise", noise, Noise)
         signals = self._signals
         given = signals.check(processed)
         ears = ear_model.hair_cells(signals.thresholds(audiogram))

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Literal, NamedTuple, get_args, overload
+from typing import Literal, NamedTuple, overload
 
 import numpy as np
 import torch
@@ -19,7 +19,7 @@ from torch import Tensor
 
 from hlsim.audiogram import FREQUENCIES, AudiogramLike
 from hlsim.calibration import PASCAL_SPL, check_full_scale
-from hlsim.checks import Lengths, check_waveform
+from hlsim.checks import Lengths, check_choice, check_waveform
 from hlsim.dsp.fft import fft_length
 from hlsim.dsp.fir import frequency_sampling_fir
 from hlsim.metrics.ear import fine_structure
@@ -173,8 +173,7 @@ class HasqiReference:
         self, processed: Tensor, *, noise: Noise = "expected", seed: int | Sequence[int] = 0
     ) -> HasqiParts:
         """As ``score``, with what it is the product of."""
-        if noise not in get_args(Noise):
-            raise ValueError(f"noise {noise!r}; allowed: {', '.join(get_args(Noise))}")
+        check_choice("noise", noise, Noise)
         given = self._signals.check(processed)
         seeds = item_seeds(seed, self._signals.shape)
         with torch.autocast(processed.device.type, enabled=False):

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from functools import partial
 from importlib import metadata
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor
 
 import hlsim
 from hlsim.audiogram import Audiogram
-from hlsim.checks import refuse_unknown
+from hlsim.checks import check_choice, refuse_unknown
 from hlsim.extras import require
 from hlsim.metrics import fidelity
 from hlsim.metrics.haspi import haspi
@@ -20,7 +20,7 @@ from hlsim.metrics.hasqi import hasqi
 from hlsim.metrics.pair import Signal, check_pair
 from hlsim.metrics.pyclarity import pyclarity_score
 
-ENGINES = ("hlsim", "pyclarity")
+Engine = Literal["hlsim", "pyclarity"]
 """What computes HASPI and HASQI: hlsim in torch, with pyclarity's figures, or pyclarity itself."""
 
 
@@ -31,7 +31,7 @@ class Measure(NamedTuple):
     ``revision`` of hlsim's part: to be raised where that changes a score. Whether audiogram, level and seed change it is
     ``of_an_ear``: STOI and PESQ compare the signal at the ear with the clean speech, and do not say what is heard.
     ``rewards_gain``: more level alone brings a higher score. ``score`` is of (clean, processed, audiogram, rate in Hz,
-    full_scale_spl, seed), and raises ValueError where there is none. ``engine`` is the one of ``ENGINES`` that computes
+    full_scale_spl, seed), and raises ValueError where there is none. ``engine`` is the ``Engine`` that computes
     it, empty where there is no choice.
     """
 
@@ -41,7 +41,7 @@ class Measure(NamedTuple):
     of_an_ear: bool
     rewards_gain: bool
     score: Callable[[Signal, Signal, Audiogram, int, float, int], float]
-    engine: str = ""
+    engine: Engine | Literal[""] = ""
     revision: int = 1
 
 
@@ -79,7 +79,9 @@ _HASPI = Measure("HASPI", None, ("numpy",), True, True, partial(_of_ear, haspi),
 _HASQI = Measure("HASQI", None, ("numpy",), True, False, partial(_of_ear, hasqi), "hlsim")
 _STOI, _PESQ = ("pystoi", "numpy", "scipy"), ("pesq", "numpy", "torchaudio")
 
-MEASURES = {
+MeasureName = Literal["haspi", "hasqi", "stoi", "pesq"]
+
+MEASURES: dict[str, Measure] = {
     "haspi": _HASPI,
     "hasqi": _HASQI,
     "stoi": Measure("STOI", ("pystoi", "eval"), _STOI, False, False, partial(_of_signals, "stoi")),
@@ -98,26 +100,25 @@ _PYCLARITYS = {
 }
 
 
-def measure_by(engine: str, name: str) -> Measure:
+def measure_by(engine: Engine, name: str) -> Measure:
     """A measure of ``MEASURES``; HASPI and HASQI by this engine."""
     return _PYCLARITYS.get(name, MEASURES[name]) if engine == "pyclarity" else MEASURES[name]
 
 
-def check_measures(names: Iterable[str], engine: str = "hlsim") -> tuple[str, ...]:
+def check_measures(names: Iterable[MeasureName], engine: Engine = "hlsim") -> tuple[MeasureName, ...]:
     """The names, each once, or ValueError with those that are allowed; MissingExtraError where a package lacks."""
     chosen = tuple(dict.fromkeys(names))
     refuse_unknown(chosen, MEASURES, "measures")
     if not chosen:
         raise ValueError(f"no measure; allowed: {', '.join(MEASURES)}")
-    if engine not in ENGINES:
-        raise ValueError(f"engine {engine!r}; allowed: {', '.join(ENGINES)}")
+    check_choice("engine", engine, Engine)
     for name in chosen:
         if needs := measure_by(engine, name).needs:
             require(*needs)
     return chosen
 
 
-def versions_of(names: Iterable[str], engine: str = "hlsim") -> dict[str, str]:
+def versions_of(names: Iterable[str], engine: Engine = "hlsim") -> dict[str, str]:
     """Versions of the packages that the scores of these measures depend on."""
     packages = dict.fromkeys(package for name in names for package in measure_by(engine, name).packages)
     return {package: version_of(package) for package in packages}

@@ -4,21 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
-from typing import Any, Self
+from typing import Any, Literal, Self, get_origin, get_type_hints
 
-from hlsim.checks import refuse_unknown
+from hlsim.checks import check_choice, refuse_unknown
 from hlsim.dsp.stft import STFT
 
 NEURO_RATE = 16000
 """The sample rate in Hz at which the networks work."""
 
-CHOICES = {
-    "block": ("cnn", "mamba", "lstm", "transformer"),
-    "structure": ("dual-path", "monolithic"),
-    "audiogram": ("channel", "concatenated"),
-    "phase": ("predicted", "input"),
-}
-
+Block = Literal["cnn", "mamba", "lstm", "transformer"]
+Structure = Literal["dual-path", "monolithic"]
+AudiogramInput = Literal["channel", "concatenated"]
+Phase = Literal["predicted", "input"]
 
 _COUNTS = {
     "fft": 1024,
@@ -80,7 +77,7 @@ class NetworkConfig(ModelConfig):
     channels: int = 24
     dense_depth: int = 0
     stride: tuple[int, int] = (2, 3)
-    block: str = "cnn"
+    block: Block = "cnn"
     blocks: int = 2
     kernel: tuple[int, int] = (7, 7)
     expansion: int = 2
@@ -108,9 +105,9 @@ class NetworkConfig(ModelConfig):
         # with longer hops the last samples may lie where the only window is almost zero, which the inverse divides by
         if 4 * self.hop > self.window:
             raise ValueError(f"hop {self.hop}, window {self.window}; allowed: 4 hop <= window")
-        for name, allowed in CHOICES.items():
-            if getattr(self, name, allowed[0]) not in allowed:
-                raise ValueError(f"{name} {getattr(self, name)!r}; allowed: {', '.join(allowed)}")
+        for name, kind in get_type_hints(type(self)).items():
+            if get_origin(kind) is Literal:
+                check_choice(name, getattr(self, name), kind)
 
     @property
     def stft(self) -> STFT:
@@ -164,9 +161,9 @@ class NeuroConfig(NetworkConfig):
     channels: int = 24
     stride: tuple[int, int] = (4, 3)
     blocks: int = 3
-    structure: str = "dual-path"
-    audiogram: str = "channel"
-    phase: str = "predicted"
+    structure: Structure = "dual-path"
+    audiogram: AudiogramInput = "channel"
+    phase: Phase = "predicted"
     prior: bool = True
     level_aware: bool = True
 

@@ -3,22 +3,25 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Literal
 
 import torch
 from torch import Tensor
 
 from hlsim.audiogram import Audiogram
 from hlsim.calibration import dbfs
-from hlsim.checks import refuse_unknown
+from hlsim.checks import check_choice
 from hlsim.data.teacher import Teacher
 from hlsim.msbg.ear import MSBG_RATE
 from hlsim.report.pictures import new_figure
+
+Method = Literal["impulse", "structural"]
 
 _SHOWN = 0.12  # s: a delay of 28 ms is plain to see
 
 
 def draw_alignment(
-    signal: Tensor, ear: Audiogram, sample_rate: int, path: str | Path, *, method: str = "impulse"
+    signal: Tensor, ear: Audiogram, sample_rate: int, path: str | Path, *, method: Method = "impulse"
 ) -> float:
     """Write a PNG of the 0.12 s about the loudest place: A as MSBG gives it, B aligned. Returns the delay in samples.
 
@@ -33,7 +36,7 @@ def draw_alignment(
     """
     if Path(path).suffix.lower() != ".png":
         raise ValueError(f"{path}: what is drawn is a PNG; allowed: a name that ends in .png")
-    refuse_unknown([method], ("impulse", "structural"), "alignments")
+    check_choice("method", method, Method)
     shown = round(_SHOWN * sample_rate)
     if signal.shape[-1] < shown or not bool(signal.any()):
         raise ValueError(f"{signal.shape[-1]} samples to draw; allowed: {shown} or more, not all zero")

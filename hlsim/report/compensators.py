@@ -20,7 +20,7 @@ from hlsim.evaluation.steadiness import DELAYS, QUIET
 from hlsim.report.gain_pictures import gain_picture, gains_at, input_output_picture, tone_picture
 from hlsim.report.haspi import scored_by
 from hlsim.report.page import Section, render_markdown, render_page, write_files
-from hlsim.report.pictures import report_pictures
+from hlsim.report.pictures import condition_colours, report_pictures
 from hlsim.report.tables import Table, cells, change_name, inner, number, paired_cells, spread, verdict
 
 FILES = ("compensators.json", "compensators.md", "compensators.html")
@@ -28,7 +28,7 @@ FILES = ("compensators.json", "compensators.md", "compensators.html")
 GROUPS = {
     "clean": "Clean speech",
     "noisy": "Speech in noise",
-    "hard": f"Where unaided HASPI is under {HARD:g}, clean and noisy",
+    "hard": f"Unaided HASPI under {HARD:g}",
 }
 
 Result = Mapping[str, Any]
@@ -73,7 +73,12 @@ def _sections(result: Result, reports: Mapping[str, HaspiReport]) -> list[Sectio
     whole = [group for group in ("clean", "noisy") if group in reports]
     sections = [Section("In short", _in_short(result, reports))]
     sections += [
-        Section(GROUPS[group], [GAIN_NOTE] if group == "clean" else [], [_main_table(result, group)])
+        Section(
+            GROUPS[group],
+            [GAIN_NOTE] if group == "clean" else [],
+            [_main_table(result, group)],
+            folded=group == "hard",
+        )
         for group in reports
     ]
     loudness = [_loudness_table(result, group) for group in whole]
@@ -81,24 +86,26 @@ def _sections(result: Result, reports: Mapping[str, HaspiReport]) -> list[Sectio
     shifts = _SHIFTS.format(len(result["shifts"][0]["items"]), " or ".join(map(str, DELAYS)))
     curves = result["gain_curves"]
     shown = dict.fromkeys(curve["ear"] for curve in curves)
-    gains, tones = [gain_picture(ear, curves) for ear in shown], result["steady_tones"]
-    as_heard = [tone_picture(ear, tones) for ear in shown]
+    colours = condition_colours([*next(iter(result["groups"].values()))["conditions"]])
+    gains, tones = [gain_picture(ear, curves, colours) for ear in shown], result["steady_tones"]
+    as_heard = [tone_picture(ear, tones, colours) for ear in shown]
     if "clean" in reports:
         own = result["groups"]["clean"]["conditions"].items()
-        gains.append(input_output_picture({name: row for name, row in own if not name.endswith(_AT_LEVEL)}))
+        levels = {name: row for name, row in own if not name.endswith(_AT_LEVEL)}
+        gains.append(input_output_picture(levels, colours))
     sections += [
         Section("As loud as a normal ear hears it?", [_LOUDNESS], loudness),
         Section("By degree of loss", [_HASQI], by_severity, folded=True),
         _gap_section(result),
-        Section("Does any output pass the limit?", (), [_peak_table(result)]),
+        Section("Does any output pass the limit?", (), [_peak_table(result)], folded=True),
         Section("Gain curves", [_GAINS], [_gain_table(curves)], gains),
-        Section("Steady tones", [_STEADY], [tone_table(tones)], as_heard),
+        Section("Steady tones", [_STEADY], [tone_table(tones)], as_heard, folded=True),
         Section("Could it be worn?", [_WEARING], [wearing_table(result["wearing"], tones)]),
-        Section("Does it matter where frames fall?", [shifts], [shift_table(result["shifts"])]),
+        Section("Does it matter where frames fall?", [shifts], [shift_table(result["shifts"])], folded=True),
     ]
     for group in whole:
         title = f"Pictures: {inner(GROUPS[group])}"
-        sections.append(Section(title, pictures=report_pictures(reports[group])))
+        sections.append(Section(title, pictures=report_pictures(reports[group]), folded=True))
     sections += [
         Section(f"Paired tests: {inner(GROUPS[group])}", tables=_tests(report, result["beside"]), folded=True)
         for group, report in reports.items()
@@ -111,7 +118,7 @@ def _sections(result: Result, reports: Mapping[str, HaspiReport]) -> list[Sectio
         sections.append(Section("Failures", ["Items that count in no table."], [table]))
     versions = ", ".join(f"{name} {version}" for name, version in result["versions"].items())
     notes = [*_NOTES, *(f"Enhancer {name}." for name in result["enhancers"])]
-    return [*sections, Section("How the figures were made", [*notes, f"{versions}."])]
+    return [*sections, Section("How the figures were made", [*notes, f"{versions}."], folded=True)]
 
 
 _LOUDNESS = (
@@ -243,7 +250,7 @@ def _loudness_table(result: Result, group: str) -> Table:
                 for level, cell in row["by_level"].items()
             }
             rows.append({_GIVEN: title, **offs})
-    return Table.of(f"{GROUPS[group]}: mean absolute difference in dB (mean difference)", rows)
+    return Table.of(f"{GROUPS[group]}: mean absolute difference in dB (mean difference)", rows, folded=True)
 
 
 def _severity_table(result: Result, group: str) -> Table:
@@ -272,7 +279,7 @@ def _gap_table(result: Result) -> Table:
             columns = {title: column for title, column in (_LOSSES | _GAPS).items() if column[0] in row}
             found = {title: cell.replace("%", " %") for title, cell in cells(row, columns).items()}
             rows.append({_GIVEN: f"{group}, {name}", **found})
-    return Table.of("Mean loss in dB on the same utterances, and relative differences", rows)
+    return Table.of("Mean loss in dB on the same utterances, and relative differences", rows, folded=True)
 
 
 def _peak_table(result: Result) -> Table:
@@ -295,7 +302,7 @@ def _gain_table(curves: Sequence[Result]) -> Table:
         for curve in curves
         for level, gains in zip(curve["levels"], curve["gain_db"], strict=True)
     ]
-    return Table("Insertion gain in dB", (_TONE, *(f"{hz:g} Hz" for hz in shown)), rows)
+    return Table("Insertion gain in dB", (_TONE, *(f"{hz:g} Hz" for hz in shown)), rows, folded=True)
 
 
 def tone_table(found: Sequence[Result]) -> Table:

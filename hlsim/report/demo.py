@@ -17,11 +17,11 @@ from hlsim.evaluation.comparison import EQUAL_DB
 from hlsim.evaluation.haspi_report import HaspiReport
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.report import spectrograms
-from hlsim.report.gain_pictures import gain_picture
+from hlsim.report.gain_pictures import Colours, gain_picture
 from hlsim.report.haspi import Front
 from hlsim.report.listening import players
 from hlsim.report.page import Picture, Section
-from hlsim.report.pictures import draw_svg, legend
+from hlsim.report.pictures import condition_colours, draw_svg, legend
 from hlsim.report.tables import Table, verdict
 
 UNAIDED, PRESCRIBED, AS_LOUD, TRAINED = "unaided", "NAL-R", "NAL-R as loud as trained", "trained"
@@ -94,6 +94,7 @@ def demo_front(
 ) -> tuple[Front, bytes]:
     """The page's beginning, and the PNG of all its spectrograms."""
     ear, level = report.items[0].audiogram, report.items[0].clean_level
+    colours = condition_colours(report.conditions)
     both = (("given", sounds.given), ("heard", sounds.heard))
     shown = {f"{name}, {what}": signals[name][0] for name in _SHOWN for what, signals in both}
     panels = spectrograms.panels(shown, NEURO_RATE)
@@ -103,7 +104,7 @@ def demo_front(
         Section(
             "The ear and the speech",
             [_EAR.format(level=level)],
-            pictures=[_ear_picture(ear, sounds), _heard_picture(sounds)],
+            pictures=[_ear_picture(ear, sounds, colours), _heard_picture(sounds, colours)],
         ),
         Section("What is given, and what is heard of it", pictures=spectrograms.pictures(panels)),
         Section(
@@ -111,22 +112,22 @@ def demo_front(
             [_LISTEN.format(name=sounds.names[0])],
             players=players({"original": sounds.clean[0], **heard}, NEURO_RATE),
         ),
-        Section("Gain", [_GAIN], pictures=[gain_picture(curves[0]["ear"], curves)]),
+        Section("Gain", [_GAIN], pictures=[gain_picture(curves[0]["ear"], curves, colours)]),
     ]
     title = f"A hearing aid trained for one ear: {curves[0]['ear']}"
     return Front(title, demo_verdict(report), sections), spectrograms.composite(panels)
 
 
-def _ear_picture(ear: Audiogram, sounds: Sounds) -> Picture:
+def _ear_picture(ear: Audiogram, sounds: Sounds, colours: Colours) -> Picture:
     def draw(axes: Any) -> None:
         axes.figure.set_figheight(4.0)
-        ear.plot(axes, label="threshold", zorder=3)
-        for color, name in (("tab:green", UNAIDED), ("tab:orange", TRAINED)):
+        ear.plot(axes, label="threshold", zorder=3, color="black")
+        for name in (UNAIDED, TRAINED):
             levels = torch.cat([band_levels(signal, NEURO_RATE) for signal in sounds.given[name]]).numpy()
             low, high = np.percentile(levels, (30, 99), axis=0) - threshold_in_quiet()
             mean = 10.0 * np.log10((10.0 ** (levels / 10.0)).mean(0)) - threshold_in_quiet()
-            axes.fill_between(band_centres(), low, high, color=color, alpha=0.25, linewidth=0)
-            axes.plot(band_centres(), mean, color=color, label=f"speech, {name}")
+            axes.fill_between(band_centres(), low, high, color=colours[name], alpha=0.25, linewidth=0)
+            axes.plot(band_centres(), mean, color=colours[name], label=f"speech, {name}")
         legend(axes)
 
     thresholds = ", ".join(f"{level:g}" for level in ear.levels)
@@ -136,17 +137,16 @@ def _ear_picture(ear: Audiogram, sounds: Sounds) -> Picture:
     return Picture(draw_svg(draw), alt, "Audiogram and speech. The bands are MSBG's degrees of loss.")
 
 
-def _heard_picture(sounds: Sounds) -> Picture:
+def _heard_picture(sounds: Sounds, colours: Colours) -> Picture:
     levels = {}
     for name in (NORMAL_EAR, *_SHOWN):
         powers = [10.0 ** (band_levels(signal, NEURO_RATE) / 10.0) for signal in sounds.heard[name]]
         levels[name] = 10.0 * torch.cat(powers).mean(0).log10().numpy()
 
     def draw(axes: Any) -> None:
-        colors = ("black", "tab:green", "tab:blue", "tab:orange")
-        for color, (name, level) in zip(colors, levels.items(), strict=True):
+        for name, level in levels.items():
             style = "--" if name == NORMAL_EAR else "-"
-            axes.plot(band_centres(), level, style, color=color, label=name)
+            axes.plot(band_centres(), level, style, color=colours.get(name, "black"), label=name)
         axes.set(ylabel="level heard (dB SPL in a band)", ylim=(0.0, None))
         frequency_axis(axes, (250, 500, 1000, 2000, 4000))
         legend(axes)

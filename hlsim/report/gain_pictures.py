@@ -11,19 +11,23 @@ from hlsim.audiogram_plot import frequency_axis
 from hlsim.report.page import Picture
 from hlsim.report.pictures import draw_svg, legend, plain
 
+Colours = Mapping[str, Any]
+"""Of each condition, as ``pictures.condition_colours`` gives them."""
+
 _LOWEST_DB = -60.0  # of tones as heard: what is further down is silent anyway
 
 
-def gain_picture(ear: str, curves: Sequence[Mapping[str, Any]]) -> Picture:
+def gain_picture(ear: str, curves: Sequence[Mapping[str, Any]], colours: Colours) -> Picture:
     """Insertion gain over frequency of every compensator and level of ``gain_curves``, for one ear."""
     curves = [curve for curve in curves if curve["ear"] == ear]
     styles = ("-", "--", ":", "-.")
 
     def draw(axes: Any) -> None:
-        for k, curve in enumerate(curves):
+        for curve in curves:
+            colour = colours[curve["compensator"]]
             for style, gains in zip(styles, curve["gain_db"], strict=False):
                 label = plain(curve["compensator"]) if style == "-" else None
-                axes.plot(curve["frequencies"], gains, style, color=f"C{k}", label=label)
+                axes.plot(curve["frequencies"], gains, style, color=colour, label=label)
         for style, level in zip(styles, curves[0]["levels"], strict=False):
             axes.plot([], [], style, color="black", label=f"input of {level:g} dB SPL")
         axes.set(ylabel="insertion gain (dB)")
@@ -42,7 +46,7 @@ def gains_at(hertz: Any, curve: Mapping[str, Any], gains: Sequence[float]) -> An
     return np.interp(np.log(hertz), np.log(curve["frequencies"]), gains)
 
 
-def input_output_picture(conditions: Mapping[str, Mapping[str, Any]]) -> Picture:
+def input_output_picture(conditions: Mapping[str, Mapping[str, Any]], colours: Colours) -> Picture:
     """Mean level of the output over that of the speech given, of a group's ``conditions``."""
     curves = {
         name: {float(level): cell["level_mean"] for level, cell in row["by_level"].items()}
@@ -51,7 +55,7 @@ def input_output_picture(conditions: Mapping[str, Mapping[str, Any]]) -> Picture
 
     def draw(axes: Any) -> None:
         for name, curve in curves.items():
-            axes.plot([*curve], [*curve.values()], marker="o", label=plain(name))
+            axes.plot([*curve], [*curve.values()], marker="o", color=colours[name], label=plain(name))
         axes.set(xlabel="speech (dB SPL)", ylabel="output (dB SPL)")
         axes.grid(alpha=0.3)
         legend(axes)
@@ -61,7 +65,7 @@ def input_output_picture(conditions: Mapping[str, Mapping[str, Any]]) -> Picture
     return Picture(draw_svg(draw), alt, "Output over input, clean speech, means over all ears.")
 
 
-def tone_picture(ear: str, found: Sequence[Mapping[str, Any]]) -> Picture:
+def tone_picture(ear: str, found: Sequence[Mapping[str, Any]], colours: Colours) -> Picture:
     """Level heard of steady tones at the middle level less a normal ear's, for one ear of ``steady_tones``."""
     rows = [row for row in found if row["ear"] == ear]
     middle = len(rows[0]["levels"]) // 2
@@ -70,7 +74,8 @@ def tone_picture(ear: str, found: Sequence[Mapping[str, Any]]) -> Picture:
         axes.axhline(0.0, color="0.5", linewidth=1.0, linestyle="--", label="a normal ear")
         for row in rows:
             offs = np.maximum(row["heard_off_db"][middle], _LOWEST_DB)
-            axes.plot(row["frequencies"], offs, marker="o", label=plain(row["compensator"]))
+            name = row["compensator"]
+            axes.plot(row["frequencies"], offs, marker="o", color=colours[name], label=plain(name))
         axes.set(ylabel="heard, against a normal ear (dB)")
         frequency_axis(axes, (250, 500, 1000, 2000, 4000))
         legend(axes)

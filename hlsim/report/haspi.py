@@ -10,7 +10,7 @@ from pathlib import Path
 from hlsim.audiogram import SEVERITIES
 from hlsim.evaluation.haspi_report import HaspiReport
 from hlsim.evaluation.scores import ItemScore
-from hlsim.metrics.registry import MEASURES
+from hlsim.metrics.registry import MEASURES, Engine
 from hlsim.metrics.words import WordsChange
 from hlsim.report.listening import listening_section
 from hlsim.report.page import Picture, Section, render_markdown, render_page, write_files
@@ -124,8 +124,8 @@ def _in_words_understood(words: WordsChange) -> str:
     )
 
 
-def scored_by(engine: str, versions: Mapping[str, str]) -> str:
-    """What computed HASPI and HASQI, of ``ENGINES``."""
+def scored_by(engine: Engine, versions: Mapping[str, str]) -> str:
+    """What computed HASPI and HASQI, an ``Engine``."""
     made = f"by {engine} {versions[engine]}"
     return made if engine == "pyclarity" else f"{made} as pyclarity 0.9 computes them"
 

@@ -59,6 +59,17 @@ def plain(text: str) -> str:
     return f"\u200b{text}" if text.startswith("_") else text
 
 
+def condition_colours(conditions: Sequence[str]) -> dict[str, Any]:
+    """A colour a condition, for all pictures of a page; what is "at X's level" has X's, paler."""
+    of = {name: [c for c in conditions if name.endswith(f" at {c}'s level")] for name in conditions}
+    own = [name for name in conditions if not of[name]]
+    colours: dict[str, Any] = {name: f"C{k}" for k, name in enumerate(own)}
+    for name in own:
+        beside = [other for other in conditions if name in of[other]]
+        colours |= {other: (colours[name], 0.6 / (k + 1)) for k, other in enumerate(beside)}
+    return {name: colours[name] for name in conditions}
+
+
 def legend(axes: Any) -> None:
     """Under the axes, where it covers nothing; the figure grows by it."""
     handles, labels = axes.get_legend_handles_labels()
@@ -187,11 +198,12 @@ def _by_severity(report: HaspiReport) -> _Drawn:
     groups, alt = _groups(report, report.severities, names, "degree of loss")
 
     def draw(axes: Any) -> None:
-        width = 0.8 / len(report.conditions)
+        width, colours = 0.8 / len(report.conditions), condition_colours(report.conditions)
         for k, condition in enumerate(report.conditions):
             at = np.arange(len(groups)) + (k - (len(report.conditions) - 1) / 2) * width
             scores = [group[k] for group in groups.values()]
-            axes.bar(at, [_mean(group) for group in scores], width * 0.9, label=plain(condition))
+            means = [_mean(group) for group in scores]
+            axes.bar(at, means, width * 0.9, color=colours[condition], label=plain(condition))
             for place, group in zip(at, scores, strict=True):
                 if len(group) >= FEWEST:
                     axes.plot((place, place), bootstrap_interval(group), color="black", linewidth=1.0)
@@ -213,9 +225,9 @@ def _by_snr(report: HaspiReport) -> _Drawn:
     groups, alt = _groups(report, snrs, sorted({snr for snr in snrs if snr is not None}), "SNR", " dB")
 
     def draw(axes: Any) -> None:
-        for k, condition in enumerate(report.conditions):
+        for k, (condition, colour) in enumerate(condition_colours(report.conditions).items()):
             means = [_mean(group[k]) for group in groups.values()]
-            axes.plot([*groups], means, marker="o", label=plain(condition))
+            axes.plot([*groups], means, marker="o", color=colour, label=plain(condition))
         axes.set(xlabel="SNR (dB)", ylabel=f"mean {report.headline.title}")
         axes.set(ylim=score_range(report.measures[0]))
         legend(axes)
@@ -240,7 +252,8 @@ def _by_listener(report: HaspiReport) -> _Drawn:
         axes.scatter(
             means[:, 0], places, s=16, facecolor="white", edgecolor="0.3", label=plain(c.before), zorder=2
         )
-        axes.scatter(means[:, 1], places, s=16, color="C0", label=plain(c.after), zorder=2)
+        colour = condition_colours(report.conditions)[c.after]
+        axes.scatter(means[:, 1], places, s=16, color=colour, label=plain(c.after), zorder=2)
         axes.set_yticks(places if few else [], map(plain, names) if few else [], fontsize="small")
         axes.set(xlim=score_range(c.measure), ylim=(-0.6, len(names) - 0.4), xlabel=f"mean {c.title}")
         legend(axes)

@@ -28,16 +28,17 @@ _CHANGE = "Δ [95 % interval]"
 
 @dataclass(frozen=True)
 class Table:
-    """Cells of text; the first column names the rows."""
+    """Cells of text; the first column names the rows. On a page a ``folded`` one is shown when it is opened."""
 
     caption: str
     header: Sequence[str]
     rows: Sequence[Sequence[str]]
+    folded: bool = False
 
     @classmethod
-    def of(cls, caption: str, rows: Sequence[Mapping[str, str]]) -> Table:
+    def of(cls, caption: str, rows: Sequence[Mapping[str, str]], *, folded: bool = False) -> Table:
         """Of rows by title of the column, all alike."""
-        return cls(caption, [*rows[0]] if rows else [], [[*row.values()] for row in rows])
+        return cls(caption, [*rows[0]] if rows else [], [[*row.values()] for row in rows], folded)
 
     def markdown(self) -> str:
         """Without the caption."""

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from compensators.aid import HearingAid
 from compensators.pretrained import CONFIGS, build_compensator, load_compensator
 from hlsim.audiogram import Audiogram
+from hlsim.criteria.choice import Criterion
 from hlsim.data.module import Batch
 from hlsim.loss import HearingLossLoss
 from hlsim.pretrained import checkpoint_digest
@@ -39,7 +40,9 @@ class CompensatorTraining(TimedModule):
         self.denoising, self.intelligibility = (
             counted.pop(name, 0.0) for name in ("denoising", "intelligibility")
         )
-        criterion = counted or "coherent-bands"  # for the examples, where nothing is learned through it
+        criterion: Criterion = (
+            counted or "coherent-bands"
+        )  # for the examples, where nothing is learned through it
         self.loss = HearingLossLoss(simulator=simulator, reference=recipe.reference, criterion=criterion)
         self.hears = bool(counted)
         if isinstance(aid := self.compensator, HearingAid):

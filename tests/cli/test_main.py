@@ -139,19 +139,23 @@ def test_compensate_is_the_compensator(tmp_path: Path, utterance: Path) -> None:
     assert main([*call, "N7"]) == 0  # which no simulator takes
 
 
-@pytest.mark.parametrize(("ear", "warned"), [("N4", False), ("N3", True)])
-def test_a_compensator_of_another_ear_warns(
-    tmp_path: Path, utterance: Path, capsys: pytest.CaptureFixture[str], ear: str, warned: bool
+@pytest.mark.parametrize(("ear", "warned"), [("N4", 0), ("N3", 1)])
+def test_a_compensator_of_another_ear_warns_once(
+    tmp_path: Path, utterance: Path, capsys: pytest.CaptureFixture[str], ear: str, warned: int
 ) -> None:
     model = MappingCompensator(MappingConfig(channels=8, blocks=1))
     about = {"audiogram": Audiogram.standard("N4").to_dict()}
     save_checkpoint(tmp_path / "mine", "mapping-compensator", model, model.config.to_dict(), about)
-    call = ["compensate", str(utterance), str(tmp_path / "out.wav"), "--compensator", str(tmp_path / "mine")]
-    assert main([*call, "--audiogram", ear]) == 0
+    (tmp_path / "in").mkdir()
+    for rate in (16000, 22050, 48000):
+        soundfile.write(tmp_path / "in" / f"{rate}.wav", np.full(rate // 10, 0.01), rate)
     line = (
         f"hlsim: warning: {tmp_path / 'mine'} was trained for one ear, 55, 55, 55, 65, 70, 75, 80, 80 dB HL"
     )
-    assert (line in capsys.readouterr().err) == warned
+    for source, target in ((utterance, "out.wav"), (tmp_path / "in", "out")):
+        files = ["compensate", str(source), str(tmp_path / target)]
+        assert main([*files, "--audiogram", ear, "--compensator", str(tmp_path / "mine")]) == 0
+        assert capsys.readouterr().err.count(line) == warned
 
 
 def _bad_files(folder: Path) -> dict[str, tuple[Path, str]]:
@@ -258,19 +262,15 @@ def test_what_a_listener_would_not_expect_of_a_file_is_told(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     noise = np.random.default_rng(0).standard_normal(48000)
-    call = [
-        "compensate",
-        str(tmp_path / "in.wav"),
-        str(tmp_path / "out.wav"),
-        "--audiogram",
-        "N3",
-        "--compensator",
-    ]
-    for level, compensator, clipped, dull in (
-        (0.001, "nalr", False, False), (0.001, "wdrc", False, True), (1.0, "nalr", True, False)
+    files = [str(tmp_path / name) for name in ("in.wav", "out.wav")]
+    for command, level, model, clipped, dull in (
+        ("compensate", 0.001, "wdrc", False, False), ("compensate", 0.001, "compensator-general", False, True),
+        ("compensate", 1.0, "nalr", True, False), ("simulate", 0.001, "neuro-msbg", False, True),
+        ("simulate", 0.001, "msbg", False, False),
     ):  # fmt: skip
         soundfile.write(tmp_path / "in.wav", level * noise, 48000, subtype="FLOAT")
-        assert main([*call, compensator]) == 0
+        kind, ear = {"compensate": ("--compensator", "N3"), "simulate": ("--simulator", "N5")}[command]
+        assert main([command, *files, "--audiogram", ear, kind, model]) == 0
         told = capsys.readouterr().err
         assert ("a player clips it" in told, "what IN has above 8 kHz is missing" in told) == (clipped, dull)
 

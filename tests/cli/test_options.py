@@ -3,7 +3,8 @@
 import inspect
 from collections.abc import Callable
 from importlib import import_module
-from typing import Any
+from pathlib import Path
+from typing import Any, get_args
 
 import pytest
 
@@ -13,11 +14,13 @@ from hlsim.cli import files, options
 from hlsim.cli.inputs import read_ear
 from hlsim.cli.main import COMMANDS
 from hlsim.cli.options import Parser
-from hlsim.data.corpora import LAYOUTS
+from hlsim.criteria.choice import CRITERIA, CriterionName
+from hlsim.data.corpora import Layout
 from hlsim.data.plan_settings import PlanSettings
-from hlsim.data.teacher import ALIGNMENTS, TEACHERS
-from hlsim.metrics.registry import ENGINES
-from hlsim.parallel import BACKENDS
+from hlsim.data.teacher import TEACHERS, Alignment
+from hlsim.metrics.registry import MEASURES, Engine, MeasureName
+from hlsim.parallel import Backend
+from hlsim.report.alignment import Method
 
 
 def declared(command: str) -> Parser:
@@ -31,14 +34,30 @@ def choices(command: str, option: str) -> tuple[str, ...]:
     return tuple(action.choices or ())
 
 
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_ends_with_two_examples_that_the_command_takes(command: str) -> None:
+    parser = declared(command)
+    text, examples = parser.format_help().split("\nexamples:\n")
+    assert text.startswith(f"usage: {command}")
+    one, two = (example.split() for example in examples.splitlines())
+    for words in (one, two):
+        assert words[0] == command and parser.parse_args(words[1:]).run
+        recipes = [word for word in words if word.endswith(".yaml")]
+        assert all((Path(__file__).parents[2] / recipe).is_file() for recipe in recipes)
+
+
 def test_names_that_are_written_twice_agree() -> None:
     assert tuple(STANDARD) == options.STANDARD_EARS
     assert files.ENDINGS == EXTENSIONS
-    assert choices("prepare", "--layout") == ("auto", *LAYOUTS)
+    assert choices("prepare", "--layout") == get_args(Layout)
     assert options.TEACHERS == TEACHERS
-    assert choices("prepare", "--alignment") == choices("draw-alignment", "--alignment") == ALIGNMENTS[:2]
-    assert choices("haspi-report", "--engine") == choices("evaluate-compensator", "--engine") == ENGINES
-    assert choices("prepare", "--backend") == choices("haspi-report", "--backend") == BACKENDS
+    assert choices("prepare", "--alignment") == get_args(Alignment)[:2]
+    assert set(choices("draw-alignment", "--alignment")) == {*get_args(Method)}
+    assert (
+        choices("haspi-report", "--engine") == choices("evaluate-compensator", "--engine") == get_args(Engine)
+    )
+    assert choices("prepare", "--backend") == choices("haspi-report", "--backend") == get_args(Backend)
+    assert tuple(MEASURES) == get_args(MeasureName) and tuple(CRITERIA) == get_args(CriterionName)
 
 
 def _parameters() -> dict[str, dict[str, Any]]:

@@ -281,7 +281,7 @@ def test_tables_of_the_users_are_not_written_over(
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        ({"layout": "timit"}, "unknown layouts timit"),
+        ({"layout": "timit"}, "layout 'timit'; allowed: auto, voicebank-demand"),
         ({"rate": 8000}, "8000 Hz"),
         ({"test_share": 1.0}, "test_share 1.0; allowed: 0 to less than 1"),
         ({"ears": 0}, "counts from 1 up"),

@@ -83,5 +83,5 @@ def test_the_grid_of_rates(rate: int, grid: int) -> None:
 def test_what_is_refused() -> None:
     with pytest.raises(ValueError, match="sample rate 16001 Hz for a teacher"):
         Teacher(16001)
-    with pytest.raises(ValueError, match="unknown alignments guess; allowed: structural, impulse, none"):
+    with pytest.raises(ValueError, match="alignment 'guess'; allowed: structural, impulse, none"):
         Teacher(16000, alignment="guess")

@@ -2,6 +2,9 @@
 
 from hlsim.evaluation.steadiness import TONES
 from hlsim.report.compensators import shift_table, tone_table
+from hlsim.report.page import Section, render_page
+from hlsim.report.pictures import condition_colours
+from hlsim.report.tables import Table
 
 
 def test_tables_of_tones_and_shifted_speech() -> None:
@@ -13,3 +16,18 @@ def test_tables_of_tones_and_shifted_speech() -> None:
     assert second[0] == "N3, own, 65 dB SPL" and second[-1] == "6 (4000 Hz)"
     found = {"compensator": "own", "items": [0, 2], "difference_db": [[-30.0, -20.0], [-12.4, -20.0]]}
     assert [*shift_table([found]).rows] == [["own", "4", "-20", "-12"]]
+
+
+def test_a_compensator_has_one_colour_and_what_is_as_loud_has_it_paler() -> None:
+    at = ["NAL-R at own's level", "equaliser at own's level"]
+    colours = condition_colours(["unaided", "NAL-R", *at, "own", "other"])
+    assert [*colours] == ["unaided", "NAL-R", *at, "own", "other"]
+    assert [colours[name] for name in ("unaided", "NAL-R", "own", "other")] == ["C0", "C1", "C2", "C3"]
+    assert [colours[name] for name in at] == [("C2", 0.6), ("C2", 0.3)]
+    assert condition_colours(["a", "b at c's level"]) == {"a": "C0", "b at c's level": "C1"}
+
+
+def test_a_folded_table_says_what_it_is_and_opens() -> None:
+    section = Section("Gain", tables=[Table("Gain in dB", ("a", "b"), [("x", "1")], folded=True)])
+    text = render_page("Title", [section])
+    assert "<details><summary>Gain in dB</summary>" in text and "<caption>" not in text

@@ -98,5 +98,5 @@ def test_the_page_shows_the_result_by_name() -> None:
     for name in (UNAIDED, PRESCRIBED, TRAINED):
         assert all(f'alt="Spectrogram: {name}, {what}"' in page for what in ("given", "heard"))
     # the report itself follows, folded on the page
-    assert "<summary>Show details</summary>" in page and page.index("<summary>") < page.index("Wilcoxon")
+    assert ">Details</h2></summary>" in page and page.index("<summary>") < page.index("Wilcoxon")
     assert "Wilcoxon" in text and "players" not in text and "<audio" not in page[page.index("<summary>") :]

@@ -75,4 +75,4 @@ def test_links_lead_to_sections_and_tables_take_the_focus() -> None:
     assert re.findall(r"<h(\d)", text) == ["1", "2", "2", "3", "2"]
     assert text.count('role="region" tabindex="0"') == text.count("<table") == 1
     assert '<html lang="en">' in text and "width=device-width" in text
-    assert text.count("<details>") == text.count("<summary>") == 1
+    assert text.count('<details class="folded">') == text.count("<summary>") == 1

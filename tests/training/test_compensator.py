@@ -242,7 +242,7 @@ def test_sounds_have_no_noise_and_babble_is_the_others_voices(data: TrainingData
         ({"seed": -(2**62)}, "seed -4611686018427387904 in the recipe; allowed: whole numbers between"),
         ({"weights": {"bands": 0.0}}, "above 0"),
         ({"model": {"layers": 2}}, "unknown network settings layers"),
-        ({"kind": "vocoder"}, "kind 'vocoder' in the recipe; allowed: mapping-compensator or hearing-aid"),
+        ({"kind": "vocoder"}, "kind 'vocoder' in the recipe; allowed: mapping-compensator, hearing-aid"),
         (
             {"weights": {"denoising": 1.0}},
             "kind 'mapping-compensator' in the recipe; allowed: no noise reduction but a hearing-aid's",

@@ -141,9 +141,9 @@ def test_lower_precision_is_near_and_leaves_the_physics_alone(data: TrainingData
 @pytest.mark.parametrize(
     ("setting", "said"),
     [
-        ({"precision": "float16"}, "float32 or bfloat16"),
+        ({"precision": "float16"}, "float32, bfloat16"),
         ({"average": 1.0}, "from 0 to below 1"),
-        ({"unit_power": "both"}, "truth or input"),
+        ({"unit_power": "both"}, "truth, input"),
         ({"seed": 2**62}, "seed 4611686018427387904 in the recipe; allowed: whole numbers between"),
         ({"levels": [80, 60]}, "a lowest and a highest"),
     ],
