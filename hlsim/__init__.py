@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from hlsim.audiogram import Audiogram
     from hlsim.haspi_loss import HASPILoss
+    from hlsim.listener import Listener
     from hlsim.loss import HearingLossLoss
     from hlsim.msbg import MSBG, estimate_delay
     from hlsim.neuro import NeuroMSBG
@@ -20,6 +21,7 @@ __all__ = [
     "Audiogram",
     "HASPILoss",
     "HearingLossLoss",
+    "Listener",
     "NeuroMSBG",
     "estimate_delay",
     "list_pretrained",
@@ -32,6 +34,7 @@ _MODULES = {
     "Audiogram": "hlsim.audiogram",
     "HASPILoss": "hlsim.haspi_loss",
     "HearingLossLoss": "hlsim.loss",
+    "Listener": "hlsim.listener",
     "NeuroMSBG": "hlsim.neuro",
     "estimate_delay": "hlsim.msbg",
     "list_pretrained": "hlsim.pretrained",

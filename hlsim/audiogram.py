@@ -12,7 +12,7 @@ from functools import lru_cache, reduce
 from itertools import pairwise
 from operator import add
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -255,8 +255,16 @@ def severity_index(thresholds: Tensor) -> Tensor:
     return torch.stack([mean > limit for limit in SEVERITY_LIMITS]).sum(0)
 
 
-AudiogramLike = Audiogram | Sequence[Audiogram] | Tensor
-"""One ear, one a batch item, or a (..., 8) tensor of dB HL. pyclarity's ``Audiogram`` is taken as ours is."""
+class TwoEars(Protocol):
+    """A ``Listener``, to which imports from here would point upwards."""
+
+    @property
+    def ears(self) -> tuple[Audiogram, Audiogram]: ...
+
+
+AudiogramLike = Audiogram | Sequence[Audiogram] | TwoEars | Sequence[TwoEars] | Tensor
+"""One ear or a ``Listener``'s two, one a batch item, or a (..., 8) tensor of dB HL. pyclarity's ``Audiogram`` is taken as
+ours is."""
 
 
 def as_thresholds(
@@ -267,7 +275,8 @@ def as_thresholds(
     A list of (8,) tensors holds an ear each, and one of eight (batch,) tensors a frequency each, as torch's
     ``default_collate`` makes it of thresholds; a list of eight (8,) tensors may be either and is refused.
 
-    Returns: (8,) for one ear, (batch, 8) for a sequence, the tensor itself otherwise; dB HL.
+    Returns: (8,) for one ear, (batch, 8) for a sequence, (2, 8) for a ``Listener``, (batch, 2, 8) for a sequence of them,
+    the tensor itself otherwise; dB HL.
 
     Raises:
         ValueError: not an audiogram, a complex or bool tensor, a last dimension other than 8, NaN, or levels outside -10
@@ -275,7 +284,11 @@ def as_thresholds(
     """
     if (ear := _one_ear(audiogram)) is not None:
         return torch.tensor(_taken(ear.thresholds, highest, taker))
+    if hasattr(audiogram, "ears"):
+        return as_thresholds(audiogram.ears, highest=highest, taker=taker)
     if isinstance(audiogram, Sequence) and audiogram:
+        if all(hasattr(one, "ears") for one in audiogram):
+            return torch.stack([as_thresholds(one, highest=highest, taker=taker) for one in audiogram])
         ears = [_one_ear(one) for one in audiogram]
         if all(ear is not None for ear in ears):
             return torch.tensor([_taken(ear.thresholds, highest, taker) for ear in ears if ear is not None])
@@ -324,6 +337,7 @@ def resolve_thresholds(
         raise ValueError("no audiogram: give one when building the simulator or with the call")
     thresholds = as_thresholds(audiogram, **limits) if audiogram is not None else stored
     assert thresholds is not None
+    check_two_ears(audiogram, waveform)
     try:
         if thresholds.ndim > 1:
             torch.broadcast_shapes(waveform.shape[:-1], thresholds.shape[:-1])
@@ -333,6 +347,15 @@ def resolve_thresholds(
             "one audiogram, or leading dimensions that broadcast"
         ) from None
     return thresholds.to(waveform.device)
+
+
+def check_two_ears(audiogram: AudiogramLike | None, waveform: Tensor) -> None:
+    """Raise ValueError where a listener is given with a waveform that has no two channels: (..., 2, time)."""
+    one = audiogram[0] if isinstance(audiogram, list | tuple) else audiogram
+    if hasattr(one, "ears") and waveform.shape[-2:-1] != (2,):
+        raise ValueError(
+            f"a waveform of shape {tuple(waveform.shape)} for a listener's two ears; allowed: (..., 2, time), left first"
+        )
 
 
 def interpolate(levels: Tensor, hz: tuple[float, ...]) -> Tensor:
@@ -402,9 +425,7 @@ def _instead(given: object) -> str:
     if isinstance(first, str) and first in STANDARD:
         make = f"Audiogram.standard({first!r})"
     elif _has_two_ears(first):
-        return (
-            "; of a listener's two ears write Audiogram.from_clarity(listener, 'left') or (listener, 'right')"
-        )
+        return "; of two ears write Listener.from_clarity(listener), of one Audiogram.from_clarity(listener, 'left')"
     elif isinstance(first, Mapping):
         make = "Audiogram.from_dict(...)"
     elif several and isinstance(first, Tensor):

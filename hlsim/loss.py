@@ -9,7 +9,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor, nn
 
-from hlsim.audiogram import FREQUENCIES, AudiogramLike, as_thresholds, own_thresholds
+from hlsim.audiogram import FREQUENCIES, AudiogramLike, as_thresholds, check_two_ears, own_thresholds
 from hlsim.calibration import PASCAL_SPL, check_full_scale, gain_to_pascals
 from hlsim.checks import Lengths, check_choice, check_lengths, check_rate, check_waveform, silent_after
 from hlsim.criteria import coherent_bands, paper
@@ -268,6 +268,7 @@ class HearingLossLoss(nn.Module):
             )
         shape = compensated.shape
         ends = None if lengths is None else check_lengths(lengths, shape)
+        check_two_ears(audiogram, clean)
         ears = self.thresholds if audiogram is None else as_thresholds(audiogram)
         if ears is None:
             raise ValueError("no audiogram: give one when building the loss or with the call")

@@ -372,7 +372,7 @@ def test_an_ear_of_pyclaritys_listeners() -> None:
         with pytest.raises(ValueError, match=r"ear is 'l'; allowed: ear='left' or ear='right'"):
             Audiogram.from_clarity(given, "l")
         for several in (given, [given, given]):
-            with pytest.raises(ValueError, match=r"two ears write .*'left'\) or \(listener, 'right'\)"):
+            with pytest.raises(ValueError, match=r"of two ears write Listener"):
                 as_thresholds(several)
     with pytest.raises(ValueError, match="ear is 'left'; allowed: None, for it is one ear"):
         Audiogram.from_clarity(listener.audiogram_left, "left")

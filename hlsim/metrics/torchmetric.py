@@ -258,13 +258,17 @@ def _ears(audiogram: AudiogramLike, batch: int, sides: int) -> list[list[Audiogr
             )
         rows = audiogram.detach().expand(batch, *one, width).reshape(batch, sides, width).double().tolist()
         return [[Audiogram(tuple(row)) for row in rows_of_item] for rows_of_item in rows]
-    if not isinstance(audiogram, Sequence) or not all(isinstance(ear, Audiogram) for ear in audiogram):
+    if sides == 2 and hasattr(audiogram, "ears"):
+        audiogram = audiogram.ears
+    given = audiogram if isinstance(audiogram, Sequence) else ()
+    ears = [ear for ear in given if isinstance(ear, Audiogram)]
+    if not ears or len(ears) < len(given):
         found, tensor = type(audiogram).__name__, f"an {(*one, 8)} or {(batch, *one, 8)} tensor"
-        each = "an Audiogram, one an item" if sides == 1 else "a left and a right Audiogram"
+        each = "an Audiogram, one an item" if sides == 1 else "a Listener, or a left and a right Audiogram"
         raise ValueError(f"audiogram is {found}; allowed: {each}, or {tensor}")
-    if len(audiogram) != (batch if sides == 1 else 2):
+    if len(ears) != (batch if sides == 1 else 2):
         each = (
             f"{batch} items; allowed: one for all, or one an item" if sides == 1 else "two ears; allowed: two"
         )
-        raise ValueError(f"{len(audiogram)} audiograms of {each}")
-    return [[ear] for ear in audiogram] if sides == 1 else [list(audiogram)] * batch
+        raise ValueError(f"{len(ears)} audiograms of {each}")
+    return [[ear] for ear in ears] if sides == 1 else [ears] * batch

@@ -1,0 +1,132 @@
+"""A listener's two ears: as two calls would have them, in everything that takes an audiogram."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from compensators import NALR, WDRC, load_compensator
+from hlsim import MSBG, Audiogram, HASPILoss, HearingLossLoss, Listener, load_pretrained
+from hlsim.calibration import set_level
+from hlsim.listener import read_listeners
+from hlsim.metrics import haspi, hasqi
+
+LEFT, RIGHT = Audiogram.standard("N2"), Audiogram.standard("N4")
+BOTH = Listener(LEFT, RIGHT)
+ENTRY = {
+    "name": "L0001",
+    "audiogram_cfs": [250, 500, 1000, 2000, 3000, 4000, 6000, 8000],
+    "audiogram_levels_l": [*LEFT.levels],
+    "audiogram_levels_r": [*RIGHT.levels],
+}
+
+
+@pytest.fixture
+def scene(speech: list[tuple[Tensor, int]]) -> Tensor:
+    """Two channels of other speech each. Shape: (2, 16000)."""
+    return torch.cat([set_level(one[:, 8000:24000], 65.0) for one, _ in speech[:2]])
+
+
+@pytest.mark.parametrize("name", ["msbg", "neuro-msbg", "nalr", "wdrc", "hearing-aid", "compensator-general"])
+def test_both_ears_in_one_call_are_each_ear_alone(name: str, scene: Tensor) -> None:
+    made: dict[str, Any] = {
+        "msbg": lambda: MSBG(sample_rate=16000),
+        "nalr": lambda: NALR(sample_rate=16000),
+        "wdrc": WDRC,
+    }
+    make = made.get(name, lambda: (load_pretrained if name == "neuro-msbg" else load_compensator)(name))
+    module = make()
+    with torch.no_grad():
+        both = module(scene, BOTH)
+        for channel, ear in enumerate((LEFT, RIGHT)):
+            torch.testing.assert_close(both[channel], module(scene[channel], ear), rtol=1e-4, atol=1e-6)
+        swapped = module(scene.flip(0), Listener(RIGHT, LEFT))
+        torch.testing.assert_close(swapped.flip(0), both, rtol=1e-4, atol=1e-6)
+        items = module(torch.stack((scene, scene.flip(0))), [BOTH, Listener(RIGHT, LEFT)])
+        torch.testing.assert_close(items[0], both, rtol=1e-4, atol=1e-6)
+        torch.testing.assert_close(items[1].flip(0), both, rtol=1e-4, atol=1e-6)
+        with pytest.raises(ValueError, match=r"two ears; allowed: \(\.\.\., 2, time\)"):
+            module(scene[0], BOTH)
+
+
+@pytest.mark.parametrize("kind", [HearingLossLoss, HASPILoss])
+def test_the_loss_is_the_mean_over_both_ears_and_reaches_both(kind: Any, scene: Tensor) -> None:
+    loss, given = kind(), (0.5 * scene).requires_grad_()
+    value = loss(given[None], scene[None], BOTH)
+    alone = [loss(given[i : i + 1], scene[i : i + 1], ear).detach() for i, ear in enumerate((LEFT, RIGHT))]
+    assert float(value.detach()) == pytest.approx(float(sum(alone)) / 2.0, rel=1e-4)
+    value.backward()
+    assert given.grad is not None and bool(given.grad.isfinite().all())
+    assert bool((given.grad.abs().amax(-1) > 0.0).all())
+    assert float(kind(BOTH)(given[None], scene[None]).detach()) == pytest.approx(
+        float(value.detach()), rel=1e-5
+    )
+    with pytest.raises(ValueError, match="two ears"):
+        loss(given[0], scene[0], BOTH)
+
+
+@pytest.mark.parametrize("score", [haspi, hasqi])
+def test_scores_are_one_an_ear(score: Any, scene: Tensor) -> None:
+    given = scene + 0.02 * torch.randn(scene.shape, generator=torch.Generator().manual_seed(0))
+    scores = score(given, scene, BOTH)
+    alone = [float(score(given[i], scene[i], ear)) for i, ear in enumerate((LEFT, RIGHT))]
+    assert scores.tolist() == pytest.approx(alone, abs=1e-5)
+
+
+def test_written_and_read(tmp_path: Path) -> None:
+    for listener in (BOTH, Listener(LEFT, None)):
+        assert Listener.from_dict(json.loads(json.dumps(listener.to_dict()))) == listener
+    assert Listener.from_clarity(ENTRY) == BOTH
+    (tmp_path / "listeners.json").write_text(json.dumps({"L0001": ENTRY}))
+    assert read_listeners(tmp_path / "listeners.json") == {"L0001": BOTH}
+    rows = [
+        {"listener": "a", "ear": "r", **RIGHT.to_row()},
+        {"listener": "a", "ear": "Left", **LEFT.to_row()},
+    ]
+    rows += [{"listener": "b", "ear": "left", **LEFT.to_row()}]
+    table = tmp_path / "ears.csv"
+    table.write_text("\n".join([",".join(rows[0]), *(",".join(row.values()) for row in rows)]))
+    assert read_listeners(table) == {"a": BOTH, "b": Listener(LEFT, None)}
+    table.write_text(table.read_text() + "\n" + ",".join(rows[0].values()))
+    with pytest.raises(ValueError, match="line 5: the right ear of a is there twice"):
+        read_listeners(table)
+
+
+def test_pyclaritys_listeners() -> None:
+    clarity = pytest.importorskip("clarity.utils.audiogram")
+    assert Listener.from_clarity(clarity.Listener.from_dict(ENTRY)) == BOTH
+
+
+def test_drawn_as_audiologists_do() -> None:
+    pytest.importorskip("matplotlib")
+    drawn = {line.get_label(): line for line in BOTH.plot().get_lines()}
+    assert drawn["left"].get_marker() == "x" and drawn["right"].get_marker() == "o"
+    assert tuple(drawn["right"].get_ydata()) == RIGHT.levels
+
+
+def test_bad_listeners(tmp_path: Path, scene: Tensor) -> None:
+    with pytest.raises(ValueError, match="without ears"):
+        Listener(None, None)
+    with pytest.raises(ValueError, match="the right ear is str"):
+        Listener(LEFT, "N4")  # type: ignore[arg-type]
+    with pytest.raises(
+        ValueError, match=r"left ear is missing; give listener\.right with waveform\[\.\.\., 1, :\]"
+    ):
+        MSBG()(scene, Listener(None, RIGHT))
+    for bad in ({}, {"left": None}, [], {"left": None, "right": None}):
+        with pytest.raises(ValueError, match="allowed"):
+            Listener.from_dict(bad)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="allowed"):
+        Listener.from_clarity({"audiogram_cfs": [250]})
+    for name, text in (
+        ("a.json", "{"),
+        ("b.json", "[]"),
+        ("c.json", '{"L1": {}}'),
+        ("d.csv", "listener,ear\n"),
+    ):
+        (tmp_path / name).write_text(text)
+        with pytest.raises(ValueError, match=name):
+            read_listeners(tmp_path / name)
