@@ -34,14 +34,15 @@ def finish(call: Call, device: torch.device) -> None:
 
 
 def peak_mib(call: Call, device: torch.device) -> float | None:
-    """MiB by which memory grows during a call: on a GPU torch's count, on a CPU Linux's of the process, None elsewhere."""
+    """MiB by which memory grows during a call: on a GPU torch's count, else Linux's of the process, or None."""
     if device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(device)
         held = torch.cuda.memory_allocated(device)
         finish(call, device)
         return (torch.cuda.max_memory_allocated(device) - held) / 2**20
     try:
-        Path("/proc/self/clear_refs").write_text("5", encoding="ascii")  # the most held so far becomes what is held
+        # the most that was held so far becomes what is held
+        Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
     except OSError:
         call()
         return None
