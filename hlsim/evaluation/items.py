@@ -29,10 +29,6 @@ INPUT_LEVELS = (50.0, 65.0, 80.0)
 STANDARD_EARS = ("N2", "N3", "N4", "N5", "N6", "S1", "S2", "S3")
 """Bisgaard's audiograms that are in every comparison of compensators."""
 
-INPUTS = ("as-is", "louder", "nal-r", "compressed")
-"""What may be done to a signal before the ear gets it: nothing, 20 dB more, NAL-R for the ear, compression 3:1. A
-compensator adds ``compensated``."""
-
 
 @dataclass(frozen=True)
 class Item:
@@ -156,7 +152,8 @@ def _about(ear: Audiogram, level: float, snr: float | None, name: str) -> dict[s
 def treat(
     items: Sequence[Item], inputs: Sequence[str], compensator: nn.Module | None = None
 ) -> Iterator[Item]:
-    """Each item under each input in turn: of ``INPUTS``, with a compensator ``compensated`` too; else ValueError."""
+    """Each item as the ear gets it under each input in turn: ``as-is``, ``louder`` by 20 dB, ``nal-r`` for the ear,
+    ``compressed`` 3:1 and, with a compensator, ``compensated``; else ValueError."""
     treatments: dict[str, Callable[[Tensor, Audiogram], Tensor]] = {
         "as-is": lambda signal, ear: signal,
         "louder": lambda signal, ear: 10.0 * signal,

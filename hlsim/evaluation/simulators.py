@@ -92,7 +92,7 @@ def evaluate_simulators(
         items: how many; each is scored under each of ``inputs``.
         seconds: length of an item; PESQ and STOI want 2 or more.
         levels: dB SPL that the items take in turn.
-        inputs: what is done to the signal before the ear gets it, of ``INPUTS`` and, with a compensator, ``compensated``.
+        inputs: what is done to the signal before the ear gets it, see ``hlsim.evaluation.items.treat``.
         compensator: called with a waveform and an ear.
         progress: called with what is done and all.
 
