@@ -16,9 +16,9 @@ from hlsim.audiogram import STANDARD, Audiogram
 from hlsim.calibration import PASCAL_SPL, level_spl, set_level
 from hlsim.dsp.resample import resample
 from hlsim.evaluation import HaspiReport, ItemScore
-from hlsim.evaluation.gain_curves import gain_curves
 from hlsim.evaluation.items import INPUT_LEVELS
 from hlsim.evaluation.judging import NORMAL, AtLevelOf, Unaided
+from hlsim.evaluation.measurements import gain_curves
 from hlsim.files import write_whole
 from hlsim.metrics.pair import check_pair
 from hlsim.metrics.registry import MEASURES

@@ -20,7 +20,6 @@ from hlsim.audiogram import Audiogram, as_thresholds
 from hlsim.criteria.bands import BANDS
 from hlsim.data.foreign_teacher import load_enhancer
 from hlsim.evaluation.compensator_result import MEASURES, compensator_result
-from hlsim.evaluation.gain_curves import draw_utterances, gain_curves, insertion_gain
 from hlsim.evaluation.haspi_report import HaspiReport
 from hlsim.evaluation.items import INPUT_LEVELS, Item, draw_judged_items, read_ears
 from hlsim.evaluation.judging import (
@@ -35,7 +34,14 @@ from hlsim.evaluation.judging import (
     judge,
     limit_of,
 )
-from hlsim.evaluation.steadiness import shift_differences, steady_tones, wearing
+from hlsim.evaluation.measurements import (
+    draw_utterances,
+    gain_curves,
+    insertion_gain,
+    shift_differences,
+    steady_tones,
+    wearing,
+)
 from hlsim.evaluation.store import ScoreStore, key_of, weights_hash
 from hlsim.extras import require
 from hlsim.metrics.pair import check_seed
