@@ -27,7 +27,6 @@ from hlsim.evaluation.judging import (
     AtLevelOf,
     Enhanced,
     Equaliser,
-    Judged,
     Keys,
     Trial,
     Unaided,
@@ -47,7 +46,7 @@ from hlsim.extras import require
 from hlsim.metrics.pair import check_seed
 from hlsim.metrics.registry import check_measures, measure_by, version_of, versions_of
 from hlsim.neuro.config import NEURO_RATE
-from hlsim.parallel import Progress, check_parallel, make_missing
+from hlsim.parallel import Failed, Progress, check_parallel, make_missing
 from hlsim.pretrained import load_pretrained
 
 UNAIDED, PRESCRIBED, COMPRESSED = "unaided", "NAL-R", "WDRC"
@@ -227,7 +226,7 @@ def _judge_all(
     *,
     progress: Progress | None,
     **parallel: Any,
-) -> list[dict[str, Judged]]:
+) -> list[dict[str, dict[str, float] | Failed]]:
     """Each item's figures by condition, those from the store among them; the conditions are by ear."""
     hashed = cache(weights_hash)
     weights = {ear: {name: hashed(module) for name, module in own.items()} for ear, own in conditions.items()}
@@ -251,10 +250,10 @@ def _judge_all(
         judge, trials, lambda trial: [*chain.from_iterable(trial.keys.values())], store, **parallel
     )
 
-    def judged(keys: Keys) -> Judged:
+    def judged(keys: Keys) -> dict[str, float] | Failed:
         if reasons := [failed[key] for key in keys if key in failed]:
-            return Judged(None, reasons[0])
+            return Failed(reasons[0])
         figures = store.records[keys.most] | store.records[keys.of_network]
-        return Judged({name: value for name, value in figures.items() if name != "engine"})
+        return {name: value for name, value in figures.items() if name != "engine"}
 
     return [{name: judged(keys) for name, keys in trial.keys.items()} for trial in trials]
