@@ -13,15 +13,15 @@ from compensators import NALR, MappingCompensator, load_compensator
 from compensators.config import MappingConfig
 from hlsim.audio import find_audio, read_audio, write_audio
 from hlsim.audiogram import STANDARD, Audiogram
-from hlsim.calibration import level_spl, set_level
+from hlsim.calibration import PASCAL_SPL, level_spl, set_level
 from hlsim.dsp.resample import resample
 from hlsim.evaluation import HaspiReport, ItemScore
-from hlsim.evaluation.gain_curves import gain_curves
 from hlsim.evaluation.items import INPUT_LEVELS
 from hlsim.evaluation.judging import NORMAL, AtLevelOf, Unaided
-from hlsim.evaluation.scoring import HaspiItem, haspi_many
+from hlsim.evaluation.measurements import gain_curves
 from hlsim.files import write_whole
 from hlsim.metrics.pair import check_pair
+from hlsim.metrics.registry import MEASURES
 from hlsim.msbg import MSBG
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.parallel import one_thread
@@ -98,12 +98,14 @@ def demo(
         given = {name: [model(one, audiogram) for one in clean] for name, (_, model) in conditions.items()}
         heard = {name: [ear(signal) for signal in signals] for name, signals in given.items()}
         heard[NORMAL_EAR] = [normal(utterance) for utterance in clean]
+    seeds = [(seed + i) % 2**32 for i in range(len(scored))]
     haspi: dict[str, list[float]] = {}
     for name, signals in given.items():
-        pairs = zip(clean, signals, strict=True)
-        haspi[name] = haspi_many(
-            [HaspiItem(*pair, audiogram, NEURO_RATE) for pair in pairs], seed=seed % 2**32
-        )
+        with one_thread():
+            haspi[name] = [
+                MEASURES["haspi"].score(*pair, audiogram, NEURO_RATE, PASCAL_SPL, own)
+                for *pair, own in zip(clean, signals, seeds, strict=True)
+            ]
         report(f"  {name}: mean HASPI {fmean(haspi[name]):.3f}")
     levels, heard_levels = ({name: _levels(own) for name, own in of.items()} for of in (given, heard))
     normally = fmean(heard_levels[NORMAL_EAR])
@@ -122,7 +124,7 @@ def demo(
             audiogram=audiogram,
             sample_rate=NEURO_RATE,
             seconds=len(clean[i]) / NEURO_RATE,
-            seed=(seed + i) % 2**32,
+            seed=seeds[i],
         )
         for i in range(len(scored))
     ]

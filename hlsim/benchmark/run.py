@@ -62,8 +62,7 @@ def benchmark(
     Returns: machine, ``rows`` and ``skipped``, what failed and why. A row has name, parameters and a list of ``cells``,
         each with sample rate, seconds, batch, direction, median, least and greatest milliseconds, peak memory in MiB,
         seconds of sound in a second of time and, at 1 s and batch 1, ``speedup``: the median of pyclarity's ``Ear``,
-        forward, over the row's. It runs at 44.1 kHz only: the same second. ``growth`` is the exponent of the time's
-        growth with length and with batch.
+        forward, over the row's. It runs at 44.1 kHz only: the same second.
 
     Raises:
         ValueError: there is no such device, or no row of such a name.
@@ -187,9 +186,8 @@ class _Simulators(Timings):
         out = []
         for row in found:
             cells = [self._cell(key) for key in self.times if key.name == row.name]
-            growth = {by: _growth(cells, by, row.rates[0]) for by in ("seconds", "batch")}
             if cells:
-                out.append({"name": row.name, "parameters": row.parameters, "cells": cells, "growth": growth})
+                out.append({"name": row.name, "parameters": row.parameters, "cells": cells})
         return {"rows": out, "skipped": list(self.skipped)}
 
     def _cell(self, key: _Key) -> dict[str, Any]:
@@ -208,21 +206,10 @@ def _expected(line: list[tuple[float, float]], seconds: float) -> float:
     """Milliseconds of a longer clip, by how the time grew so far: attention's grows with the square of the length."""
     power = 1.0
     if len(line) > 1:
+        (short, low), (long, high) = line[-2:]
         # no more than that, for what takes microseconds may look as if, where the machine was busy once
-        power = min(2.0, max(1.0, _exponent(*line[-2:])))
+        power = min(2.0, max(1.0, math.log(high / low) / math.log(long / short)))
     return line[-1][1] * (seconds / line[-1][0]) ** power
-
-
-def _growth(cells: list[dict[str, Any]], by: str, rate: int) -> float | None:
-    """Exponent of the time over the largest range measured: 1.0 is proportional."""
-    other = "batch" if by == "seconds" else "seconds"
-    alike = {other: 1, "direction": "forward", "sample_rate": rate}
-    line = [(cell[by], cell["median_ms"]) for cell in cells if alike.items() <= cell.items()]
-    return _exponent(min(line), max(line)) if len(line) > 1 else None
-
-
-def _exponent(low: tuple[float, float], high: tuple[float, float]) -> float:
-    return math.log(high[1] / low[1]) / math.log(high[0] / low[0])
 
 
 def _run(call: Callable[[Tensor], Tensor], clip: Tensor, direction: str) -> None:

@@ -64,8 +64,7 @@ def _sizes(rows: Sequence[Row]) -> list[dict[str, str]]:
         for batch, seconds in keys:
             length = f"{seconds:g} s" if batch == 1 else f"{batch} of {seconds:g} s"
             line[length] = _size(cells.get((batch, seconds)))
-        growth = ", ".join(number(value, ".2f", "-") for value in row["growth"].values())
-        table.append(line | {"growth with length, batch": growth})
+        table.append(line)
     return table
 
 

@@ -10,7 +10,6 @@ import contextlib
 import os
 import platform
 import statistics
-import threading
 import time
 from collections.abc import Callable, Container, Hashable, Mapping
 from functools import partial
@@ -35,35 +34,26 @@ def finish(call: Call, device: torch.device) -> None:
 
 
 def peak_mib(call: Call, device: torch.device) -> float | None:
-    """MiB by which memory grows during a call: on a GPU torch's count, on a CPU the process's resident memory."""
+    """MiB by which memory grows during a call: on a GPU torch's count, else Linux's of the process, or None."""
     if device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(device)
         held = torch.cuda.memory_allocated(device)
         finish(call, device)
         return (torch.cuda.max_memory_allocated(device) - held) / 2**20
-    statm = Path("/proc/self/statm")
-    if not statm.is_file():
+    try:
+        # the most that was held so far becomes what is held
+        Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
+    except OSError:
         call()
         return None
+    held = _most_held_mib()
+    call()
+    return _most_held_mib() - held
 
-    def resident() -> float:
-        return float(statm.read_text(encoding="ascii").split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**20
 
-    seen = [resident()]
-    over = threading.Event()
-
-    def watch() -> None:
-        while not over.wait(0.002):
-            seen.append(resident())
-
-    watcher = threading.Thread(target=watch, daemon=True)
-    watcher.start()
-    try:
-        call()
-    finally:
-        over.set()
-        watcher.join()
-    return max(*seen, resident()) - seen[0]
+def _most_held_mib() -> float:
+    status = Path("/proc/self/status").read_text(encoding="utf-8")
+    return float(status.split("VmHWM:")[1].split()[0]) / 1024.0
 
 
 def attempt(what: str, call: Call, device: torch.device, skipped: list[str]) -> bool:

@@ -45,11 +45,10 @@ def benchmark(parser: Parser) -> None:
 def _benchmark(options: argparse.Namespace) -> None:
     import torch
 
-    from hlsim.benchmark.metrics import metric_rows
+    from hlsim.benchmark.parts import metric_rows, scan_rows, training_step
     from hlsim.benchmark.run import benchmark
     from hlsim.benchmark.tables import benchmark_markdown
     from hlsim.benchmark.timing import about, attempt
-    from hlsim.benchmark.training import scan_rows, training_step
 
     device, repeats = options.device, options.repeats
     result = about(device, repeats) | {"skipped": []}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from itertools import accumulate
@@ -43,13 +43,6 @@ class Ears:
     measured: Mapping[str, tuple[Audiogram, ...]]
     seed: int
 
-    def check(self, splits: Iterable[str], ears: int) -> None:
-        """Raises ValueError where a file has too few ears for a split."""
-        for split in splits if self.measured else ():
-            if (found := len(self.measured[split])) < ears:
-                allowed = f"{ears} or more, for each utterance gets {ears}"
-                raise ValueError(f"{found} measured ears for {split}; allowed: {allowed}")
-
     def assign(self, split: str, utterances: int, ears: int) -> Iterator[list[Audiogram]]:
         """The ears of each utterance of a split, all different.
 
@@ -83,7 +76,7 @@ def plan_ears(settings: PlanSettings, splits: Collection[str]) -> Ears:
         splits: those that the corpus has.
 
     Raises:
-        ValueError: a file that cannot be used, or that lacks a severity asked for.
+        ValueError: a file that cannot be used, that lacks a severity asked for, or has too few ears for a split.
     """
     shares, seed = settings.severities, settings.seed
     audiograms, test_audiograms = settings.audiograms, settings.test_audiograms
@@ -103,7 +96,7 @@ def plan_ears(settings: PlanSettings, splits: Collection[str]) -> Ears:
     owner = dict.fromkeys(listeners, "train")
     for split in ("test", "valid"):
         if split in splits and not groups[split]:
-            # of one or two listeners a split gets none, and check says so
+            # of one or two listeners a split gets none, and is refused below
             for _ in range(min(len(listeners), math.ceil(_TENTHS.count(split) * len(owner) / 10))):
                 owner[listeners.pop()] = split
     for who, ear in groups.pop(""):
@@ -119,6 +112,9 @@ def plan_ears(settings: PlanSettings, splits: Collection[str]) -> Ears:
         if missing := " or ".join(sorted(set(exact) - {ear.severity for ear in ears[split]})):
             lacks = f"no {missing} ears for {split}"
             raise ValueError(f"{audiograms}: {lacks}; allowed: proportions of what is there")
+        if (found := len(ears[split])) < settings.ears:
+            allowed = f"{settings.ears} or more, for each utterance gets {settings.ears}"
+            raise ValueError(f"{found} measured ears for {split}; allowed: {allowed}")
     return Ears(exact, ears, seed)
 
 

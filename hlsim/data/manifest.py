@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import csv
 import io
-import os
-from array import array
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from pathlib import Path, PurePosixPath
-from typing import Any, BinaryIO
+from typing import Any
 
 from hlsim.files import resolved
 
@@ -90,25 +88,22 @@ def inside(root: str | Path, relative: str) -> Path:
 
 
 class Rows(Sequence[dict[str, str]]):
-    """Rows of a CSV file, read when asked for: only their places are kept, 8 bytes a row.
+    """Rows of a CSV file, kept as they are written and parsed when asked for: dictionaries take ten times as much.
 
     Raises ValueError where the file cannot be read, or lacks a column."""
 
     def __init__(self, path: str | Path, columns: Iterable[str]) -> None:
         self.path = Path(path)
-        self._places = array("Q", [0])
         try:
-            with open(self.path, "rb") as file:
-                for line in file:
-                    self._places.append(self._places[-1] + len(line))
+            self._lines = self.path.read_bytes().splitlines()
         except OSError as error:
             raise ValueError(f"{path}: cannot be read ({error.strerror})") from error
-        self.columns = self._parse(0) if len(self._places) > 1 else []
+        self.columns = self._parse(0) if self._lines else []
         if missing := ", ".join(name for name in columns if name not in self.columns):
             raise ValueError(f"{path}: no column {missing}; allowed: a CSV file of 'hlsim prepare'")
 
     def __len__(self) -> int:
-        return len(self._places) - 2
+        return len(self._lines) - 1
 
     def __getitem__(self, index: Any) -> Any:
         if isinstance(index, slice):
@@ -121,18 +116,9 @@ class Rows(Sequence[dict[str, str]]):
             raise ValueError(f"{self.path}, line {line + 1}: {len(cells)} cells; allowed: {wanted}")
         return dict(zip(self.columns, cells, strict=True))
 
-    def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in self.__dict__.items() if name != "_file"}
-
-    @cached_property
-    def _file(self) -> BinaryIO:
-        return open(self.path, "rb")  # kept open for as long as the rows are wanted
-
     def _parse(self, line: int) -> list[str]:
-        start, end = self._places[line], self._places[line + 1]
-        line_bytes = os.pread(self._file.fileno(), end - start, start)  # safe after a fork
         try:
-            return next(csv.reader([line_bytes.decode("utf-8-sig")]), [])
+            return next(csv.reader([self._lines[line].decode("utf-8-sig")]), [])
         except (UnicodeDecodeError, csv.Error) as error:
             raise ValueError(f"{self.path}, line {line + 1}: cannot be read as CSV ({error})") from error
 

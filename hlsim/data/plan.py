@@ -102,7 +102,6 @@ def prepare(
     splits = assign_splits(listing.speakers, **shares, seed=settings.seed)
     used = set(splits.values())
     ears = plan_ears(settings, used)
-    ears.check(used, settings.ears)
     noises: Noises | None = None
     faults: list[Fault] = []
     if settings.noise is not None:

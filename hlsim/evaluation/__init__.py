@@ -1,11 +1,9 @@
 """Scores of what an ear is given and of how true a simulator is; most need the extra ``eval``."""
 
-from typing import Any
-
 from hlsim.evaluation.comparison import Comparison
 from hlsim.evaluation.haspi_report import HaspiReport, haspi_report
 from hlsim.evaluation.scores import Failure, ItemScore
-from hlsim.evaluation.scoring import FileItem, HaspiItem, haspi_many, score_items
+from hlsim.evaluation.scoring import FileItem, score_items
 from hlsim.evaluation.simulators import summarise
 from hlsim.evaluation.statistics import PairedComparison, bootstrap_interval, holm, paired_comparison
 from hlsim.evaluation.store import ScoreStore
@@ -14,25 +12,14 @@ __all__ = [
     "Comparison",
     "Failure",
     "FileItem",
-    "HASPI",
-    "HaspiItem",
     "HaspiReport",
     "ItemScore",
     "PairedComparison",
     "ScoreStore",
     "bootstrap_interval",
-    "haspi_many",
     "haspi_report",
     "holm",
     "paired_comparison",
     "score_items",
     "summarise",
 ]
-
-
-def __getattr__(name: str) -> Any:
-    if name == "HASPI":  # of hlsim.metrics; torchmetrics is an extra
-        from hlsim.metrics import HASPI
-
-        return HASPI
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

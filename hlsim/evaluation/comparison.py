@@ -16,7 +16,6 @@ from hlsim.evaluation.statistics import (
     MixedModel,
     PairedComparison,
     differences,
-    group_means,
     holm,
     mixed_model,
     paired_comparison,
@@ -209,12 +208,14 @@ def _compare(items: Sequence[ItemScore], measure: str, before: str, after: str) 
         np.array([item.scores[measure][condition] for item in both]) for condition in (before, after)
     )
     severities = np.array([item.severity for item in both])
-    listeners, means = [item.listener for item in both], None
+    listeners, means = np.array([item.listener for item in both]), None
     mixed: MixedModel | str = "listeners are not named"
     if all(listeners):
-        mixed = mixed_model(differences(first, second).tolist(), listeners)
-        if len(set(listeners)) > 1:
-            means = paired_comparison(*(group_means(x, listeners).values() for x in (first, second)))
+        mixed = mixed_model(differences(first, second).tolist(), listeners.tolist())
+        if len(names := dict.fromkeys(listeners)) > 1:
+            means = paired_comparison(
+                *([x[listeners == name].mean() for name in names] for x in (first, second))
+            )
     return Comparison(
         measure=measure,
         before=before,

@@ -8,11 +8,12 @@ from typing import Any
 from hlsim.audiogram import SEVERITIES
 from hlsim.evaluation.haspi_report import HaspiReport
 from hlsim.evaluation.items import Item
-from hlsim.evaluation.judging import SIMULATORS, Judged
+from hlsim.evaluation.judging import SIMULATORS
 from hlsim.evaluation.scores import ItemScore
 from hlsim.extras import require
 from hlsim.metrics.registry import MeasureName
 from hlsim.neuro.config import NEURO_RATE
+from hlsim.parallel import Failed
 
 HARD = 0.6
 """Unaided HASPI under which an item belongs to those that need help most."""
@@ -27,7 +28,7 @@ Rows = Sequence[Mapping[str, Any]]
 
 def compensator_result(
     items: Sequence[Item],
-    judged: Sequence[Mapping[str, Judged]],
+    judged: Sequence[Mapping[str, Mapping[str, float] | Failed]],
     *,
     limits: Mapping[str, float | None],
     settings: Mapping[str, Any],
@@ -37,18 +38,17 @@ def compensator_result(
     An item counts where every condition has figures, so that all rows are of the same items; ValueError where none has.
 
     Args:
-        judged: figures of each item by condition.
+        judged: figures of each item by condition, or why there are none.
         limits: the conditions in order, unaided first, and the peak in dB SPL that each keeps to, or None.
     """
     conditions = [*limits]
     failures, rows = [], []
     for number, (item, results) in enumerate(zip(items, judged, strict=True)):
-        bad = {name: results[name].reason for name in conditions if results[name].figures is None}
+        bad = {name: found.reason for name, found in results.items() if isinstance(found, Failed)}
         failures += [{"item": number, **item.about, "compensator": name, "reason": bad[name]} for name in bad]
         if not bad:
-            figures = {name: results[name].figures for name in conditions}
             about = {**item.about, "audiogram": list(item.ear.thresholds)}
-            rows.append({"item": number, **about, "figures": figures})
+            rows.append({"item": number, **about, "figures": dict(results)})
     if not rows:
         raise ValueError(f"none of {len(items)} items could be judged; the first: {failures[0]['reason']}")
     groups: dict[str, Rows] = {

@@ -20,7 +20,6 @@ from hlsim.audiogram import Audiogram, as_thresholds
 from hlsim.criteria.bands import BANDS
 from hlsim.data.foreign_teacher import load_enhancer
 from hlsim.evaluation.compensator_result import MEASURES, compensator_result
-from hlsim.evaluation.gain_curves import draw_utterances, gain_curves, insertion_gain
 from hlsim.evaluation.haspi_report import HaspiReport
 from hlsim.evaluation.items import INPUT_LEVELS, Item, draw_judged_items, read_ears
 from hlsim.evaluation.judging import (
@@ -28,20 +27,26 @@ from hlsim.evaluation.judging import (
     AtLevelOf,
     Enhanced,
     Equaliser,
-    Judged,
     Keys,
     Trial,
     Unaided,
     judge,
     limit_of,
 )
-from hlsim.evaluation.steadiness import shift_differences, steady_tones, wearing
+from hlsim.evaluation.measurements import (
+    draw_utterances,
+    gain_curves,
+    insertion_gain,
+    shift_differences,
+    steady_tones,
+    wearing,
+)
 from hlsim.evaluation.store import ScoreStore, key_of, weights_hash
 from hlsim.extras import require
 from hlsim.metrics.pair import check_seed
 from hlsim.metrics.registry import Engine, check_measures, measure_by, version_of, versions_of
 from hlsim.neuro.config import NEURO_RATE
-from hlsim.parallel import Progress, check_parallel, make_missing
+from hlsim.parallel import Failed, Progress, check_parallel, make_missing
 from hlsim.pretrained import load_pretrained
 
 UNAIDED, PRESCRIBED, COMPRESSED = "unaided", "NAL-R", "WDRC"
@@ -227,7 +232,7 @@ def _judge_all(
     *,
     progress: Progress | None,
     **parallel: Any,
-) -> list[dict[str, Judged]]:
+) -> list[dict[str, dict[str, float] | Failed]]:
     """Each item's figures by condition, those from the store among them; the conditions are by ear."""
     hashed = cache(weights_hash)
     weights = {ear: {name: hashed(module) for name, module in own.items()} for ear, own in conditions.items()}
@@ -251,10 +256,10 @@ def _judge_all(
         judge, trials, lambda trial: [*chain.from_iterable(trial.keys.values())], store, **parallel
     )
 
-    def judged(keys: Keys) -> Judged:
+    def judged(keys: Keys) -> dict[str, float] | Failed:
         if reasons := [failed[key] for key in keys if key in failed]:
-            return Judged(None, reasons[0])
+            return Failed(reasons[0])
         figures = store.records[keys.most] | store.records[keys.of_network]
-        return Judged({name: value for name, value in figures.items() if name != "engine"})
+        return {name: value for name, value in figures.items() if name != "engine"}
 
     return [{name: judged(keys) for name, keys in trial.keys.items()} for trial in trials]

@@ -12,10 +12,9 @@ import numpy as np
 
 from hlsim.audiogram import Audiogram
 from hlsim.calibration import check_full_scale
-from hlsim.evaluation.better_ear import better_ears
 from hlsim.evaluation.comparison import Comparison, compare_conditions
 from hlsim.evaluation.inputs import read_folders, read_manifest
-from hlsim.evaluation.scores import Failure, ItemScore
+from hlsim.evaluation.scores import Failure, ItemScore, better_ears
 from hlsim.evaluation.scoring import FileItem, Result, score_items
 from hlsim.evaluation.statistics import RESAMPLES, PairedComparison
 from hlsim.evaluation.store import ScoreStore

@@ -26,7 +26,8 @@ from typing import Any, TypeVar
 from hlsim.audio import EXTENSIONS, find_audio
 from hlsim.audiogram import Audiogram, numbered_audiograms
 from hlsim.calibration import check_full_scale
-from hlsim.evaluation.scoring import EARS, FileItem
+from hlsim.evaluation.scores import EARS
+from hlsim.evaluation.scoring import FileItem
 from hlsim.files import read_rows, resolved
 
 _Name = TypeVar("_Name")

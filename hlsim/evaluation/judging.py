@@ -113,13 +113,6 @@ class Trial:
     exact: Sequence[str] = EXACT
 
 
-class Judged(NamedTuple):
-    """Figures by name, or None and the reason."""
-
-    figures: dict[str, float] | None
-    reason: str = ""
-
-
 @one_thread()
 @torch.no_grad()
 def judge(trial: Trial, missing: Sequence[str]) -> dict[str, dict[str, Any] | Failed]:

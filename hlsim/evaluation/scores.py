@@ -1,13 +1,15 @@
-"""Scores of one utterance in one ear under every condition, and scores that could not be made."""
+"""Scores of one utterance in one ear under every condition, failed ones, and the better of two ears'."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from hlsim.audiogram import Audiogram
+
+EARS = ("left", "right")
 
 _JSON = (
     *("file", "listener", "ear", "snr", "before", "after", "clean_level", "before_level", "after_level"),
@@ -88,3 +90,48 @@ class Failure:
     condition: str
     measure: str
     reason: str
+
+
+def better_ears(items: Sequence[ItemScore]) -> list[ItemScore]:
+    """One item for the left and right ear of each listener and utterance, in the order of their first.
+
+    A condition's score by each measure is the higher of the two ears', or that of the ear that has one; its level is that
+    of the ear whose first measure is higher. The item's ear and audiogram are the better ear's under the last condition.
+
+    Raises:
+        ValueError: an item that is neither a left nor a right ear's, or whose other ear is not there.
+    """
+    pairs: dict[tuple[str, str], dict[str, ItemScore]] = {}
+    for item in items:
+        if item.ear not in EARS:
+            raise ValueError(f"{item.file}: ear is {item.ear!r}; allowed: left and right, for the better ear")
+        own = item.file.removeprefix(f"{item.listener} ").removeprefix(f"{item.ear} ")
+        pairs.setdefault((item.listener, own), {})[item.ear] = item
+    return [_better(f"{listener} {own}".strip(), ears) for (listener, own), ears in pairs.items()]
+
+
+def _better(file: str, ears: dict[str, ItemScore]) -> ItemScore:
+    if lack := [ear for ear in EARS if ear not in ears]:
+        raise ValueError(
+            f"{file}: no {lack[0]} ear; allowed: both ears of each utterance, for the better ear"
+        )
+    both = [ears[ear] for ear in EARS]
+    measures, conditions = list(both[0].scores), list(both[0].levels)
+
+    def winner(measure: str, condition: str) -> ItemScore:
+        return max(both, key=lambda item: item.scores[measure].get(condition, -1.0))
+
+    last = winner(measures[0], conditions[-1])
+    return replace(
+        last,
+        file=file,
+        levels={name: winner(measures[0], name).levels[name] for name in conditions},
+        scores={
+            measure: {
+                name: best[name]
+                for name in conditions
+                if name in (best := winner(measure, name).scores[measure])
+            }
+            for measure in measures
+        },
+    )

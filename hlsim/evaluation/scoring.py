@@ -19,12 +19,11 @@ import torch
 from hlsim.audio import read_audio
 from hlsim.audiogram import Audiogram
 from hlsim.calibration import check_full_scale, dbfs
+from hlsim.evaluation.scores import EARS
 from hlsim.evaluation.store import ScoreStore, content_hash, key_of
-from hlsim.metrics.pair import Signal, check_seed
+from hlsim.metrics.pair import check_seed
 from hlsim.metrics.registry import Engine, MeasureName, check_measures, measure_by, versions_of
 from hlsim.parallel import Backend, Failed, Progress, check_parallel, make_missing, one_thread, reason_of
-
-EARS = ("left", "right")
 
 
 @dataclass(frozen=True)
@@ -211,73 +210,3 @@ def read_channel(path: str | Path, ear: str = "") -> tuple[np.ndarray, int]:
     if not bool(waveform[channel].any()):
         raise ValueError(f"{path}: silent, every sample of the {ear} channel is zero")
     return waveform[channel].double().numpy(), rate
-
-
-@dataclass(frozen=True)
-class HaspiItem:
-    """One score to compute.
-
-    Args:
-        reference, processed: clean and processed speech: (time,), or paths of one-channel audio files, which are
-            read only when their turn comes.
-        sample_rate: Hz; needed for signals, left out for files, which bring theirs.
-        seed: of the noise that HASPI adds; by default that of ``haspi_many`` plus the place in the list.
-    """
-
-    reference: Signal | str | Path
-    processed: Signal | str | Path
-    audiogram: Audiogram
-    sample_rate: int | None = None
-    seed: int | None = None
-
-
-def haspi_many(
-    items: Sequence[HaspiItem],
-    *,
-    engine: Engine = "hlsim",
-    full_scale_spl: float = 94.0,
-    seed: int = 0,
-    jobs: int | None = None,
-    progress: Progress | None = None,
-) -> list[float]:
-    """HASPI of many items in parallel processes (``jobs``; None takes all cores), the same whatever their number.
-
-    Item i, counted from 0, takes ``seed`` + i unless it brings one; ``progress`` is called after each score; ``engine``
-    is that of ``haspi_report``. The ValueError of an item without a score begins with its processed file or its place.
-    """
-    check_measures(["haspi"], engine)
-    check_parallel(jobs, "loky", None)
-    check_seed(seed)
-    store = ScoreStore()
-    tasks = [
-        (str(i), item, engine, full_scale_spl, (seed + i) % 2**32 if item.seed is None else item.seed)
-        for i, item in enumerate(items)
-    ]
-    jobs = 1 if len(items) < 2 else jobs
-    failed = make_missing(_score_item, tasks, lambda task: [task[0]], store, jobs=jobs, progress=progress)
-    for i, reason in failed.items():
-        raise ValueError(f"item {i}: {reason}")
-    return [store.records[str(i)]["score"] for i in range(len(items))]
-
-
-@one_thread()
-def _score_item(
-    task: tuple[str, HaspiItem, Engine, float, int], _: Sequence[str]
-) -> dict[str, dict[str, float]]:
-    key, item, engine, full_scale_spl, seed = task
-    try:
-        signals = [
-            read_channel(signal) if isinstance(signal, str | Path) else (signal, item.sample_rate)
-            for signal in (item.reference, item.processed)
-        ]
-        (reference, reference_rate), (processed, rate) = signals
-        if rate is None or reference_rate is None:
-            raise ValueError("no sample_rate; signals that are not files need one")
-        if rate != reference_rate:
-            raise ValueError(f"rate {rate} Hz, its reference has {reference_rate}; allowed: equal rates")
-        measure = measure_by(engine, "haspi")
-        score = measure.score(reference, processed, item.audiogram, rate, full_scale_spl, seed)
-    except ValueError as error:
-        name = item.processed if isinstance(item.processed, str | Path) else f"item {key}"
-        raise ValueError(f"{name}: {error}") from error
-    return {key: {"score": score}}

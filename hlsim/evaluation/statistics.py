@@ -142,14 +142,6 @@ def holm(p_values: Iterable[float | None]) -> list[float | None]:
     return adjusted
 
 
-def group_means(values: Iterable[float], groups: Iterable[str]) -> dict[str, float]:
-    """The mean of each group's values, in the order of the groups' first places."""
-    members: dict[str, list[float]] = {}
-    for value, group in zip(values, groups, strict=True):
-        members.setdefault(group, []).append(float(value))
-    return {group: math.fsum(mine) / len(mine) for group, mine in members.items()}
-
-
 def _largest(first: np.ndarray, second: np.ndarray) -> float:
     return max(float(np.abs(first).max()), float(np.abs(second).max()))
 

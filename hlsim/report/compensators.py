@@ -14,9 +14,8 @@ import numpy as np
 from hlsim.audiogram import FREQUENCIES
 from hlsim.evaluation.comparison import Comparison
 from hlsim.evaluation.compensator_result import HARD, NOISIER_DB
-from hlsim.evaluation.gain_curves import UTTERANCES
 from hlsim.evaluation.haspi_report import GAIN_NOTE, HaspiReport
-from hlsim.evaluation.steadiness import DELAYS, QUIET
+from hlsim.evaluation.measurements import DELAYS, QUIET, UTTERANCES
 from hlsim.report.gain_pictures import gain_picture, gains_at, input_output_picture, tone_picture
 from hlsim.report.haspi import scored_by
 from hlsim.report.page import Section, render_markdown, render_page, write_files

@@ -13,9 +13,8 @@ import torch
 from torch import Tensor
 
 from hlsim.audiogram import Audiogram
-from hlsim.benchmark import metrics as benchmark_metrics
+from hlsim.benchmark import parts
 from hlsim.benchmark import run as benchmark_module
-from hlsim.benchmark import training as benchmark_training
 from hlsim.benchmark.models import Row
 from hlsim.benchmark.run import benchmark
 from hlsim.benchmark.tables import benchmark_markdown
@@ -134,9 +133,9 @@ def test_a_table_without_what_fails(monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(*tensors: Tensor) -> Tensor:
         raise RuntimeError("too long")
 
-    monkeypatch.setattr(benchmark_training, "scan_loop", fail)
-    monkeypatch.setattr(benchmark_training, "SCAN_SHAPE", (1, 8, 16, 4))
-    scan, skipped = benchmark_training.scan_rows(repeats=1)
+    monkeypatch.setattr(parts, "scan_loop", fail)
+    monkeypatch.setattr(parts, "SCAN_SHAPE", (1, 8, 16, 4))
+    scan, skipped = parts.scan_rows(repeats=1)
     assert "step by step, forward: RuntimeError: too long" in skipped
     assert scan[0]["name"] == "hlsim (plain torch)" and "step by step" not in str(scan)
     table = benchmark_markdown(about("cpu", 1) | {"scan": scan, "skipped": skipped})
@@ -146,7 +145,7 @@ def test_a_table_without_what_fails(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_metrics_stand_beside_the_reference(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(benchmark_metrics, "SECONDS", 0.8)
+    monkeypatch.setattr(parts, "METRIC_SECONDS", 0.8)
     assert main(["benchmark", "--what", "metrics", "--repeats", "1"]) == 0
     lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("| HAS")]
     assert len(lines) == 8 and all(line.split("|")[5].strip() not in ("", "-") for line in lines)
@@ -160,10 +159,10 @@ def test_the_scan_by_a_kernel_has_a_row_of_its_own(monkeypatch: pytest.MonkeyPat
         calls.append(len(rest))
         return 0.5 * u
 
-    monkeypatch.setattr(benchmark_training, "SCAN_SHAPE", (1, 8, 16, 4))
-    for module in (scan_module, benchmark_training):
+    monkeypatch.setattr(parts, "SCAN_SHAPE", (1, 8, 16, 4))
+    for module in (scan_module, parts):
         monkeypatch.setattr(module, "kernel_for", lambda u: kernel)
-    table, _ = benchmark_training.scan_rows(repeats=2)
+    table, _ = parts.scan_rows(repeats=2)
     names = [row["name"] for row in table]
     assert names[:2] == ["hlsim (plain torch)", "step by step"] and "hlsim (by mamba-ssm's kernel)" in names
     assert len(calls) == 2 * 3  # its own row's: forward and back in each round

@@ -11,7 +11,7 @@ from hlsim import Audiogram
 from hlsim.audiogram import draw_thresholds
 from hlsim.calibration import level_spl, set_level
 from hlsim.dsp.resample import resample
-from hlsim.evaluation.steadiness import steady_tones
+from hlsim.evaluation.measurements import steady_tones
 from tests.compensators.test_wearable import EAR, trained
 
 

@@ -19,9 +19,12 @@ def plan_ears(
     second: Path | None,
     splits: tuple[str, ...],
     seed: int,
+    ears: int = 2,
 ) -> Ears:
-    tables = {"audiograms": first, "test_audiograms": second}
-    return module.plan_ears(PlanSettings(Path(), severities=shares, seed=seed, **tables), splits)  # type: ignore[arg-type]
+    settings = PlanSettings(
+        Path(), severities=shares, seed=seed, audiograms=first, test_audiograms=second, ears=ears
+    )
+    return module.plan_ears(settings, splits)
 
 
 def table(path: Path, ears: list[tuple[str, tuple[float, ...]]], **columns: list[str]) -> Path:
@@ -88,9 +91,8 @@ def test_a_file_without_splits_is_divided_by_listeners(tmp_path: Path) -> None:
 
 def test_a_file_of_fewer_listeners_than_splits_is_too_few(tmp_path: Path) -> None:
     path = table(tmp_path / "ears.csv", listeners(1))
-    ears = plan_ears(None, path, None, SPLITS, seed=0)
     with pytest.raises(ValueError, match="0 measured ears for train; allowed: 2 or more"):
-        ears.check(SPLITS, 2)
+        plan_ears(None, path, None, SPLITS, seed=0)
 
 
 def test_files_and_columns_that_say_the_split(tmp_path: Path) -> None:
@@ -122,9 +124,8 @@ def test_what_is_refused(tmp_path: Path) -> None:
         plan_ears({"mild": 1.0, "severe": 1.0}, path, None, ("train",), seed=0)
     ears = plan_ears(None, path, None, ("train",), seed=0)
     assert len(ears.measured["train"]) == 2  # 110 dB HL is more than a simulator takes
-    ears.check(("train",), 2)
     with pytest.raises(ValueError, match="2 measured ears for train; allowed: 3 or more"):
-        ears.check(("train",), 3)
+        plan_ears(None, path, None, ("train",), seed=0, ears=3)
     with pytest.raises(ValueError, match="ears for test alone"):
         plan_ears(None, None, path, ("train",), seed=0)
     bad = table(tmp_path / "bad.csv", [("a", (60.0,) * 8)], split=["dev"])

@@ -18,9 +18,8 @@ from hlsim import MSBG, Audiogram, HearingLossLoss, load_pretrained
 from hlsim.calibration import level_spl, set_level
 from hlsim.cli.main import main
 from hlsim.criteria.bands import band_edges
-from hlsim.evaluation import compensators, judging, steadiness
+from hlsim.evaluation import compensators, judging, measurements
 from hlsim.evaluation.compensators import evaluate_compensators
-from hlsim.evaluation.gain_curves import insertion_gain
 from hlsim.evaluation.items import INPUT_LEVELS, draw_judged_items, read_ears
 from hlsim.evaluation.judging import (
     Equaliser,
@@ -31,6 +30,7 @@ from hlsim.evaluation.judging import (
     judge,
     peak_spl,
 )
+from hlsim.evaluation.measurements import insertion_gain
 from hlsim.evaluation.statistics import paired_comparison
 from hlsim.metrics import registry
 from hlsim.metrics.pyclarity import pyclarity_score
@@ -78,7 +78,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
             raise ValueError("processed holds samples that are NaN or infinite")
         return share * float(aided.abs().mean() / (aided.abs().mean() + 0.1))
 
-    monkeypatch.setattr(steadiness, "TONES", (1000,))
+    monkeypatch.setattr(measurements, "TONES", (1000,))
     for name, share in (("haspi", 1.0), ("hasqi", 0.5)):
         measure = registry.MEASURES[name]._replace(score=partial(score, share))
         monkeypatch.setitem(registry.MEASURES, name, measure)

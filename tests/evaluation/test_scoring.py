@@ -18,7 +18,7 @@ import torch
 
 from hlsim.audio import read_audio, write_audio
 from hlsim.audiogram import FREQUENCIES, Audiogram
-from hlsim.evaluation.scoring import FileItem, HaspiItem, Results, haspi_many, score_items
+from hlsim.evaluation.scoring import FileItem, Results, score_items
 from hlsim.evaluation.store import ScoreStore, content_hash, key_of
 from hlsim.metrics import registry as measures_module
 from hlsim.metrics.pyclarity import pyclarity_score
@@ -334,54 +334,3 @@ def test_bad_settings(items: list[FileItem]) -> None:
         score_items(items, seed=-1)
     with pytest.raises(ValueError, match="jobs is 0"):
         score_items(items, jobs=0)
-
-
-def test_many_do_not_depend_on_the_number_of_jobs(speech_dir: Path, tmp_path: Path) -> None:
-    clips = []
-    for name in ("train/flite-slt-01", "valid/espeak-us-annie-01"):
-        waveform, rate = read_audio(speech_dir / f"{name}.flac")
-        clips.append((waveform[0, rate // 2 : rate // 2 + rate], rate))
-    clean, rate = clips[0]
-    noise = torch.randn(clean.shape, generator=torch.Generator().manual_seed(1))
-    noisy = clean + noise * clean.square().mean().sqrt() * 10 ** (-5.0 / 20)
-    for name, waveform in (("clean", clean), ("noisy", noisy)):
-        write_audio(tmp_path / f"{name}.wav", waveform[None], rate)
-    items = [
-        HaspiItem(clean, noisy, N3, rate),
-        HaspiItem(clean, clean, N3, rate),
-        HaspiItem(tmp_path / "clean.wav", str(tmp_path / "noisy.wav"), N3),
-        HaspiItem(clips[1][0], clips[1][0], Audiogram.standard("S1"), clips[1][1], seed=99),
-    ]
-    seen: list[tuple[int, int]] = []
-    parallel = haspi_many(items, seed=5, jobs=2, progress=lambda done, total: seen.append((done, total)))
-    assert seen == [(1, 4), (2, 4), (3, 4), (4, 4)]
-    assert haspi_many(items, seed=5, jobs=1) == parallel
-    expected = haspi(clean, noisy, N3, rate, seed=7)
-    assert parallel[2] == pytest.approx(expected, abs=1e-6)
-    expected = haspi(clips[1][0], clips[1][0], Audiogram.standard("S1"), clips[1][1], seed=99)
-    assert parallel[3] == pytest.approx(expected, abs=1e-6)
-    assert haspi_many(items[:1], seed=5, jobs=1, engine="pyclarity") == [
-        haspi(clean, noisy, N3, rate, seed=5)
-    ]
-    assert parallel[0] != parallel[2]
-
-
-def test_many_errors_name_the_item(tmp_path: Path) -> None:
-    speech = torch.sin(torch.arange(16000) * 0.2) * 0.05
-    good = HaspiItem(speech, speech, N3, 16000)
-    write_audio(tmp_path / "stereo.wav", speech.expand(2, -1), 16000)
-    write_audio(tmp_path / "fast.wav", speech[None], 32000)
-    for bad, message in (
-        (HaspiItem(speech, speech * 0, N3, 16000), "item 0: processed is silent"),
-        (HaspiItem(speech, speech, N3), "item 0: no sample_rate"),
-        (HaspiItem(speech, tmp_path / "stereo.wav", N3, 16000), "stereo.wav: 2 channels; allowed: 1"),
-        (HaspiItem(speech, tmp_path / "fast.wav", N3, 16000), "fast.wav: .*equal rates"),
-        (HaspiItem(speech, tmp_path / "none.wav", N3, 16000), "none.wav: no such file"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            haspi_many([bad, good], jobs=1)
-    with pytest.raises(ValueError, match="item 1: processed is silent"):
-        haspi_many([good, HaspiItem(speech, speech * 0, N3, 16000)], jobs=2)
-    with pytest.raises(ValueError, match="jobs is 0"):
-        haspi_many([good], jobs=0)
-    assert haspi_many([]) == []

@@ -8,7 +8,7 @@ import pytest
 from scipy import stats
 
 from hlsim.evaluation import bootstrap_interval, holm, paired_comparison
-from hlsim.evaluation.statistics import FEWEST, group_means
+from hlsim.evaluation.statistics import FEWEST
 
 
 def draw(n: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
@@ -118,12 +118,6 @@ def test_holm_by_hand_and_by_statsmodels() -> None:
     multitest = pytest.importorskip("statsmodels.stats.multitest")
     p = np.random.default_rng(5).uniform(0, 0.2, 30)
     assert holm(p) == pytest.approx(list(multitest.multipletests(p, method="holm")[1]), abs=1e-15)
-
-
-def test_group_means() -> None:
-    assert group_means([1.0, 2.0, 5.0], ["b", "a", "b"]) == {"b": 3.0, "a": 2.0}
-    with pytest.raises(ValueError):
-        group_means([1.0], ["a", "b"])
 
 
 def test_signs_turn_with_the_order() -> None:

@@ -1,6 +1,6 @@
 """Tables of a comparison of compensators."""
 
-from hlsim.evaluation.steadiness import TONES
+from hlsim.evaluation.measurements import TONES
 from hlsim.report.compensators import shift_table, tone_table
 from hlsim.report.page import Section, render_page
 from hlsim.report.pictures import condition_colours

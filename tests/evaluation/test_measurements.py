@@ -11,7 +11,7 @@ from hlsim import MSBG, Audiogram
 from hlsim.calibration import level_spl
 from hlsim.evaluation.items import Item
 from hlsim.evaluation.judging import NORMAL, Unaided
-from hlsim.evaluation.steadiness import TONES, shift_differences, steady_tones, tones, wearing
+from hlsim.evaluation.measurements import TONES, shift_differences, steady_tones, tones, wearing
 
 N3 = Audiogram.standard("N3")
 

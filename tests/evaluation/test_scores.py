@@ -10,7 +10,7 @@ import torch
 from hlsim.audio import read_audio, write_audio
 from hlsim.audiogram import Audiogram
 from hlsim.evaluation import ItemScore, haspi_report
-from hlsim.evaluation.better_ear import better_ears
+from hlsim.evaluation.scores import better_ears
 from hlsim.report.haspi import html, markdown
 
 EARS = {"left": Audiogram.standard("N2"), "right": Audiogram.standard("N4")}

@@ -1,10 +1,11 @@
-"""What scores of speech do not show: tones, speech a few samples later, quiet noise, latency and cost."""
+"""What scores of speech do not show: gain by frequency, tones, shifted speech, quiet noise, latency and cost."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import product
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -13,11 +14,16 @@ from torch.nn import functional
 
 from hlsim.audiogram import Audiogram
 from hlsim.calibration import level_spl, set_level
+from hlsim.criteria.bands import band_centres, band_levels
+from hlsim.data.clips import Clips
 from hlsim.evaluation.items import Item
 from hlsim.evaluation.judging import NORMAL
 from hlsim.msbg import MSBG
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.parallel import one_thread
+
+UTTERANCES = 6
+"""Clips of 3 s of speech that gains are measured on."""
 
 TONES = (250, 500, 1000, 2000, 3001, 4000)
 """In Hz. Frames that are multiples of 4 ms apart all find the others in one phase, but not 3001 Hz."""
@@ -34,6 +40,56 @@ _NEAR_HZ = 20.0
 _MIDDLE = slice(NEURO_RATE // 2, -NEURO_RATE // 2)  # one second: every tone has whole periods in it
 _END = NEURO_RATE // 4  # left out at either end of speech
 _LEAST, _SILENCE = 1e-20, 1e-30  # smallest ratio of powers, and power: JSON holds no infinity
+
+
+def insertion_gain(
+    compensator: nn.Module, ear: Audiogram, speech: Tensor, levels: Sequence[float]
+) -> list[list[float]]:
+    """Power out over power in, in dB, in 24 ERB-wide bands (``hlsim.criteria.bands``), over all of the speech.
+
+    Its spectrum is what a fitter's speech-shaped noise stands for; its pauses are in it, for a compensator may take noise
+    for noise. ``levels`` are of each utterance in dB SPL. ValueError as ``outputs``.
+
+    Shape: (utterances, time) at 16 kHz -> (levels, 24).
+    """
+    curves = []
+    for level in levels:
+        given = set_level(speech, level)
+        aided = outputs(compensator, given, ear, f"the output for speech at {level:g} dB SPL")
+        curves.append((10.0 * (_powers(aided) / _powers(given)).log10()).tolist())
+    return curves
+
+
+def draw_utterances(speech: str | Path, seed: int) -> Tensor:
+    """Six clips of 3 s from a folder, drawn from the seed. Shape: -> (6, 48000) at 16 kHz."""
+    clips = Clips(speech, sample_rate=NEURO_RATE, seconds=3.0)
+    return clips.draw(UTTERANCES, torch.Generator().manual_seed(seed))
+
+
+def gain_curves(
+    compensators: Mapping[str, nn.Module],
+    ears: Mapping[str, Audiogram],
+    utterances: Tensor,
+    levels: Sequence[float],
+) -> list[dict[str, Any]]:
+    """The curves of every compensator for every ear. Shape: (utterances, time) at 16 kHz. ValueError as ``outputs``.
+
+    Returns: for each ``{"compensator", "ear", "levels", "frequencies", "gain_db": (levels, 24)}``.
+    """
+    curves = []
+    for (ear_name, ear), (name, compensator) in product(ears.items(), compensators.items()):
+        try:
+            gains = insertion_gain(compensator, ear, utterances, levels)
+        except ValueError as error:
+            raise ValueError(f"{name}, ear {ear_name}: {error}") from error
+        about = {"compensator": name, "ear": ear_name, "levels": [*levels]}
+        curves.append({**about, "frequencies": band_centres().tolist(), "gain_db": gains})
+    return curves
+
+
+def _powers(signal: Tensor) -> Tensor:
+    """Mean power of each band. Shape: (utterances, time) -> (24,)."""
+    return (10.0 ** (band_levels(signal.double(), NEURO_RATE) / 10.0)).mean((0, 1))
 
 
 def tones(hertz: Sequence[int], levels: Sequence[float]) -> Tensor:
