@@ -42,6 +42,7 @@ def resample(waveform: Tensor, source_rate: int, target_rate: int) -> Tensor:
     common = math.gcd(source_rate, target_rate)
     if source_rate * target_rate // common**2 > _LARGEST_KERNEL:
         return _resample_odd(waveform, source_rate // common, target_rate // common)
+    waveform = waveform.contiguous()  # torchaudio takes a view of it
     # a kernel made while a program is traced is of no use to others
     if torch.compiler.is_compiling():
         slow: Tensor = _torchaudio().functional.resample(waveform, source_rate, target_rate, **_SINC)

@@ -4,8 +4,9 @@ from typing import Any
 
 from hlsim.metrics.haspi import HaspiReference, haspi
 from hlsim.metrics.hasqi import HasqiParts, HasqiReference, hasqi
+from hlsim.metrics.mbstoi import mbstoi
 
-__all__ = ["HASPI", "HASQI", "HaspiReference", "HasqiParts", "HasqiReference", "haspi", "hasqi"]
+__all__ = ["HASPI", "HASQI", "HaspiReference", "HasqiParts", "HasqiReference", "haspi", "hasqi", "mbstoi"]
 
 
 def __getattr__(name: str) -> Any:

@@ -72,6 +72,11 @@ def test_length_is_rounded_up_and_leading_dimensions_stay(source: int, target: i
     assert ours.shape == (2, 3, math.ceil(time * target / source))
 
 
+def test_one_of_a_stack_of_batches_is_resampled() -> None:
+    batch = torch.randn(3, 2, 2, 1600)[:, 0]
+    torch.testing.assert_close(resample(batch, 16000, 24000)[1, 1], resample(batch[1, 1], 16000, 24000))
+
+
 def test_there_and_back_is_the_same_up_to_the_band_edge() -> None:
     wave = tone(440.0, 16000) + tone(3000.0, 16000) + tone(6500.0, 16000)
     back = resample(resample(wave, 16000, 44100), 44100, 16000)
