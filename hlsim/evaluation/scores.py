@@ -8,8 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from hlsim.audiogram import Audiogram
-
-EARS = ("left", "right")
+from hlsim.listener import EARS
 
 _JSON = (
     *("file", "listener", "ear", "snr", "before", "after", "clean_level", "before_level", "after_level"),

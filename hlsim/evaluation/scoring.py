@@ -19,8 +19,8 @@ import torch
 from hlsim.audio import read_audio
 from hlsim.audiogram import Audiogram
 from hlsim.calibration import check_full_scale, dbfs
-from hlsim.evaluation.scores import EARS
 from hlsim.evaluation.store import ScoreStore, content_hash, key_of
+from hlsim.listener import EARS
 from hlsim.metrics.pair import check_seed
 from hlsim.metrics.registry import Engine, MeasureName, check_measures, measure_by, versions_of
 from hlsim.parallel import Backend, Failed, Progress, check_parallel, make_missing, one_thread, reason_of
