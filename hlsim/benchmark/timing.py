@@ -46,9 +46,9 @@ def peak_mib(call: Call, device: torch.device) -> float | None:
     except OSError:
         call()
         return None
-    held = _most_held_mib()
+    before = _most_held_mib()
     call()
-    return _most_held_mib() - held
+    return _most_held_mib() - before
 
 
 def _most_held_mib() -> float:
