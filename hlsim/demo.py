@@ -103,8 +103,8 @@ def demo(
     for name, signals in given.items():
         with one_thread():
             haspi[name] = [
-                MEASURES["haspi"].score(one, given_one, audiogram, NEURO_RATE, PASCAL_SPL, own)
-                for one, given_one, own in zip(clean, signals, seeds, strict=True)
+                MEASURES["haspi"].score(utterance, signal, audiogram, NEURO_RATE, PASCAL_SPL, own_seed)
+                for utterance, signal, own_seed in zip(clean, signals, seeds, strict=True)
             ]
         report(f"  {name}: mean HASPI {fmean(haspi[name]):.3f}")
     levels, heard_levels = ({name: _levels(own) for name, own in of.items()} for of in (given, heard))
