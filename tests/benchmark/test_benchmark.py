@@ -201,6 +201,11 @@ def test_a_gpu_is_measured_by_its_number(monkeypatch: pytest.MonkeyPatch) -> Non
     assert len(asked) == 4 and all(device == second for _, device in asked)
 
 
+@pytest.mark.skipif(not Path("/proc/self/clear_refs").exists(), reason="Linux tells the peak")
+def test_memory_that_is_given_back_counts() -> None:
+    assert 60.0 < peak_mib(lambda: torch.ones(2**24).sum(), torch.device("cpu")) < 80.0  # 64 MiB of float32
+
+
 def test_a_gpu_is_described(monkeypatch: pytest.MonkeyPatch) -> None:
     properties = SimpleNamespace(total_memory=80 * 2**30)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
