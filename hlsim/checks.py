@@ -11,9 +11,13 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import torch
 from torch import Tensor
+from torch.nn import Parameter
 
 LOWEST_RATE, HIGHEST_RATE = 16000, 48000
 """Sample rates in Hz that simulators and compensators take."""
+
+HIGHEST_SAMPLE = 1e9
+"""Largest sample that is taken. From 1e14 on, a power of five or a product of powers leaves float32."""
 
 Lengths = Tensor | Sequence[int]
 """Samples of each item, in the shape of the leading dimensions."""
@@ -116,8 +120,12 @@ def check_rate(sample_rate: int) -> int:
     return int(sample_rate)
 
 
-def check_waveform(waveform: Tensor, name: str = "waveform") -> Tensor:
-    """Return the waveform, or raise ValueError unless it is a floating-point (..., time) tensor with samples."""
+def check_waveform(waveform: Tensor, name: str = "waveform", *, highest: float = HIGHEST_SAMPLE) -> Tensor:
+    """Return the waveform, or raise ValueError unless it is a floating-point (..., time) tensor with samples up to 1e9.
+
+    NaN passes, and is NaN in what comes of it. How large samples are is not looked at on a GPU, whose queue it would
+    stop, nor in a compiled or exported program and in transforms of ``torch.func``.
+    """
     if not isinstance(waveform, Tensor) or not waveform.is_floating_point():
         kind = waveform.dtype if isinstance(waveform, Tensor) else type(waveform).__name__
         raise ValueError(f"{name} is {kind}; allowed: a floating-point tensor (..., time)")
@@ -125,7 +133,19 @@ def check_waveform(waveform: Tensor, name: str = "waveform") -> Tensor:
         raise ValueError(
             f"{name} has shape {tuple(waveform.shape)}; allowed: (..., time) with at least one sample"
         )
+    if _has_values(waveform):
+        low, high = torch.aminmax(waveform.detach())
+        if (peak := max(-float(low), float(high))) > highest:
+            raise ValueError(f"{name} has a sample of {peak:.3g}; allowed: up to {highest:g}")
     return waveform
+
+
+def _has_values(tensor: Tensor) -> bool:
+    """Whether its values can be asked for, and at once."""
+    if torch.compiler.is_compiling() or torch.jit.is_tracing() or type(tensor) not in (Tensor, Parameter):
+        return False
+    plain = tensor.device.type == "cpu" and tensor.layout == torch.strided
+    return plain and torch._C._functorch.maybe_current_level() is None
 
 
 def check_lengths(lengths: Lengths, shape: torch.Size) -> Tensor:

@@ -1,4 +1,4 @@
-"""Odd signals, from silence to 1e9 Pa and from one sample up: finite sound and finite gradients, or a refusal."""
+"""Odd signals, from silence to 1e38 Pa and from one sample up: finite sound and finite gradients, or a refusal."""
 
 from functools import cache
 from random import Random
@@ -13,7 +13,7 @@ from hlsim import MSBG, Audiogram, HearingLossLoss, load_pretrained
 from hlsim.metrics import haspi, hasqi
 
 EARS = ("NH", "N1", "N2", "N3", "N4", "N5", "N6", "N7", "S1", "S2", "S3")
-LEVELS = (0.0, 1e-40, 1e-20, 1e-9, 1e-5, 0.02, 1.0, -1.0, 1e3, 1e6, 1e9)
+LEVELS = (0.0, 1e-40, 1e-20, 1e-9, 1e-5, 0.02, 1.0, -1.0, 1e3, 1e6, 1e9, 1e18, 1e38)
 KINDS = {
     "numerics of simulators": ("msbg", "neuro-msbg", "neuro-msbg-lstm"),
     "numerics of compensators": ("nalr", "wdrc", "hearing-aid", "compensator-general"),
