@@ -316,8 +316,8 @@ class HearingLossLoss(nn.Module):
                 f"the speech is on {waveform.device} and the simulator on {weight.device}; move the loss with .to()"
             )
         allowed = _batches(waveform.shape[:-1], thresholds.shape[:-1])
-        apart = ends is not None and bool((ends != waveform.shape[-1]).any())
-        if apart and not listener and len(allowed) == 2 and self._holds(NeuroMSBG):
+        apart = not listener and len(allowed) == 2 and self._holds(NeuroMSBG)
+        if apart and ends is not None and bool((ends != waveform.shape[-1]).any()):
             return self._hear_to_ends(waveform, thresholds, ends.expand(allowed[1]))
         more = {
             name: value.to(waveform.device) if isinstance(value, Tensor) else value
@@ -342,7 +342,7 @@ class HearingLossLoss(nn.Module):
         batch, time, places = ends.shape, waveform.shape[-1], ends.flatten()
         items = waveform.expand(*batch, -1).reshape(-1, time)
         ears = thresholds.expand(*batch, -1).reshape(-1, len(FREQUENCIES))
-        heard = {}
+        heard: dict[int, Tensor] = {}
         for end in places.unique().tolist():
             members = (places == end).nonzero().flatten()
             chosen = members.to(items.device)
