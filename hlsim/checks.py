@@ -123,8 +123,8 @@ def check_rate(sample_rate: int) -> int:
 def check_waveform(waveform: Tensor, name: str = "waveform", *, highest: float = HIGHEST_SAMPLE) -> Tensor:
     """Return the waveform, or raise ValueError unless it is a floating-point (..., time) tensor with samples up to 1e9.
 
-    NaN passes, and is NaN in what comes of it. How large samples are is not looked at on a GPU, whose queue it would
-    stop, nor in a compiled or exported program and in transforms of ``torch.func``.
+    NaN and infinity pass, and are NaN in what comes of them. How large samples are is not looked at on a GPU, whose queue
+    it would stop, nor in a compiled or exported program and in transforms of ``torch.func``.
     """
     if not isinstance(waveform, Tensor) or not waveform.is_floating_point():
         kind = waveform.dtype if isinstance(waveform, Tensor) else type(waveform).__name__
@@ -135,7 +135,7 @@ def check_waveform(waveform: Tensor, name: str = "waveform", *, highest: float =
         )
     if _has_values(waveform):
         low, high = torch.aminmax(waveform.detach())
-        if (peak := max(-float(low), float(high))) > highest:
+        if highest < (peak := max(-float(low), float(high))) < math.inf:
             raise ValueError(f"{name} has a sample of {peak:.3g}; allowed: up to {highest:g}")
     return waveform
 

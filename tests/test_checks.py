@@ -92,18 +92,18 @@ def test_what_is_no_waveform(wave: Any) -> None:
         check_waveform(wave, "heard")
 
 
-@pytest.mark.parametrize("sample", [1.1e9, -1e18, 1e38, float("inf")])
+@pytest.mark.parametrize("sample", [1.1e9, -1e18, 1e38])
 @pytest.mark.parametrize("kind", [torch.float32, torch.float64])
 def test_a_sample_too_large(sample: float, kind: torch.dtype) -> None:
     wave = torch.zeros(2, 10, dtype=kind).index_fill(1, torch.tensor([3]), sample)
     with pytest.raises(
-        ValueError, match=r"heard has a sample of (1.1e\+09|1e\+18|1e\+38|inf); allowed: up to 1e\+09"
+        ValueError, match=r"heard has a sample of (1.1e\+09|1e\+18|1e\+38); allowed: up to 1e\+09"
     ):
         check_waveform(wave, "heard")
 
 
 def test_samples_up_to_the_highest_and_nan_pass_and_transforms_work() -> None:
-    for sample in (1e9, -1e9, float("nan")):
+    for sample in (1e9, -1e9, float("nan"), float("inf")):
         check_waveform(torch.full((10,), sample))
     wave = torch.full((2, 10), 1e18)
     assert torch.equal(torch.vmap(check_waveform)(wave), wave)
