@@ -48,6 +48,7 @@ class NALR(nn.Module):
     """
 
     thresholds: Tensor | None
+    _two_ears: bool
 
     def __init__(
         self,

@@ -24,6 +24,7 @@ from hlsim.criteria import coherent_bands, paper
 from hlsim.criteria.bands import HIGHEST, band_level_loss
 from hlsim.criteria.choice import Criterion, check_criterion, check_values, check_weights
 from hlsim.dsp.resample import resample
+from hlsim.metrics.interaural import interaural_loss
 from hlsim.metrics.objective import SCORES, missing_score
 from hlsim.msbg import MSBG
 from hlsim.msbg.normal import hear_normally
@@ -38,6 +39,8 @@ ReferenceName = Literal["clean", "normal-hearing"]
 Reduction = Literal["mean", "none"]
 
 EarsName = Literal["mean", "better"]
+
+_GIVEN = {*SCORES, "interaural"}  # of what the ears are given, not of what they hear
 
 TEMPERATURE = 0.1
 """Temperature of ``ears="better"``: an ear whose loss is 0.1 less than the other's counts 2.7 times as much."""
@@ -79,8 +82,10 @@ class HearingLossLoss(nn.Module):
             (``hlsim.criteria.coherent_bands``); ``"bands"``, levels in bands alone; ``"paper"``, Equations 2 to 9 of
             Neuro-MSBG, not balanced between ears and levels (``hlsim.criteria.paper``); ``"haspi"`` and ``"hasqi"``, 1
             less the score of what the ear is given (``hlsim.metrics.objective``), which say nothing of its level and go
-            beside another, ``{"coherent-bands": 1.0, "haspi": 0.3}``; several by name, of one hearing; or a callable of
-            what is heard and the reference, (items, time) in pascals, that returns a value for each item, (items,).
+            beside another, ``{"coherent-bands": 1.0, "haspi": 0.3}``, as does ``"interaural"``, how far the differences
+            between a listener's ears are from the clean speech's (``hlsim.metrics.interaural``); several by name, of one
+            hearing; or a callable of what is heard and the reference, (items, time) in pascals, that returns a value for
+            each item, (items,).
         weights: of the parts by name; a part left out does not count.
         reduction: ``"mean"`` over the items, whatever their lengths, or ``"none"``, a value for each.
         normal: the normal ear that belongs to the simulator, a module (frozen too) or callable, (..., time) -> (...,
@@ -202,9 +207,9 @@ class HearingLossLoss(nn.Module):
         """The parts of the loss by name, before their weights.
 
         Those of ``"coherent-bands"`` are incoherence, misalignment, levels, louder and peaks, of ``"bands"`` band_levels
-        (dB), of ``"paper"`` magnitude, phase, complex and time, of ``"haspi"`` and ``"hasqi"`` themselves, and of a
-        callable criterion. Their sum, ``sum(weight * parts[name] for name, weight in loss.weights.items())``, is what
-        ``forward`` gives.
+        (dB), of ``"paper"`` magnitude, phase, complex and time, and of ``"haspi"``, ``"hasqi"``, ``"interaural"`` and a
+        callable criterion themselves. Their sum, ``sum(weight * parts[name] for name, weight in loss.weights.items())``,
+        is what ``forward`` gives.
 
         Shape, arguments and errors: as ``forward``.
         """
@@ -215,7 +220,7 @@ class HearingLossLoss(nn.Module):
             heard = self._hear(given, ears, listener, ends)
             batch, time = heard.shape[:-1], heard.shape[-1]
             signals = {"heard": heard, "given": given.expand_as(heard)}
-            for name in [name for name in self.criteria if name not in SCORES]:
+            for name in [name for name in self.criteria if name not in _GIVEN]:
                 signals[name] = self._reference(name, clean, ears, batch, listener, ends)
             gain = gain_to_pascals(self.full_scale_spl)
             signals = {name: signal.reshape(-1, time) * gain for name, signal in signals.items()}
@@ -232,6 +237,11 @@ class HearingLossLoss(nn.Module):
                 each_ear = ears.expand(*batch, -1).reshape(-1, len(FREQUENCIES))
                 each_end = [time] * len(each_ear) if ends is None else ends.expand(batch).flatten().tolist()
                 items[name] = missing_score(name, *pair, each_ear, each_end, self.sample_rate)
+            if "interaural" in self.criteria:
+                left_right = [one.expand_as(heard) * gain for one in (given, clean)]
+                changes = interaural_loss(left_right[0], left_right[1], self.sample_rate)
+                both = 1.0 if known is None else known.all(-1).to(changes)
+                items["interaural"] = (both * changes).unsqueeze(-1).expand(batch).flatten()
         return self._reduced({name: part.reshape(batch) for name, part in items.items()}, known)
 
     @not_compiled
@@ -288,7 +298,7 @@ class HearingLossLoss(nn.Module):
                 f"compensated is on {compensated.device} and clean on {clean.device}; allowed: the same device"
             )
         shape = compensated.shape
-        check_two_ears(self.ears == "better", clean)
+        check_two_ears(self.ears == "better" or "interaural" in self.criteria, clean)
         ends = None if lengths is None else check_lengths(lengths, shape)
         check_two_ears(self._two_ears if audiogram is None else of_listeners(audiogram), clean)
         ears = self.thresholds if audiogram is None else as_thresholds(audiogram, missing=True)
@@ -328,7 +338,7 @@ class HearingLossLoss(nn.Module):
         heard = signals["heard"]
         items: dict[str, Tensor] = {}
         for name, criterion in self.criteria.items():
-            if name in SCORES:  # of what is given, not heard
+            if name in _GIVEN:
                 continue
             aim = signals[name]
             if name == "coherent-bands":

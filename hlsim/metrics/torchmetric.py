@@ -259,7 +259,8 @@ def _ears(audiogram: AudiogramLike, batch: int, sides: int) -> list[dict[int, Au
         rows = audiogram.detach().expand(batch, *one, width).reshape(batch, sides, width).double().tolist()
         return [{side: Audiogram(tuple(row)) for side, row in enumerate(own)} for own in rows]
     if sides == 2 and of_listeners(audiogram):
-        listeners: Sequence[Any] = [audiogram] * batch if is_listener(audiogram) else audiogram
+        several: Any = audiogram
+        listeners = [audiogram] * batch if is_listener(audiogram) else several
         if len(listeners) != batch:
             raise ValueError(f"{len(listeners)} listeners of {batch} items; allowed: one, or one an item")
         pairs = [enumerate((one.left, one.right)) for one in listeners]

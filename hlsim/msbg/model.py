@@ -67,6 +67,7 @@ class MSBG(nn.Module):
     """
 
     thresholds: Tensor | None
+    _two_ears: bool
 
     def __init__(
         self,
