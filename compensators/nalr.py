@@ -16,6 +16,7 @@ from hlsim.audiogram import (
     HIGHEST_LEVEL,
     AudiogramLike,
     interpolate,
+    of_listeners,
     own_thresholds,
     resolve_thresholds,
 )
@@ -47,6 +48,7 @@ class NALR(nn.Module):
     """
 
     thresholds: Tensor | None
+    _two_ears: bool
 
     def __init__(
         self,
@@ -65,6 +67,7 @@ class NALR(nn.Module):
             )
         self.order: int = int(order)
         self.register_buffer("thresholds", own_thresholds(audiogram, **_LIMITS), persistent=False)
+        self._two_ears = of_listeners(audiogram)
 
     def forward(self, waveform: Tensor, audiogram: AudiogramLike | None = None) -> Tensor:
         """The amplified waveform.
@@ -77,7 +80,9 @@ class NALR(nn.Module):
         check_waveform(waveform)
         if audiogram is None and self.thresholds is None:
             raise ValueError("no audiogram: give one when building NALR or with the call")
-        thresholds = resolve_thresholds(self.thresholds, audiogram, waveform, **_LIMITS)
+        thresholds = resolve_thresholds(
+            self.thresholds, audiogram, waveform, two_ears=self._two_ears, **_LIMITS
+        )
         with torch.autocast(waveform.device.type, enabled=False):
             signal = waveform.to(torch.promote_types(waveform.dtype, torch.float32))
             time = signal.shape[-1]

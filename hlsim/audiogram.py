@@ -6,13 +6,13 @@ import csv
 import math
 import re
 from bisect import bisect_left
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, reduce
 from itertools import pairwise
 from operator import add
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeGuard
 
 import numpy as np
 import torch
@@ -57,6 +57,8 @@ STANDARD = {
 }
 
 _COLUMN = re.compile(r"hl_(\d+\.?\d*|\.\d+)(_.+)?")  # the frequency, and the name of a remark on it
+
+_ENTRY = ("audiogram_cfs", "audiogram_levels_l", "audiogram_levels_r")  # of Clarity's listeners.json
 
 MILDER = ("NH", "N1", "N2", "S1")
 """Standard ears that join measured ones in validation, since those are mostly moderate and severe."""
@@ -204,7 +206,16 @@ class Audiogram:
         Raises:
             ValueError: none of these, a listener without ``ear``, or an audiogram with it.
         """
+        if isinstance(given, Mapping) and (lack := [key for key in _ENTRY if key not in given]):
+            raise ValueError(
+                f"an entry of listeners.json without {', '.join(lack)}; needs {', '.join(_ENTRY)}"
+            )
         two = _has_two_ears(given)
+        if not two and not _is_claritys(given):
+            raise ValueError(
+                f"{type(given).__name__} is none of pyclarity's; allowed: its Audiogram or Listener, or an entry of "
+                "listeners.json"
+            )
         if ear not in (("left", "right") if two else (None,)):
             allowed = (
                 "ear='left' or ear='right', for a listener has two" if two else "None, for it is one ear"
@@ -212,14 +223,8 @@ class Audiogram:
             raise ValueError(f"ear is {ear!r}; allowed: {allowed}")
         if two and isinstance(given, Mapping):
             return cls(given[f"audiogram_levels_{ear[0]}"], given["audiogram_cfs"])  # type: ignore[index]
-        if two:
-            given = getattr(given, f"audiogram_{ear}")
-        if not _is_claritys(given):
-            raise ValueError(
-                f"{type(given).__name__} is none of pyclarity's; allowed: its Audiogram or Listener, or an entry of "
-                "listeners.json"
-            )
-        return cls(given.levels, given.frequencies)
+        own = getattr(given, f"audiogram_{ear}") if two else given
+        return cls(own.levels, own.frequencies)
 
 
 def _is_claritys(given: Any) -> bool:
@@ -230,7 +235,7 @@ def _is_claritys(given: Any) -> bool:
 def _has_two_ears(given: Any) -> bool:
     """Whether it is pyclarity's ``Listener`` or an entry of ``listeners.json``."""
     if isinstance(given, Mapping):
-        return {"audiogram_cfs", "audiogram_levels_l", "audiogram_levels_r"} <= given.keys()
+        return set(_ENTRY) <= given.keys()
     return hasattr(given, "audiogram_left") and hasattr(given, "audiogram_right")
 
 
@@ -259,7 +264,10 @@ class TwoEars(Protocol):
     """A ``Listener``, to which imports from here would point upwards."""
 
     @property
-    def ears(self) -> tuple[Audiogram, Audiogram]: ...
+    def left(self) -> Audiogram | None: ...
+
+    @property
+    def right(self) -> Audiogram | None: ...
 
 
 AudiogramLike = Audiogram | Sequence[Audiogram] | TwoEars | Sequence[TwoEars] | Tensor
@@ -268,27 +276,36 @@ ours is."""
 
 
 def as_thresholds(
-    audiogram: AudiogramLike, *, highest: float = HIGHEST_SIMULATED, taker: str = "a simulator"
+    audiogram: AudiogramLike,
+    *,
+    highest: float = HIGHEST_SIMULATED,
+    taker: str = "a simulator",
+    missing: bool = False,
 ) -> Tensor:
     """Thresholds that a simulator takes, or another ``taker``, up to ``highest`` dB HL.
 
     A list of (8,) tensors holds an ear each, and one of eight (batch,) tensors a frequency each, as torch's
     ``default_collate`` makes it of thresholds; a list of eight (8,) tensors may be either and is refused.
 
+    Args:
+        missing: let a listener with one ear through, whose other ear is NaN.
+
     Returns: (8,) for one ear, (batch, 8) for a sequence, (2, 8) for a ``Listener``, (batch, 2, 8) for a sequence of them,
     the tensor itself otherwise; dB HL.
 
     Raises:
-        ValueError: not an audiogram, a complex or bool tensor, a last dimension other than 8, NaN, or levels outside -10
-            to ``highest`` dB HL.
+        ValueError: not an audiogram, a listener without one ear, a complex or bool tensor, a last dimension other than
+            8, NaN, or levels outside -10 to ``highest`` dB HL.
     """
     if (ear := _one_ear(audiogram)) is not None:
         return torch.tensor(_taken(ear.thresholds, highest, taker))
-    if hasattr(audiogram, "ears"):
-        return as_thresholds(audiogram.ears, highest=highest, taker=taker)
+    if is_listener(audiogram):
+        return torch.stack([*_both_ears(audiogram, missing, highest, taker)])
     if isinstance(audiogram, Sequence) and audiogram:
-        if all(hasattr(one, "ears") for one in audiogram):
-            return torch.stack([as_thresholds(one, highest=highest, taker=taker) for one in audiogram])
+        if all(is_listener(one) for one in audiogram):
+            return torch.stack(
+                [as_thresholds(one, highest=highest, taker=taker, missing=missing) for one in audiogram]
+            )
         ears = [_one_ear(one) for one in audiogram]
         if all(ear is not None for ear in ears):
             return torch.tensor([_taken(ear.thresholds, highest, taker) for ear in ears if ear is not None])
@@ -323,21 +340,27 @@ def own_thresholds(audiogram: AudiogramLike | None, **limits: Any) -> Tensor | N
 
 
 def resolve_thresholds(
-    stored: Tensor | None, audiogram: AudiogramLike | None, waveform: Tensor, **limits: Any
+    stored: Tensor | None,
+    audiogram: AudiogramLike | None,
+    waveform: Tensor,
+    *,
+    two_ears: bool = False,
+    **limits: Any,
 ) -> Tensor:
     """The call's audiogram, or else the stored one, on the waveform's device, checked to fit its leading dimensions.
 
     Args:
+        two_ears: the stored one is of a listener, or of several.
         limits: of ``as_thresholds``.
 
     Raises:
-        ValueError: there is neither, or the shapes do not broadcast.
+        ValueError: there is neither, the shapes do not broadcast, or a listener's waveform is not (..., 2, time).
     """
     if audiogram is None and stored is None:
         raise ValueError("no audiogram: give one when building the simulator or with the call")
     thresholds = as_thresholds(audiogram, **limits) if audiogram is not None else stored
     assert thresholds is not None
-    check_two_ears(audiogram, waveform)
+    check_two_ears(two_ears if audiogram is None else of_listeners(audiogram), waveform)
     try:
         if thresholds.ndim > 1:
             torch.broadcast_shapes(waveform.shape[:-1], thresholds.shape[:-1])
@@ -349,10 +372,32 @@ def resolve_thresholds(
     return thresholds.to(waveform.device)
 
 
-def check_two_ears(audiogram: AudiogramLike | None, waveform: Tensor) -> None:
-    """Raise ValueError where a listener is given with a waveform that has no two channels: (..., 2, time)."""
-    one = audiogram[0] if isinstance(audiogram, list | tuple) else audiogram
-    if hasattr(one, "ears") and waveform.shape[-2:-1] != (2,):
+def is_listener(audiogram: Any) -> TypeGuard[TwoEars]:
+    """Whether it is a ``Listener``."""
+    return hasattr(audiogram, "left") and hasattr(audiogram, "right")
+
+
+def of_listeners(audiogram: AudiogramLike | None) -> bool:
+    """Whether it is a ``Listener`` or a sequence of them."""
+    several = isinstance(audiogram, list | tuple) and len(audiogram) > 0
+    return is_listener(audiogram[0] if several else audiogram)  # type: ignore[index]
+
+
+def _both_ears(listener: TwoEars, missing: bool, highest: float, taker: str) -> Iterator[Tensor]:
+    """Left and right, (8,) each; NaN where one is missing, or ValueError unless it may."""
+    if not missing and (listener.left is None or listener.right is None):
+        gone, there, place = ("left", "right", 1) if listener.left is None else ("right", "left", 0)
+        raise ValueError(
+            f"the listener's {gone} ear is missing; give listener.{there} with waveform[..., {place}, :]"
+        )
+    for ear in (listener.left, listener.right):
+        lacks = torch.full((len(FREQUENCIES),), math.nan)
+        yield lacks if ear is None else as_thresholds(ear, highest=highest, taker=taker)
+
+
+def check_two_ears(asked: bool, waveform: Tensor) -> None:
+    """Raise ValueError where a listener's two ears are ``asked`` for of a waveform that is not (..., 2, time)."""
+    if asked and waveform.shape[-2:-1] != (2,):
         raise ValueError(
             f"a waveform of shape {tuple(waveform.shape)} for a listener's two ears; allowed: (..., 2, time), left first"
         )

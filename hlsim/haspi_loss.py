@@ -6,7 +6,7 @@ from torch import nn
 
 from hlsim.audiogram import AudiogramLike
 from hlsim.calibration import PASCAL_SPL
-from hlsim.loss import Hearing, HearingLossLoss, Reduction
+from hlsim.loss import EarsName, Hearing, HearingLossLoss, Reduction
 from hlsim.neuro.config import NEURO_RATE
 
 _LEVEL = {"levels": 0.03, "louder": 0.06, "peaks": 1.0}
@@ -28,7 +28,7 @@ class HASPILoss(HearingLossLoss):
     Args:
         quality: weight of 1 less HASQI, beside 1 of 1 less HASPI.
         level: weight of level and peaks. Without them, 0, a model learns to be as loud as it can.
-        audiogram, simulator, sample_rate, full_scale_spl, reduction, normal: as ``HearingLossLoss``.
+        audiogram, simulator, sample_rate, full_scale_spl, reduction, normal, ears: as ``HearingLossLoss``.
 
     Raises:
         ValueError: as ``HearingLossLoss``; a weight that is negative or not finite.
@@ -45,6 +45,7 @@ class HASPILoss(HearingLossLoss):
         full_scale_spl: float = PASCAL_SPL,
         reduction: Reduction = "mean",
         normal: Hearing | None = None,
+        ears: EarsName = "mean",
     ) -> None:
         criterion = {"haspi": 1.0, "hasqi": quality, "coherent-bands": level}
         criterion = {name: weight for name, weight in criterion.items() if weight != 0.0}
@@ -58,4 +59,5 @@ class HASPILoss(HearingLossLoss):
             weights=parts,
             reduction=reduction,
             normal=normal,
+            ears=ears,
         )

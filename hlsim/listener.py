@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from hlsim.audiogram import Audiogram, numbered_audiograms
 
 EARS = ("left", "right")
@@ -22,7 +24,8 @@ class Listener:
     an ear, and the better ear's with ``.amax(-1)``. A sequence of listeners is one an item, (items, 2, 8).
 
     Args:
-        left, right: None where nothing is known of an ear; the other one is then used by itself.
+        left, right: None where nothing is known of an ear. Losses and ``hlsim.metrics.HASPI`` and ``HASQI`` leave it out;
+            whatever else takes a listener refuses one without both.
 
     Raises:
         ValueError: neither ear, or something else than an ``Audiogram``.
@@ -37,16 +40,6 @@ class Listener:
                 raise ValueError(f"the {name} ear is {type(ear).__name__}; allowed: an Audiogram, or None")
         if self.left is None and self.right is None:
             raise ValueError("a listener without ears; allowed: one Audiogram or two")
-
-    @property
-    def ears(self) -> tuple[Audiogram, Audiogram]:
-        """Both. Raises ValueError where one is missing."""
-        if self.left is None or self.right is None:
-            there, gone, place = ("right", "left", 1) if self.left is None else ("left", "right", 0)
-            raise ValueError(
-                f"the listener's {gone} ear is missing; give listener.{there} with waveform[..., {place}, :]"
-            )
-        return self.left, self.right
 
     def plot(self, axes: Any = None, **style: Any) -> Any:
         """Both ears as audiologists draw them, left with blue crosses, right with red circles; as ``Audiogram.plot``."""
@@ -72,10 +65,18 @@ class Listener:
             raise ValueError("no listener; allowed: left and right, each an audiogram's to_dict, or None")
         return cls(*(None if data[name] is None else Audiogram.from_dict(data[name]) for name in EARS))
 
+    def to_rows(self, name: str) -> list[dict[str, str]]:
+        """A row an ear of the CSV file that ``read_listeners`` takes, under this name of the listener."""
+        ears = {ear: getattr(self, ear) for ear in EARS}
+        return [{"listener": name, "ear": ear, **own.to_row()} for ear, own in ears.items() if own]
+
     @classmethod
     def from_clarity(cls, given: Any) -> Listener:
         """From pyclarity's ``Listener`` or an entry of Clarity's ``listeners.json``. Raises ValueError of all else."""
         return cls(*(Audiogram.from_clarity(given, ear) for ear in EARS))
+
+
+torch.serialization.add_safe_globals([Listener])  # as of Audiogram
 
 
 def read_listeners(path: str | Path) -> dict[str, Listener]:

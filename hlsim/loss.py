@@ -10,13 +10,21 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from hlsim.audiogram import FREQUENCIES, AudiogramLike, as_thresholds, check_two_ears, own_thresholds
+from hlsim.audiogram import (
+    FREQUENCIES,
+    AudiogramLike,
+    as_thresholds,
+    check_two_ears,
+    of_listeners,
+    own_thresholds,
+)
 from hlsim.calibration import PASCAL_SPL, check_full_scale, gain_to_pascals
 from hlsim.checks import Lengths, check_choice, check_lengths, check_rate, check_waveform, silent_after
 from hlsim.criteria import coherent_bands, paper
 from hlsim.criteria.bands import HIGHEST, band_level_loss
 from hlsim.criteria.choice import Criterion, check_criterion, check_values, check_weights
 from hlsim.dsp.resample import resample
+from hlsim.metrics.interaural import interaural_loss
 from hlsim.metrics.objective import SCORES, missing_score
 from hlsim.msbg import MSBG
 from hlsim.msbg.normal import hear_normally
@@ -29,6 +37,13 @@ from hlsim.torchtools import not_compiled
 ReferenceName = Literal["clean", "normal-hearing"]
 
 Reduction = Literal["mean", "none"]
+
+EarsName = Literal["mean", "better"]
+
+_GIVEN = {*SCORES, "interaural"}  # of what the ears are given, not of what they hear
+
+TEMPERATURE = 0.1
+"""Temperature of ``ears="better"``: an ear whose loss is 0.1 less than the other's counts 2.7 times as much."""
 
 Hearing = Callable[[Tensor], Tensor]
 """(..., time) -> (..., time), as a normal ear hears."""
@@ -67,13 +82,17 @@ class HearingLossLoss(nn.Module):
             (``hlsim.criteria.coherent_bands``); ``"bands"``, levels in bands alone; ``"paper"``, Equations 2 to 9 of
             Neuro-MSBG, not balanced between ears and levels (``hlsim.criteria.paper``); ``"haspi"`` and ``"hasqi"``, 1
             less the score of what the ear is given (``hlsim.metrics.objective``), which say nothing of its level and go
-            beside another, ``{"coherent-bands": 1.0, "haspi": 0.3}``; several by name, of one hearing; or a callable of
-            what is heard and the reference, (items, time) in pascals, that returns a value for each item, (items,).
+            beside another, ``{"coherent-bands": 1.0, "haspi": 0.3}``, as does ``"interaural"``, how far the differences
+            between a listener's ears are from the clean speech's (``hlsim.metrics.interaural``); several by name, of one
+            hearing; or a callable of what is heard and the reference, (items, time) in pascals, that returns a value for
+            each item, (items,).
         weights: of the parts by name; a part left out does not count.
         reduction: ``"mean"`` over the items, whatever their lengths, or ``"none"``, a value for each.
         normal: the normal ear that belongs to the simulator, a module (frozen too) or callable, (..., time) -> (...,
             time). By default hlsim's simulators have MSBG's at 0 dB HL, and another module is asked itself with 0 dB HL:
             what it does to every ear, such as a low-pass filter, it then does to the reference, and it costs nothing.
+        ears: of two ears, (..., 2, time): ``"mean"``, or ``"better"``, smoothly the better one: each counts by its
+            share, ``softmax(-loss / 0.1)`` over the two. The gradient holds the shares, so that no ear is made worse.
         unit_power: for ``"paper"``: both waveforms are scaled so that the reference has RMS 1, as in the papers that its
             weights come from.
 
@@ -95,6 +114,7 @@ class HearingLossLoss(nn.Module):
         reduction: Reduction = "mean",
         normal: Hearing | None = None,
         unit_power: bool = False,
+        ears: EarsName = "mean",
     ) -> None:
         super().__init__()
         self.sample_rate = check_rate(sample_rate)
@@ -102,15 +122,17 @@ class HearingLossLoss(nn.Module):
         if reference is not None:
             check_choice("reference", reference, ReferenceName)
         check_choice("reduction", reduction, Reduction)
+        check_choice("ears", ears, EarsName)
         if normal is not None and not callable(normal):
             raise ValueError(
                 f"normal is {type(normal).__name__}; allowed: a module or callable (waveform) -> waveform"
             )
-        self.reference, self.reduction, self.unit_power = reference, reduction, unit_power
+        self.reference, self.reduction, self.unit_power, self.ears = reference, reduction, unit_power, ears
+        self._two_ears = of_listeners(audiogram)
         self.criteria = check_criterion(criterion)
         self.weights = check_weights(weights, self.criteria, criterion)
         with torch.device("cpu"):  # where the host is made on ``meta``, nobody gives the ear its values later
-            thresholds = own_thresholds(audiogram)
+            thresholds = own_thresholds(audiogram, missing=True)
         built = _build(simulator, self.sample_rate, self.full_scale_spl).eval().requires_grad_(False)
         if isinstance(normal, nn.Module):
             normal.eval().requires_grad_(False)
@@ -134,7 +156,7 @@ class HearingLossLoss(nn.Module):
 
     @property
     def thresholds(self) -> Tensor | None:
-        """The ear or ears given to the constructor. Shape: (..., 8) dB HL."""
+        """The ear or ears given to the constructor. Shape: (..., 8) dB HL, NaN of a listener's missing ear."""
         return self._unregistered[1]
 
     @not_compiled  # a compiled caller calls it as it is
@@ -150,7 +172,9 @@ class HearingLossLoss(nn.Module):
         """The loss: mean over the items, or of each.
 
         Shape: (..., time) twice, and one audiogram or (..., 8) that broadcasts over the leading dimensions -> (), or with
-            ``reduction="none"`` the leading dimensions. (batch, 1, time) takes (batch, 8) and (batch,) lengths, too.
+            ``reduction="none"`` the leading dimensions. (batch, 1, time) takes (batch, 8) and (batch,) lengths, too. Of a
+            ``Listener`` (..., 2, time), left first; a missing ear does not count, and is NaN with ``"none"``. With
+            ``ears="better"`` the dimension of the ears is not in the result.
 
         Args:
             lengths: samples of each item of a padded batch, (...), or shares of the longest above 0 to 1, as SpeechBrain
@@ -183,20 +207,20 @@ class HearingLossLoss(nn.Module):
         """The parts of the loss by name, before their weights.
 
         Those of ``"coherent-bands"`` are incoherence, misalignment, levels, louder and peaks, of ``"bands"`` band_levels
-        (dB), of ``"paper"`` magnitude, phase, complex and time, of ``"haspi"`` and ``"hasqi"`` themselves, and of a
-        callable criterion. Their sum, ``sum(weight * parts[name] for name, weight in loss.weights.items())``, is what
-        ``forward`` gives.
+        (dB), of ``"paper"`` magnitude, phase, complex and time, and of ``"haspi"``, ``"hasqi"``, ``"interaural"`` and a
+        callable criterion themselves. Their sum, ``sum(weight * parts[name] for name, weight in loss.weights.items())``,
+        is what ``forward`` gives.
 
         Shape, arguments and errors: as ``forward``.
         """
-        given, clean, ears, ends = self._check(compensated, clean, audiogram, lengths)
+        given, clean, ears, ends, known = self._check(compensated, clean, audiogram, lengths)
         with torch.autocast(given.device.type, enabled=False):
             if {"coherent-bands", *SCORES} & self.criteria.keys():
                 given = coherent_bands.without_spikes(given)
             heard = self._hear(given, ears, listener, ends)
             batch, time = heard.shape[:-1], heard.shape[-1]
             signals = {"heard": heard, "given": given.expand_as(heard)}
-            for name in [name for name in self.criteria if name not in SCORES]:
+            for name in [name for name in self.criteria if name not in _GIVEN]:
                 signals[name] = self._reference(name, clean, ears, batch, listener, ends)
             gain = gain_to_pascals(self.full_scale_spl)
             signals = {name: signal.reshape(-1, time) * gain for name, signal in signals.items()}
@@ -213,9 +237,12 @@ class HearingLossLoss(nn.Module):
                 each_ear = ears.expand(*batch, -1).reshape(-1, len(FREQUENCIES))
                 each_end = [time] * len(each_ear) if ends is None else ends.expand(batch).flatten().tolist()
                 items[name] = missing_score(name, *pair, each_ear, each_end, self.sample_rate)
-        if self.reduction == "none":
-            return {name: part.reshape(batch) for name, part in items.items()}
-        return {name: part.mean() for name, part in items.items()}
+            if "interaural" in self.criteria:
+                left_right = [one.expand_as(heard) * gain for one in (given, clean)]
+                changes = interaural_loss(left_right[0], left_right[1], self.sample_rate)
+                both = 1.0 if known is None else known.all(-1).to(changes)
+                items["interaural"] = (both * changes).unsqueeze(-1).expand(batch).flatten()
+        return self._reduced({name: part.reshape(batch) for name, part in items.items()}, known)
 
     @not_compiled
     def heard(
@@ -229,13 +256,14 @@ class HearingLossLoss(nn.Module):
     ) -> tuple[Tensor, Tensor]:
         """What the ear hears of the compensated speech, and the reference: for a criterion of one's own.
 
-        Both are in pascals and aligned, silent after each item's end. The simulator is frozen, and the gradient flows.
+        Both are in pascals and aligned, silent after each item's end and at a listener's missing ear. The simulator is
+        frozen, and the gradient flows.
 
         Shape: (..., time) twice -> (..., time) twice, their leading dimensions broadcast with the ears'.
 
         Args and errors: as ``forward``.
         """
-        given, clean, ears, ends = self._check(compensated, clean, audiogram, lengths)
+        given, clean, ears, ends, _ = self._check(compensated, clean, audiogram, lengths)
         with torch.autocast(given.device.type, enabled=False):
             heard = self._hear(given, ears, listener, ends)
             reference = self._reference("criterion", clean, ears, heard.shape[:-1], listener, ends)
@@ -252,8 +280,9 @@ class HearingLossLoss(nn.Module):
 
     def _check(
         self, compensated: Tensor, clean: Tensor, audiogram: AudiogramLike | None, lengths: Lengths | None
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
-        """The speech in one precision and silent after its end, the ears' thresholds, and where each item ends."""
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor | None, Tensor | None]:
+        """The speech in one precision and silent after its end, the ears' thresholds, where each item ends, and which
+        ears are known, None where all are; an unknown one is a normal one that is given silence."""
         if torch.compiler.is_exporting():
             raise ValueError(
                 "HearingLossLoss is for training, and not exported; allowed: the compensator alone"
@@ -269,9 +298,10 @@ class HearingLossLoss(nn.Module):
                 f"compensated is on {compensated.device} and clean on {clean.device}; allowed: the same device"
             )
         shape = compensated.shape
+        check_two_ears(self.ears == "better" or "interaural" in self.criteria, clean)
         ends = None if lengths is None else check_lengths(lengths, shape)
-        check_two_ears(audiogram, clean)
-        ears = self.thresholds if audiogram is None else as_thresholds(audiogram)
+        check_two_ears(self._two_ears if audiogram is None else of_listeners(audiogram), clean)
+        ears = self.thresholds if audiogram is None else as_thresholds(audiogram, missing=True)
         if ears is None:
             raise ValueError("no audiogram: give one when building the loss or with the call")
         if len(shape) == 3 and shape[1] == 1 and ears.ndim == 2 and len(ears) == shape[0]:
@@ -280,14 +310,35 @@ class HearingLossLoss(nn.Module):
         compensated, clean = compensated.to(dtype), clean.to(dtype)
         if ends is not None:
             compensated, clean = silent_after(compensated, ends), silent_after(clean, ends)
-        return compensated, clean, ears.to(compensated.device), ends
+        ears = ears.to(compensated.device)
+        known = ears.isfinite().all(-1)
+        if bool(known.all()):
+            return compensated, clean, ears, ends, None
+        compensated, clean = (torch.where(known.unsqueeze(-1), one, 0.0) for one in (compensated, clean))
+        return compensated, clean, ears.nan_to_num(), ends, known
+
+    def _reduced(self, parts: dict[str, Tensor], known: Tensor | None) -> dict[str, Tensor]:
+        """Over the ears, and the items. Shape: the leading dimensions each."""
+        if known is not None:
+            known = known.expand(next(iter(parts.values())).shape)
+        if self.ears == "better":
+            value = paper.weighted_sum(parts, self.weights).detach()
+            if known is not None:
+                value = value.masked_fill(~known, math.inf)
+            shares = torch.softmax(-value / TEMPERATURE, -1)
+            parts = {name: (shares * part).sum(-1) for name, part in parts.items()}
+        elif known is not None and self.reduction == "mean":
+            return {name: part[known].mean() for name, part in parts.items()}
+        elif known is not None:
+            parts = {name: torch.where(known, part, torch.nan) for name, part in parts.items()}
+        return parts if self.reduction == "none" else {name: part.mean() for name, part in parts.items()}
 
     def _compare(self, signals: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """The parts of each item. Shape: (items, time) each, in pascals -> (items,) each."""
         heard = signals["heard"]
         items: dict[str, Tensor] = {}
         for name, criterion in self.criteria.items():
-            if name in SCORES:  # of what is given, not heard
+            if name in _GIVEN:
                 continue
             aim = signals[name]
             if name == "coherent-bands":

@@ -1,6 +1,8 @@
 """A listener's two ears: as two calls would have them, in everything that takes an audiogram."""
 
+import io
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -64,8 +66,53 @@ def test_the_loss_is_the_mean_over_both_ears_and_reaches_both(kind: Any, scene: 
     assert float(kind(BOTH)(given[None], scene[None]).detach()) == pytest.approx(
         float(value.detach()), rel=1e-5
     )
-    with pytest.raises(ValueError, match="two ears"):
-        loss(given[0], scene[0], BOTH)
+    for mono in (loss, kind(BOTH)):
+        with pytest.raises(ValueError, match="two ears"):
+            mono(given[0], scene[0], BOTH if mono is loss else None)
+
+
+def test_the_better_ear_counts_more_and_both_have_a_gradient(scene: Tensor) -> None:
+    scenes, given = torch.stack((scene, scene.flip(0))), 0.5 * torch.stack((scene, scene.flip(0)))
+    given.requires_grad_()
+    listeners = [BOTH, Listener(RIGHT, LEFT)]
+    each = HearingLossLoss(reduction="none")(given, scenes, listeners)
+    value = HearingLossLoss(reduction="none", ears="better")(given, scenes, listeners)
+    shares = torch.softmax(-each.detach() / 0.1, -1)
+    torch.testing.assert_close(value, (shares * each).sum(-1))
+    assert bool((each.amin(-1) < value).all()) and bool((value < each.mean(-1)).all())
+    torch.testing.assert_close(value[0], value[1], rtol=1e-4, atol=0)
+    gradient, alone = (torch.autograd.grad(one.sum(), given, retain_graph=True)[0] for one in (value, each))
+    assert bool((gradient.abs().amax(-1) > 0.0).all())
+    torch.testing.assert_close(gradient, shares.unsqueeze(-1) * alone)
+    with pytest.raises(ValueError, match=r"two ears; allowed: \(\.\.\., 2, time\)"):
+        HearingLossLoss(LEFT, ears="better")(given[:, :1], scenes[:, :1])
+    with pytest.raises(ValueError, match="ears 'best'; allowed: mean, better"):
+        HearingLossLoss(ears="best")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("kind", [HearingLossLoss, HASPILoss])
+def test_the_loss_leaves_a_missing_ear_out(kind: Any, scene: Tensor) -> None:
+    one, scenes = Listener(None, RIGHT), torch.stack((scene, scene))
+    given = (0.5 * scenes).requires_grad_()
+    given.data[1, 0] = math.nan  # whatever is there
+    loss, alone = kind(), float(kind()(0.5 * scene[1:], scene[1:], RIGHT))
+    value = loss(given[1], scene, one)
+    assert float(value.detach()) == pytest.approx(alone, rel=1e-4)
+    value.backward()
+    assert given.grad is not None and bool(given.grad.isfinite().all())
+    assert [bool(row.any()) for row in given.grad[1]] == [False, True]
+    each = kind(reduction="none")(given, scenes, [BOTH, one]).detach()
+    assert each.isnan().tolist() == [[False, False], [True, False]]
+    assert float(loss(given, scenes, [BOTH, one]).detach()) == pytest.approx(float(each.nanmean()), rel=1e-5)
+    better = kind(one, ears="better")(given[1], scene)
+    assert float(better.detach()) == pytest.approx(alone, rel=1e-4)
+
+
+def test_two_channels_of_one_listener_stored(scene: Tensor) -> None:
+    for make in (lambda ear: MSBG(ear, sample_rate=16000), NALR):
+        torch.testing.assert_close(make(BOTH)(scene), make(None)(scene, BOTH))
+        with pytest.raises(ValueError, match="two ears"):
+            make(BOTH)(scene[0])
 
 
 @pytest.mark.parametrize("score", [haspi, hasqi])
@@ -76,17 +123,36 @@ def test_scores_are_one_an_ear(score: Any, scene: Tensor) -> None:
     assert scores.tolist() == pytest.approx(alone, abs=1e-5)
 
 
+def test_the_better_ears_metric_leaves_a_missing_ear_out(scene: Tensor) -> None:
+    pytest.importorskip("torchmetrics")
+    from hlsim.metrics import HASPI
+
+    given, metric = 0.3 * torch.stack((scene, scene)), HASPI()
+    metric.update(given, torch.stack((scene, scene)), [BOTH, Listener(None, RIGHT)])
+    options: dict[str, Any] = {"noise": "seeded", "whole_khz": True}
+    scores = [haspi(given[0].double(), scene.double(), BOTH, seed=0, **options).amax()]
+    scores += [haspi(given[1, 1].double(), scene[1].double(), RIGHT, seed=1, **options)]
+    assert float(metric.compute()) == pytest.approx(float(sum(scores)) / 2.0, abs=1e-5)
+    assert metric.count_ears.tolist() == [1, 2] and int(metric.failed) == 0
+    with pytest.raises(ValueError, match="2 listeners of 1 items"):
+        metric.update(given[:1], scene[None], [BOTH, BOTH])
+
+
+def _saved(listener: Listener) -> bytes:
+    file = io.BytesIO()
+    torch.save(listener, file)
+    return file.getvalue()
+
+
 def test_written_and_read(tmp_path: Path) -> None:
     for listener in (BOTH, Listener(LEFT, None)):
         assert Listener.from_dict(json.loads(json.dumps(listener.to_dict()))) == listener
+    assert torch.load(io.BytesIO(_saved(BOTH)), weights_only=True) == BOTH
     assert Listener.from_clarity(ENTRY) == BOTH
     (tmp_path / "listeners.json").write_text(json.dumps({"L0001": ENTRY}))
     assert read_listeners(tmp_path / "listeners.json") == {"L0001": BOTH}
-    rows = [
-        {"listener": "a", "ear": "r", **RIGHT.to_row()},
-        {"listener": "a", "ear": "Left", **LEFT.to_row()},
-    ]
-    rows += [{"listener": "b", "ear": "left", **LEFT.to_row()}]
+    rows = [*reversed(BOTH.to_rows("a")), *Listener(LEFT, None).to_rows("b")]
+    rows[0]["ear"], rows[1]["ear"] = "r", "Left"
     table = tmp_path / "ears.csv"
     table.write_text("\n".join([",".join(rows[0]), *(",".join(row.values()) for row in rows)]))
     assert read_listeners(table) == {"a": BOTH, "b": Listener(LEFT, None)}
@@ -119,8 +185,10 @@ def test_bad_listeners(tmp_path: Path, scene: Tensor) -> None:
     for bad in ({}, {"left": None}, [], {"left": None, "right": None}):
         with pytest.raises(ValueError, match="allowed"):
             Listener.from_dict(bad)  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="allowed"):
-        Listener.from_clarity({"audiogram_cfs": [250]})
+    with pytest.raises(
+        ValueError, match="json without audiogram_levels_r; needs audiogram_cfs, audiogram_levels_l, "
+    ):
+        Listener.from_clarity({key: value for key, value in ENTRY.items() if key != "audiogram_levels_r"})
     for name, text in (
         ("a.json", "{"),
         ("b.json", "[]"),

@@ -8,7 +8,7 @@ from torch import Tensor
 from hlsim.checks import is_finite
 from hlsim.criteria import coherent_bands, paper
 
-CriterionName = Literal["coherent-bands", "bands", "paper", "haspi", "hasqi"]
+CriterionName = Literal["coherent-bands", "bands", "paper", "haspi", "hasqi", "interaural"]
 
 CRITERIA: dict[str, Mapping[str, float]] = {
     "coherent-bands": coherent_bands.DEFAULT_WEIGHTS,
@@ -16,6 +16,7 @@ CRITERIA: dict[str, Mapping[str, float]] = {
     "paper": paper.DEFAULT_WEIGHTS,
     "haspi": {"haspi": 1.0},
     "hasqi": {"hasqi": 1.0},
+    "interaural": {"interaural": 1.0},
 }
 """Criteria by name: their parts and the default weight of each."""
 

@@ -9,7 +9,7 @@ from typing import Any, ClassVar, NamedTuple
 import torch
 from torch import Tensor
 
-from hlsim.audiogram import FREQUENCIES, Audiogram, AudiogramLike
+from hlsim.audiogram import FREQUENCIES, Audiogram, AudiogramLike, is_listener, of_listeners
 from hlsim.calibration import check_full_scale, level_spl
 from hlsim.checks import check_rate
 from hlsim.extras import require
@@ -73,8 +73,8 @@ class _MeanScore(_Metric):
         Of two channels, left and right, the better ear's score and level count, and ``ears`` tells each ear's.
 
         Args:
-            audiogram: one ear for all, one an item, or (batch, 8) dB HL; of two channels a pair of left and right, (2, 8)
-                or (batch, 2, 8) dB HL.
+            audiogram: one ear for all, one an item, or (batch, 8) dB HL; of two channels a ``Listener`` or one an item,
+                whose missing ear is left out, a pair of left and right, (2, 8) or (batch, 2, 8) dB HL.
             lengths: samples of each item, where the batch is padded.
 
         Shape: (batch, time) or (time,), or (batch, 2, time), the same for both; ``lengths`` (batch,). ValueError for
@@ -101,13 +101,13 @@ class _MeanScore(_Metric):
             if self.limit is not None and number >= self.limit:
                 break
             reasons = []
-            for side in range(sides):
+            for side, ear in own.items():
                 item = _Item(
                     number,
                     side,
                     signals[side, :end],
                     targets[side, :end],
-                    own[side],
+                    ear,
                     (self.seed + number) % 2**32,
                 )
                 try:
@@ -115,7 +115,7 @@ class _MeanScore(_Metric):
                     items.append(item)
                 except ValueError as error:
                     reasons.append(error)
-            if len(reasons) == sides:
+            if len(reasons) == len(own):
                 self.failed += 1
                 name = self.score.__name__.upper()
                 warnings.warn(f"{name} leaves out item {number}: {reasons[0]}", stacklevel=2)
@@ -245,11 +245,11 @@ def _ends(lengths: Tensor | None, batch: int, time: int) -> list[int]:
     return ends
 
 
-def _ears(audiogram: AudiogramLike, batch: int, sides: int) -> list[list[Audiogram]]:
-    """Each item's ears: one, or left and right."""
+def _ears(audiogram: AudiogramLike, batch: int, sides: int) -> list[dict[int, Audiogram]]:
+    """Each item's ears by channel, without those that are missing."""
     one = () if sides == 1 else (2,)
     if isinstance(audiogram, Audiogram) and sides == 1:
-        return [[audiogram]] * batch
+        return [{0: audiogram}] * batch
     if isinstance(audiogram, Tensor):
         width = len(FREQUENCIES)
         if audiogram.shape not in ((*one, width), (batch, *one, width)):
@@ -257,9 +257,14 @@ def _ears(audiogram: AudiogramLike, batch: int, sides: int) -> list[list[Audiogr
                 f"audiogram of shape {tuple(audiogram.shape)}; allowed: {(*one, width)} or {(batch, *one, width)} dB HL"
             )
         rows = audiogram.detach().expand(batch, *one, width).reshape(batch, sides, width).double().tolist()
-        return [[Audiogram(tuple(row)) for row in rows_of_item] for rows_of_item in rows]
-    if sides == 2 and hasattr(audiogram, "ears"):
-        audiogram = audiogram.ears
+        return [{side: Audiogram(tuple(row)) for side, row in enumerate(own)} for own in rows]
+    if sides == 2 and of_listeners(audiogram):
+        several: Any = audiogram
+        listeners = [audiogram] * batch if is_listener(audiogram) else several
+        if len(listeners) != batch:
+            raise ValueError(f"{len(listeners)} listeners of {batch} items; allowed: one, or one an item")
+        pairs = [enumerate((one.left, one.right)) for one in listeners]
+        return [{side: ear for side, ear in pair if ear is not None} for pair in pairs]
     given = audiogram if isinstance(audiogram, Sequence) else ()
     ears = [ear for ear in given if isinstance(ear, Audiogram)]
     if not ears or len(ears) < len(given):
@@ -271,4 +276,4 @@ def _ears(audiogram: AudiogramLike, batch: int, sides: int) -> list[list[Audiogr
             f"{batch} items; allowed: one for all, or one an item" if sides == 1 else "two ears; allowed: two"
         )
         raise ValueError(f"{len(ears)} audiograms of {each}")
-    return [[ear] for ear in ears] if sides == 1 else [ears] * batch
+    return [{0: ear} for ear in ears] if sides == 1 else [dict(enumerate(ears))] * batch

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from hlsim.audiogram import AudiogramLike, own_thresholds, resolve_thresholds, severity_of
+from hlsim.audiogram import AudiogramLike, of_listeners, own_thresholds, resolve_thresholds, severity_of
 from hlsim.calibration import PASCAL_SPL, check_full_scale, gain_to_pascals
 from hlsim.checks import check_rate, check_waveform
 from hlsim.dsp.fft import long_irfft, long_rfft
@@ -67,6 +67,7 @@ class MSBG(nn.Module):
     """
 
     thresholds: Tensor | None
+    _two_ears: bool
 
     def __init__(
         self,
@@ -83,6 +84,7 @@ class MSBG(nn.Module):
         self.aligned = aligned
         self.rescale_active = rescale_active
         self.register_buffer("thresholds", own_thresholds(audiogram), persistent=False)
+        self._two_ears = of_listeners(audiogram)
 
     @not_compiled  # it depends on the ear's values, and its filters are made by numpy
     def forward(self, waveform: Tensor, audiogram: AudiogramLike | None = None) -> Tensor:
@@ -94,7 +96,7 @@ class MSBG(nn.Module):
             ValueError: no audiogram, levels outside -10 to 100 dB HL, or shapes that do not fit.
         """
         check_waveform(waveform)
-        thresholds = resolve_thresholds(self.thresholds, audiogram, waveform)
+        thresholds = resolve_thresholds(self.thresholds, audiogram, waveform, two_ears=self._two_ears)
         with torch.autocast(waveform.device.type, enabled=False):
             return self._simulate(waveform, thresholds)
 
