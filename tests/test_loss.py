@@ -667,7 +667,7 @@ def test_simulator_by_folder_and_as_a_module(clean: Tensor) -> None:
         ({"reference": ["clean"]}, r"reference \['clean'\]; allowed: clean, normal-hearing"),
         (
             {"criterion": ["paper"]},
-            r"criterion is \['paper'\]; allowed: coherent-bands, bands, paper, haspi, hasqi, weights",
+            r"criterion is \['paper'\]; allowed: coherent-bands, bands, paper, haspi, hasqi, interaural, weights",
         ),
         ({"criterion": nn.L1Loss}, "criterion is <class .*; allowed: .* a callable"),
         ({"criterion": {}}, r"criterion is \{\}; allowed: coherent-bands"),
