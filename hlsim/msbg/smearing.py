@@ -117,34 +117,44 @@ def smear(waveform: Tensor, matrix: Tensor, step: int = 1) -> Tensor:
 
 def _widen(frames: Tensor, window: Tensor, matrix: Tensor) -> Tensor:
     """Smear each frame's power. Shape: (..., frames, 2 n), (2 n,), (bins, bins) -> (..., frames, n)."""
-    spectrum = rfft(frames)[..., : len(matrix)]
-    if spectrum.requires_grad and torch.is_grad_enabled():
-        spectrum = _Spread.apply(spectrum, matrix)[0]
-    else:
-        spectrum = _spread(spectrum, matrix)[0]
+    spectrum, _ = spread(rfft(frames)[..., : len(matrix)], matrix)
     half = len(window) // 2
     return torch.fft.irfft(spectrum, len(window))[..., :half] * window[:half]
 
 
-def _spread(spectrum: Tensor, matrix: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """The spectrum with its power smeared and its phase kept; the factor on it, the power, and what was made of it.
+def spread(spectrum: Tensor, matrix: Tensor) -> tuple[Tensor, Tensor]:
+    """The spectrum with its power smeared and its phase kept, and that power.
 
     Silence counts as a power of 1e-24 Pa^2, and stays as it is.
+
+    Shape: complex (..., bins), (bins, bins) or one an item (items, bins, bins) -> complex (..., bins), (..., bins).
     """
+    if torch.is_grad_enabled() and (spectrum.requires_grad or matrix.requires_grad):
+        widened, smeared, *_ = _Spread.apply(spectrum, matrix)
+    else:
+        widened, smeared, *_ = _spread(spectrum, matrix)
+    return widened, smeared
+
+
+def _spread(spectrum: Tensor, matrix: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """``spread``'s two; the factor on the spectrum, and the power that it had."""
     given = power(spectrum)
-    smeared, given = (given @ matrix.T).add_(_TINY), given.add_(_TINY)
+    smeared = (given @ matrix.mT).add_(_TINY)
+    # a matrix that is learned keeps what it was multiplied with
+    given = given + _TINY if matrix.requires_grad else given.add_(_TINY)
     quotient = smeared / given
     # the square root of a negative power is imaginary; of 0 it takes long, and beside 1e9 Pa silence counts as nothing
     real, imaginary = quotient.clamp(_TINY, _MOST).sqrt_(), quotient.neg().clamp_(_TINY, _MOST).sqrt_()
     factor = torch.complex(real, imaginary)
-    return spectrum * factor, factor, given, smeared
+    return spectrum * factor, smeared, factor, given
 
 
 class _Spread(torch.autograd.Function):
     """``_spread`` with a gradient of a third of the steps.
 
     Of z = f x with |f|^2 = s / p, s = A p and p = |x|^2, and g the conjugate of f times the gradient at z, it is
-    g + x (A^T e / s - e / p) with e = Re(conj(x) g): with the power of one frequency the factor of others changes.
+    g + x (A^T t - e / p) with e = Re(conj(x) g) and t = e / s + 2 h, h the gradient at s: with the power of one
+    frequency the factor of others changes. That of A is t p^T / 2.
     """
 
     generate_vmap_rule = True
@@ -155,20 +165,30 @@ class _Spread(torch.autograd.Function):
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor], output: tuple[Tensor, ...]) -> None:
-        ctx.mark_non_differentiable(*output[1:])
+        ctx.mark_non_differentiable(*output[2:])
+        ctx.set_materialize_grads(False)  # nobody asks for the power's where signals are smeared alone
         ctx.save_for_backward(*inputs, *output[1:])
 
     @staticmethod
-    def backward(ctx: Any, gradient: Tensor, *others: Tensor) -> tuple[Tensor, None]:
+    def backward(
+        ctx: Any, gradient: Tensor | None, of_power: Tensor | None, *others: None
+    ) -> tuple[Tensor | None, Tensor | None]:
         spectrum, matrix, *made = ctx.saved_tensors
         # where the gradient is differentiated, what is constant here comes from the spectrum anew
-        factor, given, smeared = _spread(spectrum, matrix)[1:] if torch.is_grad_enabled() else made
-        direct = factor.conj() * gradient
+        smeared, factor, given = _spread(spectrum, matrix)[1:] if torch.is_grad_enabled() else made
+        direct = torch.zeros_like(spectrum) if gradient is None else factor.conj() * gradient
         products = torch.view_as_real(spectrum) * torch.view_as_real(direct)
         changed = products[..., 0] + products[..., 1]
         divisor = smeared + torch.copysign(smeared.new_full((), _NEVER), smeared)
-        along = (changed / divisor) @ matrix - changed / given
-        return torch.addcmul(direct, spectrum, along), None
+        toward = changed / divisor
+        if of_power is not None:
+            toward = toward + 2.0 * of_power
+        along = toward @ matrix - changed / given
+        of_matrix = None
+        if ctx.needs_input_grad[1]:
+            every = 0.5 * toward.mT @ given
+            of_matrix = every.sum_to_size(matrix.shape)
+        return torch.addcmul(direct, spectrum, along), of_matrix
 
 
 def _window(step: int) -> Tensor:

@@ -7,6 +7,7 @@ from hlsim.audiogram import FREQUENCIES, SEVERITIES, interpolate, severity_index
 from hlsim.calibration import PASCAL_SPL
 from hlsim.dsp.fft import power
 from hlsim.msbg.recruitment import CATCH_UP_SPL
+from hlsim.neuro.bands import BandCorrection
 from hlsim.neuro.blocks import DualPathBlock
 from hlsim.neuro.config import NEURO_RATE, NeuroConfig
 from hlsim.neuro.decoders import MaskDecoder, PhaseDecoder
@@ -22,11 +23,12 @@ class NeuroMSBG(EarNetwork):
 
     Magnitude, phase and encoded audiogram (Equation 1) enter as three channels, a dense encoder and dual-path blocks
     follow, and two decoders give a mask for the magnitude and a phase; the inverse transform makes a waveform. With
-    ``config.prior``, MSBG's known gains come first and enter as a fourth channel, and the decoders correct them.
+    ``config.prior``, MSBG's known gains come first and enter as a fourth channel, and the decoders correct them; with the
+    structure ``bands`` a smaller network corrects them before they become a mask.
 
     On a CPU, second derivatives and ``torch.func.grad`` work with ``cnn`` and ``lstm`` blocks, the latter alone with
     ``transformer`` blocks, and neither with ``mamba`` blocks; ``torch.vmap``, ``torch.func.jvp`` and forward mode work
-    with none. What does not work raises an error.
+    with the structure ``bands`` alone. What does not work raises an error.
 
     Args:
         config: sizes and choices.
@@ -48,6 +50,12 @@ class NeuroMSBG(EarNetwork):
         super().__init__(sample_rate, full_scale_spl)
         self.config = config = NeuroConfig.given(config)
         self.stft = config.stft
+        # training may run the network, not the physics around it, in bfloat16
+        self.autocast_dtype: torch.dtype | None = None
+        self.prior = Prior(self.stft) if config.prior else None
+        self.bands = BandCorrection(config) if config.structure == "bands" else None
+        if self.bands is not None:
+            return
         frequencies, channels = self.stft.frequencies, config.channels
         monolithic, normalise = config.structure == "monolithic", not config.level_aware
         encoded = config.audiogram == "channel"
@@ -66,12 +74,9 @@ class NeuroMSBG(EarNetwork):
         self.mask_decoder = MaskDecoder(channels, depth, stride, normalise, config.prior)
         predicted = config.phase == "predicted"
         self.phase_decoder = PhaseDecoder(channels, depth, stride, normalise) if predicted else None
-        self.prior = Prior(self.stft) if config.prior else None
         self.severity = nn.Embedding(len(SEVERITIES), channels) if config.prior else None
         if self.severity is not None:
             nn.init.zeros_(self.severity.weight)
-        # training may run the network, not the physics around it, in bfloat16
-        self.autocast_dtype: torch.dtype | None = None
 
     @property
     def _receptive_field(self) -> tuple[int, int] | None:
@@ -82,7 +87,7 @@ class NeuroMSBG(EarNetwork):
 
     @property
     def _dtype(self) -> torch.dtype:
-        return self.mask_decoder.leave.weight.dtype
+        return (self.mask_decoder.leave.weight if self.bands is None else self.bands.enter).dtype
 
     def _process(self, signals: Tensor, ears: Tensor) -> Tensor:
         scale = None
@@ -93,6 +98,8 @@ class NeuroMSBG(EarNetwork):
         if self.prior is not None:
             signals = self.prior.filter(signals, severity)
         spectrum = self.stft.analyse(signals)
+        if self.bands is not None and self.prior is not None:
+            return self.stft.synthesise(self.bands(spectrum, ears, severity, self.prior), signals.shape[-1])
         squared = power(spectrum)
         factor = self.prior(squared, ears, severity) if self.prior is not None else None
         features = self._features(spectrum, squared, ears, factor)

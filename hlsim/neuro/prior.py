@@ -21,15 +21,16 @@ from hlsim.msbg.envelope import envelope_filters
 from hlsim.msbg.filterbank import BANKS, FilterBank, gammatone_response
 from hlsim.msbg.recruitment import CATCH_UP_SPL, expansion_ratios, threshold_weights
 from hlsim.msbg.response import fixed_response
-from hlsim.msbg.smearing import BROADENING, roex_filters, smearing_from_filters
+from hlsim.msbg.smearing import BROADENING, roex_filters, smearing_from_filters, spread
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.torchtools import constant_like
 
 RESPONSE_HALF_LENGTH = 1024
 """Samples at 16 kHz of the fixed responses to either side of zero."""
 
-_CHANNELS = max(bank.channels for bank in BANKS.values())
+CHANNELS = max(bank.channels for bank in BANKS.values())
 _ENVELOPE_HALF_LENGTH = 20  # frames
+_LOG_CATCH_UP = (CATCH_UP_SPL - PASCAL_SPL) / 20.0 * math.log(10.0)
 _TINY = 1e-14
 _WIDEST = 1e16  # of powers, by smearing
 
@@ -104,25 +105,56 @@ class Prior(nn.Module):
 
         Shape: (items, frames, frequencies), (items, 8), (items,) -> complex (items, frames, frequencies).
         """
-        given = powers * self.ear_power
-        identity = torch.eye(given.shape[-1], device=given.device, dtype=given.dtype).unsqueeze(0)
-        smeared = given @ torch.cat((identity, self._corrected("smearing")))[severity].mT
-        widened = _widening(smeared, given)
+        smeared = powers @ self._smearing()[severity].mT
+        level = self.smooth(self.levels(smeared, severity), severity).log()
+        gain = self.log_gain(level, thresholds, severity).exp().mT
+        relative = self._corrected("relative")[:, severity]
+        return torch.complex(gain @ relative[0], gain @ relative[1]) * _widening(smeared, powers)
 
-        level = ((smeared.relu() @ self._corrected("excitation")[severity].mT) + _TINY).sqrt().mT
-        items, channels, frames = level.shape
+    def spread(self, spectrum: Tensor, severity: Tensor) -> tuple[Tensor, Tensor]:
+        """The filtered signal's spectrum, smeared, and its power.
+
+        Shape: complex (items, frames, frequencies), (items,) -> the same, real (items, frames, frequencies).
+        """
+        return spread(spectrum, self._smearing()[severity])
+
+    def levels(self, smeared: Tensor, severity: Tensor) -> Tensor:
+        """Root of the power in each channel. Shape: (items, frames, frequencies) -> (items, channels, frames)."""
+        excitation = self._corrected("excitation") * self.ear_power
+        return ((smeared.relu() @ excitation[severity].mT) + _TINY).sqrt().mT
+
+    def smooth(self, level: Tensor, severity: Tensor, step: int = 1) -> Tensor:
+        """Envelopes at every ``step``-th frame. Shape: (items, channels, frames) -> (items, channels, frames / step)."""
+        items, channels, _ = level.shape
         kernels = self._corrected("smoothing")[severity].reshape(items * channels, 1, -1)
         level = functional.pad(level, (_ENVELOPE_HALF_LENGTH, _ENVELOPE_HALF_LENGTH), mode="replicate")
-        level = functional.conv1d(level.reshape(1, items * channels, -1), kernels, groups=items * channels)
-        level = level.reshape(items, channels, frames).clamp_min(1e-7)
+        level = functional.conv1d(
+            level.reshape(1, items * channels, -1), kernels, stride=step, groups=items * channels
+        )
+        return level.reshape(items, channels, -1).clamp_min(1e-7)
 
-        catch_up = 10.0 ** ((CATCH_UP_SPL - PASCAL_SPL) / 20.0)
+    def log_gain(self, log_level: Tensor, thresholds: Tensor, severity: Tensor) -> Tensor:
+        """Recruitment's, of envelopes. Shape: (items, channels, steps), (items, 8), (items,) -> as the first."""
         # 0 where a bank has fewer channels
         weights = constant_like(thresholds, _threshold_weights)[severity]
         exponents = (expansion_ratios(thresholds, weights) - 1.0).unsqueeze(-1)
-        gain = ((level / catch_up).log().clamp_max(0.0) * exponents).exp().mT
-        relative = self._corrected("relative")[:, severity]
-        return torch.complex(gain @ relative[0], gain @ relative[1]) * widened
+        return (log_level - _LOG_CATCH_UP).clamp_max(0.0) * exponents
+
+    def weigh(self, gain: Tensor, severity: Tensor) -> Tensor:
+        """Factor on the smeared spectrum. Shape: real and imaginary (items, 2 channels, frames) -> complex (items, frames,
+        frequencies)."""
+        real, imaginary = self._corrected("relative")[:, severity]
+        # as one product, whose columns are real and imaginary in turn
+        rows = torch.cat((torch.stack((real, imaginary), -1), torch.stack((-imaginary, real), -1)), 1)
+        return torch.view_as_complex((gain.mT @ rows.flatten(-2)).unflatten(-1, (-1, 2)))
+
+    def _smearing(self) -> Tensor:
+        """Of powers before the way into the ear, which weighs them and is taken off again.
+
+        Shape: -> (severities, frequencies, frequencies).
+        """
+        smearing = self._corrected("smearing") * (self.ear_power / self.ear_power.unsqueeze(-1))
+        return torch.cat((torch.eye(smearing.shape[-1]).to(smearing).unsqueeze(0), smearing))
 
 
 def _widening(smeared: Tensor, given: Tensor) -> Tensor:
@@ -168,4 +200,4 @@ def _threshold_weights() -> NDArray[np.float64]:
 
 
 def _padded(rows: NDArray[np.generic]) -> NDArray[np.generic]:
-    return np.pad(rows, ((0, _CHANNELS - len(rows)), (0, 0)))
+    return np.pad(rows, ((0, CHANNELS - len(rows)), (0, 0)))

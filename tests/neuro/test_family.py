@@ -40,6 +40,8 @@ KINDS = {
     "concatenated monolithic": {"audiogram": "concatenated", "structure": "monolithic", "prior": False},
     "normalised": {"level_aware": False, "prior": False, "dense_depth": 2},
     "normalised with prior": {"level_aware": False},
+    "bands": {"structure": "bands"},
+    "bands magnitude only": {"structure": "bands", "phase": "input"},
 }
 
 

@@ -258,11 +258,12 @@ def test_an_impaired_ear_expands(trained: NeuroMSBG, clips: Tensor) -> None:
         assert least < growth < most
 
 
+@pytest.mark.parametrize("checkpoint", ["neuro-msbg", "neuro-msbg-light"])
 @pytest.mark.parametrize(
     ("name", "least"), [("NH", 30.0), ("N1", 26.0), ("N2", 22.0), ("S1", 22.0), ("N3", 16.0)]
 )
-def test_trained_is_near_msbg(trained: NeuroMSBG, clips: Tensor, name: str, least: float) -> None:
-    ear = Audiogram.standard(name)
+def test_trained_is_near_msbg(checkpoint: str, clips: Tensor, name: str, least: float) -> None:
+    trained, ear = load_pretrained(checkpoint), Audiogram.standard(name)
     with torch.no_grad():
         truth = MSBG(ear, sample_rate=16000)(clips)
         snr = -noise_to_signal_db(trained(clips, ear), truth)
