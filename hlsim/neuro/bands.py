@@ -16,12 +16,13 @@ _STEEPEST = 6.0
 class BandCorrection(nn.Module):
     """What is heard of a spectrum: smeared, and each channel weighed by a corrected gain.
 
-    A network reads how the channels' levels fluctuate about their envelopes, and how these differ from channel to channel,
-    which does not change with the level. It gives each channel's envelope a correction, its gain a factor, and a phase.
+    A network reads how the channels' levels fluctuate about their envelopes, and how these differ from channel to
+    channel, which does not change with the level. It gives each channel's envelope a correction, its gain a factor, and a phase.
     Each severity has filters of its own, hence its own first and last layer; both correct nothing before training.
 
     Args:
-        config: ``channels`` is the width, ``blocks`` how many, ``kernel[0]`` their length in steps of ``stride[0]`` frames.
+        config: ``channels`` is the width, ``blocks`` how many, ``kernel[0]`` their length in steps of ``stride[0]``
+            frames.
     """
 
     def __init__(self, config: NeuroConfig) -> None:
@@ -36,7 +37,7 @@ class BandCorrection(nn.Module):
         self.leave = nn.Parameter(torch.zeros(severities, outputs, width))
 
     def forward(self, spectrum: Tensor, ears: Tensor, severity: Tensor, prior: Prior) -> Tensor:
-        """Shape: complex (items, frames, frequencies), (items, 8) dB HL, (items,) -> complex (items, frames, frequencies)."""
+        """Shape: complex (items, frames, frequencies), (items, 8) dB HL, (items,) -> as the first."""
         widened, smeared = prior.spread(spectrum, severity)
         given = prior.levels(smeared, severity)
         level = prior.smooth(given, severity, self.step).log()

@@ -145,8 +145,8 @@ class NeuroConfig(NetworkConfig):
 
     Attributes:
         structure: ``dual-path``, or ``monolithic``: no encoder and no frequency axis, each frame one vector of
-            ``channels``, blocks along time only (the paper's baselines); or ``bands``: a network along time that corrects the
-            prior's gains (``hlsim.neuro.bands``), at a third of the cost.
+            ``channels``, blocks along time only (the paper's baselines); or ``bands``: a network along time that
+            corrects the prior's gains (``hlsim.neuro.bands``), at a third of the cost.
         audiogram: encoded as an input ``channel`` (Equation 1), or its eight levels ``concatenated`` to magnitude and
             phase along frequency (the paper's Table IV).
         phase: ``predicted``, or the ``input``'s reused: magnitude only (the paper's Table III).
@@ -175,8 +175,8 @@ class NeuroConfig(NetworkConfig):
                 raise ValueError(f"{name} {getattr(self, name)!r}; allowed: true or false")
         if self.structure == "bands" and not (self.prior and self.level_aware and self.block == "cnn"):
             raise ValueError(
-                f"structure 'bands' with prior {self.prior}, level_aware {self.level_aware}, block {self.block!r}; allowed: "
-                "true, true, 'cnn'"
+                f"structure 'bands' with prior {self.prior}, level_aware {self.level_aware}, block {self.block!r}; "
+                "allowed: true, true, 'cnn'"
             )
 
     @property

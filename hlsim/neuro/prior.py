@@ -141,8 +141,10 @@ class Prior(nn.Module):
         return (log_level - _LOG_CATCH_UP).clamp_max(0.0) * exponents
 
     def weigh(self, gain: Tensor, severity: Tensor) -> Tensor:
-        """Factor on the smeared spectrum. Shape: real and imaginary (items, 2 channels, frames) -> complex (items, frames,
-        frequencies)."""
+        """Factor on the smeared spectrum.
+
+        Shape: real and imaginary (items, 2 channels, frames) -> complex (items, frames, frequencies).
+        """
         real, imaginary = self._corrected("relative")[:, severity]
         # as one product, whose columns are real and imaginary in turn
         rows = torch.cat((torch.stack((real, imaginary), -1), torch.stack((-imaginary, real), -1)), 1)
