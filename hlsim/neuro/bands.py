@@ -17,8 +17,8 @@ class BandCorrection(nn.Module):
     """What is heard of a spectrum: smeared, and each channel weighed by a corrected gain.
 
     A network reads how the channels' levels fluctuate about their envelopes, and how these differ from channel to
-    channel, which does not change with the level. It gives each channel's envelope a correction, its gain a factor, and a phase.
-    Each severity has filters of its own, hence its own first and last layer; both correct nothing before training.
+    channel, which does not change with the level. It gives each channel's envelope a correction, its gain a factor, and
+    a phase. Each severity has filters of its own, hence its own first and last layer; the last is 0 before training.
 
     Args:
         config: ``channels`` is the width, ``blocks`` how many, ``kernel[0]`` their length in steps of ``stride[0]``
