@@ -35,7 +35,7 @@ class HearingAid(Wearable):
 
     Args:
         config: sizes and choices.
-        sample_rate, full_scale_spl: as ``Wearable``.
+        sample_rate, full_scale_spl, linked: as ``Wearable``.
 
     Raises:
         ValueError: a rate or level out of range, or a configuration of another kind.
@@ -49,8 +49,9 @@ class HearingAid(Wearable):
         *,
         sample_rate: int = 16000,
         full_scale_spl: float = PASCAL_SPL,
+        linked: bool = False,
     ) -> None:
-        super().__init__(sample_rate, full_scale_spl)
+        super().__init__(sample_rate, full_scale_spl, linked)
         self.config = config = HearingAidConfig.given(config)
         self.bands, self.limit_spl = config.bands, config.limit_spl
         width, corrections = config.width, nn.Linear(config.width, config.bands)

@@ -7,6 +7,7 @@ from compensators.config import HearingAidConfig, MappingConfig
 from compensators.mapping import MappingCompensator
 from compensators.nalr import NALR
 from compensators.wdrc import WDRC
+from compensators.wearable import Wearable
 from hlsim import __version__
 from hlsim.audiogram import Audiogram
 from hlsim.calibration import PASCAL_SPL
@@ -37,7 +38,11 @@ def build_compensator(
 
 
 def load_compensator(
-    name: str | Path, *, sample_rate: int = NEURO_RATE, full_scale_spl: float = PASCAL_SPL
+    name: str | Path,
+    *,
+    sample_rate: int = NEURO_RATE,
+    full_scale_spl: float = PASCAL_SPL,
+    linked: bool = False,
 ) -> Trained | NALR | WDRC:
     """A compensator, frozen and in eval mode. Nothing is downloaded.
 
@@ -46,10 +51,21 @@ def load_compensator(
             checkpoint folder. One that was trained for one ear is meant for no other: see ``trained_for``.
         sample_rate: of its inputs and outputs in Hz, 16000 to 48000.
         full_scale_spl: level in dB SPL of RMS 1.0.
+        linked: a hearing aid's or WDRC's gains are linked between the ears, see ``compensators.wearable``.
 
     Raises:
-        ValueError: no such checkpoint, one of another kind, or one that has changed since it was saved.
+        ValueError: no such checkpoint, one of another kind, one that has changed since it was saved, or ``linked`` of one
+            that cannot.
     """
+    loaded = _load(name, sample_rate, full_scale_spl)
+    if linked and not isinstance(loaded, Wearable):
+        raise ValueError(f"{name} links no gains between ears; allowed: wdrc, or a hearing aid")
+    if isinstance(loaded, Wearable):
+        loaded.linked = linked
+    return loaded
+
+
+def _load(name: str | Path, sample_rate: int, full_scale_spl: float) -> Trained | NALR | WDRC:
     if kind := _UNTRAINED.get(str(name)):
         return kind(sample_rate=sample_rate, full_scale_spl=full_scale_spl).eval()
 

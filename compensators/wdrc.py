@@ -29,7 +29,7 @@ class WDRC(Wearable):
     more make one dB more of output; ``ratio`` is 1 up to 10 dB HL, 1 more for every 40 dB, and 3 at most.
 
     Args:
-        sample_rate, full_scale_spl: as ``Wearable``.
+        sample_rate, full_scale_spl, linked: as ``Wearable``.
         bands: an equal number of ERBs apart, but no less than 125 Hz; 4 to 40.
         attack, release: time constants in seconds; 0 to 1, and 0.01 to 2.
         knee: of the compression in dB below average speech of 65 dB SPL, in its band.
@@ -49,8 +49,9 @@ class WDRC(Wearable):
         release: float = 0.1,
         knee: float = 20.0,
         limit_spl: float = 110.0,
+        linked: bool = False,
     ) -> None:
-        super().__init__(sample_rate, full_scale_spl)
+        super().__init__(sample_rate, full_scale_spl, linked)
         ranges = {
             "bands": (bands, 4, 40),
             "attack": (attack, 0.0, 1.0),

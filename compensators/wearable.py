@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from compensators.bands import DELAY, HISTORY, HOP, RATE, apply_gains, frame_power, gain_at_rate
 from compensators.limiter import soft_limit
 from compensators.stream import Slider, State, Stream
-from hlsim.audiogram import FREQUENCIES, AudiogramLike, resolve_thresholds
+from hlsim.audiogram import FREQUENCIES, AudiogramLike, check_two_ears, resolve_thresholds
 from hlsim.calibration import PASCAL_SPL, check_full_scale, gain_to_pascals
 from hlsim.checks import check_rate, check_waveform, is_finite
 from hlsim.dsp.resample import resample
@@ -32,17 +32,20 @@ class Wearable(nn.Module):
         sample_rate: of inputs and outputs in Hz, 16000 to 48000. The bands end at 8 kHz; what faster input has above gets
             the gain of the highest, and only whole signals go through: resampling looks 8.5 ms farther ahead.
         full_scale_spl: level in dB SPL of RMS 1.0.
+        linked: of two ears, (..., 2, time), the mean power at both sets the gains of each: ears that are fitted alike get
+            the same gains, so that differences of level between them stay. The limit of the output is each ear's own.
 
     Raises:
-        ValueError: a rate or level out of range.
+        ValueError: a rate or level out of range; of a call, with ``linked``, another shape.
     """
 
     SLIDERS: tuple[str, ...] = ()
     bands: int
     limit_spl: float
 
-    def __init__(self, sample_rate: int, full_scale_spl: float) -> None:
+    def __init__(self, sample_rate: int, full_scale_spl: float, linked: bool = False) -> None:
         super().__init__()
+        self.linked = linked
         self.sample_rate = check_rate(sample_rate)
         self.full_scale_spl = check_full_scale(full_scale_spl)
 
@@ -82,6 +85,8 @@ class Wearable(nn.Module):
         """
         padded = torch.cat((state["past"], samples), -1)
         powers = frame_power(padded)
+        if self.linked:
+            powers = powers.unflatten(0, (-1, 2)).mean(1).repeat_interleave(2, 0)
         gliding = _glide(state["gliding"], sliders, powers.shape[1])
         gains_db, kept = self.control(powers, fitted, gliding, state)
         gains = torch.cat((state["gains"], 10.0 ** (gains_db / 20.0) - 1.0), 1)
@@ -153,6 +158,7 @@ class Wearable(nn.Module):
         own = next((weight.dtype for weight in self.parameters()), waveform.dtype)
         dtype = torch.promote_types(own, torch.float32)
         batch = torch.broadcast_shapes(waveform.shape[:-1], thresholds.shape[:-1])
+        check_two_ears(self.linked, waveform)
         settings = [
             check_slider(name, slider, batch).to(thresholds).expand(batch)
             for name, slider in zip(self.SLIDERS, sliders, strict=True)

@@ -54,6 +54,16 @@ def test_nalr_by_name() -> None:
     assert isinstance(load_compensator(Path("nalr")), NALR)
 
 
+def test_linked_gains_by_name() -> None:
+    for name in ("wdrc", "hearing-aid"):
+        assert load_compensator(name, linked=True).linked and not load_compensator(name).linked
+    for name in ("nalr", "compensator-general"):
+        with pytest.raises(
+            ValueError, match=f"{name} links no gains between ears; allowed: wdrc, or a hearing"
+        ):
+            load_compensator(name, linked=True)
+
+
 def test_the_ear_that_a_compensator_was_trained_for(tmp_path: Path) -> None:
     model, ear = MappingCompensator(MappingConfig(channels=8, blocks=1)), Audiogram.standard("N4")
     for name, about in (("one", {"audiogram": ear.to_dict()}), ("all", {"audiogram": None}), ("old", {})):

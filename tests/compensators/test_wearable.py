@@ -8,10 +8,11 @@ import torch
 
 from compensators import WDRC, HearingAid
 from compensators.wearable import Wearable
-from hlsim import Audiogram
+from hlsim import Audiogram, Listener
 from hlsim.audiogram import draw_thresholds
 from hlsim.calibration import level_spl, set_level
 from hlsim.dsp.resample import resample
+from hlsim.metrics.interaural import interaural_change
 
 EAR = Audiogram.standard("N3")
 FIVE_MS = 80
@@ -177,6 +178,27 @@ def test_recovers_within_three_tenths_of_a_second(make: Make, what: str) -> None
     end = (8800 if what == "slam" else 8001) + 4800
     levels = [level_spl(aid(signal, EAR)[end : end + 1600]) for signal in (steady, struck)]
     assert (levels[0] - levels[1]).abs() < 3.0
+
+
+@AIDS
+def test_linked_gains_keep_levels_between_the_ears(make: Make, noise: torch.Tensor) -> None:
+    scene = torch.stack((0.06 * noise[0], 0.02 * noise[0]))  # under the limit of the output
+    alone, aid = make(), make(linked=True)
+    for module, kept in ((alone, False), (aid, True)):
+        change = interaural_change(scene, module(scene, Listener(EAR, EAR))).level
+        assert bool((change.abs() < 0.1).all()) is kept
+    same = scene[:1].expand(2, -1)  # of equal signals the mean is each one's own
+    uneven = Listener(EAR, Audiogram.standard("N4"))
+    torch.testing.assert_close(aid(same, uneven), alone(same, uneven))
+    items = torch.stack((scene, same))
+    together = aid(items, [Listener(EAR, EAR), uneven])
+    torch.testing.assert_close(together, torch.stack((aid(scene, EAR), aid(same, uneven))), atol=1e-5, rtol=0)
+    stream = aid.stream(Listener(EAR, EAR))
+    late = torch.cat((stream(scene[:, :4001]), stream(scene[:, 4001:]), stream.flush()), -1)[:, aid.latency :]
+    torch.testing.assert_close(late, aid(scene, EAR), atol=1e-5, rtol=0)
+    for mono in (noise[0], noise[:1]):
+        with pytest.raises(ValueError, match=r"two ears; allowed: \(\.\.\., 2, time\)"):
+            aid(mono, EAR)
 
 
 @AIDS
