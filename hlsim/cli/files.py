@@ -10,7 +10,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from hlsim.cli.inputs import check_files, check_folders, read_compensator, read_ear, read_simulator
+from hlsim.cli.inputs import check_files, check_folders, read_compensator, read_ears, read_simulator
 from hlsim.cli.options import Parser
 
 if TYPE_CHECKING:
@@ -27,7 +27,7 @@ def simulate(parser: Parser) -> None:
         parser,
         _simulate,
         "speech.wav heard.wav --audiogram N3",
-        "speech heard --audiogram 20,25,30,40,50,55,60,65 --simulator msbg",
+        "scenes heard --listener listeners.json:L0001 --simulator msbg",
     )
     parser.option("--simulator", str, "msbg (exact), or a checkpoint's name or folder", "neuro-msbg")
 
@@ -45,6 +45,10 @@ def compensate(parser: Parser) -> None:
     )
     parser.option("--compensator", str, text, "hearing-aid")
     parser.sliders()
+    parser.flag(
+        "--linked",
+        "the level of both channels of a stereo file sets the gains of each: of a hearing aid or wdrc",
+    )
 
 
 def _in_and_out(parser: Parser, run: Callable[[argparse.Namespace], None], *examples: str) -> None:
@@ -53,7 +57,13 @@ def _in_and_out(parser: Parser, run: Callable[[argparse.Namespace], None], *exam
     parser.option("input", Path, text, metavar="IN")
     text = "wav (32-bit float), flac, or ogg, which takes two channels; for a folder one that takes wav files alike"
     parser.option("output", Path, text, metavar="OUT")
-    parser.audiogram(required=True)
+    ears = parser.add_mutually_exclusive_group(required=True)
+    parser.audiogram(group=ears)
+    text = (
+        "two ears, of stereo files, left first: a CSV file with columns listener, ear (left or right), hl_250, ..., or "
+        "Clarity's listeners.json; FILE:NAME of one with several listeners"
+    )
+    parser.option("--listener", str, text, group=ears, metavar="FILE[:NAME]")
     parser.full_scale()
 
 
@@ -95,7 +105,7 @@ def _pass_through(
     else:
         _check_ending(options.output)
         check_files(options.input, options.output)
-    ear = read_ear(options.audiogram)
+    ear = read_ears(options)
     import torch
 
     from hlsim.audio import check_channels, read_audio, write_audio
@@ -110,6 +120,11 @@ def _pass_through(
         try:
             waveform, rate = read_audio(source, any_rate=True)
             check_channels(target, waveform.shape[0])
+            if waveform.shape[0] != 2 and (options.listener or getattr(options, "linked", False)):
+                asked = "--listener" if options.listener else "--linked"
+                raise ValueError(
+                    f"{source}: {waveform.shape[0]} channels; allowed with {asked}: 2, left and right"
+                )
             inner = min(rate, HIGHEST_RATE)
             if inner not in models:
                 models[inner] = build(inner, not models)

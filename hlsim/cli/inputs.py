@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     import torch
 
     from hlsim.audiogram import Audiogram
+    from hlsim.listener import Listener
 
 
 _LONGEST_NAME = 220  # bytes: 255, less what a file is called until it is whole
@@ -82,6 +83,29 @@ def read_ear(text: str) -> Audiogram:
         raise ValueError(f"--audiogram {text}: {error}") from error
 
 
+def read_ears(options: argparse.Namespace) -> Audiogram | Listener:
+    """The ear that ``--audiogram`` holds, or the two of the listener that ``--listener`` names."""
+    text = options.listener
+    if text is None:
+        return read_ear(options.audiogram)
+    from hlsim.listener import read_listeners
+
+    file, _, name = (text, "", "") if Path(text).exists() else text.rpartition(":")
+    listeners = read_listeners(file or text)
+    chosen = next(iter(listeners.values())) if not name and len(listeners) == 1 else listeners.get(name)
+    if chosen is None:
+        few = ", ".join([*listeners][:5]) + (", ..." if len(listeners) > 5 else "")
+        found = f"no listener {name!r}" if name else f"{len(listeners)} listeners"
+        raise ValueError(f"--listener {text}: {found}; allowed: {file or text}:NAME, with a NAME of {few}")
+    for gone, there in (("left", "right"), ("right", "left")):
+        if getattr(chosen, gone) is None:
+            raise ValueError(
+                f"--listener {text}: the {gone} ear is missing; allowed: a listener with both, or --audiogram with the "
+                f"{there} ear's levels and a file of that channel"
+            )
+    return chosen
+
+
 def other_ear(label: str, name: str, ear: Audiogram | None) -> list[str]:
     """What there is to say of a compensator that was trained for one ear and is given another, or several (None)."""
     from compensators import trained_for
@@ -100,8 +124,10 @@ def read_compensator(
     from compensators import load_compensator
 
     name = options.compensator
-    compensator = load_compensator(name, sample_rate=sample_rate, full_scale_spl=options.full_scale_spl)
-    for line in other_ear(name, name, read_ear(options.audiogram)) if warn else ():
+    settings = {"sample_rate": sample_rate, "full_scale_spl": options.full_scale_spl}
+    compensator = load_compensator(name, **settings, linked=getattr(options, "linked", False))
+    ear = read_ear(options.audiogram) if options.audiogram else None
+    for line in other_ear(name, name, ear) if warn else ():
         print(f"hlsim: warning: {line}", file=sys.stderr)
     names = ("noise_reduction", "amplification")
     sliders = {given: value for given in names if (value := getattr(options, given)) is not None}

@@ -17,8 +17,9 @@ from compensators import (
     load_compensator,
     save_compensator,
 )
-from hlsim import MSBG, Audiogram
-from hlsim.audio import read_audio
+from hlsim import MSBG, Audiogram, Listener
+from hlsim.audio import read_audio, write_audio
+from hlsim.audiogram import FREQUENCIES
 from hlsim.cli.main import main
 from hlsim.pretrained import save_checkpoint
 
@@ -137,6 +138,55 @@ def test_compensate_is_the_compensator(tmp_path: Path, utterance: Path) -> None:
     np.testing.assert_allclose(aided, expected.numpy(), atol=1e-7)
     assert np.std(aided) > 1.5 * np.std(samples)
     assert main([*call, "N7"]) == 0  # which no simulator takes
+
+
+def listeners_csv(folder: Path, *listeners: tuple[str, Listener]) -> Path:
+    rows = [row for name, listener in listeners for row in listener.to_rows(name)]
+    lines = [",".join(rows[0]), *(",".join(row.values()) for row in rows)]
+    (folder / "ears.csv").write_text("\n".join(lines))
+    return folder / "ears.csv"
+
+
+def test_two_ears_of_a_stereo_file(tmp_path: Path, utterance: Path) -> None:
+    waveform, rate = read_audio(utterance)
+    scene, out = torch.cat((waveform, 0.3 * waveform))[:, :rate], tmp_path / "out.wav"
+    write_audio(tmp_path / "in.wav", scene, rate)
+    both = Listener(Audiogram.standard("N2"), Audiogram.standard("N4"))
+    names = {"audiogram_levels_l": both.left, "audiogram_levels_r": both.right}
+    entry = {key: ear.levels for key, ear in names.items() if ear} | {"audiogram_cfs": FREQUENCIES}
+    (tmp_path / "listeners.json").write_text(json.dumps({"L1": entry, "L2": entry}))
+    heard = MSBG(both, sample_rate=rate)(scene)
+    aided = load_compensator("wdrc", sample_rate=rate, linked=True)(scene, both)
+    for command, listener, expected in (
+        (["simulate", "--simulator", "msbg"], listeners_csv(tmp_path, ("a", both)), heard),
+        (["compensate", "--compensator", "wdrc", "--linked"], f"{tmp_path / 'listeners.json'}:L2", aided),
+    ):
+        assert main([*command, str(tmp_path / "in.wav"), str(out), "--listener", str(listener)]) == 0
+        torch.testing.assert_close(read_audio(out)[0], expected, atol=1e-6, rtol=1e-5)
+
+
+def test_listeners_that_a_file_cannot_be_given_to(
+    tmp_path: Path, utterance: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    ear = Audiogram.standard("N3")
+    path = listeners_csv(tmp_path, ("a", Listener(ear, ear)), ("b", Listener(None, ear)))
+    call = ["compensate", utterance, tmp_path / "out.wav"]
+    for listener, said in (
+        (path, f"ears.csv: 2 listeners; allowed: {path}:NAME, with a NAME of a, b"),
+        (f"{path}:c", f"no listener 'c'; allowed: {path}:NAME, with a NAME of a, b"),
+        (
+            f"{path}:b",
+            "the left ear is missing; allowed: a listener with both, or --audiogram with the right ear's",
+        ),
+        (f"{path}:a", f"{utterance}: 1 channels; allowed with --listener: 2, left and right"),
+        (tmp_path / "none.csv", "none.csv: cannot read audiograms: "),
+    ):
+        assert said in fails(capsys, *call, "--listener", listener)
+    assert "1 channels; allowed with --linked: 2" in fails(capsys, *call, "--audiogram", "N3", "--linked")
+    mapping = ("--linked", "--compensator", "nalr")
+    assert "nalr links no gains" in fails(capsys, *call, "--audiogram", "N3", *mapping)
+    assert "not allowed with" in refused(capsys, *call, "--audiogram", "N3", "--listener", path)
+    assert not (tmp_path / "out.wav").exists()
 
 
 @pytest.mark.parametrize(("ear", "warned"), [("N4", 0), ("N3", 1)])
