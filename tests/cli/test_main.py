@@ -183,8 +183,10 @@ def test_listeners_that_a_file_cannot_be_given_to(
     ):
         assert said in fails(capsys, *call, "--listener", listener)
     assert "1 channels; allowed with --linked: 2" in fails(capsys, *call, "--audiogram", "N3", "--linked")
-    mapping = ("--linked", "--compensator", "nalr")
-    assert "nalr links no gains" in fails(capsys, *call, "--audiogram", "N3", *mapping)
+    write_audio(tmp_path / "in.wav", torch.ones(2, 4000), 16000)
+    call[1] = tmp_path / "in.wav"
+    linked = ("--linked", "--compensator", "nalr")
+    assert "nalr links no gains" in fails(capsys, *call, "--audiogram", "N3", *linked)
     assert "not allowed with" in refused(capsys, *call, "--audiogram", "N3", "--listener", path)
     assert not (tmp_path / "out.wav").exists()
 
