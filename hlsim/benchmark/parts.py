@@ -38,18 +38,21 @@ def training_step(*, device: str = "cpu", repeats: int = 5) -> tuple[list[dict[s
     generator = torch.Generator().manual_seed(0)
     clean = set_level(torch.randn(8, 2 * NEURO_RATE, generator=generator), 65.0).to(place)
     compensator = MappingCompensator().to(place).train()
-    loss = HearingLossLoss(ear).to(place)
-    exact = HearingLossLoss(ear, simulator="msbg").to(place)
     leaf = clean.clone().requires_grad_()
-    parts: dict[str, Callable[[], Tensor]] = {
-        "compensator": lambda: compensator(clean, ear).square().sum(),
-        "HearingLossLoss (neuro-msbg)": lambda: loss(leaf, clean),
-        "- its simulator (neuro-msbg)": lambda: loss.simulator(leaf, ear).square().sum(),
-        "HearingLossLoss (msbg)": lambda: exact(leaf, clean),
-        "- its simulator (msbg)": lambda: exact.simulator(leaf, ear).square().sum(),
-        "whole step (neuro-msbg)": lambda: loss(compensator(clean, ear), clean),
-        "whole step (msbg)": lambda: exact(compensator(clean, ear), clean),
-    }
+
+    def square(waveform: Tensor) -> Tensor:
+        return waveform.square().sum()
+
+    parts: dict[str, Callable[[], Tensor]] = {"compensator": lambda: square(compensator(clean, ear))}
+    for name in ("neuro-msbg", "neuro-msbg-light", "msbg"):
+        loss = HearingLossLoss(ear, simulator=name).to(place)
+        parts |= {
+            f"HearingLossLoss ({name})": partial(loss, leaf, clean),
+            f"- its simulator ({name})": partial(
+                lambda simulator: square(simulator(leaf, ear)), loss.simulator
+            ),
+            f"whole step ({name})": partial(lambda loss: loss(compensator(clean, ear), clean), loss),
+        }
     return rows_by_turns(parts, place, repeats)
 
 

@@ -122,15 +122,19 @@ def _widen(frames: Tensor, window: Tensor, matrix: Tensor) -> Tensor:
     return torch.fft.irfft(spectrum, len(window))[..., :half] * window[:half]
 
 
-def spread(spectrum: Tensor, matrix: Tensor) -> tuple[Tensor, Tensor]:
+def spread(spectrum: Tensor, matrix: Tensor, least: float = 0.0) -> tuple[Tensor, Tensor]:
     """The spectrum with its power smeared and its phase kept, and that power.
 
     Silence counts as a power of 1e-24 Pa^2, and stays as it is.
 
     Shape: complex (..., bins), (bins, bins) or one an item (items, bins, bins) -> complex (..., bins), (..., bins).
+
+    Args:
+        least: gradients are held to those of powers that smearing divides or multiplies by 1 / ``least`` at most; with 0
+            they have no bound where it turns a power's sign, or fills what was empty.
     """
     if torch.is_grad_enabled() and (spectrum.requires_grad or matrix.requires_grad):
-        widened, smeared, *_ = _Spread.apply(spectrum, matrix)
+        widened, smeared, *_ = _Spread.apply(spectrum, matrix, least)
     else:
         widened, smeared, *_ = _spread(spectrum, matrix)
     return widened, smeared
@@ -160,35 +164,43 @@ class _Spread(torch.autograd.Function):
     generate_vmap_rule = True
 
     @staticmethod
-    def forward(spectrum: Tensor, matrix: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def forward(spectrum: Tensor, matrix: Tensor, least: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         return _spread(spectrum, matrix)
 
     @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor], output: tuple[Tensor, ...]) -> None:
+    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor, float], output: tuple[Tensor, ...]) -> None:
+        ctx.least = inputs[2]
         ctx.mark_non_differentiable(*output[2:])
         ctx.set_materialize_grads(False)  # nobody asks for the power's where signals are smeared alone
-        ctx.save_for_backward(*inputs, *output[1:])
+        ctx.save_for_backward(*inputs[:2], *output[1:])
 
     @staticmethod
     def backward(
         ctx: Any, gradient: Tensor | None, of_power: Tensor | None, *others: None
-    ) -> tuple[Tensor | None, Tensor | None]:
+    ) -> tuple[Tensor | None, Tensor | None, None]:
         spectrum, matrix, *made = ctx.saved_tensors
         # where the gradient is differentiated, what is constant here comes from the spectrum anew
         smeared, factor, given = _spread(spectrum, matrix)[1:] if torch.is_grad_enabled() else made
         direct = torch.zeros_like(spectrum) if gradient is None else factor.conj() * gradient
         products = torch.view_as_real(spectrum) * torch.view_as_real(direct)
         changed = products[..., 0] + products[..., 1]
-        divisor = smeared + torch.copysign(smeared.new_full((), _NEVER), smeared)
+        if ctx.least:
+            size = smeared.abs()
+            divisor = torch.copysign(torch.maximum(size, ctx.least * given), smeared)
+            held = (given / (ctx.least * size + _NEVER)).clamp_max(1.0).sqrt()
+        else:
+            divisor, held = smeared + torch.copysign(smeared.new_full((), _NEVER), smeared), None
         toward = changed / divisor
         if of_power is not None:
             toward = toward + 2.0 * of_power
+        if held is not None:
+            direct, changed = direct * held, changed * held
         along = toward @ matrix - changed / given
         of_matrix = None
         if ctx.needs_input_grad[1]:
             every = 0.5 * toward.mT @ given
             of_matrix = every.sum_to_size(matrix.shape)
-        return torch.addcmul(direct, spectrum, along), of_matrix
+        return torch.addcmul(direct, spectrum, along), of_matrix, None
 
 
 def _window(step: int) -> Tensor:

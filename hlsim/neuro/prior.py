@@ -32,6 +32,7 @@ CHANNELS = max(bank.channels for bank in BANKS.values())
 _ENVELOPE_HALF_LENGTH = 20  # frames
 _LOG_CATCH_UP = (CATCH_UP_SPL - PASCAL_SPL) / 20.0 * math.log(10.0)
 _TINY = 1e-14
+_LEAST = 1e-4  # 40 dB by which smearing changes a power at most, for its gradient
 _WIDEST = 1e16  # of powers, by smearing
 
 # By how much MSBG's envelope of speech is lower than a sinusoid's of the same power, since it fluctuates and smeared
@@ -116,7 +117,7 @@ class Prior(nn.Module):
 
         Shape: complex (items, frames, frequencies), (items,) -> the same, real (items, frames, frequencies).
         """
-        return spread(spectrum, self._smearing()[severity])
+        return spread(spectrum, self._smearing()[severity], _LEAST)
 
     def levels(self, smeared: Tensor, severity: Tensor) -> Tensor:
         """Root of the power in each channel. Shape: (items, frames, frequencies) -> (items, channels, frames)."""
