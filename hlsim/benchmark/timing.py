@@ -7,6 +7,7 @@ a busy machine; it makes two uncounted calls before each count, waits for the cu
 from __future__ import annotations
 
 import contextlib
+import gc
 import os
 import platform
 import statistics
@@ -40,6 +41,7 @@ def peak_mib(call: Call, device: torch.device) -> float | None:
         held = torch.cuda.memory_allocated(device)
         finish(call, device)
         return (torch.cuda.max_memory_allocated(device) - held) / 2**20
+    gc.collect()  # what was left behind and freed during the call would hide as much of the call's own
     try:
         # the most that was held so far becomes what is held
         Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
