@@ -58,7 +58,7 @@ def _evaluate_simulator(options: argparse.Namespace) -> None:
     done = evaluate_simulators(simulators, **passed(options, evaluate_simulators, **instead))
     write_fidelity(done.result, done.heard, done.shown, options.out)
     print((options.out / "fidelity.md").read_text(encoding="utf-8"))
-    _tell_page(options.out / "fidelity.html")
+    tell_page(options.out / "fidelity.html")
 
 
 def evaluate_compensator(parser: Parser) -> None:
@@ -95,13 +95,13 @@ def _evaluate_compensator(options: argparse.Namespace) -> None:
     if options.audiogram and options.gain_ears != GAIN_EARS:
         raise ValueError("--gain-ears with --audiogram; allowed: without it, for that ear's gains are drawn")
     need("eval", "pandas", "matplotlib")
-    _need_engine(options.engine)
+    need_engine(options.engine)
     check_there(folders=(options.speech, options.noise), files=(options.audiograms,))
     from compensators import load_compensator
     from hlsim.evaluation.compensators import evaluate_compensators
     from hlsim.report.compensators import write_compensators
 
-    named = dict(map(_labelled, options.names))
+    named = dict(map(labelled, options.names))
     if len(named) < len(options.names):
         raise ValueError(f"compensators {', '.join(options.names)}; allowed: one a label")
     loaded = {label: load_compensator(name) for label, name in named.items()}
@@ -117,19 +117,19 @@ def _evaluate_compensator(options: argparse.Namespace) -> None:
     print(text.read_text(encoding="utf-8"))
     if failed := len(done.result["failures"]):
         print(f"hlsim: {failed} outputs could not be judged; the reasons are in {text}", file=sys.stderr)
-    _tell_page(options.out / "compensators.html")
+    tell_page(options.out / "compensators.html")
 
 
-def _tell_page(path: Path) -> None:
+def tell_page(path: Path) -> None:
     print(f"The page: {path}")
 
 
-def _need_engine(engine: str) -> None:
+def need_engine(engine: str) -> None:
     if engine == "pyclarity":
         need("pyclarity", "clarity")
 
 
-def _labelled(text: str) -> tuple[str, str]:
+def labelled(text: str) -> tuple[str, str]:
     """Label and name; a folder by itself is called by its path."""
     label, sign, name = text.partition("=")
     return (text, text) if Path(text).exists() or not (sign and label) else (label, name)
@@ -175,7 +175,7 @@ def _haspi_report(options: argparse.Namespace) -> None:
     measures = [name.strip() for name in options.measures.split(",")]
     need("eval", "joblib", "matplotlib")
     if {"haspi", "hasqi"} & {*measures}:
-        _need_engine(options.engine)
+        need_engine(options.engine)
     check_there(
         folders=(options.clean, options.before, options.after, options.root),
         files=(options.manifest, options.audiograms),
@@ -196,4 +196,4 @@ def _haspi_report(options: argparse.Namespace) -> None:
         all_ = failed + sum(len(own) for item in report.items for own in item.scores.values())
         text = f"{failed} of {all_} scores could not be made; the reasons are in {options.out / 'report.md'}"
         print(f"hlsim: {text}", file=sys.stderr)
-    _tell_page(options.out / "report.html")
+    tell_page(options.out / "report.html")

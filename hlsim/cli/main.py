@@ -40,6 +40,10 @@ COMMANDS = {
         "evaluation",
         "HASPI (HASQI, STOI, PESQ) before and after a treatment, with paired tests",
     ),
+    "clarity": (
+        "clarity",
+        "judge pairs of aids on scenes of Clarity's challenges: the better ear's HASPI and HASQI",
+    ),
     "benchmark": ("benchmark", "time simulators, a training step and the scan side by side"),
 }
 """Each command's module in ``hlsim.cli``, where a function of its name declares its options, and what it does."""

@@ -20,6 +20,7 @@ from hlsim.audiogram import FREQUENCIES
 from hlsim.calibration import set_level
 from hlsim.checks import check_rate
 from hlsim.dsp.resample import resample
+from hlsim.listener import Listener
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.parallel import reason_of
 
@@ -141,6 +142,24 @@ class ForeignEnhancer(_Foreign):
         return self._ask(waveform, sample_rate).to(waveform)
 
 
+class ForeignAid(_Foreign):
+    """Anyone's pair of aids: ``(waveform, listener, sample_rate) -> waveform``, of ``hlsim clarity``.
+
+    It is called without gradients with (2, time) at the scene's rate and scale, left first, and a ``Listener``. What it
+    returns is as long and finite; it may come late, for HASPI and HASQI align what they compare.
+    """
+
+    KIND, FORM = "aid", "(waveform, listener, sample_rate) -> waveform"
+
+    def __reduce__(self) -> Any:
+        return load_aid, (self.name,)
+
+    @torch.no_grad()
+    def __call__(self, waveform: Tensor, listener: Listener, sample_rate: int) -> Tensor:
+        """Shape: (2, time) -> (2, time). Raises ValueError as ``ForeignTeacher``."""
+        return self._ask(waveform, listener, sample_rate).to(waveform)
+
+
 @lru_cache(maxsize=8)  # for each process, that what it has opened for a teacher is found again
 def load_teacher(name: str) -> ForeignTeacher:
     """The teacher ``package.module:name``, with the working directory on the import path, as ``python -m`` has it.
@@ -158,6 +177,12 @@ def load_teacher(name: str) -> ForeignTeacher:
 def load_enhancer(name: str) -> ForeignEnhancer:
     """The enhancer ``package.module:name``, found as ``load_teacher`` finds a teacher; ValueError too."""
     return ForeignEnhancer(*_found(name, ForeignEnhancer.KIND))
+
+
+@lru_cache(maxsize=8)
+def load_aid(name: str) -> ForeignAid:
+    """The pair of aids ``package.module:name``, found as ``load_teacher`` finds a teacher; ValueError too."""
+    return ForeignAid(*_found(name, ForeignAid.KIND))
 
 
 def _found(name: str, kind: str) -> tuple[Any, str, str]:

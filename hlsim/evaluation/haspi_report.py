@@ -258,6 +258,30 @@ def haspi_report(
         items = read_folders(clean, before, after, **ears_and_levels)
     else:
         raise ValueError("give either the folders clean, before and after, or a manifest (and its root)")
+    own: dict[str, Any] = {
+        "engine": engine,
+        "baseline": baseline,
+        "better_ear": better_ear,
+        "store": store,
+        "seed": seed,
+    }
+    return report_items(items, names, **own, **running)
+
+
+def report_items(
+    items: Sequence[FileItem],
+    measures: Sequence[MeasureName],
+    *,
+    engine: Engine = "hlsim",
+    baseline: str | None = None,
+    better_ear: bool = False,
+    store: str | Path | None = None,
+    seed: int = 0,
+    failures: Sequence[Failure] = (),
+    extra: Mapping[str, Any] | None = None,
+    **running: Any,
+) -> HaspiReport:
+    """The report of items that are known already; ``failures`` are told with its own. All else as ``haspi_report``."""
     conditions = list(dict.fromkeys(condition for item in items for condition in item.processed))
     if len(conditions) < 2:
         raise ValueError(f"one condition only, {conditions[0]}; allowed: two or more to compare")
@@ -265,21 +289,24 @@ def haspi_report(
         if baseline not in conditions:
             raise ValueError(f"no condition {baseline!r}; allowed: {', '.join(conditions)}")
         conditions = [baseline, *(name for name in conditions if name != baseline)]
-    scored = score_items(items, names, engine=engine, store=ScoreStore(store), seed=seed, **running)
+    scored = score_items(items, measures, engine=engine, store=ScoreStore(store), seed=seed, **running)
     pairs = [*zip(items, scored, strict=True)]
-    failures = [
-        Failure(item.name, condition, measure, str(result.reason))
-        for item, results in pairs
-        for (measure, condition), result in results.items()
-        if result.score is None
+    unscored = [
+        *failures,
+        *(
+            Failure(item.name, condition, measure, str(result.reason))
+            for item, results in pairs
+            for (measure, condition), result in results.items()
+            if result.score is None
+        ),
     ]
-    scores = [made for pair in pairs if (made := _item_score(*pair, conditions, names))]
+    scores = [made for pair in pairs if (made := _item_score(*pair, conditions, measures))]
     if not scores:
-        reasons = f"; the first, {failures[0].file}: {failures[0].reason}" if failures else ""
+        reasons = f"; the first, {unscored[0].file}: {unscored[0].reason}" if unscored else ""
         raise ValueError(f"none of {len(items)} items could be scored{reasons}")
     ears = scores if better_ear else []
     scores = better_ears(scores) if better_ear else scores
-    return HaspiReport(scores, names, seed, failures, baseline, ears=ears, engine=engine)
+    return HaspiReport(scores, measures, seed, unscored, baseline, extra or {}, ears=ears, engine=engine)
 
 
 def _item_score(

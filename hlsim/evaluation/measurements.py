@@ -184,16 +184,28 @@ def wearing(
             start = time.process_time()
             aided = outputs(compensator, given, ear, f"{name}, ear {ear_name}, changed speech: the output")
             seconds = time.process_time() - start
-        changed = (aided[1 : -len(quiet)] - aided[0]).abs() > _CHANGED * aided[0].abs().max()
-        ahead = [at - int(row.int().argmax()) for at, row in zip(_CHANGES, changed, strict=True) if row.any()]
+        ahead = samples_ahead(aided[0], aided[1 : -len(quiet)], _CHANGES)
         gains = [
             float(level_spl(own[_MIDDLE]) - level_spl(sound[_MIDDLE]))
             for own, sound in zip(aided[-len(quiet) :], quiet, strict=True)
         ]
-        figures = {"latency_ms": 1000.0 * max([0, *ahead]) / NEURO_RATE, "quiet_gain_db": gains}
+        figures = {"latency_ms": 1000.0 * ahead / NEURO_RATE, "quiet_gain_db": gains}
         cost = {"cpu_ms": 1000.0 * seconds * NEURO_RATE / (len(given) * len(speech))}
         found.append({"compensator": name, "ear": ear_name, **figures, **cost})
     return found
+
+
+def samples_ahead(unchanged: Tensor, changed: Iterable[Tensor], places: Iterable[int]) -> int:
+    """How long before the input becomes another sound, at one of ``places``, an output changes by 1e-4 of its peak.
+
+    Shape: (..., time), and one such output a place -> the most samples of all places, 0 where none is early.
+    """
+    least, most = _CHANGED * float(unchanged.abs().max()), 0
+    for other, place in zip(changed, places, strict=True):
+        apart = (other - unchanged).abs().reshape(-1, unchanged.shape[-1]).amax(0) > least
+        if apart.any():
+            most = max(most, place - int(apart.int().argmax()))
+    return most
 
 
 def outputs(compensator: nn.Module, signals: Iterable[Tensor], ear: Audiogram, what: str) -> Tensor:

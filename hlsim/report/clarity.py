@@ -1,0 +1,72 @@
+"""The page and the table of scores of Clarity's scenes."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from hlsim.evaluation.clarity import RULE_MS
+from hlsim.evaluation.haspi_report import HaspiReport
+from hlsim.report.haspi import Front, write_report
+from hlsim.report.page import Section, write_files
+from hlsim.report.tables import Table, number
+
+_COLUMNS = ("scene", "listener", "condition", "combined", "haspi", "hasqi", "level")
+
+_ABOUT = (
+    "Scores are the better ear's, by each measure, and combined is the mean of the two, as in Clarity's challenge at "
+    "ICASSP 2023. HASPI rewards any gain, so the level that the better ear is given stands beside it. An aid looks ahead "
+    "as long as its output changes before its input becomes another sound; the challenges allow {rule:g} ms."
+)
+
+
+def write_scenes(report: HaspiReport, out: str | Path, *, listen: int = 3) -> Path:
+    """Write ``scores.csv`` and the files of ``write_report`` into a folder; returns it. ValueError as that."""
+    listeners = {item.listener for item in report.items}
+    title = f"Clarity's scenes: {len(report.items)} of {len(listeners)} listener{'s' * (len(listeners) > 1)}"
+    result = Section("Conditions", [_ABOUT.format(rule=RULE_MS)], [conditions_table(report)])
+    write_report(report, out, listen=listen, front=Front(title, report.headline.in_short(), [result]))
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows([_COLUMNS, *_rows(report)])
+    return write_files(out, {"scores.csv": text.getvalue()})
+
+
+def conditions_table(report: HaspiReport) -> Table:
+    """A row a condition: mean scores, level and how far the aid looks ahead."""
+    haspi, hasqi = report.scores("haspi"), report.scores("hasqi")
+    rows = []
+    for at, name in enumerate(report.conditions):
+        ahead = report.extra["looks_ahead_ms"][name]
+        figures = (haspi[:, at], hasqi[:, at], 0.5 * (haspi + hasqi)[:, at])
+        means = [number(_mean(values), ".3f") for values in figures]
+        rule = "yes" if ahead <= RULE_MS else "no"
+        rows.append((name, *means, number(_mean(report.levels()[:, at]), ".1f"), f"{ahead:.1f}", rule))
+    header = (
+        "Given",
+        "HASPI",
+        "HASQI",
+        "Combined",
+        "Level (dB SPL)",
+        "Looks ahead (ms)",
+        f"Within {RULE_MS:g} ms",
+    )
+    return Table(f"Means of {len(report.items)} pairs of scene and listener", header, rows)
+
+
+def _mean(values: np.ndarray) -> float | None:
+    there = values[np.isfinite(values)]
+    return float(there.mean()) if len(there) else None
+
+
+def _rows(report: HaspiReport) -> Iterator[list[str]]:
+    for item in report.items:
+        scene = item.file.removeprefix(f"{item.listener} ")
+        for name in report.conditions:
+            haspi, hasqi = (item.scores[measure].get(name) for measure in ("haspi", "hasqi"))
+            both = None if haspi is None or hasqi is None else 0.5 * (haspi + hasqi)
+            figures = [number(value, ".6f", "") for value in (both, haspi, hasqi)]
+            yield [scene, item.listener, name, *figures, number(item.levels[name], ".2f", "")]
