@@ -8,6 +8,7 @@ from pathlib import Path
 
 import soundfile
 import torch
+from scipy.io import wavfile
 from torch import Tensor
 
 from hlsim.checks import HIGHEST_RATE, check_rate, check_waveform, is_finite
@@ -182,7 +183,10 @@ def write_audio(path: str | Path, waveform: Tensor, sample_rate: int) -> None:
     kind = {"subtype": _SUBTYPES[suffix], "format": suffix[1:].upper()}
     with Whole(path, new_folder=False) as file:
         try:
-            soundfile.write(str(file.partial), rows, rate, **kind)
+            if suffix == ".wav":  # by libsndfile the time of day would be in it, and one sound not one file
+                wavfile.write(file.partial, rate, rows)
+            else:
+                soundfile.write(str(file.partial), rows, rate, **kind)
         except (OSError, soundfile.LibsndfileError) as error:
             raise file.refusal(error) from error
         file.keep()

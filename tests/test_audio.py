@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import soundfile
 import torch
+from scipy.io import wavfile
 from torch import Tensor
 
 from hlsim.audio import (
@@ -60,12 +61,27 @@ def test_writing_over_a_file_replaces_it_and_leaves_nothing_else(tmp_path: Path)
     assert float(read_audio(tmp_path / "a.flac")[0].mean()) == pytest.approx(0.2, abs=1e-6)
 
 
+def test_one_sound_is_one_file(tmp_path: Path) -> None:
+    sound = 3.0 * torch.rand(2, 100)
+    for name in ("a.wav", "b.wav"):
+        write_audio(tmp_path / name, sound, 44100)
+    first, second = ((tmp_path / name).read_bytes() for name in ("a.wav", "b.wav"))
+    assert first == second and b"PEAK" not in first  # libsndfile's chunk with the time of day
+    assert torch.equal(read_audio(tmp_path / "a.wav")[0], sound)
+
+
 @pytest.mark.parametrize("failure", [OSError("disk full"), KeyboardInterrupt()])
 @pytest.mark.parametrize("before", [True, False])
+@pytest.mark.parametrize(("ending", "writer"), [("wav", wavfile), ("flac", soundfile)])
 def test_a_failing_write_leaves_what_was_there(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, failure: BaseException, before: bool
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    failure: BaseException,
+    before: bool,
+    ending: str,
+    writer: Any,
 ) -> None:
-    path = tmp_path / "a.wav"
+    path = tmp_path / f"a.{ending}"
     old = torch.full((1, 10), 0.5)
     if before:
         write_audio(path, old, 16000)
@@ -74,12 +90,12 @@ def test_a_failing_write_leaves_what_was_there(
         Path(file).write_bytes(b"RIFF")
         raise failure
 
-    monkeypatch.setattr(soundfile, "write", half_written)
+    monkeypatch.setattr(writer, "write", half_written)
     with pytest.raises((ValueError, KeyboardInterrupt)) as caught:
         write_audio(path, torch.rand(1, 10), 16000)
     if isinstance(failure, OSError):
         assert str(caught.value) == f"{path}: cannot be written (disk full)"
-    assert os.listdir(tmp_path) == (["a.wav"] if before else [])
+    assert os.listdir(tmp_path) == ([path.name] if before else [])
     if before:
         assert torch.equal(read_audio(path)[0], old)
 
