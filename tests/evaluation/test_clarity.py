@@ -167,8 +167,6 @@ def test_the_command_writes_page_scores_and_signals_and_goes_on(
     assert main(text) == 0
     printed = capsys.readouterr().out
     assert "HalfTheNoise + soft" in printed and "8.0 no" in " ".join(printed.split())
-        "   ", "  "
-    )
     assert {"report.html", "report.json", "scores.csv"} <= {path.name for path in out.iterdir()}
     with open(out / "scores.csv", newline="") as file:
         rows = [*csv.DictReader(file)]
