@@ -144,7 +144,7 @@ class FromTheFuture:
     """An aid that knows what comes in 8 ms."""
 
     def __call__(self, waveform: torch.Tensor, listener: Listener, sample_rate: int) -> torch.Tensor:
-        return 4.0 * waveform.roll(-sample_rate * 8 // 1000, -1)
+        return 4.0 * waveform.roll(-(sample_rate * 8 // 1000), -1)
 
 
 class HalfTheNoise:
