@@ -26,8 +26,7 @@ _ABOUT = (
 
 def write_scenes(report: HaspiReport, out: str | Path, *, listen: int = 3) -> Path:
     """Write ``scores.csv`` and the files of ``write_report`` into a folder; returns it. ValueError as that."""
-    listeners = {item.listener for item in report.items}
-    title = f"Clarity's scenes: {len(report.items)} of {len(listeners)} listener{'s' * (len(listeners) > 1)}"
+    title = f"Clarity's scenes: {len(report.items)} pairs of scene and listener"
     result = Section("Conditions", [_ABOUT.format(rule=RULE_MS)], [conditions_table(report)])
     write_report(report, out, listen=listen, front=Front(title, report.headline.in_short(), [result]))
     text = io.StringIO()
