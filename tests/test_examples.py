@@ -13,7 +13,7 @@ import torch
 from hlsim import MSBG, Audiogram, HearingLossLoss
 from hlsim.audio import read_audio, write_audio
 from hlsim.calibration import level_spl, set_level
-from hlsim.data.foreign_teacher import load_enhancer
+from hlsim.data.foreign import load_enhancer
 from hlsim.msbg.ear import MSBG_RATE
 from hlsim.msbg.filterbank import BANKS, gammatone_response
 

@@ -12,7 +12,7 @@ from torch.nn import functional
 
 from hlsim.audiogram import Audiogram
 from hlsim.checks import check_choice, refuse_unknown
-from hlsim.data.foreign_teacher import ForeignTeacher, load_teacher
+from hlsim.data.foreign import ForeignTeacher, load_teacher
 from hlsim.metrics.reference import pyclarity_msbg
 from hlsim.msbg import MSBG, estimate_delay
 from hlsim.msbg.ear import MSBG_RATE

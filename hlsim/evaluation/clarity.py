@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from compensators import load_compensator
 from hlsim.audio import read_audio, write_audio
 from hlsim.calibration import check_full_scale, gain_to_pascals, set_level
-from hlsim.data.foreign_teacher import ForeignAid, ForeignEnhancer, load_aid, load_enhancer
+from hlsim.data.foreign import ForeignAid, ForeignEnhancer, load_aid, load_enhancer
 from hlsim.evaluation.haspi_report import HaspiReport, report_items
 from hlsim.evaluation.measurements import samples_ahead
 from hlsim.evaluation.scores import Failure

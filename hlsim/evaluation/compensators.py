@@ -18,7 +18,7 @@ from compensators.nalr import NALR
 from compensators.wdrc import WDRC
 from hlsim.audiogram import Audiogram, as_thresholds
 from hlsim.criteria.bands import BANDS
-from hlsim.data.foreign_teacher import load_enhancer
+from hlsim.data.foreign import load_enhancer
 from hlsim.evaluation.compensator_result import MEASURES, compensator_result
 from hlsim.evaluation.haspi_report import HaspiReport
 from hlsim.evaluation.items import INPUT_LEVELS, Item, draw_judged_items, read_ears

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from hlsim.audiogram import Audiogram
 from hlsim.calibration import PASCAL_SPL, level_spl, set_level
 from hlsim.criteria.bands import audibility, band_centres, band_level_loss, band_levels, least_audible
-from hlsim.data.foreign_teacher import ForeignEnhancer
+from hlsim.data.foreign import ForeignEnhancer
 from hlsim.dsp.fir import filter_centred
 from hlsim.evaluation.items import Item
 from hlsim.metrics.reference import pyclarity_msbg

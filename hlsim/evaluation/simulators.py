@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from hlsim.audiogram import SEVERITIES
-from hlsim.data.foreign_teacher import ForeignTeacher
+from hlsim.data.foreign import ForeignTeacher
 from hlsim.data.teacher import Reference, find_teacher
 from hlsim.evaluation.items import LEVELS, Input, Item, draw_items, treat
 from hlsim.evaluation.store import ScoreStore, key_of, weights_hash
@@ -88,7 +88,7 @@ def evaluate_simulators(
             a quarter each.
         store: file of scores, there or not; None keeps nothing.
         teacher: what counts as the truth: ``"pyclarity"``, the reference itself, ``"msbg"``, hlsim's exact one, or
-            anyone's simulator, ``package.module:name``, as ``hlsim.data.foreign_teacher.load_teacher`` takes it.
+            anyone's simulator, ``package.module:name``, as ``hlsim.data.foreign.load_teacher`` takes it.
         items: how many; each is scored under each of ``inputs``.
         seconds: length of an item; PESQ and STOI want 2 or more.
         levels: dB SPL that the items take in turn.

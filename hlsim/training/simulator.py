@@ -93,7 +93,7 @@ def train_simulator(
     Args:
         data: folders to draw batches from, or a prepared plan.
         teacher: ``"msbg"``, the exact one, ``"pyclarity"``'s, or anyone's simulator, ``package.module:name``, as
-            ``hlsim.data.foreign_teacher.load_teacher`` takes it.
+            ``hlsim.data.foreign.load_teacher`` takes it.
 
     Returns: the folder that ``load_pretrained`` takes, ``out/checkpoint``.
 

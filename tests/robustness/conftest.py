@@ -20,7 +20,6 @@ from hlsim.audio import write_audio
 
 ROOT = Path(__file__).parents[2]
 OURS = tuple(str(ROOT / name) for name in ("hlsim", "compensators"))
-TALLY = pytest.StashKey[dict[str, list[int]]]()
 MOST_MEMORY = 4 << 30  # bytes more than before the trial
 LONGEST_MESSAGE = 16_000  # it quotes what was given
 
@@ -49,11 +48,6 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     group.addoption("--first-seed", type=int, help="of the trials of each kind (default: 0)")
 
 
-def pytest_terminal_summary(terminalreporter: Any, config: pytest.Config) -> None:
-    for kind, (tried, failed) in config.stash.get(TALLY, {}).items():
-        terminalreporter.write_line(f"robustness: {kind}: {tried} tried, {failed} failed")
-
-
 @contextmanager
 def limited(seconds: float) -> Iterator[None]:
     """Raise Overtime after so many seconds, and let the system refuse memory that grows without end."""
@@ -79,10 +73,10 @@ class Bench:
 
     texts, values = TEXTS, VALUES
 
-    def __init__(self, config: pytest.Config) -> None:
+    def __init__(self, config: pytest.Config, record: Callable[[str, object], None]) -> None:
         self.trials = config.getoption("trials", None) or 25
         self.first = config.getoption("first_seed", None) or 0
-        self.tally = config.stash.setdefault(TALLY, {})
+        self.record = record
 
     def run(
         self,
@@ -110,8 +104,7 @@ class Bench:
                 if not self.own_words(error):
                     said = f"{type(error).__name__}: {str(error)[:300]}"
                     failures.append(f"{kind}, seed {seed}: {said}\n  input: {repr(given)[:600]}")
-        tried, failed = self.tally.get(kind, (0, 0))
-        self.tally[kind] = [tried + len(seeds), failed + len(failures)]
+        self.record("robustness", [kind, len(seeds), len(failures)])  # counted in tests/conftest.py
         if failures:
             pytest.fail("\n".join([f"{len(failures)} of {len(seeds)} failed", *failures[:10]]), pytrace=False)
 
@@ -153,9 +146,9 @@ class Bench:
         return bytes(data)
 
 
-@pytest.fixture(scope="session")
-def bench(pytestconfig: pytest.Config) -> Bench:
-    return Bench(pytestconfig)
+@pytest.fixture
+def bench(pytestconfig: pytest.Config, record_property: Callable[[str, object], None]) -> Bench:
+    return Bench(pytestconfig, record_property)
 
 
 @pytest.fixture

@@ -19,7 +19,7 @@ from hlsim.pretrained import load_pretrained
 
 pytest.importorskip("lightning")
 
-from hlsim.data.foreign_teacher import load_teacher
+from hlsim.data.foreign import load_teacher
 from hlsim.data.module import Batch, Step
 from hlsim.training.batches import (
     MILDER,

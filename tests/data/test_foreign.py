@@ -12,7 +12,7 @@ from torch import Tensor
 
 from hlsim import Audiogram
 from hlsim.calibration import set_level
-from hlsim.data.foreign_teacher import ForeignTeacher, load_enhancer, load_teacher
+from hlsim.data.foreign import ForeignTeacher, load_enhancer, load_teacher
 from hlsim.data.teacher import Teacher, find_teacher
 from hlsim.data.writing import Recipe
 
