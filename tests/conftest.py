@@ -34,7 +34,9 @@ def pytest_terminal_summary(terminalreporter: Any) -> None:
     """Count the trials of tests/robustness by kind, whichever process ran them."""
     tally: dict[str, list[int]] = {}
     for report in chain(*terminalreporter.stats.values()):
-        for name, value in getattr(report, "user_properties", ()) if getattr(report, "when", "") == "call" else ():
+        for name, value in (
+            getattr(report, "user_properties", ()) if getattr(report, "when", "") == "call" else ()
+        ):
             if name == "robustness":
                 kind, *counts = value
                 tally[kind] = [sum(pair) for pair in zip(tally.get(kind, (0, 0)), counts, strict=True)]

@@ -1,8 +1,9 @@
-"""Killed at any moment and started again, or started twice at once: the end is that of an undisturbed run."""
+"""Killed at any moment, out of disk, or started twice at once, then started again: it ends as an undisturbed run."""
 
 import hashlib
 import multiprocessing
 import os
+import resource
 import shutil
 import signal
 import sys
@@ -13,18 +14,25 @@ from typing import Any
 
 import pytest
 
+from compensators import load_compensator
 from hlsim.cli.main import main
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="starts copies of this process")
 
 
-def start(arguments: list[str]) -> Any:
-    """The program in a copy of this process, which has imported all and needs no seconds to begin."""
+def start(arguments: list[str], largest: int | None = None) -> Any:
+    """The program in a copy of this process, which has imported all and needs no seconds to begin.
+
+    Where it may write no file over ``largest`` bytes, the system refuses more, as where a disk is full.
+    """
 
     def child() -> None:
+        if largest is not None:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (largest, largest))
         quiet = os.open(os.devnull, os.O_WRONLY)
         os.dup2(quiet, 1)
         os.dup2(quiet, 2)
+        sys.stdout = sys.stderr = os.fdopen(quiet, "w")  # pytest's are files, which fill like others
         os._exit(main(arguments))
 
     process = multiprocessing.get_context("fork").Process(target=child)
@@ -50,6 +58,8 @@ class Command:
             before = time.monotonic()
             assert main([*words, "--out", str(folder / name)]) == 0
         self.seconds, self.whole = time.monotonic() - before, results(folder / "whole")
+        sizes = [path.stat().st_size for path in (folder / "whole").rglob("*") if path.is_file()]
+        self.largest = max(sizes)
 
     def killed(self, shares: list[float]) -> None:
         """Kill it after each share of its time, and let it end."""
@@ -74,6 +84,14 @@ class Command:
         assert 0 in statuses and statuses <= {0, 2}, f"ended with {first.exitcode} and {second.exitcode}"
         self._same(arguments, target)
 
+    def filled(self, share: float) -> None:
+        """Let it write no file over a share of its largest one: it says so in a line, or that share is enough."""
+        arguments, target = self._anew()
+        process = start(arguments, largest=round(share * self.largest))
+        process.join()
+        assert process.exitcode in (0, 2), f"ended with {process.exitcode}"
+        self._same(arguments, target)
+
     def _anew(self) -> tuple[list[str], Path]:
         target = self.folder / f"out-{time.monotonic_ns()}"
         return [*self.words, "--out", str(target)], target
@@ -82,6 +100,21 @@ class Command:
         assert main(arguments) == 0
         assert results(target) == self.whole, "another result"
         shutil.rmtree(target)
+
+
+class Training(Command):
+    """Its end has all files and all steps; another clock and other batches after a kill make other weights."""
+
+    def _same(self, arguments: list[str], target: Path) -> None:
+        assert main(arguments) == 0
+        assert results(target).keys() >= {name for name in self.whole if "events" not in name}
+        load_compensator(target / "checkpoint")
+        assert main(arguments) == 0  # there is nothing left to do
+        shutil.rmtree(target)
+
+
+def share_of_a_disk(draw: Random) -> float:
+    return draw.choice((0.0, 0.01, draw.random(), draw.random()))
 
 
 def moments(draw: Random) -> list[float]:
@@ -94,6 +127,7 @@ def test_prepare(bench: Any, corpus: Path) -> None:
     command = Command(["prepare", str(corpus / "speech"), *options], corpus)
     bench.run("kills of prepare --write", moments, command.killed, share=0.2)
     bench.run("two prepares at once", moments, command.twice, share=0.2)
+    bench.run("prepare --write on a full disk", share_of_a_disk, command.filled, share=0.2)
 
 
 def test_haspi_report(bench: Any, corpus: Path) -> None:
@@ -105,3 +139,16 @@ def test_haspi_report(bench: Any, corpus: Path) -> None:
     command = Command(words, corpus)
     bench.run("kills of haspi-report", moments, command.killed, share=0.08)
     bench.run("two reports at once", moments, command.twice, share=0.04)
+    bench.run("haspi-report on a full disk", share_of_a_disk, command.filled, share=0.04)
+
+
+def test_training(bench: Any, corpus: Path) -> None:
+    pytest.importorskip("lightning")
+    recipe = corpus / "recipe.yaml"
+    recipe.write_text(
+        "batch: 2\nseconds: 0.4\nvalidate_every: 2\nvalidation_items: 2\nmodel: {channels: 4, blocks: 1}\n"
+    )
+    words = ["train-compensator", "--config", str(recipe), "--audiogram", "N3", "--max-steps", "6", "--quiet"]
+    command = Training([*words, "--speech", str(corpus / "speech")], corpus)
+    bench.run("kills of train-compensator", moments, command.killed, share=0.08)
+    bench.run("train-compensator on a full disk", share_of_a_disk, command.filled, share=0.08)
