@@ -1,17 +1,25 @@
 #!/usr/bin/env bash
-# The paper's Tables I, III and IV, and the comparison of normalisations: trains every row for the same time on one
-# thread, and compares them. Killed, it goes on with the same command. The results of one such run are in docs/paper-tables.md.
+# The paper's Tables I, III and IV, and the comparison of normalisations: trains every row for the same time, or the same
+# steps, on one thread, and compares them. Killed, it goes on with the same command. Results are in docs/paper-tables.md.
 #
-#   examples/tables.sh CORPORA OUT [MINUTES A ROW] [ITEMS]
+#   [STEPS=10000] [NARROW=4] [JOBS=2] [ROWS="paper/cnn paper/lstm"] examples/tables.sh CORPORA OUT [MINUTES A ROW] [ITEMS]
 #
 # CORPORA holds speech/{train,valid}, noise/{train,valid} and audiograms/{train,valid}.csv.
+# STEPS: of each row, whatever the minutes. NARROW: the paper's rows with as many times fewer channels. JOBS: rows trained at
+# a time. ROWS: these alone, compared as Table I.
 set -euo pipefail
 corpora=$1 out=$2 minutes=${3:-5} items=${4:-80}
 here=$(dirname "${BASH_SOURCE[0]}")
 export OMP_NUM_THREADS=${OMP_NUM_THREADS:-1}
+limit=(--max-minutes "$minutes")
+[[ -z ${STEPS:-} ]] || limit=(--max-minutes 1e6 --max-steps "$STEPS")
+mkdir -p "$out/recipes"
 
 train() { # recipe
-    hlsim train-simulator --config "$here/$1.yaml" --max-minutes "$minutes" --quiet --out "$out/$(basename "$1")" \
+    local recipe="$out/recipes/$(basename "$1").yaml"
+    awk -v by="$([[ $1 == paper/* ]] && echo "${NARROW:-1}" || echo 1)" \
+        '$1 == "channels:" && by > 1 { $0 = "  channels: " 4 * int($2 / by / 4 + 0.5) } 1' "$here/$1.yaml" >"$recipe"
+    hlsim train-simulator --config "$recipe" "${limit[@]}" --quiet --out "$out/$(basename "$1")" \
         --speech "$corpora/speech/train" --valid-speech "$corpora/speech/valid" \
         --noise "$corpora/noise/train" --valid-noise "$corpora/noise/valid" \
         --audiograms "$corpora/audiograms/train.csv" --valid-audiograms "$corpora/audiograms/valid.csv"
@@ -27,9 +35,27 @@ compare() { # name of the table, options of evaluate-simulator, --, rows
         --audiograms "$corpora/audiograms/valid.csv" --items "$items" --out "$out/$table" "${options[@]}"
 }
 
+train_all() { # recipes, JOBS at a time
+    local row pid pids=() failed=0
+    for row; do
+        while (($(jobs -rp | wc -l) >= ${JOBS:-1})); do wait -n || failed=1; done
+        train "$row" &
+        pids+=("$!")
+    done
+    for pid in "${pids[@]}"; do wait "$pid" || failed=1; done
+    return "$failed"
+}
+
+if [[ -n ${ROWS:-} ]]; then
+    read -ra rows <<<"$ROWS"
+    train_all "${rows[@]}"
+    compare table-1 --levels 65 --seconds 2 -- "${rows[@]##*/}"
+    exit
+fi
+
 table1=(monolithic-transformer monolithic-cnn monolithic-lstm transformer cnn lstm mamba)
-for row in "${table1[@]}" mamba-magnitude-only mamba-concatenated; do train "paper/$row"; done
-for row in mamba lstm transformer cnn cnn-normalised; do train "neuro-msbg-$row"; done
+family=(neuro-msbg-{mamba,lstm,transformer,cnn,cnn-normalised})
+train_all "${table1[@]/#/paper/}" paper/mamba-magnitude-only paper/mamba-concatenated "${family[@]}"
 
 compare table-1 --levels 65 --seconds 2 -- "${table1[@]}"
 compare table-3 --levels 65 --seconds 2 -- mamba-magnitude-only mamba
