@@ -17,6 +17,7 @@ from torch import Tensor
 
 from hlsim.audiogram import Audiogram
 from hlsim.calibration import level_spl
+from hlsim.listener import Listener
 from hlsim.neuro import NeuroMSBG
 from hlsim.neuro.config import NEURO_RATE
 
@@ -32,17 +33,19 @@ class Live:
     """Called by sounddevice with each block; counts what there is to show.
 
     Args:
-        stream: (time,) samples -> as many; its attributes of the names in ``KEYS`` are its sliders.
+        stream: (time,) samples -> as many, or (2, time) of two ears; its attributes of the names in ``KEYS`` are its
+            sliders.
         full_scale_spl: level in dB SPL of RMS 1.0, of microphone and headphones alike.
+        ears: 1, or 2: left and right, each from its own microphone where there are two.
     """
 
-    def __init__(self, stream: Callable[[Tensor], Tensor], full_scale_spl: float) -> None:
-        self.stream, self.full_scale_spl = stream, full_scale_spl
+    def __init__(self, stream: Callable[[Tensor], Tensor], full_scale_spl: float, ears: int = 1) -> None:
+        self.stream, self.full_scale_spl, self.ears = stream, full_scale_spl, ears
         self.drop_outs, self.error = 0, ""
         self._blocks: list[Tensor] = []
 
     def __call__(self, given: Any, played: Any, frames: int, clock: Any, status: Any) -> None:
-        """Shape: ``given`` (frames, 1) and ``played`` (frames, channels), arrays of float32."""
+        """Shape: ``given`` (frames, 1 or ears) and ``played`` (frames, channels), arrays of float32."""
         lost = (
             status.input_overflow,
             status.input_underflow,
@@ -51,9 +54,10 @@ class Live:
         )
         self.drop_outs += any(lost)
         try:
-            heard = torch.from_numpy(given[:, 0].copy())
+            heard = torch.from_numpy(given.T.copy())
+            heard = heard.expand(2, -1) if self.ears == 2 else heard[0]
             output = self.stream(heard).clamp(-1.0, 1.0)
-            played[:] = output.numpy()[:, None]
+            played[:] = torch.atleast_2d(output).mT.numpy()
             self._blocks.append(torch.stack((heard, output)))
         except Exception as error:  # nobody would see it in the device's thread
             played.fill(0.0)
@@ -72,7 +76,8 @@ class Live:
         parts = []
         if blocks:
             levels = level_spl(torch.cat(blocks, -1), self.full_scale_spl).clamp_min(0.0)
-            parts.append("in {:5.1f}, out {:5.1f} dB SPL".format(*levels.tolist()))
+            told = [" / ".join(f"{level:5.1f}" for level in ears) for ears in levels.view(2, -1).tolist()]
+            parts.append("in {}, out {} dB SPL".format(*told))
         for name, keys in KEYS.items():
             if hasattr(self.stream, name):
                 parts.append(f"{name.replace('_', ' ')} {getattr(self.stream, name):.1f} ({'/'.join(keys)})")
@@ -93,7 +98,7 @@ class Simulated:
         ValueError: another simulator.
     """
 
-    def __init__(self, simulator: torch.nn.Module, audiogram: Audiogram) -> None:
+    def __init__(self, simulator: torch.nn.Module, audiogram: Audiogram | Listener) -> None:
         field = simulator._receptive_field if isinstance(simulator, NeuroMSBG) else None
         if field is None or simulator.sample_rate != NEURO_RATE:
             raise ValueError("a simulator that looks at whole signals; allowed: neuro-msbg at 16000 Hz")
@@ -102,12 +107,13 @@ class Simulated:
         self._past = torch.zeros(2 * self.latency)
 
     def __call__(self, chunk: Tensor) -> Tensor:
-        """Shape: (time,) -> (time,)."""
-        window = torch.cat((self._past, chunk))
-        self._past = window[len(chunk) :]
+        """Shape: (time,), or (2, time) of a listener -> the same."""
+        samples = chunk.shape[-1]
+        window = torch.cat((self._past.expand(*chunk.shape[:-1], -1), chunk), -1)
+        self._past = window[..., samples:]
         with torch.no_grad():
             heard: Tensor = self._simulator(window, self._audiogram)
-        return heard[self.latency : self.latency + len(chunk)]
+        return heard[..., self.latency : self.latency + samples]
 
 
 def play(
@@ -127,13 +133,17 @@ def play(
         buffer: seconds that each device is asked to hold; it may hold more.
 
     Raises:
-        ValueError: no such device, one that does not take 16 kHz, or what the stream raised.
+        ValueError: no such device, one that does not take 16 kHz or plays one ear where there are two, or what the
+            stream raised.
     """
-    checked = [_check(sounddevice, *which) for which in zip(("input", "output"), devices, strict=True)]
+    there, here = [_check(sounddevice, *which) for which in zip(("input", "output"), devices, strict=True)]
+    if here < live.ears:
+        raise ValueError("the headphones have one channel for two ears; allowed: with two, or --audiogram")
     for _ in range(_WARM_UP):
-        live.stream(torch.zeros(block))
+        live.stream(torch.zeros(2, block) if live.ears == 2 else torch.zeros(block))
     shown, every = ("\r{:<100}", 0.2) if sys.stdout.isatty() else ("{}\n", 1.0)
-    options = {"device": devices, "channels": (1, min(2, checked[1])), "dtype": "float32", "latency": buffer}
+    channels = min(live.ears, there), min(2, here)
+    options = {"device": devices, "channels": channels, "dtype": "float32", "latency": buffer}
     try:
         with (
             suppress(KeyboardInterrupt),

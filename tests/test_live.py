@@ -1,5 +1,6 @@
 """Microphone to headphones without either: devices that hand a recording on in blocks, and refuse as PortAudio does."""
 
+import csv
 import os
 import re
 import subprocess
@@ -17,7 +18,7 @@ import torch
 
 import hlsim
 from compensators import WDRC
-from hlsim import Audiogram, load_pretrained
+from hlsim import Audiogram, Listener, load_pretrained
 from hlsim.calibration import set_level
 from hlsim.cli.main import main
 from hlsim.extras import MissingExtraError
@@ -31,13 +32,16 @@ FINE = SimpleNamespace(
 
 
 class Devices:
-    """Stands for the module sounddevice: one microphone, one pair of headphones."""
+    """Stands for the module sounddevice: one microphone, or as many as the recording has channels, and headphones."""
 
     class PortAudioError(Exception):
         pass
 
-    def __init__(self, recording: torch.Tensor, lost: tuple[int, ...] = (), takes: int = 16000) -> None:
-        self.recording, self.lost, self.takes = recording.numpy(), lost, takes
+    def __init__(
+        self, recording: torch.Tensor, lost: tuple[int, ...] = (), takes: int = 16000, plays: int = 2
+    ) -> None:
+        self.recording, self.lost, self.takes = torch.atleast_2d(recording).mT.numpy(), lost, takes
+        self.plays = plays
         self.played = np.zeros((0, 2), dtype=np.float32)
         self.opened: dict[str, Any] = {}
 
@@ -46,7 +50,7 @@ class Devices:
             return "  0 Loopback, ALSA (1 in, 2 out)"
         if device not in (None, 0, "Loopback"):
             raise ValueError(f"No {kind} device matching {device!r}")
-        return {"max_input_channels": 1, "max_output_channels": 2}
+        return {"max_input_channels": self.recording.shape[1], "max_output_channels": self.plays}
 
     def _settings(self, samplerate: int, **rest: Any) -> None:
         if samplerate != self.takes:
@@ -60,7 +64,7 @@ class Devices:
         for number, given in enumerate(np.split(self.recording, range(block, len(self.recording), block))):
             played = np.full((len(given), opened["channels"][1]), np.nan, dtype=np.float32)
             status = SimpleNamespace(**vars(FINE) | {"output_underflow": number in self.lost})
-            callback(given[:, None], played, len(given), None, status)
+            callback(given, played, len(given), None, status)
             self.played = np.concatenate((self.played, played))
         return _Open()
 
@@ -101,6 +105,41 @@ def test_what_is_played_is_what_the_aid_gives(
     out = capsys.readouterr().out
     level = 10.0 * np.log10(np.square(expected).mean()) + 100.0
     assert f"in  65.0, out {level:5.1f} dB SPL, drop-outs 2" in out and out.endswith("stopped, drop-outs 2\n")
+
+
+@pytest.mark.parametrize("microphones", [1, 2])
+def test_two_ears_each_have_their_own(
+    microphones: int,
+    recording: torch.Tensor,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """Through the aid, and through the impaired ears; each hears its own microphone, or the only one."""
+    given = torch.stack((recording, 0.1 * recording.roll(99)))[:microphones]
+    devices = Devices(given)
+    monkeypatch.setitem(sys.modules, "sounddevice", devices)
+    listener = Listener(Audiogram.standard("N2"), Audiogram.standard("N4"))
+    with (tmp_path / "ears.csv").open("w", newline="") as file:
+        rows = csv.DictWriter(file, fieldnames=[*listener.to_rows("A")[0]])
+        rows.writeheader()
+        rows.writerows(listener.to_rows("A"))
+    call = ["live", "--listener", str(tmp_path / "ears.csv"), "--seconds", "0.05"]
+    assert main([*call, "--compensator", "wdrc"]) == 0
+    stream, both = WDRC(full_scale_spl=100.0).stream(listener), given.expand(2, -1)
+    stream(torch.zeros(2, 20 * 64))  # before the devices open
+    expected = stream(both).clamp(-1.0, 1.0).numpy()
+    assert devices.opened["channels"] == (microphones, 2)
+    assert np.abs(devices.played.T - expected).max() < 1e-5 * np.abs(expected).max()
+    assert not np.allclose(expected[0], expected[1])
+    second = 65.0 if microphones == 1 else 45.0
+    assert f"in  65.0 /  {second:.1f}, out " in capsys.readouterr().out
+
+    devices.played = devices.played[:0]
+    assert main([*call, "--simulate"]) == 0
+    stream = Simulated(load_pretrained("neuro-msbg", full_scale_spl=100.0), listener)
+    heard = torch.cat([stream(chunk) for chunk in both.split(1536, -1)], -1).clamp(-1.0, 1.0).numpy()
+    assert np.abs(devices.played.T - heard).max() < 1e-4 * np.abs(heard).max() > 0.0
 
 
 def test_keys_move_the_sliders_that_are_there() -> None:
@@ -198,7 +237,8 @@ def test_simulated_blocks_are_what_is_heard_of_the_whole() -> None:
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        ([], "no --audiogram; allowed: NH, "),
+        ([], "no --audiogram and no --listener; allowed: NH, "),
+        (["--listener", "nosuch.csv"], "nosuch.csv"),
         (["--audiogram", "N3", "--input", "7"], "--input 7: no such device (No input device matching 7)"),
         (["--audiogram", "N3", "--output", "Phones"], "--output Phones: no such device (No output device"),
         (["--audiogram", "N3", "--compensator", "nalr"], "nalr takes whole signals; allowed: wdrc, or a"),
@@ -217,6 +257,12 @@ def test_refusals_are_one_line(
     assert main(["live", *arguments]) == 2
     error = capsys.readouterr().err
     assert error.startswith("hlsim: error: ") and error.count("\n") == 1 and said in error
+
+
+def test_headphones_of_one_channel_play_no_two_ears() -> None:
+    devices: Any = Devices(torch.zeros(64), plays=1)
+    with pytest.raises(ValueError, match="one channel for two ears; allowed: with two, or --audiogram"):
+        play(Live(lambda heard: heard, 94.0, ears=2), devices)
 
 
 def test_a_device_of_another_rate_and_what_is_missing(

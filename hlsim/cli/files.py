@@ -59,11 +59,7 @@ def _in_and_out(parser: Parser, run: Callable[[argparse.Namespace], None], *exam
     parser.option("output", Path, text, metavar="OUT")
     ears = parser.add_mutually_exclusive_group(required=True)
     parser.audiogram(group=ears)
-    text = (
-        "two ears, of stereo files, left first: a CSV file with columns listener, ear (left or right), hl_250, ..., or "
-        "Clarity's listeners.json; FILE:NAME of one with several listeners"
-    )
-    parser.option("--listener", str, text, group=ears, metavar="FILE[:NAME]")
+    parser.listener("two ears, of stereo files, left first", group=ears)
     parser.full_scale()
 
 

@@ -6,7 +6,7 @@ import argparse
 import math
 from types import ModuleType
 
-from hlsim.cli.inputs import read_compensator, read_ear, read_simulator
+from hlsim.cli.inputs import read_compensator, read_ears, read_simulator
 from hlsim.cli.options import STANDARD_EARS, Parser, kind, number, positive
 from hlsim.extras import require
 
@@ -22,9 +22,11 @@ def live(parser: Parser) -> None:
     parser.runs(
         _live,
         "--audiogram N3",
-        "--audiogram N4 --simulate --seconds 60",
+        "--listener listeners.json:L0001 --simulate --seconds 60",
     )
-    parser.audiogram(text="; needed but for --list-devices")
+    ears = parser.add_mutually_exclusive_group()
+    parser.audiogram(text="; this or --listener is needed but for --list-devices", group=ears)
+    parser.listener("two ears, left first, of headphones and of microphones, where those are two", group=ears)
     either = parser.add_mutually_exclusive_group()
     text = (
         "what runs chunk by chunk: a hearing aid's checkpoint, name or folder, or wdrc (compression in bands)"
@@ -47,9 +49,12 @@ def live(parser: Parser) -> None:
 
 def _live(options: argparse.Namespace) -> None:
     if not options.list_devices:
-        if options.audiogram is None:
-            raise ValueError(f"no --audiogram; allowed: {', '.join(STANDARD_EARS)}, or eight levels in dB HL")
-        ear = read_ear(options.audiogram)
+        if options.audiogram is None and options.listener is None:
+            raise ValueError(
+                "no --audiogram and no --listener; allowed: "
+                f"{', '.join(STANDARD_EARS)}, or eight levels in dB HL, or a listener's file"
+            )
+        ears = read_ears(options)
     sounddevice = _sounddevice()
     if options.list_devices:
         print(sounddevice.query_devices() or "no devices")
@@ -63,15 +68,15 @@ def _live(options: argparse.Namespace) -> None:
     if options.simulate:
         if options.noise_reduction is not None or options.amplification is not None:
             raise ValueError("sliders with --simulate; allowed: with a hearing aid")
-        stream = Simulated(read_simulator("neuro-msbg", _RATE, options.full_scale_spl), ear)
+        stream = Simulated(read_simulator("neuro-msbg", _RATE, options.full_scale_spl), ears)
         block = 12 * stream.block
     else:
         aid, sliders = read_compensator(options, _RATE)
         if not hasattr(aid, "stream"):
             raise ValueError(f"{options.compensator} takes whole signals; allowed: wdrc, or a hearing aid")
-        stream = aid.stream(ear, **sliders)
+        stream = aid.stream(ears, **sliders)
     play(
-        Live(stream, options.full_scale_spl),
+        Live(stream, options.full_scale_spl, 2 if options.listener else 1),
         sounddevice,
         devices=(options.input, options.output),
         block=block,

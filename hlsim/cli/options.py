@@ -100,6 +100,13 @@ class Parser(argparse.ArgumentParser):
         )
         self.option("--audiogram", str, help_, default, **more)
 
+    def listener(self, text: str, **more: Any) -> None:
+        file = (
+            "a CSV file with columns listener, ear (left or right), hl_250, ..., or Clarity's listeners.json; FILE:NAME "
+            "of one with several listeners"
+        )
+        self.option("--listener", str, f"{text}: {file}", metavar="FILE[:NAME]", **more)
+
     def full_scale(self, **more: Any) -> None:
         self.option("--full-scale-spl", number, "level in dB SPL of a file whose RMS is 1.0", 94.0, **more)
 
