@@ -14,7 +14,7 @@ from hlsim.audiogram import Audiogram
 from hlsim.calibration import check_full_scale
 from hlsim.evaluation.comparison import Comparison, compare_conditions
 from hlsim.evaluation.inputs import read_folders, read_manifest
-from hlsim.evaluation.scores import Failure, ItemScore, better_ears
+from hlsim.evaluation.scores import Failure, ItemScore, better_ears, check_both_ears
 from hlsim.evaluation.scoring import FileItem, Result, score_items
 from hlsim.evaluation.statistics import RESAMPLES, PairedComparison
 from hlsim.evaluation.store import ScoreStore
@@ -289,6 +289,8 @@ def report_items(
         if baseline not in conditions:
             raise ValueError(f"no condition {baseline!r}; allowed: {', '.join(conditions)}")
         conditions = [baseline, *(name for name in conditions if name != baseline)]
+    if better_ear:
+        check_both_ears((item.name, item.listener, item.ear) for item in items)
     scored = score_items(items, measures, engine=engine, store=ScoreStore(store), seed=seed, **running)
     pairs = [*zip(items, scored, strict=True)]
     unscored = [

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -91,30 +91,48 @@ class Failure:
     reason: str
 
 
+def check_both_ears(items: Iterable[tuple[str, str, str]]) -> None:
+    """Refuse items (what each is called, listener, ear) of which one has no other ear's: there is no better of one.
+
+    Raises:
+        ValueError: an item that is neither a left nor a right ear's, or whose other ear is not there.
+    """
+    found: dict[tuple[str, str], set[str]] = {}
+    for file, listener, ear in items:
+        if ear not in EARS:
+            raise ValueError(f"{file}: ear is {ear!r}; allowed: left and right, for the better ear")
+        found.setdefault(_utterance(file, listener, ear), set()).add(ear)
+    for (listener, own), ears in found.items():
+        if lack := [ear for ear in EARS if ear not in ears]:
+            raise ValueError(
+                f"{_joined(listener, own)}: no {lack[0]} ear; allowed: both ears of each utterance, for the better ear"
+            )
+
+
 def better_ears(items: Sequence[ItemScore]) -> list[ItemScore]:
     """One item for the left and right ear of each listener and utterance, in the order of their first.
 
     A condition's score by each measure is the higher of the two ears', or that of the ear that has one; its level is that
     of the ear whose first measure is higher. The item's ear and audiogram are the better ear's under the last condition.
-
-    Raises:
-        ValueError: an item that is neither a left nor a right ear's, or whose other ear is not there.
+    An ear of which nothing could be scored is not among ``items``, and counts as the worse.
     """
     pairs: dict[tuple[str, str], dict[str, ItemScore]] = {}
     for item in items:
-        if item.ear not in EARS:
-            raise ValueError(f"{item.file}: ear is {item.ear!r}; allowed: left and right, for the better ear")
-        own = item.file.removeprefix(f"{item.listener} ").removeprefix(f"{item.ear} ")
-        pairs.setdefault((item.listener, own), {})[item.ear] = item
-    return [_better(f"{listener} {own}".strip(), ears) for (listener, own), ears in pairs.items()]
+        pairs.setdefault(_utterance(item.file, item.listener, item.ear), {})[item.ear] = item
+    return [_better(_joined(*names), ears) for names, ears in pairs.items()]
+
+
+def _utterance(file: str, listener: str, ear: str) -> tuple[str, str]:
+    """Listener and utterance, which the two ears have in common."""
+    return listener, file.removeprefix(f"{listener} ").removeprefix(f"{ear} ")
+
+
+def _joined(listener: str, own: str) -> str:
+    return f"{listener} {own}".strip()
 
 
 def _better(file: str, ears: dict[str, ItemScore]) -> ItemScore:
-    if lack := [ear for ear in EARS if ear not in ears]:
-        raise ValueError(
-            f"{file}: no {lack[0]} ear; allowed: both ears of each utterance, for the better ear"
-        )
-    both = [ears[ear] for ear in EARS]
+    both = [ears[ear] for ear in EARS if ear in ears]
     measures, conditions = list(both[0].scores), list(both[0].levels)
 
     def winner(measure: str, condition: str) -> ItemScore:

@@ -1,6 +1,5 @@
 """The better ear of two: of scores, and in a report of a manifest."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +9,7 @@ import torch
 from hlsim.audio import read_audio, write_audio
 from hlsim.audiogram import Audiogram
 from hlsim.evaluation import ItemScore, haspi_report
-from hlsim.evaluation.scores import better_ears
+from hlsim.evaluation.scores import better_ears, check_both_ears
 from hlsim.report.haspi import html, markdown
 
 EARS = {"left": Audiogram.standard("N2"), "right": Audiogram.standard("N4")}
@@ -49,10 +48,29 @@ def test_an_ear_without_a_score_loses() -> None:
 def test_a_missing_ear_is_refused_and_listeners_are_kept_apart() -> None:
     both = [one(ear, 0.1, 0.2, 60.0, name) for name in ("L1", "L2") for ear in EARS]
     assert [item.file for item in better_ears(both)] == ["L1 s01", "L2 s01"]
+    named = [(item.file, item.listener, item.ear) for item in both]
+    check_both_ears(named)
     with pytest.raises(ValueError, match="L2 s01: no right ear"):
-        better_ears(both[:3])
+        check_both_ears(named[:3])
     with pytest.raises(ValueError, match="allowed: left and right"):
-        better_ears([replace(both[0], ear="")])
+        check_both_ears([("L1 s01", "L1", "")])
+
+
+def test_an_ear_of_which_nothing_can_be_scored_is_told_and_loses(tmp_path: Path, speech_dir: Path) -> None:
+    (tmp_path / "speech.flac").write_bytes((speech_dir / "valid" / "espeak-us-annie-01.flac").read_bytes())
+    (tmp_path / "broken.wav").write_text("no sound")
+    rows = ["listener,ear,condition,clean,processed,audiogram"]
+    for condition in ("before", "after"):
+        rows += [
+            f"L1,left,{condition},speech.flac,broken.wav,N4",
+            f"L1,right,{condition},speech.flac,speech.flac,N4",
+        ]
+    (tmp_path / "study.csv").write_text("\n".join(rows))
+    report = haspi_report(manifest=tmp_path / "study.csv", better_ear=True, jobs=1)
+    assert [item.ear for item in report.items] == ["right"] and len(report.failures) == 2
+    (tmp_path / "study.csv").write_text("\n".join(row for row in rows if ",left," not in row))
+    with pytest.raises(ValueError, match="no left ear"):
+        haspi_report(manifest=tmp_path / "study.csv", better_ear=True, jobs=1)
 
 
 def test_a_report_of_two_ears(tmp_path: Path, speech_dir: Path) -> None:

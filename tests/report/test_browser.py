@@ -170,6 +170,15 @@ def test_the_keyboard_reaches_everything(page: Any) -> None:
     assert hidden.is_visible()
 
 
+def test_a_link_to_a_folded_section_opens_it_and_shows_its_heading(page: Any) -> None:
+    heading = page.locator("summary > h2")
+    assert not page.locator("details").evaluate("e => e.open")
+    page.locator("nav a").last.click()
+    page.wait_for_function("document.querySelector('details').open")
+    place = heading.bounding_box()
+    assert 0 <= place["y"] < page.viewport_size["height"]
+
+
 def test_the_focus_is_seen_and_scrolls_a_wide_table(page: Any) -> None:
     wide = page.locator(".scroll").last
     page.locator("summary").click()
