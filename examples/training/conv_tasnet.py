@@ -1,7 +1,8 @@
 """torchaudio's ConvTasNet as an aid for one ear: python examples/training/conv_tasnet.py SPEECH_DIR OUT.pt [EAR] [STEPS]
 
 ConvTasNet normalises its input's level away (a global norm in each block), so that it cannot learn compression: it gives
-soft and loud speech the same gain. Train it at one level, or mend it: docs/guide/your-own-network.md.
+soft and loud speech the same gain. Train it at one level, or mend it: docs/guide/your-own-network.md, which also says
+how many steps it needs.
 """
 
 import sys

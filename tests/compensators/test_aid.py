@@ -26,7 +26,7 @@ def test_at_0_and_0_the_input_passes_unchanged(utterance: torch.Tensor) -> None:
     aid = trained()
     assert torch.equal(aid(utterance, EAR, 0.0, 0.0), utterance)
     stream = aid.stream(EAR, noise_reduction=0.0, amplification=0.0)
-    assert torch.equal(stream(utterance)[64:], utterance[:-64])
+    assert torch.equal(stream(utterance)[aid.latency :], utterance[: -aid.latency])
 
 
 def test_each_slider_does_its_own_and_more_does_more(utterance: torch.Tensor) -> None:
