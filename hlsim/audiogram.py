@@ -143,7 +143,9 @@ class Audiogram:
         """
         from hlsim.audiogram_plot import plot_audiogram
 
-        return plot_audiogram(self, axes, **style)
+        limits = pairwise((LOWEST_LEVEL, *SEVERITY_LIMITS, HIGHEST_LEVEL))
+        degrees = dict(zip(SEVERITIES, limits, strict=True))
+        return plot_audiogram(self.frequencies, self.levels, degrees, axes, **style)
 
     def to_dict(self) -> dict[str, list[float]]:
         """A plain dictionary that JSON can hold."""

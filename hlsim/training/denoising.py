@@ -12,7 +12,9 @@ from hlsim.calibration import PASCAL_SPL, level_spl, set_level
 from hlsim.metrics.objective import missing_score
 from hlsim.neuro.config import NEURO_RATE
 
-_QUIET = 10.0 ** ((-10.0 - PASCAL_SPL) / 10.0)  # of a frequency, -10 dB SPL, so that nothing is taken off silence
+_QUIET = 10.0 ** (
+    (-10.0 - PASCAL_SPL) / 10.0
+)  # of a frequency, -10 dB SPL, so that nothing is taken off silence
 _SHARE = 0.8  # of the dB
 
 
