@@ -13,7 +13,6 @@ from compensators.bands import (
     frame_power,
     level_db,
     shares,
-    shares_of_bins,
     spread,
 )
 from compensators.config import HearingAidConfig
@@ -165,7 +164,7 @@ class HearingAid(Wearable):
         # what stands out among its neighbours, as harmonics do, may be kept and what lies between them taken
         around = functional.avg_pool1d(fine, 2 * _NEIGHBOURS + 1, 1, _NEIGHBOURS, count_include_pad=False)
         contrast = ((fine - around) / 10.0).clamp(-1.0, 1.0)
-        logit = logit - clarity @ constant_like(fine, shares_of_bins, self.bands) * contrast
+        logit = logit - clarity @ constant_like(fine, shares, self.bands, LONG_FRAME).mT * contrast
         taken = -config.reduction_db * torch.sigmoid(logit)
         taken, kept = follow_peaks(taken, state["attenuation"], decay(config.opening), decay(config.closing))
         return taken, {"attenuation": kept, "hidden": torch.cat((hidden, cell)).movedim(0, 1)}

@@ -36,6 +36,7 @@ HISTORY = LONG_FRAME - HOP
 
 _NARROWEST = 125.0  # Hz from centre to centre, about what frames of 16 ms can tell apart
 _LEAST = 10.0 ** (-PASCAL_SPL / 10.0)  # power at 0 dB SPL, under which no level goes
+_REACH = 64  # samples to either side, of the smoothing of bands over frequency
 _GRID = 4096
 
 # Long-term average of speech at 70 dB SPL in thirds of an octave, men's and women's: Byrne et al. 1994, JASA 96(4)
@@ -72,15 +73,25 @@ def shares(count: int, points: int) -> NDArray[np.float64]:
     return np.stack([np.interp(hz, centres(count), row) for row in np.eye(count)], 1)
 
 
-def shares_of_bins(count: int) -> NDArray[np.float64]:
-    """``shares`` of the frequencies of a long frame. Returns (count, LONG_FRAME / 2 + 1)."""
-    return shares(count, LONG_FRAME).T
-
-
 def spread(gains_db: Tensor) -> Tensor:
     """Gains of bands as gains of single frequencies. Shape: (..., bands) dB -> (..., LONG_FRAME / 2 + 1) dB."""
-    taken = 10.0 ** (gains_db / 20.0) - 1.0  # sums of shares round, but not those of 0
-    return 20.0 * torch.log10(1.0 + taken @ constant_like(taken, shares_of_bins, gains_db.shape[-1]))
+    added = 10.0 ** (gains_db / 20.0) - 1.0  # sums of shares round, but not those of 0
+    return 20.0 * torch.log10(1.0 + added @ constant_like(added, smooth_shares, gains_db.shape[-1]))
+
+
+def smooth_shares(count: int) -> NDArray[np.float64]:
+    """``shares`` as filters of 8 ms have them, which tell frequencies less apart than 250 Hz badly.
+
+    Between a loud band and a silent one, whose gains differ by tens of dB, the gain would fall too steeply without, and a
+    tone be heard too softly. Returns (count, LONG_FRAME / 2 + 1).
+    """
+    impulses = np.fft.irfft(shares(count, LONG_FRAME).T, LONG_FRAME)
+    window = np.hanning(2 * _REACH + 3)[1:-1]
+    taps = np.roll(impulses, _REACH, -1)[:, : 2 * _REACH + 1] * window
+    smooth: NDArray[np.float64] = np.fft.rfft(
+        np.roll(np.pad(taps, ((0, 0), (0, LONG_FRAME - taps.shape[-1]))), -_REACH, -1)
+    ).real
+    return smooth
 
 
 def gain_at_rate(gains: Tensor, rate: int, time: int) -> Tensor:
