@@ -1,4 +1,4 @@
-"""A hearing aid that could be worn: learned gains and noise reduction on a direct path of 5 ms."""
+"""A hearing aid that could be worn: learned gains and noise reduction on a direct path of 4 ms."""
 
 from __future__ import annotations
 
@@ -6,15 +6,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from compensators.bands import (
-    FRAME,
-    HISTORY,
-    LONG_FRAME,
-    frame_power,
-    level_db,
-    shares,
-    spread,
-)
+from compensators.bands import FRAME, HISTORY, frame_power, level_db, shares
 from compensators.config import HearingAidConfig
 from compensators.prescription import losses, prescribed_gains, restoring_gains
 from compensators.smoothing import decay, follow_peaks
@@ -25,18 +17,16 @@ from hlsim.calibration import PASCAL_SPL
 from hlsim.torchtools import constant_like
 
 _FADE = 15.0  # dB of level over which the gain of what is quiet fades
-_NEIGHBOURS = 6  # to either side, 190 Hz
 _RARELY = -3.0  # start of the logit of noise reduction: 1 dB of 20
 
 
 class HearingAid(Wearable):
-    """Waveform and audiogram to what the impaired ear is to be given, 5 ms late, whole or in chunks as it comes.
+    """Waveform and audiogram to what the impaired ear is to be given, 4 ms late, whole or in chunks as it comes.
 
     Two networks that know nothing of one another set its gains. One, without memory, sees the ear and the level that each
     band has had of late, and corrects the gain that would restore loudness band by band
     (``prescription.restoring_gains``); the correction is 0 before training, and where there is no loss. The other, causal
-    and recurrent, sees the levels of frames, not the ear, and takes noise off, frequency by frequency, 31.25 Hz apart:
-    between the harmonics of a voice, too. In dB, the gain is
+    and recurrent, sees the levels of frames, not the ear, and takes noise off. In dB, a band's gain is
 
         amplification * (restoring + correction) - noise_reduction * attenuation,
 
@@ -63,17 +53,17 @@ class HearingAid(Wearable):
     ) -> None:
         super().__init__(sample_rate, full_scale_spl, linked)
         self.config = config = HearingAidConfig.given(config)
-        self.bands, self.limit_spl, fine = config.bands, config.limit_spl, LONG_FRAME // 2 + 1
+        self.bands, self.limit_spl = config.bands, config.limit_spl
         width, corrections = config.width, nn.Linear(config.width, config.bands)
         seen = nn.Linear(3 * config.bands + 1, width)
         self.correct = nn.Sequential(seen, nn.Tanh(), nn.Linear(width, width), nn.Tanh(), corrections)
-        self.enter = nn.Linear(config.bands + fine, width)
+        self.enter = nn.Linear(config.bands + config.bins, width)
         self.recur = nn.LSTM(width, config.hidden, batch_first=True)
-        self.leave = nn.Linear(config.hidden + width, fine + config.bands)
+        self.leave = nn.Linear(config.hidden + width, config.bands)
         with torch.no_grad():
             corrections.weight.zero_()
             corrections.bias.zero_()
-            self.leave.bias.zero_()[:fine] = _RARELY
+            self.leave.bias.fill_(_RARELY)
 
     def forward(
         self,
@@ -107,33 +97,32 @@ class HearingAid(Wearable):
         zeros, bands = like.new_zeros, self.bands
         return {
             "levels": zeros(items, 3, bands + 1),
-            "attenuation": zeros(items, 3, LONG_FRAME // 2 + 1),
+            "attenuation": zeros(items, 3, bands),
             "hidden": zeros(items, 2, self.config.hidden),
         }
 
     def control(
-        self, powers: Tensor, fine: Tensor, fitted: Tensor, sliders: Tensor, state: State
+        self, powers: Tensor, fitted: Tensor, sliders: Tensor, state: State
     ) -> tuple[Tensor, dict[str, Tensor]]:
         noise_reduction, amplification = sliders.split(1, -1)
         levels = self._levels(powers)
-        gain, followed = self._amplification(levels, fitted, state)
-        taken, recalled = self._reduction(levels[..., : self.bands], level_db(fine), state)
-        return spread(amplification * gain) + noise_reduction * taken, followed | recalled
+        gain, followed = self._amplification(levels[..., : self.bands + 1], fitted, state)
+        taken, recalled = self._reduction(levels, state)
+        return amplification * gain + noise_reduction * taken, followed | recalled
 
     def attenuation(self, samples: Tensor) -> Tensor:
-        """What noise reduction adds to each frequency's gain at the end of each frame, in dB, 0 or less; it knows no ear.
+        """What noise reduction adds to each band's gain at the end of each frame, in dB, 0 or less; it knows no ear.
 
-        Shape: (items, hops * HOP) pascals -> (items, hops, LONG_FRAME / 2 + 1).
+        Shape: (items, hops * HOP) pascals -> (items, hops, bands).
         """
-        padded = functional.pad(samples, (HISTORY, 0))
-        powers, fine = (frame_power(padded, points) for points in (FRAME, LONG_FRAME))
-        levels = self._levels(powers)[..., : self.bands]
-        return self._reduction(levels, level_db(fine), self.start(len(samples), samples))[0]
+        levels = self._levels(frame_power(functional.pad(samples, (HISTORY, 0))))
+        return self._reduction(levels, self.start(len(samples), samples))[0]
 
     def _levels(self, powers: Tensor) -> Tensor:
-        """Levels of the bands and of all. Shape: as ``control`` -> (..., bands + 1)."""
+        """Levels of the bands, of all, and of single frequencies. Shape: as ``control`` -> (..., bands + 1 + bins)."""
         by_band = powers @ constant_like(powers, shares, self.bands, FRAME)
-        return level_db(torch.cat((by_band, powers.sum(-1, keepdim=True)), -1))
+        bins = powers[..., 1 : self.config.bins + 1]
+        return level_db(torch.cat((by_band, powers.sum(-1, keepdim=True), bins), -1))
 
     def _amplification(
         self, levels: Tensor, fitted: Tensor, state: State
@@ -151,21 +140,14 @@ class HearingAid(Wearable):
         audible = ((total - config.quiet_spl) / _FADE + 1.0).clamp(0.0, 1.0)
         return audible * gain, {"levels": kept}
 
-    def _reduction(self, levels: Tensor, fine: Tensor, state: State) -> tuple[Tensor, dict[str, Tensor]]:
-        """Shape: (items, frames, bands), of frequencies (items, frames, n) -> (items, frames, n) dB, 0 or less."""
+    def _reduction(self, levels: Tensor, state: State) -> tuple[Tensor, dict[str, Tensor]]:
+        """Shape: (items, frames, bands + 1 + bins) -> (items, frames, bands) dB, 0 or less."""
         config = self.config
-        seen = torch.cat((levels, fine), -1)
+        seen = torch.cat((levels[..., : self.bands], levels[..., self.bands + 1 :]), -1)
         entered = torch.tanh(self.enter((seen - 40.0) / 20.0))
         hidden, cell = state["hidden"].movedim(1, 0).contiguous().unsqueeze(1).unbind()
         recalled, (hidden, cell) = self.recur(entered, (hidden, cell))
-        logit, clarity = self.leave(torch.cat((recalled, entered), -1)).split(
-            (fine.shape[-1], self.bands), -1
-        )
-        # what stands out among its neighbours, as harmonics do, may be kept and what lies between them taken
-        around = functional.avg_pool1d(fine, 2 * _NEIGHBOURS + 1, 1, _NEIGHBOURS, count_include_pad=False)
-        contrast = ((fine - around) / 10.0).clamp(-1.0, 1.0)
-        logit = logit - clarity @ constant_like(fine, shares, self.bands, LONG_FRAME).mT * contrast
-        taken = -config.reduction_db * torch.sigmoid(logit)
+        taken = -config.reduction_db * torch.sigmoid(self.leave(torch.cat((recalled, entered), -1)))
         taken, kept = follow_peaks(taken, state["attenuation"], decay(config.opening), decay(config.closing))
         return taken, {"attenuation": kept, "hidden": torch.cat((hidden, cell)).movedim(0, 1)}
 

@@ -1,4 +1,4 @@
-"""The bands of a wearable aid, its frames, and levels on the same division of frequency."""
+"""The bands of a wearable aid: linear-phase filters that sum to a delay, and levels on the same division of frequency."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from functools import lru_cache
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor, nn
+from torch import Tensor
 
 from hlsim.calibration import PASCAL_SPL
 from hlsim.dsp.erb import erb
@@ -17,26 +17,20 @@ from hlsim.torchtools import constant_like
 RATE = 16000
 """Sample rate in Hz at which all of it works."""
 
+DELAY = 64
+"""Delay of the filters in samples, 4 ms; each has 2 * 64 + 1 taps."""
+
 HOP = 64
 """Samples from control frame to control frame."""
 
-DELAY = 79
-"""Samples, 4.9 ms, that the direct path is late: gains of a frame that has just ended meet what is that old."""
+FRAME, _FALL = 256, 64
+"""Samples of a control frame; those over which its window falls: its peak is 4 ms before its end."""
 
-GLIDE = 32
-"""Samples, 2 ms, over which the gains of a hop go from the last frame's to the next one's, and then stay."""
+HISTORY = FRAME - HOP
+"""Samples before a hop that frame and filters look back on."""
 
-FRAME, LONG_FRAME = 256, 512
-"""Samples of the frames for levels in bands, 16 ms, and of those for single frequencies, 31.25 Hz apart."""
-
-_FALL = 32  # samples over which the frames' windows fall: their peaks are 2 ms before their ends
-
-HISTORY = LONG_FRAME - HOP
-"""Samples before a hop that frames and filters look back on."""
-
-_NARROWEST = 125.0  # Hz from centre to centre, about what frames of 16 ms can tell apart
+_NARROWEST = 125.0  # Hz from centre to centre, about what filters of this length can tell apart
 _LEAST = 10.0 ** (-PASCAL_SPL / 10.0)  # power at 0 dB SPL, under which no level goes
-_REACH = 64  # samples to either side, of the smoothing of bands over frequency
 _GRID = 4096
 
 # Long-term average of speech at 70 dB SPL in thirds of an octave, men's and women's: Byrne et al. 1994, JASA 96(4)
@@ -73,46 +67,58 @@ def shares(count: int, points: int) -> NDArray[np.float64]:
     return np.stack([np.interp(hz, centres(count), row) for row in np.eye(count)], 1)
 
 
-def spread(gains_db: Tensor) -> Tensor:
-    """Gains of bands as gains of single frequencies. Shape: (..., bands) dB -> (..., LONG_FRAME / 2 + 1) dB."""
-    added = 10.0 ** (gains_db / 20.0) - 1.0  # sums of shares round, but not those of 0
-    return 20.0 * torch.log10(1.0 + added @ constant_like(added, smooth_shares, gains_db.shape[-1]))
+def filters(count: int) -> NDArray[np.float64]:
+    """Taps of the bands' filters, symmetric, whose sum is 1 at the middle and 0 elsewhere. Returns (count, 129)."""
+    impulses = np.fft.irfft(shares(count, _GRID).T, _GRID)
+    taps = np.roll(impulses, DELAY, -1)[:, : 2 * DELAY + 1]
+    return taps * np.hanning(2 * DELAY + 3)[1:-1]
 
 
-def smooth_shares(count: int) -> NDArray[np.float64]:
-    """``shares`` as filters of 8 ms have them, which tell frequencies less apart than 250 Hz badly.
+def apply_gains(padded: Tensor, gains: Tensor, first: int = 0) -> Tensor:
+    """The sum of the bands times gains that go linearly from hop to hop, ``DELAY`` samples late.
 
-    Between a loud band and a silent one, whose gains differ by tens of dB, the gain would fall too steeply without, and a
-    tone be heard too softly. Returns (count, LONG_FRAME / 2 + 1).
+    Sums alone, no transform: what comes later changes nothing, not even by rounding. Gains of 1 change nothing either.
+
+    Args:
+        padded: the samples, ``2 * DELAY`` before them first: of whole hops, or within one.
+        gains: less 1, where each hop begins and the last ends.
+        first: the place of the first sample in its hop.
+
+    Shape: (items, 2 * DELAY + time), (items, hops + 1, bands) -> (items, time).
     """
-    impulses = np.fft.irfft(shares(count, LONG_FRAME).T, LONG_FRAME)
-    window = np.hanning(2 * _REACH + 3)[1:-1]
-    taps = np.roll(impulses, _REACH, -1)[:, : 2 * _REACH + 1] * window
-    smooth: NDArray[np.float64] = np.fft.rfft(
-        np.roll(np.pad(taps, ((0, 0), (0, LONG_FRAME - taps.shape[-1]))), -_REACH, -1)
-    ).real
-    return smooth
+    time, count = padded.shape[-1] - 2 * DELAY, gains.shape[-1]
+    length = min(time, HOP)
+    taps = constant_like(padded, _for_a_hop, count).unflatten(1, (count, HOP))[
+        : length + 2 * DELAY, :, :length
+    ]
+    ramp = constant_like(padded, _ramp)[:, first : first + length]
+    hops = padded.unfold(-1, length + 2 * DELAY, length)
+    bands = (hops @ taps.flatten(1)).unflatten(-1, (count, length))
+    both = torch.stack((gains[:, :-1], gains[:, 1:]), 2) @ bands
+    added = (both * ramp).sum(2).flatten(1)
+    return padded[:, DELAY : DELAY + time] + added
 
 
 def gain_at_rate(gains: Tensor, rate: int, time: int) -> Tensor:
-    """One frequency's gains as ``apply_filters`` has them, at the samples of another rate, aligned with the input.
+    """One band's gains as ``apply_gains`` has them, linear from hop to hop, at the samples of another rate.
 
-    Shape: (items, frames) -> (items, time).
+    Args:
+        gains: before the first sample and at the last one of each hop.
+
+    Shape: (items, hops + 1) -> (items, time).
     """
-    place = (torch.arange(time, device=gains.device).double() * RATE / rate + DELAY + 1.0) / HOP
+    place = (torch.arange(time, device=gains.device) * RATE + rate).double() / (HOP * rate)
     hop = place.long()
-    padded = nn.functional.pad(gains, (2, 0))  # what comes before the first frame
-    share = ((place - hop) * HOP / GLIDE).clamp_max(1.0)
-    return torch.lerp(padded[:, hop], padded[:, hop + 1], share.to(gains))
+    return torch.lerp(gains[:, hop], gains[:, hop + 1], (place - hop).to(gains))
 
 
-def frame_power(padded: Tensor, points: int) -> Tensor:
-    """Power of each frequency in frames of so many samples, every 4 ms, whose sum is the mean square.
+def frame_power(padded: Tensor) -> Tensor:
+    """Power of each frequency in frames of 16 ms every 4 ms, whose sum is the mean square.
 
-    Shape: (items, HISTORY + frames * HOP) pascals -> (items, frames, points / 2 + 1).
+    Shape: (items, HISTORY + frames * HOP) pascals -> (items, frames, FRAME / 2 + 1).
     """
-    frames = padded[:, LONG_FRAME - points :].unfold(-1, points, HOP) * constant_like(padded, _window, points)
-    return power(torch.fft.rfft(frames)) * constant_like(padded, _scale, points)
+    frames = padded.unfold(-1, FRAME, HOP) * constant_like(padded, _window)
+    return power(torch.fft.rfft(frames)) * constant_like(padded, _scale)
 
 
 def level_db(powers: Tensor) -> Tensor:
@@ -132,15 +138,29 @@ def speech_levels(count: int, spl: float = 65.0) -> tuple[float, ...]:
     return tuple((10.0 * np.log10(bands / bands.sum()) + spl).tolist())
 
 
-def _window(points: int) -> NDArray[np.float64]:
-    """Rises as a Hann window, and falls as a shorter one: what it tells is 2 ms old."""
-    rise = points - _FALL
+def _for_a_hop(count: int) -> NDArray[np.float64]:
+    """Weights of samples in the bands' next ``HOP`` outputs. Returns (2 * DELAY + HOP, count * HOP)."""
+    matrix = np.zeros((2 * DELAY + HOP, count, HOP))
+    for place in range(HOP):
+        matrix[place : place + 2 * DELAY + 1, :, place] = filters(count).T
+    return matrix.reshape(len(matrix), -1)
+
+
+def _ramp() -> NDArray[np.float64]:
+    """Weights of a hop's first and last gain at each sample. Returns (2, HOP)."""
+    last = np.arange(1, HOP + 1) / HOP
+    return np.stack([1.0 - last, last])
+
+
+def _window() -> NDArray[np.float64]:
+    """Rises as a Hann window over 12 ms and falls as one over 4 ms: what it tells is 4 ms old."""
+    rise = FRAME - _FALL
     up = 0.5 - 0.5 * np.cos(np.pi * (np.arange(rise) + 0.5) / rise)
     down = 0.5 + 0.5 * np.cos(np.pi * (np.arange(_FALL) + 0.5) / _FALL)
     return np.concatenate([up, down])
 
 
-def _scale(points: int) -> NDArray[np.float64]:
-    scale = np.full(points // 2 + 1, 2.0 / (points * np.square(_window(points)).sum()))
+def _scale() -> NDArray[np.float64]:
+    scale = np.full(FRAME // 2 + 1, 2.0 / (FRAME * np.square(_window()).sum()))
     scale[[0, -1]] /= 2.0
     return scale

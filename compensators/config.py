@@ -46,10 +46,11 @@ class HearingAidConfig(ModelConfig):
 
     Attributes:
         bands: whose gains it sets, an equal number of ERBs apart but no less than 125 Hz, 4 to 40.
+        bins: frequencies of a frame, 62.5 Hz apart from the first, whose levels noise reduction sees beside the bands'.
         width: of the layers before noise reduction's recurrent one, and of the correction.
         hidden: of the recurrent layer.
         reach_db: largest correction of the restoring gain up or down.
-        reduction_db: most that noise reduction takes off a frequency.
+        reduction_db: most that noise reduction takes off a band.
         attack, release: of the levels that the gain follows, time constants in seconds.
         opening, closing: of noise reduction.
         cap_db: most gain of a band.
@@ -58,20 +59,21 @@ class HearingAidConfig(ModelConfig):
     """
 
     bands: int = 20
+    bins: int = 40
     width: int = 96
     hidden: int = 256
     reach_db: float = 20.0
-    reduction_db: float = 18.0
+    reduction_db: float = 12.0
     attack: float = 0.005
     release: float = 0.1
     opening: float = 0.0
-    closing: float = 0.015
+    closing: float = 0.03
     cap_db: float = 45.0
     quiet_spl: float = 40.0
     limit_spl: float = 110.0
 
     def __post_init__(self) -> None:
-        for name, low, high in (("bands", 4, 40), ("width", 1, 4096), ("hidden", 1, 4096)):
+        for name, low, high in (("bands", 4, 40), ("bins", 0, 128), ("width", 1, 4096), ("hidden", 1, 4096)):
             if type(getattr(self, name)) is not int:
                 raise ValueError(
                     f"{name} is {getattr(self, name)!r}; allowed: whole numbers from {low} to {high}"

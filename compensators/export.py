@@ -4,8 +4,8 @@ One call takes one hop, ``HOP`` = 64 samples, 4 ms at 16 kHz, of each item (left
 
 - in: ``samples`` (items, 64), RMS 1.0 being ``aid.full_scale_spl`` dB SPL; ``fitted`` (items, n), what the aid needs of
   the ear; ``sliders`` (items, sliders), 0 to 1, in the order of ``aid.SLIDERS``, where it has any; and the state,
-  (items, ...) each, such as ``past`` (items, 448), the samples before in pascals;
-- out: ``output`` (items, 64), ``aid.latency`` = 79 samples late, and each state as ``next_past`` and so on, which the
+  (items, ...) each, such as ``past`` (items, 192), the samples before in pascals;
+- out: ``output`` (items, 64), ``aid.latency`` = 64 samples late, and each state as ``next_past`` and so on, which the
   next call takes as ``past``.
 
 ``first_inputs`` gives all of them for the first hop: fitted to an ear, in the state after silence, with samples of 0.

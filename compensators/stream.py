@@ -8,7 +8,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from compensators.bands import DELAY, HOP
+from compensators.bands import DELAY, HOP, apply_gains
 from hlsim.audiogram import AudiogramLike
 from hlsim.calibration import gain_to_pascals
 from hlsim.checks import check_waveform
@@ -30,11 +30,15 @@ class Worn(Protocol):
 
     def initial(self, sliders: Tensor) -> dict[str, Tensor]: ...
 
-    def coming(self, state: State) -> Tensor: ...
+    def advance(
+        self, samples: Tensor, fitted: Tensor, sliders: Tensor, state: State
+    ) -> dict[str, Tensor]: ...
 
     def step(
         self, samples: Tensor, fitted: Tensor, sliders: Tensor, state: State
     ) -> tuple[Tensor, dict[str, Tensor]]: ...
+
+    def finish(self, samples: Tensor) -> Tensor: ...
 
 
 class Stream:
@@ -56,7 +60,7 @@ class Stream:
         self._state: dict[str, Tensor] = {}  # empty before the first chunk
         self._set: list[Slider] = []
         self._shape = self._batch = torch.Size()
-        self._under_way = self._coming = self._fitted = self._sliders = torch.empty(0)
+        self._under_way = self._fitted = self._sliders = torch.empty(0)
 
     def __call__(self, chunk: Tensor) -> Tensor:
         check_waveform(chunk)
@@ -110,13 +114,14 @@ class Stream:
             self._under_way = self._fitted.new_zeros(len(self._fitted), 0)
 
     def _within(self, samples: Tensor) -> Tensor:
-        """Samples of the hop that is under way: what comes out of it is known when it begins."""
-        place = self._under_way.shape[-1]
-        if not place:
-            self._coming = self._aid.coming(self._state)
+        """Samples of the hop that is under way."""
+        place, state = self._under_way.shape[-1], self._state
         self._under_way = torch.cat((self._under_way, samples), -1)
-        end = self._under_way.shape[-1]
-        if end == HOP:
-            _, self._state = self._aid.step(self._under_way, self._fitted, self._sliders, self._state)
+        needed = 2 * DELAY + samples.shape[-1]
+        padded = torch.cat((state["past"], self._under_way), -1)[:, -needed:]
+        output = self._aid.finish(apply_gains(padded, state["gains"], place))
+        if self._under_way.shape[-1] == HOP:
+            after = self._aid.advance(self._under_way, self._fitted, self._sliders, state)
+            self._state = after | {"gains": after["gains"][:, -2:]}
             self._under_way = self._under_way[:, :0]
-        return self._coming[:, place:end]
+        return output

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from compensators.bands import FRAME, level_db, shares, spread
+from compensators.bands import FRAME, level_db, shares
 from compensators.config import refuse_outside
 from compensators.prescription import (
     above_speech,
@@ -85,13 +85,13 @@ class WDRC(Wearable):
         return {"levels": like.new_zeros(items, 3, self.bands)}
 
     def control(
-        self, powers: Tensor, fine: Tensor, fitted: Tensor, sliders: Tensor, state: State
+        self, powers: Tensor, fitted: Tensor, sliders: Tensor, state: State
     ) -> tuple[Tensor, dict[str, Tensor]]:
         levels = level_db(powers @ constant_like(powers, shares, self.bands, FRAME))
         levels, kept = follow_peaks(levels, state["levels"], decay(self.attack), decay(self.release))
         prescribed, ratios = fitted.chunk(2, -1)
         gains = compressive_gains(above_speech(levels), prescribed, ratios, -self.knee)
-        return spread(torch.minimum(gains, (self.limit_spl - levels).clamp_min(0.0))), {"levels": kept}
+        return torch.minimum(gains, (self.limit_spl - levels).clamp_min(0.0)), {"levels": kept}
 
     def extra_repr(self) -> str:
         return f"sample_rate={self.sample_rate}, full_scale_spl={self.full_scale_spl:g}, bands={self.bands}"

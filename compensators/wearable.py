@@ -1,4 +1,4 @@
-"""What every wearable aid is: gains by frequency, from frames that have been, on a direct path of 5 ms."""
+"""What every wearable aid is: gains in bands, by frames that have been, on a direct path of 4 ms; whole or streamed."""
 
 from __future__ import annotations
 
@@ -7,8 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from compensators.bands import DELAY, FRAME, HISTORY, HOP, LONG_FRAME, RATE, frame_power, gain_at_rate
-from compensators.filters import TAPS, apply_filters, filter_taps
+from compensators.bands import DELAY, HISTORY, HOP, RATE, apply_gains, frame_power, gain_at_rate
 from compensators.limiter import soft_limit
 from compensators.stream import Slider, State, Stream
 from hlsim.audiogram import FREQUENCIES, AudiogramLike, check_two_ears, resolve_thresholds
@@ -24,10 +23,10 @@ _RESAMPLED = 136  # samples at 16 kHz on which resampling there and back looks a
 class Wearable(nn.Module):
     """Subclasses give ``SLIDERS``, ``fit``, ``start`` and ``control``.
 
-    A direct path, 4.9 ms late, goes through a filter of minimum phase with the gain that each frequency is to have. The
-    gains come from frames of 16 and 32 ms, every 4 ms, and are applied as soon as a frame has ended, so that the output,
-    aligned with the input, looks ``DELAY`` samples ahead and no farther. The whole call and the stream run the same
-    ``step``.
+    A direct path splits the signal into bands that sum to it, 4 ms late, multiplies each with its gain and adds them. The
+    gains come from frames of 16 ms every 4 ms that end where the direct path is, so that the output, aligned with the
+    input, looks ``DELAY`` samples ahead and no farther; they go linearly from frame to frame. The whole call and the
+    stream run the same ``step``.
 
     Args:
         sample_rate: of inputs and outputs in Hz, 16000 to 48000. The bands end at 8 kHz; what faster input has above gets
@@ -41,6 +40,7 @@ class Wearable(nn.Module):
     """
 
     SLIDERS: tuple[str, ...] = ()
+    bands: int
     limit_spl: float
 
     def __init__(self, sample_rate: int, full_scale_spl: float, linked: bool = False) -> None:
@@ -63,40 +63,34 @@ class Wearable(nn.Module):
         raise NotImplementedError
 
     def control(
-        self, powers: Tensor, fine: Tensor, fitted: Tensor, sliders: Tensor, state: State
+        self, powers: Tensor, fitted: Tensor, sliders: Tensor, state: State
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        """Gain in dB of each frequency at the end of each frame, and the state after them.
+        """Gain in dB of each band at the end of each frame, and the state after them.
 
-        Shape: (items, frames, FRAME / 2 + 1) and (items, frames, LONG_FRAME / 2 + 1) of ``frame_power``, (items, n),
-        (items, frames, sliders) -> (items, frames, LONG_FRAME / 2 + 1).
+        Shape: (items, frames, FRAME / 2 + 1) of ``frame_power``, (items, n), (items, frames, sliders) -> (items, frames,
+        bands).
         """
         raise NotImplementedError
 
     def initial(self, sliders: Tensor) -> dict[str, Tensor]:
         """The state after silence. Shape: (items, sliders) -> (items, ...) each."""
         items = len(sliders)
-        past, filters = sliders.new_zeros(items, HISTORY), sliders.new_zeros(items, 2, TAPS)
-        return {"past": past, "filters": filters, "gliding": sliders, **self.start(items, sliders)}
+        past, gains = sliders.new_zeros(items, HISTORY), sliders.new_zeros(items, 2, self.bands)
+        return {"past": past, "gains": gains, "gliding": sliders, **self.start(items, sliders)}
 
-    def advance(
-        self, samples: Tensor, fitted: Tensor, sliders: Tensor, state: State
-    ) -> tuple[Tensor, dict[str, Tensor]]:
-        """The gain in dB of the highest frequency at each hop's end, and the state after whole hops; its ``filters`` are
-        all that the hops had, and the next one's.
+    def advance(self, samples: Tensor, fitted: Tensor, sliders: Tensor, state: State) -> dict[str, Tensor]:
+        """The state after whole hops; its ``gains`` are all that the hops had, and the next one's.
 
-        Shape: (items, hops * HOP) pascals, (items, n), (items, sliders) -> (items, hops).
+        Shape: (items, hops * HOP) pascals, (items, n), (items, sliders).
         """
         padded = torch.cat((state["past"], samples), -1)
-        powers, fine = (frame_power(padded, points) for points in (FRAME, LONG_FRAME))
+        powers = frame_power(padded)
         if self.linked:
-            powers, fine = (
-                some.unflatten(0, (-1, 2)).mean(1).repeat_interleave(2, 0) for some in (powers, fine)
-            )
+            powers = powers.unflatten(0, (-1, 2)).mean(1).repeat_interleave(2, 0)
         gliding = _glide(state["gliding"], sliders, powers.shape[1])
-        gains_db, kept = self.control(powers, fine, fitted, gliding, state)
-        filters = torch.cat((state["filters"], filter_taps(gains_db)), 1)
-        after = {"past": padded[:, -HISTORY:], "filters": filters, "gliding": gliding[:, -1], **kept}
-        return gains_db[..., -1], after
+        gains_db, kept = self.control(powers, fitted, gliding, state)
+        gains = torch.cat((state["gains"], 10.0 ** (gains_db / 20.0) - 1.0), 1)
+        return {"past": padded[:, -HISTORY:], "gains": gains, "gliding": gliding[:, -1], **kept}
 
     def step(
         self, samples: Tensor, fitted: Tensor, sliders: Tensor, state: State
@@ -108,19 +102,14 @@ class Wearable(nn.Module):
         output, _, after = self._amplified(samples, fitted, sliders, state)
         return self.finish(output), after
 
-    def coming(self, state: State) -> Tensor:
-        """The output of a hop before any of its samples. Shape: ... -> (items, HOP)."""
-        padded = nn.functional.pad(state["past"], (0, HOP))
-        return self.finish(apply_filters(padded, state["filters"]))
-
     def _amplified(
         self, samples: Tensor, fitted: Tensor, sliders: Tensor, state: State
     ) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
-        """As ``step`` without the limit, with the highest frequency's gains. Shape: ... -> ..., (items, hops) dB."""
-        highest, after = self.advance(samples, fitted, sliders, state)
-        padded, filters = torch.cat((state["past"], samples), -1), after["filters"]
-        output = apply_filters(padded, filters[:, :-1])
-        return output, highest, after | {"filters": filters[:, -2:]}
+        """As ``step`` without the limit, and the highest band's gains, less 1. Shape: ... -> ..., (items, hops)."""
+        after = self.advance(samples, fitted, sliders, state)
+        gains = after["gains"]
+        padded = torch.cat((state["past"][:, -2 * DELAY :], samples), -1)
+        return apply_gains(padded, gains[:, :-1]), gains[:, 2:, -1], after | {"gains": gains[:, -2:]}
 
     def finish(self, samples: Tensor) -> Tensor:
         """The last step, in pascals, sample by sample. Any shape."""
@@ -135,12 +124,12 @@ class Wearable(nn.Module):
             signals = waveform.to(fitted.dtype).expand(*batch, -1).reshape(-1, time) * gain
             low = resample(signals, self.sample_rate, RATE)
             ours = low.shape[-1]
-            state, outputs, highest = self.initial(settings), [], []
+            state, outputs, highest = self.initial(settings), [], [low.new_zeros(len(low), 1)]
             padded = nn.functional.pad(low, (0, DELAY + -(ours + DELAY) % HOP))
             for block in padded.split(max(1, _BLOCK // (len(low) * HOP)) * HOP, -1):
-                output, gains_db, state = self._amplified(block, fitted, settings, state)
+                output, gains, state = self._amplified(block, fitted, settings, state)
                 outputs.append(output)
-                highest.append(10.0 ** (gains_db / 20.0) - 1.0)
+                highest.append(gains)
             result = resample(torch.cat(outputs, -1)[:, DELAY : DELAY + ours], RATE, self.sample_rate)
             if self.sample_rate != RATE:
                 above = signals - resample(low, RATE, self.sample_rate)[:, :time]

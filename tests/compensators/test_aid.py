@@ -26,7 +26,7 @@ def test_at_0_and_0_the_input_passes_unchanged(utterance: torch.Tensor) -> None:
     aid = trained()
     assert torch.equal(aid(utterance, EAR, 0.0, 0.0), utterance)
     stream = aid.stream(EAR, noise_reduction=0.0, amplification=0.0)
-    assert torch.equal(stream(utterance)[aid.latency :], utterance[: -aid.latency])
+    assert torch.equal(stream(utterance)[64:], utterance[:-64])
 
 
 def test_each_slider_does_its_own_and_more_does_more(utterance: torch.Tensor) -> None:
@@ -57,17 +57,6 @@ def test_sliders_move_in_a_stream_without_a_click() -> None:
     hertz = torch.arange(4001) * 2.0
     near = (hertz - 1000.0).abs() < 100.0
     assert 10.0 * torch.log10(power[~near].sum() / power[near].sum()) < -40.0
-
-
-def test_a_gate_keeps_harmonics_and_takes_what_lies_between() -> None:
-    aid = HearingAid().eval().requires_grad_(False)
-    aid.leave.bias[-aid.bands :] = 4.0
-    turns = torch.arange(32000) / 16000.0
-    voice = sum(torch.sin(2.0 * torch.pi * 250.0 * number * turns) for number in range(1, 13))
-    noisy = set_level(torch.as_tensor(voice), 65.0) + set_level(torch.randn(32000), 55.0)
-    taken = aid.attenuation(noisy[None])[0, 100:].mean(0)  # every 31.25 Hz
-    harmonics, between = taken[8:97:8], taken[12:97:8]
-    assert harmonics.min() > between.max() + 3.0 and between.min() > -aid.config.reduction_db
 
 
 def test_one_slider_an_item_and_what_is_refused(utterance: torch.Tensor) -> None:
@@ -131,7 +120,7 @@ def test_the_one_that_ships_takes_noise_off_and_leaves_tones() -> None:
     aid: Any = load_compensator("hearing-aid")
     normal = Audiogram.standard("NH")
     noise = set_level(torch.randn(32000, generator=torch.Generator().manual_seed(0)), 65.0)
-    assert -aid.config.reduction_db < float(level_spl(aid(noise, normal)[16000:]) - 65.0) < -6.0
+    assert -12.0 < float(level_spl(aid(noise, normal)[16000:]) - 65.0) < -6.0
     turns = torch.arange(32000) / 16000.0
     for hz in (500.0, 1000.0, 2000.0, 4000.0):
         tone = set_level(torch.sin(2.0 * torch.pi * hz * turns), 65.0)
@@ -143,5 +132,7 @@ def test_tones_are_heard_at_nearly_the_level_that_a_normal_ear_hears(name: str, 
     ear, aid = Audiogram.standard(name), load_compensator("hearing-aid")
     found = steady_tones({"aid": aid}, {name: ear}, [65.0])[0]
     off, sidebands = found["heard_off_db"][0], found["sidebands_db"][0]
-    assert max(map(abs, off[:5])) < within  # up to 3 kHz; the card has all
-    assert max(sidebands) < -70.0  # 20 dB less than a wearable aid may have
+    assert (
+        max(map(abs, off[:5])) < within
+    )  # up to 3 kHz; at 4 kHz they are up to 9 dB too soft, as the card says
+    assert max(sidebands) < -80.0
