@@ -7,6 +7,7 @@ a busy machine; it makes two uncounted calls before each count, waits for the cu
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import gc
 import os
 import platform
@@ -42,6 +43,7 @@ def peak_mib(call: Call, device: torch.device) -> float | None:
         finish(call, device)
         return (torch.cuda.max_memory_allocated(device) - held) / 2**20
     gc.collect()  # what was left behind and freed during the call would hide as much of the call's own
+    _give_back()
     try:
         # the most that was held so far becomes what is held
         Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
@@ -51,6 +53,12 @@ def peak_mib(call: Call, device: torch.device) -> float | None:
     before = _most_held_mib()
     call()
     return _most_held_mib() - before
+
+
+def _give_back() -> None:
+    """Freed memory that glibc keeps for itself goes back: a call that got it again would seem to need none."""
+    with contextlib.suppress(OSError, AttributeError, TypeError):  # no such library, or not glibc's
+        ctypes.CDLL(None).malloc_trim(0)
 
 
 def _most_held_mib() -> float:
