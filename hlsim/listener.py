@@ -10,7 +10,8 @@ from typing import Any
 
 import torch
 
-from hlsim.audiogram import Audiogram, numbered_audiograms
+from hlsim.audiogram import Audiogram
+from hlsim.audiogram_table import numbered_audiograms
 
 EARS = ("left", "right")
 

@@ -1,4 +1,4 @@
-"""Audiograms against Bisgaard's tables and pyclarity's class; validation, interpolation, files and random ears."""
+"""Audiograms against Bisgaard's tables and pyclarity's class; validation, interpolation, severity and rows."""
 
 import dataclasses
 import io
@@ -13,20 +13,8 @@ import torch
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from compensators import NALR
-from hlsim import MSBG
-from hlsim.audiogram import (
-    FREQUENCIES,
-    SEVERITIES,
-    Audiogram,
-    as_thresholds,
-    draw_thresholds,
-    interpolate,
-    interpolation_weights,
-    read_audiograms,
-    severity_index,
-    severity_of,
-)
+from hlsim.audiogram import FREQUENCIES, SEVERITIES, Audiogram, severity_index, severity_of
+from hlsim.thresholds import as_thresholds
 
 # Bisgaard, Vlaming and Dahlquist 2010, Tables 1 and 2, all ten frequencies
 BISGAARD_HZ = (250, 375, 500, 750, 1000, 1500, 2000, 3000, 4000, 6000)
@@ -267,75 +255,6 @@ def test_a_row_without_levels_or_with_a_bad_one() -> None:
             Audiogram.from_row({"hl_250": "10", "hl_500": value})  # type: ignore[dict-item]
 
 
-def test_csv_round_trip(tmp_path: Path) -> None:
-    ears = [Audiogram.standard(name) for name in ("N1", "S3")]
-    lines = [",".join(("file", *ears[0].to_row()))]
-    lines += [",".join((name, *ear.to_row().values())) for name, ear in zip("ab", ears, strict=True)]
-    (tmp_path / "ears.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
-    read = read_audiograms(tmp_path / "ears.csv")
-    assert [ear for _, ear in read] == ears
-    assert [row["file"] for row, _ in read] == ["a", "b"]
-
-
-def test_csv_of_a_spreadsheet_keeps_its_first_column(tmp_path: Path) -> None:
-    (tmp_path / "ears.csv").write_bytes(b"\xef\xbb\xbfhl_250,hl_500\r\n10,20\r\n")
-    ((_, ear),) = read_audiograms(tmp_path / "ears.csv")
-    assert ear == Audiogram((10.0, 20.0), (250.0, 500.0))
-
-
-def test_csv_with_blanks_after_its_commas(tmp_path: Path) -> None:
-    path = tmp_path / "ears.csv"
-    path.write_text("file, hl_250 , hl_500, ,\na b.wav , 10, 20 ,,\n", encoding="utf-8")
-    assert read_audiograms(path) == [
-        ({"file": "a b.wav", "hl_250": "10", "hl_500": "20"}, Audiogram((10.0, 20.0), (250.0, 500.0)))
-    ]
-
-
-@pytest.mark.parametrize(
-    ("content", "said"),
-    [
-        ("", "no audiograms"),
-        ("hl_250,hl_500\n", "no audiograms"),
-        ("hl_250,hl_500\n10,20\n10,x\n", "line 3: .*hl_500 holds 'x'"),
-        ("hl_250,hl_500\n10\n", "line 2: .*hl_500"),
-        ("hl_250,hl_500\n10,20\n10,200\n", "line 3: .*200 dB HL; allowed: -10 to 120"),
-        ("hl_500,hl_250\n10,20\n", "line 2: .*ascending"),
-        ("left,right\n10,20\n", "line 2: .*needs columns hl_250"),
-        ("hl_250,hl_1k\n10,20\n", "line 2: audiogram column 'hl_1k'; allowed: hl_ and a frequency in Hz"),
-        ("hl_250,HL_500\n10,20\n", "line 2: audiogram column 'HL_500'"),
-        ("hl_250,hl4000\n10,20\n", "line 2: audiogram column 'hl4000'"),
-        ("hl_250,hl_8000dB\n10,20\n", "line 2: audiogram column 'hl_8000dB'"),
-        ("hl_250,hl_500, hl_500\n10,20,30\n", "line 1: column hl_500 twice"),
-        ("hl_500,hl_500.0\n10,20\n", "line 2: .*hl_500.0: a second one of 500 Hz"),
-        ("hl_250,hl_500\n10,2,5\n", "line 2: 3 values; allowed: one for each of the 2 columns"),
-        ("\nhl_250,hl_500\n\n\n10,x\n", "line 5: .*hl_500 holds 'x'"),
-    ],
-)
-def test_csv_errors_begin_with_the_file_and_name_the_line(tmp_path: Path, content: str, said: str) -> None:
-    path = tmp_path / "ears.csv"
-    path.write_text(content, encoding="utf-8")
-    with pytest.raises(ValueError, match=said) as caught:
-        read_audiograms(path)
-    assert str(caught.value).startswith(str(path))
-
-
-def test_csv_of_an_ear_that_no_simulator_takes(tmp_path: Path) -> None:
-    path = tmp_path / "ears.csv"
-    path.write_text("hl_250,hl_8000\n10,20\n90,105\n", encoding="utf-8")
-    assert len(read_audiograms(path)) == 2
-    with pytest.raises(ValueError, match=r"line 3: .*a simulator takes -10 to 100"):
-        read_audiograms(path, simulated=True)
-
-
-def test_csv_errors_of_files_that_are_none(tmp_path: Path) -> None:
-    binary = tmp_path / "binary.csv"
-    binary.write_bytes(b"hl_250\n\xff\xfe\x80\n")
-    for path in (tmp_path / "missing.csv", tmp_path, binary):
-        with pytest.raises(ValueError, match="cannot read audiograms") as caught:
-            read_audiograms(path)
-        assert str(caught.value).startswith(str(path))
-
-
 def test_pyclarity_round_trip() -> None:
     clarity = pytest.importorskip("clarity.utils.audiogram")
     ear = Audiogram.standard("S2")
@@ -380,128 +299,8 @@ def test_an_ear_of_pyclaritys_listeners() -> None:
         Audiogram.from_clarity(65.0)
 
 
-def test_thresholds_for_a_simulator() -> None:
-    n1, s1 = Audiogram.standard("N1"), Audiogram.standard("S1")
-    assert as_thresholds(n1).tolist() == list(n1.levels)
-    assert as_thresholds([n1, s1]).tolist() == [list(n1.levels), list(s1.levels)]
-    assert as_thresholds((Audiogram((7.0,), (1000.0,)),)).tolist() == [[7.0] * 8]
-    given = torch.zeros(2, 3, 8, dtype=torch.float64)
-    assert as_thresholds(given) is given
-    assert as_thresholds(torch.full((8,), 100)).dtype == torch.float32
-
-
-@pytest.mark.parametrize(
-    ("audiogram", "said"),
-    [
-        (torch.zeros(7), r"shape \(7,\); allowed: \(\.\.\., 8\)"),
-        (torch.tensor(3.0), r"shape \(\); allowed"),
-        (torch.tensor([0.0] * 7 + [float("nan")]), "takes -10 to 100"),
-        (torch.tensor([0.0] * 7 + [100.1]), "takes -10 to 100"),
-        (torch.tensor([[0.0] * 8, [-10.1] * 8]), "levels -10.1, -10.1, .*takes -10 to 100"),
-        (torch.zeros(0, 8), r"shape \(0, 8\); allowed"),
-        (torch.zeros(8, dtype=torch.bool), "of torch.bool; allowed: floating-point or integer"),
-        (torch.zeros(8, dtype=torch.complex64), "of torch.complex64; allowed: floating-point or integer"),
-        (Audiogram.standard("N7"), "takes -10 to 100"),
-        (
-            [0.0] * 8,
-            r"is list; allowed: an Audiogram, a sequence of them, or a .* tensor; write torch\.tensor\(",
-        ),
-        ([[0.0] * 8], r"is list; allowed: .* tensor; write torch\.tensor\(\.\.\.\)$"),
-        ((torch.zeros(7), torch.zeros(7)), r"is tuple; allowed: .* tensor; write torch\.stack\(\.\.\.\)$"),
-        ([], "is list; allowed: .* tensor$"),
-        ("N3", r"is str; allowed: .* tensor; write Audiogram\.standard\('N3'\)$"),
-        (["N3", "N4"], r"is list; allowed: .* tensor; write \[Audiogram\.standard\('N3'\), \.\.\.\]$"),
-        ("loud", "is str; allowed: .* tensor$"),
-        ({"levels": [0.0] * 8}, r"is dict; allowed: .* tensor; write Audiogram\.from_dict\("),
-        (None, "is NoneType; allowed: .* tensor$"),
-        (np.zeros(8), r"is ndarray; allowed: .* tensor; write torch\.tensor\(\.\.\.\)$"),
-    ],
-)
-def test_what_is_no_ear_for_a_simulator(audiogram: Any, said: str) -> None:
-    with pytest.raises(ValueError, match=said):
-        as_thresholds(audiogram)
-
-
 @pytest.mark.parametrize("levels", ["12345678", 3])
 def test_what_holds_no_numbers(levels: Any) -> None:
     for make in (Audiogram, lambda own: Audiogram.from_dict({"levels": own})):
         with pytest.raises(ValueError, match="allowed: numbers"):
             make(levels)
-
-
-@pytest.mark.parametrize("make", [MSBG, NALR])
-def test_a_stored_ear_is_its_own(make: Any) -> None:
-    given = torch.full((8,), 40.0)
-    module = make(given)
-    given.fill_(105.0)
-    assert torch.equal(module.thresholds, torch.full((8,), 40.0))
-
-
-@pytest.mark.parametrize("make", [MSBG, NALR])
-def test_an_ear_stored_in_inference_mode_trains_later(make: Any) -> None:
-    with torch.inference_mode():
-        modules = [make(ear) for ear in (Audiogram.standard("N3"), torch.full((8,), 40.0))]
-    assert not any(module.thresholds.is_inference() for module in modules)
-
-
-def test_thresholds_keep_their_gradient() -> None:
-    levels = torch.full((2, 8), 40.0, requires_grad=True)
-    as_thresholds(levels).sum().backward()
-    assert levels.grad is not None and bool((levels.grad == 1).all())
-
-
-def test_drawn_ears_look_like_measured_ones() -> None:
-    ears = draw_thresholds(20000, torch.Generator().manual_seed(3))
-    assert ears.shape == (20000, 8)
-    assert float(ears.min()) >= -10.0 and float(ears.max()) <= 100.0
-    shares = torch.bincount(severity_index(ears), minlength=4) / len(ears)
-    # the docstring's: 27, 18, 19 and 36 %
-    torch.testing.assert_close(shares, torch.tensor([0.27, 0.18, 0.19, 0.36]), atol=0.015, rtol=0)
-    rounded = (ears % 5.0 == 0.0).all(-1).float().mean()
-    assert 0.73 < float(rounded) < 0.77
-    # high-frequency losses are the rule
-    assert float((ears[:, -2] > ears[:, 0]).float().mean()) > 0.7
-
-
-def test_drawn_ears_are_alike_at_neighbouring_frequencies() -> None:
-    ears = draw_thresholds(5000, torch.Generator().manual_seed(4))
-    correlation = torch.corrcoef(ears.T)
-    neighbours = correlation.diagonal(1)
-    assert float(neighbours.min()) > 0.85
-    assert float(correlation[0, -1]) < float(neighbours.min()) - 0.1
-    # even about a series' own shape: the jump from 3 to 4 kHz is small and its sign varies
-    jump = ears[:, 5] - ears[:, 4]
-    assert float(jump.abs().median()) < 10.0
-
-
-def test_drawing_depends_on_the_generator_alone() -> None:
-    first = draw_thresholds(64, torch.Generator().manual_seed(5))
-    torch.rand(7)
-    assert torch.equal(first, draw_thresholds(64, torch.Generator().manual_seed(5)))
-    assert not torch.equal(first, draw_thresholds(64, torch.Generator().manual_seed(6)))
-    as_thresholds(first)  # every one is fit for a simulator
-
-
-def test_interpolation_is_linear_in_hz_and_flat_beyond() -> None:
-    hz = (0.0, 250.0, 251.0, 750.0, 1000.0, 2500.0, 7000.0, 8000.0, 12000.0)
-    levels = draw_thresholds(6).reshape(2, 3, 8)
-    expected = np.array([np.interp(hz, FREQUENCIES, ear) for ear in levels.reshape(6, 8).double().numpy()])
-    for ears in (levels, levels.double()):
-        found = interpolate(ears, hz)
-        assert found.shape == (2, 3, 9) and found.dtype == ears.dtype
-        np.testing.assert_allclose(found.reshape(6, 9).numpy(), expected, rtol=1e-5)
-    np.testing.assert_allclose(
-        levels.reshape(6, 8).double().numpy() @ interpolation_weights(hz), expected, rtol=1e-12
-    )
-
-
-def test_ears_as_lists_of_tensors_and_as_a_loader_collates_them() -> None:
-    ears = [Audiogram.standard(name).thresholds for name in ("N1", "N3", "S2")]
-    collated = torch.utils.data.default_collate(ears)  # eight tensors of shape (3,)
-    assert len(collated) == 8
-    assert torch.equal(as_thresholds(collated), torch.tensor(ears, dtype=torch.float64))
-    assert torch.equal(as_thresholds([torch.tensor(ear) for ear in ears]), torch.tensor(ears))
-    with pytest.raises(
-        ValueError, match=r"eight tensors of 8 levels.*allowed: torch\.stack\(audiogram\) of ears"
-    ):
-        as_thresholds(torch.utils.data.default_collate([ears[0]] * 8))

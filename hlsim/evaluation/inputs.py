@@ -24,7 +24,8 @@ from pathlib import Path, PurePath, PurePosixPath
 from typing import Any, TypeVar
 
 from hlsim.audio import EXTENSIONS, find_audio
-from hlsim.audiogram import Audiogram, numbered_audiograms
+from hlsim.audiogram import Audiogram
+from hlsim.audiogram_table import numbered_audiograms
 from hlsim.calibration import check_full_scale
 from hlsim.evaluation.scores import EARS
 from hlsim.evaluation.scoring import FileItem

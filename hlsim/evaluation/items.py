@@ -12,10 +12,12 @@ import torch
 from torch import Tensor, nn
 
 from compensators.nalr import NALR
-from hlsim.audiogram import MILDER, Audiogram, draw_thresholds, read_audiograms
+from hlsim.audiogram import Audiogram
+from hlsim.audiogram_table import read_audiograms
 from hlsim.calibration import level_spl, set_level
 from hlsim.data.augment import compress, mix
 from hlsim.data.clips import Clips
+from hlsim.data.ears import MILDER, draw_thresholds
 from hlsim.data.plan_settings import TEST_SNRS_DB
 from hlsim.evaluation.store import samples_hash
 from hlsim.neuro.config import NEURO_RATE

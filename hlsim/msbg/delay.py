@@ -3,7 +3,8 @@
 import torch
 from torch import nn
 
-from hlsim.audiogram import Audiogram, AudiogramLike
+from hlsim.audiogram import Audiogram
+from hlsim.thresholds import AudiogramLike
 
 
 def estimate_delay(

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor, nn
 
-from hlsim.audiogram import FREQUENCIES, SEVERITIES, interpolate, severity_index
+from hlsim.audiogram import FREQUENCIES, SEVERITIES, severity_index
 from hlsim.calibration import PASCAL_SPL
 from hlsim.dsp.fft import power
 from hlsim.msbg.recruitment import CATCH_UP_SPL
@@ -14,6 +14,7 @@ from hlsim.neuro.decoders import MaskDecoder, PhaseDecoder
 from hlsim.neuro.encoder import AudiogramEncoder, DenseEncoder, FrameEncoder, log_magnitude, sine_of_phase
 from hlsim.neuro.network import EarNetwork
 from hlsim.neuro.prior import Prior
+from hlsim.thresholds import interpolate
 
 _TINY = 1e-11
 

@@ -5,12 +5,13 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from hlsim.audiogram import FREQUENCIES, AudiogramLike, resolve_thresholds
+from hlsim.audiogram import FREQUENCIES
 from hlsim.calibration import check_full_scale, gain_to_pascals
 from hlsim.checks import check_rate, check_waveform
 from hlsim.dsp.overlap import overlapping
 from hlsim.dsp.resample import resample
 from hlsim.neuro.config import NEURO_RATE, NetworkConfig
+from hlsim.thresholds import AudiogramLike, resolve_thresholds
 
 # Values of the widest feature map of all items that run together on a CPU, and the samples at 16 kHz that this is at
 # least and at most. Larger maps the C library gives back to the system, and pays for their pages anew with every one; of

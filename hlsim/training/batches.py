@@ -13,10 +13,12 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from hlsim.audio import find_audio
-from hlsim.audiogram import MILDER, Audiogram, draw_thresholds, read_audiograms
+from hlsim.audiogram import Audiogram
+from hlsim.audiogram_table import read_audiograms
 from hlsim.calibration import level_spl, set_level
 from hlsim.data.augment import KNOTS, augment_speech, equalise, mix
 from hlsim.data.clips import Clips
+from hlsim.data.ears import MILDER, draw_thresholds
 from hlsim.data.module import Batch, BatchData, PlanData, Step, collate
 from hlsim.data.sounds import draw_sounds
 from hlsim.data.teacher import Reference, Teacher

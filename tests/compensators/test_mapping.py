@@ -9,9 +9,9 @@ import torch
 from compensators import NALR, MappingCompensator, MappingConfig
 from compensators.limiter import soft_limit
 from hlsim import Audiogram
-from hlsim.audiogram import draw_thresholds
 from hlsim.calibration import level_spl, set_level
 from hlsim.criteria.bands import band_levels
+from hlsim.data.ears import draw_thresholds
 from hlsim.dsp.resample import resample
 from hlsim.neuro import NeuroConfig
 

@@ -9,8 +9,8 @@ import torch
 from compensators import WDRC, HearingAid
 from compensators.wearable import Wearable
 from hlsim import Audiogram, Listener
-from hlsim.audiogram import draw_thresholds
 from hlsim.calibration import level_spl, set_level
+from hlsim.data.ears import draw_thresholds
 from hlsim.dsp.resample import resample
 from hlsim.metrics.interaural import interaural_change
 

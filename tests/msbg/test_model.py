@@ -17,8 +17,9 @@ from torch import Tensor
 
 from hlsim import torchtools
 from hlsim.audio import find_audio, read_audio
-from hlsim.audiogram import STANDARD, Audiogram, draw_thresholds
+from hlsim.audiogram import STANDARD, Audiogram
 from hlsim.calibration import gain_to_pascals, level_spl, set_level
+from hlsim.data.ears import draw_thresholds
 from hlsim.msbg import MSBG
 from hlsim.msbg.blocks import block_bounds
 from hlsim.msbg.model import STRUCTURAL_DELAY, active_rescaling

@@ -9,8 +9,9 @@ import torch
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
 
-from hlsim.audiogram import FREQUENCIES, draw_thresholds
+from hlsim.audiogram import FREQUENCIES
 from hlsim.calibration import gain_to_pascals
+from hlsim.data.ears import draw_thresholds
 from hlsim.dsp.erb import erb
 from hlsim.msbg.ear import MSBG_RATE
 from hlsim.msbg.envelope import STEP, envelope, envelope_lowpass

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from hlsim import Audiogram, NeuroMSBG
-from hlsim.audiogram import draw_thresholds
+from hlsim.data.ears import draw_thresholds
 from hlsim.neuro import NeuroConfig
 from hlsim.training.recipes import SimulatorRecipe
 

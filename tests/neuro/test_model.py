@@ -8,9 +8,9 @@ from torch import Tensor
 
 from compensators import MappingCompensator
 from hlsim import MSBG, Audiogram, NeuroMSBG, load_pretrained
-from hlsim.audiogram import draw_thresholds
 from hlsim.calibration import set_level
 from hlsim.criteria.waveform import noise_to_signal_db
+from hlsim.data.ears import draw_thresholds
 from hlsim.dsp.resample import resample
 from hlsim.neuro import NeuroConfig
 from hlsim.neuro.blocks import BidirectionalLSTM, SequencePath

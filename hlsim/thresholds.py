@@ -1,0 +1,241 @@
+"""Thresholds as tensors: of whatever is taken as an audiogram, checked, stored, and interpolated between frequencies."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from functools import lru_cache
+from typing import Any, Protocol, TypeGuard
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from hlsim.audiogram import FREQUENCIES, LOWEST_LEVEL, STANDARD, Audiogram, has_two_ears, is_claritys, listed
+from hlsim.torchtools import constant, constant_like
+
+HIGHEST_SIMULATED = 100.0
+"""What a simulator takes, in dB HL: MSBG's expansion ratio 105 / (105 - level) is singular at 105."""
+
+
+class TwoEars(Protocol):
+    """A ``Listener``, to which imports from here would point upwards."""
+
+    @property
+    def left(self) -> Audiogram | None: ...
+
+    @property
+    def right(self) -> Audiogram | None: ...
+
+
+AudiogramLike = Audiogram | Sequence[Audiogram] | TwoEars | Sequence[TwoEars] | Tensor
+"""One ear or a ``Listener``'s two, one a batch item, or a (..., 8) tensor of dB HL. pyclarity's ``Audiogram`` is taken as
+ours is."""
+
+
+def as_thresholds(
+    audiogram: AudiogramLike,
+    *,
+    highest: float = HIGHEST_SIMULATED,
+    taker: str = "a simulator",
+    missing: bool = False,
+) -> Tensor:
+    """Thresholds that a simulator takes, or another ``taker``, up to ``highest`` dB HL.
+
+    A list of (8,) tensors holds an ear each, and one of eight (batch,) tensors a frequency each, as torch's
+    ``default_collate`` makes it of thresholds; a list of eight (8,) tensors may be either and is refused.
+
+    Args:
+        missing: let a listener with one ear through, whose other ear is NaN.
+
+    Returns: (8,) for one ear, (batch, 8) for a sequence, (2, 8) for a ``Listener``, (batch, 2, 8) for a sequence of them,
+    the tensor itself otherwise; dB HL.
+
+    Raises:
+        ValueError: not an audiogram, a listener without one ear, a complex or bool tensor, a last dimension other than
+            8, NaN, or levels outside -10 to ``highest`` dB HL.
+    """
+    if (ear := _one_ear(audiogram)) is not None:
+        return torch.tensor(_taken(ear.thresholds, highest, taker))
+    if is_listener(audiogram):
+        return torch.stack([*_both_ears(audiogram, missing, highest, taker)])
+    if isinstance(audiogram, Sequence) and audiogram:
+        if all(is_listener(one) for one in audiogram):
+            return torch.stack(
+                [as_thresholds(one, highest=highest, taker=taker, missing=missing) for one in audiogram]
+            )
+        ears = [_one_ear(one) for one in audiogram]
+        if all(ear is not None for ear in ears):
+            return torch.tensor([_taken(ear.thresholds, highest, taker) for ear in ears if ear is not None])
+    if isinstance(audiogram, list | tuple):
+        audiogram = _stacked(audiogram)
+    if not isinstance(audiogram, Tensor):
+        raise ValueError(
+            f"audiogram is {type(audiogram).__name__}; allowed: an Audiogram, a sequence of them, or a (..., 8) tensor"
+            + _instead(audiogram)
+        )
+    if audiogram.is_complex() or audiogram.dtype == torch.bool:
+        raise ValueError(f"audiogram tensor of {audiogram.dtype}; allowed: floating-point or integer dB HL")
+    levels = audiogram if audiogram.is_floating_point() else audiogram.float()
+    if levels.ndim == 0 or levels.shape[-1] != len(FREQUENCIES) or not levels.numel():
+        raise ValueError(
+            f"audiogram tensor of shape {tuple(levels.shape)}; allowed: (..., 8), dB HL at {listed(FREQUENCIES)} Hz"
+        )
+    with torch.no_grad():
+        good = ((levels >= LOWEST_LEVEL) & (levels <= highest)).all(-1)
+        if not bool(good.all()):
+            _taken(levels[~good][0].tolist(), highest, taker)
+    return levels
+
+
+def own_thresholds(audiogram: AudiogramLike | None, **limits: Any) -> Tensor | None:
+    """``as_thresholds`` to keep: a copy, for the caller may write into its tensor; one that is trained stays itself."""
+    if audiogram is None:
+        return None
+    with torch.inference_mode(False):  # it may be trained through later
+        levels = as_thresholds(audiogram, **limits)
+        return levels if levels.requires_grad else levels.clone()
+
+
+def resolve_thresholds(
+    stored: Tensor | None,
+    audiogram: AudiogramLike | None,
+    waveform: Tensor,
+    *,
+    two_ears: bool = False,
+    **limits: Any,
+) -> Tensor:
+    """The call's audiogram, or else the stored one, on the waveform's device, checked to fit its leading dimensions.
+
+    Args:
+        two_ears: the stored one is of a listener, or of several.
+        limits: of ``as_thresholds``.
+
+    Raises:
+        ValueError: there is neither, the shapes do not broadcast, or a listener's waveform is not (..., 2, time).
+    """
+    if audiogram is None and stored is None:
+        raise ValueError("no audiogram: give one when building the simulator or with the call")
+    thresholds = as_thresholds(audiogram, **limits) if audiogram is not None else stored
+    assert thresholds is not None
+    check_two_ears(two_ears if audiogram is None else of_listeners(audiogram), waveform)
+    try:
+        if thresholds.ndim > 1:
+            torch.broadcast_shapes(waveform.shape[:-1], thresholds.shape[:-1])
+    except RuntimeError:
+        raise ValueError(
+            f"audiograms of shape {tuple(thresholds.shape)} for a waveform of shape {tuple(waveform.shape)}; allowed: "
+            "one audiogram, or leading dimensions that broadcast"
+        ) from None
+    return thresholds.to(waveform.device)
+
+
+def is_listener(audiogram: Any) -> TypeGuard[TwoEars]:
+    """Whether it is a ``Listener``."""
+    return hasattr(audiogram, "left") and hasattr(audiogram, "right")
+
+
+def of_listeners(audiogram: AudiogramLike | None) -> bool:
+    """Whether it is a ``Listener`` or a sequence of them."""
+    several = isinstance(audiogram, list | tuple) and len(audiogram) > 0
+    return is_listener(audiogram[0] if several else audiogram)  # type: ignore[index]
+
+
+def _both_ears(listener: TwoEars, missing: bool, highest: float, taker: str) -> Iterator[Tensor]:
+    """Left and right, (8,) each; NaN where one is missing, or ValueError unless it may."""
+    if not missing and (listener.left is None or listener.right is None):
+        gone, there, place = ("left", "right", 1) if listener.left is None else ("right", "left", 0)
+        raise ValueError(
+            f"the listener's {gone} ear is missing; give listener.{there} with waveform[..., {place}, :]"
+        )
+    for ear in (listener.left, listener.right):
+        lacks = torch.full((len(FREQUENCIES),), math.nan)
+        yield lacks if ear is None else as_thresholds(ear, highest=highest, taker=taker)
+
+
+def check_two_ears(asked: bool, waveform: Tensor) -> None:
+    """Raise ValueError where a listener's two ears are ``asked`` for of a waveform that is not (..., 2, time)."""
+    if asked and waveform.shape[-2:-1] != (2,):
+        raise ValueError(
+            f"a waveform of shape {tuple(waveform.shape)} for a listener's two ears; allowed: (..., 2, time), left first"
+        )
+
+
+def interpolate(levels: Tensor, hz: tuple[float, ...]) -> Tensor:
+    """Levels between the audiometric frequencies, linear in Hz and flat beyond. Shape: (..., 8) -> (..., frequencies)."""
+    right = constant(_right, hz, dtype=torch.int64, device=levels.device)
+    place = constant_like(levels, _place, hz)
+    return levels[..., right - 1] * (1.0 - place) + levels[..., right] * place
+
+
+@lru_cache(maxsize=8)
+def interpolation_weights(hz: tuple[float, ...]) -> NDArray[np.float64]:
+    """``interpolate`` as a matrix. Returns (8, frequencies)."""
+    one, right, place = np.eye(len(FREQUENCIES)), _right(hz), _place(hz)
+    weights: NDArray[np.float64] = one[:, right - 1] * (1.0 - place) + one[:, right] * place
+    return weights
+
+
+def _right(hz: tuple[float, ...]) -> NDArray[np.int64]:
+    """Index of the audiometric frequency at or above each one, but for the first."""
+    return np.searchsorted(FREQUENCIES, hz).clip(1, len(FREQUENCIES) - 1)
+
+
+def _place(hz: tuple[float, ...]) -> NDArray[np.float64]:
+    """Where each lies between the audiometric frequencies around it, 0 to 1."""
+    points, right = np.array(FREQUENCIES), _right(hz)
+    place: NDArray[np.float64] = (np.array(hz) - points[right - 1]) / (points[right] - points[right - 1])
+    return place.clip(0.0, 1.0)
+
+
+def _one_ear(given: Any) -> Audiogram | None:
+    """An audiogram, ours or pyclarity's, as ours."""
+    if isinstance(given, Audiogram):
+        return given
+    return Audiogram.from_clarity(given) if is_claritys(given) else None
+
+
+def _stacked(tensors: Any) -> Any:
+    """One tensor of a list of (8,) tensors, an ear each, or of eight (batch,) ones, a frequency each; else as given."""
+    kinds = len(FREQUENCIES)
+    if not all(isinstance(one, Tensor) and one.ndim == 1 for one in tensors):
+        return tensors
+    if len({len(one) for one in tensors}) != 1:
+        return tensors
+    ears, frequencies = len(tensors[0]) == kinds, len(tensors) == kinds
+    if ears and frequencies:
+        raise ValueError(
+            "audiogram is eight tensors of 8 levels, an ear each or a frequency each; allowed: torch.stack(audiogram) of "
+            "ears, torch.stack(audiogram, -1) of frequencies"
+        )
+    return torch.stack(tuple(tensors), 0 if ears else -1) if ears or frequencies else tensors
+
+
+def _taken(levels: Sequence[float], highest: float, taker: str) -> Sequence[float]:
+    """The levels, or ValueError where the taker does not take them."""
+    if not all(LOWEST_LEVEL <= level <= highest for level in levels):
+        reason = " (MSBG is singular at 105)" if highest == HIGHEST_SIMULATED else ""
+        raise ValueError(
+            f"audiogram levels {listed(levels)} dB HL; {taker} takes {LOWEST_LEVEL:g} to {highest:g}{reason}"
+        )
+    return levels
+
+
+def _instead(given: object) -> str:
+    """What to write in place of something that is no audiogram but holds one."""
+    several = isinstance(given, list | tuple) and len(given) > 0
+    first: Any = given[0] if several else given  # type: ignore[index]
+    if isinstance(first, str) and first in STANDARD:
+        make = f"Audiogram.standard({first!r})"
+    elif has_two_ears(first):
+        return "; of two ears write Listener.from_clarity(listener), of one Audiogram.from_clarity(listener, 'left')"
+    elif isinstance(first, Mapping):
+        make = "Audiogram.from_dict(...)"
+    elif several and isinstance(first, Tensor):
+        return "; write torch.stack(...)"
+    elif isinstance(first, np.ndarray) or (several and isinstance(first, float | int | list | tuple)):
+        return "; write torch.tensor(...)"
+    else:
+        return ""
+    return f"; write {f'[{make}, ...]' if several else make}"

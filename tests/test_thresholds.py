@@ -1,0 +1,101 @@
+"""Thresholds as simulators take them: what is taken and what refused, stored, interpolated as by numpy."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from compensators import NALR
+from hlsim import MSBG
+from hlsim.audiogram import FREQUENCIES, Audiogram
+from hlsim.data.ears import draw_thresholds
+from hlsim.thresholds import as_thresholds, interpolate, interpolation_weights
+
+
+def test_thresholds_for_a_simulator() -> None:
+    n1, s1 = Audiogram.standard("N1"), Audiogram.standard("S1")
+    assert as_thresholds(n1).tolist() == list(n1.levels)
+    assert as_thresholds([n1, s1]).tolist() == [list(n1.levels), list(s1.levels)]
+    assert as_thresholds((Audiogram((7.0,), (1000.0,)),)).tolist() == [[7.0] * 8]
+    given = torch.zeros(2, 3, 8, dtype=torch.float64)
+    assert as_thresholds(given) is given
+    assert as_thresholds(torch.full((8,), 100)).dtype == torch.float32
+
+
+@pytest.mark.parametrize(
+    ("audiogram", "said"),
+    [
+        (torch.zeros(7), r"shape \(7,\); allowed: \(\.\.\., 8\)"),
+        (torch.tensor(3.0), r"shape \(\); allowed"),
+        (torch.tensor([0.0] * 7 + [float("nan")]), "takes -10 to 100"),
+        (torch.tensor([0.0] * 7 + [100.1]), "takes -10 to 100"),
+        (torch.tensor([[0.0] * 8, [-10.1] * 8]), "levels -10.1, -10.1, .*takes -10 to 100"),
+        (torch.zeros(0, 8), r"shape \(0, 8\); allowed"),
+        (torch.zeros(8, dtype=torch.bool), "of torch.bool; allowed: floating-point or integer"),
+        (torch.zeros(8, dtype=torch.complex64), "of torch.complex64; allowed: floating-point or integer"),
+        (Audiogram.standard("N7"), "takes -10 to 100"),
+        (
+            [0.0] * 8,
+            r"is list; allowed: an Audiogram, a sequence of them, or a .* tensor; write torch\.tensor\(",
+        ),
+        ([[0.0] * 8], r"is list; allowed: .* tensor; write torch\.tensor\(\.\.\.\)$"),
+        ((torch.zeros(7), torch.zeros(7)), r"is tuple; allowed: .* tensor; write torch\.stack\(\.\.\.\)$"),
+        ([], "is list; allowed: .* tensor$"),
+        ("N3", r"is str; allowed: .* tensor; write Audiogram\.standard\('N3'\)$"),
+        (["N3", "N4"], r"is list; allowed: .* tensor; write \[Audiogram\.standard\('N3'\), \.\.\.\]$"),
+        ("loud", "is str; allowed: .* tensor$"),
+        ({"levels": [0.0] * 8}, r"is dict; allowed: .* tensor; write Audiogram\.from_dict\("),
+        (None, "is NoneType; allowed: .* tensor$"),
+        (np.zeros(8), r"is ndarray; allowed: .* tensor; write torch\.tensor\(\.\.\.\)$"),
+    ],
+)
+def test_what_is_no_ear_for_a_simulator(audiogram: Any, said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        as_thresholds(audiogram)
+
+
+@pytest.mark.parametrize("make", [MSBG, NALR])
+def test_a_stored_ear_is_its_own(make: Any) -> None:
+    given = torch.full((8,), 40.0)
+    module = make(given)
+    given.fill_(105.0)
+    assert torch.equal(module.thresholds, torch.full((8,), 40.0))
+
+
+@pytest.mark.parametrize("make", [MSBG, NALR])
+def test_an_ear_stored_in_inference_mode_trains_later(make: Any) -> None:
+    with torch.inference_mode():
+        modules = [make(ear) for ear in (Audiogram.standard("N3"), torch.full((8,), 40.0))]
+    assert not any(module.thresholds.is_inference() for module in modules)
+
+
+def test_thresholds_keep_their_gradient() -> None:
+    levels = torch.full((2, 8), 40.0, requires_grad=True)
+    as_thresholds(levels).sum().backward()
+    assert levels.grad is not None and bool((levels.grad == 1).all())
+
+
+def test_interpolation_is_linear_in_hz_and_flat_beyond() -> None:
+    hz = (0.0, 250.0, 251.0, 750.0, 1000.0, 2500.0, 7000.0, 8000.0, 12000.0)
+    levels = draw_thresholds(6).reshape(2, 3, 8)
+    expected = np.array([np.interp(hz, FREQUENCIES, ear) for ear in levels.reshape(6, 8).double().numpy()])
+    for ears in (levels, levels.double()):
+        found = interpolate(ears, hz)
+        assert found.shape == (2, 3, 9) and found.dtype == ears.dtype
+        np.testing.assert_allclose(found.reshape(6, 9).numpy(), expected, rtol=1e-5)
+    np.testing.assert_allclose(
+        levels.reshape(6, 8).double().numpy() @ interpolation_weights(hz), expected, rtol=1e-12
+    )
+
+
+def test_ears_as_lists_of_tensors_and_as_a_loader_collates_them() -> None:
+    ears = [Audiogram.standard(name).thresholds for name in ("N1", "N3", "S2")]
+    collated = torch.utils.data.default_collate(ears)  # eight tensors of shape (3,)
+    assert len(collated) == 8
+    assert torch.equal(as_thresholds(collated), torch.tensor(ears, dtype=torch.float64))
+    assert torch.equal(as_thresholds([torch.tensor(ear) for ear in ears]), torch.tensor(ears))
+    with pytest.raises(
+        ValueError, match=r"eight tensors of 8 levels.*allowed: torch\.stack\(audiogram\) of ears"
+    ):
+        as_thresholds(torch.utils.data.default_collate([ears[0]] * 8))
