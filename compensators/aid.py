@@ -12,8 +12,8 @@ from compensators.prescription import losses, prescribed_gains, restoring_gains
 from compensators.smoothing import decay, follow_peaks
 from compensators.stream import Slider, State, Stream
 from compensators.wearable import Wearable
+from hlsim.audiogram.thresholds import AudiogramLike
 from hlsim.calibration import PASCAL_SPL
-from hlsim.thresholds import AudiogramLike
 from hlsim.torchtools import constant_like
 
 _FADE = 15.0  # dB of level over which the gain of what is quiet fades

@@ -32,9 +32,9 @@ from torch import Tensor, nn
 from compensators.bands import HOP, RATE
 from compensators.stream import Slider
 from compensators.wearable import Wearable
+from hlsim.audiogram.thresholds import AudiogramLike
 from hlsim.calibration import gain_to_pascals
 from hlsim.export import write_onnx
-from hlsim.thresholds import AudiogramLike
 
 _NEXT = "next_"
 _GIVEN = ("samples", "fitted", "sliders")

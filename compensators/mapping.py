@@ -11,6 +11,7 @@ from torch.nn import functional
 from compensators.config import MappingConfig
 from compensators.limiter import soft_limit
 from compensators.nalr import nalr_gains_db
+from hlsim.audiogram.thresholds import interpolate
 from hlsim.calibration import PASCAL_SPL
 from hlsim.dsp.erb import erb_number
 from hlsim.dsp.fft import power
@@ -19,7 +20,6 @@ from hlsim.neuro.config import NEURO_RATE
 from hlsim.neuro.decoders import Decoder, PhaseDecoder
 from hlsim.neuro.encoder import AudiogramEncoder, DenseEncoder, log_magnitude, sine_of_phase
 from hlsim.neuro.network import EarNetwork
-from hlsim.thresholds import interpolate
 from hlsim.torchtools import constant_like
 
 _NEPER_DB = 20.0 / math.log(10.0)

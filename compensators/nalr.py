@@ -12,10 +12,16 @@ from scipy.signal.windows import hamming
 from torch import Tensor, nn
 
 from hlsim.audiogram import FREQUENCIES, HIGHEST_LEVEL
+from hlsim.audiogram.thresholds import (
+    AudiogramLike,
+    interpolate,
+    of_listeners,
+    own_thresholds,
+    resolve_thresholds,
+)
 from hlsim.calibration import PASCAL_SPL, check_full_scale
 from hlsim.checks import check_rate, check_waveform
 from hlsim.dsp.fir import frequency_sampling_fir
-from hlsim.thresholds import AudiogramLike, interpolate, of_listeners, own_thresholds, resolve_thresholds
 from hlsim.torchtools import constant, constant_like
 
 _BIAS = {250.0: -17.0, 500.0: -8.0, 1000.0: 1.0, 2000.0: -1.0, 4000.0: -2.0, 6000.0: -2.0}

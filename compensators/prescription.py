@@ -7,7 +7,7 @@ from torch import Tensor
 
 from compensators.bands import centres, speech_levels
 from compensators.nalr import nalr_gains_db
-from hlsim.thresholds import interpolate
+from hlsim.audiogram.thresholds import interpolate
 from hlsim.torchtools import constant
 
 _CATCH_UP, _NO_GAIN, _SOFTEST = 105.0, 100.0, 20.0  # dB SPL

@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from compensators.bands import DELAY, HOP, apply_gains
+from hlsim.audiogram.thresholds import AudiogramLike
 from hlsim.calibration import gain_to_pascals
 from hlsim.checks import check_waveform
-from hlsim.thresholds import AudiogramLike
 
 Slider = float | Tensor
 State = Mapping[str, Tensor]

@@ -17,8 +17,8 @@ from compensators.prescription import (
 from compensators.smoothing import decay, follow_peaks
 from compensators.stream import State, Stream
 from compensators.wearable import Wearable
+from hlsim.audiogram.thresholds import AudiogramLike
 from hlsim.calibration import PASCAL_SPL
-from hlsim.thresholds import AudiogramLike
 from hlsim.torchtools import constant_like
 
 

@@ -11,10 +11,10 @@ from compensators.bands import DELAY, HISTORY, HOP, RATE, apply_gains, frame_pow
 from compensators.limiter import soft_limit
 from compensators.stream import Slider, State, Stream
 from hlsim.audiogram import FREQUENCIES
+from hlsim.audiogram.thresholds import AudiogramLike, check_two_ears, resolve_thresholds
 from hlsim.calibration import PASCAL_SPL, check_full_scale, gain_to_pascals
 from hlsim.checks import check_rate, check_waveform, is_finite
 from hlsim.dsp.resample import resample
-from hlsim.thresholds import AudiogramLike, check_two_ears, resolve_thresholds
 
 _GLIDE = 0.04  # of a slider's way, a hop at most: 0.1 s from end to end
 _BLOCK = 320_000  # samples of all items that run together, and the least of one's: memory, for the output is the same

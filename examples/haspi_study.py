@@ -12,7 +12,7 @@ from pathlib import Path
 
 from compensators import NALR
 from hlsim.audio import find_audio, read_audio, write_audio
-from hlsim.audiogram_table import read_audiograms
+from hlsim.audiogram.table import read_audiograms
 from hlsim.calibration import level_spl, set_level
 from hlsim.evaluation import haspi_report
 from hlsim.report.haspi import markdown, write_report

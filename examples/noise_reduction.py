@@ -22,7 +22,7 @@ from torch import Tensor
 from compensators import load_compensator
 from examples.enhancers import GTCRN, DeepFilterNet3, RNNoise
 from hlsim import Audiogram
-from hlsim.audiogram_table import read_audiograms
+from hlsim.audiogram.table import read_audiograms
 from hlsim.calibration import level_spl, set_level
 from hlsim.data.augment import mix
 from hlsim.data.clips import Clips

@@ -14,12 +14,12 @@ from clarity.evaluator.msbg.msbg import Ear
 
 from hlsim import MSBG, Audiogram
 from hlsim.audiogram import LOWEST_LEVEL, STANDARD
-from hlsim.audiogram_table import read_audiograms
+from hlsim.audiogram.table import read_audiograms
+from hlsim.audiogram.thresholds import HIGHEST_SIMULATED
 from hlsim.calibration import set_level
 from hlsim.data.clips import Clips
 from hlsim.data.ears import draw_thresholds
 from hlsim.metrics.reference import pyclarity_msbg
-from hlsim.thresholds import HIGHEST_SIMULATED
 
 
 def sample_for_sample(signal: torch.Tensor, ear: Audiogram) -> float:

@@ -4,10 +4,10 @@ from pathlib import Path
 
 from torch import nn
 
+from hlsim.audiogram.thresholds import AudiogramLike
 from hlsim.calibration import PASCAL_SPL
 from hlsim.loss import EarsName, Hearing, HearingLossLoss, Reduction
 from hlsim.neuro.config import NEURO_RATE
-from hlsim.thresholds import AudiogramLike
 
 _LEVEL = {"levels": 0.03, "louder": 0.06, "peaks": 1.0}
 """What is too loud costs twice what it costs by default, for HASPI rewards gain."""

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 
 from hlsim.audiogram import Audiogram
-from hlsim.audiogram_table import numbered_audiograms
+from hlsim.audiogram.table import numbered_audiograms
 
 EARS = ("left", "right")
 

@@ -11,6 +11,13 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from hlsim.audiogram import FREQUENCIES
+from hlsim.audiogram.thresholds import (
+    AudiogramLike,
+    as_thresholds,
+    check_two_ears,
+    of_listeners,
+    own_thresholds,
+)
 from hlsim.calibration import PASCAL_SPL, check_full_scale, gain_to_pascals
 from hlsim.checks import Lengths, check_choice, check_lengths, check_rate, check_waveform, silent_after
 from hlsim.criteria import coherent_bands, paper
@@ -25,7 +32,6 @@ from hlsim.msbg.response import with_phase_of_bank
 from hlsim.neuro import NeuroMSBG
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.pretrained import SIMULATOR, find_checkpoint, load_pretrained
-from hlsim.thresholds import AudiogramLike, as_thresholds, check_two_ears, of_listeners, own_thresholds
 from hlsim.torchtools import not_compiled
 
 ReferenceName = Literal["clean", "normal-hearing"]

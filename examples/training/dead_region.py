@@ -7,7 +7,7 @@ exceeds 70 dB HL, the cochlea is dead and nothing is heard.
 import torch
 from torch import Tensor, nn
 
-from hlsim.thresholds import interpolate
+from hlsim.audiogram.thresholds import interpolate
 
 
 class DeadRegion(nn.Module):

@@ -14,11 +14,11 @@ import torch
 from torch import Tensor
 
 from hlsim.audiogram import LOWEST_LEVEL, SEVERITIES, STANDARD, Audiogram
-from hlsim.audiogram_table import read_audiograms
+from hlsim.audiogram.table import read_audiograms
+from hlsim.audiogram.thresholds import HIGHEST_SIMULATED
 from hlsim.checks import refuse_unknown
 from hlsim.data.manifest import SPLITS
 from hlsim.data.plan_settings import PlanSettings
-from hlsim.thresholds import HIGHEST_SIMULATED
 
 MILDER = ("NH", "N1", "N2", "S1")
 """Standard ears that join measured ones in validation, since those are mostly moderate and severe."""

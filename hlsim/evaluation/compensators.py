@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from compensators.nalr import NALR
 from compensators.wdrc import WDRC
 from hlsim.audiogram import Audiogram
+from hlsim.audiogram.thresholds import as_thresholds
 from hlsim.criteria.bands import BANDS
 from hlsim.data.foreign import load_enhancer
 from hlsim.evaluation.compensator_result import MEASURES, compensator_result
@@ -48,7 +49,6 @@ from hlsim.metrics.registry import Engine, check_measures, measure_by, version_o
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.parallel import Failed, Progress, check_parallel, make_missing
 from hlsim.pretrained import load_pretrained
-from hlsim.thresholds import as_thresholds
 
 UNAIDED, PRESCRIBED, COMPRESSED = "unaided", "NAL-R", "WDRC"
 """The conditions that every compensator is compared with."""

@@ -25,7 +25,7 @@ from typing import Any, TypeVar
 
 from hlsim.audio import EXTENSIONS, find_audio
 from hlsim.audiogram import Audiogram
-from hlsim.audiogram_table import numbered_audiograms
+from hlsim.audiogram.table import numbered_audiograms
 from hlsim.calibration import check_full_scale
 from hlsim.evaluation.scores import EARS
 from hlsim.evaluation.scoring import FileItem

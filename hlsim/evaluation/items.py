@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from compensators.nalr import NALR
 from hlsim.audiogram import Audiogram
-from hlsim.audiogram_table import read_audiograms
+from hlsim.audiogram.table import read_audiograms
 from hlsim.calibration import level_spl, set_level
 from hlsim.data.augment import compress, mix
 from hlsim.data.clips import Clips

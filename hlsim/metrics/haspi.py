@@ -26,6 +26,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from hlsim.audiogram.thresholds import AudiogramLike
 from hlsim.calibration import PASCAL_SPL
 from hlsim.checks import Lengths, check_choice, check_waveform
 from hlsim.metrics.ear import envelope_modulation as envelopes
@@ -33,7 +34,6 @@ from hlsim.metrics.ear import model as ear_model
 from hlsim.metrics.ear.clean_speech import CleanItem, CleanSpeech, ItemGroup
 from hlsim.metrics.ear.model import CHANNELS
 from hlsim.metrics.pair import check_seed
-from hlsim.thresholds import AudiogramLike
 from hlsim.torchtools import constant
 
 Noise = Literal["expected", "seeded", "none"]

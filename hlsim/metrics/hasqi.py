@@ -18,6 +18,7 @@ from scipy.signal.windows import hamming
 from torch import Tensor
 
 from hlsim.audiogram import FREQUENCIES
+from hlsim.audiogram.thresholds import AudiogramLike
 from hlsim.calibration import PASCAL_SPL, check_full_scale
 from hlsim.checks import Lengths, check_choice, check_waveform
 from hlsim.dsp.fft import fft_length
@@ -28,7 +29,6 @@ from hlsim.metrics.ear.clean_speech import CleanItem, CleanSpeech, ItemGroup
 from hlsim.metrics.ear.model import AUDIOMETRIC_HZ, CHANNELS, Extent
 from hlsim.metrics.ear.recursions import RATE
 from hlsim.metrics.haspi import Noise, generator_after, item_seeds
-from hlsim.thresholds import AudiogramLike
 from hlsim.torchtools import constant
 
 _NALR_ORDER = 140

@@ -10,10 +10,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from hlsim.audiogram.thresholds import check_two_ears
 from hlsim.checks import check_rate, check_waveform
 from hlsim.dsp.fft import power
 from hlsim.dsp.stft import STFT
-from hlsim.thresholds import check_two_ears
 from hlsim.torchtools import constant_like
 
 OCTAVES = (250.0, 500.0, 1000.0, 2000.0, 4000.0)

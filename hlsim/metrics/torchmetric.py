@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from hlsim.audiogram import FREQUENCIES, Audiogram
+from hlsim.audiogram.thresholds import AudiogramLike, is_listener, of_listeners
 from hlsim.calibration import check_full_scale, level_spl
 from hlsim.checks import check_rate
 from hlsim.extras import require
@@ -17,7 +18,6 @@ from hlsim.metrics.haspi import haspi
 from hlsim.metrics.hasqi import hasqi
 from hlsim.metrics.pair import check_pair, check_seed
 from hlsim.parallel import check_parallel, one_thread, run_parallel
-from hlsim.thresholds import AudiogramLike, is_listener, of_listeners
 
 _Metric: Any = require("torchmetrics", "train").Metric
 

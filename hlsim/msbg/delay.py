@@ -4,7 +4,7 @@ import torch
 from torch import nn
 
 from hlsim.audiogram import Audiogram
-from hlsim.thresholds import AudiogramLike
+from hlsim.audiogram.thresholds import AudiogramLike
 
 
 def estimate_delay(

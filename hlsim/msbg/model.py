@@ -8,6 +8,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from hlsim.audiogram import severity_of
+from hlsim.audiogram.thresholds import AudiogramLike, of_listeners, own_thresholds, resolve_thresholds
 from hlsim.calibration import PASCAL_SPL, check_full_scale, gain_to_pascals
 from hlsim.checks import check_rate, check_waveform
 from hlsim.dsp.fft import long_irfft, long_rfft
@@ -19,7 +20,6 @@ from hlsim.msbg.multirate import multirate_bank, total_response
 from hlsim.msbg.recruitment import expansion_ratios, threshold_weights
 from hlsim.msbg.resampling import from_cochlea, from_spectrum, to_cochlea, to_inner
 from hlsim.msbg.smearing import BROADENING, SMEARING_DELAY, smear, smearing_matrix_below
-from hlsim.thresholds import AudiogramLike, of_listeners, own_thresholds, resolve_thresholds
 from hlsim.torchtools import constant_like, made_once, not_compiled
 
 STRUCTURAL_DELAY = 1047

@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
+from hlsim.audiogram.thresholds import interpolation_weights
 from hlsim.calibration import PASCAL_SPL
 from hlsim.msbg.envelope import STEP
 from hlsim.msbg.filterbank import FilterBank
-from hlsim.thresholds import interpolation_weights
 from hlsim.torchtools import constant_like
 
 CATCH_UP_SPL = 105.0

@@ -4,6 +4,7 @@ import torch
 from torch import Tensor, nn
 
 from hlsim.audiogram import FREQUENCIES, SEVERITIES, severity_index
+from hlsim.audiogram.thresholds import interpolate
 from hlsim.calibration import PASCAL_SPL
 from hlsim.dsp.fft import power
 from hlsim.msbg.recruitment import CATCH_UP_SPL
@@ -14,7 +15,6 @@ from hlsim.neuro.decoders import MaskDecoder, PhaseDecoder
 from hlsim.neuro.encoder import AudiogramEncoder, DenseEncoder, FrameEncoder, log_magnitude, sine_of_phase
 from hlsim.neuro.network import EarNetwork
 from hlsim.neuro.prior import Prior
-from hlsim.thresholds import interpolate
 
 _TINY = 1e-11
 

@@ -6,12 +6,12 @@ import torch
 from torch import Tensor, nn
 
 from hlsim.audiogram import FREQUENCIES
+from hlsim.audiogram.thresholds import AudiogramLike, resolve_thresholds
 from hlsim.calibration import check_full_scale, gain_to_pascals
 from hlsim.checks import check_rate, check_waveform
 from hlsim.dsp.overlap import overlapping
 from hlsim.dsp.resample import resample
 from hlsim.neuro.config import NEURO_RATE, NetworkConfig
-from hlsim.thresholds import AudiogramLike, resolve_thresholds
 
 # Values of the widest feature map of all items that run together on a CPU, and the samples at 16 kHz that this is at
 # least and at most. Larger maps the C library gives back to the system, and pays for their pages anew with every one; of

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from hlsim.audiogram import Audiogram
-from hlsim.audiogram_plot import frequency_axis
+from hlsim.audiogram.plot import frequency_axis
 from hlsim.criteria.bands import band_centres, band_levels, threshold_in_quiet
 from hlsim.evaluation.comparison import EQUAL_DB
 from hlsim.evaluation.haspi_report import HaspiReport

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from hlsim.audiogram_plot import frequency_axis
+from hlsim.audiogram.plot import frequency_axis
 from hlsim.report.page import Picture
 from hlsim.report.pictures import draw_svg, legend, plain
 

@@ -14,7 +14,7 @@ from torch.utils.data import Dataset
 
 from hlsim.audio import find_audio
 from hlsim.audiogram import Audiogram
-from hlsim.audiogram_table import read_audiograms
+from hlsim.audiogram.table import read_audiograms
 from hlsim.calibration import level_spl, set_level
 from hlsim.data.augment import KNOTS, augment_speech, equalise, mix
 from hlsim.data.clips import Clips

@@ -9,9 +9,9 @@ from compensators import NALR, WDRC, load_compensator
 from compensators.bands import centres, shares, speech_levels
 from compensators.nalr import nalr_gains_db
 from hlsim import Audiogram
+from hlsim.audiogram.thresholds import interpolate
 from hlsim.calibration import level_spl, set_level
 from hlsim.dsp.resample import resample
-from hlsim.thresholds import interpolate
 
 BANDS = 20
 

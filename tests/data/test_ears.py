@@ -7,10 +7,10 @@ import pytest
 import torch
 
 from hlsim.audiogram import Audiogram, severity_index
+from hlsim.audiogram.thresholds import as_thresholds
 from hlsim.data import ears as module
 from hlsim.data.ears import Ears, check_shares, draw_thresholds
 from hlsim.data.plan_settings import PlanSettings
-from hlsim.thresholds import as_thresholds
 
 SPLITS = ("train", "valid", "test")
 

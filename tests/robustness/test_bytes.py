@@ -17,7 +17,7 @@ import torch
 from compensators import HearingAid, HearingAidConfig, load_compensator, save_compensator, trained_for
 from hlsim import NeuroMSBG, load_pretrained
 from hlsim.audio import read_audio, read_stretch
-from hlsim.audiogram_table import read_audiograms
+from hlsim.audiogram.table import read_audiograms
 from hlsim.cli.inputs import read_recipe
 from hlsim.data.corpora import find_utterances
 from hlsim.data.instances import Instance, Plan, is_whole

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from hlsim.audiogram import HIGHEST_LEVEL
+from hlsim.audiogram.thresholds import AudiogramLike, resolve_thresholds
 from hlsim.calibration import check_full_scale
 from hlsim.checks import Lengths, check_lengths, check_rate, check_waveform
 from hlsim.metrics.ear import input as ear_input
@@ -18,7 +19,6 @@ from hlsim.metrics.ear import model as ear_model
 from hlsim.metrics.ear.model import CHANNELS, Extent
 from hlsim.metrics.ear.recursions import RATE, middle_ear
 from hlsim.metrics.pair import LOWEST_REFERENCE_SPL, SHORTEST_SECONDS
-from hlsim.thresholds import AudiogramLike, resolve_thresholds
 
 _LEAST = 384  # samples at 24 kHz: HASQI's segment
 

@@ -12,7 +12,15 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from hlsim.audiogram import FREQUENCIES, LOWEST_LEVEL, STANDARD, Audiogram, has_two_ears, is_claritys, listed
+from hlsim.audiogram.value import (
+    FREQUENCIES,
+    LOWEST_LEVEL,
+    STANDARD,
+    Audiogram,
+    has_two_ears,
+    is_claritys,
+    listed,
+)
 from hlsim.torchtools import constant, constant_like
 
 HIGHEST_SIMULATED = 100.0

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from hlsim.audiogram import Audiogram
-from hlsim.audiogram_table import read_audiograms
+from hlsim.audiogram.table import read_audiograms
 
 
 def test_csv_round_trip(tmp_path: Path) -> None:

@@ -130,7 +130,7 @@ class Audiogram:
         Raises:
             MissingExtraError: matplotlib is not installed.
         """
-        from hlsim.audiogram_plot import plot_audiogram
+        from hlsim.audiogram.plot import plot_audiogram
 
         limits = pairwise((LOWEST_LEVEL, *SEVERITY_LIMITS, HIGHEST_LEVEL))
         degrees = dict(zip(SEVERITIES, limits, strict=True))

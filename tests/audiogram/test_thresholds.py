@@ -9,8 +9,8 @@ import torch
 from compensators import NALR
 from hlsim import MSBG
 from hlsim.audiogram import FREQUENCIES, Audiogram
+from hlsim.audiogram.thresholds import as_thresholds, interpolate, interpolation_weights
 from hlsim.data.ears import draw_thresholds
-from hlsim.thresholds import as_thresholds, interpolate, interpolation_weights
 
 
 def test_thresholds_for_a_simulator() -> None:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import csv
 from pathlib import Path
 
-from hlsim.audiogram import Audiogram
+from hlsim.audiogram.thresholds import as_thresholds
+from hlsim.audiogram.value import Audiogram
 from hlsim.files import read_rows
-from hlsim.thresholds import as_thresholds
 
 
 def read_audiograms(path: str | Path, *, simulated: bool = False) -> list[tuple[dict[str, str], Audiogram]]:
