@@ -1,4 +1,4 @@
-"""What the hearing aid's sliders trade: HASPI, HASQI and the level heard, at five settings of each.
+"""What the hearing aid's sliders and its release trade: HASPI, HASQI and the level heard, at five settings and three.
 
     python examples/sliders.py speech/valid noise/valid audiograms/valid.csv [ITEMS] [COMPENSATOR]
 
@@ -8,6 +8,7 @@ for perfect, HASPI rewards gain, and *heard* is the level after the exact MSBG l
 
 import statistics
 import sys
+from dataclasses import replace
 
 import torch
 
@@ -18,15 +19,18 @@ from hlsim.evaluation.items import draw_judged_items, read_ears
 from hlsim.metrics import haspi, hasqi
 
 FULL, STEPS = {"noise_reduction": 1.0, "amplification": 1.0}, (0.0, 0.25, 0.5, 0.75, 1.0)
+RELEASES = (0.5, 2.0)  # seconds, beside the aid's own
 
 
 def main(speech: str, noise: str, audiograms: str, count: str = "48", name: str = "hearing-aid") -> None:
     aid, msbg = load_compensator(name), MSBG(sample_rate=16000)
     items = draw_judged_items(speech, noise, read_ears(audiograms), items=int(count), seconds=3.0, seed=0)
-    settings = [FULL | {slider: value} for slider in FULL for value in STEPS if value < 1.0] + [FULL]
-    print("| noise reduction | amplification | | HASPI | HASQI | given (dB SPL) | heard (dB) |")
-    print("|---|---|---|---|---|---|---|")
-    for sliders in settings:
+    own = aid.config.release
+    settings = [(FULL | {slider: value}, own) for slider in FULL for value in STEPS if value < 1.0]
+    print("| noise reduction | amplification | release (s) | | HASPI | HASQI | given (dB SPL) | heard (dB) |")
+    print("|---|---|---|---|---|---|---|---|")
+    for sliders, release in settings + [(FULL, release) for release in (own, *RELEASES)]:
+        aid.config = replace(aid.config, release=release)
         for condition in ("clean", "noisy"):
             rows = []
             for item in items:
@@ -40,7 +44,7 @@ def main(speech: str, noise: str, audiograms: str, count: str = "48", name: str 
             means = [statistics.mean(column) for column in zip(*rows, strict=True)]
             figures = "{:.3f} | {:.3f} | {:.1f} | {:+.1f}".format(*means)
             print(
-                f"| {' | '.join(f'{value:g}' for value in sliders.values())} | {condition} | {figures} |",
+                f"| {' | '.join(f'{value:g}' for value in (*sliders.values(), release))} | {condition} | {figures} |",
                 flush=True,
             )
 

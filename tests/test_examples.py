@@ -99,11 +99,12 @@ def test_what_the_sliders_trade(
     with torch.no_grad():
         example.main(valid, valid, str(ears), "2")
     rows = [line.split(" | ") for line in capsys.readouterr().out.splitlines()[2:]]
-    levels = {tuple(row[:3]): float(row[5]) for row in rows}
-    assert len(levels) == 6
+    levels = {tuple(row[:4]): float(row[6]) for row in rows}
+    assert len(levels) == 10
     for condition in ("clean", "noisy"):
-        whole = levels["| 1", "1", condition]
-        assert levels["| 1", "0", condition] < whole < levels["| 0", "1", condition]
+        whole = levels["| 1", "1", "0.1", condition]
+        assert levels["| 1", "0", "0.1", condition] < whole < levels["| 0", "1", "0.1", condition]
+        assert levels["| 1", "1", "2", condition] < whole  # peaks are held
 
 
 def test_similarity_of_neurograms() -> None:
