@@ -7,7 +7,7 @@ as 94): RMS 1.0 is 94 dB SPL. ``full_scale_spl`` says what RMS 1.0 is in somebod
 import torch
 from torch import Tensor
 
-from hlsim.checks import is_finite
+from hlsim.checks import check_floating, is_finite
 
 PASCAL_SPL = 94.0
 """Level in dB SPL of a signal in pascals whose RMS is 1.0."""
@@ -30,7 +30,8 @@ def gain_to_pascals(full_scale_spl: float) -> float:
 def level_spl(waveform: Tensor, full_scale_spl: float = PASCAL_SPL) -> Tensor:
     """RMS level of a waveform in dB SPL.
 
-    Shape: (..., time) -> (...). Silence gives -106 dB SPL at the default scale, never infinity.
+    Shape: (..., time) -> (...). Silence gives -106 dB SPL at the default scale, never infinity. Raises ValueError for
+    what is no floating-point tensor.
     """
     power = _whole(waveform).square().mean(-1).clamp_min(_LOWEST_POWER)
     return (10.0 * torch.log10(power) + check_full_scale(full_scale_spl)).to(waveform.dtype)
@@ -39,7 +40,8 @@ def level_spl(waveform: Tensor, full_scale_spl: float = PASCAL_SPL) -> Tensor:
 def set_level(waveform: Tensor, spl: float | Tensor, full_scale_spl: float = PASCAL_SPL) -> Tensor:
     """Scale a waveform to an RMS level in dB SPL.
 
-    Shape: (..., time) -> (..., time); ``spl`` is a number or (...). Silence stays silent.
+    Shape: (..., time) -> (..., time); ``spl`` is a number or (...). Silence stays silent. Raises ValueError
+    as ``level_spl``.
     """
     whole = _whole(waveform)
     gain_db = torch.as_tensor(spl, device=waveform.device) - level_spl(whole, full_scale_spl)
@@ -50,6 +52,7 @@ def set_level(waveform: Tensor, spl: float | Tensor, full_scale_spl: float = PAS
 
 def _whole(waveform: Tensor) -> Tensor:
     """In float32 at least: float16 holds neither the power of soft speech nor that of silence."""
+    check_floating(waveform)
     return waveform.float() if waveform.dtype in (torch.float16, torch.bfloat16) else waveform
 
 

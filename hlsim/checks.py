@@ -126,9 +126,7 @@ def check_waveform(waveform: Tensor, name: str = "waveform", *, highest: float =
     NaN and infinity pass, and are NaN in what comes of them. How large samples are is not looked at on a GPU, whose queue
     it would stop, nor in a compiled or exported program and in transforms of ``torch.func``.
     """
-    if not isinstance(waveform, Tensor) or not waveform.is_floating_point():
-        kind = waveform.dtype if isinstance(waveform, Tensor) else type(waveform).__name__
-        raise ValueError(f"{name} is {kind}; allowed: a floating-point tensor (..., time)")
+    check_floating(waveform, name)
     if waveform.ndim == 0 or waveform.numel() == 0:
         raise ValueError(
             f"{name} has shape {tuple(waveform.shape)}; allowed: (..., time) with at least one sample"
@@ -138,6 +136,14 @@ def check_waveform(waveform: Tensor, name: str = "waveform", *, highest: float =
         if highest < (peak := max(-float(low), float(high))) < math.inf:
             raise ValueError(f"{name} has a sample of {peak:.3g}; allowed: up to {highest:g}")
     return waveform
+
+
+def check_floating(waveform: Tensor, name: str = "waveform") -> None:
+    """Raise ValueError unless it is a floating-point tensor."""
+    if not isinstance(waveform, Tensor) or not waveform.is_floating_point():
+        kind = waveform.dtype if isinstance(waveform, Tensor) else type(waveform).__name__
+        scaled = "; divide 16-bit samples by 32768" if "int16" in str(kind) else ""
+        raise ValueError(f"{name} is {kind}; allowed: a floating-point tensor (..., time){scaled}")
 
 
 def _has_values(tensor: Tensor) -> bool:

@@ -16,6 +16,7 @@ from hlsim.audiogram.thresholds import (
     as_thresholds,
     check_two_ears,
     of_listeners,
+    one_an_item,
     own_thresholds,
 )
 from hlsim.calibration import PASCAL_SPL, check_full_scale, gain_to_pascals
@@ -304,8 +305,7 @@ class HearingLossLoss(nn.Module):
         ears = self.thresholds if audiogram is None else as_thresholds(audiogram, missing=True)
         if ears is None:
             raise ValueError("no audiogram: give one when building the loss or with the call")
-        if len(shape) == 3 and shape[1] == 1 and ears.ndim == 2 and len(ears) == shape[0]:
-            ears = ears.unsqueeze(1)  # (batch, 1, time), one ear an item
+        ears = one_an_item(ears, shape)
         dtype = torch.promote_types(torch.promote_types(compensated.dtype, clean.dtype), torch.float32)
         compensated, clean = compensated.to(dtype), clean.to(dtype)
         if ends is not None:

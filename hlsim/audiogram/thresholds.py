@@ -116,6 +116,8 @@ def resolve_thresholds(
 ) -> Tensor:
     """The call's audiogram, or else the stored one, on the waveform's device, checked to fit its leading dimensions.
 
+    Of (batch, 1, time) and (batch, 8) each item has its ear.
+
     Args:
         two_ears: the stored one is of a listener, or of several.
         limits: of ``as_thresholds``.
@@ -128,6 +130,7 @@ def resolve_thresholds(
     thresholds = as_thresholds(audiogram, **limits) if audiogram is not None else stored
     assert thresholds is not None
     check_two_ears(two_ears if audiogram is None else of_listeners(audiogram), waveform)
+    thresholds = one_an_item(thresholds, waveform.shape)
     try:
         if thresholds.ndim > 1:
             torch.broadcast_shapes(waveform.shape[:-1], thresholds.shape[:-1])
@@ -137,6 +140,12 @@ def resolve_thresholds(
             "one audiogram, or leading dimensions that broadcast"
         ) from None
     return thresholds.to(waveform.device)
+
+
+def one_an_item(thresholds: Tensor, shape: torch.Size) -> Tensor:
+    """As many ears as items of (batch, 1, time) belong to one each. Shape: (batch, 8) -> (batch, 1, 8), else as it is."""
+    mono = len(shape) == 3 and shape[1] == 1
+    return thresholds.unsqueeze(1) if mono and thresholds.shape[:-1] == shape[:1] else thresholds
 
 
 def is_listener(audiogram: Any) -> TypeGuard[TwoEars]:
@@ -238,8 +247,14 @@ def _instead(given: object) -> str:
         make = f"Audiogram.standard({first!r})"
     elif has_two_ears(first):
         return "; of two ears write Listener.from_clarity(listener), of one Audiogram.from_clarity(listener, 'left')"
-    elif isinstance(first, Mapping):
+    elif isinstance(first, Mapping) and isinstance(first.get("levels"), Sequence):
+        if any(isinstance(level, Tensor) for level in first["levels"]):  # as default_collate makes them
+            return "; write torch.stack(audiogram['levels'], -1)"
         make = "Audiogram.from_dict(...)"
+    elif isinstance(first, Mapping) and any(str(name).startswith("hl_") for name in first):
+        make = "Audiogram.from_row(...)"
+    elif isinstance(first, Mapping):
+        return "; write Audiogram(levels, frequencies)"
     elif several and isinstance(first, Tensor):
         return "; write torch.stack(...)"
     elif isinstance(first, np.ndarray) or (several and isinstance(first, float | int | list | tuple)):

@@ -253,7 +253,7 @@ def severity_index(thresholds: Tensor) -> Tensor:
 
 def _numbers(values: Iterable[float], what: str) -> tuple[float, ...]:
     try:
-        if isinstance(values, str):  # whose characters are no levels
+        if isinstance(values, str | Mapping):  # whose characters or keys are no levels
             raise TypeError
         numbers = tuple(float(value) for value in values)
     except (TypeError, ValueError):

@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 import torch
 
-from compensators import NALR
-from hlsim import MSBG
+from compensators import NALR, load_compensator
+from hlsim import MSBG, load_pretrained
 from hlsim.audiogram import FREQUENCIES, Audiogram
 from hlsim.audiogram.thresholds import as_thresholds, interpolate, interpolation_weights
 from hlsim.data.ears import draw_thresholds
+from hlsim.metrics import haspi
 
 
 def test_thresholds_for_a_simulator() -> None:
@@ -46,6 +47,9 @@ def test_thresholds_for_a_simulator() -> None:
         (["N3", "N4"], r"is list; allowed: .* tensor; write \[Audiogram\.standard\('N3'\), \.\.\.\]$"),
         ("loud", "is str; allowed: .* tensor$"),
         ({"levels": [0.0] * 8}, r"is dict; allowed: .* tensor; write Audiogram\.from_dict\("),
+        ({"levels": [torch.zeros(2)] * 8}, r"; write torch\.stack\(audiogram\['levels'\], -1\)$"),
+        ({"hl_250": "20"}, r"is dict; allowed: .* tensor; write Audiogram\.from_row\("),
+        ({250: 20.0}, r"is dict; allowed: .* tensor; write Audiogram\(levels, frequencies\)$"),
         (None, "is NoneType; allowed: .* tensor$"),
         (np.zeros(8), r"is ndarray; allowed: .* tensor; write torch\.tensor\(\.\.\.\)$"),
     ],
@@ -53,6 +57,27 @@ def test_thresholds_for_a_simulator() -> None:
 def test_what_is_no_ear_for_a_simulator(audiogram: Any, said: str) -> None:
     with pytest.raises(ValueError, match=said):
         as_thresholds(audiogram)
+
+
+def test_mono_channels_have_one_ear_an_item() -> None:
+    """(batch, 1, time) and (batch, 8), whatever is called."""
+    waveform, ears = (
+        0.02 * torch.randn(2, 1, 16000),
+        torch.stack((torch.full((8,), 20.0), torch.full((8,), 60.0))),
+    )
+    for module in (
+        MSBG(sample_rate=16000),
+        NALR(),
+        load_compensator("hearing-aid"),
+        load_pretrained("neuro-msbg"),
+    ):
+        together = module(waveform, ears)
+        assert together.shape == waveform.shape
+        torch.testing.assert_close(together[:, 0], module(waveform[:, 0], ears), atol=1e-6, rtol=1e-4)
+    assert MSBG(sample_rate=16000)(waveform, ears[:, None].expand(2, 3, 8)).shape == (2, 3, 16000)
+    assert torch.equal(haspi(waveform, waveform, ears), haspi(waveform[:, 0], waveform[:, 0], ears)[:, None])
+    with pytest.raises(ValueError, match="allowed: one, or"):
+        haspi(waveform, waveform, ears.expand(2, 2, 8))
 
 
 @pytest.mark.parametrize("make", [MSBG, NALR])

@@ -130,7 +130,7 @@ class CleanSpeech:
         """Of each item. Returns (items, 8) dB HL."""
         probe = torch.empty((*self.shape, 1), device=self.device)
         ears = resolve_thresholds(None, audiogram, probe, highest=HIGHEST_LEVEL, taker=self._name)
-        if ears.ndim > len(self.shape) + 1:
+        if torch.broadcast_shapes(self.shape, ears.shape[:-1]) != self.shape:
             raise ValueError(
                 f"audiograms of shape {tuple(ears.shape)} for signals of {(*self.shape, self.time)}; allowed: one, or "
                 "leading dimensions that broadcast"
