@@ -191,3 +191,11 @@ def read_rows(path: str | Path) -> Iterator[tuple[int, dict[str, str]]]:
                 raise ValueError(f"{path}, line {reader.line_num}: {len(values)} values; allowed: {allowed}")
             row = zip_longest(header, values[: len(header)], fillvalue="")
             yield reader.line_num, {name: value.strip() for name, value in row if name}
+
+
+def read_table(path: str | Path, what: str) -> list[tuple[int, dict[str, str]]]:
+    """All of ``read_rows``. Raises ValueError that names ``what`` where the file cannot be read, too."""
+    try:
+        return list(read_rows(path))
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise ValueError(f"{path}: cannot read {what}: {error}") from error

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import csv
 from pathlib import Path
 
 from hlsim.audiogram.thresholds import as_thresholds
 from hlsim.audiogram.value import Audiogram
-from hlsim.files import read_rows
+from hlsim.files import read_table
 
 
 def read_audiograms(path: str | Path, *, simulated: bool = False) -> list[tuple[dict[str, str], Audiogram]]:
@@ -29,10 +28,7 @@ def numbered_audiograms(
     path: str | Path, *, simulated: bool = False
 ) -> list[tuple[int, dict[str, str], Audiogram]]:
     """``read_audiograms`` with the number of each row's line first, for messages that name it."""
-    try:
-        rows = list(read_rows(path))
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise ValueError(f"{path}: cannot read audiograms: {error}") from error
+    rows = read_table(path, "audiograms")
     if not rows:
         raise ValueError(f"{path}: no audiograms; needs a header with hl_250, hl_500, ... and a row an ear")
     ears = []

@@ -15,7 +15,6 @@ or in a second CSV file by ``listener`` and ``ear``. The level is in a column ``
 
 from __future__ import annotations
 
-import csv
 import math
 from collections.abc import Callable, Container, Mapping
 from dataclasses import replace
@@ -29,7 +28,7 @@ from hlsim.audiogram.table import numbered_audiograms
 from hlsim.calibration import check_full_scale
 from hlsim.evaluation.scores import EARS
 from hlsim.evaluation.scoring import FileItem
-from hlsim.files import read_rows, resolved
+from hlsim.files import read_table, resolved
 
 _Name = TypeVar("_Name")
 
@@ -102,10 +101,7 @@ def below_root(root: Path, name: str, column: str) -> Path:
 
 def _rows(path: str | Path) -> list[tuple[int, dict[str, str]]]:
     """With the number of each row's line."""
-    try:
-        rows = list(read_rows(path))
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise ValueError(f"{path}: cannot read the manifest: {error}") from error
+    rows = read_table(path, "the manifest")
     if not rows:
         raise ValueError(f"{path}: no rows; needs a header with {', '.join(_NEEDED)} and a row a file")
     missing = [column for column in _NEEDED if column not in rows[0][1]]
