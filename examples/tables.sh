@@ -2,11 +2,12 @@
 # The paper's Tables I, III and IV, and the comparison of normalisations: trains every row for the same time, or the same
 # steps, on one thread, and compares them. Killed, it goes on with the same command. Results are in docs/paper-tables.md.
 #
-#   [STEPS=10000] [NARROW=4] [JOBS=2] [ROWS="paper/cnn paper/lstm"] examples/tables.sh CORPORA OUT [MINUTES A ROW] [ITEMS]
+#   [STEPS=10000] [NARROW=4] [JOBS=2] [ROWS="paper/cnn neuro-msbg-lstm:phase=input:seed=1"] \
+#       examples/tables.sh CORPORA OUT [MINUTES A ROW] [ITEMS]
 #
 # CORPORA holds speech/{train,valid}, noise/{train,valid} and audiograms/{train,valid}.csv.
 # STEPS: of each row, whatever the minutes. NARROW: the paper's rows with as many times fewer channels. JOBS: rows trained at
-# a time. ROWS: these alone, compared as Table I.
+# a time. ROWS: these alone, compared as Table I; what follows a colon changes the recipe's network, or its seed.
 set -euo pipefail
 corpora=$1 out=$2 minutes=${3:-5} items=${4:-80}
 here=$(dirname "${BASH_SOURCE[0]}")
@@ -15,11 +16,21 @@ limit=(--max-minutes "$minutes")
 [[ -z ${STEPS:-} ]] || limit=(--max-minutes 1e6 --max-steps "$STEPS")
 mkdir -p "$out/recipes"
 
-train() { # recipe
-    local recipe="$out/recipes/$(basename "$1").yaml"
-    awk -v by="$([[ $1 == paper/* ]] && echo "${NARROW:-1}" || echo 1)" \
-        '$1 == "channels:" && by > 1 { $0 = "  channels: " 4 * int($2 / by / 4 + 0.5) } 1' "$here/$1.yaml" >"$recipe"
-    hlsim train-simulator --config "$recipe" "${limit[@]}" --quiet --out "$out/$(basename "$1")" \
+folder() { # row
+    basename "${1//[:=]/-}"
+}
+
+train() { # row: recipe[:setting=value[...]]
+    local name=$(folder "$1") given=${1#"${1%%:*}"}
+    local recipe="$out/recipes/$name.yaml"
+    awk -v by="$([[ $1 == paper/* ]] && echo "${NARROW:-1}" || echo 1)" -v given="${given#:}" '
+        BEGIN { for (n = split(given, pairs, ":"); n; n--) { split(pairs[n], pair, "="); value[pair[1] ":"] = pair[2] } }
+        $1 == "channels:" && by > 1 { $0 = "  channels: " 4 * int($2 / by / 4 + 0.5) }
+        !($1 in value)
+        $1 == "model:" { for (name in value) if (name != "seed:") print "  " name, value[name] }
+        END { if ("seed:" in value) print "seed:", value["seed:"] }
+    ' "$here/${1%%:*}.yaml" >"$recipe"
+    hlsim train-simulator --config "$recipe" "${limit[@]}" --quiet --out "$out/$name" \
         --speech "$corpora/speech/train" --valid-speech "$corpora/speech/valid" \
         --noise "$corpora/noise/train" --valid-noise "$corpora/noise/valid" \
         --audiograms "$corpora/audiograms/train.csv" --valid-audiograms "$corpora/audiograms/valid.csv"
@@ -30,7 +41,7 @@ compare() { # name of the table, options of evaluate-simulator, --, rows
     shift
     while [[ $1 != -- ]]; do options+=("$1") && shift; done
     shift
-    for row; do checkpoints+=("$out/$row/checkpoint"); done
+    for row; do checkpoints+=("$out/$(folder "$row")/checkpoint"); done
     hlsim evaluate-simulator "${checkpoints[@]}" --speech "$corpora/speech/valid" --noise "$corpora/noise/valid" \
         --audiograms "$corpora/audiograms/valid.csv" --items "$items" --out "$out/$table" "${options[@]}"
 }
@@ -49,7 +60,7 @@ train_all() { # recipes, JOBS at a time
 if [[ -n ${ROWS:-} ]]; then
     read -ra rows <<<"$ROWS"
     train_all "${rows[@]}"
-    compare table-1 --levels 65 --seconds 2 -- "${rows[@]##*/}"
+    compare table-1 --levels 65 --seconds 2 -- "${rows[@]}"
     exit
 fi
 

@@ -216,11 +216,12 @@ class HearingLossLoss(nn.Module):
         """
         given, clean, ears, ends, known = self._check(compensated, clean, audiogram, lengths)
         with torch.autocast(given.device.type, enabled=False):
+            output = given
             if {"coherent-bands", *SCORES} & self.criteria.keys():
                 given = coherent_bands.without_spikes(given)
             heard = self._hear(given, ears, listener, ends)
             batch, time = heard.shape[:-1], heard.shape[-1]
-            signals = {"heard": heard, "given": given.expand_as(heard)}
+            signals = {"heard": heard, "given": given.expand_as(heard), "output": output.expand_as(heard)}
             for name in [name for name in self.criteria if name not in _GIVEN]:
                 signals[name] = self._reference(name, clean, ears, batch, listener, ends)
             gain = gain_to_pascals(self.full_scale_spl)
@@ -343,7 +344,7 @@ class HearingLossLoss(nn.Module):
             aim = signals[name]
             if name == "coherent-bands":
                 items |= coherent_bands.coherent_band_parts(heard, aim, self.sample_rate)
-                items["peaks"] = coherent_bands.peak_excess(signals["given"])
+                items["peaks"] = coherent_bands.peak_excess(signals["output"])
             elif name == "bands":
                 items["band_levels"] = band_level_loss(heard, aim, self.sample_rate)
             elif name == "paper":

@@ -116,7 +116,8 @@ def without_spikes(compensated: Tensor) -> Tensor:
     """The same waveform, whose gradient is cut at 8 times what nine of ten samples of its item stay under; NaN stays.
 
     Where an ear hears next to nothing, a recruiting band or a network gives a few samples a thousand times that, and all
-    others no part of the step.
+    others no part of the step. What is cut on one side more than on the other would leave a mean, and with it a
+    constant pressure would grow that no ear hears: the mean goes.
 
     Shape: (..., time) -> (..., time).
     """
@@ -145,7 +146,12 @@ class _WithoutSpikes(torch.autograd.Function):
         # of the samples that have one: not of silence, nor of what follows an item's end
         usual = torch.where(size > 0.0, size, math.nan).nanquantile(0.9, -1, keepdim=True)
         limit = HIGHEST_GRADIENT * usual.nan_to_num(nan=math.inf)
-        return gradient.clamp(-limit, limit)
+        limited = gradient.clamp(-limit, limit)
+        # nor where none of an item was cut
+        reached = (gradient != 0.0) & (gradient != limited).any(-1, keepdim=True)
+        return limited - reached * (
+            limited.sum(-1, keepdim=True) / reached.sum(-1, keepdim=True).clamp_min(1)
+        )
 
 
 def _stretches(frames: Tensor) -> Tensor:

@@ -196,12 +196,21 @@ def test_spikes_of_the_gradient_are_cut_and_nan_is_not_hidden() -> None:
     usual[1] = 1e-3 * torch.randn(1000)
     usual[2, 500:] = 0.0  # padded
     assert torch.equal(through(usual), usual)
+    usual[:, ::2] *= -1.0
+    usual[1] -= usual[1].mean()
     spiky = usual.clone()
     spiky[:, 7] = torch.tensor([-1e6, 1e6, 1e6])
     found = through(spiky)
-    assert found[0, 7] == -HIGHEST_GRADIENT and found[2, 7] == HIGHEST_GRADIENT
+    # no constant pressure is asked for, and what follows an item's end has no part in that
+    torch.testing.assert_close(found.sum(-1), torch.zeros(3), atol=1e-4, rtol=0.0)
+    assert torch.equal(found[2, 500:], usual[2, 500:])
+    assert -HIGHEST_GRADIENT <= found[0, 7] < 1.0 - HIGHEST_GRADIENT
+    assert HIGHEST_GRADIENT - 1.0 < found[2, 7] <= HIGHEST_GRADIENT
     assert 0.0 < float(found[1, 7]) < 0.05
-    assert torch.equal(found[:, 8:], usual[:, 8:])
+    for item, own in enumerate(usual):
+        torch.testing.assert_close(
+            found[item, 8:500], own[8:500], atol=0.02 * float(own.abs().max()), rtol=0.0
+        )
     spiky[0, 8] = math.nan
     assert bool(through(spiky)[0, 8].isnan())
     assert not bool(through(torch.zeros(2, 10)).any())

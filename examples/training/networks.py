@@ -1,0 +1,165 @@
+"""Four networks that change nothing at the start, or know nothing, through the default loss, judged beside NAL-R:
+
+    python examples/training/networks.py TRAIN_SPEECH VALID_SPEECH NETWORK [EAR] [STEPS] [CRITERION] [CLIP]
+
+NETWORK is gru-mask, conv-mask, waveform or conv-tasnet; CLIP the norm at which the gradient is clipped, inf for none. It
+prints a row: HASPI at 65 dB SPL, clean and in noise of the speech's spectrum at 5 dB SNR, as given and at the level of
+NAL-R (which is judged at the network's, too), HASQI, the level given, and the correlation with the clean speech, each
+band at its best gain and as it is.
+"""
+
+import sys
+from collections.abc import Callable
+from itertools import pairwise
+
+import torch
+from filter_bank import RATE
+from torch import Tensor, nn
+
+from compensators import NALR
+from hlsim import Audiogram, HearingLossLoss
+from hlsim.calibration import level_spl, set_level
+from hlsim.criteria.bands import band_edges
+from hlsim.data.clips import Clips
+from hlsim.dsp.stft import STFT
+from hlsim.metrics import haspi, hasqi
+
+
+class Mask(nn.Module):
+    """A gain for each of 257 frequencies of 32 ms, from the logarithms of their magnitudes."""
+
+    def __init__(self, recurrent: bool) -> None:
+        super().__init__()
+        self.stft, self.recurrent = (
+            STFT(512, 512, 128),
+            nn.GRU(257, 128, batch_first=True) if recurrent else None,
+        )
+        first = [] if recurrent else [nn.Conv1d(257, 64, 3, padding=1), nn.PReLU()]
+        second = [] if recurrent else [nn.Conv1d(64, 64, 3, padding=1), nn.PReLU()]
+        last = nn.Conv1d(128, 257, 1) if recurrent else nn.Conv1d(64, 257, 3, padding=1)
+        self.layers = nn.Sequential(*first, *second, from_zero(last))
+
+    def forward(self, waveform: Tensor) -> Tensor:
+        """Shape: (items, time) -> (items, time)."""
+        spectrum = self.stft.analyse(waveform)
+        features = (spectrum.abs().square() + 1e-10).log() / 4.0
+        if self.recurrent is not None:
+            features = self.recurrent(features)[0]
+        return self.stft.synthesise(spectrum * self.layers(features.mT).mT.exp(), waveform.shape[-1])
+
+
+class Waveform(nn.Module):
+    """Three convolutions of 65 samples and 32 channels, beside the waveform itself."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        first, second = nn.Conv1d(1, 32, 65, padding=32), nn.Conv1d(32, 32, 65, padding=32)
+        last = from_zero(nn.Conv1d(32, 1, 65, padding=32))
+        self.layers = nn.Sequential(first, nn.PReLU(), second, nn.PReLU(), last)
+
+    def forward(self, waveform: Tensor) -> Tensor:
+        """Shape: (items, time) -> (items, time)."""
+        return waveform + self.layers(waveform.unsqueeze(1)).squeeze(1)
+
+
+def conv_tasnet() -> nn.Module:
+    """torchaudio's, as in conv_tasnet.py: from random weights, and for one level."""
+    from torchaudio.models import ConvTasNet
+
+    sizes = {"enc_num_feats": 128, "msk_num_feats": 64, "msk_num_hidden_feats": 128, "msk_num_layers": 6}
+    return nn.Sequential(nn.Unflatten(-1, (1, -1)), ConvTasNet(num_sources=1, **sizes), nn.Flatten(1))
+
+
+def from_zero(layer: nn.Conv1d) -> nn.Conv1d:
+    nn.init.zeros_(layer.weight)
+    nn.init.zeros_(layer.bias)
+    return layer
+
+
+# the network, Adam's learning rate, the levels of its training in dB SPL
+NETWORKS: dict[str, tuple[Callable[[], nn.Module], float, tuple[float, float]]] = {
+    "gru-mask": (lambda: Mask(recurrent=True), 3e-3, (50.0, 80.0)),
+    "conv-mask": (lambda: Mask(recurrent=False), 1e-3, (50.0, 80.0)),
+    "waveform": (Waveform, 1e-3, (50.0, 80.0)),
+    "conv-tasnet": (conv_tasnet, 1e-3, (65.0, 65.0)),
+}
+
+
+def trained(folder: str, kind: str, loss: nn.Module, steps: int, clip: float) -> nn.Module:
+    """On 4 clips of 1 s a step. Seed 0."""
+    torch.manual_seed(0)
+    build, rate, (softest, loudest) = NETWORKS[kind]
+    network = build()
+    optimiser = torch.optim.Adam(network.parameters(), lr=rate)
+    clips, generator, norms = (
+        Clips(folder, sample_rate=RATE, seconds=1.0),
+        torch.Generator().manual_seed(0),
+        [],
+    )
+    for step in range(steps):
+        speech = clips.draw(4, generator)
+        speech = set_level(speech, softest + (loudest - softest) * torch.rand(4, generator=generator))
+        value = loss(network(speech), speech)
+        optimiser.zero_grad()
+        value.backward()
+        norms.append(float(nn.utils.clip_grad_norm_(network.parameters(), clip)))
+        optimiser.step()
+        if step % 20 == 19 or step + 1 == steps:
+            median, largest = sorted(norms[-20:])[len(norms[-20:]) // 2], max(norms[-20:])
+            text = f"step {step + 1}: {value.item():.3f}, gradient's norm {median:.2f}, largest {largest:.1f}"
+            print(text, file=sys.stderr, flush=True)
+    return network
+
+
+def correlation(processed: Tensor, clean: Tensor, *, best_gains: bool) -> float:
+    """With the clean speech, of all items on average; each of 24 bands at its best gain, negative too, or as it is.
+
+    Shape: (items, time) twice.
+    """
+    ours, theirs = torch.fft.rfft(processed.double()), torch.fft.rfft(clean.double())
+    hz = torch.fft.rfftfreq(clean.shape[-1], 1.0 / RATE).double()
+    products = (ours * theirs.conj()).real, ours.abs().square(), theirs.abs().square()
+    edges = torch.as_tensor(band_edges())
+    bands = [(hz >= low) & (hz < high) for low, high in pairwise(edges)]
+    both, own, other = (torch.stack([one[:, band].sum(-1) for band in bands], -1) for one in products)
+    gains = both / own.clamp_min(1e-30) if best_gains else torch.ones_like(own)
+    together = (gains * both).sum(-1) / ((gains.square() * own).sum(-1) * other.sum(-1)).sqrt()
+    return float(together.mean())
+
+
+@torch.no_grad()
+def judged(network: nn.Module, ear: Audiogram, speech: Tensor, noise: Tensor) -> list[str]:
+    """Cells of the row. Shape: (items, time) twice."""
+    clean, nalr, cells = set_level(speech, 65.0), NALR(ear), []
+    for given in (clean, clean + set_level(noise, 60.0)):
+        aided, usual = network(given), nalr(given)
+        levels = level_spl(aided), level_spl(usual)
+        versions = given, usual, aided, set_level(aided, levels[1]), set_level(usual, levels[0])
+        cells += [f"{float(haspi(version, clean, ear).mean()):.3f}" for version in versions]
+        if given is clean:
+            score, level = float(hasqi(aided, clean, ear).mean()), float(levels[0].mean())
+            follows = (correlation(aided, clean, best_gains=best) for best in (True, False))
+            last = [f"{score:.3f}", f"{level:.1f}", *(f"{one:.2f}" for one in follows)]
+    return cells + last
+
+
+def main(
+    train: str,
+    valid: str,
+    kind: str,
+    name: str = "N3",
+    steps: str = "300",
+    criterion: str = "coherent-bands",
+    clip: str = "inf",
+    items: int = 12,
+) -> None:
+    ear, generator = Audiogram.standard(name), torch.Generator().manual_seed(0)
+    speech = Clips(valid, sample_rate=RATE, seconds=2.0).draw(items, generator)
+    spectrum = torch.fft.rfft(speech).abs().square().mean(0).sqrt()
+    noise = torch.fft.irfft(spectrum * torch.fft.rfft(torch.randn(speech.shape, generator=generator)))
+    network = trained(train, kind, HearingLossLoss(ear, criterion=criterion), int(steps), float(clip)).eval()
+    print(f"| {kind}, {steps}, {criterion}, {clip} | {' | '.join(judged(network, ear, speech, noise))} |")
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
