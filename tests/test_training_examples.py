@@ -32,6 +32,20 @@ def test_conv_tasnet_trains(tmp_path: Path, speech_dir: Path, capsys: pytest.Cap
     assert torch.load(tmp_path / "out.pt")
 
 
+@pytest.mark.parametrize("network", ["gru-mask", "waveform"])
+def test_networks_are_trained_and_judged_beside_nalr(
+    network: str, speech_dir: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(EXAMPLES)
+    folders = (str(speech_dir / "train"), str(speech_dir / "valid"))
+    load("networks.py").main([*folders, network, "--steps", "1", "--rate", "1e-9", "--items", "2"])
+    out = capsys.readouterr()
+    assert out.err.startswith("step 1: ")
+    name, unaided, nalr, aided, _, _, *_, follows, as_it_is = out.out.strip("| \n").split(" | ")
+    assert name == network and float(unaided) < float(nalr)
+    assert aided == unaided and follows == as_it_is == "1.00"  # they start as what changes nothing
+
+
 def test_a_criterion_of_ones_own_trains(capsys: pytest.CaptureFixture[str]) -> None:
     load("your_criterion.py").main(steps=6)
     values = losses(capsys.readouterr().out)

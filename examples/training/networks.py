@@ -1,13 +1,13 @@
 """Four networks that change nothing at the start, or know nothing, through the default loss, judged beside NAL-R:
 
-    python examples/training/networks.py TRAIN_SPEECH VALID_SPEECH NETWORK [EAR] [STEPS] [CRITERION] [CLIP]
+    python examples/training/networks.py TRAIN_SPEECH VALID_SPEECH {gru-mask,conv-mask,waveform,conv-tasnet} [--ear N3]
 
-NETWORK is gru-mask, conv-mask, waveform or conv-tasnet; CLIP the norm at which the gradient is clipped, inf for none. It
-prints a row: HASPI at 65 dB SPL, clean and in noise of the speech's spectrum at 5 dB SNR, as given and at the level of
-NAL-R (which is judged at the network's, too), HASQI, the level given, and the correlation with the clean speech, each
-band at its best gain and as it is.
+It prints a row: HASPI at 65 dB SPL, clean and in noise of the speech's spectrum at 5 dB SNR, each unaided, with NAL-R,
+aided, aided at NAL-R's level and with NAL-R at the aided level; then, clean, HASQI, the level given, and the correlation
+with the clean speech, each band at its best gain and as it is.
 """
 
+import argparse
 import sys
 from collections.abc import Callable
 from itertools import pairwise
@@ -71,8 +71,8 @@ def conv_tasnet() -> nn.Module:
 
 
 def from_zero(layer: nn.Conv1d) -> nn.Conv1d:
-    nn.init.zeros_(layer.weight)
-    nn.init.zeros_(layer.bias)
+    for parameter in layer.parameters():
+        nn.init.zeros_(parameter)
     return layer
 
 
@@ -85,28 +85,28 @@ NETWORKS: dict[str, tuple[Callable[[], nn.Module], float, tuple[float, float]]] 
 }
 
 
-def trained(folder: str, kind: str, loss: nn.Module, steps: int, clip: float) -> nn.Module:
-    """On 4 clips of 1 s a step. Seed 0."""
-    torch.manual_seed(0)
-    build, rate, (softest, loudest) = NETWORKS[kind]
+def trained(options: argparse.Namespace, loss: nn.Module) -> nn.Module:
+    """On 4 clips of 1 s a step."""
+    torch.manual_seed(options.seed)
+    build, rate, (softest, loudest) = NETWORKS[options.network]
     network = build()
-    optimiser = torch.optim.Adam(network.parameters(), lr=rate)
-    clips, generator, norms = (
-        Clips(folder, sample_rate=RATE, seconds=1.0),
-        torch.Generator().manual_seed(0),
-        [],
+    optimiser = torch.optim.Adam(network.parameters(), lr=options.rate or rate)
+    clips, generator = (
+        Clips(options.train, sample_rate=RATE, seconds=1.0),
+        torch.Generator().manual_seed(options.seed),
     )
-    for step in range(steps):
+    norms: list[float] = []
+    for step in range(1, options.steps + 1):
         speech = clips.draw(4, generator)
         speech = set_level(speech, softest + (loudest - softest) * torch.rand(4, generator=generator))
         value = loss(network(speech), speech)
         optimiser.zero_grad()
         value.backward()
-        norms.append(float(nn.utils.clip_grad_norm_(network.parameters(), clip)))
+        norms.append(float(nn.utils.clip_grad_norm_(network.parameters(), options.clip)))
         optimiser.step()
-        if step % 20 == 19 or step + 1 == steps:
-            median, largest = sorted(norms[-20:])[len(norms[-20:]) // 2], max(norms[-20:])
-            text = f"step {step + 1}: {value.item():.3f}, gradient's norm {median:.2f}, largest {largest:.1f}"
+        if step % 20 == 0 or step == options.steps:
+            last = torch.tensor(norms[-20:])
+            text = f"step {step}: {value.item():.3f}, gradient's norm {last.median():.2f}, largest {last.max():.1f}"
             print(text, file=sys.stderr, flush=True)
     return network
 
@@ -143,23 +143,32 @@ def judged(network: nn.Module, ear: Audiogram, speech: Tensor, noise: Tensor) ->
     return cells + last
 
 
-def main(
-    train: str,
-    valid: str,
-    kind: str,
-    name: str = "N3",
-    steps: str = "300",
-    criterion: str = "coherent-bands",
-    clip: str = "inf",
-    items: int = 12,
-) -> None:
-    ear, generator = Audiogram.standard(name), torch.Generator().manual_seed(0)
-    speech = Clips(valid, sample_rate=RATE, seconds=2.0).draw(items, generator)
+def main(arguments: list[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("train")
+    parser.add_argument("valid")
+    parser.add_argument("network", choices=NETWORKS)
+    parser.add_argument("--ear", default="N3")
+    parser.add_argument("--criterion", default="coherent-bands")
+    parser.add_argument("--steps", type=int, default=300)
+    parser.add_argument("--rate", type=float, help="Adam's learning rate")
+    parser.add_argument(
+        "--clip", type=float, default=float("inf"), help="the norm at which the gradient is clipped"
+    )
+    parser.add_argument("--items", type=int, default=12, help="clips of 2 s that are judged")
+    parser.add_argument("--seed", type=int, default=0)
+    options = parser.parse_args(arguments)
+    ear, generator = Audiogram.standard(options.ear), torch.Generator().manual_seed(0)
+    speech = Clips(options.valid, sample_rate=RATE, seconds=2.0).draw(options.items, generator)
     spectrum = torch.fft.rfft(speech).abs().square().mean(0).sqrt()
-    noise = torch.fft.irfft(spectrum * torch.fft.rfft(torch.randn(speech.shape, generator=generator)))
-    network = trained(train, kind, HearingLossLoss(ear, criterion=criterion), int(steps), float(clip)).eval()
-    print(f"| {kind}, {steps}, {criterion}, {clip} | {' | '.join(judged(network, ear, speech, noise))} |")
+    noise = torch.fft.irfft(
+        spectrum * torch.fft.rfft(torch.randn(speech.shape, generator=generator)), speech.shape[-1]
+    )
+    network = trained(options, HearingLossLoss(ear, criterion=options.criterion)).eval()
+    print(f"| {options.network} | {' | '.join(judged(network, ear, speech, noise))} |")
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    main()

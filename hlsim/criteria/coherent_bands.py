@@ -52,8 +52,8 @@ HIGHEST_PEAK = 10.0 ** ((120.0 - PASCAL_SPL) / 20.0)
 MARGIN = 3.0
 """Excess of the level in dB that is not counted as louder."""
 
-HIGHEST_GRADIENT = 8.0
-"""Of a sample, over the 0.9 quantile of its item's samples."""
+HIGHEST_GRADIENT = {0.9: 8.0, 0.5: 80.0}
+"""Of a sample, over a quantile of its item's samples: 8 times the 0.9 quantile, and 80 times the median."""
 
 _BLOCK = 3
 """Frames from stretch to stretch; each stretch is twice as long."""
@@ -113,11 +113,11 @@ def peak_excess(compensated: Tensor) -> Tensor:
 
 
 def without_spikes(compensated: Tensor) -> Tensor:
-    """The same waveform, whose gradient is cut at 8 times what nine of ten samples of its item stay under; NaN stays.
+    """The same waveform, whose gradient is cut where it is large beside that of the other samples of its item.
 
     Where an ear hears next to nothing, a recruiting band or a network gives a few samples a thousand times that, and all
     others no part of the step. What is cut on one side more than on the other would leave a mean, and with it a
-    constant pressure would grow that no ear hears: the mean goes.
+    constant pressure would grow that no ear hears: the mean goes. NaN stays.
 
     Shape: (..., time) -> (..., time).
     """
@@ -144,8 +144,12 @@ class _WithoutSpikes(torch.autograd.Function):
     def backward(ctx: Any, gradient: Tensor) -> Tensor:
         size = gradient[..., :: max(1, gradient.shape[-1] // 4096)].abs()
         # of the samples that have one: not of silence, nor of what follows an item's end
-        usual = torch.where(size > 0.0, size, math.nan).nanquantile(0.9, -1, keepdim=True)
-        limit = HIGHEST_GRADIENT * usual.nan_to_num(nan=math.inf)
+        present = torch.where(size > 0.0, size, math.nan)
+        limits = (
+            factor * present.nanquantile(share, -1, keepdim=True)
+            for share, factor in HIGHEST_GRADIENT.items()
+        )
+        limit = torch.minimum(*limits).nan_to_num(nan=math.inf)
         limited = gradient.clamp(-limit, limit)
         # nor where none of an item was cut
         reached = (gradient != 0.0) & (gradient != limited).any(-1, keepdim=True)

@@ -204,13 +204,18 @@ def test_spikes_of_the_gradient_are_cut_and_nan_is_not_hidden() -> None:
     # no constant pressure is asked for, and what follows an item's end has no part in that
     torch.testing.assert_close(found.sum(-1), torch.zeros(3), atol=1e-4, rtol=0.0)
     assert torch.equal(found[2, 500:], usual[2, 500:])
-    assert -HIGHEST_GRADIENT <= found[0, 7] < 1.0 - HIGHEST_GRADIENT
-    assert HIGHEST_GRADIENT - 1.0 < found[2, 7] <= HIGHEST_GRADIENT
+    highest = HIGHEST_GRADIENT[0.9]
+    assert -highest <= found[0, 7] < 1.0 - highest
+    assert highest - 1.0 < found[2, 7] <= highest
     assert 0.0 < float(found[1, 7]) < 0.05
     for item, own in enumerate(usual):
         torch.testing.assert_close(
             found[item, 8:500], own[8:500], atol=0.02 * float(own.abs().max()), rtol=0.0
         )
+    # where most samples ask for next to nothing, the others are cut to 80 times that
+    sparse = 1e-3 * usual[:1]
+    sparse[:, ::5] *= 1e3
+    assert float(through(sparse).abs().max()) == pytest.approx(0.08, rel=0.02)
     spiky[0, 8] = math.nan
     assert bool(through(spiky)[0, 8].isnan())
     assert not bool(through(torch.zeros(2, 10)).any())
