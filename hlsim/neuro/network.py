@@ -16,7 +16,7 @@ from hlsim.neuro.config import NEURO_RATE, NetworkConfig
 # Values of the widest feature map of all items that run together on a CPU, and the samples at 16 kHz that this is at
 # least and at most. Larger maps the C library gives back to the system, and pays for their pages anew with every one; of
 # smaller ones the steps from one to the next take longer than the sums.
-_CPU_VALUES, _CPU_SAMPLES = 1_800_000, (16_000, 256_000)
+_CPU_VALUES, _CPU_SAMPLES = 1_100_000, (16_000, 128_000)
 _DEVICE_SAMPLES = 960_000  # of a long item that run together elsewhere
 
 

@@ -91,7 +91,7 @@ def test_items_that_run_one_after_the_other_are_as_together(
 def test_wider_networks_take_fewer_samples_at_once() -> None:
     sizes = [NeuroMSBG(NeuroConfig(channels=channels, blocks=1))._at_once for channels in (4, 32, 64, 512)]
     assert sizes == sorted(sizes, reverse=True) and sizes[1] > 1.9 * sizes[2]
-    assert sizes[0] == 256_000 and sizes[-1] == 16_000
+    assert sizes[0] == 128_000 and sizes[-1] == 16_000
 
 
 LOCAL = {
