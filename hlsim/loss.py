@@ -218,7 +218,7 @@ class HearingLossLoss(nn.Module):
         with torch.autocast(given.device.type, enabled=False):
             output = given
             if {"coherent-bands", *SCORES} & self.criteria.keys():
-                given = coherent_bands.without_spikes(given)
+                given = coherent_bands.without_spikes(given, self.sample_rate)
             heard = self._hear(given, ears, listener, ends)
             batch, time = heard.shape[:-1], heard.shape[-1]
             signals = {"heard": heard, "given": given.expand_as(heard), "output": output.expand_as(heard)}

@@ -81,7 +81,7 @@ NETWORKS: dict[str, tuple[Callable[[], nn.Module], float, tuple[float, float]]] 
     "gru-mask": (lambda: Mask(recurrent=True), 3e-3, (50.0, 80.0)),
     "conv-mask": (lambda: Mask(recurrent=False), 1e-3, (50.0, 80.0)),
     "waveform": (Waveform, 1e-3, (50.0, 80.0)),
-    "conv-tasnet": (conv_tasnet, 1e-3, (65.0, 65.0)),
+    "conv-tasnet": (conv_tasnet, 3e-3, (65.0, 65.0)),
 }
 
 

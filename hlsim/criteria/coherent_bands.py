@@ -52,12 +52,14 @@ HIGHEST_PEAK = 10.0 ** ((120.0 - PASCAL_SPL) / 20.0)
 MARGIN = 3.0
 """Excess of the level in dB that is not counted as louder."""
 
-HIGHEST_GRADIENT = {0.9: 8.0, 0.5: 80.0}
-"""Of a sample, over a quantile of its item's samples: 8 times the 0.9 quantile, and 80 times the median."""
+HIGHEST_GRADIENT = 6.0
+"""Of a sample, over the 0.9 quantile of those of its item that sound; in pauses it is held to that."""
 
 _BLOCK = 3
 """Frames from stretch to stretch; each stretch is twice as long."""
 
+_LIMITER_SECONDS = 0.005
+_SOUNDING = 1e-3  # of the power of the loudest 5 ms
 _SIGN = 0.1
 _TINY = 1e-36  # a product of two powers, far under those of a heard band
 _LEAST_WEIGHT = 1e-9  # of all of an item: that of a reference at some -160 dB SPL
@@ -112,16 +114,17 @@ def peak_excess(compensated: Tensor) -> Tensor:
     return (compensated.abs() / HIGHEST_PEAK - 1.0).clamp_min(0.0).mean(-1)
 
 
-def without_spikes(compensated: Tensor) -> Tensor:
-    """The same waveform, whose gradient is cut where it is large beside that of the other samples of its item.
+def without_spikes(compensated: Tensor, sample_rate: int) -> Tensor:
+    """The same waveform, whose gradient is turned down where it is large beside that of the other samples of its item.
 
     Where an ear hears next to nothing, a recruiting band or a network gives a few samples a thousand times that, and all
-    others no part of the step. What is cut on one side more than on the other would leave a mean, and with it a
-    constant pressure would grow that no ear hears: the mean goes. NaN stays.
+    others no part of the step. Stretches of 5 ms are turned down as a whole: samples cut one by one leave a mean, and a
+    convolutional network grows a constant pressure from it that no ear hears. What sounds is what is within 30 dB of the
+    loudest stretch given. NaN stays.
 
     Shape: (..., time) -> (..., time).
     """
-    limited: Tensor = _WithoutSpikes.apply(compensated)
+    limited: Tensor = _WithoutSpikes.apply(compensated, round(_LIMITER_SECONDS * sample_rate))
     return limited
 
 
@@ -129,33 +132,37 @@ class _WithoutSpikes(torch.autograd.Function):
     generate_vmap_rule = True
 
     @staticmethod
-    def forward(waveform: Tensor) -> Tensor:
+    def forward(waveform: Tensor, block: int) -> Tensor:
         return waveform.view_as(waveform)
 
     @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Tensor], output: Tensor) -> None:
-        pass
+    def setup_context(ctx: Any, inputs: tuple[Tensor, int], output: Tensor) -> None:
+        waveform, ctx.block = inputs
+        ctx.save_for_backward(waveform)
 
     @staticmethod
-    def jvp(ctx: Any, tangent: Tensor) -> Tensor:
+    def jvp(ctx: Any, tangent: Tensor, *others: None) -> Tensor:
         return tangent.view_as(tangent)
 
     @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> Tensor:
-        size = gradient[..., :: max(1, gradient.shape[-1] // 4096)].abs()
-        # of the samples that have one: not of silence, nor of what follows an item's end
-        present = torch.where(size > 0.0, size, math.nan)
-        limits = (
-            factor * present.nanquantile(share, -1, keepdim=True)
-            for share, factor in HIGHEST_GRADIENT.items()
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
+        (waveform,), time = ctx.saved_tensors, gradient.shape[-1]
+        blocks = -1, ctx.block
+        powers = functional.pad(waveform, (0, -time % ctx.block)).unflatten(-1, blocks).square().mean(-1)
+        sizes = functional.pad(gradient.abs(), (0, -time % ctx.block)).unflatten(-1, blocks)
+        sounding = powers >= _SOUNDING * powers.amax(-1, keepdim=True)
+        # of what follows an item's end there is none
+        present = torch.where(sounding.unsqueeze(-1) & (sizes > 0.0), sizes, math.nan).flatten(-2)
+        usual = present[..., :: max(1, time // 4096)].nanquantile(0.9, -1, keepdim=True)
+        limit = usual.nan_to_num(nan=math.inf) * torch.where(sounding, HIGHEST_GRADIENT, 1.0)
+        factor = (limit / sizes.amax(-1)).clamp_max(1.0)
+        # on straight lines between the blocks' edges, none of which is over either block's
+        edges = torch.minimum(
+            functional.pad(factor, (1, 0), value=1.0), functional.pad(factor, (0, 1), value=1.0)
         )
-        limit = torch.minimum(*limits).nan_to_num(nan=math.inf)
-        limited = gradient.clamp(-limit, limit)
-        # nor where none of an item was cut
-        reached = (gradient != 0.0) & (gradient != limited).any(-1, keepdim=True)
-        return limited - reached * (
-            limited.sum(-1, keepdim=True) / reached.sum(-1, keepdim=True).clamp_min(1)
-        )
+        ramp = torch.arange(ctx.block, device=gradient.device) / ctx.block
+        factors = torch.lerp(edges[..., :-1, None], edges[..., 1:, None], ramp.to(edges)).flatten(-2)
+        return gradient * factors[..., :time], None
 
 
 def _stretches(frames: Tensor) -> Tensor:

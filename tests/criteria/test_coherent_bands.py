@@ -185,37 +185,33 @@ def test_peaks_over_120_db_spl_cost(voice: Tensor) -> None:
     assert peak_excess(voice).tolist() == [0.0, 0.0]
 
 
-def test_spikes_of_the_gradient_are_cut_and_nan_is_not_hidden() -> None:
+def test_spikes_of_the_gradient_are_turned_down_and_nan_is_not_hidden() -> None:
     def through(gradient: Tensor) -> Tensor:
         given = torch.randn(gradient.shape, requires_grad=True)
-        assert torch.equal(without_spikes(given), given)
-        (found,) = torch.autograd.grad(without_spikes(given), given, gradient)
+        assert torch.equal(without_spikes(given, 16000), given)
+        (found,) = torch.autograd.grad(without_spikes(given, 16000), given, gradient)
         return found
 
     usual = torch.ones(3, 1000)
+    usual[:, ::2] = -1.0
     usual[1] = 1e-3 * torch.randn(1000)
     usual[2, 500:] = 0.0  # padded
     assert torch.equal(through(usual), usual)
-    usual[:, ::2] *= -1.0
-    usual[1] -= usual[1].mean()
     spiky = usual.clone()
-    spiky[:, 7] = torch.tensor([-1e6, 1e6, 1e6])
+    spiky[:, 403:406] = 1e6 * torch.tensor([1.0, -0.5, -0.5])
     found = through(spiky)
-    # no constant pressure is asked for, and what follows an item's end has no part in that
-    torch.testing.assert_close(found.sum(-1), torch.zeros(3), atol=1e-4, rtol=0.0)
-    assert torch.equal(found[2, 500:], usual[2, 500:])
-    highest = HIGHEST_GRADIENT[0.9]
-    assert -highest <= found[0, 7] < 1.0 - highest
-    assert highest - 1.0 < found[2, 7] <= highest
-    assert 0.0 < float(found[1, 7]) < 0.05
-    for item, own in enumerate(usual):
-        torch.testing.assert_close(
-            found[item, 8:500], own[8:500], atol=0.02 * float(own.abs().max()), rtol=0.0
-        )
-    # where most samples ask for next to nothing, the others are cut to 80 times that
-    sparse = 1e-3 * usual[:1]
-    sparse[:, ::5] *= 1e3
-    assert float(through(sparse).abs().max()) == pytest.approx(0.08, rel=0.02)
+    # as large as may be, or next to a larger one less, and of the same form; what is 7.5 ms away stays as it is
+    assert 0.5 * HIGHEST_GRADIENT < float(found[0].abs().max()) <= HIGHEST_GRADIENT
+    assert 0.0 < float(found[1].abs().max()) < 0.05
+    away = torch.arange(1000).sub(400).abs() > 160
+    assert torch.equal(found[:, away], usual[:, away])
+    # no constant pressure is asked for, which is what cutting the samples one by one would do
+    cut = spiky.clamp(-HIGHEST_GRADIENT, HIGHEST_GRADIENT)
+    assert float((found - usual).sum(-1).abs()[0]) < 0.2 < 4.0 < float((cut - usual).sum(-1).abs()[0])
+    # in a pause no sample asks for more than those usually do that sound
+    speech = (torch.randn(1, 1000) * torch.where(torch.arange(1000) < 480, 1e-3, 1.0)).requires_grad_()
+    (found,) = torch.autograd.grad(without_spikes(speech, 16000), speech, spiky[:1])
+    assert 0.5 < float(found[:, 403:406].abs().max()) <= 1.0
     spiky[0, 8] = math.nan
     assert bool(through(spiky)[0, 8].isnan())
     assert not bool(through(torch.zeros(2, 10)).any())
