@@ -47,7 +47,6 @@ def main(folder: str, out: str, ear_name: str = "N3", steps: str = "200") -> Non
         value = loss(network(speech, ear), speech)
         optimiser.zero_grad()
         value.backward()
-        nn.utils.clip_grad_norm_(network.parameters(), 0.5)  # some steps have far larger ones
         optimiser.step()
         if step % 20 == 0 or step + 1 == int(steps):
             print(f"step {step}: loss {float(value.detach()):.3f}", flush=True)

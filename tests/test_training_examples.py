@@ -38,7 +38,7 @@ def test_networks_are_trained_and_judged_beside_nalr(
 ) -> None:
     monkeypatch.syspath_prepend(EXAMPLES)
     folders = (str(speech_dir / "train"), str(speech_dir / "valid"))
-    load("networks.py").main([*folders, network, "--steps", "1", "--rate", "1e-9", "--items", "2"])
+    load("networks.py").main([*folders, network, "--steps", "1", "--rate", "1e-9", "--items", "2", "--noisy"])
     out = capsys.readouterr()
     assert out.err.startswith("step 1: ")
     name, unaided, nalr, aided, _, _, *_, follows, as_it_is = out.out.strip("| \n").split(" | ")

@@ -20,6 +20,7 @@ from compensators import NALR
 from hlsim import Audiogram, HearingLossLoss
 from hlsim.calibration import level_spl, set_level
 from hlsim.criteria.bands import band_edges
+from hlsim.data.augment import mix
 from hlsim.data.clips import Clips
 from hlsim.dsp.stft import STFT
 from hlsim.metrics import haspi, hasqi
@@ -99,7 +100,10 @@ def trained(options: argparse.Namespace, loss: nn.Module) -> nn.Module:
     for step in range(1, options.steps + 1):
         speech = clips.draw(4, generator)
         speech = set_level(speech, softest + (loudest - softest) * torch.rand(4, generator=generator))
-        value = loss(network(speech), speech)
+        given = speech
+        if options.noisy:
+            given = mix(speech, like(speech, generator), 10.0 * torch.rand(4, generator=generator))
+        value = loss(network(given), speech)
         optimiser.zero_grad()
         value.backward()
         norms.append(float(nn.utils.clip_grad_norm_(network.parameters(), options.clip)))
@@ -109,6 +113,12 @@ def trained(options: argparse.Namespace, loss: nn.Module) -> nn.Module:
             text = f"step {step}: {value.item():.3f}, gradient's norm {last.median():.2f}, largest {last.max():.1f}"
             print(text, file=sys.stderr, flush=True)
     return network
+
+
+def like(speech: Tensor, generator: torch.Generator) -> Tensor:
+    """Noise of the spectrum that the items have on average. Shape: (items, time) -> the same."""
+    noise = torch.fft.rfft(torch.randn(speech.shape, generator=generator))
+    return torch.fft.irfft(torch.fft.rfft(speech).abs().square().mean(0).sqrt() * noise, speech.shape[-1])
 
 
 def correlation(processed: Tensor, clean: Tensor, *, best_gains: bool) -> float:
@@ -157,15 +167,13 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument(
         "--clip", type=float, default=float("inf"), help="the norm at which the gradient is clipped"
     )
+    parser.add_argument("--noisy", action="store_true", help="train in such noise too, at 0 to 10 dB SNR")
     parser.add_argument("--items", type=int, default=12, help="clips of 2 s that are judged")
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args(arguments)
     ear, generator = Audiogram.standard(options.ear), torch.Generator().manual_seed(0)
     speech = Clips(options.valid, sample_rate=RATE, seconds=2.0).draw(options.items, generator)
-    spectrum = torch.fft.rfft(speech).abs().square().mean(0).sqrt()
-    noise = torch.fft.irfft(
-        spectrum * torch.fft.rfft(torch.randn(speech.shape, generator=generator)), speech.shape[-1]
-    )
+    noise = like(speech, generator)
     network = trained(options, HearingLossLoss(ear, criterion=options.criterion)).eval()
     print(f"| {options.network} | {' | '.join(judged(network, ear, speech, noise))} |")
 
