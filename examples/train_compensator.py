@@ -47,6 +47,7 @@ def main(folder: str, out: str, ear_name: str = "N3", steps: str = "200") -> Non
         value = loss(network(speech, ear), speech)
         optimiser.zero_grad()
         value.backward()
+        nn.utils.clip_grad_norm_(network.parameters(), 1.0)  # few steps have larger ones
         optimiser.step()
         if step % 20 == 0 or step + 1 == int(steps):
             print(f"step {step}: loss {float(value.detach()):.3f}", flush=True)
