@@ -15,11 +15,16 @@ from hlsim.calibration import set_level
 from hlsim.data.clips import Clips
 
 
-def main(folder: str, out: str, ear: str = "N3", steps: str = "500", seconds: float = 1.0) -> None:
-    torch.manual_seed(0)
-    network = ConvTasNet(
+def conv_tasnet() -> ConvTasNet:
+    """Shape of what it takes and gives: (batch, 1, time)."""
+    return ConvTasNet(
         num_sources=1, enc_num_feats=128, msk_num_feats=64, msk_num_hidden_feats=128, msk_num_layers=6
     )
+
+
+def main(folder: str, out: str, ear: str = "N3", steps: str = "500", seconds: float = 1.0) -> None:
+    torch.manual_seed(0)
+    network = conv_tasnet()
     loss = HearingLossLoss(Audiogram.standard(ear))
     optimiser = torch.optim.Adam(network.parameters(), lr=3e-3)
     clips, generator = Clips(folder, sample_rate=16000, seconds=seconds), torch.Generator().manual_seed(0)

@@ -1,6 +1,6 @@
 """A 16-parameter aid from zero through the default loss, judged beside no aid and NAL-R:
 
-    python examples/training/filter_bank.py TRAIN_SPEECH VALID_SPEECH [EAR] [STEPS] [CRITERION]
+    python examples/training/filter_bank.py TRAIN_SPEECH VALID_SPEECH [EAR] [STEPS] [CRITERION] [SIMULATOR]
 
 It prints HASPI and HASQI and the level given (all at 65 dB SPL), and the level that the exact MSBG hears against a normal
 ear at 50, 65 and 80 dB SPL. HASPI rises with level: NAL-R is judged once more at the level that the trained aid gives.
@@ -87,11 +87,17 @@ def judged(aid: Callable[[Tensor], Tensor], ear: Audiogram, speech: Tensor) -> s
 
 
 def main(
-    train: str, valid: str, name: str = "N3", steps: str = "350", criterion: str = "coherent-bands"
+    train: str,
+    valid: str,
+    name: str = "N3",
+    steps: str = "350",
+    criterion: str = "coherent-bands",
+    simulator: str = "neuro-msbg",
 ) -> None:
     ear = Audiogram.standard(name)
     speech = Clips(valid, sample_rate=RATE, seconds=2.0).draw(8, torch.Generator().manual_seed(0))
-    nalr, aid = NALR(ear), trained(train, HearingLossLoss(ear, criterion=criterion), int(steps))
+    loss = HearingLossLoss(ear, simulator=simulator, criterion=criterion)
+    nalr, aid = NALR(ear), trained(train, loss, int(steps))
 
     def as_loud(waveform: Tensor) -> Tensor:
         return set_level(nalr(waveform), level_spl(aid(waveform)))

@@ -13,6 +13,7 @@ from collections.abc import Callable
 from itertools import pairwise
 
 import torch
+from conv_tasnet import conv_tasnet
 from filter_bank import RATE
 from torch import Tensor, nn
 
@@ -27,26 +28,28 @@ from hlsim.metrics import haspi, hasqi
 
 
 class Mask(nn.Module):
-    """A gain for each of 257 frequencies of 32 ms, from the logarithms of their magnitudes."""
+    """A gain for each of 257 frequencies of 32 ms, from the logarithms of their magnitudes; at the start 1."""
 
-    def __init__(self, recurrent: bool) -> None:
+    def __init__(self, *layers: nn.Module) -> None:
         super().__init__()
-        self.stft, self.recurrent = (
-            STFT(512, 512, 128),
-            nn.GRU(257, 128, batch_first=True) if recurrent else None,
-        )
-        first = [] if recurrent else [nn.Conv1d(257, 64, 3, padding=1), nn.PReLU()]
-        second = [] if recurrent else [nn.Conv1d(64, 64, 3, padding=1), nn.PReLU()]
-        last = nn.Conv1d(128, 257, 1) if recurrent else nn.Conv1d(64, 257, 3, padding=1)
-        self.layers = nn.Sequential(*first, *second, from_zero(last))
+        self.stft, self.layers = STFT(512, 512, 128), nn.Sequential(*layers)
+        from_zero(layers[-1])
 
     def forward(self, waveform: Tensor) -> Tensor:
         """Shape: (items, time) -> (items, time)."""
         spectrum = self.stft.analyse(waveform)
-        features = (spectrum.abs().square() + 1e-10).log() / 4.0
-        if self.recurrent is not None:
-            features = self.recurrent(features)[0]
-        return self.stft.synthesise(spectrum * self.layers(features.mT).mT.exp(), waveform.shape[-1])
+        features = (spectrum.abs().square() + 1e-10).log().mT / 4.0
+        return self.stft.synthesise(spectrum * self.layers(features).mT.exp(), waveform.shape[-1])
+
+
+class Recurrent(nn.GRU):
+    """Shape: (items, 257, frames) -> (items, 128, frames)."""
+
+    def __init__(self) -> None:
+        super().__init__(257, 128, batch_first=True)
+
+    def forward(self, features: Tensor) -> Tensor:
+        return super().forward(features.mT)[0].mT
 
 
 class Waveform(nn.Module):
@@ -63,26 +66,32 @@ class Waveform(nn.Module):
         return waveform + self.layers(waveform.unsqueeze(1)).squeeze(1)
 
 
-def conv_tasnet() -> nn.Module:
-    """torchaudio's, as in conv_tasnet.py: from random weights, and for one level."""
-    from torchaudio.models import ConvTasNet
-
-    sizes = {"enc_num_feats": 128, "msk_num_feats": 64, "msk_num_hidden_feats": 128, "msk_num_layers": 6}
-    return nn.Sequential(nn.Unflatten(-1, (1, -1)), ConvTasNet(num_sources=1, **sizes), nn.Flatten(1))
+def gru_mask() -> Mask:
+    return Mask(Recurrent(), nn.Conv1d(128, 257, 1))
 
 
-def from_zero(layer: nn.Conv1d) -> nn.Conv1d:
+def conv_mask() -> Mask:
+    first, second = nn.Conv1d(257, 64, 3, padding=1), nn.Conv1d(64, 64, 3, padding=1)
+    return Mask(first, nn.PReLU(), second, nn.PReLU(), nn.Conv1d(64, 257, 3, padding=1))
+
+
+def from_zero(layer: nn.Module) -> nn.Module:
     for parameter in layer.parameters():
         nn.init.zeros_(parameter)
     return layer
 
 
+def mono(network: nn.Module) -> nn.Module:
+    """One that takes and gives channels. Shape of what comes of it: (items, time) -> (items, time)."""
+    return nn.Sequential(nn.Unflatten(-1, (1, -1)), network, nn.Flatten(1))
+
+
 # the network, Adam's learning rate, the levels of its training in dB SPL
 NETWORKS: dict[str, tuple[Callable[[], nn.Module], float, tuple[float, float]]] = {
-    "gru-mask": (lambda: Mask(recurrent=True), 3e-3, (50.0, 80.0)),
-    "conv-mask": (lambda: Mask(recurrent=False), 1e-3, (50.0, 80.0)),
+    "gru-mask": (gru_mask, 3e-3, (50.0, 80.0)),
+    "conv-mask": (conv_mask, 1e-3, (50.0, 80.0)),
     "waveform": (Waveform, 1e-3, (50.0, 80.0)),
-    "conv-tasnet": (conv_tasnet, 3e-3, (65.0, 65.0)),
+    "conv-tasnet": (lambda: mono(conv_tasnet()), 3e-3, (65.0, 65.0)),
 }
 
 
@@ -92,11 +101,8 @@ def trained(options: argparse.Namespace, loss: nn.Module) -> nn.Module:
     build, rate, (softest, loudest) = NETWORKS[options.network]
     network = build()
     optimiser = torch.optim.Adam(network.parameters(), lr=options.rate or rate)
-    clips, generator = (
-        Clips(options.train, sample_rate=RATE, seconds=1.0),
-        torch.Generator().manual_seed(options.seed),
-    )
-    norms: list[float] = []
+    generator = torch.Generator().manual_seed(options.seed)
+    clips, norms = Clips(options.train, sample_rate=RATE, seconds=1.0), []
     for step in range(1, options.steps + 1):
         speech = clips.draw(4, generator)
         speech = set_level(speech, softest + (loudest - softest) * torch.rand(4, generator=generator))

@@ -147,9 +147,8 @@ class _WithoutSpikes(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
         (waveform,), time = ctx.saved_tensors, gradient.shape[-1]
-        blocks = -1, ctx.block
-        powers = functional.pad(waveform, (0, -time % ctx.block)).unflatten(-1, blocks).square().mean(-1)
-        sizes = functional.pad(gradient.abs(), (0, -time % ctx.block)).unflatten(-1, blocks)
+        powers = _blocks(waveform, ctx.block).square().mean(-1)
+        sizes = _blocks(gradient.abs(), ctx.block)
         sounding = powers >= _SOUNDING * powers.amax(-1, keepdim=True)
         # of what follows an item's end there is none
         present = torch.where(sounding.unsqueeze(-1) & (sizes > 0.0), sizes, math.nan).flatten(-2)
@@ -163,6 +162,11 @@ class _WithoutSpikes(torch.autograd.Function):
         ramp = torch.arange(ctx.block, device=gradient.device) / ctx.block
         factors = torch.lerp(edges[..., :-1, None], edges[..., 1:, None], ramp.to(edges)).flatten(-2)
         return gradient * factors[..., :time], None
+
+
+def _blocks(samples: Tensor, block: int) -> Tensor:
+    """Zeros where the last one goes on. Shape: (..., time) -> (..., blocks, block)."""
+    return functional.pad(samples, (0, -samples.shape[-1] % block)).unflatten(-1, (-1, block))
 
 
 def _stretches(frames: Tensor) -> Tensor:
