@@ -14,12 +14,13 @@ _LONG = 12000
 _EDGE_HZ = 80.0
 
 
-def rfft(signals: Tensor) -> Tensor:
-    """``torch.fft.rfft``. Shape: (..., time) -> complex (..., time // 2 + 1)."""
+def rfft(signals: Tensor, points: int | None = None) -> Tensor:
+    """``torch.fft.rfft``. Shape: (..., time) -> complex (..., points // 2 + 1)."""
+    points = signals.shape[-1] if points is None else points
     if signals.requires_grad and torch.is_grad_enabled():
-        result: Tensor = _RFFT.apply(signals)
+        result: Tensor = _RFFT.apply(signals[..., :points], points)
         return result
-    return torch.fft.rfft(signals)
+    return torch.fft.rfft(signals, points)
 
 
 class _RFFT(torch.autograd.Function):
@@ -28,19 +29,20 @@ class _RFFT(torch.autograd.Function):
     generate_vmap_rule = True
 
     @staticmethod
-    def forward(signals: Tensor) -> Tensor:
-        return torch.fft.rfft(signals)
+    def forward(signals: Tensor, points: int) -> Tensor:
+        return torch.fft.rfft(signals, points)
 
     @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Tensor], output: Tensor) -> None:
-        ctx.time = inputs[0].shape[-1]
+    def setup_context(ctx: Any, inputs: tuple[Tensor, int], output: Tensor) -> None:
+        ctx.time, ctx.points = inputs[0].shape[-1], inputs[1]
 
     @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> Tensor:
-        # the inverse adds each frequency twice but 0 Hz and, of even lengths, the last
-        once = gradient.real.new_full(gradient.shape[-1:], 0.5)
-        once[:: max(1, ctx.time // 2) if ctx.time % 2 == 0 else ctx.time] = 1.0
-        return torch.fft.irfft(gradient * once, ctx.time, norm="forward")
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
+        # the inverse adds each frequency twice but 0 Hz and, of even lengths, the last; complex, for a product of both
+        # kinds first makes the real factors so, item by item
+        once = gradient.new_full(gradient.shape[-1:], 0.5)
+        once[:: max(1, ctx.points // 2) if ctx.points % 2 == 0 else ctx.points] = 1.0
+        return torch.fft.irfft(gradient * once, ctx.points, norm="forward")[..., : ctx.time], None
 
 
 def long_rfft(waveform: Tensor, points: int) -> Tensor:
@@ -51,7 +53,7 @@ def long_rfft(waveform: Tensor, points: int) -> Tensor:
     Shape: (..., time) -> (..., points // 2 + 1).
     """
     if not _is_long_row(waveform, points):
-        return torch.fft.rfft(waveform, points)
+        return rfft(waveform, points)
     return torch.fft.fft(waveform.to(waveform.dtype.to_complex()), points)[..., : points // 2 + 1]
 
 
@@ -85,7 +87,7 @@ def fft_length(least: int, multiple: int = 1) -> int:
     No more than 8 twos: MKL takes up to three times as long for a row of 2^10 * 49 as for one of 2^4 * 3125.
     """
     spare = multiple & -multiple  # twos that it has already
-    odd = [3**a * 5**b * 7**c for a in range(9) for b in range(6) for c in range(4)]
+    odd = [3**a * 5**b * 7**c for a in range(9) for b in range(6) for c in range(2)]
     lengths = [multiple * o * 2**twos for o in odd for twos in range(9) if twos == 0 or spare << twos <= 256]
     return min(length for length in lengths if length >= least)
 

@@ -2,11 +2,14 @@
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
 from hlsim.dsp.fft import rfft
+from hlsim.torchtools import constant_like
 
 
 @dataclass(frozen=True)
@@ -41,9 +44,10 @@ class STFT:
         """Spectrum. Shape: (items, time) -> complex (items, frames, frequencies), frames = time // hop + 1."""
         # as torch.stft, whose gradient takes half as long again
         side, before = self.fft // 2, (self.fft - self.window) // 2
-        frames = functional.pad(waveform, (side, side)).unfold(-1, self.fft, self.hop)
-        windowed = frames[..., before : before + self.window] * self._hann(waveform)
-        return rfft(functional.pad(windowed, (before, self.fft - self.window - before)))
+        behind = self.fft - self.window - before
+        padded = functional.pad(waveform, (side - before, side - behind))
+        windowed = padded.unfold(-1, self.window, self.hop) * self._hann(waveform)
+        return rfft(functional.pad(windowed, (before, behind)))
 
     def synthesise(self, spectrum: Tensor, length: int) -> Tensor:
         """Waveform by overlap-add. Shape: complex (items, frames, frequencies) -> (items, length)."""
@@ -67,4 +71,8 @@ class STFT:
         return late.reshape(items, parts, places, self.hop).sum(1).flatten(1)
 
     def _hann(self, like: Tensor) -> Tensor:
-        return torch.hann_window(self.window, dtype=like.dtype, device=like.device)
+        return constant_like(like, _hann, self.window)
+
+
+def _hann(points: int) -> NDArray[np.float64]:
+    return 0.5 - 0.5 * np.cos(2.0 * np.pi * np.arange(points) / points)

@@ -140,8 +140,8 @@ def spread(spectrum: Tensor, matrix: Tensor, least: float = 0.0) -> tuple[Tensor
     return widened, smeared
 
 
-def _spread(spectrum: Tensor, matrix: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """``spread``'s two; the factor on the spectrum, and the power that it had."""
+def _spread(spectrum: Tensor, matrix: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """``spread``'s two; the factor on the spectrum, real and imaginary part, and the power that it had."""
     given = power(spectrum)
     smeared = (given @ matrix.mT).add_(_TINY)
     # a matrix that is learned keeps what it was multiplied with
@@ -149,8 +149,7 @@ def _spread(spectrum: Tensor, matrix: Tensor) -> tuple[Tensor, Tensor, Tensor, T
     quotient = smeared / given
     # the square root of a negative power is imaginary; of 0 it takes long, and beside 1e9 Pa silence counts as nothing
     real, imaginary = quotient.clamp(_TINY, _MOST).sqrt_(), quotient.neg().clamp_(_TINY, _MOST).sqrt_()
-    factor = torch.complex(real, imaginary)
-    return spectrum * factor, smeared, factor, given
+    return spectrum * torch.complex(real, imaginary), smeared, real, imaginary, given
 
 
 class _Spread(torch.autograd.Function):
@@ -164,7 +163,7 @@ class _Spread(torch.autograd.Function):
     generate_vmap_rule = True
 
     @staticmethod
-    def forward(spectrum: Tensor, matrix: Tensor, least: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def forward(spectrum: Tensor, matrix: Tensor, least: float) -> tuple[Tensor, ...]:
         return _spread(spectrum, matrix)
 
     @staticmethod
@@ -180,27 +179,34 @@ class _Spread(torch.autograd.Function):
     ) -> tuple[Tensor | None, Tensor | None, None]:
         spectrum, matrix, *made = ctx.saved_tensors
         # where the gradient is differentiated, what is constant here comes from the spectrum anew
-        smeared, factor, given = _spread(spectrum, matrix)[1:] if torch.is_grad_enabled() else made
-        direct = torch.zeros_like(spectrum) if gradient is None else factor.conj() * gradient
-        products = torch.view_as_real(spectrum) * torch.view_as_real(direct)
-        changed = products[..., 0] + products[..., 1]
+        smeared, real, imaginary, given = _spread(spectrum, matrix)[1:] if torch.is_grad_enabled() else made
         if ctx.least:
             size = smeared.abs()
             divisor = torch.copysign(torch.maximum(size, ctx.least * given), smeared)
             held = (given / (ctx.least * size + _NEVER)).clamp_max(1.0).sqrt()
+            divisor, real, imaginary = divisor * held, real * held, imaginary * held
         else:
-            divisor, held = smeared + torch.copysign(smeared.new_full((), _NEVER), smeared), None
+            divisor = smeared + torch.copysign(smeared.new_full((), _NEVER), smeared)
+        # real and imaginary part apart: a product of complex and real numbers first makes the real ones complex
+        right, up = spectrum.real, spectrum.imag
+        if gradient is None:
+            along_right = along_up = torch.zeros_like(given)
+        else:
+            along_right = torch.addcmul(gradient.real * real, gradient.imag, imaginary)
+            along_up = torch.addcmul(gradient.imag * real, gradient.real, imaginary, value=-1.0)
+        changed = torch.addcmul(right * along_right, up, along_up)
         toward = changed / divisor
         if of_power is not None:
             toward = toward + 2.0 * of_power
-        if held is not None:
-            direct, changed = direct * held, changed * held
-        along = toward @ matrix - changed / given
+        share = toward @ matrix - changed / given
         of_matrix = None
         if ctx.needs_input_grad[1]:
             every = 0.5 * toward.mT @ given
             of_matrix = every.sum_to_size(matrix.shape)
-        return torch.addcmul(direct, spectrum, along), of_matrix, None
+        of_spectrum = torch.complex(
+            torch.addcmul(along_right, right, share), torch.addcmul(along_up, up, share)
+        )
+        return of_spectrum, of_matrix, None
 
 
 def _window(step: int) -> Tensor:

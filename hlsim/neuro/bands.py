@@ -42,7 +42,9 @@ class BandCorrection(nn.Module):
         given = prior.levels(smeared, severity)
         level = prior.smooth(given, severity, self.step).log()
         # each of a step's frames, and the last one again where the step is cut short
-        frames = functional.pad(given.log(), (0, -given.shape[-1] % self.step), mode="replicate")
+        frames = given.log()
+        if short := -frames.shape[-1] % self.step:
+            frames = functional.pad(frames, (0, short), mode="replicate")
         about = frames.unflatten(-1, (-1, self.step)).unbind(-1)
         slope = functional.pad(level.diff(dim=1), (0, 0, 0, 1)).clamp(-_STEEPEST, _STEEPEST)
         features = self.enter[severity] @ torch.cat([*(frame - level for frame in about), slope], 1)
@@ -52,8 +54,8 @@ class BandCorrection(nn.Module):
         envelope, factor, *phase = (self.leave[severity] @ features).split(CHANNELS, 1)
         gain = (prior.log_gain(level + envelope, ears, severity) + factor).exp()
         turned = (gain * phase[0].cos(), gain * phase[0].sin()) if phase else (gain, torch.zeros_like(gain))
-        gains = _between(torch.cat(turned, 1), self.step)[..., : given.shape[-1]]
-        return widened * prior.weigh(gains, severity)
+        factors = _between(prior.weigh(torch.cat(turned, 1), severity), self.step)
+        return widened * torch.view_as_complex(factors[:, : widened.shape[1]])
 
 
 class _Block(nn.Module):
@@ -74,6 +76,9 @@ class _Block(nn.Module):
 
 
 def _between(values: Tensor, step: int) -> Tensor:
-    """Values at every frame, on straight lines from step to step. Shape: (..., steps) -> (..., steps * step)."""
-    rise = torch.cat((values[..., 1:], values[..., -1:]), -1) - values
-    return torch.stack([values + (k / step) * rise for k in range(step)], -1).flatten(-2)
+    """Values at every frame, on straight lines from step to step.
+
+    Shape: (items, steps, ...) -> (items, steps * step, ...).
+    """
+    later = torch.cat((values[:, 1:], values[:, -1:]), 1)
+    return torch.stack([values, *(values.lerp(later, k / step) for k in range(1, step))], 2).flatten(1, 2)

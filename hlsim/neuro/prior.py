@@ -144,12 +144,12 @@ class Prior(nn.Module):
     def weigh(self, gain: Tensor, severity: Tensor) -> Tensor:
         """Factor on the smeared spectrum.
 
-        Shape: real and imaginary (items, 2 channels, frames) -> complex (items, frames, frequencies).
+        Shape: real and imaginary (items, 2 channels, steps) -> (items, steps, frequencies, 2), real and imaginary.
         """
         real, imaginary = self._corrected("relative")[:, severity]
         # as one product, whose columns are real and imaginary in turn
         rows = torch.cat((torch.stack((real, imaginary), -1), torch.stack((-imaginary, real), -1)), 1)
-        return torch.view_as_complex((gain.mT @ rows.flatten(-2)).unflatten(-1, (-1, 2)))
+        return (gain.mT @ rows.flatten(-2)).unflatten(-1, (-1, 2))
 
     def _smearing(self) -> Tensor:
         """Of powers before the way into the ear, which weighs them and is taken off again.
