@@ -28,8 +28,7 @@ from hlsim.dsp.resample import resample
 from hlsim.metrics.interaural import interaural_loss
 from hlsim.metrics.objective import SCORES, missing_score
 from hlsim.msbg import MSBG
-from hlsim.msbg.normal import hear_normally
-from hlsim.msbg.response import with_phase_of_bank
+from hlsim.msbg.response import hear_normally, with_phase_of_bank
 from hlsim.neuro import NeuroMSBG
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.pretrained import SIMULATOR, find_checkpoint, load_pretrained
@@ -94,8 +93,6 @@ class HearingLossLoss(nn.Module):
             what it does to every ear, such as a low-pass filter, it then does to the reference, and it costs nothing.
         ears: of two ears, (..., 2, time): ``"mean"``, or ``"better"``, smoothly the better one: each counts by its
             share, ``softmax(-loss / 0.1)`` over the two. The gradient holds the shares, so that no ear is made worse.
-        unit_power: for ``"paper"``: both waveforms are scaled so that the reference has RMS 1, as in the papers that its
-            weights come from.
 
     Raises:
         ValueError: an unknown name, a value of another kind or out of range, a simulator made for another rate or level,
@@ -114,7 +111,6 @@ class HearingLossLoss(nn.Module):
         weights: Mapping[str, float] | None = None,
         reduction: Reduction = "mean",
         normal: Hearing | None = None,
-        unit_power: bool = False,
         ears: EarsName = "mean",
     ) -> None:
         super().__init__()
@@ -128,7 +124,7 @@ class HearingLossLoss(nn.Module):
             raise ValueError(
                 f"normal is {type(normal).__name__}; allowed: a module or callable (waveform) -> waveform"
             )
-        self.reference, self.reduction, self.unit_power, self.ears = reference, reduction, unit_power, ears
+        self.reference, self.reduction, self.ears = reference, reduction, ears
         self._two_ears = of_listeners(audiogram)
         self.criteria = check_criterion(criterion)
         self.weights = check_weights(weights, self.criteria, criterion)
@@ -349,8 +345,7 @@ class HearingLossLoss(nn.Module):
                 items["band_levels"] = band_level_loss(heard, aim, self.sample_rate)
             elif name == "paper":
                 stft = paper.paper_stft(self.sample_rate)
-                both = paper.to_unit_power(heard, aim) if self.unit_power else (heard, aim)
-                items |= paper.paper_parts(*both, stft, self._frequencies(stft.fft))
+                items |= paper.paper_parts(heard, aim, stft, self._frequencies(stft.fft))
             else:
                 items[name] = check_values(criterion(heard, aim), len(heard))
         return items

@@ -4,7 +4,7 @@ They are what a simulator learns by. As the criterion of a compensator through `
 
 - They are not balanced. The gradient on eight band gains from none is 6.9e-3 for N1, 2.0e-3 for N3 and 3.5e-6 for N5, and
   2.9e-5 at 50 dB SPL to 0.139 at 80: a mixed batch trains for mild ears and loud speech. The weights come from a paper
-  that scales its speech to unit power; ``to_unit_power`` mends the levels of the speech, and not the ears.
+  that scales its speech to unit power, which would mend the levels of the speech, and not the ears.
 - Of their value, 0.70 of 0.87 is phase, whose gradient is faded where it is faint: value and gradient disagree, and Adam
   on a free waveform raises the value. Polarity-inverted speech (1.36) costs more than noise at -5 dB SNR (1.34).
 - Rank correlation with HASPI and HASQI over 17 degradations is .50 and .70. A filter bank trained by them from zero is
@@ -23,8 +23,6 @@ from hlsim.dsp.stft import STFT
 
 PAPER_STFT = STFT(400, 400, 100)
 """The paper's transform at 16 kHz: 201 frequencies."""
-
-PARTS = ("magnitude", "phase", "complex", "time")
 
 DEFAULT_WEIGHTS = {"magnitude": 0.9, "phase": 0.3, "complex": 0.1, "time": 0.2}
 """The paper leaves its weights open; these are those of MP-SENet (Lu, Ai and Ling 2023), on which it builds."""
@@ -100,15 +98,6 @@ def paper_parts(
         "complex": complex_loss(first, second) * share,
         "time": time_loss(estimate, truth),
     }
-
-
-def to_unit_power(estimate: Tensor, truth: Tensor) -> tuple[Tensor, Tensor]:
-    """Both scaled by the one factor that gives the truth RMS 1, as MP-SENet does. Shape: (items, time) twice -> twice.
-
-    A truth under -26 dB SPL is taken as one of that level.
-    """
-    factor = truth.square().mean(-1, keepdim=True).clamp_min(_TINY).rsqrt()
-    return estimate * factor, truth * factor
 
 
 def weighted_sum(parts: Mapping[str, Tensor], weights: Mapping[str, float]) -> Tensor:

@@ -7,10 +7,9 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional
 
 from hlsim.extras import MissingExtraError
-from hlsim.torchtools import lasting, made_once
+from hlsim.torchtools import lasting
 
 _SINC: dict[str, Any] = {
     "lowpass_filter_width": 64,
@@ -19,10 +18,8 @@ _SINC: dict[str, Any] = {
     "beta": 14.769656459379492,
 }
 
-# values of torchaudio's kernel: 441 / 160 has 70,560, but 44101 / 16000 would have 700 million
-_LARGEST_KERNEL = 1_000_000
-
-_TOGETHER = 64  # output samples that share a row of inputs between rates with larger ones
+# of values, some 0.4 GB: 441 / 160 has 70,560 and 44056 / 16000 11 million, but 44101 / 16000 would have 700 million
+_LARGEST_KERNEL = 100_000_000
 
 
 def resample(waveform: Tensor, source_rate: int, target_rate: int) -> Tensor:
@@ -35,13 +32,16 @@ def resample(waveform: Tensor, source_rate: int, target_rate: int) -> Tensor:
     Shape: (..., time) -> (..., ceil(time * target_rate / source_rate)).
 
     Raises:
-        MissingExtraError: the rates differ and torchaudio, which all but odd ones need, cannot be loaded.
+        MissingExtraError: the rates differ and torchaudio cannot be loaded.
+        ValueError: rates with so small a common factor that no kernel is kept for them, as 44101 and 16000 Hz.
     """
     if source_rate == target_rate:
         return waveform
-    common = math.gcd(source_rate, target_rate)
-    if source_rate * target_rate // common**2 > _LARGEST_KERNEL:
-        return _resample_odd(waveform, source_rate // common, target_rate // common)
+    if source_rate * target_rate // math.gcd(source_rate, target_rate) ** 2 > _LARGEST_KERNEL:
+        raise ValueError(
+            f"from {source_rate} to {target_rate} Hz, whose common factor is too small; allowed: rates such as 16000, "
+            "22050, 24000, 32000, 44100 and 48000"
+        )
     waveform = waveform.contiguous()  # torchaudio takes a view of it
     # a kernel made while a program is traced is of no use to others
     if torch.compiler.is_compiling():
@@ -57,45 +57,6 @@ def _resampler(source_rate: int, target_rate: int, dtype: torch.dtype, device: t
     with lasting():
         made: nn.Module = _torchaudio().transforms.Resample(source_rate, target_rate, dtype=dtype, **_SINC)
         return made.to(device)
-
-
-def _resample_odd(waveform: Tensor, source: int, target: int) -> Tensor:
-    """As torchaudio, between rates without a common factor, whose kernel is nearly all zeros.
-
-    Output sample k lies at k * source / target; it and those after it take one row of inputs, each its own weights.
-    """
-    time = waveform.shape[-1]
-    length = -(-time * target // source)
-    kernel = made_once(_odd_kernel, source, target, waveform.dtype, waveform.device)
-    kernel = kernel[: -(-min(length, target) // _TOGETHER)]
-    periods, (rows, _, span) = -(-length // target), kernel.shape
-    first = torch.arange(rows, device=waveform.device) * _TOGETHER * source // target
-    first = first + source * torch.arange(periods, device=waveform.device)[:, None]
-    width = _width(source, target)
-    padded = functional.pad(waveform, (width - 1, source + span))
-    inputs = padded[..., first[..., None] + torch.arange(span, device=waveform.device)]
-    outputs = torch.einsum("...prs,rks->...prk", inputs, kernel).flatten(-2)
-    return outputs[..., :target].flatten(-2)[..., :length]
-
-
-def _width(source: int, target: int) -> int:
-    """Inputs on either side of an output sample."""
-    return math.ceil(_SINC["lowpass_filter_width"] * source / (min(source, target) * _SINC["rolloff"]))
-
-
-def _odd_kernel(source: int, target: int, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """Weights of one period, some 40 MB in float32. Shape: (rows, output samples of a row, inputs of a row)."""
-    zeros, beta = _SINC["lowpass_filter_width"], torch.tensor(_SINC["beta"], dtype=torch.float64)
-    width, scale = _width(source, target), min(1.0, target / source) * _SINC["rolloff"]
-    span = 2 * width + -(-(_TOGETHER - 1) * source // target)
-    output = torch.arange(-(-target // _TOGETHER) * _TOGETHER).reshape(-1, _TOGETHER) * source
-    place = (output - output[:, :1] // target * target).double() / target + (width - 1)
-    made = []
-    for part in place.split(32):  # in float64 the whole is large
-        t = ((torch.arange(span) - part[..., None]) * scale).clamp_(-zeros, zeros)
-        window = torch.i0(beta * (1.0 - (t / zeros).square()).sqrt()) / torch.i0(beta)
-        made.append((torch.sinc(t) * window * scale).to(dtype))
-    return torch.cat(made).to(device)
 
 
 def _torchaudio() -> ModuleType:

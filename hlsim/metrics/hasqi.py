@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Literal, NamedTuple, overload
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -58,38 +58,6 @@ class HasqiParts(NamedTuple):
     linear: Tensor
 
 
-@overload
-def hasqi(
-    processed: Tensor,
-    clean: Tensor,
-    audiogram: AudiogramLike,
-    *,
-    sample_rate: int = ...,
-    full_scale_spl: float = ...,
-    lengths: Lengths | None = ...,
-    noise: Noise = ...,
-    seed: int | Sequence[int] = ...,
-    whole_khz: bool = ...,
-    parts: Literal[False] = ...,
-) -> Tensor: ...
-
-
-@overload
-def hasqi(
-    processed: Tensor,
-    clean: Tensor,
-    audiogram: AudiogramLike,
-    *,
-    sample_rate: int = ...,
-    full_scale_spl: float = ...,
-    lengths: Lengths | None = ...,
-    noise: Noise = ...,
-    seed: int | Sequence[int] = ...,
-    whole_khz: bool = ...,
-    parts: Literal[True],
-) -> HasqiParts: ...
-
-
 def hasqi(
     processed: Tensor,
     clean: Tensor,
@@ -101,15 +69,13 @@ def hasqi(
     noise: Noise = "expected",
     seed: int | Sequence[int] = 0,
     whole_khz: bool = False,
-    parts: bool = False,
-) -> Tensor | HasqiParts:
+) -> Tensor:
     """HASQI v2 of each item: how good the processed speech sounds to this ear beside the clean with NAL-R, 0 to 1.
 
     Args:
         processed, clean, audiogram, sample_rate, full_scale_spl, lengths, seed, whole_khz: as ``haspi``.
         noise: at the threshold of hearing; it counts where nothing is heard of the processed speech. "expected" takes the
             same noise each time, "seeded" draws what pyclarity draws under ``seed``, "none" leaves it out.
-        parts: return ``HasqiParts``.
 
     Shape: (..., time) twice and one audiogram or (..., 8) dB HL -> (...,).
 
@@ -126,8 +92,7 @@ def hasqi(
         whole_khz=whole_khz,
         keep=False,
     )
-    found = reference.parts(processed, noise=noise, seed=seed)
-    return found if parts else found.combined
+    return reference.score(processed, noise=noise, seed=seed)
 
 
 class HasqiReference:

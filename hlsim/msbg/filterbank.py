@@ -8,9 +8,6 @@ from numpy.typing import NDArray
 from hlsim.dsp.erb import erb
 from hlsim.msbg.ear import MSBG_RATE
 
-ORDER = 4
-"""Order of the gammatone filters."""
-
 _CORNER_STEP = MSBG_RATE / 8192.0
 
 

@@ -1,4 +1,4 @@
-"""The fixed response of MSBG with every gain at 1, and its phase alone: what a filter bank does to any ear's signals.
+"""The fixed response of MSBG with every gain at 1: what a normal ear hears, and what a filter bank does to any signal.
 
 The bank's channels add up to a level response within a few dB, but not to a linear phase: at 1 to 2 kHz what is heard is
 nearer to the polarity-inverted signal than to the signal. Waveforms, phases and complex spectra can only be compared with
@@ -59,15 +59,42 @@ def with_phase_of_bank(waveform: Tensor, thresholds: Tensor, rate: int, *, norma
     return torch.where((severity == 0).unsqueeze(-1), waveform, moved) if normal else moved
 
 
+def hear_normally(waveform: Tensor, thresholds: Tensor, rate: int) -> Tensor:
+    """What MSBG makes of a signal at 0 dB HL, where it is linear, with the phase of the bank of each ear's severity.
+
+    The phase is that of what this ear hears, with which it is to be compared. Without a loss it is MSBG's output, 69 dB
+    SNR at 16 kHz and 105 dB at 44.1 kHz, for the time of two transforms.
+
+    Shape: (items, time), (items, 8) dB HL -> (items, time).
+    """
+    return filter_centred(waveform, constant_like(waveform, _as_normal, rate)[severity_index(thresholds)])
+
+
+def _as_normal(rate: int) -> NDArray[np.float64]:
+    """Impulse response of a normal ear with each severity's phase. Returns as ``_impulses``."""
+    responses, points = _responses(rate)
+    return _impulses(np.abs(responses[0]) * np.exp(1j * np.angle(responses)), points, rate)
+
+
 def _phases(rate: int, normal: bool) -> NDArray[np.float64]:
-    """Impulse response of each severity's phase, its zero in the middle. Returns (severities, 2 half)."""
-    shared = math.gcd(rate, MSBG_RATE)
-    points = rate // shared * 2 * math.ceil(shared / (2.0 * _SPACING))
-    responses = np.stack([fixed_response(BANKS[severity], rate, points) for severity in SEVERITIES])
+    """Impulse response of each severity's phase. Returns as ``_impulses``."""
+    responses, points = _responses(rate)
     if normal:
         phases = np.exp(1j * (np.angle(responses) - np.angle(responses[0])))
     else:
         magnitude = np.abs(responses)
         phases = responses / np.maximum(magnitude, _FAINT * magnitude.max(-1, keepdims=True))
+    return _impulses(phases, points, rate)
+
+
+def _responses(rate: int) -> tuple[NDArray[np.complex128], int]:
+    """Response of each severity's bank, (severities, points // 2 + 1), and the points of the grid."""
+    shared = math.gcd(rate, MSBG_RATE)
+    points = rate // shared * 2 * math.ceil(shared / (2.0 * _SPACING))
+    return np.stack([fixed_response(BANKS[severity], rate, points) for severity in SEVERITIES]), points
+
+
+def _impulses(spectra: NDArray[np.complex128], points: int, rate: int) -> NDArray[np.float64]:
+    """Impulse response of each, its zero in the middle. Returns (severities, 2 half)."""
     half = math.ceil(_HALF_SECONDS * rate)
-    return np.roll(np.fft.irfft(phases, points), half, -1)[:, : 2 * half]
+    return np.roll(np.fft.irfft(spectra, points), half, -1)[:, : 2 * half]

@@ -12,7 +12,7 @@ from hlsim.audiogram import Audiogram
 from hlsim.dsp.resample import resample
 from hlsim.metrics.ear import clean_speech, fine_structure
 from hlsim.metrics.ear import model as ear_model
-from hlsim.metrics.hasqi import HasqiParts, HasqiReference, _moving, _nalr, hasqi
+from hlsim.metrics.hasqi import HasqiReference, _moving, _nalr, hasqi
 from hlsim.metrics.pyclarity import numpy_seed
 
 N1, N3, N6 = (Audiogram.standard(name) for name in ("N1", "N3", "N6"))
@@ -42,10 +42,9 @@ def test_equals_pyclarity_under_its_seed(
         wanted = module.hasqi_v2(
             x.double().numpy(), rate, y.double().numpy(), rate, ear_of_clarity, level1=94.0
         )[:3]
-    settings = {"sample_rate": rate, "noise": "seeded", "seed": 7, "whole_khz": True, "parts": True}
     for dtype, error in ((torch.float64, 1e-7), (torch.float32, 1e-4)):
-        found = hasqi(y.to(dtype), x.to(dtype), ear, **settings)
-        assert isinstance(found, HasqiParts)
+        reference = HasqiReference(x.to(dtype), ear, sample_rate=rate, whole_khz=True)
+        found = reference.parts(y.to(dtype), noise="seeded", seed=7)
         assert [float(part) for part in found] == pytest.approx(list(map(float, wanted)), abs=error)
     expected = float(hasqi(y, x, ear, sample_rate=rate, whole_khz=True))
     assert expected == pytest.approx(float(wanted[0]), abs=2e-3)
