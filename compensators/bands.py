@@ -127,15 +127,15 @@ def level_db(powers: Tensor) -> Tensor:
 
 
 @lru_cache(maxsize=8)
-def speech_levels(count: int, spl: float = 65.0) -> tuple[float, ...]:
-    """Level in dB SPL of average speech of a level in each band."""
+def speech_levels(count: int) -> tuple[float, ...]:
+    """Level in dB SPL of average speech at 65 dB SPL in each band."""
     hz = np.arange(1, _GRID // 2 + 1) * RATE / _GRID
     width = 10.0 * np.log10(2.0 ** (1.0 / 6.0) - 2.0 ** (-1.0 / 6.0))
     thirds = np.array(list(_SPEECH), dtype=float)
     density = np.array(list(_SPEECH.values())) - 10.0 * np.log10(thirds) - width
     powers = 10.0 ** (np.interp(np.log(hz), np.log(thirds), density) / 10.0)
     bands = powers @ shares(count, _GRID)[1:]
-    return tuple((10.0 * np.log10(bands / bands.sum()) + spl).tolist())
+    return tuple((10.0 * np.log10(bands / bands.sum()) + 65.0).tolist())
 
 
 def _for_a_hop(count: int) -> NDArray[np.float64]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields
-from decimal import Decimal, InvalidOperation
 from numbers import Real
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
@@ -82,24 +81,9 @@ def _refuse(value: Any, kind: type, name: str, where: str) -> None:
     if is_finite(value) if kind is float else type(value) is kind:
         return
     wanted = f"allowed: {_KINDS[kind]}"
-    if kind in (int, float) and isinstance(value, str) and (written := _as_number(value)):
-        wanted = f"that is text in YAML; write {written}"
+    if kind is float and isinstance(value, str):
+        wanted += " (YAML takes 1e-3 for text; write 1.0e-3)"
     raise ValueError(f"{name} {value!r} {where}; {wanted}")
-
-
-def _as_number(text: str) -> str | None:
-    """How YAML reads what the text means; None where it is no number."""
-    try:
-        number = Decimal(text)
-    except InvalidOperation:
-        return None
-    if not number.is_finite() or abs(number.adjusted()) > 15:
-        return None
-    plain = f"{number:f}"
-    if "e" not in text.lower():
-        return plain
-    mantissa, _, exponent = f"{number:e}".partition("e")
-    return f"{plain} or {mantissa if '.' in mantissa else mantissa + '.0'}e{exponent}"
 
 
 def is_finite(value: Any) -> bool:

@@ -21,14 +21,13 @@ from hlsim.training.recipes import CompensatorRecipe, SimulatorRecipe
     [
         (
             "learning_rate: 1e-3",
-            "learning_rate '1e-3' in the recipe; that is text in YAML; write 0.001 or 1.0e-3",
+            r"learning_rate '1e-3' in the recipe; allowed: a number \(.*; write 1.0e-3\)",
         ),
-        ("learning_rate: 25e-6", "write 0.000025 or 2.5e-5"),
         ("learning_rate: -1.0", "learning_rate -1.0 in the recipe; allowed: .* above 0"),
         ("learning_rate: .nan", "learning_rate nan in the recipe; allowed: a number"),
         ("learning_rate: true", "learning_rate True in the recipe; allowed: a number"),
         ("batch: two", "batch 'two' in the recipe; allowed: a whole number"),
-        ("batch: '4'", "write 4$"),
+        ("batch: '4'", "batch '4' in the recipe; allowed: a whole number$"),
         ("batch: 2.5", "batch 2.5 in the recipe; allowed: a whole number"),
         ("batch:", "batch None in the recipe; allowed: a whole number"),
         ("seconds: .inf", "seconds inf"),

@@ -1,1 +1,1 @@
-"""Times simulators, a training step and the scan."""
+"""Times simulators, a training step and metrics."""

@@ -19,8 +19,6 @@ from hlsim.msbg.ear import MSBG_RATE
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.pretrained import SIMULATOR, load_pretrained, shipped
 
-CONNEAR_RATE = 20000
-
 Call = Callable[[Tensor], Tensor]
 Prepare = Callable[[int, Audiogram, torch.device], Call]
 
@@ -62,44 +60,11 @@ def rows(simulators: list[str] | None = None) -> tuple[list[Row], list[str]]:
         count, default = _count(load_pretrained(name)), name == "neuro-msbg"
         title = f"Neuro-MSBG ({name})"
         found.append(Row(title, both, partial(_neuro, name), parameters=count, default=default))
-    name, shape = "CoNNear's shape (random weights, speed only)", ConnearShape().eval().requires_grad_(False)
-    found.append(
-        Row(name, (CONNEAR_RATE,), lambda rate, ear, device: shape.to(device), parameters=_count(shape))
-    )
     return found, skipped
 
 
 def _count(network: nn.Module) -> int:
     return sum(parameter.numel() for parameter in network.parameters())
-
-
-class ConnearShape(nn.Module):
-    """A network of the published shape of CoNNear's cochlea (Baby, Van Den Broucke and Verhulst 2021), untrained.
-
-    Four strided convolutions of 128 filters of 64 taps with tanh, as many transposed ones with skips, 201 outputs: 11.7
-    million parameters. The clip goes through whole, with 256 samples of context on either side.
-
-    Shape: (batch, time) at 20 kHz -> (batch, 201, time).
-    """
-
-    def __init__(self) -> None:
-        super().__init__()
-        inputs = (1, 128, 128, 128)
-        self.down = nn.ModuleList(nn.Conv1d(i, 128, 64, 2, padding=31) for i in inputs)
-        sizes = ((128, 128), (256, 128), (256, 128), (256, 201))
-        self.up = nn.ModuleList(nn.ConvTranspose1d(i, o, 64, 2, padding=31) for i, o in sizes)
-
-    def forward(self, wave: Tensor) -> Tensor:
-        time = wave.shape[-1]
-        padded = nn.functional.pad(wave, (256, 256 + -time % 16))
-        hidden, skips = padded.unsqueeze(1), []
-        for layer in self.down:
-            hidden = layer(hidden).tanh()
-            skips.append(hidden)
-        for number, layer in enumerate(self.up):
-            hidden = layer(hidden if number == 0 else torch.cat((hidden, skips[3 - number]), 1))
-            hidden = hidden.tanh() if number < 3 else hidden
-        return hidden[..., 256 : 256 + time]
 
 
 def _neuro(name: str, rate: int, ear: Audiogram, device: torch.device) -> Call:

@@ -13,7 +13,7 @@ _PEAK = "peak memory (MiB)"
 
 
 def benchmark_markdown(result: Row) -> str:
-    """One second at batch 1; longer clips and larger batches; step, scan and metrics where they were timed."""
+    """One second at batch 1; longer clips and larger batches; step and metrics where they were timed."""
     head = (
         f"{result['device']} ({result['machine']}, {result['cores']} cores, {result['threads']} threads), torch "
         f"{result['torch']}{_gpu(result['gpu'])}, {result['date']}; "
@@ -22,11 +22,7 @@ def benchmark_markdown(result: Row) -> str:
     )
     rows = result.get("rows", [])
     tables = [_one_second(rows), _sizes(rows), _training(rows)]
-    for name, title in (
-        ("training", "A training step"),
-        ("scan", "Selective scan"),
-        ("metrics", "3 s at 16 kHz, one thread"),
-    ):
+    for name, title in (("training", "A training step"), ("metrics", "3 s at 16 kHz, one thread")):
         tables.append([_part(title, part) for part in result.get(name, [])])
     texts = [Table.of("", table).markdown() + "\n" for table in tables if table]
     return "\n".join([head, "", *texts, *(f"skipped: {reason}" for reason in result["skipped"])]) + "\n"

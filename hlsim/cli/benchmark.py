@@ -27,10 +27,9 @@ def benchmark(parser: Parser) -> None:
     option("--device", str, "cpu, cuda or cuda:1; pyclarity's Ear runs on the CPU always", "cpu")
     text = (
         "simulators: all, at 1 s, longer and in batches, and the default network on a batch to train on; training: "
-        "where the time of a step on 8 clips of 2 s goes; scan: the selective scan against other ways to run it; "
-        "metrics: HASPI and HASQI beside pyclarity's, on one thread"
+        "where the time of a step on 8 clips of 2 s goes; metrics: HASPI and HASQI beside pyclarity's, on one thread"
     )
-    what = ("simulators", "training", "scan", "metrics")
+    what = ("simulators", "training", "metrics")
     option("--what", str, text, ["simulators"], nargs="+", choices=what)
     option("--repeats", count, "counted rounds", 7)
     text = "seconds that one timing of a longer clip or larger batch may take; those that would take more are left out"
@@ -45,7 +44,7 @@ def benchmark(parser: Parser) -> None:
 def _benchmark(options: argparse.Namespace) -> None:
     import torch
 
-    from hlsim.benchmark.parts import metric_rows, scan_rows, training_step
+    from hlsim.benchmark.parts import metric_rows, training_step
     from hlsim.benchmark.run import benchmark
     from hlsim.benchmark.tables import benchmark_markdown
     from hlsim.benchmark.timing import about, attempt
@@ -70,7 +69,6 @@ def _benchmark(options: argparse.Namespace) -> None:
 
     tables: dict[str, tuple[str, Measure]] = {
         "training": ("a training step", training_step),
-        "scan": ("the selective scan", scan_rows),
         "metrics": ("HASPI and HASQI", metric_rows),
     }
     for name, (title, measure) in tables.items():

@@ -44,7 +44,7 @@ COMMANDS = {
         "clarity",
         "judge pairs of aids on scenes of Clarity's challenges: the better ear's HASPI and HASQI",
     ),
-    "benchmark": ("benchmark", "time simulators, a training step and the scan side by side"),
+    "benchmark": ("benchmark", "time simulators, a training step and metrics side by side"),
 }
 """Each command's module in ``hlsim.cli``, where a function of its name declares its options, and what it does."""
 

@@ -5,7 +5,6 @@ from torch import Tensor
 
 from hlsim.criteria.paper import PAPER_STFT
 from hlsim.dsp.fft import power
-from hlsim.dsp.stft import STFT
 
 _TINY = 1e-12
 _SILENT = 1e-20
@@ -21,14 +20,12 @@ def noise_to_signal_db(estimate: Tensor, truth: Tensor) -> Tensor:
     return 10.0 * torch.log10((error + 1e-6 * signal + _SILENT) / (signal + _SILENT))
 
 
-def log_spectral_distance_db(
-    estimate: Tensor, truth: Tensor, stft: STFT = PAPER_STFT, depth: float = 60.0
-) -> Tensor:
-    """Mean absolute difference of log magnitudes in dB, from ``depth`` dB under each item's loudest bin up.
+def log_spectral_distance_db(estimate: Tensor, truth: Tensor) -> Tensor:
+    """Mean absolute difference of log magnitudes in dB, from 60 dB under each item's loudest bin up.
 
     Shape: (items, time) twice -> (items,).
     """
-    powers = [power(spectrum) for spectrum in (stft.analyse(estimate), stft.analyse(truth))]
-    floor = powers[1].amax((-2, -1), keepdim=True) * 10.0 ** (-depth / 10.0) + _TINY
+    powers = [power(spectrum) for spectrum in map(PAPER_STFT.analyse, (estimate, truth))]
+    floor = powers[1].amax((-2, -1), keepdim=True) * 1e-6 + _TINY
     first, second = (10.0 * torch.log10(own + floor) for own in powers)
     return (first - second).abs().mean((-2, -1))

@@ -15,18 +15,17 @@ def sine_of_phase(spectrum: Tensor, squared: Tensor) -> Tensor:
 
 
 class AudiogramEncoder(nn.Module):
-    """Thresholds to one value a frequency: linear(flatten(average pool(ReLU(conv)))) (Equation 1).
+    """Thresholds to one value a frequency: linear(flatten(average pool(ReLU(conv)))), 16 feature maps (Equation 1).
 
     Args:
         frequencies: F, the frequencies of the transform.
-        channels: feature maps of the convolution.
     """
 
-    def __init__(self, frequencies: int, channels: int = 16) -> None:
+    def __init__(self, frequencies: int) -> None:
         super().__init__()
-        self.conv = nn.Conv1d(1, channels, kernel_size=3, padding=1)
+        self.conv = nn.Conv1d(1, 16, kernel_size=3, padding=1)
         self.pool = nn.AvgPool1d(2)
-        self.project = nn.Linear(channels * 4, frequencies)
+        self.project = nn.Linear(16 * 4, frequencies)
 
     def forward(self, thresholds: Tensor) -> Tensor:
         """Shape: (items, 8) dB HL -> (items, F)."""

@@ -15,16 +15,15 @@ class Mamba(nn.Module):
     Args:
         d_model: channels of the sequence.
         d_state: states a channel.
-        d_conv: taps of the convolution before the scan.
         expand: channels inside over ``d_model``.
     """
 
-    def __init__(self, d_model: int, d_state: int = 16, d_conv: int = 4, expand: int = 2) -> None:
+    def __init__(self, d_model: int, d_state: int = 16, expand: int = 2) -> None:
         super().__init__()
         inner, rank = expand * d_model, math.ceil(d_model / 16)
         self.sizes = (rank, d_state, d_state)
         self.in_proj = nn.Linear(d_model, 2 * inner, bias=False)
-        self.conv1d = nn.Conv1d(inner, inner, d_conv, groups=inner, padding=d_conv - 1)
+        self.conv1d = nn.Conv1d(inner, inner, 4, groups=inner, padding=3)
         self.x_proj = nn.Linear(inner, sum(self.sizes), bias=False)
         self.dt_proj = nn.Linear(rank, inner)
         self.A_log = nn.Parameter(torch.arange(1.0, d_state + 1.0).log().repeat(inner, 1))

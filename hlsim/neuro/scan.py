@@ -55,23 +55,11 @@ def selective_scan(
             f"u {[*u.shape]}, delta {[*delta.shape]}, A {[*A.shape]}, B {[*B.shape]}, C {[*C.shape]}; "
             "allowed: u and delta (items, channels, time), A (channels, states), B and C (items, states, time)"
         )
-    run = kernel_for(u) or torch_scan
-    output: Tensor = run(u, delta, A, B, C, D=D, z=z, delta_bias=delta_bias, delta_softplus=delta_softplus)
-    return output
-
-
-def torch_scan(
-    u: Tensor,
-    delta: Tensor,
-    A: Tensor,
-    B: Tensor,
-    C: Tensor,
-    D: Tensor | None = None,
-    z: Tensor | None = None,
-    delta_bias: Tensor | None = None,
-    delta_softplus: bool = False,
-) -> Tensor:
-    """``selective_scan`` without the kernel, wherever the tensors are. Shapes as there; they are not checked."""
+    if (kernel := _kernel_for(u)) is not None:
+        output: Tensor = kernel(
+            u, delta, A, B, C, D=D, z=z, delta_bias=delta_bias, delta_softplus=delta_softplus
+        )
+        return output
     # powers of decays want their precision
     given, whole = u.dtype, torch.promote_types(u.dtype, torch.float32)
     u, delta, A, B, C = (tensor.to(whole) for tensor in (u, delta, A, B, C))
@@ -231,7 +219,7 @@ def _blocks(u: Tensor, A: Tensor, back: bool) -> Iterator[tuple[slice, slice, _W
             yield slice(top, top + height), slice(left, left + width), spaces[shape]
 
 
-def kernel_for(u: Tensor) -> Callable[..., Any] | None:
+def _kernel_for(u: Tensor) -> Callable[..., Any] | None:
     """``mamba_ssm``'s scan if ``selective_scan`` takes it for such a tensor."""
     return _kernel() if u.is_cuda and u.dtype != torch.float64 else None
 

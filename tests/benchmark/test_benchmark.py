@@ -18,9 +18,8 @@ from hlsim.benchmark import run as benchmark_module
 from hlsim.benchmark.models import Row
 from hlsim.benchmark.run import benchmark
 from hlsim.benchmark.tables import benchmark_markdown
-from hlsim.benchmark.timing import about, peak_mib
+from hlsim.benchmark.timing import about, peak_mib, rows_by_turns
 from hlsim.cli.main import main
-from hlsim.neuro import scan as scan_module
 
 
 def short_of_memory(message: str) -> Row:
@@ -129,17 +128,15 @@ def test_what_is_measured_is_written_before_the_end(monkeypatch: pytest.MonkeyPa
     assert (4.0, 1) in {(cell["seconds"], cell["batch"]) for cell in result["rows"][0]["cells"]}
 
 
-def test_a_table_without_what_fails(monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail(*tensors: Tensor) -> Tensor:
-        raise RuntimeError("too long")
-
-    monkeypatch.setattr(parts, "scan_loop", fail)
-    monkeypatch.setattr(parts, "SCAN_SHAPE", (1, 8, 16, 4))
-    scan, skipped = parts.scan_rows(repeats=1)
-    assert "step by step, forward: RuntimeError: too long" in skipped
-    assert scan[0]["name"] == "hlsim (plain torch)" and "step by step" not in str(scan)
-    table = benchmark_markdown(about("cpu", 1) | {"scan": scan, "skipped": skipped})
-    assert "| Selective scan | forward | forward + backward | peak memory (MiB) |" in table
+def test_a_table_without_what_fails() -> None:
+    calls = {
+        "whole": lambda: torch.zeros(1, requires_grad=True).sum(),
+        "late": lambda: raising(RuntimeError("too long"))(torch.zeros(1)),
+    }
+    rows, skipped = rows_by_turns(calls, torch.device("cpu"), 1)
+    assert "late, forward: RuntimeError: too long" in skipped and [row["name"] for row in rows] == ["whole"]
+    table = benchmark_markdown(about("cpu", 1) | {"training": rows, "skipped": skipped})
+    assert "| A training step | forward | forward + backward | peak memory (MiB) |" in table
 
 
 def test_metrics_stand_beside_the_reference(
@@ -150,22 +147,6 @@ def test_metrics_stand_beside_the_reference(
     lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("| HAS")]
     assert len(lines) == 8 and all(line.split("|")[5].strip() not in ("", "-") for line in lines)
     assert lines[0].startswith("| HASPI (pyclarity) |") and lines[0].rstrip(" |").endswith("1.0")
-
-
-def test_the_scan_by_a_kernel_has_a_row_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
-    calls = []
-
-    def kernel(u: Tensor, *rest: Tensor, **options: Any) -> Tensor:
-        calls.append(len(rest))
-        return 0.5 * u
-
-    monkeypatch.setattr(parts, "SCAN_SHAPE", (1, 8, 16, 4))
-    for module in (scan_module, parts):
-        monkeypatch.setattr(module, "kernel_for", lambda u: kernel)
-    table, _ = parts.scan_rows(repeats=2)
-    names = [row["name"] for row in table]
-    assert names[:2] == ["hlsim (plain torch)", "step by step"] and "hlsim (by mamba-ssm's kernel)" in names
-    assert len(calls) == 2 * 3  # its own row's: forward and back in each round
 
 
 def test_the_default_network_is_timed_on_a_batch_to_train_on(monkeypatch: pytest.MonkeyPatch) -> None:

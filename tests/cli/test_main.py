@@ -497,19 +497,14 @@ def test_benchmark_on_no_device(device: str, capsys: pytest.CaptureFixture[str])
 @pytest.mark.slow
 def test_benchmark(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "speed.json"
-    arguments = ["benchmark", "--repeats", "1", "--limit", "0.001", "--what", "simulators", "scan"]
-    assert main([*arguments, "--json", str(path)]) == 0
+    assert main(["benchmark", "--repeats", "1", "--limit", "0.001", "--json", str(path)]) == 0
     result = json.loads(path.read_text())
     names = [row["name"] for row in result["rows"]]
     assert {"identity", "MSBG (exact)", "Neuro-MSBG (neuro-msbg)"} <= set(names)
     cells = [cell for row in result["rows"] for cell in row["cells"]]
     assert {cell["sample_rate"] for cell in cells} >= {16000, 44100}
     assert all(0 < cell["least_ms"] <= cell["median_ms"] <= cell["greatest_ms"] for cell in cells)
-    connear = next(row for row in result["rows"] if "CoNNear" in row["name"])
-    assert round(connear["parameters"] / 1e6, 1) == 11.7
-    assert [row["name"] for row in result["scan"]][:2] == ["hlsim (plain torch)", "step by step"]
-    printed = capsys.readouterr().out
-    assert "pyclarity" in printed and "step by step" in printed
+    assert "pyclarity" in capsys.readouterr().out
 
 
 def test_haspi_report_of_a_manifest(

@@ -1,5 +1,7 @@
 """The selective scan against the recurrence, step by step, in float64."""
 
+from typing import Any
+
 import pytest
 import torch
 from torch import Tensor
@@ -124,6 +126,22 @@ def test_shapes_that_do_not_fit() -> None:
         selective_scan(u, delta, A, B[..., :5], C)
     with pytest.raises(ValueError, match="allowed"):
         selective_scan(u, delta[:, :2], A, B, C)
+
+
+def test_a_kernel_does_all_of_it_where_there_is_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    calls = []
+
+    def kernel(*given: Tensor, **options: Any) -> Tensor:
+        calls.append((given, options))
+        return 0.5 * given[0]
+
+    monkeypatch.setattr(scan, "_kernel_for", lambda u: kernel)
+    given, D, bias = arguments(9), torch.randn(5).double(), torch.randn(5).double()
+    found = selective_scan(*given, D, given[0], bias, delta_softplus=True)
+    assert torch.equal(found, 0.5 * given[0])
+    ((taken, options),) = calls
+    assert all(a is b for a, b in zip(taken, given, strict=True))
+    assert options == {"D": D, "z": given[0], "delta_bias": bias, "delta_softplus": True}
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
