@@ -70,7 +70,7 @@ def read_checkpoint(
     also: Sequence[str] = (),
 ) -> Model:
     """A model built from a checkpoint's configuration, with its weights, on torch's default device, or the CPU where that
-    is ``meta``. A configuration without a hash, as older checkpoints have it, is taken as it is.
+    is ``meta``.
 
     Args:
         kinds: the configuration of each kind that is taken.
@@ -92,8 +92,11 @@ def read_checkpoint(
     changed = "changed since it was saved"
     if hashlib.sha256(weights).hexdigest() != record.get("sha256"):
         raise ValueError(f"{folder / WEIGHTS}: {changed}, its SHA-256 differs from {CONFIG}'s; get it anew")
-    if record.get("config_sha256", _digest(settings)) != _digest(settings):
-        raise ValueError(f"{folder / CONFIG}: {changed}, the SHA-256 of its 'config' is another; get it anew")
+    if record.get("config_sha256") != _digest(settings):
+        raise ValueError(
+            f"{folder / CONFIG}: {changed} or of another version, the SHA-256 of its 'config' is not its "
+            "'config_sha256'; get it anew"
+        )
     try:
         config = kinds[found].from_dict(settings)
     except (TypeError, ValueError) as error:

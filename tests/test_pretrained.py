@@ -39,6 +39,14 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path / "small"
 
 
+def configure(folder: Path, config: Any) -> None:
+    """Another configuration, with its hash."""
+    path = folder / "config.json"
+    digest = hashlib.sha256(json.dumps(config, sort_keys=True).encode()).hexdigest()
+    changed = {"config": config, "config_sha256": digest}
+    path.write_text(json.dumps(json.loads(path.read_text()) | changed))
+
+
 def test_save_and_load_are_bit_equal(tmp_path: Path, folder: Path) -> None:
     first = load_pretrained(folder)
     save_checkpoint(tmp_path / "again", "neuro-msbg", first, first.config.to_dict(), {})
@@ -97,9 +105,7 @@ def test_a_file_of_the_users_own_is_not_deleted(folder: Path) -> None:
 def test_configurations_that_would_fill_memory_or_time(folder: Path) -> None:
     record = json.loads((folder / "config.json").read_text())
     for name, value in (("fft", 100_000), ("blocks", 200_000), ("channels", 10**9)):
-        changed = {key: one for key, one in record.items() if key != "config_sha256"}
-        changed["config"] = record["config"] | {name: value}
-        (folder / "config.json").write_text(json.dumps(changed))
+        configure(folder, record["config"] | {name: value})
         with pytest.raises(ValueError, match=f"{name} {value}; allowed: whole numbers from"):
             load_pretrained(folder)
     for text in ("[" * 200_000, "7", "\xff", "{"):
@@ -153,10 +159,7 @@ def test_what_is_loaded_or_made_otherwise_is_named() -> None:
 
 
 def test_configuration_that_does_not_fit(folder: Path) -> None:
-    record = json.loads((folder / "config.json").read_text())
-    record["config"]["channels"] = 5
-    del record["config_sha256"]  # as in older ones
-    (folder / "config.json").write_text(json.dumps(record))
+    configure(folder, SMALL.to_dict() | {"channels": 5})
     with pytest.raises(ValueError, match="do not fit"):
         load_pretrained(folder)
     (folder / "config.json").write_text("no JSON")
@@ -169,22 +172,23 @@ def test_changed_configuration(folder: Path) -> None:
     record = json.loads(path.read_text())
     assert NeuroConfig.from_dict(record["config"]).window != 64
     path.write_text(json.dumps(record | {"config": record["config"] | {"window": 64}}))
-    with pytest.raises(ValueError, match="changed since it was saved, the SHA-256 of its 'config'") as caught:
+    with pytest.raises(ValueError, match="changed since it was saved or of another version") as caught:
         load_pretrained(folder)
     assert str(caught.value).startswith(str(path))
+    path.write_text(json.dumps({name: value for name, value in record.items() if name != "config_sha256"}))
+    with pytest.raises(ValueError, match="changed since it was saved or of another version"):
+        load_pretrained(folder)
     path.write_text(json.dumps(record | {"config": dict(reversed(record["config"].items()))}))
     load_pretrained(folder)
 
 
 @pytest.mark.parametrize("config", [None, [], {"layers": 3}, {"channels": "many"}])
 def test_odd_configuration_is_named(folder: Path, config: Any) -> None:
-    path = folder / "config.json"
-    record = json.loads(path.read_text())
-    del record["config_sha256"]
-    path.write_text(json.dumps(record | {"config": config}))
+    configure(folder, config)
     with pytest.raises(ValueError, match="allowed: ") as caught:
         load_pretrained(folder)
-    assert str(caught.value).startswith(str(path)) and len(str(caught.value).splitlines()) == 1
+    told = str(caught.value)
+    assert told.startswith(str(folder / "config.json")) and len(told.splitlines()) == 1
 
 
 @pytest.mark.parametrize("name", sorted(shipped()))

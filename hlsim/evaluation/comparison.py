@@ -12,14 +12,7 @@ import numpy as np
 
 from hlsim.audiogram import SEVERITIES
 from hlsim.evaluation.scores import ItemScore
-from hlsim.evaluation.statistics import (
-    MixedModel,
-    PairedComparison,
-    differences,
-    holm,
-    mixed_model,
-    paired_comparison,
-)
+from hlsim.evaluation.statistics import PairedComparison, holm, paired_comparison
 from hlsim.metrics.registry import MEASURES
 
 ALPHA = 0.05
@@ -38,7 +31,6 @@ class Comparison:
         level_before_mean, level_after_mean: dB SPL of what the ear was given, of the same items.
         by_severity: by degree of loss, those that occur.
         listeners: the same tests of the means of each listener; None unless two or more are named.
-        mixed: a mixed model with listeners as a random intercept, or the reason why there is none.
         p_t_holm, p_w_holm: p values adjusted by Holm over the comparisons of this measure, as many as ``comparisons``.
         unit: what ``listeners`` are called.
         left_out: how many items lack a score under one of the conditions or both.
@@ -52,7 +44,6 @@ class Comparison:
     level_after_mean: float
     by_severity: Mapping[str, PairedComparison]
     listeners: PairedComparison | None
-    mixed: MixedModel | str
     p_t_holm: float | None
     p_w_holm: float | None
     comparisons: int = 1
@@ -68,12 +59,11 @@ class Comparison:
         """A plain dictionary that JSON can hold."""
         record = asdict(self)
         del record["unit"]
-        mixed, listeners = record.pop("mixed"), record.pop("listeners")
+        listeners = record.pop("listeners")
         return {
             **record.pop("overall"),
             **record,
             "listener_means": listeners,
-            "mixed_model": {"none": mixed} if isinstance(mixed, str) else mixed,
             "in_words": self.in_words(),
         }
 
@@ -209,13 +199,8 @@ def _compare(items: Sequence[ItemScore], measure: str, before: str, after: str) 
     )
     severities = np.array([item.severity for item in both])
     listeners, means = np.array([item.listener for item in both]), None
-    mixed: MixedModel | str = "listeners are not named"
-    if all(listeners):
-        mixed = mixed_model(differences(first, second).tolist(), listeners.tolist())
-        if len(names := dict.fromkeys(listeners)) > 1:
-            means = paired_comparison(
-                *([x[listeners == name].mean() for name in names] for x in (first, second))
-            )
+    if all(listeners) and len(names := dict.fromkeys(listeners)) > 1:
+        means = paired_comparison(*([x[listeners == name].mean() for name in names] for x in (first, second)))
     return Comparison(
         measure=measure,
         before=before,
@@ -230,7 +215,6 @@ def _compare(items: Sequence[ItemScore], measure: str, before: str, after: str) 
             if name in severities
         },
         listeners=means,
-        mixed=mixed,
         p_t_holm=None,
         p_w_holm=None,
         left_out=len(items) - len(both),

@@ -38,7 +38,6 @@ from hlsim.evaluation.measurements import (
     draw_utterances,
     gain_curves,
     insertion_gain,
-    shift_differences,
     steady_tones,
     wearing,
 )
@@ -55,15 +54,13 @@ UNAIDED, PRESCRIBED, COMPRESSED = "unaided", "NAL-R", "WDRC"
 
 _EQUALISED = "equaliser at {}'s level"
 
-_SHIFTED = 6  # items, of which every condition has figures
-
 _REVISION = 2  # of what ``judge`` measures and how it is kept: raise it where that changes
 
 
 @dataclass(frozen=True)
 class CompensatorEvaluation:
-    """What ``compensators.json`` holds: ``compensator_result``'s, and ``gain_curves``, ``steady_tones``, ``shifts``,
-    ``wearing``, ``notes`` and ``beside``, the conditions that a compensator is compared with beside those that all are;
+    """What ``compensators.json`` holds: ``compensator_result``'s, and ``gain_curves``, ``steady_tones``, ``wearing``,
+    ``notes`` and ``beside``, the conditions that a compensator is compared with beside those that all are;
     and the reports of each group of items that there is, ``clean``, ``noisy`` and ``hard``.
     """
 
@@ -183,9 +180,7 @@ def evaluate_compensators(
     settings |= {"enhancers": [str(enhancer) for enhancer in before.values()]}
     limits = {name: limit_of(module) for name, module in conditions.items()}
     result, reports = compensator_result(drawn, judged, limits=limits, settings=settings)
-    shifted = sorted(result["rows"], key=lambda row: row["condition"] != "clean")[:_SHIFTED]
-    shifts = shift_differences(whole, {row["item"]: drawn[row["item"]] for row in shifted})
-    result |= {"gain_curves": curves, "steady_tones": steady, "shifts": shifts, "wearing": worn}
+    result |= {"gain_curves": curves, "steady_tones": steady, "wearing": worn}
     result |= {"beside": beside, "notes": [*notes]}
     return CompensatorEvaluation(result, reports)
 
@@ -240,14 +235,13 @@ def _judge_all(
     network = weights_hash(simulator)
     # of pyclarity's MSBG, too
     versions = {**versions_of(MEASURES, "pyclarity"), "hlsim": version_of("hlsim")}
-    # figures by pyclarity were stored when there was no other engine
     revisions = {name: measure_by(engine, name).revision for name in MEASURES}
-    by = {} if engine == "pyclarity" else {"engine": engine, "revisions": revisions}
     exact = EXACT if find_spec("clarity") else EXACT[:1]
     trials = []
+    by = {"revision": _REVISION, "versions": versions, "engine": engine, "revisions": revisions}
     for number, item in enumerate(items):
         trial_seed = (seed + number) % 2**32
-        about = {"revision": _REVISION, "versions": versions, "seed": trial_seed, **item.settings(), **by}
+        about = {**by, "seed": trial_seed, **item.settings()}
         of = {name: {**about, "weights": found} for name, found in weights[item.ear].items()}
         keys = {name: Keys(key_of(it), key_of({**it, "simulator": network})) for name, it in of.items()}
         trials.append(Trial(item, conditions[item.ear], simulator, trial_seed, keys, engine, exact))

@@ -1,4 +1,4 @@
-"""What scores of speech do not show: gain by frequency, tones, shifted speech, quiet noise, latency and cost."""
+"""What scores of speech do not show: gain by frequency, tones, quiet noise, latency and cost."""
 
 from __future__ import annotations
 
@@ -10,13 +10,11 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional
 
 from hlsim.audiogram import Audiogram
 from hlsim.calibration import level_spl, set_level
 from hlsim.criteria.bands import band_centres, band_levels
 from hlsim.data.clips import Clips
-from hlsim.evaluation.items import Item
 from hlsim.evaluation.judging import NORMAL
 from hlsim.msbg import MSBG
 from hlsim.neuro.config import NEURO_RATE
@@ -28,9 +26,6 @@ UTTERANCES = 6
 TONES = (250, 500, 1000, 2000, 3001, 4000)
 """In Hz. Frames that are multiples of 4 ms apart all find the others in one phase, but not 3001 Hz."""
 
-DELAYS = (7, 30)
-"""In samples, no multiples of a usual hop."""
-
 QUIET = (25.0, 40.0)
 """Levels in dB SPL of the noise of a room where nobody speaks."""
 
@@ -38,7 +33,6 @@ _CHANGES = range(8000, 40000, 2003)  # samples from which on the input is anothe
 _CHANGED = 1e-4  # of the output's peak: Fourier transforms round by less
 _NEAR_HZ = 20.0
 _MIDDLE = slice(NEURO_RATE // 2, -NEURO_RATE // 2)  # one second: every tone has whole periods in it
-_END = NEURO_RATE // 4  # left out at either end of speech
 _LEAST, _SILENCE = 1e-20, 1e-30  # smallest ratio of powers, and power: JSON holds no infinity
 
 
@@ -132,34 +126,6 @@ def steady_tones(
         about = {"compensator": name, "ear": ear_name, "levels": [*levels], "frequencies": [*TONES]}
         shaped = {key: values.reshape(len(TONES), -1).T.tolist() for key, values in figures.items()}
         found.append({**about, **shaped})
-    return found
-
-
-def shift_differences(
-    compensators: Mapping[str, nn.Module], items: Mapping[int, Item]
-) -> list[dict[str, Any]]:
-    """How far the output for speech that comes later differs from the output that comes later, in dB relative to it.
-
-    Of the clean speech of items, by number, without 0.25 s at either end (a quarter of one under 1 s); at least -200 dB.
-    Silence stands in for what a delay leaves. ValueError as ``outputs``.
-
-    Returns: for each ``{"compensator", "items", "delays", "difference_db": (items, delays)}``.
-    """
-    last = max(DELAYS)
-    found = []
-    for name, compensator in compensators.items():
-        differences = []
-        for number, item in items.items():
-            time, delays = len(item.clean), (0, *DELAYS)
-            given = [functional.pad(item.clean, (delay, last - delay)) for delay in delays]
-            what = f"{name}, delayed speech of item {number}: the output"
-            aided = zip(outputs(compensator, given, item.ear, what).double(), delays, strict=True)
-            end = min(_END, time // 4)
-            first, *later = (own[delay + end : delay + time - end] for own, delay in aided)
-            apart = torch.stack([(own - first).square().mean() for own in later])
-            differences.append(_ratio_db(apart, first.square().mean()).tolist())
-        about = {"compensator": name, "items": [*items], "delays": [*DELAYS]}
-        found.append({**about, "difference_db": differences})
     return found
 
 

@@ -167,9 +167,8 @@ def score_items(
 def _about(name: str, engine: Engine) -> dict[str, Any]:
     """What computes a measure, for its scores' keys."""
     measure = measure_by(engine, name)
-    about = {"revision": measure.revision, "measure": name, "versions": versions_of([name], engine)}
-    # scores by pyclarity were stored when there was no other engine
-    return about | ({"engine": "hlsim"} if measure.engine == "hlsim" else {})
+    about = {"revision": measure.revision, "measure": name, "engine": measure.engine}
+    return {**about, "versions": versions_of([name], engine)}
 
 
 @one_thread()

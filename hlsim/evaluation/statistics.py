@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import importlib
 import math
-import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 
 import numpy as np
@@ -76,7 +74,8 @@ def paired_comparison(before: Iterable[float], after: Iterable[float]) -> Paired
         raise ValueError(
             f"{len(first)} scores before and {len(second)} after; a paired comparison needs one each an item"
         )
-    difference = differences(first, second)
+    difference = second - first
+    difference = np.where(np.abs(difference) <= ROUNDING * _largest(first, second), 0.0, difference)
     n = len(first)
     spreads = [float(x.std(ddof=1)) if n > 1 else None for x in (first, second, difference)]
     zeros = int(np.count_nonzero(difference == 0.0))
@@ -95,13 +94,6 @@ def paired_comparison(before: Iterable[float], after: Iterable[float]) -> Paired
     return PairedComparison(
         n, zeros, before_mean, spreads[0], after_mean, spreads[1], delta, t, p_t, w, p_w, d, *ends
     )
-
-
-def differences(before: Iterable[float], after: Iterable[float]) -> np.ndarray:
-    """After minus before, 0 where that is rounding."""
-    first, second = (np.asarray(list(values), dtype=np.float64) for values in (before, after))
-    difference = second - first
-    return np.where(np.abs(difference) <= ROUNDING * _largest(first, second), 0.0, difference)
 
 
 def bootstrap_interval(
@@ -154,66 +146,3 @@ def _scores(values: Iterable[float], name: str) -> np.ndarray:
         if not math.isfinite(score):
             raise ValueError(f"score {index} {name} is {score}; allowed: finite numbers")
     return scores
-
-
-@dataclass(frozen=True)
-class MixedModel:
-    """Differences = mean + the listener's deviation + residual, fitted by REML.
-
-    Attributes:
-        delta, standard_error, z, p: estimated mean difference; Wald test, two-sided.
-        ci_low, ci_high: its 95 % Wald interval.
-        listener_variance, residual_variance: between and within listeners.
-        note: what the fit complained of, such as no convergence; empty where it did not.
-    """
-
-    n: int
-    listeners: int
-    delta: float
-    standard_error: float
-    z: float
-    p: float
-    ci_low: float
-    ci_high: float
-    listener_variance: float
-    residual_variance: float
-    note: str = ""
-
-
-def mixed_model(differences: Sequence[float], listeners: Sequence[str]) -> MixedModel | str:
-    """The mean difference with listeners as a random intercept, or the reason in words why there is none.
-
-    With few listeners the Wald test is too sure of itself (Luke 2017, Behav. Res. Methods 49): read it beside the tests
-    of the listeners' means.
-    """
-    groups = len(set(listeners))
-    if groups < 2 or len(differences) <= groups:
-        return "needs two listeners or more, and more items than listeners"
-    values = np.asarray(differences, dtype=np.float64)
-    if np.ptp(values) <= ROUNDING * np.abs(values).max():
-        return "the differences do not vary"
-    try:
-        # no extra brings statsmodels: the report is whole without it
-        models = importlib.import_module("statsmodels.regression.mixed_linear_model")
-    except ImportError:
-        return "statsmodels is not installed"
-    ones = np.ones((len(values), 1))
-    # statsmodels takes any variance below 0.01 for one at its boundary, whatever the unit
-    scale = float(values.std())
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        try:
-            fit = models.MixedLM(values / scale, ones, groups=np.asarray(listeners)).fit(reml=True)
-            z, p = (float(x[0]) for x in (fit.tvalues, fit.pvalues))
-            delta, error, low, high = (
-                scale * float(x) for x in (fit.fe_params[0], fit.bse_fe[0], *fit.conf_int()[0])
-            )
-        except (np.linalg.LinAlgError, ValueError) as failure:
-            return f"the fit failed ({failure})"
-    figures = (delta, error, z, p, low, high)
-    if not np.isfinite(figures).all():
-        return "the fit has no standard error"
-    complaints = [] if fit.converged else ["no convergence"]
-    complaints += sorted({str(w.message) for w in caught if "boundary" in str(w.message)})
-    between, within = (scale**2 * float(x) for x in (np.asarray(fit.cov_re)[0, 0], fit.scale))
-    return MixedModel(len(values), groups, *figures, between, within, "; ".join(complaints))

@@ -1,6 +1,6 @@
 """Scores on disk, each appended as it is made, so that a run that was killed goes on where it was; and their keys.
 
-Lines of JSON, not sqlite or diskcache: two runs may share a file, people read it, and scores stored earlier load.
+Lines of JSON, not sqlite or diskcache: two runs may share a file, and people read it.
 """
 
 from __future__ import annotations
@@ -22,11 +22,6 @@ import torch
 from torch import Tensor, nn
 
 from hlsim.files import sha256
-
-# scores of networks were stored when these had other names
-_FORMER = {"receptive_field": "reach"}
-_FORMER_MODULE = b"hlsim.dsp.stft", b"hlsim.spectrum"
-_FORMER_KIND = {"hlsim.neuro.encoder.AudiogramEncoder": "hlsim.neuro.audiogram_encoder.AudiogramEncoder"}
 
 
 class ScoreStore:
@@ -103,12 +98,11 @@ def weights_hash(module: nn.Module) -> str:
     settings = [
         (place, name, setting(value))
         for place, part in module.named_modules()
-        for name, value in sorted((_FORMER.get(name, name), value) for name, value in vars(part).items())
+        for name, value in sorted(vars(part).items())
         if name not in torchs
     ]
     kinds = {type(part): None for part in module.modules()}
-    named = {kind: f"{kind.__module__}.{kind.__qualname__}" for kind in kinds}
-    about = [f"{_FORMER_KIND.get(name, name)} {_source(kind)}" for kind, name in named.items()]
+    about = [f"{kind.__module__}.{kind.__qualname__} {_source(kind)}" for kind in kinds]
     state = hashlib.sha256(f"{about} {settings}".encode())
     for name, tensor in (*module.named_parameters(), *module.named_buffers()):
         state.update(name.encode())
@@ -135,8 +129,7 @@ def setting(value: Any) -> Any:
         case weakref.ref():  # an LSTM holds some to its weights
             return setting(value())
     try:
-        held = pickle.dumps(value, protocol=4).replace(*_FORMER_MODULE)
-        return hashlib.sha256(held).hexdigest()
+        return hashlib.sha256(pickle.dumps(value, protocol=4)).hexdigest()
     except Exception:  # a lambda, an open file: whatever it does may have changed, so it is scored anew
         return uuid.uuid4().hex
 

@@ -15,7 +15,7 @@ from hlsim.audiogram import FREQUENCIES
 from hlsim.evaluation.comparison import Comparison
 from hlsim.evaluation.compensator_result import HARD, NOISIER_DB
 from hlsim.evaluation.haspi_report import GAIN_NOTE, HaspiReport
-from hlsim.evaluation.measurements import DELAYS, QUIET, UTTERANCES
+from hlsim.evaluation.measurements import QUIET, UTTERANCES
 from hlsim.report.gain_pictures import gain_picture, gains_at, input_output_picture, tone_picture
 from hlsim.report.haspi import scored_by
 from hlsim.report.page import Section, render_markdown, render_page, write_files
@@ -82,7 +82,6 @@ def _sections(result: Result, reports: Mapping[str, HaspiReport]) -> list[Sectio
     ]
     loudness = [_loudness_table(result, group) for group in whole]
     by_severity = [_severity_table(result, group) for group in whole]
-    shifts = _SHIFTS.format(len(result["shifts"][0]["items"]), " or ".join(map(str, DELAYS)))
     curves = result["gain_curves"]
     shown = dict.fromkeys(curve["ear"] for curve in curves)
     colours = condition_colours([*next(iter(result["groups"].values()))["conditions"]])
@@ -100,7 +99,6 @@ def _sections(result: Result, reports: Mapping[str, HaspiReport]) -> list[Sectio
         Section("Gain curves", [_GAINS], [_gain_table(curves)], gains),
         Section("Steady tones", [_STEADY], [tone_table(tones)], as_heard, folded=True),
         Section("Could it be worn?", [_WEARING], [wearing_table(result["wearing"], tones)]),
-        Section("Does it matter where frames fall?", [shifts], [shift_table(result["shifts"])], folded=True),
     ]
     for group in whole:
         title = f"Pictures: {inner(GROUPS[group])}"
@@ -143,10 +141,6 @@ _STEADY = (
     "By the exact MSBG, all that is heard. A tone that the ear cannot hear under any output limit is far below 0 "
     "whatever is done. Sidebands are the power of all that is further than 20 Hz from the tone, relative to the tone, in "
     "what the ear is given: modulation, hiss, and the harmonics of a limiter."
-)
-_SHIFTS = (
-    "The clean speech of {} items is delayed by {} samples, and the output, shifted back, is compared with that of the "
-    "speech as it was, without 0.25 s at either end. A filter gives the same; what depends on where frames fall does not."
 )
 _WEARING = (
     "Latency: how long before the input becomes another sound the output changes, by more than 1e-4 of its peak; the "
@@ -338,16 +332,6 @@ def wearing_table(found: Sequence[Result], tones: Sequence[Result]) -> Table:
         for row in found
     ]
     return Table.of("Latency, gain for quiet noise, sidebands and cost", rows)
-
-
-def shift_table(found: Sequence[Result]) -> Table:
-    """A row a compensator."""
-    rows = []
-    for row in found:
-        off = np.array(row["difference_db"])
-        figures = {"n": str(off.size), "Median": f"{np.median(off):.0f}", "Worst": f"{off.max():.0f}"}
-        rows.append({_GIVEN: row["compensator"], **figures})
-    return Table.of("Difference of the outputs relative to the output, in dB", rows)
 
 
 _TONE = "Ear, compensator, input"

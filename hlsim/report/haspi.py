@@ -159,7 +159,6 @@ def _notes(report: HaspiReport) -> list[str]:
     scale = f"{min(scales):.1f} to {max(scales):.1f} dB SPL, by item"
     if report.full_scale_spl is not None:
         scale = f"{report.full_scale_spl:g} dB SPL"
-    mixed = report.headline.mixed
     extra = [
         f"{name}: {f'{value:.5g}' if isinstance(value, float) else value}"
         for name, value in report.extra.items()
@@ -182,10 +181,6 @@ def _notes(report: HaspiReport) -> list[str]:
         '"wilcox"); W is the smaller rank sum.',
         "Tests and intervals take the items as independent; where several share a talker or a listener, p is too small "
         "and the interval too narrow.",
-        f"No mixed model: {mixed}."
-        if isinstance(mixed, str)
-        else "Mixed model: difference = mean + listener's deviation + residual, by REML, Wald test"
-        + (f" ({mixed.note})." if mixed.note else "."),
         f"Numpy's seed {report.seed}; each item's seed is in report.json. {versions}.",
         *([f"{'; '.join(extra)}."] if extra else []),
     ]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 from hlsim.evaluation.comparison import ALPHA, Comparison, compare_conditions, p_text
@@ -118,17 +118,11 @@ def severity_table(comparison: Comparison) -> Table:
 
 
 def listener_table(comparison: Comparison) -> Table | None:
-    """Items, listener means and the mixed model side by side; None where listeners are not named."""
+    """Items and listener means side by side; None where listeners are not named."""
     if comparison.listeners is None:
         return None
     rows = {"items": comparison.overall, "listener means": comparison.listeners}
-    table = _paired_table(comparison, "with items nested in listeners", "Unit", rows)
-    model = comparison.mixed
-    if isinstance(model, str):
-        return table
-    change = f"{model.delta:+.3f} [{model.ci_low:+.3f}, {model.ci_high:+.3f}]"
-    name, test = f"mixed model ({model.listeners} listeners)", f"z = {model.z:+.3f}, {p_text(model.p)}"
-    return replace(table, rows=[*table.rows, (name, str(model.n), "", "", change, test, "", "")])
+    return _paired_table(comparison, "with items nested in listeners", "Unit", rows)
 
 
 def comparisons_table(comparisons: Sequence[Comparison]) -> Table:

@@ -269,7 +269,6 @@ def test_report(tmp_path: Path, speech_dir: Path, ears_csv: Path) -> None:
     assert f"| loud | 100 | {max(peaks):.2f} | {result['peaks']['loud']['over']} of 10 |" in text
     assert "| severe, HASQI: NAL-R to loud |" in text and "**broken: change, and paired tests" in text
     assert "RuntimeError: no such ear" in text and "| N2, loud, 50 dB SPL | +40.0 |" in text
-    # the worst of tones and of shifted speech; a gain does nothing else, and the noisy fill up where the clean are few
     tones = {own["compensator"]: own for own in result["steady_tones"]}
     assert [*tones] == ["unaided", "NAL-R", "WDRC", "loud", "broken"] and tones["loud"]["levels"] == [
         50,
@@ -281,9 +280,6 @@ def test_report(tmp_path: Path, speech_dir: Path, ears_csv: Path) -> None:
     assert off > tones["unaided"]["heard_off_db"][0][0] + 40.0  # recruitment
     rows = [line.split(" | ") for line in text.splitlines() if line.startswith("| N2, loud, 50 dB SPL")]
     assert len(rows) == 2 and rows[1][1] == f"{off:+.1f}"
-    assert "| loud | 12 | -200 | -200 |" in text and "The clean speech of 6 items is delayed" in text
-    numbers = [row["item"] for row in clean]
-    assert [own["items"][:5] for own in result["shifts"]] == [numbers] * 4
     # as loud as the compensator; a gain without a filter is the flat equaliser, but for its ends
     for row in result["rows"]:
         figures = row["figures"]
@@ -313,7 +309,7 @@ def test_report(tmp_path: Path, speech_dir: Path, ears_csv: Path) -> None:
     worn = [own["compensator"] for own in result["wearing"]]
     assert worn == ["NAL-R", "WDRC", "loud", "broken"] and "| N2, loud | 0.0 | +40.0 | +40.0 | -" in text
     page = (out / "compensators.html").read_text()
-    assert "Steady tones" in page and "where frames fall" in page
+    assert "Steady tones" in page
     assert page.count("data:image/svg+xml") > 2 and "Paired tests" in page and "Gain curves" in page
 
 

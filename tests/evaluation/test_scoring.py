@@ -9,7 +9,6 @@ import threading
 import time
 from dataclasses import replace
 from functools import partial
-from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +18,7 @@ import torch
 from hlsim.audio import read_audio, write_audio
 from hlsim.audiogram import FREQUENCIES, Audiogram
 from hlsim.evaluation.scoring import FileItem, Results, score_items
-from hlsim.evaluation.store import ScoreStore, content_hash, key_of
+from hlsim.evaluation.store import ScoreStore, content_hash
 from hlsim.metrics import registry as measures_module
 from hlsim.metrics.pyclarity import pyclarity_score
 
@@ -97,28 +96,6 @@ def test_equal_the_libraries_called_one_by_one(items: list[FileItem]) -> None:
     kept = sorted((record["measure"], record.get("engine", "")) for record in store.records.values())
     of_ear = [(measure, engine) for measure in ("haspi", "hasqi") for engine in ("hlsim", "pyclarity")]
     assert kept == [*of_ear, ("pesq", ""), ("stoi", "")]
-
-
-def test_scores_stored_before_there_were_engines_are_pyclaritys(items: list[FileItem]) -> None:
-    item = replace(items[0], processed={"noisy": items[0].processed["noisy"]})
-    clean, noisy = content_hash(item.clean), content_hash(item.processed["noisy"])
-    former = {
-        "revision": 1,
-        "measure": "haspi",
-        "versions": {name: version(name) for name in ("pyclarity", "numpy", "scipy")},
-        "clean": clean,
-        "processed": noisy,
-        "ear": "",
-        "audiogram": list(N3.levels),
-        "full_scale_spl": 94.0,
-        "spl": None,
-        "seed": int(clean[:8], 16),
-    }
-    store = ScoreStore()
-    store.append(key_of(former), {"score": 0.125})
-    for engine, known in (("pyclarity", True), ("hlsim", False)):
-        (result,) = score_items([item], store=store, jobs=1, engine=engine)[0].values()
-        assert (result.score == 0.125) == known
 
 
 def test_a_stored_score_has_the_seed_of_this_run(items: list[FileItem], tmp_path: Path) -> None:

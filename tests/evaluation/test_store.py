@@ -1,6 +1,5 @@
 """The store of scores: what it keeps, what a torn line costs, and what its keys depend on."""
 
-import copy
 import json
 import math
 from dataclasses import dataclass
@@ -14,9 +13,7 @@ import torch
 
 from compensators import NALR
 from hlsim import MSBG, Audiogram
-from hlsim.dsp.stft import STFT
-from hlsim.evaluation.store import ScoreStore, content_hash, key_of, setting, weights_hash
-from hlsim.neuro.encoder import AudiogramEncoder
+from hlsim.evaluation.store import ScoreStore, content_hash, key_of, weights_hash
 from hlsim.pretrained import SIMULATOR, load_pretrained, shipped
 
 
@@ -141,16 +138,3 @@ def test_settings_of_any_kind_tell_modules_apart(monkeypatch: pytest.MonkeyPatch
     # what a class of one's own does counts too
     monkeypatch.setattr("inspect.getsource", lambda kind: "changed")
     assert weights_hash(Own([1.0])) != hashes[0]
-
-
-def test_what_was_stored_under_former_names_is_still_known() -> None:
-    assert setting(STFT(400, 400, 100)) == "3768d03668076df7778297ca04329f9e91caf8b812e21d4a700033f4b4cad2cf"
-    now, then = torch.nn.Module(), torch.nn.Module()
-    now.receptive_field = then.reach = 1664
-    assert weights_hash(now) == weights_hash(then)
-    encoder = AudiogramEncoder(16)
-    former = copy.deepcopy(encoder)
-    former.__class__ = type(
-        "AudiogramEncoder", (AudiogramEncoder,), {"__module__": "hlsim.neuro.audiogram_encoder"}
-    )
-    assert weights_hash(encoder) == weights_hash(former)

@@ -1,21 +1,19 @@
 """Tables of a comparison of compensators."""
 
 from hlsim.evaluation.measurements import TONES
-from hlsim.report.compensators import shift_table, tone_table
+from hlsim.report.compensators import tone_table
 from hlsim.report.page import Section, render_page
 from hlsim.report.pictures import condition_colours
 from hlsim.report.tables import Table
 
 
-def test_tables_of_tones_and_shifted_speech() -> None:
+def test_table_of_tones() -> None:
     about = {"compensator": "own", "ear": "N3", "levels": [50.0, 65.0], "frequencies": [*TONES]}
     offs = [[0.0, 1.0, 2.0, 3.0, 4.0, 5.0], [-1.0] * 6]
     sidebands = [[-50.0, -40.0, -3.2, -10.0, -60.0, -60.0], [-120.0] * 5 + [6.0]]
     first, second = tone_table([{**about, "heard_off_db": offs, "sidebands_db": sidebands}]).rows
     assert first == ["N3, own, 50 dB SPL", "+0.0", "+1.0", "+2.0", "+3.0", "+4.0", "+5.0", "-3 (1000 Hz)"]
     assert second[0] == "N3, own, 65 dB SPL" and second[-1] == "6 (4000 Hz)"
-    found = {"compensator": "own", "items": [0, 2], "difference_db": [[-30.0, -20.0], [-12.4, -20.0]]}
-    assert [*shift_table([found]).rows] == [["own", "4", "-20", "-12"]]
 
 
 def test_a_compensator_has_one_colour_and_what_is_as_loud_has_it_paler() -> None:
