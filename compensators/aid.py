@@ -23,8 +23,8 @@ _RARELY = -3.0  # start of the logit of noise reduction: 1 dB of 20
 class HearingAid(Wearable):
     """Waveform and audiogram to what the impaired ear is to be given, 4 ms late, whole or in chunks as it comes.
 
-    Two networks that know nothing of one another set its gains. One, without memory, sees the ear and the level that each
-    band has had of late, and corrects the gain that would restore loudness band by band
+    Two networks that know nothing of one another set its gains. One, without memory, sees the ear and each band's level,
+    of late and now, and corrects the gain that would restore loudness band by band
     (``prescription.restoring_gains``); the correction is 0 before training, and where there is no loss. The other, causal
     and recurrent, sees the levels of frames, not the ear, and takes noise off. In dB, a band's gain is
 
@@ -54,9 +54,13 @@ class HearingAid(Wearable):
         super().__init__(sample_rate, full_scale_spl, linked)
         self.config = config = HearingAidConfig.given(config)
         self.bands, self.limit_spl = config.bands, config.limit_spl
-        width, corrections = config.width, nn.Linear(config.width, config.bands)
-        seen = nn.Linear(3 * config.bands + 1, width)
-        self.correct = nn.Sequential(seen, nn.Tanh(), nn.Linear(width, width), nn.Tanh(), corrections)
+        width, inner, corrections = config.width, config.inner, nn.Linear(config.inner, config.bands)
+        self.correct = nn.Sequential(
+            *(nn.Linear(4 * config.bands + 1, inner), nn.SiLU()),
+            *(nn.Linear(inner, inner), nn.SiLU()),
+            *(nn.Linear(inner, inner), nn.SiLU()),
+            corrections,
+        )
         self.enter = nn.Linear(config.bands + config.bins, width)
         self.recur = nn.LSTM(width, config.hidden, batch_first=True)
         self.leave = nn.Linear(config.hidden + width, config.bands)
@@ -128,13 +132,13 @@ class HearingAid(Wearable):
         self, levels: Tensor, fitted: Tensor, state: State
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """Shape: (items, frames, bands + 1), of bands and of all, (items, n) -> (items, frames, bands) dB."""
-        config = self.config
+        config, now = self.config, levels[..., : self.bands]
         levels, kept = follow_peaks(levels, state["levels"], decay(config.attack), decay(config.release))
         level, total = levels.split((self.bands, 1), -1)
         loss, prescribed = fitted.chunk(2, -1)
         ear = torch.cat((loss / 50.0, prescribed / 20.0), -1).unsqueeze(1).expand(-1, level.shape[1], -1)
         reach = config.reach_db * loss.clamp_min(0.0) / (loss.clamp_min(0.0) + 10.0)
-        seen = torch.cat((ear, (levels - 40.0) / 20.0), -1)
+        seen = torch.cat((ear, (levels - 40.0) / 20.0, (now - level) / 10.0), -1)
         correction = reach.unsqueeze(1) * torch.tanh(self.correct(seen))
         gain = (restoring_gains(level, loss) + correction).clamp(0.0, config.cap_db)
         audible = ((total - config.quiet_spl) / _FADE + 1.0).clamp(0.0, 1.0)

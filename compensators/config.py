@@ -47,8 +47,9 @@ class HearingAidConfig(ModelConfig):
     Attributes:
         bands: whose gains it sets, an equal number of ERBs apart but no less than 125 Hz, 4 to 40.
         bins: frequencies of a frame, 62.5 Hz apart from the first, whose levels noise reduction sees beside the bands'.
-        width: of the layers before noise reduction's recurrent one, and of the correction.
+        width: of the layer before noise reduction's recurrent one.
         hidden: of the recurrent layer.
+        inner: width of the correction's three layers.
         reach_db: largest correction of the restoring gain up or down.
         reduction_db: most that noise reduction takes off a band.
         attack, release: of the levels that the gain follows, time constants in seconds.
@@ -62,6 +63,7 @@ class HearingAidConfig(ModelConfig):
     bins: int = 40
     width: int = 96
     hidden: int = 256
+    inner: int = 192
     reach_db: float = 20.0
     reduction_db: float = 12.0
     attack: float = 0.005
@@ -73,7 +75,14 @@ class HearingAidConfig(ModelConfig):
     limit_spl: float = 110.0
 
     def __post_init__(self) -> None:
-        for name, low, high in (("bands", 4, 40), ("bins", 0, 128), ("width", 1, 4096), ("hidden", 1, 4096)):
+        sizes = {
+            "bands": (4, 40),
+            "bins": (0, 128),
+            "width": (1, 4096),
+            "hidden": (1, 4096),
+            "inner": (1, 4096),
+        }
+        for name, (low, high) in sizes.items():
             if type(getattr(self, name)) is not int:
                 raise ValueError(
                     f"{name} is {getattr(self, name)!r}; allowed: whole numbers from {low} to {high}"

@@ -50,7 +50,9 @@ class Stream:
     Shape: (..., time) -> (..., time), the same leading dimensions every time.
 
     Raises:
-        ValueError: as the aid's call, or other leading dimensions than before.
+        ValueError: as the aid's call, other leading dimensions than before, or samples that are NaN or infinite, which
+            would stay in its state. What was refused changes nothing.
+        AttributeError: a slider is set that the aid does not have.
     """
 
     def __init__(self, aid: Worn, audiogram: AudiogramLike | None, sliders: Mapping[str, Slider]) -> None:
@@ -58,12 +60,21 @@ class Stream:
         for name, slider in sliders.items():
             setattr(self, name, slider)
         self._state: dict[str, Tensor] = {}  # empty before the first chunk
-        self._set: list[Slider] = []
+        self._set: list[Slider] = []  # copies, for a tensor may be written into
         self._shape = self._batch = torch.Size()
         self._under_way = self._fitted = self._sliders = torch.empty(0)
 
+    def __setattr__(self, name: str, value: object) -> None:
+        if not name.startswith("_") and name not in (sliders := self._aid.SLIDERS):
+            raise AttributeError(
+                f"{name} of a {type(self._aid).__name__}'s stream; allowed: {', '.join(sliders) or 'nothing'}"
+            )
+        super().__setattr__(name, value)
+
     def __call__(self, chunk: Tensor) -> Tensor:
         check_waveform(chunk)
+        if not bool(chunk.isfinite().all()):
+            raise ValueError("chunk holds samples that are NaN or infinite; allowed: finite ones")
         with torch.no_grad(), torch.autocast(chunk.device.type, enabled=False):
             self._begin(chunk)
             gain = gain_to_pascals(self._aid.full_scale_spl)
@@ -105,9 +116,9 @@ class Stream:
                 f"a chunk of shape {tuple(chunk.shape)} after others of {(*self._shape, 'time')}; allowed: the same "
                 "leading dimensions"
             )
-        if not begun or any(new is not old for new, old in zip(sliders, self._set, strict=True)):
+        if not begun or not all(map(_same, sliders, self._set)):
             self._batch, self._fitted, self._sliders = self._aid.prepare(chunk, self._audiogram, sliders)
-            self._set = sliders
+            self._set = [slider.clone() if isinstance(slider, Tensor) else slider for slider in sliders]
         if not begun:
             self._shape = chunk.shape[:-1]
             self._state = self._aid.initial(self._sliders)
@@ -125,3 +136,9 @@ class Stream:
             self._state = after | {"gains": after["gains"][:, -2:]}
             self._under_way = self._under_way[:, :0]
         return output
+
+
+def _same(new: Slider, old: Slider) -> bool:
+    if isinstance(new, Tensor):
+        return isinstance(old, Tensor) and torch.equal(new, old)
+    return new is old

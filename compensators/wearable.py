@@ -11,7 +11,7 @@ from compensators.bands import DELAY, HISTORY, HOP, RATE, apply_gains, frame_pow
 from compensators.limiter import soft_limit
 from compensators.stream import Slider, State, Stream
 from hlsim.audiogram import FREQUENCIES
-from hlsim.audiogram.thresholds import AudiogramLike, check_two_ears, resolve_thresholds
+from hlsim.audiogram.thresholds import AudiogramLike, as_thresholds, check_two_ears, resolve_thresholds
 from hlsim.calibration import PASCAL_SPL, check_full_scale, gain_to_pascals
 from hlsim.checks import check_rate, check_waveform, is_finite
 from hlsim.dsp.resample import resample
@@ -144,7 +144,11 @@ class Wearable(nn.Module):
             raise ValueError(
                 f"a stream at {self.sample_rate} Hz; allowed: {RATE}, for resampling looks 8.5 ms ahead, beyond the 5 ms"
             )
-        return Stream(self, audiogram, dict(zip(self.SLIDERS, sliders, strict=True)))
+        set_to = dict(zip(self.SLIDERS, sliders, strict=True))
+        for name, slider in set_to.items():  # before the first chunk, which has the items' number
+            check_slider(name, slider, slider.shape if isinstance(slider, Tensor) else torch.Size())
+        as_thresholds(self._given(audiogram), taker=type(self).__name__)
+        return Stream(self, audiogram, set_to)
 
     def prepare(
         self, waveform: Tensor, audiogram: AudiogramLike | None, sliders: Sequence[Slider]
@@ -153,9 +157,8 @@ class Wearable(nn.Module):
 
         Shape: (..., time), (..., 8), (...) each -> (...), (items, n), (items, sliders).
         """
-        if audiogram is None:
-            raise ValueError(f"no audiogram: give one with each call, {type(self).__name__} holds none")
-        thresholds = resolve_thresholds(None, audiogram, waveform, taker=type(self).__name__)
+        given = self._given(audiogram)
+        thresholds = resolve_thresholds(None, given, waveform, taker=type(self).__name__)
         own = next((weight.dtype for weight in self.parameters()), waveform.dtype)
         dtype = torch.promote_types(own, torch.float32)
         batch = torch.broadcast_shapes(waveform.shape[:-1], thresholds.shape[:-1])
@@ -167,6 +170,11 @@ class Wearable(nn.Module):
         ears = thresholds.to(dtype).expand(*batch, -1).reshape(-1, len(FREQUENCIES))
         stacked = torch.stack(settings, -1) if settings else ears.new_zeros(*batch, 0)
         return batch, self.fit(ears), stacked.to(dtype).reshape(len(ears), -1)
+
+    def _given(self, audiogram: AudiogramLike | None) -> AudiogramLike:
+        if audiogram is None:
+            raise ValueError(f"no audiogram: give one with each call, {type(self).__name__} holds none")
+        return audiogram
 
 
 def check_slider(name: str, slider: Slider, batch: torch.Size) -> Tensor:

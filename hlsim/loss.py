@@ -57,7 +57,8 @@ class HearingLossLoss(nn.Module):
     gradients pass through it to the compensated speech. Being one for all, it is not for ``nn.DataParallel``; use
     ``DistributedDataParallel``.
 
-    Levels matter, nothing is normalised: 65 dB SPL is RMS 0.035 at the default ``full_scale_spl``.
+    Levels matter, nothing is normalised: 65 dB SPL is RMS 0.035 at the default ``full_scale_spl``. NaN and infinity are
+    not refused, for a scaler of gradients is to see them: they make their item's value NaN, and no other's.
 
     It may be called in an autocast region and works in float32 there; call ``backward()`` outside of it, as torch says:
     inside one of float16, gradients may be NaN. A compiled caller calls it as it is, so that ``fullgraph=True`` and

@@ -48,8 +48,12 @@ class CompensatorTraining(TimedModule):
         if isinstance(aid := self.compensator, HearingAid):
             if not self.hears:
                 aid.correct.requires_grad_(False)  # or HASPI would amplify
-            elif recipe.unreduced == 1.0 and not (self.denoising or self.intelligibility):
-                for part in (aid.enter, aid.recur, aid.leave):  # or weight decay would go on
+            elif not (self.denoising or self.intelligibility):
+                for part in (
+                    aid.enter,
+                    aid.recur,
+                    aid.leave,
+                ):  # to be heard at the right level it would not reduce
                     part.requires_grad_(False)
 
     def training_loss(self, batch: Batch) -> Tensor:

@@ -123,7 +123,8 @@ class CompensatorRecipe(TrainingRecipe):
         weights: of ``HearingLossLoss``'s criteria: ``coherent-bands``, ``bands`` (dB), ``paper``, and ``haspi``
             and ``hasqi`` (1 less the score; clips of 0.7 s and more); and of what a hearing aid's noise reduction is
             trained for (``hlsim.training.denoising``): ``denoising``, the error of its gains, and ``intelligibility``,
-            what HASPI lacks of 1 at equal level. Without one of the others its amplification stays as it is.
+            what HASPI lacks of 1 at equal level. Without one of the others its amplification stays as it is, without
+            these two its noise reduction.
         reference: what the paper's criterion compares with, ``clean`` or ``normal-hearing``.
         sounds: speech in noise alone teaches a network that what is steady is noise, to be taken away.
         equalised: share of clips whose speech is equalised at random by up to 15 dB, and of those whose noise is. Few

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 import torch
 
-from compensators import HearingAid, HearingAidConfig, load_compensator, save_compensator
+from compensators import WDRC, HearingAid, HearingAidConfig, load_compensator, save_compensator
 from hlsim import Audiogram
 from hlsim.calibration import level_spl, set_level
 from hlsim.data.ears import draw_thresholds
@@ -57,6 +57,34 @@ def test_sliders_move_in_a_stream_without_a_click() -> None:
     hertz = torch.arange(4001) * 2.0
     near = (hertz - 1000.0).abs() < 100.0
     assert 10.0 * torch.log10(power[~near].sum() / power[near].sum()) < -40.0
+
+
+def test_a_streams_sliders_are_checked_and_a_tensor_may_be_written_into() -> None:
+    aid: Any = trained()
+    for wrong in ({"noise_reduction": 2.0}, {"audiogram": "N3"}, {"audiogram": None}):
+        with pytest.raises(ValueError, match=r"allowed|no audiogram"):
+            aid.stream(**{"audiogram": EAR} | wrong)
+    slider = torch.tensor(1.0)
+    written, assigned = aid.stream(EAR, slider), aid.stream(EAR)
+    signal = torch.randn(2000)
+    assert torch.equal(written(signal), assigned(signal))
+    slider.fill_(0.0)
+    assigned.noise_reduction = 0.0
+    assert torch.equal(written(signal), assigned(signal))
+    with pytest.raises(AttributeError, match="noise_reducton of a HearingAid's stream; allowed: noise_reduc"):
+        assigned.noise_reducton = 0.0
+    with pytest.raises(AttributeError, match="noise_reduction of a WDRC's stream; allowed: "):
+        WDRC().stream(EAR).noise_reduction = 0.0
+
+
+def test_a_chunk_of_nan_is_refused_and_spoils_nothing_after_it() -> None:
+    aid: Any = trained()
+    stream, other, signal = aid.stream(EAR), aid.stream(EAR), torch.randn(500)
+    stream(signal), other(signal)
+    for spoiled in (float("nan"), float("inf")):
+        with pytest.raises(ValueError, match="chunk holds samples that are NaN or infinite; allowed: finite"):
+            stream(torch.full((10,), spoiled))
+    assert torch.equal(stream(signal), other(signal))
 
 
 def test_one_slider_an_item_and_what_is_refused(utterance: torch.Tensor) -> None:

@@ -178,6 +178,7 @@ def test_without_noise_reduction_it_is_trained_and_validated(data: TrainingData)
     [
         ({"denoising": 1.0, "intelligibility": 1.0}, 0.0, {"correct"}),
         ({"coherent-bands": 1.0}, 1.0, {"enter", "recur", "leave"}),
+        ({"coherent-bands": 1.0}, 0.5, {"enter", "recur", "leave"}),
         ({"coherent-bands": 1.0, "denoising": 1.0}, 0.5, set()),
     ],
 )
