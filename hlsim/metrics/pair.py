@@ -36,8 +36,9 @@ def check_pair(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Both signals, (time,), in float64.
 
-    ValueError where there is no score of them, with these ``names`` in its message: not (time,), too short, silent, not
-    finite, or not equally long; the reference below 20 dB SPL; the rate or the level out of range.
+    ValueError where there is no score of them, with these ``names`` in its message: not (time,), too short, not finite,
+    or not equally long; the reference silent or below 20 dB SPL; the rate or the level out of range. A silent processed
+    one passes: an aid that mutes is to be scored for it.
     """
     rate = check_rate(sample_rate)
     full_scale = check_full_scale(full_scale_spl)
@@ -50,6 +51,8 @@ def check_pair(
         raise ValueError(
             f"{names[0]} lasts {len(clean) / rate:.2g} s; HASPI needs {SHORTEST_SECONDS} s or more to mean anything"
         )
+    if not clean.any():
+        raise ValueError(f"{names[0]} is silent, every sample is zero")
     level = 10.0 * math.log10(max(float(np.var(clean)), 1e-30)) + full_scale
     if level < LOWEST_REFERENCE_SPL:
         raise ValueError(
@@ -67,6 +70,4 @@ def _samples(signal: Signal, name: str) -> np.ndarray:
         )
     if not np.isfinite(values).all():
         raise ValueError(f"{name} holds samples that are NaN or infinite")
-    if not values.any():
-        raise ValueError(f"{name} is silent, every sample is zero")
     return values.astype(np.float64)

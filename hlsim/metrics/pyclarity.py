@@ -42,7 +42,7 @@ def pyclarity_score(
     Shape: (time,) and (time,), equally long, at least 0.7 s.
 
     Raises:
-        ValueError: as ``check_pair``, or the audiogram is none, or the seed out of range.
+        ValueError: as ``check_pair``, ``processed`` is silent, the audiogram is none, or the seed out of range.
         MissingExtraError: pyclarity is not installed.
     """
     if not isinstance(audiogram, Audiogram):
@@ -50,6 +50,8 @@ def pyclarity_score(
             f"audiogram is {type(audiogram).__name__}; {name.upper()} takes one ear, an Audiogram"
         )
     clean, heard = check_pair(reference, processed, sample_rate, full_scale_spl)
+    if not heard.any():  # it divides by the level; hlsim's scores silence
+        raise ValueError("processed is silent, every sample is zero")
     model = getattr(require(f"clarity.evaluator.{name}", "pyclarity"), f"{name}_v2")
     # at the eight frequencies: the same ear to both, which would log a warning of grids that lack one of their six
     ear = Audiogram(audiogram.thresholds).to_clarity()

@@ -12,7 +12,7 @@ from torch import Tensor
 from hlsim.audiogram import FREQUENCIES, Audiogram
 from hlsim.audiogram.thresholds import AudiogramLike, is_listener, of_listeners
 from hlsim.calibration import check_full_scale, level_spl
-from hlsim.checks import check_rate
+from hlsim.checks import Lengths, check_lengths, check_rate, check_waveform
 from hlsim.extras import require
 from hlsim.metrics.haspi import haspi
 from hlsim.metrics.hasqi import hasqi
@@ -52,8 +52,8 @@ class _MeanScore(_Metric):
         **options: Any,
     ) -> None:
         super().__init__(**options)
-        if limit is not None and limit < 1:
-            raise ValueError(f"limit is {limit}; allowed: 1 or more, or None")
+        if limit is not None and (type(limit) is not int or limit < 1):
+            raise ValueError(f"limit is {limit!r}; allowed: a whole number of 1 or more, or None")
         check_parallel(jobs, "loky", None)
         self.sample_rate = check_rate(sample_rate)
         self.full_scale_spl = check_full_scale(full_scale_spl)
@@ -66,21 +66,25 @@ class _MeanScore(_Metric):
             self.add_state(name, torch.zeros(2), dist_reduce_fx="sum")
 
     def update(
-        self, processed: Tensor, clean: Tensor, audiogram: AudiogramLike, lengths: Tensor | None = None
+        self, processed: Tensor, clean: Tensor, audiogram: AudiogramLike, lengths: Lengths | None = None
     ) -> None:
         """Score a batch.
 
-        An item of which there is no score (silence, NaN, less than 0.7 s) is left out, counted in ``failed``, and said.
-        Of two channels, left and right, the better ear's score and level count, and ``ears`` tells each ear's.
+        An item of which there is no score (its clean speech silent or soft, NaN, less than 0.7 s) is left out, counted in
+        ``failed``, and said; silence in place of speech is scored, as ``haspi`` scores it. Of two channels, left and
+        right, the better ear's score and level count, and ``ears`` tells each ear's.
 
         Args:
             audiogram: one ear for all, one an item, or (batch, 8) dB HL; of two channels a ``Listener`` or one an item,
                 whose missing ear is left out, a pair of left and right, (2, 8) or (batch, 2, 8) dB HL.
-            lengths: samples of each item, where the batch is padded.
+            lengths: samples of each item, or shares of the time above 0 to 1, where the batch is padded.
 
         Shape: (batch, time) or (time,), or (batch, 2, time), the same for both; ``lengths`` (batch,). ValueError for
-        others, for audiograms that are none, or not one or one an item, and for lengths beyond the signals.
+        others, for signals that ``haspi`` does not take, for audiograms that are none, or not one or one an item, and for
+        lengths beyond the signals.
         """
+        check_waveform(processed, "processed")
+        check_waveform(clean, "clean")
         shape = processed.shape
         if shape != clean.shape or len(shape) not in (1, 2, 3) or (len(shape) == 3 and shape[1] != 2):
             raise ValueError(
@@ -95,7 +99,10 @@ class _MeanScore(_Metric):
             for signal in (processed, clean)
         )
         ears = _ears(audiogram, len(heard), sides)
-        ends = _ends(lengths, len(heard), shape[-1])
+        items_and_time = torch.Size((len(heard), shape[-1]))
+        ends = (
+            [shape[-1]] * len(heard) if lengths is None else check_lengths(lengths, items_and_time).tolist()
+        )
         items: list[_Item] = []
         pairs = zip(heard, reference, ears, ends, strict=True)
         for number, (signals, targets, own, end) in enumerate(pairs, start=int(self.seen)):
@@ -233,17 +240,6 @@ def _score(task: _Task) -> list[float]:
         whole_khz=True,
     )
     return [float(score) for score in scores]
-
-
-def _ends(lengths: Tensor | None, batch: int, time: int) -> list[int]:
-    if lengths is None:
-        return [time] * batch
-    ends = [int(n) for n in lengths]
-    if len(ends) != batch:
-        raise ValueError(f"{len(ends)} lengths of {batch} items; allowed: one an item")
-    if wrong := [end for end in ends if not 0 <= end <= time]:
-        raise ValueError(f"a length is {wrong[0]}; allowed: 0 to {time} samples")
-    return ends
 
 
 def _ears(audiogram: AudiogramLike, batch: int, sides: int) -> list[dict[int, Audiogram]]:

@@ -68,7 +68,7 @@ def test_of_two_channels_the_better_ear_counts(clean: Tensor) -> None:
         assert float(metric.compute()) == pytest.approx(float(expected.amax(0).mean()), abs=1e-6)
         torch.testing.assert_close(metric.ears.double(), expected.mean(1), atol=1e-6, rtol=0)
     metric.reset()
-    given[:, 0] = 0.0  # an ear without a score loses
+    given[:, 0] = torch.nan  # an ear without a score loses
     metric.update(given, both, [N3, S2])
     assert float(metric.compute()) == pytest.approx(float(expected[1].mean()), abs=1e-6)
     assert int(metric.failed) == 0 and bool(metric.ears.isnan()[0])
@@ -83,17 +83,36 @@ def test_limit_and_lengths(clean: Tensor) -> None:
     for _ in range(2):
         metric.update(padded, padded, torch.tensor(N3.levels), lengths=torch.tensor([12800, 12800]))
     assert int(metric.count) == 1 and int(metric.seen) == 4
+    metric.update(
+        padded, padded, N3, lengths=torch.tensor([1.0, 12800 / 16800])
+    )  # shares, as SpeechBrain has them
+    assert int(metric.seen) == 6
     assert float(metric.compute()) == pytest.approx(haspi(clean[0], clean[0], N3, 16000), abs=1e-6)
 
 
 def test_what_cannot_be_scored_is_left_out_and_said(clean: Tensor) -> None:
     metric = HASPI(16000)
-    processed = torch.stack([clean[0] * 0, clean[1]])
-    with pytest.warns(UserWarning, match="HASPI leaves out item 0: processed is silent"):
-        metric.update(processed, clean, N3)
-    assert (int(metric.failed), int(metric.count)) == (1, 1)
-    # the second item's seed does not depend on the first one's fate
-    assert float(metric.compute()) == pytest.approx(haspi(clean[1], clean[1], N3, 16000, seed=1), abs=1e-6)
+    for spoiled, reason in (
+        ((clean[0] * 0, clean[0]), "reference is silent"),
+        ((clean[0], clean[0] / 0), "processed holds samples that are NaN"),
+    ):
+        metric.reset()
+        reference, processed = (torch.stack([signal, clean[1]]) for signal in spoiled)
+        with pytest.warns(UserWarning, match=f"HASPI leaves out item 0: {reason}"):
+            metric.update(processed, reference, N3)
+        assert (int(metric.failed), int(metric.count)) == (1, 1)
+        # the second item's seed does not depend on the first one's fate
+        expected = haspi(clean[1], clean[1], N3, 16000, seed=1)
+        assert float(metric.compute()) == pytest.approx(expected, abs=1e-6)
+
+
+def test_silence_in_place_of_speech_counts(clean: Tensor) -> None:
+    """Or an aid that mutes what it does badly would have the best mean."""
+    metric = HASPI(16000)
+    metric.update(clean * torch.tensor([[0.0], [1.0]]), clean, N3)
+    assert (int(metric.failed), int(metric.count)) == (0, 2)
+    alone = haspi(clean[1], clean[1], N3, 16000, seed=1)
+    assert float(metric.compute()) == pytest.approx(alone / 2.0, abs=0.01)
 
 
 @pytest.mark.slow
@@ -120,6 +139,8 @@ def test_bad_input(clean: Tensor) -> None:
     metric = HASPI(16000)
     for call, message in (
         ((clean, clean[:1], N3), r"processed \(2, 12800\) and clean \(1, 12800\)"),
+        (((clean * 32767).short(), clean, N3), "processed is torch.int16; allowed: .* divide 16-bit samples"),
+        ((clean, clean.numpy(), N3), "clean is ndarray; allowed: a floating-point tensor"),
         ((clean, clean, [N3]), "1 audiograms of 2 items"),
         ((clean, clean, "N3"), "audiogram is str; allowed: an Audiogram, one an item, or"),
         ((clean, clean, 3), "audiogram is int; allowed"),
@@ -129,14 +150,16 @@ def test_bad_input(clean: Tensor) -> None:
         with pytest.raises(ValueError, match=message):
             metric.update(*call)
     for lengths, message in (
-        ([12800], "1 lengths of 2 items; allowed: one an item"),
-        ([12800, -5], "a length is -5; allowed: 0 to 12800 samples"),
-        ([12801, 12800], "a length is 12801; allowed: 0 to 12800 samples"),
+        ([12800], r"lengths of shape \(1,\); allowed: whole numbers from 1 to 12800"),
+        ([12800, -5], "lengths from -5 to 12800; allowed: whole numbers from 1 to 12800"),
+        ([12801, 12800], "lengths from 12800 to 12801; allowed: whole numbers from 1 to 12800"),
+        ([12799.5, 12800.0], "lengths of torch.float32; allowed: whole numbers"),
     ):
         with pytest.raises(ValueError, match=message):
             metric.update(clean, clean, N3, lengths=torch.tensor(lengths))
     for options, message in (
         ({"limit": 0}, "limit is 0"),
+        ({"limit": 1.5}, "limit is 1.5"),
         ({"full_scale_spl": float("inf")}, "full_scale_spl is inf"),
         ({"seed": -1}, "seed is -1"),
         ({"seed": "a"}, "seed is 'a'; allowed: whole numbers"),
