@@ -140,9 +140,12 @@ def read_compensator(
 
 def read_simulator(name: str, sample_rate: int, full_scale_spl: float = 94.0) -> torch.nn.Module:
     from hlsim import MSBG, load_pretrained
+    from hlsim.pretrained import SIMULATOR, find_checkpoint
 
     options: dict[str, Any] = {"sample_rate": sample_rate, "full_scale_spl": full_scale_spl}
-    return MSBG(**options) if name == "msbg" else load_pretrained(name, **options)
+    if name == "msbg":
+        return MSBG(**options)
+    return load_pretrained(find_checkpoint(name, [SIMULATOR], ("msbg",)), **options)
 
 
 def read_recipe(path: Path | None) -> dict[str, Any]:

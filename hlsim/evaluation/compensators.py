@@ -128,6 +128,8 @@ def evaluate_compensators(
         raise ValueError(
             f"{items} items at {len(levels)} levels for {len(compensators)} compensators; allowed: 1 or more of each"
         )
+    if wrong := [level for level in levels if not 0.0 <= level <= 120.0]:
+        raise ValueError(f"speech at {wrong[0]:g} dB SPL; allowed: 0 to 120")
     if taken := sorted({UNAIDED, PRESCRIBED, COMPRESSED} & set(compensators)):
         raise ValueError(f"a compensator named {taken[0]!r}; allowed: other names, that one is there anyway")
     if (audiograms is None) == (audiogram is None):

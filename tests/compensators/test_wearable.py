@@ -130,7 +130,7 @@ def test_what_lies_above_8_khz_gets_the_gain_of_the_highest_band(make: Make, rat
     assert level_spl(resample(added, rate, 16000)[2000:-2000]) < level_spl(both[middle]) - 60.0
 
 
-@pytest.mark.parametrize("rate", [16001, 22050, 44100, 48000])
+@pytest.mark.parametrize("rate", [17000, 22050, 44100, 48000])
 def test_sliders_at_0_return_the_whole_band(rate: int) -> None:
     signal = set_level(torch.randn(2, rate + 37), 65.0)
     same = trained(sample_rate=rate)(signal, EAR, noise_reduction=0.0, amplification=0.0)
