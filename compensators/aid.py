@@ -150,7 +150,11 @@ class HearingAid(Wearable):
         seen = torch.cat((levels[..., : self.bands], levels[..., self.bands + 1 :]), -1)
         entered = torch.tanh(self.enter((seen - 40.0) / 20.0))
         hidden, cell = state["hidden"].movedim(1, 0).contiguous().unsqueeze(1).unbind()
-        recalled, (hidden, cell) = self.recur(entered, (hidden, cell))
+        if entered.shape[1] == 1:  # a stream's: the LSTM would repack its weights for one frame
+            hidden, cell = torch.lstm_cell(entered[:, 0], (hidden[0], cell[0]), *self.recur.all_weights[0])
+            recalled, hidden, cell = hidden.unsqueeze(1), hidden.unsqueeze(0), cell.unsqueeze(0)
+        else:
+            recalled, (hidden, cell) = self.recur(entered, (hidden, cell))
         taken = -config.reduction_db * torch.sigmoid(self.leave(torch.cat((recalled, entered), -1)))
         taken, kept = follow_peaks(taken, state["attenuation"], decay(config.opening), decay(config.closing))
         return taken, {"attenuation": kept, "hidden": torch.cat((hidden, cell)).movedim(0, 1)}

@@ -6,8 +6,8 @@
 #       examples/tables.sh CORPORA OUT [MINUTES A ROW] [ITEMS]
 #
 # CORPORA holds speech/{train,valid}, noise/{train,valid} and audiograms/{train,valid}.csv.
-# STEPS: of each row, whatever the minutes. NARROW: the paper's rows with as many times fewer channels. JOBS: rows trained at
-# a time. ROWS: these alone, compared as Table I; what follows a colon changes the recipe's network, or its seed.
+# STEPS: of each row, whatever the minutes. NARROW: the paper's rows with as many times fewer channels and heads. JOBS: rows
+# trained at a time. ROWS: these alone, compared as Table I; what follows a colon changes the recipe's network, or its seed.
 set -euo pipefail
 corpora=$1 out=$2 minutes=${3:-5} items=${4:-80}
 here=$(dirname "${BASH_SOURCE[0]}")
@@ -26,6 +26,7 @@ train() { # row: recipe[:setting=value[...]]
     awk -v by="$([[ $1 == paper/* ]] && echo "${NARROW:-1}" || echo 1)" -v given="${given#:}" '
         BEGIN { for (n = split(given, pairs, ":"); n; n--) { split(pairs[n], pair, "="); value[pair[1] ":"] = pair[2] } }
         $1 == "channels:" && by > 1 { $0 = "  channels: " 4 * int($2 / by / 4 + 0.5) }
+        $1 == "heads:" && by > 1 { $0 = "  heads: " int(($2 + by - 1) / by) }  # heads stay as wide
         !($1 in value)
         $1 == "model:" { for (name in value) if (name != "seed:") print "  " name, value[name] }
         END { if ("seed:" in value) print "seed:", value["seed:"] }

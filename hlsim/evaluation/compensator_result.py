@@ -8,7 +8,6 @@ from typing import Any
 from hlsim.audiogram import SEVERITIES
 from hlsim.evaluation.haspi_report import HaspiReport
 from hlsim.evaluation.items import Item
-from hlsim.evaluation.judging import SIMULATORS
 from hlsim.evaluation.scores import ItemScore
 from hlsim.extras import require
 from hlsim.metrics.registry import MeasureName
@@ -145,24 +144,19 @@ def _means(frame: Any) -> dict[str, Any]:
 
 
 def _gap(frame: Any) -> dict[str, float | None]:
-    """Mean loss under each simulator, how far one's lies from another's relative to it, and the median over items.
+    """Mean loss under each simulator, how far the network's lies from the exact model's, relative, and the items' median.
 
-    None where the other's is 0. It is where nothing is lost: clean speech as it is, in an ear without a loss. Nothing of
-    pyclarity's where that was not installed.
+    None where the exact model's is 0. It is where nothing is lost: clean speech as it is, in an ear without a loss.
     """
-    losses = {name: float(frame[name].mean()) for name in map("loss_{}".format, SIMULATORS) if name in frame}
-    gaps = {
-        f"{one}_to_{other}": losses[f"loss_{one}"] / least - 1.0
-        if (least := losses[f"loss_{other}"])
-        else None
-        for one, other in (("neuro", "msbg"), ("neuro", "pyclarity"), ("msbg", "pyclarity"))
-        if f"loss_{other}" in losses
+    neuro, exact = float(frame.loss_neuro.mean()), float(frame.loss_msbg.mean())
+    known = frame[frame.loss_msbg != 0.0]
+    median = (known.loss_neuro / known.loss_msbg - 1.0).abs().median()
+    return {
+        "loss_neuro": neuro,
+        "loss_msbg": exact,
+        "neuro_to_msbg": neuro / exact - 1.0 if exact else None,
+        "item_median": float(median) if len(known) else None,
     }
-    if "loss_pyclarity" not in losses:
-        return {**losses, **gaps}
-    known = frame[frame.loss_pyclarity != 0.0]
-    median = (known.loss_neuro / known.loss_pyclarity - 1.0).abs().median()
-    return {**losses, **gaps, "item_median": float(median) if len(known) else None}
 
 
 def _peaks(peaks: Any, limit: float | None) -> dict[str, Any]:

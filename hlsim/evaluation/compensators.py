@@ -6,7 +6,6 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
-from importlib.util import find_spec
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -24,7 +23,6 @@ from hlsim.evaluation.compensator_result import MEASURES, compensator_result
 from hlsim.evaluation.haspi_report import HaspiReport
 from hlsim.evaluation.items import INPUT_LEVELS, Item, draw_judged_items, read_ears
 from hlsim.evaluation.judging import (
-    EXACT,
     AtLevelOf,
     Enhanced,
     Equaliser,
@@ -54,7 +52,7 @@ UNAIDED, PRESCRIBED, COMPRESSED = "unaided", "NAL-R", "WDRC"
 
 _EQUALISED = "equaliser at {}'s level"
 
-_REVISION = 2  # of what ``judge`` measures and how it is kept: raise it where that changes
+_REVISION = 3  # of what ``judge`` measures and how it is kept: raise it where that changes
 
 
 @dataclass(frozen=True)
@@ -95,8 +93,7 @@ def evaluate_compensators(
 
     Figures are stored as they are made, by the samples, the ear and the weights that they are of: a run that was
     stopped goes on where it was, one with a compensator more scores that one alone, and one with another simulator
-    computes the surrogate gap alone. Without pyclarity installed the gap under its
-    MSBG is left out. What fails is listed with the reason under ``failures`` of the result.
+    computes the surrogate gap alone. What fails is listed with the reason under ``failures`` of the result.
 
     Args:
         compensators: by name, modules at 16 kHz and 94 dB SPL full scale, called with a waveform and an ear. One with a
@@ -235,10 +232,8 @@ def _judge_all(
     hashed = cache(weights_hash)
     weights = {ear: {name: hashed(module) for name, module in own.items()} for ear, own in conditions.items()}
     network = weights_hash(simulator)
-    # of pyclarity's MSBG, too
-    versions = {**versions_of(MEASURES, "pyclarity"), "hlsim": version_of("hlsim")}
+    versions = {**versions_of(MEASURES, engine), "hlsim": version_of("hlsim")}
     revisions = {name: measure_by(engine, name).revision for name in MEASURES}
-    exact = EXACT if find_spec("clarity") else EXACT[:1]
     trials = []
     by = {"revision": _REVISION, "versions": versions, "engine": engine, "revisions": revisions}
     for number, item in enumerate(items):
@@ -246,7 +241,7 @@ def _judge_all(
         about = {**by, "seed": trial_seed, **item.settings()}
         of = {name: {**about, "weights": found} for name, found in weights[item.ear].items()}
         keys = {name: Keys(key_of(it), key_of({**it, "simulator": network})) for name, it in of.items()}
-        trials.append(Trial(item, conditions[item.ear], simulator, trial_seed, keys, engine, exact))
+        trials.append(Trial(item, conditions[item.ear], simulator, trial_seed, keys, engine))
     if progress is not None:
         parallel["progress"] = lambda done, total: progress(done // 2, total // 2)  # both of an output
     failed = make_missing(

@@ -18,15 +18,10 @@ from hlsim.criteria.bands import audibility, band_centres, band_level_loss, band
 from hlsim.data.foreign import ForeignEnhancer
 from hlsim.dsp.fir import filter_centred
 from hlsim.evaluation.items import Item
-from hlsim.metrics.reference import pyclarity_msbg
 from hlsim.metrics.registry import Engine, measure_by
 from hlsim.msbg import MSBG
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.parallel import Failed, one_thread, reason_of
-
-EXACT = ("msbg", "pyclarity")
-SIMULATORS = ("neuro", *EXACT)
-"""Under which a compensator's loss is told: the named network, hlsim's exact MSBG, pyclarity's where it is installed."""
 
 OF_NETWORK = "loss_neuro"
 """The figure that depends on the named network; no other does."""
@@ -100,8 +95,7 @@ class Trial:
     """An item to be judged as each compensator gives it.
 
     The compensators, by name, and the network are at 16 kHz and 94 dB SPL full scale; ``seed``, the same for all, is of
-    the noise that HASPI and HASQI add; ``keys`` are the figures', by compensator. ``engine`` computes HASPI and HASQI;
-    ``exact`` are those of ``EXACT`` that the loss is told under.
+    the noise that HASPI and HASQI add; ``keys`` are the figures', by compensator. ``engine`` computes HASPI and HASQI.
     """
 
     item: Item
@@ -110,7 +104,6 @@ class Trial:
     seed: int
     keys: Mapping[str, Keys]
     engine: Engine = "hlsim"
-    exact: Sequence[str] = EXACT
 
 
 @one_thread()
@@ -124,13 +117,13 @@ def judge(trial: Trial, missing: Sequence[str]) -> dict[str, dict[str, Any] | Fa
       and all; ``normal_clean``: of the speech in it.
     - ``band_error``: ``band_error_db`` (24 bands, 32 ms) of what the impaired ear hears and what a normal one hears of
       the clean speech, both by the exact MSBG.
-    - ``loss_neuro``, ``loss_msbg``, ``loss_pyclarity``: what ``HearingLossLoss(criterion="bands")`` is under each.
+    - ``loss_neuro``, ``loss_msbg``: what ``HearingLossLoss(criterion="bands")`` is under each.
     """
     item = trial.item
     try:
         normal = {"neuro": _hear(trial, "neuro", item.clean, NORMAL)}
         if any(keys.most in missing for keys in trial.keys.values()):
-            normal |= {name: _hear(trial, name, item.clean, NORMAL) for name in trial.exact}
+            normal["msbg"] = _hear(trial, "msbg", item.clean, NORMAL)
             normal["msbg, of the input"] = _hear(trial, "msbg", item.signal, NORMAL)
     except Exception as error:  # whatever it is, it is this item's reason, and the others go on
         return dict.fromkeys(missing, Failed(reason_of(error)))
@@ -161,16 +154,16 @@ def _figures(trial: Trial, aided: Tensor, normal: Mapping[str, Tensor]) -> dict[
     item = trial.item
     of_pair = (item.clean, aided, item.ear, NEURO_RATE, PASCAL_SPL, trial.seed)
     scores = {name: measure_by(trial.engine, name).score(*of_pair) for name in ("haspi", "hasqi")}
-    heard = {name: _hear(trial, name, aided, item.ear) for name in trial.exact}
+    heard = _hear(trial, "msbg", aided, item.ear)
     return {
         **scores,
         "level": float(level_spl(aided)),
         "peak": peak_spl(aided),
-        "heard": float(level_spl(heard["msbg"])),
+        "heard": float(level_spl(heard)),
         "normal": float(level_spl(normal["msbg, of the input"])),
         "normal_clean": float(level_spl(normal["msbg"])),
-        "band_error": band_error_db(heard["msbg"], normal["msbg"]),
-        **{f"loss_{name}": _loss(heard[name], normal[name]) for name in trial.exact},
+        "band_error": band_error_db(heard, normal["msbg"]),
+        "loss_msbg": _loss(heard, normal["msbg"]),
     }
 
 
@@ -196,8 +189,6 @@ def band_error_db(heard: Tensor, normal: Tensor) -> float:
 
 
 def _hear(trial: Trial, simulator: str, signal: Tensor, ear: Audiogram) -> Tensor:
-    if simulator == "pyclarity":
-        return pyclarity_msbg(signal, ear, NEURO_RATE)
     model = trial.simulator if simulator == "neuro" else MSBG(sample_rate=NEURO_RATE)
     heard: Tensor = model(signal, ear)
     return heard
