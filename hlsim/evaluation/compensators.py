@@ -129,10 +129,17 @@ def evaluate_compensators(
         raise ValueError(f"speech at {wrong[0]:g} dB SPL; allowed: 0 to 120")
     if taken := sorted({UNAIDED, PRESCRIBED, COMPRESSED} & set(compensators)):
         raise ValueError(f"a compensator named {taken[0]!r}; allowed: other names, that one is there anyway")
+    if other := [name for name, aid in compensators.items() if not isinstance(aid, nn.Module)]:
+        kind = type(compensators[other[0]]).__name__
+        raise ValueError(f"compensator {other[0]!r} is {kind}; allowed: a torch.nn.Module")
     if (audiograms is None) == (audiogram is None):
         raise ValueError("give either audiograms, a CSV file of ears, or audiogram, one ear in place of all")
     if audiogram is None:
         ears, shown = read_ears(audiograms), {name: Audiogram.standard(name) for name in gain_ears}
+    elif not isinstance(audiogram, Audiogram):
+        raise ValueError(
+            f"audiogram is {type(audiogram).__name__}; allowed: an Audiogram, Audiogram.standard('N3')"
+        )
     else:
         shown = {f"{' '.join(f'{level:g}' for level in audiogram.levels)} dB HL": audiogram}
         ears = [*shown.items()]

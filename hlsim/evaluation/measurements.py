@@ -18,7 +18,7 @@ from hlsim.data.clips import Clips
 from hlsim.evaluation.judging import NORMAL
 from hlsim.msbg import MSBG
 from hlsim.neuro.config import NEURO_RATE
-from hlsim.parallel import one_thread
+from hlsim.parallel import one_thread, reason_of
 
 UTTERANCES = 6
 """Clips of 3 s of speech that gains are measured on."""
@@ -175,15 +175,27 @@ def samples_ahead(unchanged: Tensor, changed: Iterable[Tensor], places: Iterable
 
 
 def outputs(compensator: nn.Module, signals: Iterable[Tensor], ear: Audiogram, what: str) -> Tensor:
-    """What a compensator gives, one signal at a time; ValueError where it is NaN or infinite, which says of ``what``.
+    """What a compensator gives, one signal at a time.
 
-    Shape: signals of (time,) -> (signals, time).
+    Shape: signals of (time,) -> (signals, time). ValueError, which says of ``what``, where it fails, or gives anything
+    but as many finite samples.
     """
-    with torch.no_grad():
-        aided = torch.stack([compensator(signal, ear) for signal in signals])
-    if not aided.isfinite().all():
-        raise ValueError(f"{what} holds samples that are NaN or infinite")
-    return aided
+    made: list[Tensor] = []
+    for signal in signals:
+        try:
+            with torch.no_grad():
+                aided = compensator(signal, ear)
+        except Exception as error:  # whatever somebody's module raises, and where
+            raise ValueError(f"{what}: {reason_of(error)}") from error
+        if not isinstance(aided, Tensor) or aided.shape != signal.shape:
+            found = tuple(aided.shape) if isinstance(aided, Tensor) else type(aided).__name__
+            raise ValueError(
+                f"{what} is {found}; allowed: a tensor of the input's shape, {tuple(signal.shape)}"
+            )
+        if not aided.isfinite().all():
+            raise ValueError(f"{what} holds samples that are NaN or infinite")
+        made.append(aided)
+    return torch.stack(made)
 
 
 def _heard(sounds: Tensor, ear: Audiogram) -> Tensor:

@@ -186,6 +186,10 @@ def test_gain_curves(speech: list[tuple[Tensor, int]]) -> None:
     assert loud < soft - 6.0
     with pytest.raises(ValueError, match="at 50 dB SPL holds samples that are NaN"):
         insertion_gain(Gain(math.nan), ear, utterances, INPUT_LEVELS)
+    with pytest.raises(ValueError, match=r"at 50 dB SPL: TypeError: .*takes 2 positional arguments"):
+        insertion_gain(nn.ReLU(), ear, utterances, INPUT_LEVELS)
+    with pytest.raises(ValueError, match=r"is \(1,\); allowed: a tensor of the input's shape, \("):
+        insertion_gain(First(), ear, utterances, INPUT_LEVELS)
 
 
 def compare(modules: dict[str, nn.Module], out: Path, **options: Any) -> dict[str, Any]:
@@ -379,6 +383,11 @@ def test_engines_are_kept_apart(tmp_path: Path, speech_dir: Path, monkeypatch: p
     assert {*measured} == {"pyclarity"} and theirs["rows"] == both["rows"] and theirs["engine"] == "pyclarity"
 
 
+class First(Gain):
+    def forward(self, waveform: Tensor, ear: Audiogram) -> Tensor:
+        return waveform[:1]
+
+
 class MutesSoftSpeech(Gain):
     def forward(self, waveform: Tensor, ear: Audiogram) -> Tensor:
         return super().forward(waveform, ear) * (level_spl(waveform) > 57.0)
@@ -476,6 +485,10 @@ def test_nothing_to_judge(tmp_path: Path, speech_dir: Path) -> None:
         compare({"own": Unaided()}, **options)
     with pytest.raises(ValueError, match="0 compensators; allowed: 1 or more"):
         compare({}, **options, audiogram=ear)
+    with pytest.raises(ValueError, match="audiogram is str; allowed: an Audiogram"):
+        compare({"own": Unaided()}, **options, audiogram="N3")
+    with pytest.raises(ValueError, match="'own' is function; allowed"):
+        compare({"own": lambda waveform, ear: waveform}, **options, audiogram=ear)  # type: ignore[dict-item]
     # HASPI takes nothing under 0.7 s
     with pytest.raises(ValueError, match=r"none of 1 items could be judged; the first: .*needs 0.7 s"):
         compare({"own": Unaided()}, **options, audiogram=ear, items=1, seconds=0.5)
