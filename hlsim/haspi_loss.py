@@ -6,7 +6,8 @@ from torch import nn
 
 from hlsim.audiogram.thresholds import AudiogramLike
 from hlsim.calibration import PASCAL_SPL
-from hlsim.loss import EarsName, Hearing, HearingLossLoss, Reduction
+from hlsim.hearing import Hearing
+from hlsim.loss import EarsName, HearingLossLoss, Reduction
 from hlsim.neuro.config import NEURO_RATE
 
 _LEVEL = {"levels": 0.03, "louder": 0.06, "peaks": 1.0}

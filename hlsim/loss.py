@@ -1,14 +1,12 @@
 """A training loss that hears through an impaired ear."""
 
 import math
-import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional
 
 from hlsim.audiogram import FREQUENCIES
 from hlsim.audiogram.thresholds import (
@@ -22,19 +20,13 @@ from hlsim.audiogram.thresholds import (
 from hlsim.calibration import PASCAL_SPL, check_full_scale, gain_to_pascals
 from hlsim.checks import Lengths, check_choice, check_lengths, check_rate, check_waveform, silent_after
 from hlsim.criteria import coherent_bands, paper
-from hlsim.criteria.bands import HIGHEST, band_level_loss
+from hlsim.criteria.bands import band_level_loss
 from hlsim.criteria.choice import Criterion, check_criterion, check_values, check_weights
-from hlsim.dsp.resample import resample
+from hlsim.hearing import FrozenEar, Hearing, ReferenceName, moved
 from hlsim.metrics.interaural import interaural_loss
 from hlsim.metrics.objective import SCORES, missing_score
-from hlsim.msbg import MSBG
-from hlsim.msbg.response import hear_normally, with_phase_of_bank
-from hlsim.neuro import NeuroMSBG
 from hlsim.neuro.config import NEURO_RATE
-from hlsim.pretrained import SIMULATOR, find_checkpoint, load_pretrained
 from hlsim.torchtools import not_compiled
-
-ReferenceName = Literal["clean", "normal-hearing"]
 
 Reduction = Literal["mean", "none"]
 
@@ -44,9 +36,6 @@ _GIVEN = {*SCORES, "interaural"}  # of what the ears are given, not of what they
 
 TEMPERATURE = 0.1
 """Temperature of ``ears="better"``: an ear whose loss is 0.1 less than the other's counts 2.7 times as much."""
-
-Hearing = Callable[[Tensor], Tensor]
-"""(..., time) -> (..., time), as a normal ear hears."""
 
 
 class HearingLossLoss(nn.Module):
@@ -121,41 +110,40 @@ class HearingLossLoss(nn.Module):
             check_choice("reference", reference, ReferenceName)
         check_choice("reduction", reduction, Reduction)
         check_choice("ears", ears, EarsName)
-        if normal is not None and not callable(normal):
-            raise ValueError(
-                f"normal is {type(normal).__name__}; allowed: a module or callable (waveform) -> waveform"
-            )
-        self.reference, self.reduction, self.ears = reference, reduction, ears
+        self.reduction, self.ears = reduction, ears
         self._two_ears = of_listeners(audiogram)
         self.criteria = check_criterion(criterion)
         self.weights = check_weights(weights, self.criteria, criterion)
         with torch.device("cpu"):  # where the host is made on ``meta``, nobody gives the ear its values later
             thresholds = own_thresholds(audiogram, missing=True)
-        built = _build(simulator, self.sample_rate, self.full_scale_spl).eval().requires_grad_(False)
-        if isinstance(normal, nn.Module):
-            normal.eval().requires_grad_(False)
+        self._ear = FrozenEar(simulator, self.sample_rate, self.full_scale_spl, normal, reference)
         # in a tuple, nn.Module does not see them
-        self._unregistered = (built, thresholds, normal, criterion)
+        self._unregistered = (thresholds, criterion)
 
     @property
     def criterion(self) -> Criterion:
         """The criterion, as it was given."""
-        return self._unregistered[3]
+        return self._unregistered[1]
 
     @property
     def simulator(self) -> nn.Module:
         """The simulator, frozen."""
-        return self._unregistered[0]
+        return self._ear.simulator
 
     @property
     def normal(self) -> Hearing | None:
         """The normal ear given to the constructor."""
-        return self._unregistered[2]
+        return self._ear.normal
+
+    @property
+    def reference(self) -> ReferenceName | None:
+        """The reference given to the constructor."""
+        return self._ear.choice
 
     @property
     def thresholds(self) -> Tensor | None:
         """The ear or ears given to the constructor. Shape: (..., 8) dB HL, NaN of a listener's missing ear."""
-        return self._unregistered[1]
+        return self._unregistered[0]
 
     @not_compiled  # a compiled caller calls it as it is
     def forward(
@@ -216,11 +204,11 @@ class HearingLossLoss(nn.Module):
             output = given
             if {"coherent-bands", *SCORES} & self.criteria.keys():
                 given = coherent_bands.without_spikes(given, self.sample_rate)
-            heard = self._hear(given, ears, listener, ends)
+            heard = self._ear.hear(given, ears, listener, ends)
             batch, time = heard.shape[:-1], heard.shape[-1]
             signals = {"heard": heard, "given": given.expand_as(heard), "output": output.expand_as(heard)}
             for name in [name for name in self.criteria if name not in _GIVEN]:
-                signals[name] = self._reference(name, clean, ears, batch, listener, ends)
+                signals[name] = self._ear.reference(name, clean, ears, batch, listener, ends)
             gain = gain_to_pascals(self.full_scale_spl)
             signals = {name: signal.reshape(-1, time) * gain for name, signal in signals.items()}
             if ends is None or bool((ends == time).all()):
@@ -264,8 +252,8 @@ class HearingLossLoss(nn.Module):
         """
         given, clean, ears, ends, _ = self._check(compensated, clean, audiogram, lengths)
         with torch.autocast(given.device.type, enabled=False):
-            heard = self._hear(given, ears, listener, ends)
-            reference = self._reference("criterion", clean, ears, heard.shape[:-1], listener, ends)
+            heard = self._ear.hear(given, ears, listener, ends)
+            reference = self._ear.reference("criterion", clean, ears, heard.shape[:-1], listener, ends)
             if ends is not None:
                 heard, reference = silent_after(heard, ends), silent_after(reference, ends)
             gain = gain_to_pascals(self.full_scale_spl)
@@ -346,188 +334,14 @@ class HearingLossLoss(nn.Module):
                 items["band_levels"] = band_level_loss(heard, aim, self.sample_rate)
             elif name == "paper":
                 stft = paper.paper_stft(self.sample_rate)
-                items |= paper.paper_parts(heard, aim, stft, self._frequencies(stft.fft))
+                items |= paper.paper_parts(heard, aim, stft, self._ear.frequencies(stft.fft))
             else:
                 items[name] = check_values(criterion(heard, aim), len(heard))
         return items
 
-    def _hear(
-        self,
-        waveform: Tensor,
-        thresholds: Tensor,
-        listener: Mapping[str, Any] | None,
-        ends: Tensor | None = None,
-    ) -> Tensor:
-        weight = next(self.simulator.parameters(), None)
-        if weight is not None and weight.device != waveform.device:
-            raise ValueError(
-                f"the speech is on {waveform.device} and the simulator on {weight.device}; move the loss with .to()"
-            )
-        allowed = _batches(waveform.shape[:-1], thresholds.shape[:-1])
-        apart = not listener and len(allowed) == 2 and self._holds(NeuroMSBG)
-        if apart and ends is not None and bool((ends != waveform.shape[-1]).any()):
-            return self._hear_to_ends(waveform, thresholds, ends.expand(allowed[1]))
-        more = {
-            name: value.to(waveform.device) if isinstance(value, Tensor) else value
-            for name, value in (listener or {}).items()
-        }
-        try:
-            heard = self.simulator(waveform, thresholds, **more)
-        except (RuntimeError, NotImplementedError) as error:
-            if torch._C._functorch.maybe_current_level() is None:
-                raise
-            raise ValueError(
-                f"{type(self.simulator).__name__} does not go through this transform of torch.func; allowed: grad, and "
-                "with simulator='msbg' jvp and, of all criteria but 'bands', vmap"
-            ) from error
-        return _check_heard(heard, "simulator", waveform, allowed)
-
-    def _hear_to_ends(self, waveform: Tensor, thresholds: Tensor, ends: Tensor) -> Tensor:
-        """``_hear``, items of one length at a time: to a network, silence after an end is not the end itself.
-
-        Shape: (..., time), (..., 8), (*batch) -> (*batch, time), zeros after each item's end.
-        """
-        batch, time, places = ends.shape, waveform.shape[-1], ends.flatten()
-        items = waveform.expand(*batch, -1).reshape(-1, time)
-        ears = thresholds.expand(*batch, -1).reshape(-1, len(FREQUENCIES))
-        heard: dict[int, Tensor] = {}
-        for end in places.unique().tolist():
-            members = (places == end).nonzero().flatten()
-            chosen = members.to(items.device)
-            alone = self._hear(items[chosen, :end], ears[chosen], None)
-            heard |= zip(members.tolist(), functional.pad(alone, (0, time - end)), strict=True)
-        return torch.stack([heard[item] for item in range(len(items))]).reshape(*batch, time)
-
-    def _reference(
-        self,
-        kind: str,
-        clean: Tensor,
-        ears: Tensor,
-        batch: torch.Size,
-        listener: Mapping[str, Any] | None,
-        ends: Tensor | None,
-    ) -> Tensor:
-        """What the heard is compared with. Shape: (..., time), (..., 8) -> (*batch, time).
-
-        Args:
-            kind: ``bands``, ``paper``, ``coherent-bands``, or of another criterion.
-        """
-        time, ours, choice = clean.shape[-1], self._holds(MSBG, NeuroMSBG), self.reference
-        if kind in ("coherent-bands", "bands"):
-            choice = "normal-hearing"
-        elif choice is None:
-            choice = "clean" if kind == "paper" else "normal-hearing"
-        if ours:
-            ears = (
-                ears.expand(*batch, -1).reshape(-1, len(FREQUENCIES)) if ears.ndim > 1 else ears.unsqueeze(0)
-            )
-        with torch.set_grad_enabled(torch.is_grad_enabled() and clean.requires_grad):
-            if choice == "clean":
-                aim = self._narrowed(clean)
-            elif self.normal is not None:
-                aim = _check_heard(self.normal(clean), "normal ear", clean, [clean.shape[:-1]])
-                return aim.expand(*batch, time)
-            elif ours and kind not in ("bands", "paper"):
-                items = self._narrowed(clean).expand(*batch, time).reshape(-1, time)
-                return hear_normally(items, ears, self.sample_rate).reshape(*batch, time)
-            else:
-                aim = self._hear(clean, clean.new_zeros(len(FREQUENCIES)), listener, ends)
-            if kind == "bands" or not ours:
-                return aim.expand(*batch, time)
-            aim = aim.expand(*batch, time).reshape(-1, time)
-            normal = choice == "normal-hearing"
-            return with_phase_of_bank(aim, ears, self.sample_rate, normal=normal).reshape(*batch, time)
-
-    def _narrowed(self, clean: Tensor) -> Tensor:
-        """In the same band as what is heard."""
-        if not self._narrow:
-            return clean
-        low = resample(clean, self.sample_rate, NEURO_RATE)
-        return resample(low, NEURO_RATE, self.sample_rate)[..., : clean.shape[-1]]
-
-    def _holds(self, *kinds: type[nn.Module]) -> bool:
-        """Whether the simulator is one of these or, compiled or in somebody's module, holds one."""
-        return any(isinstance(module, kinds) for module in self.simulator.modules())
-
-    @property
-    def _narrow(self) -> bool:
-        """Whether the simulator leaves part of the band out."""
-        return self.sample_rate > NEURO_RATE and self._holds(NeuroMSBG)
-
-    def _frequencies(self, fft: int) -> int | None:
-        """Number of the transform's frequencies to compare: those that the simulator gives back."""
-        return int(HIGHEST * fft / self.sample_rate) + 1 if self._narrow else None
-
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> "HearingLossLoss":
         super()._apply(fn, recurse)
-        for kept in self._unregistered:
-            if isinstance(kept, nn.Module):
-                kept._apply(lambda tensor: _moved(fn, tensor))
+        self._ear.apply(fn)
+        if isinstance(self.criterion, nn.Module):
+            self.criterion._apply(lambda tensor: moved(fn, tensor))
         return self
-
-
-def _batches(items: torch.Size, ears: torch.Size) -> list[torch.Size]:
-    """Leading dimensions that what is heard may have.
-
-    Raises:
-        ValueError: ears broadcast so that each item is heard with each ear: (batch, 1) items, (batch,) ears.
-    """
-    try:
-        together = torch.broadcast_shapes(items, ears)
-    except RuntimeError:  # the simulator's to refuse
-        return [items]
-    if math.prod(together) > max(math.prod(items), math.prod(ears)):
-        raise ValueError(
-            f"audiograms of shape {(*ears, len(FREQUENCIES))} would pair each item of {tuple(items)} with each ear; "
-            f"allowed: one audiogram, or one an item: {(*items, len(FREQUENCIES))}"
-        )
-    return [items, together]
-
-
-def _moved(fn: Callable[[Tensor], Tensor], tensor: Tensor) -> Tensor:
-    """Move a tensor of the simulator with its host, but never to half precision, which it does not work in.
-
-    Its values stay: where the host goes to ``meta`` it stays too, and follows when ``to_empty`` calls the host back.
-    """
-    moved = fn(tensor)
-    device = tensor.device if moved.is_meta else moved.device
-    halved = moved.is_floating_point() and moved.dtype not in (torch.float32, torch.float64)
-    return tensor.to(device) if halved else tensor.to(device, moved.dtype)
-
-
-def _build(simulator: str | Path | nn.Module, sample_rate: int, full_scale_spl: float) -> nn.Module:
-    if isinstance(simulator, nn.Module):
-        for name, own in (("sample_rate", sample_rate), ("full_scale_spl", full_scale_spl)):
-            if getattr(simulator, name, own) != own:
-                raise ValueError(
-                    f"the simulator has {name} {getattr(simulator, name):g} and the loss {own:g}; allowed: the same"
-                )
-        if getattr(simulator, "aligned", True) is False:
-            raise ValueError(
-                "the simulator delays what it hears; allowed: one that does not, as MSBG(aligned=True)"
-            )
-        return simulator
-    if not isinstance(simulator, str | os.PathLike):
-        raise ValueError(
-            f"simulator is {type(simulator).__name__}; allowed: a name, a folder or a module (not its class)"
-        )
-    if str(simulator) == "msbg":
-        return MSBG(sample_rate=sample_rate, full_scale_spl=full_scale_spl)
-    folder = find_checkpoint(simulator, [SIMULATOR], ("msbg",))
-    return load_pretrained(folder, sample_rate=sample_rate, full_scale_spl=full_scale_spl)
-
-
-def _check_heard(heard: Any, what: str, waveform: Tensor, allowed: list[torch.Size]) -> Tensor:
-    """What a simulator or normal ear returned, or ValueError unless it is a waveform like the one that it was given."""
-    check_waveform(heard, f"what the {what} returned", highest=math.inf)
-    if heard.shape[:-1] not in allowed:
-        raise ValueError(
-            f"the {what} made shape {tuple(heard.shape)} of {tuple(waveform.shape)}; allowed: one that keeps the "
-            "shape, or broadcasts it with the audiograms'"
-        )
-    if heard.shape[-1] != waveform.shape[-1]:
-        raise ValueError(
-            f"the {what} made {heard.shape[-1]} samples of {waveform.shape[-1]}; allowed: one that keeps the "
-            "length, as MSBG(aligned=True)"
-        )
-    return heard

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, fields
 from typing import Any, ClassVar, Literal, Self
 
 from hlsim.checks import refuse_other_kinds, refuse_seed, refuse_unknown, refuse_weights
-from hlsim.loss import ReferenceName
+from hlsim.hearing import ReferenceName
 from hlsim.metrics.pair import SHORTEST_SECONDS
 
 _WHERE = "in the recipe"
