@@ -149,15 +149,17 @@ class HearingAid(Wearable):
         config = self.config
         seen = torch.cat((levels[..., : self.bands], levels[..., self.bands + 1 :]), -1)
         entered = torch.tanh(self.enter((seen - 40.0) / 20.0))
-        hidden, cell = state["hidden"].movedim(1, 0).contiguous().unsqueeze(1).unbind()
+        hidden, cell = state["hidden"].unbind(1)
         if entered.shape[1] == 1:  # a stream's: the LSTM would repack its weights for one frame
-            hidden, cell = torch.lstm_cell(entered[:, 0], (hidden[0], cell[0]), *self.recur.all_weights[0])
-            recalled, hidden, cell = hidden.unsqueeze(1), hidden.unsqueeze(0), cell.unsqueeze(0)
+            hidden, cell = torch.lstm_cell(entered[:, 0], (hidden, cell), *self.recur.all_weights[0])
+            recalled = hidden.unsqueeze(1)
         else:
-            recalled, (hidden, cell) = self.recur(entered, (hidden, cell))
+            before = (hidden.unsqueeze(0).contiguous(), cell.unsqueeze(0).contiguous())
+            recalled, (hidden, cell) = self.recur(entered, before)
+            hidden, cell = hidden.squeeze(0), cell.squeeze(0)
         taken = -config.reduction_db * torch.sigmoid(self.leave(torch.cat((recalled, entered), -1)))
         taken, kept = follow_peaks(taken, state["attenuation"], decay(config.opening), decay(config.closing))
-        return taken, {"attenuation": kept, "hidden": torch.cat((hidden, cell)).movedim(0, 1)}
+        return taken, {"attenuation": kept, "hidden": torch.stack((hidden, cell), 1)}
 
     def extra_repr(self) -> str:
         return f"sample_rate={self.sample_rate}, full_scale_spl={self.full_scale_spl:g}"

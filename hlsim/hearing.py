@@ -170,9 +170,8 @@ class FrozenEar:
 
     def apply(self, fn: Callable[[Tensor], Tensor]) -> None:
         """Move the modules, as ``nn.Module._apply`` does."""
-        for module in (self.simulator, self.normal):
-            if isinstance(module, nn.Module):
-                module._apply(lambda tensor: moved(fn, tensor))
+        move(self.simulator, fn)
+        move(self.normal, fn)
 
 
 def _batches(items: torch.Size, ears: torch.Size) -> list[torch.Size]:
@@ -193,7 +192,13 @@ def _batches(items: torch.Size, ears: torch.Size) -> list[torch.Size]:
     return [items, together]
 
 
-def moved(fn: Callable[[Tensor], Tensor], tensor: Tensor) -> Tensor:
+def move(kept: object, fn: Callable[[Tensor], Tensor]) -> None:
+    """Move what is kept unregistered with its host, if it is a module."""
+    if isinstance(kept, nn.Module):
+        kept._apply(lambda tensor: _moved(fn, tensor))
+
+
+def _moved(fn: Callable[[Tensor], Tensor], tensor: Tensor) -> Tensor:
     """Move a tensor of a simulator with its host, but never to half precision, which it does not work in.
 
     Its values stay: where the host goes to ``meta`` it stays too, and follows when ``to_empty`` calls the host back.

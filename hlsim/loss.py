@@ -22,7 +22,7 @@ from hlsim.checks import Lengths, check_choice, check_lengths, check_rate, check
 from hlsim.criteria import coherent_bands, paper
 from hlsim.criteria.bands import band_level_loss
 from hlsim.criteria.choice import Criterion, check_criterion, check_values, check_weights
-from hlsim.hearing import FrozenEar, Hearing, ReferenceName, moved
+from hlsim.hearing import FrozenEar, Hearing, ReferenceName, move
 from hlsim.metrics.interaural import interaural_loss
 from hlsim.metrics.objective import SCORES, missing_score
 from hlsim.neuro.config import NEURO_RATE
@@ -342,6 +342,5 @@ class HearingLossLoss(nn.Module):
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> "HearingLossLoss":
         super()._apply(fn, recurse)
         self._ear.apply(fn)
-        if isinstance(self.criterion, nn.Module):
-            self.criterion._apply(lambda tensor: moved(fn, tensor))
+        move(self.criterion, fn)
         return self

@@ -129,9 +129,9 @@ def evaluate_compensators(
         raise ValueError(f"speech at {wrong[0]:g} dB SPL; allowed: 0 to 120")
     if taken := sorted({UNAIDED, PRESCRIBED, COMPRESSED} & set(compensators)):
         raise ValueError(f"a compensator named {taken[0]!r}; allowed: other names, that one is there anyway")
-    if other := [name for name, aid in compensators.items() if not isinstance(aid, nn.Module)]:
-        kind = type(compensators[other[0]]).__name__
-        raise ValueError(f"compensator {other[0]!r} is {kind}; allowed: a torch.nn.Module")
+    for name, aid in compensators.items():
+        if not isinstance(aid, nn.Module):
+            raise ValueError(f"compensator {name!r} is {type(aid).__name__}; allowed: a torch.nn.Module")
     if (audiograms is None) == (audiogram is None):
         raise ValueError("give either audiograms, a CSV file of ears, or audiogram, one ear in place of all")
     if audiogram is None:

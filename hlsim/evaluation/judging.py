@@ -121,10 +121,10 @@ def judge(trial: Trial, missing: Sequence[str]) -> dict[str, dict[str, Any] | Fa
     """
     item = trial.item
     try:
-        normal = {"neuro": _hear(trial, "neuro", item.clean, NORMAL)}
+        normal = {"neuro": trial.simulator(item.clean, NORMAL)}
         if any(keys.most in missing for keys in trial.keys.values()):
-            normal["msbg"] = _hear(trial, "msbg", item.clean, NORMAL)
-            normal["msbg, of the input"] = _hear(trial, "msbg", item.signal, NORMAL)
+            normal["msbg"] = _hear(item.clean, NORMAL)
+            normal["msbg, of the input"] = _hear(item.signal, NORMAL)
     except Exception as error:  # whatever it is, it is this item's reason, and the others go on
         return dict.fromkeys(missing, Failed(reason_of(error)))
     made: dict[str, dict[str, Any] | Failed] = {}
@@ -136,7 +136,7 @@ def judge(trial: Trial, missing: Sequence[str]) -> dict[str, dict[str, Any] | Fa
             records: dict[str, dict[str, Any]] = (
                 {keys.most: _figures(trial, aided, normal)} if keys.most in wanted else {}
             )
-            of_network = _loss(_hear(trial, "neuro", aided, item.ear), normal["neuro"])
+            of_network = _loss(trial.simulator(aided, item.ear), normal["neuro"])
             records[keys.of_network] = {OF_NETWORK: of_network}
             figures = {figure: value for record in records.values() for figure, value in record.items()}
             if unknown := [figure for figure, value in figures.items() if not math.isfinite(value)]:
@@ -154,7 +154,7 @@ def _figures(trial: Trial, aided: Tensor, normal: Mapping[str, Tensor]) -> dict[
     item = trial.item
     of_pair = (item.clean, aided, item.ear, NEURO_RATE, PASCAL_SPL, trial.seed)
     scores = {name: measure_by(trial.engine, name).score(*of_pair) for name in ("haspi", "hasqi")}
-    heard = _hear(trial, "msbg", aided, item.ear)
+    heard = _hear(aided, item.ear)
     return {
         **scores,
         "level": float(level_spl(aided)),
@@ -188,7 +188,7 @@ def band_error_db(heard: Tensor, normal: Tensor) -> float:
     return float((levels - truth).abs()[audible].double().quantile(0.5))
 
 
-def _hear(trial: Trial, simulator: str, signal: Tensor, ear: Audiogram) -> Tensor:
-    model = trial.simulator if simulator == "neuro" else MSBG(sample_rate=NEURO_RATE)
-    heard: Tensor = model(signal, ear)
+def _hear(signal: Tensor, ear: Audiogram) -> Tensor:
+    """What the exact MSBG makes of it."""
+    heard: Tensor = MSBG(sample_rate=NEURO_RATE)(signal, ear)
     return heard
