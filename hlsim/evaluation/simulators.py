@@ -17,6 +17,7 @@ from hlsim.audiogram import SEVERITIES
 from hlsim.data.foreign import ForeignTeacher
 from hlsim.data.teacher import Reference, find_teacher
 from hlsim.evaluation.items import LEVELS, Input, Item, draw_items, treat
+from hlsim.evaluation.statistics import paired_comparison
 from hlsim.evaluation.store import ScoreStore, key_of, weights_hash
 from hlsim.extras import MissingExtraError, require
 from hlsim.metrics.fidelity import (
@@ -50,8 +51,8 @@ _REVISION = 2  # of what is measured: raise it where that changes a figure
 @dataclass(frozen=True)
 class SimulatorEvaluation:
     """What ``fidelity.json`` holds: the settings, and of each of ``simulators`` the ``items`` and, by each of ``inputs``,
-    their summary; the item of the spectrograms; and what is heard of it by the truth and by each simulator, by name,
-    (time,) in pascals at 16 kHz.
+    their summary and, of all but the first, ``snr_over_first``, a ``PairedComparison``; the item of the spectrograms; and
+    what is heard of it by the truth and by each simulator, by name, (time,) in pascals at 16 kHz.
     """
 
     result: dict[str, Any]
@@ -136,11 +137,14 @@ def evaluate_simulators(
         scores = scored.get(key) or {"reasons": [failed[key]]}
         return {"item": number // len(inputs), **item.about, **scores}
 
-    entries = {}
+    entries: dict[str, dict[str, Any]] = {}
     for name in simulators:
         rows = [row(number, item, keys[name]) for number, (item, keys) in enumerate(tasks)]
         of = {given: [row for row in rows if row["input"] == given] for given in inputs}
         entries[name] = {"inputs": {given: summarise(part) for given, part in of.items()}, "items": rows}
+    first, *others = entries.values()
+    for entry in others:
+        entry["snr_over_first"] = {given: _snr_over(first, entry, given) for given in inputs}
     result = {"teacher": told, "items": items, "seconds": seconds, "seed": seed}
     result |= {"levels": [*levels], "inputs": [*inputs], "simulators": entries}
     shown, truth = _shown([item for item, _ in tasks], reference)
@@ -150,6 +154,14 @@ def evaluate_simulators(
             heard = simulator(shown.signal, shown.ear)
             heard_of |= {name: heard} if heard.isfinite().all() else {}
     return SimulatorEvaluation(result, shown, heard_of)
+
+
+def _snr_over(first: Mapping[str, Any], other: Mapping[str, Any], given: Input) -> dict[str, Any] | None:
+    """A paired comparison of the SNR of those items of an input that both have one of; None where there is none."""
+    rows = zip(first["items"], other["items"], strict=True)
+    both = [(one.get("snr"), two.get("snr")) for one, two in rows if one["input"] == given]
+    pairs = [pair for pair in both if None not in pair]
+    return paired_comparison(*zip(*pairs, strict=True)).to_dict() if pairs else None
 
 
 def _score_item(

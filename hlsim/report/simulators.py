@@ -15,11 +15,12 @@ from torch import Tensor
 
 from hlsim.audiogram import SEVERITIES
 from hlsim.evaluation.items import Item
+from hlsim.evaluation.statistics import PairedComparison
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.report.page import Picture, Section, render_markdown, render_page, write_files
 from hlsim.report.pictures import draw_svg, legend, scatter
 from hlsim.report.spectrograms import composite, panels, pictures
-from hlsim.report.tables import Table, inner, loss_name, number
+from hlsim.report.tables import Table, inner, loss_name, number, paired_cells
 
 FILES = ("fidelity.json", "fidelity.md", "fidelity.html", "spectrograms.png")
 
@@ -97,7 +98,8 @@ def _about(result: Row) -> str:
 
 def _sections(result: Row, spectrograms: Sequence[Picture], shown: Item) -> list[Section]:
     sections = [
-        Section(_INPUT_TITLES[given], tables=[side_by_side(result, given)]) for given in result["inputs"]
+        Section(_INPUT_TITLES[given], tables=[side_by_side(result, given), *_over_first(result, given)])
+        for given in result["inputs"]
     ]
     about = (
         f"{_INPUT_TITLES[shown.about['input']]}, {shown.about['condition']}, {shown.about['level']:g} dB SPL, "
@@ -128,6 +130,15 @@ def side_by_side(result: Row, given: str) -> Table:
     """The paper's Table I and our columns: a row a simulator, over all items of one input."""
     figures = {name: entry["inputs"][given]["overall"] for name, entry in result["simulators"].items()}
     return _table("Simulators side by side", "Simulator", figures)
+
+
+def _over_first(result: Row, given: str) -> list[Table]:
+    """Whether the others are nearer than the first: a row each, paired over the items of one input."""
+    first, *others = result["simulators"].items()
+    found = {name: entry["snr_over_first"][given] for name, entry in others}
+    compared = {name: PairedComparison(**paired) for name, paired in found.items() if paired}
+    rows = [{"Simulator": name, "n": str(c.n)} | paired_cells(c) for name, c in compared.items()]
+    return [Table.of(f"SNR (dB) less that of {first[0]}, mean over the items", rows)] if rows else []
 
 
 def summary_tables(summary: Row) -> list[Table]:

@@ -157,7 +157,7 @@ class FailsOnHardEars(torch.nn.Module):
 def test_what_a_simulator_fails_on_is_told(tmp_path: Path, speech_dir: Path, ears: Path) -> None:
     failing = {how: FailsOnHardEars(how) for how in ("raise", "nan", "silent")}
     result = compare(
-        {"identity": Unimpaired(), **failing},
+        {"identity": Unimpaired(), **failing, "exact": MSBG(sample_rate=16000)},
         speech=speech_dir / "valid",
         audiograms=ears,
         out=tmp_path,
@@ -168,15 +168,25 @@ def test_what_a_simulator_fails_on_is_told(tmp_path: Path, speech_dir: Path, ear
     whole = {name: entry["inputs"]["as-is"]["overall"] for name, entry in result["simulators"].items()}
     hard = sum(row["severity"] == "severe" for row in result["simulators"]["identity"]["items"])
     assert 0 < hard < 8 and all(figures["n"] == 8 for figures in whole.values())
-    assert [whole[name]["snr_n"] for name in whole] == [8, 8 - hard, 8 - hard, 8]
-    assert [whole[name]["stoi_n"] for name in whole] == [8, 8 - hard, 8 - hard, 8 - hard]
+    assert [whole[name]["snr_n"] for name in whole] == [8, 8 - hard, 8 - hard, 8, 8]
+    assert [whole[name]["stoi_n"] for name in whole] == [8, 8 - hard, 8 - hard, 8 - hard, 8]
     text = (tmp_path / "fidelity.md").read_text()
     failures = text[text.index("## Failures") :]
     assert failures.count("RuntimeError: not that ear") == failures.count("NaN or infinite") == hard
     assert failures.count("| silent |") == 2 * hard and "identity" not in failures
     assert f"({8 - hard} of 8)" in text and "not that ear" in (tmp_path / "fidelity.html").read_text()
+    # against the first, over the items that both have
+    exact = result["simulators"]["exact"]
+    assert "snr_over_first" not in result["simulators"]["identity"]
+    over = exact["snr_over_first"]["as-is"]
+    snr = [[row["snr"] for row in result["simulators"][name]["items"]] for name in ("identity", "exact")]
+    gains = [after - before for before, after in zip(*snr, strict=True)]
+    assert over["n"] == 8 and over["delta"] == pytest.approx(sum(gains) / 8)
+    assert min(gains) < over["ci_low"] < over["delta"] < over["ci_high"] < max(gains)
+    assert result["simulators"]["nan"]["snr_over_first"]["as-is"]["n"] == 8 - hard
+    assert "SNR (dB) less that of identity" in text and f"| exact | 8 | {over['delta']:+.3f} [" in text
     # what failed is not stored, but tried again
-    assert len((tmp_path / "scores.jsonl").read_text().splitlines()) == 4 * 8 - 2 * hard
+    assert len((tmp_path / "scores.jsonl").read_text().splitlines()) == 5 * 8 - 2 * hard
 
 
 def test_what_the_truth_fails_on_is_told_and_is_no_picture(
