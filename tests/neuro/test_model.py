@@ -13,7 +13,7 @@ from hlsim.criteria.waveform import noise_to_signal_db
 from hlsim.data.ears import draw_thresholds
 from hlsim.dsp.resample import resample
 from hlsim.neuro import NeuroConfig
-from hlsim.neuro.blocks import BidirectionalLSTM, SequencePath
+from hlsim.neuro.blocks import BidirectionalLSTM, EncoderLayer, SequencePath
 from hlsim.neuro.network import EarNetwork
 
 N3 = Audiogram.standard("N3")
@@ -314,9 +314,10 @@ def test_a_waveform_on_another_device_is_named() -> None:
         model(torch.zeros(4000, device="meta"), Audiogram.standard("N3"))
 
 
-def test_an_lstm_stays_in_float32_under_autocast() -> None:
+@pytest.mark.parametrize("core", [BidirectionalLSTM(8, 4), EncoderLayer(8, 2, 16)], ids=["lstm", "attention"])
+def test_what_stays_in_float32_under_autocast(core: torch.nn.Module) -> None:
     torch.manual_seed(0)
-    path = SequencePath(8, 0, BidirectionalLSTM(8, 4), 8)
+    path = SequencePath(8, 0, core, 8)
     seen: list[torch.dtype] = []
     path.core.register_forward_hook(lambda core, given, output: seen.append(output.dtype))
     features = torch.randn(1, 12, 3, 8)
