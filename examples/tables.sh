@@ -42,7 +42,7 @@ compare() { # name of the table, options of evaluate-simulator, --, rows
     shift
     while [[ $1 != -- ]]; do options+=("$1") && shift; done
     shift
-    for row; do checkpoints+=("$out/$(folder "$row")/checkpoint"); done
+    for row; do checkpoints+=("$(folder "$row")=$out/$(folder "$row")/checkpoint"); done
     hlsim evaluate-simulator "${checkpoints[@]}" --speech "$corpora/speech/valid" --noise "$corpora/noise/valid" \
         --audiograms "$corpora/audiograms/valid.csv" --items "$items" --out "$out/$table" "${options[@]}"
 }

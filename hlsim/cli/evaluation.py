@@ -17,10 +17,11 @@ def evaluate_simulator(parser: Parser) -> None:
     parser.runs(
         _evaluate_simulator,
         "neuro-msbg neuro-msbg-cnn --speech speech/valid --audiograms ears.csv --out judged",
-        "runs/simulator/checkpoint --teacher msbg --speech speech/valid --audiograms ears.csv --out judged",
+        "mine=runs/simulator/checkpoint --teacher msbg --speech speech/valid --audiograms ears.csv --out judged",
     )
     option = parser.option
-    option("names", str, "checkpoints, by name or folder, or msbg (exact)", nargs="+", metavar="NAME")
+    text = "checkpoints, by name or folder, or msbg (exact); LABEL=FOLDER is LABEL in the tables"
+    option("names", str, text, nargs="+", metavar="NAME")
     option("--speech", Path, "folder of clean speech", required=True)
     option("--audiograms", Path, EARS_TABLE, required=True)
     option("--noise", Path, "folder of noises; every second item is then noisy")
@@ -36,8 +37,9 @@ def evaluate_simulator(parser: Parser) -> None:
 
 
 def _evaluate_simulator(options: argparse.Namespace) -> None:
-    if len(set(options.names)) < len(options.names):
-        raise ValueError(f"simulators {', '.join(options.names)}; allowed: each once")
+    named = dict(map(labelled, options.names))
+    if len(named) < len(options.names):
+        raise ValueError(f"simulators {', '.join(options.names)}; allowed: one a label")
     if options.compensator and "compensated" not in options.inputs:
         raise ValueError("--compensator without --inputs compensated; allowed: only with it")
     need("eval", "pystoi", "pesq", "pandas", "matplotlib")
@@ -54,7 +56,7 @@ def _evaluate_simulator(options: argparse.Namespace) -> None:
         "compensator": load_compensator(options.compensator) if options.compensator else None,
         "progress": show_progress("items"),
     }
-    simulators = {name: read_simulator(name, NEURO_RATE) for name in options.names}
+    simulators = {label: read_simulator(name, NEURO_RATE) for label, name in named.items()}
     done = evaluate_simulators(simulators, **passed(options, evaluate_simulators, **instead))
     write_fidelity(done.result, done.heard, done.shown, options.out)
     print((options.out / "fidelity.md").read_text(encoding="utf-8"))
