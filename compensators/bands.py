@@ -126,7 +126,6 @@ def level_db(powers: Tensor) -> Tensor:
     return 10.0 * torch.log10(powers + _LEAST) + PASCAL_SPL
 
 
-@lru_cache(maxsize=8)
 def speech_levels(count: int) -> tuple[float, ...]:
     """Level in dB SPL of average speech at 65 dB SPL in each band."""
     hz = np.arange(1, _GRID // 2 + 1) * RATE / _GRID

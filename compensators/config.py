@@ -32,12 +32,9 @@ class MappingConfig(NetworkConfig):
         super().__post_init__()
         if self.start != "nalr" and not (isinstance(self.start, float | int) and 0.0 <= self.start <= 1.0):
             raise ValueError(f"start is {self.start!r}; allowed: 'nalr', or a share of the loss from 0 to 1")
-        if type(self.bands) is not int or not 4 <= self.bands <= 40:
-            raise ValueError(f"bands is {self.bands!r}; allowed: whole numbers from 4 to 40")
+        refuse_outside({"bands": (self.bands, 4, 40), "limit_spl": (self.limit_spl, 60.0, 140.0)})
         if not (is_finite(self.reach_db) and 0.0 < self.reach_db <= 60.0):
             raise ValueError(f"reach_db is {self.reach_db!r}; allowed: more than 0, to 60 dB")
-        if not (is_finite(self.limit_spl) and 60.0 <= self.limit_spl <= 140.0):
-            raise ValueError(f"limit_spl is {self.limit_spl!r}; allowed: 60 to 140 dB SPL")
 
 
 @dataclass(frozen=True)
@@ -75,36 +72,29 @@ class HearingAidConfig(ModelConfig):
     limit_spl: float = 110.0
 
     def __post_init__(self) -> None:
-        sizes = {
+        ranges: dict[str, tuple[float, float]] = {
             "bands": (4, 40),
             "bins": (0, 128),
             "width": (1, 4096),
             "hidden": (1, 4096),
             "inner": (1, 4096),
+            "reach_db": (0.0, 60.0),
+            "reduction_db": (0.0, 60.0),
+            "attack": (0.0, 1.0),
+            "release": (0.01, 2.0),
+            "opening": (0.0, 1.0),
+            "closing": (0.01, 2.0),
+            "cap_db": (0.0, 80.0),
+            "quiet_spl": (0.0, 80.0),
+            "limit_spl": (60.0, 140.0),
         }
-        for name, (low, high) in sizes.items():
-            if type(getattr(self, name)) is not int:
-                raise ValueError(
-                    f"{name} is {getattr(self, name)!r}; allowed: whole numbers from {low} to {high}"
-                )
-            refuse_outside({name: (getattr(self, name), low, high)})
-        refuse_outside(
-            {
-                "reach_db": (self.reach_db, 0.0, 60.0),
-                "reduction_db": (self.reduction_db, 0.0, 60.0),
-                "attack": (self.attack, 0.0, 1.0),
-                "release": (self.release, 0.01, 2.0),
-                "opening": (self.opening, 0.0, 1.0),
-                "closing": (self.closing, 0.01, 2.0),
-                "cap_db": (self.cap_db, 0.0, 80.0),
-                "quiet_spl": (self.quiet_spl, 0.0, 80.0),
-                "limit_spl": (self.limit_spl, 60.0, 140.0),
-            }
-        )
+        refuse_outside({name: (getattr(self, name), *limits) for name, limits in ranges.items()})
 
 
 def refuse_outside(ranges: Mapping[str, tuple[float, float, float]]) -> None:
     """Raise ValueError unless each value is a number from its lowest to its highest: (value, lowest, highest) by name."""
     for name, (value, low, high) in ranges.items():
-        if not (is_finite(value) and low <= value <= high):
-            raise ValueError(f"{name} is {value!r}; allowed: {low:g} to {high:g}")
+        whole = isinstance(low, int)
+        if not (is_finite(value) and low <= value <= high) or (whole and type(value) is not int):
+            kind = "whole numbers from " if whole else ""
+            raise ValueError(f"{name} is {value!r}; allowed: {kind}{low:g} to {high:g}")

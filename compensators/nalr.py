@@ -137,7 +137,6 @@ def _steps_hz(sample_rate: int, count: int) -> tuple[float, ...]:
     return tuple(torch.linspace(0.0, sample_rate / 2.0, count, dtype=torch.float64, device="cpu").tolist())
 
 
-@lru_cache(maxsize=8)
 def _design(order: int) -> NDArray[np.float64]:
     """The filter is linear in its gains: one row a gain on ``order + 1`` even steps. Returns (order + 1, order + 1)."""
     grid, window = np.arange(order + 1) / order, hamming(order + 1)

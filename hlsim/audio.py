@@ -11,7 +11,7 @@ import torch
 from scipy.io import wavfile
 from torch import Tensor
 
-from hlsim.checks import HIGHEST_RATE, check_rate, check_waveform, is_finite
+from hlsim.checks import HIGHEST_RATE, HIGHEST_SAMPLE, check_rate, check_waveform, is_finite
 from hlsim.files import Whole
 
 EXTENSIONS = (".wav", ".flac", ".ogg")
@@ -21,7 +21,6 @@ _STREAMED = 0x7FFF0000  # sizes from here on were written before the length was 
 
 # what a header may tell, beyond which it is believed to be broken; of samples 16 GB
 _HIGHEST_READ, _MOST_CHANNELS, _MOST_SAMPLES = 384_000, 64, 2**32
-_LOUDEST = 1e9  # a sample, 274 dB SPL where RMS 1.0 is 94: beyond it powers overflow in single precision
 
 _HIGHEST_STORED = {".wav": 2**31 - 1, ".flac": 655_350, ".ogg": 200_000}  # in Hz; libvorbis crashes beyond
 _SUBTYPES = {".wav": "FLOAT", ".flac": "PCM_24", ".ogg": "VORBIS"}
@@ -56,8 +55,8 @@ def read_audio(path: str | Path, *, any_rate: bool = False) -> tuple[Tensor, int
         raise ValueError(f"{path}: holds samples that are NaN or infinite")
     if not (peak := float(waveform.abs().max())):
         raise ValueError(f"{path}: silent, every sample is zero")
-    if peak > _LOUDEST:
-        raise ValueError(f"{path}: samples reach {peak:.3g}; allowed: up to {_LOUDEST:g}")
+    if peak > HIGHEST_SAMPLE:
+        raise ValueError(f"{path}: samples reach {peak:.3g}; allowed: up to {HIGHEST_SAMPLE:g}")
     try:
         check_rate(min(rate, HIGHEST_RATE) if any_rate else rate)
     except ValueError as error:

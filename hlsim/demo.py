@@ -162,7 +162,8 @@ def _read(path: Path) -> Tensor:
 def _names(files: list[Path], speech: str | Path | None) -> list[str]:
     """What each is called: its path below the folder, for several speakers may have a 001.wav."""
     root = _EMBEDDED / "valid" if speech is None else Path(speech)
-    return ["-".join(path.relative_to(root).with_suffix("").parts) for path in files]
+    names = ["-".join(path.relative_to(root).with_suffix("").parts) for path in files]
+    return [name if names.count(name) == 1 else f"{name}-{i}" for i, name in enumerate(names)]
 
 
 def _write_audio(folder: Path, names: list[str], clean: list[Tensor], heard: dict[str, list[Tensor]]) -> None:

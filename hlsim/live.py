@@ -193,10 +193,13 @@ def _keys() -> Iterator[Callable[[float], str]]:
     try:
         import termios
         import tty
-
+    except ImportError:  # no such terminals on this system
+        yield wait
+        return
+    try:
         terminal = sys.stdin.fileno()
         before = termios.tcgetattr(terminal)
-    except (ImportError, AttributeError, OSError, ValueError, termios.error):  # no terminal, or none such
+    except (AttributeError, OSError, ValueError, termios.error):  # no terminal
         yield wait
         return
 

@@ -68,7 +68,7 @@ def test_speech_that_cannot_be_scored_is_named_before_the_training(
     first = sorted(short_speech.iterdir())[0]
     samples, rate = soundfile.read(first)
     soundfile.write(first, samples[: rate // 2], rate)
-    with pytest.raises(ValueError, match=rf"{first.name} lasts 0.5 s; HASPI needs 0.7 s"):
+    with pytest.raises(ValueError, match=rf"{first.name} lasts 0.5 s; a score needs 0.7 s"):
         demo(tmp_path / "out", Audiogram.standard("N4"), speech=short_speech)
     assert not (tmp_path / "out").exists()
 
@@ -76,6 +76,7 @@ def test_speech_that_cannot_be_scored_is_named_before_the_training(
 def test_names_tell_speakers_apart(tmp_path: Path) -> None:
     files = [tmp_path / "p225" / "001.wav", tmp_path / "p226" / "001.wav"]
     assert _names(files, tmp_path) == ["p225-001", "p226-001"]
+    assert len(set(_names([*files, tmp_path / "p225-001.wav"], tmp_path))) == 3
 
 
 def test_too_little_speech(tmp_path: Path, speech_dir: Path) -> None:

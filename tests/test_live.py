@@ -207,6 +207,12 @@ def test_ctrl_c_ends_it_and_devices_that_stop_are_started_again_or_told(
     assert live.drop_outs == 2 and not starts
 
 
+def test_without_terminals_there_are_no_keys(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "termios", None)
+    with _keys() as key:
+        assert key(0.0) == ""
+
+
 def test_a_terminal_gives_its_keys_and_is_left_as_it_was(monkeypatch: pytest.MonkeyPatch) -> None:
     termios, pty = pytest.importorskip("termios"), pytest.importorskip("pty")
     ours, theirs = pty.openpty()

@@ -21,7 +21,7 @@ from hlsim.audiogram.value import (
     is_claritys,
     listed,
 )
-from hlsim.torchtools import constant, constant_like
+from hlsim.torchtools import constant_like
 
 HIGHEST_SIMULATED = 100.0
 """What a simulator takes, in dB HL: MSBG's expansion ratio 105 / (105 - level) is singular at 105."""
@@ -132,8 +132,7 @@ def resolve_thresholds(
     check_two_ears(two_ears if audiogram is None else of_listeners(audiogram), waveform)
     thresholds = one_an_item(thresholds, waveform.shape)
     try:
-        if thresholds.ndim > 1:
-            torch.broadcast_shapes(waveform.shape[:-1], thresholds.shape[:-1])
+        torch.broadcast_shapes(waveform.shape[:-1], thresholds.shape[:-1])
     except RuntimeError:
         raise ValueError(
             f"audiograms of shape {tuple(thresholds.shape)} for a waveform of shape {tuple(waveform.shape)}; allowed: "
@@ -181,29 +180,14 @@ def check_two_ears(asked: bool, waveform: Tensor) -> None:
 
 def interpolate(levels: Tensor, hz: tuple[float, ...]) -> Tensor:
     """Levels between the audiometric frequencies, linear in Hz and flat beyond. Shape: (..., 8) -> (..., frequencies)."""
-    right = constant(_right, hz, dtype=torch.int64, device=levels.device)
-    place = constant_like(levels, _place, hz)
-    return levels[..., right - 1] * (1.0 - place) + levels[..., right] * place
+    # no matrix product, which a GPU may be allowed to round to ten bits
+    return (levels.unsqueeze(-1) * constant_like(levels, interpolation_weights, hz)).sum(-2)
 
 
 @lru_cache(maxsize=8)
 def interpolation_weights(hz: tuple[float, ...]) -> NDArray[np.float64]:
     """``interpolate`` as a matrix. Returns (8, frequencies)."""
-    one, right, place = np.eye(len(FREQUENCIES)), _right(hz), _place(hz)
-    weights: NDArray[np.float64] = one[:, right - 1] * (1.0 - place) + one[:, right] * place
-    return weights
-
-
-def _right(hz: tuple[float, ...]) -> NDArray[np.int64]:
-    """Index of the audiometric frequency at or above each one, but for the first."""
-    return np.searchsorted(FREQUENCIES, hz).clip(1, len(FREQUENCIES) - 1)
-
-
-def _place(hz: tuple[float, ...]) -> NDArray[np.float64]:
-    """Where each lies between the audiometric frequencies around it, 0 to 1."""
-    points, right = np.array(FREQUENCIES), _right(hz)
-    place: NDArray[np.float64] = (np.array(hz) - points[right - 1]) / (points[right] - points[right - 1])
-    return place.clip(0.0, 1.0)
+    return np.stack([np.interp(hz, FREQUENCIES, row) for row in np.eye(len(FREQUENCIES))])
 
 
 def _one_ear(given: Any) -> Audiogram | None:

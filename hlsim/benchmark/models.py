@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from hlsim.audiogram import FREQUENCIES, Audiogram
 from hlsim.extras import MissingExtraError, require
@@ -57,14 +57,10 @@ def rows(simulators: list[str] | None = None) -> tuple[list[Row], list[str]]:
             skipped.append(f"{name}: {error}")
     found.append(Row("MSBG (exact)", both, lambda rate, ear, device: MSBG(ear, sample_rate=rate).to(device)))
     for name in shipped([SIMULATOR]) if simulators is None else simulators:
-        count, default = _count(load_pretrained(name)), name == "neuro-msbg"
+        count, default = sum(own.numel() for own in load_pretrained(name).parameters()), name == "neuro-msbg"
         title = f"Neuro-MSBG ({name})"
         found.append(Row(title, both, partial(_neuro, name), parameters=count, default=default))
     return found, skipped
-
-
-def _count(network: nn.Module) -> int:
-    return sum(parameter.numel() for parameter in network.parameters())
 
 
 def _neuro(name: str, rate: int, ear: Audiogram, device: torch.device) -> Call:

@@ -6,7 +6,6 @@ import argparse
 import sys
 from collections.abc import Callable, Iterator
 from functools import partial
-from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -150,11 +149,13 @@ def _pairs(source: Path, target: Path) -> list[tuple[Path, Path]]:
     """Each file under a folder, and its place under the other as wav, which holds what is over full scale."""
     from hlsim.audio import find_audio
 
-    pairs = [(path, (target / path.relative_to(source)).with_suffix(".wav")) for path in find_audio(source)]
-    for (path, one), (other, two) in pairwise(pairs):
-        if one == two:
-            raise ValueError(f"{other} and {path} would both be {one}; rename one")
-    return pairs
+    made: dict[Path, Path] = {}
+    for path in find_audio(source):
+        one = (target / path.relative_to(source)).with_suffix(".wav")
+        if one in made:
+            raise ValueError(f"{path} and {made[one]} would both be {one}; rename one")
+        made[one] = path
+    return [(path, one) for one, path in made.items()]
 
 
 def _levels(before: Tensor, after: Tensor, full_scale_spl: float) -> str:

@@ -101,7 +101,6 @@ def band_centres() -> NDArray[np.float64]:
     return middles
 
 
-@lru_cache(maxsize=16)
 def band_shares(fft: int, sample_rate: int) -> NDArray[np.float64]:
     """Share of each frequency bin in each band. Returns (fft // 2 + 1, 24)."""
     spacing = sample_rate / fft
@@ -114,7 +113,6 @@ def band_shares(fft: int, sample_rate: int) -> NDArray[np.float64]:
 @lru_cache(maxsize=1)
 def threshold_in_quiet() -> NDArray[np.float64]:
     """Threshold of a normal ear at the middle of each band in dB SPL (Terhardt 1979, Equation 1). Returns (24,)."""
-    edges = band_edges() / 1000.0
-    khz = np.sqrt(edges[1:] * edges[:-1])
+    khz = band_centres() / 1000.0
     quiet: NDArray[np.float64] = 3.64 * khz**-0.8 - 6.5 * np.exp(-0.6 * (khz - 3.3) ** 2) + 1e-3 * khz**4
     return quiet

@@ -30,7 +30,6 @@ DEFAULT_WEIGHTS = {"magnitude": 0.9, "phase": 0.3, "complex": 0.1, "time": 0.2}
 _TINY = 1e-12
 
 _FAINT = 8e-4  # squared magnitude of a tone of 20 dB SPL in the paper's transform
-_SILENT = 1e-20
 
 
 def magnitude_loss(estimate: Tensor, truth: Tensor) -> Tensor:

@@ -7,7 +7,7 @@ import importlib
 import inspect
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -177,6 +177,14 @@ def load_teacher(name: str) -> ForeignTeacher:
 def load_enhancer(name: str) -> ForeignEnhancer:
     """The enhancer ``package.module:name``, found as ``load_teacher`` finds a teacher; ValueError too."""
     return ForeignEnhancer(*_found(name, ForeignEnhancer.KIND))
+
+
+def load_enhancers(names: Sequence[str]) -> dict[str, ForeignEnhancer]:
+    """Several, by what stands after the colon; ValueError where two are called alike."""
+    loaded = {name.partition(":")[2]: load_enhancer(name) for name in names}
+    if len(loaded) < len(names):
+        raise ValueError(f"enhancers {', '.join(names)}; allowed: one a name after the colon")
+    return loaded
 
 
 @lru_cache(maxsize=8)

@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from compensators import load_compensator
 from hlsim.audio import read_audio, write_audio
 from hlsim.calibration import check_full_scale, gain_to_pascals, set_level
-from hlsim.data.foreign import ForeignAid, ForeignEnhancer, load_aid, load_enhancer
+from hlsim.data.foreign import ForeignAid, ForeignEnhancer, load_aid, load_enhancers
 from hlsim.evaluation.haspi_report import HaspiReport, report_items
 from hlsim.evaluation.measurements import samples_ahead
 from hlsim.evaluation.scores import Failure
@@ -269,7 +269,7 @@ def read_pairs(
 def _conditions(
     aids: Mapping[str, str], enhancers: Sequence[str], linked: bool, rate: int, full_scale_spl: float
 ) -> dict[str, Aids]:
-    before = {name.partition(":")[2]: load_enhancer(name) for name in enhancers}
+    before = load_enhancers(enhancers)
     options: dict[str, Any] = {"sample_rate": rate, "full_scale_spl": full_scale_spl}
 
     def load(name: str) -> Any:
@@ -294,8 +294,12 @@ def _looks_ahead(conditions: Mapping[str, Aids], mix: Path, listener: Listener) 
     scene, rate = read_audio(mix)
     scene = _two_channels(mix, scene)[:, : int(_LONGEST * rate)]
     time = scene.shape[-1]
-    other = set_level(torch.randn(scene.shape, generator=torch.Generator().manual_seed(0)), 65.0)
-    other *= scene.square().mean().sqrt() / other.square().mean().sqrt()
+    drawn = torch.Generator().manual_seed(0)
+    other = set_level(torch.randn(scene.shape, generator=drawn), 65.0)
+    if scene.any():
+        other *= scene.square().mean().sqrt() / other.square().mean().sqrt()
+    else:  # its beginning is silent
+        scene = set_level(torch.randn(scene.shape, generator=drawn), 65.0)
     places = [*range(time // 4, time, max(1, time // (_PLACES + 3)))][:_PLACES]
     changed = [torch.cat((scene[:, :place], other[:, place:]), -1) for place in places]
     found = {}
@@ -323,7 +327,7 @@ def _reference(mix: Tensor, reference: Tensor, in_room: Tensor | None = None) ->
 
 
 def _aided(mix: Tensor, aids: Aids, listener: Listener) -> Tensor:
-    return aids(mix.float(), listener)
+    return aids(mix, listener)
 
 
 def _two_channels(path: Path, waveform: Tensor, mono: bool = False) -> Tensor:

@@ -18,7 +18,7 @@ from compensators.wdrc import WDRC
 from hlsim.audiogram import Audiogram
 from hlsim.audiogram.thresholds import as_thresholds
 from hlsim.criteria.bands import BANDS
-from hlsim.data.foreign import load_enhancer
+from hlsim.data.foreign import load_enhancers
 from hlsim.evaluation.compensator_result import MEASURES, compensator_result
 from hlsim.evaluation.haspi_report import HaspiReport
 from hlsim.evaluation.items import INPUT_LEVELS, Item, draw_judged_items, read_ears
@@ -145,9 +145,7 @@ def evaluate_compensators(
         ears = [*shown.items()]
     for ear in shown.values():
         as_thresholds(ear)  # to be known before hours of judging
-    before = {name.partition(":")[2]: load_enhancer(name) for name in enhancers}
-    if len(before) < len(enhancers):
-        raise ValueError(f"enhancers {', '.join(enhancers)}; allowed: one a name after the colon")
+    before = load_enhancers(enhancers)
     aids = {
         PRESCRIBED: NALR(sample_rate=NEURO_RATE),
         COMPRESSED: WDRC(sample_rate=NEURO_RATE),

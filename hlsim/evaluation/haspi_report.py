@@ -123,7 +123,8 @@ class HaspiReport:
     def _words(self, measure: str, before: str, after: str) -> WordsChange | None:
         if measure != "haspi":
             return None
-        both = [found for item in self.items if {before, after} <= (found := item.scores[measure]).keys()]
+        scores = [item.scores.get(measure, {}) for item in self.items]
+        both = [found for found in scores if {before, after} <= found.keys()]
         # a score may end a little above 1
         first, second = (np.clip([found[name] for found in both], 0.0, 1.0) for name in (before, after))
         return words_change(first, second)

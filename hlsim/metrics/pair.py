@@ -49,14 +49,14 @@ def check_pair(
         )
     if len(clean) < SHORTEST_SECONDS * rate:
         raise ValueError(
-            f"{names[0]} lasts {len(clean) / rate:.2g} s; HASPI needs {SHORTEST_SECONDS} s or more to mean anything"
+            f"{names[0]} lasts {len(clean) / rate:.2g} s; a score needs {SHORTEST_SECONDS} s or more to mean anything"
         )
     if not clean.any():
         raise ValueError(f"{names[0]} is silent, every sample is zero")
     level = 10.0 * math.log10(max(float(np.var(clean)), 1e-30)) + full_scale
     if level < LOWEST_REFERENCE_SPL:
         raise ValueError(
-            f"{names[0]} is at {level:.1f} dB SPL with full_scale_spl {full_scale:g}; HASPI needs "
+            f"{names[0]} is at {level:.1f} dB SPL with full_scale_spl {full_scale:g}; a score needs "
             f"{LOWEST_REFERENCE_SPL:g} or more to mean anything"
         )
     return clean, heard

@@ -29,7 +29,8 @@ def pyclarity_msbg(waveform: Tensor, audiogram: Audiogram, sample_rate: int) -> 
     """
     msbg, utils = (require(f"clarity.evaluator.msbg.{name}", "pyclarity") for name in ("msbg", "msbg_utils"))
     ear = msbg.Ear()  # RMS 1.0 is 120 dB SPL
-    logging.disable(logging.WARNING)
+    disabled = logging.root.manager.disable
+    logging.disable(max(disabled, logging.WARNING))
     try:
         ear.set_audiogram(audiogram.to_clarity())
         to_reference = gain_to_pascals(PASCAL_SPL) / gain_to_pascals(float(ear.equiv_0db_spl + ear.ahr))
@@ -39,7 +40,7 @@ def pyclarity_msbg(waveform: Tensor, audiogram: Audiogram, sample_rate: int) -> 
         signal = np.append(signal, np.zeros(_TAIL))
         heard = ear.process(signal * _undo_rescaling(signal, utils.measure_rms))[0]
     finally:
-        logging.disable(logging.NOTSET)
+        logging.disable(disabled)
     delay = MSBG(sample_rate=MSBG_RATE).delay(audiogram.severity)
     heard = heard[delay : delay + len(signal) - _TAIL] / to_reference
     back = resample_poly(heard, down, up, window=("kaiser", 12.0))[: len(waveform)]

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
 
-from hlsim.audiogram import FREQUENCIES, Audiogram
-from hlsim.audiogram.thresholds import AudiogramLike, is_listener, of_listeners
+from hlsim.audiogram import FREQUENCIES, HIGHEST_LEVEL, Audiogram
+from hlsim.audiogram.thresholds import AudiogramLike, as_thresholds, of_listeners
 from hlsim.calibration import check_full_scale, level_spl
 from hlsim.checks import Lengths, check_lengths, check_rate, check_waveform
 from hlsim.extras import require
@@ -244,33 +244,10 @@ def _score(task: _Task) -> list[float]:
 
 def _ears(audiogram: AudiogramLike, batch: int, sides: int) -> list[dict[int, Audiogram]]:
     """Each item's ears by channel, without those that are missing."""
-    one = () if sides == 1 else (2,)
-    if isinstance(audiogram, Audiogram) and sides == 1:
-        return [{0: audiogram}] * batch
-    if isinstance(audiogram, Tensor):
-        width = len(FREQUENCIES)
-        if audiogram.shape not in ((*one, width), (batch, *one, width)):
-            raise ValueError(
-                f"audiogram of shape {tuple(audiogram.shape)}; allowed: {(*one, width)} or {(batch, *one, width)} dB HL"
-            )
-        rows = audiogram.detach().expand(batch, *one, width).reshape(batch, sides, width).double().tolist()
-        return [{side: Audiogram(tuple(row)) for side, row in enumerate(own)} for own in rows]
-    if sides == 2 and of_listeners(audiogram):
-        several: Any = audiogram
-        listeners = [audiogram] * batch if is_listener(audiogram) else several
-        if len(listeners) != batch:
-            raise ValueError(f"{len(listeners)} listeners of {batch} items; allowed: one, or one an item")
-        pairs = [enumerate((one.left, one.right)) for one in listeners]
-        return [{side: ear for side, ear in pair if ear is not None} for pair in pairs]
-    given = audiogram if isinstance(audiogram, Sequence) else ()
-    ears = [ear for ear in given if isinstance(ear, Audiogram)]
-    if not ears or len(ears) < len(given):
-        found, tensor = type(audiogram).__name__, f"an {(*one, 8)} or {(batch, *one, 8)} tensor"
-        each = "an Audiogram, one an item" if sides == 1 else "a Listener, or a left and a right Audiogram"
-        raise ValueError(f"audiogram is {found}; allowed: {each}, or {tensor}")
-    if len(ears) != (batch if sides == 1 else 2):
-        each = (
-            f"{batch} items; allowed: one for all, or one an item" if sides == 1 else "two ears; allowed: two"
-        )
-        raise ValueError(f"{len(ears)} audiograms of {each}")
-    return [{0: ear} for ear in ears] if sides == 1 else [dict(enumerate(ears))] * batch
+    shapes = [(*lead, *((2,) if sides == 2 else ()), len(FREQUENCIES)) for lead in ((), (batch,))]
+    levels = as_thresholds(audiogram, highest=HIGHEST_LEVEL, taker="a score", missing=sides == 2).detach()
+    if levels.shape not in shapes or (sides == 1 and of_listeners(audiogram)):
+        found, (alone, each) = tuple(levels.shape), shapes
+        raise ValueError(f"audiogram of shape {found}; allowed: {alone} or {each} dB HL")
+    rows = levels.expand(shapes[1]).reshape(batch, sides, -1).double().tolist()
+    return [{side: Audiogram(row) for side, row in enumerate(own) if row[0] == row[0]} for own in rows]

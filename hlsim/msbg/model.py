@@ -112,9 +112,7 @@ class MSBG(nn.Module):
 
     def _simulate(self, waveform: Tensor, thresholds: Tensor) -> Tensor:
         dtype = waveform.dtype if waveform.dtype == torch.float64 else torch.float32
-        batch = waveform.shape[:-1]
-        if thresholds.ndim > 1:
-            batch = torch.broadcast_shapes(batch, thresholds.shape[:-1])
+        batch = torch.broadcast_shapes(waveform.shape[:-1], thresholds.shape[:-1])
         signals = waveform.to(dtype).expand(*batch, -1).reshape(-1, waveform.shape[-1])
         ears = thresholds.to(signals).expand(*batch, -1).reshape(-1, thresholds.shape[-1])
         if (gain := gain_to_pascals(self.full_scale_spl)) != 1.0:

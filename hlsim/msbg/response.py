@@ -71,20 +71,20 @@ def hear_normally(waveform: Tensor, thresholds: Tensor, rate: int) -> Tensor:
 
 
 def _as_normal(rate: int) -> NDArray[np.float64]:
-    """Impulse response of a normal ear with each severity's phase. Returns as ``_impulses``."""
+    """Impulse response of a normal ear with each severity's phase. Returns as ``impulses``."""
     responses, points = _responses(rate)
-    return _impulses(np.abs(responses[0]) * np.exp(1j * np.angle(responses)), points, rate)
+    return impulses(np.abs(responses[0]) * np.exp(1j * np.angle(responses)), points, rate)
 
 
 def _phases(rate: int, normal: bool) -> NDArray[np.float64]:
-    """Impulse response of each severity's phase. Returns as ``_impulses``."""
+    """Impulse response of each severity's phase. Returns as ``impulses``."""
     responses, points = _responses(rate)
     if normal:
         phases = np.exp(1j * (np.angle(responses) - np.angle(responses[0])))
     else:
         magnitude = np.abs(responses)
         phases = responses / np.maximum(magnitude, _FAINT * magnitude.max(-1, keepdims=True))
-    return _impulses(phases, points, rate)
+    return impulses(phases, points, rate)
 
 
 def _responses(rate: int) -> tuple[NDArray[np.complex128], int]:
@@ -94,7 +94,7 @@ def _responses(rate: int) -> tuple[NDArray[np.complex128], int]:
     return np.stack([fixed_response(BANKS[severity], rate, points) for severity in SEVERITIES]), points
 
 
-def _impulses(spectra: NDArray[np.complex128], points: int, rate: int) -> NDArray[np.float64]:
+def impulses(spectra: NDArray[np.complex128], points: int, rate: int) -> NDArray[np.float64]:
     """Impulse response of each, its zero in the middle. Returns (severities, 2 half)."""
     half = math.ceil(_HALF_SECONDS * rate)
     return np.roll(np.fft.irfft(spectra, points), half, -1)[:, : 2 * half]

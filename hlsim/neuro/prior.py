@@ -20,7 +20,7 @@ from hlsim.msbg.ear import MSBG_RATE, ear_filter
 from hlsim.msbg.envelope import envelope_filters
 from hlsim.msbg.filterbank import BANKS, FilterBank, gammatone_response
 from hlsim.msbg.recruitment import CATCH_UP_SPL, expansion_ratios, threshold_weights
-from hlsim.msbg.response import fixed_response
+from hlsim.msbg.response import fixed_response, impulses
 from hlsim.msbg.smearing import BROADENING, roex_filters, smearing_from_filters, spread
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.torchtools import constant_like
@@ -64,7 +64,10 @@ class Prior(nn.Module):
         banks = [BANKS[severity] for severity in SEVERITIES]
         ear = np.abs(np.fft.rfft(ear_filter(), points * 441 // 160)[coarse]) ** 2
         self.register_buffer("ear_power", torch.tensor(ear, dtype=torch.float32))
-        responses = np.stack([_sum_response(bank) for bank in banks])
+        fine = 160 * 160  # points of a grid that 44.1 kHz shares, at 16 kHz
+        responses = impulses(
+            np.stack([fixed_response(bank, NEURO_RATE, fine) for bank in banks]), fine, NEURO_RATE
+        )
         self.register_buffer("response", torch.tensor(responses, dtype=torch.float32))
 
         excitation, relative, smoothing = [], [], []
@@ -167,13 +170,6 @@ def _widening(smeared: Tensor, given: Tensor) -> Tensor:
     root = (size / torch.maximum(given + _TINY, size / _WIDEST)).sqrt()
     imaginary = root * (smeared < 0.0)
     return torch.complex(root - imaginary, imaginary)
-
-
-def _sum_response(bank: FilterBank) -> NDArray[np.float64]:
-    """Impulse response of all of MSBG at 16 kHz, gains at 1, aligned. Returns (2 half lengths,), zero in the middle."""
-    points = 160 * 160
-    impulse = np.fft.irfft(fixed_response(bank, NEURO_RATE, points), points)
-    return np.roll(impulse, RESPONSE_HALF_LENGTH)[: 2 * RESPONSE_HALF_LENGTH]
 
 
 def _smoothing(bank: FilterBank, hop: int) -> NDArray[np.float64]:

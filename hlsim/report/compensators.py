@@ -94,7 +94,7 @@ def _sections(result: Result, reports: Mapping[str, HaspiReport]) -> list[Sectio
     sections += [
         Section("As loud as a normal ear hears it?", [_LOUDNESS], loudness),
         Section("By degree of loss", [_HASQI], by_severity, folded=True),
-        _gap_section(result),
+        Section("The surrogate gap", [_GAP.format(**result)], [_gap_table(result)]),
         Section("Does any output pass the limit?", (), [_peak_table(result)], folded=True),
         Section("Gain curves", [_GAINS], [_gain_table(curves)], gains),
         Section("Steady tones", [_STEADY], [tone_table(tones)], as_heard, folded=True),
@@ -249,10 +249,6 @@ def _severity_table(result: Result, group: str) -> Table:
             title = {"Degree of loss": f"{severity}, {name}"}
             rows.append({**title, **_scores(row), **cells({**row, **over}, _BY_SEVERITY)})
     return Table.of(f"{GROUPS[group]}, by degree of loss", rows)
-
-
-def _gap_section(result: Result) -> Section:
-    return Section("The surrogate gap", [_GAP.format(**result)], [_gap_table(result)])
 
 
 def _gap_table(result: Result) -> Table:

@@ -17,7 +17,7 @@ import hlsim
 from hlsim.audio import read_audio
 from hlsim.cli.main import main
 from hlsim.dsp.resample import resample
-from hlsim.evaluation.clarity import evaluate_scenes, read_pairs, read_scenes
+from hlsim.evaluation.clarity import _conditions, _looks_ahead, evaluate_scenes, read_pairs, read_scenes
 from hlsim.listener import Listener, read_listeners
 from hlsim.report.clarity import conditions_table, write_scenes
 
@@ -138,6 +138,28 @@ def test_the_challenges_baseline_has_its_scores(clarity: Path, tmp_path: Path) -
             assert item.scores[measure]["baseline"] == pytest.approx(expected, abs=1e-3), (item.file, measure)
     assert report.extra["looks_ahead_ms"]["baseline"] == 0.0  # late by 2.5 ms, but never early
     assert 2.0 < report.extra["looks_ahead_ms"]["NAL-R"] <= 5.0
+
+
+def test_a_scene_that_begins_in_silence_still_tells_how_far_an_aid_looks_ahead(tmp_path: Path) -> None:
+    mix = tmp_path / "mix.wav"
+    soundfile.write(
+        mix,
+        np.concatenate([np.zeros((5 * RATE, 2)), 0.02 * np.sin(np.arange(2.0 * RATE)).reshape(-1, 2)]),
+        RATE,
+    )
+    (tmp_path / "listeners.json").write_text(json.dumps(LISTENERS))
+    listener = read_listeners(tmp_path / "listeners.json")["L0001"]
+    ahead = _looks_ahead(_conditions({}, [], False, RATE, 94.0), mix, listener)
+    assert ahead["unaided"] == 0.0 and 1.0 < ahead["NAL-R"] <= 5.0
+
+
+def unchanged(waveform: torch.Tensor, sample_rate: int) -> torch.Tensor:
+    return waveform
+
+
+def test_two_enhancers_of_one_name_are_refused() -> None:
+    with pytest.raises(ValueError, match="one a name after the colon"):
+        _conditions({}, [f"{__name__}:unchanged", f"{__name__}:unchanged"], False, RATE, 94.0)
 
 
 class FromTheFuture:

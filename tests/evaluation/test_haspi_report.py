@@ -229,7 +229,7 @@ def test_folders_that_differ_are_refused_before_the_first_score(
         (shorter, "p2/c", "before", r"clean/p2/c.flac has 17640 samples and .*before/p2/c.wav 17639"),
         (faster, "a.b", "after", r"after/a.b.wav has 24000 Hz and .*clean/a.b.flac 16000 Hz"),
         (silent, "a.b", "after", r"after/a.b.wav: silent"),
-        (short, "a.b", "before", r"reference lasts 0.5 s; HASPI needs 0.7 s"),
+        (short, "a.b", "before", r"reference lasts 0.5 s; a score needs 0.7 s"),
         (quiet, "p2/c", "before", r"reference is at -\d+.\d dB SPL with full_scale_spl 94"),
         (broken, "p2/c", "before", r"before/p2/c.wav: not readable as audio"),
     ],

@@ -132,7 +132,7 @@ SPEECH = torch.sin(torch.arange(16000) * 0.2) * 0.05
         (SPEECH.expand(2, -1), SPEECH.expand(2, -1), {}, r"reference has shape \(2, 16000\)"),
         (SPEECH[:0], SPEECH[:0], {}, r"reference has shape \(0,\)"),
         ((SPEECH * 100).long(), SPEECH, {}, "int64"),
-        (SPEECH[:11000], SPEECH[:11000], {}, "lasts 0.69 s; HASPI needs 0.7 s"),
+        (SPEECH[:11000], SPEECH[:11000], {}, "lasts 0.69 s; a score needs 0.7 s"),
         (SPEECH * 1e-3, SPEECH, {}, "reference is at 5.0 dB SPL with full_scale_spl 94"),
         (SPEECH * 1e-3 + 0.1, SPEECH, {}, "reference is at 5.0 dB SPL"),
         (SPEECH, SPEECH, {"sample_rate": 8000}, "8000 Hz; allowed: 16000 to 48000"),

@@ -86,6 +86,13 @@ def test_the_change_is_told_in_words_where_haspi_is_the_headlines() -> None:
     assert HaspiReport(items).words is None and "In words" not in markdown(HaspiReport(items))
 
 
+def test_an_item_without_the_measure_does_not_count() -> None:
+    items = make_report(8).items
+    by_another = replace(items[0], scores={"hasqi": items[0].scores["haspi"]})
+    report = HaspiReport([*items[1:], by_another])
+    assert report.headline.overall.n == 7 and report.headline.left_out == 1
+
+
 def test_markdown_is_the_papers_table() -> None:
     report = make_report(seed=3, extra={"nalr_mean": 0.5125})
     text, c = markdown(report), report.comparison

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from functools import lru_cache
 
 import numpy as np
 import torch
@@ -80,7 +79,6 @@ def _power_below(signal: Tensor, rate: int) -> Tensor:
     return torch.fft.irfft(spectrum, points)[:time].square().mean()
 
 
-@lru_cache(maxsize=8)
 def _chebyshev(rate: int, points: int) -> NDArray[np.complex128]:
     sections = cheby2(7, 30, 21000.0 / rate, output="sos")
     response: NDArray[np.complex128] = sosfreqz(sections, 2.0 * np.pi * np.arange(points // 2 + 1) / points)[

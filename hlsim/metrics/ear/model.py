@@ -78,13 +78,11 @@ class HairCells:
     inner: Tensor
 
     def __getitem__(self, channels: slice) -> HairCells:
-        fields = (self.attenuation, self.bandwidth, self.knee, self.ratio, self.inner)
-        return HairCells(*(field[..., channels] for field in fields))
+        return HairCells(*(field[..., channels] for field in vars(self).values()))
 
     def items(self, chosen: Sequence[int]) -> HairCells:
         """Of some of the items of (items, 32)."""
-        fields = (self.attenuation, self.bandwidth, self.knee, self.ratio, self.inner)
-        return HairCells(*(field[list(chosen)] for field in fields))
+        return HairCells(*(field[list(chosen)] for field in vars(self).values()))
 
 
 def hair_cells(thresholds: Tensor) -> HairCells:

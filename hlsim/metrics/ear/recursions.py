@@ -66,16 +66,9 @@ class Recursion(NamedTuple):
     def __call__(self, signal: Tensor) -> Tensor:
         """The outputs, in blocks. Shape: (rows or 1, time) -> (rows, time / BLOCK, outputs)."""
         blocks = signal.unflatten(-1, (-1, BLOCK))
-        if self.through.ndim == 2:
-            output = (blocks @ self.inward, blocks @ self.through)
-        else:
-            blocks = blocks.expand(len(self.through), -1, -1)
-            output = (torch.bmm(blocks, self.inward), torch.bmm(blocks, self.through))
-        states = _accumulated(output[0], self.step, self.memory // BLOCK)
+        states = _accumulated(blocks @ self.inward, self.step, self.memory // BLOCK)
         before = functional.pad(states[..., :-1, :], (0, 0, 1, 0))
-        if self.through.ndim == 2:
-            return output[1] + before @ self.outward
-        return torch.baddbmm(output[1], before, self.outward)
+        return blocks @ self.through + before @ self.outward
 
     def repeated(self, items: int) -> Recursion:
         """The same filters for each of several items."""
