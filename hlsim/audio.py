@@ -12,9 +12,7 @@ from scipy.io import wavfile
 from torch import Tensor
 
 from hlsim.checks import HIGHEST_RATE, HIGHEST_SAMPLE, check_rate, check_waveform, is_finite
-from hlsim.files import Whole
-
-EXTENSIONS = (".wav", ".flac", ".ogg")
+from hlsim.files import EXTENSIONS, Whole, check_extension
 
 _LARGEST_PAGE, _ENDS = 65_307, 4  # of Ogg: bytes of a page, and the flag of a stream's last one (RFC 3533, 6)
 _STREAMED = 0x7FFF0000  # sizes from here on were written before the length was known: 0x7FFFF000, 0xFFFFFFFF
@@ -130,15 +128,6 @@ def _refuse_cut(path: str | Path) -> None:
                     raise ValueError(f"{path}: cut off, {told}")
                 return
             file.seek(size + size % 2, os.SEEK_CUR)
-
-
-def check_extension(path: str | Path) -> str:
-    """Return the extension in lower case, or raise ValueError unless it is one that ``write_audio`` writes."""
-    suffix = Path(path).suffix.lower()
-    if suffix not in EXTENSIONS:
-        found = suffix or "a file without extension"
-        raise ValueError(f"{path}: cannot write {found}; allowed: {', '.join(EXTENSIONS)}")
-    return suffix
 
 
 def check_channels(path: str | Path, channels: int) -> int:

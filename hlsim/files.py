@@ -23,6 +23,9 @@ try:
 except ImportError:  # Windows
     fcntl = None  # type: ignore[assignment]
 
+EXTENSIONS = (".wav", ".flac", ".ogg")
+"""Of audio that is read and written."""
+
 PARTIAL = ".part"
 """Ending of a file that is not yet whole."""
 
@@ -158,6 +161,15 @@ def resolved(path: str | Path) -> Path:
     if "\0" in str(path):
         raise ValueError(f"{str(path)!r}: holds a null character; allowed: a path")
     return Path(os.path.realpath(path))
+
+
+def check_extension(path: str | Path) -> str:
+    """Return the extension in lower case, or raise ValueError unless it is one of audio that is written."""
+    suffix = Path(path).suffix.lower()
+    if suffix not in EXTENSIONS:
+        found = suffix or "a file without extension"
+        raise ValueError(f"{path}: cannot write {found}; allowed: {', '.join(EXTENSIONS)}")
+    return suffix
 
 
 def sha256(path: Path) -> str:

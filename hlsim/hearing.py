@@ -51,7 +51,7 @@ class FrozenEar:
                 f"normal is {type(normal).__name__}; allowed: a module or callable (waveform) -> waveform"
             )
         self.sample_rate, self.normal, self.choice = sample_rate, normal, reference
-        self.simulator = _build(simulator, sample_rate, full_scale_spl).eval().requires_grad_(False)
+        self.simulator = build_simulator(simulator, sample_rate, full_scale_spl).eval().requires_grad_(False)
         if isinstance(normal, nn.Module):
             normal.eval().requires_grad_(False)
 
@@ -209,7 +209,8 @@ def _moved(fn: Callable[[Tensor], Tensor], tensor: Tensor) -> Tensor:
     return tensor.to(device) if halved else tensor.to(device, moved.dtype)
 
 
-def _build(simulator: str | Path | nn.Module, sample_rate: int, full_scale_spl: float) -> nn.Module:
+def build_simulator(simulator: str | Path | nn.Module, sample_rate: int, full_scale_spl: float) -> nn.Module:
+    """The simulator of that name or folder, ``"msbg"`` being the exact one; a module is checked and returned."""
     if isinstance(simulator, nn.Module):
         for name, own in (("sample_rate", sample_rate), ("full_scale_spl", full_scale_spl)):
             if getattr(simulator, name, own) != own:

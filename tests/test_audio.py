@@ -12,13 +12,13 @@ from scipy.io import wavfile
 from torch import Tensor
 
 from hlsim.audio import (
-    EXTENSIONS,
     encode_flac,
     find_audio,
     read_audio,
     read_stretch,
     write_audio,
 )
+from hlsim.files import EXTENSIONS
 
 
 @pytest.mark.parametrize(("suffix", "step"), [(".wav", 0.0), (".flac", 2.0**-24)])

@@ -6,7 +6,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from hlsim.cli.inputs import check_there, need, other_ear, read_ear, read_simulator
+from hlsim.cli.inputs import check_there, need, other_ear, read_ear
 from hlsim.cli.options import EARS_TABLE, Parser, count, foreign_name, natural, number, passed, positive
 from hlsim.cli.progress import show_progress
 
@@ -47,7 +47,9 @@ def _evaluate_simulator(options: argparse.Namespace) -> None:
         need("pyclarity", "clarity")
     check_there(folders=(options.speech, options.noise), files=(options.audiograms,))
     from compensators import load_compensator
+    from hlsim.calibration import PASCAL_SPL
     from hlsim.evaluation.simulators import evaluate_simulators
+    from hlsim.hearing import build_simulator
     from hlsim.neuro.config import NEURO_RATE
     from hlsim.report.simulators import write_fidelity
 
@@ -56,7 +58,7 @@ def _evaluate_simulator(options: argparse.Namespace) -> None:
         "compensator": load_compensator(options.compensator) if options.compensator else None,
         "progress": show_progress("items"),
     }
-    simulators = {label: read_simulator(name, NEURO_RATE) for label, name in named.items()}
+    simulators = {label: build_simulator(name, NEURO_RATE, PASCAL_SPL) for label, name in named.items()}
     done = evaluate_simulators(simulators, **passed(options, evaluate_simulators, **instead))
     write_fidelity(done.result, done.heard, done.shown, options.out)
     print((options.out / "fidelity.md").read_text(encoding="utf-8"))

@@ -9,13 +9,12 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from hlsim.cli.inputs import check_files, check_folders, read_compensator, read_ears, read_simulator
+from hlsim.cli.inputs import check_files, check_folders, read_compensator, read_ears
 from hlsim.cli.options import Parser
+from hlsim.files import check_extension
 
 if TYPE_CHECKING:
     from torch import Tensor
-
-ENDINGS = (".wav", ".flac", ".ogg")
 
 _UPPER_BAND = 8500.0  # Hz, from where on nothing of a model at 16 kHz comes
 _HEARD, _LOST = 1e-6, 1e-3  # share of the upper band in the power, and what of that share counts as gone
@@ -64,7 +63,9 @@ def _in_and_out(parser: Parser, run: Callable[[argparse.Namespace], None], *exam
 
 def _simulate(options: argparse.Namespace) -> None:
     def build(rate: int, _: bool) -> Callable[..., Tensor]:
-        return read_simulator(options.simulator, rate, options.full_scale_spl)
+        from hlsim.hearing import build_simulator
+
+        return build_simulator(options.simulator, rate, options.full_scale_spl)
 
     # above 8 kHz msbg leaves little to many ears, and all that they hear
     _pass_through(options, build, "" if options.simulator == "msbg" else "--simulator msbg keeps it")
@@ -78,15 +79,6 @@ def _compensate(options: argparse.Namespace) -> None:
     _pass_through(options, build, "--compensator hearing-aid, wdrc and nalr keep it")
 
 
-def _check_ending(path: Path) -> None:
-    """As ``hlsim.audio.check_extension``, without torch."""
-    if path.is_dir():
-        raise ValueError(f"{path}: a folder; allowed: a file, for IN is one")
-    if (ending := path.suffix.lower()) not in ENDINGS:
-        found = ending or "a file without extension"
-        raise ValueError(f"{path}: cannot write {found}; allowed: {', '.join(ENDINGS)}")
-
-
 def _pass_through(
     options: argparse.Namespace, build: Callable[[int, bool], Callable[..., Tensor]], keeper: str
 ) -> None:
@@ -98,7 +90,9 @@ def _pass_through(
     if whole:
         check_folders(options.input, options.output)
     else:
-        _check_ending(options.output)
+        if options.output.is_dir():
+            raise ValueError(f"{options.output}: a folder; allowed: a file, for IN is one")
+        check_extension(options.output)
         check_files(options.input, options.output)
     ear = read_ears(options)
     import torch

@@ -14,8 +14,6 @@ from hlsim.extras import require
 from hlsim.files import resolved
 
 if TYPE_CHECKING:
-    import torch
-
     from hlsim.audiogram import Audiogram
     from hlsim.listener import Listener
 
@@ -136,16 +134,6 @@ def read_compensator(
             f"{', '.join(idle)} of {name}, which has no such slider; allowed: with a hearing aid"
         )
     return compensator, sliders
-
-
-def read_simulator(name: str, sample_rate: int, full_scale_spl: float = 94.0) -> torch.nn.Module:
-    from hlsim import MSBG, load_pretrained
-    from hlsim.pretrained import SIMULATOR, find_checkpoint
-
-    options: dict[str, Any] = {"sample_rate": sample_rate, "full_scale_spl": full_scale_spl}
-    if name == "msbg":
-        return MSBG(**options)
-    return load_pretrained(find_checkpoint(name, [SIMULATOR], ("msbg",)), **options)
 
 
 def read_recipe(path: Path | None) -> dict[str, Any]:

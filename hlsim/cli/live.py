@@ -6,7 +6,7 @@ import argparse
 import math
 from types import ModuleType
 
-from hlsim.cli.inputs import read_compensator, read_ears, read_simulator
+from hlsim.cli.inputs import read_compensator, read_ears
 from hlsim.cli.options import STANDARD_EARS, Parser, kind, number, positive
 from hlsim.extras import require
 
@@ -61,6 +61,7 @@ def _live(options: argparse.Namespace) -> None:
         return
     import torch
 
+    from hlsim.hearing import build_simulator
     from hlsim.live import Live, Simulated, play
 
     torch.set_num_threads(1)  # others would only wait for one another in 4 ms
@@ -68,7 +69,7 @@ def _live(options: argparse.Namespace) -> None:
     if options.simulate:
         if options.noise_reduction is not None or options.amplification is not None:
             raise ValueError("sliders with --simulate; allowed: with a hearing aid")
-        stream = Simulated(read_simulator("neuro-msbg", _RATE, options.full_scale_spl), ears)
+        stream = Simulated(build_simulator("neuro-msbg", _RATE, options.full_scale_spl), ears)
         block = 12 * stream.block
     else:
         aid, sliders = read_compensator(options, _RATE)

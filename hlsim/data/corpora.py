@@ -14,9 +14,8 @@ from pathlib import Path
 from random import Random
 from typing import Literal
 
-from hlsim.audio import EXTENSIONS
 from hlsim.data.manifest import SPLITS, Utterance, inside, printable, storable
-from hlsim.files import read_rows
+from hlsim.files import EXTENSIONS, read_rows
 
 Layout = Literal["auto", "voicebank-demand", "librispeech", "folder"]
 

@@ -22,13 +22,13 @@ from itertools import chain
 from pathlib import Path, PurePath, PurePosixPath
 from typing import Any, TypeVar
 
-from hlsim.audio import EXTENSIONS, find_audio
+from hlsim.audio import find_audio
 from hlsim.audiogram import Audiogram
 from hlsim.audiogram.table import numbered_audiograms
 from hlsim.calibration import check_full_scale
 from hlsim.evaluation.scores import EARS
 from hlsim.evaluation.scoring import FileItem
-from hlsim.files import read_table, resolved
+from hlsim.files import EXTENSIONS, read_table, resolved
 
 _Name = TypeVar("_Name")
 

@@ -88,11 +88,6 @@ def smearing_matrix_below(severity: str, step: int, highest: float) -> NDArray[n
     return smearing_matrix(*BROADENING[severity])[:bins, :bins]
 
 
-def smeared_length(samples: int) -> int:
-    """Length of what ``smear`` returns."""
-    return HOP * (math.ceil(samples / HOP) + 3)
-
-
 def smear(waveform: Tensor, matrix: Tensor, step: int = 1) -> Tensor:
     """Smear a waveform as pyclarity's ``smear3`` does at 44.1 kHz, its delay and its first, irregular frames included.
 

@@ -8,9 +8,8 @@ from typing import Any, get_args
 
 import pytest
 
-from hlsim.audio import EXTENSIONS
 from hlsim.audiogram import STANDARD
-from hlsim.cli import files, options
+from hlsim.cli import options
 from hlsim.cli.inputs import read_ear
 from hlsim.cli.main import COMMANDS
 from hlsim.cli.options import Parser
@@ -48,7 +47,6 @@ def test_help_ends_with_two_examples_that_the_command_takes(command: str) -> Non
 
 def test_names_that_are_written_twice_agree() -> None:
     assert tuple(STANDARD) == options.STANDARD_EARS
-    assert files.ENDINGS == EXTENSIONS
     assert choices("prepare", "--layout") == get_args(Layout)
     assert options.TEACHERS == TEACHERS
     assert choices("prepare", "--alignment") == get_args(Alignment)[:2]
