@@ -92,7 +92,10 @@ class HearingAidConfig(ModelConfig):
 
 
 def refuse_outside(ranges: Mapping[str, tuple[float, float, float]]) -> None:
-    """Raise ValueError unless each value is a number from its lowest to its highest: (value, lowest, highest) by name."""
+    """Raise ValueError unless each value is a number from its lowest to its highest: (value, lowest, highest) by name.
+
+    Where the lowest is an int, whole numbers alone pass.
+    """
     for name, (value, low, high) in ranges.items():
         whole = isinstance(low, int)
         if not (is_finite(value) and low <= value <= high) or (whole and type(value) is not int):

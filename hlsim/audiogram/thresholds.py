@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from functools import lru_cache
 from typing import Any, Protocol, TypeGuard
 
 import numpy as np
@@ -184,7 +183,6 @@ def interpolate(levels: Tensor, hz: tuple[float, ...]) -> Tensor:
     return (levels.unsqueeze(-1) * constant_like(levels, interpolation_weights, hz)).sum(-2)
 
 
-@lru_cache(maxsize=8)
 def interpolation_weights(hz: tuple[float, ...]) -> NDArray[np.float64]:
     """``interpolate`` as a matrix. Returns (8, frequencies)."""
     return np.stack([np.interp(hz, FREQUENCIES, row) for row in np.eye(len(FREQUENCIES))])

@@ -94,7 +94,12 @@ def _responses(rate: int) -> tuple[NDArray[np.complex128], int]:
     return np.stack([fixed_response(BANKS[severity], rate, points) for severity in SEVERITIES]), points
 
 
+def half_length(rate: int) -> int:
+    """Samples of the impulse responses to either side of zero."""
+    return math.ceil(_HALF_SECONDS * rate)
+
+
 def impulses(spectra: NDArray[np.complex128], points: int, rate: int) -> NDArray[np.float64]:
     """Impulse response of each, its zero in the middle. Returns (severities, 2 half)."""
-    half = math.ceil(_HALF_SECONDS * rate)
+    half = half_length(rate)
     return np.roll(np.fft.irfft(spectra, points), half, -1)[:, : 2 * half]

@@ -20,12 +20,12 @@ from hlsim.msbg.ear import MSBG_RATE, ear_filter
 from hlsim.msbg.envelope import envelope_filters
 from hlsim.msbg.filterbank import BANKS, FilterBank, gammatone_response
 from hlsim.msbg.recruitment import CATCH_UP_SPL, expansion_ratios, threshold_weights
-from hlsim.msbg.response import fixed_response, impulses
+from hlsim.msbg.response import fixed_response, half_length, impulses
 from hlsim.msbg.smearing import BROADENING, roex_filters, smearing_from_filters, spread
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.torchtools import constant_like
 
-RESPONSE_HALF_LENGTH = 1024
+RESPONSE_HALF_LENGTH = half_length(NEURO_RATE)
 """Samples at 16 kHz of the fixed responses to either side of zero."""
 
 CHANNELS = max(bank.channels for bank in BANKS.values())
