@@ -7,7 +7,7 @@
 #
 # CORPORA holds speech/{train,valid}, noise/{train,valid} and audiograms/{train,valid}.csv.
 # STEPS: of each row, whatever the minutes. NARROW: the paper's rows with as many times fewer channels and heads. JOBS: rows
-# trained at a time. ROWS: these alone, compared as Table I; what follows a colon changes the recipe's network, or its seed.
+# trained at a time. ROWS: these alone, compared as Table I; what follows a colon changes the recipe's network, its seed or its precision.
 set -euo pipefail
 corpora=$1 out=$2 minutes=${3:-5} items=${4:-80}
 here=$(dirname "${BASH_SOURCE[0]}")
@@ -28,8 +28,8 @@ train() { # row: recipe[:setting=value[...]]
         $1 == "channels:" && by > 1 { $0 = "  channels: " 4 * int($2 / by / 4 + 0.5) }
         $1 == "heads:" && by > 1 { $0 = "  heads: " int(($2 + by - 1) / by) }  # heads stay as wide
         !($1 in value)
-        $1 == "model:" { for (name in value) if (name != "seed:") print "  " name, value[name] }
-        END { if ("seed:" in value) print "seed:", value["seed:"] }
+        $1 == "model:" { for (name in value) if (name !~ /^(seed|precision):/) print "  " name, value[name] }
+        END { for (name in value) if (name ~ /^(seed|precision):/) print name, value[name] }
     ' "$here/${1%%:*}.yaml" >"$recipe"
     hlsim train-simulator --config "$recipe" "${limit[@]}" --quiet --out "$out/$name" \
         --speech "$corpora/speech/train" --valid-speech "$corpora/speech/valid" \

@@ -93,7 +93,7 @@ class SimulatorRecipe(TrainingRecipe):
         sounds: 0 with a manifest.
         treated: whether clips are equalised, amplified and compressed at random, as compensators do.
         precision: ``float32``, or ``bfloat16`` for the network's own layers: several times faster where the hardware has
-            matrix units for it. Transforms, physics, scans and criteria stay in float32.
+            units for it, several times slower where it has not. Transforms, physics, scans and criteria stay in float32.
         average: weight of the past in the exponential moving average of the weights; the average is validated and kept. 0
             for none.
     """
