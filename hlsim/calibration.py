@@ -41,10 +41,17 @@ def set_level(waveform: Tensor, spl: float | Tensor, full_scale_spl: float = PAS
     """Scale a waveform to an RMS level in dB SPL.
 
     Shape: (..., time) -> (..., time); ``spl`` is a number or (...). Silence stays silent. Raises ValueError
-    as ``level_spl``.
+    as ``level_spl``, and for another ``spl``.
     """
     whole = _whole(waveform)
-    gain_db = torch.as_tensor(spl, device=waveform.device) - level_spl(whole, full_scale_spl)
+    if not isinstance(spl, Tensor) and not is_finite(spl):
+        raise ValueError(f"spl is {spl!r}; allowed: a level in dB SPL, or a tensor of one an item")
+    levels, wanted = level_spl(whole, full_scale_spl), torch.as_tensor(spl, device=waveform.device)
+    try:
+        gain_db = wanted.expand_as(levels) - levels
+    except RuntimeError as error:
+        shapes = f"spl of shape {tuple(wanted.shape)} for items of {tuple(levels.shape)}"
+        raise ValueError(f"{shapes}; allowed: one for all, or one an item") from error
     silent = whole.square().mean(-1) <= _LOWEST_POWER
     gain = torch.where(silent, torch.ones_like(gain_db), 10.0 ** (gain_db / 20.0))
     return (whole * gain.unsqueeze(-1).to(whole.dtype)).to(waveform.dtype)

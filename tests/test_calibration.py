@@ -91,3 +91,15 @@ def test_levels_of_samples_that_are_no_floats_are_refused(given: Any) -> None:
     for call in (level_spl, lambda waveform: set_level(waveform, 65.0)):
         with pytest.raises(ValueError, match=r"waveform is .*; allowed: a floating-point tensor"):
             call(given)
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, "65", None, [65.0, 70.0], True])
+def test_levels_that_are_none(value: Any) -> None:
+    with pytest.raises(ValueError, match=r"spl is .*; allowed: a level in dB SPL"):
+        set_level(torch.randn(2, 100), value)
+
+
+@pytest.mark.parametrize("shape", [(3, 1), (3,), (2, 100)])
+def test_levels_in_a_shape_that_is_not_the_items(shape: tuple[int, ...]) -> None:
+    with pytest.raises(ValueError, match=r"spl of shape .* for items of \(2,\)"):
+        set_level(torch.randn(2, 100), torch.zeros(shape))
