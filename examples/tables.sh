@@ -27,7 +27,8 @@ train() { # row: recipe[:setting=value[...]]
         BEGIN { for (n = split(given, pairs, ":"); n; n--) { split(pairs[n], pair, "="); value[pair[1] ":"] = pair[2] } }
         $1 == "channels:" && by > 1 { $0 = "  channels: " 4 * int($2 / by / 4 + 0.5) }
         $1 == "heads:" && by > 1 { $0 = "  heads: " int(($2 + by - 1) / by) }  # heads stay as wide
-        !($1 in value)
+        /^[a-z]/ { part = $1 }
+        !($1 in value) || part == "weights:"
         $1 == "model:" { for (name in value) if (name !~ /^(seed|precision):/) print "  " name, value[name] }
         END { for (name in value) if (name ~ /^(seed|precision):/) print name, value[name] }
     ' "$here/${1%%:*}.yaml" >"$recipe"
