@@ -7,7 +7,8 @@
 #
 # CORPORA holds speech/{train,valid}, noise/{train,valid} and audiograms/{train,valid}.csv.
 # STEPS: of each row, whatever the minutes. NARROW: the paper's rows with as many times fewer channels and heads. JOBS: rows
-# trained at a time. ROWS: these alone, compared as Table I; what follows a colon changes the recipe's network, its seed or its precision.
+# trained at a time. ROWS: these alone, compared as Table I; what follows a colon changes the recipe's network, seed or
+# precision.
 set -euo pipefail
 corpora=$1 out=$2 minutes=${3:-5} items=${4:-80}
 here=$(dirname "${BASH_SOURCE[0]}")
@@ -24,13 +25,14 @@ train() { # row: recipe[:setting=value[...]]
     local name=$(folder "$1") given=${1#"${1%%:*}"}
     local recipe="$out/recipes/$name.yaml"
     awk -v by="$([[ $1 == paper/* ]] && echo "${NARROW:-1}" || echo 1)" -v given="${given#:}" '
+        function of_recipe(name) { return name == "seed:" || name == "precision:" }  # others are of the network
         BEGIN { for (n = split(given, pairs, ":"); n; n--) { split(pairs[n], pair, "="); value[pair[1] ":"] = pair[2] } }
         $1 == "channels:" && by > 1 { $0 = "  channels: " 4 * int($2 / by / 4 + 0.5) }
         $1 == "heads:" && by > 1 { $0 = "  heads: " int(($2 + by - 1) / by) }  # heads stay as wide
         /^[a-z]/ { part = $1 }
         !($1 in value) || part == "weights:"
-        $1 == "model:" { for (name in value) if (name !~ /^(seed|precision):/) print "  " name, value[name] }
-        END { for (name in value) if (name ~ /^(seed|precision):/) print name, value[name] }
+        $1 == "model:" { for (name in value) if (!of_recipe(name)) print "  " name, value[name] }
+        END { for (name in value) if (of_recipe(name)) print name, value[name] }
     ' "$here/${1%%:*}.yaml" >"$recipe"
     hlsim train-simulator --config "$recipe" "${limit[@]}" --quiet --out "$out/$name" \
         --speech "$corpora/speech/train" --valid-speech "$corpora/speech/valid" \
