@@ -51,7 +51,8 @@ class DilatedConv(nn.Conv2d):
 
     def forward(self, features: Tensor) -> Tensor:
         step, time = self.dilation[0], features.shape[2]
-        if step == 1 or features.is_cuda or not (torch.is_grad_enabled() and self.weight.requires_grad):
+        trained = torch.is_grad_enabled() and self.weight.requires_grad
+        if step == 1 or not trained or features.device.type != "cpu":
             return super().forward(features)
         # on a CPU the weights' gradient takes three to six times as long with dilation as of every step-th time by itself
         phases = functional.pad(features, (0, 0, 0, -time % step)).unflatten(2, (-1, step)).movedim(3, 1)
