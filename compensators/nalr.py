@@ -77,8 +77,6 @@ class NALR(nn.Module):
             ValueError: no audiogram, levels outside -10 to 120 dB HL, or shapes that do not fit.
         """
         check_waveform(waveform)
-        if audiogram is None and self.thresholds is None:
-            raise ValueError("no audiogram: give one when building NALR or with the call")
         thresholds = resolve_thresholds(
             self.thresholds, audiogram, waveform, two_ears=self._two_ears, **_LIMITS
         )

@@ -49,7 +49,6 @@ class HASPILoss(HearingLossLoss):
         ears: EarsName = "mean",
     ) -> None:
         criterion = {"haspi": 1.0, "hasqi": quality, "coherent-bands": level}
-        criterion = {name: weight for name, weight in criterion.items() if weight != 0.0}
         parts = {"haspi": 1.0} | ({"hasqi": 1.0} if quality else {}) | (_LEVEL if level else {})
         super().__init__(
             audiogram,

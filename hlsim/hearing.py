@@ -122,7 +122,8 @@ class FrozenEar:
         Args:
             kind: ``bands``, ``paper``, ``coherent-bands``, or of another criterion.
         """
-        time, ours, choice = clean.shape[-1], self._holds(MSBG, NeuroMSBG), self.choice
+        time, choice = clean.shape[-1], self.choice
+        ours = self.normal is None and self._holds(MSBG, NeuroMSBG)
         if kind in ("coherent-bands", "bands"):
             choice = "normal-hearing"
         elif choice is None:
@@ -131,7 +132,9 @@ class FrozenEar:
             ears = (
                 ears.expand(*batch, -1).reshape(-1, len(FREQUENCIES)) if ears.ndim > 1 else ears.unsqueeze(0)
             )
-        with torch.set_grad_enabled(torch.is_grad_enabled() and clean.requires_grad):
+        # what torch.func differentiates by does not say so
+        followed = clean.requires_grad or torch._C._functorch.maybe_current_level() is not None
+        with torch.set_grad_enabled(torch.is_grad_enabled() and followed):
             if choice == "clean":
                 aim = self._narrowed(clean)
             elif self.normal is not None:

@@ -66,8 +66,8 @@ class HearingLossLoss(nn.Module):
         reference: what ``"paper"``, a callable and ``heard`` compare with: ``"clean"``, the clean speech itself (the
             default for ``"paper"``), or ``"normal-hearing"``, what a normal ear hears of it (the default else). Either
             has the phase of MSBG's bank of the ear's severity (``hlsim.msbg.response``), or polarity-inverted speech
-            could be nearer than the speech; with a module that neither is nor holds one of hlsim's simulators, it is
-            compared as it is. The other criteria always compare with what a normal ear hears.
+            could be nearer than the speech; with ``normal``, or a module that neither is nor holds one of hlsim's
+            simulators, it is compared as it is. The other criteria always compare with what a normal ear hears.
         criterion: ``"coherent-bands"``, whether bands follow the reference and have its level
             (``hlsim.criteria.coherent_bands``); ``"bands"``, levels in bands alone; ``"paper"``, Equations 2 to 9 of
             Neuro-MSBG, not balanced between ears and levels (``hlsim.criteria.paper``); ``"haspi"`` and ``"hasqi"``, 1
@@ -81,6 +81,7 @@ class HearingLossLoss(nn.Module):
         normal: the normal ear that belongs to the simulator, a module (frozen too) or callable, (..., time) -> (...,
             time). By default hlsim's simulators have MSBG's at 0 dB HL, and another module is asked itself with 0 dB HL:
             what it does to every ear, such as a low-pass filter, it then does to the reference, and it costs nothing.
+            A network that learned another teacher than MSBG needs that one's.
         ears: of two ears, (..., 2, time): ``"mean"``, or ``"better"``, smoothly the better one: each counts by its
             share, ``softmax(-loss / 0.1)`` over the two. The gradient holds the shares, so that no ear is made worse.
 
@@ -119,6 +120,14 @@ class HearingLossLoss(nn.Module):
         self._ear = FrozenEar(simulator, self.sample_rate, self.full_scale_spl, normal, reference)
         # in a tuple, nn.Module does not see them
         self._unregistered = (thresholds, criterion)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        # nn.Module would register a module behind the property's back, and the loss would not change
+        if name in ("simulator", "normal", "criterion"):
+            raise AttributeError(
+                f"{name} is what the loss was built with; build another one for another {name}"
+            )
+        super().__setattr__(name, value)
 
     @property
     def criterion(self) -> Criterion:

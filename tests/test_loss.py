@@ -945,6 +945,14 @@ def test_a_simulator_brings_its_normal_ear(clean: Tensor) -> None:
     assert list(HearingLossLoss(N3, normal=ear).parameters()) == []
     copied = copy.deepcopy(HearingLossLoss(N3, normal=ear)).double()
     assert copied.normal.weight.dtype == torch.float64 and ear.weight.dtype == torch.float32
+    # a network of another teacher: its normal ear, given, has a phase of its own, not MSBG's
+    perfect = copy.deepcopy(load_pretrained("neuro-msbg"))
+    perfect.forward = lambda waveform, _: waveform * 1.0
+    for criterion in ("paper", lambda heard, aim: (heard - aim).square().mean(-1)):
+        learned = HearingLossLoss(
+            N4, simulator=perfect, normal=nn.Identity(), criterion=criterion, reference="clean"
+        )
+        assert float(learned(clean, clean)) == pytest.approx(0.0, abs=1e-6)
     broken = HearingLossLoss(N3, normal=lambda waveform: waveform[..., 1:])
     with pytest.raises(ValueError, match=r"normal ear made 4799 samples of 4800; allowed"):
         broken(clean, clean)
@@ -1029,6 +1037,9 @@ def test_transforms_work_or_say_so(clean: Tensor) -> None:
         torch.testing.assert_close(torch.func.grad(lambda wave, loss=loss: loss(wave, clean))(given), slope)
     each = torch.stack([exact(one, true) for one, true in zip(given, clean, strict=True)])
     torch.testing.assert_close(torch.vmap(exact)(given, clean), each, rtol=1e-4, atol=1e-5)
+    _, by_clean = gradient(lambda true, wave: exact(wave, true), clean, given)
+    summed = torch.func.grad(lambda true: torch.vmap(exact)(given, true).mean())(clean)
+    torch.testing.assert_close(summed, by_clean, rtol=1e-3, atol=1e-5 * float(by_clean.abs().max()))
     along = torch.func.jvp(lambda wave: exact(wave, clean), (given,), (clean,))[1]
     assert bool(along.isfinite())
     with pytest.raises(
@@ -1039,3 +1050,18 @@ def test_transforms_work_or_say_so(clean: Tensor) -> None:
         torch.export.export(Host(network).loss, (given, clean))
     with pytest.raises(RuntimeError, match="hlsim runs eagerly here: leave fullgraph out"):
         torch.compile(lambda wave: network(wave, clean), backend="eager", fullgraph=True)(given)
+
+
+def test_what_it_was_built_with_stays() -> None:
+    loss = HearingLossLoss(N3)
+    for name, other in (
+        ("simulator", MSBG(sample_rate=16000)),
+        ("normal", nn.Identity()),
+        ("criterion", "bands"),
+    ):
+        with pytest.raises(AttributeError, match=f"{name} is what the loss was built with"):
+            setattr(loss, name, other)
+    assert not loss.state_dict()
+    assert list(HearingLossLoss(N3, criterion={"coherent-bands": 1.0, "haspi": 0.0}).criteria) == [
+        "coherent-bands"
+    ]

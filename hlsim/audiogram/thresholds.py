@@ -125,7 +125,7 @@ def resolve_thresholds(
         ValueError: there is neither, the shapes do not broadcast, or a listener's waveform is not (..., 2, time).
     """
     if audiogram is None and stored is None:
-        raise ValueError("no audiogram: give one when building the simulator or with the call")
+        raise ValueError("no audiogram: give one with the call, or when building what keeps one (MSBG, NALR)")
     thresholds = as_thresholds(audiogram, **limits) if audiogram is not None else stored
     assert thresholds is not None
     check_two_ears(two_ears if audiogram is None else of_listeners(audiogram), waveform)

@@ -37,7 +37,7 @@ def check_values(values: Any, items: int) -> Tensor:
 
 
 def check_criterion(criterion: Any) -> dict[str, Any]:
-    """The criteria by name, each with its weight; a callable as itself, under the name criterion."""
+    """The criteria by name, each with its weight unless that is 0; a callable as itself, under the name criterion."""
     if callable(criterion) and not isinstance(criterion, type):
         return {"criterion": criterion}
     named = {criterion: 1.0} if isinstance(criterion, str) else criterion
@@ -46,7 +46,7 @@ def check_criterion(criterion: Any) -> dict[str, Any]:
             f"criterion is {criterion!r}; allowed: {', '.join(CRITERIA)}, weights by these names, or a callable "
             "(heard, reference) -> (items,)"
         )
-    return _check_numbers(named, "criterion")
+    return {name: weight for name, weight in _check_numbers(named, "criterion").items() if weight}
 
 
 def check_weights(

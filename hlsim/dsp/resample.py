@@ -43,8 +43,8 @@ def resample(waveform: Tensor, source_rate: int, target_rate: int) -> Tensor:
             "22050, 24000, 32000, 44100 and 48000"
         )
     waveform = waveform.contiguous()  # torchaudio takes a view of it
-    # a kernel made while a program is traced is of no use to others
-    if torch.compiler.is_compiling():
+    # a kernel made while a program is traced, or of fake tensors, is of no use to others
+    if torch.compiler.is_compiling() or torch._C._len_torch_dispatch_stack():
         slow: Tensor = _torchaudio().functional.resample(waveform, source_rate, target_rate, **_SINC)
         return slow
     resampled: Tensor = _resampler(source_rate, target_rate, waveform.dtype, waveform.device)(waveform)

@@ -1,4 +1,4 @@
-"""HASPI version 2 in torch: pyclarity 0.9.0's score, differentiable, on any device, many times as fast.
+"""HASPI version 2 in torch: pyclarity 0.9.0's score, differentiable, on a CPU or a GPU, many times as fast.
 
 Kates and Arehart 2021, "The hearing-aid speech perception index (HASPI) version 2", Speech Communication 131, 35-46,
 doi 10.1016/j.specom.2020.05.001. What to know of it:
@@ -34,12 +34,13 @@ from hlsim.metrics.ear import model as ear_model
 from hlsim.metrics.ear.clean_speech import CleanItem, CleanSpeech, ItemGroup
 from hlsim.metrics.ear.model import CHANNELS
 from hlsim.metrics.pair import check_seed
-from hlsim.torchtools import constant
+from hlsim.torchtools import constant, not_compiled
 
 Noise = Literal["expected", "seeded", "none"]
 """Of the hair cells' firing: its mean effect, what pyclarity draws under a seed, or none."""
 
 
+@not_compiled  # traced, it takes minutes
 def haspi(
     processed: Tensor,
     clean: Tensor,
@@ -104,6 +105,7 @@ class HaspiReference:
         ValueError: as ``haspi``.
     """
 
+    @torch.inference_mode(False)  # it may be scored against where gradients are wanted
     def __init__(
         self,
         clean: Tensor,
@@ -257,7 +259,10 @@ def generator_after(seed: int, count: int) -> np.random.RandomState:
 def item_seeds(seed: int | Sequence[int], shape: torch.Size) -> list[int]:
     """One an item, or ValueError."""
     items = shape.numel()
-    seeds = [seed] * items if isinstance(seed, int | np.integer) else list(seed)
+    try:
+        seeds: list[Any] = list(seed)  # type: ignore[arg-type]
+    except TypeError:  # no sequence, nor a tensor with elements
+        seeds = [seed] * items
     if len(seeds) != items:
         raise ValueError(f"{len(seeds)} seeds for {items} items; allowed: one, or one an item")
     return [check_seed(one) for one in seeds]

@@ -1,4 +1,4 @@
-"""HASQI version 2 in torch: pyclarity 0.9.0's score, differentiable, on any device, many times as fast.
+"""HASQI version 2 in torch: pyclarity 0.9.0's score, differentiable, on a CPU or a GPU, many times as fast.
 
 Kates and Arehart 2014, "The hearing-aid speech quality index (HASQI) version 2", J. Audio Eng. Soc. 62(3), 99-117. Both
 signals are heard by the impaired ear, the clean one with NAL-R: what is scored is distortion, noise and colour, not
@@ -29,7 +29,7 @@ from hlsim.metrics.ear.clean_speech import CleanItem, CleanSpeech, ItemGroup
 from hlsim.metrics.ear.model import AUDIOMETRIC_HZ, CHANNELS, Extent
 from hlsim.metrics.ear.recursions import RATE
 from hlsim.metrics.haspi import Noise, generator_after, item_seeds
-from hlsim.torchtools import constant
+from hlsim.torchtools import constant, not_compiled
 
 _NALR_ORDER = 140
 _NALR_BIAS = np.array([-17.0, -8.0, 1.0, -1.0, -2.0, -2.0])
@@ -58,6 +58,7 @@ class HasqiParts(NamedTuple):
     linear: Tensor
 
 
+@not_compiled  # traced, it takes minutes
 def hasqi(
     processed: Tensor,
     clean: Tensor,
@@ -109,6 +110,7 @@ class HasqiReference:
         ValueError: as ``haspi``.
     """
 
+    @torch.inference_mode(False)  # it may be scored against where gradients are wanted
     def __init__(
         self,
         clean: Tensor,

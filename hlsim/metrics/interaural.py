@@ -83,7 +83,8 @@ def interaural_loss(processed: Tensor, clean: Tensor, sample_rate: int) -> Tenso
     true_left, true_right, true_cross, _ = _spectra(clean, sample_rate)
     levels = [torch.log10(one @ octaves + _TINY) for one in (left, right, true_left, true_right)]
     error = (levels[0] - levels[1] - levels[2] + levels[3]).abs()
-    phase = cross / (power(cross) + _TINY**2).sqrt()
+    # as deep as the floor of the powers, or the phase of an ear that is mute would have a gradient of a million
+    phase = cross / (power(cross) + _TINY * (left + right + _TINY)).sqrt()
     size = (power(true_cross) + _TINY**2).sqrt() @ octaves
     powers = (true_left + true_right).detach() @ octaves
     weights = powers / (powers + _DEPTH * powers.amax(-1, keepdim=True) + _TINY)

@@ -63,7 +63,9 @@ def check_pair(
 
 
 def _samples(signal: Signal, name: str) -> np.ndarray:
-    values = signal.detach().cpu().numpy() if isinstance(signal, Tensor) else np.asarray(signal)
+    if isinstance(signal, Tensor):  # numpy has no bfloat16
+        signal = (signal.double() if signal.is_floating_point() else signal).detach().cpu().numpy()
+    values = np.asarray(signal)
     if values.ndim != 1 or not len(values) or values.dtype.kind != "f":
         raise ValueError(
             f"{name} has shape {values.shape} of {values.dtype}; allowed: (time,), floating point, of one ear"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+import zlib
 from collections.abc import Callable
 from typing import Any, ClassVar, NamedTuple
 
@@ -64,6 +65,19 @@ class _MeanScore(_Metric):
             self.add_state(name, torch.tensor(0), dist_reduce_fx="sum")
         for name in ("total_ears", "count_ears"):
             self.add_state(name, torch.zeros(2), dist_reduce_fx="sum")
+        # a MetricCollection merges metrics whose states are equal, as after a batch of which none has a score
+        made_as = repr((type(self), self.sample_rate, self.full_scale_spl, self.seed, self.limit))
+        self.add_state("made_as", torch.tensor(zlib.crc32(made_as.encode())), dist_reduce_fx="max")
+
+    def forward(self, *args: Any, **kwargs: Any) -> Tensor:
+        """``update``, and the mean score of this batch alone, in this process.
+
+        torchmetrics' own resets before each: ``limit`` and ``seed`` would begin anew.
+        """
+        total, count = self.total.clone(), self.count.clone()
+        self.update(*args, **kwargs)
+        self._forward_cache: Tensor = (self.total - total) / (self.count - count)
+        return self._forward_cache
 
     def update(
         self, processed: Tensor, clean: Tensor, audiogram: AudiogramLike, lengths: Lengths | None = None
@@ -91,11 +105,11 @@ class _MeanScore(_Metric):
                 f"processed {tuple(shape)} and clean {tuple(clean.shape)}; allowed: (batch, time), (time,) or (batch, 2, "
                 "time), the same for both"
             )
-        device = processed.device
-        precision = torch.float32 if device.type == "mps" else torch.float64
         sides = 2 if len(shape) == 3 else 1
         heard, reference = (
-            torch.atleast_2d(signal.detach()).to(device, precision).reshape(-1, sides, shape[-1])
+            torch.atleast_2d(signal.detach())
+            .to(processed.device, torch.float64)
+            .reshape(-1, sides, shape[-1])
             for signal in (processed, clean)
         )
         ears = _ears(audiogram, len(heard), sides)
@@ -175,7 +189,7 @@ class HASPI(_MeanScore):
     """Mean HASPI v2 of processed speech over all items since the last ``reset``.
 
     It rewards any gain: log ``level``, the mean level in dB SPL, beside it. The figures are pyclarity's, which takes
-    44.1 kHz for 44: its noise is drawn, and the precision is double where the device has it. On a CPU a second of audio
+    44.1 kHz for 44: its noise is drawn, and the precision is double. On a CPU a second of audio
     takes about 0.12 s, on one core; ``limit`` bounds what a validation epoch costs.
 
     In a LightningModule ``self.haspi = HASPI(sample_rate=16000)``, in ``validation_step``

@@ -1,4 +1,4 @@
-"""The exact MSBG: batched, differentiable, on any device."""
+"""The exact MSBG: batched, differentiable, on a CPU or a GPU."""
 
 import math
 from functools import partial
@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from hlsim.audiogram import severity_of
+from hlsim.audiogram import SEVERITIES, severity_of
 from hlsim.audiogram.thresholds import AudiogramLike, of_listeners, own_thresholds, resolve_thresholds
 from hlsim.calibration import PASCAL_SPL, check_full_scale, gain_to_pascals
 from hlsim.checks import check_rate, check_waveform
@@ -67,7 +67,7 @@ class MSBG(nn.Module):
         ValueError: a rate, level or audiogram out of range.
     """
 
-    thresholds: Tensor | None
+    _levels: Tensor | None
     _two_ears: bool
 
     def __init__(
@@ -84,8 +84,16 @@ class MSBG(nn.Module):
         self.full_scale_spl = check_full_scale(full_scale_spl)
         self.aligned = aligned
         self.rescale_active = rescale_active
-        self.register_buffer("thresholds", own_thresholds(audiogram), persistent=False)
+        levels = own_thresholds(audiogram)
+        trained = levels is not None and levels.requires_grad
+        self.register_buffer("_levels", None if trained else levels, persistent=False)
+        self._trained = (levels if trained else None,)  # a buffer that moves would be another tensor
         self._two_ears = of_listeners(audiogram)
+
+    @property
+    def thresholds(self) -> Tensor | None:
+        """The ear or ears given to the constructor. Shape: (..., 8) dB HL."""
+        return self._levels if self._trained[0] is None else self._trained[0]
 
     @not_compiled  # it depends on the ear's values, and its filters are made by numpy
     def forward(self, waveform: Tensor, audiogram: AudiogramLike | None = None) -> Tensor:
@@ -97,12 +105,15 @@ class MSBG(nn.Module):
             ValueError: no audiogram, levels outside -10 to 100 dB HL, or shapes that do not fit.
         """
         check_waveform(waveform)
-        thresholds = resolve_thresholds(self.thresholds, audiogram, waveform, two_ears=self._two_ears)
+        given = self._trained[0] if audiogram is None else audiogram  # what is trained may leave the range
+        thresholds = resolve_thresholds(self._levels, given, waveform, two_ears=self._two_ears)
         with torch.autocast(waveform.device.type, enabled=False):
             return self._simulate(waveform, thresholds)
 
     def delay(self, severity: str) -> int:
-        """Structural delay in samples at 44.1 kHz at a severity."""
+        """Structural delay in samples at 44.1 kHz at a severity, one of ``SEVERITIES``; ValueError for others."""
+        if severity not in SEVERITIES:
+            raise ValueError(f"severity {severity!r}; allowed: {', '.join(SEVERITIES)}")
         return STRUCTURAL_DELAY + (SMEARING_DELAY if severity in BROADENING else 0)
 
     def extra_repr(self) -> str:

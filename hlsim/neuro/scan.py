@@ -1,4 +1,4 @@
-"""The selective scan of Mamba (Gu and Dao 2023) in plain torch: parallel over time, on any device."""
+"""The selective scan of Mamba (Gu and Dao 2023) in plain torch: parallel over time."""
 
 from __future__ import annotations
 

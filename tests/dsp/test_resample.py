@@ -112,6 +112,15 @@ def test_a_kernel_made_in_a_transform_serves_others_too() -> None:
     torch.testing.assert_close(torch.func.grad(energy)(wave.detach()), expected)
 
 
+def test_fake_tensors_leave_no_kernel_behind() -> None:
+    from torch._subclasses.fake_tensor import FakeTensorMode
+
+    _resampler.cache_clear()
+    with FakeTensorMode(allow_non_fake_inputs=True):
+        resample(torch.ones(50), 17000, 16000)
+    assert type(resample(torch.ones(50), 17000, 16000)) is Tensor
+
+
 def test_rates_without_a_common_factor_are_refused_before_a_kernel_of_gigabytes_is_made() -> None:
     with pytest.raises(ValueError, match="from 44101 to 16000 Hz, whose common factor is too small; allowed"):
         resample(torch.ones(50), 44101, 16000)

@@ -16,6 +16,7 @@ from hlsim.metrics import pyclarity as reference
 from hlsim.metrics.ear import clean_speech
 from hlsim.metrics.ear import model as ear_model
 from hlsim.metrics.haspi import HaspiReference, generator_after, haspi
+from hlsim.metrics.hasqi import HasqiReference
 
 N2, N3, N6 = (Audiogram.standard(name) for name in ("N2", "N3", "N6"))
 
@@ -118,9 +119,11 @@ def test_a_prepared_reference_is_the_same(clean: Tensor, noisy: Tensor) -> None:
 def test_what_inference_mode_keeps_serves_training(clean: Tensor, noisy: Tensor) -> None:
     with torch.inference_mode():
         haspi(noisy[0], clean[0], N3)
+        prepared = HaspiReference(clean[0]).score, HasqiReference(clean[0], N3).score
     given = noisy[0].clone().requires_grad_()
-    haspi(given, clean[0], N3).backward()
-    assert given.grad is not None and bool(given.grad.any())
+    for value in (haspi(given, clean[0], N3), prepared[0](given, N3), prepared[1](given)):
+        (slope,) = torch.autograd.grad(value, given)
+        assert bool(slope.any())
 
 
 def test_autocast_changes_nothing(clean: Tensor, noisy: Tensor) -> None:
@@ -241,6 +244,7 @@ def test_a_delay_does_not_count(clean: Tensor, noisy: Tensor) -> None:
         ({"lengths": 9000}, "lasts 0.56 s"),
         ({"noise": "loud"}, "noise 'loud'; allowed: expected, seeded, none"),
         ({"seed": [1, 2]}, "2 seeds for 1 items"),
+        ({"seed": None}, "seed is None; allowed: whole numbers"),
         ({"seed": -1}, "seed is -1"),
     ],
 )

@@ -71,6 +71,15 @@ def test_the_loss_is_of_what_differs_between_the_ears_alone(scene: Tensor) -> No
     assert float(interaural_loss(scene, torch.zeros_like(scene), 16000)) == pytest.approx(0.0, abs=1e-5)
 
 
+def test_an_ear_that_is_mute_has_a_small_gradient(scene: Tensor) -> None:
+    norms = []
+    for gain in (1e-3, 1e-6, 0.0):
+        given = (scene * torch.tensor([[1.0], [gain]])).requires_grad_()
+        (gradient,) = torch.autograd.grad(interaural_loss(given, scene, 16000), given)
+        norms.append(float(gradient[1].norm()))
+    assert max(norms) < 1e4  # 7e6 where the floor is under both ears' product alone
+
+
 def test_as_a_part_of_the_loss_it_brings_the_ears_back_together(scene: Tensor) -> None:
     loss = HearingLossLoss(
         Listener(EAR, EAR), criterion={"coherent-bands": 1.0, "interaural": 2.0}, reduction="none"

@@ -90,6 +90,32 @@ def test_limit_and_lengths(clean: Tensor) -> None:
     assert float(metric.compute()) == pytest.approx(haspi(clean[0], clean[0], N3, 16000), abs=1e-6)
 
 
+def test_a_call_counts_as_an_update_and_gives_the_batchs_own_mean(clean: Tensor) -> None:
+    updated, called = HASPI(16000, limit=2), HASPI(16000, limit=2)
+    batches = [noisy(clean)[:1], clean[:1], noisy(clean)[:1]]
+    values = []
+    for batch in batches:
+        updated.update(batch, clean[:1], N3)
+        values.append(float(called(batch, clean[:1], N3)))
+    assert int(called.count) == int(updated.count) == 2
+    torch.testing.assert_close(called.compute(), updated.compute())
+    assert sum(values[:2]) / 2 == pytest.approx(float(called.compute()), abs=1e-6) and values[2] != values[2]
+
+
+def test_a_collection_keeps_apart_what_was_made_apart(clean: Tensor) -> None:
+    from torchmetrics import MetricCollection
+
+    collection = MetricCollection({"haspi": HASPI(), "hasqi": HASQI(), "one": HASPI(limit=1)})
+    with pytest.warns(UserWarning, match="leaves out item 0"):
+        collection.update(clean[:1, :8000], clean[:1, :8000], N3)  # no score: all states are equal
+    collection.reset()
+    collection.update(noisy(clean), clean, [N3, S2])
+    expected = [kind(16000, limit=limit) for kind, limit in ((HASPI, None), (HASQI, None), (HASPI, 1))]
+    for metric in expected:
+        metric.update(noisy(clean), clean, [N3, S2])
+    torch.testing.assert_close(list(collection.compute().values()), [metric.compute() for metric in expected])
+
+
 def test_what_cannot_be_scored_is_left_out_and_said(clean: Tensor) -> None:
     metric = HASPI(16000)
     for spoiled, reason in (

@@ -358,6 +358,29 @@ def test_nothing_is_trained_or_stored_and_copies_are_alike(speech: list[tuple[Te
     assert "sample_rate=44100" in repr(model)
 
 
+def test_an_ear_that_is_trained_is_followed_after_a_move() -> None:
+    ear = torch.nn.Parameter(torch.full((8,), 40.0))
+    model = MSBG(ear, sample_rate=16000).double()
+    assert model.thresholds is ear and not list(model.parameters())
+    wave = 0.03 * torch.randn(2000, dtype=torch.float64)
+    before = model(wave)
+    before.square().sum().backward()
+    assert ear.grad is not None and bool(ear.grad.any())
+    with torch.no_grad():
+        ear += 10.0
+    assert not torch.equal(model(wave), before)
+    assert copy.deepcopy(model).thresholds is not ear
+    with torch.no_grad():
+        ear += 60.0
+    with pytest.raises(ValueError, match=r"110.*-10 to 100"):
+        model(wave)
+
+
+def test_an_unknown_severity_has_no_delay() -> None:
+    with pytest.raises(ValueError, match="severity 'Severe'; allowed: none, mild, moderate, severe"):
+        MSBG().delay("Severe")
+
+
 N3 = Audiogram.standard("N3")
 
 

@@ -2,7 +2,7 @@
 
 Every filter of the ear is linear and time-invariant. Within a block of 64 samples its output is a triangular Toeplitz
 product of the input; what earlier blocks leave behind is a state of two to eight numbers, handed on by a small matrix.
-That is exact, fast on any device, and differentiable in the signal and in the filters' bandwidths.
+That is exact, fast on a GPU too, and differentiable in the signal and in the filters' bandwidths.
 """
 
 from __future__ import annotations
