@@ -37,10 +37,13 @@ class Live:
             sliders.
         full_scale_spl: level in dB SPL of RMS 1.0, of microphone and headphones alike.
         ears: 1, or 2: left and right, each from its own microphone where there are two.
+        latency: samples that the stream's output is late.
     """
 
-    def __init__(self, stream: Callable[[Tensor], Tensor], full_scale_spl: float, ears: int = 1) -> None:
-        self.stream, self.full_scale_spl, self.ears = stream, full_scale_spl, ears
+    def __init__(
+        self, stream: Callable[[Tensor], Tensor], full_scale_spl: float, ears: int = 1, latency: int = 0
+    ) -> None:
+        self.stream, self.full_scale_spl, self.ears, self.latency = stream, full_scale_spl, ears, latency
         self.drop_outs, self.error = 0, ""
         self._blocks: list[Tensor] = []
 
@@ -150,7 +153,7 @@ def play(
             _keys() as key,
             sounddevice.Stream(samplerate=NEURO_RATE, blocksize=block, callback=live, **options) as audio,
         ):
-            late = 1000.0 * sum(audio.latency)
+            late = 1000.0 * (sum(audio.latency) + live.latency / NEURO_RATE)
             print(f"blocks of {1000 * block / NEURO_RATE:g} ms, {late:.0f} ms late; q or Ctrl-C ends it")
             end, pressed = time.monotonic() + seconds, ""
             while pressed != "q" and not live.error and (left := end - time.monotonic()) > 0.0:

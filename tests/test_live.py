@@ -104,6 +104,7 @@ def test_what_is_played_is_what_the_aid_gives(
     }  # fmt: skip
     out = capsys.readouterr().out
     level = 10.0 * np.log10(np.square(expected).mean()) + 100.0
+    assert "blocks of 5 ms, 34 ms late" in out  # 30 of the devices, 4 of the aid
     assert f"in  65.0, out {level:5.1f} dB SPL, drop-outs 2" in out and out.endswith("stopped, drop-outs 2\n")
 
 

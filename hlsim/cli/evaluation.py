@@ -197,7 +197,7 @@ def _haspi_report(options: argparse.Namespace) -> None:
     write_report(report, options.out, listen=options.listen)
     print(markdown(report))
     if failed := len(report.failures):
-        all_ = failed + sum(len(own) for item in report.items for own in item.scores.values())
+        all_ = failed + sum(len(own) for item in report.ears or report.items for own in item.scores.values())
         text = f"{failed} of {all_} scores could not be made; the reasons are in {options.out / 'report.md'}"
         print(f"hlsim: {text}", file=sys.stderr)
     tell_page(options.out / "report.html")

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from hlsim.cli.inputs import check_files, check_folders, read_compensator, read_ears
 from hlsim.cli.options import Parser
-from hlsim.files import check_extension
+from hlsim.files import check_extension, resolved
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -149,6 +149,10 @@ def _pairs(source: Path, target: Path) -> list[tuple[Path, Path]]:
         if one in made:
             raise ValueError(f"{path} and {made[one]} would both be {one}; rename one")
         made[one] = path
+    read = {resolved(path) for path in made.values()}
+    for one, path in made.items():
+        if resolved(one) in read:
+            raise ValueError(f"{one}: made of {path}, a file of IN would be lost; allowed: another OUT")
     return [(path, one) for one, path in made.items()]
 
 

@@ -70,14 +70,14 @@ def _live(options: argparse.Namespace) -> None:
         if options.noise_reduction is not None or options.amplification is not None:
             raise ValueError("sliders with --simulate; allowed: with a hearing aid")
         stream = Simulated(build_simulator("neuro-msbg", _RATE, options.full_scale_spl), ears)
-        block = 12 * stream.block
+        block, latency = 12 * stream.block, stream.latency
     else:
         aid, sliders = read_compensator(options, _RATE)
         if not hasattr(aid, "stream"):
             raise ValueError(f"{options.compensator} takes whole signals; allowed: wdrc, or a hearing aid")
-        stream = aid.stream(ears, **sliders)
+        stream, latency = aid.stream(ears, **sliders), aid.latency
     play(
-        Live(stream, options.full_scale_spl, 2 if options.listener else 1),
+        Live(stream, options.full_scale_spl, 2 if options.listener else 1, latency),
         sounddevice,
         devices=(options.input, options.output),
         block=block,

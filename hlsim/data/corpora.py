@@ -88,7 +88,7 @@ def assign_splits(
     given = any(splits != {""} for splits in speakers.values())
     for split, share in (("test", 0.0 if given else test_share), ("valid", valid_share)):
         training = sorted(speaker for speaker, given_to in assigned.items() if given_to == "train")
-        count = min(max(1, round(share * len(training))), len(training) - 1) if share else 0
+        count = min(max(1, round(share * len(training))), len(training) - 1) if share and training else 0
         for speaker in Random(f"{seed}:{split}").sample(training, count):
             assigned[speaker] = split
     return assigned

@@ -18,6 +18,7 @@ from hlsim.data.plan_settings import PlanSettings
 
 _QUIET_DB = 30.0  # a stretch this far below its recording's level counts as a pause of the noise
 _STEP, _STRETCH = 0.1, 5  # s from one possible start to the next, and how many of these are no pause
+_BESIDE = "beside the folders of splits; move it into one"
 
 
 Types = Mapping[str, list[tuple[str, Sequence[float]]]]
@@ -73,6 +74,9 @@ def find_noises(
         kinds.setdefault(split, {}).setdefault(kind, []).append((name, _starts(waveform[0], rate)))
     if not kinds:
         raise ValueError(f"{root / folder}: no noise in it that can be used")
+    if len(kinds) > 1:
+        for name, _ in (file for members in kinds.pop("", {}).values() for file in members):
+            faults.append(Fault(name, _BESIDE))
     files: dict[str, Types] = {**kinds}
     if set(kinds) == {""}:
         files = _drawn(kinds[""], settings.train_types, settings.test_types, settings.seed)

@@ -114,7 +114,6 @@ def prepare(
     folder.mkdir(parents=True, exist_ok=True)
     for leftover in folder.glob(f".*{PARTIAL}"):  # of a run that was killed
         leftover.unlink(missing_ok=True)
-    (folder / SETTINGS).unlink(missing_ok=True)  # it is written last: without it the folder is not prepared
     prepared = Prepared()
     with Whole(folder / FAULTS) as report, Whole(folder / MANIFEST) as manifest:
         report.write(csv_line(FAULT_COLUMNS))
@@ -145,6 +144,9 @@ def prepare(
         _refuse_faults(prepared, strict, folder)
         if not prepared.utterances:
             raise ValueError(f"{root / corpus}: nothing in it can be used; {folder / FAULTS} says why")
+        (folder / SETTINGS).unlink(
+            missing_ok=True
+        )  # it is written last: without it the folder is not prepared
         manifest.keep()
     inputs = ["clean", "noisy"] if listing.paired or noises is not None else ["clean"]
     _write_instances(settings, folder, prepared, ears, inputs)

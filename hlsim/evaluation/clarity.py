@@ -136,7 +136,8 @@ def evaluate_scenes(
         progress: of what it is to tell of, called with how many are done and all.
 
     Returns: a report of all conditions, ``unaided`` first, the last aid last, whose ``extra`` has ``looks_ahead_ms`` by
-        condition: how long before the input becomes another sound the output changes, see ``samples_ahead``.
+        condition: how long before the input becomes another sound the output changes, see ``samples_ahead``; None where
+        an aid refused the first pair.
 
     Raises:
         ValueError: a file is missing, broken or contradicts another, a listener lacks an ear, or nothing could be scored.
@@ -199,6 +200,7 @@ def evaluate_scenes(
         items,
         _MEASURES,
         engine=engine,
+        conditions=[*conditions],
         better_ear=True,
         store=folder / "scores.jsonl",
         seed=seed,
@@ -289,8 +291,8 @@ def _conditions(
     return conditions
 
 
-def _looks_ahead(conditions: Mapping[str, Aids], mix: Path, listener: Listener) -> dict[str, float]:
-    """By condition in ms, on the beginning of a scene."""
+def _looks_ahead(conditions: Mapping[str, Aids], mix: Path, listener: Listener) -> dict[str, float | None]:
+    """By condition in ms, on the beginning of a scene; None where it fails, which scoring will tell."""
     scene, rate = read_audio(mix)
     scene = _two_channels(mix, scene)[:, : int(_LONGEST * rate)]
     time = scene.shape[-1]
@@ -302,9 +304,13 @@ def _looks_ahead(conditions: Mapping[str, Aids], mix: Path, listener: Listener) 
         scene = set_level(torch.randn(scene.shape, generator=drawn), 65.0)
     places = [*range(time // 4, time, max(1, time // (_PLACES + 3)))][:_PLACES]
     changed = [torch.cat((scene[:, :place], other[:, place:]), -1) for place in places]
-    found = {}
+    found: dict[str, float | None] = {}
     for label, aids in conditions.items():
-        first, *others = (aids(given, listener) for given in (scene, *changed))
+        try:
+            first, *others = (aids(given, listener) for given in (scene, *changed))
+        except ValueError:
+            found[label] = None
+            continue
         found[label] = 1000.0 * samples_ahead(first, others, places) / rate
     return found
 

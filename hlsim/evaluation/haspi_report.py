@@ -274,6 +274,7 @@ def report_items(
     measures: Sequence[MeasureName],
     *,
     engine: Engine = "hlsim",
+    conditions: Sequence[str] = (),
     baseline: str | None = None,
     better_ear: bool = False,
     store: str | Path | None = None,
@@ -282,8 +283,12 @@ def report_items(
     extra: Mapping[str, Any] | None = None,
     **running: Any,
 ) -> HaspiReport:
-    """The report of items that are known already; ``failures`` are told with its own. All else as ``haspi_report``."""
-    conditions = list(dict.fromkeys(condition for item in items for condition in item.processed))
+    """The report of items that are known already; ``failures`` are told with its own. All else as ``haspi_report``.
+
+    Args:
+        conditions: their order, those that no item has included; by default the items' own.
+    """
+    conditions = list(conditions or dict.fromkeys(name for item in items for name in item.processed))
     if len(conditions) < 2:
         raise ValueError(f"one condition only, {conditions[0]}; allowed: two or more to compare")
     if baseline is not None:

@@ -75,10 +75,8 @@ def draw_items(
     chosen = []
     for i, (clean, masker) in zip(range(items), _clips(speech, noise, seconds, generator), strict=False):
         kind, around = (i // 2) % 4, i // 8
-        # moved on, or ratios and levels of an even number would go round together
-        slip = 0 if len(levels) % 2 else around // len(levels)
-        level = levels[(kind + around) % len(levels)]
-        snr = None if masker is None else TEST_SNRS_DB[(kind + around + slip) % len(TEST_SNRS_DB)]
+        level, ratio, slip = _turn(kind, around, levels)
+        snr = None if masker is None else ratio
         signal = _mixed(clean, masker, snr)
         if kind < 2:
             ear = measured[int(torch.randint(len(measured), (), generator=generator))]
@@ -90,6 +88,16 @@ def draw_items(
         about = _about(ear, level, snr, "noise_snr") | {"input": "as-is", "audiogram": list(ear.thresholds)}
         chosen.append(Item((clean * gain).squeeze(0), (signal * gain).squeeze(0), ear, about))
     return chosen
+
+
+def _turn(number: int, around: int, levels: Sequence[float]) -> tuple[float, float, int]:
+    """Level and SNR of an ear's turn: each round moves both on, so that no ear keeps to one.
+
+    Returns also how often the ratios moved on alone, or with levels of an even number both would go round together.
+    """
+    slip = 0 if len(levels) % 2 else around // len(levels)
+    turn = number + around
+    return levels[turn % len(levels)], TEST_SNRS_DB[(turn + slip) % len(TEST_SNRS_DB)], slip
 
 
 def read_ears(audiograms: str | Path | None) -> list[tuple[str, Audiogram]]:
@@ -126,9 +134,8 @@ def draw_judged_items(
     for i, (drawn, masker) in zip(range(items), clips, strict=False):
         around, number = divmod(i if noise is None else i // 2, len(ears))
         name, ear = ears[number]
-        # counters of different periods, so that no ear keeps to one level
-        level = levels[(number + around) % len(levels)]
-        snr = None if masker is None else TEST_SNRS_DB[(number + around) % len(TEST_SNRS_DB)]
+        level, ratio, _ = _turn(number, around, levels)
+        snr = None if masker is None else ratio
         clean = set_level(drawn, level)
         signal = _mixed(clean, masker, snr).squeeze(0)
         chosen.append(Item(clean.squeeze(0), signal, ear, {"name": name, **_about(ear, level, snr, "snr")}))

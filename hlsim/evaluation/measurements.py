@@ -135,7 +135,7 @@ def wearing(
     """Whether a compensator could be worn: how far it looks ahead, how loud it makes quiet rooms, what it costs.
 
     ``latency_ms`` is how long before the input becomes another sound the output changes by more than 1e-4 of its peak,
-    the longest of 16 places; ``quiet_gain_db`` the level gained by white noise at ``QUIET``, in the middle second;
+    the longest of 16 places; ``quiet_gain_db`` the level gained by white noise at ``QUIET``, in the middle two seconds;
     ``cpu_ms`` the processor's time for a second of sound, on one thread. ValueError as ``outputs``.
 
     Shape: (time,) of 3 s at 16 kHz.

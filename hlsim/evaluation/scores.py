@@ -92,16 +92,19 @@ class Failure:
 
 
 def check_both_ears(items: Iterable[tuple[str, str, str]]) -> None:
-    """Refuse items (what each is called, listener, ear) of which one has no other ear's: there is no better of one.
+    """Refuse items (what each is called, listener, ear) unless each has its other ear's: there is no better of one.
 
     Raises:
-        ValueError: an item that is neither a left nor a right ear's, or whose other ear is not there.
+        ValueError: an item of neither a left nor a right ear, two of one name, or one whose other ear is not there.
     """
     found: dict[tuple[str, str], set[str]] = {}
     for file, listener, ear in items:
         if ear not in EARS:
             raise ValueError(f"{file}: ear is {ear!r}; allowed: left and right, for the better ear")
-        found.setdefault(_utterance(file, listener, ear), set()).add(ear)
+        ears = found.setdefault(_utterance(file, listener, ear), set())
+        if ear in ears:
+            raise ValueError(f"{file}: two items of this name and ear; allowed: one, for the better ear")
+        ears.add(ear)
     for (listener, own), ears in found.items():
         if lack := [ear for ear in EARS if ear not in ears]:
             raise ValueError(

@@ -35,15 +35,21 @@ def write_scenes(report: HaspiReport, out: str | Path, *, listen: int = 3) -> Pa
 
 
 def conditions_table(report: HaspiReport) -> Table:
-    """A row a condition: mean scores, level and how far the aid looks ahead."""
-    haspi, hasqi = report.scores("haspi"), report.scores("hasqi")
+    """A row a condition: means of the pairs that all have scores of, and how far the aid looks ahead.
+
+    A condition that has no score at all takes none from the others.
+    """
+    haspi, hasqi, levels = report.scores("haspi"), report.scores("hasqi"), report.levels()
+    combined = 0.5 * (haspi + hasqi)
+    scored = np.isfinite(combined)
+    shared = scored[:, scored.any(0)].all(1)
     rows = []
     for at, name in enumerate(report.conditions):
         ahead = report.extra["looks_ahead_ms"][name]
-        figures = (haspi[:, at], hasqi[:, at], 0.5 * (haspi + hasqi)[:, at])
-        means = [number(_mean(values), ".3f") for values in figures]
-        rule = "yes" if ahead <= RULE_MS else "no"
-        rows.append((name, *means, number(_mean(report.levels()[:, at]), ".1f"), f"{ahead:.1f}", rule))
+        figures = ((haspi, ".3f"), (hasqi, ".3f"), (combined, ".3f"), (levels, ".1f"))
+        means = [number(_mean(values[shared, at]), how) for values, how in figures]
+        rule = "" if ahead is None else "yes" if ahead <= RULE_MS else "no"
+        rows.append((name, *means, number(ahead, ".1f"), rule))
     header = (
         "Given",
         "HASPI",
@@ -53,12 +59,12 @@ def conditions_table(report: HaspiReport) -> Table:
         "Looks ahead (ms)",
         f"Within {RULE_MS:g} ms",
     )
-    return Table(f"Means of {len(report.items)} pairs of scene and listener", header, rows)
+    of = "" if shared.all() else f"the {shared.sum()} that all have scores of, of "
+    return Table(f"Means of {of}{len(report.items)} pairs of scene and listener", header, rows)
 
 
 def _mean(values: np.ndarray) -> float | None:
-    there = values[np.isfinite(values)]
-    return float(there.mean()) if len(there) else None
+    return float(values.mean()) if len(values) else None
 
 
 def _rows(report: HaspiReport) -> Iterator[list[str]]:

@@ -20,7 +20,7 @@ _LOWEST_DB = -60.0  # of tones as heard: what is further down is silent anyway
 def gain_picture(ear: str, curves: Sequence[Mapping[str, Any]], colours: Colours) -> Picture:
     """Insertion gain over frequency of every compensator and level of ``gain_curves``, for one ear."""
     curves = [curve for curve in curves if curve["ear"] == ear]
-    styles = ("-", "--", ":", "-.")
+    styles = ("-", "--", ":", "-.", (0, (6, 1, 1, 1, 1, 1)), (0, (1, 4)))[: len(curves[0]["levels"])]
 
     def draw(axes: Any) -> None:
         for curve in curves:

@@ -193,7 +193,12 @@ def simulator_data(
 
 def compensator_data(data: TrainingData, recipe: CompensatorRecipe, ear: Audiogram | None) -> BatchData:
     """What a compensator for an ear, or else for all, is trained and validated on. Raises ValueError as
-    ``simulator_data``."""
+    ``simulator_data``, and where a recipe that trains noise reduction has no noise."""
+    reducing = sorted({"denoising", "intelligibility"} & {name for name, w in recipe.weights.items() if w})
+    if data.noise is None and (reducing or recipe.babble):
+        raise ValueError(
+            f"no noise, and the recipe's {reducing[0] if reducing else 'babble'} is for it; allowed: --noise DIR"
+        )
     plain = replace(recipe, equalised=0.0, seconds=_VALID_SECONDS)
     valid = CompensatorBatches(plain, data.validation(), ear)
     generator = torch.Generator().manual_seed(2_000 + recipe.seed)

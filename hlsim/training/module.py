@@ -139,7 +139,7 @@ def initial_network(
     network: Any = load(start)
     what = f"start {start!r} in the recipe"
     if not isinstance(getattr(network, "config", None), config_kind):
-        raise ValueError(f"{what} is none to be trained; allowed: a checkpoint's name or folder")
+        raise ValueError(f"{what} is a {type(network).__name__}; allowed: a checkpoint of the recipe's kind")
     if settings and config != network.config:
         ours, theirs = config.to_dict(), network.config.to_dict()
         differing = ", ".join(name for name in ours if ours[name] != theirs[name])

@@ -32,7 +32,7 @@ class TrainingRecipe:
         levels: lowest and highest level of the speech in dB SPL.
         sounds: share of clips that are tones or clicks instead of speech, 0 to 1.
         validate_every: steps.
-        validation_items: how many.
+        validation_items: how many, rounded up to whole batches of 4 (compensators) or 8.
         seed: of every random draw.
     """
 

@@ -309,6 +309,13 @@ def test_folders_keep_their_tree_and_what_cannot_be_read_is_told(
         (tmp_path / "in" / name).write_bytes(utterance.read_bytes())
     capsys.readouterr()
     assert "would both be" in fails(capsys, *call)
+    inner = tmp_path / "in" / "a"
+    (inner / "a").mkdir()
+    for name in ("a/one.wav", "one.wav"):
+        (inner / name).write_bytes(utterance.read_bytes())
+    over = fails(capsys, "compensate", str(inner), str(inner.parent), *call[3:])
+    assert "a file of IN would be lost; allowed: another OUT" in over
+    assert (inner / "one.wav").read_bytes() == utterance.read_bytes()
 
 
 def test_what_a_listener_would_not_expect_of_a_file_is_told(

@@ -188,6 +188,7 @@ def test_speakers_are_in_one_split() -> None:
     given = assign_splits({"a": {"train"}, "b": {"test"}, "c": {"train"}, "d": {"train"}}, **options)
     mixed = assign_splits({"a": {"", "test"}, "b": {""}}, **options | {"valid_share": 0.0})
     assert mixed == {"a": "test", "b": "train"}
+    assert assign_splits({"a": {"test"}}, **options) == {"a": "test"}  # none to take validation from
     assert given["b"] == "test" and sorted(given.values()) == ["test", "train", "train", "valid"]
     with pytest.raises(ValueError, match=r"speaker a is in test and train; allowed: one split"):
         assign_splits({"a": {"train", "test"}}, **options)

@@ -65,6 +65,10 @@ def test_fewer_types_and_folders_of_splits(tmp_path: Path) -> None:
         "valid": {"a", "b"},
         "test": {"c"},
     }
+    many(tmp_path / "split", "rain/1.wav")
+    noises, faults = find_noises(root, "noise", ("train", "test"))
+    assert faults == [Fault("noise/rain/1.wav", "beside the folders of splits; move it into one")]
+    assert set(noises.files["train"]) == {"a", "b"}
 
 
 def test_what_is_refused(tmp_path: Path) -> None:

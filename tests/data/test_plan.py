@@ -234,6 +234,10 @@ def test_strict_makes_a_fault_an_error(voicebank: Path, tmp_path: Path) -> None:
     run(voicebank, tmp_path / "out")
     with pytest.raises(ValueError, match="12 faults"):
         prepare(PlanSettings(voicebank), tmp_path / "out", strict=True, jobs=1)
+    plan = (tmp_path / "out" / "plan.json").read_text()
+    with pytest.raises(ValueError, match="12 faults"):
+        prepare(PlanSettings(voicebank, seed=1), tmp_path / "out", strict=True, jobs=1)
+    assert (tmp_path / "out" / "plan.json").read_text() == plan  # until there is another
 
 
 def test_what_is_refused_before_a_file_is_read(

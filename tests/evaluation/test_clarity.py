@@ -256,6 +256,36 @@ def test_one_broken_scene_is_told_and_the_others_go_on(clarity: Path, tmp_path: 
     assert len(conditions_table(report).rows) == 3
 
 
+class Choosy:
+    """Refuses the first listener's second scene, and so does not look ahead on the first pair."""
+
+    def __call__(self, waveform: torch.Tensor, listener: Listener, sample_rate: int) -> torch.Tensor:
+        if waveform.abs().max() > float(LOUDEST[0]):
+            raise ValueError("too loud for me")
+        return 2.0 * waveform
+
+
+LOUDEST = [torch.inf]
+
+
+def test_means_are_of_the_pairs_that_all_have_and_a_refused_pair_stops_nothing(
+    clarity: Path, tmp_path: Path
+) -> None:
+    peaks = [
+        np.abs(soundfile.read(str(clarity / "scenes" / f"{name}_mix_CH1.wav"))[0]).max() for name in PAIRS
+    ]
+    LOUDEST[0] = sum(peaks) / 2
+    own = options(clarity, every=2)
+    report = evaluate_scenes({"choosy": f"{__name__}:Choosy", "soft": "wdrc"}, out=tmp_path / "out", **own)
+    assert report.conditions == ("unaided", "NAL-R", "choosy", "soft") and report.headline.after == "soft"
+    table = conditions_table(report)
+    assert table.caption == "Means of the 1 that all have scores of, of 2 pairs of scene and listener"
+    kept = int(np.isfinite(report.scores("haspi")[:, 2]).argmax())
+    assert [row[1] for row in table.rows] == [f"{score:.3f}" for score in report.scores("haspi")[kept]]
+    looks = report.extra["looks_ahead_ms"]
+    assert (looks["choosy"] is None) == (peaks[0] > peaks[1]) and looks["soft"] > 0.0
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [

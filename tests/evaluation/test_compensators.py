@@ -112,6 +112,17 @@ def test_every_ear_meets_every_level_and_ratio(speech_dir: Path, count: int) -> 
         assert len(about) == 12 * count and len(met) == combinations * count
 
 
+@pytest.mark.parametrize(
+    "levels", [(55.0, 75.0), (50.0, 60.0, 70.0, 80.0), (40.0, 50.0, 60.0, 70.0, 80.0, 90.0)]
+)
+def test_levels_of_an_even_number_meet_every_ratio(speech_dir: Path, levels: tuple[float, ...]) -> None:
+    ears = [(f"{i}", Audiogram((float(i),) * 8)) for i in range(8)]
+    many = {"items": 2 * 8 * 24, "seconds": 0.05, "seed": 0, "levels": levels}
+    drawn = draw_judged_items(speech_dir / "valid", speech_dir / "train", ears, **many)
+    met = {(item.about["level"], item.about["snr"]) for item in drawn if item.about["snr"] is not None}
+    assert len(met) == 4 * len(levels)
+
+
 def test_speech_has_its_level_and_noise_comes_on_top(speech_dir: Path) -> None:
     ears = [("N3", Audiogram.standard("N3"))]
     drawn, again, other = (

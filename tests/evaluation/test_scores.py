@@ -54,6 +54,8 @@ def test_a_missing_ear_is_refused_and_listeners_are_kept_apart() -> None:
         check_both_ears(named[:3])
     with pytest.raises(ValueError, match="allowed: left and right"):
         check_both_ears([("L1 s01", "L1", "")])
+    with pytest.raises(ValueError, match="L1 left s01: two items of this name and ear"):
+        check_both_ears([*named, named[0]])
 
 
 def test_an_ear_of_which_nothing_can_be_scored_is_told_and_loses(tmp_path: Path, speech_dir: Path) -> None:

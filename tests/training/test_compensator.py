@@ -254,3 +254,14 @@ def test_sounds_have_no_noise_and_babble_is_the_others_voices(data: TrainingData
 def test_bad_recipes(settings: dict[str, object], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         CompensatorTraining(CompensatorRecipe.from_dict(settings), EVER, simulator="msbg")
+
+
+@pytest.mark.parametrize(
+    "settings", [{"weights": {"denoising": 1.0}}, {"weights": {"intelligibility": 1.0}}, {"babble": 0.3}]
+)
+def test_noise_is_not_learned_from_none(speech_dir: Path, settings: dict[str, object]) -> None:
+    recipe = CompensatorRecipe.from_dict({"kind": "hearing-aid", "seconds": 1.0, **settings})
+    with pytest.raises(
+        ValueError, match=r"no noise, and the recipe.s [a-z]+ is for it; allowed: --noise DIR"
+    ):
+        compensator_data(TrainingData(speech_dir / "train"), recipe, None)

@@ -85,7 +85,10 @@ def test_what_makes_the_start_worse_is_not_kept(data: TrainingData, tmp_path: Pa
 @pytest.mark.parametrize(
     ("settings", "said"),
     [
-        ({"start": "nalr"}, "start 'nalr' in the recipe is none to be trained"),
+        (
+            {"start": "nalr"},
+            "start 'nalr' in the recipe is a NALR; allowed: a checkpoint of the recipe's kind",
+        ),
         ({"start": "none"}, "no checkpoint 'none'; allowed: nalr, wdrc, compensator-general"),
         ({"start": "neuro-msbg"}, "a checkpoint of kind 'neuro-msbg'; needed here"),
         (
