@@ -120,5 +120,6 @@ def export_aid(aid: Wearable, path: str | Path, *, items: int = 1) -> None:
                 given["samples"] = samples
         return hop_program(aid, items=items), given
 
-    outputs = ["output", *(_NEXT + name for name in first_inputs(aid, torch.zeros(8)) if name not in _GIVEN)]
+    given = first_inputs(aid, torch.zeros(8), items=items)
+    outputs = ["output", *(_NEXT + name for name in given if name not in _GIVEN)]
     write_onnx(f"a {type(aid).__name__}", path, make, outputs)

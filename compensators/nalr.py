@@ -65,7 +65,12 @@ class NALR(nn.Module):
                 f"order of the NAL-R filter is {order!r}; allowed: even whole numbers from 2 to 1022"
             )
         self.order: int = int(order)
-        self.register_buffer("thresholds", own_thresholds(audiogram, **_LIMITS), persistent=False)
+        levels = own_thresholds(audiogram, **_LIMITS)
+        if levels is not None and levels.requires_grad:
+            raise ValueError(
+                "the audiogram is trained, and a prescription's own stays; allowed: with each call"
+            )
+        self.register_buffer("thresholds", levels, persistent=False)
         self._two_ears = of_listeners(audiogram)
 
     def forward(self, waveform: Tensor, audiogram: AudiogramLike | None = None) -> Tensor:

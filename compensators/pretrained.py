@@ -75,10 +75,13 @@ def _load(name: str | Path, sample_rate: int, full_scale_spl: float) -> Trained 
     return read_checkpoint(name, CONFIGS, build, also=tuple(_UNTRAINED)).eval().requires_grad_(False)
 
 
-def save_compensator(model: Trained, folder: str | Path) -> None:
+def save_compensator(model: Trained, folder: str | Path, audiogram: Audiogram | None = None) -> None:
     """Write a checkpoint that ``load_compensator`` reads, whole or not at all; an older one there is replaced.
 
-    Rate and level are no part of it: ``load_compensator`` is told them.
+    Rate and level are no part of it: ``load_compensator`` is told them. An older one's card stays, and is of that one.
+
+    Args:
+        audiogram: the one ear that it was trained for, see ``trained_for``; None for all ears.
 
     Raises:
         ValueError: another kind of model, or a folder that holds something else.
@@ -87,7 +90,8 @@ def save_compensator(model: Trained, folder: str | Path) -> None:
         allowed = "a MappingCompensator or HearingAid"
         raise ValueError(f"{type(model).__name__} cannot be saved; allowed: {allowed}")
     kind = next(kind for kind, config in CONFIGS.items() if isinstance(model.config, config))
-    save_checkpoint(folder, kind, model, model.config.to_dict(), {"hlsim": __version__})
+    about = {"hlsim": __version__, "audiogram": audiogram.to_dict() if audiogram is not None else None}
+    save_checkpoint(folder, kind, model, model.config.to_dict(), about)
 
 
 def trained_for(name: str | Path) -> Audiogram | None:

@@ -148,7 +148,8 @@ class Wearable(nn.Module):
         for name, slider in set_to.items():  # before the first chunk, which has the items' number
             check_slider(name, slider, slider.shape if isinstance(slider, Tensor) else torch.Size())
         as_thresholds(self._given(audiogram), taker=type(self).__name__)
-        return Stream(self, audiogram, set_to)
+        # it is asked for again when a slider moves, and a tensor may have been written into
+        return Stream(self, audiogram.clone() if isinstance(audiogram, Tensor) else audiogram, set_to)
 
     def prepare(
         self, waveform: Tensor, audiogram: AudiogramLike | None, sliders: Sequence[Slider]

@@ -64,7 +64,7 @@ def conditions_table(report: HaspiReport) -> Table:
 
 
 def _mean(values: np.ndarray) -> float | None:
-    return float(values.mean()) if len(values) else None
+    return float(values.mean()) if np.isfinite(values).any() else None
 
 
 def _rows(report: HaspiReport) -> Iterator[list[str]]:

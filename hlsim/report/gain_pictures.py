@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import cycle
 from typing import Any
 
 import numpy as np
@@ -20,24 +21,27 @@ _LOWEST_DB = -60.0  # of tones as heard: what is further down is silent anyway
 def gain_picture(ear: str, curves: Sequence[Mapping[str, Any]], colours: Colours) -> Picture:
     """Insertion gain over frequency of every compensator and level of ``gain_curves``, for one ear."""
     curves = [curve for curve in curves if curve["ear"] == ear]
-    styles = ("-", "--", ":", "-.", (0, (6, 1, 1, 1, 1, 1)), (0, (1, 4)))[: len(curves[0]["levels"])]
+    levels = curves[0]["levels"]
+    widths = [1.5 * (1 + number // 4) for number in range(len(levels))]  # four dashes, then thicker
+    styles = [*zip(range(len(levels)), cycle(("-", "--", ":", "-.")), strict=False)]
 
     def draw(axes: Any) -> None:
         for curve in curves:
             colour = colours[curve["compensator"]]
-            for style, gains in zip(styles, curve["gain_db"], strict=False):
-                label = plain(curve["compensator"]) if style == "-" else None
-                axes.plot(curve["frequencies"], gains, style, color=colour, label=label)
-        for style, level in zip(styles, curves[0]["levels"], strict=False):
-            axes.plot([], [], style, color="black", label=f"input of {level:g} dB SPL")
+            for (number, style), gains in zip(styles, curve["gain_db"], strict=True):
+                label = None if number else plain(curve["compensator"])
+                axes.plot(curve["frequencies"], gains, style, color=colour, label=label, lw=widths[number])
+        for (number, style), level in zip(styles, levels, strict=True):
+            label = f"input of {level:g} dB SPL"
+            axes.plot([], [], style, color="black", label=label, lw=widths[number])
         axes.set(ylabel="insertion gain (dB)")
         frequency_axis(axes, (250, 500, 1000, 2000, 4000))
         legend(axes)
 
     gains = [[f"{gains_at(2000.0, curve, row):.0f}" for row in curve["gain_db"]] for curve in curves]
     at_2k = [f"{curve['compensator']} {', '.join(own)}" for curve, own in zip(curves, gains, strict=True)]
-    levels = ", ".join(f"{level:g}" for level in curves[0]["levels"])
-    alt = f"Insertion gain for {ear} over frequency; at 2 kHz and {levels} dB SPL: {'; '.join(at_2k)} dB."
+    named = ", ".join(f"{level:g}" for level in levels)
+    alt = f"Insertion gain for {ear} over frequency; at 2 kHz and {named} dB SPL: {'; '.join(at_2k)} dB."
     return Picture(draw_svg(draw), alt, f"Insertion gain, {ear}.")
 
 

@@ -162,7 +162,7 @@ class CompensatorBatches(DrawnBatches):
         signal = clean = set_level(sounds, uniform(*self.recipe.levels))
         if self.noise is not None:
             noise = equalised(self.noise.draw(count, generator))
-            if self.recipe.babble and count > 1:
+            if self.recipe.babble:
                 others = [voices.roll(apart, 0) for apart in range(1, min(count, _VOICES + 1))]
                 babble = torch.stack([set_level(one, 65.0) for one in others]).sum(0)
                 noise = torch.where(uniform(0.0, 1.0, 1) < self.recipe.babble, babble, noise)

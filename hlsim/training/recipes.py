@@ -162,3 +162,10 @@ class CompensatorRecipe(TrainingRecipe):
         reduced = sum(self.weights.get(name, 0.0) for name in ("denoising", "intelligibility"))
         wrong = self.kind != "hearing-aid" and self.unreduced + reduced > 0.0
         self._refuse(wrong, ("unreduced", "weights", "kind"), "no noise reduction but a hearing-aid's")
+        noiseless = not self.noisy and self.babble + reduced > 0.0
+        self._refuse(
+            noiseless, ("noisy", "babble", "weights"), "noisy above 0 with babble or noise reduction"
+        )
+        self._refuse(
+            self.babble > 0.0 and self.batch < 2, ("babble", "batch"), "batches of 2 or more with babble"
+        )

@@ -71,6 +71,12 @@ def test_a_streams_sliders_are_checked_and_a_tensor_may_be_written_into() -> Non
     slider.fill_(0.0)
     assigned.noise_reduction = 0.0
     assert torch.equal(written(signal), assigned(signal))
+    ear = torch.tensor(EAR.thresholds)
+    kept, same = aid.stream(ear), aid.stream(EAR)
+    ear.fill_(80.0)
+    assert torch.equal(kept(signal), same(signal))
+    kept.noise_reduction = same.noise_reduction = 0.0  # the ear is asked for again
+    assert torch.equal(kept(signal), same(signal))
     with pytest.raises(AttributeError, match="noise_reducton of a HearingAid's stream; allowed: noise_reduc"):
         assigned.noise_reducton = 0.0
     with pytest.raises(AttributeError, match="noise_reduction of a WDRC's stream; allowed: "):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from compensators import HearingAid
+from compensators import WDRC, HearingAid
 from compensators.export import export_aid, first_inputs, hop_program
 from compensators.wearable import Wearable
 from hlsim import Audiogram
@@ -59,6 +59,14 @@ def test_onnxruntime_gives_what_the_stream_gives(make: Make, tmp_path: Path) -> 
         expected.append(stream(samples))
     whole = torch.cat(expected, -1)
     assert (torch.cat(found, -1) - whole).abs().max() < 1e-4 * whole.abs().max()
+
+
+def test_a_linked_aid_is_exported_for_two_ears(tmp_path: Path) -> None:
+    pytest.importorskip("onnxscript")
+    runtime = pytest.importorskip("onnxruntime")
+    export_aid(WDRC(linked=True), tmp_path / "aid.onnx", items=2)
+    session = runtime.InferenceSession(str(tmp_path / "aid.onnx"), providers=["CPUExecutionProvider"])
+    assert session.get_outputs()[0].shape == [2, 64]
 
 
 def test_the_aid_keeps_its_mode_and_what_is_refused(tmp_path: Path) -> None:

@@ -111,6 +111,8 @@ def test_refuses_what_it_cannot_use() -> None:
     nalr = NALR()
     with pytest.raises(ValueError, match="no audiogram"):
         nalr(torch.randn(100))
+    with pytest.raises(ValueError, match=r"the audiogram is trained, .* allowed: with each call"):
+        NALR(torch.zeros(8, requires_grad=True))
     with pytest.raises(ValueError, match="broadcast"):
         nalr(torch.randn(3, 100), torch.zeros(2, 8))
     with pytest.raises(ValueError, match="16000 to 48000"):

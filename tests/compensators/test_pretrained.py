@@ -69,6 +69,8 @@ def test_the_ear_that_a_compensator_was_trained_for(tmp_path: Path) -> None:
     for name, about in (("one", {"audiogram": ear.to_dict()}), ("all", {"audiogram": None}), ("old", {})):
         save_checkpoint(tmp_path / name, "mapping-compensator", model, model.config.to_dict(), about)
     assert [trained_for(tmp_path / name) for name in ("one", "all", "old")] == [ear, None, None]
+    save_compensator(model, tmp_path / "all", ear)
+    assert trained_for(tmp_path / "all") == ear
     assert trained_for("nalr") is trained_for("compensator-general") is None
     with pytest.raises(ValueError, match="no checkpoint 'nobody'"):
         trained_for("nobody")

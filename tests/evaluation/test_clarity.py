@@ -6,6 +6,7 @@ import csv
 import hashlib
 import json
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -282,6 +283,13 @@ def test_means_are_of_the_pairs_that_all_have_and_a_refused_pair_stops_nothing(
     assert table.caption == "Means of the 1 that all have scores of, of 2 pairs of scene and listener"
     kept = int(np.isfinite(report.scores("haspi")[:, 2]).argmax())
     assert [row[1] for row in table.rows] == [f"{score:.3f}" for score in report.scores("haspi")[kept]]
+    scores = np.array([[0.1, 0.2, np.nan, 0.4], [0.3, 0.4, np.nan, 0.6]])
+    none = SimpleNamespace(
+        scores=lambda measure: scores,
+        levels=lambda: 100.0 * scores,
+        **{name: getattr(report, name) for name in ("items", "conditions", "extra")},
+    )
+    assert [row[1] for row in conditions_table(none).rows] == ["0.200", "0.300", "n/a", "0.500"]
     looks = report.extra["looks_ahead_ms"]
     assert (looks["choosy"] is None) == (peaks[0] > peaks[1]) and looks["soft"] > 0.0
 

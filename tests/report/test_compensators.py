@@ -1,7 +1,10 @@
 """Tables of a comparison of compensators."""
 
+import pytest
+
 from hlsim.evaluation.measurements import TONES
 from hlsim.report.compensators import tone_table
+from hlsim.report.gain_pictures import gain_picture
 from hlsim.report.page import Section, render_page
 from hlsim.report.pictures import condition_colours
 from hlsim.report.tables import Table
@@ -14,6 +17,19 @@ def test_table_of_tones() -> None:
     first, second = tone_table([{**about, "heard_off_db": offs, "sidebands_db": sidebands}]).rows
     assert first == ["N3, own, 50 dB SPL", "+0.0", "+1.0", "+2.0", "+3.0", "+4.0", "+5.0", "-3 (1000 Hz)"]
     assert second[0] == "N3, own, 65 dB SPL" and second[-1] == "6 (4000 Hz)"
+
+
+@pytest.mark.parametrize("count", [1, 3, 6])
+def test_every_level_has_its_curve(count: int) -> None:
+    levels, hz = [40.0 + 10.0 * i for i in range(count)], [250.0, 1000.0, 2000.0, 4000.0]
+    about = {"ear": "N3", "levels": levels, "frequencies": hz}
+    curves = [
+        {**about, "compensator": name, "gain_db": [[9.0 * i] * 4 for i in range(count)]} for name in "ab"
+    ]
+    picture = gain_picture("N3", curves, {"a": "C0", "b": "C1"})
+    text = picture.data.decode()
+    assert text.count(">input of ") + text.count("<!-- input of ") == count
+    assert f"a {', '.join(f'{9 * i}' for i in range(count))}" in picture.alt
 
 
 def test_a_compensator_has_one_colour_and_what_is_as_loud_has_it_paler() -> None:
