@@ -6,9 +6,9 @@
 #       examples/tables.sh CORPORA OUT [MINUTES A ROW] [ITEMS]
 #
 # CORPORA holds speech/{train,valid}, noise/{train,valid} and audiograms/{train,valid}.csv.
-# STEPS: of each row, whatever the minutes. NARROW: the paper's rows with as many times fewer channels and heads. JOBS: rows
-# trained at a time. ROWS: these alone, compared as Table I; what follows a colon changes the recipe's network, seed or
-# precision.
+# STEPS: of each row, whatever the minutes; the learning rate falls by time, and so stays. NARROW: the paper's rows with as
+# many times fewer channels and heads. JOBS: rows trained at a time. ROWS: these alone, compared as Table I; what follows a
+# colon changes the recipe's network, seed or precision.
 set -euo pipefail
 corpora=$1 out=$2 minutes=${3:-5} items=${4:-80}
 here=$(dirname "${BASH_SOURCE[0]}")

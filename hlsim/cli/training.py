@@ -53,7 +53,9 @@ def _training_options(parser: Parser, *, minutes: float, required: bool = False)
     text = "checkpoint whose weights to start from, instead of random ones"
     option("--start", str, text, metavar="NAME")
     option("--max-minutes", positive, "of training, resumed parts included", minutes)
-    option("--max-steps", integer, "stop earlier; -1 for no such limit", -1)
+    option(
+        "--max-steps", integer, "stop earlier, with the learning rate of that time; -1 for no such limit", -1
+    )
     option("--device", str, "where to train", "auto", choices=("auto", "cpu", "cuda"))
     option("--devices", count, "GPUs or processes a machine", 1)
     option("--nodes", count, "machines", 1)
