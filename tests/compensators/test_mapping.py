@@ -162,6 +162,7 @@ def test_config_survives_json_and_refuses_nonsense() -> None:
         {"bands": "a"},
         {"bands": 20.0},
         {"reach_db": None},
+        {"start": True},
         {"limit_spl": 200.0},
         {"limit_spl": "loud"},
         {"channels": 0},
