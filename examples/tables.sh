@@ -1,6 +1,7 @@
 #!/usr/bin/env bash
 # The paper's Tables I, III and IV, and the comparison of normalisations: trains every row for the same time, or the same
-# steps, on one thread, and compares them. Killed, it goes on with the same command. Results are in docs/paper-tables.md.
+# steps, on one thread, and compares them. Killed, it goes on with the same command. Results are in docs/paper-tables.md,
+# but for the paper's rows at full width, which want a GPU.
 #
 #   [STEPS=10000] [NARROW=4] [JOBS=2] [ROWS="paper/cnn neuro-msbg-lstm:phase=input:seed=1"] \
 #       examples/tables.sh CORPORA OUT [MINUTES A ROW] [ITEMS]
