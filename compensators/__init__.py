@@ -1,7 +1,7 @@
 """Compensators: modules that turn a waveform and an audiogram into what the ear is to be given."""
 
-from compensators.aid import HearingAid
 from compensators.config import HearingAidConfig, MappingConfig
+from compensators.hearing_aid import HearingAid
 from compensators.mapping import MappingCompensator
 from compensators.nalr import NALR
 from compensators.pretrained import load_compensator, save_compensator, trained_for

@@ -30,9 +30,15 @@ class MappingConfig(NetworkConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        share = isinstance(self.start, float | int) and is_finite(self.start) and 0.0 <= self.start <= 1.0
+        share = (
+            isinstance(self.start, float | int)
+            and is_finite(self.start)
+            and 0.0 <= self.start <= 1.0
+        )
         if self.start != "nalr" and not share:
-            raise ValueError(f"start is {self.start!r}; allowed: 'nalr', or a share of the loss from 0 to 1")
+            raise ValueError(
+                f"start is {self.start!r}; allowed: 'nalr', or a share of the loss from 0 to 1"
+            )
         refuse_outside({"bands": (self.bands, 4, 40), "limit_spl": (self.limit_spl, 60.0, 140.0)})
         if not (is_finite(self.reach_db) and 0.0 < self.reach_db <= 60.0):
             raise ValueError(f"reach_db is {self.reach_db!r}; allowed: more than 0, to 60 dB")

@@ -29,7 +29,7 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from compensators.bands import HOP, RATE
+from compensators.filter_bank import HOP, RATE
 from compensators.stream import Slider
 from compensators.wearable import Wearable
 from hlsim.audiogram.thresholds import AudiogramLike
@@ -80,7 +80,12 @@ def first_inputs(
         _, fitted, settings = aid.prepare(
             samples, audiogram, [sliders.get(name, 1.0) for name in aid.SLIDERS]
         )
-        inputs = {"samples": samples, "fitted": fitted, "sliders": settings, **aid.initial(settings)}
+        inputs = {
+            "samples": samples,
+            "fitted": fitted,
+            "sliders": settings,
+            **aid.initial(settings),
+        }
     # each its own tensor: torch.export takes two inputs that are one tensor for one input
     return {name: tensor.clone() for name, tensor in inputs.items() if tensor.numel()}
 
@@ -110,9 +115,13 @@ def export_aid(aid: Wearable, path: str | Path, *, items: int = 1) -> None:
 
     def make() -> tuple[torch.export.ExportedProgram, dict[str, Tensor]]:
         inputs, hop = first_inputs(aid, torch.linspace(20.0, 90.0, 8), items=items), _Hop(aid)
-        noise = torch.randn(16, *inputs["samples"].shape, generator=torch.Generator().manual_seed(0))
+        noise = torch.randn(
+            16, *inputs["samples"].shape, generator=torch.Generator().manual_seed(0)
+        )
         level = 0.03 / gain_to_pascals(aid.full_scale_spl)
-        given = inputs | {name: 0.2 * inputs[name] for name in inputs if name == "sliders"}  # on their way
+        given = inputs | {
+            name: 0.2 * inputs[name] for name in inputs if name == "sliders"
+        }  # on their way
         with torch.no_grad():
             for samples in level * noise.to(inputs["samples"]):
                 after = hop(**given)

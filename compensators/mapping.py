@@ -62,12 +62,18 @@ class MappingCompensator(EarNetwork):
         self.encoder = DenseEncoder(4 if predicted else 3, size, depth, stride, normalise=False)
         self.blocks = nn.ModuleList(DualPathBlock(config) for _ in range(config.blocks))
         self.magnitude_decoder = Decoder(size, 1, depth, stride, normalise=False)
-        self.phase_decoder = PhaseDecoder(size, depth, stride, normalise=False) if predicted else None
+        self.phase_decoder = (
+            PhaseDecoder(size, depth, stride, normalise=False) if predicted else None
+        )
 
     def start_gains_db(self, thresholds: Tensor) -> Tensor:
         """Gain before training at the transform's frequencies. Shape: (items, 8) dB HL -> (items, frequencies) dB."""
         start = self.config.start
-        gains = nalr_gains_db(thresholds) if start == "nalr" else float(start) * thresholds.clamp_min(0.0)
+        gains = (
+            nalr_gains_db(thresholds)
+            if start == "nalr"
+            else float(start) * thresholds.clamp_min(0.0)
+        )
         return interpolate(gains, self.config.hz)
 
     def extra_repr(self) -> str:
@@ -92,14 +98,20 @@ class MappingCompensator(EarNetwork):
         spectrum = self.stft.analyse(signals)
         start = self.start_gains_db(ears) / _NEPER_DB
         features = self._features(spectrum, ears, start)
-        features = self.encoder(features.contiguous(memory_format=torch.channels_last)).permute(0, 2, 3, 1)
+        features = self.encoder(features.contiguous(memory_format=torch.channels_last)).permute(
+            0, 2, 3, 1
+        )
         for block in self.blocks:
             features = block(features)
         features = features.permute(0, 3, 1, 2)
         size = (spectrum.shape[-2], spectrum.shape[-1])
         # log magnitude out = log magnitude in + gain, so that silence stays silent and needs no logarithm
         gain = start.unsqueeze(1) + self._correction(features, size)
-        factor = gain.exp() if self.phase_decoder is None else self.phase_decoder.factor(features, size, gain)
+        factor = (
+            gain.exp()
+            if self.phase_decoder is None
+            else self.phase_decoder.factor(features, size, gain)
+        )
         return self.stft.synthesise(spectrum * factor, signals.shape[-1])
 
     def _correction(self, features: Tensor, size: tuple[int, int]) -> Tensor:
@@ -108,7 +120,9 @@ class MappingCompensator(EarNetwork):
         Shape: (items, channels, ...) -> (items, frames, frequencies).
         """
         bands = self.config.bands, self.config.fft
-        into, out_of = (constant_like(features, weights, *bands) for weights in (_into_bands, _out_of_bands))
+        into, out_of = (
+            constant_like(features, weights, *bands) for weights in (_into_bands, _out_of_bands)
+        )
         levels = self.magnitude_decoder(features, size).squeeze(1) @ into
         smooth = _steady(torch.tanh(levels), self.config.stride[0])
         return smooth @ out_of * (self.config.reach_db / _NEPER_DB)

@@ -122,7 +122,9 @@ def nalr_gains_db(thresholds: Tensor) -> Tensor:
     gains = (common + 0.31 * losses + bias).clamp_min(0.0)
     low, high = gains[..., :4], gains[..., 4:]
     between = 0.5 * (low[..., -1:] + high[..., :1])
-    return torch.where(_impaired(thresholds), torch.cat((low, between, high, high[..., -1:]), -1), 0.0)
+    return torch.where(
+        _impaired(thresholds), torch.cat((low, between, high, high[..., -1:]), -1), 0.0
+    )
 
 
 def _impaired(thresholds: Tensor) -> Tensor:
@@ -137,10 +139,14 @@ def _prescribed(thresholds: Tensor) -> Tensor:
 
 @lru_cache(maxsize=8)
 def _steps_hz(sample_rate: int, count: int) -> tuple[float, ...]:
-    return tuple(torch.linspace(0.0, sample_rate / 2.0, count, dtype=torch.float64, device="cpu").tolist())
+    return tuple(
+        torch.linspace(0.0, sample_rate / 2.0, count, dtype=torch.float64, device="cpu").tolist()
+    )
 
 
 def _design(order: int) -> NDArray[np.float64]:
     """The filter is linear in its gains: one row a gain on ``order + 1`` even steps. Returns (order + 1, order + 1)."""
     grid, window = np.arange(order + 1) / order, hamming(order + 1)
-    return np.stack([frequency_sampling_fir(order + 1, grid, gain, window) for gain in np.eye(order + 1)])
+    return np.stack(
+        [frequency_sampling_fir(order + 1, grid, gain, window) for gain in np.eye(order + 1)]
+    )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from compensators.bands import centres, speech_levels
+from compensators.filter_bank import centres, speech_levels
 from compensators.nalr import nalr_gains_db
 from hlsim.audiogram.thresholds import interpolate
 from hlsim.torchtools import constant

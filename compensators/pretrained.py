@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
-from compensators.aid import HearingAid
 from compensators.config import HearingAidConfig, MappingConfig
+from compensators.hearing_aid import HearingAid
 from compensators.mapping import MappingCompensator
 from compensators.nalr import NALR
 from compensators.wdrc import WDRC
@@ -72,10 +72,14 @@ def _load(name: str | Path, sample_rate: int, full_scale_spl: float) -> Trained 
     def build(config: MappingConfig | HearingAidConfig) -> Trained:
         return build_compensator(config, sample_rate=sample_rate, full_scale_spl=full_scale_spl)
 
-    return read_checkpoint(name, CONFIGS, build, also=tuple(_UNTRAINED)).eval().requires_grad_(False)
+    return (
+        read_checkpoint(name, CONFIGS, build, also=tuple(_UNTRAINED)).eval().requires_grad_(False)
+    )
 
 
-def save_compensator(model: Trained, folder: str | Path, audiogram: Audiogram | None = None) -> None:
+def save_compensator(
+    model: Trained, folder: str | Path, audiogram: Audiogram | None = None
+) -> None:
     """Write a checkpoint that ``load_compensator`` reads, whole or not at all; an older one there is replaced.
 
     Rate and level are no part of it: ``load_compensator`` is told them. An older one's card stays, and is of that one.
@@ -90,7 +94,10 @@ def save_compensator(model: Trained, folder: str | Path, audiogram: Audiogram | 
         allowed = "a MappingCompensator or HearingAid"
         raise ValueError(f"{type(model).__name__} cannot be saved; allowed: {allowed}")
     kind = next(kind for kind, config in CONFIGS.items() if isinstance(model.config, config))
-    about = {"hlsim": __version__, "audiogram": audiogram.to_dict() if audiogram is not None else None}
+    about = {
+        "hlsim": __version__,
+        "audiogram": audiogram.to_dict() if audiogram is not None else None,
+    }
     save_checkpoint(folder, kind, model, model.config.to_dict(), about)
 
 

@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from compensators.bands import HOP, RATE
+from compensators.filter_bank import HOP, RATE
 from hlsim.torchtools import constant_like
 
 _BLOCK = 128  # frames; the weights of a block are a matrix, and must not overflow
@@ -38,7 +38,9 @@ def average(values: Tensor, state: Tensor, past: float) -> Tensor:
     return done[0] if len(done) == 1 else torch.cat(done, 1)
 
 
-def follow_peaks(values: Tensor, state: Tensor, attack: float, release: float) -> tuple[Tensor, Tensor]:
+def follow_peaks(
+    values: Tensor, state: Tensor, attack: float, release: float
+) -> tuple[Tensor, Tensor]:
     """A level that rises with ``attack`` and falls with ``release``, both weights of the past.
 
     The smooth decoupled peak detector of Giannoulis, Massberg and Reiss 2012, J. Audio Eng. Soc. 60(6), Equation 17:

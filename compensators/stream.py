@@ -8,7 +8,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from compensators.bands import DELAY, HOP, apply_gains
+from compensators.filter_bank import DELAY, HOP, apply_gains
 from hlsim.audiogram.thresholds import AudiogramLike
 from hlsim.calibration import gain_to_pascals
 from hlsim.checks import check_waveform
@@ -55,7 +55,9 @@ class Stream:
         AttributeError: a slider is set that the aid does not have.
     """
 
-    def __init__(self, aid: Worn, audiogram: AudiogramLike | None, sliders: Mapping[str, Slider]) -> None:
+    def __init__(
+        self, aid: Worn, audiogram: AudiogramLike | None, sliders: Mapping[str, Slider]
+    ) -> None:
         self._aid, self._audiogram = aid, audiogram
         for name, slider in sliders.items():
             setattr(self, name, slider)
@@ -79,7 +81,8 @@ class Stream:
             self._begin(chunk)
             gain = gain_to_pascals(self._aid.full_scale_spl)
             samples = (
-                chunk.to(self._fitted.dtype).expand(*self._batch, -1).reshape(len(self._fitted), -1) * gain
+                chunk.to(self._fitted.dtype).expand(*self._batch, -1).reshape(len(self._fitted), -1)
+                * gain
             )
             outputs = []
             while left := samples.shape[-1]:
@@ -102,7 +105,9 @@ class Stream:
             ValueError: nothing has been given yet.
         """
         if not self._state:
-            raise ValueError("flush of a stream that was given nothing; allowed: after the first chunk")
+            raise ValueError(
+                "flush of a stream that was given nothing; allowed: after the first chunk"
+            )
         rest = self(self._fitted.new_zeros(*self._batch, DELAY))
         self._state = {}
         return rest
@@ -117,8 +122,12 @@ class Stream:
                 "leading dimensions"
             )
         if not begun or not all(map(_same, sliders, self._set)):
-            self._batch, self._fitted, self._sliders = self._aid.prepare(chunk, self._audiogram, sliders)
-            self._set = [slider.clone() if isinstance(slider, Tensor) else slider for slider in sliders]
+            self._batch, self._fitted, self._sliders = self._aid.prepare(
+                chunk, self._audiogram, sliders
+            )
+            self._set = [
+                slider.clone() if isinstance(slider, Tensor) else slider for slider in sliders
+            ]
         if not begun:
             self._shape = chunk.shape[:-1]
             self._state = self._aid.initial(self._sliders)

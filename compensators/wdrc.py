@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from compensators.bands import FRAME, level_db, shares
 from compensators.config import refuse_outside
+from compensators.filter_bank import FRAME, level_db, shares
 from compensators.prescription import (
     above_speech,
     compression_ratios,
@@ -88,7 +88,9 @@ class WDRC(Wearable):
         self, powers: Tensor, fitted: Tensor, sliders: Tensor, state: State
     ) -> tuple[Tensor, dict[str, Tensor]]:
         levels = level_db(powers @ constant_like(powers, shares, self.bands, FRAME))
-        levels, kept = follow_peaks(levels, state["levels"], decay(self.attack), decay(self.release))
+        levels, kept = follow_peaks(
+            levels, state["levels"], decay(self.attack), decay(self.release)
+        )
         prescribed, ratios = fitted.chunk(2, -1)
         gains = compressive_gains(above_speech(levels), prescribed, ratios, -self.knee)
         return torch.minimum(gains, (self.limit_spl - levels).clamp_min(0.0)), {"levels": kept}

@@ -7,11 +7,24 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from compensators.bands import DELAY, HISTORY, HOP, RATE, apply_gains, frame_power, gain_at_rate
+from compensators.filter_bank import (
+    DELAY,
+    HISTORY,
+    HOP,
+    RATE,
+    apply_gains,
+    frame_power,
+    gain_at_rate,
+)
 from compensators.limiter import soft_limit
 from compensators.stream import Slider, State, Stream
 from hlsim.audiogram import FREQUENCIES
-from hlsim.audiogram.thresholds import AudiogramLike, as_thresholds, check_two_ears, resolve_thresholds
+from hlsim.audiogram.thresholds import (
+    AudiogramLike,
+    as_thresholds,
+    check_two_ears,
+    resolve_thresholds,
+)
 from hlsim.calibration import PASCAL_SPL, check_full_scale, gain_to_pascals
 from hlsim.checks import check_rate, check_waveform, is_finite
 from hlsim.dsp.resample import resample
@@ -53,7 +66,11 @@ class Wearable(nn.Module):
     @property
     def latency(self) -> int:
         """Samples that the output, which is aligned with the input, looks ahead: what a stream's output is late."""
-        return DELAY if self.sample_rate == RATE else -(-(DELAY + _RESAMPLED) * self.sample_rate // RATE)
+        return (
+            DELAY
+            if self.sample_rate == RATE
+            else -(-(DELAY + _RESAMPLED) * self.sample_rate // RATE)
+        )
 
     def fit(self, thresholds: Tensor) -> Tensor:
         """What is needed of the ears. Shape: (items, 8) dB HL -> (items, n)."""
@@ -79,7 +96,9 @@ class Wearable(nn.Module):
         past, gains = sliders.new_zeros(items, HISTORY), sliders.new_zeros(items, 2, self.bands)
         return {"past": past, "gains": gains, "gliding": sliders, **self.start(items, sliders)}
 
-    def advance(self, samples: Tensor, fitted: Tensor, sliders: Tensor, state: State) -> dict[str, Tensor]:
+    def advance(
+        self, samples: Tensor, fitted: Tensor, sliders: Tensor, state: State
+    ) -> dict[str, Tensor]:
         """The state after whole hops; its ``gains`` are all that the hops had, and the next one's.
 
         Shape: (items, hops * HOP) pascals, (items, n), (items, sliders).
@@ -110,13 +129,19 @@ class Wearable(nn.Module):
         after = self.advance(samples, fitted, sliders, state)
         gains = after["gains"]
         padded = torch.cat((state["past"][:, -2 * DELAY :], samples), -1)
-        return apply_gains(padded, gains[:, :-1]), gains[:, 2:, -1], after | {"gains": gains[:, -2:]}
+        return (
+            apply_gains(padded, gains[:, :-1]),
+            gains[:, 2:, -1],
+            after | {"gains": gains[:, -2:]},
+        )
 
     def finish(self, samples: Tensor) -> Tensor:
         """The last step, in pascals, sample by sample. Any shape."""
         return soft_limit(samples, 10.0 ** ((self.limit_spl - PASCAL_SPL) / 20.0))
 
-    def whole(self, waveform: Tensor, audiogram: AudiogramLike | None, sliders: Sequence[Slider]) -> Tensor:
+    def whole(
+        self, waveform: Tensor, audiogram: AudiogramLike | None, sliders: Sequence[Slider]
+    ) -> Tensor:
         """Shape: (..., time) and one audiogram or (..., 8) that broadcasts over the leading dimensions -> (..., time)."""
         check_waveform(waveform)
         with torch.autocast(waveform.device.type, enabled=False):
@@ -131,7 +156,9 @@ class Wearable(nn.Module):
                 output, gains, state = self._amplified(block, fitted, settings, state)
                 outputs.append(output)
                 highest.append(gains)
-            result = resample(torch.cat(outputs, -1)[:, DELAY : DELAY + ours], RATE, self.sample_rate)
+            result = resample(
+                torch.cat(outputs, -1)[:, DELAY : DELAY + ours], RATE, self.sample_rate
+            )
             if self.sample_rate != RATE:
                 above = signals - resample(low, RATE, self.sample_rate)[:, :time]
                 gains = gain_at_rate(torch.cat(highest, -1), self.sample_rate, time)
@@ -149,7 +176,9 @@ class Wearable(nn.Module):
             check_slider(name, slider, slider.shape if isinstance(slider, Tensor) else torch.Size())
         as_thresholds(self._given(audiogram), taker=type(self).__name__)
         # it is asked for again when a slider moves, and a tensor may have been written into
-        return Stream(self, audiogram.clone() if isinstance(audiogram, Tensor) else audiogram, set_to)
+        return Stream(
+            self, audiogram.clone() if isinstance(audiogram, Tensor) else audiogram, set_to
+        )
 
     def prepare(
         self, waveform: Tensor, audiogram: AudiogramLike | None, sliders: Sequence[Slider]
@@ -174,7 +203,9 @@ class Wearable(nn.Module):
 
     def _given(self, audiogram: AudiogramLike | None) -> AudiogramLike:
         if audiogram is None:
-            raise ValueError(f"no audiogram: give one with each call, {type(self).__name__} holds none")
+            raise ValueError(
+                f"no audiogram: give one with each call, {type(self).__name__} holds none"
+            )
         return audiogram
 
 

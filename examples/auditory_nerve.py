@@ -31,7 +31,11 @@ from hlsim.evaluation.items import read_ears
 
 RATE, INSIDE = 16000, 100_000  # Hz
 PLACES = np.geomspace(200.0, 7000.0, 16)  # Hz
-FIBRES = {100.0: 0.61, 4.0: 0.23, 0.1: 0.16}  # spontaneous rates and their shares (Liberman 1978, JASA 63)
+FIBRES = {
+    100.0: 0.61,
+    4.0: 0.23,
+    0.1: 0.16,
+}  # spontaneous rates and their shares (Liberman 1978, JASA 63)
 COHC = np.linspace(1.0, 0.0, 21)
 HEALTHY = Audiogram.standard("NH")
 Array = NDArray[np.float64]
@@ -40,7 +44,9 @@ Array = NDArray[np.float64]
 def potential(sound: Array, place: float, cohc: float = 1.0, cihc: float = 1.0) -> Array:
     """Of inner hair cells, for a sound in pascals at 100 kHz."""
     stimulus = brucezilany.stimulus.Stimulus(sound.tolist(), INSIDE, len(sound) / INSIDE + 0.1)
-    return np.array(brucezilany.inner_hair_cell(stimulus, cf=place, cohc=cohc, cihc=cihc))[: len(sound)]
+    return np.array(brucezilany.inner_hair_cell(stimulus, cf=place, cohc=cohc, cihc=cihc))[
+        : len(sound)
+    ]
 
 
 @cache
@@ -79,7 +85,9 @@ def nsim(response: Array, normal: Array) -> float:
     level, shape = (0.01 * normal.max()) ** 2, 0.5 * (0.03 * normal.max()) ** 2
     a, b = blurred(response), blurred(normal)
     across = blurred(response * normal) - a * b
-    spreads = np.sqrt((blurred(response**2) - a**2).clip(0.0) * (blurred(normal**2) - b**2).clip(0.0))
+    spreads = np.sqrt(
+        (blurred(response**2) - a**2).clip(0.0) * (blurred(normal**2) - b**2).clip(0.0)
+    )
     alike = (2.0 * a * b + level) / (a**2 + b**2 + level) * (across + shape) / (spreads + shape)
     return float(alike.mean())
 
@@ -92,7 +100,9 @@ def main(speech: str, noise: str, audiograms: str, count: str = "32") -> None:
     noises = Clips(noise, sample_rate=RATE, seconds=3.0, repeat=True).draw(len(ears), generator)
     middle = slice(RATE, 2 * RATE)
     found: dict[tuple[str, str], list[tuple[float, float]]] = {}
-    for place, (clean, masker, (name, ear)) in enumerate(zip(clips, noises, ears, strict=True), start=1):
+    for place, (clean, masker, (name, ear)) in enumerate(
+        zip(clips, noises, ears, strict=True), start=1
+    ):
         normal = neurogram(clean[middle].double().numpy(), HEALTHY)
         for scene, signal in (
             ("clean", clean),
@@ -107,7 +117,9 @@ def main(speech: str, noise: str, audiograms: str, count: str = "32") -> None:
                 figures = nsim(response, normal), float(np.abs(response - normal).mean())
                 found.setdefault((scene, aid), []).append(figures)
         print(f"{place} of {len(ears)} ears: {name}", file=sys.stderr, flush=True)
-    print("| scene | aid | NSIM | nearer than NAL-R | p (sign test) | difference (spikes/s) | nearer | p |")
+    print(
+        "| scene | aid | NSIM | nearer than NAL-R | p (sign test) | difference (spikes/s) | nearer | p |"
+    )
     print("|---|---|---|---|---|---|---|---|")
     for (scene, aid), rows in found.items():
         columns = []

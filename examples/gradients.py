@@ -45,7 +45,9 @@ def main() -> None:
         NALR(sample_rate=RATE),
     )
     scenes = clean, nalr(clean, ears), noisy, nalr(noisy, ears)
-    print("| criterion | through | clean | clean, NAL-R | noisy | noisy, NAL-R |\n|---|---|---|---|---|---|")
+    print(
+        "| criterion | through | clean | clean, NAL-R | noisy | noisy, NAL-R |\n|---|---|---|---|---|---|"
+    )
     for criterion in ("coherent-bands", "bands"):
         losses = {
             name: HearingLossLoss(simulator=name, criterion=criterion, reduction="none")
@@ -55,10 +57,14 @@ def main() -> None:
         for name, later in (("neuro-msbg", 0), ("neuro-msbg-light", 0), ("msbg", HALF_A_HOP)):
             found = [gradients(losses[name], scene, clean, ears, later) for scene in scenes]
             cosines = [
-                functional.cosine_similarity(*pair, dim=-1).median() for pair in zip(found, true, strict=True)
+                functional.cosine_similarity(*pair, dim=-1).median()
+                for pair in zip(found, true, strict=True)
             ]
             cells = " | ".join(f"{float(cosine):.2f}" for cosine in cosines)
-            print(f"| `{criterion}` | {name}{', begun later' if later else ''} | {cells} |", flush=True)
+            print(
+                f"| `{criterion}` | {name}{', begun later' if later else ''} | {cells} |",
+                flush=True,
+            )
 
 
 if __name__ == "__main__":

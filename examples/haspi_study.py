@@ -25,7 +25,9 @@ def main() -> None:
     count = int(sys.argv[5]) if len(sys.argv) > 5 else 12
     noisy = {path.stem: path for path in find_audio(noisy_dir)}
     pairs = [(path, noisy[path.stem]) for path in find_audio(clean_dir)]
-    ears = [(row, ear) for row, ear in read_audiograms(audiograms) if row["ear"] in ("l", "left")][:LISTENERS]
+    ears = [(row, ear) for row, ear in read_audiograms(audiograms) if row["ear"] in ("l", "left")][
+        :LISTENERS
+    ]
     rows = []
     for number in range(count):
         row, ear = ears[number % len(ears)]

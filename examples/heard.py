@@ -35,7 +35,9 @@ def draw(signals: dict[str, Tensor], to: Path, of: str = "") -> None:
     differences = {f"{name} less {of}": (told[name], told[of]) for name in later}
     drawn = panels({told[name]: signal for name, signal in signals.items()}, RATE, differences)
     image = Image.open(BytesIO(composite(drawn))).convert("RGB")
-    image.quantize(96, Image.Quantize.MAXCOVERAGE).save(to, optimize=True)  # less than half of the size
+    image.quantize(96, Image.Quantize.MAXCOVERAGE).save(
+        to, optimize=True
+    )  # less than half of the size
 
 
 @torch.no_grad()
@@ -46,7 +48,9 @@ def main(folder: Path = ROOT / "docs") -> None:
         heard[f"heard with {name}"] = exact(load_compensator(name)(clean, ear), ear)
     draw(heard, folder / "heard.png")
     ear = Audiogram.standard("N2")
-    family = [name for name, loader in list_pretrained().items() if loader == "hlsim.load_pretrained"]
+    family = [
+        name for name, loader in list_pretrained().items() if loader == "hlsim.load_pretrained"
+    ]
     heard = {name: load_pretrained(name)(clean, ear) for name in family}
     draw({"clean speech": clean, EXACT: exact(clean, ear)} | heard, folder / "family.png", EXACT)
 

@@ -33,14 +33,20 @@ def at_ears(signal: Tensor, azimuth: float, sample_rate: int) -> Tensor:
     for ear in (-90.0, 90.0):
         angle = abs((azimuth - ear + 180.0) % 360.0 - 180.0)
         turned = np.deg2rad(angle)
-        delay = HEAD_SECONDS * (1.0 - np.cos(turned) if angle < 90.0 else 1.0 + turned - np.pi / 2.0)
+        delay = HEAD_SECONDS * (
+            1.0 - np.cos(turned) if angle < 90.0 else 1.0 + turned - np.pi / 2.0
+        )
         treble = 1.05 + 0.95 * np.cos(turned * 180.0 / 150.0)
         shadow = (1.0 + 0.5 * treble * w * HEAD_SECONDS) / (1.0 + 0.5 * w * HEAD_SECONDS)
-        ears.append(torch.fft.irfft(spectrum * shadow * torch.exp(-w * delay), points)[: len(signal)])
+        ears.append(
+            torch.fft.irfft(spectrum * shadow * torch.exp(-w * delay), points)[: len(signal)]
+        )
     return torch.stack(ears)
 
 
-def mixed(speech: Tensor, noise: Tensor, azimuths: tuple[float, float], snr: float, rate: int) -> Tensor:
+def mixed(
+    speech: Tensor, noise: Tensor, azimuths: tuple[float, float], snr: float, rate: int
+) -> Tensor:
     """Clean and noisy speech at the ears, the SNR in dB. Shape: (time,) twice -> (2, 2, time)."""
     clean, masker = (at_ears(*each, rate) for each in zip((speech, noise), azimuths, strict=True))
     masker = masker * (clean.norm() / masker.norm() * 10.0 ** (-snr / 20.0))
@@ -76,11 +82,15 @@ def main(speech: str, noise: str, count: str = "50", rate: str = "16000") -> Non
         ratios.append((between - start) / (time.process_time() - between))
         scores.append(expected)
         errors.append(abs(found - expected))
-        single.append(abs(float(mbstoi(noisy.float(), clean.float(), sample_rate=int(rate))) - expected))
+        single.append(
+            abs(float(mbstoi(noisy.float(), clean.float(), sample_rate=int(rate))) - expected)
+        )
     print(f"{rate} Hz, {count} pairs, scores {min(scores):.2f} to {max(scores):.2f}")
     for name, each in (("float64", errors), ("float32", single)):
         print(f"{name} signals: error {np.median(each):.1e} median, {max(each):.1e} worst")
-    print(f"{np.median(ratios):.1f} times pyclarity's speed, {min(ratios):.1f} to {max(ratios):.1f}")
+    print(
+        f"{np.median(ratios):.1f} times pyclarity's speed, {min(ratios):.1f} to {max(ratios):.1f}"
+    )
 
 
 if __name__ == "__main__":

@@ -49,7 +49,9 @@ def scenes(speech: str, noise: str, items: int) -> dict[str, tuple[Tensor, Tenso
     noises = Clips(noise, sample_rate=RATE, seconds=SECONDS, repeat=True).draw(items, generator)
     others = [set_level(voices.draw(items, generator), LEVEL) for _ in range(6)]
     snr = torch.tensor([2.5, 7.5, 12.5, 17.5])[torch.arange(items) % 4]
-    reverberant = torch.from_numpy(fftconvolve(clean.numpy(), room(generator).numpy()[None], axes=-1))
+    reverberant = torch.from_numpy(
+        fftconvolve(clean.numpy(), room(generator).numpy()[None], axes=-1)
+    )
     return {
         "noise, 2.5 to 17.5 dB": (mix(clean, noises, snr), clean),
         "babble of six, 0 dB": (mix(clean, torch.stack(others).sum(0), torch.zeros(items)), clean),

@@ -23,7 +23,9 @@ def cells(exact: MSBG, network: torch.nn.Module, ear: Audiogram) -> list[str]:
     row = []
     for hertz in (LOW, HIGH):
         sound, middle = tones(hertz, LEVELS), slice(RATE // 2, -RATE // 2)
-        expected, heard = (level_spl(signal[:, middle]) for signal in (exact(sound), network(sound, ear)))
+        expected, heard = (
+            level_spl(signal[:, middle]) for signal in (exact(sound), network(sound, ear))
+        )
         off = (heard - expected)[expected >= 0.0]
         row.append(f"{float(off.min()):+.1f} to {float(off.max()):+.1f}" if len(off) else "-")
     noise = torch.randn(1, 2 * RATE, generator=torch.Generator().manual_seed(0))
@@ -35,7 +37,9 @@ def cells(exact: MSBG, network: torch.nn.Module, ear: Audiogram) -> list[str]:
         off = level_spl(heard) - level_spl(expected)
         row += [
             ", ".join(f"{value:+.1f}" for value in off.tolist()),
-            ", ".join(f"{snr_db(*pair):.0f}" for pair in zip(expected.numpy(), heard.numpy(), strict=True)),
+            ", ".join(
+                f"{snr_db(*pair):.0f}" for pair in zip(expected.numpy(), heard.numpy(), strict=True)
+            ),
         ]
     return row
 

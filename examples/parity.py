@@ -41,14 +41,22 @@ def below_7_khz(signal: torch.Tensor, ear: Audiogram) -> float:
     return float(np.linalg.norm(heard - expected) / np.linalg.norm(expected))
 
 
-def everyday(number: int, measured: list[Audiogram], generator: torch.Generator) -> tuple[Audiogram, float]:
+def everyday(
+    number: int, measured: list[Audiogram], generator: torch.Generator
+) -> tuple[Audiogram, float]:
     """An ear, measured or drawn in turn, and a level of 50 to 80 dB SPL."""
     drawn = Audiogram(tuple(draw_thresholds(1, generator)[0].tolist()))
-    ear = drawn if number % 2 else measured[int(torch.randint(len(measured), (), generator=generator))]
+    ear = (
+        drawn
+        if number % 2
+        else measured[int(torch.randint(len(measured), (), generator=generator))]
+    )
     return ear, 50.0 + 30.0 * float(torch.rand((), generator=generator))
 
 
-def amplified(number: int, measured: list[Audiogram], generator: torch.Generator) -> tuple[Audiogram, float]:
+def amplified(
+    number: int, measured: list[Audiogram], generator: torch.Generator
+) -> tuple[Audiogram, float]:
     """An ear within some 5 dB of N4, N5, N6 or S3 in turn, and the 80 to 115 dB SPL that compensators give those."""
     standard = torch.tensor(STANDARD[("N4", "N5", "N6", "S3")[number % 4]])
     near = standard + 5.0 * torch.randn(8, generator=generator)

@@ -60,14 +60,21 @@ def timed(call: Callable[[], Any]) -> tuple[Any, float]:
 @torch.no_grad()
 def main(folder: str, items: str = "24") -> None:
     torch.set_num_threads(1)
-    clips, generator = Clips(folder, sample_rate=RATE, seconds=3.0), torch.Generator().manual_seed(0)
+    clips, generator = (
+        Clips(folder, sample_rate=RATE, seconds=3.0),
+        torch.Generator().manual_seed(0),
+    )
     for name in ("haspi", "hasqi"):
         errors, ratios = {torch.float64: [], torch.float32: []}, []
         for index in range(int(items)):
             ear = Audiogram.standard(EARS[index % len(EARS)])
-            clean = set_level(clips.draw(1, generator)[0], 50.0 + 30.0 * torch.rand((), generator=generator))
+            clean = set_level(
+                clips.draw(1, generator)[0], 50.0 + 30.0 * torch.rand((), generator=generator)
+            )
             given = processed(clean, index, ear, generator)
-            expected, theirs = timed(partial(pyclarity_score, name, clean, given, ear, RATE, 94.0, index))
+            expected, theirs = timed(
+                partial(pyclarity_score, name, clean, given, ear, RATE, 94.0, index)
+            )
             for dtype, found in errors.items():
                 score = prepared(name, clean.to(dtype), ear)
                 value, seeded = timed(partial(score, given.to(dtype), noise="seeded", seed=index))

@@ -22,12 +22,18 @@ FULL, STEPS = {"noise_reduction": 1.0, "amplification": 1.0}, (0.0, 0.25, 0.5, 0
 RELEASES = (0.5, 2.0)  # seconds, beside the aid's own
 
 
-def main(speech: str, noise: str, audiograms: str, count: str = "48", name: str = "hearing-aid") -> None:
+def main(
+    speech: str, noise: str, audiograms: str, count: str = "48", name: str = "hearing-aid"
+) -> None:
     aid, msbg = load_compensator(name), MSBG(sample_rate=16000)
-    items = draw_judged_items(speech, noise, read_ears(audiograms), items=int(count), seconds=3.0, seed=0)
+    items = draw_judged_items(
+        speech, noise, read_ears(audiograms), items=int(count), seconds=3.0, seed=0
+    )
     own = aid.config.release
     settings = [(FULL | {slider: value}, own) for slider in FULL for value in STEPS if value < 1.0]
-    print("| noise reduction | amplification | release (s) | | HASPI | HASQI | given (dB SPL) | heard (dB) |")
+    print(
+        "| noise reduction | amplification | release (s) | | HASPI | HASQI | given (dB SPL) | heard (dB) |"
+    )
     print("|---|---|---|---|---|---|---|---|")
     for sliders, release in settings + [(FULL, release) for release in (own, *RELEASES)]:
         aid.config = replace(aid.config, release=release)

@@ -34,7 +34,9 @@ def main(speech: str, name: str = "hearing-aid") -> None:
     there = ", ".join(f"{level:.0f}" for level in level_spl(clips[:, after]).tolist())
     print(f"the clips from 0.3 to 0.5 s after the sound: {there} dB SPL")
     for ear in ("N2", "N4"):
-        given = [aid(sound, Audiogram.standard(ear)) for sound in (clips, clips + slam, clips + click)]
+        given = [
+            aid(sound, Audiogram.standard(ear)) for sound in (clips, clips + slam, clips + click)
+        ]
         plain, *struck = (level_spl(signal[:, after]) for signal in given)
         for sound, level in zip(("slam", "click"), struck, strict=True):
             off = ", ".join(f"{value:+.1f}" for value in (level - plain).tolist())

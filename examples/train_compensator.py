@@ -30,9 +30,15 @@ class MyNetwork(nn.Module):
     def forward(self, waveform: Tensor, ear: Audiogram) -> Tensor:
         batch = waveform.reshape(-1, waveform.shape[-1])  # (items, time)
         spectrum = self.stft.analyse(self.prescription(batch, ear))  # (items, frames, frequencies)
-        gains = self.layers((spectrum.abs().square() + 1e-11).log().mT / 4.0).mT  # (items, frames, 8)
-        gains = nn.functional.interpolate(gains, self.stft.frequencies, mode="linear", align_corners=True)
-        return self.stft.synthesise(spectrum * gains.exp(), waveform.shape[-1]).reshape(waveform.shape)
+        gains = self.layers(
+            (spectrum.abs().square() + 1e-11).log().mT / 4.0
+        ).mT  # (items, frames, 8)
+        gains = nn.functional.interpolate(
+            gains, self.stft.frequencies, mode="linear", align_corners=True
+        )
+        return self.stft.synthesise(spectrum * gains.exp(), waveform.shape[-1]).reshape(
+            waveform.shape
+        )
 
 
 def main(folder: str, out: str, ear_name: str = "N3", steps: str = "200") -> None:
@@ -40,10 +46,15 @@ def main(folder: str, out: str, ear_name: str = "N3", steps: str = "200") -> Non
     ear, network = Audiogram.standard(ear_name), MyNetwork()
     loss = HearingLossLoss(ear, sample_rate=RATE)  # frozen; simulator="msbg" is the exact one
     optimiser = torch.optim.AdamW(network.parameters(), lr=1e-3)
-    clips, generator = Clips(folder, sample_rate=RATE, seconds=1.0), torch.Generator().manual_seed(0)
+    clips, generator = (
+        Clips(folder, sample_rate=RATE, seconds=1.0),
+        torch.Generator().manual_seed(0),
+    )
     for step in range(int(steps)):
         # in pascals: RMS 1.0 is 94 dB SPL, and levels matter
-        speech = set_level(clips.draw(4, generator), 50.0 + 30.0 * torch.rand(4, generator=generator))
+        speech = set_level(
+            clips.draw(4, generator), 50.0 + 30.0 * torch.rand(4, generator=generator)
+        )
         value = loss(network(speech, ear), speech)
         optimiser.zero_grad()
         value.backward()

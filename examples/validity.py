@@ -17,16 +17,23 @@ from torch import Tensor
 
 from hlsim import MSBG, Audiogram, HearingLossLoss
 from hlsim.calibration import set_level
-from hlsim.criteria.bands import band_edges, band_levels
 from hlsim.data.clips import Clips
 from hlsim.dsp.stft import STFT
+from hlsim.losses.band_levels import band_edges, band_levels
 from hlsim.metrics import HaspiReference, HasqiReference
 from hlsim.metrics.fidelity import rank_correlation
 
 RATE, SECONDS, SPL = 16000, 3.0, 65.0
 TALKERS, EARS = 4, ("N2", "N3", "N4")
 CRITERIA = ("coherent-bands", "bands", "paper")
-NOISY = ("clean", "noise at 20 dB", "noise at 10 dB", "noise at 5 dB", "noise at 0 dB", "noise at -5 dB")
+NOISY = (
+    "clean",
+    "noise at 20 dB",
+    "noise at 10 dB",
+    "noise at 5 dB",
+    "noise at 0 dB",
+    "noise at -5 dB",
+)
 GAINS = {"heard as normal": 1.0, "half the gain": 0.5}
 
 
@@ -50,17 +57,23 @@ def degraded(speech: Tensor, noise: Tensor, generator: torch.Generator) -> dict[
     floor = stft.analyse(noise[None]).abs().square().mean(-2, keepdim=True)
     for snr in (10.0, 0.0):  # what spectral subtraction leaves of the noise is tones
         mixed = stft.analyse((speech + noise * 10.0 ** (-snr / 20.0))[None])
-        kept = (1.0 - 2.0 * floor * 10.0 ** (-snr / 10.0) / mixed.abs().square().clamp_min(1e-20)).clamp_min(
-            0.0
-        )
+        kept = (
+            1.0 - 2.0 * floor * 10.0 ** (-snr / 10.0) / mixed.abs().square().clamp_min(1e-20)
+        ).clamp_min(0.0)
         signals[f"musical noise, from {snr:g} dB"] = stft.synthesise(mixed * kept.sqrt(), time)[0]
     for seconds, direct_db in ((0.4, 5.0), (1.0, 0.0)):
-        tail = torch.randn(time, generator=generator) * 10.0 ** (-3.0 * torch.arange(time) / (RATE * seconds))
-        wet = torch.fft.irfft(torch.fft.rfft(speech, 2 * time) * torch.fft.rfft(tail, 2 * time))[:time]
+        tail = torch.randn(time, generator=generator) * 10.0 ** (
+            -3.0 * torch.arange(time) / (RATE * seconds)
+        )
+        wet = torch.fft.irfft(torch.fft.rfft(speech, 2 * time) * torch.fft.rfft(tail, 2 * time))[
+            :time
+        ]
         wet = set_level(wet, SPL - direct_db)
         signals[f"reverberation of {seconds:g} s"] = set_level(speech + wet, SPL)
     signals["a delay of 1 ms"] = filtered(speech, torch.exp(-2j * torch.pi * 0.001 * hz))
-    signals["phase turned by 90 degrees"] = filtered(speech, torch.full_like(hz, 1j, dtype=torch.complex64))
+    signals["phase turned by 90 degrees"] = filtered(
+        speech, torch.full_like(hz, 1j, dtype=torch.complex64)
+    )
     signals["sign"] = -speech
     return signals
 
@@ -72,7 +85,9 @@ def equaliser(speech: Tensor, ear: Audiogram) -> Tensor:
     """
     msbg, hz = MSBG(sample_rate=RATE), torch.fft.rfftfreq(speech.shape[-1], 1.0 / RATE)
     edges = torch.from_numpy(band_edges()).float()
-    place = torch.bucketize(hz, edges[1:-1])  # the bands at the ends go on to 0 Hz and to half the rate
+    place = torch.bucketize(
+        hz, edges[1:-1]
+    )  # the bands at the ends go on to 0 Hz and to half the rate
 
     def heard(waveform: Tensor, audiogram: Audiogram) -> Tensor:
         powers = 10.0 ** (band_levels(msbg(waveform, audiogram), RATE) / 10.0)
@@ -109,15 +124,20 @@ def summary(found: dict[str, dict[str, Tensor]], criterion: str) -> tuple[float,
         for name in ("HASPI", "HASQI")
     )
     ordered = all(bool(loss[less] < loss[more]) for less, more in pairwise(NOISY))
-    return float(haspi), float(hasqi), ordered, min(loss, key=lambda name: float(loss[name])) == "clean"
+    return (
+        float(haspi),
+        float(hasqi),
+        ordered,
+        min(loss, key=lambda name: float(loss[name])) == "clean",
+    )
 
 
 def shaped(speech: Tensor, generator: torch.Generator) -> Tensor:
     """Noise with the spectrum of speech. Shape: (time,) -> (time,)."""
     spectrum = torch.fft.rfft(speech).abs()
-    smooth = torch.nn.functional.avg_pool1d(spectrum.square()[None], 101, 1, 50, count_include_pad=False)[
-        0
-    ].sqrt()
+    smooth = torch.nn.functional.avg_pool1d(
+        spectrum.square()[None], 101, 1, 50, count_include_pad=False
+    )[0].sqrt()
     return filtered(torch.randn(speech.shape, generator=generator), smooth)
 
 
@@ -126,11 +146,18 @@ def main(folder: str, noise_folder: str | None = None) -> None:
     torch.set_num_threads(1)
     generator = torch.Generator().manual_seed(0)
     clips = Clips(folder, sample_rate=RATE, seconds=SECONDS, repeat=True)
-    noises = Clips(noise_folder, sample_rate=RATE, seconds=SECONDS, repeat=True) if noise_folder else None
+    noises = (
+        Clips(noise_folder, sample_rate=RATE, seconds=SECONDS, repeat=True)
+        if noise_folder
+        else None
+    )
     talkers = sorted({path.parent for path in clips.files})
     chosen = [talkers[index * len(talkers) // TALKERS] for index in range(TALKERS)]
     network = HearingLossLoss().simulator
-    losses = {name: HearingLossLoss(simulator=network, criterion=name, reduction="none") for name in CRITERIA}
+    losses = {
+        name: HearingLossLoss(simulator=network, criterion=name, reduction="none")
+        for name in CRITERIA
+    }
     rows: dict[tuple[str, str], list[tuple[float, float, bool, bool]]] = {}
     for talker in chosen:
         file = next(index for index, path in enumerate(clips.files) if path.parent == talker)
@@ -145,8 +172,14 @@ def main(folder: str, noise_folder: str | None = None) -> None:
                 for criterion in CRITERIA:
                     row = summary(found, criterion)
                     rows.setdefault((title, criterion), []).append(row)
-                    print(f"{talker.name}, {name}, {title}, {criterion}: {row}", file=sys.stderr, flush=True)
-    print("| gain | criterion | HASPI: mean (worst) | HASQI: mean (worst) | noise in order | clean nearest |")
+                    print(
+                        f"{talker.name}, {name}, {title}, {criterion}: {row}",
+                        file=sys.stderr,
+                        flush=True,
+                    )
+    print(
+        "| gain | criterion | HASPI: mean (worst) | HASQI: mean (worst) | noise in order | clean nearest |"
+    )
     print("|---|---|---|---|---|---|")
     for (title, criterion), pairs in rows.items():
         haspi, hasqi, ordered, nearest = zip(*pairs, strict=True)

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from hlsim.audiogram import Audiogram
-    from hlsim.haspi_loss import HASPILoss
-    from hlsim.listener import Listener
-    from hlsim.loss import HearingLossLoss
+    from hlsim.audiogram.listener import Listener
+    from hlsim.losses.haspi_loss import HASPILoss
+    from hlsim.losses.hearing_loss import HearingLossLoss
     from hlsim.msbg import MSBG, estimate_delay
     from hlsim.neuro import NeuroMSBG
     from hlsim.pretrained import list_pretrained, load_pretrained
@@ -32,9 +32,9 @@ __all__ = [
 _MODULES = {
     "MSBG": "hlsim.msbg",
     "Audiogram": "hlsim.audiogram",
-    "HASPILoss": "hlsim.haspi_loss",
-    "HearingLossLoss": "hlsim.loss",
-    "Listener": "hlsim.listener",
+    "HASPILoss": "hlsim.losses.haspi_loss",
+    "HearingLossLoss": "hlsim.losses.hearing_loss",
+    "Listener": "hlsim.audiogram.listener",
     "NeuroMSBG": "hlsim.neuro",
     "estimate_delay": "hlsim.msbg",
     "list_pretrained": "hlsim.pretrained",

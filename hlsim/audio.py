@@ -14,13 +14,20 @@ from torch import Tensor
 from hlsim.checks import HIGHEST_RATE, HIGHEST_SAMPLE, check_rate, check_waveform, is_finite
 from hlsim.files import EXTENSIONS, Whole, check_extension
 
-_LARGEST_PAGE, _ENDS = 65_307, 4  # of Ogg: bytes of a page, and the flag of a stream's last one (RFC 3533, 6)
+_LARGEST_PAGE, _ENDS = (
+    65_307,
+    4,
+)  # of Ogg: bytes of a page, and the flag of a stream's last one (RFC 3533, 6)
 _STREAMED = 0x7FFF0000  # sizes from here on were written before the length was known: 0x7FFFF000, 0xFFFFFFFF
 
 # what a header may tell, beyond which it is believed to be broken; of samples 16 GB
 _HIGHEST_READ, _MOST_CHANNELS, _MOST_SAMPLES = 384_000, 64, 2**32
 
-_HIGHEST_STORED = {".wav": 2**31 - 1, ".flac": 655_350, ".ogg": 200_000}  # in Hz; libvorbis crashes beyond
+_HIGHEST_STORED = {
+    ".wav": 2**31 - 1,
+    ".flac": 655_350,
+    ".ogg": 200_000,
+}  # in Hz; libvorbis crashes beyond
 _SUBTYPES = {".wav": "FLOAT", ".flac": "PCM_24", ".ogg": "VORBIS"}
 
 
@@ -44,7 +51,9 @@ def read_audio(path: str | Path, *, any_rate: bool = False) -> tuple[Tensor, int
         rate = int(file.samplerate)
         _refuse_header(path, rate, file.channels)
         if (told := file.frames * file.channels) > _MOST_SAMPLES:
-            raise ValueError(f"{path}: its header tells of {told} samples; allowed: up to {_MOST_SAMPLES}")
+            raise ValueError(
+                f"{path}: its header tells of {told} samples; allowed: up to {_MOST_SAMPLES}"
+            )
         samples = file.read(dtype="float32", always_2d=True)
     if samples.shape[0] == 0:
         raise ValueError(f"{path}: empty, no samples")
@@ -93,7 +102,9 @@ def _told(path: str | Path) -> Iterator[None]:
         yield
     except (OSError, soundfile.LibsndfileError, RuntimeError, MemoryError) as error:
         # no memory is enough for the length that a broken header tells
-        raise ValueError(f"{path}: not readable as audio ({error}); allowed: wav, flac, ogg") from error
+        raise ValueError(
+            f"{path}: not readable as audio ({error}); allowed: wav, flac, ogg"
+        ) from error
 
 
 def _refuse_header(path: str | Path, rate: int, channels: int) -> None:
@@ -115,7 +126,9 @@ def _refuse_cut(path: str | Path) -> None:
             end = file.read()
             page = end[end.rfind(b"OggS") :]
             segments = page[27 : 27 + page[26]] if len(page) > 26 else b""
-            if not (segments and page[5] & _ENDS and len(page) >= 27 + len(segments) + sum(segments)):
+            if not (
+                segments and page[5] & _ENDS and len(page) >= 27 + len(segments) + sum(segments)
+            ):
                 raise ValueError(f"{path}: cut off, its last page does not end the stream")
         if start[:4] != b"RIFF" or start[8:] != b"WAVE":
             return
@@ -133,7 +146,9 @@ def _refuse_cut(path: str | Path) -> None:
 def check_channels(path: str | Path, channels: int) -> int:
     """Return the number, or raise ValueError for ogg with more than two: libvorbis takes the sixth for a subwoofer's."""
     if Path(path).suffix.lower() == ".ogg" and channels > 2:
-        raise ValueError(f"{path}: {channels} channels; allowed: up to 2 in .ogg, more in .wav and .flac")
+        raise ValueError(
+            f"{path}: {channels} channels; allowed: up to 2 in .ogg, more in .wav and .flac"
+        )
     return channels
 
 
@@ -141,7 +156,9 @@ def _check_stored_rate(rate: int, suffix: str) -> int:
     """Return the rate, or raise ValueError unless it is a whole number of Hz that such a file holds."""
     highest = _HIGHEST_STORED[suffix]
     if not is_finite(rate) or not 1 <= rate <= highest or int(rate) != rate:
-        raise ValueError(f"sample rate {rate!r} Hz; allowed in {suffix}: whole numbers up to {highest}")
+        raise ValueError(
+            f"sample rate {rate!r} Hz; allowed in {suffix}: whole numbers up to {highest}"
+        )
     return int(rate)
 
 
@@ -155,7 +172,9 @@ def write_audio(path: str | Path, waveform: Tensor, sample_rate: int) -> None:
     """
     suffix = check_extension(path)
     if check_waveform(waveform).ndim > 2:
-        raise ValueError(f"{path}: shape {tuple(waveform.shape)}; allowed: (channels, time) or (time,)")
+        raise ValueError(
+            f"{path}: shape {tuple(waveform.shape)}; allowed: (channels, time) or (time,)"
+        )
     check_channels(path, waveform.shape[:-1].numel())
     try:
         check_rate(min(sample_rate, HIGHEST_RATE) if is_finite(sample_rate) else sample_rate)
@@ -171,7 +190,9 @@ def write_audio(path: str | Path, waveform: Tensor, sample_rate: int) -> None:
     kind = {"subtype": _SUBTYPES[suffix], "format": suffix[1:].upper()}
     with Whole(path, new_folder=False) as file:
         try:
-            if suffix == ".wav":  # by libsndfile the time of day would be in it, and one sound not one file
+            if (
+                suffix == ".wav"
+            ):  # by libsndfile the time of day would be in it, and one sound not one file
                 wavfile.write(file.partial, rate, rows)
             else:
                 soundfile.write(str(file.partial), rows, rate, **kind)
@@ -189,7 +210,9 @@ def encode_flac(waveform: Tensor, sample_rate: int) -> bytes:
     rate = _check_stored_rate(sample_rate, ".flac")
     samples = check_waveform(waveform).detach().to("cpu", torch.float32)
     if samples.ndim != 1 or not bool((samples.abs() <= 1.0).all()):
-        raise ValueError(f"shape {tuple(samples.shape)}; allowed: (time,), samples from -1.0 to 1.0")
+        raise ValueError(
+            f"shape {tuple(samples.shape)}; allowed: (time,), samples from -1.0 to 1.0"
+        )
     data = io.BytesIO()
     try:
         soundfile.write(data, samples.numpy(), rate, format="FLAC", subtype="PCM_16")

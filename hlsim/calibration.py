@@ -18,7 +18,9 @@ _LOWEST_POWER = 1e-20  # -106 dB SPL: keeps the level of silence finite
 def check_full_scale(full_scale_spl: float) -> float:
     """Return ``full_scale_spl`` as a float, or raise ValueError where it cannot be a level in dB SPL (0 to 200)."""
     if not (is_finite(full_scale_spl) and 0.0 <= full_scale_spl <= 200.0):
-        raise ValueError(f"full_scale_spl is {full_scale_spl!r}; allowed: 0 to 200 dB SPL at RMS 1.0")
+        raise ValueError(
+            f"full_scale_spl is {full_scale_spl!r}; allowed: 0 to 200 dB SPL at RMS 1.0"
+        )
     return float(full_scale_spl)
 
 

@@ -24,12 +24,16 @@ Lengths = Tensor | Sequence[int]
 _KINDS = {int: "a whole number", float: "a number", bool: "true or false", str: "text"}
 
 
-def refuse_unknown(found: Iterable[Any], allowed: Iterable[str], what: str, where: str = "") -> None:
+def refuse_unknown(
+    found: Iterable[Any], allowed: Iterable[str], what: str, where: str = ""
+) -> None:
     """Raise ValueError unless every name is allowed; ``what`` they are and ``where`` they stand is for the message."""
     allowed = list(allowed)
     if unknown := sorted({str(name) for name in found} - set(allowed)):
         place = f" {where}" if where else ""
-        raise ValueError(f"unknown {what} {', '.join(unknown)}{place}; allowed: {', '.join(allowed)}")
+        raise ValueError(
+            f"unknown {what} {', '.join(unknown)}{place}; allowed: {', '.join(allowed)}"
+        )
 
 
 def check_choice(name: str, value: Any, choice: Any, where: str = "") -> None:
@@ -50,11 +54,15 @@ def refuse_other_kinds(settings: Any, where: str) -> None:
             check_choice(name, value, kind, where)
         elif origin is tuple:
             if not isinstance(value, tuple | list) or len(value) != 2:
-                raise ValueError(f"{name} {value!r} {where}; allowed: a lowest and a highest, as [0, 20]")
+                raise ValueError(
+                    f"{name} {value!r} {where}; allowed: a lowest and a highest, as [0, 20]"
+                )
             for one in value:
                 _refuse(one, float, name, where)
             if value[0] > value[1]:
-                raise ValueError(f"{name} {list(value)} {where}; allowed: a lowest and a highest, ascending")
+                raise ValueError(
+                    f"{name} {list(value)} {where}; allowed: a lowest and a highest, ascending"
+                )
         elif origin is dict:
             if not isinstance(value, Mapping):
                 raise ValueError(f"{name} {value!r} {where}; allowed: 'name: value' lines below it")
@@ -68,7 +76,9 @@ def refuse_weights(weights: Mapping[str, float], allowed: Iterable[str], where: 
     """Raise ValueError unless all are of known criteria, none is negative and one or more is above 0."""
     refuse_unknown(weights, allowed, "criteria", where)
     if min(weights.values(), default=0.0) < 0.0 or not any(weights.values()):
-        raise ValueError(f"weights {dict(weights)} {where}; allowed: 0 or more, one or more above 0")
+        raise ValueError(
+            f"weights {dict(weights)} {where}; allowed: 0 or more, one or more above 0"
+        )
 
 
 def refuse_seed(seed: int, where: str) -> None:
@@ -100,11 +110,15 @@ def check_rate(sample_rate: int) -> int:
     """Return the rate, or raise ValueError unless it is a whole number of Hz from 16000 to 48000."""
     inside = is_finite(sample_rate) and LOWEST_RATE <= sample_rate <= HIGHEST_RATE
     if not inside or int(sample_rate) != sample_rate:
-        raise ValueError(f"sample rate {sample_rate!r} Hz; allowed: {LOWEST_RATE} to {HIGHEST_RATE}")
+        raise ValueError(
+            f"sample rate {sample_rate!r} Hz; allowed: {LOWEST_RATE} to {HIGHEST_RATE}"
+        )
     return int(sample_rate)
 
 
-def check_waveform(waveform: Tensor, name: str = "waveform", *, highest: float = HIGHEST_SAMPLE) -> Tensor:
+def check_waveform(
+    waveform: Tensor, name: str = "waveform", *, highest: float = HIGHEST_SAMPLE
+) -> Tensor:
     """Return the waveform, or raise ValueError unless it is a floating-point (..., time) tensor with samples up to 1e9.
 
     NaN and infinity pass, and are NaN in what comes of them. How large samples are is not looked at on a GPU, whose queue
@@ -132,7 +146,11 @@ def check_floating(waveform: Tensor, name: str = "waveform") -> None:
 
 def _has_values(tensor: Tensor) -> bool:
     """Whether its values can be asked for, and at once."""
-    if torch.compiler.is_compiling() or torch.jit.is_tracing() or type(tensor) not in (Tensor, Parameter):
+    if (
+        torch.compiler.is_compiling()
+        or torch.jit.is_tracing()
+        or type(tensor) not in (Tensor, Parameter)
+    ):
         return False
     plain = tensor.device.type == "cpu" and tensor.layout == torch.strided
     return plain and torch._C._functorch.maybe_current_level() is None
@@ -152,7 +170,9 @@ def check_lengths(lengths: Lengths, shape: torch.Size) -> Tensor:
         ValueError: other numbers, of another shape, or outside 1 to time.
     """
     *items, time = shape
-    allowed = f"allowed: whole numbers from 1 to {time} (samples) of shape {tuple(items)}, one an item"
+    allowed = (
+        f"allowed: whole numbers from 1 to {time} (samples) of shape {tuple(items)}, one an item"
+    )
     try:
         ends = torch.as_tensor(lengths, device="cpu")
     except (TypeError, ValueError, RuntimeError):

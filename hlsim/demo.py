@@ -75,7 +75,9 @@ def demo(
     for path, utterance in zip(scored, clean, strict=True):  # not after minutes of training
         check_pair(utterance, utterance, NEURO_RATE, names=(str(path), str(path)))
     recipe = CompensatorRecipe(seed=seed)
-    report(f"training on {len(training)} utterances for {minutes:g} minutes, ear {_name(audiogram)}")
+    report(
+        f"training on {len(training)} utterances for {minutes:g} minutes, ear {_name(audiogram)}"
+    )
     data, where = TrainingData(speech=training), folder / "training"
     with one_thread():  # the steps are small: on a busy machine two threads wait for each other
         checkpoint = train_compensator(
@@ -95,7 +97,10 @@ def demo(
     report(f"scoring {len(scored)} other utterances by HASPI, {len(conditions)} conditions")
     ear, normal = (MSBG(a, sample_rate=NEURO_RATE) for a in (audiogram, NORMAL))
     with torch.no_grad():
-        given = {name: [model(one, audiogram) for one in clean] for name, (_, model) in conditions.items()}
+        given = {
+            name: [model(one, audiogram) for one in clean]
+            for name, (_, model) in conditions.items()
+        }
         heard = {name: [ear(signal) for signal in signals] for name, signals in given.items()}
         heard[NORMAL_EAR] = [normal(utterance) for utterance in clean]
     seeds = [(seed + i) % 2**32 for i in range(len(scored))]
@@ -103,11 +108,15 @@ def demo(
     for name, signals in given.items():
         with one_thread():
             haspi[name] = [
-                MEASURES["haspi"].score(utterance, signal, audiogram, NEURO_RATE, PASCAL_SPL, own_seed)
+                MEASURES["haspi"].score(
+                    utterance, signal, audiogram, NEURO_RATE, PASCAL_SPL, own_seed
+                )
                 for utterance, signal, own_seed in zip(clean, signals, seeds, strict=True)
             ]
         report(f"  {name}: mean HASPI {fmean(haspi[name]):.3f}")
-    levels, heard_levels = ({name: _levels(own) for name, own in of.items()} for of in (given, heard))
+    levels, heard_levels = (
+        {name: _levels(own) for name, own in of.items()} for of in (given, heard)
+    )
     normally = fmean(heard_levels[NORMAL_EAR])
     heard_off = {name: fmean(heard_levels[name]) - normally for name in conditions}
     extra: dict[str, object] = {"normal_heard_level_mean": normally}
@@ -137,7 +146,9 @@ def demo(
     front, picture = demo_front(result, table, Sounds(names, clean, given, heard), curves)
     write_report(result, folder, front=front)
     write_whole(folder / "spectrograms.png", picture)
-    _write_audio(folder / "audio", names, clean, {key: heard[name] for name, (key, _) in conditions.items()})
+    _write_audio(
+        folder / "audio", names, clean, {key: heard[name] for name, (key, _) in conditions.items()}
+    )
     return f"\n{front.lead}\n\n{table.text()}\n\nThe page: {folder / 'report.html'}"
 
 
@@ -166,7 +177,9 @@ def _names(files: list[Path], speech: str | Path | None) -> list[str]:
     return [name if names.count(name) == 1 else f"{name}-{i}" for i, name in enumerate(names)]
 
 
-def _write_audio(folder: Path, names: list[str], clean: list[Tensor], heard: dict[str, list[Tensor]]) -> None:
+def _write_audio(
+    folder: Path, names: list[str], clean: list[Tensor], heard: dict[str, list[Tensor]]
+) -> None:
     """The original and what is heard of each condition, by one gain, so that their loudness can be compared."""
     folder.mkdir(parents=True, exist_ok=True)
     for i, name in enumerate(names):

@@ -67,7 +67,9 @@ def export_program(
             module.training = training
 
 
-def export_onnx(simulator: nn.Module, path: str | Path, *, seconds: float = 1.0, items: int = 1) -> None:
+def export_onnx(
+    simulator: nn.Module, path: str | Path, *, seconds: float = 1.0, items: int = 1
+) -> None:
     """Write ``export_program``'s program as an ONNX file, whole or not at all; with Mamba blocks that takes minutes.
 
     Raises:
@@ -126,7 +128,9 @@ def write_onnx(
         raise ValueError(f"ONNX cannot take {what}: {_reason(error)}") from error
 
 
-def _check(what: str, path: Path, program: torch.export.ExportedProgram, given: Mapping[str, Tensor]) -> None:
+def _check(
+    what: str, path: Path, program: torch.export.ExportedProgram, given: Mapping[str, Tensor]
+) -> None:
     """Run the file as its user will: the exporter also writes what no runtime takes, or takes wrongly."""
     runtime = require("onnxruntime", "dev")
     try:

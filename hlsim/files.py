@@ -43,7 +43,9 @@ def file_lock(path: Path) -> Iterator[None]:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             where = path.parent
-            raise ValueError(f"{where}: another process is writing there; wait until it is done") from None
+            raise ValueError(
+                f"{where}: another process is writing there; wait until it is done"
+            ) from None
         except OSError:
             pass  # no locks on this drive
         yield
@@ -79,7 +81,9 @@ class Whole:
     def write(self, data: str | bytes) -> None:
         assert self._file is not None
         try:
-            self._file.write(data.encode(errors="backslashreplace") if isinstance(data, str) else data)
+            self._file.write(
+                data.encode(errors="backslashreplace") if isinstance(data, str) else data
+            )
         except OSError as error:
             raise self.refusal(error) from error
 
@@ -105,7 +109,9 @@ class Whole:
                 f"{self.path}: the disk is full; what was finished is kept, and with more space the same command goes on "
                 "from there"
             )
-        return ValueError(f"{self.path}: cannot be written ({getattr(error, 'strerror', None) or error})")
+        return ValueError(
+            f"{self.path}: cannot be written ({getattr(error, 'strerror', None) or error})"
+        )
 
 
 def write_whole(path: str | Path, data: str | bytes) -> None:
@@ -123,7 +129,10 @@ def whole_folder(folder: Path) -> Iterator[Path]:
     """
     folder.parent.mkdir(parents=True, exist_ok=True)
     repair_folder(folder)
-    staging, old = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent)), _old(folder)
+    staging, old = (
+        Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent)),
+        _old(folder),
+    )
     try:
         yield staging
         staging.chmod(0o755)
@@ -194,13 +203,19 @@ def read_rows(path: str | Path) -> Iterator[tuple[int, dict[str, str]]]:
         header = [name.strip() for name in next(filter(None, reader), [])]
         for name in filter(None, header):
             if header.count(name) > 1:
-                raise ValueError(f"{path}, line {reader.line_num}: column {name} twice; allowed: once")
+                raise ValueError(
+                    f"{path}, line {reader.line_num}: column {name} twice; allowed: once"
+                )
         for values in filter(None, reader):
             if "\0" in "".join(values):
-                raise ValueError(f"{path}, line {reader.line_num}: holds a null character; allowed: text")
+                raise ValueError(
+                    f"{path}, line {reader.line_num}: holds a null character; allowed: text"
+                )
             if any(value.strip() for value in values[len(header) :]):
                 allowed = f"one for each of the {len(header)} columns"
-                raise ValueError(f"{path}, line {reader.line_num}: {len(values)} values; allowed: {allowed}")
+                raise ValueError(
+                    f"{path}, line {reader.line_num}: {len(values)} values; allowed: {allowed}"
+                )
             row = zip_longest(header, values[: len(header)], fillvalue="")
             yield reader.line_num, {name: value.strip() for name, value in row if name}
 

@@ -16,8 +16,8 @@ import torch
 from torch import Tensor
 
 from hlsim.audiogram import Audiogram
+from hlsim.audiogram.listener import Listener
 from hlsim.calibration import level_spl
-from hlsim.listener import Listener
 from hlsim.neuro import NeuroMSBG
 from hlsim.neuro.config import NEURO_RATE
 
@@ -41,9 +41,18 @@ class Live:
     """
 
     def __init__(
-        self, stream: Callable[[Tensor], Tensor], full_scale_spl: float, ears: int = 1, latency: int = 0
+        self,
+        stream: Callable[[Tensor], Tensor],
+        full_scale_spl: float,
+        ears: int = 1,
+        latency: int = 0,
     ) -> None:
-        self.stream, self.full_scale_spl, self.ears, self.latency = stream, full_scale_spl, ears, latency
+        self.stream, self.full_scale_spl, self.ears, self.latency = (
+            stream,
+            full_scale_spl,
+            ears,
+            latency,
+        )
         self.drop_outs, self.error = 0, ""
         self._blocks: list[Tensor] = []
 
@@ -79,11 +88,16 @@ class Live:
         parts = []
         if blocks:
             levels = level_spl(torch.cat(blocks, -1), self.full_scale_spl).clamp_min(0.0)
-            told = [" / ".join(f"{level:5.1f}" for level in ears) for ears in levels.view(2, -1).tolist()]
+            told = [
+                " / ".join(f"{level:5.1f}" for level in ears)
+                for ears in levels.view(2, -1).tolist()
+            ]
             parts.append("in {}, out {} dB SPL".format(*told))
         for name, keys in KEYS.items():
             if hasattr(self.stream, name):
-                parts.append(f"{name.replace('_', ' ')} {getattr(self.stream, name):.1f} ({'/'.join(keys)})")
+                parts.append(
+                    f"{name.replace('_', ' ')} {getattr(self.stream, name):.1f} ({'/'.join(keys)})"
+                )
         return ", ".join([*parts, f"drop-outs {self.drop_outs}"])
 
 
@@ -104,7 +118,9 @@ class Simulated:
     def __init__(self, simulator: torch.nn.Module, audiogram: Audiogram | Listener) -> None:
         field = simulator._receptive_field if isinstance(simulator, NeuroMSBG) else None
         if field is None or simulator.sample_rate != NEURO_RATE:
-            raise ValueError("a simulator that looks at whole signals; allowed: neuro-msbg at 16000 Hz")
+            raise ValueError(
+                "a simulator that looks at whole signals; allowed: neuro-msbg at 16000 Hz"
+            )
         self._simulator, self._audiogram, (self.block, needed) = simulator, audiogram, field
         self.latency = math.ceil(needed / self.block) * self.block
         self._past = torch.zeros(2 * self.latency)
@@ -139,9 +155,13 @@ def play(
         ValueError: no such device, one that does not take 16 kHz or plays one ear where there are two, or what the
             stream raised.
     """
-    there, here = [_check(sounddevice, *which) for which in zip(("input", "output"), devices, strict=True)]
+    there, here = [
+        _check(sounddevice, *which) for which in zip(("input", "output"), devices, strict=True)
+    ]
     if here < live.ears:
-        raise ValueError("the headphones have one channel for two ears; allowed: with two, or --audiogram")
+        raise ValueError(
+            "the headphones have one channel for two ears; allowed: with two, or --audiogram"
+        )
     for _ in range(_WARM_UP):
         live.stream(torch.zeros(2, block) if live.ears == 2 else torch.zeros(block))
     shown, every = ("\r{:<100}", 0.2) if sys.stdout.isatty() else ("{}\n", 1.0)
@@ -151,10 +171,14 @@ def play(
         with (
             suppress(KeyboardInterrupt),
             _keys() as key,
-            sounddevice.Stream(samplerate=NEURO_RATE, blocksize=block, callback=live, **options) as audio,
+            sounddevice.Stream(
+                samplerate=NEURO_RATE, blocksize=block, callback=live, **options
+            ) as audio,
         ):
             late = 1000.0 * (sum(audio.latency) + live.latency / NEURO_RATE)
-            print(f"blocks of {1000 * block / NEURO_RATE:g} ms, {late:.0f} ms late; q or Ctrl-C ends it")
+            print(
+                f"blocks of {1000 * block / NEURO_RATE:g} ms, {late:.0f} ms late; q or Ctrl-C ends it"
+            )
             end, pressed = time.monotonic() + seconds, ""
             while pressed != "q" and not live.error and (left := end - time.monotonic()) > 0.0:
                 live.press(pressed := key(min(every, left)))

@@ -203,7 +203,9 @@ def _pool(
     return results
 
 
-def _make(function: Callable[[Task, Sequence[str]], Result], task: tuple[Task, Sequence[str]]) -> Result:
+def _make(
+    function: Callable[[Task, Sequence[str]], Result], task: tuple[Task, Sequence[str]]
+) -> Result:
     return function(*task)
 
 
@@ -218,6 +220,8 @@ def _died(error: Exception) -> bool:
 
 def _connect(scheduler: str) -> Any:
     try:
-        return require("distributed", "cluster").Client(scheduler, set_as_default=False, timeout=_PATIENCE)
+        return require("distributed", "cluster").Client(
+            scheduler, set_as_default=False, timeout=_PATIENCE
+        )
     except (OSError, ValueError) as error:
         raise ValueError(f"no Dask scheduler answers at {scheduler} ({error})") from error

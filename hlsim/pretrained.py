@@ -91,7 +91,9 @@ def read_checkpoint(
     settings: Any = record.get("config")
     changed = "changed since it was saved"
     if hashlib.sha256(weights).hexdigest() != record.get("sha256"):
-        raise ValueError(f"{folder / WEIGHTS}: {changed}, its SHA-256 differs from {CONFIG}'s; get it anew")
+        raise ValueError(
+            f"{folder / WEIGHTS}: {changed}, its SHA-256 differs from {CONFIG}'s; get it anew"
+        )
     if record.get("config_sha256") != _digest(settings):
         raise ValueError(
             f"{folder / CONFIG}: {changed} or of another version, the SHA-256 of its 'config' is not its "
@@ -114,7 +116,9 @@ def read_checkpoint(
         return model if device.type == "meta" else model.to(device)
 
 
-def find_checkpoint(name: str | Path, kinds: Collection[str] | None = None, also: Sequence[str] = ()) -> Path:
+def find_checkpoint(
+    name: str | Path, kinds: Collection[str] | None = None, also: Sequence[str] = ()
+) -> Path:
     """The folder of a checkpoint that ships with hlsim, or another.
 
     Raises:
@@ -132,7 +136,9 @@ def find_checkpoint(name: str | Path, kinds: Collection[str] | None = None, also
     hint = f", but {str(inner)!r} is one" if (inner / CONFIG).is_file() else ""
     if str(name) in _MODELS:
         hint = f": it is {_MODELS[str(name)]}"
-    raise ValueError(f"no checkpoint {str(name)!r}{hint}; allowed: {names}, or a folder with {CONFIG}")
+    raise ValueError(
+        f"no checkpoint {str(name)!r}{hint}; allowed: {names}, or a folder with {CONFIG}"
+    )
 
 
 def checkpoint_digest(name: str | Path) -> str:
@@ -150,7 +156,9 @@ def shipped(kinds: Collection[str] | None = None) -> dict[str, Path]:
     """The checkpoints that ship with hlsim, name and folder; all kinds by default."""
     folders = (path.parent for path in sorted(checkpoints_folder().glob(f"*/{CONFIG}")))
     return {
-        folder.name: folder for folder in folders if kinds is None or _record(folder).get("kind") in kinds
+        folder.name: folder
+        for folder in folders
+        if kinds is None or _record(folder).get("kind") in kinds
     }
 
 
@@ -162,7 +170,12 @@ def checkpoints_folder() -> Path:
 
 
 def save_checkpoint(
-    folder: str | Path, kind: str, model: nn.Module, config: Settings, about: Settings, card: str = ""
+    folder: str | Path,
+    kind: str,
+    model: nn.Module,
+    config: Settings,
+    about: Settings,
+    card: str = "",
 ) -> None:
     """Write a checkpoint folder, whole or not at all; an older one of the same name is replaced.
 
@@ -174,7 +187,9 @@ def save_checkpoint(
         ValueError: the folder holds something else.
     """
     target = check_replaceable(folder)
-    state = {name: tensor.detach().cpu().contiguous() for name, tensor in model.state_dict().items()}
+    state = {
+        name: tensor.detach().cpu().contiguous() for name, tensor in model.state_dict().items()
+    }
     weights, settings = safetensors.torch.save(state), dict(config)
     hashes = {"sha256": hashlib.sha256(weights).hexdigest(), "config_sha256": _digest(settings)}
     record = {"kind": kind, "config": settings, **hashes, "about": dict(about)}

@@ -39,7 +39,9 @@ def lasting() -> Iterator[None]:
         yield
 
 
-def constant(make: Callable[..., Any], *arguments: Any, dtype: torch.dtype, device: torch.device) -> Tensor:
+def constant(
+    make: Callable[..., Any], *arguments: Any, dtype: torch.dtype, device: torch.device
+) -> Tensor:
     """What ``make`` returns for these arguments as a tensor that nobody may write into, made once.
 
     Args:
@@ -69,7 +71,9 @@ def made_once(make: Callable[..., Any], *arguments: Any) -> Any:
 
 def as_tensor(values: Any, dtype: torch.dtype, device: torch.device) -> Tensor:
     """Real or complex values as a tensor of ``dtype`` or its complex counterpart."""
-    tensor = torch.as_tensor(np.ascontiguousarray(values) if isinstance(values, np.ndarray) else values)
+    tensor = torch.as_tensor(
+        np.ascontiguousarray(values) if isinstance(values, np.ndarray) else values
+    )
     return tensor.to(device=device, dtype=dtype.to_complex() if tensor.is_complex() else dtype)
 
 

@@ -24,9 +24,7 @@ def pytest_configure(config: pytest.Config) -> None:
 def pytest_report_header(config: pytest.Config) -> str | None:
     """Say what a plain run leaves out."""
     if config.option.markexpr == "not install and not browser and not audio":
-        return (
-            "left out: tests of an installation, of a browser and of sound: pytest -m install, browser, audio"
-        )
+        return "left out: tests of an installation, of a browser and of sound: pytest -m install, browser, audio"
     return None
 
 
@@ -39,7 +37,9 @@ def pytest_terminal_summary(terminalreporter: Any) -> None:
         ):
             if name == "robustness":
                 kind, *counts = value
-                tally[kind] = [sum(pair) for pair in zip(tally.get(kind, (0, 0)), counts, strict=True)]
+                tally[kind] = [
+                    sum(pair) for pair in zip(tally.get(kind, (0, 0)), counts, strict=True)
+                ]
     for kind, (tried, failed) in sorted(tally.items()):
         terminalreporter.write_line(f"robustness: {kind}: {tried} tried, {failed} failed")
 
@@ -74,5 +74,10 @@ def speech(speech_dir: Path) -> list[tuple[Tensor, int]]:
 
     Shape: (1, time) each.
     """
-    names = ("train/flite-slt-01", "train/espeak-nyc-m4-01", "valid/flite-rms-01", "valid/espeak-us-annie-01")
+    names = (
+        "train/flite-slt-01",
+        "train/espeak-nyc-m4-01",
+        "valid/flite-rms-01",
+        "valid/espeak-us-annie-01",
+    )
     return [read_audio(speech_dir / f"{name}.flac") for name in names]

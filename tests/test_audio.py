@@ -107,11 +107,23 @@ def test_a_failing_write_leaves_what_was_there(
         ("a", torch.zeros(10), "cannot write a file without extension"),
         ("a.wav", torch.tensor([0.0, float("nan")]), "NaN or infinite"),
         ("a.wav", torch.tensor([0.0, float("inf")]), "NaN or infinite"),
-        ("a.flac", torch.tensor([0.0, -1.5]), r"samples reach 1\.5, \.flac holds 1\.0; write \.wav"),
+        (
+            "a.flac",
+            torch.tensor([0.0, -1.5]),
+            r"samples reach 1\.5, \.flac holds 1\.0; write \.wav",
+        ),
         ("a.ogg", torch.tensor([0.0, 1.5]), r"samples reach 1\.5, \.ogg holds 1\.0; write \.wav"),
         ("a.flac", torch.zeros(9, 10), "cannot be written"),
-        ("a.OGG", torch.zeros(3, 10), r"3 channels; allowed: up to 2 in \.ogg, more in \.wav and \.flac"),
-        ("a.wav", torch.zeros(2, 3, 10), r"shape \(2, 3, 10\); allowed: \(channels, time\) or \(time,\)"),
+        (
+            "a.OGG",
+            torch.zeros(3, 10),
+            r"3 channels; allowed: up to 2 in \.ogg, more in \.wav and \.flac",
+        ),
+        (
+            "a.wav",
+            torch.zeros(2, 3, 10),
+            r"shape \(2, 3, 10\); allowed: \(channels, time\) or \(time,\)",
+        ),
         ("nowhere/a.wav", torch.zeros(10), "cannot be written"),
     ],
 )
@@ -125,18 +137,28 @@ def test_what_cannot_be_written(tmp_path: Path, name: str, wave: Tensor, said: s
 
 @pytest.mark.parametrize("rate", [8000, 0, "16k", None])
 @pytest.mark.parametrize("suffix", EXTENSIONS)
-def test_rates_that_could_not_be_read_again_are_not_written(tmp_path: Path, suffix: str, rate: Any) -> None:
-    with pytest.raises(ValueError, match=rf"sample rate {rate!r} Hz; allowed: 16000 to 48000") as caught:
+def test_rates_that_could_not_be_read_again_are_not_written(
+    tmp_path: Path, suffix: str, rate: Any
+) -> None:
+    with pytest.raises(
+        ValueError, match=rf"sample rate {rate!r} Hz; allowed: 16000 to 48000"
+    ) as caught:
         write_audio(tmp_path / f"a{suffix}", torch.zeros(10), rate)
     assert str(caught.value).startswith(str(tmp_path))
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize(("suffix", "most"), [(".wav", 2**31 - 1), (".flac", 655350), (".ogg", 200000)])
-def test_rates_that_a_file_cannot_hold_are_not_written(tmp_path: Path, suffix: str, most: int) -> None:
+@pytest.mark.parametrize(
+    ("suffix", "most"), [(".wav", 2**31 - 1), (".flac", 655350), (".ogg", 200000)]
+)
+def test_rates_that_a_file_cannot_hold_are_not_written(
+    tmp_path: Path, suffix: str, most: int
+) -> None:
     wrong: list[Any] = [most + 1, 96000.5, 9_000_000_000]
     for beyond in wrong:
-        with pytest.raises(ValueError, match=rf"sample rate {beyond} Hz; .* whole numbers up to {most}"):
+        with pytest.raises(
+            ValueError, match=rf"sample rate {beyond} Hz; .* whole numbers up to {most}"
+        ):
             write_audio(tmp_path / f"a{suffix}", torch.zeros(10), beyond)
     assert not list(tmp_path.iterdir())
 
@@ -257,7 +279,9 @@ def test_a_header_that_tells_of_more_than_memory_holds(
     data[21] &= 0xF0
     path.write_bytes(data)
 
-    def refuse(*args: object, **kwargs: object) -> None:  # whether the system would, depends on its settings
+    def refuse(
+        *args: object, **kwargs: object
+    ) -> None:  # whether the system would, depends on its settings
         raise MemoryError("Unable to allocate 16. GiB")
 
     monkeypatch.setattr(np, "empty", refuse)
@@ -277,7 +301,9 @@ def test_find_audio_says_what_is_missing(tmp_path: Path) -> None:
 @pytest.mark.parametrize("header", ["plain", "chunk before", "odd"])
 def test_a_wav_cut_off_is_named(tmp_path: Path, header: str) -> None:
     path = tmp_path / "cut.wav"
-    soundfile.write(path, np.full(101, 0.25), 16000, subtype="PCM_U8" if header == "odd" else "PCM_16")
+    soundfile.write(
+        path, np.full(101, 0.25), 16000, subtype="PCM_U8" if header == "odd" else "PCM_16"
+    )
     whole = path.read_bytes()
     place = whole.index(b"data")
     if header == "chunk before":
@@ -290,9 +316,13 @@ def test_a_wav_cut_off_is_named(tmp_path: Path, header: str) -> None:
             if held == size:  # the odd one without its byte of padding
                 assert bool((read(path)[0] == 0.25).all())
                 continue
-            with pytest.raises(ValueError, match=f"{size} bytes of samples, {held} are there") as caught:
+            with pytest.raises(
+                ValueError, match=f"{size} bytes of samples, {held} are there"
+            ) as caught:
                 read(path)
-            assert str(caught.value).startswith(f"{path}: cut off") and "\n" not in str(caught.value)
+            assert str(caught.value).startswith(f"{path}: cut off") and "\n" not in str(
+                caught.value
+            )
 
 
 @pytest.mark.parametrize("size", [0, 0x7FFFF000, 0xFFFFFFFF])

@@ -32,7 +32,8 @@ def test_gain_to_pascals_is_pyclaritys_full_scale() -> None:
 
 
 @pytest.mark.parametrize(
-    "value", [-0.1, 200.1, math.nan, math.inf, -math.inf, 10**400, None, "a", "94", True, [94.0], 94 + 0j]
+    "value",
+    [-0.1, 200.1, math.nan, math.inf, -math.inf, 10**400, None, "a", "94", True, [94.0], 94 + 0j],
 )
 def test_full_scales_that_are_none(value: Any) -> None:
     with pytest.raises(ValueError, match=r"full_scale_spl is .*; allowed: 0 to 200 dB SPL"):
@@ -50,13 +51,17 @@ def test_numbers_of_numpy_are_full_scales(value: Any) -> None:
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_set_level_gives_each_item_its_own(dtype: torch.dtype) -> None:
-    wave = torch.randn(2, 3, 400, dtype=dtype) * 10 ** torch.linspace(-3, 2, 6, dtype=dtype).reshape(2, 3, 1)
+    wave = torch.randn(2, 3, 400, dtype=dtype) * 10 ** torch.linspace(
+        -3, 2, 6, dtype=dtype
+    ).reshape(2, 3, 1)
     wanted = torch.tensor([[40.0, 55.0, 60.0], [75.0, 90.0, 115.0]])
     out = set_level(wave, wanted, 107.0)
     assert out.dtype == dtype
     torch.testing.assert_close(level_spl(out, 107.0), wanted.to(dtype), atol=1e-3, rtol=0)
     # only the level changes
-    torch.testing.assert_close(out / out.norm(dim=-1, keepdim=True), wave / wave.norm(dim=-1, keepdim=True))
+    torch.testing.assert_close(
+        out / out.norm(dim=-1, keepdim=True), wave / wave.norm(dim=-1, keepdim=True)
+    )
     assert float(level_spl(set_level(wave, 65), 94.0).sub(65).abs().max()) < 1e-3
 
 
@@ -76,7 +81,9 @@ def test_half_precision_is_levelled_too(dtype: torch.dtype) -> None:
     assert level.dtype == dtype and float(level) == pytest.approx(-6.0, abs=0.5)
     assert float(level_spl(torch.zeros(10, dtype=dtype))) == -106.0
     louder = set_level(wave, 65.0)
-    assert louder.dtype == dtype and float(level_spl(louder.float())) == pytest.approx(65.0, abs=0.05)
+    assert louder.dtype == dtype and float(level_spl(louder.float())) == pytest.approx(
+        65.0, abs=0.05
+    )
     assert not bool(set_level(torch.zeros(10, dtype=dtype), 65.0).any())
 
 

@@ -33,7 +33,10 @@ from hlsim.training.recipes import CompensatorRecipe, SimulatorRecipe
         ("seconds: .inf", "seconds inf"),
         ("levels: 65", r"levels 65 in the recipe; allowed: a lowest and a highest, as \[0, 20\]"),
         ("levels: [50, loud]", "levels 'loud' in the recipe; allowed: a number"),
-        ("levels: [80, 50]", r"levels \[80, 50\] in the recipe; allowed: a lowest and a highest, ascending"),
+        (
+            "levels: [80, 50]",
+            r"levels \[80, 50\] in the recipe; allowed: a lowest and a highest, ascending",
+        ),
         ("weights:", "weights None in the recipe; allowed: 'name: value' lines below it"),
         ("weights: 1.0", "weights 1.0 in the recipe; allowed: 'name: value' lines"),
         ("weights: {}", r"weights \{\} in the recipe; allowed: 0 or more, one or more above 0"),
@@ -47,7 +50,9 @@ def test_values_that_are_not_allowed(recipe: Any, text: str, said: str) -> None:
         recipe.from_dict(yaml.safe_load(text))
 
 
-@pytest.mark.parametrize(("recipe", "criterion"), [(SimulatorRecipe, "snr"), (CompensatorRecipe, "bands")])
+@pytest.mark.parametrize(
+    ("recipe", "criterion"), [(SimulatorRecipe, "snr"), (CompensatorRecipe, "bands")]
+)
 def test_weights(recipe: Any, criterion: str) -> None:
     for value in (-1.0, 0.0, 0):
         with pytest.raises(ValueError, match="allowed: 0 or more, one or more above 0"):
@@ -71,7 +76,21 @@ def test_other_names() -> None:
 
 @pytest.mark.parametrize(
     "rate",
-    [15999, 48001, 16000.5, -16000, 0, math.nan, math.inf, 10**400, None, "16k", "16000", True, [16000]],
+    [
+        15999,
+        48001,
+        16000.5,
+        -16000,
+        0,
+        math.nan,
+        math.inf,
+        10**400,
+        None,
+        "16k",
+        "16000",
+        True,
+        [16000],
+    ],
 )
 def test_rates_out_of_range(rate: Any) -> None:
     with pytest.raises(ValueError, match=r"sample rate .* Hz; allowed: 16000 to 48000"):
@@ -84,7 +103,8 @@ def test_rates_in_range_come_back_whole(rate: int) -> None:
 
 
 @pytest.mark.parametrize(
-    "wave", [torch.zeros(10, dtype=torch.int16), np.zeros(10), None, torch.tensor(1.0), torch.zeros(2, 0)]
+    "wave",
+    [torch.zeros(10, dtype=torch.int16), np.zeros(10), None, torch.tensor(1.0), torch.zeros(2, 0)],
 )
 def test_what_is_no_waveform(wave: Any) -> None:
     with pytest.raises(ValueError, match=r"heard (is|has shape) .*; allowed: .*\(\.\.\., time\)"):

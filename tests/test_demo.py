@@ -39,10 +39,17 @@ def test_demo_writes_report_audio_and_pictures(tmp_path: Path, short_speech: Pat
     rows = {line[:24].strip(): line[24:].split() for line in text.splitlines()}
     for key, name in names.items():
         assert 0.0 <= report[f"{key}_mean"] <= 1.0
-        assert rows[name][:2] == [f"{report[f'{key}_mean']:.3f}", f"{report[f'{key}_level_mean']:.1f}"]
-    assert report["nalr_as_loud_level_mean"] == pytest.approx(report["compensated_level_mean"], abs=1e-3)
+        assert rows[name][:2] == [
+            f"{report[f'{key}_mean']:.3f}",
+            f"{report[f'{key}_level_mean']:.1f}",
+        ]
+    assert report["nalr_as_loud_level_mean"] == pytest.approx(
+        report["compensated_level_mean"], abs=1e-3
+    )
     page = (out / "report.html").read_text()
-    assert text.startswith("\nThe trained aid ") and text.endswith(f"\n\nThe page: {out / 'report.html'}")
+    assert text.startswith("\nThe trained aid ") and text.endswith(
+        f"\n\nThe page: {out / 'report.html'}"
+    )
     assert text.splitlines()[1] in page and page.count("<audio") == 5 and "N4 (severe loss)" in page
     assert report["before_mean"] == pytest.approx(report["unaided_mean"])
     assert report["after_mean"] == pytest.approx(report["compensated_mean"])

@@ -20,7 +20,10 @@ GPU = torch.device("cuda", 0)
 MOVES = {"aten::_to_copy", "aten::copy_"}  # these take tensors of both
 
 # of what torch leaves for later, dispatch down here knows nothing
-EAGER = {"aten::_conj": torch.ops.aten.conj_physical.default, "aten::_neg_view": torch.ops.aten.neg.default}
+EAGER = {
+    "aten::_conj": torch.ops.aten.conj_physical.default,
+    "aten::_neg_view": torch.ops.aten.neg.default,
+}
 
 
 class OnGPU(Tensor):
@@ -48,9 +51,15 @@ class OnGPU(Tensor):
     def __torch_dispatch__(cls, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         kwargs = kwargs or {}
         tensors = [leaf for leaf in tree_leaves((args, kwargs)) if isinstance(leaf, Tensor)]
-        others = [tuple(tensor.shape) for tensor in tensors if not isinstance(tensor, OnGPU) and tensor.ndim]
+        others = [
+            tuple(tensor.shape)
+            for tensor in tensors
+            if not isinstance(tensor, OnGPU) and tensor.ndim
+        ]
         if others and func._schema.name not in MOVES:
-            raise RuntimeError(f"{func} got tensors of the GPU and of the CPU, these of shape {others}")
+            raise RuntimeError(
+                f"{func} got tensors of the GPU and of the CPU, these of shape {others}"
+            )
         func = EAGER.get(func._schema.name, func)
         out = func(*tree_map(inside, args), **tree_map(inside, kwargs))
         if func._schema.is_mutable:
@@ -101,8 +110,12 @@ class PretendedGPU(TorchFunctionMode):
             tensor, *rest = args
             like = next((value for value in rest if isinstance(value, Tensor)), None)
             device = {"cpu": "cpu", "cuda": GPU}.get(name) or kwargs.get("device")
-            device = device or next((value for value in rest if isinstance(value, torch.device | str)), None)
-            dtype = kwargs.get("dtype") or next((v for v in rest if isinstance(v, torch.dtype)), None)
+            device = device or next(
+                (value for value in rest if isinstance(value, torch.device | str)), None
+            )
+            dtype = kwargs.get("dtype") or next(
+                (v for v in rest if isinstance(v, torch.dtype)), None
+            )
             if like is not None:
                 device, dtype = GPU if isinstance(like, OnGPU) else "cpu", like.dtype
             tensor = tensor if dtype is None else func(tensor, dtype)
@@ -205,7 +218,9 @@ class Doubled(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> Tensor:
         Doubled.seen = gradient.device
-        return gradient * torch.full((3,), 2.0, device="cpu" if Doubled.by_processor else gradient.device)
+        return gradient * torch.full(
+            (3,), 2.0, device="cpu" if Doubled.by_processor else gradient.device
+        )
 
 
 def test_the_pretended_device_is_there_on_the_way_back(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -28,21 +28,30 @@ def load(name: str) -> ModuleType:
     return module
 
 
-def test_own_network_trains(tmp_path: Path, speech_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_own_network_trains(
+    tmp_path: Path, speech_dir: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert len((EXAMPLES / "train_compensator.py").read_text().splitlines()) < 60
     example, out = load("train_compensator.py"), tmp_path / "network.pt"
     example.main(str(speech_dir / "train"), str(out), "N4", "2")
-    assert [line.split(":")[0] for line in capsys.readouterr().out.splitlines()] == ["step 0", "step 1"]
+    assert [line.split(":")[0] for line in capsys.readouterr().out.splitlines()] == [
+        "step 0",
+        "step 1",
+    ]
     fresh, trained = example.MyNetwork(), example.MyNetwork()
     trained.load_state_dict(torch.load(out))
     ear, noise = Audiogram.standard("N4"), 0.03 * torch.randn(2, 8000)
     # it starts from the prescription, and two steps have moved it
-    torch.testing.assert_close(fresh(noise, ear), fresh.prescription(noise, ear), atol=1e-4, rtol=1e-3)
+    torch.testing.assert_close(
+        fresh(noise, ear), fresh.prescription(noise, ear), atol=1e-4, rtol=1e-3
+    )
     assert float((trained(noise, ear) - fresh(noise, ear)).abs().max()) > 1e-4
     assert trained(noise[0], ear).shape == (8000,)
 
 
-def test_the_papers_last_table(tmp_path: Path, speech_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_papers_last_table(
+    tmp_path: Path, speech_dir: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     for module in ("matplotlib", "joblib"):
         pytest.importorskip(module)
     clean, rate = read_audio(speech_dir / "valid" / "flite-rms-01.flac")
@@ -83,18 +92,25 @@ def test_enhancers_take_noise_off_and_do_not_delay(
     enhancer = load_enhancer(f"examples.enhancers:{name}")  # which refuses what is late
     clean = set_level(speech[0][0][:, :48000], 65.0)
     noise = set_level(torch.randn_like(clean), 60.0)
-    apart = [float(level_spl(made - clean)) for made in (clean + noise, enhancer(clean + noise, 16000))]
+    apart = [
+        float(level_spl(made - clean)) for made in (clean + noise, enhancer(clean + noise, 16000))
+    ]
     assert apart[1] < apart[0] - 4.0
 
 
 def test_what_the_sliders_trade(
-    speech_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    speech_dir: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     example, valid = load("sliders.py"), str(speech_dir / "valid")
     monkeypatch.setattr(example, "STEPS", (0.0, 1.0))
     ears = tmp_path / "ears.csv"
     ears.write_text(
-        "\n".join(",".join(line) for line in zip(*Audiogram.standard("N2").to_row().items(), strict=True))
+        "\n".join(
+            ",".join(line) for line in zip(*Audiogram.standard("N2").to_row().items(), strict=True)
+        )
     )
     with torch.no_grad():
         example.main(valid, valid, str(ears), "2")
@@ -118,7 +134,9 @@ def test_similarity_of_neurograms() -> None:
     assert example.outer_hair_cells_db(500.0)[-1] < example.outer_hair_cells_db(4000.0)[-1] < 65.0
 
 
-def test_delay_by_frequency(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_delay_by_frequency(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     pytest.importorskip("matplotlib")
     example = load("delay.py")
     given = example.bursts()
@@ -136,11 +154,16 @@ def test_delay_by_frequency(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Capt
     example.main()
     table = capsys.readouterr().out.splitlines()
     assert table[2] == "| NH | none |" + "".join(f" {samples:+d} |" for samples in left)
-    assert len(table) == 2 + len(example.TABLED) and drawn == [EXAMPLES.parent / "docs" / "delay.png"]
+    assert len(table) == 2 + len(example.TABLED) and drawn == [
+        EXAMPLES.parent / "docs" / "delay.png"
+    ]
 
 
 def test_parity(
-    tmp_path: Path, speech_dir: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path,
+    speech_dir: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     pytest.importorskip("clarity")
     example = load("parity.py")
@@ -152,7 +175,9 @@ def test_parity(
     ears = tmp_path / "ears.csv"
     rows = [{"listener": "N2", **Audiogram.standard("N2").to_row()}]
     ears.write_text("\n".join([",".join(rows[0]), *(",".join(row.values()) for row in rows)]))
-    monkeypatch.setattr(example.sys, "argv", ["parity.py", str(speech_dir / "valid"), str(ears), "1"])
+    monkeypatch.setattr(
+        example.sys, "argv", ["parity.py", str(speech_dir / "valid"), str(ears), "1"]
+    )
     example.main()
     lines = capsys.readouterr().out.splitlines()
     assert [line.split(", ")[0] for line in lines] == ["44.1 kHz", "16 kHz"] * 2
@@ -165,16 +190,24 @@ def test_other_sounds(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFix
     monkeypatch.setattr(example, "EARS", ("N3",))
     monkeypatch.setattr(example.sys, "argv", ["other_sounds.py"])
     ear = Audiogram.standard("N3")
-    itself = example.cells(MSBG(ear, sample_rate=16000), lambda x, _: MSBG(ear, sample_rate=16000)(x), ear)
+    itself = example.cells(
+        MSBG(ear, sample_rate=16000), lambda x, _: MSBG(ear, sample_rate=16000)(x), ear
+    )
     assert itself[:2] == ["+0.0 to +0.0"] * 2 and itself[3] == itself[5] == "200, 200, 200"
     # one that gives 3 dB too much
     louder = example.cells(
         MSBG(ear, sample_rate=16000), lambda x, _: 2**0.5 * MSBG(ear, sample_rate=16000)(x), ear
     )
-    assert louder[0] == "+3.0 to +3.0" and louder[2] == "+3.0, +3.0, +3.0" and louder[3] == "8, 8, 8"
+    assert (
+        louder[0] == "+3.0 to +3.0" and louder[2] == "+3.0, +3.0, +3.0" and louder[3] == "8, 8, 8"
+    )
     example.main()
     table = capsys.readouterr().out.splitlines()
-    assert len(table) == 3 and all(line.count("|") == 8 for line in table) and table[2].startswith("| N3 |")
+    assert (
+        len(table) == 3
+        and all(line.count("|") == 8 for line in table)
+        and table[2].startswith("| N3 |")
+    )
 
 
 def test_the_default_criterion_is_valid(speech: list[tuple[torch.Tensor, int]]) -> None:
@@ -186,7 +219,8 @@ def test_the_default_criterion_is_valid(speech: list[tuple[torch.Tensor, int]]) 
     signals = example.degraded(clean, noise, generator)
     assert len(signals) == 18 and all(signal.shape == clean.shape for signal in signals.values())
     few = {
-        name: signals[name] for name in (*example.NOISY, "low-pass 1000 Hz", "reverberation of 1 s", "sign")
+        name: signals[name]
+        for name in (*example.NOISY, "low-pass 1000 Hz", "reverberation of 1 s", "sign")
     }
     gain_db = example.equaliser(clean, ear)
     exact, given = MSBG(sample_rate=16000), example.filtered(clean, 10.0 ** (gain_db / 20.0))

@@ -57,10 +57,16 @@ def test_what_cannot_be_exported_is_said(tmp_path: Path) -> None:
         export_program(load_pretrained("neuro-msbg", sample_rate=44100))
 
 
-def test_a_missing_folder_is_said_before_the_export(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_folder_is_said_before_the_export(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("hlsim.export.export_program", lambda *_, **__: pytest.fail("exported"))
-    with pytest.raises(ValueError, match=r"there is no folder '.*missing'; allowed: a file in a folder"):
-        export_onnx(NeuroMSBG(NeuroConfig(channels=4, blocks=1)), tmp_path / "missing" / "simulator.onnx")
+    with pytest.raises(
+        ValueError, match=r"there is no folder '.*missing'; allowed: a file in a folder"
+    ):
+        export_onnx(
+            NeuroMSBG(NeuroConfig(channels=4, blocks=1)), tmp_path / "missing" / "simulator.onnx"
+        )
 
 
 @pytest.mark.slow
@@ -75,14 +81,19 @@ def test_onnx_gives_the_outputs(tmp_path: Path, items: int, seconds: float) -> N
     names = [entry.name for entry in session.get_inputs()]
     heard = session.run(None, dict(zip(names, (wave.numpy(), ears.numpy()), strict=True)))[0]
     expected = simulator(wave, ears)
-    assert float((torch.from_numpy(heard) - expected).abs().max()) < 1e-4 * float(expected.abs().max())
+    assert float((torch.from_numpy(heard) - expected).abs().max()) < 1e-4 * float(
+        expected.abs().max()
+    )
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("broken", "complaint"),
     [
-        (lambda session, names, given: [0.999 * heard for heard in session(names, given)], "off by 1e-03"),
+        (
+            lambda session, names, given: [0.999 * heard for heard in session(names, given)],
+            "off by 1e-03",
+        ),
         (lambda session, names, given: 1 / 0, "onnxruntime refuses the file"),
     ],
 )
@@ -97,6 +108,10 @@ def test_onnx_that_gives_something_else_is_not_written(
         "run",
         lambda self, names, given: broken(lambda *wanted: run(self, *wanted), names, given),
     )
-    with pytest.raises(ValueError, match=f"ONNX cannot take the simulator: .*{complaint}") as caught:
-        export_onnx(NeuroMSBG(NeuroConfig(channels=4, blocks=1)), tmp_path / "simulator.onnx", seconds=0.1)
+    with pytest.raises(
+        ValueError, match=f"ONNX cannot take the simulator: .*{complaint}"
+    ) as caught:
+        export_onnx(
+            NeuroMSBG(NeuroConfig(channels=4, blocks=1)), tmp_path / "simulator.onnx", seconds=0.1
+        )
     assert "\n" not in str(caught.value) and not list(tmp_path.iterdir())

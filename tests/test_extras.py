@@ -34,5 +34,7 @@ def test_all_but_its_own_engine_does_without_pyclarity() -> None:
     for module in ("torchmetrics", "lightning", "joblib", "matplotlib", "pandas"):
         pytest.importorskip(module)
     command = [sys.executable, "-c", SCRIPT]
-    ended = subprocess.run(command, capture_output=True, text=True, cwd=Path(hlsim.__file__).parents[1])
+    ended = subprocess.run(
+        command, capture_output=True, text=True, cwd=Path(hlsim.__file__).parents[1]
+    )
     assert ended.returncode == 0, ended.stderr[-2000:]

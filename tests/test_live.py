@@ -38,7 +38,11 @@ class Devices:
         pass
 
     def __init__(
-        self, recording: torch.Tensor, lost: tuple[int, ...] = (), takes: int = 16000, plays: int = 2
+        self,
+        recording: torch.Tensor,
+        lost: tuple[int, ...] = (),
+        takes: int = 16000,
+        plays: int = 2,
     ) -> None:
         self.recording, self.lost, self.takes = torch.atleast_2d(recording).mT.numpy(), lost, takes
         self.plays = plays
@@ -61,7 +65,9 @@ class Devices:
     def Stream(self, callback: Callable[..., None], **opened: Any) -> Any:
         self.opened = opened
         block, number = opened["blocksize"], -1
-        for number, given in enumerate(np.split(self.recording, range(block, len(self.recording), block))):
+        for number, given in enumerate(
+            np.split(self.recording, range(block, len(self.recording), block))
+        ):
             played = np.full((len(given), opened["channels"][1]), np.nan, dtype=np.float32)
             status = SimpleNamespace(**vars(FINE) | {"output_underflow": number in self.lost})
             callback(given, played, len(given), None, status)
@@ -105,7 +111,9 @@ def test_what_is_played_is_what_the_aid_gives(
     out = capsys.readouterr().out
     level = 10.0 * np.log10(np.square(expected).mean()) + 100.0
     assert "blocks of 5 ms, 34 ms late" in out  # 30 of the devices, 4 of the aid
-    assert f"in  65.0, out {level:5.1f} dB SPL, drop-outs 2" in out and out.endswith("stopped, drop-outs 2\n")
+    assert f"in  65.0, out {level:5.1f} dB SPL, drop-outs 2" in out and out.endswith(
+        "stopped, drop-outs 2\n"
+    )
 
 
 @pytest.mark.parametrize("microphones", [1, 2])
@@ -139,7 +147,9 @@ def test_two_ears_each_have_their_own(
     devices.played = devices.played[:0]
     assert main([*call, "--simulate"]) == 0
     stream = Simulated(load_pretrained("neuro-msbg", full_scale_spl=100.0), listener)
-    heard = torch.cat([stream(chunk) for chunk in both.split(1536, -1)], -1).clamp(-1.0, 1.0).numpy()
+    heard = (
+        torch.cat([stream(chunk) for chunk in both.split(1536, -1)], -1).clamp(-1.0, 1.0).numpy()
+    )
     assert np.abs(devices.played.T - heard).max() < 1e-4 * np.abs(heard).max() > 0.0
 
 
@@ -165,7 +175,9 @@ def test_output_stays_within_full_scale_and_levels_begin_anew() -> None:
     assert live.told() == "in   0.0, out   0.0 dB SPL, drop-outs 0"
 
 
-def test_what_a_stream_raises_ends_it(recording: torch.Tensor, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_a_stream_raises_ends_it(
+    recording: torch.Tensor, capsys: pytest.CaptureFixture[str]
+) -> None:
     calls = 0
 
     def broken(heard: torch.Tensor) -> torch.Tensor:
@@ -237,7 +249,9 @@ def test_simulated_blocks_are_what_is_heard_of_the_whole() -> None:
     middle = slice(stream.latency, -2 * stream.latency)  # begun from silence, as the whole does not
     found = found[stream.latency :][middle]
     assert (found - whole[: -stream.latency][middle]).abs().max() < 1e-4 * whole.abs().max()
-    with pytest.raises(ValueError, match="a simulator that looks at whole signals; allowed: neuro-msbg"):
+    with pytest.raises(
+        ValueError, match="a simulator that looks at whole signals; allowed: neuro-msbg"
+    ):
         Simulated(load_pretrained("neuro-msbg-lstm"), EAR)
 
 
@@ -246,9 +260,18 @@ def test_simulated_blocks_are_what_is_heard_of_the_whole() -> None:
     [
         ([], "no --audiogram and no --listener; allowed: NH, "),
         (["--listener", "nosuch.csv"], "nosuch.csv"),
-        (["--audiogram", "N3", "--input", "7"], "--input 7: no such device (No input device matching 7)"),
-        (["--audiogram", "N3", "--output", "Phones"], "--output Phones: no such device (No output device"),
-        (["--audiogram", "N3", "--compensator", "nalr"], "nalr takes whole signals; allowed: wdrc, or a"),
+        (
+            ["--audiogram", "N3", "--input", "7"],
+            "--input 7: no such device (No input device matching 7)",
+        ),
+        (
+            ["--audiogram", "N3", "--output", "Phones"],
+            "--output Phones: no such device (No output device",
+        ),
+        (
+            ["--audiogram", "N3", "--compensator", "nalr"],
+            "nalr takes whole signals; allowed: wdrc, or a",
+        ),
         (["--audiogram", "N3", "--simulate", "--amplification", "1"], "sliders with --simulate"),
         (
             ["--audiogram", "N3", "--compensator", "wdrc", "--amplification", "1"],
@@ -258,7 +281,10 @@ def test_simulated_blocks_are_what_is_heard_of_the_whole() -> None:
     ],
 )
 def test_refusals_are_one_line(
-    arguments: list[str], said: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    arguments: list[str],
+    said: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.setitem(sys.modules, "sounddevice", Devices(torch.zeros(64)))
     assert main(["live", *arguments]) == 2
@@ -268,7 +294,9 @@ def test_refusals_are_one_line(
 
 def test_headphones_of_one_channel_play_no_two_ears() -> None:
     devices: Any = Devices(torch.zeros(64), plays=1)
-    with pytest.raises(ValueError, match="one channel for two ears; allowed: with two, or --audiogram"):
+    with pytest.raises(
+        ValueError, match="one channel for two ears; allowed: with two, or --audiogram"
+    ):
         play(Live(lambda heard: heard, 94.0, ears=2), devices)
 
 
@@ -277,7 +305,9 @@ def test_a_device_of_another_rate_and_what_is_missing(
 ) -> None:
     monkeypatch.setitem(sys.modules, "sounddevice", Devices(torch.zeros(64), takes=48000))
     assert main(["live", "--audiogram", "N3"]) == 2
-    assert "the system's input does not take 16000 Hz (Invalid sample rate" in capsys.readouterr().err
+    assert (
+        "the system's input does not take 16000 Hz (Invalid sample rate" in capsys.readouterr().err
+    )
     assert main(["live", "--list-devices"]) == 0 and "Loopback" in capsys.readouterr().out
 
     def missing(error: Exception) -> Callable[..., None]:
@@ -287,7 +317,10 @@ def test_a_device_of_another_rate_and_what_is_missing(
         return find
 
     extra = MissingExtraError("sounddevice is needed here: pip install 'hlsim[live]'")
-    for error, said in ((OSError("PortAudio library not found"), "libportaudio2"), (extra, "hlsim[live]")):
+    for error, said in (
+        (OSError("PortAudio library not found"), "libportaudio2"),
+        (extra, "hlsim[live]"),
+    ):
         monkeypatch.setattr("hlsim.cli.live.require", missing(error))
         assert main(["live", "--audiogram", "N3"]) == 2
         message = capsys.readouterr().err
@@ -321,7 +354,9 @@ def server(tmp_path: Path) -> Iterator[dict[str, str]]:
 def test_through_an_audio_server(server: dict[str, str], tmp_path: Path) -> None:
     """A tone of 65 dB SPL in the room is at the ears as the aid gives it."""
     soundfile = pytest.importorskip("soundfile")
-    tone = set_level(torch.sin(2.0 * torch.pi * 1000.0 * torch.arange(16000 * 60) / 16000.0), 65.0, 100.0)
+    tone = set_level(
+        torch.sin(2.0 * torch.pi * 1000.0 * torch.arange(16000 * 60) / 16000.0), 65.0, 100.0
+    )
     soundfile.write(tmp_path / "tone.wav", tone.numpy(), 16000)
     command = [sys.executable, "-m", "hlsim", "live", "--audiogram", "N3", "--seconds", "6"]
     command += ["--compensator", "wdrc"]
@@ -340,7 +375,9 @@ def test_through_an_audio_server(server: dict[str, str], tmp_path: Path) -> None
         speaker.terminate()
         listener.terminate()
     assert ended.returncode == 0, ended.stderr
-    assert re.search(r"in  6[45]\.\d, out  \d\d\.\d dB SPL, drop-outs \d", ended.stdout), ended.stdout
+    assert re.search(r"in  6[45]\.\d, out  \d\d\.\d dB SPL, drop-outs \d", ended.stdout), (
+        ended.stdout
+    )
     aid = WDRC(full_scale_spl=100.0)(tone[:16000], EAR)[8000:]
     expected = float(aid.square().mean().log10() * 10.0 + 100.0)
     blocks = np.fromfile(tmp_path / "heard", dtype=np.float32)

@@ -147,6 +147,8 @@ def test_what_is_stored_is_not_made_again() -> None:
 @pytest.mark.slow
 def test_a_process_that_dies_is_a_reason_and_the_others_are_stored() -> None:
     store = Kept()
-    failed = make_missing(square_and_die_at_three, range(8), lambda number: [str(number)], store, jobs=2)
+    failed = make_missing(
+        square_and_die_at_three, range(8), lambda number: [str(number)], store, jobs=2
+    )
     assert list(failed) == ["3"] and "the process that made it died" in failed["3"]
     assert store == {str(n): {"square": n * n} for n in range(8) if n != 3}

@@ -35,7 +35,9 @@ def folder(tmp_path: Path) -> Path:
     with torch.no_grad():
         for parameter in model.parameters():
             parameter.add_(0.01 * torch.randn_like(parameter))
-    save_checkpoint(tmp_path / "small", "neuro-msbg", model, SMALL.to_dict(), {"seed": 0}, card="# small\n")
+    save_checkpoint(
+        tmp_path / "small", "neuro-msbg", model, SMALL.to_dict(), {"seed": 0}, card="# small\n"
+    )
     return tmp_path / "small"
 
 
@@ -52,7 +54,9 @@ def test_save_and_load_are_bit_equal(tmp_path: Path, folder: Path) -> None:
     save_checkpoint(tmp_path / "again", "neuro-msbg", first, first.config.to_dict(), {})
     second = load_pretrained(tmp_path / "again")
     assert first.config == second.config == SMALL
-    for (name, a), (other, b) in zip(first.state_dict().items(), second.state_dict().items(), strict=True):
+    for (name, a), (other, b) in zip(
+        first.state_dict().items(), second.state_dict().items(), strict=True
+    ):
         assert name == other and torch.equal(a, b)
     waveform, ear = 0.02 * torch.randn(2, 4000), torch.full((8,), 40.0)
     assert torch.equal(first(waveform, ear), second(waveform, ear))
@@ -82,7 +86,11 @@ def test_loaded_in_inference_mode_gives_a_gradient_later(load: Any, name: str) -
 
 
 def test_folder_holds_three_files_and_no_pickle(folder: Path) -> None:
-    assert {path.name for path in folder.iterdir()} == {"model.safetensors", "config.json", "README.md"}
+    assert {path.name for path in folder.iterdir()} == {
+        "model.safetensors",
+        "config.json",
+        "README.md",
+    }
     assert not list(folder.parent.glob(".*"))
     header = (folder / "model.safetensors").read_bytes()[8:200]
     assert header.startswith(b"{")  # safetensors: a length, then JSON
@@ -99,7 +107,9 @@ def test_a_file_of_the_users_own_is_not_deleted(folder: Path) -> None:
     (folder / "notes.txt").write_text("mine")
     with pytest.raises(ValueError, match=r"small: holds something else \(notes.txt\); allowed"):
         save_checkpoint(folder, "neuro-msbg", NeuroMSBG(SMALL), SMALL.to_dict(), {"seed": 1})
-    assert (folder / "notes.txt").read_text() == "mine" and json.loads((folder / "config.json").read_text())
+    assert (folder / "notes.txt").read_text() == "mine" and json.loads(
+        (folder / "config.json").read_text()
+    )
 
 
 def test_configurations_that_would_fill_memory_or_time(folder: Path) -> None:
@@ -122,7 +132,9 @@ def test_configurations_that_would_fill_memory_or_time(folder: Path) -> None:
     load_pretrained(folder)
 
 
-def test_failing_save_leaves_the_old_checkpoint(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_failing_save_leaves_the_old_checkpoint(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
 
     def fail(*_: object) -> None:
@@ -152,9 +164,13 @@ def test_another_kind(folder: Path) -> None:
 
 
 def test_what_is_loaded_or_made_otherwise_is_named() -> None:
-    with pytest.raises(ValueError, match=r"'neuro-msbg' \(compensators\.load_compensator loads the former\)"):
+    with pytest.raises(
+        ValueError, match=r"'neuro-msbg' \(compensators\.load_compensator loads the former\)"
+    ):
         load_pretrained("compensator-general")
-    with pytest.raises(ValueError, match=r"no checkpoint 'msbg': it is hlsim\.MSBG; allowed: neuro-msbg"):
+    with pytest.raises(
+        ValueError, match=r"no checkpoint 'msbg': it is hlsim\.MSBG; allowed: neuro-msbg"
+    ):
         load_pretrained("msbg")
 
 
@@ -172,10 +188,14 @@ def test_changed_configuration(folder: Path) -> None:
     record = json.loads(path.read_text())
     assert NeuroConfig.from_dict(record["config"]).window != 64
     path.write_text(json.dumps(record | {"config": record["config"] | {"window": 64}}))
-    with pytest.raises(ValueError, match="changed since it was saved or of another version") as caught:
+    with pytest.raises(
+        ValueError, match="changed since it was saved or of another version"
+    ) as caught:
         load_pretrained(folder)
     assert str(caught.value).startswith(str(path))
-    path.write_text(json.dumps({name: value for name, value in record.items() if name != "config_sha256"}))
+    path.write_text(
+        json.dumps({name: value for name, value in record.items() if name != "config_sha256"})
+    )
     with pytest.raises(ValueError, match="changed since it was saved or of another version"):
         load_pretrained(folder)
     path.write_text(json.dumps(record | {"config": dict(reversed(record["config"].items()))}))
@@ -228,12 +248,17 @@ def test_only_those_of_the_kind_are_listed() -> None:
 
 def test_folder_of_a_training_names_the_checkpoint_in_it(folder: Path) -> None:
     folder.rename(folder.with_name("checkpoint"))
-    with pytest.raises(ValueError, match=r"no checkpoint '.*', but '.*checkpoint' is one; allowed: "):
+    with pytest.raises(
+        ValueError, match=r"no checkpoint '.*', but '.*checkpoint' is one; allowed: "
+    ):
         load_pretrained(folder.parent)
 
 
 def test_what_ships_is_listed_with_what_loads_it() -> None:
-    loaders = {"hlsim.load_pretrained": load_pretrained, "compensators.load_compensator": load_compensator}
+    loaders = {
+        "hlsim.load_pretrained": load_pretrained,
+        "compensators.load_compensator": load_compensator,
+    }
     listed = list_pretrained()
     assert {"neuro-msbg", "neuro-msbg-lstm", "compensator-general", "hearing-aid"} <= set(listed)
     for name, loader in listed.items():
@@ -288,7 +313,12 @@ def test_names_do_not_lead_out_of_the_folder_that_ships(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     shipped = tmp_path / "package" / "checkpoints"
-    for place in (shipped / "good", shipped / "deep" / "er", shipped.parent, shipped.parent / "beside"):
+    for place in (
+        shipped / "good",
+        shipped / "deep" / "er",
+        shipped.parent,
+        shipped.parent / "beside",
+    ):
         place.mkdir(parents=True, exist_ok=True)
         (place / "config.json").write_text("{}")
     monkeypatch.setattr("hlsim.pretrained.checkpoints_folder", lambda: shipped)

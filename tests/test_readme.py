@@ -60,7 +60,9 @@ def test_commands_parse(page: Path) -> None:
 
 def test_demo_and_tests_are_one_line_each() -> None:
     for marker, last in (("demo", "hlsim demo"), ("tests", "pytest")):
-        found = re.search(rf"<!-- {marker} -->\n```sh\n(.*)\n```", README.read_text(encoding="utf-8"))
+        found = re.search(
+            rf"<!-- {marker} -->\n```sh\n(.*)\n```", README.read_text(encoding="utf-8")
+        )
         assert found is not None and found[1].endswith(f"&& .venv/bin/{last}")
 
 

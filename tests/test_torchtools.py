@@ -26,7 +26,9 @@ def test_made_once_for_each_type_and_device() -> None:
         return [1] * count
 
     first = constant(make, 3, dtype=torch.float32, device=CPU)
-    assert constant(make, 3, dtype=torch.float32, device=CPU) is first and first.tolist() == [1.0] * 3
+    assert (
+        constant(make, 3, dtype=torch.float32, device=CPU) is first and first.tolist() == [1.0] * 3
+    )
     assert constant(make, 3, dtype=torch.float64, device=CPU).dtype == torch.float64
     assert constant(make, 4, dtype=torch.float32, device=CPU).shape == (4,)
     assert constant(make, 3, dtype=torch.float32, device=torch.device("meta")).is_meta
@@ -72,7 +74,11 @@ def test_complex_constants_and_those_like_a_tensor() -> None:
 
     for dtype, expected in ((torch.float32, torch.complex64), (torch.float64, torch.complex128)):
         made = constant(make, 3, dtype=dtype, device=CPU)
-        assert made.dtype == expected and made.is_contiguous() and made.imag.tolist() == [2.0, 1.0, 0.0]
+        assert (
+            made.dtype == expected
+            and made.is_contiguous()
+            and made.imag.tolist() == [2.0, 1.0, 0.0]
+        )
         for like in (torch.ones(1, dtype=dtype), torch.ones(1, dtype=expected)):
             assert constant_like(like, make, 3) is made
     assert constant(make, 4, dtype=torch.float32, device=CPU) is not constant(
@@ -129,7 +135,9 @@ print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
 
 
 def faults(how: str) -> int:
-    done = subprocess.run([sys.executable, "-c", _FAULTS, how], capture_output=True, text=True, timeout=120)
+    done = subprocess.run(
+        [sys.executable, "-c", _FAULTS, how], capture_output=True, text=True, timeout=120
+    )
     if done.returncode == 7:
         pytest.skip("no glibc")
     assert done.returncode == 0, done.stderr

@@ -26,7 +26,9 @@ def losses(out: str) -> list[float]:
     return [float(line.split(":")[1]) for line in out.splitlines()]
 
 
-def test_conv_tasnet_trains(tmp_path: Path, speech_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_conv_tasnet_trains(
+    tmp_path: Path, speech_dir: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     load("conv_tasnet.py").main(str(speech_dir / "train"), str(tmp_path / "out.pt"), "N3", "2", 0.3)
     assert all(0.0 < value < 5.0 for value in losses(capsys.readouterr().out))
     assert torch.load(tmp_path / "out.pt")
@@ -34,11 +36,16 @@ def test_conv_tasnet_trains(tmp_path: Path, speech_dir: Path, capsys: pytest.Cap
 
 @pytest.mark.parametrize("network", ["gru-mask", "waveform"])
 def test_networks_are_trained_and_judged_beside_nalr(
-    network: str, speech_dir: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    network: str,
+    speech_dir: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.syspath_prepend(EXAMPLES)
     folders = (str(speech_dir / "train"), str(speech_dir / "valid"))
-    load("networks.py").main([*folders, network, "--steps", "1", "--rate", "1e-9", "--items", "2", "--noisy"])
+    load("networks.py").main(
+        [*folders, network, "--steps", "1", "--rate", "1e-9", "--items", "2", "--noisy"]
+    )
     out = capsys.readouterr()
     assert out.err.startswith("step 1: ")
     name, unaided, nalr, aided, _, _, *_, follows, as_it_is = out.out.strip("| \n").split(" | ")
@@ -62,7 +69,10 @@ def test_criteria_of_other_packages_on_what_is_heard(
     values = losses(capsys.readouterr().out)
     assert values[-1] < values[0]
     # it has a gradient of its own, and the reference itself costs least
-    measure, reference = example.from_elsewhere(package), example.set_level(torch.randn(2, 16000), 65.0)
+    measure, reference = (
+        example.from_elsewhere(package),
+        example.set_level(torch.randn(2, 16000), 65.0),
+    )
     heard = (reference + 0.02 * torch.randn(2, 16000)).requires_grad_()
     worse = measure(heard, reference)
     worse.backward()
@@ -78,7 +88,10 @@ def test_a_loop_of_accelerate(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_an_aid_learns_through_a_network_that_learned_another_simulator(
-    tmp_path: Path, speech_dir: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path,
+    speech_dir: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """docs/guide/any-teacher.md, a few steps."""
     for module in ("lightning", "yaml", "pystoi", "pesq", "pandas", "matplotlib"):
@@ -93,12 +106,40 @@ def test_an_aid_learns_through_a_network_that_learned_another_simulator(
     for change in shorter:
         lines = [change if line.startswith(change.split()[0]) else line for line in lines]
     recipe.write_text("\n".join(lines))
-    common = ("--out", str(out), "--device", "cpu", "--quiet", "--max-steps", "2", "--max-minutes", "10")
-    assert main(["train-simulator", *teacher, "--config", str(recipe), "--speech", str(train), *common]) == 0
+    common = (
+        "--out",
+        str(out),
+        "--device",
+        "cpu",
+        "--quiet",
+        "--max-steps",
+        "2",
+        "--max-minutes",
+        "10",
+    )
+    assert (
+        main(
+            ["train-simulator", *teacher, "--config", str(recipe), "--speech", str(train), *common]
+        )
+        == 0
+    )
     ears = tmp_path / "ears.csv"
     ears.write_text("hl_250,hl_1000,hl_4000\n20,30,75\n")
-    given = (*teacher, "--speech", str(valid), "--audiograms", str(ears), "--items", "2", "--seconds", "0.5")
-    assert main(["evaluate-simulator", str(out / "checkpoint"), *given, "--out", str(tmp_path / "of")]) == 0
+    given = (
+        *teacher,
+        "--speech",
+        str(valid),
+        "--audiograms",
+        str(ears),
+        "--items",
+        "2",
+        "--seconds",
+        "0.5",
+    )
+    assert (
+        main(["evaluate-simulator", str(out / "checkpoint"), *given, "--out", str(tmp_path / "of")])
+        == 0
+    )
     assert "Against examples.training.dead_region:DeadRegion (sha256" in capsys.readouterr().out
     example = importlib.import_module("examples.training.dead_region_aid")
     for simulator in (str(out / "checkpoint"), ""):
@@ -110,13 +151,17 @@ def test_an_aid_learns_through_a_network_that_learned_another_simulator(
 def test_a_dead_region_is_silent_and_the_rest_is_attenuated() -> None:
     ear, rate = torch.tensor([20.0, 20.0, 25.0, 55.0, 75.0, 95.0, 95.0, 95.0]), 16000
     time = torch.arange(rate) / rate
-    tones = torch.stack([torch.sin(2 * torch.pi * hz * time) for hz in (500.0, 1000.0, 2000.0, 3500.0)])
+    tones = torch.stack(
+        [torch.sin(2 * torch.pi * hz * time) for hz in (500.0, 1000.0, 2000.0, 3500.0)]
+    )
     heard = load("dead_region.py").DeadRegion()(tones, ear)[:, 1000:-1000]
     levels = 20.0 * (heard.std(-1) / tones[:, 1000:-1000].std(-1)).log10()
     torch.testing.assert_close(levels[:3], torch.tensor([-20.0, -25.0, -55.0]), atol=0.5, rtol=0.0)
     assert float(levels[3]) < -75.0
     # in phase: nothing is delayed
-    assert float(torch.nn.functional.cosine_similarity(heard[0], tones[0, 1000:-1000], dim=0)) > 0.9999
+    assert (
+        float(torch.nn.functional.cosine_similarity(heard[0], tones[0, 1000:-1000], dim=0)) > 0.9999
+    )
 
 
 def test_lightning_in_bf16(capsys: pytest.CaptureFixture[str]) -> None:
@@ -139,7 +184,9 @@ def test_a_filter_bank_trains(speech_dir: Path, capsys: pytest.CaptureFixture[st
     speech = example.Clips(str(speech_dir / "valid"), sample_rate=16000, seconds=1.0).draw(
         1, torch.Generator().manual_seed(0)
     )
-    nothing, louder = (example.judged(lambda wave, g=gain: g * wave, ear, speech) for gain in (1.0, 10.0))
+    nothing, louder = (
+        example.judged(lambda wave, g=gain: g * wave, ear, speech) for gain in (1.0, 10.0)
+    )
     assert "gives 65.0 dB SPL" in nothing and "gives 85.0 dB SPL" in louder
     assert nothing < louder  # HASPI comes first
 

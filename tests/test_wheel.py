@@ -22,7 +22,9 @@ def run(*command: str | Path, cwd: Path) -> None:
     """Run a command that sees nothing of this interpreter's environment; fail with what it printed."""
     hidden = ("PYTHONPATH", "PYTHONHOME", "VIRTUAL_ENV")
     environment = {name: value for name, value in os.environ.items() if name not in hidden}
-    done = subprocess.run(command, cwd=cwd, env=environment, capture_output=True, text=True, timeout=900)
+    done = subprocess.run(
+        command, cwd=cwd, env=environment, capture_output=True, text=True, timeout=900
+    )
     assert done.returncode == 0, f"{' '.join(map(str, command))}\n{done.stdout}\n{done.stderr}"
 
 
@@ -48,7 +50,9 @@ def environment(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterat
 
 
 def test_wheel_holds_checkpoints_speech_and_type_markers(wheel: Path) -> None:
-    expected = {f"{package}/py.typed": ROOT / package / "py.typed" for package in ("hlsim", "compensators")}
+    expected = {
+        f"{package}/py.typed": ROOT / package / "py.typed" for package in ("hlsim", "compensators")
+    }
     for file in (ROOT / "hlsim" / "data" / "speech").rglob("*.*"):
         expected[file.relative_to(ROOT).as_posix()] = file
     checkpoints = sorted(config.parent for config in (ROOT / "checkpoints").glob("*/config.json"))

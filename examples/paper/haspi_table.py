@@ -43,18 +43,30 @@ def main(arguments: list[str] | None = None) -> None:
     found = find_utterances(options.corpus, "voicebank-demand")
     test = [entry for entry in found if isinstance(entry, Utterance) and entry.split == "test"]
     listed = [
-        {"file": u.clean, "id": u.id, "speaker": u.speaker, "split": u.split, "noisy": u.noisy} for u in test
+        {"file": u.clean, "id": u.id, "speaker": u.speaker, "split": u.split, "noisy": u.noisy}
+        for u in test
     ]
     write_table(out / "test.csv", listed)
     ears = {
         "audiograms": options.audiograms,
         "test_audiograms": options.audiograms,
     }  # all of them are for test
-    settings = PlanSettings(corpus=options.corpus, table=out / "test.csv", ears=options.ears, **ears)
-    print(prepare(settings, out / "plan", jobs=options.jobs, progress=show_progress("utterances")).to_text())
-    plan, models = Plan(out / "plan"), {Path(n).name: load_compensator(n) for n in options.compensators}
+    settings = PlanSettings(
+        corpus=options.corpus, table=out / "test.csv", ears=options.ears, **ears
+    )
+    print(
+        prepare(
+            settings, out / "plan", jobs=options.jobs, progress=show_progress("utterances")
+        ).to_text()
+    )
+    plan, models = (
+        Plan(out / "plan"),
+        {Path(n).name: load_compensator(n) for n in options.compensators},
+    )
     if len(models) < len(options.compensators):
-        sys.exit(f"{', '.join(options.compensators)}: two of one name; allowed: folders of different names")
+        sys.exit(
+            f"{', '.join(options.compensators)}: two of one name; allowed: folders of different names"
+        )
     chosen = [i for i in plan.indices("test").tolist() if plan.rows[i]["input"] == options.input]
     for condition in ("clean", "unaided", *models):
         (out / condition).mkdir(parents=True, exist_ok=True)
@@ -65,12 +77,17 @@ def main(arguments: list[str] | None = None) -> None:
             f"{plan.rows[index]['id']}-{index}.wav",
         )  # 65 dB SPL, active speech level
         with torch.no_grad():
-            aided = {condition: model(given.signal, given.thresholds) for condition, model in models.items()}
+            aided = {
+                condition: model(given.signal, given.thresholds)
+                for condition, model in models.items()
+            }
         for condition, signal in {"clean": given.clean, "unaided": given.signal, **aided}.items():
             write_audio(out / condition / name, signal, plan.rate)
             if condition != "clean":
                 ear = {
-                    column: value for column, value in plan.rows[index].items() if column.startswith("hl_")
+                    column: value
+                    for column, value in plan.rows[index].items()
+                    if column.startswith("hl_")
                 }
                 files = {"clean": f"clean/{name}", "processed": f"{condition}/{name}"}
                 rows.append({"condition": condition, **files, **ear})

@@ -14,7 +14,9 @@ def main(steps: int = 20) -> nn.Module:
     aid = nn.Conv1d(1, 1, 65, padding=32)
     speech = set_level(torch.randn(8, 1, 8000), 65.0)  # (items, 1, time), in pascals
     loader = DataLoader(TensorDataset(speech), batch_size=4)
-    aid, optimiser, loader = accelerator.prepare(aid, torch.optim.Adam(aid.parameters(), lr=1e-3), loader)
+    aid, optimiser, loader = accelerator.prepare(
+        aid, torch.optim.Adam(aid.parameters(), lr=1e-3), loader
+    )
     # frozen, without parameters of its own, and in no checkpoint: there is nothing to prepare
     loss = HearingLossLoss(Audiogram.standard("N3")).to(accelerator.device)
     for step in range(steps):

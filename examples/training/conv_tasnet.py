@@ -18,7 +18,11 @@ from hlsim.data.clips import Clips
 def conv_tasnet() -> ConvTasNet:
     """Shape of what it takes and gives: (batch, 1, time)."""
     return ConvTasNet(
-        num_sources=1, enc_num_feats=128, msk_num_feats=64, msk_num_hidden_feats=128, msk_num_layers=6
+        num_sources=1,
+        enc_num_feats=128,
+        msk_num_feats=64,
+        msk_num_hidden_feats=128,
+        msk_num_layers=6,
     )
 
 
@@ -27,9 +31,14 @@ def main(folder: str, out: str, ear: str = "N3", steps: str = "500", seconds: fl
     network = conv_tasnet()
     loss = HearingLossLoss(Audiogram.standard(ear))
     optimiser = torch.optim.Adam(network.parameters(), lr=3e-3)
-    clips, generator = Clips(folder, sample_rate=16000, seconds=seconds), torch.Generator().manual_seed(0)
+    clips, generator = (
+        Clips(folder, sample_rate=16000, seconds=seconds),
+        torch.Generator().manual_seed(0),
+    )
     for step in range(int(steps)):
-        speech = set_level(clips.draw(4, generator), 65.0).unsqueeze(1)  # (batch, 1, time), in pascals
+        speech = set_level(clips.draw(4, generator), 65.0).unsqueeze(
+            1
+        )  # (batch, 1, time), in pascals
         value = loss(network(speech), speech)
         optimiser.zero_grad()
         value.backward()

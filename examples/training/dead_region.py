@@ -20,7 +20,9 @@ class DeadRegion(nn.Module):
         dead = (loss > 70.0) & (torch.tensor(hz, device=loss.device) >= 2000.0)
         gains = 10.0 ** (-loss.clamp_min(0.0) / 20.0) * (dead.cumsum(-1) == 0)
         # a filter of 32 ms around its middle, so that nothing is delayed
-        taps = torch.fft.irfft(gains.to(waveform)).roll(256, -1) * torch.hann_window(512).to(waveform)
+        taps = torch.fft.irfft(gains.to(waveform)).roll(256, -1) * torch.hann_window(512).to(
+            waveform
+        )
         time = waveform.shape[-1]
         size = time + 512
         product = torch.fft.rfft(waveform, size) * torch.fft.rfft(taps, size)

@@ -29,20 +29,27 @@ class FilterBank(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        self.gain, self.slope = nn.Parameter(torch.zeros(8)), nn.Parameter(torch.zeros(8))  # in 10 dB
+        self.gain, self.slope = (
+            nn.Parameter(torch.zeros(8)),
+            nn.Parameter(torch.zeros(8)),
+        )  # in 10 dB
         self.stft = STFT(256, 256, 64)
         octaves = (torch.arange(129) * RATE / 256).clamp(CENTRES[0], CENTRES[-1]).log2()
         centres = torch.tensor(CENTRES).log2()
         low = (torch.bucketize(octaves, centres) - 1).clamp(0, 6)
         high_share = (octaves - centres[low]) / (centres[low + 1] - centres[low])
         shares = torch.zeros(129, 8).scatter_(1, low[:, None], 1.0 - high_share[:, None])
-        self.register_buffer("shares", shares.scatter_add_(1, low[:, None] + 1, high_share[:, None]))
+        self.register_buffer(
+            "shares", shares.scatter_add_(1, low[:, None] + 1, high_share[:, None])
+        )
 
     def forward(self, waveform: Tensor) -> Tensor:
         """Shape: (items, time) in pascals -> (items, time)."""
         spectrum = self.stft.analyse(waveform)
         powers = (spectrum.abs().square() * (2.0 / (256 * 0.375 * 256))) @ self.shares
-        smooth = functional.avg_pool1d(functional.pad(powers.mT, (8, 8), mode="replicate"), 17, 1).mT
+        smooth = functional.avg_pool1d(
+            functional.pad(powers.mT, (8, 8), mode="replicate"), 17, 1
+        ).mT
         levels = 10.0 * torch.log10(smooth + 1e-10) + 94.0
         gain_db = 10.0 * (self.gain + self.slope * (levels - 50.0) / 40.0)
         gains = 10.0 ** (gain_db.clamp(-30.0, 90.0) @ self.shares.T / 20.0)
@@ -50,12 +57,19 @@ class FilterBank(nn.Module):
 
 
 def trained(
-    folder: str, loss: nn.Module, steps: int, clips: int = 4, given: Callable[[Tensor], Tensor] | None = None
+    folder: str,
+    loss: nn.Module,
+    steps: int,
+    clips: int = 4,
+    given: Callable[[Tensor], Tensor] | None = None,
 ) -> FilterBank:
     """From zero, on speech of 50 to 80 dB SPL, ``clips`` at a time; ``given`` makes of it what the aid is given."""
     aid = FilterBank()
     optimiser = torch.optim.Adam(aid.parameters(), lr=0.05)
-    source, generator = Clips(folder, sample_rate=RATE, seconds=1.0), torch.Generator().manual_seed(0)
+    source, generator = (
+        Clips(folder, sample_rate=RATE, seconds=1.0),
+        torch.Generator().manual_seed(0),
+    )
     for step in range(steps):
         speech = source.draw(clips, generator)
         speech = set_level(speech, 50.0 + 30.0 * torch.rand(clips, generator=generator))
@@ -75,7 +89,9 @@ def judged(aid: Callable[[Tensor], Tensor], ear: Audiogram, speech: Tensor) -> s
     for spl in (50.0, 65.0, 80.0):
         clean = set_level(speech, spl)
         aided = aid(clean)
-        heard, normal = (level_spl(exact(w, e)) for w, e in ((aided, ear), (clean, Audiogram.standard("NH"))))
+        heard, normal = (
+            level_spl(exact(w, e)) for w, e in ((aided, ear), (clean, Audiogram.standard("NH")))
+        )
         differences.append(f"{float((heard - normal).mean()):+.1f}")
         if spl == 65.0:
             scores = [float(score(aided, clean, ear).mean()) for score in (haspi, hasqi)]

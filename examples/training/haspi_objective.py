@@ -28,7 +28,9 @@ LOSSES: dict[str, Callable[[Audiogram], HearingLossLoss]] = {
 
 
 def in_noise(speech: Tensor, snr: float, generator: torch.Generator) -> Tensor:
-    return speech + set_level(torch.randn(speech.shape, generator=generator), level_spl(speech) - snr)
+    return speech + set_level(
+        torch.randn(speech.shape, generator=generator), level_spl(speech) - snr
+    )
 
 
 @torch.no_grad()
@@ -43,7 +45,9 @@ def told(aid: nn.Module, ear: Audiogram, speech: Tensor, snr: float) -> str:
     return f"{judged(given, ear, speech)}, peak {peak:.0f} dB SPL"
 
 
-def main(train: str, valid: str, name: str = "N3", steps: str = "200", snr: str = "inf", *names: str) -> None:
+def main(
+    train: str, valid: str, name: str = "N3", steps: str = "200", snr: str = "inf", *names: str
+) -> None:
     ear = Audiogram.standard(name)
     speech = Clips(valid, sample_rate=RATE, seconds=2.0).draw(8, torch.Generator().manual_seed(0))
     for title, aid in (("unaided", nn.Identity()), ("NAL-R", NALR(ear))):

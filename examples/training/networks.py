@@ -20,10 +20,10 @@ from torch import Tensor, nn
 from compensators import NALR
 from hlsim import Audiogram, HearingLossLoss
 from hlsim.calibration import level_spl, set_level
-from hlsim.criteria.bands import band_edges
 from hlsim.data.augment import mix
 from hlsim.data.clips import Clips
 from hlsim.dsp.stft import STFT
+from hlsim.losses.band_levels import band_edges
 from hlsim.metrics import haspi, hasqi
 
 
@@ -105,7 +105,9 @@ def trained(options: argparse.Namespace, loss: nn.Module) -> nn.Module:
     clips, norms = Clips(options.train, sample_rate=RATE, seconds=1.0), []
     for step in range(1, options.steps + 1):
         speech = clips.draw(4, generator)
-        speech = set_level(speech, softest + (loudest - softest) * torch.rand(4, generator=generator))
+        speech = set_level(
+            speech, softest + (loudest - softest) * torch.rand(4, generator=generator)
+        )
         given = speech
         if options.noisy:
             given = mix(speech, like(speech, generator), 10.0 * torch.rand(4, generator=generator))
@@ -124,7 +126,9 @@ def trained(options: argparse.Namespace, loss: nn.Module) -> nn.Module:
 def like(speech: Tensor, generator: torch.Generator) -> Tensor:
     """Noise of the spectrum that the items have on average. Shape: (items, time) -> the same."""
     noise = torch.fft.rfft(torch.randn(speech.shape, generator=generator))
-    return torch.fft.irfft(torch.fft.rfft(speech).abs().square().mean(0).sqrt() * noise, speech.shape[-1])
+    return torch.fft.irfft(
+        torch.fft.rfft(speech).abs().square().mean(0).sqrt() * noise, speech.shape[-1]
+    )
 
 
 def correlation(processed: Tensor, clean: Tensor, *, best_gains: bool) -> float:
@@ -137,7 +141,9 @@ def correlation(processed: Tensor, clean: Tensor, *, best_gains: bool) -> float:
     products = (ours * theirs.conj()).real, ours.abs().square(), theirs.abs().square()
     edges = torch.as_tensor(band_edges())
     bands = [(hz >= low) & (hz < high) for low, high in pairwise(edges)]
-    both, own, other = (torch.stack([one[:, band].sum(-1) for band in bands], -1) for one in products)
+    both, own, other = (
+        torch.stack([one[:, band].sum(-1) for band in bands], -1) for one in products
+    )
     gains = both / own.clamp_min(1e-30) if best_gains else torch.ones_like(own)
     together = (gains * both).sum(-1) / ((gains.square() * own).sum(-1) * other.sum(-1)).sqrt()
     return float(together.mean())
@@ -173,7 +179,9 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument(
         "--clip", type=float, default=float("inf"), help="the norm at which the gradient is clipped"
     )
-    parser.add_argument("--noisy", action="store_true", help="train in such noise too, at 0 to 10 dB SNR")
+    parser.add_argument(
+        "--noisy", action="store_true", help="train in such noise too, at 0 to 10 dB SNR"
+    )
     parser.add_argument("--items", type=int, default=12, help="clips of 2 s that are judged")
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args(arguments)

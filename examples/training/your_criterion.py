@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from hlsim import Audiogram, HearingLossLoss
 from hlsim.calibration import set_level
-from hlsim.criteria.bands import band_levels
+from hlsim.losses.band_levels import band_levels
 
 
 def envelope_correlation(heard: Tensor, reference: Tensor) -> Tensor:

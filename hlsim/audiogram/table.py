@@ -9,7 +9,9 @@ from hlsim.audiogram.value import Audiogram
 from hlsim.files import read_table
 
 
-def read_audiograms(path: str | Path, *, simulated: bool = False) -> list[tuple[dict[str, str], Audiogram]]:
+def read_audiograms(
+    path: str | Path, *, simulated: bool = False
+) -> list[tuple[dict[str, str], Audiogram]]:
     """Rows of a CSV file with columns ``hl_250`` and so on: each row's columns and its audiogram.
 
     Blanks around names and values do not count. Frequencies other than the eight are interpolated, as in ``Audiogram``.
@@ -30,7 +32,9 @@ def numbered_audiograms(
     """``read_audiograms`` with the number of each row's line first, for messages that name it."""
     rows = read_table(path, "audiograms")
     if not rows:
-        raise ValueError(f"{path}: no audiograms; needs a header with hl_250, hl_500, ... and a row an ear")
+        raise ValueError(
+            f"{path}: no audiograms; needs a header with hl_250, hl_500, ... and a row an ear"
+        )
     ears = []
     for number, row in rows:
         try:

@@ -70,11 +70,16 @@ def as_thresholds(
     if isinstance(audiogram, Sequence) and audiogram:
         if all(is_listener(one) for one in audiogram):
             return torch.stack(
-                [as_thresholds(one, highest=highest, taker=taker, missing=missing) for one in audiogram]
+                [
+                    as_thresholds(one, highest=highest, taker=taker, missing=missing)
+                    for one in audiogram
+                ]
             )
         ears = [_one_ear(one) for one in audiogram]
         if all(ear is not None for ear in ears):
-            return torch.tensor([_taken(ear.thresholds, highest, taker) for ear in ears if ear is not None])
+            return torch.tensor(
+                [_taken(ear.thresholds, highest, taker) for ear in ears if ear is not None]
+            )
     if isinstance(audiogram, list | tuple):
         audiogram = _stacked(audiogram)
     if not isinstance(audiogram, Tensor):
@@ -83,7 +88,9 @@ def as_thresholds(
             + _instead(audiogram)
         )
     if audiogram.is_complex() or audiogram.dtype == torch.bool:
-        raise ValueError(f"audiogram tensor of {audiogram.dtype}; allowed: floating-point or integer dB HL")
+        raise ValueError(
+            f"audiogram tensor of {audiogram.dtype}; allowed: floating-point or integer dB HL"
+        )
     levels = audiogram if audiogram.is_floating_point() else audiogram.float()
     if levels.ndim == 0 or levels.shape[-1] != len(FREQUENCIES) or not levels.numel():
         raise ValueError(
@@ -125,7 +132,9 @@ def resolve_thresholds(
         ValueError: there is neither, the shapes do not broadcast, or a listener's waveform is not (..., 2, time).
     """
     if audiogram is None and stored is None:
-        raise ValueError("no audiogram: give one with the call, or when building what keeps one (MSBG, NALR)")
+        raise ValueError(
+            "no audiogram: give one with the call, or when building what keeps one (MSBG, NALR)"
+        )
     thresholds = as_thresholds(audiogram, **limits) if audiogram is not None else stored
     assert thresholds is not None
     check_two_ears(two_ears if audiogram is None else of_listeners(audiogram), waveform)
@@ -230,7 +239,9 @@ def _instead(given: object) -> str:
     elif has_two_ears(first):
         return "; of two ears write Listener.from_clarity(listener), of one Audiogram.from_clarity(listener, 'left')"
     elif isinstance(first, Mapping) and isinstance(first.get("levels"), Sequence):
-        if any(isinstance(level, Tensor) for level in first["levels"]):  # as default_collate makes them
+        if any(
+            isinstance(level, Tensor) for level in first["levels"]
+        ):  # as default_collate makes them
             return "; write torch.stack(audiogram['levels'], -1)"
         make = "Audiogram.from_dict(...)"
     elif isinstance(first, Mapping) and any(str(name).startswith("hl_") for name in first):
@@ -239,7 +250,9 @@ def _instead(given: object) -> str:
         return "; write Audiogram(levels, frequencies)"
     elif several and isinstance(first, Tensor):
         return "; write torch.stack(...)"
-    elif isinstance(first, np.ndarray) or (several and isinstance(first, float | int | list | tuple)):
+    elif isinstance(first, np.ndarray) or (
+        several and isinstance(first, float | int | list | tuple)
+    ):
         return "; write torch.tensor(...)"
     else:
         return ""

@@ -50,7 +50,11 @@ STANDARD = {
 
 _COLUMN = re.compile(r"hl_(\d+\.?\d*|\.\d+)(_.+)?")  # the frequency, and the name of a remark on it
 
-_ENTRY = ("audiogram_cfs", "audiogram_levels_l", "audiogram_levels_r")  # of Clarity's listeners.json
+_ENTRY = (
+    "audiogram_cfs",
+    "audiogram_levels_l",
+    "audiogram_levels_r",
+)  # of Clarity's listeners.json
 
 
 @dataclass(frozen=True)
@@ -86,7 +90,9 @@ class Audiogram:
             raise ValueError(
                 f"audiogram frequencies {listed(frequencies)} Hz; allowed: positive and ascending"
             )
-        if frequencies[-1] < FREQUENCIES[0] or frequencies[0] > FREQUENCIES[-1]:  # in kHz, as a rule
+        if (
+            frequencies[-1] < FREQUENCIES[0] or frequencies[0] > FREQUENCIES[-1]
+        ):  # in kHz, as a rule
             raise ValueError(
                 f"audiogram frequencies {listed(frequencies)} Hz; allowed: Hz, not all under {FREQUENCIES[0]:g} or all "
                 f"over {FREQUENCIES[-1]:g}"
@@ -150,7 +156,9 @@ class Audiogram:
 
     def to_row(self) -> dict[str, str]:
         """Columns ``hl_250`` and so on for a CSV file."""
-        return {f"hl_{_exact(f)}": _exact(v) for f, v in zip(self.frequencies, self.levels, strict=True)}
+        return {
+            f"hl_{_exact(f)}": _exact(v) for f, v in zip(self.frequencies, self.levels, strict=True)
+        }
 
     @classmethod
     def from_row(cls, row: Mapping[str, str]) -> Audiogram:
@@ -167,11 +175,15 @@ class Audiogram:
         for column, value in row.items():
             found = _COLUMN.fullmatch(str(column))
             if found is None and str(column).lower().startswith("hl"):
-                raise ValueError(f"audiogram column {column!r}; allowed: hl_ and a frequency in Hz, hl_500")
+                raise ValueError(
+                    f"audiogram column {column!r}; allowed: hl_ and a frequency in Hz, hl_500"
+                )
             if found is None or found[2]:
                 continue
             if float(found[1]) in points:
-                raise ValueError(f"audiogram column {column}: a second one of {float(found[1]):g} Hz")
+                raise ValueError(
+                    f"audiogram column {column}: a second one of {float(found[1]):g} Hz"
+                )
             try:
                 points[float(found[1])] = float(value)
             except (TypeError, ValueError):
@@ -179,13 +191,17 @@ class Audiogram:
                     f"audiogram column {column} holds {value!r}; allowed: a level in dB HL"
                 ) from None
         if not points:
-            raise ValueError(f"a row of audiograms needs columns hl_250, hl_500, ..., got {list(row)}")
+            raise ValueError(
+                f"a row of audiograms needs columns hl_250, hl_500, ..., got {list(row)}"
+            )
         return cls(tuple(points.values()), tuple(points))
 
     def to_clarity(self) -> Any:
         """The same ear as pyclarity's ``Audiogram`` (needs the extra ``pyclarity``)."""
         clarity = require("clarity.utils.audiogram", "pyclarity")
-        return clarity.Audiogram(levels=np.array(self.levels), frequencies=np.array(self.frequencies))
+        return clarity.Audiogram(
+            levels=np.array(self.levels), frequencies=np.array(self.frequencies)
+        )
 
     @classmethod
     def from_clarity(cls, given: Any, ear: str | None = None) -> Audiogram:
@@ -209,7 +225,9 @@ class Audiogram:
             )
         if ear not in (("left", "right") if two else (None,)):
             allowed = (
-                "ear='left' or ear='right', for a listener has two" if two else "None, for it is one ear"
+                "ear='left' or ear='right', for a listener has two"
+                if two
+                else "None, for it is one ear"
             )
             raise ValueError(f"ear is {ear!r}; allowed: {allowed}")
         if two and isinstance(given, Mapping):
@@ -247,7 +265,9 @@ def severity_index(thresholds: Tensor) -> Tensor:
     # by tensors: CUDA multiplies by a number's reciprocal instead of dividing by it, which is off by the last bit
     fine, count = (high.new_full((), value) for value in (_FINE, high.shape[-1]))
     levels = ((high * _FINE).round() / fine).unbind(-1)
-    mean = sum(levels[1:], start=levels[0]) / count  # in the order of ``severity_of``, for the same last bit
+    mean = (
+        sum(levels[1:], start=levels[0]) / count
+    )  # in the order of ``severity_of``, for the same last bit
     return torch.stack([mean > limit for limit in SEVERITY_LIMITS]).sum(0)
 
 

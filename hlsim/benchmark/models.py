@@ -55,9 +55,14 @@ def rows(simulators: list[str] | None = None) -> tuple[list[Row], list[str]]:
             found.append(Row(name, (MSBG_RATE,), prepare, differentiable))
         except MissingExtraError as error:
             skipped.append(f"{name}: {error}")
-    found.append(Row("MSBG (exact)", both, lambda rate, ear, device: MSBG(ear, sample_rate=rate).to(device)))
+    found.append(
+        Row("MSBG (exact)", both, lambda rate, ear, device: MSBG(ear, sample_rate=rate).to(device))
+    )
     for name in shipped([SIMULATOR]) if simulators is None else simulators:
-        count, default = sum(own.numel() for own in load_pretrained(name).parameters()), name == "neuro-msbg"
+        count, default = (
+            sum(own.numel() for own in load_pretrained(name).parameters()),
+            name == "neuro-msbg",
+        )
         title = f"Neuro-MSBG ({name})"
         found.append(Row(title, both, partial(_neuro, name), parameters=count, default=default))
     return found, skipped

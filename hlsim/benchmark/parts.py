@@ -13,7 +13,7 @@ from compensators import MappingCompensator
 from hlsim.audiogram import Audiogram
 from hlsim.benchmark.timing import clip, rows_by_turns
 from hlsim.calibration import set_level
-from hlsim.loss import HearingLossLoss
+from hlsim.losses.hearing_loss import HearingLossLoss
 from hlsim.metrics import HaspiReference, HasqiReference, haspi, hasqi
 from hlsim.metrics.pyclarity import pyclarity_score
 from hlsim.neuro.config import NEURO_RATE
@@ -22,7 +22,9 @@ from hlsim.parallel import one_thread
 METRIC_SECONDS = 3.0
 
 
-def training_step(*, device: str = "cpu", repeats: int = 5) -> tuple[list[dict[str, Any]], list[str]]:
+def training_step(
+    *, device: str = "cpu", repeats: int = 5
+) -> tuple[list[dict[str, Any]], list[str]]:
     """Where the time of a step on 8 clips of 2 s goes: an untrained compensator, the loss that judges it, its simulator
     alone, and the whole step.
 
@@ -38,7 +40,9 @@ def training_step(*, device: str = "cpu", repeats: int = 5) -> tuple[list[dict[s
     def square(waveform: Tensor) -> Tensor:
         return waveform.square().sum()
 
-    parts: dict[str, Callable[[], Tensor]] = {"compensator": lambda: square(compensator(clean, ear))}
+    parts: dict[str, Callable[[], Tensor]] = {
+        "compensator": lambda: square(compensator(clean, ear))
+    }
     for name in ("neuro-msbg", "neuro-msbg-light", "msbg"):
         loss = HearingLossLoss(ear, simulator=name).to(place)
         parts |= {
@@ -46,7 +50,9 @@ def training_step(*, device: str = "cpu", repeats: int = 5) -> tuple[list[dict[s
             f"- its simulator ({name})": partial(
                 lambda simulator: square(simulator(leaf, ear)), loss.simulator
             ),
-            f"whole step ({name})": partial(lambda loss: loss(compensator(clean, ear), clean), loss),
+            f"whole step ({name})": partial(
+                lambda loss: loss(compensator(clean, ear), clean), loss
+            ),
         }
     return rows_by_turns(parts, place, repeats)
 
@@ -74,13 +80,17 @@ def metric_rows(*, device: str = "cpu", repeats: int = 5) -> tuple[list[dict[str
         "HASPI, the same, noise seeded": partial(against.score, given, ear, noise="seeded"),
         "HASQI": partial(hasqi, given, clean, ear),
         "HASQI, clean signal prepared": partial(HasqiReference(clean, ear).score, given),
-        "HASQI, the same, noise seeded": partial(HasqiReference(clean, ear).score, given, noise="seeded"),
+        "HASQI, the same, noise seeded": partial(
+            HasqiReference(clean, ear).score, given, noise="seeded"
+        ),
     }
     rows, skipped = rows_by_turns(theirs | ours, place, repeats, forward_only=theirs)
     medians = {row["name"]: row["forward"]["median_ms"] for row in rows if row["forward"]}
     for row in rows:
         reference = medians.get(f"{row['name'][:5]} (pyclarity)")
-        row["speedup"] = reference / medians[row["name"]] if reference and row["name"] in medians else None
+        row["speedup"] = (
+            reference / medians[row["name"]] if reference and row["name"] in medians else None
+        )
     return rows, skipped
 
 

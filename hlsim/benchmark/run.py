@@ -117,7 +117,9 @@ class _Key(NamedTuple):
 class _Simulators(Timings):
     """What is timed of each row."""
 
-    def __init__(self, device: torch.device, repeats: int, limit: float, skipped: list[str]) -> None:
+    def __init__(
+        self, device: torch.device, repeats: int, limit: float, skipped: list[str]
+    ) -> None:
         super().__init__(device, skipped)
         self.repeats, self.limit = repeats, limit
         self.calls: dict[tuple[str, int, str], Callable[[Tensor], Tensor]] = {}
@@ -156,16 +158,24 @@ class _Simulators(Timings):
         """Another length or batch, forward at the row's own rate, where it does not take too long."""
         key = _Key(row.name, row.rates[0], seconds, batch, "forward")
         alone = key._replace(batch=1)
-        same = {k.seconds: median(t) for k, t in self.times.items() if k._replace(seconds=seconds) == alone}
+        same = {
+            k.seconds: median(t)
+            for k, t in self.times.items()
+            if k._replace(seconds=seconds) == alone
+        }
         if 1.0 in same:
-            self._repeat(key, same[1.0] * batch if batch > 1 else _expected(list(same.items()), seconds))
+            self._repeat(
+                key, same[1.0] * batch if batch > 1 else _expected(list(same.items()), seconds)
+            )
 
     def training(self, row: Row, seconds: float, batch: int) -> None:
         """A batch to train on, forward plus backward at the network's own rate, where a CPU does not take too long."""
         key = _Key(row.name, NEURO_RATE, seconds, batch, "both")
         if second := self.times.get(key._replace(seconds=1.0, batch=1)):
             # a GPU takes much less than what one second tells
-            self._repeat(key, median(second) * seconds * batch if self.device.type == "cpu" else 0.0)
+            self._repeat(
+                key, median(second) * seconds * batch if self.device.type == "cpu" else 0.0
+            )
 
     def _repeat(self, key: _Key, expected: float) -> None:
         def take() -> None:

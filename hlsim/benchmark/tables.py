@@ -25,7 +25,10 @@ def benchmark_markdown(result: Row) -> str:
     for name, title in (("training", "A training step"), ("metrics", "3 s at 16 kHz, one thread")):
         tables.append([_part(title, part) for part in result.get(name, [])])
     texts = [Table.of("", table).markdown() + "\n" for table in tables if table]
-    return "\n".join([head, "", *texts, *(f"skipped: {reason}" for reason in result["skipped"])]) + "\n"
+    return (
+        "\n".join([head, "", *texts, *(f"skipped: {reason}" for reason in result["skipped"])])
+        + "\n"
+    )
 
 
 def _one_second(rows: Sequence[Row]) -> list[dict[str, str]]:
@@ -50,12 +53,19 @@ def _one_second(rows: Sequence[Row]) -> list[dict[str, str]]:
 
 
 def _sizes(rows: Sequence[Row]) -> list[dict[str, str]]:
-    forward = {row["name"]: [cell for cell in row["cells"] if cell["direction"] == "forward"] for row in rows}
-    keys = sorted({(cell["batch"], cell["seconds"]) for cells in forward.values() for cell in cells})
+    forward = {
+        row["name"]: [cell for cell in row["cells"] if cell["direction"] == "forward"]
+        for row in rows
+    }
+    keys = sorted(
+        {(cell["batch"], cell["seconds"]) for cells in forward.values() for cell in cells}
+    )
     table = []
     for row in rows:
         rate = forward[row["name"]][0]["sample_rate"]
-        cells = {(c["batch"], c["seconds"]): c for c in forward[row["name"]] if c["sample_rate"] == rate}
+        cells = {
+            (c["batch"], c["seconds"]): c for c in forward[row["name"]] if c["sample_rate"] == rate
+        }
         line = {"forward, ms (MiB)": f"{row['name']}, {rate} Hz"}
         for batch, seconds in keys:
             length = f"{seconds:g} s" if batch == 1 else f"{batch} of {seconds:g} s"
@@ -82,7 +92,9 @@ def _training(rows: Sequence[Row]) -> list[dict[str, str]]:
 
 def _part(title: str, part: Row) -> dict[str, str]:
     line = {title: part["name"], **_both_ways(part["forward"], part["both"])}
-    return line | ({"times pyclarity": number(part["speedup"], ".1f", "-")} if "speedup" in part else {})
+    return line | (
+        {"times pyclarity": number(part["speedup"], ".1f", "-")} if "speedup" in part else {}
+    )
 
 
 def _gpu(gpu: Row | None) -> str:
@@ -93,7 +105,11 @@ def _gpu(gpu: Row | None) -> str:
 
 
 def _both_ways(forward: Row | None, both: Row | None) -> dict[str, str]:
-    return {"forward": _times(forward), "forward + backward": _times(both), _PEAK: _peaks(forward, both)}
+    return {
+        "forward": _times(forward),
+        "forward + backward": _times(both),
+        _PEAK: _peaks(forward, both),
+    }
 
 
 def _size(cell: Row | None) -> str:

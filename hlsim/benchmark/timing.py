@@ -116,7 +116,12 @@ class Timings:
         if not (times := self.times.get(key)):
             return None
         middle, peak = statistics.median(times), self.peaks.get(key)
-        return {"median_ms": middle, "least_ms": min(times), "greatest_ms": max(times), "peak_mib": peak}
+        return {
+            "median_ms": middle,
+            "least_ms": min(times),
+            "greatest_ms": max(times),
+            "peak_mib": peak,
+        }
 
 
 def rows_by_turns(
@@ -145,7 +150,9 @@ def rows_by_turns(
                     timings.attempt(key, partial(take, key, partial(_run, part, direction), turn))
     rows = []
     for name in parts:
-        figures = {direction: timings.figures(f"{name}, {said}") for direction, said in DIRECTIONS.items()}
+        figures = {
+            direction: timings.figures(f"{name}, {said}") for direction, said in DIRECTIONS.items()
+        }
         if any(figures.values()):
             rows.append({"name": name, **figures})
     return rows, timings.skipped
@@ -174,7 +181,9 @@ def about(device: str, repeats: int) -> dict[str, Any]:
     """
     found = ["cpu", *(f"cuda:{index}" for index in range(torch.cuda.device_count()))]
     if device not in (*found, *(["cuda"] if len(found) > 1 else ())):
-        raise ValueError(f"device {device!r}: there is none that torch can use; allowed: {', '.join(found)}")
+        raise ValueError(
+            f"device {device!r}: there is none that torch can use; allowed: {', '.join(found)}"
+        )
     on_gpu = device.startswith("cuda")
     return {
         "device": device,

@@ -58,7 +58,9 @@ def _benchmark(options: argparse.Namespace) -> None:
             write_whole(options.json, json.dumps(result, indent=2) + "\n")
 
     if "simulators" in options.what:
-        sizes: dict[str, Any] = {"lengths": (), "batches": (), "training": None} if options.brief else {}
+        sizes: dict[str, Any] = (
+            {"lengths": (), "batches": (), "training": None} if options.brief else {}
+        )
         how = {"simulators": options.simulator, "progress": show_progress("timings"), "keep": keep}
         benchmark(**passed(options, benchmark, **how, **sizes))
 

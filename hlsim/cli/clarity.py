@@ -34,13 +34,17 @@ def clarity(parser: Parser) -> None:
         Path,
         "JSON file of each scene's listeners; every listener in every scene by default",
     )
-    option("--every", count, "take the first pair of scene and listener, and then each so manyth", 1)
+    option(
+        "--every", count, "take the first pair of scene and listener, and then each so manyth", 1
+    )
     text = (
         "what takes noise off before each aid, package.module:name: a callable (waveform, sample_rate) -> waveform or "
         "its class, of (2, time) in pascals"
     )
     option("--enhancer", foreign_name, text, [], nargs="+", metavar="NAME", dest="enhancers")
-    parser.flag("--linked", "the level at both ears sets the gains of each: of a hearing aid or wdrc")
+    parser.flag(
+        "--linked", "the level at both ears sets the gains of each: of a hearing aid or wdrc"
+    )
     parser.engine()
     option("--full-scale-spl", number, "level in dB SPL of a file whose RMS is 1.0", 100.0)
     option("--listen", natural, "items with players in report.html", 3)

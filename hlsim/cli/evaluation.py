@@ -7,7 +7,16 @@ import sys
 from pathlib import Path
 
 from hlsim.cli.inputs import check_there, need, other_ear, read_ear
-from hlsim.cli.options import EARS_TABLE, Parser, count, foreign_name, natural, number, passed, positive
+from hlsim.cli.options import (
+    EARS_TABLE,
+    Parser,
+    count,
+    foreign_name,
+    natural,
+    number,
+    passed,
+    positive,
+)
 from hlsim.cli.progress import show_progress
 
 GAIN_EARS = ["N3", "S2"]
@@ -49,7 +58,7 @@ def _evaluate_simulator(options: argparse.Namespace) -> None:
     from compensators import load_compensator
     from hlsim.calibration import PASCAL_SPL
     from hlsim.evaluation.simulators import evaluate_simulators
-    from hlsim.hearing import build_simulator
+    from hlsim.losses.frozen_simulator import build_simulator
     from hlsim.neuro.config import NEURO_RATE
     from hlsim.report.simulators import write_fidelity
 
@@ -58,7 +67,9 @@ def _evaluate_simulator(options: argparse.Namespace) -> None:
         "compensator": load_compensator(options.compensator) if options.compensator else None,
         "progress": show_progress("items"),
     }
-    simulators = {label: build_simulator(name, NEURO_RATE, PASCAL_SPL) for label, name in named.items()}
+    simulators = {
+        label: build_simulator(name, NEURO_RATE, PASCAL_SPL) for label, name in named.items()
+    }
     done = evaluate_simulators(simulators, **passed(options, evaluate_simulators, **instead))
     write_fidelity(done.result, done.heard, done.shown, options.out)
     print((options.out / "fidelity.md").read_text(encoding="utf-8"))
@@ -97,7 +108,9 @@ def evaluate_compensator(parser: Parser) -> None:
 
 def _evaluate_compensator(options: argparse.Namespace) -> None:
     if options.audiogram and options.gain_ears != GAIN_EARS:
-        raise ValueError("--gain-ears with --audiogram; allowed: without it, for that ear's gains are drawn")
+        raise ValueError(
+            "--gain-ears with --audiogram; allowed: without it, for that ear's gains are drawn"
+        )
     need("eval", "pandas", "matplotlib")
     need_engine(options.engine)
     check_there(folders=(options.speech, options.noise), files=(options.audiograms,))
@@ -114,13 +127,21 @@ def _evaluate_compensator(options: argparse.Namespace) -> None:
     for line in notes:
         print(f"hlsim: warning: {line}", file=sys.stderr)
     store = options.out / "scores.jsonl"
-    instead = {"audiogram": ear, "notes": notes, "store": store, "progress": show_progress("outputs")}
+    instead = {
+        "audiogram": ear,
+        "notes": notes,
+        "store": store,
+        "progress": show_progress("outputs"),
+    }
     done = evaluate_compensators(loaded, **passed(options, evaluate_compensators, **instead))
     write_compensators(done.result, done.reports, options.out)
     text = options.out / "compensators.md"
     print(text.read_text(encoding="utf-8"))
     if failed := len(done.result["failures"]):
-        print(f"hlsim: {failed} outputs could not be judged; the reasons are in {text}", file=sys.stderr)
+        print(
+            f"hlsim: {failed} outputs could not be judged; the reasons are in {text}",
+            file=sys.stderr,
+        )
     tell_page(options.out / "compensators.html")
 
 
@@ -158,11 +179,17 @@ def haspi_report(parser: Parser) -> None:
     parser.audiogram(text=", for all files, or of a manifest for rows that bring none")
     text = "; and a column file (folders) or columns listener and ear (manifest, for rows without)"
     option("--audiograms", Path, EARS_TABLE + text)
-    option("--measures", str, "of haspi, hasqi, stoi, pesq, separated by commas; the first leads", "haspi")
+    option(
+        "--measures",
+        str,
+        "of haspi, hasqi, stoi, pesq, separated by commas; the first leads",
+        "haspi",
+    )
     parser.engine()
     option("--baseline", str, "condition that all others are compared with; all pairs by default")
     parser.flag(
-        "--better-ear", "of a manifest with both ears of each utterance, take the better ear's scores"
+        "--better-ear",
+        "of a manifest with both ears of each utterance, take the better ear's scores",
     )
     level = parser.add_mutually_exclusive_group()
     parser.full_scale(group=level)
@@ -197,7 +224,9 @@ def _haspi_report(options: argparse.Namespace) -> None:
     write_report(report, options.out, listen=options.listen)
     print(markdown(report))
     if failed := len(report.failures):
-        all_ = failed + sum(len(own) for item in report.ears or report.items for own in item.scores.values())
+        all_ = failed + sum(
+            len(own) for item in report.ears or report.items for own in item.scores.values()
+        )
         text = f"{failed} of {all_} scores could not be made; the reasons are in {options.out / 'report.md'}"
         print(f"hlsim: {text}", file=sys.stderr)
     tell_page(options.out / "report.html")

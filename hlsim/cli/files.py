@@ -17,7 +17,10 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 _UPPER_BAND = 8500.0  # Hz, from where on nothing of a model at 16 kHz comes
-_HEARD, _LOST = 1e-6, 1e-3  # share of the upper band in the power, and what of that share counts as gone
+_HEARD, _LOST = (
+    1e-6,
+    1e-3,
+)  # share of the upper band in the power, and what of that share counts as gone
 
 
 def simulate(parser: Parser) -> None:
@@ -27,7 +30,9 @@ def simulate(parser: Parser) -> None:
         "speech.wav heard.wav --audiogram N3",
         "scenes heard --listener listeners.json:L0001 --simulator msbg",
     )
-    parser.option("--simulator", str, "msbg (exact), or a checkpoint's name or folder", "neuro-msbg")
+    parser.option(
+        "--simulator", str, "msbg (exact), or a checkpoint's name or folder", "neuro-msbg"
+    )
 
 
 def compensate(parser: Parser) -> None:
@@ -63,12 +68,14 @@ def _in_and_out(parser: Parser, run: Callable[[argparse.Namespace], None], *exam
 
 def _simulate(options: argparse.Namespace) -> None:
     def build(rate: int, _: bool) -> Callable[..., Tensor]:
-        from hlsim.hearing import build_simulator
+        from hlsim.losses.frozen_simulator import build_simulator
 
         return build_simulator(options.simulator, rate, options.full_scale_spl)
 
     # above 8 kHz msbg leaves little to many ears, and all that they hear
-    _pass_through(options, build, "" if options.simulator == "msbg" else "--simulator msbg keeps it")
+    _pass_through(
+        options, build, "" if options.simulator == "msbg" else "--simulator msbg keeps it"
+    )
 
 
 def _compensate(options: argparse.Namespace) -> None:
@@ -152,7 +159,9 @@ def _pairs(source: Path, target: Path) -> list[tuple[Path, Path]]:
     read = {resolved(path) for path in made.values()}
     for one, path in made.items():
         if resolved(one) in read:
-            raise ValueError(f"{one}: made of {path}, a file of IN would be lost; allowed: another OUT")
+            raise ValueError(
+                f"{one}: made of {path}, a file of IN would be lost; allowed: another OUT"
+            )
     return [(path, one) for one, path in made.items()]
 
 

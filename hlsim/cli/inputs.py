@@ -15,7 +15,7 @@ from hlsim.files import resolved
 
 if TYPE_CHECKING:
     from hlsim.audiogram import Audiogram
-    from hlsim.listener import Listener
+    from hlsim.audiogram.listener import Listener
 
 
 _LONGEST_NAME = 220  # bytes: 255, less what a file is called until it is whole
@@ -28,7 +28,9 @@ def need(extra: str, *modules: str) -> None:
             require(module, extra)
 
 
-def check_there(*, folders: tuple[Path | None, ...] = (), files: tuple[Path | None, ...] = ()) -> None:
+def check_there(
+    *, folders: tuple[Path | None, ...] = (), files: tuple[Path | None, ...] = ()
+) -> None:
     """Refuse folders and files to read that are not there; those that were not given pass."""
     for path in folders:
         if path is not None and not path.is_dir():
@@ -46,7 +48,9 @@ def check_files(source: Path, target: Path) -> None:
     if not source.exists():
         raise ValueError(f"{source}: no such file")
     if len(os.fsencode(target.name)) > _LONGEST_NAME:
-        raise ValueError(f"{target}: a name of more than {_LONGEST_NAME} bytes; allowed: a shorter OUT")
+        raise ValueError(
+            f"{target}: a name of more than {_LONGEST_NAME} bytes; allowed: a shorter OUT"
+        )
     if target.exists() and target.samefile(source):
         raise ValueError(f"{target}: OUT is IN itself; allowed: another file, for IN would be lost")
 
@@ -86,15 +90,19 @@ def read_ears(options: argparse.Namespace) -> Audiogram | Listener:
     text = options.listener
     if text is None:
         return read_ear(options.audiogram)
-    from hlsim.listener import read_listeners
+    from hlsim.audiogram.listener import read_listeners
 
     file, _, name = (text, "", "") if Path(text).exists() else text.rpartition(":")
     listeners = read_listeners(file or text)
-    chosen = next(iter(listeners.values())) if not name and len(listeners) == 1 else listeners.get(name)
+    chosen = (
+        next(iter(listeners.values())) if not name and len(listeners) == 1 else listeners.get(name)
+    )
     if chosen is None:
         few = ", ".join([*listeners][:5]) + (", ..." if len(listeners) > 5 else "")
         found = f"no listener {name!r}" if name else f"{len(listeners)} listeners"
-        raise ValueError(f"--listener {text}: {found}; allowed: {file or text}:NAME, with a NAME of {few}")
+        raise ValueError(
+            f"--listener {text}: {found}; allowed: {file or text}:NAME, with a NAME of {few}"
+        )
     for gone, there in (("left", "right"), ("right", "left")):
         if getattr(chosen, gone) is None:
             raise ValueError(

@@ -26,22 +26,29 @@ def live(parser: Parser) -> None:
     )
     ears = parser.add_mutually_exclusive_group()
     parser.audiogram(text="; this or --listener is needed but for --list-devices", group=ears)
-    parser.listener("two ears, left first, of headphones and of microphones, where those are two", group=ears)
-    either = parser.add_mutually_exclusive_group()
-    text = (
-        "what runs chunk by chunk: a hearing aid's checkpoint, name or folder, or wdrc (compression in bands)"
+    parser.listener(
+        "two ears, left first, of headphones and of microphones, where those are two", group=ears
     )
+    either = parser.add_mutually_exclusive_group()
+    text = "what runs chunk by chunk: a hearing aid's checkpoint, name or folder, or wdrc (compression in bands)"
     parser.option("--compensator", str, text, "hearing-aid", group=either)
     text = "hear what that ear hears instead, by neuro-msbg, in blocks of 96 ms and 200 ms late"
     either.add_argument("--simulate", action="store_true", help=text)
     parser.sliders()
     text = "level in dB SPL of samples whose RMS is 1.0, of microphone and headphones alike; to be measured"
     parser.option("--full-scale-spl", number, text, 100.0)
-    parser.option("--input", _device, "microphone: number or part of its name; the system's by default")
-    parser.option("--output", _device, "headphones: number or part of their name; the system's by default")
+    parser.option(
+        "--input", _device, "microphone: number or part of its name; the system's by default"
+    )
+    parser.option(
+        "--output", _device, "headphones: number or part of their name; the system's by default"
+    )
     parser.option("--block-ms", positive, "of an aid", 4.0)
     parser.option(
-        "--buffer-ms", positive, "that each device is asked to hold: more, where there are drop-outs", 20.0
+        "--buffer-ms",
+        positive,
+        "that each device is asked to hold: more, where there are drop-outs",
+        20.0,
     )
     parser.option("--seconds", positive, "until it ends by itself")
     parser.flag("--list-devices", "show what there is, and end")
@@ -61,8 +68,8 @@ def _live(options: argparse.Namespace) -> None:
         return
     import torch
 
-    from hlsim.hearing import build_simulator
     from hlsim.live import Live, Simulated, play
+    from hlsim.losses.frozen_simulator import build_simulator
 
     torch.set_num_threads(1)  # others would only wait for one another in 4 ms
     block = max(1, round(options.block_ms * _RATE / 1000))
@@ -74,7 +81,9 @@ def _live(options: argparse.Namespace) -> None:
     else:
         aid, sliders = read_compensator(options, _RATE)
         if not hasattr(aid, "stream"):
-            raise ValueError(f"{options.compensator} takes whole signals; allowed: wdrc, or a hearing aid")
+            raise ValueError(
+                f"{options.compensator} takes whole signals; allowed: wdrc, or a hearing aid"
+            )
         stream, latency = aid.stream(ears, **sliders), aid.latency
     play(
         Live(stream, options.full_scale_spl, 2 if options.listener else 1, latency),

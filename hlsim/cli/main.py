@@ -14,10 +14,16 @@ from hlsim.cli.options import Parser
 from hlsim.extras import MissingExtraError
 
 COMMANDS = {
-    "demo": ("demo", "train a compensator for one ear on the embedded speech and score it by HASPI"),
+    "demo": (
+        "demo",
+        "train a compensator for one ear on the embedded speech and score it by HASPI",
+    ),
     "simulate": ("files", "write what an impaired ear hears of a file"),
     "compensate": ("files", "write what an impaired ear is to be given of a file"),
-    "live": ("live", "give an impaired ear what it needs, or hear as it does: microphone to headphones"),
+    "live": (
+        "live",
+        "give an impaired ear what it needs, or hear as it does: microphone to headphones",
+    ),
     "prepare": (
         "prepare",
         "check a corpus and plan training instances: utterances, noise, ears, levels; with --write make them",
@@ -26,7 +32,10 @@ COMMANDS = {
         "prepare",
         "draw an utterance and what an ear hears of it, raised to the utterance's level, before and after alignment",
     ),
-    "train-simulator": ("training", "train a Neuro-MSBG on targets from the exact MSBG or another teacher"),
+    "train-simulator": (
+        "training",
+        "train a Neuro-MSBG on targets from the exact MSBG or another teacher",
+    ),
     "train-compensator": ("training", "train a compensator through a frozen simulator"),
     "evaluate-simulator": (
         "evaluation",
@@ -83,7 +92,10 @@ def _parser() -> Parser:
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     for command, (module, text) in COMMANDS.items():
         commands.add_parser(
-            command, help=text, description=text, declare=partial(_declare, module, command.replace("-", "_"))
+            command,
+            help=text,
+            description=text,
+            declare=partial(_declare, module, command.replace("-", "_")),
         )
     return parser
 

@@ -108,7 +108,9 @@ class Parser(argparse.ArgumentParser):
         self.option("--listener", str, f"{text}: {file}", metavar="FILE[:NAME]", **more)
 
     def full_scale(self, **more: Any) -> None:
-        self.option("--full-scale-spl", number, "level in dB SPL of a file whose RMS is 1.0", 94.0, **more)
+        self.option(
+            "--full-scale-spl", number, "level in dB SPL of a file whose RMS is 1.0", 94.0, **more
+        )
 
     def sliders(self) -> None:
         for name in ("--noise-reduction", "--amplification"):
@@ -123,7 +125,9 @@ class Parser(argparse.ArgumentParser):
 
     def parallel(self) -> None:
         self.jobs()
-        self.option("--backend", str, "this machine, or a cluster", "loky", choices=("loky", "dask"))
+        self.option(
+            "--backend", str, "this machine, or a cluster", "loky", choices=("loky", "dask")
+        )
         self.option("--scheduler", str, "of --backend dask: its address, such as tcp://host:8786")
 
     def seed(self) -> None:
@@ -133,13 +137,17 @@ class Parser(argparse.ArgumentParser):
         self.option("--out", folder, "folder for the results", required=True)
 
 
-def passed(options: argparse.Namespace, *functions: Callable[..., Any], **instead: Any) -> dict[str, Any]:
+def passed(
+    options: argparse.Namespace, *functions: Callable[..., Any], **instead: Any
+) -> dict[str, Any]:
     """The options that are arguments of the functions, by their names, and what is given in the place of some."""
     names = {name for function in functions for name in signature(function).parameters}
     return {name: value for name, value in vars(options).items() if name in names} | instead
 
 
-def kind(read: Callable[[str], Any], fits: Callable[[Any], bool], allowed: str) -> Callable[[str], Any]:
+def kind(
+    read: Callable[[str], Any], fits: Callable[[Any], bool], allowed: str
+) -> Callable[[str], Any]:
     """Reads a value that ``fits``, and refuses any other with what is allowed."""
 
     def value_of(text: str) -> Any:
@@ -171,7 +179,8 @@ numbers = kind(
 )
 shares = kind(
     lambda text: {
-        name.strip(): float(value) for name, _, value in (part.partition("=") for part in text.split(","))
+        name.strip(): float(value)
+        for name, _, value in (part.partition("=") for part in text.split(","))
     },
     lambda pairs: all(map(math.isfinite, pairs.values())),
     "severities with a number each, such as mild=1,severe=2",
@@ -181,7 +190,9 @@ shares = kind(
 def folder(text: str) -> Path:
     """Where results go, there or not: one that cannot be is to be known before hours of work."""
     path = Path(text)
-    there = next(part for part in (path.absolute(), *path.absolute().parents) if os.path.lexists(part))
+    there = next(
+        part for part in (path.absolute(), *path.absolute().parents) if os.path.lexists(part)
+    )
     if not there.is_dir():
         raise argparse.ArgumentTypeError(f"{there}: not a folder; allowed: a folder, there or not")
     if not os.access(there, os.W_OK | os.X_OK):

@@ -7,7 +7,17 @@ from pathlib import Path
 from typing import Any
 
 from hlsim.cli.inputs import check_files, check_there, need, read_ear
-from hlsim.cli.options import EARS_TABLE, Parser, count, integer, number, numbers, passed, positive, shares
+from hlsim.cli.options import (
+    EARS_TABLE,
+    Parser,
+    count,
+    integer,
+    number,
+    numbers,
+    passed,
+    positive,
+    shares,
+)
 from hlsim.cli.progress import show_progress
 from hlsim.parallel import run_parallel
 
@@ -30,10 +40,18 @@ def prepare(parser: Parser) -> None:
         "speech --noise noise --ears 1 --write --out plan",
     )
     option = parser.option
-    option("corpus", Path, "folder: VoiceBank-DEMAND's, LibriSpeech's, or any with wav, flac or ogg files")
+    option(
+        "corpus",
+        Path,
+        "folder: VoiceBank-DEMAND's, LibriSpeech's, or any with wav, flac or ogg files",
+    )
     layouts = ("auto", "voicebank-demand", "librispeech", "folder")
     option("--layout", str, "of the corpus", "auto", choices=layouts)
-    option("--table", Path, "CSV with columns file and any of id, speaker, split, noisy, noise, snr (dB)")
+    option(
+        "--table",
+        Path,
+        "CSV with columns file and any of id, speaker, split, noisy, noise, snr (dB)",
+    )
     option("--noise", Path, "folder of noises to mix in, a folder a type")
     option("--root", Path, "folder that holds corpus and noise; by default what they share")
     option("--train-snr", numbers, "SNRs in dB by active speech level", MIXING["train_snr"])
@@ -105,7 +123,9 @@ def _prepare(options: argparse.Namespace) -> None:
         print(f"{prepared.faults} faults are left out: {options.out / FAULTS}")
     if recipe is not None:
         where = passed(options, run_parallel)
-        count_made = write_instances(options.out, recipe, progress=show_progress("instances"), **where)
+        count_made = write_instances(
+            options.out, recipe, progress=show_progress("instances"), **where
+        )
         print(f"{count_made} instances are in {options.out / 'instances'}")
 
 
@@ -132,4 +152,6 @@ def _draw_alignment(options: argparse.Namespace) -> None:
     waveform, rate = read_audio(options.input)
     signal = waveform[0] * gain_to_pascals(options.full_scale_spl)
     delay = draw_alignment(signal, ear, rate, options.output, method=options.alignment)
-    print(f"{options.output}: delay {delay:.1f} samples at {rate} Hz ({1000 * delay / rate:.2f} ms)")
+    print(
+        f"{options.output}: delay {delay:.1f} samples at {rate} Hz ({1000 * delay / rate:.2f} ms)"
+    )

@@ -38,7 +38,9 @@ def train_compensator(parser: Parser) -> None:
     )
     parser.option("--config", Path, "recipe, a YAML file (examples/compensator.yaml)")
     parser.audiogram(text="; without it one compensator for all ears is trained")
-    parser.option("--simulator", str, "msbg (exact), or a checkpoint's name or folder", "neuro-msbg")
+    parser.option(
+        "--simulator", str, "msbg (exact), or a checkpoint's name or folder", "neuro-msbg"
+    )
     _training_options(parser, minutes=10.0, required=True)
 
 
@@ -54,7 +56,10 @@ def _training_options(parser: Parser, *, minutes: float, required: bool = False)
     option("--start", str, text, metavar="NAME")
     option("--max-minutes", positive, "of training, resumed parts included", minutes)
     option(
-        "--max-steps", integer, "stop earlier, with the learning rate of that time; -1 for no such limit", -1
+        "--max-steps",
+        integer,
+        "stop earlier, with the learning rate of that time; -1 for no such limit",
+        -1,
     )
     option("--device", str, "where to train", "auto", choices=("auto", "cpu", "cuda"))
     option("--devices", count, "GPUs or processes a machine", 1)
@@ -66,7 +71,11 @@ def _training_options(parser: Parser, *, minutes: float, required: bool = False)
 
 def _train_simulator(options: argparse.Namespace) -> None:
     if options.manifest is None:
-        planned = {"root": options.root, "prepared": options.prepared or None, "workers": options.workers}
+        planned = {
+            "root": options.root,
+            "prepared": options.prepared or None,
+            "workers": options.workers,
+        }
         if given := _given(planned, planned):
             raise ValueError(f"{given} without --manifest; allowed: with it alone")
         if options.speech is None:
@@ -74,9 +83,13 @@ def _train_simulator(options: argparse.Namespace) -> None:
                 "nothing to train on; allowed: --speech, a folder, or --manifest, of 'hlsim prepare'"
             )
     elif given := _given(vars(options), FOLDERS):
-        raise ValueError(f"--manifest with {given}; allowed: one or the other, for a manifest has it all")
+        raise ValueError(
+            f"--manifest with {given}; allowed: one or the other, for a manifest has it all"
+        )
     elif not options.manifest.exists():
-        raise ValueError(f"{options.manifest}: not prepared (no such file); 'hlsim prepare' makes it")
+        raise ValueError(
+            f"{options.manifest}: not prepared (no such file); 'hlsim prepare' makes it"
+        )
     _check(options)
     from hlsim.training.batches import PlannedSource
     from hlsim.training.recipes import SimulatorRecipe
@@ -85,7 +98,9 @@ def _train_simulator(options: argparse.Namespace) -> None:
     arguments = _arguments(options, train_simulator)
     if options.manifest is not None:
         workers = 1 if options.workers is None else options.workers
-        arguments["data"] = PlannedSource(options.manifest, options.root, options.prepared, workers=workers)
+        arguments["data"] = PlannedSource(
+            options.manifest, options.root, options.prepared, workers=workers
+        )
     folder = train_simulator(recipe=SimulatorRecipe.from_dict(_recipe(options)), **arguments)
     print(f"the best checkpoint is in {folder}")
 
@@ -99,7 +114,9 @@ def _train_compensator(options: argparse.Namespace) -> None:
     from hlsim.training.recipes import CompensatorRecipe
 
     recipe = CompensatorRecipe.from_dict(_recipe(options))
-    folder = train_compensator(recipe=recipe, **_arguments(options, train_compensator, audiogram=ear))
+    folder = train_compensator(
+        recipe=recipe, **_arguments(options, train_compensator, audiogram=ear)
+    )
     print(f"the best checkpoint is in {folder}")
 
 
@@ -122,13 +139,17 @@ def _recipe(options: argparse.Namespace) -> dict[str, Any]:
     return read_recipe(options.config) | ({} if options.start is None else {"start": options.start})
 
 
-def _arguments(options: argparse.Namespace, train: Callable[..., Path], **more: Any) -> dict[str, Any]:
+def _arguments(
+    options: argparse.Namespace, train: Callable[..., Path], **more: Any
+) -> dict[str, Any]:
     from hlsim.torchtools import keep_freed_memory
     from hlsim.training.batches import TrainingData
     from hlsim.training.loop import RunOptions
 
     keep_freed_memory()
-    running = {name: value for name, value in vars(options).items() if name in RunOptions.__annotations__}
+    running = {
+        name: value for name, value in vars(options).items() if name in RunOptions.__annotations__
+    }
     return running | passed(
         options,
         train,

@@ -82,7 +82,11 @@ def augment_speech(
     signal = set_level(some(1, 0.2, compress(signal, ratio, sample_rate), signal), loud)
     gains = uniform(-15.0, 15.0, len(KNOTS))
     signal = some(2, 0.4, equalise(signal, gains, torch.tensor(KNOTS), sample_rate), signal)
-    amplified = equalise(signal, ears * uniform(0.2, 0.8, 1), torch.tensor(FREQUENCIES), sample_rate)
+    amplified = equalise(
+        signal, ears * uniform(0.2, 0.8, 1), torch.tensor(FREQUENCIES), sample_rate
+    )
     signal = some(3, 0.4, amplified, signal)
-    excess = (10.0 * signal.square().mean(-1).clamp_min(1e-20).log10() + 94.0 - HIGHEST_LEVEL).clamp_min(0.0)
+    excess = (
+        10.0 * signal.square().mean(-1).clamp_min(1e-20).log10() + 94.0 - HIGHEST_LEVEL
+    ).clamp_min(0.0)
     return signal * 10.0 ** (-excess / 20.0).unsqueeze(-1)

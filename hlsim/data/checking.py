@@ -42,7 +42,9 @@ class Listing:
     def digest(self, noise: Path, settings: PlanSettings) -> str:
         if settings.noise is not None:
             for path in walk_audio(noise):
-                self._digest.update(f"{path} {_state(noise / path)}\n".encode(errors="backslashreplace"))
+                self._digest.update(
+                    f"{path} {_state(noise / path)}\n".encode(errors="backslashreplace")
+                )
         for table in (settings.audiograms, settings.test_audiograms):
             self._digest.update(f"{table and _state(table)}\n".encode())
         return self._digest.hexdigest()
@@ -91,10 +93,14 @@ def examine(root: Path, shortest: float, pairs: bool, task: tuple[int, Found]) -
             if noisy_rate != rate:
                 raise ValueError(f"{noisy_rate} Hz, its clean speech has {rate} Hz")
             if (found_samples := noisy.shape[-1]) != samples:
-                raise ValueError(f"{found_samples} samples, its clean speech has {samples}: unequal lengths")
+                raise ValueError(
+                    f"{found_samples} samples, its clean speech has {samples}: unequal lengths"
+                )
     except ValueError as error:
         return fault_of(root, path, error)
-    return replace(found, rate=rate, seconds=samples / rate, active_level=active_level_db(clean[0], rate))
+    return replace(
+        found, rate=rate, seconds=samples / rate, active_level=active_level_db(clean[0], rate)
+    )
 
 
 def examine_all(

@@ -31,13 +31,20 @@ class Clips:
     """
 
     def __init__(
-        self, source: str | Path | Sequence[Path], *, sample_rate: int, seconds: float, repeat: bool = False
+        self,
+        source: str | Path | Sequence[Path],
+        *,
+        sample_rate: int,
+        seconds: float,
+        repeat: bool = False,
     ) -> None:
         self.files = find_audio(source) if isinstance(source, str | Path) else list(source)
         self.sample_rate, self.repeat = sample_rate, repeat
         self.samples = round(seconds * sample_rate)
         if self.samples < 1:
-            raise ValueError(f"clips of {seconds} s; allowed: a sample or more, {1.0 / sample_rate:.2g} s")
+            raise ValueError(
+                f"clips of {seconds} s; allowed: a sample or more, {1.0 / sample_rate:.2g} s"
+            )
         self._kept: dict[int, Tensor] = {}
         self._bad: dict[int, str] = {}
 
@@ -75,7 +82,9 @@ class Clips:
             if not self._usable(index):
                 failed += 1
                 if failed == _TRIES:
-                    raise ValueError(f"{self._bad[index]}; {_TRIES} files like it were drawn in a row")
+                    raise ValueError(
+                        f"{self._bad[index]}; {_TRIES} files like it were drawn in a row"
+                    )
                 continue
             failed, clip = 0, self.clip(index, place)
             if float(clip.square().mean()) > 1e-7:

@@ -88,7 +88,11 @@ def assign_splits(
     given = any(splits != {""} for splits in speakers.values())
     for split, share in (("test", 0.0 if given else test_share), ("valid", valid_share)):
         training = sorted(speaker for speaker, given_to in assigned.items() if given_to == "train")
-        count = min(max(1, round(share * len(training))), len(training) - 1) if share and training else 0
+        count = (
+            min(max(1, round(share * len(training))), len(training) - 1)
+            if share and training
+            else 0
+        )
         for speaker in Random(f"{seed}:{split}").sample(training, count):
             assigned[speaker] = split
     return assigned
@@ -155,7 +159,9 @@ def _voicebank(corpus: Path) -> Iterator[Found]:
                 continue
             key = Path(path).stem
             noise = noises.get(key, ("", None))
-            yield Utterance(key, key.split("_")[0], split, f"{clean}/{path}", f"{noisy}/{path}", *noise)
+            yield Utterance(
+                key, key.split("_")[0], split, f"{clean}/{path}", f"{noisy}/{path}", *noise
+            )
         for path in walk_audio(corpus / noisy):
             if not (corpus / clean / path).is_file():
                 yield Fault(f"{noisy}/{path}", f"no clean counterpart {clean}/{path}")
@@ -181,9 +187,15 @@ def _librispeech_parts(corpus: Path) -> list[tuple[str, str]]:
     """Folders such as ``train-clean-100`` with the split of each."""
     inner = "LibriSpeech/" if (corpus / "LibriSpeech").is_dir() else ""
     heads = {
-        path: path.name.partition("-")[0] for path in sorted((corpus / inner).glob("*-*")) if path.is_dir()
+        path: path.name.partition("-")[0]
+        for path in sorted((corpus / inner).glob("*-*"))
+        if path.is_dir()
     }
-    return [(inner + path.name, _LIBRISPEECH[head]) for path, head in heads.items() if head in _LIBRISPEECH]
+    return [
+        (inner + path.name, _LIBRISPEECH[head])
+        for path, head in heads.items()
+        if head in _LIBRISPEECH
+    ]
 
 
 def _librispeech(corpus: Path) -> Iterator[Found]:
@@ -228,7 +240,9 @@ def _listed(corpus: Path, table: Path) -> Iterator[Found]:
             if not path:
                 raise ValueError(f"{where}: no file named; needs a column 'file' with a path a row")
             if row.get("split", "") not in ("", *SPLITS):
-                raise ValueError(f"{where}: split {row['split']!r}; allowed: {', '.join(SPLITS)}, or none")
+                raise ValueError(
+                    f"{where}: split {row['split']!r}; allowed: {', '.join(SPLITS)}, or none"
+                )
             key = row.get("id") or _stem(path)
             try:
                 snr = float(row["snr"]) if row.get("snr") else None
@@ -261,7 +275,11 @@ def find_below(
             continue
         if isinstance(found, Fault):
             fits = storable(path) and storable(found.reason)
-            yield Fault(path, found.reason) if fits else Fault(printable(path), printable(found.reason))
+            yield (
+                Fault(path, found.reason)
+                if fits
+                else Fault(printable(path), printable(found.reason))
+            )
             continue
         noisy = found.noisy and prefix + found.noisy
         wrong = [Fault(printable(name), BAD_NAME) for name in (path, noisy) if not storable(name)]

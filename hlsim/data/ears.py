@@ -43,7 +43,9 @@ def draw_thresholds(count: int, generator: torch.Generator | None = None) -> Ten
     """
     uniform = torch.rand(count, 5, generator=generator)
     ears = torch.empty(count, 8)
-    for series, members in enumerate((("NH", "N1", "N2", "N3", "N4", "N5", "N6"), ("NH", "S1", "S2", "S3"))):
+    for series, members in enumerate(
+        (("NH", "N1", "N2", "N3", "N4", "N5", "N6"), ("NH", "S1", "S2", "S3"))
+    ):
         table = torch.tensor([STANDARD[name] for name in members], dtype=torch.float32)
         # the power favours the mild end, where more ears are
         place = uniform[:, 1] ** 1.8 * (len(members) - 1)
@@ -91,12 +93,16 @@ class Ears:
         names = list(shares)
         draw = Random(f"{self.seed}:ears:{split}")
         order = draw.sample(range(utterances), utterances)
-        source = _Measured(self.measured[split], draw) if self.measured else _Drawn(split, self.seed)
+        source = (
+            _Measured(self.measured[split], draw) if self.measured else _Drawn(split, self.seed)
+        )
         for place in order:
             chosen: list[Audiogram] = []
             for number in range(ears):
                 rank = place + number * utterances  # places far apart in a list sorted by severity
-                chosen.append(source.take(names[next(i for i, end in enumerate(ends) if rank < end)], chosen))
+                chosen.append(
+                    source.take(names[next(i for i, end in enumerate(ends) if rank < end)], chosen)
+                )
             yield chosen
 
 
@@ -117,7 +123,9 @@ def plan_ears(settings: PlanSettings, splits: Collection[str]) -> Ears:
     audiograms, test_audiograms = settings.audiograms, settings.test_audiograms
     if audiograms is None:
         if test_audiograms is not None:
-            raise ValueError(f"{test_audiograms}: ears for test alone; allowed: with ears for training")
+            raise ValueError(
+                f"{test_audiograms}: ears for test alone; allowed: with ears for training"
+            )
         return Ears(check_shares(shares or MILD_TO_SEVERE), {}, seed)
     groups: dict[str, list[tuple[str, Audiogram]]] = {split: [] for split in ("", *SPLITS)}
     for path, default in ((audiograms, ""), (test_audiograms, "test")):
@@ -125,7 +133,9 @@ def plan_ears(settings: PlanSettings, splits: Collection[str]) -> Ears:
             if max(ear.thresholds) <= HIGHEST_SIMULATED:
                 split = row.get("split") or default
                 refuse_unknown([split], groups, "splits", f"in {path}")
-                groups[split].append((row.get("listener") or repr(ear.levels), _as_written(ear.thresholds)))
+                groups[split].append(
+                    (row.get("listener") or repr(ear.levels), _as_written(ear.thresholds))
+                )
     listeners = sorted({who for who, _ in groups[""]})
     Random(f"{seed}:listeners").shuffle(listeners)
     owner = dict.fromkeys(listeners, "train")
@@ -167,7 +177,9 @@ class _Measured:
 
     def take(self, severity: str, other_than: list[Audiogram]) -> Audiogram:
         others = [ear for ear in self.all if ear not in other_than]
-        alike = [ear for ear in others if ear.severity == severity] or others  # where one ear alone has it
+        alike = [
+            ear for ear in others if ear.severity == severity
+        ] or others  # where one ear alone has it
         waiting = self.turns.setdefault(severity, [])
         for ear in waiting:
             if ear in alike:

@@ -17,10 +17,10 @@ from torch import Tensor, nn
 
 from hlsim.audio import read_audio
 from hlsim.audiogram import FREQUENCIES
+from hlsim.audiogram.listener import Listener
 from hlsim.calibration import set_level
 from hlsim.checks import check_rate
 from hlsim.dsp.resample import resample
-from hlsim.listener import Listener
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.parallel import reason_of
 
@@ -35,7 +35,9 @@ class _Foreign:
 
     def __init__(self, call: Callable[..., Tensor], name: str, digest: str) -> None:
         if not callable(call):
-            raise ValueError(f"{self.KIND} {name} is {type(call).__name__}; allowed: a callable {self.FORM}")
+            raise ValueError(
+                f"{self.KIND} {name} is {type(call).__name__}; allowed: a callable {self.FORM}"
+            )
         self.call, self.name, self.digest = call, name, digest
         self.who = f"{self.KIND} {name}"
         if isinstance(call, nn.Module):
@@ -50,12 +52,16 @@ class _Foreign:
             self.call.to(given.device)
         try:
             made = self.call(given, *more)
-        except Exception as error:  # whatever somebody's code raises is to be one line, and say where
+        except (
+            Exception
+        ) as error:  # whatever somebody's code raises is to be one line, and say where
             place = inspect.getinnerframes(error.__traceback__)[-1] if error.__traceback__ else None
             where = f" ({Path(place.filename).name}, line {place.lineno})" if place else ""
             raise ValueError(f"{self.who}: {reason_of(error)}{where}") from error
         if not isinstance(made, Tensor) or made.is_complex() or made.shape != given.shape:
-            shape = f"shape {tuple(made.shape)}" if isinstance(made, Tensor) else type(made).__name__
+            shape = (
+                f"shape {tuple(made.shape)}" if isinstance(made, Tensor) else type(made).__name__
+            )
             kind = f"complex {shape}" if isinstance(made, Tensor) and made.is_complex() else shape
             raise ValueError(
                 f"{self.who} made {kind} of {tuple(given.shape)}; allowed: a real tensor of the same shape"
@@ -93,7 +99,9 @@ class ForeignTeacher(_Foreign):
             and an ear without a loss is no waveform, not as long, not finite, or late or early by more than 2 ms.
     """
 
-    def __init__(self, simulator: Callable[[Tensor, Tensor], Tensor], name: str, digest: str) -> None:
+    def __init__(
+        self, simulator: Callable[[Tensor, Tensor], Tensor], name: str, digest: str
+    ) -> None:
         super().__init__(simulator, name, digest)
         try:
             self.sample_rate = rate = check_rate(getattr(simulator, "sample_rate", NEURO_RATE))

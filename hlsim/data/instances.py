@@ -69,7 +69,9 @@ class Instance:
         try:
             return cls(**load_file(path))
         except (OSError, SafetensorError, TypeError) as error:
-            raise ValueError(f"{path}: no instance ({error}); 'hlsim prepare --write' makes them") from error
+            raise ValueError(
+                f"{path}: no instance ({error}); 'hlsim prepare --write' makes them"
+            ) from error
 
 
 class Plan:
@@ -94,18 +96,27 @@ class Plan:
             self.rate = check_rate(about["settings"]["rate"])
             self.each = len(about["inputs"]) * int(about["settings"]["ears"])
             # neither table has the rate
-            self.digest: str = f"{about['manifest_sha256']}{about['instances_sha256']} at {self.rate} Hz"
+            self.digest: str = (
+                f"{about['manifest_sha256']}{about['instances_sha256']} at {self.rate} Hz"
+            )
         except (OSError, KeyError, TypeError, ValueError, OverflowError, RecursionError) as error:
-            raise ValueError(f"{self.folder}: not prepared ({error}); 'hlsim prepare' makes it") from error
+            raise ValueError(
+                f"{self.folder}: not prepared ({error}); 'hlsim prepare' makes it"
+            ) from error
         self.utterances = Rows(self.folder / MANIFEST, UTTERANCE_COLUMNS)
         self.rows = Rows(self.folder / INSTANCES, INSTANCE_COLUMNS)
-        self._last = (-1, torch.empty(0))  # an utterance is wanted as often as it has instances, and in a row
+        self._last = (
+            -1,
+            torch.empty(0),
+        )  # an utterance is wanted as often as it has instances, and in a row
         if len(self.rows) != len(self.utterances) * self.each:
             found = f"{len(self.rows)} instances of {len(self.utterances)} utterances"
             raise ValueError(f"{self.folder}: {found}; allowed: {self.each} of each")
         for path in (self.folder / MANIFEST, self.folder / INSTANCES):
             if sha256(path) != about[f"{path.stem}_sha256"]:
-                raise ValueError(f"{path}: has changed since it was prepared; 'hlsim prepare' makes it anew")
+                raise ValueError(
+                    f"{path}: has changed since it was prepared; 'hlsim prepare' makes it anew"
+                )
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -143,7 +154,9 @@ class Plan:
         if self._last[0] != key:
             self._last = (key, self._read(utterance))
         level = float(self.rows[index]["level"])
-        clean, noisy = self._last[1] * 10.0 ** ((level - PASCAL_SPL - utterance.active_level) / 20.0)
+        clean, noisy = self._last[1] * 10.0 ** (
+            (level - PASCAL_SPL - utterance.active_level) / 20.0
+        )
         return clean, noisy
 
     def _read(self, utterance: Utterance) -> Tensor:
@@ -167,7 +180,9 @@ class Plan:
         """As long a piece as asked of the noise that an utterance is mixed with. Shape: -> (samples,)."""
         start = utterance.noise_start or 0.0
         # a little more, for resampling rounds
-        noise, file_rate = read_stretch(inside(self.root, utterance.noise), start, samples / rate + 0.01)
+        noise, file_rate = read_stretch(
+            inside(self.root, utterance.noise), start, samples / rate + 0.01
+        )
         return resample(noise[0], file_rate, rate)[:samples]
 
     def instance(self, index: int) -> Instance:

@@ -51,7 +51,11 @@ class Utterance:
     def to_row(self) -> dict[str, str]:
         row = {name: getattr(self, name) for name in UTTERANCE_COLUMNS}
         return {
-            name: f"{value:.6g}" if isinstance(value, float) else "" if value is None else str(value)
+            name: f"{value:.6g}"
+            if isinstance(value, float)
+            else ""
+            if value is None
+            else str(value)
             for name, value in row.items()
         }
 
@@ -59,7 +63,9 @@ class Utterance:
     def from_row(cls, row: Mapping[str, str]) -> Utterance:
         """Raises ValueError where a column is missing or holds what it cannot."""
         try:
-            utterance = cls(**{entry.name: _READ[str(entry.type)](row[entry.name]) for entry in fields(cls)})
+            utterance = cls(
+                **{entry.name: _READ[str(entry.type)](row[entry.name]) for entry in fields(cls)}
+            )
         except (KeyError, TypeError, ValueError) as error:
             allowed = ", ".join(UTTERANCE_COLUMNS)
             raise ValueError(f"no row of a manifest ({error!r}); allowed: {allowed}") from None
@@ -80,7 +86,11 @@ def inside(root: str | Path, relative: str) -> Path:
     """The path ``root / relative``, or ValueError where it leads out of the root, be it through .. or a link."""
     path = PurePosixPath(relative)
     full = Path(root) / path
-    if path.is_absolute() or ".." in path.parts or not resolved(full).is_relative_to(_resolved(Path(root))):
+    if (
+        path.is_absolute()
+        or ".." in path.parts
+        or not resolved(full).is_relative_to(_resolved(Path(root)))
+    ):
         raise ValueError(
             f"{relative}: leads out of {root}; allowed: paths below it, without .. and links out"
         )
@@ -120,13 +130,17 @@ class Rows(Sequence[dict[str, str]]):
         try:
             return next(csv.reader([self._lines[line].decode("utf-8-sig")]), [])
         except (UnicodeDecodeError, csv.Error) as error:
-            raise ValueError(f"{self.path}, line {line + 1}: cannot be read as CSV ({error})") from error
+            raise ValueError(
+                f"{self.path}, line {line + 1}: cannot be read as CSV ({error})"
+            ) from error
 
 
 def csv_line(cells: Iterable[object]) -> str:
     """One line of a CSV file; line breaks within cells become spaces."""
     line = io.StringIO()
-    csv.writer(line, lineterminator="\n").writerow([" ".join(str(cell).splitlines()) for cell in cells])
+    csv.writer(line, lineterminator="\n").writerow(
+        [" ".join(str(cell).splitlines()) for cell in cells]
+    )
     return line.getvalue()
 
 
@@ -142,7 +156,9 @@ def storable(name: str) -> bool:
 
 def printable(name: str) -> str:
     """What cannot be printed in a line, as escapes."""
-    return "".join(char if char.isprintable() else char.encode("unicode_escape").decode() for char in name)
+    return "".join(
+        char if char.isprintable() else char.encode("unicode_escape").decode() for char in name
+    )
 
 
 _resolved = lru_cache(maxsize=16)(resolved)

@@ -188,7 +188,9 @@ class PlannedBatches(Dataset[Batch]):
 
     def __getitem__(self, step: Step) -> Batch:
         first = step.number * self.batch
-        return collate([self.clip(step.rank + (first + i) * step.processes) for i in range(self.batch)])
+        return collate(
+            [self.clip(step.rank + (first + i) * step.processes) for i in range(self.batch)]
+        )
 
     def clip(self, position: int) -> Instance:
         for offset in range(_TRIES):
@@ -211,10 +213,14 @@ class PlannedBatches(Dataset[Batch]):
         first = self.grid * int(torch.randint(spare // self.grid + 1, (), generator=generator))
         if not self.augment:
             return instance.clip(first, self.samples)
-        clip = Instance(*plan.pair(int(indices[number])), instance.thresholds).clip(first, self.samples)
+        clip = Instance(*plan.pair(int(indices[number])), instance.thresholds).clip(
+            first, self.samples
+        )
         other, another = indices[torch.randint(len(indices), (2,), generator=generator)].tolist()
         donor = plan.utterance(another)
-        noise = plan.noise(donor, self.samples, plan.rate) if donor.mixed else clip.signal - clip.clean
+        noise = (
+            plan.noise(donor, self.samples, plan.rate) if donor.mixed else clip.signal - clip.clean
+        )
         ear = plan.thresholds(other) + 10.0 * torch.rand((), generator=generator) - 5.0
         ear = ear.clamp(LOWEST_LEVEL, HIGHEST_SIMULATED)
         added = noise[None] if bool(noise.any()) else None
@@ -277,7 +283,9 @@ class PlanData(BatchData):
         return self._whole("test")
 
     def _whole(self, split: str) -> TimedLoader:
-        return self._loader(self.items(split), batch_size=self.clips.get("batch", 6), collate_fn=collate)
+        return self._loader(
+            self.items(split), batch_size=self.clips.get("batch", 6), collate_fn=collate
+        )
 
 
 def collate(instances: list[Instance]) -> Batch:
@@ -287,5 +295,7 @@ def collate(instances: list[Instance]) -> Batch:
         values = [getattr(instance, name) for instance in instances]
         if all(value is not None for value in values):
             longest = max(value.shape[-1] for value in values)
-            batch[name] = torch.stack([functional.pad(x, (0, longest - x.shape[-1])) for x in values])
+            batch[name] = torch.stack(
+                [functional.pad(x, (0, longest - x.shape[-1])) for x in values]
+            )
     return batch

@@ -17,7 +17,10 @@ from hlsim.data.manifest import Utterance, printable, storable
 from hlsim.data.plan_settings import PlanSettings
 
 _QUIET_DB = 30.0  # a stretch this far below its recording's level counts as a pause of the noise
-_STEP, _STRETCH = 0.1, 5  # s from one possible start to the next, and how many of these are no pause
+_STEP, _STRETCH = (
+    0.1,
+    5,
+)  # s from one possible start to the next, and how many of these are no pause
 _BESIDE = "beside the folders of splits; move it into one"
 
 
@@ -89,7 +92,9 @@ def find_noises(
                 "such folders"
             )
     if both := sorted(set(files.get("train", ())) & set(files.get("test", ()))):
-        raise ValueError(f"{root / folder}: {', '.join(both)} for training and test; allowed: disjoint types")
+        raise ValueError(
+            f"{root / folder}: {', '.join(both)} for training and test; allowed: disjoint types"
+        )
     return Noises(files, snrs), faults
 
 

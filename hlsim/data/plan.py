@@ -80,7 +80,9 @@ def prepare(
     _spare_what_is_not_ours(settings, folder)
     layout = detect_layout(root / corpus) if settings.layout == "auto" else settings.layout
     listing = Listing()
-    find = partial(find_below, root, corpus, layout, settings.table, noise if settings.noise else None)
+    find = partial(
+        find_below, root, corpus, layout, settings.table, noise if settings.noise else None
+    )
     for found in find():
         listing.add(root, found)
     if not listing.total:
@@ -143,7 +145,9 @@ def prepare(
         report.keep()
         _refuse_faults(prepared, strict, folder)
         if not prepared.utterances:
-            raise ValueError(f"{root / corpus}: nothing in it can be used; {folder / FAULTS} says why")
+            raise ValueError(
+                f"{root / corpus}: nothing in it can be used; {folder / FAULTS} says why"
+            )
         (folder / SETTINGS).unlink(
             missing_ok=True
         )  # it is written last: without it the folder is not prepared
@@ -159,15 +163,24 @@ def _spare_what_is_not_ours(settings: PlanSettings, folder: Path) -> None:
     """Raises ValueError where a table of the user's would be written over."""
     given = (settings.table, settings.audiograms, settings.test_audiograms)
     tables = [table for table in given if table is not None and table.exists()]
-    ours = {MANIFEST: UTTERANCE_COLUMNS, INSTANCES: INSTANCE_COLUMNS, FAULTS: FAULT_COLUMNS, SETTINGS: None}
+    ours = {
+        MANIFEST: UTTERANCE_COLUMNS,
+        INSTANCES: INSTANCE_COLUMNS,
+        FAULTS: FAULT_COLUMNS,
+        SETTINGS: None,
+    }
     for path, columns in ((folder / name, columns) for name, columns in ours.items()):
         if not path.is_file():
             continue
         if any(map(path.samefile, tables)):
-            raise ValueError(f"{path}: would be written over, and is read from; choose another --out")
+            raise ValueError(
+                f"{path}: would be written over, and is read from; choose another --out"
+            )
         with open(path, "rb") as file:
             if columns is not None and file.readline() != csv_line(columns).encode():
-                raise ValueError(f"{path}: not written by 'hlsim prepare'; choose another --out, or move it")
+                raise ValueError(
+                    f"{path}: not written by 'hlsim prepare'; choose another --out, or move it"
+                )
 
 
 def _unchanged(folder: Path, about: Mapping[str, Any], strict: bool) -> Prepared | None:
@@ -198,7 +211,9 @@ def _refuse_faults(prepared: Prepared, strict: bool, folder: Path) -> None:
 def _write_instances(
     settings: PlanSettings, folder: Path, prepared: Prepared, ears: Ears, inputs: Sequence[str]
 ) -> None:
-    assigned = {split: ears.assign(split, n, settings.ears) for split, n in prepared.utterances.items()}
+    assigned = {
+        split: ears.assign(split, n, settings.ears) for split, n in prepared.utterances.items()
+    }
     number = 0
     with Whole(folder / INSTANCES) as file:
         file.write(csv_line(INSTANCE_COLUMNS))

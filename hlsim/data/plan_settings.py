@@ -83,9 +83,13 @@ class PlanSettings:
             )
         root = resolved(self.root) if self.root else Path(os.path.commonpath(folders))
         if root == Path(root.anchor):
-            raise ValueError(f"{folders[0]} and {folders[-1]} have only {root} in common; allowed: a --root")
+            raise ValueError(
+                f"{folders[0]} and {folders[-1]} have only {root} in common; allowed: a --root"
+            )
         for folder in folders:
             if not folder.is_relative_to(root):
                 raise ValueError(f"{folder}: not in the root {root}; allowed: folders below it")
-        names = ["" if folder == root else folder.relative_to(root).as_posix() for folder in folders]
+        names = [
+            "" if folder == root else folder.relative_to(root).as_posix() for folder in folders
+        ]
         return root, names[0], names[-1]

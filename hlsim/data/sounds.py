@@ -34,7 +34,9 @@ def draw_sounds(
     levels_db[:, 1:][uniform(0.0, 1.0, _TONES - 1) < 0.5] = -math.inf
     time = torch.arange(samples)
     # in double precision: in single, thousands of turns are noise 50 dB below the tone
-    turns = uniform(0.0, 1.0, _TONES).unsqueeze(-1) + hertz.double().unsqueeze(-1) * time / sample_rate
+    turns = (
+        uniform(0.0, 1.0, _TONES).unsqueeze(-1) + hertz.double().unsqueeze(-1) * time / sample_rate
+    )
     tones = (10.0 ** (levels_db / 20.0)).unsqueeze(-1) * torch.sin(2.0 * math.pi * turns).float()
     begins = uniform(-begun * 0.5 * samples, 0.5 * samples, 1)
     rise = ((time - begins) / (0.01 * sample_rate)).clamp(0.0, 1.0)  # 10 ms

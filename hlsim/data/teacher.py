@@ -45,7 +45,11 @@ class Teacher(nn.Module):
     """
 
     def __init__(
-        self, sample_rate: int, *, alignment: Alignment = "structural", reference: Reference | None = None
+        self,
+        sample_rate: int,
+        *,
+        alignment: Alignment = "structural",
+        reference: Reference | None = None,
     ) -> None:
         super().__init__()
         check_choice("alignment", alignment, Alignment)
@@ -54,7 +58,9 @@ class Teacher(nn.Module):
                 f"alignment {alignment!r} of {reference.name}; allowed: structural, for it is aligned"
             )
         self.sample_rate, self.alignment, self.reference = sample_rate, alignment, reference
-        self.msbg = MSBG(sample_rate=sample_rate, aligned=alignment == "structural" or reference is not None)
+        self.msbg = MSBG(
+            sample_rate=sample_rate, aligned=alignment == "structural" or reference is not None
+        )
         self.grid = check_grid(sample_rate)
         self.body = self.grid * math.ceil(_BODY * sample_rate / self.grid)
         self.context = self.grid * math.ceil(_CONTEXT * sample_rate / self.grid)
@@ -70,7 +76,9 @@ class Teacher(nn.Module):
         if isinstance(self.reference, ForeignTeacher):
             return self.reference(signals, thresholds, self.sample_rate)
         if self.reference is not None:
-            return torch.stack([self._by_reference(*item) for item in zip(signals, thresholds, strict=True)])
+            return torch.stack(
+                [self._by_reference(*item) for item in zip(signals, thresholds, strict=True)]
+            )
         time = signals.shape[-1]
         body, length = self.body, self.context + self.body + self.tail
         if not blocks:
@@ -99,7 +107,9 @@ class Teacher(nn.Module):
             unaligned = MSBG(sample_rate=self.sample_rate, aligned=False)
             delay = estimate_delay(unaligned, Audiogram(ear))
             if self.reference is not None:  # it has been advanced by the structural delay
-                delay -= round(unaligned.delay(Audiogram(ear).severity) * self.sample_rate / MSBG_RATE)
+                delay -= round(
+                    unaligned.delay(Audiogram(ear).severity) * self.sample_rate / MSBG_RATE
+                )
             self._delays[ear] = delay
         return self._delays[ear]
 

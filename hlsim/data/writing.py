@@ -67,7 +67,9 @@ def write_instances(
         for leftover in (plan.folder / "instances").rglob(f".*{PARTIAL}"):
             leftover.unlink(missing_ok=True)
         # a worker on another machine has another working folder
-        task = partial(make, str(plan.folder.absolute()), str(plan.root.absolute()), plan.digest, recipe)
+        task = partial(
+            make, str(plan.folder.absolute()), str(plan.root.absolute()), plan.digest, recipe
+        )
         failed = make_missing(
             task,
             range(len(plan.utterances)),
@@ -79,7 +81,8 @@ def write_instances(
             scheduler=scheduler,
         )
         faults = [
-            (no_formula(plan.utterance(int(n) * plan.each).clean), failed[n]) for n in sorted(failed, key=int)
+            (no_formula(plan.utterance(int(n) * plan.each).clean), failed[n])
+            for n in sorted(failed, key=int)
         ]
         if faults:
             write_whole(report, "".join(map(csv_line, [("path", "reason"), *faults])))
@@ -95,7 +98,9 @@ def make(
     folder: str, root: str, digest: str, recipe: Recipe, number: int, keys: Sequence[str]
 ) -> dict[str, dict[str, Any] | Failed]:
     """Write the instances of one utterance that are missing; its key with what is at fault, if its audio is."""
-    torch.set_num_threads(1)  # which sums in one order; for good, for a worker may have other threads
+    torch.set_num_threads(
+        1
+    )  # which sums in one order; for good, for a worker may have other threads
     plan, teacher = _opened(folder, root, digest, recipe)
     for index in range(number * plan.each, (number + 1) * plan.each):
         if is_whole(plan.path(index)):
@@ -134,7 +139,9 @@ def claimed(plan: Plan) -> str:
     path = plan.folder / CLAIM
     found = path.read_text(encoding="utf-8") if path.is_file() else ""
     if found.splitlines()[:1] != [plan.digest]:
-        raise ValueError(f"{path.parent}: no instances of this plan; 'hlsim prepare --write' makes them")
+        raise ValueError(
+            f"{path.parent}: no instances of this plan; 'hlsim prepare --write' makes them"
+        )
     if missing := sum(not plan.path(index).is_file() for index in range(len(plan))):
         what = f"{missing} of {len(plan)} instances missing"
         raise ValueError(f"{path.parent}: {what}; 'hlsim prepare --write' goes on with them")

@@ -33,12 +33,18 @@ def active_level_db(waveform: Tensor | np.ndarray, sample_rate: int) -> float:
     smooth = ([1.0 - pole], [1.0, -pole])
     envelope = lfilter(*smooth, lfilter(*smooth, np.abs(samples)))
     width = max(1, round(_HANGOVER * sample_rate))
-    held = maximum_filter1d(envelope, width, mode="constant", origin=(width - 1) // 2)  # over the last 0.2 s
+    held = maximum_filter1d(
+        envelope, width, mode="constant", origin=(width - 1) // 2
+    )  # over the last 0.2 s
     thresholds = _THRESHOLDS * envelope.max()
     active = len(held) - np.searchsorted(np.sort(held), thresholds)
     levels = 10.0 * np.log10(np.square(samples).sum() / np.maximum(active, 1))
     margins = levels - 20.0 * np.log10(thresholds)  # they fall as the threshold rises
-    above = int(np.argmax(margins <= _MARGIN_DB)) if bool((margins <= _MARGIN_DB).any()) else len(margins) - 1
+    above = (
+        int(np.argmax(margins <= _MARGIN_DB))
+        if bool((margins <= _MARGIN_DB).any())
+        else len(margins) - 1
+    )
     if above == 0 or margins[above] > _MARGIN_DB:
         return float(levels[above])
     share = (margins[above - 1] - _MARGIN_DB) / (margins[above - 1] - margins[above])

@@ -64,7 +64,9 @@ def long_irfft(spectrum: Tensor, points: int) -> Tensor:
     """
     if not _is_long_row(spectrum, points):
         return torch.fft.irfft(spectrum, points)
-    return torch.fft.ifft(spectrum * constant_like(spectrum, _sides, spectrum.shape[-1], points), points).real
+    return torch.fft.ifft(
+        spectrum * constant_like(spectrum, _sides, spectrum.shape[-1], points), points
+    ).real
 
 
 def _is_long_row(signal: Tensor, points: int) -> bool:
@@ -88,7 +90,12 @@ def fft_length(least: int, multiple: int = 1) -> int:
     """
     spare = multiple & -multiple  # twos that it has already
     odd = [3**a * 5**b * 7**c for a in range(9) for b in range(6) for c in range(2)]
-    lengths = [multiple * o * 2**twos for o in odd for twos in range(9) if twos == 0 or spare << twos <= 256]
+    lengths = [
+        multiple * o * 2**twos
+        for o in odd
+        for twos in range(9)
+        if twos == 0 or spare << twos <= 256
+    ]
     return min(length for length in lengths if length >= least)
 
 

@@ -17,7 +17,10 @@ _GRID = 512
 
 
 def frequency_sampling_fir(
-    taps: int, frequencies: NDArray[np.float64], gains: NDArray[np.float64], window: NDArray[np.float64]
+    taps: int,
+    frequencies: NDArray[np.float64],
+    gains: NDArray[np.float64],
+    window: NDArray[np.float64],
 ) -> NDArray[np.float64]:
     """FIR filter with given gains at given frequencies, as MATLAB's ``fir2`` designs it.
 
@@ -52,7 +55,9 @@ def filter_centred(waveform: Tensor, taps: Tensor) -> Tensor:
     time, half = waveform.shape[-1], taps.shape[-1] // 2
     points = fft_length(time + 2 * half, 4)
     if torch.compiler.is_exporting():
-        points = 1 << (points - 1).bit_length()  # at other lengths onnxruntime is off by 1e-3 to 1e-2
+        points = (
+            1 << (points - 1).bit_length()
+        )  # at other lengths onnxruntime is off by 1e-3 to 1e-2
     product = long_rfft(waveform, points) * long_rfft(taps, points)
     return long_irfft(product, points)[..., half : half + time]
 

@@ -45,17 +45,25 @@ def resample(waveform: Tensor, source_rate: int, target_rate: int) -> Tensor:
     waveform = waveform.contiguous()  # torchaudio takes a view of it
     # a kernel made while a program is traced, or of fake tensors, is of no use to others
     if torch.compiler.is_compiling() or torch._C._len_torch_dispatch_stack():
-        slow: Tensor = _torchaudio().functional.resample(waveform, source_rate, target_rate, **_SINC)
+        slow: Tensor = _torchaudio().functional.resample(
+            waveform, source_rate, target_rate, **_SINC
+        )
         return slow
-    resampled: Tensor = _resampler(source_rate, target_rate, waveform.dtype, waveform.device)(waveform)
+    resampled: Tensor = _resampler(source_rate, target_rate, waveform.dtype, waveform.device)(
+        waveform
+    )
     return resampled
 
 
 @lru_cache(maxsize=32)
-def _resampler(source_rate: int, target_rate: int, dtype: torch.dtype, device: torch.device) -> nn.Module:
+def _resampler(
+    source_rate: int, target_rate: int, dtype: torch.dtype, device: torch.device
+) -> nn.Module:
     """Its kernel takes up to forty times as long to compute as to apply to a second."""
     with lasting():
-        made: nn.Module = _torchaudio().transforms.Resample(source_rate, target_rate, dtype=dtype, **_SINC)
+        made: nn.Module = _torchaudio().transforms.Resample(
+            source_rate, target_rate, dtype=dtype, **_SINC
+        )
         return made.to(device)
 
 

@@ -61,7 +61,9 @@ class STFT:
     def _overlap_add(self, frames: Tensor) -> Tensor:
         """Shape: (items, frames, window) -> (items, time)."""
         items, count, window = frames.shape
-        parts = -(-window // self.hop)  # of a frame, each added to the next part of the frame before
+        parts = -(
+            -window // self.hop
+        )  # of a frame, each added to the next part of the frame before
         if window % self.hop:
             frames = functional.pad(frames, (0, parts * self.hop - window))
         rows = frames.reshape(items, count, parts, self.hop).transpose(1, 2)

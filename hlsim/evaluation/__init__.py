@@ -5,7 +5,12 @@ from hlsim.evaluation.haspi_report import HaspiReport, haspi_report
 from hlsim.evaluation.scores import Failure, ItemScore
 from hlsim.evaluation.scoring import FileItem, score_items
 from hlsim.evaluation.simulators import summarise
-from hlsim.evaluation.statistics import PairedComparison, bootstrap_interval, holm, paired_comparison
+from hlsim.evaluation.statistics import (
+    PairedComparison,
+    bootstrap_interval,
+    holm,
+    paired_comparison,
+)
 from hlsim.evaluation.store import ScoreStore
 
 __all__ = [

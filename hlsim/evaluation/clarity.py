@@ -19,6 +19,7 @@ from torch import Tensor, nn
 
 from compensators import load_compensator
 from hlsim.audio import read_audio, write_audio
+from hlsim.audiogram.listener import EARS, Listener, read_listeners
 from hlsim.calibration import check_full_scale, gain_to_pascals, set_level
 from hlsim.data.foreign import ForeignAid, ForeignEnhancer, load_aid, load_enhancers
 from hlsim.evaluation.haspi_report import HaspiReport, report_items
@@ -26,7 +27,6 @@ from hlsim.evaluation.measurements import samples_ahead
 from hlsim.evaluation.scores import Failure
 from hlsim.evaluation.scoring import FileItem
 from hlsim.evaluation.store import ScoreStore, content_hash, key_of, weights_hash
-from hlsim.listener import EARS, Listener, read_listeners
 from hlsim.metrics.pair import check_seed
 from hlsim.metrics.registry import Engine, MeasureName, check_measures
 from hlsim.parallel import Failed, Progress, check_parallel, make_missing, one_thread, reason_of
@@ -83,7 +83,11 @@ class Aids(NamedTuple):
         """What its outputs are stored under."""
         aid = self.aid
         of_aid = weights_hash(aid) if isinstance(aid, nn.Module) else str(aid)
-        return {"aid": of_aid, "enhancer": str(self.enhancer), "full_scale_spl": self.full_scale_spl}
+        return {
+            "aid": of_aid,
+            "enhancer": str(self.enhancer),
+            "full_scale_spl": self.full_scale_spl,
+        }
 
 
 class _Task(NamedTuple):
@@ -150,7 +154,9 @@ def evaluate_scenes(
     if every < 1:
         raise ValueError(f"every is {every}; allowed: 1 or more")
     if taken := {UNAIDED, PRESCRIBED} & {*aids}:
-        raise ValueError(f"an aid named {min(taken)!r}; allowed: other names, that one is there anyway")
+        raise ValueError(
+            f"an aid named {min(taken)!r}; allowed: other names, that one is there anyway"
+        )
     known, people = read_scenes(scenes), read_listeners(listeners)
     pairs = read_pairs(scenes_listeners, known, people)[::every]
     rate = read_audio(known[pairs[0][0]].mix)[1]
@@ -161,7 +167,10 @@ def evaluate_scenes(
     references = {name: folder / "reference" / f"{name}.wav" for name, _ in pairs}
     tasks = [_reference_task(known[name], path, rate) for name, path in references.items()]
     given = {label: {"rate": rate, **own.settings()} for label, own in conditions.items()}
-    made = {label: folder / "signals" / re.sub(r"[^\w.+-]+", "-", label).strip(".-") for label in conditions}
+    made = {
+        label: folder / "signals" / re.sub(r"[^\w.+-]+", "-", label).strip(".-")
+        for label in conditions
+    }
     if len({*made.values(), folder / "signals"}) <= len(made):
         raise ValueError(
             f"labels {', '.join(aids)}; allowed: ones whose letters and digits differ, for folders' names"
@@ -178,24 +187,32 @@ def evaluate_scenes(
             tasks.append(_Task(_aided, (known[name].mix,), (own, people[person]), rate, path, key))
     for task in tasks:
         _forget_changed(store, task)
-    failed = make_missing(_make, tasks, lambda task: [task.key], store, jobs=jobs, progress=show("signals"))
+    failed = make_missing(
+        _make, tasks, lambda task: [task.key], store, jobs=jobs, progress=show("signals")
+    )
     reasons = {task.made: failed[task.key] for task in tasks if task.key in failed}
     items, failures = [], []
     for name, person in pairs:
         reference = references[name]
         paths = {label: made[label] / f"{name}_{person}_HA-output.wav" for label in conditions}
-        broken = {label: reasons.get(reference) or reasons.get(path) for label, path in paths.items()}
+        broken = {
+            label: reasons.get(reference) or reasons.get(path) for label, path in paths.items()
+        }
         whole = {label: path for label, path in paths.items() if not broken[label]}
         for label, reason in broken.items():
             failures += [
-                Failure(f"{person} {name}", label, measure, reason) for measure in _MEASURES if reason
+                Failure(f"{person} {name}", label, measure, reason)
+                for measure in _MEASURES
+                if reason
             ]
         for ear in EARS if whole else ():
             about = {"listener": person, "ear": ear, "full_scale_spl": full_scale_spl}
             audiogram = getattr(people[person], ear)
             items.append(FileItem(f"{person} {ear} {name}", reference, whole, audiogram, **about))
     if not items:
-        raise ValueError(f"no scene could be used; the first, {failures[0].file}: {failures[0].reason}")
+        raise ValueError(
+            f"no scene could be used; the first, {failures[0].file}: {failures[0].reason}"
+        )
     return report_items(
         items,
         _MEASURES,
@@ -228,7 +245,11 @@ def read_scenes(folder: str | Path) -> dict[str, Scene]:
             )
         in_room = folder / (name + _IN_ROOM)
         # a reference of the third challenge has its level
-        level_of = in_room if in_room.is_file() and not references[0].name.endswith(_REFERENCE[-1]) else None
+        level_of = (
+            in_room
+            if in_room.is_file() and not references[0].name.endswith(_REFERENCE[-1])
+            else None
+        )
         found[name] = Scene(path, references[0], level_of)
     if not found:
         raise ValueError(f"{folder}: no scenes; allowed: files that end with {' or '.join(_MIX)}")
@@ -248,7 +269,14 @@ def read_pairs(
         try:
             given = json.loads(Path(path).read_text(encoding="utf-8"))
             pairs = [(scene, name) for scene, names in given.items() for name in names]
-        except (OSError, UnicodeDecodeError, RecursionError, ValueError, AttributeError, TypeError) as error:
+        except (
+            OSError,
+            UnicodeDecodeError,
+            RecursionError,
+            ValueError,
+            AttributeError,
+            TypeError,
+        ) as error:
             raise ValueError(
                 f"{path}: cannot be read ({error}); allowed: a JSON object with a list of listeners for each scene"
             ) from error
@@ -269,7 +297,11 @@ def read_pairs(
 
 
 def _conditions(
-    aids: Mapping[str, str], enhancers: Sequence[str], linked: bool, rate: int, full_scale_spl: float
+    aids: Mapping[str, str],
+    enhancers: Sequence[str],
+    linked: bool,
+    rate: int,
+    full_scale_spl: float,
 ) -> dict[str, Aids]:
     before = load_enhancers(enhancers)
     options: dict[str, Any] = {"sample_rate": rate, "full_scale_spl": full_scale_spl}
@@ -291,7 +323,9 @@ def _conditions(
     return conditions
 
 
-def _looks_ahead(conditions: Mapping[str, Aids], mix: Path, listener: Listener) -> dict[str, float | None]:
+def _looks_ahead(
+    conditions: Mapping[str, Aids], mix: Path, listener: Listener
+) -> dict[str, float | None]:
     """By condition in ms, on the beginning of a scene; None where it fails, which scoring will tell."""
     scene, rate = read_audio(mix)
     scene = _two_channels(mix, scene)[:, : int(_LONGEST * rate)]
@@ -318,7 +352,11 @@ def _looks_ahead(conditions: Mapping[str, Aids], mix: Path, listener: Listener) 
 def _reference_task(scene: Scene, made: Path, rate: int) -> _Task:
     given = (scene.mix, scene.reference, *filter(None, [scene.in_room]))
     key = key_of(
-        {"files": [content_hash(path) for path in given[1:]], "made": made.name, "kind": "reference"}
+        {
+            "files": [content_hash(path) for path in given[1:]],
+            "made": made.name,
+            "kind": "reference",
+        }
     )
     return _Task(_reference, given, (), rate, made, key)
 
@@ -326,7 +364,9 @@ def _reference_task(scene: Scene, made: Path, rate: int) -> _Task:
 def _reference(mix: Tensor, reference: Tensor, in_room: Tensor | None = None) -> Tensor:
     if in_room is None:
         return reference
-    power, wanted = (signal.double().square().mean(-1, keepdim=True) for signal in (reference, in_room))
+    power, wanted = (
+        signal.double().square().mean(-1, keepdim=True) for signal in (reference, in_room)
+    )
     if not bool(power.all()):
         raise ValueError("a silent channel of the reference; allowed: speech in both")
     return reference * (wanted / power).sqrt()
@@ -339,7 +379,9 @@ def _aided(mix: Tensor, aids: Aids, listener: Listener) -> Tensor:
 def _two_channels(path: Path, waveform: Tensor, mono: bool = False) -> Tensor:
     channels = waveform.shape[0]
     if channels != 2 and not (mono and channels == 1):
-        raise ValueError(f"{path}: {channels} channels; allowed: {'1 or ' if mono else ''}2, left and right")
+        raise ValueError(
+            f"{path}: {channels} channels; allowed: {'1 or ' if mono else ''}2, left and right"
+        )
     return waveform.expand(2, -1)
 
 

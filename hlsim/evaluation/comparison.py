@@ -94,7 +94,9 @@ class Comparison:
 
     def _chance(self) -> str:
         defined = [
-            (n, p) for n, p in (("t-test", self.p_t_holm), ("Wilcoxon", self.p_w_holm)) if p is not None
+            (n, p)
+            for n, p in (("t-test", self.p_t_holm), ("Wilcoxon", self.p_w_holm))
+            if p is not None
         ]
         if not defined:
             return "Neither test is defined for these figures, so they do not tell a change from chance."
@@ -102,7 +104,9 @@ class Comparison:
         if self.comparisons > 1:
             named += f", Holm-adjusted for {self.comparisons} comparisons"
         against = [p < ALPHA for name, p in defined if name == "t-test" or self._wilcoxon_can()]
-        few = "" if self._wilcoxon_can() else f"; with so few Wilcoxon's cannot fall below {ALPHA:g}"
+        few = (
+            "" if self._wilcoxon_can() else f"; with so few Wilcoxon's cannot fall below {ALPHA:g}"
+        )
         if against and all(against):
             return f"Chance alone hardly explains it ({named}{few})."
         if any(against):
@@ -127,9 +131,7 @@ class Comparison:
             return f"{self.title} knows neither loss nor level: it rates the signal at the ear, not what is heard."
         louder = self.level_after_mean - self.level_before_mean
         if self.level_alike:
-            return (
-                f"The mean level changed by {louder:+.1f} dB only, so that gain overall does not explain it."
-            )
+            return f"The mean level changed by {louder:+.1f} dB only, so that gain overall does not explain it."
         moved = f"The level {'rose' if louder > 0 else 'fell'} by {abs(louder):.1f} dB"
         if not measure.rewards_gain:
             return f"{moved}, on which {self.title} depends too: the figures do not tell gain from the rest."
@@ -190,17 +192,22 @@ def p_text(p: float) -> str:
     return "p < 0.00001" if p < 1e-5 else f"p = {p:.5f}"
 
 
-def _compare(items: Sequence[ItemScore], measure: str, before: str, after: str) -> Comparison | None:
+def _compare(
+    items: Sequence[ItemScore], measure: str, before: str, after: str
+) -> Comparison | None:
     both = [item for item in items if {before, after} <= item.scores.get(measure, {}).keys()]
     if not both:
         return None
     first, second = (
-        np.array([item.scores[measure][condition] for item in both]) for condition in (before, after)
+        np.array([item.scores[measure][condition] for item in both])
+        for condition in (before, after)
     )
     severities = np.array([item.severity for item in both])
     listeners, means = np.array([item.listener for item in both]), None
     if all(listeners) and len(names := dict.fromkeys(listeners)) > 1:
-        means = paired_comparison(*([x[listeners == name].mean() for name in names] for x in (first, second)))
+        means = paired_comparison(
+            *([x[listeners == name].mean() for name in names] for x in (first, second))
+        )
     return Comparison(
         measure=measure,
         before=before,

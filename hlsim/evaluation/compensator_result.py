@@ -44,12 +44,16 @@ def compensator_result(
     failures, rows = [], []
     for number, (item, results) in enumerate(zip(items, judged, strict=True)):
         bad = {name: found.reason for name, found in results.items() if isinstance(found, Failed)}
-        failures += [{"item": number, **item.about, "compensator": name, "reason": bad[name]} for name in bad]
+        failures += [
+            {"item": number, **item.about, "compensator": name, "reason": bad[name]} for name in bad
+        ]
         if not bad:
             about = {**item.about, "audiogram": list(item.ear.thresholds)}
             rows.append({"item": number, **about, "figures": dict(results)})
     if not rows:
-        raise ValueError(f"none of {len(items)} items could be judged; the first: {failures[0]['reason']}")
+        raise ValueError(
+            f"none of {len(items)} items could be judged; the first: {failures[0]['reason']}"
+        )
     groups: dict[str, Rows] = {
         name: [row for row in rows if row["condition"] == name] for name in ("clean", "noisy")
     }
@@ -107,7 +111,9 @@ def _report(rows: Rows, items: Sequence[Item], settings: Mapping[str, Any]) -> H
 def _frame(rows: Rows, condition: str) -> Any:
     """For pandas: a row an item, with its severity, given level, SNR (NaN without noise) and a condition's figures."""
     names = {"severity": "severity", "level": "given", "snr": "snr"}
-    about = [{new: row[old] for old, new in names.items()} | row["figures"][condition] for row in rows]
+    about = [
+        {new: row[old] for old, new in names.items()} | row["figures"][condition] for row in rows
+    ]
     return require("pandas", "eval").DataFrame(about).astype({"snr": float})
 
 
@@ -118,7 +124,9 @@ def _summary(frame: Any) -> dict[str, Any]:
     return {
         **_means(frame),
         "by_level": {f"{level:g}": _means(part) for level, part in frame.groupby("given")},
-        "by_severity": {name: _means(by_severity[name]) for name in SEVERITIES if name in by_severity},
+        "by_severity": {
+            name: _means(by_severity[name]) for name in SEVERITIES if name in by_severity
+        },
         "by_snr": {name: _means(part) for name, part in by_snr.items() if len(part)},
     }
 

@@ -17,7 +17,6 @@ from compensators.nalr import NALR
 from compensators.wdrc import WDRC
 from hlsim.audiogram import Audiogram
 from hlsim.audiogram.thresholds import as_thresholds
-from hlsim.criteria.bands import BANDS
 from hlsim.data.foreign import load_enhancers
 from hlsim.evaluation.compensator_result import MEASURES, compensator_result
 from hlsim.evaluation.haspi_report import HaspiReport
@@ -41,6 +40,7 @@ from hlsim.evaluation.measurements import (
 )
 from hlsim.evaluation.store import ScoreStore, key_of, weights_hash
 from hlsim.extras import require
+from hlsim.losses.band_levels import BANDS
 from hlsim.metrics.pair import check_seed
 from hlsim.metrics.registry import Engine, check_measures, measure_by, version_of, versions_of
 from hlsim.neuro.config import NEURO_RATE
@@ -128,12 +128,18 @@ def evaluate_compensators(
     if wrong := [level for level in levels if not 0.0 <= level <= 120.0]:
         raise ValueError(f"speech at {wrong[0]:g} dB SPL; allowed: 0 to 120")
     if taken := sorted({UNAIDED, PRESCRIBED, COMPRESSED} & set(compensators)):
-        raise ValueError(f"a compensator named {taken[0]!r}; allowed: other names, that one is there anyway")
+        raise ValueError(
+            f"a compensator named {taken[0]!r}; allowed: other names, that one is there anyway"
+        )
     for name, aid in compensators.items():
         if not isinstance(aid, nn.Module):
-            raise ValueError(f"compensator {name!r} is {type(aid).__name__}; allowed: a torch.nn.Module")
+            raise ValueError(
+                f"compensator {name!r} is {type(aid).__name__}; allowed: a torch.nn.Module"
+            )
     if (audiograms is None) == (audiogram is None):
-        raise ValueError("give either audiograms, a CSV file of ears, or audiogram, one ear in place of all")
+        raise ValueError(
+            "give either audiograms, a CSV file of ears, or audiogram, one ear in place of all"
+        )
     if audiogram is None:
         ears, shown = read_ears(audiograms), {name: Audiogram.standard(name) for name in gain_ears}
     elif not isinstance(audiogram, Audiogram):
@@ -153,26 +159,37 @@ def evaluate_compensators(
     }
     aids = {name: module.eval() for name, module in aids.items()}
     enhanced = {
-        name: {f"{prefix} + {name}": Enhanced(enhancer, aid).eval() for prefix, enhancer in before.items()}
+        name: {
+            f"{prefix} + {name}": Enhanced(enhancer, aid).eval()
+            for prefix, enhancer in before.items()
+        }
         for name, aid in aids.items()
     }
-    drawn = draw_judged_items(speech, noise, ears, items=items, seconds=seconds, seed=seed, levels=levels)
+    drawn = draw_judged_items(
+        speech, noise, ears, items=items, seconds=seconds, seed=seed, levels=levels
+    )
     utterances = draw_utterances(speech, seed)
-    curves = gain_curves(aids, shown, utterances, levels)  # first: what cannot be used shows at once
+    curves = gain_curves(
+        aids, shown, utterances, levels
+    )  # first: what cannot be used shows at once
     whole = {**aids, **dict(chain.from_iterable(own.items() for own in enhanced.values()))}
     steady = steady_tones({UNAIDED: Unaided(), **whole}, shown, levels)
     worn = wearing(whole, shown, utterances[0])
     conditions, beside = _conditions(aids, compensators, enhanced)
     by_ear = {}
     for ear in dict.fromkeys(item.ear for item in drawn):
-        gains = {name: _mean_gains(aid, ear, utterances, levels) for name, aid in compensators.items()}
+        gains = {
+            name: _mean_gains(aid, ear, utterances, levels) for name, aid in compensators.items()
+        }
         own = {
             _EQUALISED.format(name): AtLevelOf(Equaliser(gains[name]), aid)
             for name, aid in compensators.items()
         }
         by_ear[ear] = conditions | own
     network = load_pretrained(simulator)
-    judged = _judge_all(drawn, by_ear, network, engine, seed, ScoreStore(store), jobs=jobs, progress=progress)
+    judged = _judge_all(
+        drawn, by_ear, network, engine, seed, ScoreStore(store), jobs=jobs, progress=progress
+    )
     settings: dict[str, Any] = {
         "items": items,
         "seconds": seconds,
@@ -203,7 +220,14 @@ def _conditions(
                 f"{PRESCRIBED} at {name}'s level": AtLevelOf(aids[PRESCRIBED], aid),
                 _EQUALISED.format(name): AtLevelOf(Unaided(), aid),
             }
-            rivals = [UNAIDED, PRESCRIBED, COMPRESSED, *enhanced[PRESCRIBED], *as_loud, *enhanced[name]]
+            rivals = [
+                UNAIDED,
+                PRESCRIBED,
+                COMPRESSED,
+                *enhanced[PRESCRIBED],
+                *as_loud,
+                *enhanced[name],
+            ]
             conditions |= {**as_loud, **enhanced[name], name: aid}
         else:
             rivals = [UNAIDED] if name == PRESCRIBED else [UNAIDED, PRESCRIBED]
@@ -213,13 +237,17 @@ def _conditions(
     return conditions, beside
 
 
-def _mean_gains(aid: nn.Module, ear: Audiogram, utterances: Tensor, levels: Sequence[float]) -> list[float]:
+def _mean_gains(
+    aid: nn.Module, ear: Audiogram, utterances: Tensor, levels: Sequence[float]
+) -> list[float]:
     """Insertion gain in dB by band, the mean over the levels; NaN where there is none, and no score then."""
     try:
         gains = np.mean(insertion_gain(aid, ear, utterances, levels), 0).clip(-100.0, None)
     except Exception:  # whatever it is, it is told of the aid's own items
         return [math.nan] * BANDS
-    return [round(gain, 1) for gain in gains.tolist()]  # the same from machine to machine, for it is in keys
+    return [
+        round(gain, 1) for gain in gains.tolist()
+    ]  # the same from machine to machine, for it is in keys
 
 
 def _judge_all(
@@ -235,7 +263,10 @@ def _judge_all(
 ) -> list[dict[str, dict[str, float] | Failed]]:
     """Each item's figures by condition, those from the store among them; the conditions are by ear."""
     hashed = cache(weights_hash)
-    weights = {ear: {name: hashed(module) for name, module in own.items()} for ear, own in conditions.items()}
+    weights = {
+        ear: {name: hashed(module) for name, module in own.items()}
+        for ear, own in conditions.items()
+    }
     network = weights_hash(simulator)
     versions = {**versions_of(MEASURES, engine), "hlsim": version_of("hlsim")}
     revisions = {name: measure_by(engine, name).revision for name in MEASURES}
@@ -245,10 +276,14 @@ def _judge_all(
         trial_seed = (seed + number) % 2**32
         about = {**by, "seed": trial_seed, **item.settings()}
         of = {name: {**about, "weights": found} for name, found in weights[item.ear].items()}
-        keys = {name: Keys(key_of(it), key_of({**it, "simulator": network})) for name, it in of.items()}
+        keys = {
+            name: Keys(key_of(it), key_of({**it, "simulator": network})) for name, it in of.items()
+        }
         trials.append(Trial(item, conditions[item.ear], simulator, trial_seed, keys, engine))
     if progress is not None:
-        parallel["progress"] = lambda done, total: progress(done // 2, total // 2)  # both of an output
+        parallel["progress"] = lambda done, total: progress(
+            done // 2, total // 2
+        )  # both of an output
     failed = make_missing(
         judge, trials, lambda trial: [*chain.from_iterable(trial.keys.values())], store, **parallel
     )

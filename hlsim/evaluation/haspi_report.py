@@ -118,7 +118,9 @@ class HaspiReport:
         )
         taken = sorted(set(self._own()) & set(self.extra))
         if taken:
-            raise ValueError(f"extra keys {', '.join(taken)} are the report's own; allowed: other names")
+            raise ValueError(
+                f"extra keys {', '.join(taken)} are the report's own; allowed: other names"
+            )
 
     def _words(self, measure: str, before: str, after: str) -> WordsChange | None:
         if measure != "haspi":
@@ -126,7 +128,9 @@ class HaspiReport:
         scores = [item.scores.get(measure, {}) for item in self.items]
         both = [found for found in scores if {before, after} <= found.keys()]
         # a score may end a little above 1
-        first, second = (np.clip([found[name] for found in both], 0.0, 1.0) for name in (before, after))
+        first, second = (
+            np.clip([found[name] for found in both], 0.0, 1.0) for name in (before, after)
+        )
         return words_change(first, second)
 
     @property
@@ -143,7 +147,9 @@ class HaspiReport:
         """Levels in dB SPL, as ``scores``."""
         return self._array([item.levels for item in self.items], conditions)
 
-    def _array(self, rows: Sequence[Mapping[str, Any]], conditions: Sequence[str] | None) -> np.ndarray:
+    def _array(
+        self, rows: Sequence[Mapping[str, Any]], conditions: Sequence[str] | None
+    ) -> np.ndarray:
         names = self.conditions if conditions is None else conditions
         # None becomes NaN
         return np.array([[row.get(name) for name in names] for row in rows], dtype=np.float64)
@@ -176,7 +182,13 @@ class HaspiReport:
         return {**self._own(), **self.extra}
 
     def _own(self) -> dict[str, Any]:
-        facts = ("full_scale_spl", "clean_level_mean", "before_level_mean", "after_level_mean", "seed")
+        facts = (
+            "full_scale_spl",
+            "clean_level_mean",
+            "before_level_mean",
+            "after_level_mean",
+            "seed",
+        )
         return {
             **self.comparison.to_dict(),
             "in_words": self.headline.in_words(),
@@ -255,10 +267,18 @@ def haspi_report(
     }
     if manifest is not None and clean is None and before is None and after is None:
         items = read_manifest(manifest, root, **ears_and_levels)
-    elif manifest is None and root is None and clean is not None and before is not None and after is not None:
+    elif (
+        manifest is None
+        and root is None
+        and clean is not None
+        and before is not None
+        and after is not None
+    ):
         items = read_folders(clean, before, after, **ears_and_levels)
     else:
-        raise ValueError("give either the folders clean, before and after, or a manifest (and its root)")
+        raise ValueError(
+            "give either the folders clean, before and after, or a manifest (and its root)"
+        )
     own: dict[str, Any] = {
         "engine": engine,
         "baseline": baseline,
@@ -288,7 +308,9 @@ def report_items(
     Args:
         conditions: their order, those that no item has included; by default the items' own.
     """
-    conditions = list(conditions or dict.fromkeys(name for item in items for name in item.processed))
+    conditions = list(
+        conditions or dict.fromkeys(name for item in items for name in item.processed)
+    )
     if len(conditions) < 2:
         raise ValueError(f"one condition only, {conditions[0]}; allowed: two or more to compare")
     if baseline is not None:
@@ -297,7 +319,9 @@ def report_items(
         conditions = [baseline, *(name for name in conditions if name != baseline)]
     if better_ear:
         check_both_ears((item.name, item.listener, item.ear) for item in items)
-    scored = score_items(items, measures, engine=engine, store=ScoreStore(store), seed=seed, **running)
+    scored = score_items(
+        items, measures, engine=engine, store=ScoreStore(store), seed=seed, **running
+    )
     pairs = [*zip(items, scored, strict=True)]
     unscored = [
         *failures,
@@ -314,7 +338,9 @@ def report_items(
         raise ValueError(f"none of {len(items)} items could be scored{reasons}")
     ears = scores if better_ear else []
     scores = better_ears(scores) if better_ear else scores
-    return HaspiReport(scores, measures, seed, unscored, baseline, extra or {}, ears=ears, engine=engine)
+    return HaspiReport(
+        scores, measures, seed, unscored, baseline, extra or {}, ears=ears, engine=engine
+    )
 
 
 def _item_score(
@@ -337,7 +363,9 @@ def _item_score(
         clean_level=fact.clean_dbfs + full_scale,
         levels=dict.fromkeys(conditions) | levels,
         scores={
-            measure: {name: known[measure, name].score for name in conditions if (measure, name) in known}
+            measure: {
+                name: known[measure, name].score for name in conditions if (measure, name) in known
+            }
             for measure in measures
         },
         full_scale_spl=full_scale,

@@ -82,10 +82,13 @@ def read_manifest(
     idle = {
         "audiogram": audiogram is not None and id(audiogram) not in used,
         "audiograms": audiograms is not None and used.isdisjoint(map(id, ears.values())),
-        "spl": spl is not None and all(row.get("spl") or row.get("full_scale_spl") for _, row in rows),
+        "spl": spl is not None
+        and all(row.get("spl") or row.get("full_scale_spl") for _, row in rows),
     }
     for what in filter(idle.get, idle):
-        raise ValueError(f"{path}: no row takes {what}, for each has its own; leave one of the two out")
+        raise ValueError(
+            f"{path}: no row takes {what}, for each has its own; leave one of the two out"
+        )
     return list(items.values())
 
 
@@ -103,7 +106,9 @@ def _rows(path: str | Path) -> list[tuple[int, dict[str, str]]]:
     """With the number of each row's line."""
     rows = read_table(path, "the manifest")
     if not rows:
-        raise ValueError(f"{path}: no rows; needs a header with {', '.join(_NEEDED)} and a row a file")
+        raise ValueError(
+            f"{path}: no rows; needs a header with {', '.join(_NEEDED)} and a row a file"
+        )
     missing = [column for column in _NEEDED if column not in rows[0][1]]
     if missing:
         raise ValueError(f"{path}: no column {', '.join(missing)}; needs {', '.join(_NEEDED)}")
@@ -131,7 +136,9 @@ def _item(
     elif row_spl is not None:
         spl = row_spl
     levels = {key: value for key, value in row.items() if key.lower().startswith("hl")}
-    if any(levels.values()):  # then all: a blank is no threshold, and not one like its neighbour's either
+    if any(
+        levels.values()
+    ):  # then all: a blank is no threshold, and not one like its neighbour's either
         audiogram: Audiogram | None = Audiogram.from_row(levels)
     elif row.get("audiogram"):
         audiogram = Audiogram.standard(row["audiogram"])
@@ -142,7 +149,11 @@ def _item(
             f"no audiogram of listener {listener!r}, ear {ear!r}: neither in columns hl_250, hl_500, ... or audiogram "
             "nor in a file of audiograms"
         )
-    parts = (listener, ear, row.get("item", "") or PurePosixPath(row["clean"]).with_suffix("").as_posix())
+    parts = (
+        listener,
+        ear,
+        row.get("item", "") or PurePosixPath(row["clean"]).with_suffix("").as_posix(),
+    )
     label = " ".join(filter(None, parts))
     item = FileItem(
         name=label if snr is None else f"{label} {snr:g} dB",
@@ -237,7 +248,9 @@ def read_folders(
             raise ValueError(
                 f"{root}: {lack[0]} missing, {lack[1]}; clean, before and after need the same names"
             )
-    ears = dict.fromkeys(names, audiogram) if audiogram is not None else _ears(str(audiograms), _file)
+    ears = (
+        dict.fromkeys(names, audiogram) if audiogram is not None else _ears(str(audiograms), _file)
+    )
     if lack := _lack(names, ears):
         raise ValueError(f"{audiograms}: no audiogram of {lack[0]}, {lack[1]}")
     items = []

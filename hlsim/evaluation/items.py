@@ -73,7 +73,9 @@ def draw_items(
     generator = torch.Generator().manual_seed(seed)
     measured = [ear for _, ear in read_audiograms(audiograms, simulated=True)]
     chosen = []
-    for i, (clean, masker) in zip(range(items), _clips(speech, noise, seconds, generator), strict=False):
+    for i, (clean, masker) in zip(
+        range(items), _clips(speech, noise, seconds, generator), strict=False
+    ):
         kind, around = (i // 2) % 4, i // 8
         level, ratio, slip = _turn(kind, around, levels)
         snr = None if masker is None else ratio
@@ -85,7 +87,10 @@ def draw_items(
         else:
             ear = Audiogram(tuple(draw_thresholds(1, generator).squeeze(0).tolist()))
         gain = 10.0 ** ((level - float(level_spl(signal))) / 20.0)
-        about = _about(ear, level, snr, "noise_snr") | {"input": "as-is", "audiogram": list(ear.thresholds)}
+        about = _about(ear, level, snr, "noise_snr") | {
+            "input": "as-is",
+            "audiogram": list(ear.thresholds),
+        }
         chosen.append(Item((clean * gain).squeeze(0), (signal * gain).squeeze(0), ear, about))
     return chosen
 
@@ -138,7 +143,9 @@ def draw_judged_items(
         snr = None if masker is None else ratio
         clean = set_level(drawn, level)
         signal = _mixed(clean, masker, snr).squeeze(0)
-        chosen.append(Item(clean.squeeze(0), signal, ear, {"name": name, **_about(ear, level, snr, "snr")}))
+        chosen.append(
+            Item(clean.squeeze(0), signal, ear, {"name": name, **_about(ear, level, snr, "snr")})
+        )
     return chosen
 
 
@@ -147,7 +154,11 @@ def _clips(
 ) -> Iterator[tuple[Tensor, Tensor | None]]:
     """Speech, every second time with a noise to mix in, where there are any. Shape: (1, time)."""
     clips = Clips(speech, sample_rate=NEURO_RATE, seconds=seconds)
-    noises = Clips(noise, sample_rate=NEURO_RATE, seconds=seconds, repeat=True) if noise is not None else None
+    noises = (
+        Clips(noise, sample_rate=NEURO_RATE, seconds=seconds, repeat=True)
+        if noise is not None
+        else None
+    )
     for i in count():
         clean = clips.draw(1, generator)
         yield clean, noises.draw(1, generator) if noises is not None and i % 2 else None
@@ -170,7 +181,9 @@ def treat(
         "as-is": lambda signal, ear: signal,
         "louder": lambda signal, ear: 10.0 * signal,
         "nal-r": NALR(sample_rate=NEURO_RATE),
-        "compressed": lambda signal, ear: compress(signal[None], torch.tensor([3.0]), NEURO_RATE)[0],
+        "compressed": lambda signal, ear: compress(signal[None], torch.tensor([3.0]), NEURO_RATE)[
+            0
+        ],
     }
     if compensator is not None:
         treatments["compensated"] = compensator

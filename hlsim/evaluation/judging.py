@@ -14,10 +14,16 @@ from torch import Tensor, nn
 
 from hlsim.audiogram import Audiogram
 from hlsim.calibration import PASCAL_SPL, level_spl, set_level
-from hlsim.criteria.bands import audibility, band_centres, band_level_loss, band_levels, least_audible
 from hlsim.data.foreign import ForeignEnhancer
 from hlsim.dsp.fir import filter_centred
 from hlsim.evaluation.items import Item
+from hlsim.losses.band_levels import (
+    audibility,
+    band_centres,
+    band_level_loss,
+    band_levels,
+    least_audible,
+)
 from hlsim.metrics.registry import Engine, measure_by
 from hlsim.msbg import MSBG
 from hlsim.neuro.config import NEURO_RATE
@@ -138,7 +144,9 @@ def judge(trial: Trial, missing: Sequence[str]) -> dict[str, dict[str, Any] | Fa
             )
             of_network = _loss(trial.simulator(aided, item.ear), normal["neuro"])
             records[keys.of_network] = {OF_NETWORK: of_network}
-            figures = {figure: value for record in records.values() for figure, value in record.items()}
+            figures = {
+                figure: value for record in records.values() for figure, value in record.items()
+            }
             if unknown := [figure for figure, value in figures.items() if not math.isfinite(value)]:
                 raise ValueError(f"{', '.join(unknown)}: not finite")
             if keys.most in records:

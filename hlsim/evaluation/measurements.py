@@ -13,9 +13,9 @@ from torch import Tensor, nn
 
 from hlsim.audiogram import Audiogram
 from hlsim.calibration import level_spl, set_level
-from hlsim.criteria.bands import band_centres, band_levels
 from hlsim.data.clips import Clips
 from hlsim.evaluation.judging import NORMAL
+from hlsim.losses.band_levels import band_centres, band_levels
 from hlsim.msbg import MSBG
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.parallel import one_thread, reason_of
@@ -29,7 +29,9 @@ TONES = (250, 500, 1000, 2000, 3001, 4000)
 QUIET = (25.0, 40.0)
 """Levels in dB SPL of the noise of a room where nobody speaks."""
 
-_CHANGES = range(8000, 40000, 2003)  # samples from which on the input is another, at many places of any hop
+_CHANGES = range(
+    8000, 40000, 2003
+)  # samples from which on the input is another, at many places of any hop
 _CHANGED = 1e-4  # of the output's peak: Fourier transforms round by less
 _NEAR_HZ = 20.0
 _MIDDLE = slice(NEURO_RATE // 2, -NEURO_RATE // 2)  # one second: every tone has whole periods in it
@@ -39,7 +41,7 @@ _LEAST, _SILENCE = 1e-20, 1e-30  # smallest ratio of powers, and power: JSON hol
 def insertion_gain(
     compensator: nn.Module, ear: Audiogram, speech: Tensor, levels: Sequence[float]
 ) -> list[list[float]]:
-    """Power out over power in, in dB, in 24 ERB-wide bands (``hlsim.criteria.bands``), over all of the speech.
+    """Power out over power in, in dB, in 24 ERB-wide bands (``hlsim.losses.band_levels``), over all of the speech.
 
     Its spectrum is what a fitter's speech-shaped noise stands for; its pauses are in it, for a compensator may take noise
     for noise. ``levels`` are of each utterance in dB SPL. ValueError as ``outputs``.
@@ -88,7 +90,9 @@ def _powers(signal: Tensor) -> Tensor:
 
 def tones(hertz: Sequence[int], levels: Sequence[float]) -> Tensor:
     """Sines of 2 s at 16 kHz in pascals, each at each level in dB SPL. Shape: -> (tones * levels, 32000)."""
-    turns = torch.tensor(hertz).unsqueeze(-1) * torch.arange(2 * NEURO_RATE) % NEURO_RATE / NEURO_RATE
+    turns = (
+        torch.tensor(hertz).unsqueeze(-1) * torch.arange(2 * NEURO_RATE) % NEURO_RATE / NEURO_RATE
+    )
     sines = (2.0 * torch.pi * turns).sin().repeat_interleave(len(levels), 0)
     return set_level(sines, torch.tensor(levels, dtype=torch.float32).repeat(len(hertz)))
 
@@ -121,8 +125,13 @@ def steady_tones(
     normal = _heard(sounds, NORMAL)
     found = []
     for (ear_name, ear), (name, compensator) in product(ears.items(), compensators.items()):
-        aided = outputs(compensator, sounds, ear, f"{name}, ear {ear_name}, steady tones: the output")
-        figures = {"heard_off_db": _heard(aided, ear) - normal, "sidebands_db": sidebands_db(aided, hertz)}
+        aided = outputs(
+            compensator, sounds, ear, f"{name}, ear {ear_name}, steady tones: the output"
+        )
+        figures = {
+            "heard_off_db": _heard(aided, ear) - normal,
+            "sidebands_db": sidebands_db(aided, hertz),
+        }
         about = {"compensator": name, "ear": ear_name, "levels": [*levels], "frequencies": [*TONES]}
         shaped = {key: values.reshape(len(TONES), -1).T.tolist() for key, values in figures.items()}
         found.append({**about, **shaped})
@@ -148,7 +157,9 @@ def wearing(
     for (ear_name, ear), (name, compensator) in product(ears.items(), compensators.items()):
         with one_thread():
             start = time.process_time()
-            aided = outputs(compensator, given, ear, f"{name}, ear {ear_name}, changed speech: the output")
+            aided = outputs(
+                compensator, given, ear, f"{name}, ear {ear_name}, changed speech: the output"
+            )
             seconds = time.process_time() - start
         ahead = samples_ahead(aided[0], aided[1 : -len(quiet)], _CHANGES)
         gains = [

@@ -8,10 +8,20 @@ from pathlib import Path
 from typing import Any
 
 from hlsim.audiogram import Audiogram
-from hlsim.listener import EARS
+from hlsim.audiogram.listener import EARS
 
 _JSON = (
-    *("file", "listener", "ear", "snr", "before", "after", "clean_level", "before_level", "after_level"),
+    *(
+        "file",
+        "listener",
+        "ear",
+        "snr",
+        "before",
+        "after",
+        "clean_level",
+        "before_level",
+        "after_level",
+    ),
     *("full_scale_spl", "severity", "sample_rate", "seconds", "seed"),
 )
 
@@ -103,7 +113,9 @@ def check_both_ears(items: Iterable[tuple[str, str, str]]) -> None:
             raise ValueError(f"{file}: ear is {ear!r}; allowed: left and right, for the better ear")
         ears = found.setdefault(_utterance(file, listener, ear), set())
         if ear in ears:
-            raise ValueError(f"{file}: two items of this name and ear; allowed: one, for the better ear")
+            raise ValueError(
+                f"{file}: two items of this name and ear; allowed: one, for the better ear"
+            )
         ears.add(ear)
     for (listener, own), ears in found.items():
         if lack := [ear for ear in EARS if ear not in ears]:

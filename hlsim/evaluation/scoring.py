@@ -18,12 +18,20 @@ import torch
 
 from hlsim.audio import read_audio
 from hlsim.audiogram import Audiogram
+from hlsim.audiogram.listener import EARS
 from hlsim.calibration import check_full_scale, dbfs
 from hlsim.evaluation.store import ScoreStore, content_hash, key_of
-from hlsim.listener import EARS
 from hlsim.metrics.pair import check_seed
 from hlsim.metrics.registry import Engine, MeasureName, check_measures, measure_by, versions_of
-from hlsim.parallel import Backend, Failed, Progress, check_parallel, make_missing, one_thread, reason_of
+from hlsim.parallel import (
+    Backend,
+    Failed,
+    Progress,
+    check_parallel,
+    make_missing,
+    one_thread,
+    reason_of,
+)
 
 
 @dataclass(frozen=True)
@@ -132,7 +140,10 @@ def score_items(
     hashes = cache(content_hash)
     about_measures = {name: _about(name, engine) for name in names}
     for index, item in enumerate(items):
-        scale = {"full_scale_spl": item.full_scale_spl if item.spl is None else None, "spl": item.spl}
+        scale = {
+            "full_scale_spl": item.full_scale_spl if item.spl is None else None,
+            "spl": item.spl,
+        }
         for condition, path in item.processed.items():
             try:
                 files = {"clean": hashes(item.clean), "processed": hashes(path), "ear": item.ear}
@@ -177,9 +188,13 @@ def score_task(task: FileTask, _: Sequence[str] = ()) -> dict[str, dict[str, Any
     item, processed = task.item, task.item.processed[task.condition]
     measure = measure_by(task.engine, task.measure)
     try:
-        (clean, rate), (heard, other) = (read_channel(path, item.ear) for path in (item.clean, processed))
+        (clean, rate), (heard, other) = (
+            read_channel(path, item.ear) for path in (item.clean, processed)
+        )
         if other != rate:
-            raise ValueError(f"{processed} has {other} Hz and {item.clean} {rate} Hz; allowed: equal rates")
+            raise ValueError(
+                f"{processed} has {other} Hz and {item.clean} {rate} Hz; allowed: equal rates"
+            )
         if len(clean) != len(heard):
             raise ValueError(
                 f"{item.clean} has {len(clean)} samples and {processed} {len(heard)}; allowed: equal lengths"
@@ -203,7 +218,9 @@ def read_channel(path: str | Path, ear: str = "") -> tuple[np.ndarray, int]:
     """
     waveform, rate = read_audio(path)
     if waveform.shape[0] != 1 and not (ear and waveform.shape[0] == 2):
-        allowed = "1, or 2 for left and right" if ear else "1, for one file is what one ear is given"
+        allowed = (
+            "1, or 2 for left and right" if ear else "1, for one file is what one ear is given"
+        )
         raise ValueError(f"{path}: {waveform.shape[0]} channels; allowed: {allowed}")
     channel = EARS.index(ear) if waveform.shape[0] == 2 else 0
     if not bool(waveform[channel].any()):

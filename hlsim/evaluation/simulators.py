@@ -111,9 +111,13 @@ def evaluate_simulators(
     if len(set(inputs)) < len(inputs):
         raise ValueError(f"inputs {', '.join(inputs)}; allowed: each once")
     if not seconds >= _SHORTEST:
-        raise ValueError(f"items of {seconds:g} s; allowed: {_SHORTEST:g} or more, and 2 for PESQ and STOI")
+        raise ValueError(
+            f"items of {seconds:g} s; allowed: {_SHORTEST:g} or more, and 2 for PESQ and STOI"
+        )
     require("pandas", "eval")  # to be known before hours of scoring
-    drawn = draw_items(speech, noise, audiograms, items=items, seconds=seconds, seed=seed, levels=levels)
+    drawn = draw_items(
+        speech, noise, audiograms, items=items, seconds=seconds, seed=seed, levels=levels
+    )
     scored = ScoreStore(store)
     own = {name: version_of(name) for name in ("pyclarity", "hlsim")}  # whose MSBG is the truth
     versions = {**versions_of(["stoi", "pesq"]), **own}
@@ -122,7 +126,9 @@ def evaluate_simulators(
     tasks = []
     for item in treat(drawn, inputs, compensator):
         about = settings | item.settings()
-        tasks.append((item, {name: key_of({**about, "weights": weights[name]}) for name in simulators}))
+        tasks.append(
+            (item, {name: key_of({**about, "weights": weights[name]}) for name in simulators})
+        )
     many = len(simulators)
     failed = make_missing(
         partial(_score_item, simulators, reference),
@@ -141,7 +147,10 @@ def evaluate_simulators(
     for name in simulators:
         rows = [row(number, item, keys[name]) for number, (item, keys) in enumerate(tasks)]
         of = {given: [row for row in rows if row["input"] == given] for given in inputs}
-        entries[name] = {"inputs": {given: summarise(part) for given, part in of.items()}, "items": rows}
+        entries[name] = {
+            "inputs": {given: summarise(part) for given, part in of.items()},
+            "items": rows,
+        }
     first, *others = entries.values()
     for entry in others:
         entry["snr_over_first"] = {given: _snr_over(first, entry, given) for given in inputs}
@@ -156,7 +165,9 @@ def evaluate_simulators(
     return SimulatorEvaluation(result, shown, heard_of)
 
 
-def _snr_over(first: Mapping[str, Any], other: Mapping[str, Any], given: Input) -> dict[str, Any] | None:
+def _snr_over(
+    first: Mapping[str, Any], other: Mapping[str, Any], given: Input
+) -> dict[str, Any] | None:
     """A paired comparison of the SNR of those items of an input that both have one of; None where there is none."""
     rows = zip(first["items"], other["items"], strict=True)
     both = [(one.get("snr"), two.get("snr")) for one, two in rows if one["input"] == given]
@@ -183,7 +194,9 @@ def _score_item(
     for name, key in ((name, key) for name, key in keys.items() if key in missing):
         try:
             with torch.no_grad():
-                scores = _scores(item.clean, truth, simulators[name](item.signal, item.ear).double())
+                scores = _scores(
+                    item.clean, truth, simulators[name](item.signal, item.ear).double()
+                )
             made[key] = true | scores | {"reasons": true["reasons"] + scores["reasons"]}
         except Exception as error:  # one simulator's; the others go on
             made[key] = Failed(reason_of(error))
@@ -215,7 +228,9 @@ def _both(clean: Tensor, heard: Tensor, whose: str) -> dict[str, Any]:
         f"stoi_{whose}": stoi(clean, heard, NEURO_RATE),
         f"pesq_{whose}": pesq_wb(clean, heard, NEURO_RATE),
     }
-    reasons = [f"no {name}: {score.reason}" for name, score in scores.items() if score.value is None]
+    reasons = [
+        f"no {name}: {score.reason}" for name, score in scores.items() if score.value is None
+    ]
     return {name: score.value for name, score in scores.items()} | {"reasons": reasons}
 
 
@@ -258,7 +273,9 @@ def summarise(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
             )
     pandas = require("pandas", "eval")
     # None becomes NaN
-    frame = pandas.DataFrame(rows, columns=[*_SCORES, *_KINDS]).astype(dict.fromkeys(_SCORES, float))
+    frame = pandas.DataFrame(rows, columns=[*_SCORES, *_KINDS]).astype(
+        dict.fromkeys(_SCORES, float)
+    )
     summary: dict[str, Any] = {"overall": _figures(frame)}
     for key in _KINDS:
         # degrees of loss in their order, levels as numbers, conditions by name
@@ -284,5 +301,7 @@ def _figures(frame: Any) -> dict[str, float | int | None]:
     for name in ("stoi", "pesq"):
         pairs = frame[[f"{name}_true", f"{name}_sim"]].dropna()
         figures[f"{name}_n"] = len(pairs)
-        figures |= {f"{name}_{key}": agree(*pairs.to_numpy().T) for key, agree in _AGREEMENT.items()}
+        figures |= {
+            f"{name}_{key}": agree(*pairs.to_numpy().T) for key, agree in _AGREEMENT.items()
+        }
     return figures

@@ -113,7 +113,9 @@ def bootstrap_interval(
     at_once = max(1, _DRAWS // len(data))
     sizes = [min(at_once, resamples - start) for start in range(0, resamples, at_once)]
     means = [data[generator.integers(0, len(data), (size, len(data)))].mean(-1) for size in sizes]
-    expanded = stats.t.ppf(0.5 + 0.5 * confidence, len(data) - 1) * math.sqrt(len(data) / (len(data) - 1))
+    expanded = stats.t.ppf(0.5 + 0.5 * confidence, len(data) - 1) * math.sqrt(
+        len(data) / (len(data) - 1)
+    )
     tail = 100.0 * stats.norm.cdf(-expanded)
     low, high = np.percentile(np.concatenate(means), [tail, 100.0 - tail])
     return float(low), float(high)

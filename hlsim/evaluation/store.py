@@ -80,13 +80,17 @@ def content_hash(path: str | Path) -> str:
     try:
         return sha256(Path(path))
     except OSError as error:
-        reason = "no such file" if isinstance(error, FileNotFoundError) else f"cannot be read ({error})"
+        reason = (
+            "no such file" if isinstance(error, FileNotFoundError) else f"cannot be read ({error})"
+        )
         raise ValueError(f"{path}: {reason}") from error
 
 
 def key_of(settings: Mapping[str, Any]) -> str:
     """SHA-256, in hexadecimal, of settings that JSON can hold, whatever their order."""
-    return hashlib.sha256(json.dumps(settings, sort_keys=True, allow_nan=False).encode()).hexdigest()
+    return hashlib.sha256(
+        json.dumps(settings, sort_keys=True, allow_nan=False).encode()
+    ).hexdigest()
 
 
 def weights_hash(module: nn.Module) -> str:
@@ -130,7 +134,9 @@ def setting(value: Any) -> Any:
             return setting(value())
     try:
         return hashlib.sha256(pickle.dumps(value, protocol=4)).hexdigest()
-    except Exception:  # a lambda, an open file: whatever it does may have changed, so it is scored anew
+    except (
+        Exception
+    ):  # a lambda, an open file: whatever it does may have changed, so it is scored anew
         return uuid.uuid4().hex
 
 
@@ -146,4 +152,6 @@ def _source(kind: type) -> str:
 
 def samples_hash(*signals: Tensor) -> str:
     """What makes signals these ones."""
-    return hashlib.sha256(b"".join(signal.contiguous().numpy().tobytes() for signal in signals)).hexdigest()
+    return hashlib.sha256(
+        b"".join(signal.contiguous().numpy().tobytes() for signal in signals)
+    ).hexdigest()

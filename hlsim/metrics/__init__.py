@@ -2,11 +2,20 @@
 
 from typing import Any
 
-from hlsim.metrics.haspi import HaspiReference, haspi
-from hlsim.metrics.hasqi import HasqiParts, HasqiReference, hasqi
-from hlsim.metrics.mbstoi import mbstoi
+from hlsim.metrics.haspi_score import HaspiReference, haspi
+from hlsim.metrics.hasqi_score import HasqiParts, HasqiReference, hasqi
+from hlsim.metrics.mbstoi_score import mbstoi
 
-__all__ = ["HASPI", "HASQI", "HaspiReference", "HasqiParts", "HasqiReference", "haspi", "hasqi", "mbstoi"]
+__all__ = [
+    "HASPI",
+    "HASQI",
+    "HaspiReference",
+    "HasqiParts",
+    "HasqiReference",
+    "haspi",
+    "hasqi",
+    "mbstoi",
+]
 
 
 def __getattr__(name: str) -> Any:

@@ -19,7 +19,9 @@ from hlsim.extras import require
 Signal = np.ndarray | Tensor
 
 _PESQ_RATE = 16000
-_BANDS = 1000.0 * 2.0 ** (np.arange(-9, 9) / 3.0)  # centres in Hz, 125 to 6350: the last band ends at 7127
+_BANDS = 1000.0 * 2.0 ** (
+    np.arange(-9, 9) / 3.0
+)  # centres in Hz, 125 to 6350: the last band ends at 7127
 _BAND_RANGE_DB = 50.0
 _FLOOR = 1e-20  # of the truth's power: keeps an exact estimate at 200 dB SNR, which JSON can hold
 
@@ -64,7 +66,9 @@ def third_octave_error_db(truth: Signal, estimate: Signal, sample_rate: int) -> 
         raise ValueError(f"sample rate {sample_rate} Hz; bands up to 7 kHz need 16000 or more")
     points = max(len(true), sample_rate // 4)  # 4 Hz apart or less: the lowest band is 29 Hz wide
     frequencies = np.fft.rfftfreq(points, 1.0 / sample_rate)
-    edges = np.searchsorted(frequencies, np.append(_BANDS * 2.0 ** (-1 / 6), _BANDS[-1] * 2.0 ** (1 / 6)))
+    edges = np.searchsorted(
+        frequencies, np.append(_BANDS * 2.0 ** (-1 / 6), _BANDS[-1] * 2.0 ** (1 / 6))
+    )
     powers = []
     for signal in (true, found):
         total = np.append(0.0, np.cumsum(np.abs(np.fft.rfft(signal, points)) ** 2))
@@ -146,7 +150,9 @@ def _score(run: Callable[[np.ndarray, np.ndarray], float], clean: Signal, heard:
             # pystoi's word, and its score is 1e-5
             warnings.filterwarnings("error", message="Not enough STFT frames")
             value = float(run(*pair))
-    except Exception as error:  # whatever a third party's measure raises is that item's reason, no more
+    except (
+        Exception
+    ) as error:  # whatever a third party's measure raises is that item's reason, no more
         text = error.args[0] if error.args else error
         return Score(None, text.decode() if isinstance(text, bytes) else str(text))
     return Score(value) if math.isfinite(value) else Score(None, f"the score is {value}")
@@ -156,7 +162,9 @@ def _equal(*signals: Signal) -> tuple[np.ndarray, ...]:
     arrays = (x.detach().cpu().numpy() if isinstance(x, Tensor) else np.asarray(x) for x in signals)
     a, b = (x.astype(np.float64) for x in arrays)
     if a.ndim != 1 or a.shape != b.shape or not len(a):
-        raise ValueError(f"signals have shapes {a.shape} and {b.shape}; allowed: (time,) twice, equally long")
+        raise ValueError(
+            f"signals have shapes {a.shape} and {b.shape}; allowed: (time,) twice, equally long"
+        )
     return a, b
 
 

@@ -111,6 +111,7 @@ def _spectra(waveform: Tensor, sample_rate: int) -> tuple[Tensor, Tensor, Tensor
 def _octaves(points: int, sample_rate: int) -> NDArray[np.float64]:
     """1 where a frequency of an FFT lies in an octave. Returns (points / 2 + 1, 5)."""
     octaves = np.log2(
-        np.maximum(np.arange(points // 2 + 1) * sample_rate / points, 1.0)[:, None] / np.array(OCTAVES)
+        np.maximum(np.arange(points // 2 + 1) * sample_rate / points, 1.0)[:, None]
+        / np.array(OCTAVES)
     )
     return ((octaves >= -0.5) & (octaves < 0.5)).astype(np.float64)

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from hlsim.metrics.ear.clean_speech import UnscorableError
-from hlsim.metrics.haspi import haspi
-from hlsim.metrics.hasqi import hasqi
+from hlsim.metrics.haspi_score import haspi
+from hlsim.metrics.hasqi_score import hasqi
 
 SCORES: dict[str, Callable[..., Tensor]] = {"haspi": haspi, "hasqi": hasqi}
 """Scores by name that are the less a loss, the higher they are."""

@@ -27,16 +27,23 @@ def pyclarity_msbg(waveform: Tensor, audiogram: Audiogram, sample_rate: int) -> 
 
     Shape: (time,) -> (time,), float64.
     """
-    msbg, utils = (require(f"clarity.evaluator.msbg.{name}", "pyclarity") for name in ("msbg", "msbg_utils"))
+    msbg, utils = (
+        require(f"clarity.evaluator.msbg.{name}", "pyclarity") for name in ("msbg", "msbg_utils")
+    )
     ear = msbg.Ear()  # RMS 1.0 is 120 dB SPL
     disabled = logging.root.manager.disable
     logging.disable(max(disabled, logging.WARNING))
     try:
         ear.set_audiogram(audiogram.to_clarity())
-        to_reference = gain_to_pascals(PASCAL_SPL) / gain_to_pascals(float(ear.equiv_0db_spl + ear.ahr))
+        to_reference = gain_to_pascals(PASCAL_SPL) / gain_to_pascals(
+            float(ear.equiv_0db_spl + ear.ahr)
+        )
         common = math.gcd(MSBG_RATE, sample_rate)
         up, down = MSBG_RATE // common, sample_rate // common
-        signal = resample_poly(waveform.double().numpy(), up, down, window=("kaiser", 12.0)) * to_reference
+        signal = (
+            resample_poly(waveform.double().numpy(), up, down, window=("kaiser", 12.0))
+            * to_reference
+        )
         signal = np.append(signal, np.zeros(_TAIL))
         heard = ear.process(signal * _undo_rescaling(signal, utils.measure_rms))[0]
     finally:

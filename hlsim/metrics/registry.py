@@ -15,8 +15,8 @@ from hlsim.audiogram import Audiogram
 from hlsim.checks import check_choice, refuse_unknown
 from hlsim.extras import require
 from hlsim.metrics import fidelity
-from hlsim.metrics.haspi import haspi
-from hlsim.metrics.hasqi import hasqi
+from hlsim.metrics.haspi_score import haspi
+from hlsim.metrics.hasqi_score import hasqi
 from hlsim.metrics.pair import Signal, check_pair
 from hlsim.metrics.pyclarity import pyclarity_score
 
@@ -105,7 +105,9 @@ def measure_by(engine: Engine, name: str) -> Measure:
     return _PYCLARITYS.get(name, MEASURES[name]) if engine == "pyclarity" else MEASURES[name]
 
 
-def check_measures(names: Iterable[MeasureName], engine: Engine = "hlsim") -> tuple[MeasureName, ...]:
+def check_measures(
+    names: Iterable[MeasureName], engine: Engine = "hlsim"
+) -> tuple[MeasureName, ...]:
     """The names, each once, or ValueError with those that are allowed; MissingExtraError where a package lacks."""
     chosen = tuple(dict.fromkeys(names))
     refuse_unknown(chosen, MEASURES, "measures")
@@ -120,7 +122,9 @@ def check_measures(names: Iterable[MeasureName], engine: Engine = "hlsim") -> tu
 
 def versions_of(names: Iterable[str], engine: Engine = "hlsim") -> dict[str, str]:
     """Versions of the packages that the scores of these measures depend on."""
-    packages = dict.fromkeys(package for name in names for package in measure_by(engine, name).packages)
+    packages = dict.fromkeys(
+        package for name in names for package in measure_by(engine, name).packages
+    )
     return {package: version_of(package) for package in packages}
 
 

@@ -15,8 +15,8 @@ from hlsim.audiogram.thresholds import AudiogramLike, as_thresholds, of_listener
 from hlsim.calibration import check_full_scale, level_spl
 from hlsim.checks import Lengths, check_lengths, check_rate, check_waveform
 from hlsim.extras import require
-from hlsim.metrics.haspi import haspi
-from hlsim.metrics.hasqi import hasqi
+from hlsim.metrics.haspi_score import haspi
+from hlsim.metrics.hasqi_score import hasqi
 from hlsim.metrics.pair import check_pair, check_seed
 from hlsim.parallel import check_parallel, one_thread, run_parallel
 
@@ -80,7 +80,11 @@ class _MeanScore(_Metric):
         return self._forward_cache
 
     def update(
-        self, processed: Tensor, clean: Tensor, audiogram: AudiogramLike, lengths: Lengths | None = None
+        self,
+        processed: Tensor,
+        clean: Tensor,
+        audiogram: AudiogramLike,
+        lengths: Lengths | None = None,
     ) -> None:
         """Score a batch.
 
@@ -100,7 +104,11 @@ class _MeanScore(_Metric):
         check_waveform(processed, "processed")
         check_waveform(clean, "clean")
         shape = processed.shape
-        if shape != clean.shape or len(shape) not in (1, 2, 3) or (len(shape) == 3 and shape[1] != 2):
+        if (
+            shape != clean.shape
+            or len(shape) not in (1, 2, 3)
+            or (len(shape) == 3 and shape[1] != 2)
+        ):
             raise ValueError(
                 f"processed {tuple(shape)} and clean {tuple(clean.shape)}; allowed: (batch, time), (time,) or (batch, 2, "
                 "time), the same for both"
@@ -115,7 +123,9 @@ class _MeanScore(_Metric):
         ears = _ears(audiogram, len(heard), sides)
         items_and_time = torch.Size((len(heard), shape[-1]))
         ends = (
-            [shape[-1]] * len(heard) if lengths is None else check_lengths(lengths, items_and_time).tolist()
+            [shape[-1]] * len(heard)
+            if lengths is None
+            else check_lengths(lengths, items_and_time).tolist()
         )
         items: list[_Item] = []
         pairs = zip(heard, reference, ears, ends, strict=True)
@@ -180,7 +190,9 @@ class _MeanScore(_Metric):
         made: dict[int, list[float]] = {}
         for task, scores in run_parallel(_score, tasks, jobs=1 if len(tasks) < 2 else self.jobs):
             if scores is None:
-                raise ValueError(f"item {task.number} of the batch: the process that scored it died")
+                raise ValueError(
+                    f"item {task.number} of the batch: the process that scored it died"
+                )
             made[task.number] = scores
         return [score for number in range(len(tasks)) for score in made[number]]
 
@@ -259,9 +271,13 @@ def _score(task: _Task) -> list[float]:
 def _ears(audiogram: AudiogramLike, batch: int, sides: int) -> list[dict[int, Audiogram]]:
     """Each item's ears by channel, without those that are missing."""
     shapes = [(*lead, *((2,) if sides == 2 else ()), len(FREQUENCIES)) for lead in ((), (batch,))]
-    levels = as_thresholds(audiogram, highest=HIGHEST_LEVEL, taker="a score", missing=sides == 2).detach()
+    levels = as_thresholds(
+        audiogram, highest=HIGHEST_LEVEL, taker="a score", missing=sides == 2
+    ).detach()
     if levels.shape not in shapes or (sides == 1 and of_listeners(audiogram)):
         found, (alone, each) = tuple(levels.shape), shapes
         raise ValueError(f"audiogram of shape {found}; allowed: {alone} or {each} dB HL")
     rows = levels.expand(shapes[1]).reshape(batch, sides, -1).double().tolist()
-    return [{side: Audiogram(row) for side, row in enumerate(own) if row[0] == row[0]} for own in rows]
+    return [
+        {side: Audiogram(row) for side, row in enumerate(own) if row[0] == row[0]} for own in rows
+    ]

@@ -62,7 +62,9 @@ def fitted() -> Curve:
     return Curve(**json.loads((Path(__file__).parent / "words.json").read_text(encoding="utf-8")))
 
 
-def words_change(before: ArrayLike, after: ArrayLike, *, interval: float = 0.9, seed: int = 0) -> WordsChange:
+def words_change(
+    before: ArrayLike, after: ArrayLike, *, interval: float = 0.9, seed: int = 0
+) -> WordsChange:
     """What HASPI under two aids says of the words that one new listener understands of these sentences.
 
     Args:
@@ -79,7 +81,9 @@ def words_change(before: ArrayLike, after: ArrayLike, *, interval: float = 0.9, 
     for name, given in (("before", before), ("after", after)):
         scores = np.asarray(given, dtype=np.float64)
         if scores.ndim != 1 or not len(scores) or not ((scores >= 0.0) & (scores <= 1.0)).all():
-            raise ValueError(f"{name} holds what is no HASPI; allowed: (items,) from 0 to 1, at least one")
+            raise ValueError(
+                f"{name} holds what is no HASPI; allowed: (items,) from 0 to 1, at least one"
+            )
         pair.append((scores, float(scores.mean())))
     if not 0.0 < interval < 1.0:
         raise ValueError(f"interval is {interval!r}; allowed: above 0, below 1")
@@ -96,25 +100,31 @@ def simulate(curve: Curve, pair: Sequence[tuple[Array, float]], seed: int = 0) -
     return second - first
 
 
-def simulate_shares(curve: Curve, aids: Sequence[tuple[Array, float]], seed: int = 0) -> list[Array]:
+def simulate_shares(
+    curve: Curve, aids: Sequence[tuple[Array, float]], seed: int = 0
+) -> list[Array]:
     """Shares of words that drawn listeners understand with each aid, of which HASPI is given by sentence and on average.
 
     Shape: ((sentences,), ()) an aid -> (draws,) each.
     """
     random = np.random.default_rng(seed)
     coefficients = random.multivariate_normal(curve.coefficients, curve.covariance, DRAWS)
-    listener, slope = (s * random.standard_normal(DRAWS) for s in (curve.listener, curve.listener_slope))
+    listener, slope = (
+        s * random.standard_normal(DRAWS) for s in (curve.listener, curve.listener_slope)
+    )
     shares = []
     for scores, mean in aids:
         logit = coefficients @ np.stack(
             [np.ones(len(scores)), scores - mean, np.full(len(scores), mean - 0.5)]
         )
-        logit += (listener + curve.aid * random.standard_normal(DRAWS))[:, None] + slope[:, None] * (
-            scores - 0.5
-        )
+        logit += (listener + curve.aid * random.standard_normal(DRAWS))[:, None] + slope[
+            :, None
+        ] * (scores - 0.5)
         p = 1.0 / (1.0 + np.exp(-logit))
         # of a beta-binomial share, averaged over the sentences
-        spread = p * (1.0 - p) / curve.words * (1.0 + (curve.words - 1.0) / (curve.dispersion + 1.0))
+        spread = (
+            p * (1.0 - p) / curve.words * (1.0 + (curve.words - 1.0) / (curve.dispersion + 1.0))
+        )
         noise = np.sqrt(spread.sum(1)) / len(scores) * random.standard_normal(DRAWS)
         shares.append(np.clip(p.mean(1) + noise, 0.0, 1.0))
     return shares

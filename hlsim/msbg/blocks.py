@@ -48,7 +48,9 @@ def block_bounds(samples: int, rate: int) -> list[Block]:
     unit = (
         common * rate // math.gcd(common * rate, MSBG_RATE)
     )  # samples in a whole number of hops and of steps
-    return overlapping(samples, round(_BLOCK_SECONDS * rate), _LEAD_SECONDS * rate, _LAG_SECONDS * rate, unit)
+    return overlapping(
+        samples, round(_BLOCK_SECONDS * rate), _LEAD_SECONDS * rate, _LAG_SECONDS * rate, unit
+    )
 
 
 def _faded(block: Tensor, rate: int, begin: bool, end: bool) -> Tensor:
@@ -57,7 +59,9 @@ def _faded(block: Tensor, rate: int, begin: bool, end: bool) -> Tensor:
     Shape: (items, time) -> (items, time).
     """
     time = round(_FADE_SECONDS * rate)
-    place = torch.arange(1, time + 1, dtype=torch.float64, device=block.device) * (math.pi / (time + 1))
+    place = torch.arange(1, time + 1, dtype=torch.float64, device=block.device) * (
+        math.pi / (time + 1)
+    )
     ramp = (0.5 - 0.5 * place.cos()).to(block.dtype)
     ones = block.new_ones(block.shape[-1] - 2 * time)
     edge = ramp.new_ones(time)

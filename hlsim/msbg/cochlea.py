@@ -9,7 +9,15 @@ from torch import Tensor
 
 from hlsim.dsp.fft import fft_length, long_irfft, long_rfft
 from hlsim.msbg.ear import MSBG_RATE
-from hlsim.msbg.envelope import HALF_RATE_STEP, STEP, decimate, detect, envelope, envelope_lowpass, smooth
+from hlsim.msbg.envelope import (
+    HALF_RATE_STEP,
+    STEP,
+    decimate,
+    detect,
+    envelope,
+    envelope_lowpass,
+    smooth,
+)
 from hlsim.msbg.filterbank import FilterBank, gammatone_response
 from hlsim.msbg.filtfilt_end import ending, ending_response, ending_weights
 from hlsim.msbg.multirate import MultirateBank, RateBand
@@ -104,8 +112,12 @@ def hear_ending(heard: Tensor, ratios: Tensor, bank: FilterBank) -> Tensor:
     """
     length = heard.shape[-1]
     points = fft_length(length + BANK_TAIL, 2 * STEP)
-    spectrum = long_rfft(heard, points).unsqueeze(-2) * constant_like(heard, gammatone_response, bank, points)
-    channels = long_irfft(spectrum, points) * constant_like(heard, _not_advanced, bank, points, length)
+    spectrum = long_rfft(heard, points).unsqueeze(-2) * constant_like(
+        heard, gammatone_response, bank, points
+    )
+    channels = long_irfft(spectrum, points) * constant_like(
+        heard, _not_advanced, bank, points, length
+    )
     weights = constant_like(heard, ending_weights, bank)
     response = constant_like(heard, ending_response, bank, (length - 1) % STEP + 1)
     envelopes = envelope(channels, constant_like(heard, envelope_lowpass, bank, points))

@@ -25,7 +25,10 @@ def estimate_delay(
     Raises:
         ValueError: the simulator has no rate, or more than one ear is given.
     """
-    rate, full_scale = getattr(simulator, "sample_rate", None), getattr(simulator, "full_scale_spl", None)
+    rate, full_scale = (
+        getattr(simulator, "sample_rate", None),
+        getattr(simulator, "full_scale_spl", None),
+    )
     if not isinstance(rate, int) or full_scale is None:
         raise ValueError(
             f"{type(simulator).__name__} has no sample_rate and full_scale_spl; allowed: hlsim's simulators"

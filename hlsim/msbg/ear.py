@@ -55,5 +55,7 @@ def ear_filter(backward: bool = False) -> NDArray[np.float64]:
 def lowpass_filter() -> NDArray[np.float64]:
     """FIR that keeps processing noise above 18 kHz out. Returns (133,) for 44.1 kHz."""
     taps = 2 * int(0.0015 * MSBG_RATE) + 1
-    coefficients: NDArray[np.float64] = firwin(taps, LOWPASS_HZ / (MSBG_RATE / 2.0), window=("kaiser", 8.0))
+    coefficients: NDArray[np.float64] = firwin(
+        taps, LOWPASS_HZ / (MSBG_RATE / 2.0), window=("kaiser", 8.0)
+    )
     return coefficients

@@ -74,7 +74,9 @@ _MIDDLE = FilterBank(
         "3060.05966689 3636.11057091 4313.0570293 5108.57094018 6043.41944195 7142.00704589 8433.01272356 9950.13858023 "
         "11732.98965891 13828.10784223 16290.1868429 19183.5"
     ),
-    _ints("379 339 289 253 216 184 156 132 111 95 80 68 58 49 42 36 30 26 22 19 16 13 11 10 8 7 6 5"),
+    _ints(
+        "379 339 289 253 216 184 156 132 111 95 80 68 58 49 42 36 30 26 22 19 16 13 11 10 8 7 6 5"
+    ),
     _ints("23 29 35 44 55 70 88 112 142 180 228 288 361 448 541 625"),
     4.967792069637238,
 )
@@ -128,13 +130,17 @@ def gammatone_response(
     first = bank.first_highpass
     upper = [place for place, channel in enumerate(chosen) if channel >= first]
     if upper:
-        corners = _CORNER_STEP * np.array(bank.highpass_corners)[[chosen[i] - first for i in upper], None]
+        corners = (
+            _CORNER_STEP * np.array(bank.highpass_corners)[[chosen[i] - first for i in upper], None]
+        )
         unity = np.abs(_bessel_highpass(corners, peak[upper]))
         response[upper] *= _bessel_highpass(corners, omega) / unity
     return response
 
 
-def _bessel_highpass(corner: NDArray[np.float64], omega: NDArray[np.floating]) -> NDArray[np.complex128]:
+def _bessel_highpass(
+    corner: NDArray[np.float64], omega: NDArray[np.floating]
+) -> NDArray[np.complex128]:
     """s^2 / (s^2 + 3 s + 3) of the corner in Hz, by the bilinear transform with the corner kept in place."""
     s = 1j * np.tan(omega / 2.0) / np.tan(np.pi * corner / MSBG_RATE)
     return s**2 / (s**2 + 3.0 * s + 3.0)

@@ -50,7 +50,9 @@ def ending_weights(bank: FilterBank) -> Array:
 def ending_response(bank: FilterBank, length: int) -> Array:
     """The oscillation at the steps up to ``AHEAD`` behind the end. Returns (channels, 170, 2)."""
     first = (length - 1) % STEP
-    return np.stack([response[first::STEP][: LOOK_BACK // STEP][::-1] for _, response in _oscillations(bank)])
+    return np.stack(
+        [response[first::STEP][: LOOK_BACK // STEP][::-1] for _, response in _oscillations(bank)]
+    )
 
 
 @lru_cache(maxsize=4)
@@ -82,7 +84,9 @@ def _oscillation(numerator: Array, denominator: Array) -> tuple[Array, Array]:
     # in silence the forward pass rings on, z, move z, ..., and the backward pass has S z: S = enter [1 0] + move S move
     silent = np.linalg.solve(np.eye(4) - np.kron(move, move.T), np.outer(enter, [1.0, 0.0]).ravel())
     nothing = np.zeros(_PADDING + 1)
-    from_state = np.stack([reflected(unit, nothing) for unit in np.eye(2)], 1) - silent.reshape(2, 2)
+    from_state = np.stack([reflected(unit, nothing) for unit in np.eye(2)], 1) - silent.reshape(
+        2, 2
+    )
     from_newest = np.stack([reflected(np.zeros(2), unit) for unit in np.eye(_PADDING + 1)], 1)
 
     behind = AHEAD * STEP

@@ -8,7 +8,12 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from hlsim.audiogram import SEVERITIES, severity_of
-from hlsim.audiogram.thresholds import AudiogramLike, of_listeners, own_thresholds, resolve_thresholds
+from hlsim.audiogram.thresholds import (
+    AudiogramLike,
+    of_listeners,
+    own_thresholds,
+    resolve_thresholds,
+)
 from hlsim.calibration import PASCAL_SPL, check_full_scale, gain_to_pascals
 from hlsim.checks import check_rate, check_waveform
 from hlsim.dsp.fft import long_irfft, long_rfft
@@ -87,7 +92,9 @@ class MSBG(nn.Module):
         levels = own_thresholds(audiogram)
         trained = levels is not None and levels.requires_grad
         self.register_buffer("_levels", None if trained else levels, persistent=False)
-        self._trained = (levels if trained else None,)  # a buffer that moves would be another tensor
+        self._trained = (
+            levels if trained else None,
+        )  # a buffer that moves would be another tensor
         self._two_ears = of_listeners(audiogram)
 
     @property
@@ -105,7 +112,9 @@ class MSBG(nn.Module):
             ValueError: no audiogram, levels outside -10 to 100 dB HL, or shapes that do not fit.
         """
         check_waveform(waveform)
-        given = self._trained[0] if audiogram is None else audiogram  # what is trained may leave the range
+        given = (
+            self._trained[0] if audiogram is None else audiogram
+        )  # what is trained may leave the range
         thresholds = resolve_thresholds(self._levels, given, waveform, two_ears=self._two_ears)
         with torch.autocast(waveform.device.type, enabled=False):
             return self._simulate(waveform, thresholds)
@@ -117,9 +126,7 @@ class MSBG(nn.Module):
         return STRUCTURAL_DELAY + (SMEARING_DELAY if severity in BROADENING else 0)
 
     def extra_repr(self) -> str:
-        return (
-            f"sample_rate={self.sample_rate}, full_scale_spl={self.full_scale_spl:g}, aligned={self.aligned}"
-        )
+        return f"sample_rate={self.sample_rate}, full_scale_spl={self.full_scale_spl:g}, aligned={self.aligned}"
 
     def _simulate(self, waveform: Tensor, thresholds: Tensor) -> Tensor:
         dtype = waveform.dtype if waveform.dtype == torch.float64 else torch.float32
@@ -145,14 +152,18 @@ class MSBG(nn.Module):
         if len(outputs) == 1:  # a copy, or it would hold all that the last transform made
             heard = outputs[0].clone(memory_format=torch.contiguous_format)
         else:
-            heard = torch.cat([functional.pad(output, (0, longest - output.shape[-1])) for output in outputs])
+            heard = torch.cat(
+                [functional.pad(output, (0, longest - output.shape[-1])) for output in outputs]
+            )
         if order != list(range(len(order))):
             heard = heard[torch.tensor(order).argsort().to(heard.device)]
         if gain != 1.0:
             heard = heard / gain
         return heard.reshape(*batch, longest).to(waveform.dtype)
 
-    def _simulate_alike(self, signals: Tensor, ears: Tensor, last: bool, severity: str, none: bool) -> Tensor:
+    def _simulate_alike(
+        self, signals: Tensor, ears: Tensor, last: bool, severity: str, none: bool
+    ) -> Tensor:
         """All items have the same severity. Shape: (items, time), (items, 8) -> (items, time).
 
         Args:
@@ -170,7 +181,9 @@ class MSBG(nn.Module):
             given, rate, math.ceil((math.ceil(samples * MSBG_RATE / rate) + delay) / step), step
         )
         if smears:
-            heard = smear(heard, constant_like(heard, smearing_matrix_below, severity, step, highest), step)
+            heard = smear(
+                heard, constant_like(heard, smearing_matrix_below, severity, step, highest), step
+            )
         heard = heard.to(signals.dtype)
         ratios = expansion_ratios(ears, constant_like(signals, threshold_weights, bank))
         gain = 10.0 ** (-bank.recombination_db / 20.0)
@@ -192,7 +205,9 @@ class MSBG(nn.Module):
         heard = long_irfft(spectrum, points // step)[..., :length]
         return from_cochlea(heard, rate, samples, gain=gain, step=step, delay=delay)
 
-    def _late(self, heard: Tensor, ratios: Tensor, bank: FilterBank, smears: bool, last: bool) -> Tensor:
+    def _late(
+        self, heard: Tensor, ratios: Tensor, bank: FilterBank, smears: bool, last: bool
+    ) -> Tensor:
         """With the delay and, at the end, what the reference makes of it. Shape: (items, time) -> (items, time)."""
         length = heard.shape[-1]
         # with a slight loss and no smearing, nothing buries what the lower rates change where the envelope is next to 0
@@ -200,7 +215,9 @@ class MSBG(nn.Module):
             return hear_ending(heard, ratios, bank)
         points = bank_points(length, MSBG_RATE)
         key = bank, points, 1, MSBG_RATE / 2, heard.dtype, heard.device
-        spectrum = hear(long_rfft(heard, points), ratios, made_once(multirate_bank, *key), not smears)
+        spectrum = hear(
+            long_rfft(heard, points), ratios, made_once(multirate_bank, *key), not smears
+        )
         all_but_the_end = long_irfft(spectrum, points)[..., :length]
         if not last:
             return all_but_the_end
@@ -217,20 +234,29 @@ def active_rescaling(signals: Tensor) -> Tensor:
     to_reference = 10.0 ** ((PASCAL_SPL - 120.0) / 10.0)  # powers in pyclarity's full scale
     overall = signals.square().mean(-1) * to_reference
     threshold_db = (10.0 * overall.clamp_min(1e-30).log10() - 12.0).clamp_min(-80.0)
-    frames = signals[..., : signals.shape[-1] // frame * frame].unflatten(-1, (-1, frame)).square().mean(-1)
+    frames = (
+        signals[..., : signals.shape[-1] // frame * frame]
+        .unflatten(-1, (-1, frame))
+        .square()
+        .mean(-1)
+    )
     frames = frames * to_reference
     floor = 10.0 ** ((threshold_db - 30.0) / 10.0)
     active = 10.0 * (frames + floor.unsqueeze(-1)).log10() >= threshold_db.unsqueeze(-1)
     count = active.sum(-1)
     power = (frames * active).sum(-1) / count.clamp_min(1)
-    ratio = torch.where((count > 0) & (power > 0), overall / power.clamp_min(1e-30), torch.ones_like(overall))
+    ratio = torch.where(
+        (count > 0) & (power > 0), overall / power.clamp_min(1e-30), torch.ones_like(overall)
+    )
     return ratio.sqrt().unsqueeze(-1)
 
 
 def _alike(ears: Tensor) -> list[tuple[str, bool, list[int]]]:
     """Severity, whether all is 0 dB HL, and the indices of the items with ears like that. Shape: (items, 8)."""
     groups: dict[tuple[str, bool], list[int]] = {}
-    for item, levels in enumerate(ears.tolist()):  # once a call; the rest asks nothing of the device
+    for item, levels in enumerate(
+        ears.tolist()
+    ):  # once a call; the rest asks nothing of the device
         none = not any(levels) and not ears.requires_grad
         groups.setdefault((severity_of(levels), none), []).append(item)
     return [(*kind, members) for kind, members in groups.items()]

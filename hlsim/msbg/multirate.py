@@ -35,7 +35,9 @@ _WIDE = 2.5  # broadening above which bands come so near to 0 Hz that a rectifie
 _TRUE_HZ = 400.0  # below, channels are rectified as they are
 _FAR = 1.75  # times the highest frequency of interest, above which channels run as one
 _FAR_RATIO = 1.3  # expansion, of a loss of 24 dB, at which their gain is right; with more they are heard less
-_CACHED = 2_000_000  # samples of a rate band on a CPU, for each step to find the last one's in its cache
+_CACHED = (
+    2_000_000  # samples of a rate band on a CPU, for each step to find the last one's in its cache
+)
 
 
 Detector = Literal["itself", "modulus", "harmonics"]
@@ -95,7 +97,9 @@ def assign_rates(
     slow, fast = 3, 6
     widest = int((highest + SKIRT_HZ) / a_second) + 1
     kinds: list[tuple[int, Detector]] = []
-    for hz, width in zip(bank.centre_frequencies, erb(np.array(bank.centre_frequencies)), strict=True):
+    for hz, width in zip(
+        bank.centre_frequencies, erb(np.array(bank.centre_frequencies)), strict=True
+    ):
         top = hz + _KEPT * bank.broadening * float(width)
         if hz < _TRUE_HZ:
             kinds.append((fast, "itself"))
@@ -113,7 +117,12 @@ def assign_rates(
 
 
 def multirate_bank(
-    bank: FilterBank, points: int, step: int, highest: float, dtype: torch.dtype, device: torch.device
+    bank: FilterBank,
+    points: int,
+    step: int,
+    highest: float,
+    dtype: torch.dtype,
+    device: torch.device,
 ) -> MultirateBank:
     """A bank's channels, each at the rate that it needs.
 
@@ -127,7 +136,9 @@ def multirate_bank(
     steps = round(points / envelope_step(step))
     together = next((count for count in (8, 9, 7, 10, 6, 5) if steps % count == 0), 8)
     bands, lowpass = [], []
-    for channels, samples, detector in _cut_for_cache(assign_rates(bank, step, highest), steps, device):
+    for channels, samples, detector in _cut_for_cache(
+        assign_rates(bank, step, highest), steps, device
+    ):
         count, analytic = steps * samples, detector != "itself"
         bins = min(count if analytic else count // 2 + 1, points // step // 2 + 1)
         # signals are too loud by the ratio of the rates, as their sum's spectrum is to be; those that are to be

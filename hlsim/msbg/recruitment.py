@@ -156,7 +156,9 @@ def expand(channels: Tensor, envelopes: Tensor, ratios: Tensor) -> Tensor:
 
 
 @lru_cache(maxsize=16)
-def interpolation_kernel(samples: int = STEP, parts: int = 1, together: int = 8) -> NDArray[np.float64]:
+def interpolation_kernel(
+    samples: int = STEP, parts: int = 1, together: int = 8
+) -> NDArray[np.float64]:
     """Weights of the values about some steps for the samples of these: six count for each, after Lagrange.
 
     Args:

@@ -24,7 +24,9 @@ def to_cochlea(signals: Tensor, rate: int, length: int, step: int) -> Tensor:
     if rate == MSBG_RATE and step == 1:
         return filter_blocks(signals, constant_like(signals, _inward_blocks), length)
     up, down = _ratio(rate, step)
-    least = max(signals.shape[-1], math.ceil(length * down / up)) + math.ceil(_FIR_TAIL * down / up / step)
+    least = max(signals.shape[-1], math.ceil(length * down / up)) + math.ceil(
+        _FIR_TAIL * down / up / step
+    )
     outer, inner = _grid(least, up, down)
     bins = min(outer, inner) // 2 + 1
     response = constant_like(signals, _inward, inner * step, bins, up / down, rate)
@@ -88,7 +90,9 @@ def _inward(points: int, bins: int, gain: float, rate: int) -> NDArray[np.comple
 
 def _outward(points: int, delay: int, bins: int, gain: float, rate: int) -> NDArray[np.complex128]:
     """The way out with the low-pass, ahead by ``delay``. Returns (bins,)."""
-    response = np.fft.rfft(ear_filter(backward=True), points) * np.fft.rfft(lowpass_filter(), points)
+    response = np.fft.rfft(ear_filter(backward=True), points) * np.fft.rfft(
+        lowpass_filter(), points
+    )
     advance = np.exp(2j * np.pi * np.arange(bins) * delay / points)
     return gain * response[:bins] * advance * _end(points, bins, rate)
 

@@ -42,7 +42,9 @@ def fixed_response(bank: FilterBank, rate: int, points: int) -> NDArray[np.compl
     return np.pad(total, (0, points // 2 + 1 - bins))
 
 
-def with_phase_of_bank(waveform: Tensor, thresholds: Tensor, rate: int, *, normal: bool = False) -> Tensor:
+def with_phase_of_bank(
+    waveform: Tensor, thresholds: Tensor, rate: int, *, normal: bool = False
+) -> Tensor:
     """A signal with the phase that MSBG's bank of each ear's severity gives it, and the magnitude as it is.
 
     Where the response ends, from 20 dB down, the magnitude goes with it.
@@ -67,7 +69,9 @@ def hear_normally(waveform: Tensor, thresholds: Tensor, rate: int) -> Tensor:
 
     Shape: (items, time), (items, 8) dB HL -> (items, time).
     """
-    return filter_centred(waveform, constant_like(waveform, _as_normal, rate)[severity_index(thresholds)])
+    return filter_centred(
+        waveform, constant_like(waveform, _as_normal, rate)[severity_index(thresholds)]
+    )
 
 
 def _as_normal(rate: int) -> NDArray[np.float64]:
@@ -91,7 +95,9 @@ def _responses(rate: int) -> tuple[NDArray[np.complex128], int]:
     """Response of each severity's bank, (severities, points // 2 + 1), and the points of the grid."""
     shared = math.gcd(rate, MSBG_RATE)
     points = rate // shared * 2 * math.ceil(shared / (2.0 * _SPACING))
-    return np.stack([fixed_response(BANKS[severity], rate, points) for severity in SEVERITIES]), points
+    return np.stack(
+        [fixed_response(BANKS[severity], rate, points) for severity in SEVERITIES]
+    ), points
 
 
 def half_length(rate: int) -> int:

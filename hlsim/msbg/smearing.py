@@ -46,7 +46,9 @@ def roex_filters(lower: float, upper: float, count: int, spacing: float) -> NDAr
     hz = bins * spacing
     bandwidth = erb(hz)
     with np.errstate(divide="ignore", invalid="ignore"):
-        distance = np.abs(bins[:, None] - bins) / bins[:, None] * 4.0 * hz[:, None] / bandwidth[:, None]
+        distance = (
+            np.abs(bins[:, None] - bins) / bins[:, None] * 4.0 * hz[:, None] / bandwidth[:, None]
+        )
     g = distance / np.where(bins < bins[:, None], lower, upper)
     filters = (1.0 + g) * np.exp(-g) / (bandwidth * (lower + upper) / (2.0 * ERB_AT_0_HZ))[:, None]
     filters[0] = 0.0
@@ -54,7 +56,9 @@ def roex_filters(lower: float, upper: float, count: int, spacing: float) -> NDAr
     return filters
 
 
-def smearing_from_filters(normal: NDArray[np.float64], wide: NDArray[np.float64]) -> NDArray[np.float64]:
+def smearing_from_filters(
+    normal: NDArray[np.float64], wide: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """The wide filters with the normal ones divided out: what, seen through normal filters, looks like the wide ones.
 
     Shape: (count, count) twice -> (count, count), to be multiplied with a power spectrum.
@@ -74,7 +78,9 @@ def smearing_from_filters(normal: NDArray[np.float64], wide: NDArray[np.float64]
 @lru_cache(maxsize=4)
 def smearing_matrix(lower: float, upper: float) -> NDArray[np.float64]:
     """The matrix for MSBG's 512-point spectra. Returns (256, 256)."""
-    normal, wide = (roex_filters(*sides, FFT // 2, MSBG_RATE / FFT) for sides in ((1.0, 1.0), (lower, upper)))
+    normal, wide = (
+        roex_filters(*sides, FFT // 2, MSBG_RATE / FFT) for sides in ((1.0, 1.0), (lower, upper))
+    )
     return smearing_from_filters(normal, wide)
 
 
@@ -104,10 +110,16 @@ def smear(waveform: Tensor, matrix: Tensor, step: int = 1) -> Tensor:
     window = constant_like(waveform, _window, step)
     frames = _frames(waveform, count, hop, window)
     # on a CPU a few frames at a time, for the steps from one to the next to find them in its cache
-    size = max(1, _CACHED * step // waveform[..., 0].numel()) if waveform.device.type == "cpu" else count
+    size = (
+        max(1, _CACHED * step // waveform[..., 0].numel())
+        if waveform.device.type == "cpu"
+        else count
+    )
     if size >= count:
         return _overlap_add(_widen(frames, window, matrix), hop)
-    return _overlap_add(torch.cat([_widen(part, window, matrix) for part in frames.split(size, -2)], -2), hop)
+    return _overlap_add(
+        torch.cat([_widen(part, window, matrix) for part in frames.split(size, -2)], -2), hop
+    )
 
 
 def _widen(frames: Tensor, window: Tensor, matrix: Tensor) -> Tensor:
@@ -143,7 +155,10 @@ def _spread(spectrum: Tensor, matrix: Tensor) -> tuple[Tensor, Tensor, Tensor, T
     given = given + _TINY if matrix.requires_grad else given.add_(_TINY)
     quotient = smeared / given
     # the square root of a negative power is imaginary; of 0 it takes long, and beside 1e9 Pa silence counts as nothing
-    real, imaginary = quotient.clamp(_TINY, _MOST).sqrt_(), quotient.neg().clamp_(_TINY, _MOST).sqrt_()
+    real, imaginary = (
+        quotient.clamp(_TINY, _MOST).sqrt_(),
+        quotient.neg().clamp_(_TINY, _MOST).sqrt_(),
+    )
     return spectrum * torch.complex(real, imaginary), smeared, real, imaginary, given
 
 
@@ -162,10 +177,14 @@ class _Spread(torch.autograd.Function):
         return _spread(spectrum, matrix)
 
     @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor, float], output: tuple[Tensor, ...]) -> None:
+    def setup_context(
+        ctx: Any, inputs: tuple[Tensor, Tensor, float], output: tuple[Tensor, ...]
+    ) -> None:
         ctx.least = inputs[2]
         ctx.mark_non_differentiable(*output[2:])
-        ctx.set_materialize_grads(False)  # nobody asks for the power's where signals are smeared alone
+        ctx.set_materialize_grads(
+            False
+        )  # nobody asks for the power's where signals are smeared alone
         ctx.save_for_backward(*inputs[:2], *output[1:])
 
     @staticmethod
@@ -174,7 +193,9 @@ class _Spread(torch.autograd.Function):
     ) -> tuple[Tensor | None, Tensor | None, None]:
         spectrum, matrix, *made = ctx.saved_tensors
         # where the gradient is differentiated, what is constant here comes from the spectrum anew
-        smeared, real, imaginary, given = _spread(spectrum, matrix)[1:] if torch.is_grad_enabled() else made
+        smeared, real, imaginary, given = (
+            _spread(spectrum, matrix)[1:] if torch.is_grad_enabled() else made
+        )
         if ctx.least:
             size = smeared.abs()
             divisor = torch.copysign(torch.maximum(size, ctx.least * given), smeared)

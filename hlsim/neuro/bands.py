@@ -30,7 +30,9 @@ class BandCorrection(nn.Module):
         width, severities = config.channels, len(SEVERITIES)
         self.step = config.stride[0]
         inputs = (self.step + 1) * CHANNELS
-        self.enter = nn.Parameter(torch.randn(severities, width, inputs) / (2.0 * math.sqrt(inputs)))
+        self.enter = nn.Parameter(
+            torch.randn(severities, width, inputs) / (2.0 * math.sqrt(inputs))
+        )
         self.bias = nn.Parameter(torch.zeros(severities, width, 1))
         self.blocks = nn.ModuleList(_Block(config) for _ in range(config.blocks))
         outputs = (3 if config.phase == "predicted" else 2) * CHANNELS
@@ -53,7 +55,11 @@ class BandCorrection(nn.Module):
             features = block(features)
         envelope, factor, *phase = (self.leave[severity] @ features).split(CHANNELS, 1)
         gain = (prior.log_gain(level + envelope, ears, severity) + factor).exp()
-        turned = (gain * phase[0].cos(), gain * phase[0].sin()) if phase else (gain, torch.zeros_like(gain))
+        turned = (
+            (gain * phase[0].cos(), gain * phase[0].sin())
+            if phase
+            else (gain, torch.zeros_like(gain))
+        )
         factors = _between(prior.weigh(torch.cat(turned, 1), severity), self.step)
         return widened * torch.view_as_complex(factors[:, : widened.shape[1]])
 
@@ -81,4 +87,6 @@ def _between(values: Tensor, step: int) -> Tensor:
     Shape: (items, steps, ...) -> (items, steps * step, ...).
     """
     later = torch.cat((values[:, 1:], values[:, -1:]), 1)
-    return torch.stack([values, *(values.lerp(later, k / step) for k in range(1, step))], 2).flatten(1, 2)
+    return torch.stack(
+        [values, *(values.lerp(later, k / step) for k in range(1, step))], 2
+    ).flatten(1, 2)

@@ -126,7 +126,10 @@ def _path(config: NetworkConfig, axis: int) -> nn.Module:
         case "mamba":
             core, width = BidirectionalMamba(channels, config.states, expansion), 2 * channels
         case "lstm":
-            core, width = BidirectionalLSTM(channels, expansion * channels), 2 * expansion * channels
+            core, width = (
+                BidirectionalLSTM(channels, expansion * channels),
+                2 * expansion * channels,
+            )
         case _:
             core, width = EncoderLayer(channels, config.heads, expansion * channels), channels
     return SequencePath(channels, axis, core, width)

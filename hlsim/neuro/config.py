@@ -88,13 +88,21 @@ class NetworkConfig(ModelConfig):
         for name in ("stride", "kernel"):
             pair = getattr(self, name)
             if not isinstance(pair, list | tuple) or len(pair) != 2:
-                raise ValueError(f"{name} {pair!r}; allowed: two whole numbers, of time and of frequency")
+                raise ValueError(
+                    f"{name} {pair!r}; allowed: two whole numbers, of time and of frequency"
+                )
             object.__setattr__(self, name, tuple(pair))
         for name, most in _COUNTS.items():
             values, least = getattr(self, name), 0 if name == "dense_depth" else 1
             for value in values if isinstance(values, tuple) else (values,):
-                if not isinstance(value, int) or isinstance(value, bool) or not least <= value <= most:
-                    raise ValueError(f"{name} {values!r}; allowed: whole numbers from {least} to {most}")
+                if (
+                    not isinstance(value, int)
+                    or isinstance(value, bool)
+                    or not least <= value <= most
+                ):
+                    raise ValueError(
+                        f"{name} {values!r}; allowed: whole numbers from {least} to {most}"
+                    )
         uneven = self.block == "transformer" and self.channels % self.heads
         if any(k % 2 == 0 for k in self.kernel) or uneven:
             raise ValueError(
@@ -173,7 +181,9 @@ class NeuroConfig(NetworkConfig):
         for name in ("prior", "level_aware"):
             if not isinstance(getattr(self, name), bool):
                 raise ValueError(f"{name} {getattr(self, name)!r}; allowed: true or false")
-        if self.structure == "bands" and not (self.prior and self.level_aware and self.block == "cnn"):
+        if self.structure == "bands" and not (
+            self.prior and self.level_aware and self.block == "cnn"
+        ):
             raise ValueError(
                 f"structure 'bands' with prior {self.prior}, level_aware {self.level_aware}, block {self.block!r}; "
                 "allowed: true, true, 'cnn'"
@@ -181,4 +191,6 @@ class NeuroConfig(NetworkConfig):
 
     @property
     def density(self) -> float:
-        return 2.0 * self.stft.frequencies / self.hop if self.structure == "bands" else super().density
+        return (
+            2.0 * self.stft.frequencies / self.hop if self.structure == "bands" else super().density
+        )

@@ -78,7 +78,9 @@ class _Turning(torch.autograd.Function):
     @staticmethod
     def forward(log_gain: Tensor, right: Tensor, up: Tensor) -> Tensor:
         right = right + 1.0
-        scale = torch.addcmul(right.square(), up, up).clamp_min_(_TINY).rsqrt_().mul_(log_gain.exp())
+        scale = (
+            torch.addcmul(right.square(), up, up).clamp_min_(_TINY).rsqrt_().mul_(log_gain.exp())
+        )
         return torch.complex(right.mul_(scale), scale.mul_(up))
 
     @staticmethod

@@ -55,7 +55,9 @@ class DilatedConv(nn.Conv2d):
         if step == 1 or not trained or features.device.type != "cpu":
             return super().forward(features)
         # on a CPU the weights' gradient takes three to six times as long with dilation as of every step-th time by itself
-        phases = functional.pad(features, (0, 0, 0, -time % step)).unflatten(2, (-1, step)).movedim(3, 1)
+        phases = (
+            functional.pad(features, (0, 0, 0, -time % step)).unflatten(2, (-1, step)).movedim(3, 1)
+        )
         convolved = functional.conv2d(phases.flatten(0, 1), self.weight, self.bias, padding=1)
         return convolved.unflatten(0, (-1, step)).movedim(1, 3).flatten(2, 3)[:, :, :time]
 
@@ -69,7 +71,8 @@ class DenseBlock(nn.Module):
     def __init__(self, channels: int, depth: int, normalise: bool) -> None:
         super().__init__()
         self.units = nn.ModuleList(
-            Unit(DilatedConv(channels * (i + 1), channels, 2**i), channels, normalise) for i in range(depth)
+            Unit(DilatedConv(channels * (i + 1), channels, 2**i), channels, normalise)
+            for i in range(depth)
         )
 
     def forward(self, features: Tensor) -> Tensor:
@@ -90,7 +93,9 @@ class DenseEncoder(nn.Module):
     ) -> None:
         super().__init__()
         kernel = (2 * stride[0] + 1, 2 * stride[1] + 1)
-        self.enter = Unit(nn.Conv2d(inputs, channels, kernel, stride, padding=stride), channels, normalise)
+        self.enter = Unit(
+            nn.Conv2d(inputs, channels, kernel, stride, padding=stride), channels, normalise
+        )
         self.dense = DenseBlock(channels, depth, normalise)
 
     def forward(self, features: Tensor) -> Tensor:

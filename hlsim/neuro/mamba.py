@@ -40,7 +40,9 @@ class Mamba(nn.Module):
         signal, gate = self.in_proj(sequence).chunk(2, -1)
         signal = functional.silu(self.conv1d(signal.mT)[..., :time].mT.contiguous())
         step, entry, leave = self.x_proj(signal).split(self.sizes, -1)
-        with torch.autocast(sequence.device.type, enabled=False):  # powers of decays want their precision
+        with torch.autocast(
+            sequence.device.type, enabled=False
+        ):  # powers of decays want their precision
             dtype = self.A_log.dtype
             y = selective_scan(
                 signal.to(dtype).mT,

@@ -12,7 +12,13 @@ from hlsim.neuro.bands import BandCorrection
 from hlsim.neuro.blocks import DualPathBlock
 from hlsim.neuro.config import NEURO_RATE, NeuroConfig
 from hlsim.neuro.decoders import MaskDecoder, PhaseDecoder
-from hlsim.neuro.encoder import AudiogramEncoder, DenseEncoder, FrameEncoder, log_magnitude, sine_of_phase
+from hlsim.neuro.encoder import (
+    AudiogramEncoder,
+    DenseEncoder,
+    FrameEncoder,
+    log_magnitude,
+    sine_of_phase,
+)
 from hlsim.neuro.network import EarNetwork
 from hlsim.neuro.prior import Prior
 
@@ -100,7 +106,9 @@ class NeuroMSBG(EarNetwork):
             signals = self.prior.filter(signals, severity)
         spectrum = self.stft.analyse(signals)
         if self.bands is not None and self.prior is not None:
-            return self.stft.synthesise(self.bands(spectrum, ears, severity, self.prior), signals.shape[-1])
+            return self.stft.synthesise(
+                self.bands(spectrum, ears, severity, self.prior), signals.shape[-1]
+            )
         squared = power(spectrum)
         factor = self.prior(squared, ears, severity) if self.prior is not None else None
         features = self._features(spectrum, squared, ears, factor)
@@ -108,7 +116,9 @@ class NeuroMSBG(EarNetwork):
         # of recruitment, ratio - 1, at the transform's frequencies
         exponents = CATCH_UP_SPL / (CATCH_UP_SPL - interpolate(ears, self.config.hz)) - 1.0
         lower = self.autocast_dtype
-        with torch.autocast(signals.device.type, lower or torch.bfloat16, enabled=lower is not None):
+        with torch.autocast(
+            signals.device.type, lower or torch.bfloat16, enabled=lower is not None
+        ):
             features = self.encoder(features.contiguous(memory_format=torch.channels_last)).permute(
                 0, 2, 3, 1
             )
@@ -127,7 +137,9 @@ class NeuroMSBG(EarNetwork):
         heard = self.stft.synthesise(spectrum * correction, signals.shape[-1])
         return heard if scale is None else heard * scale
 
-    def _features(self, spectrum: Tensor, squared: Tensor, ears: Tensor, factor: Tensor | None) -> Tensor:
+    def _features(
+        self, spectrum: Tensor, squared: Tensor, ears: Tensor, factor: Tensor | None
+    ) -> Tensor:
         """The input channels.
 
         Shape: (items, frames, frequencies) twice, (items, 8) -> (items, 2 to 4, frames, rows).

@@ -66,7 +66,9 @@ class EarNetwork(nn.Module):
             ears = thresholds.to(dtype).expand(*batch, -1).reshape(-1, len(FREQUENCIES))
             together = len(signals)
             if signals.device.type == "cpu" and not torch.compiler.is_compiling():
-                together = max(1, self._at_once * self.sample_rate // (NEURO_RATE * signals.shape[-1]))
+                together = max(
+                    1, self._at_once * self.sample_rate // (NEURO_RATE * signals.shape[-1])
+                )
             parts = zip(signals.split(together), ears.split(together), strict=True)
             result = torch.cat([self._run(some, theirs) for some, theirs in parts])
             return result.reshape(*batch, -1).to(waveform.dtype)
@@ -75,7 +77,10 @@ class EarNetwork(nn.Module):
         """``_process`` at the waveform's rate and level. Shape: (items, time), (items, 8) -> (items, time)."""
         gain = gain_to_pascals(self.full_scale_spl)
         result = self._in_blocks(resample(signals * gain, self.sample_rate, NEURO_RATE), ears)
-        return self._finish(resample(result, NEURO_RATE, self.sample_rate)[..., : signals.shape[-1]]) / gain
+        return (
+            self._finish(resample(result, NEURO_RATE, self.sample_rate)[..., : signals.shape[-1]])
+            / gain
+        )
 
     def _in_blocks(self, signals: Tensor, ears: Tensor) -> Tensor:
         """``_process``, of long signals by blocks where that is the same. Shapes as ``_process``'s."""

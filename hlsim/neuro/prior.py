@@ -72,7 +72,9 @@ class Prior(nn.Module):
 
         excitation, relative, smoothing = [], [], []
         for severity, bank in zip(SEVERITIES, banks, strict=True):
-            channels = gammatone_response(bank, points * 441 // 160, bins=points // 2 + 1)[:, coarse]
+            channels = gammatone_response(bank, points * 441 // 160, bins=points // 2 + 1)[
+                :, coarse
+            ]
             scale = 32.0 / (3.0 * stft.window * stft.fft) * (2.0 / math.pi) ** 2
             scale *= 10.0 ** (-_FLUCTUATION_DB[severity] / 10.0)
             excitation.append(_padded(np.abs(channels) ** 2 * scale))
@@ -82,7 +84,9 @@ class Prior(nn.Module):
         self._known("excitation", np.stack(excitation))
         self._known("relative", np.stack((parts.real, parts.imag)))
         self._known("smoothing", np.stack(smoothing))
-        self._known("smearing", np.stack([_smearing(severity, stft) for severity in SEVERITIES[1:]]))
+        self._known(
+            "smearing", np.stack([_smearing(severity, stft) for severity in SEVERITIES[1:]])
+        )
 
     def _known(self, name: str, values: NDArray[np.float64]) -> None:
         """What a formula gives, and a trained correction that starts at 0 and is relative to it.
@@ -131,7 +135,9 @@ class Prior(nn.Module):
         """Envelopes at every ``step``-th frame. Shape: (items, channels, frames) -> (items, channels, frames / step)."""
         items, channels, _ = level.shape
         kernels = self._corrected("smoothing")[severity].reshape(items * channels, 1, -1)
-        level = functional.pad(level, (_ENVELOPE_HALF_LENGTH, _ENVELOPE_HALF_LENGTH), mode="replicate")
+        level = functional.pad(
+            level, (_ENVELOPE_HALF_LENGTH, _ENVELOPE_HALF_LENGTH), mode="replicate"
+        )
         level = functional.conv1d(
             level.reshape(1, items * channels, -1), kernels, stride=step, groups=items * channels
         )
@@ -151,7 +157,9 @@ class Prior(nn.Module):
         """
         real, imaginary = self._corrected("relative")[:, severity]
         # as one product, whose columns are real and imaginary in turn
-        rows = torch.cat((torch.stack((real, imaginary), -1), torch.stack((-imaginary, real), -1)), 1)
+        rows = torch.cat(
+            (torch.stack((real, imaginary), -1), torch.stack((-imaginary, real), -1)), 1
+        )
         return (gain.mT @ rows.flatten(-2)).unflatten(-1, (-1, 2))
 
     def _smearing(self) -> Tensor:

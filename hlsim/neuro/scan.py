@@ -51,7 +51,11 @@ def selective_scan(
     """
     items, channels, time = u.shape
     states = A.shape[-1]
-    if delta.shape != u.shape or A.shape[0] != channels or not B.shape == C.shape == (items, states, time):
+    if (
+        delta.shape != u.shape
+        or A.shape[0] != channels
+        or not B.shape == C.shape == (items, states, time)
+    ):
         raise ValueError(
             f"u {[*u.shape]}, delta {[*delta.shape]}, A {[*A.shape]}, B {[*B.shape]}, C {[*C.shape]}; "
             "allowed: u and delta (items, channels, time), A (channels, states), B and C (items, states, time)"
@@ -154,13 +158,17 @@ class _Slopes(torch.autograd.Function):
     ) -> tuple[Tensor, ...]:
         grad_delta, grad_u = u.new_empty(u.shape), u.new_empty(u.shape)
         grad_A, grad_B, grad_C = torch.zeros_like(A), torch.zeros_like(B), torch.zeros_like(C)
-        with torch.autocast(u.device.type, enabled=False):  # backward may be called in an autocast region
+        with torch.autocast(
+            u.device.type, enabled=False
+        ):  # backward may be called in an autocast region
             for rows, columns, work in _blocks(u, A, back=True):
                 d, v, g = (tensor[rows, :, columns].contiguous() for tensor in (delta, u, grad))
                 b, c = (tensor[rows].contiguous() for tensor in (B, C))
                 a = A[:, columns]
                 work.run(d, v, b, a)
-                grad_C[rows] += vecdot(work.states, g.unsqueeze(-2))  # matmul takes three times as long
+                grad_C[rows] += vecdot(
+                    work.states, g.unsqueeze(-2)
+                )  # matmul takes three times as long
                 slope = work.run_back(g, c)
                 driven = (b.unsqueeze(-2) @ slope).squeeze(-2)
                 grad_u[rows, :, columns] = driven * d

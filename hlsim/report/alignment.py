@@ -21,7 +21,12 @@ _SHOWN = 0.12  # s: a delay of 28 ms is plain to see
 
 
 def draw_alignment(
-    signal: Tensor, ear: Audiogram, sample_rate: int, path: str | Path, *, method: Method = "impulse"
+    signal: Tensor,
+    ear: Audiogram,
+    sample_rate: int,
+    path: str | Path,
+    *,
+    method: Method = "impulse",
 ) -> float:
     """Write a PNG of the 0.12 s about the loudest place: A as MSBG gives it, B aligned. Returns the delay in samples.
 
@@ -39,7 +44,9 @@ def draw_alignment(
     check_choice("method", method, Method)
     shown = round(_SHOWN * sample_rate)
     if signal.shape[-1] < shown or not bool(signal.any()):
-        raise ValueError(f"{signal.shape[-1]} samples to draw; allowed: {shown} or more, not all zero")
+        raise ValueError(
+            f"{signal.shape[-1]} samples to draw; allowed: {shown} or more, not all zero"
+        )
     thresholds = torch.tensor(ear.thresholds)
     impulse = Teacher(sample_rate, alignment=method)
     teachers = (Teacher(sample_rate, alignment="none"), impulse)
@@ -51,12 +58,17 @@ def draw_alignment(
     times = torch.arange(first, first + shown) / sample_rate
 
     figure = new_figure((9.0, 5.0))
-    titles = (f"A. MSBG as it is, {1000.0 * delay / sample_rate:.1f} ms late", f"B. aligned, {method} method")
+    titles = (
+        f"A. MSBG as it is, {1000.0 * delay / sample_rate:.1f} ms late",
+        f"B. aligned, {method} method",
+    )
     panels = figure.subplots(2, 1, sharex=True)
     for axes, heard, title in zip(panels, (before, after), titles, strict=True):
         gain, label = _raised(signal, heard)
         axes.plot(times, signal[first : first + shown], color="tab:blue", label="input")
-        axes.plot(times, gain * heard[first : first + shown], color="tab:red", label=label, alpha=0.8)
+        axes.plot(
+            times, gain * heard[first : first + shown], color="tab:red", label=label, alpha=0.8
+        )
         axes.set(title=title, ylabel="Pa")
         axes.legend(fontsize="small", loc="upper right")
     axes.set(xlabel="s")

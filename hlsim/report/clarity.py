@@ -28,7 +28,9 @@ def write_scenes(report: HaspiReport, out: str | Path, *, listen: int = 3) -> Pa
     """Write ``scores.csv`` and the files of ``write_report`` into a folder; returns it. ValueError as that."""
     title = f"Clarity's scenes: {len(report.items)} pairs of scene and listener"
     result = Section("Conditions", [_ABOUT.format(rule=RULE_MS)], [conditions_table(report)])
-    write_report(report, out, listen=listen, front=Front(title, report.headline.in_short(), [result]))
+    write_report(
+        report, out, listen=listen, front=Front(title, report.headline.in_short(), [result])
+    )
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerows([_COLUMNS, *_rows(report)])
     return write_files(out, {"scores.csv": text.getvalue()})

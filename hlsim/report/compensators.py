@@ -20,7 +20,16 @@ from hlsim.report.gain_pictures import gain_picture, gains_at, input_output_pict
 from hlsim.report.haspi import scored_by
 from hlsim.report.page import Section, render_markdown, render_page, write_files
 from hlsim.report.pictures import condition_colours, report_pictures
-from hlsim.report.tables import Table, cells, change_name, inner, number, paired_cells, spread, verdict
+from hlsim.report.tables import (
+    Table,
+    cells,
+    change_name,
+    inner,
+    number,
+    paired_cells,
+    spread,
+    verdict,
+)
 
 FILES = ("compensators.json", "compensators.md", "compensators.html")
 
@@ -51,7 +60,9 @@ def _in_short(result: Result, reports: Mapping[str, HaspiReport]) -> list[str]:
     for group, speech in (("clean", "clean speech"), ("noisy", "speech in noise")):
         for c in reports[group].comparisons if group in reports else ():
             if (c.measure, c.before) == ("haspi", f"NAL-R at {c.after}{_AT_LEVEL}"):
-                clause = verdict(reports[group].items, c.before, c.after, c.after, "NAL-R made as loud")
+                clause = verdict(
+                    reports[group].items, c.before, c.after, c.after, "NAL-R made as loud"
+                )
                 told.append(f"On {speech} {clause}.")
     return [*told, _about(result)]
 
@@ -104,14 +115,22 @@ def _sections(result: Result, reports: Mapping[str, HaspiReport]) -> list[Sectio
         title = f"Pictures: {inner(GROUPS[group])}"
         sections.append(Section(title, pictures=report_pictures(reports[group]), folded=True))
     sections += [
-        Section(f"Paired tests: {inner(GROUPS[group])}", tables=_tests(report, result["beside"]), folded=True)
+        Section(
+            f"Paired tests: {inner(GROUPS[group])}",
+            tables=_tests(report, result["beside"]),
+            folded=True,
+        )
         for group, report in reports.items()
     ]
     by_degree = [_severity_tests(reports[group], group, result["beside"]) for group in whole]
     sections.append(Section("Paired tests by degree of loss", tables=by_degree, folded=True))
     if result["failures"]:
-        rows = [(str(f["item"]), f["compensator"], f["name"], f["reason"]) for f in result["failures"]]
-        table = Table("Outputs that could not be judged", ("Item", "Compensator", "Ear", "Reason"), rows)
+        rows = [
+            (str(f["item"]), f["compensator"], f["name"], f["reason"]) for f in result["failures"]
+        ]
+        table = Table(
+            "Outputs that could not be judged", ("Item", "Compensator", "Ear", "Reason"), rows
+        )
         sections.append(Section("Failures", ["Items that count in no table."], [table]))
     versions = ", ".join(f"{name} {version}" for name, version in result["versions"].items())
     notes = [*_NOTES, *(f"Enhancer {name}." for name in result["enhancers"])]
@@ -185,7 +204,12 @@ def _main_table(result: Result, group: str) -> Table:
     """Scores, levels, and how far what is heard lies from what a normal ear hears."""
     conditions = result["groups"][group]["conditions"].items()
     rows = [
-        {_GIVEN: name, **_scores(row), **(_by_snr(row) if group == "noisy" else {}), **cells(row, _MAIN)}
+        {
+            _GIVEN: name,
+            **_scores(row),
+            **(_by_snr(row) if group == "noisy" else {}),
+            **cells(row, _MAIN),
+        }
         for name, row in conditions
     ]
     return Table.of(f"{GROUPS[group]}: scores, output and what is heard", rows)
@@ -193,7 +217,11 @@ def _main_table(result: Result, group: str) -> Table:
 
 def _by_snr(row: Result) -> dict[str, str]:
     parts = [row["by_snr"].get(name, {}).get("haspi_mean") for name in ("under", "over")]
-    return {f"HASPI under / over {NOISIER_DB:g} dB SNR": " / ".join(number(part, ".3f") for part in parts)}
+    return {
+        f"HASPI under / over {NOISIER_DB:g} dB SNR": " / ".join(
+            number(part, ".3f") for part in parts
+        )
+    }
 
 
 def _tests(report: HaspiReport, beside: Beside) -> list[Table]:
@@ -235,7 +263,9 @@ def _loudness_table(result: Result, group: str) -> Table:
                 for level, cell in row["by_level"].items()
             }
             rows.append({_GIVEN: title, **offs})
-    return Table.of(f"{GROUPS[group]}: mean absolute difference in dB (mean difference)", rows, folded=True)
+    return Table.of(
+        f"{GROUPS[group]}: mean absolute difference in dB (mean difference)", rows, folded=True
+    )
 
 
 def _severity_table(result: Result, group: str) -> Table:
@@ -257,7 +287,9 @@ def _gap_table(result: Result) -> Table:
         for name, row in conditions.items():
             found = {title: cell.replace("%", " %") for title, cell in cells(row, _GAPS).items()}
             rows.append({_GIVEN: f"{group}, {name}", **found})
-    return Table.of("Mean loss in dB on the same utterances, and relative differences", rows, folded=True)
+    return Table.of(
+        "Mean loss in dB on the same utterances, and relative differences", rows, folded=True
+    )
 
 
 def _peak_table(result: Result) -> Table:
@@ -280,7 +312,9 @@ def _gain_table(curves: Sequence[Result]) -> Table:
         for curve in curves
         for level, gains in zip(curve["levels"], curve["gain_db"], strict=True)
     ]
-    return Table("Insertion gain in dB", (_TONE, *(f"{hz:g} Hz" for hz in shown)), rows, folded=True)
+    return Table(
+        "Insertion gain in dB", (_TONE, *(f"{hz:g} Hz" for hz in shown)), rows, folded=True
+    )
 
 
 def tone_table(found: Sequence[Result]) -> Table:
@@ -293,7 +327,9 @@ def tone_table(found: Sequence[Result]) -> Table:
         ):
             worst = int(np.argmax(sidebands))
             heard = {f"{hz} Hz": f"{off:+.1f}" for hz, off in zip(hertz, offs, strict=True)}
-            sides = {"Worst sidebands (of the tone)": f"{round(sidebands[worst])} ({hertz[worst]} Hz)"}
+            sides = {
+                "Worst sidebands (of the tone)": f"{round(sidebands[worst])} ({hertz[worst]} Hz)"
+            }
             rows.append({_TONE: _tone_name(row, level), **heard, **sides})
     return Table.of(
         "Level heard less a normal ear's of the same tone, and sidebands of the output, in dB", rows

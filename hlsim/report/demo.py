@@ -12,9 +12,9 @@ from torch import Tensor
 
 from hlsim.audiogram import Audiogram
 from hlsim.audiogram.plot import frequency_axis
-from hlsim.criteria.bands import band_centres, band_levels, threshold_in_quiet
 from hlsim.evaluation.comparison import EQUAL_DB
 from hlsim.evaluation.haspi_report import HaspiReport
+from hlsim.losses.band_levels import band_centres, band_levels, threshold_in_quiet
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.report import spectrograms
 from hlsim.report.gain_pictures import Colours, gain_picture
@@ -46,9 +46,7 @@ _EAR = (
     "to the 99th percentile of frames of 32 ms, in dB above a normal ear's threshold (Terhardt 1979). What lies above "
     "the line of the thresholds, towards the top, is not heard."
 )
-_GAIN = (
-    "A prescription such as NAL-R has one curve for all levels; less gain for louder speech is compression."
-)
+_GAIN = "A prescription such as NAL-R has one curve for all levels; less gain for louder speech is compression."
 
 
 @dataclass(frozen=True)
@@ -70,7 +68,12 @@ def result_table(report: HaspiReport, heard_off: Mapping[str, float]) -> Table:
         (name, f"{haspi[i]:.3f}", f"{level[i]:.1f}", f"{heard_off[name]:+.1f}")
         for i, name in enumerate(report.conditions)
     ]
-    header = ("What the ear is given", "HASPI", "Level given (dB SPL)", "Level heard, against normal (dB)")
+    header = (
+        "What the ear is given",
+        "HASPI",
+        "Level given (dB SPL)",
+        "Level heard, against normal (dB)",
+    )
     return Table(f"Means of {len(report.items)} utterances", header, rows)
 
 
@@ -98,7 +101,9 @@ def demo_front(
     both = (("given", sounds.given), ("heard", sounds.heard))
     shown = {f"{name}, {what}": signals[name][0] for name in _SHOWN for what, signals in both}
     panels = spectrograms.panels(shown, NEURO_RATE)
-    heard = {f"heard, {name}": sounds.heard[name][0] for name in (UNAIDED, PRESCRIBED, AS_LOUD, TRAINED)}
+    heard = {
+        f"heard, {name}": sounds.heard[name][0] for name in (UNAIDED, PRESCRIBED, AS_LOUD, TRAINED)
+    }
     sections = [
         Section("Result", [_RESULT], [table]),
         Section(
@@ -123,18 +128,22 @@ def _ear_picture(ear: Audiogram, sounds: Sounds, colours: Colours) -> Picture:
         axes.figure.set_figheight(4.0)
         ear.plot(axes, label="threshold", zorder=3, color="black")
         for name in (UNAIDED, TRAINED):
-            levels = torch.cat([band_levels(signal, NEURO_RATE) for signal in sounds.given[name]]).numpy()
+            levels = torch.cat(
+                [band_levels(signal, NEURO_RATE) for signal in sounds.given[name]]
+            ).numpy()
             low, high = np.percentile(levels, (30, 99), axis=0) - threshold_in_quiet()
             mean = 10.0 * np.log10((10.0 ** (levels / 10.0)).mean(0)) - threshold_in_quiet()
-            axes.fill_between(band_centres(), low, high, color=colours[name], alpha=0.25, linewidth=0)
+            axes.fill_between(
+                band_centres(), low, high, color=colours[name], alpha=0.25, linewidth=0
+            )
             axes.plot(band_centres(), mean, color=colours[name], label=f"speech, {name}")
         legend(axes)
 
     thresholds = ", ".join(f"{level:g}" for level in ear.levels)
-    alt = (
-        f"Audiogram of the ear, {thresholds} dB HL, with the speech as it is and as the trained aid gives it."
+    alt = f"Audiogram of the ear, {thresholds} dB HL, with the speech as it is and as the trained aid gives it."
+    return Picture(
+        draw_svg(draw), alt, "Audiogram and speech. The bands are MSBG's degrees of loss."
     )
-    return Picture(draw_svg(draw), alt, "Audiogram and speech. The bands are MSBG's degrees of loss.")
 
 
 def _heard_picture(sounds: Sounds, colours: Colours) -> Picture:

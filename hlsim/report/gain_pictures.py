@@ -30,7 +30,9 @@ def gain_picture(ear: str, curves: Sequence[Mapping[str, Any]], colours: Colours
             colour = colours[curve["compensator"]]
             for (number, style), gains in zip(styles, curve["gain_db"], strict=True):
                 label = None if number else plain(curve["compensator"])
-                axes.plot(curve["frequencies"], gains, style, color=colour, label=label, lw=widths[number])
+                axes.plot(
+                    curve["frequencies"], gains, style, color=colour, label=label, lw=widths[number]
+                )
         for (number, style), level in zip(styles, levels, strict=True):
             label = f"input of {level:g} dB SPL"
             axes.plot([], [], style, color="black", label=label, lw=widths[number])
@@ -38,8 +40,12 @@ def gain_picture(ear: str, curves: Sequence[Mapping[str, Any]], colours: Colours
         frequency_axis(axes, (250, 500, 1000, 2000, 4000))
         legend(axes)
 
-    gains = [[f"{gains_at(2000.0, curve, row):.0f}" for row in curve["gain_db"]] for curve in curves]
-    at_2k = [f"{curve['compensator']} {', '.join(own)}" for curve, own in zip(curves, gains, strict=True)]
+    gains = [
+        [f"{gains_at(2000.0, curve, row):.0f}" for row in curve["gain_db"]] for curve in curves
+    ]
+    at_2k = [
+        f"{curve['compensator']} {', '.join(own)}" for curve, own in zip(curves, gains, strict=True)
+    ]
     named = ", ".join(f"{level:g}" for level in levels)
     alt = f"Insertion gain for {ear} over frequency; at 2 kHz and {named} dB SPL: {'; '.join(at_2k)} dB."
     return Picture(draw_svg(draw), alt, f"Insertion gain, {ear}.")
@@ -59,12 +65,16 @@ def input_output_picture(conditions: Mapping[str, Mapping[str, Any]], colours: C
 
     def draw(axes: Any) -> None:
         for name, curve in curves.items():
-            axes.plot([*curve], [*curve.values()], marker="o", color=colours[name], label=plain(name))
+            axes.plot(
+                [*curve], [*curve.values()], marker="o", color=colours[name], label=plain(name)
+            )
         axes.set(xlabel="speech (dB SPL)", ylabel="output (dB SPL)")
         axes.grid(alpha=0.3)
         legend(axes)
 
-    told = "; ".join(f"{name} {', '.join(f'{y:.0f}' for y in own.values())}" for name, own in curves.items())
+    told = "; ".join(
+        f"{name} {', '.join(f'{y:.0f}' for y in own.values())}" for name, own in curves.items()
+    )
     alt = f"Level of the output over that of clean speech: {told} dB SPL."
     return Picture(draw_svg(draw), alt, "Output over input, clean speech, means over all ears.")
 
@@ -85,4 +95,6 @@ def tone_picture(ear: str, found: Sequence[Mapping[str, Any]], colours: Colours)
         legend(axes)
 
     level = f"{rows[0]['levels'][middle]:g} dB SPL"
-    return Picture(draw_svg(draw), f"Tones of {level} as heard, {ear}.", f"Tones of {level} as heard, {ear}.")
+    return Picture(
+        draw_svg(draw), f"Tones of {level} as heard, {ear}.", f"Tones of {level} as heard, {ear}."
+    )

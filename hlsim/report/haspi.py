@@ -15,7 +15,14 @@ from hlsim.metrics.words import WordsChange
 from hlsim.report.listening import listening_section
 from hlsim.report.page import Picture, Section, render_markdown, render_page, write_files
 from hlsim.report.pictures import draw_report, report_pictures
-from hlsim.report.tables import Table, comparisons_table, listener_table, number, paper_table, severity_table
+from hlsim.report.tables import (
+    Table,
+    comparisons_table,
+    listener_table,
+    number,
+    paper_table,
+    severity_table,
+)
 
 REPORT_FILES = ("report.json", "report.md", "report.tex", "report.html", "before-after.png")
 
@@ -72,7 +79,9 @@ def latex(report: HaspiReport) -> str:
     """What ``report.tex`` says: tables for ``\\input``, which need the package booktabs."""
     comments = (f"{_title(report)}. Needs \\usepackage{{booktabs}}.", *_notes(report))
     tables = [paper_table(report.headline), severity_table(report.headline), *_further(report)]
-    return "".join(f"% {line}\n" for line in comments) + "\n".join(table.latex() for table in tables)
+    return "".join(f"% {line}\n" for line in comments) + "\n".join(
+        table.latex() for table in tables
+    )
 
 
 def _title(report: HaspiReport) -> str:
@@ -104,7 +113,9 @@ def _sections(
         sections.append(Section("Listeners and further comparisons", others, further))
     if report.failures:
         rows = [(f.file, f.condition, MEASURES[f.measure].title, f.reason) for f in report.failures]
-        table = Table("Scores that could not be made", ("Item", "Condition", "Measure", "Reason"), rows)
+        table = Table(
+            "Scores that could not be made", ("Item", "Condition", "Measure", "Reason"), rows
+        )
         sections.append(Section("Failures", tables=[table]))
     sections.append(Section("How the figures were made", _notes(report)))
     tables = [_items(report, report.items, "Scores and levels of every item")]
@@ -114,7 +125,9 @@ def _sections(
 
 
 def _in_words_understood(words: WordsChange) -> str:
-    share = f"{100.0 * words.before:.0f} % of the words before and {100.0 * words.after:.0f} % after"
+    share = (
+        f"{100.0 * words.before:.0f} % of the words before and {100.0 * words.after:.0f} % after"
+    )
     change, low, high = (f"{100.0 * value:+.0f}" for value in (words.change, words.low, words.high))
     return (
         f"In words: a listener who hears these sentences would understand {share}, a change of {change} points; for nine "
@@ -133,18 +146,26 @@ def scored_by(engine: Engine, versions: Mapping[str, str]) -> str:
 def _further(report: HaspiReport) -> list[Table]:
     listeners = listener_table(report.headline)
     tables = [] if listeners is None else [listeners]
-    return [*tables, comparisons_table(report.comparisons)] if len(report.comparisons) > 1 else tables
+    return (
+        [*tables, comparisons_table(report.comparisons)] if len(report.comparisons) > 1 else tables
+    )
 
 
 def _items(report: HaspiReport, items: Sequence[ItemScore], title: str) -> Table:
     titles = [MEASURES[name].title for name in report.measures]
     rows = []
     for item in items:
-        row = {"Item": item.file, "Loss": item.severity, "Clean (dB SPL)": f"{item.clean_level:.1f}"}
+        row = {
+            "Item": item.file,
+            "Loss": item.severity,
+            "Clean (dB SPL)": f"{item.clean_level:.1f}",
+        }
         row["Full scale (dB SPL)"] = f"{item.full_scale_spl:.1f}"
         for condition in report.conditions:
             for name, measure in zip(report.measures, titles, strict=True):
-                row[f"{measure}, {condition}"] = number(item.scores.get(name, {}).get(condition), ".3f")
+                row[f"{measure}, {condition}"] = number(
+                    item.scores.get(name, {}).get(condition), ".3f"
+                )
             row[f"dB SPL, {condition}"] = number(item.levels[condition], ".1f")
         rows.append(row)
     return Table.of(title, rows)

@@ -55,7 +55,9 @@ def heard(item: ItemScore) -> tuple[dict[str, Tensor], int]:
         if name in item.processed and item.levels[name] is not None:
             samples, _ = read_channel(item.processed[name], item.ear)
             with torch.no_grad():
-                signals[f"{name}, as heard"] = ear(torch.from_numpy(samples[:end]).float() * to_pascals)
+                signals[f"{name}, as heard"] = ear(
+                    torch.from_numpy(samples[:end]).float() * to_pascals
+                )
     return signals, rate
 
 

@@ -88,14 +88,21 @@ def scatter(
     for number, severity in enumerate(SEVERITIES):
         chosen = there & (degrees == severity)
         if chosen.any():
-            style = {"color": f"C{number}", "label": loss_name(severity), "rasterized": chosen.sum() > _MANY}
+            style = {
+                "color": f"C{number}",
+                "label": loss_name(severity),
+                "rasterized": chosen.sum() > _MANY,
+            }
             axes.scatter(x[chosen], y[chosen], s=14, alpha=0.7, **style)
 
 
 def draw_report(report: HaspiReport) -> bytes:
     """The PNG of score and level of the headline, after over before."""
     figure, c = new_figure((9.0, 4.8)), report.headline
-    scores, levels = report.scores(c.measure, (c.before, c.after)), report.levels((c.before, c.after))
+    scores, levels = (
+        report.scores(c.measure, (c.before, c.after)),
+        report.levels((c.before, c.after)),
+    )
     levels[np.isnan(scores).any(1)] = np.nan
     ends = (float(np.nanmin(levels)) - 3.0, float(np.nanmax(levels)) + 3.0)
     left, right = figure.subplots(1, 2)
@@ -116,12 +123,23 @@ def score_range(measure: str) -> tuple[float, float]:
 def report_pictures(report: HaspiReport) -> list[Picture]:
     """Before against after, change of level, distributions, by severity, by SNR and by listener (where there are any),
     the audiograms."""
-    kinds = [_before_after, _levels, _distributions, _by_severity, _by_snr, _by_listener, _audiograms]
+    kinds = [
+        _before_after,
+        _levels,
+        _distributions,
+        _by_severity,
+        _by_snr,
+        _by_listener,
+        _audiograms,
+    ]
     if all(item.snr is None for item in report.items):
         kinds.remove(_by_snr)
     if report.headline.listeners is None:
         kinds.remove(_by_listener)
-    return [Picture(draw_svg(draw), alt, caption) for draw, alt, caption in (kind(report) for kind in kinds)]
+    return [
+        Picture(draw_svg(draw), alt, caption)
+        for draw, alt, caption in (kind(report) for kind in kinds)
+    ]
 
 
 # what each draws on its axes, its words where it is not seen, and its caption
@@ -147,13 +165,17 @@ def _draw_ends(
     """The headline's conditions, after over before. Shape: (items, 2)."""
     scatter(axes, values[:, 0], values[:, 1], report.severities)
     axes.set(xlim=limits, ylim=limits, aspect="equal")
-    before, after = (plain(f"{what}, {name}") for name in (report.headline.before, report.headline.after))
+    before, after = (
+        plain(f"{what}, {name}") for name in (report.headline.before, report.headline.after)
+    )
     axes.set(xlabel=before, ylabel=after)
 
 
 def _levels(report: HaspiReport) -> _Drawn:
     c, ends = report.headline, (report.headline.before, report.headline.after)
-    x, y = (np.diff(values)[:, 0] for values in (report.levels(ends), report.scores(c.measure, ends)))
+    x, y = (
+        np.diff(values)[:, 0] for values in (report.levels(ends), report.scores(c.measure, ends))
+    )
     there = np.isfinite(x + y)
     x, y = x[there], y[there]
 
@@ -182,7 +204,13 @@ def _distributions(report: HaspiReport) -> _Drawn:
                 axes.plot((middle, middle), (place - 0.28, place + 0.28), color="black")
             shift = generator.uniform(-0.18, 0.18, len(group))
             axes.scatter(
-                group, place + shift, s=7, alpha=0.4, linewidths=0, rasterized=len(group) > _MANY, color="C0"
+                group,
+                place + shift,
+                s=7,
+                alpha=0.4,
+                linewidths=0,
+                rasterized=len(group) > _MANY,
+                color="C0",
             )
         axes.set_yticks(range(len(values)), labels, fontsize="small")
         axes.invert_yaxis()
@@ -206,7 +234,9 @@ def _by_severity(report: HaspiReport) -> _Drawn:
             axes.bar(at, means, width * 0.9, color=colours[condition], label=plain(condition))
             for place, group in zip(at, scores, strict=True):
                 if len(group) >= FEWEST:
-                    axes.plot((place, place), bootstrap_interval(group), color="black", linewidth=1.0)
+                    axes.plot(
+                        (place, place), bootstrap_interval(group), color="black", linewidth=1.0
+                    )
         counts = [f"{name} ({report.severities.count(name)})" for name in groups]
         axes.set_xticks(range(len(groups)), counts)
         axes.set(ylim=(0.0, score_range(report.measures[0])[1]), xlabel="loss (items)")
@@ -222,7 +252,9 @@ def _by_severity(report: HaspiReport) -> _Drawn:
 
 def _by_snr(report: HaspiReport) -> _Drawn:
     snrs = [item.snr for item in report.items]
-    groups, alt = _groups(report, snrs, sorted({snr for snr in snrs if snr is not None}), "SNR", " dB")
+    groups, alt = _groups(
+        report, snrs, sorted({snr for snr in snrs if snr is not None}), "SNR", " dB"
+    )
 
     def draw(axes: Any) -> None:
         for k, (condition, colour) in enumerate(condition_colours(report.conditions).items()):
@@ -250,12 +282,20 @@ def _by_listener(report: HaspiReport) -> _Drawn:
         axes.figure.set_figheight(1.2 + 0.19 * len(names) if few else 5.0)
         axes.hlines(places, means[:, 0], means[:, 1], color="0.6", linewidth=1.0)
         axes.scatter(
-            means[:, 0], places, s=16, facecolor="white", edgecolor="0.3", label=plain(c.before), zorder=2
+            means[:, 0],
+            places,
+            s=16,
+            facecolor="white",
+            edgecolor="0.3",
+            label=plain(c.before),
+            zorder=2,
         )
         colour = condition_colours(report.conditions)[c.after]
         axes.scatter(means[:, 1], places, s=16, color=colour, label=plain(c.after), zorder=2)
         axes.set_yticks(places if few else [], map(plain, names) if few else [], fontsize="small")
-        axes.set(xlim=score_range(c.measure), ylim=(-0.6, len(names) - 0.4), xlabel=f"mean {c.title}")
+        axes.set(
+            xlim=score_range(c.measure), ylim=(-0.6, len(names) - 0.4), xlabel=f"mean {c.title}"
+        )
         legend(axes)
 
     rose = int((means[:, 1] > means[:, 0]).sum())
@@ -269,7 +309,9 @@ def _audiograms(report: HaspiReport) -> _Drawn:
 
     def draw(axes: Any) -> None:
         for ear in ears:
-            ear.plot(axes, color="C0", alpha=max(0.15, 1.0 / len(ears)), marker="." if many else "o")
+            ear.plot(
+                axes, color="C0", alpha=max(0.15, 1.0 / len(ears)), marker="." if many else "o"
+            )
         if many:
             mean = np.mean([ear.thresholds for ear in ears], axis=0)
             axes.plot(FREQUENCIES, mean, color="black", label="mean")
@@ -289,7 +331,9 @@ def _groups(
     told = []
     for name, group in groups.items():
         pairs = zip(report.conditions, group, strict=True)
-        means = ", ".join(f"{c} {_mean(known):.3f}" if len(known) else f"{c} n/a" for c, known in pairs)
+        means = ", ".join(
+            f"{c} {_mean(known):.3f}" if len(known) else f"{c} n/a" for c, known in pairs
+        )
         told.append(f"{name if isinstance(name, str) else f'{name:g}'}{unit}: {means}")
     return groups, f"Mean {report.headline.title} by {by}: {'; '.join(told)}."
 

@@ -39,7 +39,11 @@ COLUMNS = {
 }
 """Titles of a table's columns, with the figure and its format."""
 
-_GROUPS = {"severity": "By degree of loss", "level": "By level (dB SPL)", "condition": "By condition"}
+_GROUPS = {
+    "severity": "By degree of loss",
+    "level": "By level (dB SPL)",
+    "condition": "By condition",
+}
 
 _TEACHERS = {"pyclarity": "pyclarity's MSBG", "msbg": "hlsim's exact MSBG"}
 
@@ -60,26 +64,43 @@ def write_fidelity(result: Row, heard: Mapping[str, Tensor], shown: Item, out: s
     ``heard`` is what is heard of ``shown``, the truth first, by name, in pascals at 16 kHz.
     """
     truth, *others = heard
-    named = {"original": shown.signal, "reference": heard[truth], **{name: heard[name] for name in others}}
-    end = int(shown.signal.nonzero().max()) + NEURO_RATE // 10  # a short clip is filled up with silence
+    named = {
+        "original": shown.signal,
+        "reference": heard[truth],
+        **{name: heard[name] for name in others},
+    }
+    end = (
+        int(shown.signal.nonzero().max()) + NEURO_RATE // 10
+    )  # a short clip is filled up with silence
     named = {name: signal[:end] for name, signal in named.items()}
-    drawn = panels(named, NEURO_RATE, {f"{name} less reference": (name, "reference") for name in others})
+    drawn = panels(
+        named, NEURO_RATE, {f"{name} less reference": (name, "reference") for name in others}
+    )
     page = (
         "Fidelity to MSBG" if result["teacher"] in _TEACHERS else "Fidelity",
         _sections(result, pictures(drawn), shown),
         _lead(result),
     )
-    contents = (json.dumps(result, indent=1), render_markdown(*page), render_page(*page), composite(drawn))
+    contents = (
+        json.dumps(result, indent=1),
+        render_markdown(*page),
+        render_page(*page),
+        composite(drawn),
+    )
     write_files(out, dict(zip(FILES, contents, strict=True)))
 
 
 def _lead(result: Row) -> str:
     """Each simulator's SNR, the best first."""
     given = result["inputs"][0]
-    found = {name: entry["inputs"][given]["overall"] for name, entry in result["simulators"].items()}
+    found = {
+        name: entry["inputs"][given]["overall"] for name, entry in result["simulators"].items()
+    }
     told = [
         f"{name} {number(own['snr_median'], '.1f')} ({number(own['snr_worst_tenth'], '.1f')})"
-        for name, own in sorted(found.items(), key=lambda pair: -(pair[1]["snr_median"] or -math.inf))
+        for name, own in sorted(
+            found.items(), key=lambda pair: -(pair[1]["snr_median"] or -math.inf)
+        )
     ]
     reference = _TEACHERS.get(result["teacher"], result["teacher"])
     return f"SNR in dB against {reference}, median item (worst tenth): {', '.join(told)}."
@@ -98,7 +119,9 @@ def _about(result: Row) -> str:
 
 def _sections(result: Row, spectrograms: Sequence[Picture], shown: Item) -> list[Section]:
     sections = [
-        Section(_INPUT_TITLES[given], tables=[side_by_side(result, given), *_over_first(result, given)])
+        Section(
+            _INPUT_TITLES[given], tables=[side_by_side(result, given), *_over_first(result, given)]
+        )
         for given in result["inputs"]
     ]
     about = (
@@ -128,7 +151,9 @@ def _sections(result: Row, spectrograms: Sequence[Picture], shown: Item) -> list
 
 def side_by_side(result: Row, given: str) -> Table:
     """The paper's Table I and our columns: a row a simulator, over all items of one input."""
-    figures = {name: entry["inputs"][given]["overall"] for name, entry in result["simulators"].items()}
+    figures = {
+        name: entry["inputs"][given]["overall"] for name, entry in result["simulators"].items()
+    }
     return _table("Simulators side by side", "Simulator", figures)
 
 
@@ -138,20 +163,26 @@ def _over_first(result: Row, given: str) -> list[Table]:
     found = {name: entry["snr_over_first"][given] for name, entry in others}
     compared = {name: PairedComparison(**paired) for name, paired in found.items() if paired}
     rows = [{"Simulator": name, "n": str(c.n)} | paired_cells(c) for name, c in compared.items()]
-    return [Table.of(f"SNR (dB) less that of {first[0]}, mean over the items", rows)] if rows else []
+    return (
+        [Table.of(f"SNR (dB) less that of {first[0]}, mean over the items", rows)] if rows else []
+    )
 
 
 def summary_tables(summary: Row) -> list[Table]:
     """What ``summarise`` returned: the whole first, then each of severity, level and condition that the items have."""
     groups = [
-        _table(title, key.capitalize(), summary[key]) for key, title in _GROUPS.items() if summary.get(key)
+        _table(title, key.capitalize(), summary[key])
+        for key, title in _GROUPS.items()
+        if summary.get(key)
     ]
     return [_table("All items", "Items", {"all": summary["overall"]}), *groups]
 
 
 def _table(caption: str, of: str, groups: Mapping[str, Row]) -> Table:
     return Table(
-        caption, (of, *COLUMNS), [(name, *column_cells(figures)) for name, figures in groups.items()]
+        caption,
+        (of, *COLUMNS),
+        [(name, *column_cells(figures)) for name, figures in groups.items()],
     )
 
 
@@ -178,7 +209,9 @@ def _pictures(rows: Sequence[Row]) -> list[Picture]:
         legend(axes)
 
     def boxes(axes: Any, key: str, title: str) -> None:
-        groups = {s: [row[key] for row in rows if row["severity"] == s and key in row] for s in SEVERITIES}
+        groups = {
+            s: [row[key] for row in rows if row["severity"] == s and key in row] for s in SEVERITIES
+        }
         if there := {severity: values for severity, values in groups.items() if values}:
             axes.boxplot([*there.values()], tick_labels=[*there])
         axes.set(ylabel=title)

@@ -25,7 +25,9 @@ Panels = Mapping[str, Callable[[Any, Any], None]]
 
 
 def panels(
-    signals: Mapping[str, Tensor], sample_rate: int, differences: Mapping[str, tuple[str, str]] | None = None
+    signals: Mapping[str, Tensor],
+    sample_rate: int,
+    differences: Mapping[str, tuple[str, str]] | None = None,
 ) -> Panels:
     """What draws each signal, and after it, where it is one's, a difference: of one name less another, in dB.
 
@@ -74,11 +76,15 @@ def _levels(signal: Tensor, sample_rate: int) -> Tensor:
     """Windows of 20 ms, every 10 ms; silence is at -46 dB SPL. Shape: (time,) -> (bins, frames) in dB SPL."""
     points = 2 * (sample_rate // 100)
     window = torch.hann_window(points)
-    spectrum = torch.stft(signal.float().cpu(), points, points // 2, window=window, return_complex=True)
+    spectrum = torch.stft(
+        signal.float().cpu(), points, points // 2, window=window, return_complex=True
+    )
     return 20.0 * torch.log10(spectrum.abs() * 2.0**0.5 / window.sum() + 1e-7) + PASCAL_SPL
 
 
-def _draw(figure: Any, axes: Any, image: Tensor, title: str, unit: str, scale: Mapping[str, Any]) -> None:
+def _draw(
+    figure: Any, axes: Any, image: Tensor, title: str, unit: str, scale: Mapping[str, Any]
+) -> None:
     # without interpolation a page's picture holds the bins themselves, sharp at any size
     drawn = axes.imshow(image.numpy(), origin="lower", aspect="auto", interpolation="none", **scale)
     axes.set(xlabel="s", ylabel="kHz", ylim=(0.0, min(_HIGHEST / 1e3, scale["extent"][3])))

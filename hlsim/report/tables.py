@@ -52,14 +52,18 @@ class Table:
         lines = [self.header, *self.rows]
         widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
         return "\n".join(
-            "  ".join(cell.rjust(width) if i else cell.ljust(width) for i, (cell, width) in enumerate(pairs))
+            "  ".join(
+                cell.rjust(width) if i else cell.ljust(width)
+                for i, (cell, width) in enumerate(pairs)
+            )
             for pairs in ([*zip(line, widths, strict=True)] for line in lines)
         )
 
     def latex(self) -> str:
         """For ``\\input``; needs the package booktabs."""
         header, *rows = (
-            " & ".join(cell.translate(_LATEX) for cell in line) + r" \\" for line in (self.header, *self.rows)
+            " & ".join(cell.translate(_LATEX) for cell in line) + r" \\"
+            for line in (self.header, *self.rows)
         )
         columns, body = "l" + "r" * (len(self.header) - 1), "\n".join(rows)
         return (
@@ -105,7 +109,11 @@ def paper_table(comparison: Comparison) -> Table:
         ("t-test (paired)", "", "", t),
         ("Wilcoxon signed-rank", "", "", w),
         ("Cohen's d (paired)", "", "", d if c.cohens_d is None else f"d = {d}"),
-        ("Level (dB SPL, mean)", *(f"{level:.1f}" for level in levels), f"{levels[1] - levels[0]:+.1f}"),
+        (
+            "Level (dB SPL, mean)",
+            *(f"{level:.1f}" for level in levels),
+            f"{levels[1] - levels[0]:+.1f}",
+        ),
     ]
     caption = f"{name}, {comparison.before} against {comparison.after}, {c.n} items"
     return Table(caption, ("Metric", *_ends(comparison), "Change (Δ)"), rows)
@@ -135,7 +143,10 @@ def comparisons_table(comparisons: Sequence[Comparison]) -> Table:
             | {"From": f"{c.overall.before_mean:.3f}", "To": f"{c.overall.after_mean:.3f}"}
             | {_CHANGE: paired[_CHANGE]}
             | {f"{test}, Holm": "n/a" if p is None else p_text(p) for test, p in tests.items()}
-            | {"d": paired["d"], "Level change (dB)": f"{c.level_after_mean - c.level_before_mean:+.1f}"}
+            | {
+                "d": paired["d"],
+                "Level change (dB)": f"{c.level_after_mean - c.level_before_mean:+.1f}",
+            }
         )
     return Table.of("All comparisons, p adjusted by Holm within each measure", rows)
 
@@ -180,13 +191,17 @@ def paired_cells(
     """Change and interval, both tests, and d; where ``p_t`` or ``p_w`` is given, it is told, such as an adjusted one."""
     return {
         _CHANGE: f"{c.delta:+.3f} {_interval(c)}".rstrip(),
-        "t-test (paired)": _test(f"t = {number(c.t, f'+.{digits}f')}", c.p_t if p_t is None else p_t, none),
+        "t-test (paired)": _test(
+            f"t = {number(c.t, f'+.{digits}f')}", c.p_t if p_t is None else p_t, none
+        ),
         "Wilcoxon": _test(f"W = {number(c.w, '.1f')}", c.p_w if p_w is None else p_w, none),
         "d": number(c.cohens_d, f"+.{digits}f", none),
     }
 
 
-def _paired_table(comparison: Comparison, by: str, unit: str, rows: Mapping[str, PairedComparison]) -> Table:
+def _paired_table(
+    comparison: Comparison, by: str, unit: str, rows: Mapping[str, PairedComparison]
+) -> Table:
     # two conditions may differ in their capitals alone: no titles of a dictionary
     header = (unit, "n", *_ends(comparison), *paired_cells(comparison.overall))
     cells = [(name, str(c.n), *_means(c), *paired_cells(c).values()) for name, c in rows.items()]

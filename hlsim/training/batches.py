@@ -55,7 +55,9 @@ class TrainingData:
             training, validation = getattr(self, name), getattr(self, f"valid_{name}")
             if not training or not validation:
                 continue
-            trained, validated = ({path.resolve() for path in _files(one)} for one in (training, validation))
+            trained, validated = (
+                {path.resolve() for path in _files(one)} for one in (training, validation)
+            )
             if shared := len(trained & validated):
                 raise ValueError(
                     f"{shared} of {len(validated)} files of the {name} to validate on are also trained on; give folders "
@@ -101,19 +103,25 @@ class DrawnBatches(Dataset[Batch]):
 
     def __getitem__(self, step: Step) -> Batch:
         number = (self.seed * 1_000_003 + step.number) * 64 + step.rank
-        return self.draw(self.batch, torch.Generator().manual_seed(number % 2**63))  # which takes no more
+        return self.draw(
+            self.batch, torch.Generator().manual_seed(number % 2**63)
+        )  # which takes no more
 
     def draw(self, count: int, generator: torch.Generator) -> Batch:
         """``clean`` and ``signal`` (count, time) in pascals, ``thresholds`` (count, 8) dB HL."""
         raise NotImplementedError
 
-    def join_measured(self, ears: Tensor, share: float, moved: float, generator: torch.Generator) -> Tensor:
+    def join_measured(
+        self, ears: Tensor, share: float, moved: float, generator: torch.Generator
+    ) -> Tensor:
         """A share of the drawn ears, replaced by measured ones, where there are, moved by up to some dB either way."""
         if self.ears is None:
             return ears
         measured = self.ears[torch.randint(len(self.ears), (len(ears),), generator=generator)]
         if moved:
-            measured = measured + 2.0 * moved * torch.rand(len(ears), 1, generator=generator) - moved
+            measured = (
+                measured + 2.0 * moved * torch.rand(len(ears), 1, generator=generator) - moved
+            )
             measured = measured.clamp(-10.0, 100.0)
         return torch.where(torch.rand(len(ears), 1, generator=generator) < share, measured, ears)
 
@@ -144,7 +152,9 @@ class CompensatorBatches(DrawnBatches):
 
     recipe: CompensatorRecipe
 
-    def __init__(self, recipe: CompensatorRecipe, data: TrainingData, ear: Audiogram | None) -> None:
+    def __init__(
+        self, recipe: CompensatorRecipe, data: TrainingData, ear: Audiogram | None
+    ) -> None:
         super().__init__(recipe, data)
         self.ear = None if ear is None else torch.tensor(ear.thresholds)
 
@@ -153,7 +163,9 @@ class CompensatorBatches(DrawnBatches):
             return low + (high - low) * torch.rand(count, *shape, generator=generator)
 
         def equalised(clips: Tensor) -> Tensor:
-            changed = equalise(clips, uniform(-15.0, 15.0, len(KNOTS)), torch.tensor(KNOTS), NEURO_RATE)
+            changed = equalise(
+                clips, uniform(-15.0, 15.0, len(KNOTS)), torch.tensor(KNOTS), NEURO_RATE
+            )
             return torch.where(uniform(0.0, 1.0, 1) < self.recipe.equalised, changed, clips)
 
         voices = equalised(self.speech.draw(count, generator))
@@ -166,7 +178,9 @@ class CompensatorBatches(DrawnBatches):
                 others = [voices.roll(apart, 0) for apart in range(1, min(count, _VOICES + 1))]
                 babble = torch.stack([set_level(one, 65.0) for one in others]).sum(0)
                 noise = torch.where(uniform(0.0, 1.0, 1) < self.recipe.babble, babble, noise)
-            noisy = (uniform(0.0, 1.0, 1) < self.recipe.noisy) & (sounds == voices).all(-1, keepdim=True)
+            noisy = (uniform(0.0, 1.0, 1) < self.recipe.noisy) & (sounds == voices).all(
+                -1, keepdim=True
+            )
             signal = torch.where(noisy, mix(clean, noise, uniform(*self.recipe.snr)), clean)
         if self.ear is not None:
             ears = self.ear.expand(count, -1)
@@ -187,14 +201,21 @@ def simulator_data(
     if isinstance(data, PlannedSource):
         return PlannedData(data, recipe, reference)
     training = SimulatorBatches(recipe, data)
-    validation = [*speech_to_validate(data, recipe), *(sounds_to_validate(recipe) if recipe.sounds else [])]
+    validation = [
+        *speech_to_validate(data, recipe),
+        *(sounds_to_validate(recipe) if recipe.sounds else []),
+    ]
     return BatchData(training, validation, teacher=Teacher(NEURO_RATE, reference=reference))
 
 
-def compensator_data(data: TrainingData, recipe: CompensatorRecipe, ear: Audiogram | None) -> BatchData:
+def compensator_data(
+    data: TrainingData, recipe: CompensatorRecipe, ear: Audiogram | None
+) -> BatchData:
     """What a compensator for an ear, or else for all, is trained and validated on. Raises ValueError as
     ``simulator_data``, and where a recipe that trains noise reduction has no noise."""
-    reducing = sorted({"denoising", "intelligibility"} & {name for name, w in recipe.weights.items() if w})
+    reducing = sorted(
+        {"denoising", "intelligibility"} & {name for name, w in recipe.weights.items() if w}
+    )
     if data.noise is None and (reducing or recipe.babble):
         raise ValueError(
             f"no noise, and the recipe's {reducing[0] if reducing else 'babble'} is for it; allowed: --noise DIR"
@@ -215,7 +236,9 @@ def speech_to_validate(data: TrainingData, recipe: SimulatorRecipe) -> list[Batc
     for _ in range(0, recipe.validation_items, 8):
         signal = valid.speech.draw(8, generator)
         if valid.noise is not None:
-            noisy = mix(signal, valid.noise.draw(8, generator), 20.0 * torch.rand(8, generator=generator))
+            noisy = mix(
+                signal, valid.noise.draw(8, generator), 20.0 * torch.rand(8, generator=generator)
+            )
             signal = torch.where((torch.arange(8) % 2 == 1).unsqueeze(-1), noisy, signal)
         signal = set_level(signal, _levels_to_validate(recipe, generator))
         ears = draw_thresholds(8, generator)
@@ -256,12 +279,17 @@ class PlannedData(PlanData):
     ) -> None:
         if recipe.sounds:
             raise ValueError(f"sounds {recipe.sounds} in the recipe, with a manifest; allowed: 0")
-        clips = {name: getattr(recipe, name) for name in ("batch", "seconds", "seed", "levels", "treated")}
+        clips = {
+            name: getattr(recipe, name)
+            for name in ("batch", "seconds", "seed", "levels", "treated")
+        }
         where = {name: getattr(source, name) for name in ("root", "prepared", "workers")}
         making = Recipe(reference=reference)
         super().__init__(source.manifest, recipe=making, **where, **clips)
         if self.plan.rate != NEURO_RATE:
-            raise ValueError(f"{source.manifest}: prepared at {self.plan.rate} Hz; allowed: {NEURO_RATE}")
+            raise ValueError(
+                f"{source.manifest}: prepared at {self.plan.rate} Hz; allowed: {NEURO_RATE}"
+            )
         split = next(split for split in ("valid", "test", "train") if len(self.plan.indices(split)))
         if split != "valid":
             warnings.warn(
@@ -270,7 +298,11 @@ class PlannedData(PlanData):
                 stacklevel=2,
             )
         items = self.items(split)
-        chosen = torch.linspace(0, len(items) - 1, min(recipe.validation_items, len(items))).round().int()
+        chosen = (
+            torch.linspace(0, len(items) - 1, min(recipe.validation_items, len(items)))
+            .round()
+            .int()
+        )
         samples = round(_VALID_SECONDS * NEURO_RATE)
         whole = [items[place] for place in chosen.tolist()]
         middle = [one.clip(max(0, (len(one.signal) - samples) // 2), samples) for one in whole]

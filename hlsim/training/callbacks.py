@@ -41,11 +41,15 @@ class KeepBest(Callback):
         self.best = float(state_dict["best"])
         # there may be none, or one that a crash broke
         with contextlib.suppress(OSError, ValueError, TypeError, LookupError):
-            self.best = max(self.best, float(json.loads(self.note.read_text(encoding="utf-8"))["best"]))
+            self.best = max(
+                self.best, float(json.loads(self.note.read_text(encoding="utf-8"))["best"])
+            )
 
     def on_validation_end(self, trainer: L.Trainer, module: L.LightningModule) -> None:
         kept = ("score", "valid_")
-        figures = {name: float(v) for name, v in trainer.callback_metrics.items() if name.startswith(kept)}
+        figures = {
+            name: float(v) for name, v in trainer.callback_metrics.items() if name.startswith(kept)
+        }
         score = figures.pop("score", -math.inf)
         if trainer.is_global_zero and score > self.best:
             self.best = score
@@ -63,7 +67,9 @@ class History(Callback):
     def on_validation_end(self, trainer: L.Trainer, module: L.LightningModule) -> None:
         if trainer.is_global_zero:
             metrics = trainer.callback_metrics.items()
-            figures = ", ".join(f"{name} {float(value):.3f}" for name, value in metrics if name != "score")
+            figures = ", ".join(
+                f"{name} {float(value):.3f}" for name, value in metrics if name != "score"
+            )
             self.report(f"step {trainer.global_step}, {_minutes(module):.1f} min: {figures}")
 
 
@@ -73,7 +79,9 @@ class TimeProgress(Callback):
     def __init__(self, max_minutes: float) -> None:
         self.max_minutes, self.shown = max_minutes, 0.0
 
-    def on_train_batch_end(self, trainer: L.Trainer, module: L.LightningModule, *of_batch: Any) -> None:
+    def on_train_batch_end(
+        self, trainer: L.Trainer, module: L.LightningModule, *of_batch: Any
+    ) -> None:
         if not trainer.is_global_zero or time.monotonic() - self.shown < 2.0:
             return
         self.shown = time.monotonic()
@@ -93,7 +101,9 @@ class DataWait(Callback):
     def __init__(self) -> None:
         self.marks: list[tuple[float, float]] = []
 
-    def on_train_batch_end(self, trainer: L.Trainer, module: L.LightningModule, *of_batch: Any) -> None:
+    def on_train_batch_end(
+        self, trainer: L.Trainer, module: L.LightningModule, *of_batch: Any
+    ) -> None:
         # from the second step on, for the first one waits until the workers have started
         waited = trainer.datamodule.loader.waited  # type: ignore[attr-defined]
         self.marks = [*self.marks[-_WINDOW:], (time.perf_counter(), waited)]
@@ -126,7 +136,9 @@ class ShowExamples(Callback):
         # what is heard may be inaudible as played: each sound is as loud as it can be, the picture tells the level
         for name, signal in signals.items():
             sound = signal.detach().float().cpu()
-            writer.add_audio(name, sound / sound.abs().max().clamp_min(1e-9), trainer.global_step, NEURO_RATE)
+            writer.add_audio(
+                name, sound / sound.abs().max().clamp_min(1e-9), trainer.global_step, NEURO_RATE
+            )
             writer.add_image(name, spectrogram_image(sound), trainer.global_step)
 
 

@@ -9,12 +9,12 @@ from typing import Any, Unpack
 import torch
 from torch import Tensor, nn
 
-from compensators.aid import HearingAid
+from compensators.hearing_aid import HearingAid
 from compensators.pretrained import CONFIGS, build_compensator, load_compensator
 from hlsim.audiogram import Audiogram
-from hlsim.criteria.choice import Criterion
 from hlsim.data.module import Batch
-from hlsim.loss import HearingLossLoss
+from hlsim.losses.criteria import Criterion
+from hlsim.losses.hearing_loss import HearingLossLoss
 from hlsim.pretrained import checkpoint_digest
 from hlsim.training.batches import TrainingData, compensator_data, identity_of
 from hlsim.training.denoising import attenuation_error, missing_intelligibility
@@ -43,7 +43,9 @@ class CompensatorTraining(TimedModule):
         criterion: Criterion = (
             counted or "coherent-bands"
         )  # for the examples, where nothing is learned through it
-        self.loss = HearingLossLoss(simulator=simulator, reference=recipe.reference, criterion=criterion)
+        self.loss = HearingLossLoss(
+            simulator=simulator, reference=recipe.reference, criterion=criterion
+        )
         self.hears = bool(counted)
         if isinstance(aid := self.compensator, HearingAid):
             if not self.hears:
@@ -61,7 +63,9 @@ class CompensatorTraining(TimedModule):
         value = signal.new_zeros(())
         if self.denoising:
             assert isinstance(self.compensator, HearingAid)
-            value = value + self.denoising * attenuation_error(self.compensator, signal, clean).mean()
+            value = (
+                value + self.denoising * attenuation_error(self.compensator, signal, clean).mean()
+            )
         if self.intelligibility:
             assert isinstance(self.compensator, HearingAid)
             missing = missing_intelligibility(self.compensator, signal, clean, ears)
@@ -118,10 +122,14 @@ def train_compensator(
     options.get("report", print)(f"start: valid_loss {start:.3f}")
     trained = {
         "audiogram": audiogram.to_dict() if audiogram else None,
-        "simulator": type(simulator).__name__ if isinstance(simulator, nn.Module) else str(simulator),
+        "simulator": type(simulator).__name__
+        if isinstance(simulator, nn.Module)
+        else str(simulator),
     }
     if isinstance(simulator, str | Path) and str(simulator) != "msbg":
-        trained["simulator_sha256"] = checkpoint_digest(simulator)  # a folder may hold another one next time
+        trained["simulator_sha256"] = checkpoint_digest(
+            simulator
+        )  # a folder may hold another one next time
     about = trained | {"start_valid_loss": start}
     how: dict[str, Any] = {"out": out, "identity": identity_of(data) | trained, "about": about}
     return train_network(module, batches, recipe, recipe.kind, **how, **options)

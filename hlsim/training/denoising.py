@@ -6,8 +6,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from compensators.aid import HearingAid
-from compensators.bands import FRAME, HISTORY, HOP, frame_power, shares
+from compensators.filter_bank import FRAME, HISTORY, HOP, frame_power, shares
+from compensators.hearing_aid import HearingAid
 from hlsim.calibration import PASCAL_SPL, level_spl, set_level
 from hlsim.metrics.objective import missing_score
 from hlsim.neuro.config import NEURO_RATE
@@ -32,7 +32,9 @@ def attenuation_error(aid: HearingAid, signal: Tensor, clean: Tensor) -> Tensor:
     gains = 10.0 ** (aid.attenuation(signal) / 20.0)
     with torch.no_grad():
         parts = functional.pad(torch.stack((clean, signal - clean)), (HISTORY, 0)).flatten(0, 1)
-        speech, noise = (frame_power(parts) @ constant_like(parts, shares, aid.bands, FRAME)).chunk(2)
+        speech, noise = (frame_power(parts) @ constant_like(parts, shares, aid.bands, FRAME)).chunk(
+            2
+        )
         wiener = ((speech + _QUIET) / (speech + noise + _QUIET)).sqrt()
         aim = (wiener**_SHARE).clamp_min(10.0 ** (-aid.config.reduction_db / 20.0))[:, _AHEAD:]
     return (gains[:, :-_AHEAD].sqrt() - aim.sqrt()).square().mean((-2, -1))

@@ -103,13 +103,19 @@ def run(
         KeyboardInterrupt: it was stopped; the state is that of the last validation.
     """
     if (max_steps := options.get("max_steps", -1)) < -1:
-        raise ValueError(f"max_steps {max_steps}; allowed: whole numbers from 0 up, or -1 for no such limit")
+        raise ValueError(
+            f"max_steps {max_steps}; allowed: whole numbers from 0 up, or -1 for no such limit"
+        )
     folder, last = Path(out), Path(out) / LAST
     accelerator, strategy = options.get("accelerator", "auto"), options.get("strategy", "auto")
     devices, nodes = options.get("devices", 1), options.get("nodes", 1)
     module.timer = Timer(timedelta(minutes=module.max_minutes), interval="step", verbose=False)
     # at the end of each validation, not before it: a run that goes on from a state does not validate it
-    how: dict[str, Any] = {"save_top_k": 1, "save_on_train_epoch_end": False, "enable_version_counter": False}
+    how: dict[str, Any] = {
+        "save_top_k": 1,
+        "save_on_train_epoch_end": False,
+        "enable_version_counter": False,
+    }
     states = ModelCheckpoint(dirpath=folder, filename="last", **how)
     callbacks: list[Callback] = [
         module.timer,
@@ -141,7 +147,9 @@ def run(
                 default_root_dir=str(folder),  # for what SLURM's end of a job makes Lightning store
                 logger=TensorBoardLogger(str(folder), name="", version="events"),
                 val_check_interval=validate_every,
-                num_sanity_val_steps=-int(begun),  # -1: all of it, as later ones; not where a run goes on
+                num_sanity_val_steps=-int(
+                    begun
+                ),  # -1: all of it, as later ones; not where a run goes on
                 log_every_n_steps=10,
                 enable_progress_bar=False,
                 enable_model_summary=False,
@@ -150,7 +158,9 @@ def run(
             raise ValueError(
                 f"cannot train with device {accelerator}, devices {devices}, nodes {nodes}, strategy {strategy}: {error}"
             ) from error
-        with claimed(folder, recipe, first=trainer.is_global_zero):  # now that the training can begin
+        with claimed(
+            folder, recipe, first=trainer.is_global_zero
+        ):  # now that the training can begin
             # SLURM's end of a job leaves another state, newer than the last validation's
             left = [path for path in (last, *folder.glob("hpc_ckpt_*.ckpt")) if path.is_file()]
             newest = max(left, key=lambda path: path.stat().st_mtime_ns, default=None)

@@ -57,7 +57,9 @@ class TimedModule(L.LightningModule):
     def validate(self, batches: Iterable[Batch]) -> dict[str, float]:
         """The figures on batches, without a Trainer."""
         with torch.no_grad():
-            placed = ({name: value.to(self.device) for name, value in batch.items()} for batch in batches)
+            placed = (
+                {name: value.to(self.device) for name, value in batch.items()} for batch in batches
+            )
             return self._figures([self.evaluate(batch) for batch in placed])
 
     def trained_parameters(self) -> list[nn.Parameter]:
@@ -78,7 +80,9 @@ class TimedModule(L.LightningModule):
         share = min(1.0, spent / (60.0 * self.max_minutes))
         rise = min(1.0, (self.global_step + 1) / 50.0)
         for group in self.optimizers().param_groups:  # type: ignore[union-attr]
-            group["lr"] = self.learning_rate * rise * max(0.01, 0.5 * (1.0 + math.cos(math.pi * share)))
+            group["lr"] = (
+                self.learning_rate * rise * max(0.01, 0.5 * (1.0 + math.cos(math.pi * share)))
+            )
 
     def on_validation_epoch_start(self) -> None:
         self.values = []
@@ -90,11 +94,15 @@ class TimedModule(L.LightningModule):
         self.log_dict(self._figures(self.values), prog_bar=True, batch_size=1, sync_dist=True)
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
-        return torch.optim.AdamW(self.trained_parameters(), lr=self.learning_rate, weight_decay=1e-4)
+        return torch.optim.AdamW(
+            self.trained_parameters(), lr=self.learning_rate, weight_decay=1e-4
+        )
 
     def _figures(self, values: Sequence[Mapping[str, Tensor]]) -> dict[str, float]:
         names = dict.fromkeys(name for one in values for name in one)
-        return self.figures({name: torch.cat([one[name] for one in values if name in one]) for name in names})
+        return self.figures(
+            {name: torch.cat([one[name] for one in values if name in one]) for name in names}
+        )
 
 
 def exponential_average(model: nn.Module, decay: float) -> AveragedModel:
@@ -139,7 +147,9 @@ def initial_network(
     network: Any = load(start)
     what = f"start {start!r} in the recipe"
     if not isinstance(getattr(network, "config", None), config_kind):
-        raise ValueError(f"{what} is a {type(network).__name__}; allowed: a checkpoint of the recipe's kind")
+        raise ValueError(
+            f"{what} is a {type(network).__name__}; allowed: a checkpoint of the recipe's kind"
+        )
     if settings and config != network.config:
         ours, theirs = config.to_dict(), network.config.to_dict()
         differing = ", ".join(name for name in ours if ours[name] != theirs[name])

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, fields
 from typing import Any, ClassVar, Literal, Self
 
 from hlsim.checks import refuse_other_kinds, refuse_seed, refuse_unknown, refuse_weights
-from hlsim.hearing import ReferenceName
+from hlsim.losses.frozen_simulator import ReferenceName
 from hlsim.metrics.pair import SHORTEST_SECONDS
 
 _WHERE = "in the recipe"
@@ -151,21 +151,37 @@ class CompensatorRecipe(TrainingRecipe):
     validate_every: int = 50
     validation_items: int = 8
 
-    criteria = ("coherent-bands", "bands", "paper", "haspi", "hasqi", "denoising", "intelligibility")
+    criteria = (
+        "coherent-bands",
+        "bands",
+        "paper",
+        "haspi",
+        "hasqi",
+        "denoising",
+        "intelligibility",
+    )
     shares = ("sounds", "equalised", "noisy", "babble", "unreduced")
 
     def __post_init__(self) -> None:
         super().__post_init__()
         scored = sum(self.weights.get(name, 0.0) for name in ("haspi", "hasqi", "intelligibility"))
         wrong = scored > 0.0 and self.seconds < SHORTEST_SECONDS
-        self._refuse(wrong, ("seconds",), f"{SHORTEST_SECONDS} or more with haspi, hasqi or intelligibility")
+        self._refuse(
+            wrong, ("seconds",), f"{SHORTEST_SECONDS} or more with haspi, hasqi or intelligibility"
+        )
         reduced = sum(self.weights.get(name, 0.0) for name in ("denoising", "intelligibility"))
         wrong = self.kind != "hearing-aid" and self.unreduced + reduced > 0.0
-        self._refuse(wrong, ("unreduced", "weights", "kind"), "no noise reduction but a hearing-aid's")
+        self._refuse(
+            wrong, ("unreduced", "weights", "kind"), "no noise reduction but a hearing-aid's"
+        )
         noiseless = not self.noisy and self.babble + reduced > 0.0
         self._refuse(
-            noiseless, ("noisy", "babble", "weights"), "noisy above 0 with babble or noise reduction"
+            noiseless,
+            ("noisy", "babble", "weights"),
+            "noisy above 0 with babble or noise reduction",
         )
         self._refuse(
-            self.babble > 0.0 and self.batch < 2, ("babble", "batch"), "batches of 2 or more with babble"
+            self.babble > 0.0 and self.batch < 2,
+            ("babble", "batch"),
+            "batches of 2 or more with babble",
         )

@@ -9,13 +9,19 @@ from typing import Any, Unpack
 import torch
 from torch import Tensor
 
-from hlsim.criteria.paper import paper_parts, weighted_sum
-from hlsim.criteria.waveform import log_spectral_distance_db, noise_to_signal_db
 from hlsim.data.module import Batch
 from hlsim.data.teacher import find_teacher, name_of
+from hlsim.losses.paper import paper_parts, weighted_sum
+from hlsim.losses.waveform import log_spectral_distance_db, noise_to_signal_db
 from hlsim.neuro import NeuroConfig, NeuroMSBG
 from hlsim.pretrained import SIMULATOR, load_pretrained
-from hlsim.training.batches import PlannedData, PlannedSource, TrainingData, identity_of, simulator_data
+from hlsim.training.batches import (
+    PlannedData,
+    PlannedSource,
+    TrainingData,
+    identity_of,
+    simulator_data,
+)
 from hlsim.training.loop import RunOptions, train_network
 from hlsim.training.module import TimedModule, exponential_average, initial_network
 from hlsim.training.recipes import SimulatorRecipe
@@ -28,7 +34,9 @@ class SimulatorTraining(TimedModule):
         super().__init__(recipe.learning_rate, max_minutes)
         torch.manual_seed(recipe.seed)
         self.recipe = recipe
-        self.student = initial_network(recipe.start, recipe.model, NeuroConfig, NeuroMSBG, load_pretrained)
+        self.student = initial_network(
+            recipe.start, recipe.model, NeuroConfig, NeuroMSBG, load_pretrained
+        )
         self.student.autocast_dtype = None if recipe.precision == "float32" else torch.bfloat16
         self.kept = exponential_average(self.student, recipe.average)
 
@@ -110,5 +118,9 @@ def train_simulator(
     told = {} if reference is None else {"teacher": name_of(reference)}
     batches = simulator_data(data, recipe, reference)
     made_of = {"instances": batches.made_of} if isinstance(batches, PlannedData) else {}
-    how: dict[str, Any] = {"out": out, "identity": identity_of(data) | made_of | told, "about": told}
+    how: dict[str, Any] = {
+        "out": out,
+        "identity": identity_of(data) | made_of | told,
+        "about": told,
+    }
     return train_network(module, batches, recipe, SIMULATOR, **how, **options)

@@ -11,7 +11,9 @@ from hlsim.audiogram.table import read_audiograms
 def test_csv_round_trip(tmp_path: Path) -> None:
     ears = [Audiogram.standard(name) for name in ("N1", "S3")]
     lines = [",".join(("file", *ears[0].to_row()))]
-    lines += [",".join((name, *ear.to_row().values())) for name, ear in zip("ab", ears, strict=True)]
+    lines += [
+        ",".join((name, *ear.to_row().values())) for name, ear in zip("ab", ears, strict=True)
+    ]
     (tmp_path / "ears.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
     read = read_audiograms(tmp_path / "ears.csv")
     assert [ear for _, ear in read] == ears
@@ -28,7 +30,10 @@ def test_csv_with_blanks_after_its_commas(tmp_path: Path) -> None:
     path = tmp_path / "ears.csv"
     path.write_text("file, hl_250 , hl_500, ,\na b.wav , 10, 20 ,,\n", encoding="utf-8")
     assert read_audiograms(path) == [
-        ({"file": "a b.wav", "hl_250": "10", "hl_500": "20"}, Audiogram((10.0, 20.0), (250.0, 500.0)))
+        (
+            {"file": "a b.wav", "hl_250": "10", "hl_500": "20"},
+            Audiogram((10.0, 20.0), (250.0, 500.0)),
+        )
     ]
 
 
@@ -42,7 +47,10 @@ def test_csv_with_blanks_after_its_commas(tmp_path: Path) -> None:
         ("hl_250,hl_500\n10,20\n10,200\n", "line 3: .*200 dB HL; allowed: -10 to 120"),
         ("hl_500,hl_250\n10,20\n", "line 2: .*ascending"),
         ("left,right\n10,20\n", "line 2: .*needs columns hl_250"),
-        ("hl_250,hl_1k\n10,20\n", "line 2: audiogram column 'hl_1k'; allowed: hl_ and a frequency in Hz"),
+        (
+            "hl_250,hl_1k\n10,20\n",
+            "line 2: audiogram column 'hl_1k'; allowed: hl_ and a frequency in Hz",
+        ),
         ("hl_250,HL_500\n10,20\n", "line 2: audiogram column 'HL_500'"),
         ("hl_250,hl4000\n10,20\n", "line 2: audiogram column 'hl4000'"),
         ("hl_250,hl_8000dB\n10,20\n", "line 2: audiogram column 'hl_8000dB'"),
@@ -52,7 +60,9 @@ def test_csv_with_blanks_after_its_commas(tmp_path: Path) -> None:
         ("\nhl_250,hl_500\n\n\n10,x\n", "line 5: .*hl_500 holds 'x'"),
     ],
 )
-def test_csv_errors_begin_with_the_file_and_name_the_line(tmp_path: Path, content: str, said: str) -> None:
+def test_csv_errors_begin_with_the_file_and_name_the_line(
+    tmp_path: Path, content: str, said: str
+) -> None:
     path = tmp_path / "ears.csv"
     path.write_text(content, encoding="utf-8")
     with pytest.raises(ValueError, match=said) as caught:

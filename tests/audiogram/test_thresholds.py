@@ -34,17 +34,26 @@ def test_thresholds_for_a_simulator() -> None:
         (torch.tensor([[0.0] * 8, [-10.1] * 8]), "levels -10.1, -10.1, .*takes -10 to 100"),
         (torch.zeros(0, 8), r"shape \(0, 8\); allowed"),
         (torch.zeros(8, dtype=torch.bool), "of torch.bool; allowed: floating-point or integer"),
-        (torch.zeros(8, dtype=torch.complex64), "of torch.complex64; allowed: floating-point or integer"),
+        (
+            torch.zeros(8, dtype=torch.complex64),
+            "of torch.complex64; allowed: floating-point or integer",
+        ),
         (Audiogram.standard("N7"), "takes -10 to 100"),
         (
             [0.0] * 8,
             r"is list; allowed: an Audiogram, a sequence of them, or a .* tensor; write torch\.tensor\(",
         ),
         ([[0.0] * 8], r"is list; allowed: .* tensor; write torch\.tensor\(\.\.\.\)$"),
-        ((torch.zeros(7), torch.zeros(7)), r"is tuple; allowed: .* tensor; write torch\.stack\(\.\.\.\)$"),
+        (
+            (torch.zeros(7), torch.zeros(7)),
+            r"is tuple; allowed: .* tensor; write torch\.stack\(\.\.\.\)$",
+        ),
         ([], "is list; allowed: .* tensor$"),
         ("N3", r"is str; allowed: .* tensor; write Audiogram\.standard\('N3'\)$"),
-        (["N3", "N4"], r"is list; allowed: .* tensor; write \[Audiogram\.standard\('N3'\), \.\.\.\]$"),
+        (
+            ["N3", "N4"],
+            r"is list; allowed: .* tensor; write \[Audiogram\.standard\('N3'\), \.\.\.\]$",
+        ),
         ("loud", "is str; allowed: .* tensor$"),
         ({"levels": [0.0] * 8}, r"is dict; allowed: .* tensor; write Audiogram\.from_dict\("),
         ({"levels": [torch.zeros(2)] * 8}, r"; write torch\.stack\(audiogram\['levels'\], -1\)$"),
@@ -73,9 +82,13 @@ def test_mono_channels_have_one_ear_an_item() -> None:
     ):
         together = module(waveform, ears)
         assert together.shape == waveform.shape
-        torch.testing.assert_close(together[:, 0], module(waveform[:, 0], ears), atol=1e-6, rtol=1e-4)
+        torch.testing.assert_close(
+            together[:, 0], module(waveform[:, 0], ears), atol=1e-6, rtol=1e-4
+        )
     assert MSBG(sample_rate=16000)(waveform, ears[:, None].expand(2, 3, 8)).shape == (2, 3, 16000)
-    assert torch.equal(haspi(waveform, waveform, ears), haspi(waveform[:, 0], waveform[:, 0], ears)[:, None])
+    assert torch.equal(
+        haspi(waveform, waveform, ears), haspi(waveform[:, 0], waveform[:, 0], ears)[:, None]
+    )
     with pytest.raises(ValueError, match="allowed: one, or"):
         haspi(waveform, waveform, ears.expand(2, 2, 8))
 
@@ -104,7 +117,9 @@ def test_thresholds_keep_their_gradient() -> None:
 def test_interpolation_is_linear_in_hz_and_flat_beyond() -> None:
     hz = (0.0, 250.0, 251.0, 750.0, 1000.0, 2500.0, 7000.0, 8000.0, 12000.0)
     levels = draw_thresholds(6).reshape(2, 3, 8)
-    expected = np.array([np.interp(hz, FREQUENCIES, ear) for ear in levels.reshape(6, 8).double().numpy()])
+    expected = np.array(
+        [np.interp(hz, FREQUENCIES, ear) for ear in levels.reshape(6, 8).double().numpy()]
+    )
     for ears in (levels, levels.double()):
         found = interpolate(ears, hz)
         assert found.shape == (2, 3, 9) and found.dtype == ears.dtype

@@ -89,7 +89,11 @@ def test_the_ends_of_the_range_are_allowed(edge: float) -> None:
             (0.25, 8.0),
             r"frequencies 0\.25, 8 Hz; allowed: Hz, not all under 250 or all over 8000",
         ),
-        ((0.0, 0.0), (9000.0, 12000.0), "frequencies 9000, 12000 Hz; allowed: Hz, not all under 250"),
+        (
+            (0.0, 0.0),
+            (9000.0, 12000.0),
+            "frequencies 9000, 12000 Hz; allowed: Hz, not all under 250",
+        ),
         (("loud",) + (0.0,) * 7, FREQUENCIES, "levels .*loud.*; allowed: numbers"),
         ((None,) + (0.0,) * 7, FREQUENCIES, "levels .*None.*; allowed: numbers"),
         (30.0, FREQUENCIES, r"levels 30\.0; allowed: numbers"),
@@ -152,12 +156,16 @@ def test_severity_is_the_same_to_the_last_bit_of_the_mean() -> None:
 def test_severity_on_a_limit_is_pyclaritys_in_single_precision_too() -> None:
     clarity = pytest.importorskip("clarity.utils.audiogram")
     rng = np.random.default_rng(2)
-    ears = [[10.0, 10.0, 10.0, 19.7, 14.8, 18.7, 12.6, 9.2]]  # 15, which in single precision is a bit more
+    ears = [
+        [10.0, 10.0, 10.0, 19.7, 14.8, 18.7, 12.6, 9.2]
+    ]  # 15, which in single precision is a bit more
     for limit in (15.0, 35.0, 56.0):
         tenths = rng.integers(round(10.0 * limit) - 80, round(10.0 * limit) + 81, (500, 8))
         tenths[:, 7] = round(50.0 * limit) - tenths[:, 3:7].sum(-1) + rng.integers(-1, 2, 500)
         ears += (tenths.clip(-100, 1000) / 10.0).tolist()
-    expected = [CLARITY_SEVERITIES[clarity.Audiogram(levels=np.array(ear)).severity] for ear in ears]
+    expected = [
+        CLARITY_SEVERITIES[clarity.Audiogram(levels=np.array(ear)).severity] for ear in ears
+    ]
     assert set(expected) == set(SEVERITIES)
     assert [Audiogram(tuple(ear)).severity for ear in ears] == expected
     single = as_thresholds([Audiogram(tuple(ear)) for ear in ears])
@@ -225,7 +233,9 @@ def test_an_ear_is_a_hyperparameter_of_lightnings(tmp_path: Path) -> None:
     assert loaded.hparams.ear == Audiogram.standard("N3")
 
 
-@pytest.mark.parametrize(("data", "got"), [(3, "int"), (["levels"], "list"), ({1: 2, "a": 3}, r"\[1, 'a'\]")])
+@pytest.mark.parametrize(
+    ("data", "got"), [(3, "int"), (["levels"], "list"), ({1: 2, "a": 3}, r"\[1, 'a'\]")]
+)
 def test_what_is_no_dictionary_of_an_ear(data: Any, got: str) -> None:
     with pytest.raises(ValueError, match=f"needs 'levels', got {got}"):
         Audiogram.from_dict(data)
@@ -240,7 +250,9 @@ def test_row_round_trip(frequencies: tuple[float, ...]) -> None:
 
 
 def test_row_keeps_all_digits_and_adds_none() -> None:
-    ear = Audiogram((35.1234567, -0.1 - 0.2, 61.25, 100.0), (250.0, 707.1067811865476, 1000.0, 11313.7085))
+    ear = Audiogram(
+        (35.1234567, -0.1 - 0.2, 61.25, 100.0), (250.0, 707.1067811865476, 1000.0, 11313.7085)
+    )
     row = ear.to_row()
     assert Audiogram.from_row(row) == ear
     assert list(row) == ["hl_250", "hl_707.1067811865476", "hl_1000", "hl_11313.7085"]
@@ -268,7 +280,9 @@ def test_pyclarity_round_trip() -> None:
     assert mild.thresholds == (10, 15, 19, 25, 28, 31, 35, 38)
     # taken as it is wherever an ear is
     assert torch.equal(as_thresholds(theirs), as_thresholds(ear))
-    assert torch.equal(as_thresholds([theirs, ear, clarity.AUDIOGRAM_MILD]), as_thresholds([ear, ear, mild]))
+    assert torch.equal(
+        as_thresholds([theirs, ear, clarity.AUDIOGRAM_MILD]), as_thresholds([ear, ear, mild])
+    )
 
 
 def test_an_ear_of_pyclaritys_listeners() -> None:
@@ -295,7 +309,9 @@ def test_an_ear_of_pyclaritys_listeners() -> None:
                 as_thresholds(several)
     with pytest.raises(ValueError, match="ear is 'left'; allowed: None, for it is one ear"):
         Audiogram.from_clarity(listener.audiogram_left, "left")
-    with pytest.raises(ValueError, match="float is none of pyclarity's; allowed: its Audiogram or Listener"):
+    with pytest.raises(
+        ValueError, match="float is none of pyclarity's; allowed: its Audiogram or Listener"
+    ):
         Audiogram.from_clarity(65.0)
 
 

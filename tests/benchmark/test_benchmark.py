@@ -35,12 +35,16 @@ def identity() -> Row:
     return Row("modest", (16000,), lambda rate, ear, device: torch.clone)
 
 
-def test_a_row_that_runs_out_of_memory_is_left_out_there_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_row_that_runs_out_of_memory_is_left_out_there_alone(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     rows = [short_of_memory("DefaultCPUAllocator: can't allocate memory"), identity()]
     monkeypatch.setattr(benchmark_module, "rows", lambda simulators: (rows, []))
     result = benchmark(repeats=1, lengths=(1.0, 4.0), batches=(1, 2))
     assert result["skipped"] == ["greedy, 16000 Hz, 4 s, batch 1, forward: memory ran out"]
-    sizes = {row["name"]: {(c["seconds"], c["batch"]) for c in row["cells"]} for row in result["rows"]}
+    sizes = {
+        row["name"]: {(c["seconds"], c["batch"]) for c in row["cells"]} for row in result["rows"]
+    }
     assert sizes == {"greedy": {(1.0, 1), (1.0, 2)}, "modest": {(1.0, 1), (4.0, 1), (1.0, 2)}}
     assert "skipped: greedy, 16000 Hz, 4 s" in benchmark_markdown(result)
 
@@ -56,7 +60,10 @@ def test_time_that_grows_with_the_square_is_seen_coming(monkeypatch: pytest.Monk
     monkeypatch.setattr(benchmark_module, "rows", lambda simulators: ([square, identity()], []))
     result = benchmark(repeats=1, limit=0.5, lengths=(1.0, 4.0, 16.0), batches=(1,))
     lengths = [sorted({cell["seconds"] for cell in row["cells"]}) for row in result["rows"]]
-    assert lengths == [[1.0, 4.0], [1.0, 4.0, 16.0]]  # by the first second alone 80 ms would be expected
+    assert lengths == [
+        [1.0, 4.0],
+        [1.0, 4.0, 16.0],
+    ]  # by the first second alone 80 ms would be expected
 
 
 class NoWayBack(torch.autograd.Function):
@@ -90,12 +97,19 @@ def test_a_row_that_fails_loses_none_of_the_others(monkeypatch: pytest.MonkeyPat
             lambda rate, ear, device: raising(RuntimeError("CUDA error: invalid argument")),
         ),
         Row("one-way", (16000,), lambda rate, ear, device: NoWayBack.apply),
-        Row("short", (16000,), lambda rate, ear, device: raising(RuntimeError("CUFFT_ALLOC_FAILED"), 2.0)),
+        Row(
+            "short",
+            (16000,),
+            lambda rate, ear, device: raising(RuntimeError("CUFFT_ALLOC_FAILED"), 2.0),
+        ),
         identity(),
     ]
     monkeypatch.setattr(benchmark_module, "rows", lambda simulators: (rows, []))
     result = benchmark(repeats=2, lengths=(1.0, 4.0), batches=(1,))
-    sizes = {row["name"]: [(c["seconds"], c["direction"]) for c in row["cells"]] for row in result["rows"]}
+    sizes = {
+        row["name"]: [(c["seconds"], c["direction"]) for c in row["cells"]]
+        for row in result["rows"]
+    }
     assert sizes == {
         "one-way": [(1.0, "forward"), (4.0, "forward")],
         "short": [(1.0, "forward"), (1.0, "both")],
@@ -117,8 +131,13 @@ def test_nothing_but_failures_is_a_result_too(monkeypatch: pytest.MonkeyPatch) -
     assert result["rows"] == [] and "skipped: broken, 16000 Hz, 1 s" in benchmark_markdown(result)
 
 
-def test_what_is_measured_is_written_before_the_end(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    rows = [identity(), Row("stopped", (16000,), lambda rate, ear, device: raising(KeyboardInterrupt(), 2.0))]
+def test_what_is_measured_is_written_before_the_end(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    rows = [
+        identity(),
+        Row("stopped", (16000,), lambda rate, ear, device: raising(KeyboardInterrupt(), 2.0)),
+    ]
     monkeypatch.setattr(benchmark_module, "rows", lambda simulators: (rows, []))
     path = tmp_path / "speed.json"
     with contextlib.suppress(KeyboardInterrupt):
@@ -134,7 +153,9 @@ def test_a_table_without_what_fails() -> None:
         "late": lambda: raising(RuntimeError("too long"))(torch.zeros(1)),
     }
     rows, skipped = rows_by_turns(calls, torch.device("cpu"), 1)
-    assert "late, forward: RuntimeError: too long" in skipped and [row["name"] for row in rows] == ["whole"]
+    assert "late, forward: RuntimeError: too long" in skipped and [row["name"] for row in rows] == [
+        "whole"
+    ]
     table = benchmark_markdown(about("cpu", 1) | {"training": rows, "skipped": skipped})
     assert "| A training step | forward | forward + backward | peak memory (MiB) |" in table
 
@@ -149,7 +170,9 @@ def test_metrics_stand_beside_the_reference(
     assert lines[0].startswith("| HASPI (pyclarity) |") and lines[0].rstrip(" |").endswith("1.0")
 
 
-def test_the_default_network_is_timed_on_a_batch_to_train_on(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_default_network_is_timed_on_a_batch_to_train_on(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     def call(waveform: Tensor) -> Tensor:
         time.sleep(0.005)
         return 0.5 * waveform
@@ -167,13 +190,20 @@ def test_the_default_network_is_timed_on_a_batch_to_train_on(monkeypatch: pytest
         f"| default, 16000 Hz, 8 of 2 s | {cell['median_ms']:.1f} " in table
         and "8 of 2 s |" not in table[: table.index("batch, forward + backward")]
     )
-    brief = benchmark(repeats=1, limit=0.05, lengths=(), batches=(), training=(2.0, 8))  # 16 times 5 ms
+    brief = benchmark(
+        repeats=1, limit=0.05, lengths=(), batches=(), training=(2.0, 8)
+    )  # 16 times 5 ms
     assert {cell["batch"] for cell in brief["rows"][0]["cells"]} == {1}
 
 
 def test_a_gpu_is_measured_by_its_number(monkeypatch: pytest.MonkeyPatch) -> None:
     asked = []
-    for name in ("synchronize", "reset_peak_memory_stats", "memory_allocated", "max_memory_allocated"):
+    for name in (
+        "synchronize",
+        "reset_peak_memory_stats",
+        "memory_allocated",
+        "max_memory_allocated",
+    ):
         monkeypatch.setattr(
             torch.cuda, name, lambda device=None, name=name: asked.append((name, device)) or 0
         )
@@ -200,7 +230,9 @@ def test_a_gpu_is_described(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda device: f"GPU {device}")
     monkeypatch.setattr(torch.cuda, "get_device_properties", lambda device: properties)
-    monkeypatch.setattr(torch.backends.cudnn, "version", lambda: 91900)  # it would ask the GPU the first time
+    monkeypatch.setattr(
+        torch.backends.cudnn, "version", lambda: 91900
+    )  # it would ask the GPU the first time
     machine = about("cuda:1", 1)
     assert machine["machine"] == "GPU cuda:1" and machine["gpu"]["cuda"] == torch.version.cuda
     line = benchmark_markdown(machine | {"skipped": []}).splitlines()[0]

@@ -51,7 +51,10 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
     ("arguments", "said"),
     [
         (["simulate"], "hlsim simulate: error: the following arguments are required: IN"),
-        (["simulate", "a", "b", "--audiogram", "N3", "--loud"], "hlsim simulate: error: unrecognized"),
+        (
+            ["simulate", "a", "b", "--audiogram", "N3", "--loud"],
+            "hlsim simulate: error: unrecognized",
+        ),
         (["nothing"], "hlsim: error: argument COMMAND: invalid choice"),
         ([], "hlsim: error: the following arguments are required: COMMAND"),
     ],
@@ -117,7 +120,14 @@ def test_the_sliders_of_a_hearing_aid(
     default = load_compensator("hearing-aid", sample_rate=rate)
     expected = default(waveform, Audiogram.standard("N3"), 0.0, 0.0)
     torch.testing.assert_close(read_audio(tmp_path / "out.wav")[0], expected, atol=1e-6, rtol=1e-5)
-    own = ["--compensator", str(tmp_path / "aid"), "--noise-reduction", "0.5", "--amplification", "0"]
+    own = [
+        "--compensator",
+        str(tmp_path / "aid"),
+        "--noise-reduction",
+        "0.5",
+        "--amplification",
+        "0",
+    ]
     assert main([*call, *own]) == 0
     expected = aid(waveform, Audiogram.standard("N3"), 0.5, 0.0).detach()
     torch.testing.assert_close(read_audio(tmp_path / "out.wav")[0], expected, atol=1e-6, rtol=1e-5)
@@ -159,9 +169,15 @@ def test_two_ears_of_a_stereo_file(tmp_path: Path, utterance: Path) -> None:
     aided = load_compensator("wdrc", sample_rate=rate, linked=True)(scene, both)
     for command, listener, expected in (
         (["simulate", "--simulator", "msbg"], listeners_csv(tmp_path, ("a", both)), heard),
-        (["compensate", "--compensator", "wdrc", "--linked"], f"{tmp_path / 'listeners.json'}:L2", aided),
+        (
+            ["compensate", "--compensator", "wdrc", "--linked"],
+            f"{tmp_path / 'listeners.json'}:L2",
+            aided,
+        ),
     ):
-        assert main([*command, str(tmp_path / "in.wav"), str(out), "--listener", str(listener)]) == 0
+        assert (
+            main([*command, str(tmp_path / "in.wav"), str(out), "--listener", str(listener)]) == 0
+        )
         torch.testing.assert_close(read_audio(out)[0], expected, atol=1e-6, rtol=1e-5)
 
 
@@ -182,7 +198,9 @@ def test_listeners_that_a_file_cannot_be_given_to(
         (tmp_path / "none.csv", "none.csv: cannot read audiograms: "),
     ):
         assert said in fails(capsys, *call, "--listener", listener)
-    assert "1 channels; allowed with --linked: 2" in fails(capsys, *call, "--audiogram", "N3", "--linked")
+    assert "1 channels; allowed with --linked: 2" in fails(
+        capsys, *call, "--audiogram", "N3", "--linked"
+    )
     write_audio(tmp_path / "in.wav", torch.ones(2, 4000), 16000)
     call[1] = tmp_path / "in.wav"
     linked = ("--linked", "--compensator", "nalr")
@@ -201,9 +219,7 @@ def test_a_compensator_of_another_ear_warns_once(
     (tmp_path / "in").mkdir()
     for rate in (16000, 22050, 48000):
         soundfile.write(tmp_path / "in" / f"{rate}.wav", np.full(rate // 10, 0.01), rate)
-    line = (
-        f"hlsim: warning: {tmp_path / 'mine'} was trained for one ear, 55, 55, 55, 65, 70, 75, 80, 80 dB HL"
-    )
+    line = f"hlsim: warning: {tmp_path / 'mine'} was trained for one ear, 55, 55, 55, 65, 70, 75, 80, 80 dB HL"
     for source, target in ((utterance, "out.wav"), (tmp_path / "in", "out")):
         files = ["compensate", str(source), str(tmp_path / target)]
         assert main([*files, "--audiogram", ear, "--compensator", str(tmp_path / "mine")]) == 0
@@ -297,7 +313,9 @@ def test_folders_keep_their_tree_and_what_cannot_be_read_is_told(
     assert "left out" in told.err and "1 of 3 files were left out" in told.err
     assert main([*call[:1], str(utterance), str(tmp_path / "alone.wav"), *call[3:]]) == 0
     alone, _ = read_audio(tmp_path / "alone.wav")
-    written = {path.relative_to(tmp_path / "out").as_posix() for path in (tmp_path / "out").rglob("*.wav")}
+    written = {
+        path.relative_to(tmp_path / "out").as_posix() for path in (tmp_path / "out").rglob("*.wav")
+    }
     assert written == {"one.wav", "a/two.wav"}
     assert all(torch.equal(read_audio(tmp_path / "out" / name)[0], alone) for name in written)
     samples, _ = soundfile.read(utterance)
@@ -329,10 +347,15 @@ def test_what_a_listener_would_not_expect_of_a_file_is_told(
         ("simulate", 0.001, "msbg", False, False),
     ):  # fmt: skip
         soundfile.write(tmp_path / "in.wav", level * noise, 48000, subtype="FLOAT")
-        kind, ear = {"compensate": ("--compensator", "N3"), "simulate": ("--simulator", "N5")}[command]
+        kind, ear = {"compensate": ("--compensator", "N3"), "simulate": ("--simulator", "N5")}[
+            command
+        ]
         assert main([command, *files, "--audiogram", ear, kind, model]) == 0
         told = capsys.readouterr().err
-        assert ("a player clips it" in told, "what IN has above 8 kHz is missing" in told) == (clipped, dull)
+        assert ("a player clips it" in told, "what IN has above 8 kHz is missing" in told) == (
+            clipped,
+            dull,
+        )
 
 
 @pytest.mark.parametrize("command", ["simulate", "compensate"])
@@ -366,15 +389,37 @@ def test_a_file_in_the_place_of_the_folder_for_results(
         assert f"argument --out: {plain}: not a folder; allowed: a folder, there or not" in error
 
 
-def test_options_that_contradict_each_other(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_options_that_contradict_each_other(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     out = ["--out", tmp_path / "out"]
     error = refused(capsys, "haspi-report", "--spl", "65", "--full-scale-spl", "94", *out)
     assert "argument --full-scale-spl: not allowed with argument --spl" in error
     call = ["evaluate-simulator", "msbg", "msbg", "--speech", "s", "--audiograms", "a", *out]
     assert "simulators msbg, msbg; allowed: one a label" in fails(capsys, *call)
-    call = ["evaluate-simulator", "msbg", "--speech", "s", "--audiograms", "a", "--compensator", "nalr", *out]
+    call = [
+        "evaluate-simulator",
+        "msbg",
+        "--speech",
+        "s",
+        "--audiograms",
+        "a",
+        "--compensator",
+        "nalr",
+        *out,
+    ]
     assert "--compensator without --inputs compensated; allowed" in fails(capsys, *call)
-    call = ["evaluate-compensator", "nalr", "--speech", "s", "--audiogram", "N3", "--gain-ears", "S3", *out]
+    call = [
+        "evaluate-compensator",
+        "nalr",
+        "--speech",
+        "s",
+        "--audiogram",
+        "N3",
+        "--gain-ears",
+        "S3",
+        *out,
+    ]
     assert "--gain-ears with --audiogram; allowed: without it" in fails(capsys, *call)
     pytest.importorskip("lightning")
     call = ["train-compensator", "--speech", "s", "--audiogram", "N4", "--audiograms", "a", *out]
@@ -390,7 +435,15 @@ def test_audiograms_that_do_not_ascend(
     out = tmp_path / "out"
     speech = speech_dir / "valid"
     error = fails(
-        capsys, "evaluate-simulator", "msbg", "--speech", speech, "--audiograms", table, "--out", out
+        capsys,
+        "evaluate-simulator",
+        "msbg",
+        "--speech",
+        speech,
+        "--audiograms",
+        table,
+        "--out",
+        out,
     )
     assert f"{table}, line 2" in error and "ascending" in error
 
@@ -413,12 +466,16 @@ def test_unknown_and_changed_checkpoints(
     assert not (tmp_path / "out.wav").exists()
 
 
-def test_unequal_file_lists(tmp_path: Path, utterance: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_unequal_file_lists(
+    tmp_path: Path, utterance: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     for name in ("clean", "before", "after"):
         (tmp_path / name).mkdir()
         (tmp_path / name / "a.flac").write_bytes(utterance.read_bytes())
     (tmp_path / "clean" / "b.flac").write_bytes(utterance.read_bytes())
-    folders = [part for name in ("clean", "before", "after") for part in (f"--{name}", tmp_path / name)]
+    folders = [
+        part for name in ("clean", "before", "after") for part in (f"--{name}", tmp_path / name)
+    ]
     error = fails(capsys, "haspi-report", *folders, "--audiogram", "N4", "--out", tmp_path / "out")
     assert "b" in error and not (tmp_path / "out").exists()
 
@@ -448,9 +505,27 @@ def test_unequal_file_lists(tmp_path: Path, utterance: Path, capsys: pytest.Capt
             ],
             "clarity",
         ),
-        (["evaluate-simulator", "msbg", "--speech", "s", "--audiograms", "a", "--out", "o"], "pesq"),
-        (["evaluate-simulator", "msbg", "--speech", "s", "--audiograms", "a", "--out", "o"], "clarity"),
-        (["evaluate-compensator", "nalr", "--speech", "s", "--engine", "pyclarity", "--out", "o"], "clarity"),
+        (
+            ["evaluate-simulator", "msbg", "--speech", "s", "--audiograms", "a", "--out", "o"],
+            "pesq",
+        ),
+        (
+            ["evaluate-simulator", "msbg", "--speech", "s", "--audiograms", "a", "--out", "o"],
+            "clarity",
+        ),
+        (
+            [
+                "evaluate-compensator",
+                "nalr",
+                "--speech",
+                "s",
+                "--engine",
+                "pyclarity",
+                "--out",
+                "o",
+            ],
+            "clarity",
+        ),
         (["demo", "--out", "o"], "matplotlib"),
     ],
 )
@@ -468,7 +543,9 @@ def test_missing_extra_names_the_install_command(
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, module, None)
     error = fails(capsys, *command)
-    extra = {"lightning": "train", "tensorboard": "train", "clarity": "pyclarity"}.get(module, "eval")
+    extra = {"lightning": "train", "tensorboard": "train", "clarity": "pyclarity"}.get(
+        module, "eval"
+    )
     assert module in error and f"pip install 'hlsim[{extra}]'" in error
     assert not list(tmp_path.iterdir())
 
@@ -480,14 +557,31 @@ def test_bad_recipe(tmp_path: Path, speech_dir: Path, capsys: pytest.CaptureFixt
     call = ("train-simulator", "--config", recipe, "--speech", speech_dir / "train", "--out", out)
     assert "learning_rat" in fails(capsys, *call) and not out.exists()
     recipe.write_text("batch: 2\n")
-    assert "no such folder" in fails(capsys, *call[:3], "--speech", tmp_path / "nowhere", "--out", out)
+    assert "no such folder" in fails(
+        capsys, *call[:3], "--speech", tmp_path / "nowhere", "--out", out
+    )
 
 
 def test_evaluate_simulator_writes_both_files(tmp_path: Path, speech_dir: Path) -> None:
     ears = tmp_path / "ears.csv"
     ears.write_text(",".join(Audiogram.standard("N3").to_row()) + "\n35,35,40,50,55,60,65,65\n")
-    arguments = ["evaluate-simulator", "exact=msbg", "neuro-msbg", "--speech", str(speech_dir / "valid")]
-    arguments += ["--audiograms", str(ears), "--items", "4", "--seconds", "2", "--out", str(tmp_path / "out")]
+    arguments = [
+        "evaluate-simulator",
+        "exact=msbg",
+        "neuro-msbg",
+        "--speech",
+        str(speech_dir / "valid"),
+    ]
+    arguments += [
+        "--audiograms",
+        str(ears),
+        "--items",
+        "4",
+        "--seconds",
+        "2",
+        "--out",
+        str(tmp_path / "out"),
+    ]
     assert main(arguments) == 0
     result = json.loads((tmp_path / "out" / "fidelity.json").read_text())
     assert list(result["simulators"]) == ["exact", "neuro-msbg"]
@@ -499,7 +593,10 @@ def test_evaluate_simulator_writes_both_files(tmp_path: Path, speech_dir: Path) 
 @pytest.mark.parametrize("device", ["gpu", "cuda:99", "cpu:3"])
 def test_benchmark_on_no_device(device: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["benchmark", "--device", device]) == 2
-    assert f"device '{device}': there is none that torch can use; allowed: cpu" in capsys.readouterr().err
+    assert (
+        f"device '{device}': there is none that torch can use; allowed: cpu"
+        in capsys.readouterr().err
+    )
 
 
 @pytest.mark.slow
@@ -523,13 +620,27 @@ def test_haspi_report_of_a_manifest(
         pytest.importorskip(module)
     samples, rate = soundfile.read(utterance)
     for name, gain in (("clean", 1.0), ("aided", 4.0)):
-        soundfile.write(tmp_path / f"{name}.wav", gain * samples[rate : 2 * rate], rate, subtype="FLOAT")
+        soundfile.write(
+            tmp_path / f"{name}.wav", gain * samples[rate : 2 * rate], rate, subtype="FLOAT"
+        )
     (tmp_path / "broken.wav").write_text("this is no audio")
     lines = ["listener,ear,condition,clean,processed,audiogram"]
-    lines += [f"L1,l,{c},clean.wav,{f}.wav,N4" for c, f in (("unaided", "clean"), ("aided", "aided"))]
-    lines += [f"L2,r,{c},clean.wav,{f}.wav,N2" for c, f in (("unaided", "clean"), ("aided", "broken"))]
+    lines += [
+        f"L1,l,{c},clean.wav,{f}.wav,N4" for c, f in (("unaided", "clean"), ("aided", "aided"))
+    ]
+    lines += [
+        f"L2,r,{c},clean.wav,{f}.wav,N2" for c, f in (("unaided", "clean"), ("aided", "broken"))
+    ]
     (tmp_path / "study.csv").write_text("\n".join(lines))
-    call = ["haspi-report", "--manifest", tmp_path / "study.csv", "--out", tmp_path / "out", "--jobs", "1"]
+    call = [
+        "haspi-report",
+        "--manifest",
+        tmp_path / "study.csv",
+        "--out",
+        tmp_path / "out",
+        "--jobs",
+        "1",
+    ]
     call += ["--measures", "stoi", "--spl", "65", "--listen", "1"]
     assert main([str(part) for part in call]) == 0
     printed = capsys.readouterr()
@@ -558,7 +669,15 @@ def test_a_recipe_of_brackets_or_with_a_name_twice(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     recipe = tmp_path / "recipe.yaml"
-    call = ["train-compensator", "--speech", tmp_path, "--out", tmp_path / "out", "--config", recipe]
+    call = [
+        "train-compensator",
+        "--speech",
+        tmp_path,
+        "--out",
+        tmp_path / "out",
+        "--config",
+        recipe,
+    ]
     recipe.write_text("[" * 3000)
     assert "not readable as YAML" in fails(capsys, *call)
     recipe.write_text("batch: 2\nweights:\n  bands: 1.0\n  bands: 2.0\n")
@@ -581,7 +700,10 @@ def test_a_stopped_command_says_how_to_go_on(
 
     before = signal.getsignal(signal.SIGTERM)
     monkeypatch.setattr("hlsim.audio.read_audio", stopped)
-    assert main(["compensate", str(utterance), str(tmp_path / "out.wav"), "--audiogram", "N3"]) == status
+    assert (
+        main(["compensate", str(utterance), str(tmp_path / "out.wav"), "--audiogram", "N3"])
+        == status
+    )
     assert "stopped; what was finished is kept" in capsys.readouterr().err
     assert signal.getsignal(signal.SIGTERM) is before
 

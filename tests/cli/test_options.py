@@ -13,10 +13,10 @@ from hlsim.cli import options
 from hlsim.cli.inputs import read_ear
 from hlsim.cli.main import COMMANDS
 from hlsim.cli.options import Parser
-from hlsim.criteria.choice import CRITERIA, CriterionName
 from hlsim.data.corpora import Layout
 from hlsim.data.plan_settings import PlanSettings
 from hlsim.data.teacher import TEACHERS, Alignment
+from hlsim.losses.criteria import CRITERIA, CriterionName
 from hlsim.metrics.registry import MEASURES, Engine, MeasureName
 from hlsim.parallel import Backend
 from hlsim.report.alignment import Method
@@ -52,9 +52,13 @@ def test_names_that_are_written_twice_agree() -> None:
     assert choices("prepare", "--alignment") == get_args(Alignment)[:2]
     assert set(choices("draw-alignment", "--alignment")) == {*get_args(Method)}
     assert (
-        choices("haspi-report", "--engine") == choices("evaluate-compensator", "--engine") == get_args(Engine)
+        choices("haspi-report", "--engine")
+        == choices("evaluate-compensator", "--engine")
+        == get_args(Engine)
     )
-    assert choices("prepare", "--backend") == choices("haspi-report", "--backend") == get_args(Backend)
+    assert (
+        choices("prepare", "--backend") == choices("haspi-report", "--backend") == get_args(Backend)
+    )
     assert tuple(MEASURES) == get_args(MeasureName) and tuple(CRITERIA) == get_args(CriterionName)
 
 
@@ -94,7 +98,9 @@ def test_defaults_of_the_program_are_the_functions() -> None:
     for command, parameters in _parameters().items():
         parser = declared(command)
         for name, expected in parameters.items():
-            default = parser.get_default({"train_snrs": "train_snr", "test_snrs": "test_snr"}.get(name, name))
+            default = parser.get_default(
+                {"train_snrs": "train_snr", "test_snrs": "test_snr"}.get(name, name)
+            )
             if default is None or expected in (None, inspect.Parameter.empty):
                 continue  # required of one or the other, or read before it is passed on
             if name == "level":
@@ -108,7 +114,9 @@ def test_defaults_of_the_program_are_the_functions() -> None:
     assert compared > 30
 
 
-TRAINING = "speech noise audiograms valid_speech valid_noise valid_audiograms config start device quiet"
+TRAINING = (
+    "speech noise audiograms valid_speech valid_noise valid_audiograms config start device quiet"
+)
 
 # options that are not passed on by their names
 READ = {

@@ -16,12 +16,18 @@ def corpus(tmp_path: Path) -> Path:
     for name in ("ann", "bob"):
         (tmp_path / "speech" / name).mkdir(parents=True)
         write_audio(
-            tmp_path / "speech" / name / "1.wav", 0.05 * torch.randn(9600, generator=generator), 16000
+            tmp_path / "speech" / name / "1.wav",
+            0.05 * torch.randn(9600, generator=generator),
+            16000,
         )
     (tmp_path / "speech" / "bob" / "2.wav").write_text("x")
     for kind in ("hum", "hiss"):
         (tmp_path / "noise" / kind).mkdir(parents=True)
-        write_audio(tmp_path / "noise" / kind / "1.wav", 0.05 * torch.randn(9600, generator=generator), 16000)
+        write_audio(
+            tmp_path / "noise" / kind / "1.wav",
+            0.05 * torch.randn(9600, generator=generator),
+            16000,
+        )
     return tmp_path / "speech"
 
 
@@ -53,11 +59,25 @@ def test_prepare_says_what_it_found_and_writes(
     assert len(list(out.rglob("*.safetensors"))) == 8
 
 
-def test_options_reach_the_plan(corpus: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_options_reach_the_plan(
+    corpus: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     out = tmp_path / "out"
-    options = ["--severities", "none=1,severe=1", "--ears", "4", "--level", "50", "70", "--rate", "22050"]
+    options = [
+        "--severities",
+        "none=1,severe=1",
+        "--ears",
+        "4",
+        "--level",
+        "50",
+        "70",
+        "--rate",
+        "22050",
+    ]
     assert main(["prepare", str(corpus), "--out", str(out), "--jobs", "1", *options]) == 0
-    assert capsys.readouterr().out.splitlines()[0].endswith("4 instances; ears 50 % none, 50 % severe")
+    assert (
+        capsys.readouterr().out.splitlines()[0].endswith("4 instances; ears 50 % none, 50 % severe")
+    )
     rows = (out / "instances.csv").read_text().splitlines()[1:]
     assert {row.split(",")[3] for row in rows} == {"clean"}
     assert all(50.0 <= float(row.split(",")[4]) <= 70.0 for row in rows)
@@ -72,8 +92,14 @@ def test_options_reach_the_plan(corpus: Path, tmp_path: Path, capsys: pytest.Cap
         (["--backend", "dask"], "needs the scheduler's address"),
         (["--backend", "dask", "--scheduler", "tcp://127.0.0.1:1"], "no Dask scheduler answers"),
         (["--root", "."], "not in the root"),
-        (["--train-snr", "5,10", "--test-snr", "5", "--noise", "NOISE"], "SNRs 5 dB for training and test"),
-        (["--train-snr", "5", "--test-types", "1"], "--train-snr, --test-types without --noise; allowed"),
+        (
+            ["--train-snr", "5,10", "--test-snr", "5", "--noise", "NOISE"],
+            "SNRs 5 dB for training and test",
+        ),
+        (
+            ["--train-snr", "5", "--test-types", "1"],
+            "--train-snr, --test-types without --noise; allowed",
+        ),
         (["--teacher", "pyclarity"], "--teacher without --write; allowed: only with it"),
         (["--teacher", "nobody:hears", "--write"], "teacher nobody:hears: cannot be had"),
         (["--rate", "44101", "--write"], "44101 Hz for a teacher; allowed: 16000"),
@@ -96,7 +122,10 @@ def test_bad_input_is_one_line(
 def test_draw_alignment(corpus: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("matplotlib")
     picture = tmp_path / "a.png"
-    assert main(["draw-alignment", str(corpus / "ann" / "1.wav"), str(picture), "--audiogram", "N3"]) == 0
+    assert (
+        main(["draw-alignment", str(corpus / "ann" / "1.wav"), str(picture), "--audiogram", "N3"])
+        == 0
+    )
     assert "samples at 16000 Hz" in capsys.readouterr().out and picture.stat().st_size > 1000
     assert main(["draw-alignment", str(corpus / "bob" / "2.wav"), str(picture)]) == 2
 

@@ -18,5 +18,7 @@ def test_the_end_is_told_from_the_pace_since_the_first_call(
     show(100, 100)
     first, second, third = capsys.readouterr().err.removeprefix("\r").split("\r")
     assert first.strip() == "50 of 100 scores"
-    assert second.startswith("60 of 100 scores, ends about ") and second.rstrip().endswith("(in 4.0 min)")
+    assert second.startswith("60 of 100 scores, ends about ") and second.rstrip().endswith(
+        "(in 4.0 min)"
+    )
     assert third.strip() == "100 of 100 scores" and third.endswith("\n")

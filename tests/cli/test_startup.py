@@ -22,7 +22,11 @@ for arguments, status in json.loads(sys.argv[1]):
 
 
 def test_help_and_refusals_import_nothing_heavy(tmp_path: Path) -> None:
-    plain, missing, out = tmp_path / "plain.wav", str(tmp_path / "missing"), str(tmp_path / "out.wav")
+    plain, missing, out = (
+        tmp_path / "plain.wav",
+        str(tmp_path / "missing"),
+        str(tmp_path / "out.wav"),
+    )
     plain.touch()
     refused: list[list[str]] = [
         [],
@@ -42,7 +46,16 @@ def test_help_and_refusals_import_nothing_heavy(tmp_path: Path) -> None:
         ["train-simulator", "--config", str(plain), "--out", out],
         ["train-simulator", "--config", str(plain), "--manifest", missing, "--out", out],
         ["train-compensator", "--speech", missing, "--out", out],
-        ["evaluate-simulator", "msbg", "--speech", str(tmp_path), "--audiograms", missing, "--out", out],
+        [
+            "evaluate-simulator",
+            "msbg",
+            "--speech",
+            str(tmp_path),
+            "--audiograms",
+            missing,
+            "--out",
+            out,
+        ],
         ["evaluate-compensator", "nalr", "--speech", missing, "--out", out],
         ["haspi-report", "--manifest", missing, "--out", out],
         ["demo", "--speech", missing],
@@ -51,7 +64,9 @@ def test_help_and_refusals_import_nothing_heavy(tmp_path: Path) -> None:
     shown = [["--help"], ["--version"], *([command, "--help"] for command in COMMANDS)]
     calls = [(call, 0) for call in shown] + [(call, 2) for call in refused]
     command = [sys.executable, "-c", SCRIPT, json.dumps(calls)]
-    ended = subprocess.run(command, capture_output=True, text=True, cwd=Path(hlsim.__file__).parents[1])
+    ended = subprocess.run(
+        command, capture_output=True, text=True, cwd=Path(hlsim.__file__).parents[1]
+    )
     assert ended.returncode == 0, ended.stderr[-2000:]
     assert not (tmp_path / "out.wav").exists()
 
@@ -60,7 +75,7 @@ def test_names_are_handed_on_when_they_are_asked_for() -> None:
     script = """
 import sys, hlsim
 assert "torch" not in sys.modules and {*hlsim.__all__, "__version__"} <= set(dir(hlsim))
-assert hlsim.HearingLossLoss.__module__ == "hlsim.loss"
+assert hlsim.HearingLossLoss.__module__ == "hlsim.losses.hearing_loss"
 from hlsim import *
 assert Audiogram is hlsim.Audiogram and MSBG is hlsim.MSBG and load_pretrained("neuro-msbg")
 try:

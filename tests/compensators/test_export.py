@@ -43,7 +43,9 @@ def test_onnxruntime_gives_what_the_stream_gives(make: Make, tmp_path: Path) -> 
     runtime = pytest.importorskip("onnxruntime")
     aid: Any = make()
     export_aid(aid, tmp_path / "aid.onnx")
-    session = runtime.InferenceSession(str(tmp_path / "aid.onnx"), providers=["CPUExecutionProvider"])
+    session = runtime.InferenceSession(
+        str(tmp_path / "aid.onnx"), providers=["CPUExecutionProvider"]
+    )
     names = [entry.name.removeprefix("next_") for entry in session.get_outputs()]
     inputs = {name: tensor.numpy() for name, tensor in first_inputs(aid, EAR).items()}
     steps = torch.tensor([20.0, 70.0, 50.0, 90.0, 60.0]).repeat_interleave(3200)
@@ -51,7 +53,10 @@ def test_onnxruntime_gives_what_the_stream_gives(make: Make, tmp_path: Path) -> 
     stream, found, expected = aid.stream(EAR), [], []
     for number, samples in enumerate(hops(signal)):
         if number == 100 and aid.SLIDERS:
-            stream.noise_reduction, inputs["sliders"] = 0.2, np.array([[0.2, 1.0]], dtype=np.float32)
+            stream.noise_reduction, inputs["sliders"] = (
+                0.2,
+                np.array([[0.2, 1.0]], dtype=np.float32),
+            )
         inputs["samples"] = samples.numpy()
         outputs = dict(zip(names, session.run(None, inputs), strict=True))
         found.append(torch.from_numpy(outputs.pop("output")))
@@ -65,7 +70,9 @@ def test_a_linked_aid_is_exported_for_two_ears(tmp_path: Path) -> None:
     pytest.importorskip("onnxscript")
     runtime = pytest.importorskip("onnxruntime")
     export_aid(WDRC(linked=True), tmp_path / "aid.onnx", items=2)
-    session = runtime.InferenceSession(str(tmp_path / "aid.onnx"), providers=["CPUExecutionProvider"])
+    session = runtime.InferenceSession(
+        str(tmp_path / "aid.onnx"), providers=["CPUExecutionProvider"]
+    )
     assert session.get_outputs()[0].shape == [2, 64]
 
 
@@ -75,7 +82,9 @@ def test_the_aid_keeps_its_mode_and_what_is_refused(tmp_path: Path) -> None:
     assert all(module.training for module in aid.modules())
     with pytest.raises(ValueError, match="at 44100 Hz; allowed: 16000"):
         hop_program(trained(sample_rate=44100))
-    with pytest.raises(ValueError, match="no slider volume; allowed: noise_reduction, amplification"):
+    with pytest.raises(
+        ValueError, match="no slider volume; allowed: noise_reduction, amplification"
+    ):
         first_inputs(trained(), EAR, volume=1.0)
     with pytest.raises(ValueError, match=r"there is no folder '.*missing'"):
         export_aid(trained(), tmp_path / "missing" / "aid.onnx")

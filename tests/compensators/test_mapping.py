@@ -10,9 +10,9 @@ from compensators import NALR, MappingCompensator, MappingConfig
 from compensators.limiter import soft_limit
 from hlsim import Audiogram
 from hlsim.calibration import level_spl, set_level
-from hlsim.criteria.bands import band_levels
 from hlsim.data.ears import draw_thresholds
 from hlsim.dsp.resample import resample
+from hlsim.losses.band_levels import band_levels
 from hlsim.neuro import NeuroConfig
 
 SMALL = MappingConfig(channels=8, blocks=1)
@@ -119,19 +119,25 @@ def test_other_rates_give_the_same_band(rate: int, utterance: torch.Tensor) -> N
     faster = resample(utterance, 16000, rate)
     aided = trained(sample_rate=rate)(faster, ear)
     assert aided.shape == faster.shape
-    difference = bands_db(resample(aided, rate, 16000)[: len(utterance)])[:22] - bands_db(at_neuro_rate)[:22]
+    difference = (
+        bands_db(resample(aided, rate, 16000)[: len(utterance)])[:22] - bands_db(at_neuro_rate)[:22]
+    )
     assert difference.abs().max() < 0.2
 
 
 def test_full_scale(utterance: torch.Tensor) -> None:
     ear = Audiogram.standard("N3")
     softer = utterance / 10.0  # 94 dB SPL at RMS 1.0 is 114 at RMS 10
-    torch.testing.assert_close(trained(full_scale_spl=114.0)(softer, ear) * 10.0, trained()(utterance, ear))
+    torch.testing.assert_close(
+        trained(full_scale_spl=114.0)(softer, ear) * 10.0, trained()(utterance, ear)
+    )
 
 
 def test_aligned(utterance: torch.Tensor) -> None:
     aided = MappingCompensator(SMALL)(utterance, Audiogram.standard("N3"))
-    spectra = torch.fft.rfft(aided, 2 * len(aided)) * torch.fft.rfft(utterance, 2 * len(aided)).conj()
+    spectra = (
+        torch.fft.rfft(aided, 2 * len(aided)) * torch.fft.rfft(utterance, 2 * len(aided)).conj()
+    )
     assert int(torch.fft.irfft(spectra).argmax()) == 0
 
 
@@ -207,7 +213,9 @@ def test_phase_stays_or_is_predicted(utterance: torch.Tensor) -> None:
     for phase in ("input", "predicted"):
         model = trained(MappingConfig(channels=8, blocks=1, phase=phase))
         assert MappingConfig.from_dict(model.config.to_dict()) == model.config
-        given, aided = (model.stft.analyse(signal[None]) for signal in (utterance, model(utterance, ear)))
+        given, aided = (
+            model.stft.analyse(signal[None]) for signal in (utterance, model(utterance, ear))
+        )
         loud = given.abs() > 0.1 * given.abs().max()
         turned.append((aided * given.conj())[loud].angle().abs().mean().item())
     assert turned[0] < 0.1 < 0.2 < turned[1]

@@ -64,7 +64,9 @@ def test_gain_of_a_tone_is_the_prescribed_one() -> None:
     hz = torch.tensor(FREQUENCIES[1:-1])
     tones = torch.sin(2.0 * torch.pi * hz[:, None] * torch.arange(16000) / 16000.0)
     middle = slice(4000, 12000)
-    gains = 20.0 * torch.log10(NALR(ear)(tones)[:, middle].norm(dim=-1) / tones[:, middle].norm(dim=-1))
+    gains = 20.0 * torch.log10(
+        NALR(ear)(tones)[:, middle].norm(dim=-1) / tones[:, middle].norm(dim=-1)
+    )
     prescribed = nalr_gains_db(torch.tensor(ear.thresholds))[1:-1]
     assert (gains - prescribed).abs().max() < 0.6  # the window of 221 samples rounds the corners
 
@@ -124,7 +126,9 @@ def test_refuses_what_it_cannot_use() -> None:
 
 def test_a_trained_compensator_is_named_where_it_refuses_what_the_prescription_takes() -> None:
     with pytest.raises(ValueError, match="105 dB HL; MappingCompensator takes -10 to 100"):
-        MappingCompensator(MappingConfig(channels=8, blocks=1))(torch.randn(100), Audiogram.standard("N7"))
+        MappingCompensator(MappingConfig(channels=8, blocks=1))(
+            torch.randn(100), Audiogram.standard("N7")
+        )
 
 
 @pytest.mark.parametrize("order", [221, 2.0, "220", None, True, 0, 1024])

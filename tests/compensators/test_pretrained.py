@@ -25,7 +25,9 @@ def test_saved_and_loaded_is_the_same_to_the_bit(tmp_path: Path) -> None:
     save_compensator(model, tmp_path / "mine")  # in place of the other
     loaded = load_compensator(tmp_path / "mine")
     assert isinstance(loaded, MappingCompensator) and loaded.config == model.config
-    assert not loaded.training and not any(parameter.requires_grad for parameter in loaded.parameters())
+    assert not loaded.training and not any(
+        parameter.requires_grad for parameter in loaded.parameters()
+    )
     waveform, ear = 0.05 * torch.randn(2, 4000), Audiogram.standard("N4")
     assert torch.equal(loaded(waveform, ear), model.eval()(waveform, ear))
 
@@ -66,8 +68,14 @@ def test_linked_gains_by_name() -> None:
 
 def test_the_ear_that_a_compensator_was_trained_for(tmp_path: Path) -> None:
     model, ear = MappingCompensator(MappingConfig(channels=8, blocks=1)), Audiogram.standard("N4")
-    for name, about in (("one", {"audiogram": ear.to_dict()}), ("all", {"audiogram": None}), ("old", {})):
-        save_checkpoint(tmp_path / name, "mapping-compensator", model, model.config.to_dict(), about)
+    for name, about in (
+        ("one", {"audiogram": ear.to_dict()}),
+        ("all", {"audiogram": None}),
+        ("old", {}),
+    ):
+        save_checkpoint(
+            tmp_path / name, "mapping-compensator", model, model.config.to_dict(), about
+        )
     assert [trained_for(tmp_path / name) for name in ("one", "all", "old")] == [ear, None, None]
     save_compensator(model, tmp_path / "all", ear)
     assert trained_for(tmp_path / "all") == ear
@@ -83,7 +91,9 @@ def test_unknown_name_and_other_kind(tmp_path: Path) -> None:
         load_compensator("nobody")
     assert "neuro-msbg" not in str(caught.value)
     save_checkpoint(tmp_path / "other", "neuro-msbg", torch.nn.Linear(2, 2), {}, {})
-    with pytest.raises(ValueError, match=r"'neuro-msbg'; needed here: .* \(hlsim.load_pretrained loads"):
+    with pytest.raises(
+        ValueError, match=r"'neuro-msbg'; needed here: .* \(hlsim.load_pretrained loads"
+    ):
         load_compensator(tmp_path / "other")
 
 

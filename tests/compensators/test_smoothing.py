@@ -29,7 +29,9 @@ def test_peaks_are_followed_as_giannoulis_says(attack: float, release: float) ->
     # in two calls as in one
     first, between = follow_peaks(values[:, :333], torch.zeros(2, 3, 3), up, down)
     second, after = follow_peaks(values[:, 333:], between, up, down)
-    assert (torch.cat((first, second), 1) - found).abs().max() < 1e-3 and (after - state).abs().max() < 1e-3
+    assert (torch.cat((first, second), 1) - found).abs().max() < 1e-3 and (
+        after - state
+    ).abs().max() < 1e-3
 
 
 def test_gradients_are_finite() -> None:

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from compensators import NALR, WDRC, load_compensator
-from compensators.bands import centres, shares, speech_levels
+from compensators.filter_bank import centres, shares, speech_levels
 from compensators.nalr import nalr_gains_db
 from hlsim import Audiogram
 from hlsim.audiogram.thresholds import interpolate
@@ -24,26 +24,33 @@ def tone(hertz: float, spl: float, seconds: float = 1.0) -> torch.Tensor:
 def test_static_curve() -> None:
     """In each band NAL-R's gain at the level of average speech, and about it a dB of output for every ratio dB of input,
     down to the knee and up to the limit."""
-    aid, ears = WDRC().double(), torch.tensor([[20.0 * i] * 8 for i in range(6)], dtype=torch.float64)
+    aid, ears = (
+        WDRC().double(),
+        torch.tensor([[20.0 * i] * 8 for i in range(6)], dtype=torch.float64),
+    )
     powers = torch.rand(6, 1, 129, dtype=torch.float64) * 10.0 ** torch.linspace(
         -9.0, 1.0, 129, dtype=torch.float64
     )
     steady = powers.expand(-1, 1000, -1)
-    gains = aid.control(steady, aid.fit(ears), torch.zeros(6, 1000, 0), aid.start(6, powers))[0][:, -1]
+    gains = aid.control(steady, aid.fit(ears), torch.zeros(6, 1000, 0), aid.start(6, powers))[0][
+        :, -1
+    ]
     levels = 10.0 * (powers[:, 0] @ torch.tensor(shares(BANDS, 256))).log10() + 94.0
     above = levels - torch.tensor(speech_levels(BANDS))
     assert (above < -25.0).any() and (above > 40.0).any()
     ratios = (1.0 + (ears[:, :1] - 10.0) / 40.0).clamp(1.0, 3.0)
-    expected = interpolate(nalr_gains_db(ears), centres(BANDS)) + (1.0 / ratios - 1.0) * above.clamp(
-        min=-20.0
-    )
+    expected = interpolate(nalr_gains_db(ears), centres(BANDS)) + (
+        1.0 / ratios - 1.0
+    ) * above.clamp(min=-20.0)
     expected = torch.minimum(expected.clamp(min=0.0), (110.0 - levels).clamp(min=0.0))
     assert (gains - expected).abs().max() < 0.01
 
 
 @pytest.mark.parametrize(("loss", "ratio"), [(0.0, 1.0), (30.0, 1.5), (50.0, 2.0), (80.0, 2.75)])
 @pytest.mark.parametrize("hertz", [500.0, 2030.0, 4083.0])
-def test_a_louder_tone_comes_out_louder_by_the_ratio(loss: float, ratio: float, hertz: float) -> None:
+def test_a_louder_tone_comes_out_louder_by_the_ratio(
+    loss: float, ratio: float, hertz: float
+) -> None:
     ear = torch.full((8,), loss)
     aid = WDRC(limit_spl=140.0)
     soft, loud = (level_spl(aid(tone(hertz, spl), ear)[8000:12000]) for spl in (60.0, 66.0))
@@ -71,12 +78,19 @@ def test_attack_and_release(attack: float, release: float) -> None:
 
     assert abs(milliseconds(gain[1000:], loud, soft) - 1000.0 * attack) < 12.0
     assert (
-        abs(milliseconds(gain[2010:], soft, loud) + 10.0 - 1000.0 * release) < 0.2 * 1000.0 * release + 12.0
+        abs(milliseconds(gain[2010:], soft, loud) + 10.0 - 1000.0 * release)
+        < 0.2 * 1000.0 * release + 12.0
     )
 
 
 def test_by_name_and_what_is_refused() -> None:
     assert isinstance(load_compensator("wdrc", full_scale_spl=100.0), WDRC)
-    for wrong in ({"bands": 2}, {"attack": -1.0}, {"release": 0.0}, {"knee": 99.0}, {"limit_spl": 200.0}):
+    for wrong in (
+        {"bands": 2},
+        {"attack": -1.0},
+        {"release": 0.0},
+        {"knee": 99.0},
+        {"limit_spl": 200.0},
+    ):
         with pytest.raises(ValueError, match=f"{next(iter(wrong))} is .*; allowed: "):
             WDRC(**wrong)  # type: ignore[arg-type]

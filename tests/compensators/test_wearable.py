@@ -55,7 +55,9 @@ def test_looks_as_far_ahead_as_it_says(
 
 @AIDS
 @pytest.mark.parametrize("sizes", [[1], [7], [64], [1000], None])
-def test_chunks_give_what_the_whole_gives(make: Make, noise: torch.Tensor, sizes: list[int] | None) -> None:
+def test_chunks_give_what_the_whole_gives(
+    make: Make, noise: torch.Tensor, sizes: list[int] | None
+) -> None:
     aid: Any = make()
     ears = torch.tensor([EAR.thresholds, Audiogram.standard("S2").thresholds])
     signal = noise[:, :1500] if sizes == [1] else noise
@@ -80,7 +82,10 @@ def test_a_batch_is_its_items(make: Make, noise: torch.Tensor) -> None:
     together = aid(signals, ears)
     for item in range(3):
         alone = aid(signals[item], ears[item])
-        assert alone.shape == (6000,) and (together[item] - alone).abs().max() < 1e-5 * alone.abs().max()
+        assert (
+            alone.shape == (6000,)
+            and (together[item] - alone).abs().max() < 1e-5 * alone.abs().max()
+        )
     assert torch.equal(aid(signals.unsqueeze(1), ears.unsqueeze(1)), together.unsqueeze(1))
     assert aid(signals[0], ears).shape == (3, 6000)
 
@@ -192,9 +197,13 @@ def test_linked_gains_keep_levels_between_the_ears(make: Make, noise: torch.Tens
     torch.testing.assert_close(aid(same, uneven), alone(same, uneven))
     items = torch.stack((scene, same))
     together = aid(items, [Listener(EAR, EAR), uneven])
-    torch.testing.assert_close(together, torch.stack((aid(scene, EAR), aid(same, uneven))), atol=1e-5, rtol=0)
+    torch.testing.assert_close(
+        together, torch.stack((aid(scene, EAR), aid(same, uneven))), atol=1e-5, rtol=0
+    )
     stream = aid.stream(Listener(EAR, EAR))
-    late = torch.cat((stream(scene[:, :4001]), stream(scene[:, 4001:]), stream.flush()), -1)[:, aid.latency :]
+    late = torch.cat((stream(scene[:, :4001]), stream(scene[:, 4001:]), stream.flush()), -1)[
+        :, aid.latency :
+    ]
     torch.testing.assert_close(late, aid(scene, EAR), atol=1e-5, rtol=0)
     for mono in (noise[0], noise[:1]):
         with pytest.raises(ValueError, match=r"two ears; allowed: \(\.\.\., 2, time\)"):

@@ -34,7 +34,9 @@ def voicebank(tmp_path: Path, pieces: list[Tensor]) -> Path:
         "trainset_28spk": ("p226_001", "p226_002", "p227_001", "p227_002"),
         "testset": ("p232_001", "p232_002"),
     }
-    for number, (part, name) in enumerate((part, name) for part, own in names.items() for name in own):
+    for number, (part, name) in enumerate(
+        (part, name) for part, own in names.items() for name in own
+    ):
         clean = pieces[number]
         noisy = clean + 0.01 * torch.randn(clean.shape, generator=generator)
         for kind, wave in (("clean", clean), ("noisy", noisy)):

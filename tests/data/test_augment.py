@@ -45,14 +45,18 @@ def test_equalise_has_the_gains_at_and_between_the_frequencies(rate: int) -> Non
         assert out.shape == tone.shape
         middle = slice(rate // 8, -rate // 8)
         # zero-phase: the tone itself, louder or softer
-        torch.testing.assert_close(out[:, middle], 10 ** (gain_db / 20) * tone[:, middle], atol=0.02, rtol=0)
+        torch.testing.assert_close(
+            out[:, middle], 10 ** (gain_db / 20) * tone[:, middle], atol=0.02, rtol=0
+        )
 
 
 def test_equalise_gives_each_item_its_gains() -> None:
     wave = torch.randn(3, 1000)
     flat = torch.tensor([0.0, 20.0, -20.0]).unsqueeze(-1).expand(3, 8)
     out = equalise(wave, flat, torch.tensor(FREQUENCIES), 16000)
-    torch.testing.assert_close(out, wave * torch.tensor([[1.0], [10.0], [0.1]]), atol=1e-5, rtol=1e-4)
+    torch.testing.assert_close(
+        out, wave * torch.tensor([[1.0], [10.0], [0.1]]), atol=1e-5, rtol=1e-4
+    )
 
 
 def test_compress_divides_level_differences_by_the_ratio() -> None:
@@ -68,7 +72,9 @@ def test_compress_divides_level_differences_by_the_ratio() -> None:
 
 def test_compress_does_not_depend_on_the_level() -> None:
     wave, ratio = torch.randn(2, 1600), torch.tensor([2.0, 3.0])
-    torch.testing.assert_close(compress(100.0 * wave, ratio, 16000), 100.0 * compress(wave, ratio, 16000))
+    torch.testing.assert_close(
+        compress(100.0 * wave, ratio, 16000), 100.0 * compress(wave, ratio, 16000)
+    )
     assert bool(torch.isfinite(compress(torch.zeros(2, 1600), ratio, 16000)).all())
 
 
@@ -113,7 +119,9 @@ def test_two_in_five_are_amplified_for_the_ear() -> None:
 def test_silence_stays_finite() -> None:
     generator = torch.Generator().manual_seed(0)
     speech = torch.zeros(32, 1600)
-    out = augment_speech(speech, torch.randn(32, 1600), draw_thresholds(32, generator), 16000, generator)
+    out = augment_speech(
+        speech, torch.randn(32, 1600), draw_thresholds(32, generator), 16000, generator
+    )
     assert bool(torch.isfinite(out).all())
     assert not bool(augment_speech(speech, None, torch.zeros(32, 8), 16000, generator).any())
 
@@ -124,5 +132,9 @@ def test_levels_of_items_do_not_depend_on_the_recordings() -> None:
     outs = []
     for gain in (1.0, 1e-3):
         generator.manual_seed(7)
-        outs.append(augment_speech(set_level(speech, 60.0) * gain, None, torch.zeros(8, 8), 16000, generator))
+        outs.append(
+            augment_speech(
+                set_level(speech, 60.0) * gain, None, torch.zeros(8, 8), 16000, generator
+            )
+        )
     torch.testing.assert_close(outs[0], outs[1], atol=1e-6, rtol=1e-3)

@@ -23,7 +23,9 @@ def ramp(samples: int) -> Tensor:
 
 
 def test_clips_are_pieces_of_the_recordings(tmp_path: Path) -> None:
-    clips = Clips(folder_with(tmp_path, a=ramp(4000), b=-0.5 * ramp(3000)), sample_rate=16000, seconds=0.1)
+    clips = Clips(
+        folder_with(tmp_path, a=ramp(4000), b=-0.5 * ramp(3000)), sample_rate=16000, seconds=0.1
+    )
     assert (len(clips), clips.samples) == (2, 1600)
     step = 1.0 / 32767  # kept as 16-bit samples, peak at 1
     for index, whole in enumerate((ramp(4000), -ramp(3000))):
@@ -31,7 +33,9 @@ def test_clips_are_pieces_of_the_recordings(tmp_path: Path) -> None:
         torch.testing.assert_close(clips.clip(index, 0.0), whole[:1600], atol=step, rtol=0)
         torch.testing.assert_close(clips.clip(index, 1.0), whole[-1600:], atol=step, rtol=0)
         middle = (len(whole) - 1600) // 2
-        torch.testing.assert_close(clips.clip(index, 0.5), whole[middle : middle + 1600], atol=step, rtol=0)
+        torch.testing.assert_close(
+            clips.clip(index, 0.5), whole[middle : middle + 1600], atol=step, rtol=0
+        )
 
 
 def test_short_recordings_end_in_silence_or_are_repeated(tmp_path: Path) -> None:
@@ -105,7 +109,9 @@ def test_what_is_refused_names_the_path(tmp_path: Path) -> None:
     bad.write_text("no recording")
     with (
         pytest.warns(UserWarning, match="left out: .*bad.wav"),
-        pytest.raises(ValueError, match=r"not readable as audio.*; 100 files like it were drawn") as caught,
+        pytest.raises(
+            ValueError, match=r"not readable as audio.*; 100 files like it were drawn"
+        ) as caught,
     ):
         Clips(tmp_path, sample_rate=16000, seconds=1.0).draw(1, torch.Generator())
     assert str(caught.value).startswith(str(bad))

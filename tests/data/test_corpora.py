@@ -4,7 +4,14 @@ from pathlib import Path
 
 import pytest
 
-from hlsim.data.corpora import Fault, assign_splits, detect_layout, find_below, find_utterances, walk_audio
+from hlsim.data.corpora import (
+    Fault,
+    assign_splits,
+    detect_layout,
+    find_below,
+    find_utterances,
+    walk_audio,
+)
 from hlsim.data.manifest import Utterance
 
 
@@ -26,7 +33,11 @@ def found(corpus: Path, table: Path | None = None) -> tuple[list[Utterance], lis
 def test_voicebank_demand(tmp_path: Path) -> None:
     corpus = tree(
         tmp_path,
-        *(f"{kind}_trainset_28spk_wav/p226_00{i}.wav" for kind in ("clean", "noisy") for i in (1, 2)),
+        *(
+            f"{kind}_trainset_28spk_wav/p226_00{i}.wav"
+            for kind in ("clean", "noisy")
+            for i in (1, 2)
+        ),
         *(f"{kind}_trainset_56spk_wav/p234_001.wav" for kind in ("clean", "noisy")),
         *(f"{kind}_testset_wav/p232_001.wav" for kind in ("clean", "noisy")),
         "clean_trainset_28spk_wav/p226_003.wav",
@@ -34,7 +45,9 @@ def test_voicebank_demand(tmp_path: Path) -> None:
         "clean_testset_wav/notes.txt",
     )
     (corpus / "logfiles").mkdir()
-    (corpus / "logfiles" / "log_trainset_28spk.txt").write_text("p226_002 office 15\np226_009 bus x\n\n")
+    (corpus / "logfiles" / "log_trainset_28spk.txt").write_text(
+        "p226_002 office 15\np226_009 bus x\n\n"
+    )
     (corpus / "log_testset.txt").write_text("p232_001 living 17.5\n")
     utterances, faults = found(corpus)
     assert [(u.id, u.speaker, u.split, u.noise, u.snr) for u in utterances] == [
@@ -75,7 +88,14 @@ def test_librispeech(tmp_path: Path, inner: str) -> None:
 
 def test_any_folder(tmp_path: Path) -> None:
     corpus = tree(
-        tmp_path, "b/x/1.wav", "a/1.flac", "a/1.wav", "top.ogg", "a/.hidden.wav", ".git/2.wav", "a/n.txt"
+        tmp_path,
+        "b/x/1.wav",
+        "a/1.flac",
+        "a/1.wav",
+        "top.ogg",
+        "a/.hidden.wav",
+        ".git/2.wav",
+        "a/n.txt",
     )
     utterances, faults = found(corpus)
     assert {(u.id, u.speaker, u.split) for u in utterances} == {
@@ -83,7 +103,9 @@ def test_any_folder(tmp_path: Path) -> None:
         ("b/x/1", "b/x", ""),
         ("top", "unknown", ""),
     }
-    assert [f.path for f in faults] == ["a/1.wav"] and "second file of the name a/1" in faults[0].reason
+    assert [f.path for f in faults] == ["a/1.wav"] and "second file of the name a/1" in faults[
+        0
+    ].reason
     assert list(walk_audio(corpus)) == ["top.ogg", "a/1.flac", "a/1.wav", "b/x/1.wav"]
 
 
@@ -126,12 +148,16 @@ def test_a_second_file_of_a_name_is_a_fault(tmp_path: Path) -> None:
         tree(corpus, "noisy_testset_wav/1-2.flac", "noisy_testset_wav/1-2.wav")
         utterances, faults = found(corpus)
         assert [u.clean for u in utterances] == [f"{place}/1-2.flac"]
-        assert [(f.path, f.reason) for f in faults] == [(f"{place}/1-2.wav", "a second file of the name 1-2")]
+        assert [(f.path, f.reason) for f in faults] == [
+            (f"{place}/1-2.wav", "a second file of the name 1-2")
+        ]
 
 
 def test_a_folder_above_whose_name_ends_in_clean_is_none_of_a_pair(tmp_path: Path) -> None:
     utterances, faults = found(tree(tmp_path, "vctk-clean/clean/1.wav", "vctk-clean/noisy/1.wav"))
-    assert [(u.clean, u.noisy) for u in utterances] == [("vctk-clean/clean/1.wav", "vctk-clean/noisy/1.wav")]
+    assert [(u.clean, u.noisy) for u in utterances] == [
+        ("vctk-clean/clean/1.wav", "vctk-clean/noisy/1.wav")
+    ]
     assert list(faults) == []
 
 
@@ -142,12 +168,16 @@ def test_links_to_folders_are_told_of(tmp_path: Path) -> None:
         ("libri", "train-clean-100/b"),
         ("vbd", "clean_testset_wav/b"),
     ):
-        corpus = tree(tmp_path / name, f"{Path(inner).parent}/a/s-1.wav", "noisy_testset_wav/a/s-1.wav")
+        corpus = tree(
+            tmp_path / name, f"{Path(inner).parent}/a/s-1.wav", "noisy_testset_wav/a/s-1.wav"
+        )
         (corpus / inner).symlink_to(tmp_path / "far")
         _, faults = found(corpus)
         assert [(f.path, f.reason.split(";")[0]) for f in faults] == [(inner, "a link to a folder")]
         assert [
-            f.path for f in find_below(tmp_path, name, detect_layout(corpus)) if isinstance(f, Fault)
+            f.path
+            for f in find_below(tmp_path, name, detect_layout(corpus))
+            if isinstance(f, Fault)
         ] == [f"{name}/{inner}"]
 
 
@@ -180,15 +210,21 @@ def test_speakers_are_in_one_split() -> None:
     speakers = {f"s{i}": {""} for i in range(20)}
     options = {"test_share": 0.1, "valid_share": 0.2, "seed": 0}
     splits = assign_splits(speakers, **options)
-    counts = {split: sum(own == split for own in splits.values()) for split in ("train", "valid", "test")}
+    counts = {
+        split: sum(own == split for own in splits.values()) for split in ("train", "valid", "test")
+    }
     assert counts == {"train": 14, "valid": 4, "test": 2}
     assert splits == assign_splits(dict(reversed(speakers.items())), **options)
     assert splits != assign_splits(speakers, **options | {"seed": 1})
     assert assign_splits({"a": {""}}, **options) == {"a": "train"}
-    given = assign_splits({"a": {"train"}, "b": {"test"}, "c": {"train"}, "d": {"train"}}, **options)
+    given = assign_splits(
+        {"a": {"train"}, "b": {"test"}, "c": {"train"}, "d": {"train"}}, **options
+    )
     mixed = assign_splits({"a": {"", "test"}, "b": {""}}, **options | {"valid_share": 0.0})
     assert mixed == {"a": "test", "b": "train"}
-    assert assign_splits({"a": {"test"}}, **options) == {"a": "test"}  # none to take validation from
+    assert assign_splits({"a": {"test"}}, **options) == {
+        "a": "test"
+    }  # none to take validation from
     assert given["b"] == "test" and sorted(given.values()) == ["test", "train", "train", "valid"]
     with pytest.raises(ValueError, match=r"speaker a is in test and train; allowed: one split"):
         assign_splits({"a": {"train", "test"}}, **options)

@@ -33,7 +33,9 @@ def table(path: Path, ears: list[tuple[str, tuple[float, ...]]], **columns: list
     names = [f"hl_{f}" for f in (250, 500, 1000, 2000, 3000, 4000, 6000, 8000)]
     lines = [",".join(["listener", *columns, *names])]
     for i, (who, levels) in enumerate(ears):
-        lines.append(",".join([who, *(values[i] for values in columns.values()), *map(str, levels)]))
+        lines.append(
+            ",".join([who, *(values[i] for values in columns.values()), *map(str, levels)])
+        )
     path.write_text("\n".join(lines) + "\n")
     return path
 
@@ -92,8 +94,12 @@ def test_drawn_ears_meet_the_proportions_and_are_disjoint() -> None:
         and not sets["train"] & sets["valid"]
         and not sets["valid"] & sets["test"]
     )
-    assert drawn["train"] == list(plan_ears(None, None, None, SPLITS, seed=0).assign("train", 150, 2))
-    assert drawn["train"] != list(plan_ears(None, None, None, SPLITS, seed=1).assign("train", 150, 2))
+    assert drawn["train"] == list(
+        plan_ears(None, None, None, SPLITS, seed=0).assign("train", 150, 2)
+    )
+    assert drawn["train"] != list(
+        plan_ears(None, None, None, SPLITS, seed=1).assign("train", 150, 2)
+    )
 
 
 def test_other_proportions_and_counts() -> None:
@@ -153,7 +159,9 @@ def test_few_measured_ears_are_still_different_and_of_the_severity(tmp_path: Pat
 
 
 def test_what_is_refused(tmp_path: Path) -> None:
-    path = table(tmp_path / "ears.csv", [("a", (60.0,) * 8), ("b", (61.0,) * 8), ("c", (110.0,) * 8)])
+    path = table(
+        tmp_path / "ears.csv", [("a", (60.0,) * 8), ("b", (61.0,) * 8), ("c", (110.0,) * 8)]
+    )
     with pytest.raises(ValueError, match="no mild ears for train"):
         plan_ears({"mild": 1.0, "severe": 1.0}, path, None, ("train",), seed=0)
     ears = plan_ears(None, path, None, ("train",), seed=0)

@@ -78,7 +78,9 @@ def test_found_in_the_working_directory_and_asked_at_its_own_rate(write: Write) 
 
 
 def test_another_source_or_weights_are_another_teacher(write: Write) -> None:
-    first, same, other = (load_teacher(f"{write(text)}:ready") for text in (HALF, HALF, HALF + "# changed"))
+    first, same, other = (
+        load_teacher(f"{write(text)}:ready") for text in (HALF, HALF, HALF + "# changed")
+    )
     assert first.digest == same.digest != other.digest
     assert len(first.digest) == 64 and first.digest[:12] in str(first)
     weights = write(HALF.replace("torch.tensor(0.5)", "torch.rand(())"))
@@ -125,7 +127,10 @@ def test_a_silent_ear_is_allowed_and_later_faults_are_told() -> None:
 @pytest.mark.parametrize(
     ("body", "said"),
     [
-        ("return waveform[..., 1:]", r"made shape \(\d+,\) of \(\d+,\); allowed: a real tensor of the same"),
+        (
+            "return waveform[..., 1:]",
+            r"made shape \(\d+,\) of \(\d+,\); allowed: a real tensor of the same",
+        ),
         ("return waveform / 0", "made NaN or infinity"),
         ("return waveform.roll(320, -1)", r"delays by 20\.0 ms; allowed: time-aligned"),
         ("return waveform @ nobody", r"NameError: .* \(somebodys_ears_\d+\.py, line 2\)"),
@@ -151,7 +156,10 @@ def test_what_is_no_teacher_is_refused(write: Write) -> None:
         (f"{module}:number", "is int; allowed: a callable"),
         (f"{module}:nobody", "cannot be had .*nobody"),
         ("no_such_module_here:hear", "cannot be had .*No module named 'no_such_module_here'"),
-        (f"{write(HALF.replace('44100', '96000'))}:ready", "sample rate 96000 Hz; allowed: 16000 to 48000"),
+        (
+            f"{write(HALF.replace('44100', '96000'))}:ready",
+            "sample rate 96000 Hz; allowed: 16000 to 48000",
+        ),
         ("pyclarty", "unknown teachers pyclarty; allowed: msbg, pyclarity, package.module:name"),
     ):
         with pytest.raises(ValueError, match=said):

@@ -50,14 +50,18 @@ def test_noise_is_mixed_at_the_files_rate(tmp_path: Path) -> None:
         (tmp_path / "n" / name).mkdir(parents=True)
         both = torch.sin(2 * torch.pi * 2000 * time) + torch.sin(2 * torch.pi * 15000 * time)
         write_audio(tmp_path / "n" / name / "a.wav", 0.1 * both, 48000)
-    settings = PlanSettings(tmp_path / "s", noise=tmp_path / "n", train_snrs=(6.0,), test_snrs=(1.0,))
+    settings = PlanSettings(
+        tmp_path / "s", noise=tmp_path / "n", train_snrs=(6.0,), test_snrs=(1.0,)
+    )
     prepare(settings, tmp_path / "out", jobs=1)
     opened = Plan(tmp_path / "out")
     clean, noisy = opened.pair(0)
     assert clean.shape == (16000,)
     inner = slice(800, -800)
     snr = float(dbfs(clean[inner]) - dbfs((noisy - clean)[inner]))
-    pauses = float(dbfs(speech)) - opened.utterance(0).active_level  # a tone has none, but it begins
+    pauses = (
+        float(dbfs(speech)) - opened.utterance(0).active_level
+    )  # a tone has none, but it begins
     assert snr == pytest.approx(6.0 + 3.01 + pauses, abs=0.02)
     assert torch.equal(opened.pair(0)[1], Plan(tmp_path / "out").pair(0)[1])
 
@@ -105,7 +109,9 @@ def test_what_has_changed_since(plan: Path, voicebank: Path, tmp_path: Path) -> 
     (plan / "plan.json").write_text(json.dumps(about))
     with pytest.raises(ValueError, match="leads out of"):
         Plan(plan).instance(16)
-    (plan / "instances.csv").write_text("".join((plan / "instances.csv").read_text().splitlines(True)[:-1]))
+    (plan / "instances.csv").write_text(
+        "".join((plan / "instances.csv").read_text().splitlines(True)[:-1])
+    )
     with pytest.raises(ValueError, match="23 instances of 6 utterances; allowed: 4 of each"):
         Plan(plan)
     with pytest.raises(ValueError, match="not prepared"):

@@ -10,7 +10,9 @@ from hlsim.data.manifest import UTTERANCE_COLUMNS, Rows, Utterance, csv_line, in
 
 def test_rows_come_back_as_they_were(tmp_path: Path) -> None:
     rows = [
-        Utterance('a, "b"', "ö", "train", "c/a.wav", "n/a.wav", "bus", 5.0, None, 16000, 1.5, -20.25),
+        Utterance(
+            'a, "b"', "ö", "train", "c/a.wav", "n/a.wav", "bus", 5.0, None, 16000, 1.5, -20.25
+        ),
         Utterance("b", "s", "valid", "b.wav", "", "noise/x.wav", -2.5, 1.25, 48000, 2.0, -30.5),
         Utterance("c", "s", "test", "c.wav", rate=44100, seconds=0.75, active_level=1.0),
     ]
@@ -55,7 +57,9 @@ def test_no_path_leads_out_of_the_root(tmp_path: Path) -> None:
     (root / "folder").symlink_to(outside)
     (root / "within.wav").symlink_to(root / "a" / "x.wav")
     (root / "loop.wav").symlink_to(root / "loop.wav")
-    assert inside(root, "loop.wav") == root / "loop.wav"  # to be refused as a file that is not there
+    assert (
+        inside(root, "loop.wav") == root / "loop.wav"
+    )  # to be refused as a file that is not there
     (tmp_path / "root2").mkdir()
     assert inside(root, "a/x.wav") == root / "a" / "x.wav"
     assert inside(root, "within.wav").read_text() == "x"

@@ -29,7 +29,9 @@ def written(plan: Path) -> Path:
 
 
 def test_whole_utterances_are_the_same_both_ways(written: Path) -> None:
-    fly, disk = (PlanData(written, prepared=prepared, workers=0, batch=3) for prepared in (False, True))
+    fly, disk = (
+        PlanData(written, prepared=prepared, workers=0, batch=3) for prepared in (False, True)
+    )
     for made, read in zip(fly.test_dataloader(), disk.test_dataloader(), strict=True):
         assert "impaired" not in made
         made = fly.on_after_batch_transfer(made, 0)
@@ -45,7 +47,9 @@ def test_whole_utterances_are_the_same_both_ways(written: Path) -> None:
 def test_clips_are_the_same_places_both_ways(written: Path) -> None:
     options = {"seconds": 0.15, "augment": False, "seed": 3}
     plan = Plan(written)
-    fly, disk = (PlannedBatches(PlanItems(plan, "train", prepared=p), **options) for p in (False, True))  # type: ignore[arg-type]
+    fly, disk = (
+        PlannedBatches(PlanItems(plan, "train", prepared=p), **options) for p in (False, True)
+    )  # type: ignore[arg-type]
     teacher = MSBG(sample_rate=16000)
     speech = [plan.instance(index).clean for index in range(0, 16, 4)]
     starts: set[int] = set()
@@ -58,7 +62,9 @@ def test_clips_are_the_same_places_both_ways(written: Path) -> None:
         # at either end the one from disk knows what lies beyond; and what is under 0 dB SPL is no difference
         target, error = read.impaired[800:-800], (heard - read.impaired)[800:-800]
         assert float(level_spl(error)) < max(float(level_spl(target)) - 60.0, 0.0)
-        starts |= {s for s in (0, 10240) for x in speech if torch.equal(made.clean, x[s : s + 2400])}
+        starts |= {
+            s for s in (0, 10240) for x in speech if torch.equal(made.clean, x[s : s + 2400])
+        }
     assert starts == {0, 10240}
 
 
@@ -66,7 +72,10 @@ def test_every_instance_comes_once_an_epoch_and_the_order_resumes(plan: Path) ->
     items = PlanItems(Plan(plan), "train")
     options = {"seconds": 0.2, "seed": 1}
     clips = PlannedBatches(items, augment=False, **options)  # type: ignore[arg-type]
-    seen = [tuple(clips.clip(i).signal[:50].tolist() + clips.clip(i).thresholds.tolist()) for i in range(16)]
+    seen = [
+        tuple(clips.clip(i).signal[:50].tolist() + clips.clip(i).thresholds.tolist())
+        for i in range(16)
+    ]
     ears = [clips.clip(i).thresholds.tolist() for i in range(32)]
     assert sorted(ears[:16]) == sorted(ears[16:]) and ears[:16] != ears[16:]
     assert len(set(seen)) == 16
@@ -87,12 +96,18 @@ def test_training_varies_level_ear_noise_and_spectrum(plan: Path) -> None:
     levels = torch.stack([level_spl(one.signal) for one in drawn])
     assert float(levels.min()) < 55.0 and float(levels.max()) > 85.0
     assert all(
-        float(level_spl(one.clean)) == pytest.approx(float(level_spl(one.signal)), abs=0.1) for one in drawn
+        float(level_spl(one.clean)) == pytest.approx(float(level_spl(one.signal)), abs=0.1)
+        for one in drawn
     )
     planned = {tuple(Plan(plan).thresholds(i).tolist()) for i in range(16)}
     assert not planned & {tuple(one.thresholds.tolist()) for one in drawn}
-    assert all(float(one.thresholds.min()) >= -10.0 and float(one.thresholds.max()) <= 100.0 for one in drawn)
-    alike = [float(torch.nn.functional.cosine_similarity(one.signal, one.clean, 0)) for one in drawn]
+    assert all(
+        float(one.thresholds.min()) >= -10.0 and float(one.thresholds.max()) <= 100.0
+        for one in drawn
+    )
+    alike = [
+        float(torch.nn.functional.cosine_similarity(one.signal, one.clean, 0)) for one in drawn
+    ]
     assert sum(value > 0.9999 for value in alike) > 5 and sum(value < 0.98 for value in alike) > 15
     assert all(bool(torch.isfinite(one.signal).all()) for one in drawn)
 
@@ -106,7 +121,10 @@ def test_what_cannot_be_read_is_left_out_while_training(plan: Path, voicebank: P
     for path in (voicebank / "clean_trainset_28spk_wav").iterdir():
         path.unlink()
     clips = PlannedBatches(PlanItems(Plan(plan), "train"), seconds=0.2, augment=True, seed=0)
-    with pytest.warns(UserWarning), pytest.raises(ValueError, match="8 instances in a row cannot be read"):
+    with (
+        pytest.warns(UserWarning),
+        pytest.raises(ValueError, match="8 instances in a row cannot be read"),
+    ):
         clips[Step(0)]
 
 
@@ -119,7 +137,9 @@ def test_workers_give_the_same_batches_and_the_wait_is_known(plan: Path) -> None
         assert loader is data.loader and data.loader.waited > 0.0
     for first, second in zip(*batches, strict=True):
         assert first["signal"].shape == (2, 4800)
-        assert torch.equal(first["signal"], second["signal"]) and torch.equal(first["clean"], second["clean"])
+        assert torch.equal(first["signal"], second["signal"]) and torch.equal(
+            first["clean"], second["clean"]
+        )
 
 
 class Seen(L.LightningModule):
@@ -138,7 +158,9 @@ class Seen(L.LightningModule):
         return torch.optim.SGD(self.parameters(), lr=0.1)
 
 
-def test_epochs_and_resumed_trainings_go_on_where_the_batches_were(plan: Path, tmp_path: Path) -> None:
+def test_epochs_and_resumed_trainings_go_on_where_the_batches_were(
+    plan: Path, tmp_path: Path
+) -> None:
     def fit(epochs: int, state: Path | None = None) -> tuple[list[float], L.Trainer]:
         module = Seen()
         data = PlanData(plan, workers=0, batch=2, seconds=0.1, prepared=True)
@@ -160,7 +182,9 @@ def test_epochs_and_resumed_trainings_go_on_where_the_batches_were(plan: Path, t
     write_instances(plan, Recipe(), jobs=1)
     whole, _ = fit(3)
     loader = PlanData(plan, workers=0, batch=2, seconds=0.1, prepared=True).train_dataloader()
-    expected = [float(batch["signal"].double().sum()) for batch, _ in zip(loader, range(12), strict=False)]
+    expected = [
+        float(batch["signal"].double().sum()) for batch, _ in zip(loader, range(12), strict=False)
+    ]
     assert whole == expected and len(set(whole)) == 12
     first, trainer = fit(2)
     trainer.save_checkpoint(tmp_path / "state.ckpt")
@@ -170,15 +194,25 @@ def test_epochs_and_resumed_trainings_go_on_where_the_batches_were(plan: Path, t
 @pytest.mark.parametrize(
     ("ready", "completed", "steps", "first"),
     [(5, 4, 5, 5), (5, 4, 4, 4), (4, 4, 2, 4), (4, 4, 8, 4), (0, 0, 0, 0)],
-    ids=["stored after the step of a batch", "before it", "two batches a step", "two steps a batch", "new"],
+    ids=[
+        "stored after the step of a batch",
+        "before it",
+        "two batches a step",
+        "two steps a batch",
+        "new",
+    ],
 )
 def test_the_first_batch_is_the_one_after_the_last_step(
     ready: int, completed: int, steps: int, first: int
 ) -> None:
     data = BatchData([])  # type: ignore[arg-type]
     total = SimpleNamespace(ready=ready, completed=completed)
-    progress = SimpleNamespace(epoch_loop=SimpleNamespace(batch_progress=SimpleNamespace(total=total)))
-    data.trainer = SimpleNamespace(fit_loop=progress, global_step=steps, global_rank=1, world_size=2)
+    progress = SimpleNamespace(
+        epoch_loop=SimpleNamespace(batch_progress=SimpleNamespace(total=total))
+    )
+    data.trainer = SimpleNamespace(
+        fit_loop=progress, global_step=steps, global_rank=1, world_size=2
+    )
     given = itertools.islice(iter(data.train_dataloader().sampler), 2)
     assert list(given) == [(first, 1, 2), (first + 1, 1, 2)]
 
@@ -193,14 +227,18 @@ def test_workers_go_on_too(plan: Path) -> None:
 
 
 def test_collate_pads_with_silence() -> None:
-    batch = collate([Instance(torch.ones(n), torch.ones(n), torch.zeros(8), torch.ones(n)) for n in (3, 5)])
+    batch = collate(
+        [Instance(torch.ones(n), torch.ones(n), torch.zeros(8), torch.ones(n)) for n in (3, 5)]
+    )
     assert batch["lengths"].tolist() == [3, 5]
     assert batch["impaired"].tolist() == [[1, 1, 1, 0, 0], [1, 1, 1, 1, 1]]
     assert batch["thresholds"].shape == (2, 8)
 
 
 def test_prepared_instances_must_be_there(plan: Path) -> None:
-    with pytest.raises(ValueError, match=r"no instances of this plan; 'hlsim prepare --write' makes them"):
+    with pytest.raises(
+        ValueError, match=r"no instances of this plan; 'hlsim prepare --write' makes them"
+    ):
         PlanData(plan, prepared=True)
     write_instances(plan, Recipe(), jobs=1)
     Plan(plan).path(3).unlink()

@@ -83,8 +83,12 @@ def test_what_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="SNRs 5 dB for training and test"):
         find_noises(one, "noise", ("train",), test_snrs=(5.0, 7.5))
     (one / "noise" / "broken.wav").write_text("x")
-    write_audio(one / "noise" / "stereo.wav", torch.stack((torch.zeros(160), torch.ones(160))), 16000)
-    soundfile.write(one / "noise" / "tiny.wav", torch.full((160,), 1e-39).numpy(), 16000, subtype="FLOAT")
+    write_audio(
+        one / "noise" / "stereo.wav", torch.stack((torch.zeros(160), torch.ones(160))), 16000
+    )
+    soundfile.write(
+        one / "noise" / "tiny.wav", torch.full((160,), 1e-39).numpy(), 16000, subtype="FLOAT"
+    )
     (one / "noise" / "linked").symlink_to(both / "noise")
     noises, faults = find_noises(one, "noise", ("train",))
     assert set(noises.files["train"]) == {"a"}
@@ -103,7 +107,9 @@ def test_the_snr_is_that_of_the_active_level(speech: list[tuple[Tensor, int]], s
         level = active_level_db(clean, rate)
         added = mix_at(clean, noise, snr, level) - clean
         assert level - float(dbfs(added)) == pytest.approx(snr, abs=1e-3)
-        assert float(torch.nn.functional.cosine_similarity(added, noise, 0)) == pytest.approx(1.0, abs=1e-4)
+        assert float(torch.nn.functional.cosine_similarity(added, noise, 0)) == pytest.approx(
+            1.0, abs=1e-4
+        )
     assert bool(torch.isfinite(mix_at(clean, torch.zeros_like(clean), snr, level)).all())
 
 
@@ -123,7 +129,11 @@ def test_a_recording_begins_again_where_it_ends(tmp_path: Path) -> None:
     write_audio(tmp_path / "a.wav", torch.arange(100.0) / 100, 16000)
     piece, _ = read_stretch(tmp_path / "a.wav", 90 / 16000, 250 / 16000)
     assert torch.equal(piece[0], torch.arange(90, 340).remainder(100) / 100)
-    for name, said in (("none.wav", "not readable"), ("bad.wav", "not readable"), ("empty.wav", "empty")):
+    for name, said in (
+        ("none.wav", "not readable"),
+        ("bad.wav", "not readable"),
+        ("empty.wav", "empty"),
+    ):
         (tmp_path / "bad.wav").write_text("x")
         soundfile.write(tmp_path / "empty.wav", torch.zeros(0).numpy(), 16000)
         with pytest.raises(ValueError, match=said):

@@ -31,10 +31,20 @@ def run(corpus: Path, out: Path, **options: object) -> Prepared:
 
 def test_a_plan_of_voicebank_demand(voicebank: Path, tmp_path: Path) -> None:
     prepared = run(voicebank, tmp_path / "out")
-    assert prepared.utterances == {"train": 4, "test": 2} and prepared.instances == {"train": 16, "test": 8}
+    assert prepared.utterances == {"train": 4, "test": 2} and prepared.instances == {
+        "train": 16,
+        "test": 8,
+    }
     assert prepared.faults == 0 and rows(tmp_path / "out" / "faults.csv") == []
-    assert prepared.to_text().splitlines()[0].startswith("train: 4 utterances, 0.00 h, 16 instances; ears ")
-    manifest, instances = rows(tmp_path / "out" / "manifest.csv"), rows(tmp_path / "out" / "instances.csv")
+    assert (
+        prepared.to_text()
+        .splitlines()[0]
+        .startswith("train: 4 utterances, 0.00 h, 16 instances; ears ")
+    )
+    manifest, instances = (
+        rows(tmp_path / "out" / "manifest.csv"),
+        rows(tmp_path / "out" / "instances.csv"),
+    )
     first = manifest[0]
     assert list(first) == [
         *(
@@ -58,7 +68,9 @@ def test_a_plan_of_voicebank_demand(voicebank: Path, tmp_path: Path) -> None:
     for i, row in enumerate(instances):
         assert row["id"] == manifest[i // 4]["id"] and row["input"] == ("clean", "noisy")[i % 2]
     assert len({tuple(row.values())[6:] for row in instances}) == 12  # two ears an utterance
-    train, test = ({tuple(r.values())[6:] for r in instances if r["split"] == s} for s in ("train", "test"))
+    train, test = (
+        {tuple(r.values())[6:] for r in instances if r["split"] == s} for s in ("train", "test")
+    )
     assert not train & test
 
 
@@ -80,28 +92,50 @@ def test_voicebank_demands_names_give_the_papers_counts(tmp_path: Path) -> None:
     assert prepared.instances == {"train": 46288, "test": 3296}
     plan = Plan(tmp_path / "out")
     assert len(plan) == 46288 + 3296 and len(plan.indices("test")) == 3296
-    shares = {key: count / prepared.instances[key.split()[0]] for key, count in prepared.severities.items()}
+    shares = {
+        key: count / prepared.instances[key.split()[0]]
+        for key, count in prepared.severities.items()
+    }
     assert shares == pytest.approx(dict.fromkeys(shares, 1 / 3), abs=2 / 3296) and len(shares) == 6
 
 
-def test_noise_is_mixed_in_by_the_plan(tmp_path: Path, pieces: list[Tensor], noise_folder: Path) -> None:
+def test_noise_is_mixed_in_by_the_plan(
+    tmp_path: Path, pieces: list[Tensor], noise_folder: Path
+) -> None:
     for i, piece in enumerate(pieces):
         folder = tmp_path / "speech" / f"speaker{i % 5}"
         folder.mkdir(parents=True, exist_ok=True)
         write_audio(folder / f"{i}.wav", piece, 16000)
-    prepared = run(tmp_path / "speech", tmp_path / "out", noise=noise_folder, valid_share=0.25, ears=1)
-    assert sum(prepared.instances.values()) == 20 and set(prepared.utterances) == {"train", "valid", "test"}
+    prepared = run(
+        tmp_path / "speech", tmp_path / "out", noise=noise_folder, valid_share=0.25, ears=1
+    )
+    assert sum(prepared.instances.values()) == 20 and set(prepared.utterances) == {
+        "train",
+        "valid",
+        "test",
+    }
     manifest = rows(tmp_path / "out" / "manifest.csv")
     kinds = {
         split: {row["noise"].split("/")[1] for row in manifest if row["split"] == split}
         for split in ("train", "valid", "test")
     }
     assert not (kinds["train"] | kinds["valid"]) & kinds["test"]
-    snrs = {split: {float(row["snr"]) for row in manifest if row["split"] == split} for split in kinds}
-    assert snrs["train"] | snrs["valid"] <= {0.0, 5.0, 10.0, 15.0} and snrs["test"] <= {2.5, 7.5, 12.5, 17.5}
-    speakers = {split: {row["speaker"] for row in manifest if row["split"] == split} for split in kinds}
+    snrs = {
+        split: {float(row["snr"]) for row in manifest if row["split"] == split} for split in kinds
+    }
+    assert snrs["train"] | snrs["valid"] <= {0.0, 5.0, 10.0, 15.0} and snrs["test"] <= {
+        2.5,
+        7.5,
+        12.5,
+        17.5,
+    }
+    speakers = {
+        split: {row["speaker"] for row in manifest if row["split"] == split} for split in kinds
+    }
     assert sum(map(len, speakers.values())) == len(set().union(*speakers.values()))
-    assert all(row["clean"].startswith("speech/") and row["noise"].startswith("noise/") for row in manifest)
+    assert all(
+        row["clean"].startswith("speech/") and row["noise"].startswith("noise/") for row in manifest
+    )
     assert json.loads((tmp_path / "out" / "plan.json").read_text())["root"] == str(tmp_path)
     # the folder of noise is no speech, wherever it lies
     noise_folder.rename(tmp_path / "speech" / "noise")
@@ -120,7 +154,9 @@ def test_the_same_corpus_gives_the_same_bytes_and_is_not_read_twice(
     assert run(voicebank, tmp_path / "a") == first
     monkeypatch.undo()
     assert run(voicebank, tmp_path / "a", seed=1) == first  # counts; the ears are others
-    assert (tmp_path / "a" / "instances.csv").read_bytes() != (tmp_path / "b" / "instances.csv").read_bytes()
+    assert (tmp_path / "a" / "instances.csv").read_bytes() != (
+        tmp_path / "b" / "instances.csv"
+    ).read_bytes()
     (voicebank / "clean_testset_wav" / "p232_001.wav").unlink()
     assert run(voicebank, tmp_path / "a", seed=1).utterances == {"train": 4, "test": 1}
 
@@ -156,8 +192,13 @@ def faulty(corpus: Path) -> dict[str, str]:
     write_audio(clean / "p300_8.wav", torch.stack((torch.zeros(12800), tone)), 16000)
     (clean / "p300_9.wav").unlink()
     for name in "bc":
-        for folder, peak in ((clean, 1e-39 if name == "b" else 0.1), (noisy, 1e-39 if name == "c" else 0.1)):
-            soundfile.write(folder / f"p300_{name}.wav", (peak * tone).numpy(), 16000, subtype="FLOAT")
+        for folder, peak in (
+            (clean, 1e-39 if name == "b" else 0.1),
+            (noisy, 1e-39 if name == "c" else 0.1),
+        ):
+            soundfile.write(
+                folder / f"p300_{name}.wav", (peak * tone).numpy(), 16000, subtype="FLOAT"
+            )
     outside = corpus.parent / "outside.wav"
     write_audio(outside, tone, 16000)
     (clean / "p300_a.wav").symlink_to(outside)
@@ -207,7 +248,9 @@ def test_names_that_fit_no_csv_file_are_faults(
         shutil.copy(tmp_path / "good.wav", voicebank / "clean_testset_wav" / name)
     assert run(tmp_path / "speech", tmp_path / "out", noise=noise_folder).utterances == {"train": 1}
     listed = {row["path"]: row["reason"] for row in rows(tmp_path / "out" / "faults.csv")}
-    assert set(listed) == {f"{place}/{name}" for place in ("speech", "noise/hum") for name in names.values()}
+    assert set(listed) == {
+        f"{place}/{name}" for place in ("speech", "noise/hum") for name in names.values()
+    }
     assert all("rename it" in reason for reason in listed.values())
     assert run(voicebank, tmp_path / "vbd-out").faults == 3  # here without a noisy counterpart
 
@@ -227,7 +270,8 @@ def test_strict_makes_a_fault_an_error(voicebank: Path, tmp_path: Path) -> None:
     faulty(voicebank)
     for _ in range(2):
         with pytest.raises(
-            ValueError, match=r"12 faults, the first clean_trainset_28spk_wav/p300_1.wav: not readable"
+            ValueError,
+            match=r"12 faults, the first clean_trainset_28spk_wav/p300_1.wav: not readable",
         ):
             prepare(PlanSettings(voicebank), tmp_path / "out", strict=True, jobs=1)
         assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["faults.csv"]
@@ -275,7 +319,9 @@ def test_tables_of_the_users_are_not_written_over(
         ):
             run(voicebank, out)
         for option in ("table", "audiograms", "test_audiograms"):
-            with pytest.raises(ValueError, match=rf"{name}: would be written over, and is read from; choose"):
+            with pytest.raises(
+                ValueError, match=rf"{name}: would be written over, and is read from; choose"
+            ):
                 run(voicebank, out, **{option: out / name})
         assert (out / name).read_text().startswith("file\n")
         (out / name).unlink()

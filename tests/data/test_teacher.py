@@ -70,14 +70,22 @@ def test_pyclarity_as_the_teacher(long_speech: Tensor, monkeypatch: pytest.Monke
     assert reference.dtype == torch.float32
     exact = Teacher(16000)(signal[None], levels[None])[0]
     assert float((reference - exact).norm() / exact.norm()) < 0.03  # its resampling is another
-    shifted = Teacher(16000, alignment="impulse", reference=pyclarity_msbg)(signal[None], levels[None])[0]
+    shifted = Teacher(16000, alignment="impulse", reference=pyclarity_msbg)(
+        signal[None], levels[None]
+    )[0]
     own = Teacher(16000, alignment="impulse")(signal[None], levels[None])[0]
     places = range(-3, 4)
     errors = [float((shifted.roll(k) - own)[100:-100].norm()) for k in places]
-    assert places[errors.index(min(errors))] in (-1, 0, 1)  # half a sample of rounding on either side
+    assert places[errors.index(min(errors))] in (
+        -1,
+        0,
+        1,
+    )  # half a sample of rounding on either side
 
 
-@pytest.mark.parametrize(("rate", "grid"), [(16000, 10240), (22050, 32), (44100, 64), (48000, 10240)])
+@pytest.mark.parametrize(
+    ("rate", "grid"), [(16000, 10240), (22050, 32), (44100, 64), (48000, 10240)]
+)
 def test_the_grid_of_rates(rate: int, grid: int) -> None:
     teacher = Teacher(rate)
     assert teacher.grid == grid and grid * 44100 % (64 * rate) == 0

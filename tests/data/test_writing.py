@@ -53,7 +53,10 @@ def program(*arguments: str) -> subprocess.Popen[bytes]:
         }
     )
     return subprocess.Popen(
-        [sys.executable, *arguments], env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+        [sys.executable, *arguments],
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
     )
 
 
@@ -72,12 +75,16 @@ def test_another_plan_in_the_folder_is_another_plan(plan: Path) -> None:
 
 def test_another_rate_in_the_folder_is_another_plan(plan: Path, voicebank: Path) -> None:
     write(plan)
-    with pytest.raises(ValueError, match="another plan, with other settings or files; choose another --out"):
+    with pytest.raises(
+        ValueError, match="another plan, with other settings or files; choose another --out"
+    ):
         prepare(PlanSettings(voicebank, level=(55.0, 75.0), rate=22050), plan, jobs=1)
     write(plan)  # the plan that is there is still its own
 
 
-def test_workers_elsewhere_are_told_whole_paths(plan: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_workers_elsewhere_are_told_whole_paths(
+    plan: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(plan.parent)
     told: list[Any] = []
 
@@ -121,7 +128,9 @@ def test_what_is_there_is_kept_and_the_rest_made(plan: Path) -> None:
     opened = Plan(plan)
     untouched = opened.path(3).stat().st_mtime_ns
     opened.path(0).unlink()
-    opened.path(5).write_bytes(opened.path(5).read_bytes()[:1000])  # as a crash of the machine may leave it
+    opened.path(5).write_bytes(
+        opened.path(5).read_bytes()[:1000]
+    )  # as a crash of the machine may leave it
     (opened.path(7).parent / ".00000007.safetensors.1.part").write_bytes(b"half")
     write(plan)
     assert digests(plan) == whole and opened.path(3).stat().st_mtime_ns == untouched
@@ -129,13 +138,18 @@ def test_what_is_there_is_kept_and_the_rest_made(plan: Path) -> None:
 
 def test_two_do_not_write_at_once(plan: Path) -> None:
     pytest.importorskip("fcntl")
-    with file_lock(plan / MANIFEST), pytest.raises(ValueError, match="another process is writing there"):
+    with (
+        file_lock(plan / MANIFEST),
+        pytest.raises(ValueError, match="another process is writing there"),
+    ):
         write(plan)
     write(plan)
 
 
 @pytest.mark.slow
-def test_killed_and_started_again_is_byte_for_byte_the_same(voicebank: Path, tmp_path: Path) -> None:
+def test_killed_and_started_again_is_byte_for_byte_the_same(
+    voicebank: Path, tmp_path: Path
+) -> None:
     command = ("-m", "hlsim", "prepare", str(voicebank), "--write", "--jobs", "1", "--out")
     undisturbed = program(*command, str(tmp_path / "a"))
     out = tmp_path / "b"
@@ -216,7 +230,9 @@ def test_a_device_that_is_full(tmp_path: Path) -> None:
 def test_another_plan_or_recipe_needs_another_folder(plan: Path, voicebank: Path) -> None:
     write(plan)
     before = digests(plan / "instances")
-    with pytest.raises(ValueError, match="another plan, teacher or alignment; choose another --out"):
+    with pytest.raises(
+        ValueError, match="another plan, teacher or alignment; choose another --out"
+    ):
         write_instances(plan, Recipe(alignment="impulse"), jobs=1)
     with pytest.raises(ValueError, match="another plan"):
         prepare(PlanSettings(voicebank, seed=1), plan, jobs=1)
@@ -227,7 +243,9 @@ def test_audio_that_went_bad_since_is_told_of_after_the_rest(plan: Path, voiceba
     bad = voicebank / "noisy_trainset_28spk_wav" / "p226_002.wav"
     good = bad.read_bytes()
     bad.write_bytes(b"gone")
-    with pytest.raises(ValueError, match=r"1 of 6 utterances have no instances, the first clean_.*p226_002"):
+    with pytest.raises(
+        ValueError, match=r"1 of 6 utterances have no instances, the first clean_.*p226_002"
+    ):
         write(plan)
     assert len(list(plan.rglob("*.safetensors"))) == 20
     assert "not readable as audio" in (plan / "write-faults.csv").read_text()
@@ -242,10 +260,14 @@ def fails_on_soft(signal: Tensor, ear: Audiogram, rate: int) -> Tensor:
 
 
 def test_what_the_teacher_fails_on_is_told_by_the_name_of_its_utterance(plan: Path) -> None:
-    with pytest.raises(ValueError, match=r"of 6 utterances have no instances, the first clean_.*: too soft"):
+    with pytest.raises(
+        ValueError, match=r"of 6 utterances have no instances, the first clean_.*: too soft"
+    ):
         write_instances(plan, Recipe(reference=fails_on_soft), jobs=1)
     named = (plan / "write-faults.csv").read_text().splitlines()[1:]
-    assert named and all(line.startswith("clean_") and line.endswith(".wav,too soft") for line in named)
+    assert named and all(
+        line.startswith("clean_") and line.endswith(".wav,too soft") for line in named
+    )
     assert 0 < len(list(plan.rglob("*.safetensors"))) < 24
 
 

@@ -12,7 +12,14 @@ from torch import Tensor
 
 from hlsim.dsp.resample import _resampler, resample
 
-RATES = [(16000, 44100), (44100, 16000), (48000, 16000), (16000, 48000), (22050, 44100), (32000, 44100)]
+RATES = [
+    (16000, 44100),
+    (44100, 16000),
+    (48000, 16000),
+    (16000, 48000),
+    (22050, 44100),
+    (32000, 44100),
+]
 
 
 def tone(hz: float, rate: int, seconds: float = 0.5) -> Tensor:
@@ -54,7 +61,9 @@ def test_equals_scipys_polyphase_filter_on_band_limited_noise(source: int, targe
     noise = scipy.signal.lfilter(low, 1.0, np.random.default_rng(0).standard_normal(source // 2))
     common = math.gcd(source, target)
     up, down = target // common, source // common
-    taps = scipy.signal.firwin(2 * 80 * max(up, down) + 1, 0.95 / max(up, down), window=("kaiser", 12.0))
+    taps = scipy.signal.firwin(
+        2 * 80 * max(up, down) + 1, 0.95 / max(up, down), window=("kaiser", 12.0)
+    )
     theirs = scipy.signal.resample_poly(noise, up, down, window=taps)
     ours = resample(torch.from_numpy(noise), source, target).numpy()
     assert ours.shape == theirs.shape
@@ -65,14 +74,18 @@ def test_equals_scipys_polyphase_filter_on_band_limited_noise(source: int, targe
 
 @pytest.mark.parametrize(("source", "target"), RATES)
 @pytest.mark.parametrize("time", [1, 2, 159, 1601])
-def test_length_is_rounded_up_and_leading_dimensions_stay(source: int, target: int, time: int) -> None:
+def test_length_is_rounded_up_and_leading_dimensions_stay(
+    source: int, target: int, time: int
+) -> None:
     ours = resample(torch.randn(2, 3, time), source, target)
     assert ours.shape == (2, 3, math.ceil(time * target / source))
 
 
 def test_one_of_a_stack_of_batches_is_resampled() -> None:
     batch = torch.randn(3, 2, 2, 1600)[:, 0]
-    torch.testing.assert_close(resample(batch, 16000, 24000)[1, 1], resample(batch[1, 1], 16000, 24000))
+    torch.testing.assert_close(
+        resample(batch, 16000, 24000)[1, 1], resample(batch[1, 1], 16000, 24000)
+    )
 
 
 def test_there_and_back_is_the_same_up_to_the_band_edge() -> None:
@@ -122,7 +135,9 @@ def test_fake_tensors_leave_no_kernel_behind() -> None:
 
 
 def test_rates_without_a_common_factor_are_refused_before_a_kernel_of_gigabytes_is_made() -> None:
-    with pytest.raises(ValueError, match="from 44101 to 16000 Hz, whose common factor is too small; allowed"):
+    with pytest.raises(
+        ValueError, match="from 44101 to 16000 Hz, whose common factor is too small; allowed"
+    ):
         resample(torch.ones(50), 44101, 16000)
 
 

@@ -26,7 +26,9 @@ def test_equals_scipys_transform(fft: int, window: int, hop: int) -> None:
 
 @pytest.mark.parametrize(("fft", "window", "hop"), SIZES)
 @pytest.mark.parametrize("time", [1, 100, 399, 1600, 1601])
-def test_inverse_returns_the_waveform_at_its_length(fft: int, window: int, hop: int, time: int) -> None:
+def test_inverse_returns_the_waveform_at_its_length(
+    fft: int, window: int, hop: int, time: int
+) -> None:
     stft = STFT(fft, window, hop)
     wave = torch.randn(3, time)
     spectrum = stft.analyse(wave)
@@ -42,7 +44,9 @@ def test_a_tone_lies_in_its_bin() -> None:
     spectrum = STFT(400, 400, 100).analyse(tone).abs()
     middle = spectrum[0, 10:-10]
     assert bool((middle.argmax(-1) == 25).all())  # bins of 40 Hz
-    torch.testing.assert_close(middle[:, 25], torch.full_like(middle[:, 25], 100.0))  # half the window's sum
+    torch.testing.assert_close(
+        middle[:, 25], torch.full_like(middle[:, 25], 100.0)
+    )  # half the window's sum
 
 
 def test_both_ways_are_differentiable() -> None:
@@ -55,7 +59,9 @@ def test_both_ways_are_differentiable() -> None:
     "sizes", [(400, 400, 201), (400, 401, 100), (401, 400, 100), (400, 400, 0), (0, 0, 0)]
 )
 def test_lengths_that_do_not_fit(sizes: tuple[int, int, int]) -> None:
-    with pytest.raises(ValueError, match=r"STFT of fft .*; allowed: 2 hop <= window <= fft, fft even"):
+    with pytest.raises(
+        ValueError, match=r"STFT of fft .*; allowed: 2 hop <= window <= fft, fft even"
+    ):
         STFT(*sizes)
 
 

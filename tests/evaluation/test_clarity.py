@@ -16,10 +16,16 @@ import torch
 
 import hlsim
 from hlsim.audio import read_audio
+from hlsim.audiogram.listener import Listener, read_listeners
 from hlsim.cli.main import main
 from hlsim.dsp.resample import resample
-from hlsim.evaluation.clarity import _conditions, _looks_ahead, evaluate_scenes, read_pairs, read_scenes
-from hlsim.listener import Listener, read_listeners
+from hlsim.evaluation.clarity import (
+    _conditions,
+    _looks_ahead,
+    evaluate_scenes,
+    read_pairs,
+    read_scenes,
+)
 from hlsim.report.clarity import conditions_table, write_scenes
 
 RATE = 44100
@@ -40,7 +46,10 @@ LISTENERS = {
     },
 }
 COMPRESSOR = {"fs": RATE, "attack": 50, "release": 1000, "threshold": 0.35, "attenuation": 0.1}
-COMPRESSOR |= {"makeup_gain": 1, "rms_buffer_size": 0.064}  # recipes/icassp_2023/baseline/config.yaml
+COMPRESSOR |= {
+    "makeup_gain": 1,
+    "rms_buffer_size": 0.064,
+}  # recipes/icassp_2023/baseline/config.yaml
 PAIRS = {"S06001": ["L0001", "L0002"], "S06002": ["L0001"]}
 
 
@@ -66,7 +75,9 @@ def make_scenes(folder: Path, seconds: float = 1.0) -> Path:
             ("target_CH1", target),
             ("target_anechoic_CH1", anechoic),
         ):
-            soundfile.write(str(folder / "scenes" / f"{name}_{end}.wav"), signal, RATE, subtype="PCM_16")
+            soundfile.write(
+                str(folder / "scenes" / f"{name}_{end}.wav"), signal, RATE, subtype="PCM_16"
+            )
     (folder / "listeners.json").write_text(json.dumps(LISTENERS))
     (folder / "pairs.json").write_text(json.dumps(PAIRS))
     return folder
@@ -85,7 +96,9 @@ def options(folder: Path, **more: Any) -> dict[str, Any]:
 class Baseline:
     """Clarity's own: pyclarity's NAL-R and compressor with the challenge's settings, its delay kept, its tail cut."""
 
-    def __call__(self, waveform: torch.Tensor, listener: Listener, sample_rate: int) -> torch.Tensor:
+    def __call__(
+        self, waveform: torch.Tensor, listener: Listener, sample_rate: int
+    ) -> torch.Tensor:
         from clarity.enhancer.compressor import Compressor
         from clarity.enhancer.nalr import NALR
         from clarity.utils.audiogram import Audiogram
@@ -93,7 +106,9 @@ class Baseline:
         nalr = NALR(nfir=220, sample_rate=sample_rate)
         compressor = Compressor(**COMPRESSOR)
         made = []
-        for channel, ear in zip(waveform.double().numpy(), (listener.left, listener.right), strict=True):
+        for channel, ear in zip(
+            waveform.double().numpy(), (listener.left, listener.right), strict=True
+        ):
             assert ear is not None
             filtered = nalr.apply(nalr.build(Audiogram(ear.thresholds, CFS))[0], channel)
             made.append(np.tanh(compressor.process(filtered)[0]))
@@ -121,9 +136,15 @@ def pyclaritys(folder: Path, scene: str, listener: str) -> dict[str, float]:
     ):
         amplified.append(compressor.process(nalr.apply(nalr.build(ear)[0], channel))[0])
     given = np.tanh(np.stack(amplified, 1)).astype(np.float32)
-    level = (signals["target_CH1"] ** 2).mean(0) ** 0.5 / (signals["target_anechoic_CH1"] ** 2).mean(0) ** 0.5
+    level = (signals["target_CH1"] ** 2).mean(0) ** 0.5 / (
+        signals["target_anechoic_CH1"] ** 2
+    ).mean(0) ** 0.5
     reference = signals["target_anechoic_CH1"] * level
-    both = {"reference_left": reference[:, 0], "reference_right": reference[:, 1], "sample_rate": RATE}
+    both = {
+        "reference_left": reference[:, 0],
+        "reference_right": reference[:, 1],
+        "sample_rate": RATE,
+    }
     both |= {"processed_left": given[:, 0], "processed_right": given[:, 1], "listener": person}
     return {"haspi": haspi_v2_be(**both), "hasqi": hasqi_v2_better_ear(**both)}
 
@@ -136,16 +157,23 @@ def test_the_challenges_baseline_has_its_scores(clarity: Path, tmp_path: Path) -
     for item in report.items:
         scene = item.file.removeprefix(f"{item.listener} ")
         for measure, expected in pyclaritys(clarity, scene, item.listener).items():
-            assert item.scores[measure]["baseline"] == pytest.approx(expected, abs=1e-3), (item.file, measure)
+            assert item.scores[measure]["baseline"] == pytest.approx(expected, abs=1e-3), (
+                item.file,
+                measure,
+            )
     assert report.extra["looks_ahead_ms"]["baseline"] == 0.0  # late by 2.5 ms, but never early
     assert 2.0 < report.extra["looks_ahead_ms"]["NAL-R"] <= 5.0
 
 
-def test_a_scene_that_begins_in_silence_still_tells_how_far_an_aid_looks_ahead(tmp_path: Path) -> None:
+def test_a_scene_that_begins_in_silence_still_tells_how_far_an_aid_looks_ahead(
+    tmp_path: Path,
+) -> None:
     mix = tmp_path / "mix.wav"
     soundfile.write(
         mix,
-        np.concatenate([np.zeros((5 * RATE, 2)), 0.02 * np.sin(np.arange(2.0 * RATE)).reshape(-1, 2)]),
+        np.concatenate(
+            [np.zeros((5 * RATE, 2)), 0.02 * np.sin(np.arange(2.0 * RATE)).reshape(-1, 2)]
+        ),
         RATE,
     )
     (tmp_path / "listeners.json").write_text(json.dumps(LISTENERS))
@@ -166,7 +194,9 @@ def test_two_enhancers_of_one_name_are_refused() -> None:
 class FromTheFuture:
     """An aid that knows what comes in 8 ms."""
 
-    def __call__(self, waveform: torch.Tensor, listener: Listener, sample_rate: int) -> torch.Tensor:
+    def __call__(
+        self, waveform: torch.Tensor, listener: Listener, sample_rate: int
+    ) -> torch.Tensor:
         return 4.0 * waveform.roll(-(sample_rate * 8 // 1000), -1)
 
 
@@ -175,7 +205,9 @@ class HalfTheNoise:
 
     def __call__(self, waveform: torch.Tensor, sample_rate: int) -> torch.Tensor:
         if sample_rate == RATE:
-            assert 0.02 < float(waveform.square().mean().sqrt()) < 0.06  # 0.014 in the file: 100 to 94 dB SPL
+            assert (
+                0.02 < float(waveform.square().mean().sqrt()) < 0.06
+            )  # 0.014 in the file: 100 to 94 dB SPL
         return 0.5 * waveform
 
 
@@ -184,8 +216,22 @@ def test_the_command_writes_page_scores_and_signals_and_goes_on(
 ) -> None:
     out = tmp_path / "out"
     arguments = ["clarity", clarity / "scenes", "soft=wdrc", f"early={__name__}:FromTheFuture"]
-    arguments += ["--listeners", clarity / "listeners.json", "--scenes-listeners", clarity / "pairs.json"]
-    arguments += ["--enhancer", f"{__name__}:HalfTheNoise", "--out", out, "--jobs", "1", "--every", "2"]
+    arguments += [
+        "--listeners",
+        clarity / "listeners.json",
+        "--scenes-listeners",
+        clarity / "pairs.json",
+    ]
+    arguments += [
+        "--enhancer",
+        f"{__name__}:HalfTheNoise",
+        "--out",
+        out,
+        "--jobs",
+        "1",
+        "--every",
+        "2",
+    ]
     text = [*map(str, arguments)]
     assert main(text) == 0
     printed = capsys.readouterr().out
@@ -208,14 +254,17 @@ def test_the_command_writes_page_scores_and_signals_and_goes_on(
     made, rate = soundfile.read(str(signal))
     assert rate == RATE and np.allclose(made, 4 * np.roll(mix, -352, 0), atol=1e-6)
 
-    stored = {name: (out / name).read_text() for name in ("signals.jsonl", "scores.jsonl", "report.json")}
+    stored = {
+        name: (out / name).read_text() for name in ("signals.jsonl", "scores.jsonl", "report.json")
+    }
     signal.write_bytes(b"gone")
     assert main(text) == 0
     assert np.allclose(soundfile.read(str(signal))[0], made)  # made anew; no other, and no score
     assert (out / "scores.jsonl").read_text() == stored["scores.jsonl"]
     assert (out / "report.json").read_text() == stored["report.json"]
     assert (
-        len((out / "signals.jsonl").read_text().splitlines()) == len(stored["signals.jsonl"].splitlines()) + 1
+        len((out / "signals.jsonl").read_text().splitlines())
+        == len(stored["signals.jsonl"].splitlines()) + 1
     )
 
 
@@ -226,7 +275,9 @@ def test_linked_gains_and_a_reference_of_one_channel(clarity: Path, tmp_path: Pa
         signal, _ = soundfile.read(str(clarity / "scenes" / f"{scene}_target_anechoic_CH1.wav"))
         soundfile.write(str(folder / f"{scene}_reference.wav"), signal[:, 0], RATE)
         (folder / f"{scene}_mix_CH1.wav").symlink_to(clarity / "scenes" / f"{scene}_mix_CH1.wav")
-        (folder / f"{scene}_target_CH1.wav").symlink_to(clarity / "scenes" / f"{scene}_target_CH1.wav")
+        (folder / f"{scene}_target_CH1.wav").symlink_to(
+            clarity / "scenes" / f"{scene}_target_CH1.wav"
+        )
     given = options(clarity, scenes=folder, scenes_listeners=None, every=4)
     apart, linked = (
         evaluate_scenes({"aid": "wdrc"}, out=tmp_path / str(own), linked=own, **given)
@@ -260,7 +311,9 @@ def test_one_broken_scene_is_told_and_the_others_go_on(clarity: Path, tmp_path: 
 class Choosy:
     """Refuses the first listener's second scene, and so does not look ahead on the first pair."""
 
-    def __call__(self, waveform: torch.Tensor, listener: Listener, sample_rate: int) -> torch.Tensor:
+    def __call__(
+        self, waveform: torch.Tensor, listener: Listener, sample_rate: int
+    ) -> torch.Tensor:
         if waveform.abs().max() > float(LOUDEST[0]):
             raise ValueError("too loud for me")
         return 2.0 * waveform
@@ -273,16 +326,26 @@ def test_means_are_of_the_pairs_that_all_have_and_a_refused_pair_stops_nothing(
     clarity: Path, tmp_path: Path
 ) -> None:
     peaks = [
-        np.abs(soundfile.read(str(clarity / "scenes" / f"{name}_mix_CH1.wav"))[0]).max() for name in PAIRS
+        np.abs(soundfile.read(str(clarity / "scenes" / f"{name}_mix_CH1.wav"))[0]).max()
+        for name in PAIRS
     ]
     LOUDEST[0] = sum(peaks) / 2
     own = options(clarity, every=2)
-    report = evaluate_scenes({"choosy": f"{__name__}:Choosy", "soft": "wdrc"}, out=tmp_path / "out", **own)
-    assert report.conditions == ("unaided", "NAL-R", "choosy", "soft") and report.headline.after == "soft"
+    report = evaluate_scenes(
+        {"choosy": f"{__name__}:Choosy", "soft": "wdrc"}, out=tmp_path / "out", **own
+    )
+    assert (
+        report.conditions == ("unaided", "NAL-R", "choosy", "soft")
+        and report.headline.after == "soft"
+    )
     table = conditions_table(report)
-    assert table.caption == "Means of the 1 that all have scores of, of 2 pairs of scene and listener"
+    assert (
+        table.caption == "Means of the 1 that all have scores of, of 2 pairs of scene and listener"
+    )
     kept = int(np.isfinite(report.scores("haspi")[:, 2]).argmax())
-    assert [row[1] for row in table.rows] == [f"{score:.3f}" for score in report.scores("haspi")[kept]]
+    assert [row[1] for row in table.rows] == [
+        f"{score:.3f}" for score in report.scores("haspi")[kept]
+    ]
     scores = np.array([[0.1, 0.2, np.nan, 0.4], [0.3, 0.4, np.nan, 0.6]])
     none = SimpleNamespace(
         scores=lambda measure: scores,

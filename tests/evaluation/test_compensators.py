@@ -17,7 +17,6 @@ from compensators import NALR, MappingCompensator, MappingConfig
 from hlsim import MSBG, Audiogram, HearingLossLoss, load_pretrained
 from hlsim.calibration import level_spl, set_level
 from hlsim.cli.main import main
-from hlsim.criteria.bands import band_edges
 from hlsim.evaluation import compensators, judging, measurements
 from hlsim.evaluation.compensators import evaluate_compensators
 from hlsim.evaluation.items import INPUT_LEVELS, draw_judged_items, read_ears
@@ -32,6 +31,7 @@ from hlsim.evaluation.judging import (
 )
 from hlsim.evaluation.measurements import insertion_gain
 from hlsim.evaluation.statistics import paired_comparison
+from hlsim.losses.band_levels import band_edges
 from hlsim.metrics import registry
 from hlsim.metrics.pyclarity import pyclarity_score
 from hlsim.pretrained import find_checkpoint, save_checkpoint
@@ -86,14 +86,27 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_ears_are_the_standard_ones_and_those_of_the_file(ears_csv: Path) -> None:
     ears = read_ears(ears_csv)
-    assert [name for name, _ in ears] == ["N2", "N3", "N4", "N5", "N6", "S1", "S2", "S3", "L1 l", "L1 r"]
+    assert [name for name, _ in ears] == [
+        "N2",
+        "N3",
+        "N4",
+        "N5",
+        "N6",
+        "S1",
+        "S2",
+        "S3",
+        "L1 l",
+        "L1 r",
+    ]
     assert ears[0][1] == Audiogram.standard("N2") and ears[-1][1] == Audiogram.standard("N3")
 
 
 def test_ears_of_one_name_are_told_apart(tmp_path: Path) -> None:
     path = tmp_path / "ears.csv"
     names = ("A", "B", "A", "N3", "", "A")
-    rows = [{"listener": name, **Audiogram((10.0 * i,) * 8).to_row()} for i, name in enumerate(names)]
+    rows = [
+        {"listener": name, **Audiogram((10.0 * i,) * 8).to_row()} for i, name in enumerate(names)
+    ]
     path.write_text("\n".join([",".join(rows[0]), *(",".join(row.values()) for row in rows)]))
     own = read_ears(path)[8:]
     assert [name for name, _ in own] == ["A", "B", "A, row 3", "N3, row 4", "row 5", "A, row 6"]
@@ -115,18 +128,24 @@ def test_every_ear_meets_every_level_and_ratio(speech_dir: Path, count: int) -> 
 @pytest.mark.parametrize(
     "levels", [(55.0, 75.0), (50.0, 60.0, 70.0, 80.0), (40.0, 50.0, 60.0, 70.0, 80.0, 90.0)]
 )
-def test_levels_of_an_even_number_meet_every_ratio(speech_dir: Path, levels: tuple[float, ...]) -> None:
+def test_levels_of_an_even_number_meet_every_ratio(
+    speech_dir: Path, levels: tuple[float, ...]
+) -> None:
     ears = [(f"{i}", Audiogram((float(i),) * 8)) for i in range(8)]
     many = {"items": 2 * 8 * 24, "seconds": 0.05, "seed": 0, "levels": levels}
     drawn = draw_judged_items(speech_dir / "valid", speech_dir / "train", ears, **many)
-    met = {(item.about["level"], item.about["snr"]) for item in drawn if item.about["snr"] is not None}
+    met = {
+        (item.about["level"], item.about["snr"]) for item in drawn if item.about["snr"] is not None
+    }
     assert len(met) == 4 * len(levels)
 
 
 def test_speech_has_its_level_and_noise_comes_on_top(speech_dir: Path) -> None:
     ears = [("N3", Audiogram.standard("N3"))]
     drawn, again, other = (
-        draw_judged_items(speech_dir / "valid", speech_dir / "train", ears, items=8, seconds=1.0, seed=seed)
+        draw_judged_items(
+            speech_dir / "valid", speech_dir / "train", ears, items=8, seconds=1.0, seed=seed
+        )
         for seed in (0, 0, 1)
     )
     for item in drawn:
@@ -159,7 +178,9 @@ def test_figures_are_those_of_the_measures_and_the_loss(speech_dir: Path) -> Non
         loss = HearingLossLoss(ear, criterion="bands", simulator=simulator)
         assert figures[f"loss_{name}"] == pytest.approx(float(loss(aided, item.clean)), rel=1e-4)
     assert figures["level"] == pytest.approx(float(level_spl(aided)), abs=1e-3)
-    assert figures["heard"] == pytest.approx(float(level_spl(MSBG(ear, sample_rate=16000)(aided))), abs=1e-3)
+    assert figures["heard"] == pytest.approx(
+        float(level_spl(MSBG(ear, sample_rate=16000)(aided))), abs=1e-3
+    )
     normal = MSBG(Audiogram.standard("NH"), sample_rate=16000)
     assert figures["normal"] == pytest.approx(float(level_spl(normal(item.signal))), abs=1e-3)
     assert figures["normal_clean"] == pytest.approx(float(level_spl(normal(item.clean))), abs=1e-3)
@@ -179,7 +200,9 @@ def test_errors_of_bands_and_peaks(speech: list[tuple[Tensor, int]]) -> None:
 def test_gain_curves(speech: list[tuple[Tensor, int]]) -> None:
     utterances = torch.stack([speech[i][0][0, :24000] for i in (0, 2)])
     ear = Audiogram((50.0,) * 8)
-    np.testing.assert_allclose(insertion_gain(Gain(6.0), ear, utterances, INPUT_LEVELS), 6.0, atol=1e-3)
+    np.testing.assert_allclose(
+        insertion_gain(Gain(6.0), ear, utterances, INPUT_LEVELS), 6.0, atol=1e-3
+    )
     # a linear filter has one curve: its own response
     prescribed = NALR()
     curves = np.array(insertion_gain(prescribed, ear, utterances, INPUT_LEVELS))
@@ -193,11 +216,15 @@ def test_gain_curves(speech: list[tuple[Tensor, int]]) -> None:
         assert inside.min() - 0.1 <= gain <= inside.max() + 0.1
     # a limit bends the curve of loud speech
     limited = MappingCompensator(MappingConfig(limit_spl=80.0)).eval()
-    soft, _, loud = (np.mean(curve) for curve in insertion_gain(limited, ear, utterances, INPUT_LEVELS))
+    soft, _, loud = (
+        np.mean(curve) for curve in insertion_gain(limited, ear, utterances, INPUT_LEVELS)
+    )
     assert loud < soft - 6.0
     with pytest.raises(ValueError, match="at 50 dB SPL holds samples that are NaN"):
         insertion_gain(Gain(math.nan), ear, utterances, INPUT_LEVELS)
-    with pytest.raises(ValueError, match=r"at 50 dB SPL: TypeError: .*takes 2 positional arguments"):
+    with pytest.raises(
+        ValueError, match=r"at 50 dB SPL: TypeError: .*takes 2 positional arguments"
+    ):
         insertion_gain(nn.ReLU(), ear, utterances, INPUT_LEVELS)
     with pytest.raises(ValueError, match=r"is \(1,\); allowed: a tensor of the input's shape, \("):
         insertion_gain(First(), ear, utterances, INPUT_LEVELS)
@@ -252,15 +279,24 @@ def test_report(tmp_path: Path, speech_dir: Path, ears_csv: Path) -> None:
     own = group["conditions"]["loud"]
     assert own["haspi_mean"] == pytest.approx(column("loud", "haspi").mean())
     off = column("loud", "heard") - column("loud", "normal")
-    assert (own["heard_off"], own["heard_off_abs"]) == pytest.approx((off.mean(), np.abs(off).mean()))
-    assert set(own["by_level"]) == {"50", "65", "80"} and set(own["by_severity"]) <= {"moderate", "severe"}
+    assert (own["heard_off"], own["heard_off_abs"]) == pytest.approx(
+        (off.mean(), np.abs(off).mean())
+    )
+    assert set(own["by_level"]) == {"50", "65", "80"} and set(own["by_severity"]) <= {
+        "moderate",
+        "severe",
+    }
     (against,) = [
         c
         for c in group["comparisons"]
         if (c["measure"], c["before"], c["after"]) == ("haspi", "NAL-R", "loud")
     ]
     expected = paired_comparison(column("NAL-R", "haspi"), column("loud", "haspi"))
-    assert (against["t"], against["w"], against["cohens_d"]) == (expected.t, expected.w, expected.cohens_d)
+    assert (against["t"], against["w"], against["cohens_d"]) == (
+        expected.t,
+        expected.w,
+        expected.cohens_d,
+    )
     assert against["p_t_holm"] >= expected.p_t
     gap = result["gap"]["clean"]["loud"]
     assert gap["loss_neuro"] == pytest.approx(column("loud", "loss_neuro").mean())
@@ -279,10 +315,14 @@ def test_report(tmp_path: Path, speech_dir: Path, ears_csv: Path) -> None:
     # clean and noisy for each ear; those of which all failed were met too, three of the ten were not
     assert "14 items of 0.3 s, 7 ears in turn" in text
     assert f"| loud | 100 | {max(peaks):.2f} | {result['peaks']['loud']['over']} of 10 |" in text
-    assert "| severe, HASQI: NAL-R to loud |" in text and "**broken: change, and paired tests" in text
+    assert (
+        "| severe, HASQI: NAL-R to loud |" in text and "**broken: change, and paired tests" in text
+    )
     assert "RuntimeError: no such ear" in text and "| N2, loud, 50 dB SPL | +40.0 |" in text
     tones = {own["compensator"]: own for own in result["steady_tones"]}
-    assert [*tones] == ["unaided", "NAL-R", "WDRC", "loud", "broken"] and tones["loud"]["levels"] == [
+    assert [*tones] == ["unaided", "NAL-R", "WDRC", "loud", "broken"] and tones["loud"][
+        "levels"
+    ] == [
         50,
         65,
         80,
@@ -290,13 +330,17 @@ def test_report(tmp_path: Path, speech_dir: Path, ears_csv: Path) -> None:
     assert tones["broken"]["heard_off_db"] == tones["unaided"]["heard_off_db"]
     off = tones["loud"]["heard_off_db"][0][0]
     assert off > tones["unaided"]["heard_off_db"][0][0] + 40.0  # recruitment
-    rows = [line.split(" | ") for line in text.splitlines() if line.startswith("| N2, loud, 50 dB SPL")]
+    rows = [
+        line.split(" | ") for line in text.splitlines() if line.startswith("| N2, loud, 50 dB SPL")
+    ]
     assert len(rows) == 2 and rows[1][1] == f"{off:+.1f}"
     # as loud as the compensator; a gain without a filter is the flat equaliser, but for its ends
     for row in result["rows"]:
         figures = row["figures"]
         at_level = [figures[f"{aid} at loud's level"] for aid in ("NAL-R", "equaliser")]
-        assert [own["level"] for own in at_level] == pytest.approx([figures["loud"]["level"]] * 2, abs=1e-3)
+        assert [own["level"] for own in at_level] == pytest.approx(
+            [figures["loud"]["level"]] * 2, abs=1e-3
+        )
         assert at_level[1]["peak"] == pytest.approx(figures["loud"]["peak"], abs=0.1)
     # each is compared with what a user would pick instead, and with nothing else
     assert result["beside"]["loud"] == [
@@ -319,7 +363,10 @@ def test_report(tmp_path: Path, speech_dir: Path, ears_csv: Path) -> None:
         )
     assert f"| {np.mean(under):.3f} / {np.mean(over):.3f} |" in text
     worn = [own["compensator"] for own in result["wearing"]]
-    assert worn == ["NAL-R", "WDRC", "loud", "broken"] and "| N2, loud | 0.0 | +40.0 | +40.0 | -" in text
+    assert (
+        worn == ["NAL-R", "WDRC", "loud", "broken"]
+        and "| N2, loud | 0.0 | +40.0 | +40.0 | -" in text
+    )
     page = (out / "compensators.html").read_text()
     assert "Steady tones" in page
     assert page.count("data:image/svg+xml") > 2 and "Paired tests" in page and "Gain curves" in page
@@ -369,19 +416,32 @@ def test_a_stopped_run_goes_on_and_new_weights_are_judged_anew(
     assert f"with the Neuro-MSBG {folder}." in (parts / "compensators.md").read_text()
     for before, after in zip(whole["rows"], other["rows"], strict=True):
         for name, figures in before["figures"].items():
-            assert {key for key, value in figures.items() if value != after["figures"][name][key]} == {
-                "loss_neuro"
-            }
-    assert whole["ears"] == ["55 55 55 65 70 75 80 80 dB HL"] and whole["groups"].keys() <= {"clean", "hard"}
+            assert {
+                key for key, value in figures.items() if value != after["figures"][name][key]
+            } == {"loss_neuro"}
+    assert whole["ears"] == ["55 55 55 65 70 75 80 80 dB HL"] and whole["groups"].keys() <= {
+        "clean",
+        "hard",
+    }
     assert {curve["ear"] for curve in whole["gain_curves"]} == {*whole["ears"]}
 
 
 @pytest.mark.usefixtures("quick")
-def test_engines_are_kept_apart(tmp_path: Path, speech_dir: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    options: dict[str, Any] = {"speech": speech_dir / "valid", "items": 2, "seconds": 0.3, "jobs": 1}
+def test_engines_are_kept_apart(
+    tmp_path: Path, speech_dir: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    options: dict[str, Any] = {
+        "speech": speech_dir / "valid",
+        "items": 2,
+        "seconds": 0.3,
+        "jobs": 1,
+    }
     options |= {"audiogram": Audiogram.standard("N4"), "out": tmp_path}
     both = compare({"own": Gain()}, **options)
-    assert both["engine"] == "hlsim" and "HASQI v2, by hlsim " in (tmp_path / "compensators.md").read_text()
+    assert (
+        both["engine"] == "hlsim"
+        and "HASQI v2, by hlsim " in (tmp_path / "compensators.md").read_text()
+    )
 
     measured: list[str] = []
     original = judging.measure_by
@@ -391,7 +451,11 @@ def test_engines_are_kept_apart(tmp_path: Path, speech_dir: Path, monkeypatch: p
     monkeypatch.setattr(compensators, "check_measures", lambda *names: None)
     assert compare({"own": Gain()}, **options)["rows"] == both["rows"] and not measured
     theirs = compare({"own": Gain()}, **options, engine="pyclarity")
-    assert {*measured} == {"pyclarity"} and theirs["rows"] == both["rows"] and theirs["engine"] == "pyclarity"
+    assert (
+        {*measured} == {"pyclarity"}
+        and theirs["rows"] == both["rows"]
+        and theirs["engine"] == "pyclarity"
+    )
 
 
 class First(Gain):
@@ -406,7 +470,12 @@ class MutesSoftSpeech(Gain):
 
 @pytest.mark.usefixtures("quick")
 def test_what_an_aid_mutes_counts_against_it(tmp_path: Path, speech_dir: Path) -> None:
-    options: dict[str, Any] = {"speech": speech_dir / "valid", "items": 2, "seconds": 0.3, "jobs": 1}
+    options: dict[str, Any] = {
+        "speech": speech_dir / "valid",
+        "items": 2,
+        "seconds": 0.3,
+        "jobs": 1,
+    }
     options |= {"audiogram": Audiogram.standard("N2"), "levels": (50.0, 65.0), "out": tmp_path}
     result = compare({"own": MutesSoftSpeech()}, **options)
     soft, loud = (row["figures"] for row in result["rows"])
@@ -421,12 +490,25 @@ class OneAtATime(Gain):
 
 
 @pytest.mark.usefixtures("quick")
-def test_an_ear_without_a_loss_and_a_module_for_one_signal(tmp_path: Path, speech_dir: Path) -> None:
-    options: dict[str, Any] = {"speech": speech_dir / "valid", "items": 2, "seconds": 0.3, "jobs": 1}
-    result = compare({"own": OneAtATime()}, **options, audiogram=Audiogram.standard("NH"), out=tmp_path)
+def test_an_ear_without_a_loss_and_a_module_for_one_signal(
+    tmp_path: Path, speech_dir: Path
+) -> None:
+    options: dict[str, Any] = {
+        "speech": speech_dir / "valid",
+        "items": 2,
+        "seconds": 0.3,
+        "jobs": 1,
+    }
+    result = compare(
+        {"own": OneAtATime()}, **options, audiogram=Audiogram.standard("NH"), out=tmp_path
+    )
     # nothing is lost of clean speech as it is: no loss to be relative to
     unaided = result["gap"]["clean"]["unaided"]
-    assert unaided["loss_msbg"] == 0.0 and unaided["neuro_to_msbg"] is None and unaided["item_median"] is None
+    assert (
+        unaided["loss_msbg"] == 0.0
+        and unaided["neuro_to_msbg"] is None
+        and unaided["item_median"] is None
+    )
     assert "n/a" in (tmp_path / "compensators.md").read_text()
 
 
@@ -439,27 +521,42 @@ def half(waveform, sample_rate):
 
 @pytest.mark.usefixtures("quick")
 def test_an_enhancer_before_each_aid(
-    tmp_path: Path, speech_dir: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path,
+    speech_dir: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [*sys.path])
     for name, text in (("my_enhancer", ENHANCER), ("my_enhancer_2", ENHANCER.replace("2", "4"))):
         (tmp_path / f"{name}.py").write_text(text)
-    options: dict[str, Any] = {"speech": speech_dir / "valid", "audiogram": Audiogram.standard("N3")}
+    options: dict[str, Any] = {
+        "speech": speech_dir / "valid",
+        "audiogram": Audiogram.standard("N3"),
+    }
     options |= {"items": 1, "seconds": 0.3, "jobs": 1, "out": tmp_path / "out"}
     result = compare({"own": Gain(20.0)}, enhancers=["my_enhancer:half"], **options)
     (row,) = result["rows"]
     for aid in ("NAL-R", "own"):
         difference = row["figures"][f"half + {aid}"]["level"] - row["figures"][aid]["level"]
         assert difference == pytest.approx(20.0 * math.log10(0.5), abs=1e-3)
-    assert "half + NAL-R" in result["beside"]["own"] and result["beside"]["half + NAL-R"] == ["NAL-R"]
+    assert "half + NAL-R" in result["beside"]["own"] and result["beside"]["half + NAL-R"] == [
+        "NAL-R"
+    ]
     text = (tmp_path / "out" / "compensators.md").read_text()
     assert "Enhancer my_enhancer:half (sha256 " in text and "| half + own, HASPI |" in text
     # one of another source has scores of its own
     stored = len((tmp_path / "out" / "scores.jsonl").read_text().splitlines())
     compare({"own": Gain(20.0)}, enhancers=["my_enhancer_2:half"], **options)
     assert len((tmp_path / "out" / "scores.jsonl").read_text().splitlines()) == stored + 2 * 3
-    command = ["evaluate-compensator", "nalr", "--speech", str(speech_dir / "valid"), "--audiogram", "N3"]
+    command = [
+        "evaluate-compensator",
+        "nalr",
+        "--speech",
+        str(speech_dir / "valid"),
+        "--audiogram",
+        "N3",
+    ]
     command += ["--out", str(tmp_path / "none"), "--enhancer"]
     for name, said in (
         ("my_enhancer", "allowed: package.module:name"),
@@ -501,14 +598,23 @@ def test_nothing_to_judge(tmp_path: Path, speech_dir: Path) -> None:
     with pytest.raises(ValueError, match="'own' is function; allowed"):
         compare({"own": lambda waveform, ear: waveform}, **options, audiogram=ear)  # type: ignore[dict-item]
     # HASPI takes nothing under 0.7 s
-    with pytest.raises(ValueError, match=r"none of 1 items could be judged; the first: .*needs 0.7 s"):
+    with pytest.raises(
+        ValueError, match=r"none of 1 items could be judged; the first: .*needs 0.7 s"
+    ):
         compare({"own": Unaided()}, **options, audiogram=ear, items=1, seconds=0.5)
     assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.usefixtures("quick")
 def test_command(tmp_path: Path, speech_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    command = ["evaluate-compensator", "mine=nalr", "--speech", str(speech_dir / "valid"), "--jobs", "1"]
+    command = [
+        "evaluate-compensator",
+        "mine=nalr",
+        "--speech",
+        str(speech_dir / "valid"),
+        "--jobs",
+        "1",
+    ]
     command += ["--items", "2", "--seconds", "0.3", "--out", str(tmp_path / "out")]
     assert main([*command, "--audiogram", "N3"]) == 0
     said = capsys.readouterr()

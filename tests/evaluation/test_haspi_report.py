@@ -50,7 +50,9 @@ def run(
 ) -> HaspiReport:
     """As the command does, which joins both where there is a folder for the files."""
     if "manifest" not in options:
-        options |= {name: corpus / name for name in ("clean", "before", "after")} | {"audiogram": audiogram}
+        options |= {name: corpus / name for name in ("clean", "before", "after")} | {
+            "audiogram": audiogram
+        }
     if out is None:
         return haspi_report(**options, jobs=1)
     report = haspi_report(**options, store=check_out(out) / "scores.jsonl", jobs=1)
@@ -100,7 +102,8 @@ def test_both_engines_make_one_report(corpus: Path) -> None:
     pytest.importorskip("clarity")
     store, measures = corpus / "scores.jsonl", ("haspi", "hasqi")
     ours, theirs = (
-        run(corpus, measures=measures, engine=engine, store=store) for engine in ("hlsim", "pyclarity")
+        run(corpus, measures=measures, engine=engine, store=store)
+        for engine in ("hlsim", "pyclarity")
     )
     for measure in measures:
         assert ours.scores(measure) == pytest.approx(theirs.scores(measure), abs=1e-6)
@@ -134,13 +137,17 @@ def test_audiograms_of_a_csv(corpus: Path) -> None:
 
 def stereo(corpus: Path) -> None:
     write_audio(
-        corpus / "after" / "p2" / "c.wav", signal(corpus / "after" / "p2" / "c.wav").expand(2, -1), 22050
+        corpus / "after" / "p2" / "c.wav",
+        signal(corpus / "after" / "p2" / "c.wav").expand(2, -1),
+        22050,
     )
 
 
 def shorter(corpus: Path) -> None:
     write_audio(
-        corpus / "before" / "p2" / "c.wav", signal(corpus / "before" / "p2" / "c.wav")[None, 1:], 22050
+        corpus / "before" / "p2" / "c.wav",
+        signal(corpus / "before" / "p2" / "c.wav")[None, 1:],
+        22050,
     )
 
 
@@ -153,14 +160,20 @@ def silent(corpus: Path) -> None:
 
 
 def short(corpus: Path) -> None:
-    for path in (corpus / "clean" / "a.b.flac", corpus / "before" / "a.b.wav", corpus / "after" / "a.b.wav"):
+    for path in (
+        corpus / "clean" / "a.b.flac",
+        corpus / "before" / "a.b.wav",
+        corpus / "after" / "a.b.wav",
+    ):
         write_audio(path, signal(path)[None, :8000], 16000)
 
 
 def quiet(corpus: Path) -> None:
     (corpus / "clean" / "p2" / "c.flac").unlink()
     write_audio(
-        corpus / "clean" / "p2" / "c.wav", signal(corpus / "before" / "p2" / "c.wav")[None] * 1e-4, 22050
+        corpus / "clean" / "p2" / "c.wav",
+        signal(corpus / "before" / "p2" / "c.wav")[None] * 1e-4,
+        22050,
     )
 
 
@@ -226,7 +239,12 @@ def test_folders_that_differ_are_refused_before_the_first_score(
             "after",
             r"after/p2/c.wav: 2 channels; allowed: 1, for one file is what one ear is given",
         ),
-        (shorter, "p2/c", "before", r"clean/p2/c.flac has 17640 samples and .*before/p2/c.wav 17639"),
+        (
+            shorter,
+            "p2/c",
+            "before",
+            r"clean/p2/c.flac has 17640 samples and .*before/p2/c.wav 17639",
+        ),
         (faster, "a.b", "after", r"after/a.b.wav has 24000 Hz and .*clean/a.b.flac 16000 Hz"),
         (silent, "a.b", "after", r"after/a.b.wav: silent"),
         (short, "a.b", "before", r"reference lasts 0.5 s; a score needs 0.7 s"),
@@ -235,7 +253,12 @@ def test_folders_that_differ_are_refused_before_the_first_score(
     ],
 )
 def test_what_cannot_be_scored_is_listed_and_the_rest_go_on(
-    corpus: Path, quick: list[int], damage: Callable[[Path], None], file: str, condition: str, message: str
+    corpus: Path,
+    quick: list[int],
+    damage: Callable[[Path], None],
+    file: str,
+    condition: str,
+    message: str,
 ) -> None:
     damage(corpus)
     report = run(corpus, out=corpus / "out")
@@ -243,7 +266,9 @@ def test_what_cannot_be_scored_is_listed_and_the_rest_go_on(
     assert (failure.file, failure.condition, failure.measure) == (file, condition, "haspi")
     assert re.search(message, failure.reason) and "\n" not in failure.reason
     assert report.comparison.n == 1
-    assert f"| {file} | {condition} | HASPI | " in (corpus / "out" / "report.md").read_text(encoding="utf-8")
+    assert f"| {file} | {condition} | HASPI | " in (corpus / "out" / "report.md").read_text(
+        encoding="utf-8"
+    )
 
 
 def test_nothing_scored_is_an_error(corpus: Path) -> None:
@@ -252,7 +277,8 @@ def test_nothing_scored_is_an_error(corpus: Path) -> None:
         path.write_bytes(b"no audio")
     (corpus / "after" / "p2" / "c.wav").write_bytes(b"no audio")
     with pytest.raises(
-        ValueError, match=r"none of 2 items could be scored; the first, a\.b: .*not readable as audio"
+        ValueError,
+        match=r"none of 2 items could be scored; the first, a\.b: .*not readable as audio",
     ):
         run(corpus, out=corpus / "out")
     assert not (corpus / "out").exists()
@@ -267,7 +293,10 @@ def test_a_second_run_scores_nothing(corpus: Path, quick: list[int]) -> None:
     assert {p.name: p.read_bytes() for p in (corpus / "out").iterdir()} == files
     run(corpus, Audiogram.standard("N2"), out=corpus / "out")
     assert len(quick) == 8
-    assert run(corpus, store=corpus / "out" / "scores.jsonl").to_dict() == first.to_dict() and len(quick) == 8
+    assert (
+        run(corpus, store=corpus / "out" / "scores.jsonl").to_dict() == first.to_dict()
+        and len(quick) == 8
+    )
 
 
 MANIFEST = """listener,ear,condition,clean,processed,snr,audiogram,spl
@@ -289,7 +318,10 @@ def test_manifest_from_files_to_report(corpus: Path, quick: list[int]) -> None:
         baseline="aided",
         out=corpus / "out",
     )
-    assert report.conditions == ("aided", "unaided", "loud") and report.measures == ("haspi", "stoi")
+    assert report.conditions == ("aided", "unaided", "loud") and report.measures == (
+        "haspi",
+        "stoi",
+    )
     assert [(c.before, c.after, c.overall.n) for c in report.comparisons[:2]] == [
         ("aided", "unaided", 2),
         ("aided", "loud", 1),
@@ -300,7 +332,9 @@ def test_manifest_from_files_to_report(corpus: Path, quick: list[int]) -> None:
     assert report.items[0].levels["aided"] - report.items[0].levels["unaided"] == pytest.approx(
         gain, abs=1e-4
     )
-    assert {(f.file, f.condition) for f in report.failures} == {("L2 right clean/p2/c 0 dB", "loud")}
+    assert {(f.file, f.condition) for f in report.failures} == {
+        ("L2 right clean/p2/c 0 dB", "loud")
+    }
     # a pair of files is scored once a measure, whatever the conditions are called
     assert len(quick) == 4
     page = (corpus / "out" / "report.html").read_text(encoding="utf-8")
@@ -316,9 +350,15 @@ LEVELS = ",".join(N4.to_row().values())
     ("table", "message"),
     [
         (f"{HEADER}\na.b,{LEVELS}\n", "ears.csv: no audiogram of 1 of 2 files, p2/c"),
-        (f"{HEADER}\na.b,{LEVELS}\n\na.b.wav,{LEVELS}\n", "ears.csv, line 4: a second row of a.b.wav"),
+        (
+            f"{HEADER}\na.b,{LEVELS}\n\na.b.wav,{LEVELS}\n",
+            "ears.csv, line 4: a second row of a.b.wav",
+        ),
         (f"{HEADER[5:]}\n{LEVELS}\n", "ears.csv, line 2: no file named"),
-        (f"{HEADER}\na.b,{LEVELS.replace('55', '555')}\n", "ears.csv, line 2: audiogram levels 555"),
+        (
+            f"{HEADER}\na.b,{LEVELS.replace('55', '555')}\n",
+            "ears.csv, line 2: audiogram levels 555",
+        ),
     ],
 )
 def test_bad_csv(corpus: Path, table: str, message: str) -> None:

@@ -30,7 +30,12 @@ def test_rows_become_items(tmp_path: Path) -> None:
         "unaided": tmp_path.resolve() / "noisy/a.wav",
         "NAL-R": tmp_path.resolve() / "nalr/a.wav",
     }
-    assert (first.name, first.listener, first.ear, first.snr) == ("L1 left clean/a 5 dB", "L1", "left", 5.0)
+    assert (first.name, first.listener, first.ear, first.snr) == (
+        "L1 left clean/a 5 dB",
+        "L1",
+        "left",
+        5.0,
+    )
     assert first.audiogram == Audiogram((20.0, 30.0, 60.0), (250.0, 1000.0, 8000.0))
     assert (first.full_scale_spl, first.spl) == (100.0, None)
     assert (second.ear, second.audiogram.levels[0]) == ("right", 10.0)
@@ -57,7 +62,9 @@ def test_audiograms_of_rows_of_a_file_and_of_all(tmp_path: Path) -> None:
     found = [item.audiogram.levels for item in read_manifest(path, audiograms=ears)]
     assert found == [(10.0, 20.0), (30.0, 40.0), (50.0, 60.0), Audiogram.standard("S2").levels]
     path = write(tmp_path, header, "L9,left,u,c.wav,u.wav,")
-    with pytest.raises(ValueError, match=r"study\.csv, line 2: no audiogram of listener 'L9', ear 'left'"):
+    with pytest.raises(
+        ValueError, match=r"study\.csv, line 2: no audiogram of listener 'L9', ear 'left'"
+    ):
         read_manifest(path, audiograms=ears)
     assert read_manifest(path, audiogram=N3)[0].audiogram == N3
 
@@ -78,7 +85,9 @@ def test_levels_of_rows_and_of_all(tmp_path: Path) -> None:
 
 
 def test_what_no_row_takes_is_refused(tmp_path: Path) -> None:
-    own = write(tmp_path, "listener,condition,clean,processed,audiogram,spl", "L1,u,c.wav,u.wav,N3,65")
+    own = write(
+        tmp_path, "listener,condition,clean,processed,audiogram,spl", "L1,u,c.wav,u.wav,N3,65"
+    )
     ears = write(tmp_path, "listener,hl_250", "L1,10", name="ears.csv")
     for options in ({"audiogram": N3}, {"audiograms": ears}, {"spl": 70.0}):
         with pytest.raises(
@@ -89,7 +98,10 @@ def test_what_no_row_takes_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="no row takes audiogram,"):
         read_manifest(some, audiogram=N3, audiograms=ears)
     both = write(
-        tmp_path, "condition,clean,processed,audiogram,spl", "u,c.wav,u.wav,N4,60", "v,d.wav,v.wav,,"
+        tmp_path,
+        "condition,clean,processed,audiogram,spl",
+        "u,c.wav,u.wav,N4,60",
+        "v,d.wav,v.wav,,",
     )
     assert [item.spl for item in read_manifest(both, audiogram=N3, spl=70.0)] == [60.0, 70.0]
 
@@ -110,7 +122,9 @@ def test_no_path_leaves_the_root(tmp_path: Path, name: str) -> None:
     os.symlink(tmp_path, root / "link")
     for column, row in (("clean", f"u,{name},u.wav,N3"), ("processed", f"u,u.wav,{name},N3")):
         path = write(tmp_path, "condition,clean,processed,audiogram", row)
-        with pytest.raises(ValueError, match=f"line 2: {column} is '.*(which leaves|a path relative to)"):
+        with pytest.raises(
+            ValueError, match=f"line 2: {column} is '.*(which leaves|a path relative to)"
+        ):
             read_manifest(path, root)
     with pytest.raises(ValueError):
         below_root(root, name, "clean")
@@ -134,7 +148,10 @@ HEADER = "listener,ear,condition,clean,processed,audiogram,spl,full_scale_spl,sn
         ),
         ((HEADER, "L1,l,u,c.wav,u.wav,N9,,,"), "line 2: no standard audiogram 'N9'"),
         ((HEADER, "L1,l,u,c.wav,u.wav,N3,65,94,"), "line 2: both spl and full_scale_spl"),
-        ((HEADER, "L1,l,u,c.wav,u.wav,N3,loud,,"), "line 2: spl is 'loud'; allowed: a number of dB"),
+        (
+            (HEADER, "L1,l,u,c.wav,u.wav,N3,loud,,"),
+            "line 2: spl is 'loud'; allowed: a number of dB",
+        ),
         ((HEADER, "L1,l,u,c.wav,u.wav,N3,,,inf"), "line 2: snr is 'inf'"),
         ((HEADER, "L1,l,u,c.wav,u.wav,N3,,900,"), "line 2: full_scale_spl is 900"),
         (

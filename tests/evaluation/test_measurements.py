@@ -53,7 +53,9 @@ def test_unaided_is_what_the_exact_model_gives() -> None:
     time = torch.arange(32000, dtype=torch.float64) / 16000
     for row, level in enumerate((50.0, 65.0)):
         tone = 2**0.5 * 10.0 ** ((level - 94.0) / 20.0) * (2.0 * torch.pi * 1000.0 * time).sin()
-        heard, normal = (level_spl(MSBG(ear, sample_rate=16000)(tone)[8000:24000]) for ear in (N3, NORMAL))
+        heard, normal = (
+            level_spl(MSBG(ear, sample_rate=16000)(tone)[8000:24000]) for ear in (N3, NORMAL)
+        )
         off = found["heard_off_db"][row][TONES.index(1000)]
         assert off == pytest.approx(float(heard - normal), abs=0.01) and off < -20.0
 
@@ -70,12 +72,16 @@ def test_modulation_is_caught(depth: float) -> None:
     (sidebands,) = found["sidebands_db"]
     assert sidebands == pytest.approx([10.0 * math.log10(depth**2 / 2.0)] * len(TONES), abs=0.01)
     # a linear ear hears them too
-    assert found["heard_off_db"][0][2] == pytest.approx(10.0 * math.log10(1.0 + depth**2 / 2.0), abs=0.1)
+    assert found["heard_off_db"][0][2] == pytest.approx(
+        10.0 * math.log10(1.0 + depth**2 / 2.0), abs=0.1
+    )
 
 
 def test_muting_of_steady_sounds_is_caught() -> None:
     # with no loss all is linear: 0 dB off unaided, and what was taken away
-    unaided, muted = steady_tones({"unaided": Unaided(), "own": Muting()}, {"NH": NORMAL}, (50.0, 80.0))
+    unaided, muted = steady_tones(
+        {"unaided": Unaided(), "own": Muting()}, {"NH": NORMAL}, (50.0, 80.0)
+    )
     for level in range(2):
         assert unaided["heard_off_db"][level] == pytest.approx([0.0] * len(TONES), abs=1e-3)
         assert muted["heard_off_db"][level] == pytest.approx([-40.0] * len(TONES), abs=1e-3)
@@ -119,5 +125,7 @@ def test_silence_has_figures() -> None:
 
 
 def test_samples_that_are_not_numbers() -> None:
-    with pytest.raises(ValueError, match="own, ear N3, steady tones: the output holds samples that are NaN"):
+    with pytest.raises(
+        ValueError, match="own, ear N3, steady tones: the output holds samples that are NaN"
+    ):
         steady_tones({"own": Unable()}, {"N3": N3}, (65.0,))

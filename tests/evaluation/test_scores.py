@@ -15,7 +15,9 @@ from hlsim.report.haspi import html, markdown
 EARS = {"left": Audiogram.standard("N2"), "right": Audiogram.standard("N4")}
 
 
-def one(ear: str, before: float | None, after: float | None, level: float, listener: str = "L1") -> ItemScore:
+def one(
+    ear: str, before: float | None, after: float | None, level: float, listener: str = "L1"
+) -> ItemScore:
     scores = {"before": before, "after": after}
     return ItemScore(
         file=f"{listener} {ear} s01",
@@ -58,8 +60,12 @@ def test_a_missing_ear_is_refused_and_listeners_are_kept_apart() -> None:
         check_both_ears([*named, named[0]])
 
 
-def test_an_ear_of_which_nothing_can_be_scored_is_told_and_loses(tmp_path: Path, speech_dir: Path) -> None:
-    (tmp_path / "speech.flac").write_bytes((speech_dir / "valid" / "espeak-us-annie-01.flac").read_bytes())
+def test_an_ear_of_which_nothing_can_be_scored_is_told_and_loses(
+    tmp_path: Path, speech_dir: Path
+) -> None:
+    (tmp_path / "speech.flac").write_bytes(
+        (speech_dir / "valid" / "espeak-us-annie-01.flac").read_bytes()
+    )
     (tmp_path / "broken.wav").write_text("no sound")
     rows = ["listener,ear,condition,clean,processed,audiogram"]
     for condition in ("before", "after"):
@@ -89,7 +95,9 @@ def test_a_report_of_two_ears(tmp_path: Path, speech_dir: Path) -> None:
     report = haspi_report(manifest=tmp_path / "study.csv", better_ear=True, jobs=1)
     each = haspi_report(manifest=tmp_path / "study.csv", jobs=1)
     assert [ear.to_dict() for ear in report.ears] == [item.to_dict() for item in each.items]
-    np.testing.assert_array_equal(report.scores("haspi"), each.scores("haspi").max(0, keepdims=True))
+    np.testing.assert_array_equal(
+        report.scores("haspi"), each.scores("haspi").max(0, keepdims=True)
+    )
     assert report.items[0].ear == "left" and len(report.to_dict()["ears"]) == 2
     text = markdown(report)
     assert "Each is the better ear's." in text and "Scores and levels of each ear" in html(report)

@@ -93,8 +93,12 @@ def test_equal_the_libraries_called_one_by_one(items: list[FileItem]) -> None:
         assert results["stoi", condition].dbfs == pytest.approx(level, abs=1e-9)
         assert results["stoi", condition].seconds == 0.8
     # HASPI and HASQI are kept by engine, for STOI and PESQ there is but one
-    kept = sorted((record["measure"], record.get("engine", "")) for record in store.records.values())
-    of_ear = [(measure, engine) for measure in ("haspi", "hasqi") for engine in ("hlsim", "pyclarity")]
+    kept = sorted(
+        (record["measure"], record.get("engine", "")) for record in store.records.values()
+    )
+    of_ear = [
+        (measure, engine) for measure in ("haspi", "hasqi") for engine in ("hlsim", "pyclarity")
+    ]
     assert kept == [*of_ear, ("pesq", ""), ("stoi", "")]
 
 
@@ -102,7 +106,9 @@ def test_a_stored_score_has_the_seed_of_this_run(items: list[FileItem], tmp_path
     """STOI knows no seed, so that a score of another run serves."""
     store = tmp_path / "scores.jsonl"
     first, second = (
-        score_items(items[:1], ("stoi",), store=ScoreStore(store), seed=seed, jobs=1)[0]["stoi", "noisy"]
+        score_items(items[:1], ("stoi",), store=ScoreStore(store), seed=seed, jobs=1)[0][
+            "stoi", "noisy"
+        ]
         for seed in (0, 7)
     )
     assert second == first._replace(seed=first.seed + 7)
@@ -111,7 +117,9 @@ def test_a_stored_score_has_the_seed_of_this_run(items: list[FileItem], tmp_path
 @pytest.mark.slow
 def test_two_processes_give_the_same(items: list[FileItem]) -> None:
     given = [replace(item, processed={"noisy": item.processed["noisy"]}) for item in items]
-    assert scores(score_items(given, ALL[::2], jobs=2)) == scores(score_items(given, ALL[::2], jobs=1))
+    assert scores(score_items(given, ALL[::2], jobs=2)) == scores(
+        score_items(given, ALL[::2], jobs=1)
+    )
 
 
 def test_two_threads_do_not_share_numpys_generator(items: list[FileItem]) -> None:
@@ -204,7 +212,9 @@ def count_scores(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return made
 
 
-def test_the_same_pair_twice_is_scored_once(items: list[FileItem], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_same_pair_twice_is_scored_once(
+    items: list[FileItem], monkeypatch: pytest.MonkeyPatch
+) -> None:
     made = count_scores(monkeypatch)
     twins = [items[0], replace(items[0], name="twin", audiogram=Audiogram.standard("N1"))]
     results = score_items(twins, ("haspi", "stoi"), jobs=1)
@@ -290,10 +300,14 @@ def test_a_killed_run_goes_on_where_it_was(items: list[FileItem], tmp_path: Path
     before = path.read_bytes()
     assert 3 <= before.count(b"\n") < 12
     # each file is its own reference, so that its two conditions are one score
-    many = [FileItem(p.stem, p, {"a": p, "b": p}, N3) for p in sorted((tmp_path / "many").iterdir())]
+    many = [
+        FileItem(p.stem, p, {"a": p, "b": p}, N3) for p in sorted((tmp_path / "many").iterdir())
+    ]
     seen: list[int] = []
     store = ScoreStore(path)
-    resumed = score_items(many, ("stoi",), store=store, jobs=1, progress=lambda done, _: seen.append(done))
+    resumed = score_items(
+        many, ("stoi",), store=store, jobs=1, progress=lambda done, _: seen.append(done)
+    )
     assert seen[0] == 2 * before.count(b"\n")
     assert path.read_bytes().startswith(before) and path.read_bytes().count(b"\n") == 12
     assert len({json.loads(line)["key"] for line in path.read_text().splitlines()}) == 12
@@ -301,7 +315,9 @@ def test_a_killed_run_goes_on_where_it_was(items: list[FileItem], tmp_path: Path
 
 
 def test_bad_settings(items: list[FileItem]) -> None:
-    with pytest.raises(ValueError, match="unknown measures loudness; allowed: haspi, hasqi, stoi, pesq"):
+    with pytest.raises(
+        ValueError, match="unknown measures loudness; allowed: haspi, hasqi, stoi, pesq"
+    ):
         score_items(items, ("loudness",))
     with pytest.raises(ValueError, match="engine 'matlab'; allowed: hlsim, pyclarity"):
         score_items(items, engine="matlab")

@@ -34,16 +34,22 @@ def ears(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize(("name", "level"), [("NH", 65.0), ("N2", 50.0), ("N3", 80.0)])
-def test_truth_is_the_exact_model(speech: list[tuple[Tensor, int]], name: str, level: float) -> None:
+def test_truth_is_the_exact_model(
+    speech: list[tuple[Tensor, int]], name: str, level: float
+) -> None:
     waveform, rate = speech[0]
     signal = set_level(waveform[0, : 2 * rate], level)
     ear = Audiogram.standard(name)
     assert snr_db(pyclarity_msbg(signal, ear, rate), MSBG(ear, sample_rate=rate)(signal)) > 40.0
 
 
-def test_items_are_the_same_for_a_seed_and_cover_what_they_say(speech_dir: Path, ears: Path) -> None:
+def test_items_are_the_same_for_a_seed_and_cover_what_they_say(
+    speech_dir: Path, ears: Path
+) -> None:
     draw = [
-        draw_items(speech_dir / "valid", speech_dir / "train", ears, items=40, seconds=2.0, seed=seed)
+        draw_items(
+            speech_dir / "valid", speech_dir / "train", ears, items=40, seconds=2.0, seed=seed
+        )
         for seed in (0, 0, 1)
     ]
     assert all(torch.equal(a.signal, b.signal) for a, b in zip(draw[0], draw[1], strict=True))
@@ -59,21 +65,33 @@ def test_items_are_the_same_for_a_seed_and_cover_what_they_say(speech_dir: Path,
 
 
 @pytest.mark.parametrize("count", [2, 4, 5])
-def test_every_kind_of_ear_meets_every_level_at_every_ratio(speech_dir: Path, ears: Path, count: int) -> None:
+def test_every_kind_of_ear_meets_every_level_at_every_ratio(
+    speech_dir: Path, ears: Path, count: int
+) -> None:
     levels, each = [50.0, 55.0, 60.0, 70.0, 80.0][:count], 16 * count
     drawn = draw_items(
-        speech_dir / "valid", speech_dir / "train", ears, items=2 * each, seconds=0.1, seed=0, levels=levels
+        speech_dir / "valid",
+        speech_dir / "train",
+        ears,
+        items=2 * each,
+        seconds=0.1,
+        seed=0,
+        levels=levels,
     )
     noisy = [item.about for item in drawn if item.about["condition"] == "noisy"]
     met = {(number % 4, about["level"], about["noise_snr"]) for number, about in enumerate(noisy)}
     assert len(met) == each == len(noisy)
     standard = {(tuple(about["audiogram"]), about["noise_snr"]) for about in noisy[2::4]}
     assert len({ear for ear, _ in standard}) == 4 and len(standard) > 4
-    assert {item.about["noise_snr"] for item in drawn if item.about["condition"] == "clean"} == {None}
+    assert {item.about["noise_snr"] for item in drawn if item.about["condition"] == "clean"} == {
+        None
+    }
 
 
 def test_inputs_are_what_their_names_say(speech_dir: Path, ears: Path) -> None:
-    drawn = draw_items(speech_dir / "valid", None, ears, items=2, seconds=1.5, seed=0, levels=(65.0,))
+    drawn = draw_items(
+        speech_dir / "valid", None, ears, items=2, seconds=1.5, seed=0, levels=(65.0,)
+    )
     inputs = ("as-is", "louder", "nal-r", "compressed", "compensated")
     halved = torch.nn.Module()
     halved.forward = lambda waveform, ear: 0.5 * waveform  # type: ignore[method-assign]
@@ -87,11 +105,16 @@ def test_inputs_are_what_their_names_say(speech_dir: Path, ears: Path) -> None:
         assert torch.equal(amplified.signal, NALR(own.ear)(own.signal))
         assert torch.equal(compensated.signal, 0.5 * own.signal)
         # compression brings frames' levels nearer to each other, down to 30 dB below the mean
-        frames = [item.signal.unfold(0, 400, 400).square().mean(-1).log10() for item in (as_is, compressed)]
+        frames = [
+            item.signal.unfold(0, 400, 400).square().mean(-1).log10()
+            for item in (as_is, compressed)
+        ]
         loud = frames[0] > frames[0].max() - 2.0
         spread = [float(levels[loud].std()) for levels in frames]
         assert spread[1] < 0.7 * spread[0]
-    with pytest.raises(ValueError, match="allowed: as-is, louder, nal-r, compressed, and compensated with a"):
+    with pytest.raises(
+        ValueError, match="allowed: as-is, louder, nal-r, compressed, and compensated with a"
+    ):
         next(treat(drawn, ["compensated"]))
 
 
@@ -107,7 +130,9 @@ class Unimpaired(torch.nn.Module):
         return waveform
 
 
-def test_files_and_an_identity_is_no_simulator(tmp_path: Path, speech_dir: Path, ears: Path) -> None:
+def test_files_and_an_identity_is_no_simulator(
+    tmp_path: Path, speech_dir: Path, ears: Path
+) -> None:
     out = tmp_path / "out"
     result = compare(
         {"exact": MSBG(sample_rate=16000), "identity": Unimpaired()},
@@ -131,7 +156,11 @@ def test_files_and_an_identity_is_no_simulator(tmp_path: Path, speech_dir: Path,
         "scores.jsonl",
     }
     text = (out / "fidelity.md").read_text()
-    assert "## Speech as it is" in text and "| exact | 4 |" in text and "## identity: 20 dB louder" in text
+    assert (
+        "## Speech as it is" in text
+        and "| exact | 4 |" in text
+        and "## identity: 20 dB louder" in text
+    )
     assert text.splitlines()[2].startswith(
         "SNR in dB against hlsim's exact MSBG, median item (worst tenth): exact "
     )
@@ -165,7 +194,9 @@ def test_what_a_simulator_fails_on_is_told(tmp_path: Path, speech_dir: Path, ear
         items=8,
         seconds=1.5,
     )
-    whole = {name: entry["inputs"]["as-is"]["overall"] for name, entry in result["simulators"].items()}
+    whole = {
+        name: entry["inputs"]["as-is"]["overall"] for name, entry in result["simulators"].items()
+    }
     hard = sum(row["severity"] == "severe" for row in result["simulators"]["identity"]["items"])
     assert 0 < hard < 8 and all(figures["n"] == 8 for figures in whole.values())
     assert [whole[name]["snr_n"] for name in whole] == [8, 8 - hard, 8 - hard, 8, 8]
@@ -174,17 +205,24 @@ def test_what_a_simulator_fails_on_is_told(tmp_path: Path, speech_dir: Path, ear
     failures = text[text.index("## Failures") :]
     assert failures.count("RuntimeError: not that ear") == failures.count("NaN or infinite") == hard
     assert failures.count("| silent |") == 2 * hard and "identity" not in failures
-    assert f"({8 - hard} of 8)" in text and "not that ear" in (tmp_path / "fidelity.html").read_text()
+    assert (
+        f"({8 - hard} of 8)" in text and "not that ear" in (tmp_path / "fidelity.html").read_text()
+    )
     # against the first, over the items that both have
     exact = result["simulators"]["exact"]
     assert "snr_over_first" not in result["simulators"]["identity"]
     over = exact["snr_over_first"]["as-is"]
-    snr = [[row["snr"] for row in result["simulators"][name]["items"]] for name in ("identity", "exact")]
+    snr = [
+        [row["snr"] for row in result["simulators"][name]["items"]]
+        for name in ("identity", "exact")
+    ]
     gains = [after - before for before, after in zip(*snr, strict=True)]
     assert over["n"] == 8 and over["delta"] == pytest.approx(sum(gains) / 8)
     assert min(gains) < over["ci_low"] < over["delta"] < over["ci_high"] < max(gains)
     assert result["simulators"]["nan"]["snr_over_first"]["as-is"]["n"] == 8 - hard
-    assert "SNR (dB) less that of identity" in text and f"| exact | 8 | {over['delta']:+.3f} [" in text
+    assert (
+        "SNR (dB) less that of identity" in text and f"| exact | 8 | {over['delta']:+.3f} [" in text
+    )
     # what failed is not stored, but tried again
     assert len((tmp_path / "scores.jsonl").read_text().splitlines()) == 5 * 8 - 2 * hard
 
@@ -206,7 +244,10 @@ def test_what_the_truth_fails_on_is_told_and_is_no_picture(
         soft, loud = (simulator["inputs"][given]["overall"] for given in ("as-is", "louder"))
         assert (soft["n"], soft["snr_n"], loud["n"], loud["snr_n"]) == (2, 0, 2, 2)
     text = (tmp_path / "fidelity.md").read_text()
-    assert text[text.index("## Failures") :].count("no truth: too soft for pyclarity's active level") == 4
+    assert (
+        text[text.index("## Failures") :].count("no truth: too soft for pyclarity's active level")
+        == 4
+    )
     assert "20 dB louder, clean, 28 dB SPL" in (tmp_path / "fidelity.html").read_text()
     with pytest.raises(ValueError, match="no item has a truth: too soft for pyclarity's"):
         compare(
@@ -223,7 +264,12 @@ def test_what_the_truth_fails_on_is_told_and_is_no_picture(
 def test_a_stopped_comparison_goes_on_and_a_new_simulator_is_scored_alone(
     tmp_path: Path, speech_dir: Path, ears: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    options = {"speech": speech_dir / "valid", "audiograms": ears, "teacher": "msbg", "seconds": 1.0}
+    options = {
+        "speech": speech_dir / "valid",
+        "audiograms": ears,
+        "teacher": "msbg",
+        "seconds": 1.0,
+    }
     whole = compare({"a": Unimpaired()}, **options, items=3, out=tmp_path / "whole")
     scored: list[int] = []
     original = simulators._scores
@@ -262,22 +308,33 @@ def test_teachers_share_no_stored_scores(
     exact = compare(given, teacher="msbg", **options)
     other = compare(given, teacher="dead_region:DeadRegion", **options)
     assert len((tmp_path / "scores.jsonl").read_text().splitlines()) == 4
-    assert other["teacher"].startswith("dead_region:DeadRegion (sha256 ") and exact["teacher"] == "msbg"
+    assert (
+        other["teacher"].startswith("dead_region:DeadRegion (sha256 ")
+        and exact["teacher"] == "msbg"
+    )
     text = (tmp_path / "fidelity.md").read_text()
     assert text.startswith("# Fidelity\n") and f"Against {other['teacher']}: 2 items" in text
-    snr = [[item["snr"] for item in result["simulators"]["identity"]["items"]] for result in (exact, other)]
+    snr = [
+        [item["snr"] for item in result["simulators"]["identity"]["items"]]
+        for result in (exact, other)
+    ]
     assert snr[0] != snr[1]
 
 
 def test_unknown_teacher(tmp_path: Path, speech_dir: Path, ears: Path) -> None:
-    with pytest.raises(ValueError, match="unknown teachers nobody; allowed: msbg, pyclarity, package"):
+    with pytest.raises(
+        ValueError, match="unknown teachers nobody; allowed: msbg, pyclarity, package"
+    ):
         compare({}, speech=speech_dir, audiograms=ears, out=tmp_path, teacher="nobody")
 
 
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        ({"inputs": ("as-is", "louder", "as-is")}, "inputs as-is, louder, as-is; allowed: each once"),
+        (
+            {"inputs": ("as-is", "louder", "as-is")},
+            "inputs as-is, louder, as-is; allowed: each once",
+        ),
         ({"seconds": 0.01}, r"items of 0\.01 s; allowed: 0\.02 or more"),
     ],
 )
@@ -285,7 +342,12 @@ def test_what_would_fail_or_count_twice_is_refused_before_the_work(
     tmp_path: Path, speech_dir: Path, ears: Path, options: dict[str, Any], said: str
 ) -> None:
     out = tmp_path / "out"
-    call: dict[str, Any] = {"speech": speech_dir / "valid", "audiograms": ears, "teacher": "msbg", "items": 1}
+    call: dict[str, Any] = {
+        "speech": speech_dir / "valid",
+        "audiograms": ears,
+        "teacher": "msbg",
+        "items": 1,
+    }
     with pytest.raises(ValueError, match=said):
         compare({"identity": Unimpaired()}, **call, out=out, **options)
     assert not out.exists()
@@ -335,14 +397,19 @@ def test_summary_is_of_its_rows() -> None:
     assert overall["snr_median"] == pytest.approx(np.median(snr))
     assert overall["snr_worst_tenth"] == pytest.approx(np.percentile(snr, 10))
     assert overall["raw_mse"] == pytest.approx(np.mean([row["raw_mse"] for row in data]))
-    assert overall["band_error_median"] == pytest.approx(np.median([row["band_error"] for row in data]))
+    assert overall["band_error_median"] == pytest.approx(
+        np.median([row["band_error"] for row in data])
+    )
     scored = [row for row in data if row["pesq_sim"] is not None]
     true, simulated = ([row[key] for row in scored] for key in ("pesq_true", "pesq_sim"))
     assert overall["pesq_srcc"] == pytest.approx(stats.spearmanr(true, simulated)[0])
     assert list(summary["severity"]) == ["none", "mild", "severe"]
     assert list(summary["level"]) == ["65", "80"]
     assert {key: figures["n"] for key, figures in summary["condition"].items()} == {"clean": 40}
-    assert summary["severity"]["mild"] == summarise([r for r in data if r["severity"] == "mild"])["overall"]
+    assert (
+        summary["severity"]["mild"]
+        == summarise([r for r in data if r["severity"] == "mild"])["overall"]
+    )
     assert json.loads(json.dumps(summary, allow_nan=False)) == summary
 
 

@@ -32,7 +32,9 @@ def test_equals_scipy(n: int) -> None:
     else:
         assert c.ci_low is not None and c.ci_high is not None and c.ci_low <= c.delta <= c.ci_high
     assert c.before_mean == pytest.approx(before.mean(), abs=1e-15)
-    assert c.after_std == pytest.approx(math.sqrt(((after - after.mean()) ** 2).sum() / (n - 1)), rel=1e-12)
+    assert c.after_std == pytest.approx(
+        math.sqrt(((after - after.mean()) ** 2).sum() / (n - 1)), rel=1e-12
+    )
     assert c.delta == pytest.approx(c.after_mean - c.before_mean, abs=1e-15)
     assert c.cohens_d == pytest.approx(c.t / math.sqrt(n), rel=1e-12)
 
@@ -73,7 +75,11 @@ def test_interval_is_scipys_expanded(n: int) -> None:
     wider = 1.0 - 2.0 * stats.norm.cdf(-stats.t.ppf(0.975, n - 1) * math.sqrt(n / (n - 1)))
     assert wider > 0.95
     # scipy draws as we do where all resamples are drawn at once
-    options = {"random_state": np.random.default_rng(0), "n_resamples": 9999, "method": "percentile"}
+    options = {
+        "random_state": np.random.default_rng(0),
+        "n_resamples": 9999,
+        "method": "percentile",
+    }
     scipys = stats.bootstrap(
         (after - before,), np.mean, confidence_level=wider, **options
     ).confidence_interval
@@ -84,7 +90,9 @@ def test_interval_of_many_is_the_normal_one() -> None:
     values = np.random.default_rng(4).normal(0.2, 1.0, 4000)
     low, high = bootstrap_interval(values)
     half = 1.96 * values.std(ddof=1) / math.sqrt(4000)
-    assert (low, high) == pytest.approx((values.mean() - half, values.mean() + half), abs=0.03 * half)
+    assert (low, high) == pytest.approx(
+        (values.mean() - half, values.mean() + half), abs=0.03 * half
+    )
     narrow = bootstrap_interval(values, confidence=0.5)
     assert low < narrow[0] < values.mean() < narrow[1] < high
     assert bootstrap_interval(values, seed=1) != (low, high) == bootstrap_interval(values)

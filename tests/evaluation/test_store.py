@@ -75,7 +75,10 @@ def test_errors_are_one_line(tmp_path: Path) -> None:
 def test_keys_and_hashes(tmp_path: Path) -> None:
     (tmp_path / "a").write_bytes(b"abc")
     # FIPS 180-2, the one-block example
-    assert content_hash(tmp_path / "a") == "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
+    assert (
+        content_hash(tmp_path / "a")
+        == "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
+    )
     assert key_of({"a": 1, "b": [1.0, 2.0]}) == key_of({"b": [1.0, 2.0], "a": 1})
     assert len({key_of({"a": value}) for value in (1, 2, "1", None)}) == 4
     assert json.loads(json.dumps(key_of({}))) == key_of({})

@@ -38,7 +38,9 @@ def test_snr_and_raw_mse_of_a_known_error(pair: tuple[Tensor, Tensor]) -> None:
         error = torch.randn(clean.shape, dtype=torch.float64)
         error *= (clean.square().sum() / error.square().sum()).sqrt() * 10 ** (-db / 20)
         assert snr_db(clean, clean + error) == pytest.approx(db, abs=1e-9)
-        assert raw_mse(clean.numpy(), (clean + error).numpy()) == pytest.approx(10 ** (-db / 10), rel=1e-9)
+        assert raw_mse(clean.numpy(), (clean + error).numpy()) == pytest.approx(
+            10 ** (-db / 10), rel=1e-9
+        )
     assert snr_db(clean, clean) == 200.0
     assert raw_mse(clean, clean) == 0.0
     assert raw_mse(clean, clean * 0) == pytest.approx(1.0)
@@ -53,8 +55,12 @@ def test_errors_do_not_depend_on_the_level(pair: tuple[Tensor, Tensor]) -> None:
 def test_third_octave_error_of_a_gain_is_the_gain(pair: tuple[Tensor, Tensor]) -> None:
     clean = pair[0]
     assert third_octave_error_db(clean, clean, 16000) == 0.0
-    assert third_octave_error_db(clean, clean * 2.0, 16000) == pytest.approx(20 * math.log10(2), abs=1e-5)
-    assert third_octave_error_db(clean, clean * -0.25, 16000) == pytest.approx(20 * math.log10(4), abs=1e-5)
+    assert third_octave_error_db(clean, clean * 2.0, 16000) == pytest.approx(
+        20 * math.log10(2), abs=1e-5
+    )
+    assert third_octave_error_db(clean, clean * -0.25, 16000) == pytest.approx(
+        20 * math.log10(4), abs=1e-5
+    )
     assert third_octave_error_db(clean, clean * 0, 16000) > 70.0
 
 
@@ -86,7 +92,10 @@ def test_stoi_equals_pystoi(pair: tuple[Tensor, Tensor], speech: list[tuple[Tens
     assert score.value == pytest.approx(direct, abs=1e-12) and score.reason is None
     assert 0.3 < direct < 0.99
     other, rate = speech[3]
-    x, y = other[0].double().numpy(), (other[0] + 0.02 * torch.randn(other.shape[1])).double().numpy()
+    x, y = (
+        other[0].double().numpy(),
+        (other[0] + 0.02 * torch.randn(other.shape[1])).double().numpy(),
+    )
     assert stoi(x, y, rate).value == pytest.approx(pystoi.stoi(x, y, rate), abs=1e-12)
 
 
@@ -99,7 +108,9 @@ def test_pesq_equals_pesq(pair: tuple[Tensor, Tensor], speech: list[tuple[Tensor
     other, rate = speech[3]
     heard = other[0] + 0.02 * torch.randn(other.shape[1])
     pair_16k = [resample(x.double(), rate, 16000).numpy() for x in (other[0], heard)]
-    assert pesq_wb(other[0], heard, rate).value == pytest.approx(pesq.pesq(16000, *pair_16k, "wb"), abs=1e-12)
+    assert pesq_wb(other[0], heard, rate).value == pytest.approx(
+        pesq.pesq(16000, *pair_16k, "wb"), abs=1e-12
+    )
 
 
 @pytest.mark.parametrize(("measure", "package"), [(stoi, "pystoi"), (pesq_wb, "pesq")])
@@ -110,7 +121,9 @@ def test_an_item_without_a_score_has_a_reason(
     clean, noisy = pair
     assert measure(clean, noisy * 0, 16000) == Score(None, "heard is silent")
     assert measure(clean * 0, noisy, 16000) == Score(None, "clean is silent")
-    assert measure(clean, noisy / 0, 16000) == Score(None, "heard holds samples that are NaN or infinite")
+    assert measure(clean, noisy / 0, 16000) == Score(
+        None, "heard holds samples that are NaN or infinite"
+    )
     short = measure(clean[:2000], noisy[:2000], 16000)
     assert short.value is None and short.reason
     with pytest.raises(ValueError, match="equally long"):
@@ -153,9 +166,15 @@ def test_correlations_equal_scipy() -> None:
     rng = np.random.default_rng(0)
     true = rng.uniform(size=40).round(1)  # ties
     simulated = true**3 + rng.normal(0, 0.05, 40)
-    assert linear_correlation(true, simulated) == pytest.approx(stats.pearsonr(true, simulated)[0], abs=1e-14)
-    assert rank_correlation(true, simulated) == pytest.approx(stats.spearmanr(true, simulated)[0], abs=1e-14)
-    assert mean_squared_error(true, simulated) == pytest.approx(np.mean((true - simulated) ** 2), abs=1e-15)
+    assert linear_correlation(true, simulated) == pytest.approx(
+        stats.pearsonr(true, simulated)[0], abs=1e-14
+    )
+    assert rank_correlation(true, simulated) == pytest.approx(
+        stats.spearmanr(true, simulated)[0], abs=1e-14
+    )
+    assert mean_squared_error(true, simulated) == pytest.approx(
+        np.mean((true - simulated) ** 2), abs=1e-15
+    )
     assert rank_correlation(true, np.exp(true)) == pytest.approx(1.0)
 
 

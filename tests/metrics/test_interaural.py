@@ -32,8 +32,12 @@ def test_a_known_delay_and_level_is_found_in_each_octave(rate: int) -> None:
         right = 10.0 ** (-decibels / 20.0) * delayed(noise, microseconds * 1e-6, rate)
         found = interaural(torch.stack((noise, right), -2), sample_rate=rate)
         assert found.level.shape == (3, len(OCTAVES))
-        torch.testing.assert_close(found.level, torch.full_like(found.level, decibels), atol=0.2, rtol=0)
-        torch.testing.assert_close(found.time, torch.full_like(found.time, microseconds), atol=8.0, rtol=0)
+        torch.testing.assert_close(
+            found.level, torch.full_like(found.level, decibels), atol=0.2, rtol=0
+        )
+        torch.testing.assert_close(
+            found.time, torch.full_like(found.time, microseconds), atol=8.0, rtol=0
+        )
         assert bool((found.coherence > 0.97).all())
     alone = interaural(torch.stack((noise[0], torch.randn(rate))), sample_rate=rate)
     assert bool((alone.coherence < 0.3).all())
@@ -48,7 +52,9 @@ def test_swapped_ears_change_the_sign(scene: Tensor) -> None:
 
 def test_what_an_aid_changes(scene: Tensor) -> None:
     change = interaural_change(scene, scene * torch.tensor([[0.5], [2.0]]))
-    torch.testing.assert_close(change.level, torch.full_like(change.level, -12.0412), atol=1e-3, rtol=0)
+    torch.testing.assert_close(
+        change.level, torch.full_like(change.level, -12.0412), atol=1e-3, rtol=0
+    )
     assert not bool(change.time.any())
     one = torch.stack((scene[0], torch.zeros(16000)))
     assert bool(torch.stack(interaural(one)).isnan().all())
@@ -68,7 +74,9 @@ def test_the_loss_is_of_what_differs_between_the_ears_alone(scene: Tensor) -> No
         value = interaural_loss(given, scene, 16000)
         (gradient,) = torch.autograd.grad(value, given)
         assert bool(value.isfinite()) and bool(gradient.isfinite().all())
-    assert float(interaural_loss(scene, torch.zeros_like(scene), 16000)) == pytest.approx(0.0, abs=1e-5)
+    assert float(interaural_loss(scene, torch.zeros_like(scene), 16000)) == pytest.approx(
+        0.0, abs=1e-5
+    )
 
 
 def test_an_ear_that_is_mute_has_a_small_gradient(scene: Tensor) -> None:

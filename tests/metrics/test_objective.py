@@ -61,7 +61,9 @@ def test_a_short_item_is_refused(clean: Tensor) -> None:
 def test_gradient_is_that_of_finite_differences(clean: Tensor, name: str) -> None:
     """Of a gain below and one above 1.4 kHz, in double precision."""
     truth = clean.double()
-    noise = torch.randn(clean.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(3))
+    noise = torch.randn(
+        clean.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(3)
+    )
     spectrum = torch.fft.rfft(truth + 0.3 * noise * truth.square().mean().sqrt())
     above = (torch.arange(spectrum.shape[-1]) * 16000 / TIME > 1400.0).long()
 

@@ -60,7 +60,9 @@ def test_equals_pyclarity(
     )
 
 
-def test_other_grids_are_the_ear_that_pyclarity_takes_them_for(clips: list[tuple[Tensor, int]]) -> None:
+def test_other_grids_are_the_ear_that_pyclarity_takes_them_for(
+    clips: list[tuple[Tensor, int]],
+) -> None:
     clean, rate = clips[0]
     ear = Audiogram((20.0, 50.0, 70.0), (500.0, 1500.0, 6000.0))
     np.random.seed(0)
@@ -141,7 +143,9 @@ SPEECH = torch.sin(torch.arange(16000) * 0.2) * 0.05
         (SPEECH, SPEECH, {"audiogram": (0,) * 8}, "audiogram is tuple"),
     ],
 )
-def test_bad_input(reference: Tensor, processed: Tensor, options: dict[str, object], message: str) -> None:
+def test_bad_input(
+    reference: Tensor, processed: Tensor, options: dict[str, object], message: str
+) -> None:
     arguments: dict[str, object] = {"audiogram": N3, "sample_rate": 16000, **options}
     with pytest.raises(ValueError, match=message) as error:
         haspi(reference, processed, **arguments)

@@ -26,7 +26,9 @@ haspi = partial(pyclarity_score, "haspi")
 @pytest.fixture(scope="module")
 def clean(speech_dir: Path) -> Tensor:
     """Two clips of 0.8 s at 16 kHz, (2, time)."""
-    clips = [read_audio(speech_dir / "train" / f"flite-slt-0{i}.flac")[0][0, 16000:28800] for i in (1, 2)]
+    clips = [
+        read_audio(speech_dir / "train" / f"flite-slt-0{i}.flac")[0][0, 16000:28800] for i in (1, 2)
+    ]
     return torch.stack(clips)
 
 
@@ -62,7 +64,11 @@ def test_of_two_channels_the_better_ear_counts(clean: Tensor) -> None:
     for side, ear in enumerate((N3, S2)):
         each.append([haspi(clean[i], given[i, side], ear, 16000, seed=i) for i in range(2)])
     expected = torch.tensor(each, dtype=torch.float64)
-    for ears in ([N3, S2], torch.tensor([N3.levels, S2.levels]), torch.tensor([[N3.levels, S2.levels]] * 2)):
+    for ears in (
+        [N3, S2],
+        torch.tensor([N3.levels, S2.levels]),
+        torch.tensor([[N3.levels, S2.levels]] * 2),
+    ):
         metric.reset()
         metric.update(given, both, ears)
         assert float(metric.compute()) == pytest.approx(float(expected.amax(0).mean()), abs=1e-6)
@@ -99,7 +105,10 @@ def test_a_call_counts_as_an_update_and_gives_the_batchs_own_mean(clean: Tensor)
         values.append(float(called(batch, clean[:1], N3)))
     assert int(called.count) == int(updated.count) == 2
     torch.testing.assert_close(called.compute(), updated.compute())
-    assert sum(values[:2]) / 2 == pytest.approx(float(called.compute()), abs=1e-6) and values[2] != values[2]
+    assert (
+        sum(values[:2]) / 2 == pytest.approx(float(called.compute()), abs=1e-6)
+        and values[2] != values[2]
+    )
 
 
 def test_a_collection_keeps_apart_what_was_made_apart(clean: Tensor) -> None:
@@ -110,10 +119,14 @@ def test_a_collection_keeps_apart_what_was_made_apart(clean: Tensor) -> None:
         collection.update(clean[:1, :8000], clean[:1, :8000], N3)  # no score: all states are equal
     collection.reset()
     collection.update(noisy(clean), clean, [N3, S2])
-    expected = [kind(16000, limit=limit) for kind, limit in ((HASPI, None), (HASQI, None), (HASPI, 1))]
+    expected = [
+        kind(16000, limit=limit) for kind, limit in ((HASPI, None), (HASQI, None), (HASPI, 1))
+    ]
     for metric in expected:
         metric.update(noisy(clean), clean, [N3, S2])
-    torch.testing.assert_close(list(collection.compute().values()), [metric.compute() for metric in expected])
+    torch.testing.assert_close(
+        list(collection.compute().values()), [metric.compute() for metric in expected]
+    )
 
 
 def test_what_cannot_be_scored_is_left_out_and_said(clean: Tensor) -> None:
@@ -165,13 +178,19 @@ def test_bad_input(clean: Tensor) -> None:
     metric = HASPI(16000)
     for call, message in (
         ((clean, clean[:1], N3), r"processed \(2, 12800\) and clean \(1, 12800\)"),
-        (((clean * 32767).short(), clean, N3), "processed is torch.int16; allowed: .* divide 16-bit samples"),
+        (
+            ((clean * 32767).short(), clean, N3),
+            "processed is torch.int16; allowed: .* divide 16-bit samples",
+        ),
         ((clean, clean.numpy(), N3), "clean is ndarray; allowed: a floating-point tensor"),
         ((clean, clean, [N3]), r"audiogram of shape \(1, 8\); allowed: \(8,\) or \(2, 8\)"),
         ((clean, clean, "N3"), "audiogram is str; allowed: an Audiogram, a sequence of them"),
         ((clean, clean, 3), "audiogram is int; allowed"),
         ((clean, clean, [N3, "N3"]), "audiogram is list; allowed"),
-        ((clean, clean, torch.zeros(3, 8)), r"audiogram of shape \(3, 8\); allowed: \(8,\) or \(2, 8\)"),
+        (
+            (clean, clean, torch.zeros(3, 8)),
+            r"audiogram of shape \(3, 8\); allowed: \(8,\) or \(2, 8\)",
+        ),
     ):
         with pytest.raises(ValueError, match=message):
             metric.update(*call)

@@ -17,7 +17,9 @@ def test_what_ships_is_what_a_fit_of_the_responses_gives() -> None:
     assert (len(rows), rows.listener.nunique(), rows.system.nunique()) == (2001, 22, 10)
     fit = example["fit"](rows)
     for name, value in fitted()._asdict().items():
-        np.testing.assert_allclose(value, getattr(fit.curve, name), rtol=2e-2, atol=2e-4, err_msg=name)
+        np.testing.assert_allclose(
+            value, getattr(fit.curve, name), rtol=2e-2, atol=2e-4, err_msg=name
+        )
     by_aid = rows.groupby("system")[["haspi", "correctness"]].mean()
     assert by_aid.corr().iloc[0, 1] > 0.96  # as its docstring says, 0.97
     # the plain logistic of the challenge misses a sentence by 26.4 points

@@ -19,7 +19,9 @@ def _band_noise(bank: FilterBank, time: int) -> np.ndarray:
     rng = np.random.default_rng(1)
     slow = np.exp(np.cumsum(rng.standard_normal(time)) / 400)
     rows = []
-    for hz, width in zip(bank.centre_frequencies, erb(np.array(bank.centre_frequencies)), strict=True):
+    for hz, width in zip(
+        bank.centre_frequencies, erb(np.array(bank.centre_frequencies)), strict=True
+    ):
         edges = [max(20.0, hz - width), min(22000.0, hz + width)]
         sos = scipy.signal.butter(2, edges, "bandpass", fs=MSBG_RATE, output="sos")
         row = scipy.signal.sosfilt(sos, rng.standard_normal(time)) * slow

@@ -44,7 +44,9 @@ def test_lowpass_is_the_reference() -> None:
 
 
 def test_lowpass_is_flat_in_the_band_of_speech_and_shut_at_20_khz() -> None:
-    response = np.abs(scipy.signal.freqz(lowpass_filter(), 1.0, [100, 8000, 15000, 20000], fs=MSBG_RATE)[1])
+    response = np.abs(
+        scipy.signal.freqz(lowpass_filter(), 1.0, [100, 8000, 15000, 20000], fs=MSBG_RATE)[1]
+    )
     np.testing.assert_allclose(response[:3], 1.0, atol=1e-3)
     assert response[3] < 1e-4
 

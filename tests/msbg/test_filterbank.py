@@ -34,7 +34,9 @@ def test_tables(both: tuple[FilterBank, dict[str, Any]]) -> None:
     assert bank.first_highpass == theirs["Start2PoleHP"] - 1
     assert (theirs["NGAMMA"], theirs["Fs"]) == (4, MSBG_RATE)
     # its "ERBn_CentFrq" are bandwidths
-    np.testing.assert_allclose(erb(np.array(bank.centre_frequencies)), theirs["ERBn_CentFrq"], rtol=1e-6)
+    np.testing.assert_allclose(
+        erb(np.array(bank.centre_frequencies)), theirs["ERBn_CentFrq"], rtol=1e-6
+    )
 
 
 def test_responses_with_advances_and_highpasses(both: tuple[FilterBank, dict[str, Any]]) -> None:
@@ -48,7 +50,9 @@ def test_responses_with_advances_and_highpasses(both: tuple[FilterBank, dict[str
         response = response * np.exp(1j * omega * theirs["GTnDelays"][i])
         place = i - (theirs["Start2PoleHP"] - 1)
         if place >= 0:
-            response *= scipy.signal.freqz(theirs["HP_nums"][place], theirs["HP_denoms"][place], omega)[1]
+            response *= scipy.signal.freqz(
+                theirs["HP_nums"][place], theirs["HP_denoms"][place], omega
+            )[1]
         np.testing.assert_allclose(ours[i], response, atol=2e-7 * np.abs(response).max())
 
 
@@ -57,20 +61,27 @@ def test_a_click_through_the_reference_bank(both: tuple[FilterBank, dict[str, An
     bank, theirs = both
     click = np.zeros(POINTS)
     click[2000] = 1.0
-    filters = (cochlea.FilterBank(theirs[f"{kind}_nums"], theirs[f"{kind}_denoms"]) for kind in ("GTn", "HP"))
+    filters = (
+        cochlea.FilterBank(theirs[f"{kind}_nums"], theirs[f"{kind}_denoms"])
+        for kind in ("GTn", "HP")
+    )
     first, second = filters
     expected = cochlea.gammatone_filterbank(
         click, theirs["NGAMMA"], first, theirs["GTnDelays"], theirs["Start2PoleHP"], second
     )
     ours = np.fft.irfft(gammatone_response(bank, POINTS) * np.fft.rfft(click), POINTS)
-    np.testing.assert_allclose(ours[:, 500:7000], expected[:, 500:7000], atol=1e-6 * np.abs(expected).max())
+    np.testing.assert_allclose(
+        ours[:, 500:7000], expected[:, 500:7000], atol=1e-6 * np.abs(expected).max()
+    )
 
 
 def test_channels_have_unit_gain_at_their_frequency_and_the_sum_is_what_the_table_says() -> None:
     for bank in (BANKS["mild"], BANKS["moderate"], BANKS["severe"]):
         response = gammatone_response(bank, MSBG_RATE)  # a bin a hertz
         for channel, hz in zip(response, bank.centre_frequencies, strict=True):
-            assert np.interp(hz, np.arange(len(channel)), np.abs(channel)) == pytest.approx(1.0, abs=1e-3)
+            assert np.interp(hz, np.arange(len(channel)), np.abs(channel)) == pytest.approx(
+                1.0, abs=1e-3
+            )
         level = 20 * np.log10(np.abs(response.sum(0)[300:8000])) - bank.recombination_db
         assert abs(level.mean()) < 0.5 and np.abs(level).max() < 3.0
 

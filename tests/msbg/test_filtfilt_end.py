@@ -34,7 +34,9 @@ def tones(bank: FilterBank, length: int, points: int) -> np.ndarray:
 def test_envelopes_of_what_ends_abruptly(name: str, length: int) -> None:
     bank = BANKS[name]
     channels = tones(bank, length, 2 * STEP * 342)
-    theirs = cochlea.compute_envelope(channels[:, :length], erb(np.array(bank.centre_frequencies)), MSBG_RATE)
+    theirs = cochlea.compute_envelope(
+        channels[:, :length], erb(np.array(bank.centre_frequencies)), MSBG_RATE
+    )
     ours = torch.from_numpy(channels)
     silent = envelope(ours, torch.from_numpy(envelope_lowpass(bank, channels.shape[-1])))
     held = (silent + added(ours, bank, length)).numpy()[:, : -(-length // STEP)]

@@ -79,7 +79,9 @@ def speech_at(speech: list[tuple[Tensor, int]], spl: float = 65.0, seconds: floa
     wave, rate = speech[0]
     start = round(0.5 * rate)
     piece = wave[0, start : start + round(seconds * rate)].double().numpy()
-    return set_level(torch.from_numpy(scipy.signal.resample(piece, round(seconds * RATE))).float(), spl)
+    return set_level(
+        torch.from_numpy(scipy.signal.resample(piece, round(seconds * RATE))).float(), spl
+    )
 
 
 def test_equals_pyclarity_sample_for_sample(
@@ -118,7 +120,13 @@ def band_error(ours: Wave, theirs: Wave, rate: int, highest: float) -> float:
 
 @pytest.mark.parametrize(
     ("rate", "count", "highest"),
-    [(16000, 12, 7000.0), (22050, 3, 9500.0), (24000, 3, 10000.0), (32000, 3, 14000.0), (48000, 3, 16000.0)],
+    [
+        (16000, 12, 7000.0),
+        (22050, 3, 9500.0),
+        (24000, 3, 10000.0),
+        (32000, 3, 14000.0),
+        (48000, 3, 16000.0),
+    ],
 )
 def test_other_rates_equal_pyclarity_on_the_resampled_input(
     recordings: list[tuple[Wave, int]], ears: list[Audiogram], rate: int, count: int, highest: float
@@ -141,7 +149,9 @@ def test_other_rates_equal_pyclarity_on_the_resampled_input(
 
 
 @pytest.mark.parametrize("severity", EARS)
-def test_aligned_is_the_reference_without_its_delay(speech: list[tuple[Tensor, int]], severity: str) -> None:
+def test_aligned_is_the_reference_without_its_delay(
+    speech: list[tuple[Tensor, int]], severity: str
+) -> None:
     ear = Audiogram.standard(EARS[severity])
     assert ear.severity == severity
     wave = speech_at(speech)
@@ -201,7 +211,9 @@ def mixed(count: int) -> Tensor:
 @pytest.mark.parametrize(
     "options", [{}, {"aligned": False}, {"sample_rate": 16000}, {"rescale_active": True}]
 )
-def test_a_mixed_batch_equals_its_items(speech: list[tuple[Tensor, int]], options: dict[str, Any]) -> None:
+def test_a_mixed_batch_equals_its_items(
+    speech: list[tuple[Tensor, int]], options: dict[str, Any]
+) -> None:
     ears = mixed(6).reshape(2, 3, 8)
     waves = torch.stack(
         [set_level(speech_at(speech, seconds=0.3).roll(500 * i), 50.0 + 6 * i) for i in range(6)]
@@ -250,7 +262,12 @@ def test_gradcheck(severity: str, options: dict[str, Any]) -> None:
     # what a severe loss leaves is faint: measured in its own unit, or nothing would be checked
     scale = 1.0 / float(model(wave).abs().max())
     assert torch.autograd.gradcheck(
-        lambda w: scale * model(w), wave.requires_grad_(), eps=1e-7, atol=1e-3, rtol=1e-3, fast_mode=True
+        lambda w: scale * model(w),
+        wave.requires_grad_(),
+        eps=1e-7,
+        atol=1e-3,
+        rtol=1e-3,
+        fast_mode=True,
     )
 
 
@@ -286,13 +303,17 @@ def test_full_scale_changes_the_unit_and_nothing_else(speech: list[tuple[Tensor,
 
 @pytest.mark.parametrize("severity", EARS)
 @pytest.mark.parametrize("hops", [1, 7])
-def test_a_later_signal_is_heard_later(speech: list[tuple[Tensor, int]], severity: str, hops: int) -> None:
+def test_a_later_signal_is_heard_later(
+    speech: list[tuple[Tensor, int]], severity: str, hops: int
+) -> None:
     """By whole hops of the smearing, 64 samples; its first frames are irregular, so that some silence comes first."""
     wave = torch.cat((torch.zeros(512), speech_at(speech, seconds=0.3), torch.zeros(3000)))
     model = MSBG(Audiogram.standard(EARS[severity]))
     shift = 64 * hops
     heard = model(torch.stack((wave, wave.roll(shift))))
-    assert relative(heard[1].roll(-shift)[1000:-shift].numpy(), heard[0][1000:-shift].numpy()) < 1e-4
+    assert (
+        relative(heard[1].roll(-shift)[1000:-shift].numpy(), heard[0][1000:-shift].numpy()) < 1e-4
+    )
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -350,7 +371,9 @@ def test_compiled_it_is_called_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None
     assert torch.equal(heard, model(wave))
 
 
-def test_nothing_is_trained_or_stored_and_copies_are_alike(speech: list[tuple[Tensor, int]]) -> None:
+def test_nothing_is_trained_or_stored_and_copies_are_alike(
+    speech: list[tuple[Tensor, int]],
+) -> None:
     model = MSBG(Audiogram.standard("N3"))
     assert not model.state_dict() and not list(model.parameters())
     wave = speech_at(speech, seconds=0.1)
@@ -377,7 +400,9 @@ def test_an_ear_that_is_trained_is_followed_after_a_move() -> None:
 
 
 def test_an_unknown_severity_has_no_delay() -> None:
-    with pytest.raises(ValueError, match="severity 'Severe'; allowed: none, mild, moderate, severe"):
+    with pytest.raises(
+        ValueError, match="severity 'Severe'; allowed: none, mild, moderate, severe"
+    ):
         MSBG().delay("Severe")
 
 
@@ -490,7 +515,9 @@ def test_gradients_through_blocks_are_those_of_the_whole(monkeypatch: pytest.Mon
     assert relative(gradients[0], gradients[1]) < 1e-4
 
 
-def test_gradients_through_blocks_are_the_same_by_a_transform(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_gradients_through_blocks_are_the_same_by_a_transform(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr("hlsim.msbg.blocks._BLOCK_SECONDS", 1.0)
     model, wave = MSBG(Audiogram.standard("N3"), sample_rate=16000), 0.03 * torch.randn(20000)
     assert len(block_bounds(20000, 16000)) > 1

@@ -33,7 +33,11 @@ def test_every_channel_has_one_rate_that_holds_its_band(name: str, step: int) ->
 @pytest.mark.parametrize("name", ["mild", "moderate", "severe"])
 @pytest.mark.parametrize(
     ("highest", "ratios", "error"),
-    [(hz, ratios, error) for hz in (22050.0, 10000.0, 9000.0, 8000.0) for ratios, error in RATIOS.items()],
+    [
+        (hz, ratios, error)
+        for hz in (22050.0, 10000.0, 9000.0, 8000.0)
+        for ratios, error in RATIOS.items()
+    ],
 )
 def test_rate_bands_equal_all_channels_at_44_khz(
     name: str, highest: float, ratios: tuple[float, float], error: float
@@ -47,7 +51,9 @@ def test_rate_bands_equal_all_channels_at_44_khz(
     each = torch.linspace(*ratios, bank.channels, dtype=torch.float64)[None]
     multirate = multirate_bank(bank, POINTS, step, highest, torch.float64, CPU)
     # the spectrum of a signal at half the rate is half as large
-    heard = hear(spectrum[:, : POINTS // step // 2 + 1] / step, each, multirate, False)[:, :bins] * step
+    heard = (
+        hear(spectrum[:, : POINTS // step // 2 + 1] / step, each, multirate, False)[:, :bins] * step
+    )
     channels = torch.fft.irfft(
         spectrum.unsqueeze(-2) * torch.from_numpy(gammatone_response(bank, POINTS)), POINTS
     )

@@ -56,7 +56,10 @@ class RoundsProducts(TorchFunctionMode):
 
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         if func in (torch.matmul, Tensor.matmul, Tensor.__matmul__):
-            args = [((factor.view(torch.int32) + 2**12) & -(2**13)).view(torch.float32) for factor in args]
+            args = [
+                ((factor.view(torch.int32) + 2**12) & -(2**13)).view(torch.float32)
+                for factor in args
+            ]
         return func(*args, **(kwargs or {}))
 
 
@@ -77,13 +80,16 @@ def test_recruitment(name: str, band_noise: Callable[[FilterBank, int], np.ndarr
         cochlea.compute_envelope(channels, erb(np.array(bank.centre_frequencies)), MSBG_RATE), 1e-7
     )
     ratios = expansion_ratios(
-        torch.linspace(20.0, 70.0, 8, dtype=torch.float64), torch.from_numpy(threshold_weights(bank))
+        torch.linspace(20.0, 70.0, 8, dtype=torch.float64),
+        torch.from_numpy(threshold_weights(bank)),
     )
     expected = cochlea.recruitment(
         channels.copy(), theirs.copy(), 120.0, ratios.numpy(), np.full(bank.channels, 105.0)
     ).sum(0)
     ours = expand(
-        TO_PASCALS * torch.from_numpy(channels), TO_PASCALS * torch.from_numpy(theirs[:, ::STEP]), ratios
+        TO_PASCALS * torch.from_numpy(channels),
+        TO_PASCALS * torch.from_numpy(theirs[:, ::STEP]),
+        ratios,
     )
     error = (ours.numpy() / TO_PASCALS - expected)[EDGE:-EDGE]
     assert np.sqrt((error**2).mean() / (expected[EDGE:-EDGE] ** 2).mean()) < 2e-4
@@ -109,7 +115,9 @@ def test_one_db_in_is_the_ratio_of_db_out() -> None:
     tone = torch.cos(torch.arange(40 * STEP, dtype=torch.float64)).unsqueeze(0)
     ratio = torch.tensor([105.0 / (105.0 - 60.0)], dtype=torch.float64)
     heard = [
-        expand(10 ** (db / 20) * tone, torch.full((1, 40), 10 ** (db / 20), dtype=torch.float64), ratio)
+        expand(
+            10 ** (db / 20) * tone, torch.full((1, 40), 10 ** (db / 20), dtype=torch.float64), ratio
+        )
         for db in (-40.0, -39.0)
     ]
     gain_db = 20 * torch.log10(heard[1].norm() / heard[0].norm())
@@ -130,7 +138,9 @@ def test_gradients() -> None:
 @pytest.mark.parametrize("steps", [16, 21, 40])
 @pytest.mark.parametrize("each", [3, 5, 6, 24])
 @pytest.mark.parametrize("together", [5, 8])
-def test_interpolation_is_exact_for_polynomials_of_fifth_order(steps: int, each: int, together: int) -> None:
+def test_interpolation_is_exact_for_polynomials_of_fifth_order(
+    steps: int, each: int, together: int
+) -> None:
     powers = torch.randn(6, dtype=torch.float64)
 
     def polynomial(place: torch.Tensor) -> torch.Tensor:
@@ -138,7 +148,9 @@ def test_interpolation_is_exact_for_polynomials_of_fifth_order(steps: int, each:
 
     places = torch.arange(steps * each, dtype=torch.float64) / each
     kernel = torch.from_numpy(interpolation_kernel(each, together=together))
-    fine = interpolate(around(polynomial(torch.arange(steps, dtype=torch.float64))[None]), kernel)[0]
+    fine = interpolate(around(polynomial(torch.arange(steps, dtype=torch.float64))[None]), kernel)[
+        0
+    ]
     inside = slice(2 * each, (steps - 3) * each)  # it is taken as periodic
     torch.testing.assert_close(fine[inside], polynomial(places)[inside])
 
@@ -146,6 +158,7 @@ def test_interpolation_is_exact_for_polynomials_of_fifth_order(steps: int, each:
 def test_interpolation_of_two_parts_gives_both_the_same() -> None:
     values = torch.randn(3, 24, dtype=torch.float64)
     once, twice = (
-        interpolate(around(values), torch.from_numpy(interpolation_kernel(6, parts))) for parts in (1, 2)
+        interpolate(around(values), torch.from_numpy(interpolation_kernel(6, parts)))
+        for parts in (1, 2)
     )
     torch.testing.assert_close(twice, once.repeat_interleave(2, -1))

@@ -61,11 +61,16 @@ def test_smearing_sample_for_sample(severity: str, length: int) -> None:
 
 @pytest.mark.parametrize("severity", BROADENING)
 @pytest.mark.parametrize("highest", [8000.0, 9000.0])
-def test_frequencies_above_the_highest_of_interest_need_not_be_smeared(severity: str, highest: float) -> None:
+def test_frequencies_above_the_highest_of_interest_need_not_be_smeared(
+    severity: str, highest: float
+) -> None:
     spectrum = torch.fft.rfft(torch.randn(32 * 400, dtype=torch.float64))
     spectrum[round(highest / (MSBG_RATE / 2) * 32 * 400) :] = 0.0
     noise = torch.fft.irfft(spectrum)
-    matrices = smearing_matrix(*BROADENING[severity])[:128, :128], smearing_matrix_below(severity, 2, highest)
+    matrices = (
+        smearing_matrix(*BROADENING[severity])[:128, :128],
+        smearing_matrix_below(severity, 2, highest),
+    )
     assert len(matrices[1]) < 128
     whole, part = (torch.fft.rfft(smear(noise, torch.from_numpy(matrix), 2)) for matrix in matrices)
     below = slice(round(highest / (MSBG_RATE / 2) * HOP * (32 * 400 // HOP + 3)))
@@ -88,14 +93,19 @@ def test_an_identity_delays_by_three_hops() -> None:
     out = smear(wave, torch.eye(256, dtype=torch.float64))
     steady = slice(4 * HOP, 1700)
     torch.testing.assert_close(
-        out[steady.start + SMEARING_DELAY : steady.stop + SMEARING_DELAY], wave[steady], atol=1e-3, rtol=0
+        out[steady.start + SMEARING_DELAY : steady.stop + SMEARING_DELAY],
+        wave[steady],
+        atol=1e-3,
+        rtol=0,
     )
 
 
 def test_smearing_is_homogeneous() -> None:
     wave = torch.randn(900, dtype=torch.float64)
     matrix = torch.from_numpy(smearing_matrix(*BROADENING["severe"]))
-    torch.testing.assert_close(smear(1e-3 * wave, matrix), 1e-3 * smear(wave, matrix), atol=1e-12, rtol=1e-9)
+    torch.testing.assert_close(
+        smear(1e-3 * wave, matrix), 1e-3 * smear(wave, matrix), atol=1e-12, rtol=1e-9
+    )
 
 
 @pytest.mark.parametrize("severity", BROADENING)

@@ -23,7 +23,9 @@ def test_factor_is_the_gain_and_the_angle_of_the_two_maps() -> None:
     features, log_gain = given()
     right, up = model(features, SIZE).unbind(1)
     expected = torch.polar(log_gain.exp(), torch.atan2(up, 1.0 + right))
-    torch.testing.assert_close(model.factor(features, SIZE, log_gain), expected, atol=1e-12, rtol=1e-12)
+    torch.testing.assert_close(
+        model.factor(features, SIZE, log_gain), expected, atol=1e-12, rtol=1e-12
+    )
 
 
 def test_untrained_there_is_no_shift() -> None:

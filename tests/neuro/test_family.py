@@ -13,7 +13,9 @@ from hlsim.training.recipes import SimulatorRecipe
 yaml = pytest.importorskip("yaml")
 
 RECIPES = sorted((Path(__file__).parents[2] / "examples").glob("**/*.yaml"))
-SIMULATORS = {path.stem: path for path in RECIPES if not path.stem.startswith(("compensator", "hearing-aid"))}
+SIMULATORS = {
+    path.stem: path for path in RECIPES if not path.stem.startswith(("compensator", "hearing-aid"))
+}
 MILLIONS = {
     "mamba": 1.45,
     "transformer": 1.45,
@@ -37,7 +39,11 @@ KINDS = {
     },
     "magnitude only": {"phase": "input", "prior": False},
     "concatenated": {"audiogram": "concatenated", "prior": False},
-    "concatenated monolithic": {"audiogram": "concatenated", "structure": "monolithic", "prior": False},
+    "concatenated monolithic": {
+        "audiogram": "concatenated",
+        "structure": "monolithic",
+        "prior": False,
+    },
     "normalised": {"level_aware": False, "prior": False, "dense_depth": 2},
     "normalised with prior": {"level_aware": False},
     "bands": {"structure": "bands"},
@@ -93,7 +99,9 @@ def test_keeps_shapes_and_gives_items_what_they_would_get_alone(kind: str) -> No
             assert float((together[i] - alone).norm() / alone.norm()) < 1e-4
 
 
-def test_attention_takes_no_shortcut_that_holds_every_pair_of_times(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_attention_takes_no_shortcut_that_holds_every_pair_of_times(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     model = network("transformer").eval()
     waveform, ear = 0.02 * torch.randn(1, 1600), Audiogram.standard("N3")
     expected = model(waveform, ear).detach()
@@ -152,7 +160,9 @@ def test_magnitude_only_keeps_the_phase() -> None:
     synthesise = type(model.stft).synthesise
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(
-            type(model.stft), "synthesise", lambda s, x, n: (calls.append(x), synthesise(s, x, n))[1]
+            type(model.stft),
+            "synthesise",
+            lambda s, x, n: (calls.append(x), synthesise(s, x, n))[1],
         )
         model(waveform, Audiogram.standard("N3"))
     spectrum = model.stft.analyse(waveform)
@@ -198,7 +208,10 @@ def test_bad_choices(change: dict[str, object]) -> None:
 def test_derivatives_are_right_or_refused(block: str) -> None:
     """What the docstring of NeuroMSBG says of each kind of block."""
     model, ear = network(block).double(), Audiogram.standard("N3")
-    wave, along = 0.02 * torch.randn(2, 400, dtype=torch.float64), torch.randn(400, dtype=torch.float64)
+    wave, along = (
+        0.02 * torch.randn(2, 400, dtype=torch.float64),
+        torch.randn(400, dtype=torch.float64),
+    )
 
     def energy(waveform: torch.Tensor) -> torch.Tensor:
         return model(waveform, ear).square().sum()

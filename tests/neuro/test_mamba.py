@@ -38,7 +38,8 @@ def published(model: Mamba, sequence: Tensor) -> Tensor:
     taps = p["conv1d.weight"].squeeze(1)
     padded = functional.pad(x, (0, 0, taps.shape[1] - 1, 0))
     x = functional.silu(
-        sum(padded[:, k : k + x.shape[1]] * taps[:, k] for k in range(taps.shape[1])) + p["conv1d.bias"]
+        sum(padded[:, k : k + x.shape[1]] * taps[:, k] for k in range(taps.shape[1]))
+        + p["conv1d.bias"]
     )
     step, B, C = (x @ p["x_proj.weight"].T).split(
         [p["dt_proj.weight"].shape[1], *2 * [p["A_log"].shape[1]]], -1

@@ -9,9 +9,9 @@ from torch import Tensor
 from compensators import MappingCompensator
 from hlsim import MSBG, Audiogram, NeuroMSBG, load_pretrained
 from hlsim.calibration import set_level
-from hlsim.criteria.waveform import noise_to_signal_db
 from hlsim.data.ears import draw_thresholds
 from hlsim.dsp.resample import resample
+from hlsim.losses.waveform import noise_to_signal_db
 from hlsim.neuro import NeuroConfig
 from hlsim.neuro.blocks import BidirectionalLSTM, EncoderLayer, SequencePath
 from hlsim.neuro.network import EarNetwork
@@ -89,7 +89,10 @@ def test_items_that_run_one_after_the_other_are_as_together(
 
 
 def test_wider_networks_take_fewer_samples_at_once() -> None:
-    sizes = [NeuroMSBG(NeuroConfig(channels=channels, blocks=1))._at_once for channels in (4, 32, 64, 512)]
+    sizes = [
+        NeuroMSBG(NeuroConfig(channels=channels, blocks=1))._at_once
+        for channels in (4, 32, 64, 512)
+    ]
     assert sizes == sorted(sizes, reverse=True) and sizes[1] > 1.9 * sizes[2]
     assert sizes[0] == 128_000 and sizes[-1] == 16_000
 
@@ -101,7 +104,14 @@ LOCAL = {
     ),
     "paper's transform": lambda: NeuroMSBG(
         NeuroConfig(
-            fft=400, window=400, hop=100, stride=(3, 2), kernel=(11, 3), channels=4, blocks=1, prior=False
+            fft=400,
+            window=400,
+            hop=100,
+            stride=(3, 2),
+            kernel=(11, 3),
+            channels=4,
+            blocks=1,
+            prior=False,
         )
     ),
     "monolithic": lambda: NeuroMSBG(
@@ -131,12 +141,15 @@ def test_long_signals_by_blocks_are_as_whole(kind: str, monkeypatch: pytest.Monk
     blocks = model(given, N3)
     assert len(calls) == 3 and max(calls) < time / 2
     assert float((blocks - whole).detach().norm() / whole.detach().norm()) < 1e-12
-    first, second = (torch.autograd.grad(heard.square().sum(), given)[0] for heard in (whole, blocks))
+    first, second = (
+        torch.autograd.grad(heard.square().sum(), given)[0] for heard in (whole, blocks)
+    )
     assert float((second - first).norm() / first.norm()) < 1e-12
 
 
 @pytest.mark.parametrize(
-    "change", [{"block": "lstm"}, {"block": "mamba"}, {"block": "transformer"}, {"level_aware": False}]
+    "change",
+    [{"block": "lstm"}, {"block": "mamba"}, {"block": "transformer"}, {"level_aware": False}],
 )
 def test_networks_that_look_at_all_of_a_signal_take_it_whole(
     change: dict[str, Any], monkeypatch: pytest.MonkeyPatch
@@ -252,7 +265,8 @@ def test_an_impaired_ear_expands(trained: NeuroMSBG, clips: Tensor) -> None:
     """Recruitment: 10 dB more in is more than 10 dB more out where there is a loss, and 10 dB where there is none."""
     for name, least, most in (("NH", 9.9, 10.1), ("N3", 14.0, 25.0)):
         soft, loud = (
-            trained(clips * gain, Audiogram.standard(name)).square().mean() for gain in (1.0, 10**0.5)
+            trained(clips * gain, Audiogram.standard(name)).square().mean()
+            for gain in (1.0, 10**0.5)
         )
         growth = 10.0 * float(torch.log10(loud / soft))
         assert least < growth < most
@@ -314,7 +328,9 @@ def test_a_waveform_on_another_device_is_named() -> None:
         model(torch.zeros(4000, device="meta"), Audiogram.standard("N3"))
 
 
-@pytest.mark.parametrize("core", [BidirectionalLSTM(8, 4), EncoderLayer(8, 2, 16)], ids=["lstm", "attention"])
+@pytest.mark.parametrize(
+    "core", [BidirectionalLSTM(8, 4), EncoderLayer(8, 2, 16)], ids=["lstm", "attention"]
+)
 def test_what_stays_in_float32_under_autocast(core: torch.nn.Module) -> None:
     torch.manual_seed(0)
     path = SequencePath(8, 0, core, 8)

@@ -46,7 +46,9 @@ def test_equals_the_recurrence_and_so_do_its_gradients(
     given = [tensor.requires_grad_() for tensor in arguments(time, channels=20)]
     found, true = selective_scan(*given), by_steps(*given)
     torch.testing.assert_close(found, true, rtol=1e-10, atol=1e-10)
-    weight = torch.randn(true.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    weight = torch.randn(
+        true.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64
+    )
     # at one step the decay multiplies nothing
     for a, b in zip(
         torch.autograd.grad((found * weight).sum(), given),
@@ -109,7 +111,9 @@ def test_autocast_does_not_reach_it() -> None:
     u, delta, A, B, C = (tensor.float() for tensor in arguments(33))
     lower = [tensor.bfloat16() for tensor in (u, delta, B, C)]
     coarse = selective_scan(lower[0], lower[1], A, *lower[2:])
-    fine = selective_scan(lower[0].float(), lower[1].float(), A, *(tensor.float() for tensor in lower[2:]))
+    fine = selective_scan(
+        lower[0].float(), lower[1].float(), A, *(tensor.float() for tensor in lower[2:])
+    )
     assert coarse.dtype == torch.bfloat16 and torch.equal(coarse, fine.bfloat16())
 
 

@@ -14,7 +14,9 @@ from hlsim.report.alignment import draw_alignment
 
 
 @pytest.mark.parametrize("method", ["structural", "impulse"])
-def test_stoi_and_pesq_are_higher_when_aligned(speech: list[tuple[Tensor, int]], method: str) -> None:
+def test_stoi_and_pesq_are_higher_when_aligned(
+    speech: list[tuple[Tensor, int]], method: str
+) -> None:
     for package in ("pystoi", "pesq"):
         pytest.importorskip(package)
     from hlsim.metrics.fidelity import pesq_wb, stoi
@@ -24,7 +26,8 @@ def test_stoi_and_pesq_are_higher_when_aligned(speech: list[tuple[Tensor, int]],
     for name in ("NH", "N2", "N4"):
         ear = torch.tensor(Audiogram.standard(name).thresholds)
         late, aligned = (
-            Teacher(16000, alignment=alignment)(clean[None], ear[None])[0] for alignment in ("none", method)
+            Teacher(16000, alignment=alignment)(clean[None], ear[None])[0]
+            for alignment in ("none", method)
         )
         better, worse = (stoi(clean, heard, 16000).value for heard in (aligned, late))
         assert better is not None and worse is not None and better > worse + 0.05
@@ -41,7 +44,9 @@ def test_the_picture(speech: list[tuple[Tensor, int]], tmp_path: Path, method: s
     ear = Audiogram.standard("N3")
     delay = draw_alignment(waveform[0], ear, rate, tmp_path / "a.png", method=method)
     assert (tmp_path / "a.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
-    assert delay / rate == pytest.approx(1239 / 44100 if method == "structural" else 1200 / 44100, abs=0.002)
+    assert delay / rate == pytest.approx(
+        1239 / 44100 if method == "structural" else 1200 / 44100, abs=0.002
+    )
     with pytest.raises(ValueError, match="samples to draw"):
         draw_alignment(waveform[0, :100], ear, rate, tmp_path / "b.png")
     with pytest.raises(ValueError, match="method 'none'; allowed: impulse, structural"):
@@ -58,7 +63,9 @@ def test_the_legend_says_how_far_what_is_heard_was_raised(
 
     legends: list[list[str]] = []
     monkeypatch.setattr(
-        Axes, "legend", lambda axes, **options: legends.append([line.get_label() for line in axes.lines])
+        Axes,
+        "legend",
+        lambda axes, **options: legends.append([line.get_label() for line in axes.lines]),
     )
     waveform, rate = speech[0]
     signal, ear = set_level(waveform[0], spl), Audiogram.standard("N6")

@@ -36,14 +36,21 @@ def page_file(tmp_path_factory: pytest.TempPathFactory, speech_dir: Path) -> Pat
     items = []
     for i in range(12):
         low, rise = torch.rand(2, generator=generator).tolist()
-        scores = {"unaided": low / 2, "NAL-R": low / 2 + rise / 3, "compensated": low / 2 + rise / 2}
+        scores = {
+            "unaided": low / 2,
+            "NAL-R": low / 2 + rise / 3,
+            "compensated": low / 2 + rise / 2,
+        }
         items.append(
             ItemScore(
                 file=f"a long name of an utterance/in a folder/{i:02}",
                 audiogram=Audiogram.standard(("N1", "N3", "N4", "S2")[i % 4]),
                 clean_level=65.0,
                 levels={"unaided": 65.0, "NAL-R": 77.0, "compensated": 79.0},
-                scores={"haspi": scores, "stoi": {name: 0.7 + value / 10 for name, value in scores.items()}},
+                scores={
+                    "haspi": scores,
+                    "stoi": {name: 0.7 + value / 10 for name, value in scores.items()},
+                },
                 sample_rate=rate,
                 seconds=1.0,
                 seed=i,
@@ -109,15 +116,15 @@ def test_the_demos_pictures_and_players_load(opened: Callable[[Path], Any], tmp_
     assert len(widths) == 2 + 6 + 1 + 5
     assert all(natural > 0 and 150 < shown <= inner for natural, shown in widths)
     assert page.evaluate("document.documentElement.scrollWidth") <= inner
-    ready = (
-        "[...document.querySelectorAll('audio')].map(e => e.readyState > 0 && e.error === null && e.duration)"
-    )
+    ready = "[...document.querySelectorAll('audio')].map(e => e.readyState > 0 && e.error === null && e.duration)"
     page.wait_for_function(f"{ready}.every(Boolean)")
     assert page.evaluate(ready) == pytest.approx([1.0] * 5, abs=0.02)
 
 
 def test_pictures_are_drawn_and_nothing_is_wider_than_the_screen(page: Any) -> None:
-    widths = page.evaluate("[...document.images].map(i => [i.naturalWidth, i.getBoundingClientRect().width])")
+    widths = page.evaluate(
+        "[...document.images].map(i => [i.naturalWidth, i.getBoundingClientRect().width])"
+    )
     # seven of the report, and of each of two items the original and three as heard
     assert len(widths) == 7 + 2 * 4
     inner = page.viewport_size["width"]
@@ -126,7 +133,9 @@ def test_pictures_are_drawn_and_nothing_is_wider_than_the_screen(page: Any) -> N
     # the paper's table is whole even on a phone
     region = page.locator(".scroll").first
     assert region.evaluate("e => e.scrollWidth <= e.clientWidth")
-    assert page.evaluate("parseFloat(getComputedStyle(document.querySelector('td')).fontSize)") >= 13
+    assert (
+        page.evaluate("parseFloat(getComputedStyle(document.querySelector('td')).fontSize)") >= 13
+    )
 
 
 def test_players_play(page: Any) -> None:
@@ -157,7 +166,9 @@ def test_the_keyboard_reaches_everything(page: Any) -> None:
     reached = []
     for _ in range(80):
         page.keyboard.press("Tab")
-        kind = page.evaluate("document.activeElement.tagName + '.' + document.activeElement.className")
+        kind = page.evaluate(
+            "document.activeElement.tagName + '.' + document.activeElement.className"
+        )
         reached.append(kind)
         if kind.startswith("SUMMARY"):
             break

@@ -51,7 +51,9 @@ def make_report(n: int = 12, **options: object) -> HaspiReport:
             seconds=2.5,
             seed=i,
         )
-        for i, (low, high) in enumerate(zip(rng.uniform(0, 0.6, n), rng.uniform(-0.05, 0.5, n), strict=True))
+        for i, (low, high) in enumerate(
+            zip(rng.uniform(0, 0.6, n), rng.uniform(-0.05, 0.5, n), strict=True)
+        )
     ]
     return HaspiReport(items, **options)
 
@@ -67,7 +69,11 @@ def test_figures_are_scipys(tmp_path: Path) -> None:
     assert data["p_w"] == stats.wilcoxon(after, before).pvalue
     assert data["cohens_d"] == pytest.approx(data["t"] / math.sqrt(12))
     assert data["after_std"] == pytest.approx(np.std(after, ddof=1))
-    assert (data["before_level_mean"], data["after_level_mean"], data["full_scale_spl"]) == (69.5, 79.5, 94.0)
+    assert (data["before_level_mean"], data["after_level_mean"], data["full_scale_spl"]) == (
+        69.5,
+        79.5,
+        94.0,
+    )
     assert data["wilcoxon_zero_method"] == "wilcox"
     assert set(data["versions"]) == {"hlsim", "numpy", "scipy"}
     assert (data["ci_low"], data["ci_high"]) == bootstrap_interval(np.subtract(after, before))
@@ -78,7 +84,9 @@ def test_figures_are_scipys(tmp_path: Path) -> None:
 def test_the_change_is_told_in_words_where_haspi_is_the_headlines() -> None:
     report = make_report()
     words = report.words
-    assert words is not None and words.low < words.change < words.high and words.before < words.after
+    assert (
+        words is not None and words.low < words.change < words.high and words.before < words.after
+    )
     said = f"{100 * words.after:.0f} % after, a change of {100 * words.change:+.0f} points"
     assert said in markdown(report) and said in html(report)
     assert report.to_dict()["words"] == words._asdict()
@@ -97,8 +105,15 @@ def test_markdown_is_the_papers_table() -> None:
     report = make_report(seed=3, extra={"nalr_mean": 0.5125})
     text, c = markdown(report), report.comparison
     assert "| Metric | Before | After | Change (Δ) |" in text
-    assert f"| {c.before_mean:.3f} ± {c.before_std:.3f} | {c.after_mean:.3f} ± {c.after_std:.3f} | +" in text
-    assert f"t = +{c.t:.3f}, p " in text and f"W = {c.w:.1f}, p " in text and f"d = +{c.cohens_d:.3f}" in text
+    assert (
+        f"| {c.before_mean:.3f} ± {c.before_std:.3f} | {c.after_mean:.3f} ± {c.after_std:.3f} | +"
+        in text
+    )
+    assert (
+        f"t = +{c.t:.3f}, p " in text
+        and f"W = {c.w:.1f}, p " in text
+        and f"d = +{c.cohens_d:.3f}" in text
+    )
     assert "| 69.5 | 79.5 | +10.0 |" in text
     assert "HASPI rewards any gain" in text
     assert "none 3, mild 3, severe 6" in text
@@ -117,7 +132,11 @@ def test_undefined_tests_are_said_and_never_nan(tmp_path: Path) -> None:
 
 def test_extra_keys_stand_beside_the_others() -> None:
     report = replace(make_report(), extra={"nalr_mean": 0.5, "initial_mean": 0.25})
-    assert (report.to_dict()["nalr_mean"], report.to_dict()["initial_mean"], report.to_dict()["n"]) == (
+    assert (
+        report.to_dict()["nalr_mean"],
+        report.to_dict()["initial_mean"],
+        report.to_dict()["n"],
+    ) == (
         0.5,
         0.25,
         12,
@@ -171,7 +190,9 @@ def test_files_are_replaced_and_others_stay(tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.iterdir()] == ["out"]
 
 
-def test_nothing_is_written_beside_the_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nothing_is_written_beside_the_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """It may be the root of a drive."""
     original, seen = Whole.write, set()
 
@@ -181,7 +202,9 @@ def test_nothing_is_written_beside_the_folder(tmp_path: Path, monkeypatch: pytes
 
     monkeypatch.setattr(Whole, "write", look)
     write_report(make_report(5), tmp_path / "out")
-    assert seen == {"out"} and sorted(p.name for p in (tmp_path / "out").iterdir()) == sorted(REPORT_FILES)
+    assert seen == {"out"} and sorted(p.name for p in (tmp_path / "out").iterdir()) == sorted(
+        REPORT_FILES
+    )
 
 
 @pytest.mark.parametrize("broken", ["picture", "nan"])
@@ -224,7 +247,11 @@ def three_conditions() -> HaspiReport:
     for i in range(9):
         low = rng.uniform(0.1, 0.5)
         scores = {
-            "haspi": {"unaided": low, "NAL-R": low + 0.3, "new_one": low + 0.35 + 0.01 * rng.normal()},
+            "haspi": {
+                "unaided": low,
+                "NAL-R": low + 0.3,
+                "new_one": low + 0.35 + 0.01 * rng.normal(),
+            },
             "stoi": {"unaided": 0.7, "NAL-R": 0.7 + 0.01 * rng.normal(), "new_one": 0.7},
         }
         if i == 4:
@@ -264,7 +291,9 @@ def test_every_pair_of_conditions_by_every_measure() -> None:
         ("unaided", "new_one"),
     ]
     assert len(one.comparisons) == 4
-    with pytest.raises(ValueError, match="baseline is 'NAL-R'; allowed: the first condition, 'unaided'"):
+    with pytest.raises(
+        ValueError, match="baseline is 'NAL-R'; allowed: the first condition, 'unaided'"
+    ):
         replace(report, baseline="NAL-R")
 
 
@@ -307,7 +336,10 @@ def test_texts_of_three_conditions(tmp_path: Path) -> None:
 
 
 def test_of_haspis_gain_only_where_it_is_a_measure() -> None:
-    items = [replace(item, scores={"stoi": dict(item.scores["stoi"])}) for item in three_conditions().items]
+    items = [
+        replace(item, scores={"stoi": dict(item.scores["stoi"])})
+        for item in three_conditions().items
+    ]
     report = HaspiReport(items)
     assert report.to_dict()["note"] == "" and "\n\n8 items.\n\n" in markdown(report)
     assert "HASPI rewards" not in markdown(report) + html(report, 0)
@@ -319,7 +351,12 @@ def test_of_haspis_gain_only_where_it_is_a_measure() -> None:
 @pytest.mark.parametrize("made_by", [make_report, three_conditions])
 def test_latex_compiles(made_by: Callable[[], HaspiReport], tmp_path: Path) -> None:
     write_report(made_by(), tmp_path)
-    lines = (r"\documentclass{article}", r"\usepackage{booktabs}", r"\begin{document}", r"\input{report.tex}")
+    lines = (
+        r"\documentclass{article}",
+        r"\usepackage{booktabs}",
+        r"\begin{document}",
+        r"\input{report.tex}",
+    )
     (tmp_path / "paper.tex").write_text("\n".join([*lines, r"\end{document}"]))
     call = ["pdflatex", "-interaction=nonstopmode", "-halt-on-error", "paper.tex"]
     made = subprocess.run(call, cwd=tmp_path, capture_output=True, text=True, check=False)

@@ -82,7 +82,9 @@ def test_players_of_an_item_have_one_gain(item: ItemScore, tmp_path: Path) -> No
         waves.append(read_audio(tmp_path / f"{number}.flac")[0][0])
     signals, _ = heard(item)
     expected = [float(signal.square().mean().sqrt()) for signal in signals.values()]
-    ratios = [float(wave.square().mean().sqrt()) / own for wave, own in zip(waves, expected, strict=True)]
+    ratios = [
+        float(wave.square().mean().sqrt()) / own for wave, own in zip(waves, expected, strict=True)
+    ]
     assert ratios == pytest.approx([ratios[0]] * 3, rel=1e-2)
     assert max(float(wave.abs().max()) for wave in waves) == pytest.approx(0.9, abs=1e-3)
     level = 94 + 20 * math.log10(expected[2])

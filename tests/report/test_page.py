@@ -32,7 +32,11 @@ NASTY = '<script>alert("x")</script> & \'quotes\' "too"'
 def page() -> str:
     inner = Section("Inner", players=[Player(b"fLaC123", NASTY), Player(b"RIFF123", "wav")])
     sections = [
-        Section(NASTY, paragraphs=[NASTY], tables=[Table(NASTY, ("a", NASTY), [(NASTY, "1"), ("b", "2")])]),
+        Section(
+            NASTY,
+            paragraphs=[NASTY],
+            tables=[Table(NASTY, ("a", NASTY), [(NASTY, "1"), ("b", "2")])],
+        ),
         Section(
             "Pictures",
             pictures=[Picture(b"\x89PNG", NASTY, NASTY), Picture(b"<svg/>", "svg")],
@@ -49,16 +53,24 @@ def test_everything_is_escaped_and_closed() -> None:
     parser.feed(text)
     assert parser.open == []
     assert "<script" not in text and text.count("&lt;script&gt;") >= 8
-    assert ("img", "alt", NASTY) in parser.attributes and ("audio", "aria-label", NASTY) in parser.attributes
+    assert ("img", "alt", NASTY) in parser.attributes and (
+        "audio",
+        "aria-label",
+        NASTY,
+    ) in parser.attributes
 
 
 def test_nothing_is_fetched() -> None:
     parser = Balance()
     parser.feed(page())
-    addresses = [value for _, name, value in parser.attributes if name in ("src", "href", "data", "srcset")]
+    addresses = [
+        value for _, name, value in parser.attributes if name in ("src", "href", "data", "srcset")
+    ]
     assert len(addresses) == 2 + 2 + 1 + 1 + 3  # pictures, players, icon, skip link, sections
     assert all(value.startswith(("data:", "#")) for value in addresses)
-    assert {value.split(";")[0] for value in addresses if value.startswith("data:") and ";" in value} == {
+    assert {
+        value.split(";")[0] for value in addresses if value.startswith("data:") and ";" in value
+    } == {
         "data:image/png",
         "data:image/svg+xml",
         "data:audio/flac",

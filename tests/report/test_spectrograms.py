@@ -28,6 +28,9 @@ def test_a_tone_has_its_level_and_a_difference_is_in_db() -> None:
 
 def test_a_picture_a_panel_and_one_of_all() -> None:
     found = panels({"a$b": torch.randn(1600), "silent": torch.zeros(1600)}, 16000)
-    assert [picture.alt for picture in pictures(found)] == ["Spectrogram: a$b", "Spectrogram: silent"]
+    assert [picture.alt for picture in pictures(found)] == [
+        "Spectrogram: a$b",
+        "Spectrogram: silent",
+    ]
     assert all(b"<svg" in picture.data for picture in pictures(found))
     assert composite(found).startswith(b"\x89PNG")

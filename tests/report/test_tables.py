@@ -24,7 +24,11 @@ def test_cells_are_escaped() -> None:
 
 
 def test_what_there_is_not() -> None:
-    assert (number(None, ".1f"), number(0.25, ".1f"), number(None, "g", "none")) == ("n/a", "0.2", "none")
+    assert (number(None, ".1f"), number(0.25, ".1f"), number(None, "g", "none")) == (
+        "n/a",
+        "0.2",
+        "none",
+    )
     assert (spread(0.5, None), spread(0.5, 0.25)) == ("0.500", "0.500 ± 0.250")
 
 
@@ -56,4 +60,7 @@ def test_markdown_leaves_to_the_page_what_is_folded_or_nested() -> None:
         Section("Empty"),
     ]
     text = render_markdown("Title", sections, "lead")
-    assert text == "# Title\n\nlead\n\n## One\n\ntext\n\n**t**\n\n| a | b |\n| --- | --- |\n| 1 | 2 |\n"
+    assert (
+        text
+        == "# Title\n\nlead\n\n## One\n\ntext\n\n**t**\n\n| a | b |\n| --- | --- |\n| 1 | 2 |\n"
+    )

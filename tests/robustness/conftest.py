@@ -106,7 +106,10 @@ class Bench:
                     failures.append(f"{kind}, seed {seed}: {said}\n  input: {repr(given)[:600]}")
         self.record("robustness", [kind, len(seeds), len(failures)])  # counted in tests/conftest.py
         if failures:
-            pytest.fail("\n".join([f"{len(failures)} of {len(seeds)} failed", *failures[:10]]), pytrace=False)
+            pytest.fail(
+                "\n".join([f"{len(failures)} of {len(seeds)} failed", *failures[:10]]),
+                pytrace=False,
+            )
 
     @staticmethod
     def own_words(error: BaseException) -> bool:
@@ -117,7 +120,9 @@ class Bench:
         assert trace is not None
         file = trace.tb_frame.f_code.co_filename
         raised = linecache.getline(file, trace.tb_lineno).strip().startswith("raise ")
-        own = kind is ValueError or (isinstance(error, ValueError) and kind.__module__.startswith("hlsim"))
+        own = kind is ValueError or (
+            isinstance(error, ValueError) and kind.__module__.startswith("hlsim")
+        )
         return own and raised and file.startswith(OURS) and 10 < len(str(error)) < LONGEST_MESSAGE
 
     @staticmethod
@@ -140,7 +145,9 @@ class Bench:
             elif way == 3:
                 del data[place : place + piece]
             elif way == 4:
-                data[place:place] = draw.choice((draw.randbytes(piece), bytes(data[place : place + piece])))
+                data[place:place] = draw.choice(
+                    (draw.randbytes(piece), bytes(data[place : place + piece]))
+                )
             elif draw.random() < 0.5:
                 del data[draw.randrange(len(data) + 1) :]
         return bytes(data)
@@ -155,7 +162,13 @@ def bench(pytestconfig: pytest.Config, record_property: Callable[[str, object], 
 def corpus(tmp_path: Path) -> Path:
     """Three speakers of three utterances of 0.8 s each, and two files of noise."""
     generator, envelope = torch.Generator().manual_seed(0), torch.linspace(0.0, 9.0, 12800).sin()
-    for name in (*(f"speech/s{n // 3}/{n}.wav" for n in range(9)), "noise/hum/1.wav", "noise/hiss/2.wav"):
+    for name in (
+        *(f"speech/s{n // 3}/{n}.wav" for n in range(9)),
+        "noise/hum/1.wav",
+        "noise/hiss/2.wav",
+    ):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
-        write_audio(tmp_path / name, 0.1 * envelope * torch.randn(12800, generator=generator), 16000)
+        write_audio(
+            tmp_path / name, 0.1 * envelope * torch.randn(12800, generator=generator), 16000
+        )
     return tmp_path

@@ -14,7 +14,13 @@ import pytest
 import soundfile
 import torch
 
-from compensators import HearingAid, HearingAidConfig, load_compensator, save_compensator, trained_for
+from compensators import (
+    HearingAid,
+    HearingAidConfig,
+    load_compensator,
+    save_compensator,
+    trained_for,
+)
 from hlsim import NeuroMSBG, load_pretrained
 from hlsim.audio import read_audio, read_stretch
 from hlsim.audiogram.table import read_audiograms
@@ -31,7 +37,10 @@ from hlsim.training.recipes import CompensatorRecipe, SimulatorRecipe
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 CORPUS = "file,id,speaker,split,noisy,noise,snr\na.wav,1,s,train,b.wav,hum,5\nc.wav,2,t,test,,,\n"
-LEVELS = "hl_250,hl_500,hl_1000,hl_2000,hl_3000,hl_4000,hl_6000,hl_8000\n", "35,35,40,50,55,60,65,65\n"
+LEVELS = (
+    "hl_250,hl_500,hl_1000,hl_2000,hl_3000,hl_4000,hl_6000,hl_8000\n",
+    "35,35,40,50,55,60,65,65\n",
+)
 EARS = f"listener,ear,split,{LEVELS[0]}L1,left,train,{LEVELS[1]}L1,right,test,{LEVELS[1]}"
 MANIFEST = f"listener,ear,condition,clean,processed,snr,spl,{LEVELS[0]}" + "".join(
     f"L{n},left,{name},c/{n}.wav,{name}/{n}.wav,5,65,{LEVELS[1]}" for n in (1, 2) for name in "ab"
@@ -85,7 +94,9 @@ def damaged_table(bench: Any, draw: Random, text: str) -> bytes:
             rows.insert(row, list(draw.choice(rows)))
     table = io.StringIO()
     csv.writer(table, delimiter=draw.choice(",,,,;\t")).writerows(rows)
-    return table.getvalue().encode(draw.choice(("utf-8", "utf-8", "utf-8-sig", "utf-16")), "replace")
+    return table.getvalue().encode(
+        draw.choice(("utf-8", "utf-8", "utf-8-sig", "utf-16")), "replace"
+    )
 
 
 @pytest.mark.parametrize("kind", ["audiogram tables", "report manifests", "corpus tables"])
@@ -122,14 +133,19 @@ def test_recipes(bench: Any, tmp_path: Path) -> None:
         text = draw.choice(texts)
         if draw.random() < 0.4:
             return bench.damage(draw, text.encode())
-        return yaml.safe_dump(damaged_values(bench, draw, yaml.safe_load(text)), allow_unicode=True).encode()
+        return yaml.safe_dump(
+            damaged_values(bench, draw, yaml.safe_load(text)), allow_unicode=True
+        ).encode()
 
     def attempt(data: bytes) -> None:
         path.write_bytes(data)
         settings = read_recipe(path)
         all_of(
             bench,
-            *(lambda kind=kind: kind.from_dict(settings) for kind in (SimulatorRecipe, CompensatorRecipe)),
+            *(
+                lambda kind=kind: kind.from_dict(settings)
+                for kind in (SimulatorRecipe, CompensatorRecipe)
+            ),
         )
 
     bench.run("YAML recipes", make, attempt, share=4.0)
@@ -138,7 +154,9 @@ def test_recipes(bench: Any, tmp_path: Path) -> None:
 def test_checkpoints(bench: Any, tmp_path: Path) -> None:
     config, about = NeuroConfig(channels=4, blocks=1), {"audiogram": {"levels": [0] * 8}}
     save_checkpoint(tmp_path / "s", "neuro-msbg", NeuroMSBG(config), config.to_dict(), about)
-    save_compensator(HearingAid(HearingAidConfig(bands=4, bins=0, width=4, hidden=4)), tmp_path / "a")
+    save_compensator(
+        HearingAid(HearingAidConfig(bands=4, bins=0, width=4, hidden=4)), tmp_path / "a"
+    )
     loaders = {tmp_path / "s": load_pretrained, tmp_path / "a": load_compensator}
     whole = {
         folder: [(folder / name).read_bytes() for name in ("config.json", "model.safetensors")]
@@ -152,7 +170,9 @@ def test_checkpoints(bench: Any, tmp_path: Path) -> None:
             return folder, bench.damage(draw, record), weights
         changed = damaged_values(bench, draw, json.loads(record))
         if isinstance(changed, dict) and draw.random() < 0.8:
-            config = json.dumps(changed.get("config"), sort_keys=True)  # as of a person who knows how to
+            config = json.dumps(
+                changed.get("config"), sort_keys=True
+            )  # as of a person who knows how to
             changed["config_sha256"] = hashlib.sha256(config.encode()).hexdigest()
         return folder, json.dumps(changed).encode(), weights
 
@@ -189,14 +209,22 @@ def test_instances_and_scores(bench: Any, tmp_path: Path) -> None:
         ScoreStore(path).append("new", {"score": 1.0})
         assert ScoreStore(path).get("new") == {"score": 1.0}
 
-    bench.run("safetensors of instances", lambda draw: bench.damage(draw, instance), read_instance, share=4.0)
+    bench.run(
+        "safetensors of instances",
+        lambda draw: bench.damage(draw, instance),
+        read_instance,
+        share=4.0,
+    )
     bench.run("stored scores", lambda draw: bench.damage(draw, scores), read_scores, share=2.0)
 
 
 def test_plans(bench: Any, corpus: Path) -> None:
     folder = corpus / "plan"
     prepare(PlanSettings(corpus / "speech"), folder, jobs=1)
-    whole = {name: (folder / name).read_bytes() for name in ("plan.json", "manifest.csv", "instances.csv")}
+    whole = {
+        name: (folder / name).read_bytes()
+        for name in ("plan.json", "manifest.csv", "instances.csv")
+    }
 
     def make(draw: Random) -> tuple[str, bytes]:
         name = draw.choice(list(whole))

@@ -32,7 +32,9 @@ def start(arguments: list[str], largest: int | None = None) -> Any:
         quiet = os.open(os.devnull, os.O_WRONLY)
         os.dup2(quiet, 1)
         os.dup2(quiet, 2)
-        sys.stdout = sys.stderr = os.fdopen(quiet, "w")  # pytest's are files, which fill like others
+        sys.stdout = sys.stderr = os.fdopen(
+            quiet, "w"
+        )  # pytest's are files, which fill like others
         os._exit(main(arguments))
 
     process = multiprocessing.get_context("fork").Process(target=child)
@@ -81,7 +83,9 @@ class Command:
         for process in (first, second):
             process.join()
         statuses = {first.exitcode, second.exitcode}
-        assert 0 in statuses and statuses <= {0, 2}, f"ended with {first.exitcode} and {second.exitcode}"
+        assert 0 in statuses and statuses <= {0, 2}, (
+            f"ended with {first.exitcode} and {second.exitcode}"
+        )
         self._same(arguments, target)
 
     def filled(self, share: float) -> None:
@@ -148,7 +152,16 @@ def test_training(bench: Any, corpus: Path) -> None:
     recipe.write_text(
         "batch: 2\nseconds: 0.4\nvalidate_every: 2\nvalidation_items: 2\nmodel: {channels: 4, blocks: 1}\n"
     )
-    words = ["train-compensator", "--config", str(recipe), "--audiogram", "N3", "--max-steps", "6", "--quiet"]
+    words = [
+        "train-compensator",
+        "--config",
+        str(recipe),
+        "--audiogram",
+        "N3",
+        "--max-steps",
+        "6",
+        "--quiet",
+    ]
     command = Training([*words, "--speech", str(corpus / "speech")], corpus)
     bench.run("kills of train-compensator", moments, command.killed, share=0.08)
     bench.run("train-compensator on a full disk", share_of_a_disk, command.filled, share=0.08)

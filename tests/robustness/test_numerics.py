@@ -29,11 +29,18 @@ KINDS = {
 def signal(draw: Random, samples: int) -> Tensor:
     """An impulse, a constant, noise, a tone, a step or bursts, of a random level. Shape: -> (samples,)."""
     time, at = torch.arange(samples, dtype=torch.float64), draw.randrange(samples)
-    noise = torch.randn(samples, generator=torch.Generator().manual_seed(draw.randrange(2**32))).clamp(
-        -1.0, 1.0
-    )
+    noise = torch.randn(
+        samples, generator=torch.Generator().manual_seed(draw.randrange(2**32))
+    ).clamp(-1.0, 1.0)
     tone = torch.sin(time * draw.choice((1e-4, 0.1, 1.0, 3.1)))
-    shapes = (time == at, time >= 0, noise, tone, time >= at, noise * (torch.sin(time / 300.0) > 0.0))
+    shapes = (
+        time == at,
+        time >= 0,
+        noise,
+        tone,
+        time >= at,
+        noise * (torch.sin(time / 300.0) > 0.0),
+    )
     return draw.choice(LEVELS) * draw.choice(shapes).double()
 
 
@@ -51,10 +58,12 @@ class Case:
         self.given, self.clean = (
             torch.stack([signal(draw, samples) for _ in range(items)]).to(kind) for _ in range(2)
         )
-        if shortest > 1 and draw.random() < 0.7:  # something that can be heard, of which there is a score
-            self.clean = 0.05 * torch.randn(self.clean.shape, generator=torch.Generator().manual_seed(0)).to(
-                kind
-            )
+        if (
+            shortest > 1 and draw.random() < 0.7
+        ):  # something that can be heard, of which there is a score
+            self.clean = 0.05 * torch.randn(
+                self.clean.shape, generator=torch.Generator().manual_seed(0)
+            ).to(kind)
 
     def __repr__(self) -> str:
         peaks = [f"{float(one.abs().max()):.3g}" for one in (*self.given, *self.clean)]
@@ -87,7 +96,9 @@ def test_numerics(bench: Any, kind: str) -> None:
     bench.run(kind, lambda draw: Case(draw, KINDS[kind]), check)
 
 
-@pytest.mark.parametrize(("name", "pascals"), [("msbg", 1e9), ("neuro-msbg", 1e6), ("neuro-msbg", 1e9)])
+@pytest.mark.parametrize(
+    ("name", "pascals"), [("msbg", 1e9), ("neuro-msbg", 1e6), ("neuro-msbg", 1e9)]
+)
 @pytest.mark.parametrize("ear", ["N1", "N4", "S3"])
 def test_a_constant_beside_which_all_other_frequencies_are_silent(
     name: str, pascals: float, ear: str

@@ -25,7 +25,11 @@ CALLS = {  # of each command one whose values may be replaced; most of them end 
     "evaluate-compensator": "nalr --speech empty --out new --items 1 --seconds 1 --jobs 1 --audiogram N3",
 }
 ASIDE = re.compile(r"^\d+ of \d+ |: warning: ")
-LEFT = {"scores.jsonl", "faults.csv", "lock"}  # reports that a refusal names, and what a claim leaves
+LEFT = {
+    "scores.jsonl",
+    "faults.csv",
+    "lock",
+}  # reports that a refusal names, and what a claim leaves
 
 
 @pytest.fixture
@@ -80,7 +84,9 @@ def test_options(bench: Any, place: Path) -> None:
         status, said = call(arguments)
         assert status in (0, 2), f"status {status}"
         if status == 2:
-            one_line = len(said.splitlines()) == 1 and said.startswith("hlsim") and ": error: " in said
+            one_line = (
+                len(said.splitlines()) == 1 and said.startswith("hlsim") and ": error: " in said
+            )
             assert one_line and len(said) < 12_000, f"said {said[:300]!r}"
         new = sorted(set(place.parents[2].rglob("*")) - before, reverse=True)
         left = [path for path in new if path.is_file() and path.name not in LEFT]
@@ -94,7 +100,9 @@ def test_options(bench: Any, place: Path) -> None:
 TRAIN = "train-compensator --config r.yaml --speech speech --out new"
 REPORT = "haspi-report --manifest m.csv --out new --audiogram N3 --jobs 1"
 HEAD = "condition,clean,processed\n"
-LAUGHS = "".join(f"{c}: &{c} {{x: *{b}, y: *{b}}}\n" for b, c in pairwise("abcdefghijklmnopqrstuvwx"))
+LAUGHS = "".join(
+    f"{c}: &{c} {{x: *{b}, y: *{b}}}\n" for b, c in pairwise("abcdefghijklmnopqrstuvwx")
+)
 TABLE: list[tuple[dict[str, str], str, str]] = [
     ({"r.yaml": "[" * 3000}, TRAIN, "not readable as YAML"),
     ({"r.yaml": "batch: 1\nbatch: 2"}, TRAIN, "batch is there twice"),
@@ -109,7 +117,11 @@ TABLE: list[tuple[dict[str, str], str, str]] = [
     ({}, "prepare loop --out new", "loop: no such folder"),
     ({}, "prepare speech --root loop --out new", "loop: no such folder"),
     ({}, "prepare speech --out loop", "loop: not a folder"),
-    ({"t.csv": "file\nloop.wav\n"}, "prepare speech --table t.csv --jobs 1 --out new", "can be used; "),
+    (
+        {"t.csv": "file\nloop.wav\n"},
+        "prepare speech --table t.csv --jobs 1 --out new",
+        "can be used; ",
+    ),
     (
         {"t.csv": "file\na\0.wav\n"},
         "prepare speech --table t.csv --out new",

@@ -84,7 +84,9 @@ def test_prepared_instances_train_too(plan: Path, tmp_path: Path) -> None:
     assert len(train(PlannedSource(plan, prepared=True, workers=0), tmp_path / "out", 4)) == 2
 
 
-def test_prepared_validation_is_on_what_lies_on_disk_and_needs_no_corpus(plan: Path, tmp_path: Path) -> None:
+def test_prepared_validation_is_on_what_lies_on_disk_and_needs_no_corpus(
+    plan: Path, tmp_path: Path
+) -> None:
     write_instances(plan, Recipe(alignment="impulse"), jobs=1)
     (tmp_path / "speech").rename(tmp_path / "gone")
     source = PlannedSource(plan, prepared=True, workers=0)
@@ -122,7 +124,9 @@ def test_another_plan_in_the_same_folder_is_another_training(plan: Path, tmp_pat
 
 def test_the_validation_split_is_used(plan: Path) -> None:
     data = PlannedData(PlannedSource(plan, workers=0), SimulatorRecipe.from_dict(TINY))
-    assert [(len(batch["signal"]), batch["thresholds"].shape) for batch in data.validation] == [(4, (4, 8))]
+    assert [(len(batch["signal"]), batch["thresholds"].shape) for batch in data.validation] == [
+        (4, (4, 8))
+    ]
     opened = data.plan
     expected = torch.stack([opened.thresholds(int(index)) for index in opened.indices("valid")])
     assert torch.equal(data.validation[0]["thresholds"], expected)
@@ -134,7 +138,9 @@ def test_a_plan_has_no_sounds_but_its_own(plan: Path) -> None:
         PlannedData(PlannedSource(plan, workers=0), recipe)
 
 
-def test_a_plan_without_a_validation_split_says_what_it_is_chosen_on(plan: Path, tmp_path: Path) -> None:
+def test_a_plan_without_a_validation_split_says_what_it_is_chosen_on(
+    plan: Path, tmp_path: Path
+) -> None:
     prepare(PlanSettings(tmp_path / "speech"), tmp_path / "other", jobs=1)
     with pytest.warns(UserWarning, match="chosen on 'test'"):
         PlannedData(PlannedSource(tmp_path / "other", workers=0), SimulatorRecipe.from_dict(TINY))
@@ -146,7 +152,10 @@ def test_bad_calls(plan: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str
     call = ["train-simulator", "--config", str(recipe), "--out", str(tmp_path / "out")]
     for options, said in (
         ([], "nothing to train on; allowed: --speech, a folder, or --manifest"),
-        (["--speech", "s", "--root", "r", "--workers", "0"], "--root, --workers without --manifest"),
+        (
+            ["--speech", "s", "--root", "r", "--workers", "0"],
+            "--root, --workers without --manifest",
+        ),
         (["--speech", "s", "--prepared"], "--prepared without --manifest; allowed: with it alone"),
         (["--manifest", str(plan), "--noise", "n"], "--manifest with --noise"),
         (["--manifest", str(tmp_path / "manifest.csv")], "not prepared"),

@@ -29,7 +29,12 @@ EVER = 1e6  # minutes, so that the learning rate does not fall within a test
 def train(data: TrainingData, out: Path, **options: object) -> tuple[Path, list[str]]:
     """A few steps through the exact MSBG."""
     lines: list[str] = []
-    settings = {"max_minutes": EVER, "simulator": "msbg", "accelerator": "cpu", "progress": False} | options
+    settings = {
+        "max_minutes": EVER,
+        "simulator": "msbg",
+        "accelerator": "cpu",
+        "progress": False,
+    } | options
     recipe = CompensatorRecipe.from_dict(SMALL | settings.pop("recipe", {}))  # type: ignore[operator]
     folder = train_compensator(data, recipe, out=out, report=lines.append, **settings)  # type: ignore[arg-type]
     return folder, lines
@@ -37,7 +42,9 @@ def train(data: TrainingData, out: Path, **options: object) -> tuple[Path, list[
 
 def test_twenty_steps_lower_the_loss(data: TrainingData, tmp_path: Path) -> None:
     ear = Audiogram.standard("N3")
-    folder, lines = train(data, tmp_path, audiogram=ear, max_steps=20, recipe={"learning_rate": 1e-2})
+    folder, lines = train(
+        data, tmp_path, audiogram=ear, max_steps=20, recipe={"learning_rate": 1e-2}
+    )
     about = json.loads((folder / CONFIG).read_text())["about"]
     assert lines[0].startswith("start: valid_loss")
     assert about["validation"]["valid_loss"] < 0.8 * about["start_valid_loss"]
@@ -53,7 +60,9 @@ def test_twenty_steps_lower_the_loss(data: TrainingData, tmp_path: Path) -> None
     assert module.validate(valid)["valid_loss"] == pytest.approx(about["validation"]["valid_loss"])
 
 
-def test_what_it_starts_with_is_validated_as_all_that_follows(data: TrainingData, tmp_path: Path) -> None:
+def test_what_it_starts_with_is_validated_as_all_that_follows(
+    data: TrainingData, tmp_path: Path
+) -> None:
     first, _ = train(data, tmp_path / "first", max_steps=1)
     settings = {"start": str(first), "validation_items": 12}  # three batches
     _, lines = train(data, tmp_path / "second", max_steps=1, recipe=settings)
@@ -83,7 +92,9 @@ def test_goes_on_where_it_was_stopped(data: TrainingData, tmp_path: Path) -> Non
         )
     assert (tmp_path / "stopped" / "last.ckpt").is_file()
     resumed, lines = train(data, tmp_path / "stopped", max_steps=6, **options)
-    assert not any(line.startswith("step 2") for line in lines) and any("step 6" in line for line in lines)
+    assert not any(line.startswith("step 2") for line in lines) and any(
+        "step 6" in line for line in lines
+    )
     first, second = (
         torch.load(tmp_path / name / "last.ckpt", weights_only=True)["state_dict"]
         for name in ("whole", "stopped")
@@ -101,11 +112,15 @@ def test_another_recipe_does_not_go_on(data: TrainingData, tmp_path: Path) -> No
         train(data, tmp_path, audiogram=Audiogram.standard("N4"), **options)
 
 
-def test_another_simulator_in_the_same_folder_does_not_go_on(data: TrainingData, tmp_path: Path) -> None:
+def test_another_simulator_in_the_same_folder_does_not_go_on(
+    data: TrainingData, tmp_path: Path
+) -> None:
     config = NeuroConfig(channels=4, blocks=1)
     options = {"recipe": {"seconds": 0.2}, "max_steps": 1, "simulator": tmp_path / "simulator"}
     for again in (False, True):
-        save_checkpoint(tmp_path / "simulator", "neuro-msbg", NeuroMSBG(config), config.to_dict(), {})
+        save_checkpoint(
+            tmp_path / "simulator", "neuro-msbg", NeuroMSBG(config), config.to_dict(), {}
+        )
         if not again:
             train(data, tmp_path / "out", **options)
     with pytest.raises(ValueError, match=r"another recipe \(other simulator_sha256; "):
@@ -129,13 +144,20 @@ def test_general_one_draws_ears_and_noise(data: TrainingData, tmp_path: Path) ->
     assert 0.25 < noisy < 0.75 and 0.25 < measured < 0.75 and len(drawn.unique(dim=0)) > 20
     loss = module.training_loss(batches.draw(recipe.batch, torch.Generator().manual_seed(0)))
     loss.backward()
-    assert all(p.grad is not None and bool(p.grad.isfinite().all()) for p in module.trained_parameters())
+    assert all(
+        p.grad is not None and bool(p.grad.isfinite().all()) for p in module.trained_parameters()
+    )
     assert all(name.startswith("compensator.") for name in module.state_dict())
 
 
 def test_haspi_joins_the_criteria(data: TrainingData) -> None:
     """Of speech, tones and clicks, of which there is no score; its clips last a second."""
-    settings = {"weights": {"coherent-bands": 1.0, "haspi": 0.3}, "seconds": 1.0, "sounds": 0.6, "batch": 6}
+    settings = {
+        "weights": {"coherent-bands": 1.0, "haspi": 0.3},
+        "seconds": 1.0,
+        "sounds": 0.6,
+        "batch": 6,
+    }
     recipe = CompensatorRecipe.from_dict(SMALL | settings)
     module = CompensatorTraining(recipe, EVER, simulator="msbg")
     batch = CompensatorBatches(recipe, data, None).draw(6, torch.Generator().manual_seed(1))
@@ -143,10 +165,14 @@ def test_haspi_joins_the_criteria(data: TrainingData) -> None:
     loss = module.training_loss(batch)
     loss.backward()
     assert bool(loss.isfinite())
-    assert all(p.grad is not None and bool(p.grad.isfinite().all()) for p in module.trained_parameters())
+    assert all(
+        p.grad is not None and bool(p.grad.isfinite().all()) for p in module.trained_parameters()
+    )
 
 
-def test_a_hearing_aid_learns_to_amplify_and_to_take_noise_off(data: TrainingData, tmp_path: Path) -> None:
+def test_a_hearing_aid_learns_to_amplify_and_to_take_noise_off(
+    data: TrainingData, tmp_path: Path
+) -> None:
     noisy = TrainingData(data.speech, noise=data.speech, valid_speech=data.valid_speech)
     settings = {
         "kind": "hearing-aid",
@@ -154,7 +180,11 @@ def test_a_hearing_aid_learns_to_amplify_and_to_take_noise_off(data: TrainingDat
         "seconds": 0.5,
         "learning_rate": 0.01,
     }
-    settings |= {"weights": {"coherent-bands": 1.0, "denoising": 10.0}, "unreduced": 0.5, "noisy": 1.0}
+    settings |= {
+        "weights": {"coherent-bands": 1.0, "denoising": 10.0},
+        "unreduced": 0.5,
+        "noisy": 1.0,
+    }
     folder, _ = train(noisy, tmp_path, max_steps=100, recipe=settings)
     about = json.loads((folder / CONFIG).read_text())["about"]
     assert about["validation"]["valid_loss"] < 0.9 * about["start_valid_loss"]
@@ -185,8 +215,15 @@ def test_without_noise_reduction_it_is_trained_and_validated(data: TrainingData)
 def test_what_a_hearing_aid_is_not_trained_for_stays_as_it_is(
     data: TrainingData, weights: dict[str, float], unreduced: float, kept: set[str]
 ) -> None:
-    settings = {"kind": "hearing-aid", "model": {"width": 8, "hidden": 8}, "seconds": 0.8, "noisy": 1.0}
-    recipe = CompensatorRecipe.from_dict(SMALL | settings | {"weights": weights, "unreduced": unreduced})
+    settings = {
+        "kind": "hearing-aid",
+        "model": {"width": 8, "hidden": 8},
+        "seconds": 0.8,
+        "noisy": 1.0,
+    }
+    recipe = CompensatorRecipe.from_dict(
+        SMALL | settings | {"weights": weights, "unreduced": unreduced}
+    )
     module = CompensatorTraining(recipe, EVER, simulator="msbg")
     noisy = TrainingData(data.speech, noise=data.speech)
     batch = CompensatorBatches(recipe, noisy, None).draw(2, torch.Generator().manual_seed(0))
@@ -233,17 +270,26 @@ def test_sounds_have_no_noise_and_babble_is_the_others_voices(data: TrainingData
         ),
         ({"lr": 0.1}, "unknown settings lr"),
         ({"weights": {"loudness": 1.0}}, "unknown criteria loudness"),
-        ({"weights": {"haspi": 1.0}}, "seconds 0.6 in the recipe; allowed: 0.7 or more with haspi, hasqi or"),
+        (
+            {"weights": {"haspi": 1.0}},
+            "seconds 0.6 in the recipe; allowed: 0.7 or more with haspi, hasqi or",
+        ),
         (
             {"kind": "hearing-aid", "weights": {"intelligibility": 1.0}, "seconds": 0.5},
             "0.7 or more with haspi, hasqi or intelligibility",
         ),
         ({"levels": [80.0, 50.0]}, "a lowest and a highest"),
         ({"batch": 0}, "counts from 1 up"),
-        ({"seed": -(2**62)}, "seed -4611686018427387904 in the recipe; allowed: whole numbers between"),
+        (
+            {"seed": -(2**62)},
+            "seed -4611686018427387904 in the recipe; allowed: whole numbers between",
+        ),
         ({"weights": {"bands": 0.0}}, "above 0"),
         ({"model": {"layers": 2}}, "unknown network settings layers"),
-        ({"kind": "vocoder"}, "kind 'vocoder' in the recipe; allowed: mapping-compensator, hearing-aid"),
+        (
+            {"kind": "vocoder"},
+            "kind 'vocoder' in the recipe; allowed: mapping-compensator, hearing-aid",
+        ),
         (
             {"weights": {"denoising": 1.0}},
             "kind 'mapping-compensator' in the recipe; allowed: no noise reduction but a hearing-aid's",
@@ -257,7 +303,8 @@ def test_bad_recipes(settings: dict[str, object], message: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "settings", [{"weights": {"denoising": 1.0}}, {"weights": {"intelligibility": 1.0}}, {"babble": 0.3}]
+    "settings",
+    [{"weights": {"denoising": 1.0}}, {"weights": {"intelligibility": 1.0}}, {"babble": 0.3}],
 )
 def test_noise_is_not_learned_from_none(speech_dir: Path, settings: dict[str, object]) -> None:
     recipe = CompensatorRecipe.from_dict({"kind": "hearing-aid", "seconds": 1.0, **settings})

@@ -48,10 +48,14 @@ def test_intelligibility_is_haspi_at_the_level_of_the_clean_speech_amplified(
 ) -> None:
     aid, ears = HearingAid(HearingAidConfig(width=8, hidden=8)).eval(), torch.full((2, 8), 50.0)
     clean = set_level(resample(*speech[0], 16000)[:, :16000], 65.0).expand(2, -1)
-    signal = clean + set_level(torch.randn(2, 16000, generator=torch.Generator().manual_seed(0)), 60.0)
+    signal = clean + set_level(
+        torch.randn(2, 16000, generator=torch.Generator().manual_seed(0)), 60.0
+    )
     missing = missing_intelligibility(aid, signal, clean, ears)
     missing.mean().backward()  # type: ignore[no-untyped-call]
-    reached = {name for name, one in aid.named_parameters() if one.grad is not None and one.grad.any()}
+    reached = {
+        name for name, one in aid.named_parameters() if one.grad is not None and one.grad.any()
+    }
     assert {name.split(".")[0] for name in reached} == {"enter", "recur", "leave", "correct"}
     level = level_spl(aid(clean, ears, 0.0))
     expected = 1.0 - haspi(set_level(aid(signal, ears), level), clean, ears)

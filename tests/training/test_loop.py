@@ -62,10 +62,15 @@ class Toy(TimedModule):
 
     def figures(self, values: Mapping[str, Tensor]) -> dict[str, float]:
         total = float(values["valid_sum"])
-        return {"score": self.scores[self.global_step] if self.scores else -total, "valid_sum": total}
+        return {
+            "score": self.scores[self.global_step] if self.scores else -total,
+            "valid_sum": total,
+        }
 
 
-def go(module: Toy, out: Path, max_steps: int = 6, **options: Any) -> tuple[list[dict[str, Any]], list[str]]:
+def go(
+    module: Toy, out: Path, max_steps: int = 6, **options: Any
+) -> tuple[list[dict[str, Any]], list[str]]:
     """Run; what was written and reported."""
     written: list[dict[str, Any]] = []
     lines: list[str] = []
@@ -179,7 +184,9 @@ def test_a_second_training_in_the_folder_is_refused_until_the_first_is_over(tmp_
     assert second.seen == [4, 5]
 
 
-def test_a_file_of_the_users_in_the_checkpoints_folder_is_told_before_the_training(tmp_path: Path) -> None:
+def test_a_file_of_the_users_in_the_checkpoints_folder_is_told_before_the_training(
+    tmp_path: Path,
+) -> None:
     (tmp_path / CHECKPOINT).mkdir()
     (tmp_path / CHECKPOINT / "mine.txt").touch()
     module = Toy()
@@ -244,7 +251,9 @@ def test_a_broken_state_is_named(tmp_path: Path, broken: bytes | str | None) -> 
         last.write_bytes(state)
     else:
         last.write_bytes(broken)
-    with pytest.raises(ValueError, match="not readable as a state; remove it to start anew") as caught:
+    with pytest.raises(
+        ValueError, match="not readable as a state; remove it to start anew"
+    ) as caught:
         go(Toy(), tmp_path, max_steps=4)
     assert str(caught.value).startswith(str(last))
     last.unlink()
@@ -264,7 +273,9 @@ def test_a_broken_state_is_named(tmp_path: Path, broken: bytes | str | None) -> 
         ),
     ],
 )
-def test_where_it_cannot_train_nothing_is_written(tmp_path: Path, options: dict[str, Any], said: str) -> None:
+def test_where_it_cannot_train_nothing_is_written(
+    tmp_path: Path, options: dict[str, Any], said: str
+) -> None:
     with pytest.raises(ValueError, match=said):
         go(Toy(), tmp_path / "out", **options)
     assert not (tmp_path / "out").exists()
@@ -326,7 +337,9 @@ def test_the_minutes_told_are_of_all_parts(tmp_path: Path) -> None:
 def test_learning_rate_rises_over_fifty_steps_and_falls_with_time(tmp_path: Path) -> None:
     rising = Toy(learning_rate=0.5)
     go(rising, tmp_path / "a", max_steps=60, validate_every=30)
-    assert rising.rates[:50] == pytest.approx([0.5 * (step + 1) / 50 for step in range(50)], rel=1e-3)
+    assert rising.rates[:50] == pytest.approx(
+        [0.5 * (step + 1) / 50 for step in range(50)], rel=1e-3
+    )
     assert rising.rates[50:] == pytest.approx([0.5] * 10, rel=1e-3)
     falling = Toy(max_minutes=4.0 / 60.0, learning_rate=0.5)
     go(falling, tmp_path / "b", max_steps=-1, validate_every=10_000)

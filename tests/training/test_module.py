@@ -20,12 +20,21 @@ from hlsim.training.module import exponential_average
 from hlsim.training.recipes import CompensatorRecipe, SimulatorRecipe
 from hlsim.training.simulator import SimulatorTraining, train_simulator
 
-SHORT = {"batch": 1, "seconds": 0.25, "validate_every": 1, "validation_items": 4, "learning_rate": 1e-6}
+SHORT = {
+    "batch": 1,
+    "seconds": 0.25,
+    "validate_every": 1,
+    "validation_items": 4,
+    "learning_rate": 1e-6,
+}
 RUN = {"max_minutes": 1e6, "accelerator": "cpu", "progress": False, "report": lambda line: None}
 
 
 def furthest(one: torch.nn.Module, other: torch.nn.Module) -> float:
-    return max(float((a - b).abs().max()) for a, b in zip(one.parameters(), other.parameters(), strict=True))
+    return max(
+        float((a - b).abs().max())
+        for a, b in zip(one.parameters(), other.parameters(), strict=True)
+    )
 
 
 def test_a_simulator_goes_on_from_a_checkpoint(data: TrainingData, tmp_path: Path) -> None:
@@ -39,7 +48,10 @@ def test_a_simulator_goes_on_from_a_checkpoint(data: TrainingData, tmp_path: Pat
     assert about["start_sha256"] == checkpoint_digest("neuro-msbg")
     with pytest.raises(ValueError, match=r"another recipe \(other start, start_sha256"):
         train_simulator(
-            data, SimulatorRecipe.from_dict(SHORT | {"start": "neuro-msbg-cnn"}), out=tmp_path, **RUN
+            data,
+            SimulatorRecipe.from_dict(SHORT | {"start": "neuro-msbg-cnn"}),
+            out=tmp_path,
+            **RUN,
         )
 
 
@@ -54,9 +66,14 @@ def test_all_is_trained_that_is_trained_from_the_beginning() -> None:
     assert furthest(started.kept.module, load_pretrained("neuro-msbg")) == 0.0
 
 
-def test_a_compensator_for_one_ear_starts_from_that_for_all(data: TrainingData, tmp_path: Path) -> None:
+def test_a_compensator_for_one_ear_starts_from_that_for_all(
+    data: TrainingData, tmp_path: Path
+) -> None:
     ear = Audiogram.standard("N4")
-    recipes = [CompensatorRecipe.from_dict(SHORT | {"start": start}) for start in ("compensator-general", "")]
+    recipes = [
+        CompensatorRecipe.from_dict(SHORT | {"start": start})
+        for start in ("compensator-general", "")
+    ]
     valid = compensator_data(data, recipes[0], ear).validation
     general, random = (
         CompensatorTraining(recipe, 1.0, simulator="msbg").validate(valid) for recipe in recipes
@@ -74,7 +91,9 @@ def test_a_compensator_for_one_ear_starts_from_that_for_all(data: TrainingData, 
 
 
 def test_what_makes_the_start_worse_is_not_kept(data: TrainingData, tmp_path: Path) -> None:
-    recipe = CompensatorRecipe.from_dict(SHORT | {"start": "compensator-general", "learning_rate": 10.0})
+    recipe = CompensatorRecipe.from_dict(
+        SHORT | {"start": "compensator-general", "learning_rate": 10.0}
+    )
     folder = train_compensator(data, recipe, out=tmp_path, max_steps=1, simulator="msbg", **RUN)
     assert furthest(load_compensator(folder), load_compensator("compensator-general")) == 0.0
     about = json.loads((folder / CONFIG).read_text())["about"]
@@ -114,7 +133,14 @@ def test_the_program_starts_from_a_checkpoint(
 ) -> None:
     text = "".join(f"{name}: {value}\n" for name, value in SHORT.items() if name != "learning_rate")
     (tmp_path / "recipe.yaml").write_text(text)
-    command = ["--config", tmp_path / "recipe.yaml", "--speech", speech_dir / "train", "--out", tmp_path]
+    command = [
+        "--config",
+        tmp_path / "recipe.yaml",
+        "--speech",
+        speech_dir / "train",
+        "--out",
+        tmp_path,
+    ]
     command += ["--max-steps", "1", "--quiet", "--device", "cpu", "--start"]
     arguments = [str(part) for part in ("train-compensator", "--audiogram", "N3", *command)]
     assert main([*arguments, "compensator-general"]) == 0

@@ -47,7 +47,9 @@ def data(speech_dir: Path) -> TrainingData:
     return TrainingData(speech_dir / "train")
 
 
-def train(data: TrainingData, out: Path, recipe: dict[str, Any] | None = None, **options: Any) -> list[str]:
+def train(
+    data: TrainingData, out: Path, recipe: dict[str, Any] | None = None, **options: Any
+) -> list[str]:
     """A few steps; the lines reported."""
     lines: list[str] = []
     settings = {
@@ -56,7 +58,9 @@ def train(data: TrainingData, out: Path, recipe: dict[str, Any] | None = None, *
         "progress": False,
         "report": lines.append,
     } | options
-    folder = train_simulator(data, SimulatorRecipe.from_dict(TINY | (recipe or {})), out=out, **settings)
+    folder = train_simulator(
+        data, SimulatorRecipe.from_dict(TINY | (recipe or {})), out=out, **settings
+    )
     assert folder == out / "checkpoint"
     return lines
 
@@ -77,7 +81,9 @@ def state(out: Path) -> dict[str, Any]:
     return loaded
 
 
-def test_eight_steps_leave_a_checkpoint_that_loads_and_a_state(data: TrainingData, tmp_path: Path) -> None:
+def test_eight_steps_leave_a_checkpoint_that_loads_and_a_state(
+    data: TrainingData, tmp_path: Path
+) -> None:
     lines = train(data, tmp_path / "out", max_steps=8)
     assert [line.split(",")[0] for line in lines] == ["step 4", "step 8", "step 8"]
     assert "valid_snr_median" in lines[0] and "valid_snr_worst_tenth" in lines[0]
@@ -118,7 +124,9 @@ def test_a_short_training_on_synthetic_speech_beats_the_untrained_network(
     assert figures(module, data)["valid_snr_median"] > untrained + 0.5
 
 
-def test_averaged_weights_are_what_is_validated_and_kept(data: TrainingData, tmp_path: Path) -> None:
+def test_averaged_weights_are_what_is_validated_and_kept(
+    data: TrainingData, tmp_path: Path
+) -> None:
     train(data, tmp_path / "out", {"average": 0.9}, max_steps=4)
     kept = load_pretrained(tmp_path / "out" / "checkpoint").state_dict()
     states = state(tmp_path / "out")["state_dict"]
@@ -133,7 +141,10 @@ def test_lower_precision_is_near_and_leaves_the_physics_alone(data: TrainingData
         module = SimulatorTraining(recipe, EVER)
         loss = module.training_loss(drawn(data, recipe))
         loss.backward()
-        assert all(p.grad is not None and p.grad.dtype == torch.float32 for p in module.trained_parameters())
+        assert all(
+            p.grad is not None and p.grad.dtype == torch.float32
+            for p in module.trained_parameters()
+        )
         losses.append(float(loss.detach()))
     assert losses[1] == pytest.approx(losses[0], abs=0.02)
 
@@ -153,7 +164,9 @@ def test_values_of_a_recipe_that_are_not_allowed(setting: dict[str, Any], said: 
         SimulatorRecipe.from_dict(TINY | setting)
 
 
-def test_stopped_and_resumed_is_as_good_as_uninterrupted(data: TrainingData, tmp_path: Path) -> None:
+def test_stopped_and_resumed_is_as_good_as_uninterrupted(
+    data: TrainingData, tmp_path: Path
+) -> None:
     train(data, tmp_path / "whole", max_steps=8)
     train(data, tmp_path / "parts", max_steps=4)
     assert state(tmp_path / "parts")["global_step"] == 4
@@ -186,7 +199,9 @@ def test_a_killed_run_goes_on(data: TrainingData, tmp_path: Path) -> None:
     recipe = TINY | {"validate_every": 2}
     out = tmp_path / "out"
     root = str(Path(__file__).parents[2])
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join((root, os.environ.get("PYTHONPATH", "")))}
+    environment = os.environ | {
+        "PYTHONPATH": os.pathsep.join((root, os.environ.get("PYTHONPATH", "")))
+    }
     code = KILLED.format(recipe=recipe, minutes=EVER)
     child = subprocess.Popen(
         [sys.executable, "-c", code, str(data.speech), str(out)],
@@ -196,7 +211,9 @@ def test_a_killed_run_goes_on(data: TrainingData, tmp_path: Path) -> None:
     )
     try:
         deadline = time.monotonic() + 120.0
-        while not ((out / "last.ckpt").is_file() and (out / "checkpoint" / "config.json").is_file()):
+        while not (
+            (out / "last.ckpt").is_file() and (out / "checkpoint" / "config.json").is_file()
+        ):
             assert child.poll() is None, child.stderr.read().decode() if child.stderr else ""
             assert time.monotonic() < deadline
             time.sleep(0.05)
@@ -214,7 +231,9 @@ def test_a_killed_run_goes_on(data: TrainingData, tmp_path: Path) -> None:
     assert state(out)["global_step"] == reached + 2
 
 
-def test_another_recipe_or_other_data_need_another_folder(data: TrainingData, tmp_path: Path) -> None:
+def test_another_recipe_or_other_data_need_another_folder(
+    data: TrainingData, tmp_path: Path
+) -> None:
     train(data, tmp_path, max_steps=4)
     before = (tmp_path / "last.ckpt").read_bytes()
     other = TrainingData(data.speech.parent / "valid")
@@ -234,7 +253,10 @@ def test_another_recipe_or_other_data_need_another_folder(data: TrainingData, tm
     [
         ({"batch": 0}, "counts from 1 up"),
         ({"learning_rate": -1.0}, "learning_rate above 0"),
-        ({"epochs": 3}, "unknown settings epochs in the recipe; allowed: model, start, batch, seconds"),
+        (
+            {"epochs": 3},
+            "unknown settings epochs in the recipe; allowed: model, start, batch, seconds",
+        ),
         (
             {"weights": {"loudness": 1.0}},
             "unknown criteria loudness in the recipe; allowed: complex, log_spectrum",
@@ -264,7 +286,9 @@ def test_another_teacher_is_told_and_needs_another_folder(
     assert not torch.allclose(heard[0]["impaired"], heard[1]["impaired"])
     prepared = PlannedSource(tmp_path, prepared=True)
     with pytest.raises(ValueError, match=r"teacher a:b for what is prepared; allowed: none"):
-        train_simulator(prepared, SimulatorRecipe(), out=tmp_path / "b", max_minutes=1.0, teacher="a:b")
+        train_simulator(
+            prepared, SimulatorRecipe(), out=tmp_path / "b", max_minutes=1.0, teacher="a:b"
+        )
 
 
 def test_unknown_settings_of_the_network(data: TrainingData, tmp_path: Path) -> None:
@@ -297,7 +321,9 @@ def test_files_trained_on_are_none_to_validate_on(speech_dir: Path, tmp_path: Pa
         ("noise", {"speech": train_dir, "noise": speech_dir, "valid_noise": valid}),
     ):
         data = TrainingData(**given)  # type: ignore[arg-type]
-        with pytest.raises(ValueError, match=rf"^\d+ of \d+ files of the {name} to validate on are also"):
+        with pytest.raises(
+            ValueError, match=rf"^\d+ of \d+ files of the {name} to validate on are also"
+        ):
             simulator_data(data, SimulatorRecipe.from_dict(TINY))
 
 
@@ -311,18 +337,31 @@ def rich(speech_dir: Path, tmp_path: Path) -> TrainingData:
     row = Audiogram.standard("N5").to_row()
     (tmp_path / "ears.csv").write_text(",".join(row) + "\n" + ",".join(row.values()) + "\n")
     return TrainingData(
-        speech_dir / "train", tmp_path / "noise", tmp_path / "ears.csv", valid_speech=speech_dir / "valid"
+        speech_dir / "train",
+        tmp_path / "noise",
+        tmp_path / "ears.csv",
+        valid_speech=speech_dir / "valid",
     )
 
 
 def test_noise_ears_and_all_criteria_train(rich: TrainingData) -> None:
-    weights = {"snr": 1.0, "log_spectrum": 0.5, "magnitude": 0.9, "phase": 0.3, "complex": 0.1, "time": 0.2}
+    weights = {
+        "snr": 1.0,
+        "log_spectrum": 0.5,
+        "magnitude": 0.9,
+        "phase": 0.3,
+        "complex": 0.1,
+        "time": 0.2,
+    }
     recipe = SimulatorRecipe.from_dict(TINY | {"weights": weights})
     module = SimulatorTraining(recipe, EVER)
     loss = module.training_loss(drawn(rich, recipe))
     assert bool(torch.isfinite(loss))
     loss.backward()
-    assert all(p.grad is not None and bool(torch.isfinite(p.grad).all()) for p in module.trained_parameters())
+    assert all(
+        p.grad is not None and bool(torch.isfinite(p.grad).all())
+        for p in module.trained_parameters()
+    )
     assert {id(p) for p in module.trained_parameters()} == {
         id(p) for p in module.parameters() if p.requires_grad
     }
@@ -374,10 +413,14 @@ def test_sounds_are_validated_by_their_share(data: TrainingData) -> None:
 
 
 @pytest.mark.parametrize(("treated", "low", "high"), [(True, 50.0, 80.0), (False, 85.0, 90.0)])
-def test_sounds_have_the_levels_of_the_validation_set(treated: bool, low: float, high: float) -> None:
+def test_sounds_have_the_levels_of_the_validation_set(
+    treated: bool, low: float, high: float
+) -> None:
     recipe = SimulatorRecipe(sounds=0.1, treated=treated, levels=(85.0, 90.0))
     levels = torch.cat([level_spl(batch["signal"]) for batch in sounds_to_validate(recipe)])
-    assert len(levels) == 16 and low - 0.01 <= float(levels.min()) < float(levels.max()) <= high + 0.01
+    assert (
+        len(levels) == 16 and low - 0.01 <= float(levels.min()) < float(levels.max()) <= high + 0.01
+    )
 
 
 @pytest.mark.parametrize("sounds", [-0.1, 1.1])

@@ -74,9 +74,13 @@ class CleanSpeech:
         with torch.no_grad():
             # in double precision, for a sample more or less at an end would move all frames
             rows = clean.detach().double().reshape(-1, self.time)
-            self.items = [self._item(i, rows[i, :end], end, full_scale, rate) for i, end in enumerate(ends)]
+            self.items = [
+                self._item(i, rows[i, :end], end, full_scale, rate) for i, end in enumerate(ends)
+            ]
 
-    def _item(self, index: int, signal: Tensor, length: int, full_scale: float, rate: int) -> CleanItem:
+    def _item(
+        self, index: int, signal: Tensor, length: int, full_scale: float, rate: int
+    ) -> CleanItem:
         name = "clean" if self.shape.numel() == 1 else f"clean, item {index}"
         if length < SHORTEST_SECONDS * rate:
             raise ValueError(
@@ -100,7 +104,11 @@ class CleanSpeech:
                 f"{1000.0 * _LEAST / RATE:g} ms or more to be defined"
             )
         return CleanItem(
-            index, length, part, ear_input.spectrum_for_alignment(at_ear.to(self.dtype)), at_ear[part]
+            index,
+            length,
+            part,
+            ear_input.spectrum_for_alignment(at_ear.to(self.dtype)),
+            at_ear[part],
         )
 
     def groups(self) -> list[list[CleanItem]]:
@@ -169,7 +177,9 @@ class ItemGroup(Generic[Channels]):
         if self._kept is not None:
             yield from self._kept
             return
-        for chosen in ear_model.channel_chunks(len(self._items), self._extent.padded, self._signals.device):
+        for chosen in ear_model.channel_chunks(
+            len(self._items), self._extent.padded, self._signals.device
+        ):
             yield self._hear(chosen)
 
     def _hear(self, chosen: slice) -> Channels:

@@ -134,7 +134,10 @@ def agreement(reference: Tensor, processed: Tensor) -> Agreement:
     """Filter the cosines' course in time by ten band-passes without delay and compare. Shape: (5, kept) twice."""
     kept = reference.shape[-1]
     points = _points(kept)
-    a, b = (torch.fft.rfft(waves - waves.mean(-1, keepdim=True), points) for waves in (reference, processed))
+    a, b = (
+        torch.fft.rfft(waves - waves.mean(-1, keepdim=True), points)
+        for waves in (reference, processed)
+    )
     sums = []
     for response in constant(_responses, points, dtype=reference.dtype, device=reference.device):
         x, y = (torch.fft.irfft(spectrum * response, points)[..., :kept] for spectrum in (a, b))
@@ -205,7 +208,11 @@ def expected_correlation(found: Agreement) -> Tensor:
     plain = xy / norm
     mean = plain * (1.0 + 0.375 * (spread_x + spread_y)) - 0.5 * both * (1.0 / xx + 1.0 / yy)
     product = (variance * (xx2 + yy2) + own) / norm.square()
-    spread = product + 0.25 * plain.square() * (spread_x + spread_y) - plain * both * (1.0 / xx + 1.0 / yy)
+    spread = (
+        product
+        + 0.25 * plain.square() * (spread_x + spread_y)
+        - plain * both * (1.0 / xx + 1.0 / yy)
+    )
     spread = spread.clamp_min(1e-12)
     folded = (2.0 / math.pi * spread).sqrt() * torch.exp(-0.5 * mean.square() / spread)
     return (folded + mean * torch.erf(mean / (2.0 * spread).sqrt())).mean(-1)

@@ -39,7 +39,9 @@ def smoothed(levels: Tensor) -> Tensor:
     """Hann-weighted means. Shape: (channels, time) -> (channels, segments)."""
     count = segments(levels.shape[-1])
     window = constant(_halves, dtype=levels.dtype, device=levels.device)
-    rising, falling = (levels[..., : count * _HALF].unflatten(-1, (count, _HALF)) @ window).unbind(-1)
+    rising, falling = (levels[..., : count * _HALF].unflatten(-1, (count, _HALF)) @ window).unbind(
+        -1
+    )
     inner = 0.5 * (rising[..., 1:-1] + falling[..., 2:])
     return torch.cat((falling[..., :1], inner, rising[..., -1:]), -1)
 

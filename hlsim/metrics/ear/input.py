@@ -43,14 +43,18 @@ def to_ear_rate(signal: Tensor, sample_rate: int) -> Tensor:
     inputs, outputs = kernel.shape
     rows = -(-length // outputs)
     lead = _reach(up, down)
-    padded = functional.pad(signal, (lead, max(0, (rows - 1) * down * periods + inputs - lead - len(signal))))
+    padded = functional.pad(
+        signal, (lead, max(0, (rows - 1) * down * periods + inputs - lead - len(signal)))
+    )
     resampled = (padded.unfold(-1, inputs, down * periods)[:rows] @ kernel).flatten()[:length]
     if sample_rate < RATE:
         powers = (signal.square().mean(), resampled.square().mean())
     else:
         powers = (_power_below(signal, sample_rate), _power_below(resampled, RATE))
     heard = powers[1] > 0.0  # of silence there is no level to match
-    return resampled * torch.where(heard, powers[0] / torch.where(heard, powers[1], 1.0), 1.0).sqrt()
+    return (
+        resampled * torch.where(heard, powers[0] / torch.where(heard, powers[1], 1.0), 1.0).sqrt()
+    )
 
 
 def _reach(up: int, down: int) -> int:
@@ -81,9 +85,9 @@ def _power_below(signal: Tensor, rate: int) -> Tensor:
 
 def _chebyshev(rate: int, points: int) -> NDArray[np.complex128]:
     sections = cheby2(7, 30, 21000.0 / rate, output="sos")
-    response: NDArray[np.complex128] = sosfreqz(sections, 2.0 * np.pi * np.arange(points // 2 + 1) / points)[
-        1
-    ]
+    response: NDArray[np.complex128] = sosfreqz(
+        sections, 2.0 * np.pi * np.arange(points // 2 + 1) / points
+    )[1]
     return response
 
 
@@ -128,4 +132,6 @@ def moved(signal: Tensor, delay: int, part: slice) -> Tensor:
 
 def stacked(signals: Sequence[Tensor], length: int) -> Tensor:
     """Signals of several lengths in one tensor, silent after their ends. Shape: (time,) each -> (items, length)."""
-    return torch.stack([functional.pad(signal, (0, length - signal.shape[-1])) for signal in signals])
+    return torch.stack(
+        [functional.pad(signal, (0, length - signal.shape[-1])) for signal in signals]
+    )

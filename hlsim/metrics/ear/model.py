@@ -26,7 +26,15 @@ from torch.nn import functional
 
 from hlsim.audiogram import FREQUENCIES
 from hlsim.dsp.fft import fft_length
-from hlsim.metrics.ear.recursions import BLOCK, RATE, Recursion, adaptation, gain_lowpass, gammatone, kept
+from hlsim.metrics.ear.recursions import (
+    BLOCK,
+    RATE,
+    Recursion,
+    adaptation,
+    gain_lowpass,
+    gammatone,
+    kept,
+)
 from hlsim.torchtools import constant
 
 CHANNELS = 32
@@ -157,9 +165,14 @@ def channel_chunks(items: int, samples: int, device: torch.device) -> Iterator[s
 
 
 @kept
-def _control_filters(channels: tuple[int, int], device: torch.device, dtype: torch.dtype) -> Recursion:
+def _control_filters(
+    channels: tuple[int, int], device: torch.device, dtype: torch.dtype
+) -> Recursion:
     chosen = slice(*channels)
-    decay = constant(_decay_of_normal, dtype=torch.float64, device=device)[chosen] * _widest(device)[chosen]
+    decay = (
+        constant(_decay_of_normal, dtype=torch.float64, device=device)[chosen]
+        * _widest(device)[chosen]
+    )
     return gammatone(decay, _angles(device)[chosen], _memory(chosen), dtype)
 
 
@@ -224,7 +237,9 @@ class Heard:
     mean_control: Tensor
 
 
-def listen(signal: Tensor, ear: HairCells, channels: slice, extent: Extent, *, motion: bool = False) -> Heard:
+def listen(
+    signal: Tensor, ear: HairCells, channels: slice, extent: Extent, *, motion: bool = False
+) -> Heard:
     """Filter and compress some channels of what the middle ear lets through.
 
     Args:
@@ -243,7 +258,9 @@ def listen(signal: Tensor, ear: HairCells, channels: slice, extent: Extent, *, m
     gain = compression_gain(control, cells)
     compressed = power * gain.square()
     moved = real.flatten(-2) * gain if motion else None
-    means = (extent.mean(power), extent.mean(control)) if motion else (power[..., 0], control[..., 0])
+    means = (
+        (extent.mean(power), extent.mean(control)) if motion else (power[..., 0], control[..., 0])
+    )
     return Heard(compressed, moved, width, *means)
 
 
@@ -265,7 +282,9 @@ def mean_level(heard: Heard, cells: HairCells) -> Tensor:
     """Long-term level over threshold in dB, by the means of envelope and control. Returns (items, channels)."""
     knee = 10.0 ** (cells.knee / 10.0)
     control = torch.maximum(heard.mean_control.double().clamp_max(10.0 ** (_CEILING / 10.0)), knee)
-    gain = -cells.attenuation - (10.0 * torch.log10(control) - cells.knee) * (1.0 - 1.0 / cells.ratio)
+    gain = -cells.attenuation - (10.0 * torch.log10(control) - cells.knee) * (
+        1.0 - 1.0 / cells.ratio
+    )
     level = 10.0 * torch.log10(heard.mean_power.double().clamp_min(1.0))
     return (level + gain - cells.inner).clamp_min(0.0).to(heard.power.dtype)
 
@@ -312,7 +331,9 @@ def channel_lags(reference: Tensor, processed: Tensor, extent: Extent) -> Tensor
         return correlation.argmax(-1) - (most - 1)
 
 
-def shift(signal: Tensor, delays: Tensor, ends: Sequence[int], stops: Sequence[int], size: int) -> Tensor:
+def shift(
+    signal: Tensor, delays: Tensor, ends: Sequence[int], stops: Sequence[int], size: int
+) -> Tensor:
     """Move channels later by whole samples: ``output[t] = signal[t - delay]`` up to the item's stop, 0 elsewhere.
 
     Args:
@@ -333,7 +354,12 @@ class _Shift(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, signal: Tensor, delays: Tensor, ends: tuple[int, ...], stops: tuple[int, ...], size: int
+        ctx: Any,
+        signal: Tensor,
+        delays: Tensor,
+        ends: tuple[int, ...],
+        stops: tuple[int, ...],
+        size: int,
     ) -> Tensor:
         ctx.settings = (delays, ends, stops, signal.shape[-1])
         return _shifted(signal, delays, ends, stops, size)
@@ -398,7 +424,9 @@ def longest_group_delay(signal: Tensor, ear: HairCells, extent: Extent) -> Tenso
 def sensation(power: Tensor, inner: Tensor) -> Tensor:
     """Level over the threshold in dB, 0 or more. Shape: (items, channels, padded), (items or 1, channels) -> as power."""
     floor = 10.0 ** (inner.to(power).unsqueeze(-1) / 10.0)
-    return torch.maximum(power, floor).log() * (10.0 / math.log(10.0)) - inner.to(power).unsqueeze(-1)
+    return torch.maximum(power, floor).log() * (10.0 / math.log(10.0)) - inner.to(power).unsqueeze(
+        -1
+    )
 
 
 def adapted(level: Tensor) -> Tensor:

@@ -111,7 +111,10 @@ def _recursion(a: Array, b: Array, c: Array, d: float, memory: int) -> Recursion
     through = np.where(lag >= 0, impulse[np.maximum(lag, 0)], 0.0)
     inward = np.stack([(powers[BLOCK - 1 - i] @ b)[:, 0] for i in range(BLOCK)])
     outward = np.stack([(c @ powers[i])[0] for i in range(BLOCK)], -1)
-    parts = [torch.from_numpy(np.ascontiguousarray(x)) for x in (through, inward, outward, powers[BLOCK].T)]
+    parts = [
+        torch.from_numpy(np.ascontiguousarray(x))
+        for x in (through, inward, outward, powers[BLOCK].T)
+    ]
     return Recursion(parts[0], parts[1], parts[2], parts[3], memory)
 
 
@@ -202,4 +205,6 @@ def gammatone(decay: Tensor, angle: Tensor, memory: int, dtype: torch.dtype) -> 
     cosine, sine = (whole * wave(BLOCK * angle)[:, None, None] for wave in (torch.cos, torch.sin))
     step = torch.cat((torch.cat((cosine, sine), -1), torch.cat((-sine, cosine), -1)), -2)
     through = through.transpose(-1, -2).flatten(-2)
-    return Recursion(through, torch.cat(inward, -1).to(dtype), outward.to(dtype), step.to(dtype), memory)
+    return Recursion(
+        through, torch.cat(inward, -1).to(dtype), outward.to(dtype), step.to(dtype), memory
+    )

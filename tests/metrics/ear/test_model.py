@@ -25,7 +25,9 @@ def pair(speech_dir: Path) -> tuple[Tensor, Tensor]:
     """0.8 s of speech at 16 kHz between silences, and the same with noise, late, float64."""
     clean = read_audio(speech_dir / "valid" / "flite-rms-01.flac")[0][0, 8000:20800].double()
     clean = torch.cat((torch.zeros(300), clean, torch.zeros(200)))
-    noise = torch.randn(clean.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    noise = torch.randn(
+        clean.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(1)
+    )
     late = torch.cat((torch.zeros(77), clean[:-77]))
     return clean, late + 0.3 * clean.square().mean().sqrt() * noise
 
@@ -47,9 +49,13 @@ def test_rate_and_alignment_are_those_of_pyclarity(pair: tuple[Tensor, Tensor], 
     np.testing.assert_allclose(clean.numpy(), before[0], rtol=0, atol=1e-12)
     expected = eb.input_align(*before)
     part = ear_input.audible_part(clean)
-    delay = ear_input.bulk_delay(ear_input.spectrum_for_alignment(clean), -late)  # the sign does not count
+    delay = ear_input.bulk_delay(
+        ear_input.spectrum_for_alignment(clean), -late
+    )  # the sign does not count
     np.testing.assert_allclose(clean[part].numpy(), expected[0], rtol=0, atol=1e-12)
-    np.testing.assert_allclose(ear_input.moved(late, delay, part).numpy(), expected[1], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(
+        ear_input.moved(late, delay, part).numpy(), expected[1], rtol=0, atol=1e-12
+    )
 
 
 @pytest.mark.parametrize("delay", [-5000, -7, 0, 3, 5000])
@@ -61,7 +67,9 @@ def test_moved_is_a_slice_of_what_is_there(delay: int) -> None:
 
 
 @pytest.mark.parametrize(("dtype", "error"), [(torch.float64, 1e-12), (torch.float32, 1e-6)])
-def test_middle_ear_and_adaptation(pair: tuple[Tensor, Tensor], dtype: torch.dtype, error: float) -> None:
+def test_middle_ear_and_adaptation(
+    pair: tuple[Tensor, Tensor], dtype: torch.dtype, error: float
+) -> None:
     eb = of_clarity()
     signal = blocks(pair[0])
     ours = recursions.middle_ear(CPU, dtype)(signal.to(dtype)).flatten(-2)[0].double().numpy()
@@ -127,12 +135,16 @@ def test_the_ear_as_a_whole(pair: tuple[Tensor, Tensor], name: str) -> None:
     gain = 10.0 ** (SPL / 20.0)
     x, y = (ear_input.stacked([torch.tensor(one)], extent.padded) * gain for one in (clean, late))
     x, y = (recursions.middle_ear(CPU, torch.float64)(one).flatten(-2) for one in (x, y))
-    normal, ours = (ear_model.hair_cells(torch.tensor(a.thresholds)) for a in (Audiogram.standard("NH"), ear))
+    normal, ours = (
+        ear_model.hair_cells(torch.tensor(a.thresholds)) for a in (Audiogram.standard("NH"), ear)
+    )
     latest = ear_model.longest_group_delay(x, normal, extent)
     for chosen in (slice(0, 3), slice(20, 22)):
         a = ear_model.listen(x, normal, chosen, extent, motion=True)
         b = ear_model.listen(y, ours, chosen, extent, motion=True)
-        lags = ear_model.channel_lags(ear_model.lag_spectrum(a.power.sqrt(), extent), b.power.sqrt(), extent)
+        lags = ear_model.channel_lags(
+            ear_model.lag_spectrum(a.power.sqrt(), extent), b.power.sqrt(), extent
+        )
         power = ear_model.shift(b.power, lags, extent.ends, extent.ends, extent.padded)
         delays = latest - ear_model.group_delays(a.bandwidth, chosen)
         pairs = ((a.power, normal, expected[0]), (power, ours, expected[2]))
@@ -150,7 +162,9 @@ def test_frames_and_modulation() -> None:
     random = np.random.RandomState(0)
     levels = np.cumsum(random.standard_normal((32, 9000)), -1)
     extent = ear_model.Extent((9000,))
-    ours = envelopes.frames(torch.tensor(levels)[None], torch.zeros(1, 32, dtype=torch.int64), extent)[0]
+    ours = envelopes.frames(
+        torch.tensor(levels)[None], torch.zeros(1, 32, dtype=torch.int64), extent
+    )[0]
     expected, _ = ebm.env_filter(levels, levels, 320.0, 2560.0, 24000.0)
     np.testing.assert_allclose(ours.numpy(), expected.T, rtol=0, atol=1e-10)
     y = ours + torch.from_numpy(random.standard_normal(ours.shape))
@@ -177,7 +191,9 @@ def test_channels_may_come_in_chunks() -> None:
 def test_expected_noise_adds_what_noise_has_on_average() -> None:
     noise = torch.randn(300, 5, 900, dtype=torch.float64)
     energy = torch.stack([envelopes.agreement(one, one).xx.mean(-1) for one in noise]).mean(0)
-    torch.testing.assert_close(energy, torch.from_numpy(envelopes._noise_energy(900)), rtol=0.05, atol=0.0)
+    torch.testing.assert_close(
+        energy, torch.from_numpy(envelopes._noise_energy(900)), rtol=0.05, atol=0.0
+    )
 
 
 def test_shift_of_several_items_and_its_gradient() -> None:

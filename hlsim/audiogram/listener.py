@@ -38,7 +38,9 @@ class Listener:
     def __post_init__(self) -> None:
         for name in EARS:
             if not isinstance(ear := getattr(self, name), Audiogram | None):
-                raise ValueError(f"the {name} ear is {type(ear).__name__}; allowed: an Audiogram, or None")
+                raise ValueError(
+                    f"the {name} ear is {type(ear).__name__}; allowed: an Audiogram, or None"
+                )
         if self.left is None and self.right is None:
             raise ValueError("a listener without ears; allowed: one Audiogram or two")
 
@@ -63,8 +65,12 @@ class Listener:
     def from_dict(cls, data: Mapping[str, Any]) -> Listener:
         """Raises ValueError unless it has ``left`` and ``right``, each an audiogram's ``to_dict`` or None."""
         if not isinstance(data, Mapping) or set(data) != set(EARS):
-            raise ValueError("no listener; allowed: left and right, each an audiogram's to_dict, or None")
-        return cls(*(None if data[name] is None else Audiogram.from_dict(data[name]) for name in EARS))
+            raise ValueError(
+                "no listener; allowed: left and right, each an audiogram's to_dict, or None"
+            )
+        return cls(
+            *(None if data[name] is None else Audiogram.from_dict(data[name]) for name in EARS)
+        )
 
     def to_rows(self, name: str) -> list[dict[str, str]]:
         """A row an ear of the CSV file that ``read_listeners`` takes, under this name of the listener."""
@@ -114,6 +120,8 @@ def read_listeners(path: str | Path) -> dict[str, Listener]:
                 f"{path}, line {number}: listener {name!r}, ear {given!r}; allowed: a name, left or right"
             )
         if ear in found.setdefault(name, {}):
-            raise ValueError(f"{path}, line {number}: the {ear} ear of {name} is there twice; allowed: once")
+            raise ValueError(
+                f"{path}, line {number}: the {ear} ear of {name} is there twice; allowed: once"
+            )
         found[name][ear] = audiogram
     return {name: Listener(ears.get("left"), ears.get("right")) for name, ears in found.items()}

@@ -12,7 +12,7 @@ from hlsim.audiogram import Audiogram
 from hlsim.dsp.resample import resample
 from hlsim.metrics.ear import clean_speech, fine_structure
 from hlsim.metrics.ear import model as ear_model
-from hlsim.metrics.hasqi import HasqiReference, _moving, _nalr, hasqi
+from hlsim.metrics.hasqi_score import HasqiReference, _moving, _nalr, hasqi
 from hlsim.metrics.pyclarity import numpy_seed
 
 N1, N3, N6 = (Audiogram.standard(name) for name in ("N1", "N3", "N6"))
@@ -21,7 +21,9 @@ N1, N3, N6 = (Audiogram.standard(name) for name in ("N1", "N3", "N6"))
 @pytest.fixture(scope="module")
 def clean(speech_dir: Path) -> Tensor:
     """Two clips of 0.8 s at 16 kHz, 68 dB SPL, (2, time)."""
-    clips = [read_audio(speech_dir / "valid" / f"flite-rms-0{i}.flac")[0][0, 8000:20800] for i in (3, 4)]
+    clips = [
+        read_audio(speech_dir / "valid" / f"flite-rms-0{i}.flac")[0][0, 8000:20800] for i in (3, 4)
+    ]
     return torch.stack(clips)
 
 
@@ -31,7 +33,9 @@ def noisy(clean: Tensor) -> Tensor:
     return clean + 0.3 * noise * clean.square().mean(-1, keepdim=True).sqrt()
 
 
-@pytest.mark.parametrize(("ear", "rate", "gain"), [(N1, 16000, 1.0), (N3, 48000, 5.0), (N3, 44100, 0.5)])
+@pytest.mark.parametrize(
+    ("ear", "rate", "gain"), [(N1, 16000, 1.0), (N3, 48000, 5.0), (N3, 44100, 0.5)]
+)
 def test_equals_pyclarity_under_its_seed(
     clean: Tensor, noisy: Tensor, ear: Audiogram, rate: int, gain: float
 ) -> None:
@@ -66,7 +70,9 @@ def test_segments_stage_by_stage(time: int) -> None:
     y[:, :3000] = x[:, 5:3005]
     y[3] = 0.0
     a, b = torch.from_numpy(x), torch.from_numpy(y)
-    np.testing.assert_allclose(fine_structure.smoothed(a).numpy(), eb.env_smooth(x, 16, 24000.0), rtol=1e-12)
+    np.testing.assert_allclose(
+        fine_structure.smoothed(a).numpy(), eb.env_smooth(x, 16, 24000.0), rtol=1e-12
+    )
     wanted = eb.bm_covary(x, y, 16, 24000.0)
     spectra = fine_structure.segment_spectra(a), fine_structure.segment_spectra(b)
     both = fine_structure.coherence(*spectra)
@@ -89,16 +95,22 @@ def test_motion_where_the_envelopes_shift_leaves_nothing() -> None:
     assert _moving(motion, power, levels, 0.25).tolist() == [1.0, 0.0, pytest.approx(8.0)]
 
 
-def test_a_batch_is_its_items(clean: Tensor, noisy: Tensor, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_batch_is_its_items(
+    clean: Tensor, noisy: Tensor, monkeypatch: pytest.MonkeyPatch
+) -> None:
     x, y, ends, ears = clean.double(), noisy.double(), [12800, 11300], [N1, N3]
     for noise in ("expected", "seeded", "none"):
         alone = [hasqi(y[i, :n], x[i, :n], ears[i], noise=noise) for i, n in enumerate(ends)]
         together = hasqi(y, x, ears, lengths=ends, noise=noise)
         torch.testing.assert_close(together, torch.stack(alone), rtol=0, atol=1e-13)
     assert torch.equal(HasqiReference(x, ears, lengths=ends).score(y, noise="none"), together)
-    monkeypatch.setattr(clean_speech.CleanSpeech, "groups", lambda self: [self.items])  # as on a GPU
+    monkeypatch.setattr(
+        clean_speech.CleanSpeech, "groups", lambda self: [self.items]
+    )  # as on a GPU
     monkeypatch.setattr(ear_model, "_shifted", ear_model._gathered)
-    torch.testing.assert_close(hasqi(y, x, ears, lengths=ends, noise="none"), together, rtol=0, atol=1e-13)
+    torch.testing.assert_close(
+        hasqi(y, x, ears, lengths=ends, noise="none"), together, rtol=0, atol=1e-13
+    )
 
 
 def test_gradient_is_that_of_finite_differences(clean: Tensor, noisy: Tensor) -> None:

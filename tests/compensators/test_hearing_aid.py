@@ -77,7 +77,9 @@ def test_a_streams_sliders_are_checked_and_a_tensor_may_be_written_into() -> Non
     assert torch.equal(kept(signal), same(signal))
     kept.noise_reduction = same.noise_reduction = 0.0  # the ear is asked for again
     assert torch.equal(kept(signal), same(signal))
-    with pytest.raises(AttributeError, match="noise_reducton of a HearingAid's stream; allowed: noise_reduc"):
+    with pytest.raises(
+        AttributeError, match="noise_reducton of a HearingAid's stream; allowed: noise_reduc"
+    ):
         assigned.noise_reducton = 0.0
     with pytest.raises(AttributeError, match="noise_reduction of a WDRC's stream; allowed: "):
         WDRC().stream(EAR).noise_reduction = 0.0
@@ -88,7 +90,9 @@ def test_a_chunk_of_nan_is_refused_and_spoils_nothing_after_it() -> None:
     stream, other, signal = aid.stream(EAR), aid.stream(EAR), torch.randn(500)
     stream(signal), other(signal)
     for spoiled in (float("nan"), float("inf")):
-        with pytest.raises(ValueError, match="chunk holds samples that are NaN or infinite; allowed: finite"):
+        with pytest.raises(
+            ValueError, match="chunk holds samples that are NaN or infinite; allowed: finite"
+        ):
             stream(torch.full((10,), spoiled))
     assert torch.equal(stream(signal), other(signal))
 
@@ -162,7 +166,9 @@ def test_the_one_that_ships_takes_noise_off_and_leaves_tones() -> None:
 
 
 @pytest.mark.parametrize(("name", "within"), [("N2", 2.5), ("N3", 4.9)])
-def test_tones_are_heard_at_nearly_the_level_that_a_normal_ear_hears(name: str, within: float) -> None:
+def test_tones_are_heard_at_nearly_the_level_that_a_normal_ear_hears(
+    name: str, within: float
+) -> None:
     ear, aid = Audiogram.standard(name), load_compensator("hearing-aid")
     found = steady_tones({"aid": aid}, {name: ear}, [65.0])[0]
     off, sidebands = found["heard_off_db"][0], found["sidebands_db"][0]

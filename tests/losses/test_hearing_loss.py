@@ -14,11 +14,11 @@ from torch import Tensor, nn
 from compensators import NALR
 from hlsim import MSBG, Audiogram, HearingLossLoss, NeuroMSBG, load_pretrained
 from hlsim.calibration import set_level
-from hlsim.criteria.bands import band_level_loss
-from hlsim.criteria.coherent_bands import DEFAULT_WEIGHTS as COHERENT_WEIGHTS
-from hlsim.criteria.coherent_bands import coherent_band_parts
-from hlsim.criteria.paper import DEFAULT_WEIGHTS, paper_parts
 from hlsim.dsp.resample import resample
+from hlsim.losses.band_levels import band_level_loss
+from hlsim.losses.coherent_bands import DEFAULT_WEIGHTS as COHERENT_WEIGHTS
+from hlsim.losses.coherent_bands import coherent_band_parts
+from hlsim.losses.paper import DEFAULT_WEIGHTS, paper_parts
 from hlsim.msbg.response import with_phase_of_bank
 from hlsim.pretrained import find_checkpoint
 
@@ -61,7 +61,9 @@ def gradient(
 def same(first: tuple[Tensor, Tensor], second: tuple[Tensor, Tensor]) -> None:
     """Value and gradient of the same computation."""
     torch.testing.assert_close(second[0], first[0], rtol=1e-5, atol=1e-7)
-    torch.testing.assert_close(second[1], first[1], rtol=1e-4, atol=1e-4 * float(first[1].abs().max()))
+    torch.testing.assert_close(
+        second[1], first[1], rtol=1e-4, atol=1e-4 * float(first[1].abs().max())
+    )
 
 
 def alike(first: tuple[Tensor, Tensor], second: tuple[Tensor, Tensor]) -> None:
@@ -114,7 +116,9 @@ def test_a_step_trains_the_compensator_alone(simulator: str, criterion: str, cle
     assert value.shape == ()
     value.backward()
     gradients = [parameter.grad for parameter in host.filter.parameters()]
-    assert all(grad is not None and bool(grad.isfinite().all()) and bool(grad.any()) for grad in gradients)
+    assert all(
+        grad is not None and bool(grad.isfinite().all()) and bool(grad.any()) for grad in gradients
+    )
     optimiser.step()
     assert all(parameter.grad is None for parameter in host.loss.simulator.parameters())
     after = host.loss.simulator.state_dict()
@@ -141,7 +145,9 @@ def test_gradient_is_that_of_the_value(
 
 @both
 @each_criterion
-def test_built_in_inference_mode_it_trains_later(simulator: str, criterion: str, clean: Tensor) -> None:
+def test_built_in_inference_mode_it_trains_later(
+    simulator: str, criterion: str, clean: Tensor
+) -> None:
     expected = HearingLossLoss(N3, simulator=simulator, criterion=criterion)
     with torch.inference_mode():
         loss = HearingLossLoss(N3, simulator=simulator, criterion=criterion)
@@ -191,7 +197,9 @@ def to_meta_and_back(loss: HearingLossLoss) -> nn.Module:
 def made_on_meta(loss: HearingLossLoss) -> nn.Module:
     with torch.device("meta"):
         host = Host(
-            HearingLossLoss(N3, simulator="msbg" if isinstance(loss.simulator, MSBG) else "neuro-msbg")
+            HearingLossLoss(
+                N3, simulator="msbg" if isinstance(loss.simulator, MSBG) else "neuro-msbg"
+            )
         )
     return host.to_empty(device="cpu")
 
@@ -210,7 +218,9 @@ def test_a_host_without_values_leaves_the_simulator_its_own(
 
 @both
 @pytest.mark.parametrize("how", [copy.deepcopy, lambda loss: pickle.loads(pickle.dumps(loss))])
-def test_copies_are_their_own(simulator: str, how: Callable[[nn.Module], Host], clean: Tensor) -> None:
+def test_copies_are_their_own(
+    simulator: str, how: Callable[[nn.Module], Host], clean: Tensor
+) -> None:
     host = Host(HearingLossLoss(N3, simulator=simulator))
     twin = how(host)
     assert twin.loss.simulator is not host.loss.simulator and list(twin.loss.parameters()) == []
@@ -262,7 +272,9 @@ def test_batch_is_the_mean_of_its_items(simulator: str, criterion: str, clean: T
     aided = 3.0 * signals + 1e-4 * torch.randn(signals.shape)
     ears = torch.tensor([ear.thresholds for ear in (N3, S2, N4, Audiogram.standard("NH"))])
     items = [loss(aided[i], signals[i], ears[i]) for i in range(4)]
-    assert float(loss(aided, signals, ears)) == pytest.approx(float(torch.stack(items).mean()), rel=1e-9)
+    assert float(loss(aided, signals, ears)) == pytest.approx(
+        float(torch.stack(items).mean()), rel=1e-9
+    )
     # any leading dimensions
     shape = (2, 2, -1)
     folded = loss(aided.reshape(shape), signals.reshape(shape), ears.reshape(shape))
@@ -307,7 +319,9 @@ def test_items_that_are_as_long_as_the_batch_need_no_lengths(
 @both
 @each_criterion
 @pytest.mark.parametrize("reference", ["clean", "normal-hearing"])
-def test_a_padded_item_is_as_alone(simulator: str, criterion: str, reference: str, clean: Tensor) -> None:
+def test_a_padded_item_is_as_alone(
+    simulator: str, criterion: str, reference: str, clean: Tensor
+) -> None:
     loss = HearingLossLoss(
         simulator=simulator, criterion=criterion, reference=reference, reduction="none"
     ).double()
@@ -324,7 +338,9 @@ def test_a_padded_item_is_as_alone(simulator: str, criterion: str, reference: st
 
 @both
 @each_criterion
-def test_what_follows_the_end_counts_for_nothing(simulator: str, criterion: str, clean: Tensor) -> None:
+def test_what_follows_the_end_counts_for_nothing(
+    simulator: str, criterion: str, clean: Tensor
+) -> None:
     loss = HearingLossLoss([N3, S2], simulator=simulator, criterion=criterion)
     lengths = [4800, 3000]
     after = torch.zeros_like(clean)
@@ -340,13 +356,17 @@ def test_what_follows_the_end_counts_for_nothing(simulator: str, criterion: str,
 @each_criterion
 def test_a_value_for_each_item(simulator: str, criterion: str, clean: Tensor) -> None:
     mean = HearingLossLoss([N3, S2], simulator=simulator, criterion=criterion)
-    each = HearingLossLoss([N3, S2], simulator=mean.simulator, criterion=criterion, reduction="none")
+    each = HearingLossLoss(
+        [N3, S2], simulator=mean.simulator, criterion=criterion, reduction="none"
+    )
     for lengths in (None, [1, 4800]):
         values = each(3.0 * clean, clean, lengths=lengths)
         assert values.shape == (2,) and values[0] != values[1]
         torch.testing.assert_close(values.mean(), mean(3.0 * clean, clean, lengths=lengths))
         parts = each.parts(3.0 * clean, clean, lengths=lengths)
-        torch.testing.assert_close(sum(each.weights[name] * part for name, part in parts.items()), values)
+        torch.testing.assert_close(
+            sum(each.weights[name] * part for name, part in parts.items()), values
+        )
     # one clip in two ears, and leading dimensions of two
     assert each(clean[0], clean[0], lengths=4000).shape == (2,)
     assert each(clean[:, None], clean[:, None], N3, lengths=[[4800], [99]]).shape == (2, 1)
@@ -384,7 +404,9 @@ def test_parts_and_weights_make_the_value(
 ) -> None:
     loss = HearingLossLoss(N3, simulator=simulator, criterion=criterion, reference=reference)
     parts = loss.parts(2.0 * clean, clean)
-    default = {"paper": DEFAULT_WEIGHTS, "bands": {"band_levels": 1.0}}.get(criterion, COHERENT_WEIGHTS)
+    default = {"paper": DEFAULT_WEIGHTS, "bands": {"band_levels": 1.0}}.get(
+        criterion, COHERENT_WEIGHTS
+    )
     assert set(parts) == set(default)
     assert all(part.shape == () and float(part) >= 0.0 for part in parts.values())
     total = sum(default[name] * part for name, part in parts.items())
@@ -427,7 +449,9 @@ def test_what_is_heard_is_compared_with_the_reference(simulator: str, clean: Ten
 @each_criterion
 def test_a_normal_ear_loses_nothing(simulator: str, criterion: str, clean: Tensor) -> None:
     normal = Audiogram.standard("NH")
-    loss = HearingLossLoss(normal, simulator=simulator, criterion=criterion, reference="normal-hearing")
+    loss = HearingLossLoss(
+        normal, simulator=simulator, criterion=criterion, reference="normal-hearing"
+    )
     # the default's normal ear is a filter, which is the exact model's to 69 dB, the network's to 55 dB
     assert float(loss(clean, clean)) < (1e-3 if criterion == "coherent-bands" else 1e-5)
     # 0 dB HL is where MSBG is linear: a gain is heard as it is
@@ -477,7 +501,9 @@ def test_a_module_of_ones_own_is_compared_as_it_is(clean: Tensor) -> None:
 
 @both
 @each_criterion
-def test_a_prescribed_gain_is_better_than_none(simulator: str, criterion: str, clean: Tensor) -> None:
+def test_a_prescribed_gain_is_better_than_none(
+    simulator: str, criterion: str, clean: Tensor
+) -> None:
     loss = HearingLossLoss(N4, simulator=simulator, criterion=criterion, reference="normal-hearing")
     assert float(loss(20.0 * clean, clean)) < float(loss(clean, clean))
     _, slope = gradient(loss, clean, clean)
@@ -502,7 +528,9 @@ def test_full_scale_is_a_unit(simulator: str, criterion: str, clean: Tensor) -> 
     # in double precision, for the phase of what is next to silent hangs on single precision's last bits
     clean = clean.double()
     pascals = HearingLossLoss(N3, simulator=simulator, criterion=criterion).double()
-    other = HearingLossLoss(N3, simulator=simulator, criterion=criterion, full_scale_spl=114.0).double()
+    other = HearingLossLoss(
+        N3, simulator=simulator, criterion=criterion, full_scale_spl=114.0
+    ).double()
     assert float(other(0.2 * clean, 0.1 * clean)) == pytest.approx(
         float(pascals(2.0 * clean, clean)), rel=1e-6
     )
@@ -555,7 +583,9 @@ def test_a_wrapped_neuro_msbg_judges_the_same_band(
     model = load_pretrained("neuro-msbg", sample_rate=44100)
     faster = resample(clean, 16000, 44100)
     expected = HearingLossLoss(N3, simulator=model, sample_rate=44100).parts(3.0 * faster, faster)
-    found = HearingLossLoss(N3, simulator=wrap(model), sample_rate=44100).parts(3.0 * faster, faster)
+    found = HearingLossLoss(N3, simulator=wrap(model), sample_rate=44100).parts(
+        3.0 * faster, faster
+    )
     for name, part in expected.items():
         assert float(found[name]) == pytest.approx(float(part), rel=1e-3), name
 
@@ -673,7 +703,10 @@ def test_simulator_by_folder_and_as_a_module(clean: Tensor) -> None:
         ({"criterion": {}}, r"criterion is \{\}; allowed: coherent-bands"),
         ({"criterion": {"l1": 1.0}}, r"criterion is \{'l1': 1.0\}; allowed: coherent-bands"),
         ({"criterion": {"bands": -1.0}}, "'bands': -1.0.*allowed: finite numbers, 0 or more"),
-        ({"criterion": {"bands": 0.0}}, "count nothing; allowed: one above 0 at least, of coherent-bands"),
+        (
+            {"criterion": {"bands": 0.0}},
+            "count nothing; allowed: one above 0 at least, of coherent-bands",
+        ),
         ({"normal": "N0"}, r"normal is str; allowed: a module or callable"),
         ({"weights": 1.0}, "weights is float; allowed: numbers by name"),
         ({"weights": [1, 2]}, "weights is list; allowed: numbers by name"),
@@ -686,7 +719,10 @@ def test_simulator_by_folder_and_as_a_module(clean: Tensor) -> None:
             {"criterion": "paper", "weights": {"magnitude": "a"}},
             "'magnitude': 'a'.*allowed: finite numbers, 0 or more",
         ),
-        ({"criterion": "paper", "weights": {"magnitude": True}}, "allowed: finite numbers, 0 or more"),
+        (
+            {"criterion": "paper", "weights": {"magnitude": True}},
+            "allowed: finite numbers, 0 or more",
+        ),
         ({"reference": "noisy"}, "reference 'noisy'; allowed: clean, normal-hearing"),
         ({"reduction": "sum"}, "reduction 'sum'; allowed: mean, none"),
         ({"reduction": None}, "reduction None; allowed: mean, none"),
@@ -699,18 +735,33 @@ def test_simulator_by_folder_and_as_a_module(clean: Tensor) -> None:
             {"weights": {"pitch": 1.0}},
             "pitch .*'coherent-bands'; allowed: incoherence, misalignment, levels, louder, peaks",
         ),
-        ({"criterion": "bands", "weights": {"phase": 1.0}}, "phase .*'bands'; allowed: band_levels"),
+        (
+            {"criterion": "bands", "weights": {"phase": 1.0}},
+            "phase .*'bands'; allowed: band_levels",
+        ),
         ({"criterion": "paper", "weights": {"time": -1.0}}, "allowed: finite numbers, 0 or more"),
-        ({"criterion": "paper", "weights": {"time": float("nan")}}, "allowed: finite numbers, 0 or more"),
-        ({"criterion": "paper", "weights": {}}, "count nothing; allowed: one above 0 at least, of magnitude"),
+        (
+            {"criterion": "paper", "weights": {"time": float("nan")}},
+            "allowed: finite numbers, 0 or more",
+        ),
+        (
+            {"criterion": "paper", "weights": {}},
+            "count nothing; allowed: one above 0 at least, of magnitude",
+        ),
         (
             {"simulator": MSBG(sample_rate=16000, aligned=False)},
             r"allowed: one that does not, as MSBG\(aligned=True\)",
         ),
         ({"audiogram": Audiogram.standard("N7")}, "takes -10 to 100"),
         ({"audiogram": torch.zeros(7)}, "allowed: .*8"),
-        ({"simulator": MSBG()}, "simulator has sample_rate 44100 and the loss 16000; allowed: the same"),
-        ({"simulator": MSBG(sample_rate=16000, full_scale_spl=120)}, "simulator has full_scale_spl 120"),
+        (
+            {"simulator": MSBG()},
+            "simulator has sample_rate 44100 and the loss 16000; allowed: the same",
+        ),
+        (
+            {"simulator": MSBG(sample_rate=16000, full_scale_spl=120)},
+            "simulator has full_scale_spl 120",
+        ),
     ],
 )
 def test_what_cannot_be_built(options: dict[str, object], message: str) -> None:
@@ -754,7 +805,10 @@ def test_simulator_must_keep_the_length() -> None:
 @pytest.mark.parametrize(
     ("returned", "message"),
     [
-        (lambda wave: (wave, wave), r"returned is tuple; allowed: a floating-point tensor \(\.\.\., time\)"),
+        (
+            lambda wave: (wave, wave),
+            r"returned is tuple; allowed: a floating-point tensor \(\.\.\., time\)",
+        ),
         (lambda wave: None, "returned is NoneType; allowed"),
         (lambda wave: wave.cfloat(), "returned is torch.complex64; allowed"),
         (lambda wave: wave.mean(), r"returned has shape \(\); allowed"),
@@ -762,7 +816,10 @@ def test_simulator_must_keep_the_length() -> None:
             lambda wave: wave.mean(0),
             r"made shape \(4000,\) of \(2, 4000\); allowed: one that keeps the shape",
         ),
-        (lambda wave: wave.mean(-1), r"made shape \(2,\) of \(2, 4000\); allowed: one that keeps the shape"),
+        (
+            lambda wave: wave.mean(-1),
+            r"made shape \(2,\) of \(2, 4000\); allowed: one that keeps the shape",
+        ),
         (lambda wave: wave.expand(2, 2, -1), r"made shape \(2, 2, 4000\) of \(2, 4000\); allowed"),
     ],
 )
@@ -791,7 +848,9 @@ def test_own_simulator_may_broadcast_with_the_ears(heard: tuple[int, ...]) -> No
 @each_criterion
 def test_clean_speech_on_another_device_is_named(criterion: str) -> None:
     loss, wave = HearingLossLoss(N3, criterion=criterion), torch.randn(4000)
-    with pytest.raises(ValueError, match="compensated is on cpu and clean on meta; allowed: the same device"):
+    with pytest.raises(
+        ValueError, match="compensated is on cpu and clean on meta; allowed: the same device"
+    ):
         loss(wave, wave.to("meta"))
 
 
@@ -821,11 +880,15 @@ def test_import_and_simulator_leave_the_compiler_alone() -> None:
 
 
 def test_one_ear_an_item_never_becomes_every_ear_for_every_item() -> None:
-    loss, ears = HearingLossLoss(simulator="msbg"), [Audiogram.standard("N2"), Audiogram.standard("N4")]
+    loss, ears = (
+        HearingLossLoss(simulator="msbg"),
+        [Audiogram.standard("N2"), Audiogram.standard("N4")],
+    )
     speech = 0.03 * torch.randn(2, 1, 2000)
     many = speech.unsqueeze(1).expand(2, 3, 1, 2000)
     with pytest.raises(
-        ValueError, match=r"pair each item of .* with each ear; allowed: .*one an item: \(2, 3, 1, 8\)"
+        ValueError,
+        match=r"pair each item of .* with each ear; allowed: .*one an item: \(2, 3, 1, 8\)",
     ):
         loss(many, many, ears)
     levels = torch.tensor([ear.thresholds for ear in ears])
@@ -848,7 +911,10 @@ def test_several_criteria_of_one_hearing(clean: Tensor) -> None:
             return 0.5 * waveform
 
     loss = HearingLossLoss(
-        N3, simulator=Counted(), criterion={"bands": 0.1, "paper": 2.0}, normal=lambda waveform: waveform
+        N3,
+        simulator=Counted(),
+        criterion={"bands": 0.1, "paper": 2.0},
+        normal=lambda waveform: waveform,
     )
     value = loss(2.1 * clean, clean)
     assert len(calls) == 1
@@ -856,7 +922,9 @@ def test_several_criteria_of_one_hearing(clean: Tensor) -> None:
         HearingLossLoss(N3, simulator=Counted(), criterion=name, normal=lambda waveform: waveform)
         for name in ("bands", "paper")
     ]
-    torch.testing.assert_close(value, 0.1 * alone[0](2.1 * clean, clean) + 2.0 * alone[1](2.1 * clean, clean))
+    torch.testing.assert_close(
+        value, 0.1 * alone[0](2.1 * clean, clean) + 2.0 * alone[1](2.1 * clean, clean)
+    )
     assert set(loss.weights) == set(loss.parts(clean, clean)) == {"band_levels", *DEFAULT_WEIGHTS}
 
 
@@ -867,7 +935,9 @@ def test_a_criterion_of_ones_own_gets_what_heard_gives(simulator: str, clean: Te
         return (heard - reference).square().mean(-1)
 
     for options in ({}, {"reference": "clean"}, {"full_scale_spl": 100.0}):
-        loss = HearingLossLoss([N3, S2], simulator=simulator, criterion=own, reduction="none", **options)
+        loss = HearingLossLoss(
+            [N3, S2], simulator=simulator, criterion=own, reduction="none", **options
+        )
         given = (3.0 * clean).requires_grad_()
         heard, reference = loss.heard(given, clean)
         assert heard.shape == reference.shape == clean.shape and not reference.requires_grad
@@ -878,7 +948,9 @@ def test_a_criterion_of_ones_own_gets_what_heard_gives(simulator: str, clean: Te
         heard, reference = loss.heard(given, clean, lengths=lengths)
         assert not bool(heard[1, 3000:].any()) and not bool(reference[1, 3000:].any())
         scale = torch.tensor([1.0, 4800 / 3000])
-        torch.testing.assert_close(own(heard, reference) * scale, loss(given, clean, lengths=lengths))
+        torch.testing.assert_close(
+            own(heard, reference) * scale, loss(given, clean, lengths=lengths)
+        )
     assert tuple(loss.parts(clean, clean)) == tuple(loss.weights) == ("criterion",)
 
 
@@ -893,7 +965,9 @@ def test_the_default_compares_what_heard_gives(clean: Tensor) -> None:
 @pytest.mark.parametrize("returned", [torch.zeros(()), torch.zeros(3), 0.5])
 def test_a_criterion_that_gives_no_value_an_item(returned: object, clean: Tensor) -> None:
     loss = HearingLossLoss(N3, criterion=lambda heard, reference: returned)
-    with pytest.raises(ValueError, match=r"criterion returned .* for 2 items; .*\(2,\); .* loss.heard"):
+    with pytest.raises(
+        ValueError, match=r"criterion returned .* for 2 items; .*\(2,\); .* loss.heard"
+    ):
         loss(clean, clean)
 
 
@@ -919,7 +993,11 @@ class DeadRegion(nn.Module):
 @pytest.mark.parametrize("criterion", ["coherent-bands", "bands"])
 def test_a_listener_is_more_than_an_audiogram(criterion: str, clean: Tensor) -> None:
     loss = HearingLossLoss(
-        N3, simulator=DeadRegion(), criterion=criterion, reduction="none", normal=lambda waveform: waveform
+        N3,
+        simulator=DeadRegion(),
+        criterion=criterion,
+        reduction="none",
+        normal=lambda waveform: waveform,
     )
     whole = {"edge": torch.tensor([1e5, 1e5])}
     assert loss(clean, clean, listener=whole).tolist() == pytest.approx([0.0, 0.0], abs=1e-4)
@@ -937,7 +1015,9 @@ def test_a_simulator_brings_its_normal_ear(clean: Tensor) -> None:
             return low(waveform, thresholds, torch.tensor(2000.0))
 
     # asked itself, it takes the speech over 2 kHz off the reference, too
-    assert float(HearingLossLoss(N3, simulator=Dull())(clean, clean)) == pytest.approx(0.0, abs=1e-6)
+    assert float(HearingLossLoss(N3, simulator=Dull())(clean, clean)) == pytest.approx(
+        0.0, abs=1e-6
+    )
     ear = nn.Conv1d(1, 1, 1)
     loss = HearingLossLoss(N3, simulator=Dull(), normal=nn.Identity())
     assert float(loss(clean, clean)) > 0.1
@@ -969,7 +1049,9 @@ def at_snr(clean: Tensor, snr: float) -> Tensor:
 @both
 @pytest.mark.parametrize("ear", ["N2", "N4", "S2"])
 @pytest.mark.parametrize("gain", [0.0, 0.5, 1.0])
-def test_less_noise_is_nearer_however_soft(simulator: str, ear: str, gain: float, clean: Tensor) -> None:
+def test_less_noise_is_nearer_however_soft(
+    simulator: str, ear: str, gain: float, clean: Tensor
+) -> None:
     """Unaided, too, where noise fills the bands that are too soft."""
     audiogram = Audiogram.standard(ear)
     prescription = NALR(audiogram)
@@ -983,13 +1065,16 @@ def test_less_noise_is_nearer_however_soft(simulator: str, ear: str, gain: float
 
 @both
 @pytest.mark.parametrize("ear", ["N1", "N3", "S2"])
-def test_sign_and_a_millisecond_cost_less_than_noise(simulator: str, ear: str, clean: Tensor) -> None:
+def test_sign_and_a_millisecond_cost_less_than_noise(
+    simulator: str, ear: str, clean: Tensor
+) -> None:
     audiogram = Audiogram.standard(ear)
     loss = HearingLossLoss(audiogram, simulator=simulator)
     longer = nn.functional.pad(clean, (200, 200))
     aided = NALR(audiogram)
     noise, sign, delayed = (
-        float(loss(aided(given), longer)) for given in (at_snr(longer, 20.0), -longer, longer.roll(16, -1))
+        float(loss(aided(given), longer))
+        for given in (at_snr(longer, 20.0), -longer, longer.roll(16, -1))
     )
     assert max(sign, delayed) < noise
 
@@ -997,7 +1082,9 @@ def test_sign_and_a_millisecond_cost_less_than_noise(simulator: str, ear: str, c
 def test_ears_and_levels_count_alike(clean: Tensor) -> None:
     """The gradient on eight band gains, from no gain."""
     hz = torch.fft.rfftfreq(clean.shape[-1], 1.0 / 16000)
-    bands = torch.bucketize(hz, torch.tensor([354.0, 707.0, 1414.0, 2449.0, 3464.0, 4899.0, 6928.0]))
+    bands = torch.bucketize(
+        hz, torch.tensor([354.0, 707.0, 1414.0, 2449.0, 3464.0, 4899.0, 6928.0])
+    )
     slopes = []
     for ear, spl in [(f"N{i}", 65.0) for i in range(1, 6)] + [("N3", 50.0), ("N3", 80.0)]:
         gains = torch.zeros(8, requires_grad=True)
@@ -1019,7 +1106,9 @@ def test_the_gradient_is_zero_only_where_the_reference_is(simulator: str, clean:
 
 
 @both
-def test_no_sample_takes_the_gradient_over(simulator: str, speech: list[tuple[Tensor, int]]) -> None:
+def test_no_sample_takes_the_gradient_over(
+    simulator: str, speech: list[tuple[Tensor, int]]
+) -> None:
     clean = torch.cat([waveform[:, 8000:24000] for waveform, _ in speech[:2]])
     for ear in ("N1", "N3", "N4"):
         loss = HearingLossLoss(Audiogram.standard(ear), simulator=simulator)
@@ -1034,7 +1123,9 @@ def test_transforms_work_or_say_so(clean: Tensor) -> None:
     given = 3.0 * clean
     for loss in (exact, network):
         _, slope = gradient(loss, given, clean)
-        torch.testing.assert_close(torch.func.grad(lambda wave, loss=loss: loss(wave, clean))(given), slope)
+        torch.testing.assert_close(
+            torch.func.grad(lambda wave, loss=loss: loss(wave, clean))(given), slope
+        )
     each = torch.stack([exact(one, true) for one, true in zip(given, clean, strict=True)])
     torch.testing.assert_close(torch.vmap(exact)(given, clean), each, rtol=1e-4, atol=1e-5)
     _, by_clean = gradient(lambda true, wave: exact(wave, true), clean, given)
@@ -1043,7 +1134,8 @@ def test_transforms_work_or_say_so(clean: Tensor) -> None:
     along = torch.func.jvp(lambda wave: exact(wave, clean), (given,), (clean,))[1]
     assert bool(along.isfinite())
     with pytest.raises(
-        ValueError, match=r"NeuroMSBG does not go through this transform of torch.func; allowed: grad"
+        ValueError,
+        match=r"NeuroMSBG does not go through this transform of torch.func; allowed: grad",
     ):
         torch.vmap(network)(given, clean)
     with pytest.raises(ValueError, match="HearingLossLoss is for training, and not exported"):

@@ -1,7 +1,7 @@
 """Whether what is heard follows, band by band, what a normal ear hears, and has its level: the default criterion.
 
-Both are cut into 24 ERB-wide bands (``hlsim.criteria.bands``) and overlapping stretches of 96 ms. With ``H`` and ``R``
-the spectra of what the impaired and the normal ear hear, in frames of 32 ms, each band and stretch has
+Both are cut into 24 ERB-wide bands (``hlsim.losses.band_levels``) and overlapping stretches of 96 ms. With ``H`` and
+``R`` the spectra of what the impaired and the normal ear hear, in frames of 32 ms, each band and stretch has
 
 - ``incoherence``, ``1 - (sum |mean H R*|)^2 / (sum mean |H|^2 * sum mean |R|^2)``, the means over the stretch's frames,
   the sums over the band's frequencies. It is 0 where what is heard is the reference times any gain and any fixed phase,
@@ -29,12 +29,18 @@ from torch import Tensor
 from torch.nn import functional
 
 from hlsim.calibration import PASCAL_SPL
-from hlsim.criteria.bands import FRAME_SECONDS, band_shares, threshold_in_quiet
 from hlsim.dsp.fft import power
 from hlsim.dsp.stft import STFT
+from hlsim.losses.band_levels import FRAME_SECONDS, band_shares, threshold_in_quiet
 from hlsim.torchtools import constant
 
-DEFAULT_WEIGHTS = {"incoherence": 1.0, "misalignment": 0.03, "levels": 0.03, "louder": 0.03, "peaks": 1.0}
+DEFAULT_WEIGHTS = {
+    "incoherence": 1.0,
+    "misalignment": 0.03,
+    "levels": 0.03,
+    "louder": 0.03,
+    "peaks": 1.0,
+}
 """What follows nothing costs 1, what is heard 40 dB too softly 0.48, and 40 dB too loud some 1.6."""
 
 DEPTH = 41.0
@@ -87,7 +93,9 @@ def coherent_band_parts(heard: Tensor, normal: Tensor, sample_rate: int) -> dict
     product = (level + LOWEST_POWER) * truth + _TINY
 
     quiet = constant(_quiet_power, dtype=heard.dtype, device=heard.device)
-    least = torch.maximum(quiet, 10.0 ** (-DEPTH / 10.0) * truth.detach().amax((-2, -1), keepdim=True))
+    least = torch.maximum(
+        quiet, 10.0 ** (-DEPTH / 10.0) * truth.detach().amax((-2, -1), keepdim=True)
+    )
     weights, own_weights = _audibility(truth, least), _audibility(level, least)
     total = weights.sum((-2, -1)).clamp_min(_LEAST_WEIGHT)
     error = (_decibels(level) - _decibels(truth)).abs()
@@ -96,7 +104,10 @@ def coherent_band_parts(heard: Tensor, normal: Tensor, sample_rate: int) -> dict
         "incoherence": (weights * (1.0 - common.square() / product)).sum((-2, -1)) / total,
         "misalignment": (
             weights
-            * ((common.square() - aligned.square()) / product + _SIGN * (common - aligned) / product.sqrt())
+            * (
+                (common.square() - aligned.square()) / product
+                + _SIGN * (common - aligned) / product.sqrt()
+            )
         ).sum((-2, -1))
         / total,
         "levels": (weights * (KNEE * torch.log1p(error / KNEE))).sum((-2, -1)) / total,
@@ -160,7 +171,9 @@ class _WithoutSpikes(torch.autograd.Function):
             functional.pad(factor, (1, 0), value=1.0), functional.pad(factor, (0, 1), value=1.0)
         )
         ramp = torch.arange(ctx.block, device=gradient.device) / ctx.block
-        factors = torch.lerp(edges[..., :-1, None], edges[..., 1:, None], ramp.to(edges)).flatten(-2)
+        factors = torch.lerp(edges[..., :-1, None], edges[..., 1:, None], ramp.to(edges)).flatten(
+            -2
+        )
         return gradient * factors[..., :time], None
 
 

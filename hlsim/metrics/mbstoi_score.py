@@ -27,7 +27,11 @@ from hlsim.dsp.fft import power, rfft
 from hlsim.torchtools import constant_like
 
 _RATE = 10000  # Hz that the measure works at
-_FRAME, _HOP, _POINTS = 256, 128, 512  # samples of a frame, from frame to frame, and of its transform
+_FRAME, _HOP, _POINTS = (
+    256,
+    128,
+    512,
+)  # samples of a frame, from frame to frame, and of its transform
 _SEGMENT = 30  # frames that are correlated, 0.4 s
 _BANDS, _LOWEST_CENTRE = 15, 150.0  # one-third octaves, and the lowest one's centre in Hz
 _RANGE_DB = 40.0  # below the loudest frame, under which clean speech counts as silent
@@ -108,7 +112,9 @@ def _check(processed: Tensor, clean: Tensor) -> None:
             f"processed has shape {tuple(processed.shape)}, clean {tuple(clean.shape)}; allowed: equal shapes"
         )
     if processed.device != clean.device:
-        raise ValueError(f"processed is on {processed.device}, clean on {clean.device}; allowed: one device")
+        raise ValueError(
+            f"processed is on {processed.device}, clean on {clean.device}; allowed: one device"
+        )
     if not bool(clean.detach().flatten(-2).any(-1).all()):
         raise ValueError("clean is silent, every sample of an item is zero")
 
@@ -130,9 +136,13 @@ def _without_silence(signals: list[Tensor]) -> tuple[Tensor, Tensor]:
         and how many frames there are of each item, (items,).
     """
     # the reference leaves out a frame that ends with the signal
-    frames_of = torch.tensor([max(0, (signal.shape[-1] - 1 - _FRAME) // _HOP + 1) for signal in signals])
+    frames_of = torch.tensor(
+        [max(0, (signal.shape[-1] - 1 - _FRAME) // _HOP + 1) for signal in signals]
+    )
     padded = max(_FRAME, *(signal.shape[-1] - 1 for signal in signals))
-    rows = torch.stack([functional.pad(signal, (0, padded - signal.shape[-1])) for signal in signals])
+    rows = torch.stack(
+        [functional.pad(signal, (0, padded - signal.shape[-1])) for signal in signals]
+    )
     window = constant_like(rows, _window)
     frames = rows.unfold(-1, _FRAME, _HOP) * window
     there = torch.arange(frames.shape[2], device=rows.device) < frames_of.to(rows.device)[:, None]
@@ -150,7 +160,9 @@ def _without_silence(signals: list[Tensor]) -> tuple[Tensor, Tensor]:
     order = (~active).byte().argsort(dim=-1, stable=True)[:, :longest]
     used = torch.arange(longest, device=rows.device) < count[:, None]
     kept = frames.take_along_dim(order[:, None, :, None], 2) * used[:, None, :, None]
-    hops = functional.pad(kept[..., :_HOP], (0, 0, 0, 1)) + functional.pad(kept[..., _HOP:], (0, 0, 1, 0))
+    hops = functional.pad(kept[..., :_HOP], (0, 0, 0, 1)) + functional.pad(
+        kept[..., _HOP:], (0, 0, 1, 0)
+    )
     return torch.cat([hops[..., :-1, :], hops[..., 1:, :]], -1) * window, count
 
 
@@ -215,7 +227,10 @@ def _best(clean: Tensor, given: Tensor, grid: Tensor) -> tuple[Tensor, Tensor]:
 
     Shape: (segments, bands, pairs) twice, (bands, pairs, grid) -> (segments, bands) twice.
     """
-    found = [(clean[:, band] @ pairs).div_(given[:, band] @ pairs).max(-1) for band, pairs in enumerate(grid)]
+    found = [
+        (clean[:, band] @ pairs).div_(given[:, band] @ pairs).max(-1)
+        for band, pairs in enumerate(grid)
+    ]
     gain, place = (torch.stack(part, -1) for part in zip(*found, strict=True))
     return place, gain
 

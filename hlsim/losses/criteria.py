@@ -6,7 +6,7 @@ from typing import Any, Literal
 from torch import Tensor
 
 from hlsim.checks import is_finite
-from hlsim.criteria import coherent_bands, paper
+from hlsim.losses import coherent_bands, paper
 
 CriterionName = Literal["coherent-bands", "bands", "paper", "haspi", "hasqi", "interaural"]
 
@@ -28,7 +28,9 @@ Criterion = CriterionName | Mapping[str, float] | Callable[[Tensor, Tensor], Ten
 def check_values(values: Any, items: int) -> Tensor:
     """What a callable criterion returned, or ValueError unless it is a value for each item."""
     if not isinstance(values, Tensor) or values.shape != (items,):
-        found = f"shape {tuple(values.shape)}" if isinstance(values, Tensor) else type(values).__name__
+        found = (
+            f"shape {tuple(values.shape)}" if isinstance(values, Tensor) else type(values).__name__
+        )
         raise ValueError(
             f"the criterion returned {found} for {items} items; allowed: a value for each, ({items},); one that gives "
             "a mean goes on what loss.heard(...) returns"
@@ -58,7 +60,9 @@ def check_weights(
         weights = {part: CRITERIA.get(name, {name: 1.0})[part] for part, name in of.items()}
     if not isinstance(weights, Mapping):
         allowed = {part: 1.0 for part in of}
-        raise ValueError(f"weights is {type(weights).__name__}; allowed: numbers by name, as {allowed}")
+        raise ValueError(
+            f"weights is {type(weights).__name__}; allowed: numbers by name, as {allowed}"
+        )
     if unknown := sorted(map(str, set(weights) - set(of))):
         raise ValueError(
             f"unknown weights {', '.join(unknown)} for criterion {criterion!r}; allowed: {', '.join(of)}"
@@ -68,7 +72,9 @@ def check_weights(
     return {part: weight * scales[of[part]] for part, weight in checked.items()}
 
 
-def _check_numbers(weights: Mapping[str, float], what: str, allowed: Any = CRITERIA) -> dict[str, float]:
+def _check_numbers(
+    weights: Mapping[str, float], what: str, allowed: Any = CRITERIA
+) -> dict[str, float]:
     if not all(is_finite(weight) and weight >= 0.0 for weight in weights.values()):
         raise ValueError(f"{what} {dict(weights)}; allowed: finite numbers, 0 or more")
     checked = {name: float(weight) for name, weight in weights.items()}

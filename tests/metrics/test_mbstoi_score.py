@@ -28,7 +28,10 @@ def scenes(speech_dir: Path) -> tuple[Tensor, Tensor]:
     assert spec is not None and spec.loader is not None
     example = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(example)
-    voices = [read_audio(speech_dir / "valid" / f"flite-rms-0{i}.flac")[0][0, 8000:32000] for i in (1, 2, 3)]
+    voices = [
+        read_audio(speech_dir / "valid" / f"flite-rms-0{i}.flac")[0][0, 8000:32000]
+        for i in (1, 2, 3)
+    ]
     other, rate = read_audio(speech_dir / "valid" / "espeak-us-annie-01.flac")
     hisses = torch.randn(2, 24000, generator=torch.Generator().manual_seed(0))
     noises = [hisses[0], resample(other[0], rate, 16000)[4000:28000], hisses[1]]
@@ -57,7 +60,9 @@ def test_equals_pyclarity(scenes: tuple[Tensor, Tensor], rate: int) -> None:
 
 
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
-@pytest.mark.parametrize("case", ["clean pauses", "one ear pauses", "deaf in one ear", "nothing", "shortest"])
+@pytest.mark.parametrize(
+    "case", ["clean pauses", "one ear pauses", "deaf in one ear", "nothing", "shortest"]
+)
 def test_equals_pyclarity_of_silence(scenes: tuple[Tensor, Tensor], case: str) -> None:
     x, y = (signal[1].clone() for signal in scenes)
     if case == "clean pauses":
@@ -79,9 +84,12 @@ def test_batch_equals_its_items(scenes: tuple[Tensor, Tensor]) -> None:
     scores = mbstoi(noisy, clean)
     assert scores.shape == (2, 3)
     one_by_one = [
-        [mbstoi(y, x) for y, x in zip(*rows, strict=True)] for rows in zip(noisy, clean, strict=True)
+        [mbstoi(y, x) for y, x in zip(*rows, strict=True)]
+        for rows in zip(noisy, clean, strict=True)
     ]
-    torch.testing.assert_close(scores, torch.tensor(one_by_one, dtype=torch.float64), atol=1e-12, rtol=0.0)
+    torch.testing.assert_close(
+        scores, torch.tensor(one_by_one, dtype=torch.float64), atol=1e-12, rtol=0.0
+    )
     assert torch.equal(scores, mbstoi(noisy, clean))
 
 
@@ -90,11 +98,16 @@ def test_padded_items_equal_their_own(scenes: tuple[Tensor, Tensor]) -> None:
     ends = (24000, 17011, 12000)
     given, reference = (
         torch.stack(
-            [functional.pad(row[:, :end], (0, 24000 - end)) for row, end in zip(rows, ends, strict=True)]
+            [
+                functional.pad(row[:, :end], (0, 24000 - end))
+                for row, end in zip(rows, ends, strict=True)
+            ]
         )
         for rows in (noisy, clean)
     )
-    alone = [float(mbstoi(y[:, :end], x[:, :end])) for y, x, end in zip(noisy, clean, ends, strict=True)]
+    alone = [
+        float(mbstoi(y[:, :end], x[:, :end])) for y, x, end in zip(noisy, clean, ends, strict=True)
+    ]
     assert mbstoi(given, reference, lengths=ends).tolist() == pytest.approx(alone, abs=1e-12)
 
 
@@ -123,7 +136,7 @@ def test_blocks_do_not_change_the_score(
 ) -> None:
     clean, noisy = scenes
     whole = mbstoi(noisy, clean)
-    monkeypatch.setattr(sys.modules["hlsim.metrics.mbstoi"], "_TOGETHER_CPU", 7 * 4000)
+    monkeypatch.setattr(sys.modules["hlsim.metrics.mbstoi_score"], "_TOGETHER_CPU", 7 * 4000)
     torch.testing.assert_close(mbstoi(noisy, clean), whole, atol=1e-12, rtol=0.0)
 
 
@@ -134,7 +147,9 @@ def test_gradient_is_that_of_differences(scenes: tuple[Tensor, Tensor]) -> None:
     assert given.grad is not None
     way = torch.randn_like(noisy) * noisy.std()
     step = 1e-7
-    difference = (mbstoi(noisy + step * way, clean) - mbstoi(noisy - step * way, clean)) / (2.0 * step)
+    difference = (mbstoi(noisy + step * way, clean) - mbstoi(noisy - step * way, clean)) / (
+        2.0 * step
+    )
     assert float((given.grad * way).sum()) == pytest.approx(float(difference), rel=1e-3)
 
 
@@ -169,13 +184,22 @@ def test_silence_has_a_finite_gradient(scenes: tuple[Tensor, Tensor]) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"processed": torch.zeros(16000), "clean": torch.zeros(16000)}, "the left and the right ear"),
+        (
+            {"processed": torch.zeros(16000), "clean": torch.zeros(16000)},
+            "the left and the right ear",
+        ),
         ({"clean": torch.ones(3, 16000)}, "the left and the right ear"),
         ({"clean": torch.ones(2, 12000)}, "equal shapes"),
-        ({"processed": torch.full((2, 16000), math.nan)}, "processed holds samples that are NaN or infinite"),
+        (
+            {"processed": torch.full((2, 16000), math.nan)},
+            "processed holds samples that are NaN or infinite",
+        ),
         ({"clean": torch.zeros(2, 16000)}, "clean is silent"),
         ({"processed": torch.ones(2, 16000, dtype=torch.int16)}, "floating-point"),
-        ({"processed": torch.randn(2, 6000), "clean": torch.randn(2, 6000)}, "allowed: 0.41 s or more"),
+        (
+            {"processed": torch.randn(2, 6000), "clean": torch.randn(2, 6000)},
+            "allowed: 0.41 s or more",
+        ),
         ({"processed": torch.randn(2, 9), "clean": torch.randn(2, 9)}, "0 s of speech"),
         ({"sample_rate": 8000}, "16000 to 48000"),
         ({"lengths": [16000, 16000]}, "lengths of shape"),

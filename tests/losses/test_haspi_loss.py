@@ -18,7 +18,9 @@ TIME = 12000
 @pytest.fixture
 def clean(speech: list[tuple[Tensor, int]]) -> Tensor:
     """0.75 s of two voices at 65 dB SPL. Shape: (2, time)."""
-    return set_level(torch.cat([waveform[:, 10000 : 10000 + TIME] for waveform, _ in speech[:2]]), 65.0)
+    return set_level(
+        torch.cat([waveform[:, 10000 : 10000 + TIME] for waveform, _ in speech[:2]]), 65.0
+    )
 
 
 def at_snr(clean: Tensor, snr: float) -> Tensor:
@@ -34,7 +36,9 @@ def test_it_is_1_less_the_scores_beside_the_level(clean: Tensor) -> None:
     torch.testing.assert_close(parts["haspi"], 1.0 - haspi(given, clean, N3))
     torch.testing.assert_close(parts["hasqi"], 1.0 - hasqi(given, clean, N3))
     expected = parts["haspi"] + 0.5 * parts["hasqi"]
-    expected = expected + sum(loss.weights[name] * parts[name] for name in ("levels", "louder", "peaks"))
+    expected = expected + sum(
+        loss.weights[name] * parts[name] for name in ("levels", "louder", "peaks")
+    )
     torch.testing.assert_close(loss(given, clean), expected)
     assert set(HASPILoss(N3, level=0.0).weights) == {"haspi"}
     torch.testing.assert_close(
@@ -45,7 +49,9 @@ def test_it_is_1_less_the_scores_beside_the_level(clean: Tensor) -> None:
 def test_haspi_joins_other_criteria(clean: Tensor) -> None:
     given = NALR(N3)(at_snr(clean, 5.0))
     loss = HearingLossLoss(N3, criterion={"coherent-bands": 1.0, "haspi": 0.3}, reduction="none")
-    expected = HearingLossLoss(N3, reduction="none")(given, clean) + 0.3 * (1.0 - haspi(given, clean, N3))
+    expected = HearingLossLoss(N3, reduction="none")(given, clean) + 0.3 * (
+        1.0 - haspi(given, clean, N3)
+    )
     torch.testing.assert_close(loss(given, clean), expected)
 
 
@@ -93,7 +99,9 @@ def test_what_it_does_not_take_is_refused(clean: Tensor) -> None:
     loss = HASPILoss(N3)
     with pytest.raises(ValueError, match=r"clean, item 0 lasts 0.5 s; HASPI needs 0.7 s or more"):
         loss(clean[:, :8000], clean[:, :8000])
-    with pytest.raises(ValueError, match=r"haspi goes through no transform of torch.func; allowed: backward"):
+    with pytest.raises(
+        ValueError, match=r"haspi goes through no transform of torch.func; allowed: backward"
+    ):
         torch.func.grad(loss)(clean, clean)
 
 
@@ -116,7 +124,10 @@ def test_a_host_does_not_know_what_is_frozen(clean: Tensor) -> None:
 
 
 def test_hard_inputs_give_finite_values_and_gradients(clean: Tensor) -> None:
-    silence, square = torch.zeros(TIME), 30.0 * torch.sign(torch.sin(torch.arange(TIME) * 0.3 + 0.1))
+    silence, square = (
+        torch.zeros(TIME),
+        30.0 * torch.sign(torch.sin(torch.arange(TIME) * 0.3 + 0.1)),
+    )
     truth = torch.stack((silence, clean[0], silence, clean[0], clean[0], square))
     given = torch.stack(
         (silence, silence, clean[0], 1e-9 * clean[0], 1e4 * clean[0], square)
@@ -136,7 +147,9 @@ def test_nan_stays(clean: Tensor) -> None:
 def test_ears_and_levels_count_alike(clean: Tensor) -> None:
     """The gradient on eight band gains, from no gain: HASPI's own is 500 times as large in one ear as in another."""
     hz = torch.fft.rfftfreq(TIME, 1.0 / 16000)
-    bands = torch.bucketize(hz, torch.tensor([354.0, 707.0, 1414.0, 2449.0, 3464.0, 4899.0, 6928.0]))
+    bands = torch.bucketize(
+        hz, torch.tensor([354.0, 707.0, 1414.0, 2449.0, 3464.0, 4899.0, 6928.0])
+    )
     slopes, loss = [], HASPILoss()
     for ear, spl in [(f"N{i}", 65.0) for i in range(1, 6)] + [("N3", 50.0), ("N3", 80.0)]:
         gains = torch.zeros(8, requires_grad=True)

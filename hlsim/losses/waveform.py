@@ -3,8 +3,8 @@
 import torch
 from torch import Tensor
 
-from hlsim.criteria.paper import PAPER_STFT
 from hlsim.dsp.fft import power
+from hlsim.losses.paper import PAPER_STFT
 
 _TINY = 1e-12
 _SILENT = 1e-20

@@ -44,7 +44,9 @@ def band_levels(waveform: Tensor, sample_rate: int) -> Tensor:
     spectrum = stft.analyse(waveform.reshape(-1, waveform.shape[-1]))
     # both halves of the spectrum; the squares of a Hann window of n samples sum to 3 n / 8
     powers = power(spectrum) * (2.0 / (stft.fft * 0.375 * stft.window))
-    powers = powers @ constant(band_shares, stft.fft, sample_rate, dtype=powers.dtype, device=powers.device)
+    powers = powers @ constant(
+        band_shares, stft.fft, sample_rate, dtype=powers.dtype, device=powers.device
+    )
     levels = 10.0 * torch.log10(powers + LOWEST_POWER) + PASCAL_SPL
     return levels.reshape(*waveform.shape[:-1], *levels.shape[-2:])
 
@@ -106,7 +108,9 @@ def band_shares(fft: int, sample_rate: int) -> NDArray[np.float64]:
     spacing = sample_rate / fft
     centre = np.arange(fft // 2 + 1)[:, None] * spacing
     edges = band_edges()
-    overlap = np.minimum(edges[1:], centre + spacing / 2) - np.maximum(edges[:-1], centre - spacing / 2)
+    overlap = np.minimum(edges[1:], centre + spacing / 2) - np.maximum(
+        edges[:-1], centre - spacing / 2
+    )
     return np.clip(overlap / spacing, 0.0, None)
 
 
@@ -114,5 +118,7 @@ def band_shares(fft: int, sample_rate: int) -> NDArray[np.float64]:
 def threshold_in_quiet() -> NDArray[np.float64]:
     """Threshold of a normal ear at the middle of each band in dB SPL (Terhardt 1979, Equation 1). Returns (24,)."""
     khz = band_centres() / 1000.0
-    quiet: NDArray[np.float64] = 3.64 * khz**-0.8 - 6.5 * np.exp(-0.6 * (khz - 3.3) ** 2) + 1e-3 * khz**4
+    quiet: NDArray[np.float64] = (
+        3.64 * khz**-0.8 - 6.5 * np.exp(-0.6 * (khz - 3.3) ** 2) + 1e-3 * khz**4
+    )
     return quiet

@@ -18,11 +18,18 @@ from hlsim.audiogram.thresholds import (
     own_thresholds,
 )
 from hlsim.calibration import PASCAL_SPL, check_full_scale, gain_to_pascals
-from hlsim.checks import Lengths, check_choice, check_lengths, check_rate, check_waveform, silent_after
-from hlsim.criteria import coherent_bands, paper
-from hlsim.criteria.bands import band_level_loss
-from hlsim.criteria.choice import Criterion, check_criterion, check_values, check_weights
-from hlsim.hearing import FrozenEar, Hearing, ReferenceName, move
+from hlsim.checks import (
+    Lengths,
+    check_choice,
+    check_lengths,
+    check_rate,
+    check_waveform,
+    silent_after,
+)
+from hlsim.losses import coherent_bands, paper
+from hlsim.losses.band_levels import band_level_loss
+from hlsim.losses.criteria import Criterion, check_criterion, check_values, check_weights
+from hlsim.losses.frozen_simulator import FrozenEar, Hearing, ReferenceName, move
 from hlsim.metrics.interaural import interaural_loss
 from hlsim.metrics.objective import SCORES, missing_score
 from hlsim.neuro.config import NEURO_RATE
@@ -69,8 +76,8 @@ class HearingLossLoss(nn.Module):
             could be nearer than the speech; with ``normal``, or a module that neither is nor holds one of hlsim's
             simulators, it is compared as it is. The other criteria always compare with what a normal ear hears.
         criterion: ``"coherent-bands"``, whether bands follow the reference and have its level
-            (``hlsim.criteria.coherent_bands``); ``"bands"``, levels in bands alone; ``"paper"``, Equations 2 to 9 of
-            Neuro-MSBG, not balanced between ears and levels (``hlsim.criteria.paper``); ``"haspi"`` and ``"hasqi"``, 1
+            (``hlsim.losses.coherent_bands``); ``"bands"``, levels in bands alone; ``"paper"``, Equations 2 to 9 of
+            Neuro-MSBG, not balanced between ears and levels (``hlsim.losses.paper``); ``"haspi"`` and ``"hasqi"``, 1
             less the score of what the ear is given (``hlsim.metrics.objective``), which say nothing of its level and go
             beside another, ``{"coherent-bands": 1.0, "haspi": 0.3}``, as does ``"interaural"``, how far the differences
             between a listener's ears are from the clean speech's (``hlsim.metrics.interaural``); several by name, of one
@@ -115,7 +122,9 @@ class HearingLossLoss(nn.Module):
         self._two_ears = of_listeners(audiogram)
         self.criteria = check_criterion(criterion)
         self.weights = check_weights(weights, self.criteria, criterion)
-        with torch.device("cpu"):  # where the host is made on ``meta``, nobody gives the ear its values later
+        with torch.device(
+            "cpu"
+        ):  # where the host is made on ``meta``, nobody gives the ear its values later
             thresholds = own_thresholds(audiogram, missing=True)
         self._ear = FrozenEar(simulator, self.sample_rate, self.full_scale_spl, normal, reference)
         # in a tuple, nn.Module does not see them
@@ -215,7 +224,11 @@ class HearingLossLoss(nn.Module):
                 given = coherent_bands.without_spikes(given, self.sample_rate)
             heard = self._ear.hear(given, ears, listener, ends)
             batch, time = heard.shape[:-1], heard.shape[-1]
-            signals = {"heard": heard, "given": given.expand_as(heard), "output": output.expand_as(heard)}
+            signals = {
+                "heard": heard,
+                "given": given.expand_as(heard),
+                "output": output.expand_as(heard),
+            }
             for name in [name for name in self.criteria if name not in _GIVEN]:
                 signals[name] = self._ear.reference(name, clean, ears, batch, listener, ends)
             gain = gain_to_pascals(self.full_scale_spl)
@@ -224,14 +237,20 @@ class HearingLossLoss(nn.Module):
                 items = self._compare(signals)
             else:
                 each = [
-                    self._compare({name: signal[item, None, :end] for name, signal in signals.items()})
+                    self._compare(
+                        {name: signal[item, None, :end] for name, signal in signals.items()}
+                    )
                     for item, end in enumerate(ends.expand(batch).flatten().tolist())
                 ]
                 items = {name: torch.cat([own[name] for own in each]) for name in each[0]}
             for name in [name for name in self.criteria if name in SCORES]:
                 pair = (signals["given"], clean.expand_as(heard).reshape(-1, time) * gain)
                 each_ear = ears.expand(*batch, -1).reshape(-1, len(FREQUENCIES))
-                each_end = [time] * len(each_ear) if ends is None else ends.expand(batch).flatten().tolist()
+                each_end = (
+                    [time] * len(each_ear)
+                    if ends is None
+                    else ends.expand(batch).flatten().tolist()
+                )
                 items[name] = missing_score(name, *pair, each_ear, each_end, self.sample_rate)
             if "interaural" in self.criteria:
                 left_right = [one.expand_as(heard) * gain for one in (given, clean)]
@@ -262,7 +281,9 @@ class HearingLossLoss(nn.Module):
         given, clean, ears, ends, _ = self._check(compensated, clean, audiogram, lengths)
         with torch.autocast(given.device.type, enabled=False):
             heard = self._ear.hear(given, ears, listener, ends)
-            reference = self._ear.reference("criterion", clean, ears, heard.shape[:-1], listener, ends)
+            reference = self._ear.reference(
+                "criterion", clean, ears, heard.shape[:-1], listener, ends
+            )
             if ends is not None:
                 heard, reference = silent_after(heard, ends), silent_after(reference, ends)
             gain = gain_to_pascals(self.full_scale_spl)
@@ -275,7 +296,11 @@ class HearingLossLoss(nn.Module):
         )
 
     def _check(
-        self, compensated: Tensor, clean: Tensor, audiogram: AudiogramLike | None, lengths: Lengths | None
+        self,
+        compensated: Tensor,
+        clean: Tensor,
+        audiogram: AudiogramLike | None,
+        lengths: Lengths | None,
     ) -> tuple[Tensor, Tensor, Tensor, Tensor | None, Tensor | None]:
         """The speech in one precision and silent after its end, the ears' thresholds, where each item ends, and which
         ears are known, None where all are; an unknown one is a normal one that is given silence."""
@@ -301,7 +326,9 @@ class HearingLossLoss(nn.Module):
         if ears is None:
             raise ValueError("no audiogram: give one when building the loss or with the call")
         ears = one_an_item(ears, shape)
-        dtype = torch.promote_types(torch.promote_types(compensated.dtype, clean.dtype), torch.float32)
+        dtype = torch.promote_types(
+            torch.promote_types(compensated.dtype, clean.dtype), torch.float32
+        )
         compensated, clean = compensated.to(dtype), clean.to(dtype)
         if ends is not None:
             compensated, clean = silent_after(compensated, ends), silent_after(clean, ends)
@@ -309,7 +336,9 @@ class HearingLossLoss(nn.Module):
         known = ears.isfinite().all(-1)
         if bool(known.all()):
             return compensated, clean, ears, ends, None
-        compensated, clean = (torch.where(known.unsqueeze(-1), one, 0.0) for one in (compensated, clean))
+        compensated, clean = (
+            torch.where(known.unsqueeze(-1), one, 0.0) for one in (compensated, clean)
+        )
         return compensated, clean, ears.nan_to_num(), ends, known
 
     def _reduced(self, parts: dict[str, Tensor], known: Tensor | None) -> dict[str, Tensor]:
@@ -326,7 +355,11 @@ class HearingLossLoss(nn.Module):
             return {name: part[known].mean() for name, part in parts.items()}
         elif known is not None:
             parts = {name: torch.where(known, part, torch.nan) for name, part in parts.items()}
-        return parts if self.reduction == "none" else {name: part.mean() for name, part in parts.items()}
+        return (
+            parts
+            if self.reduction == "none"
+            else {name: part.mean() for name, part in parts.items()}
+        )
 
     def _compare(self, signals: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """The parts of each item. Shape: (items, time) each, in pascals -> (items,) each."""

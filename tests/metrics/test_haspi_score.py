@@ -15,8 +15,8 @@ from hlsim.dsp.resample import resample
 from hlsim.metrics import pyclarity as reference
 from hlsim.metrics.ear import clean_speech
 from hlsim.metrics.ear import model as ear_model
-from hlsim.metrics.haspi import HaspiReference, generator_after, haspi
-from hlsim.metrics.hasqi import HasqiReference
+from hlsim.metrics.haspi_score import HaspiReference, generator_after, haspi
+from hlsim.metrics.hasqi_score import HasqiReference
 
 N2, N3, N6 = (Audiogram.standard(name) for name in ("N2", "N3", "N6"))
 
@@ -24,7 +24,9 @@ N2, N3, N6 = (Audiogram.standard(name) for name in ("N2", "N3", "N6"))
 @pytest.fixture(scope="module")
 def clean(speech_dir: Path) -> Tensor:
     """Two clips of 1 s at 16 kHz, 68 dB SPL, (2, time)."""
-    clips = [read_audio(speech_dir / "valid" / f"flite-rms-0{i}.flac")[0][0, 8000:24000] for i in (1, 2)]
+    clips = [
+        read_audio(speech_dir / "valid" / f"flite-rms-0{i}.flac")[0][0, 8000:24000] for i in (1, 2)
+    ]
     return torch.stack(clips)
 
 
@@ -46,7 +48,11 @@ def amplified(signal: Tensor, gains_db: Tensor) -> Tensor:
 CASES: dict[str, tuple[Audiogram, int, Callable[[Tensor], Tensor]]] = {
     "noisy": (N2, 16000, lambda signal: signal),
     "amplified, 48 kHz": (N3, 48000, lambda signal: 10.0 * signal),
-    "clipped, 44.1 kHz": (Audiogram.standard("S2"), 44100, lambda signal: signal.clamp(-0.02, 0.02)),
+    "clipped, 44.1 kHz": (
+        Audiogram.standard("S2"),
+        44100,
+        lambda signal: signal.clamp(-0.02, 0.02),
+    ),
     "nearly inaudible": (Audiogram.standard("N5"), 24000, lambda signal: 0.3 * signal),
 }
 
@@ -59,7 +65,9 @@ def test_equals_pyclarity_under_its_seed(clean: Tensor, noisy: Tensor, case: str
     y = change(y)
     expected = reference.pyclarity_score("haspi", x, y, ear, rate, seed=7)
     settings = {"sample_rate": rate, "noise": "seeded", "seed": 7, "whole_khz": True}
-    assert float(haspi(y.double(), x.double(), ear, **settings)) == pytest.approx(expected, abs=1e-7)
+    assert float(haspi(y.double(), x.double(), ear, **settings)) == pytest.approx(
+        expected, abs=1e-7
+    )
     assert float(haspi(y, x, ear, **settings)) == pytest.approx(expected, abs=1e-4)
 
 
@@ -74,7 +82,9 @@ def test_full_scale_is_pyclaritys_level1(clean: Tensor, noisy: Tensor) -> None:
 
 def test_odd_rates_are_taken_as_they_are_unless_asked(clean: Tensor, noisy: Tensor) -> None:
     x, y = (resample(signal[0], 16000, 44100).double() for signal in (clean, noisy))
-    exact, rounded = (float(haspi(y, x, N2, sample_rate=44100, whole_khz=whole)) for whole in (False, True))
+    exact, rounded = (
+        float(haspi(y, x, N2, sample_rate=44100, whole_khz=whole)) for whole in (False, True)
+    )
     low = float(haspi(noisy[0].double(), clean[0].double(), N2))
     assert abs(exact - low) < abs(rounded - low)
 
@@ -82,7 +92,10 @@ def test_odd_rates_are_taken_as_they_are_unless_asked(clean: Tensor, noisy: Tens
 def test_a_batch_is_its_items(clean: Tensor, noisy: Tensor) -> None:
     short = [16000, 12345]
     x, y = clean.double(), noisy.double()
-    alone = [haspi(y[i, :n], x[i, :n], ear) for i, (n, ear) in enumerate(zip(short, (N2, N3), strict=True))]
+    alone = [
+        haspi(y[i, :n], x[i, :n], ear)
+        for i, (n, ear) in enumerate(zip(short, (N2, N3), strict=True))
+    ]
     padded = torch.where(torch.arange(16000) < torch.tensor(short)[:, None], y, 0.7)
     ears = torch.tensor([N2.levels, N3.levels], dtype=torch.float64)
     for given in ([N2, N3], ears):
@@ -139,7 +152,9 @@ def test_autocast_changes_nothing(clean: Tensor, noisy: Tensor) -> None:
 def test_the_generator_skips_what_is_not_needed(count: int) -> None:
     random = np.random.RandomState(11)
     random.standard_normal(count)
-    np.testing.assert_array_equal(generator_after(11, count).standard_normal(5), random.standard_normal(5))
+    np.testing.assert_array_equal(
+        generator_after(11, count).standard_normal(5), random.standard_normal(5)
+    )
 
 
 @pytest.mark.parametrize(("ear", "gain"), [(N2, 1.0), (N3, 3.0)])
@@ -205,7 +220,10 @@ def test_ascent_on_gains_raises_pyclaritys_score(clean: Tensor, noisy: Tensor) -
         (-prepared.score(amplified(noisy[0], gains), N3)).backward()
         climb.step()
     after = amplified(noisy[0], gains.detach())
-    scores = [reference.pyclarity_score("haspi", clean[0], signal, N3, 16000) for signal in (noisy[0], after)]
+    scores = [
+        reference.pyclarity_score("haspi", clean[0], signal, N3, 16000)
+        for signal in (noisy[0], after)
+    ]
     assert scores[1] > scores[0] + 0.05
 
 
@@ -213,7 +231,9 @@ def test_ascent_on_gains_raises_pyclaritys_score(clean: Tensor, noisy: Tensor) -
 
 
 def test_less_noise_is_better(clean: Tensor) -> None:
-    noise = torch.randn(clean.shape[-1], generator=torch.Generator().manual_seed(2)) * clean[0].std()
+    noise = (
+        torch.randn(clean.shape[-1], generator=torch.Generator().manual_seed(2)) * clean[0].std()
+    )
     scores = [float(haspi(clean[0] + gain * noise, clean[0], N2)) for gain in (3.0, 1.0, 0.3, 0.0)]
     assert scores == sorted(scores)
 
@@ -222,7 +242,9 @@ def test_a_delay_does_not_count(clean: Tensor, noisy: Tensor) -> None:
     x, y = (functional.pad(signal[0].double(), (0, 2000)) for signal in (clean, noisy))
     scores = [float(haspi(y.roll(delay), x, N2)) for delay in (0, 100, 800)]
     assert scores[1] == pytest.approx(scores[2], abs=1e-9)
-    assert scores[0] == pytest.approx(scores[2], abs=1e-3)  # its first samples are not there any more
+    assert scores[0] == pytest.approx(
+        scores[2], abs=1e-3
+    )  # its first samples are not there any more
 
 
 @pytest.mark.parametrize(
@@ -253,4 +275,6 @@ def test_refusals(clean: Tensor, change: dict[str, object], message: str) -> Non
     if "clean" in change and "processed" not in change:
         settings["processed"] = settings["clean"]
     with pytest.raises(ValueError, match=message):
-        haspi(settings.pop("processed"), settings.pop("clean"), settings.pop("audiogram"), **settings)
+        haspi(
+            settings.pop("processed"), settings.pop("clean"), settings.pop("audiogram"), **settings
+        )

@@ -12,8 +12,8 @@ from torch import Tensor
 
 from compensators import NALR, WDRC, load_compensator
 from hlsim import MSBG, Audiogram, HASPILoss, HearingLossLoss, Listener, load_pretrained
+from hlsim.audiogram.listener import read_listeners
 from hlsim.calibration import set_level
-from hlsim.listener import read_listeners
 from hlsim.metrics import haspi, hasqi
 
 LEFT, RIGHT = Audiogram.standard("N2"), Audiogram.standard("N4")
@@ -32,19 +32,25 @@ def scene(speech: list[tuple[Tensor, int]]) -> Tensor:
     return torch.cat([set_level(one[:, 8000:24000], 65.0) for one, _ in speech[:2]])
 
 
-@pytest.mark.parametrize("name", ["msbg", "neuro-msbg", "nalr", "wdrc", "hearing-aid", "compensator-general"])
+@pytest.mark.parametrize(
+    "name", ["msbg", "neuro-msbg", "nalr", "wdrc", "hearing-aid", "compensator-general"]
+)
 def test_both_ears_in_one_call_are_each_ear_alone(name: str, scene: Tensor) -> None:
     made: dict[str, Any] = {
         "msbg": lambda: MSBG(sample_rate=16000),
         "nalr": lambda: NALR(sample_rate=16000),
         "wdrc": WDRC,
     }
-    make = made.get(name, lambda: (load_pretrained if name == "neuro-msbg" else load_compensator)(name))
+    make = made.get(
+        name, lambda: (load_pretrained if name == "neuro-msbg" else load_compensator)(name)
+    )
     module = make()
     with torch.no_grad():
         both = module(scene, BOTH)
         for channel, ear in enumerate((LEFT, RIGHT)):
-            torch.testing.assert_close(both[channel], module(scene[channel], ear), rtol=1e-4, atol=1e-6)
+            torch.testing.assert_close(
+                both[channel], module(scene[channel], ear), rtol=1e-4, atol=1e-6
+            )
         swapped = module(scene.flip(0), Listener(RIGHT, LEFT))
         torch.testing.assert_close(swapped.flip(0), both, rtol=1e-4, atol=1e-6)
         items = module(torch.stack((scene, scene.flip(0))), [BOTH, Listener(RIGHT, LEFT)])
@@ -58,7 +64,10 @@ def test_both_ears_in_one_call_are_each_ear_alone(name: str, scene: Tensor) -> N
 def test_the_loss_is_the_mean_over_both_ears_and_reaches_both(kind: Any, scene: Tensor) -> None:
     loss, given = kind(), (0.5 * scene).requires_grad_()
     value = loss(given[None], scene[None], BOTH)
-    alone = [loss(given[i : i + 1], scene[i : i + 1], ear).detach() for i, ear in enumerate((LEFT, RIGHT))]
+    alone = [
+        loss(given[i : i + 1], scene[i : i + 1], ear).detach()
+        for i, ear in enumerate((LEFT, RIGHT))
+    ]
     assert float(value.detach()) == pytest.approx(float(sum(alone)) / 2.0, rel=1e-4)
     value.backward()
     assert given.grad is not None and bool(given.grad.isfinite().all())
@@ -81,7 +90,9 @@ def test_the_better_ear_counts_more_and_both_have_a_gradient(scene: Tensor) -> N
     torch.testing.assert_close(value, (shares * each).sum(-1))
     assert bool((each.amin(-1) < value).all()) and bool((value < each.mean(-1)).all())
     torch.testing.assert_close(value[0], value[1], rtol=1e-4, atol=0)
-    gradient, alone = (torch.autograd.grad(one.sum(), given, retain_graph=True)[0] for one in (value, each))
+    gradient, alone = (
+        torch.autograd.grad(one.sum(), given, retain_graph=True)[0] for one in (value, each)
+    )
     assert bool((gradient.abs().amax(-1) > 0.0).all())
     torch.testing.assert_close(gradient, shares.unsqueeze(-1) * alone)
     with pytest.raises(ValueError, match=r"two ears; allowed: \(\.\.\., 2, time\)"):
@@ -103,7 +114,9 @@ def test_the_loss_leaves_a_missing_ear_out(kind: Any, scene: Tensor) -> None:
     assert [bool(row.any()) for row in given.grad[1]] == [False, True]
     each = kind(reduction="none")(given, scenes, [BOTH, one]).detach()
     assert each.isnan().tolist() == [[False, False], [True, False]]
-    assert float(loss(given, scenes, [BOTH, one]).detach()) == pytest.approx(float(each.nanmean()), rel=1e-5)
+    assert float(loss(given, scenes, [BOTH, one]).detach()) == pytest.approx(
+        float(each.nanmean()), rel=1e-5
+    )
     better = kind(one, ears="better")(given[1], scene)
     assert float(better.detach()) == pytest.approx(alone, rel=1e-4)
 
@@ -134,7 +147,9 @@ def test_the_better_ears_metric_leaves_a_missing_ear_out(scene: Tensor) -> None:
     scores += [haspi(given[1, 1].double(), scene[1].double(), RIGHT, seed=1, **options)]
     assert float(metric.compute()) == pytest.approx(float(sum(scores)) / 2.0, abs=1e-5)
     assert metric.count_ears.tolist() == [1, 2] and int(metric.failed) == 0
-    with pytest.raises(ValueError, match=r"audiogram of shape \(2, 2, 8\); allowed: \(2, 8\) or \(1, 2, 8\)"):
+    with pytest.raises(
+        ValueError, match=r"audiogram of shape \(2, 2, 8\); allowed: \(2, 8\) or \(1, 2, 8\)"
+    ):
         metric.update(given[:1], scene[None], [BOTH, BOTH])
 
 
@@ -186,9 +201,12 @@ def test_bad_listeners(tmp_path: Path, scene: Tensor) -> None:
         with pytest.raises(ValueError, match="allowed"):
             Listener.from_dict(bad)  # type: ignore[arg-type]
     with pytest.raises(
-        ValueError, match="json without audiogram_levels_r; needs audiogram_cfs, audiogram_levels_l, "
+        ValueError,
+        match="json without audiogram_levels_r; needs audiogram_cfs, audiogram_levels_l, ",
     ):
-        Listener.from_clarity({key: value for key, value in ENTRY.items() if key != "audiogram_levels_r"})
+        Listener.from_clarity(
+            {key: value for key, value in ENTRY.items() if key != "audiogram_levels_r"}
+        )
     for name, text in (
         ("a.json", "{"),
         ("b.json", "[]"),

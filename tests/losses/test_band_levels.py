@@ -10,7 +10,8 @@ from scipy.signal import get_window
 from torch import Tensor
 
 from hlsim.calibration import set_level
-from hlsim.criteria.bands import (
+from hlsim.dsp.resample import resample
+from hlsim.losses.band_levels import (
     BANDS,
     DEPTH,
     audibility,
@@ -20,7 +21,6 @@ from hlsim.criteria.bands import (
     least_audible,
     threshold_in_quiet,
 )
-from hlsim.dsp.resample import resample
 
 RATE = 16000
 
@@ -28,7 +28,9 @@ RATE = 16000
 @pytest.fixture
 def voice(speech: list[tuple[Tensor, int]]) -> Tensor:
     """A second of two voices at 65 dB SPL, float64. Shape: (2, time)."""
-    return set_level(torch.cat([waveform[:, 8000:24000] for waveform, _ in speech[:2]]).double(), 65.0)
+    return set_level(
+        torch.cat([waveform[:, 8000:24000] for waveform, _ in speech[:2]]).double(), 65.0
+    )
 
 
 def loss(heard: Tensor, normal: Tensor) -> list[float]:
@@ -42,11 +44,17 @@ def tone(frequency: float, spl: float, rate: int = RATE) -> Tensor:
 
 def test_bands_are_equally_wide_on_the_erb_number_scale() -> None:
     edges = band_edges()
-    assert edges[0] == pytest.approx(80.0) and edges[-1] == pytest.approx(7500.0) and len(edges) == BANDS + 1
+    assert (
+        edges[0] == pytest.approx(80.0)
+        and edges[-1] == pytest.approx(7500.0)
+        and len(edges) == BANDS + 1
+    )
     # an ERB of 24.7 (4.37 f / kHz + 1) Hz, integrated over each band
     for low, high in pairwise(edges):
         hz = np.linspace(low, high, 2001)
-        assert np.trapezoid(1.0 / (24.7 * (4.37e-3 * hz + 1.0)), hz) == pytest.approx(1.24, rel=0.01)
+        assert np.trapezoid(1.0 / (24.7 * (4.37e-3 * hz + 1.0)), hz) == pytest.approx(
+            1.24, rel=0.01
+        )
 
 
 def test_levels_against_numpy(voice: Tensor) -> None:
@@ -93,7 +101,16 @@ def test_leading_dimensions_and_silence() -> None:
 
 def test_thresholds_in_quiet_are_like_iso_389_7() -> None:
     # free field, in dB SPL
-    standard = {125: 22.1, 250: 11.4, 500: 4.4, 1000: 2.4, 2000: -1.3, 3000: -5.8, 4000: -5.4, 6000: 4.3}
+    standard = {
+        125: 22.1,
+        250: 11.4,
+        500: 4.4,
+        1000: 2.4,
+        2000: -1.3,
+        3000: -5.8,
+        4000: -5.4,
+        6000: 4.3,
+    }
     edges = band_edges()
     own = np.interp(list(standard), np.sqrt(edges[1:] * edges[:-1]), threshold_in_quiet())
     np.testing.assert_allclose(own, list(standard.values()), atol=6.0)
@@ -108,7 +125,11 @@ def test_audibility_rises_from_the_threshold_or_the_depth_under_the_loudest() ->
     assert least[0, 0, 1:].tolist() == [60.0 - DEPTH] * (BANDS - 1)
     np.testing.assert_allclose(least[1, 0].numpy(), threshold_in_quiet(), rtol=1e-6)
     weights = audibility(levels, least)
-    assert weights[0, 2, 10] == 1.0 and weights[0, 3, 10] == pytest.approx(0.5) and weights[0, 4, 10] == 0.0
+    assert (
+        weights[0, 2, 10] == 1.0
+        and weights[0, 3, 10] == pytest.approx(0.5)
+        and weights[0, 4, 10] == 0.0
+    )
     assert 0.0 < weights[1, 2, 10] < 1.0
     assert weights[1].count_nonzero() == 1
 
@@ -143,7 +164,9 @@ def test_an_inaudible_band_keeps_its_gradient(voice: Tensor, attenuation: float)
     hz = torch.fft.rfftfreq(normal.shape[-1], 1.0 / RATE)
     band = (hz > 2000.0) & (hz < 4000.0)
     gain = torch.tensor(-attenuation, requires_grad=True)
-    heard = torch.fft.irfft(spectrum * torch.where(band, 10.0 ** (gain / 20.0), 1.0), normal.shape[-1])
+    heard = torch.fft.irfft(
+        spectrum * torch.where(band, 10.0 ** (gain / 20.0), 1.0), normal.shape[-1]
+    )
     (gradient,) = torch.autograd.grad(band_level_loss(heard, normal, RATE).mean(), gain)
     truth = band_levels(normal, RATE)
     weights = audibility(truth, least_audible(truth))

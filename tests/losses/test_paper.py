@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from scipy.signal import get_window
 from torch import Tensor
 
-from hlsim.criteria.paper import (
+from hlsim.dsp.resample import resample
+from hlsim.losses.paper import (
     DEFAULT_WEIGHTS,
     PAPER_STFT,
     anti_wrap,
@@ -22,8 +23,7 @@ from hlsim.criteria.paper import (
     time_loss,
     weighted_sum,
 )
-from hlsim.criteria.waveform import log_spectral_distance_db, noise_to_signal_db
-from hlsim.dsp.resample import resample
+from hlsim.losses.waveform import log_spectral_distance_db, noise_to_signal_db
 
 Criterion = Callable[[Tensor, Tensor], Tensor]
 
@@ -112,7 +112,9 @@ def test_gradcheck_of_spectral_criteria(criterion: Criterion) -> None:
 def test_gradcheck_of_time_criteria(pair: tuple[Tensor, Tensor]) -> None:
     truth, estimate = (10.0 * waveform[:, 2000:2040] for waveform in pair)
     for criterion in (time_loss, noise_to_signal_db):
-        assert torch.autograd.gradcheck(lambda x, c=criterion: c(x, truth), (estimate.requires_grad_(),))
+        assert torch.autograd.gradcheck(
+            lambda x, c=criterion: c(x, truth), (estimate.requires_grad_(),)
+        )
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -133,7 +135,9 @@ def test_gradients_of_silence_are_finite(pair: tuple[Tensor, Tensor], dtype: tor
 
 
 @pytest.mark.parametrize("pause_spl", [-20.0, 0.0, 20.0])
-def test_phase_gradient_comes_from_what_is_heard(pair: tuple[Tensor, Tensor], pause_spl: float) -> None:
+def test_phase_gradient_comes_from_what_is_heard(
+    pair: tuple[Tensor, Tensor], pause_spl: float
+) -> None:
     """Untamed it is 1 / magnitude, and that of the pause was more than that of the speech before it."""
     noise = 10.0 ** ((pause_spl - 94.0) / 20.0) * torch.randn(2, 16000)
     clean = torch.cat((pair[1].float(), torch.zeros(2, 8000)), -1) + noise
@@ -155,7 +159,9 @@ def test_the_phases_gradient_is_the_same_in_every_mode() -> None:
     torch.testing.assert_close(torch.func.grad(loss)(estimate), expected)
 
     def one_by_one(spectrum: Tensor) -> Tensor:
-        return torch.vmap(lambda one, true: phase_loss(one[None], true[None]).sum())(spectrum, truth).sum()
+        return torch.vmap(lambda one, true: phase_loss(one[None], true[None]).sum())(
+            spectrum, truth
+        ).sum()
 
     torch.testing.assert_close(torch.func.grad(one_by_one)(estimate), expected)
     along = (expected.conj() * tangent).real.sum()
@@ -166,7 +172,10 @@ def test_noise_to_signal_is_the_negative_snr(pair: tuple[Tensor, Tensor]) -> Non
     truth = pair[1]
     for db in (-20.0, 0.0, 30.0):
         error = torch.randn(truth.shape, dtype=torch.float64)
-        error = error * (truth.square().sum(-1, keepdim=True) / error.square().sum(-1, keepdim=True)).sqrt()
+        error = (
+            error
+            * (truth.square().sum(-1, keepdim=True) / error.square().sum(-1, keepdim=True)).sqrt()
+        )
         value = noise_to_signal_db(truth + error * 10.0 ** (-db / 20.0), truth)
         torch.testing.assert_close(value, torch.full_like(value, -db), atol=0.01, rtol=0.0)
     assert float(noise_to_signal_db(truth, truth).max()) == pytest.approx(-60.0, abs=0.01)
@@ -194,9 +203,13 @@ def test_transform_keeps_its_duration_at_every_rate(rate: int) -> None:
 
 def test_parts_mean_the_same_at_another_rate(pair: tuple[Tensor, Tensor]) -> None:
     estimate, truth = (resample(waveform, 16000, 15000) for waveform in pair)  # nothing near 8 kHz
-    low = paper_parts(*(resample(waveform, 15000, 16000) for waveform in (estimate, truth)), PAPER_STFT, 181)
+    low = paper_parts(
+        *(resample(waveform, 15000, 16000) for waveform in (estimate, truth)), PAPER_STFT, 181
+    )
     high = paper_parts(
-        *(resample(waveform, 15000, 48000) for waveform in (estimate, truth)), paper_stft(48000), 181
+        *(resample(waveform, 15000, 48000) for waveform in (estimate, truth)),
+        paper_stft(48000),
+        181,
     )
     for name in DEFAULT_WEIGHTS:
         torch.testing.assert_close(high[name], low[name], rtol=0.01, atol=0.0)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from compensators.bands import (
+from compensators.filter_bank import (
     DELAY,
     FRAME,
     HISTORY,
@@ -47,13 +47,17 @@ def test_levels_are_in_db_spl() -> None:
 
 def test_average_speech_has_its_level_and_falls_with_frequency() -> None:
     levels = torch.tensor(speech_levels(20))
-    assert float(10.0 * torch.log10((10.0 ** (levels / 10.0)).sum())) == pytest.approx(65.0, abs=1e-4)
+    assert float(10.0 * torch.log10((10.0 ** (levels / 10.0)).sum())) == pytest.approx(
+        65.0, abs=1e-4
+    )
     assert float(levels.argmax()) in (1, 2, 3, 4) and float(levels.max() - levels[-2]) > 15.0
 
 
 def test_gains_against_a_sum_in_float64() -> None:
     signal, gains = torch.randn(2, 2 * DELAY + 3 * HOP), torch.randn(2, 4, 20)
-    bands = np.stack([[np.convolve(item, taps, "valid") for taps in filters(20)] for item in signal.numpy()])
+    bands = np.stack(
+        [[np.convolve(item, taps, "valid") for taps in filters(20)] for item in signal.numpy()]
+    )
     place = (np.arange(3 * HOP) + 1) / HOP
     knots = gains.double().numpy()
     paths = np.stack([[np.interp(place, np.arange(4), band) for band in item.T] for item in knots])

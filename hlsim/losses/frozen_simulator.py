@@ -12,8 +12,8 @@ from torch.nn import functional
 
 from hlsim.audiogram import FREQUENCIES
 from hlsim.checks import check_waveform
-from hlsim.criteria.bands import HIGHEST
 from hlsim.dsp.resample import resample
+from hlsim.losses.band_levels import HIGHEST
 from hlsim.msbg import MSBG
 from hlsim.msbg.response import hear_normally, with_phase_of_bank
 from hlsim.neuro import NeuroMSBG
@@ -51,7 +51,9 @@ class FrozenEar:
                 f"normal is {type(normal).__name__}; allowed: a module or callable (waveform) -> waveform"
             )
         self.sample_rate, self.normal, self.choice = sample_rate, normal, reference
-        self.simulator = build_simulator(simulator, sample_rate, full_scale_spl).eval().requires_grad_(False)
+        self.simulator = (
+            build_simulator(simulator, sample_rate, full_scale_spl).eval().requires_grad_(False)
+        )
         if isinstance(normal, nn.Module):
             normal.eval().requires_grad_(False)
 
@@ -130,7 +132,9 @@ class FrozenEar:
             choice = "clean" if kind == "paper" else "normal-hearing"
         if ours:
             ears = (
-                ears.expand(*batch, -1).reshape(-1, len(FREQUENCIES)) if ears.ndim > 1 else ears.unsqueeze(0)
+                ears.expand(*batch, -1).reshape(-1, len(FREQUENCIES))
+                if ears.ndim > 1
+                else ears.unsqueeze(0)
             )
         # what torch.func differentiates by does not say so
         followed = clean.requires_grad or torch._C._functorch.maybe_current_level() is not None
@@ -149,7 +153,9 @@ class FrozenEar:
                 return aim.expand(*batch, time)
             aim = aim.expand(*batch, time).reshape(-1, time)
             normal = choice == "normal-hearing"
-            return with_phase_of_bank(aim, ears, self.sample_rate, normal=normal).reshape(*batch, time)
+            return with_phase_of_bank(aim, ears, self.sample_rate, normal=normal).reshape(
+                *batch, time
+            )
 
     def _narrowed(self, clean: Tensor) -> Tensor:
         """In the same band as what is heard."""
@@ -212,7 +218,9 @@ def _moved(fn: Callable[[Tensor], Tensor], tensor: Tensor) -> Tensor:
     return tensor.to(device) if halved else tensor.to(device, moved.dtype)
 
 
-def build_simulator(simulator: str | Path | nn.Module, sample_rate: int, full_scale_spl: float) -> nn.Module:
+def build_simulator(
+    simulator: str | Path | nn.Module, sample_rate: int, full_scale_spl: float
+) -> nn.Module:
     """The simulator of that name or folder, ``"msbg"`` being the exact one; a module is checked and returned."""
     if isinstance(simulator, nn.Module):
         for name, own in (("sample_rate", sample_rate), ("full_scale_spl", full_scale_spl)):

@@ -28,7 +28,7 @@ from hlsim.metrics.ear import model as ear_model
 from hlsim.metrics.ear.clean_speech import CleanItem, CleanSpeech, ItemGroup
 from hlsim.metrics.ear.model import AUDIOMETRIC_HZ, CHANNELS, Extent
 from hlsim.metrics.ear.recursions import RATE
-from hlsim.metrics.haspi import Noise, generator_after, item_seeds
+from hlsim.metrics.haspi_score import Noise, generator_after, item_seeds
 from hlsim.torchtools import constant, not_compiled
 
 _NALR_ORDER = 140
@@ -85,7 +85,9 @@ def hasqi(
     """
     check_waveform(processed, "processed")
     reference = HasqiReference(
-        clean.to(torch.promote_types(clean.dtype, processed.dtype)) if isinstance(clean, Tensor) else clean,
+        clean.to(torch.promote_types(clean.dtype, processed.dtype))
+        if isinstance(clean, Tensor)
+        else clean,
         audiogram,
         sample_rate=sample_rate,
         full_scale_spl=full_scale_spl,
@@ -133,7 +135,9 @@ class HasqiReference:
                 for group in self._groups:
                     group.keep()
 
-    def score(self, processed: Tensor, *, noise: Noise = "expected", seed: int | Sequence[int] = 0) -> Tensor:
+    def score(
+        self, processed: Tensor, *, noise: Noise = "expected", seed: int | Sequence[int] = 0
+    ) -> Tensor:
         """``hasqi`` of processed signals of the clean ones' shape, rate and scale. Returns (...,)."""
         return self.parts(processed, noise=noise, seed=seed).combined
 
@@ -145,7 +149,9 @@ class HasqiReference:
         given = self._signals.check(processed)
         seeds = item_seeds(seed, self._signals.shape)
         with torch.autocast(processed.device.type, enabled=False):
-            scores = [score for group in self._groups for score in group.compare(given, noise, seeds)]
+            scores = [
+                score for group in self._groups for score in group.compare(given, noise, seeds)
+            ]
             nonlinear, linear = torch.stack(scores).reshape(*self._signals.shape, 2).unbind(-1)
             return HasqiParts(nonlinear * linear, nonlinear, linear)
 
@@ -180,7 +186,9 @@ class _Channels:
 class _Group(ItemGroup[_Channels]):
     """Items that are worked on together, each with what the ear makes of the clean speech."""
 
-    def __init__(self, signals: CleanSpeech, items: list[CleanItem], thresholds: Tensor, unit: float) -> None:
+    def __init__(
+        self, signals: CleanSpeech, items: list[CleanItem], thresholds: Tensor, unit: float
+    ) -> None:
         super().__init__(signals, items)
         self._unit, self._noise = unit, unit * 10.0 ** (_THRESHOLD_NOISE / 20.0)
         chosen = thresholds[[item.index for item in items]]
@@ -252,14 +260,25 @@ class _Group(ItemGroup[_Channels]):
             for i, rows in enumerate(found):
                 both = fine_structure.coherence(x[i], y[i])
                 rows.append((part.smoothed[i], smoothed[i], both, x[i][1], part.level[i], level[i]))
-        return [self._score(*(torch.cat(column) for column in zip(*rows, strict=True))) for rows in found]
+        return [
+            self._score(*(torch.cat(column) for column in zip(*rows, strict=True)))
+            for rows in found
+        ]
 
     def _score(
-        self, clean: Tensor, heard: Tensor, coherence: Tensor, energy: Tensor, before: Tensor, after: Tensor
+        self,
+        clean: Tensor,
+        heard: Tensor,
+        coherence: Tensor,
+        energy: Tensor,
+        before: Tensor,
+        after: Tensor,
     ) -> Tensor:
         envelopes = fine_structure.envelope_correlation(clean, heard)
         fine = fine_structure.synchrony(coherence, energy)
-        return torch.stack((envelopes.square() * fine, fine_structure.spectral_likeness(before, after)))
+        return torch.stack(
+            (envelopes.square() * fine, fine_structure.spectral_likeness(before, after))
+        )
 
 
 # -- noise -------------------------------------------------------------------------------------------------------------
@@ -271,7 +290,9 @@ def _sources(
     """Noise of the clean signals, where it is drawn, and of the processed ones."""
     if noise == "none":
         return None, None
-    if noise == "expected":  # only what is heard of the clean signal counts, and there noise is nothing
+    if (
+        noise == "expected"
+    ):  # only what is heard of the clean signal counts, and there noise is nothing
         return None, [_frozen() for _ in seeds]
     drawn = [
         [_drawn(seed, start * CHANNELS * end) for seed, end in zip(seeds, extent.ends, strict=True)]
@@ -295,7 +316,9 @@ def _frozen() -> _Source:
         nonlocal taken
         starts = range(taken * _APART, (taken + channels) * _APART, _APART)
         taken += channels
-        return table.repeat(-(-(starts[-1] + end) // _FROZEN))[starts[0] :].unfold(0, end, _APART)[:channels]
+        return table.repeat(-(-(starts[-1] + end) // _FROZEN))[starts[0] :].unfold(0, end, _APART)[
+            :channels
+        ]
 
     return source
 

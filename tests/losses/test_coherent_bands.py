@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 from hlsim.calibration import set_level
-from hlsim.criteria.coherent_bands import (
+from hlsim.dsp.resample import resample
+from hlsim.losses.coherent_bands import (
     DEFAULT_WEIGHTS,
     HIGHEST_GRADIENT,
     KNEE,
@@ -17,7 +18,6 @@ from hlsim.criteria.coherent_bands import (
     peak_excess,
     without_spikes,
 )
-from hlsim.dsp.resample import resample
 
 RATE = 16000
 
@@ -25,7 +25,9 @@ RATE = 16000
 @pytest.fixture
 def voice(speech: list[tuple[Tensor, int]]) -> Tensor:
     """A second of two voices at 65 dB SPL, float64. Shape: (2, time)."""
-    return set_level(torch.cat([waveform[:, 8000:24000] for waveform, _ in speech[:2]]).double(), 65.0)
+    return set_level(
+        torch.cat([waveform[:, 8000:24000] for waveform, _ in speech[:2]]).double(), 65.0
+    )
 
 
 def part(name: str, heard: Tensor, normal: Tensor) -> list[float]:
@@ -62,7 +64,9 @@ def test_a_gain_costs_its_level_and_nothing_else(voice: Tensor, gain: float) -> 
     for name in ("incoherence", "misalignment"):
         assert parts[name].tolist() == pytest.approx([0.0, 0.0], abs=1e-6)
     # as much up as down
-    assert parts["levels"].tolist() == pytest.approx([KNEE * math.log1p(abs(gain) / KNEE)] * 2, rel=1e-4)
+    assert parts["levels"].tolist() == pytest.approx(
+        [KNEE * math.log1p(abs(gain) / KNEE)] * 2, rel=1e-4
+    )
     louder = max(gain - MARGIN, 0.0)
     assert all(0.5 * louder <= float(value) <= 1.6 * louder for value in parts["louder"])
 
@@ -92,7 +96,9 @@ def test_noise_that_fills_what_is_missing_costs_more(voice: Tensor) -> None:
     missing = without_highs(voice)
     noise = noisy(voice, 0.0) - voice
     highs = noise - without_highs(noise)
-    costs = [total(missing + 10.0 ** (db / 20.0) * highs, voice) for db in (-99.0, -60.0, -50.0, -40.0)]
+    costs = [
+        total(missing + 10.0 ** (db / 20.0) * highs, voice) for db in (-99.0, -60.0, -50.0, -40.0)
+    ]
     for less, more in pairwise(costs):
         assert bool((less < more).all())
 
@@ -109,7 +115,9 @@ def test_worse_costs_more(voice: Tensor) -> None:
     limit = float(voice.abs().max())
     clipped = [voice.clamp(-share * limit, share * limit) for share in (1.0, 0.5, 0.25, 0.1)]
     tail = torch.randn(8000, dtype=torch.float64) * 10.0 ** (-3.0 * torch.arange(8000) / 8000)
-    wet = torch.fft.irfft(torch.fft.rfft(voice, 32000) * torch.fft.rfft(tail, 32000), 32000)[:, :16000]
+    wet = torch.fft.irfft(torch.fft.rfft(voice, 32000) * torch.fft.rfft(tail, 32000), 32000)[
+        :, :16000
+    ]
     reverberant = [voice + share * set_level(wet, 65.0) for share in (0.0, 0.2, 0.5, 1.0)]
     for row in (clipped, reverberant):
         for less, more in pairwise(row):
@@ -157,7 +165,9 @@ def test_gradcheck(voice: Tensor, time: int) -> None:
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_gradients_are_finite_and_zero_only_where_the_reference_is(voice: Tensor, dtype: torch.dtype) -> None:
+def test_gradients_are_finite_and_zero_only_where_the_reference_is(
+    voice: Tensor, dtype: torch.dtype
+) -> None:
     clean = voice.to(dtype)
     silence = torch.zeros_like(clean)
     for heard, normal in (
@@ -181,7 +191,9 @@ def test_gradients_are_finite_and_zero_only_where_the_reference_is(voice: Tensor
 def test_peaks_over_120_db_spl_cost(voice: Tensor) -> None:
     peak = 10.0 ** ((120.0 - 94.0) / 20.0)
     tone = torch.full((1, 100), 2.0 * peak)
-    assert peak_excess(torch.cat((tone, 0.9 * tone / 2.0, -tone))).tolist() == pytest.approx([1.0, 0.0, 1.0])
+    assert peak_excess(torch.cat((tone, 0.9 * tone / 2.0, -tone))).tolist() == pytest.approx(
+        [1.0, 0.0, 1.0]
+    )
     assert peak_excess(voice).tolist() == [0.0, 0.0]
 
 
@@ -207,9 +219,13 @@ def test_spikes_of_the_gradient_are_turned_down_and_nan_is_not_hidden() -> None:
     assert torch.equal(found[:, away], usual[:, away])
     # no constant pressure is asked for, which is what cutting the samples one by one would do
     cut = spiky.clamp(-HIGHEST_GRADIENT, HIGHEST_GRADIENT)
-    assert float((found - usual).sum(-1).abs()[0]) < 0.2 < 4.0 < float((cut - usual).sum(-1).abs()[0])
+    assert (
+        float((found - usual).sum(-1).abs()[0]) < 0.2 < 4.0 < float((cut - usual).sum(-1).abs()[0])
+    )
     # in a pause no sample asks for more than those usually do that sound
-    speech = (torch.randn(1, 1000) * torch.where(torch.arange(1000) < 480, 1e-3, 1.0)).requires_grad_()
+    speech = (
+        torch.randn(1, 1000) * torch.where(torch.arange(1000) < 480, 1e-3, 1.0)
+    ).requires_grad_()
     (found,) = torch.autograd.grad(without_spikes(speech, 16000), speech, spiky[:1])
     assert 0.5 < float(found[:, 403:406].abs().max()) <= 1.0
     spiky[0, 8] = math.nan

@@ -6,8 +6,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from compensators.bands import FRAME, HISTORY, frame_power, level_db, shares
 from compensators.config import HearingAidConfig
+from compensators.filter_bank import FRAME, HISTORY, frame_power, level_db, shares
 from compensators.prescription import losses, prescribed_gains, restoring_gains
 from compensators.smoothing import decay, follow_peaks
 from compensators.stream import Slider, State, Stream
@@ -54,7 +54,11 @@ class HearingAid(Wearable):
         super().__init__(sample_rate, full_scale_spl, linked)
         self.config = config = HearingAidConfig.given(config)
         self.bands, self.limit_spl = config.bands, config.limit_spl
-        width, inner, corrections = config.width, config.inner, nn.Linear(config.inner, config.bands)
+        width, inner, corrections = (
+            config.width,
+            config.inner,
+            nn.Linear(config.inner, config.bands),
+        )
         self.correct = nn.Sequential(
             *(nn.Linear(4 * config.bands + 1, inner), nn.SiLU()),
             *(nn.Linear(inner, inner), nn.SiLU()),
@@ -95,7 +99,9 @@ class HearingAid(Wearable):
         return self.streamed(audiogram, (noise_reduction, amplification))
 
     def fit(self, thresholds: Tensor) -> Tensor:
-        return torch.cat((losses(thresholds, self.bands), prescribed_gains(thresholds, self.bands)), -1)
+        return torch.cat(
+            (losses(thresholds, self.bands), prescribed_gains(thresholds, self.bands)), -1
+        )
 
     def start(self, items: int, like: Tensor) -> dict[str, Tensor]:
         zeros, bands = like.new_zeros, self.bands
@@ -133,10 +139,16 @@ class HearingAid(Wearable):
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """Shape: (items, frames, bands + 1), of bands and of all, (items, n) -> (items, frames, bands) dB."""
         config, now = self.config, levels[..., : self.bands]
-        levels, kept = follow_peaks(levels, state["levels"], decay(config.attack), decay(config.release))
+        levels, kept = follow_peaks(
+            levels, state["levels"], decay(config.attack), decay(config.release)
+        )
         level, total = levels.split((self.bands, 1), -1)
         loss, prescribed = fitted.chunk(2, -1)
-        ear = torch.cat((loss / 50.0, prescribed / 20.0), -1).unsqueeze(1).expand(-1, level.shape[1], -1)
+        ear = (
+            torch.cat((loss / 50.0, prescribed / 20.0), -1)
+            .unsqueeze(1)
+            .expand(-1, level.shape[1], -1)
+        )
         reach = config.reach_db * loss.clamp_min(0.0) / (loss.clamp_min(0.0) + 10.0)
         seen = torch.cat((ear, (levels - 40.0) / 20.0, (now - level) / 10.0), -1)
         correction = reach.unsqueeze(1) * torch.tanh(self.correct(seen))
@@ -151,14 +163,18 @@ class HearingAid(Wearable):
         entered = torch.tanh(self.enter((seen - 40.0) / 20.0))
         hidden, cell = state["hidden"].unbind(1)
         if entered.shape[1] == 1:  # a stream's: the LSTM would repack its weights for one frame
-            hidden, cell = torch.lstm_cell(entered[:, 0], (hidden, cell), *self.recur.all_weights[0])
+            hidden, cell = torch.lstm_cell(
+                entered[:, 0], (hidden, cell), *self.recur.all_weights[0]
+            )
             recalled = hidden.unsqueeze(1)
         else:
             before = (hidden.unsqueeze(0).contiguous(), cell.unsqueeze(0).contiguous())
             recalled, (hidden, cell) = self.recur(entered, before)
             hidden, cell = hidden.squeeze(0), cell.squeeze(0)
         taken = -config.reduction_db * torch.sigmoid(self.leave(torch.cat((recalled, entered), -1)))
-        taken, kept = follow_peaks(taken, state["attenuation"], decay(config.opening), decay(config.closing))
+        taken, kept = follow_peaks(
+            taken, state["attenuation"], decay(config.opening), decay(config.closing)
+        )
         return taken, {"attenuation": kept, "hidden": torch.stack((hidden, cell), 1)}
 
     def extra_repr(self) -> str:

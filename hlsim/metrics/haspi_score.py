@@ -81,7 +81,9 @@ def haspi(
     """
     check_waveform(processed, "processed")
     reference = HaspiReference(
-        clean.to(torch.promote_types(clean.dtype, processed.dtype)) if isinstance(clean, Tensor) else clean,
+        clean.to(torch.promote_types(clean.dtype, processed.dtype))
+        if isinstance(clean, Tensor)
+        else clean,
         sample_rate=sample_rate,
         full_scale_spl=full_scale_spl,
         lengths=lengths,
@@ -139,7 +141,9 @@ class HaspiReference:
         seeds = item_seeds(seed, signals.shape)
         with torch.autocast(processed.device.type, enabled=False):
             features = [
-                features for group in self._groups for features in group.compare(given, ears, noise, seeds)
+                features
+                for group in self._groups
+                for features in group.compare(given, ears, noise, seeds)
             ]
             return understood(torch.stack(features)).reshape(signals.shape)
 

@@ -6,8 +6,8 @@ from torch import nn
 
 from hlsim.audiogram.thresholds import AudiogramLike
 from hlsim.calibration import PASCAL_SPL
-from hlsim.hearing import Hearing
-from hlsim.loss import EarsName, HearingLossLoss, Reduction
+from hlsim.losses.frozen_simulator import Hearing
+from hlsim.losses.hearing_loss import EarsName, HearingLossLoss, Reduction
 from hlsim.neuro.config import NEURO_RATE
 
 _LEVEL = {"levels": 0.03, "louder": 0.06, "peaks": 1.0}
@@ -19,7 +19,7 @@ class HASPILoss(HearingLossLoss):
 
     HASPI alone rewards any gain. What is heard through ``simulator`` is therefore compared, in level only, with what a
     normal ear hears of the clean speech, and samples over 120 dB SPL cost: the parts levels, louder and peaks of
-    ``hlsim.criteria.coherent_bands``. HASPI and HASQI are of what the ear is given (``hlsim.metrics``), with the hair
+    ``hlsim.losses.coherent_bands``. HASPI and HASQI are of what the ear is given (``hlsim.metrics``), with the hair
     cells' noise as expected; an item whose clean speech nobody hears counts 0 there (``hlsim.metrics.objective``).
 
     It is a ``HearingLossLoss`` and is called as one, ``loss(compensated, clean, audiogram=None, lengths=None)``, with its
