@@ -17,9 +17,9 @@ from hlsim.audiogram import LOWEST_LEVEL, STANDARD
 from hlsim.audiogram.table import read_audiograms
 from hlsim.audiogram.thresholds import HIGHEST_SIMULATED
 from hlsim.calibration import set_level
-from hlsim.data.clips import Clips
-from hlsim.data.ears import draw_thresholds
 from hlsim.metrics.reference import pyclarity_msbg
+from hlsim.training.clips import Clips
+from hlsim.training.ears import draw_thresholds
 
 
 def sample_for_sample(signal: torch.Tensor, ear: Audiogram) -> float:

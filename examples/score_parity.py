@@ -19,9 +19,9 @@ from torch import Tensor
 from compensators import NALR
 from hlsim import Audiogram
 from hlsim.calibration import set_level
-from hlsim.data.clips import Clips
 from hlsim.metrics import HaspiReference, HasqiReference
 from hlsim.metrics.pyclarity import pyclarity_score
+from hlsim.training.clips import Clips
 
 RATE = 16000
 EARS = ("N1", "N2", "N3", "N4", "N5", "N6", "S1", "S2", "S3")

@@ -15,7 +15,7 @@ from torch import Tensor
 from compensators import load_compensator
 from hlsim import Audiogram
 from hlsim.calibration import level_spl, set_level
-from hlsim.data.clips import Clips
+from hlsim.training.clips import Clips
 
 RATE = 16000
 

@@ -17,11 +17,11 @@ from torch import Tensor
 
 from hlsim import MSBG, Audiogram, HearingLossLoss
 from hlsim.calibration import set_level
-from hlsim.data.clips import Clips
 from hlsim.dsp.stft import STFT
 from hlsim.losses.band_levels import band_edges, band_levels
 from hlsim.metrics import HaspiReference, HasqiReference
 from hlsim.metrics.fidelity import rank_correlation
+from hlsim.training.clips import Clips
 
 RATE, SECONDS, SPL = 16000, 3.0, 65.0
 TALKERS, EARS = 4, ("N2", "N3", "N4")

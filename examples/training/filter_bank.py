@@ -16,9 +16,9 @@ from torch.nn import functional
 from compensators import NALR
 from hlsim import MSBG, Audiogram, HearingLossLoss
 from hlsim.calibration import level_spl, set_level
-from hlsim.data.clips import Clips
 from hlsim.dsp.stft import STFT
 from hlsim.metrics import haspi, hasqi
+from hlsim.training.clips import Clips
 
 RATE = 16000
 CENTRES = (250.0, 500.0, 1000.0, 2000.0, 3000.0, 4000.0, 6000.0, 8000.0)

@@ -20,11 +20,11 @@ from torch import Tensor, nn
 from compensators import NALR
 from hlsim import Audiogram, HearingLossLoss
 from hlsim.calibration import level_spl, set_level
-from hlsim.data.augment import mix
-from hlsim.data.clips import Clips
 from hlsim.dsp.stft import STFT
 from hlsim.losses.band_levels import band_edges
 from hlsim.metrics import haspi, hasqi
+from hlsim.training.augment import mix
+from hlsim.training.clips import Clips
 
 
 class Mask(nn.Module):

@@ -11,17 +11,14 @@ from itertools import accumulate
 from random import Random
 
 import torch
-from torch import Tensor
 
-from hlsim.audiogram import LOWEST_LEVEL, SEVERITIES, STANDARD, Audiogram
+from hlsim.audiogram import SEVERITIES, Audiogram
 from hlsim.audiogram.table import read_audiograms
 from hlsim.audiogram.thresholds import HIGHEST_SIMULATED
 from hlsim.checks import refuse_unknown
 from hlsim.data.manifest import SPLITS
 from hlsim.data.plan_settings import PlanSettings
-
-MILDER = ("NH", "N1", "N2", "S1")
-"""Standard ears that join measured ones in validation, since those are mostly moderate and severe."""
+from hlsim.training.ears import draw_thresholds
 
 MILD_TO_SEVERE: Mapping[str, float] = {"mild": 1.0, "moderate": 1.0, "severe": 1.0}
 """Default proportions of MSBG's severities: the paper says no more than "from mild to severe"."""
@@ -29,37 +26,6 @@ MILD_TO_SEVERE: Mapping[str, float] = {"mild": 1.0, "moderate": 1.0, "severe": 1
 # of drawn ears, and of listeners in a file without splits
 _TENTHS = ("test", "test", "valid", *7 * ["train"])
 _KEPT = 2048  # drawn ears of a severity that wait for their turn
-
-
-def draw_thresholds(count: int, generator: torch.Generator | None = None) -> Tensor:
-    """Random ears that look like measured ones, from no loss to severe.
-
-    Each lies between two neighbours of one of Bisgaard's series (NH, N1 ... N6 or NH, S1 ... S3), is tilted by up to
-    20 dB at 250 Hz, and moved by Gaussian noise with a deviation of 2.4 to 8 dB that is alike at neighbouring frequencies
-    (correlation 0.8, as among measured ears). Three of four are rounded to 5 dB, as audiologists do. In MSBG's sense
-    27 % have no loss, 18 % a mild, 19 % a moderate and 36 % a severe one.
-
-    Returns: (count, 8) dB HL, -10 to 100.
-    """
-    uniform = torch.rand(count, 5, generator=generator)
-    ears = torch.empty(count, 8)
-    for series, members in enumerate(
-        (("NH", "N1", "N2", "N3", "N4", "N5", "N6"), ("NH", "S1", "S2", "S3"))
-    ):
-        table = torch.tensor([STANDARD[name] for name in members], dtype=torch.float32)
-        # the power favours the mild end, where more ears are
-        place = uniform[:, 1] ** 1.8 * (len(members) - 1)
-        low = place.long().clamp(max=len(members) - 2)
-        between = table[low] + (table[low + 1] - table[low]) * (place - low).unsqueeze(-1)
-        ears = torch.where(((uniform[:, 0] < 0.65) == (series == 0)).unsqueeze(-1), between, ears)
-    tilt = torch.tensor([1.0, 0.9, 0.6, 0.2, 0.0, 0.0, 0.0, 0.0])
-    ears = ears + (40.0 * uniform[:, 4:] - 20.0) * tilt
-    noise = torch.randn(count, 8, generator=generator)
-    for i in range(1, 8):
-        noise[:, i] = 0.8 * noise[:, i - 1] + math.sqrt(1 - 0.8**2) * noise[:, i]
-    ears = ears + 8.0 * noise * (0.3 + 0.7 * uniform[:, 3:4])
-    ears = torch.where(uniform[:, 2:3] < 0.75, 5.0 * (ears / 5.0).round(), ears)
-    return ears.clamp(LOWEST_LEVEL, HIGHEST_SIMULATED)
 
 
 def check_shares(shares: Mapping[str, float]) -> dict[str, Fraction]:

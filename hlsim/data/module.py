@@ -20,10 +20,10 @@ from torch.utils.data import DataLoader, Dataset, Sampler
 from hlsim.audiogram import LOWEST_LEVEL
 from hlsim.audiogram.thresholds import HIGHEST_SIMULATED
 from hlsim.calibration import level_spl, set_level
-from hlsim.data.augment import augment_speech
 from hlsim.data.instances import Instance, Plan
 from hlsim.data.teacher import Teacher, check_grid
 from hlsim.data.writing import Recipe, claimed
+from hlsim.training.augment import augment_speech
 
 _ENDLESS = 10_000_000  # steps: time or steps end a training, not the data
 _TRIES = 8  # instances that cannot be read, one after the other, before training ends

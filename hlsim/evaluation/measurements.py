@@ -13,12 +13,12 @@ from torch import Tensor, nn
 
 from hlsim.audiogram import Audiogram
 from hlsim.calibration import level_spl, set_level
-from hlsim.data.clips import Clips
 from hlsim.evaluation.judging import NORMAL
 from hlsim.losses.band_levels import band_centres, band_levels
 from hlsim.msbg import MSBG
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.parallel import one_thread, reason_of
+from hlsim.training.clips import Clips
 
 UTTERANCES = 6
 """Clips of 3 s of speech that gains are measured on."""

@@ -16,15 +16,15 @@ from hlsim.audio import find_audio
 from hlsim.audiogram import Audiogram
 from hlsim.audiogram.table import read_audiograms
 from hlsim.calibration import level_spl, set_level
-from hlsim.data.augment import KNOTS, augment_speech, equalise, mix
-from hlsim.data.clips import Clips
-from hlsim.data.ears import MILDER, draw_thresholds
 from hlsim.data.module import Batch, BatchData, PlanData, Step, collate
-from hlsim.data.sounds import draw_sounds
 from hlsim.data.teacher import Reference, Teacher
 from hlsim.data.writing import Recipe
 from hlsim.neuro.config import NEURO_RATE
+from hlsim.training.augment import KNOTS, augment_speech, equalise, mix
+from hlsim.training.clips import Clips
+from hlsim.training.ears import MILDER, draw_thresholds
 from hlsim.training.recipes import CompensatorRecipe, SimulatorRecipe, TrainingRecipe
+from hlsim.training.sounds import draw_sounds
 
 _VALID_SECONDS = 2.0
 _VOICES = 4  # of babble, at most

@@ -9,9 +9,9 @@ import torch
 from compensators import WDRC, HearingAid, HearingAidConfig, load_compensator, save_compensator
 from hlsim import Audiogram
 from hlsim.calibration import level_spl, set_level
-from hlsim.data.ears import draw_thresholds
 from hlsim.dsp.resample import resample
 from hlsim.evaluation.measurements import steady_tones
+from hlsim.training.ears import draw_thresholds
 from tests.compensators.test_wearable import EAR, trained
 
 

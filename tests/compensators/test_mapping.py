@@ -10,10 +10,10 @@ from compensators import NALR, MappingCompensator, MappingConfig
 from compensators.limiter import soft_limit
 from hlsim import Audiogram
 from hlsim.calibration import level_spl, set_level
-from hlsim.data.ears import draw_thresholds
 from hlsim.dsp.resample import resample
 from hlsim.losses.band_levels import band_levels
 from hlsim.neuro import NeuroConfig
+from hlsim.training.ears import draw_thresholds
 
 SMALL = MappingConfig(channels=8, blocks=1)
 

@@ -11,7 +11,7 @@ from compensators import NALR, MappingCompensator, MappingConfig
 from compensators.nalr import nalr_gains_db
 from hlsim import Audiogram
 from hlsim.audiogram import FREQUENCIES
-from hlsim.data.ears import draw_thresholds
+from hlsim.training.ears import draw_thresholds
 
 EARS = ["NH", "N1", "N3", "N6", "S1", "S3"]
 

@@ -10,9 +10,9 @@ from compensators import WDRC, HearingAid
 from compensators.wearable import Wearable
 from hlsim import Audiogram, Listener
 from hlsim.calibration import level_spl, set_level
-from hlsim.data.ears import draw_thresholds
 from hlsim.dsp.resample import resample
 from hlsim.metrics.interaural import interaural_change
+from hlsim.training.ears import draw_thresholds
 
 EAR = Audiogram.standard("N3")
 FIVE_MS = 80

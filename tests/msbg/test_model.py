@@ -19,12 +19,12 @@ from hlsim import torchtools
 from hlsim.audio import find_audio, read_audio
 from hlsim.audiogram import STANDARD, Audiogram
 from hlsim.calibration import gain_to_pascals, level_spl, set_level
-from hlsim.data.ears import draw_thresholds
 from hlsim.msbg import MSBG
 from hlsim.msbg.blocks import block_bounds
 from hlsim.msbg.model import STRUCTURAL_DELAY, active_rescaling
 from hlsim.msbg.resampling import to_inner
 from hlsim.msbg.smearing import HOP
+from hlsim.training.ears import draw_thresholds
 
 EARS = {"none": "NH", "mild": "N1", "moderate": "N2", "severe": "N4"}  # one a severity
 RATE = 44100

@@ -11,7 +11,6 @@ from torch.overrides import TorchFunctionMode
 
 from hlsim.audiogram import FREQUENCIES
 from hlsim.calibration import gain_to_pascals
-from hlsim.data.ears import draw_thresholds
 from hlsim.dsp.erb import erb
 from hlsim.msbg.ear import MSBG_RATE
 from hlsim.msbg.envelope import STEP, envelope, envelope_lowpass
@@ -25,6 +24,7 @@ from hlsim.msbg.recruitment import (
     interpolation_kernel,
     threshold_weights,
 )
+from hlsim.training.ears import draw_thresholds
 
 cochlea = pytest.importorskip("clarity.evaluator.msbg.cochlea")
 clarity_audiogram = pytest.importorskip("clarity.utils.audiogram")

@@ -9,12 +9,12 @@ from torch import Tensor
 from compensators import MappingCompensator
 from hlsim import MSBG, Audiogram, NeuroMSBG, load_pretrained
 from hlsim.calibration import set_level
-from hlsim.data.ears import draw_thresholds
 from hlsim.dsp.resample import resample
 from hlsim.losses.waveform import noise_to_signal_db
 from hlsim.neuro import NeuroConfig
 from hlsim.neuro.blocks import BidirectionalLSTM, EncoderLayer, SequencePath
 from hlsim.neuro.network import EarNetwork
+from hlsim.training.ears import draw_thresholds
 
 N3 = Audiogram.standard("N3")
 PAPER = NeuroConfig(

@@ -6,8 +6,8 @@ from torch import Tensor
 
 from hlsim.audiogram import FREQUENCIES
 from hlsim.calibration import level_spl, set_level
-from hlsim.data.augment import HIGHEST_LEVEL, augment_speech, compress, equalise, mix
-from hlsim.data.ears import draw_thresholds
+from hlsim.training.augment import HIGHEST_LEVEL, augment_speech, compress, equalise, mix
+from hlsim.training.ears import draw_thresholds
 
 
 def tones(*hz: float, rate: int = 16000, seconds: float = 0.5) -> Tensor:

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from hlsim.audio import read_audio, write_audio
-from hlsim.data.clips import Clips
+from hlsim.training.clips import Clips
 
 
 def folder_with(tmp_path: Path, **waves: Tensor) -> Path:
@@ -80,7 +80,7 @@ def test_no_drawn_clip_is_silent(tmp_path: Path) -> None:
 def test_drawing_ends_where_all_clips_are_silent_or_empty(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("hlsim.data.clips._SILENT_TRIES", 300)
+    monkeypatch.setattr("hlsim.training.clips._SILENT_TRIES", 300)
     wave = torch.zeros(40000)
     wave[-1] = 1.0  # of 24,001 places only the last reaches it
     folder = folder_with(tmp_path, a=wave)
