@@ -10,7 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from hlsim.cli.options import Parser, count, passed, positive
+from hlsim.cli.options import Parser, count, positive
 from hlsim.cli.progress import show_progress
 from hlsim.files import write_whole
 
@@ -61,8 +61,16 @@ def _benchmark(options: argparse.Namespace) -> None:
         sizes: dict[str, Any] = (
             {"lengths": (), "batches": (), "training": None} if options.brief else {}
         )
-        how = {"simulators": options.simulator, "progress": show_progress("timings"), "keep": keep}
-        benchmark(**passed(options, benchmark, **how, **sizes))
+        benchmark(
+            device=device,
+            repeats=repeats,
+            limit=options.limit,
+            simulators=options.simulator,
+            only=options.only,
+            progress=show_progress("timings"),
+            keep=keep,
+            **sizes,
+        )
 
     def table(name: str, measure: Measure) -> None:
         rows, skipped = measure(device=device, repeats=repeats)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from hlsim.cli.evaluation import labelled, need_engine, tell_page
 from hlsim.cli.inputs import check_there, need
-from hlsim.cli.options import Parser, count, foreign_name, natural, number, passed
+from hlsim.cli.options import Parser, count, foreign_name, natural, number
 from hlsim.cli.progress import show_progress
 
 
@@ -63,7 +63,21 @@ def _clarity(options: argparse.Namespace) -> None:
     aids = dict(map(labelled, options.names))
     if len(aids) < len(options.names):
         raise ValueError(f"aids {', '.join(options.names)}; allowed: one a label")
-    report = evaluate_scenes(aids, **passed(options, evaluate_scenes, progress=show_progress))
+    report = evaluate_scenes(
+        aids,
+        scenes=options.scenes,
+        listeners=options.listeners,
+        out=options.out,
+        scenes_listeners=options.scenes_listeners,
+        every=options.every,
+        enhancers=options.enhancers,
+        linked=options.linked,
+        engine=options.engine,
+        full_scale_spl=options.full_scale_spl,
+        seed=options.seed,
+        jobs=options.jobs,
+        progress=show_progress,
+    )
     write_scenes(report, options.out, listen=options.listen)
     print(f"{conditions_table(report).text()}\n\n{report.headline.in_short()}")
     if failed := len(report.failures):

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from hlsim.cli.inputs import check_there, need, read_ear
-from hlsim.cli.options import Parser, folder, passed, positive
+from hlsim.cli.options import Parser, folder, positive
 from hlsim.extras import require
 
 
@@ -34,4 +34,7 @@ def _demo(options: argparse.Namespace) -> None:
     from hlsim.torchtools import keep_freed_memory
 
     keep_freed_memory()
-    print(demo(**passed(options, demo, audiogram=ear)))
+    summary = demo(
+        options.out, ear, speech=options.speech, minutes=options.minutes, seed=options.seed
+    )
+    print(summary)

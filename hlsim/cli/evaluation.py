@@ -14,7 +14,6 @@ from hlsim.cli.options import (
     foreign_name,
     natural,
     number,
-    passed,
     positive,
 )
 from hlsim.cli.progress import show_progress
@@ -62,15 +61,24 @@ def _evaluate_simulator(options: argparse.Namespace) -> None:
     from hlsim.neuro.config import NEURO_RATE
     from hlsim.report.simulators import write_fidelity
 
-    instead = {
-        "store": options.out / "scores.jsonl",
-        "compensator": load_compensator(options.compensator) if options.compensator else None,
-        "progress": show_progress("items"),
-    }
     simulators = {
         label: build_simulator(name, NEURO_RATE, PASCAL_SPL) for label, name in named.items()
     }
-    done = evaluate_simulators(simulators, **passed(options, evaluate_simulators, **instead))
+    done = evaluate_simulators(
+        simulators,
+        speech=options.speech,
+        audiograms=options.audiograms,
+        store=options.out / "scores.jsonl",
+        noise=options.noise,
+        teacher=options.teacher,
+        items=options.items,
+        seconds=options.seconds,
+        levels=options.levels,
+        inputs=options.inputs,
+        compensator=load_compensator(options.compensator) if options.compensator else None,
+        seed=options.seed,
+        progress=show_progress("items"),
+    )
     write_fidelity(done.result, done.heard, done.shown, options.out)
     print((options.out / "fidelity.md").read_text(encoding="utf-8"))
     tell_page(options.out / "fidelity.html")
@@ -126,14 +134,25 @@ def _evaluate_compensator(options: argparse.Namespace) -> None:
     notes = [line for label, name in named.items() for line in other_ear(label, name, ear)]
     for line in notes:
         print(f"hlsim: warning: {line}", file=sys.stderr)
-    store = options.out / "scores.jsonl"
-    instead = {
-        "audiogram": ear,
-        "notes": notes,
-        "store": store,
-        "progress": show_progress("outputs"),
-    }
-    done = evaluate_compensators(loaded, **passed(options, evaluate_compensators, **instead))
+    done = evaluate_compensators(
+        loaded,
+        speech=options.speech,
+        store=options.out / "scores.jsonl",
+        audiograms=options.audiograms,
+        audiogram=ear,
+        noise=options.noise,
+        enhancers=options.enhancers,
+        simulator=options.simulator,
+        engine=options.engine,
+        items=options.items,
+        seconds=options.seconds,
+        levels=options.levels,
+        gain_ears=options.gain_ears,
+        notes=notes,
+        seed=options.seed,
+        jobs=options.jobs,
+        progress=show_progress("outputs"),
+    )
     write_compensators(done.result, done.reports, options.out)
     text = options.out / "compensators.md"
     print(text.read_text(encoding="utf-8"))
@@ -211,16 +230,30 @@ def _haspi_report(options: argparse.Namespace) -> None:
         folders=(options.clean, options.before, options.after, options.root),
         files=(options.manifest, options.audiograms),
     )
-    from hlsim.evaluation import haspi_report, score_items
+    from hlsim.evaluation import haspi_report
     from hlsim.report.haspi import markdown, write_report
 
-    instead = {
-        "audiogram": read_ear(options.audiogram) if options.audiogram else None,
-        "measures": measures,
-        "store": options.scores or options.out / "scores.jsonl",
-        "progress": show_progress("scores"),
-    }
-    report = haspi_report(**passed(options, haspi_report, score_items, **instead))
+    report = haspi_report(
+        clean=options.clean,
+        before=options.before,
+        after=options.after,
+        audiogram=read_ear(options.audiogram) if options.audiogram else None,
+        audiograms=options.audiograms,
+        manifest=options.manifest,
+        root=options.root,
+        measures=measures,
+        engine=options.engine,
+        baseline=options.baseline,
+        better_ear=options.better_ear,
+        store=options.scores or options.out / "scores.jsonl",
+        full_scale_spl=options.full_scale_spl,
+        spl=options.spl,
+        seed=options.seed,
+        jobs=options.jobs,
+        backend=options.backend,
+        scheduler=options.scheduler,
+        progress=show_progress("scores"),
+    )
     write_report(report, options.out, listen=options.listen)
     print(markdown(report))
     if failed := len(report.failures):

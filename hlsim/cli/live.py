@@ -7,11 +7,11 @@ import math
 from types import ModuleType
 
 from hlsim.cli.inputs import read_compensator, read_ears
-from hlsim.cli.options import STANDARD_EARS, Parser, kind, number, positive
+from hlsim.cli.options import STANDARD_EARS, Parser, checked_type, number, positive
 from hlsim.extras import require
 
 _RATE = 16000
-_device = kind(
+_device = checked_type(
     lambda text: int(text) if text.isdecimal() else text,
     lambda device: device != "",
     "a number or part of a name",

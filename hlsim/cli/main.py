@@ -10,7 +10,7 @@ from functools import partial
 from importlib import import_module
 
 from hlsim import __version__
-from hlsim.cli.options import Parser
+from hlsim.cli.options import Parser, join_negative_values
 from hlsim.extras import MissingExtraError
 
 COMMANDS = {
@@ -69,7 +69,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     main_thread = threading.current_thread() is threading.main_thread()
     before = signal.signal(signal.SIGTERM, end) if main_thread else None
     try:
-        options = _parser().parse_args(arguments)
+        given = sys.argv[1:] if arguments is None else arguments
+        options = _parser().parse_args(join_negative_values(given))
         options.run(options)
     except (ValueError, MissingExtraError, OSError) as error:
         print(f"hlsim: error: {' '.join(str(error).split())}", file=sys.stderr)

@@ -1,4 +1,7 @@
-"""How a command's options are declared, those that several share, and the kinds of values; nothing here imports torch."""
+"""Options of the command line: the parser, the options that commands share, and the types of their values.
+
+Nothing here imports torch, so that ``--help`` takes a fraction of a second.
+"""
 
 from __future__ import annotations
 
@@ -6,9 +9,8 @@ import argparse
 import math
 import os
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
-from inspect import signature
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -17,42 +19,61 @@ STANDARD_EARS = ("NH", "N1", "N2", "N3", "N4", "N5", "N6", "N7", "S1", "S2", "S3
 TEACHERS = ("msbg", "pyclarity")
 
 EARS_TABLE = (
-    "CSV with columns hl_250, hl_500, ... hl_8000 in dB HL; where one of the eight is missing its level is interpolated "
-    "over log frequency, flat beyond the ends"
+    "CSV file with columns hl_250, hl_500, ... hl_8000 in dB HL; the level of a missing column is "
+    "interpolated over log frequency, or extended flat beyond the ends"
 )
+
+_NEGATIVE_LIST = re.compile(r"-\.?\d.*[,e]")
+
+
+def join_negative_values(arguments: Sequence[str]) -> list[str]:
+    """Join an option and a value such as ``-10,0,20``, which argparse takes for another option.
+
+    Returns: the arguments, with ``--option -10,0`` written as ``--option=-10,0``.
+    """
+    joined: list[str] = []
+    for argument in arguments:
+        previous = joined[-1] if joined else ""
+        follows_option = previous.startswith("--") and "=" not in previous
+        if follows_option and _NEGATIVE_LIST.match(argument):
+            joined[-1] = f"{previous}={argument}"
+        else:
+            joined.append(argument)
+    return joined
 
 
 class Parser(argparse.ArgumentParser):
-    """Says what is wrong in one line, without the usage; its commands' parsers are of this class too.
+    """Parser of the program and of each command. Errors take one line, without the usage.
 
     Args:
-        declare: declares the options, once the command is named.
+        declare: Function that declares the options; called when the command is used.
     """
 
     def __init__(self, *, declare: Callable[[Parser], None] | None = None, **settings: Any) -> None:
         super().__init__(**settings)
-        # as from Python 3.14 on: no option begins with a digit, so that -10,0 and -2.5e1 are values
-        self._negative_number_matcher = re.compile(r"-\.?\d")
         self._declare = declare
         self._examples: tuple[str, ...] = ()
 
     def runs(self, run: Callable[[argparse.Namespace], None], *examples: str) -> None:
-        """What the command does with its options, and arguments that the help ends with."""
+        """Set the function that runs the command, and the arguments that the help shows as examples."""
         self.set_defaults(run=run)
         self._examples = examples
 
     def format_help(self) -> str:
-        lines = [f"  {self.prog} {example}".rstrip() + "\n" for example in self._examples]
-        return super().format_help() + "".join(["\nexamples:\n", *lines] if lines else [])
+        text = super().format_help()
+        if self._examples:
+            lines = [f"  {self.prog} {example}".rstrip() for example in self._examples]
+            text += "\nexamples:\n" + "\n".join(lines) + "\n"
+        return text
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         if self._declare is not None:
             declare, self._declare = self._declare, None
             declare(self)
-        found, unknown = super().parse_known_args(args, namespace)
-        if unknown:  # here, not in the program's own parser, so that the command is named
+        options, unknown = super().parse_known_args(args, namespace)
+        if unknown:  # reported here, by the command's parser, so that the message names the command
             self.error(f"unrecognized arguments: {' '.join(unknown)}")
-        return found, unknown
+        return options, unknown
 
     def error(self, message: str) -> NoReturn:
         self.exit(2, f"{self.prog}: error: {' '.join(message.split())}; see {self.prog} --help\n")
@@ -64,139 +85,160 @@ class Parser(argparse.ArgumentParser):
         text: str,
         default: Any = None,
         *,
-        group: argparse._ActionsContainer | None = None,
-        **more: Any,
+        group: Any = None,
+        **settings: Any,
     ) -> None:
-        """An option or, without dashes, an argument; the help says that it is required, or its default."""
-        if more.get("required"):
+        """Declare an option or, if the name has no dashes, a positional argument.
+
+        The help text ends with the default, or says that the option is required.
+
+        Args:
+            kind: Function that reads the value.
+            group: Group of options to add this one to, such as a mutually exclusive group.
+            settings: Other arguments of ``add_argument``.
+        """
+        if settings.get("required"):
             text += " (required)"
         elif default not in (None, []):
-            values = default if isinstance(default, list | tuple) else [default]
-            shown = (" " if "nargs" in more else ",").join(
-                f"{value:g}" if isinstance(value, float) else str(value) for value in values
-            )
-            text += f" (default: {shown})"
+            text += f" (default: {_shown(default, separator=' ' if 'nargs' in settings else ',')})"
         if name.startswith("-"):
-            more["default"] = default
-        (group or self).add_argument(name, type=kind, help=text, **more)
+            settings["default"] = default
+        (group or self).add_argument(name, type=kind, help=text, **settings)
 
-    def flag(self, name: str, text: str) -> None:
-        self.add_argument(name, action="store_true", help=text)
+    def flag(self, name: str, text: str, group: Any = None) -> None:
+        """Declare an option without a value."""
+        (group or self).add_argument(name, action="store_true", help=text)
 
-    # what several commands take
+    # options that several commands have
 
     def teacher(self, text: str, default: str) -> None:
         help_ = (
-            f"{text}: msbg (exact), pyclarity, or anyone's simulator, package.module:name, found from the working "
-            "directory too: a callable (waveform, audiogram) -> waveform or its class, time-aligned, of (items, time) in "
-            "pascals and (items, 8) in dB HL, at its attribute sample_rate or else 16000 Hz"
+            f"{text}: msbg (exact), pyclarity, or your own simulator as package.module:name, "
+            "imported from the working directory too: a callable (waveform, audiogram) -> waveform, "
+            "or a class of such callables, time-aligned, for waveforms (items, time) in pascals and "
+            "audiograms (items, 8) in dB HL, at its attribute sample_rate or else 16000 Hz"
         )
         self.option("--teacher", teacher_name, help_, default, metavar="NAME")
 
-    def audiogram(self, default: str | None = None, text: str = "", **more: Any) -> None:
+    def audiogram(self, default: str | None = None, text: str = "", **settings: Any) -> None:
         help_ = (
-            "NH, N1 to N7 (simulators and trained compensators take up to N6), S1 to S3, or eight levels in dB HL at "
-            f"250, 500, 1000, 2000, 3000, 4000, 6000, 8000 Hz, separated by commas{text}"
+            "NH, N1 to N7 (simulators and trained compensators take up to N6), S1 to S3, or eight "
+            "levels in dB HL at 250, 500, 1000, 2000, 3000, 4000, 6000 and 8000 Hz, separated by "
+            f"commas{text}"
         )
-        self.option("--audiogram", str, help_, default, **more)
+        self.option("--audiogram", str, help_, default, **settings)
 
-    def listener(self, text: str, **more: Any) -> None:
-        file = (
-            "a CSV file with columns listener, ear (left or right), hl_250, ..., or Clarity's listeners.json; FILE:NAME "
-            "of one with several listeners"
+    def listener(self, text: str, **settings: Any) -> None:
+        help_ = (
+            f"{text}: a CSV file with columns listener, ear (left or right), hl_250, ..., or Clarity's "
+            "listeners.json; write FILE:NAME if the file holds several listeners"
         )
-        self.option("--listener", str, f"{text}: {file}", metavar="FILE[:NAME]", **more)
+        self.option("--listener", str, help_, metavar="FILE[:NAME]", **settings)
 
-    def full_scale(self, **more: Any) -> None:
-        self.option(
-            "--full-scale-spl", number, "level in dB SPL of a file whose RMS is 1.0", 94.0, **more
-        )
+    def full_scale(self, **settings: Any) -> None:
+        text = "level in dB SPL of a file whose RMS is 1.0"
+        self.option("--full-scale-spl", number, text, 94.0, **settings)
 
     def sliders(self) -> None:
-        for name in ("--noise-reduction", "--amplification"):
-            self.option(name, slider, "of a hearing aid, 0 to 1; 1 by default")
+        text = "strength of a hearing aid's noise reduction, 0 to 1 (default: 1)"
+        self.option("--noise-reduction", slider, text)
+        text = "strength of a hearing aid's amplification, 0 to 1 (default: 1)"
+        self.option("--amplification", slider, text)
 
     def engine(self) -> None:
         text = "what computes HASPI and HASQI: hlsim, with pyclarity's figures, or pyclarity itself, which is slower"
         self.option("--engine", str, text, "hlsim", choices=("hlsim", "pyclarity"))
 
     def jobs(self) -> None:
-        self.option("--jobs", count, "processes; all cores by default")
+        self.option("--jobs", count, "number of processes; all cores by default")
 
     def parallel(self) -> None:
         self.jobs()
-        self.option(
-            "--backend", str, "this machine, or a cluster", "loky", choices=("loky", "dask")
-        )
-        self.option("--scheduler", str, "of --backend dask: its address, such as tcp://host:8786")
+        text = "where to run: processes on this machine, or a Dask cluster"
+        self.option("--backend", str, text, "loky", choices=("loky", "dask"))
+        text = "address of the Dask scheduler, such as tcp://host:8786"
+        self.option("--scheduler", str, text)
 
     def seed(self) -> None:
-        self.option("--seed", integer, "of every random draw", 0)
+        self.option("--seed", integer, "seed of every random draw", 0)
 
     def out(self) -> None:
         self.option("--out", folder, "folder for the results", required=True)
 
 
-def passed(
-    options: argparse.Namespace, *functions: Callable[..., Any], **instead: Any
-) -> dict[str, Any]:
-    """The options that are arguments of the functions, by their names, and what is given in the place of some."""
-    names = {name for function in functions for name in signature(function).parameters}
-    return {name: value for name, value in vars(options).items() if name in names} | instead
+def _shown(default: Any, separator: str) -> str:
+    values = default if isinstance(default, list | tuple) else [default]
+    texts = [f"{value:g}" if isinstance(value, float) else str(value) for value in values]
+    return separator.join(texts)
 
 
-def kind(
-    read: Callable[[str], Any], fits: Callable[[Any], bool], allowed: str
+def checked_type(
+    read: Callable[[str], Any], accepts: Callable[[Any], bool], expected: str
 ) -> Callable[[str], Any]:
-    """Reads a value that ``fits``, and refuses any other with what is allowed."""
+    """Make the type of an option: a function that reads a value and rejects those not accepted.
+
+    Args:
+        read: Function from text to value; a ValueError rejects the text.
+        accepts: Condition on the value.
+        expected: Description of accepted values, for the error message.
+    """
 
     def value_of(text: str) -> Any:
         with suppress(ValueError):
-            if fits(value := read(text)):
+            value = read(text)
+            if accepts(value):
                 return value
-        raise argparse.ArgumentTypeError(f"{text}; allowed: {allowed}")
+        raise argparse.ArgumentTypeError(f"got {text!r}, expected {expected}")
 
     return value_of
 
 
-number = kind(float, math.isfinite, "numbers such as 65 or 2.5")
-positive = kind(float, lambda value: 0 < value < math.inf, "numbers above 0")
-slider = kind(float, lambda value: 0 <= value <= 1, "0 to 1")
-integer = kind(int, lambda value: True, "whole numbers")
-count = kind(int, lambda value: value >= 1, "whole numbers from 1 up")
-natural = kind(int, lambda value: value >= 0, "whole numbers from 0 up")
-_FOREIGN = re.compile(r"\w+(\.\w+)*:\w+")
-foreign_name = kind(str, lambda text: bool(_FOREIGN.fullmatch(text)), "package.module:name")
-teacher_name = kind(
+def _read_numbers(text: str) -> tuple[float, ...]:
+    return tuple(float(part) for part in text.split(","))
+
+
+def _read_shares(text: str) -> dict[str, float]:
+    shares = {}
+    for part in text.split(","):
+        name, _, value = part.partition("=")
+        shares[name.strip()] = float(value)
+    return shares
+
+
+_PLUGIN = re.compile(r"\w+(\.\w+)*:\w+")
+
+number = checked_type(float, math.isfinite, "a number such as 65 or 2.5")
+positive = checked_type(float, lambda value: 0 < value < math.inf, "a number above 0")
+slider = checked_type(float, lambda value: 0 <= value <= 1, "a number from 0 to 1")
+integer = checked_type(int, lambda value: True, "a whole number")
+count = checked_type(int, lambda value: value >= 1, "a whole number, 1 or more")
+natural = checked_type(int, lambda value: value >= 0, "a whole number, 0 or more")
+foreign_name = checked_type(str, lambda text: bool(_PLUGIN.fullmatch(text)), "package.module:name")
+teacher_name = checked_type(
     str,
-    lambda text: text in TEACHERS or bool(_FOREIGN.fullmatch(text)),
-    f"{', '.join(TEACHERS)}, or package.module:name",
+    lambda text: text in TEACHERS or bool(_PLUGIN.fullmatch(text)),
+    f"{', '.join(TEACHERS)} or package.module:name",
 )
-numbers = kind(
-    lambda text: tuple(map(float, text.split(","))),
-    lambda values: all(map(math.isfinite, values)),
+numbers = checked_type(
+    _read_numbers,
+    lambda values: all(math.isfinite(value) for value in values),
     "numbers separated by commas, such as 0,2.5,5",
 )
-shares = kind(
-    lambda text: {
-        name.strip(): float(value)
-        for name, _, value in (part.partition("=") for part in text.split(","))
-    },
-    lambda pairs: all(map(math.isfinite, pairs.values())),
+shares = checked_type(
+    _read_shares,
+    lambda shares: all(math.isfinite(value) for value in shares.values()),
     "severities with a number each, such as mild=1,severe=2",
 )
 
 
 def folder(text: str) -> Path:
-    """Where results go, there or not: one that cannot be is to be known before hours of work."""
+    """Read the name of a folder for results; reject one that cannot be created before work starts."""
     path = Path(text)
-    there = next(
-        part for part in (path.absolute(), *path.absolute().parents) if os.path.lexists(part)
-    )
-    if not there.is_dir():
-        raise argparse.ArgumentTypeError(f"{there}: not a folder; allowed: a folder, there or not")
-    if not os.access(there, os.W_OK | os.X_OK):
-        raise argparse.ArgumentTypeError(
-            f"{there}: no permission to write there; allowed: a folder of one's own"
-        )
+    existing = path.absolute()
+    while not os.path.lexists(existing):
+        existing = existing.parent
+    if not existing.is_dir():
+        raise argparse.ArgumentTypeError(f"{existing} is not a folder")
+    if not os.access(existing, os.W_OK | os.X_OK):
+        raise argparse.ArgumentTypeError(f"no permission to write to {existing}")
     return path

@@ -14,12 +14,10 @@ from hlsim.cli.options import (
     integer,
     number,
     numbers,
-    passed,
     positive,
     shares,
 )
 from hlsim.cli.progress import show_progress
-from hlsim.parallel import run_parallel
 
 ALIGNMENTS = ("structural", "impulse")
 
@@ -109,20 +107,48 @@ def _prepare(options: argparse.Namespace) -> None:
     from hlsim.data.teacher import check_grid, find_teacher
     from hlsim.data.writing import Recipe, write_instances
 
-    levels = (options.level[0], options.level[-1])
-    snrs = {"train_snrs": options.train_snr, "test_snrs": options.test_snr}
-    settings = PlanSettings(**passed(options, PlanSettings, level=levels, **snrs))
+    settings = PlanSettings(
+        corpus=options.corpus,
+        layout=options.layout,
+        table=options.table,
+        noise=options.noise,
+        root=options.root,
+        train_snrs=options.train_snr,
+        test_snrs=options.test_snr,
+        train_types=options.train_types,
+        test_types=options.test_types,
+        audiograms=options.audiograms,
+        test_audiograms=options.test_audiograms,
+        ears=options.ears,
+        severities=options.severities,
+        level=(options.level[0], options.level[-1]),
+        rate=options.rate,
+        test_share=options.test_share,
+        valid_share=options.valid_share,
+        shortest=options.shortest,
+        seed=options.seed,
+    )
     if options.teacher == "pyclarity":
         need("pyclarity", "clarity")
     if options.write:
         check_grid(options.rate)  # before hours of checking files
     recipe = Recipe(options.alignment, find_teacher(options.teacher)) if options.write else None
-    prepared = prepare(settings, **passed(options, prepare, progress=show_progress("utterances")))
+    where = {
+        "jobs": options.jobs,
+        "backend": options.backend,
+        "scheduler": options.scheduler,
+    }
+    prepared = prepare(
+        settings,
+        options.out,
+        strict=options.strict,
+        progress=show_progress("utterances"),
+        **where,
+    )
     print(prepared.to_text())
     if prepared.faults:
         print(f"{prepared.faults} faults are left out: {options.out / FAULTS}")
     if recipe is not None:
-        where = passed(options, run_parallel)
         count_made = write_instances(
             options.out, recipe, progress=show_progress("instances"), **where
         )

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 from hlsim.cli.inputs import check_there, need, read_ear, read_recipe
-from hlsim.cli.options import Parser, count, integer, natural, passed, positive
+from hlsim.cli.options import Parser, count, integer, natural, positive
 from hlsim.extras import require
 
 FOLDERS = ("speech", "noise", "audiograms", "valid_speech", "valid_noise", "valid_audiograms")
@@ -95,7 +95,7 @@ def _train_simulator(options: argparse.Namespace) -> None:
     from hlsim.training.recipes import SimulatorRecipe
     from hlsim.training.simulator import train_simulator
 
-    arguments = _arguments(options, train_simulator)
+    arguments = _arguments(options) | {"teacher": options.teacher}
     if options.manifest is not None:
         workers = 1 if options.workers is None else options.workers
         arguments["data"] = PlannedSource(
@@ -115,7 +115,7 @@ def _train_compensator(options: argparse.Namespace) -> None:
 
     recipe = CompensatorRecipe.from_dict(_recipe(options))
     folder = train_compensator(
-        recipe=recipe, **_arguments(options, train_compensator, audiogram=ear)
+        recipe=recipe, audiogram=ear, simulator=options.simulator, **_arguments(options)
     )
     print(f"the best checkpoint is in {folder}")
 
@@ -139,22 +139,30 @@ def _recipe(options: argparse.Namespace) -> dict[str, Any]:
     return read_recipe(options.config) | ({} if options.start is None else {"start": options.start})
 
 
-def _arguments(
-    options: argparse.Namespace, train: Callable[..., Path], **more: Any
-) -> dict[str, Any]:
+def _arguments(options: argparse.Namespace) -> dict[str, Any]:
+    """Arguments that ``train_simulator`` and ``train_compensator`` have in common."""
     from hlsim.torchtools import keep_freed_memory
     from hlsim.training.batches import TrainingData
-    from hlsim.training.loop import RunOptions
 
     keep_freed_memory()
-    running = {
-        name: value for name, value in vars(options).items() if name in RunOptions.__annotations__
+    data = None
+    if options.speech is not None:
+        data = TrainingData(
+            speech=options.speech,
+            noise=options.noise,
+            audiograms=options.audiograms,
+            valid_speech=options.valid_speech,
+            valid_noise=options.valid_noise,
+            valid_audiograms=options.valid_audiograms,
+        )
+    return {
+        "data": data,
+        "out": options.out,
+        "max_minutes": options.max_minutes,
+        "max_steps": options.max_steps,
+        "accelerator": "gpu" if options.device == "cuda" else options.device,
+        "devices": options.devices,
+        "nodes": options.nodes,
+        "strategy": options.strategy,
+        "progress": not options.quiet,
     }
-    return running | passed(
-        options,
-        train,
-        data=None if options.speech is None else TrainingData(**passed(options, TrainingData)),
-        accelerator="gpu" if options.device == "cuda" else options.device,
-        progress=not options.quiet,
-        **more,
-    )

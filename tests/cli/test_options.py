@@ -114,30 +114,6 @@ def test_defaults_of_the_program_are_the_functions() -> None:
     assert compared > 30
 
 
-TRAINING = (
-    "speech noise audiograms valid_speech valid_noise valid_audiograms config start device quiet"
-)
-
-# options that are not passed on by their names
-READ = {
-    "prepare": "out strict write teacher alignment jobs backend scheduler train_snr test_snr",
-    "demo": "",
-    "benchmark": "what simulator brief json",
-    "haspi-report": "scores listen out",
-    "evaluate-compensator": "names out",
-    "evaluate-simulator": "names out",
-    "train-compensator": TRAINING,
-    "train-simulator": f"{TRAINING} manifest root prepared workers",
-}
-
-
-def test_options_are_arguments_of_what_is_called_or_are_read() -> None:
-    parameters = _parameters()
-    for command, read in READ.items():
-        found = {action.dest for action in declared(command)._actions} - {"help"}
-        assert found - parameters[command].keys() == set(read.split()), command
-
-
 def test_required_options_are_shown_as_required() -> None:
     text = " ".join(declared("evaluate-simulator").format_help().split())
     assert "folder of clean speech (required)" in text and "None" not in text
