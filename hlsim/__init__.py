@@ -5,6 +5,8 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from hlsim.version import __version__ as __version__
+
 if TYPE_CHECKING:
     from hlsim.audiogram import Audiogram
     from hlsim.audiogram.listener import Listener
@@ -14,7 +16,6 @@ if TYPE_CHECKING:
     from hlsim.neuro import NeuroMSBG
     from hlsim.pretrained import list_pretrained, load_pretrained
 
-__version__ = "0.1.0"
 
 __all__ = [
     "MSBG",

@@ -9,9 +9,9 @@ from collections.abc import Sequence
 from functools import partial
 from importlib import import_module
 
-from hlsim import __version__
 from hlsim.cli.options import Parser, join_negative_values
 from hlsim.extras import MissingExtraError
+from hlsim.version import __version__
 
 COMMANDS = {
     "demo": (

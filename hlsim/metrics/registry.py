@@ -10,7 +10,6 @@ from typing import Any, Literal, NamedTuple
 import torch
 from torch import Tensor
 
-import hlsim
 from hlsim.audiogram import Audiogram
 from hlsim.checks import check_choice, refuse_unknown
 from hlsim.extras import require
@@ -19,6 +18,7 @@ from hlsim.metrics.haspi_score import haspi
 from hlsim.metrics.hasqi_score import hasqi
 from hlsim.metrics.pair import Signal, check_pair
 from hlsim.metrics.pyclarity import pyclarity_score
+from hlsim.version import __version__
 
 Engine = Literal["hlsim", "pyclarity"]
 """What computes HASPI and HASQI: hlsim in torch, with pyclarity's figures, or pyclarity itself."""
@@ -131,7 +131,7 @@ def versions_of(names: Iterable[str], engine: Engine = "hlsim") -> dict[str, str
 def version_of(package: str) -> str:
     """An installed package's version, or that it is not installed; hlsim's own also where it runs from its sources."""
     if package == "hlsim":
-        return hlsim.__version__
+        return __version__
     try:
         return metadata.version(package)
     except metadata.PackageNotFoundError:

@@ -16,13 +16,13 @@ from lightning.pytorch.callbacks import Callback, ModelCheckpoint, Timer
 from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
-from hlsim import __version__
 from hlsim.data.module import BatchData
 from hlsim.pretrained import checkpoint_digest, save_checkpoint
 from hlsim.training.callbacks import DataWait, History, KeepBest, ShowExamples, TimeProgress
 from hlsim.training.module import TimedModule
 from hlsim.training.recipes import TrainingRecipe
 from hlsim.training.state import BEST, CHECKPOINT, LAST, WholeStates, claimed
+from hlsim.version import __version__
 
 
 class RunOptions(TypedDict, total=False):
