@@ -241,3 +241,24 @@ def test_pictures_of_what_is_heard_are_small(tmp_path: Path) -> None:
     load("heard.py").main(tmp_path)
     sizes = {path.name: path.stat().st_size for path in tmp_path.iterdir()}
     assert set(sizes) == {"heard.png", "family.png"} and max(sizes.values()) < 300_000
+
+
+def test_benchmark_prints_a_table_of_each_kind(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("clarity")
+    example = load("benchmark.py")
+    monkeypatch.setattr(example, "LOSS_SIMULATORS", ("neuro-msbg-light",))
+    example.main(["--repeats", "1", "--seconds", "0.2", "--simulators", "neuro-msbg-light"])
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[1] for line in lines if "forward (ms)" in line] == [*example.TABLES]
+    rows = [line for line in lines if line.startswith("| pyclarity")]
+    assert len(rows) == 5 and sum("1.0 (1.0 to 1.0)" in row for row in rows) == 4
+
+
+def test_alignment_by_structure_and_by_an_impulse_agree(speech_dir: Path, tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    source, target = speech_dir / "valid" / "flite-rms-01.flac", tmp_path / "alignment.png"
+    structural_ms, impulse_ms = load("draw_alignment.py").main(str(source), str(target))
+    assert structural_ms == pytest.approx(1239 / 44.1) and abs(impulse_ms - structural_ms) < 2.0
+    assert target.read_bytes().startswith(b"\x89PNG")

@@ -28,10 +28,6 @@ COMMANDS = {
         "prepare",
         "check a corpus and plan training instances: utterances, noise, ears, levels; with --write make them",
     ),
-    "draw-alignment": (
-        "prepare",
-        "draw an utterance and what an ear hears of it, raised to the utterance's level, before and after alignment",
-    ),
     "train-simulator": (
         "training",
         "train a Neuro-MSBG on targets from the exact MSBG or another teacher",
@@ -53,7 +49,6 @@ COMMANDS = {
         "clarity",
         "judge pairs of aids on scenes of Clarity's challenges: the better ear's HASPI and HASQI",
     ),
-    "benchmark": ("benchmark", "time simulators, a training step and metrics side by side"),
 }
 """Each command's module in ``hlsim.cli``, where a function of its name declares its options, and what it does."""
 

@@ -1,4 +1,4 @@
-"""The commands ``prepare`` and ``draw-alignment``."""
+"""The command ``prepare``."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from hlsim.cli.inputs import check_files, check_there, need, read_ear
+from hlsim.cli.inputs import check_there, need
 from hlsim.cli.options import (
     EARS_TABLE,
     Parser,
@@ -78,19 +78,6 @@ def prepare(parser: Parser) -> None:
     parser.parallel()
     parser.seed()
     parser.out()
-
-
-def draw_alignment(parser: Parser) -> None:
-    parser.runs(
-        _draw_alignment,
-        "speech.wav alignment.png",
-        "speech.wav alignment.png --audiogram N4 --alignment structural",
-    )
-    parser.option("input", Path, "wav, flac or ogg, 16 to 48 kHz; its first channel", metavar="IN")
-    parser.option("output", Path, "png", metavar="OUT")
-    parser.audiogram("N3")
-    parser.option("--alignment", str, "impulse is the paper's", "impulse", choices=ALIGNMENTS)
-    parser.full_scale()
 
 
 def _prepare(options: argparse.Namespace) -> None:
@@ -166,18 +153,3 @@ def _refuse_without(
     ]
     if given and not there:
         raise ValueError(f"{', '.join(given)} without {needed}; allowed: only with it")
-
-
-def _draw_alignment(options: argparse.Namespace) -> None:
-    check_files(options.input, options.output)
-    ear = read_ear(options.audiogram)
-    from hlsim.audio import read_audio
-    from hlsim.calibration import gain_to_pascals
-    from hlsim.report.alignment import draw_alignment
-
-    waveform, rate = read_audio(options.input)
-    signal = waveform[0] * gain_to_pascals(options.full_scale_spl)
-    delay = draw_alignment(signal, ear, rate, options.output, method=options.alignment)
-    print(
-        f"{options.output}: delay {delay:.1f} samples at {rate} Hz ({1000 * delay / rate:.2f} ms)"
-    )

@@ -73,8 +73,7 @@ def test_unreadable_options_are_one_line_without_the_usage(
         ("prepare", ["--severities", "mild"], "got 'mild', expected severities"),
         ("prepare", ["--train-snr", "0,x"], "got '0,x', expected numbers separated by commas"),
         ("prepare", ["--seed", "a"], "got 'a', expected a whole number"),
-        ("draw-alignment", ["--full-scale-spl", "abc"], "got 'abc', expected a number"),
-        ("draw-alignment", ["--full-scale-spl", "nan"], "got 'nan', expected a number"),
+        ("simulate", ["--full-scale-spl", "nan"], "got 'nan', expected a number"),
     ],
 )
 def test_values_of_another_kind(
@@ -590,29 +589,6 @@ def test_evaluate_simulator_writes_both_files(tmp_path: Path, speech_dir: Path) 
     exact = [row["snr"] for row in result["simulators"]["exact"]["items"]]
     assert len(exact) == 4 and min(exact) > 40.0
     assert "neuro-msbg" in (tmp_path / "out" / "fidelity.md").read_text()
-
-
-@pytest.mark.parametrize("device", ["gpu", "cuda:99", "cpu:3"])
-def test_benchmark_on_no_device(device: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["benchmark", "--device", device]) == 2
-    assert (
-        f"device '{device}': there is none that torch can use; allowed: cpu"
-        in capsys.readouterr().err
-    )
-
-
-@pytest.mark.slow
-def test_benchmark(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = tmp_path / "speed.json"
-    options = "--repeats 1 --limit 0.001 --only identity exact pyclarity (neuro-msbg)".split()
-    assert main(["benchmark", *options, "--json", str(path)]) == 0
-    result = json.loads(path.read_text())
-    names = [row["name"] for row in result["rows"]]
-    assert {"identity", "MSBG (exact)", "Neuro-MSBG (neuro-msbg)"} <= set(names)
-    cells = [cell for row in result["rows"] for cell in row["cells"]]
-    assert {cell["sample_rate"] for cell in cells} >= {16000, 44100}
-    assert all(0 < cell["least_ms"] <= cell["median_ms"] <= cell["greatest_ms"] for cell in cells)
-    assert "pyclarity" in capsys.readouterr().out
 
 
 def test_haspi_report_of_a_manifest(

@@ -19,7 +19,6 @@ from hlsim.data.teacher import TEACHERS, Alignment
 from hlsim.losses.criteria import CRITERIA, CriterionName
 from hlsim.metrics.registry import MEASURES, Engine, MeasureName
 from hlsim.parallel import Backend
-from hlsim.report.alignment import Method
 
 
 def declared(command: str) -> Parser:
@@ -50,7 +49,6 @@ def test_names_that_are_written_twice_agree() -> None:
     assert choices("prepare", "--layout") == get_args(Layout)
     assert options.TEACHERS == TEACHERS
     assert choices("prepare", "--alignment") == get_args(Alignment)[:2]
-    assert set(choices("draw-alignment", "--alignment")) == {*get_args(Method)}
     assert (
         choices("haspi-report", "--engine")
         == choices("evaluate-compensator", "--engine")
@@ -65,7 +63,6 @@ def test_names_that_are_written_twice_agree() -> None:
 def _parameters() -> dict[str, dict[str, Any]]:
     """Defaults by the names of the arguments that each command's functions take."""
     pytest.importorskip("lightning")
-    from hlsim.benchmark.run import benchmark
     from hlsim.demo import demo
     from hlsim.evaluation import haspi_report, score_items
     from hlsim.evaluation.compensators import evaluate_compensators
@@ -77,7 +74,6 @@ def _parameters() -> dict[str, dict[str, Any]]:
     functions: dict[str, tuple[Callable[..., Any], ...]] = {
         "prepare": (PlanSettings,),
         "demo": (demo,),
-        "benchmark": (benchmark,),
         "haspi-report": (haspi_report, score_items),
         "evaluate-compensator": (evaluate_compensators,),
         "evaluate-simulator": (evaluate_simulators,),

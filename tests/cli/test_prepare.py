@@ -1,4 +1,4 @@
-"""The commands ``prepare`` and ``draw-alignment``: what they say and write, and one line on bad input."""
+"""The command ``prepare``: what they say and write, and one line on bad input."""
 
 from pathlib import Path
 
@@ -117,25 +117,3 @@ def test_bad_input_is_one_line(
     error = capsys.readouterr().err.strip().splitlines()[-1]
     assert error.startswith("hlsim: error: ") and said in error
     assert not (tmp_path / "out" / "manifest.csv").exists()
-
-
-def test_draw_alignment(corpus: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    pytest.importorskip("matplotlib")
-    picture = tmp_path / "a.png"
-    assert (
-        main(["draw-alignment", str(corpus / "ann" / "1.wav"), str(picture), "--audiogram", "N3"])
-        == 0
-    )
-    assert "samples at 16000 Hz" in capsys.readouterr().out and picture.stat().st_size > 1000
-    assert main(["draw-alignment", str(corpus / "bob" / "2.wav"), str(picture)]) == 2
-
-
-def test_bad_pictures_are_refused_before_the_work(
-    corpus: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    for picture, said in (
-        (tmp_path / "a.jpg", "a.jpg: what is drawn is a PNG; allowed: a name that ends in .png"),
-        (tmp_path / "none" / "a.png", "none: no such folder"),
-    ):
-        assert main(["draw-alignment", str(corpus / "ann" / "1.wav"), str(picture)]) == 2
-        assert said in capsys.readouterr().err and not picture.exists()

@@ -41,7 +41,6 @@ def test_help_and_refusals_import_nothing_heavy(tmp_path: Path) -> None:
         ["live", "--audiogram", "N3", "--block-ms", "0"],
         ["prepare", missing, "--out", out],
         ["prepare", str(tmp_path), "--out", out, "--layout", "mine"],
-        ["draw-alignment", missing, out],
         ["train-simulator", "--config", missing, "--speech", str(tmp_path), "--out", out],
         ["train-simulator", "--config", str(plain), "--out", out],
         ["train-simulator", "--config", str(plain), "--manifest", missing, "--out", out],
@@ -59,7 +58,6 @@ def test_help_and_refusals_import_nothing_heavy(tmp_path: Path) -> None:
         ["evaluate-compensator", "nalr", "--speech", missing, "--out", out],
         ["haspi-report", "--manifest", missing, "--out", out],
         ["demo", "--speech", missing],
-        ["benchmark", "--repeats", "0"],
     ]
     shown = [["--help"], ["--version"], *([command, "--help"] for command in COMMANDS)]
     calls = [(call, 0) for call in shown] + [(call, 2) for call in refused]

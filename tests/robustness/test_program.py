@@ -17,7 +17,6 @@ CALLS = {  # of each command one whose values may be replaced; most of them end 
     "compensate": "IN out.wav --audiogram N3 --compensator nalr --full-scale-spl 94",
     "prepare": "speech --out new --jobs 1 --layout folder --ears 1 --severities mild=1 --level 65 --rate 16000 "
     "--test-share 0.4 --valid-share 0.1 --shortest 0.5 --seed 0",
-    "draw-alignment": "IN out.png --audiogram N3 --full-scale-spl 94 --alignment structural",
     "haspi-report": "--manifest m.csv --out new --measures haspi --jobs 1 --spl 65 --listen 0 --seed 0 --audiogram N3",
     "train-compensator": "--speech empty --out new --max-steps 1 --max-minutes 0.1 --device cpu --audiogram N3",
     "train-simulator": "--config r.yaml --speech empty --out new --max-steps 1 --device cpu --teacher msbg",

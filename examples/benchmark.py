@@ -1,0 +1,225 @@
+"""Times of simulators, loss, training step and metrics, and their ratios to pyclarity's.
+
+    python examples/benchmark.py
+    python examples/benchmark.py --what simulators --simulators neuro-msbg runs/mine/checkpoint
+    OMP_NUM_THREADS=1 python examples/benchmark.py --what loss step --seconds 2 --batch 8
+
+The rows of a table take turns in every round, so that a ratio compares calls that ran within seconds of each other; the
+first round is not counted. Tables show the median (minimum to maximum) of all counted rounds.
+"""
+
+import argparse
+import logging
+import statistics
+import time
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from compensators import MappingCompensator
+from hlsim import MSBG, Audiogram, HearingLossLoss, list_pretrained, load_pretrained
+from hlsim.calibration import set_level
+from hlsim.metrics import haspi, hasqi, mbstoi
+
+EAR = Audiogram.standard("N2")
+FULL_SCALE_SPL = 94.0
+SHIPPED = [name for name in list_pretrained() if name.startswith("neuro-")]
+LOSS_SIMULATORS = ("neuro-msbg", "neuro-msbg-light", "msbg")
+PYCLARITY_RATE = 44100  # Hz, the only rate of pyclarity's MSBG
+
+
+class Row(NamedTuple):
+    """A call to time.
+
+    Attributes:
+        call: Function without arguments that returns a tensor.
+        reference: Name of the row of pyclarity that the ratios refer to.
+        backward: Whether the call is differentiable; it is then timed with its backward pass, too.
+    """
+
+    name: str
+    call: Callable[[], Tensor]
+    reference: str
+    backward: bool = True
+
+
+def noise_like_speech(rate: int, seconds: float, batch: int, seed: int = 0) -> Tensor:
+    """Noise at 65 dB SPL, modulated at the rate of syllables. Shape: (batch, time)."""
+    generator = torch.Generator().manual_seed(seed)
+    samples = round(rate * seconds)
+    envelope = torch.sin(2.0 * torch.pi * 4.0 * torch.arange(samples) / rate).clamp_min(0.05)
+    return set_level(torch.randn(batch, samples, generator=generator) * envelope, 65.0)
+
+
+def simulator_rows(options: argparse.Namespace) -> list[Row]:
+    """Exact MSBG, Neuro-MSBG and pyclarity's two models."""
+    device, reference = options.device, "pyclarity Ear, 44100 Hz"
+    inputs = {}
+    for rate in (PYCLARITY_RATE, 16000):
+        signal = noise_like_speech(rate, options.seconds, options.batch).to(device)
+        inputs[rate] = signal.requires_grad_()
+    rows = pyclarity_simulator_rows(inputs[PYCLARITY_RATE], reference, device)
+    for rate, signal in inputs.items():
+        exact = MSBG(EAR, sample_rate=rate).to(device)
+        rows.append(Row(f"MSBG (exact), {rate} Hz", lambda m=exact, x=signal: m(x), reference))
+        for name in options.simulators or SHIPPED:
+            network = load_pretrained(name, sample_rate=rate).to(device)
+            parameters = sum(weights.numel() for weights in network.parameters())
+            title = f"{name} ({parameters:,} parameters), {rate} Hz"
+            rows.append(Row(title, lambda m=network, x=signal: m(x, EAR), reference))
+    return rows
+
+
+def pyclarity_simulator_rows(signal: Tensor, reference: str, device: str) -> list[Row]:
+    """pyclarity's reference in NumPy, which takes one item at a time on the CPU, and its model in torch."""
+    from clarity.evaluator.msbg.msbg import Ear
+    from clarity.predictor.torch_msbg import MSBGHearingModel
+
+    logging.getLogger("clarity").setLevel(logging.ERROR)
+    ear = Ear(equiv_0db_spl=FULL_SCALE_SPL - 20.0)  # it adds 20 dB
+    ear.set_audiogram(EAR.to_clarity())
+    items = signal.detach().cpu().double().numpy()
+    model = MSBGHearingModel(
+        np.array(EAR.thresholds), np.array(EAR.frequencies), sr=PYCLARITY_RATE, device=device
+    ).to(device)
+
+    def process_items() -> Tensor:
+        return torch.from_numpy(np.stack([ear.process(item)[0] for item in items]))
+
+    return [
+        Row(reference, process_items, reference, backward=False),
+        Row(f"pyclarity torch_msbg, {PYCLARITY_RATE} Hz", lambda: model(signal), reference),
+    ]
+
+
+def loss_rows(options: argparse.Namespace) -> list[Row]:
+    """The loss through each simulator, without the network that it trains."""
+    clean = noise_like_speech(16000, options.seconds, options.batch).to(options.device)
+    output = noise_like_speech(16000, options.seconds, options.batch, seed=1).to(options.device)
+    output.requires_grad_()
+    rows = []
+    for simulator in LOSS_SIMULATORS:
+        loss = HearingLossLoss(EAR, simulator=simulator).to(options.device)
+        rows.append(Row(f"HearingLossLoss ({simulator})", lambda f=loss: f(output, clean), ""))
+    return rows
+
+
+def step_rows(options: argparse.Namespace) -> list[Row]:
+    """An untrained compensator alone, and with the loss behind it: what a training step computes."""
+    clean = noise_like_speech(16000, options.seconds, options.batch).to(options.device)
+    network = MappingCompensator().to(options.device).train()
+    rows = [Row("compensator alone", lambda: network(clean, EAR), "")]
+    for simulator in LOSS_SIMULATORS:
+        loss = HearingLossLoss(EAR, simulator=simulator).to(options.device)
+        title = f"compensator and HearingLossLoss ({simulator})"
+        rows.append(Row(title, lambda f=loss: f(network(clean, EAR), clean), ""))
+    return rows
+
+
+def metric_rows(options: argparse.Namespace) -> list[Row]:
+    """HASPI, HASQI and MBSTOI of one pair of at least 1 s, by hlsim and by pyclarity."""
+    from clarity.evaluator.haspi import haspi_v2
+    from clarity.evaluator.hasqi import hasqi_v2
+    from clarity.evaluator.mbstoi import mbstoi as pyclarity_mbstoi
+
+    rate, seconds = 16000, max(1.0, options.seconds)
+    clean = noise_like_speech(rate, seconds, 2)
+    output = clean + 0.3 * noise_like_speech(rate, seconds, 2, seed=1)
+    pair = (clean[0].double().numpy(), output[0].double().numpy())
+    both_ears = (*clean.double().numpy(), *output.double().numpy())
+    clarity_ear = EAR.to_clarity()
+    ours, clean = output.to(options.device).requires_grad_(), clean.to(options.device)
+
+    def one_ear(score: Callable[..., tuple[float, ...]]) -> Tensor:
+        value = score(pair[0], rate, pair[1], rate, clarity_ear, level1=FULL_SCALE_SPL)[0]
+        return torch.tensor(value)
+
+    def two_ears() -> Tensor:
+        return torch.tensor(pyclarity_mbstoi(*both_ears, rate))
+
+    names = [f"pyclarity {metric}" for metric in ("HASPI", "HASQI", "MBSTOI")]
+    return [
+        Row(names[0], lambda: one_ear(haspi_v2), names[0], backward=False),
+        Row("HASPI", lambda: haspi(ours[0], clean[0], EAR), names[0]),
+        Row(names[1], lambda: one_ear(hasqi_v2), names[1], backward=False),
+        Row("HASQI", lambda: hasqi(ours[0], clean[0], EAR), names[1]),
+        Row(names[2], two_ears, names[2], backward=False),
+        Row("MBSTOI", lambda: mbstoi(ours, clean), names[2]),
+    ]
+
+
+TABLES = {
+    "simulators": simulator_rows,
+    "loss": loss_rows,
+    "step": step_rows,
+    "metrics": metric_rows,
+}
+
+
+def milliseconds(row: Row, backward: bool, device: str) -> float:
+    """Time of one call, forward alone or with the backward pass."""
+    start = time.perf_counter()
+    with torch.inference_mode(not backward):
+        value = row.call()
+        if backward:
+            value.square().sum().backward()
+    if device.startswith("cuda"):
+        torch.cuda.synchronize(device)
+    return 1000.0 * (time.perf_counter() - start)
+
+
+def print_table(title: str, rows: list[Row], repeats: int, device: str) -> None:
+    """Time the rows in turns and print a Markdown table."""
+    times: dict[tuple[str, bool], list[float]] = {}
+    for repeat in range(repeats + 1):
+        for row in rows:
+            for backward in (False, True) if row.backward else (False,):
+                elapsed = milliseconds(row, backward, device)
+                if repeat > 0:
+                    times.setdefault((row.name, backward), []).append(elapsed)
+    print(f"\n| {title} | forward (ms) | forward + backward (ms) | pyclarity's time / forward |")
+    print("|---|---|---|---|")
+    for row in rows:
+        forward = times[row.name, False]
+        ratios = []
+        if row.reference:
+            pairs = zip(times[row.reference, False], forward, strict=True)
+            ratios = [reference / own for reference, own in pairs]
+        columns = [summary(forward), summary(times.get((row.name, True), [])), summary(ratios)]
+        print(f"| {row.name} | {' | '.join(columns)} |")
+
+
+def summary(values: list[float]) -> str:
+    """Median (minimum to maximum)."""
+    if not values:
+        return "-"
+    return f"{statistics.median(values):.1f} ({min(values):.1f} to {max(values):.1f})"
+
+
+def main(arguments: list[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument(
+        "--what", nargs="+", choices=TABLES, default=[*TABLES], help="tables to print"
+    )
+    parser.add_argument(
+        "--simulators", nargs="+", metavar="NAME", help="checkpoints by name or folder"
+    )
+    parser.add_argument("--seconds", type=float, default=1.0, help="length of each signal")
+    parser.add_argument("--batch", type=int, default=1, help="signals per batch")
+    parser.add_argument("--repeats", type=int, default=7, help="counted rounds")
+    parser.add_argument("--device", default="cpu", help="cpu, cuda or cuda:1")
+    options = parser.parse_args(arguments)
+    size = f"{options.batch} x {options.seconds:g} s"
+    print(
+        f"{size} on {options.device}, {torch.get_num_threads()} threads, torch {torch.__version__}, "
+        f"{time.strftime('%Y-%m-%d')}; median (minimum to maximum) of {options.repeats} rounds"
+    )
+    for name in options.what:
+        print_table(name, TABLES[name](options), options.repeats, options.device)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,1 +1,0 @@
-"""Times simulators, a training step and metrics."""
