@@ -1,0 +1,105 @@
+"""Plug-ins: how they are found, and how their outputs are checked."""
+
+import pickle
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from hlsim.calibration import set_level
+from hlsim.plugins import WaveformPlugin, load_plugin
+
+CODE = """
+import torch
+from torch import nn
+from neighbour import GAIN
+
+def half(waveform, *_):
+    return waveform * GAIN
+
+class Quieter(nn.Module):
+    fingerprint = "version 2"
+    def forward(self, waveform, *_):
+        assert not self.training and not torch.is_grad_enabled()
+        return waveform * GAIN
+
+def short(waveform):
+    return waveform[..., 1:]
+
+def complex_numbers(waveform):
+    return waveform + 0j
+
+def array(waveform):
+    return waveform.numpy()
+
+def infinite(waveform):
+    return waveform / 0
+
+def broken(waveform):
+    return waveform @ nobody
+
+def late(waveform):
+    return waveform.roll(80, -1)
+
+number = 3
+"""
+
+
+@pytest.fixture
+def module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+    """Write a module into the working directory and return its name, which no other test uses."""
+    name = f"plugins_{tmp_path.name}".replace("-", "_")
+    (tmp_path / f"{name}.py").write_text(CODE)
+    (tmp_path / "neighbour.py").write_text("GAIN = 0.5\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delitem(sys.modules, "neighbour", raising=False)
+    return name
+
+
+def noise() -> Tensor:
+    return set_level(torch.randn(2, 8000), 65.0)
+
+
+def test_a_module_and_a_file_give_the_same_plugin_and_leave_no_path_behind(module: str) -> None:
+    paths, waveform = list(sys.path), noise()
+    for name in (f"{module}:half", f"{module}.py:half", f"./{module}.py:Quieter"):
+        torch.testing.assert_close(WaveformPlugin(name, "teacher")(waveform), waveform / 2)
+    assert sys.path == paths
+
+
+def test_a_changed_file_is_loaded_anew(module: str) -> None:
+    assert load_plugin(f"{module}.py:number", "measure") == 3
+    Path(f"{module}.py").write_text("number = 4")
+    assert load_plugin(f"{module}.py:number", "measure") == 4
+
+
+def test_another_process_loads_the_plugin_again_under_the_same_fingerprint(module: str) -> None:
+    plugin = WaveformPlugin(f"{module}.py:Quieter", "aid")
+    copy = pickle.loads(pickle.dumps(plugin))
+    assert copy.fingerprint == plugin.fingerprint == "version 2"
+    assert WaveformPlugin(f"{module}:half", "aid").fingerprint == f"{module}:half"
+
+
+@pytest.mark.parametrize("attribute", ["short", "complex_numbers", "array", "infinite", "broken"])
+def test_outputs_that_are_no_waveform_are_rejected_by_name(module: str, attribute: str) -> None:
+    plugin = WaveformPlugin(f"{module}:{attribute}", "teacher")
+    with pytest.raises(ValueError, match=f"^teacher {module}:{attribute} "):
+        plugin(noise())
+
+
+def test_outputs_that_are_not_aligned_are_rejected(module: str) -> None:
+    WaveformPlugin(f"{module}:half", "teacher").check_aligned(noise(), 16000)
+    with pytest.raises(ValueError, match=r"delays by 5\.0 ms"):
+        WaveformPlugin(f"{module}:late", "teacher").check_aligned(noise(), 16000)
+
+
+@pytest.mark.parametrize("name", ["msbg", "no_such_module:half", "none.py:half", ":half", "x:"])
+def test_names_that_cannot_be_loaded_are_rejected(module: str, name: str) -> None:
+    with pytest.raises(ValueError, match=name):
+        load_plugin(name, "teacher")
+    with pytest.raises(ValueError, match="nobody"):
+        load_plugin(f"{module}:nobody", "teacher")
+    with pytest.raises(ValueError, match="expected a callable"):
+        WaveformPlugin(f"{module}:number", "teacher")
