@@ -16,12 +16,13 @@ and both extremes; every other section uses the defaults.
 Predictions, made before the first run on a GPU
 -----------------------------------------------
 ``PREDICTIONS`` holds, for a call with one item of 4 s, the number of operations that launch a
-kernel and the megabytes that they read and write, as counted on a CPU by ``python examples/gpu.py --device
-cpu --only operations --out DIR``. (The count is torch's profiler's; an operation is one without
-children that is no view, and it writes as much as its largest input holds. On a CPU HASPI, HASQI
-and Mamba work in more and smaller blocks than on a GPU, so that their operations are upper bounds.) We
-assume 8 microseconds of host time per operation and 2 terabytes per second. The expected time of a
-call is the longer one of the two; the table of throughput shows it beside the measurement.
+kernel and the megabytes that they read and write, as counted on a CPU by
+``python examples/gpu.py --device cpu --only operations --out DIR``. (The count is that of torch's
+profiler; an operation is one without children that is no view, and it writes as much as its largest
+input holds. On a CPU HASPI, HASQI and Mamba work in more and smaller blocks than on a GPU, so that
+their operations are upper bounds.) We assume 8 microseconds of host time per operation and
+2 terabytes per second. The expected time of a call is the longer one of the two; the table of
+throughput shows it beside the measurement.
 
 * At batch 1 the GPU waits for the host in every module. At batch 64 MSBG, the networks and the loss
   are limited by memory bandwidth: 41,000 times real time for MSBG at 16 kHz, 15,000 with its
