@@ -1,6 +1,7 @@
-"""One error for every missing optional dependency, naming the command that installs it."""
+"""Optional dependencies, and one error that names the command that installs them."""
 
-import importlib
+from importlib import import_module
+from importlib.util import find_spec
 from types import ModuleType
 
 
@@ -9,18 +10,29 @@ class MissingExtraError(ImportError):
 
 
 def require(module: str, extra: str) -> ModuleType:
-    """Import an optional module, or say how to install it.
+    """Import an optional module, or raise an error that says how to install it.
 
     Args:
-        module: dotted module name, e.g. ``"clarity.evaluator.haspi"``.
-        extra: the extra of hlsim that brings it, e.g. ``"eval"``.
+        module: dotted module name, e.g. ``"matplotlib.figure"``.
+        extra: hlsim's extra that installs it, e.g. ``"eval"``.
 
     Raises:
-        MissingExtraError: the module (or something it needs) is not installed.
+        MissingExtraError: the module, or one that it imports, is not installed.
     """
     try:
-        return importlib.import_module(module)
+        return import_module(module)
     except ImportError as error:
+        package = module.split(".")[0]
         raise MissingExtraError(
-            f"{module.split('.')[0]} is needed here and not installed ({error}): pip install 'hlsim[{extra}]'"
+            f"{package} is needed here and not installed ({error}); install it: {install_command(extra)}"
         ) from error
+
+
+def is_installed(module: str) -> bool:
+    """Whether a top-level module can be found; it is not imported, which may take seconds."""
+    return find_spec(module) is not None
+
+
+def install_command(extra: str) -> str:
+    """The command that installs one of hlsim's extras."""
+    return f"pip install 'hlsim[{extra}]'"

@@ -5,6 +5,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from torch import nn
 
 import hlsim
 
@@ -38,3 +39,27 @@ def test_all_but_its_own_engine_does_without_pyclarity() -> None:
         command, capture_output=True, text=True, cwd=Path(hlsim.__file__).parents[1]
     )
     assert ended.returncode == 0, ended.stderr[-2000:]
+
+
+def test_simulators_are_compared_without_pesq(
+    speech_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for module in ("joblib", "matplotlib", "pandas", "pystoi"):
+        pytest.importorskip(module)
+    from hlsim.evaluation.simulators import evaluate_simulators
+    from hlsim.report.simulators import write_fidelity
+
+    monkeypatch.setitem(sys.modules, "pesq", None)
+    ears = tmp_path / "ears.csv"
+    row = hlsim.Audiogram.standard("N3").to_row()
+    ears.write_text(f"{','.join(row)}\n{','.join(row.values())}\n")
+    simulators: dict[str, nn.Module] = {"exact": hlsim.MSBG(sample_rate=16000)}
+    speech = speech_dir / "valid"
+    done = evaluate_simulators(
+        simulators, speech=speech, audiograms=ears, teacher="msbg", items=4, seconds=1.0
+    )
+    write_fidelity(done.result, done.heard, done.shown, tmp_path / "out")
+    overall = done.result["simulators"]["exact"]["inputs"]["as-is"]["overall"]
+    assert overall["stoi_n"] == 4 and overall["pesq_n"] == 0 and overall["pesq_lcc"] is None
+    page = (tmp_path / "out" / "fidelity.md").read_text()
+    assert "PESQ was not computed" in page and "pip install 'hlsim[pesq]'" in page

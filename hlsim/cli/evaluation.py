@@ -50,7 +50,7 @@ def _evaluate_simulator(options: argparse.Namespace) -> None:
         raise ValueError(f"simulators {', '.join(options.names)}; allowed: one a label")
     if options.compensator and "compensated" not in options.inputs:
         raise ValueError("--compensator without --inputs compensated; allowed: only with it")
-    need("eval", "pystoi", "pesq", "pandas", "matplotlib")
+    need("eval", "pystoi", "pandas", "matplotlib")
     if options.teacher == "pyclarity":
         need("pyclarity", "clarity")
     check_there(folders=(options.speech, options.noise), files=(options.audiograms,))

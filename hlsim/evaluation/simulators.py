@@ -19,7 +19,7 @@ from hlsim.data.teacher import Reference, find_teacher
 from hlsim.evaluation.items import LEVELS, Input, Item, draw_items, treat
 from hlsim.evaluation.statistics import paired_comparison
 from hlsim.evaluation.store import ScoreStore, key_of, weights_hash
-from hlsim.extras import MissingExtraError, require
+from hlsim.extras import MissingExtraError, is_installed, require
 from hlsim.metrics.fidelity import (
     linear_correlation,
     mean_squared_error,
@@ -99,7 +99,7 @@ def evaluate_simulators(
 
     Raises:
         ValueError: data that cannot be used, an unknown teacher or input, or no item that the truth does not fail on.
-        MissingExtraError: pyclarity, pystoi or pesq is not installed.
+        MissingExtraError: pyclarity or pystoi is not installed.
     """
     reference = find_teacher(teacher)
     told = str(reference) if isinstance(reference, ForeignTeacher) else teacher
@@ -223,11 +223,10 @@ def _scores(clean: Tensor, truth: Tensor, heard: Tensor) -> dict[str, Any]:
 
 
 def _both(clean: Tensor, heard: Tensor, whose: str) -> dict[str, Any]:
-    """STOI and PESQ of the truth or the simulator, and the reasons why there is none."""
-    scores = {
-        f"stoi_{whose}": stoi(clean, heard, NEURO_RATE),
-        f"pesq_{whose}": pesq_wb(clean, heard, NEURO_RATE),
-    }
+    """STOI, and PESQ where its package is installed, of the truth or the simulator; and the reasons for missing ones."""
+    scores = {f"stoi_{whose}": stoi(clean, heard, NEURO_RATE)}
+    if is_installed("pesq"):
+        scores[f"pesq_{whose}"] = pesq_wb(clean, heard, NEURO_RATE)
     reasons = [
         f"no {name}: {score.reason}" for name, score in scores.items() if score.value is None
     ]

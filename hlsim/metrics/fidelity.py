@@ -98,7 +98,7 @@ def pesq_wb(clean: Signal, heard: Signal, sample_rate: int) -> Score:
 
     Shape: (time,) and (time,). Raises as ``stoi``, for pesq.
     """
-    run = require("pesq", "eval").pesq
+    run = require("pesq", "pesq").pesq
 
     def at_16k(*signals: np.ndarray) -> float:
         pair = [resample(torch.from_numpy(x), sample_rate, _PESQ_RATE).numpy() for x in signals]

@@ -77,7 +77,7 @@ def _of_signals(
 # numpy draws the noise
 _HASPI = Measure("HASPI", None, ("numpy",), True, True, partial(_of_ear, haspi), "hlsim")
 _HASQI = Measure("HASQI", None, ("numpy",), True, False, partial(_of_ear, hasqi), "hlsim")
-_STOI, _PESQ = ("pystoi", "numpy", "scipy"), ("pesq", "numpy", "torchaudio")
+_STOI, _PESQ = ("pystoi", "numpy", "scipy"), ("pesq", "numpy")
 
 MeasureName = Literal["haspi", "hasqi", "stoi", "pesq"]
 
@@ -85,7 +85,7 @@ MEASURES: dict[str, Measure] = {
     "haspi": _HASPI,
     "hasqi": _HASQI,
     "stoi": Measure("STOI", ("pystoi", "eval"), _STOI, False, False, partial(_of_signals, "stoi")),
-    "pesq": Measure("PESQ", ("pesq", "eval"), _PESQ, False, False, partial(_of_signals, "pesq_wb")),
+    "pesq": Measure("PESQ", ("pesq", "pesq"), _PESQ, False, False, partial(_of_signals, "pesq_wb")),
 }
 """By the names that options and files use. Higher is better in all: HASPI, HASQI and STOI end at 1, PESQ at 4.64."""
 

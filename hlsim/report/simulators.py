@@ -16,6 +16,7 @@ from torch import Tensor
 from hlsim.audiogram import SEVERITIES
 from hlsim.evaluation.items import Item
 from hlsim.evaluation.statistics import PairedComparison
+from hlsim.extras import install_command, is_installed
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.report.page import Picture, Section, render_markdown, render_page, write_files
 from hlsim.report.pictures import draw_svg, legend, scatter
@@ -109,12 +110,15 @@ def _lead(result: Row) -> str:
 def _about(result: Row) -> str:
     reference = _TEACHERS.get(result["teacher"], result["teacher"])
     levels = ", ".join(f"{level:g}" for level in result["levels"])
-    return (
+    about = (
         f"Against {reference}: {result['items']} items of {result['seconds']:g} s at {levels} dB SPL in turn, seed "
         f"{result['seed']}. RAW MSE is on waveforms scaled to unit power of the reference. STOI and PESQ are of what is "
         "heard against the clean speech, of the reference and of the simulator: correlations (LCC, SRCC) and mean "
         "squared difference. PESQ says little where both signals are nearly inaudible."
     )
+    if not is_installed("pesq"):
+        about += f" PESQ was not computed. To add it, install pesq ({install_command('pesq')}) and run again."
+    return about
 
 
 def _sections(result: Row, spectrograms: Sequence[Picture], shown: Item) -> list[Section]:

@@ -508,7 +508,7 @@ def test_unequal_file_lists(
         ),
         (
             ["evaluate-simulator", "msbg", "--speech", "s", "--audiograms", "a", "--out", "o"],
-            "pesq",
+            "pystoi",
         ),
         (
             ["evaluate-simulator", "msbg", "--speech", "s", "--audiograms", "a", "--out", "o"],

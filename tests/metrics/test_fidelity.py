@@ -113,9 +113,15 @@ def test_pesq_equals_pesq(pair: tuple[Tensor, Tensor], speech: list[tuple[Tensor
     )
 
 
-@pytest.mark.parametrize(("measure", "package"), [(stoi, "pystoi"), (pesq_wb, "pesq")])
+@pytest.mark.parametrize(
+    ("measure", "package", "extra"), [(stoi, "pystoi", "eval"), (pesq_wb, "pesq", "pesq")]
+)
 def test_an_item_without_a_score_has_a_reason(
-    pair: tuple[Tensor, Tensor], measure: type[Score], package: str, monkeypatch: pytest.MonkeyPatch
+    pair: tuple[Tensor, Tensor],
+    measure: type[Score],
+    package: str,
+    extra: str,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     pytest.importorskip(package)
     clean, noisy = pair
@@ -129,7 +135,7 @@ def test_an_item_without_a_score_has_a_reason(
     with pytest.raises(ValueError, match="equally long"):
         measure(clean, noisy[1:], 16000)
     monkeypatch.setitem(sys.modules, package, None)
-    with pytest.raises(extras.MissingExtraError, match=r"pip install 'hlsim\[eval\]'"):
+    with pytest.raises(extras.MissingExtraError, match=rf"pip install 'hlsim\[{extra}\]'"):
         measure(clean, noisy, 16000)
 
 
