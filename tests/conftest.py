@@ -12,19 +12,41 @@ import torch
 from torch import Tensor
 
 from hlsim.audio import read_audio
+from tests.pyclarity import PyclarityOutputs, write_outputs
 
 SPEECH_DIR = Path(__file__).parents[1] / "hlsim" / "data" / "speech"
+
+
+NEW_OUTPUTS = pytest.StashKey[dict[str, Any]]()
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption(
+        "--write-pyclarity",
+        action="store_true",
+        help="store pyclarity's outputs that the slow tests compute (tests/pyclarity.py)",
+    )
 
 
 def pytest_configure(config: pytest.Config) -> None:
     """Take one thread, for transforms of several need not round alike from process to process."""
     torch.set_num_threads(1)
+    config.stash[NEW_OUTPUTS] = {}
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    """Store pyclarity's outputs where that was asked for."""
+    if session.config.stash[NEW_OUTPUTS]:
+        write_outputs(session.config.stash[NEW_OUTPUTS])
 
 
 def pytest_report_header(config: pytest.Config) -> str | None:
     """Say what a plain run leaves out."""
-    if config.option.markexpr == "not install and not browser and not audio":
-        return "left out: tests of an installation, of a browser and of sound: pytest -m install, browser, audio"
+    if config.option.markexpr == "not slow and not install and not browser and not audio":
+        return (
+            "left out: slow tests, and tests of an installation, of a browser and of sound; "
+            "run them with pytest -m slow, install, browser, audio"
+        )
     return None
 
 
@@ -42,6 +64,14 @@ def pytest_terminal_summary(terminalreporter: Any) -> None:
                 ]
     for kind, (tried, failed) in sorted(tally.items()):
         terminalreporter.write_line(f"robustness: {kind}: {tried} tried, {failed} failed")
+
+
+@pytest.fixture(params=["stored", pytest.param("computed", marks=pytest.mark.slow)])
+def pyclarity(request: pytest.FixtureRequest) -> PyclarityOutputs:
+    """Outputs of pyclarity by key: those stored, and in a second, slow test those computed anew."""
+    writes = request.config.option.write_pyclarity
+    new_outputs = request.config.stash[NEW_OUTPUTS] if writes else None
+    return PyclarityOutputs(request.param == "computed", new_outputs)
 
 
 @pytest.fixture(autouse=True)

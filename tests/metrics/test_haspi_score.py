@@ -2,21 +2,23 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from scipy.signal import resample_poly
 from torch import Tensor
 from torch.nn import functional
 
 from hlsim.audio import read_audio
 from hlsim.audiogram import FREQUENCIES, Audiogram
-from hlsim.dsp.resample import resample
-from hlsim.metrics import pyclarity as reference
 from hlsim.metrics.ear import clean_speech
 from hlsim.metrics.ear import model as ear_model
 from hlsim.metrics.haspi_score import HaspiReference, generator_after, haspi
 from hlsim.metrics.hasqi_score import HasqiReference
+from tests import pyclarity as reference
+from tests.pyclarity import PyclarityOutputs
 
 N2, N3, N6 = (Audiogram.standard(name) for name in ("N2", "N3", "N6"))
 
@@ -57,18 +59,23 @@ CASES: dict[str, tuple[Audiogram, int, Callable[[Tensor], Tensor]]] = {
 }
 
 
+def at_rate(signal: Tensor, rate: int) -> Tensor:
+    """The first item at another rate. Shape: (items, time) -> (time,), float64."""
+    return torch.from_numpy(resample_poly(signal[0].double().numpy(), rate // 100, 160))
+
+
 @pytest.mark.parametrize("case", CASES)
-def test_equals_pyclarity_under_its_seed(clean: Tensor, noisy: Tensor, case: str) -> None:
-    pytest.importorskip("clarity")
+def test_equals_pyclarity_under_its_seed(
+    clean: Tensor, noisy: Tensor, pyclarity: PyclarityOutputs, case: str
+) -> None:
     ear, rate, change = CASES[case]
-    x, y = (resample(signal[0], 16000, rate) for signal in (clean, noisy))
-    y = change(y)
-    expected = reference.pyclarity_score("haspi", x, y, ear, rate, seed=7)
+    x, y = at_rate(clean, rate), change(at_rate(noisy, rate))
+    key = f"haspi, {case}"
+    expected = float(pyclarity(key, reference.haspi, x.numpy(), y.numpy(), ear, rate, 7))
     settings = {"sample_rate": rate, "noise": "seeded", "seed": 7, "whole_khz": True}
-    assert float(haspi(y.double(), x.double(), ear, **settings)) == pytest.approx(
-        expected, abs=1e-7
-    )
-    assert float(haspi(y, x, ear, **settings)) == pytest.approx(expected, abs=1e-4)
+    assert float(haspi(y, x, ear, **settings)) == pytest.approx(expected, abs=1e-7)
+    single = haspi(y.float(), x.float(), ear, **settings)
+    assert float(single) == pytest.approx(expected, abs=1e-4)
 
 
 def test_full_scale_is_pyclaritys_level1(clean: Tensor, noisy: Tensor) -> None:
@@ -81,7 +88,7 @@ def test_full_scale_is_pyclaritys_level1(clean: Tensor, noisy: Tensor) -> None:
 
 
 def test_odd_rates_are_taken_as_they_are_unless_asked(clean: Tensor, noisy: Tensor) -> None:
-    x, y = (resample(signal[0], 16000, 44100).double() for signal in (clean, noisy))
+    x, y = at_rate(clean, 44100), at_rate(noisy, 44100)
     exact, rounded = (
         float(haspi(y, x, N2, sample_rate=44100, whole_khz=whole)) for whole in (False, True)
     )
@@ -210,8 +217,7 @@ def test_gradient_is_finite(clean: Tensor, given: str, noise: str) -> None:
     assert y.grad is not None and bool(y.grad.isfinite().all())
 
 
-def test_ascent_on_gains_raises_pyclaritys_score(clean: Tensor, noisy: Tensor) -> None:
-    pytest.importorskip("clarity")
+def test_ascent_on_gains_raises_the_score(clean: Tensor, noisy: Tensor) -> None:
     prepared = HaspiReference(clean[0])
     gains = torch.zeros(8, requires_grad=True)
     climb = torch.optim.Adam([gains], lr=4.0)
@@ -220,10 +226,7 @@ def test_ascent_on_gains_raises_pyclaritys_score(clean: Tensor, noisy: Tensor) -
         (-prepared.score(amplified(noisy[0], gains), N3)).backward()
         climb.step()
     after = amplified(noisy[0], gains.detach())
-    scores = [
-        reference.pyclarity_score("haspi", clean[0], signal, N3, 16000)
-        for signal in (noisy[0], after)
-    ]
+    scores = [float(prepared.score(signal, N3, noise="seeded")) for signal in (noisy[0], after)]
     assert scores[1] > scores[0] + 0.05
 
 
@@ -248,33 +251,31 @@ def test_a_delay_does_not_count(clean: Tensor, noisy: Tensor) -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    "change",
     [
-        ({"clean": torch.ones(8000) * 0.01}, "lasts 0.5 s"),
-        ({"clean": torch.zeros(16000)}, "clean is silent"),
-        ({"clean": torch.full((16000,), torch.nan)}, "NaN or infinite"),
-        ({"clean": 1e-5 * torch.randn(16000)}, "HASPI needs 20 or more"),
-        ({"processed": torch.full((16000,), torch.inf)}, "processed holds samples that are NaN"),
-        ({"processed": torch.zeros(2, 16000)}, "allowed: equal shapes"),
-        ({"processed": torch.zeros(16000, dtype=torch.int64)}, "floating-point"),
-        ({"audiogram": "N3"}, "audiogram is str"),
-        ({"audiogram": torch.full((8,), 130.0)}, "HASPI takes -10 to 120"),
-        ({"audiogram": [N3, N3]}, "broadcast"),
-        ({"sample_rate": 8000}, "sample rate 8000"),
-        ({"full_scale_spl": -1.0}, "full_scale_spl"),
-        ({"lengths": 17000}, "lengths"),
-        ({"lengths": 9000}, "lasts 0.56 s"),
-        ({"noise": "loud"}, "noise 'loud'; allowed: expected, seeded, none"),
-        ({"seed": [1, 2]}, "2 seeds for 1 items"),
-        ({"seed": None}, "seed is None; allowed: whole numbers"),
-        ({"seed": -1}, "seed is -1"),
+        {"clean": torch.ones(8000) * 0.01},  # too short
+        {"clean": torch.zeros(16000)},
+        {"clean": torch.full((16000,), torch.nan)},
+        {"clean": 1e-5 * torch.randn(16000)},  # too soft
+        {"processed": torch.full((16000,), torch.inf)},
+        {"processed": torch.zeros(2, 16000)},
+        {"processed": torch.zeros(16000, dtype=torch.int64)},
+        {"audiogram": 3},
+        {"audiogram": torch.full((8,), 130.0)},
+        {"audiogram": [N3, N3]},
+        {"sample_rate": 8000},
+        {"full_scale_spl": -1.0},
+        {"lengths": 17000},
+        {"lengths": 9000},
+        {"noise": "loud"},
+        {"seed": [1, 2]},
+        {"seed": None},
+        {"seed": -1},
     ],
+    ids=str,
 )
-def test_refusals(clean: Tensor, change: dict[str, object], message: str) -> None:
-    settings = {"processed": clean[0], "clean": clean[0], "audiogram": N3, **change}
-    if "clean" in change and "processed" not in change:
-        settings["processed"] = settings["clean"]
-    with pytest.raises(ValueError, match=message):
-        haspi(
-            settings.pop("processed"), settings.pop("clean"), settings.pop("audiogram"), **settings
-        )
+def test_bad_input_raises_value_error(clean: Tensor, change: dict[str, Any]) -> None:
+    signals = {"clean": change.get("clean", clean[0])}
+    settings = {"processed": signals["clean"], "audiogram": N3, **signals, **change}
+    with pytest.raises(ValueError):
+        haspi(**settings)

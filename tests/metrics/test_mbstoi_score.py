@@ -8,12 +8,15 @@ from typing import Any
 
 import pytest
 import torch
+from scipy.signal import resample_poly
 from torch import Tensor
 from torch.nn import functional
 
 from hlsim.audio import read_audio
 from hlsim.dsp.resample import resample
 from hlsim.metrics import mbstoi
+from tests import pyclarity as reference
+from tests.pyclarity import PyclarityOutputs
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "mbstoi_parity.py"
 
@@ -43,15 +46,18 @@ def scenes(speech_dir: Path) -> tuple[Tensor, Tensor]:
     return clean, noisy
 
 
-def pyclaritys(noisy: Tensor, clean: Tensor, rate: int = 16000) -> float:
-    module = pytest.importorskip("clarity.evaluator.mbstoi")
-    return float(module.mbstoi(*clean.numpy(), *noisy.numpy(), rate))
-
-
 @pytest.mark.parametrize("rate", [16000, 44100, 48000])
-def test_equals_pyclarity(scenes: tuple[Tensor, Tensor], rate: int) -> None:
-    clean, noisy = (resample(signal, 16000, rate) for signal in scenes)
-    expected = [pyclaritys(y, x, rate) for y, x in zip(noisy, clean, strict=True)]
+def test_equals_pyclarity(
+    scenes: tuple[Tensor, Tensor], pyclarity: PyclarityOutputs, rate: int
+) -> None:
+    clean, noisy = (
+        torch.from_numpy(resample_poly(signal.numpy(), rate // 100, 160, axis=-1))
+        for signal in scenes
+    )
+    expected = [
+        float(pyclarity(f"mbstoi, scene {i}, {rate} Hz", reference.mbstoi, x, y, rate))
+        for i, (x, y) in enumerate(zip(clean.numpy(), noisy.numpy(), strict=True))
+    ]
     assert max(expected) - min(expected) > 0.1
     assert mbstoi(noisy, clean, sample_rate=rate).tolist() == pytest.approx(expected, abs=1e-9)
     single = mbstoi(noisy.float(), clean.float(), sample_rate=rate)
@@ -63,7 +69,9 @@ def test_equals_pyclarity(scenes: tuple[Tensor, Tensor], rate: int) -> None:
 @pytest.mark.parametrize(
     "case", ["clean pauses", "one ear pauses", "deaf in one ear", "nothing", "shortest"]
 )
-def test_equals_pyclarity_of_silence(scenes: tuple[Tensor, Tensor], case: str) -> None:
+def test_equals_pyclarity_of_silence(
+    scenes: tuple[Tensor, Tensor], pyclarity: PyclarityOutputs, case: str
+) -> None:
     x, y = (signal[1].clone() for signal in scenes)
     if case == "clean pauses":
         x[:, 6000:14000] = 0.0
@@ -75,7 +83,8 @@ def test_equals_pyclarity_of_silence(scenes: tuple[Tensor, Tensor], case: str) -
         y = torch.zeros_like(y)
     else:
         x, y = x[:, 4000:10600], y[:, 4000:10600]
-    assert float(mbstoi(y, x)) == pytest.approx(pyclaritys(y, x), abs=1e-6)
+    expected = pyclarity(f"mbstoi, {case}", reference.mbstoi, x.numpy(), y.numpy(), 16000)
+    assert float(mbstoi(y, x)) == pytest.approx(float(expected), abs=1e-6)
 
 
 def test_batch_equals_its_items(scenes: tuple[Tensor, Tensor]) -> None:
@@ -182,30 +191,21 @@ def test_silence_has_a_finite_gradient(scenes: tuple[Tensor, Tensor]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    "change",
     [
-        (
-            {"processed": torch.zeros(16000), "clean": torch.zeros(16000)},
-            "the left and the right ear",
-        ),
-        ({"clean": torch.ones(3, 16000)}, "the left and the right ear"),
-        ({"clean": torch.ones(2, 12000)}, "equal shapes"),
-        (
-            {"processed": torch.full((2, 16000), math.nan)},
-            "processed holds samples that are NaN or infinite",
-        ),
-        ({"clean": torch.zeros(2, 16000)}, "clean is silent"),
-        ({"processed": torch.ones(2, 16000, dtype=torch.int16)}, "floating-point"),
-        (
-            {"processed": torch.randn(2, 6000), "clean": torch.randn(2, 6000)},
-            "allowed: 0.41 s or more",
-        ),
-        ({"processed": torch.randn(2, 9), "clean": torch.randn(2, 9)}, "0 s of speech"),
-        ({"sample_rate": 8000}, "16000 to 48000"),
-        ({"lengths": [16000, 16000]}, "lengths of shape"),
+        {"processed": torch.zeros(16000), "clean": torch.zeros(16000)},
+        {"clean": torch.ones(3, 16000)},
+        {"clean": torch.ones(2, 12000)},
+        {"processed": torch.full((2, 16000), math.nan)},
+        {"clean": torch.zeros(2, 16000)},
+        {"processed": torch.ones(2, 16000, dtype=torch.int16)},
+        {"processed": torch.randn(2, 6000), "clean": torch.randn(2, 6000)},  # too short
+        {"processed": torch.randn(2, 9), "clean": torch.randn(2, 9)},
+        {"sample_rate": 8000},
+        {"lengths": [16000, 16000]},
     ],
 )
-def test_refuses(change: dict[str, Any], message: str) -> None:
+def test_bad_input_raises_value_error(change: dict[str, Any]) -> None:
     arguments = {"processed": torch.randn(2, 16000), "clean": torch.randn(2, 16000)} | change
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(ValueError):
         mbstoi(**arguments)
