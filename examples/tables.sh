@@ -1,21 +1,19 @@
 #!/usr/bin/env bash
-# The paper's Tables I, III and IV, and the comparison of normalisations: trains every row for the same time, or the same
-# steps, on one thread, and compares them. Killed, it goes on with the same command. Results are in docs/paper-tables.md,
-# but for the paper's rows at full width, which want a GPU.
+# The paper's Tables I, III and IV, and the comparison of normalisations: trains every row on one thread, and compares
+# them. Killed, it goes on with the same command. Results are in docs/paper-tables.md, but for the paper's rows at full
+# width, which want a GPU.
 #
 #   [STEPS=10000] [NARROW=4] [JOBS=2] [ROWS="paper/cnn neuro-msbg-lstm:phase=input:seed=1"] \
-#       examples/tables.sh CORPORA OUT [MINUTES A ROW] [ITEMS]
+#       examples/tables.sh CORPORA OUT [ITEMS]
 #
 # CORPORA holds speech/{train,valid}, noise/{train,valid} and audiograms/{train,valid}.csv.
-# STEPS: of each row, whatever the minutes; the learning rate falls by time, and so stays. NARROW: the paper's rows with as
+# STEPS: of each row, instead of those of its recipe. NARROW: the paper's rows with as
 # many times fewer channels and heads. JOBS: rows trained at a time. ROWS: these alone, compared as Table I; what follows a
 # colon changes the recipe's network, seed or precision.
 set -euo pipefail
-corpora=$1 out=$2 minutes=${3:-5} items=${4:-80}
+corpora=$1 out=$2 items=${3:-80}
 here=$(dirname "${BASH_SOURCE[0]}")
 export OMP_NUM_THREADS=${OMP_NUM_THREADS:-1}
-limit=(--max-minutes "$minutes")
-[[ -z ${STEPS:-} ]] || limit=(--max-minutes 1e6 --max-steps "$STEPS")
 mkdir -p "$out/recipes"
 
 folder() { # row
@@ -23,10 +21,10 @@ folder() { # row
 }
 
 train() { # row: recipe[:setting=value[...]]
-    local name=$(folder "$1") given=${1#"${1%%:*}"}
+    local name=$(folder "$1") given=${1#"${1%%:*}"}${STEPS:+:steps=$STEPS}
     local recipe="$out/recipes/$name.yaml"
     awk -v by="$([[ $1 == paper/* ]] && echo "${NARROW:-1}" || echo 1)" -v given="${given#:}" '
-        function of_recipe(name) { return name == "seed:" || name == "precision:" }  # others are of the network
+        function of_recipe(name) { return name ~ /^(seed|precision|steps):$/ }  # others are of the network
         BEGIN { for (n = split(given, pairs, ":"); n; n--) { split(pairs[n], pair, "="); value[pair[1] ":"] = pair[2] } }
         $1 == "channels:" && by > 1 { $0 = "  channels: " 4 * int($2 / by / 4 + 0.5) }
         $1 == "heads:" && by > 1 { $0 = "  heads: " int(($2 + by - 1) / by) }  # heads stay as wide
@@ -35,7 +33,7 @@ train() { # row: recipe[:setting=value[...]]
         $1 == "model:" { for (name in value) if (!of_recipe(name)) print "  " name, value[name] }
         END { for (name in value) if (of_recipe(name)) print name, value[name] }
     ' "$here/${1%%:*}.yaml" >"$recipe"
-    hlsim train-simulator --config "$recipe" "${limit[@]}" --quiet --out "$out/$name" \
+    hlsim train-simulator --config "$recipe" --quiet --out "$out/$name" \
         --speech "$corpora/speech/train" --valid-speech "$corpora/speech/valid" \
         --noise "$corpora/noise/train" --valid-noise "$corpora/noise/valid" \
         --audiograms "$corpora/audiograms/train.csv" --valid-audiograms "$corpora/audiograms/valid.csv"

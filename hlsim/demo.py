@@ -40,9 +40,13 @@ from hlsim.report.tables import loss_name
 from hlsim.training.batches import TrainingData
 from hlsim.training.compensator import train_compensator
 from hlsim.training.recipes import CompensatorRecipe
+from hlsim.version import __version__
 
 SPEECH_LEVEL = 65.0
 """Level in dB SPL at which the utterances are given to the unaided ear and to the compensators."""
+
+DEMO_STEPS = 3000
+"""Number of training steps: about three minutes on two cores."""
 
 FEWEST_SCORED = 8
 
@@ -55,7 +59,7 @@ def demo(
     audiogram: Audiogram,
     *,
     speech: str | Path | None = None,
-    minutes: float = 3.0,
+    steps: int = DEMO_STEPS,
     seed: int = 0,
     report: Callable[[str], None] = print,
 ) -> str:
@@ -63,7 +67,7 @@ def demo(
 
     Args:
         speech: folder to use instead of the embedded speech; every third file is scored and not trained on.
-        minutes: of training.
+        steps: number of training steps.
         report: called with a line of progress.
 
     Raises:
@@ -74,15 +78,11 @@ def demo(
     clean = [_read(path) for path in scored]
     for path, utterance in zip(scored, clean, strict=True):  # not after minutes of training
         check_pair(utterance, utterance, NEURO_RATE, names=(str(path), str(path)))
-    recipe = CompensatorRecipe(seed=seed)
-    report(
-        f"training on {len(training)} utterances for {minutes:g} minutes, ear {_name(audiogram)}"
-    )
+    recipe = CompensatorRecipe(seed=seed, steps=steps)
+    report(f"training on {len(training)} utterances, {steps} steps, ear {_name(audiogram)}")
     data, where = TrainingData(speech=training), folder / "training"
     with one_thread():  # the steps are small: on a busy machine two threads wait for each other
-        checkpoint = train_compensator(
-            data, recipe, out=where, audiogram=audiogram, max_minutes=minutes, report=report
-        )
+        checkpoint = train_compensator(data, recipe, out=where, audiogram=audiogram, report=report)
     torch.manual_seed(seed)
     trained, nalr = load_compensator(checkpoint), NALR()
     start = MappingCompensator(MappingConfig.from_dict(recipe.model)).eval()
@@ -149,7 +149,9 @@ def demo(
     _write_audio(
         folder / "audio", names, clean, {key: heard[name] for name, (key, _) in conditions.items()}
     )
-    return f"\n{front.lead}\n\n{table.text()}\n\nThe page: {folder / 'report.html'}"
+    origin = f"hlsim {__version__}, torch {torch.__version__}, seed {seed}, {steps} training steps"
+    page = folder / "report.html"
+    return f"\n{front.lead}\n\n{table.text()}\n\nMade with {origin}.\nThe page: {page}"
 
 
 def _split(speech: str | Path | None) -> tuple[list[Path], list[Path]]:

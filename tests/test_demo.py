@@ -29,7 +29,7 @@ def test_demo_writes_report_audio_and_pictures(tmp_path: Path, short_speech: Pat
     out = tmp_path / "out"
     lines: list[str] = []
     ear, seed = Audiogram.standard("N4"), 2**32 - 2
-    text = demo(out, ear, speech=short_speech, minutes=0.1, seed=seed, report=lines.append)
+    text = demo(out, ear, speech=short_speech, steps=60, seed=seed, report=lines.append)
     report = json.loads((out / "report.json").read_text())
     assert report["n"] == len(report["items"]) == 8
     # after numpy's last seed comes its first

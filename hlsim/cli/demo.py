@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from hlsim.cli.inputs import check_there, need, read_ear
-from hlsim.cli.options import Parser, folder, positive
+from hlsim.cli.options import Parser, count, folder
 from hlsim.extras import require
 
 
@@ -14,13 +14,13 @@ def demo(parser: Parser) -> None:
     parser.runs(
         _demo,
         "",
-        "--audiogram S2 --minutes 1 --out s2",
+        "--audiogram S2 --steps 1000 --out s2",
     )
     parser.option("--out", folder, "folder for report, audio and pictures", Path("hlsim-demo"))
     parser.audiogram("N4")
     text = "folder of 22 files or more instead of the embedded speech; a third is scored"
     parser.option("--speech", Path, text)
-    parser.option("--minutes", positive, "of training", 3.0)
+    parser.option("--steps", count, "training steps; 3000 take about three minutes", 3000)
     parser.seed()
 
 
@@ -34,7 +34,5 @@ def _demo(options: argparse.Namespace) -> None:
     from hlsim.torchtools import keep_freed_memory
 
     keep_freed_memory()
-    summary = demo(
-        options.out, ear, speech=options.speech, minutes=options.minutes, seed=options.seed
-    )
+    summary = demo(options.out, ear, speech=options.speech, steps=options.steps, seed=options.seed)
     print(summary)

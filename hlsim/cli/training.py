@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from hlsim.cli.inputs import check_there, need, read_ear, read_recipe
-from hlsim.cli.options import Parser, count, integer, natural, positive
+from hlsim.cli.options import Parser, count, natural, positive
 from hlsim.extras import require
 
 FOLDERS = ("speech", "noise", "audiograms", "valid_speech", "valid_noise", "valid_audiograms")
@@ -18,7 +18,7 @@ def train_simulator(parser: Parser) -> None:
     parser.runs(
         _train_simulator,
         "--config examples/neuro-msbg.yaml --speech speech/train --valid-speech speech/valid --out runs/simulator",
-        "--config examples/neuro-msbg.yaml --manifest plan/manifest.csv --max-minutes 600 --out runs/simulator",
+        "--config examples/neuro-msbg.yaml --manifest plan/manifest.csv --out runs/simulator",
     )
     parser.option("--config", Path, "recipe, a YAML file (examples/neuro-msbg.yaml)", required=True)
     text = "manifest.csv that 'hlsim prepare' wrote, instead of folders and files"
@@ -27,7 +27,7 @@ def train_simulator(parser: Parser) -> None:
     parser.flag("--prepared", "train on what 'hlsim prepare --write' wrote")
     parser.teacher("that says what is heard", "msbg")
     parser.option("--workers", natural, "processes that read the manifest's files; 1 by default")
-    _training_options(parser, minutes=60.0)
+    _training_options(parser)
 
 
 def train_compensator(parser: Parser) -> None:
@@ -41,10 +41,10 @@ def train_compensator(parser: Parser) -> None:
     parser.option(
         "--simulator", str, "msbg (exact), or a checkpoint's name or folder", "neuro-msbg"
     )
-    _training_options(parser, minutes=10.0, required=True)
+    _training_options(parser, required=True)
 
 
-def _training_options(parser: Parser, *, minutes: float, required: bool = False) -> None:
+def _training_options(parser: Parser, *, required: bool = False) -> None:
     option = parser.option
     option("--speech", Path, "folder of clean speech to train on", required=required)
     option("--noise", Path, "folder of noises to mix in")
@@ -54,13 +54,10 @@ def _training_options(parser: Parser, *, minutes: float, required: bool = False)
     option("--valid-audiograms", Path, "CSV of ears to validate with")
     text = "checkpoint whose weights to start from, instead of random ones"
     option("--start", str, text, metavar="NAME")
-    option("--max-minutes", positive, "of training, resumed parts included", minutes)
-    option(
-        "--max-steps",
-        integer,
-        "stop earlier, with the learning rate of that time; -1 for no such limit",
-        -1,
-    )
+    text = "minutes after which to stop, those before a resumption included; the learning rate does not depend on them"
+    option("--max-minutes", positive, text)
+    text = "step after which to stop, before the recipe's steps are done; the learning rate does not depend on it"
+    option("--max-steps", count, text)
     option("--device", str, "where to train", "auto", choices=("auto", "cpu", "cuda"))
     option("--devices", count, "GPUs or processes a machine", 1)
     option("--nodes", count, "machines", 1)

@@ -111,10 +111,8 @@ class BatchData(L.LightningDataModule):
     def train_dataloader(self) -> DataLoader[Any]:
         steps = Steps()
         if self.trainer is not None:
-            given = self.trainer.fit_loop.epoch_loop.batch_progress.total
-            # a step is right, and the count behind it, where SLURM has a state stored in the midst of one
-            first = min(given.ready, max(given.completed, self.trainer.global_step))
-            steps = Steps(first, self.trainer.global_rank, self.trainer.world_size)
+            trainer = self.trainer
+            steps = Steps(trainer.global_step, trainer.global_rank, trainer.world_size)
         self.loader = self._loader(self.training, batch_size=None, sampler=steps)
         return self.loader
 

@@ -73,11 +73,11 @@ class History(Callback):
             self.report(f"step {trainer.global_step}, {_minutes(module):.1f} min: {figures}")
 
 
-class TimeProgress(Callback):
-    """A line that shows the share of the time spent, every two seconds: the number of steps is not known beforehand."""
+class StepProgress(Callback):
+    """A line that shows the share of the steps done, every two seconds."""
 
-    def __init__(self, max_minutes: float) -> None:
-        self.max_minutes, self.shown = max_minutes, 0.0
+    def __init__(self, steps: int) -> None:
+        self.steps, self.shown = steps, 0.0
 
     def on_train_batch_end(
         self, trainer: L.Trainer, module: L.LightningModule, *of_batch: Any
@@ -85,9 +85,9 @@ class TimeProgress(Callback):
         if not trainer.is_global_zero or time.monotonic() - self.shown < 2.0:
             return
         self.shown = time.monotonic()
-        share = min(100.0, 100.0 * _minutes(module) / self.max_minutes)
+        share = 100.0 * trainer.global_step / self.steps
         loss = float(trainer.callback_metrics.get("loss", math.nan))
-        line = f"{share:3.0f} % of {self.max_minutes:g} min, step {trainer.global_step}, loss {loss:.3f}"
+        line = f"{share:3.0f} %, step {trainer.global_step} of {self.steps}, loss {loss:.3f}"
         print(f"\r{line:<60}", end="", file=sys.stderr, flush=True)
 
     def on_validation_start(self, trainer: L.Trainer, module: L.LightningModule) -> None:

@@ -19,19 +19,17 @@ from hlsim.pretrained import checkpoint_digest
 from hlsim.training.batches import TrainingData, compensator_data, identity_of
 from hlsim.training.denoising import attenuation_error, missing_intelligibility
 from hlsim.training.loop import RunOptions, train_network
-from hlsim.training.module import TimedModule, initial_network
+from hlsim.training.module import ScheduledModule, initial_network
 from hlsim.training.recipes import CompensatorRecipe
 
 Simulator = str | Path | nn.Module
 
 
-class CompensatorTraining(TimedModule):
+class CompensatorTraining(ScheduledModule):
     """Hears the compensator's output through the simulator, as ``HearingLossLoss`` takes it, frozen."""
 
-    def __init__(
-        self, recipe: CompensatorRecipe, max_minutes: float, *, simulator: Simulator = "neuro-msbg"
-    ) -> None:
-        super().__init__(recipe.learning_rate, max_minutes)
+    def __init__(self, recipe: CompensatorRecipe, *, simulator: Simulator = "neuro-msbg") -> None:
+        super().__init__(recipe.learning_rate, recipe.steps)
         torch.manual_seed(recipe.seed)
         self.recipe = recipe
         network = (CONFIGS[recipe.kind], build_compensator, load_compensator)
@@ -102,7 +100,6 @@ def train_compensator(
     out: str | Path,
     audiogram: Audiogram | None = None,
     simulator: Simulator = "neuro-msbg",
-    max_minutes: float,
     **options: Unpack[RunOptions],
 ) -> Path:
     """Train, resume, and keep the best checkpoint.
@@ -116,7 +113,7 @@ def train_compensator(
     Raises:
         ValueError: data, recipe or simulator that cannot be used; the message names them.
     """
-    module = CompensatorTraining(recipe, max_minutes, simulator=simulator)
+    module = CompensatorTraining(recipe, simulator=simulator)
     batches = compensator_data(data, recipe, audiogram)
     start = module.validate(batches.val_dataloader())["valid_loss"]
     options.get("report", print)(f"start: valid_loss {start:.3f}")

@@ -1,4 +1,4 @@
-"""One way to run a training: time-boxed, resumable, with progress, TensorBoard and the best checkpoint kept."""
+"""One way to run a training: a number of steps, resumable, with progress, TensorBoard and the best checkpoint kept."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
 from hlsim.data.module import BatchData
 from hlsim.pretrained import checkpoint_digest, save_checkpoint
-from hlsim.training.callbacks import DataWait, History, KeepBest, ShowExamples, TimeProgress
-from hlsim.training.module import TimedModule
+from hlsim.training.callbacks import DataWait, History, KeepBest, ShowExamples, StepProgress
+from hlsim.training.module import ScheduledModule
 from hlsim.training.recipes import TrainingRecipe
 from hlsim.training.state import BEST, CHECKPOINT, LAST, WholeStates, claimed
 from hlsim.version import __version__
@@ -29,14 +29,17 @@ class RunOptions(TypedDict, total=False):
     """How a training runs.
 
     Attributes:
-        max_steps: stop earlier; -1, the default, for no such limit.
+        max_minutes: minutes after which training stops, those before a resumption included; by default
+            only the recipe's number of steps ends it.
+        max_steps: number of steps after which training stops, for a test that goes on later.
         accelerator, devices, nodes, strategy: as Lightning's Trainer takes them, by default "auto" and 1; each process
             has batches of its own, so that the batch grows with their number.
         report: is given a line a validation; by default it is printed.
         progress: show a line that tells how far it is, the default.
     """
 
-    max_steps: int
+    max_minutes: float | None
+    max_steps: int | None
     accelerator: str
     devices: int
     nodes: int
@@ -46,7 +49,7 @@ class RunOptions(TypedDict, total=False):
 
 
 def train_network(
-    module: TimedModule,
+    module: ScheduledModule,
     data: BatchData,
     recipe: TrainingRecipe,
     kind: str,
@@ -71,14 +74,14 @@ def train_network(
         told = {"hlsim": __version__, "recipe": asdict(recipe), **start, **about, **figures}
         save_checkpoint(folder, kind, network, network.config.to_dict(), told)
 
-    what = asdict(recipe) | {"max_minutes": module.max_minutes} | dict(identity) | start
+    what = asdict(recipe) | dict(identity) | start
     how: dict[str, Any] = {"validate_every": recipe.validate_every, "begun": bool(recipe.start)}
     run(module, data, out=out, recipe=what, write=write, **how, **options)
     return folder
 
 
 def run(
-    module: TimedModule,
+    module: ScheduledModule,
     data: BatchData,
     *,
     out: str | Path,
@@ -88,7 +91,7 @@ def run(
     begun: bool = False,
     **options: Unpack[RunOptions],
 ) -> None:
-    """Train until the time is up; go on from ``out`` where a run of the same recipe lies there.
+    """Train for the module's number of steps; go on from ``out`` where a run of the same recipe lies there.
 
     Args:
         out: folder for ``last.ckpt``, TensorBoard's events and what ``write`` puts there.
@@ -102,14 +105,13 @@ def run(
             finite, or the disk is full.
         KeyboardInterrupt: it was stopped; the state is that of the last validation.
     """
-    if (max_steps := options.get("max_steps", -1)) < -1:
-        raise ValueError(
-            f"max_steps {max_steps}; allowed: whole numbers from 0 up, or -1 for no such limit"
-        )
+    max_steps, max_minutes = options.get("max_steps"), options.get("max_minutes")
+    max_steps = module.steps if max_steps is None else min(max_steps, module.steps)
     folder, last = Path(out), Path(out) / LAST
     accelerator, strategy = options.get("accelerator", "auto"), options.get("strategy", "auto")
     devices, nodes = options.get("devices", 1), options.get("nodes", 1)
-    module.timer = Timer(timedelta(minutes=module.max_minutes), interval="step", verbose=False)
+    duration = None if max_minutes is None else timedelta(minutes=max_minutes)
+    module.timer = Timer(duration, interval="step", verbose=False)
     # at the end of each validation, not before it: a run that goes on from a state does not validate it
     how: dict[str, Any] = {
         "save_top_k": 1,
@@ -124,7 +126,7 @@ def run(
         ShowExamples(),
         DataWait(),
         states,
-        *([TimeProgress(module.max_minutes)] if options.get("progress", True) else []),
+        *([StepProgress(max_steps)] if options.get("progress", True) else []),
     ]
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
     with warnings.catch_warnings():
@@ -140,7 +142,7 @@ def run(
                 strategy=strategy,
                 plugins=[WholeStates()],
                 use_distributed_sampler=False,  # each process draws by its rank
-                max_epochs=-1,  # steps and time limit it; an epoch that is over would not be resumed
+                max_epochs=-1,  # steps limit it; an epoch that is over would not be resumed
                 max_steps=max_steps,
                 gradient_clip_val=1.0,
                 callbacks=callbacks,

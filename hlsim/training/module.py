@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from typing import Any, TypeVar
 
 import lightning as L
 import torch
 from lightning.pytorch.callbacks import Timer
+from lightning.pytorch.utilities.types import OptimizerLRScheduler
 from torch import Tensor, nn
+from torch.optim.lr_scheduler import LambdaLR
 from torch.optim.swa_utils import AveragedModel
 
 from hlsim.data.module import Batch
@@ -18,21 +21,26 @@ from hlsim.neuro.config import ModelConfig
 Network = TypeVar("Network", bound=nn.Module)
 Config = TypeVar("Config", bound=ModelConfig)
 
+WARM_UP_STEPS = 50
+"""Number of steps over which the learning rate rises."""
 
-class TimedModule(L.LightningModule):
-    """A module whose learning rate falls with the time spent, as half a cosine after a short rise.
 
-    Subclasses give ``training_loss``, ``evaluate``, ``figures`` and ``released``, and log whatever they like.
+class ScheduledModule(L.LightningModule):
+    """A module whose learning rate depends on the step alone: a short rise, then half a cosine down to 1 %.
+
+    Subclasses implement ``training_loss``, ``evaluate``, ``figures`` and ``released``.
 
     Args:
-        max_minutes: of training, all resumed parts together.
+        learning_rate: highest learning rate of AdamW.
+        steps: number of steps of the whole training.
     """
 
     timer: Timer
 
-    def __init__(self, learning_rate: float, max_minutes: float) -> None:
+    def __init__(self, learning_rate: float, steps: int) -> None:
         super().__init__()
-        self.learning_rate, self.max_minutes = learning_rate, max_minutes
+        self.learning_rate = learning_rate
+        self.steps = steps
         self.values: list[dict[str, Tensor]] = []  # of the validation under way
 
     def training_loss(self, batch: Batch) -> Tensor:
@@ -74,16 +82,6 @@ class TimedModule(L.LightningModule):
         self.log("loss", loss, prog_bar=True)
         return loss
 
-    def on_train_batch_start(self, batch: Batch, index: int) -> None:
-        # one clock for all processes, whose weights would drift apart
-        spent = self.trainer.strategy.broadcast(self.timer.time_elapsed("train"))
-        share = min(1.0, spent / (60.0 * self.max_minutes))
-        rise = min(1.0, (self.global_step + 1) / 50.0)
-        for group in self.optimizers().param_groups:  # type: ignore[union-attr]
-            group["lr"] = (
-                self.learning_rate * rise * max(0.01, 0.5 * (1.0 + math.cos(math.pi * share)))
-            )
-
     def on_validation_epoch_start(self) -> None:
         self.values = []
 
@@ -93,16 +91,31 @@ class TimedModule(L.LightningModule):
     def on_validation_epoch_end(self) -> None:
         self.log_dict(self._figures(self.values), prog_bar=True, batch_size=1, sync_dist=True)
 
-    def configure_optimizers(self) -> torch.optim.Optimizer:
-        return torch.optim.AdamW(
+    def configure_optimizers(self) -> OptimizerLRScheduler:
+        optimizer = torch.optim.AdamW(
             self.trained_parameters(), lr=self.learning_rate, weight_decay=1e-4
         )
+        scheduler = LambdaLR(optimizer, partial(relative_learning_rate, steps=self.steps))
+        return {
+            "optimizer": optimizer,
+            "lr_scheduler": {"scheduler": scheduler, "interval": "step"},
+        }
 
     def _figures(self, values: Sequence[Mapping[str, Tensor]]) -> dict[str, float]:
         names = dict.fromkeys(name for one in values for name in one)
         return self.figures(
             {name: torch.cat([one[name] for one in values if name in one]) for name in names}
         )
+
+
+def relative_learning_rate(step: int, steps: int) -> float:
+    """Compute the learning rate of a step as a share of the highest one.
+
+    It rises over the first 50 steps and falls as half a cosine, to 1 % at the last step.
+    """
+    rise = min(1.0, (step + 1) / WARM_UP_STEPS)
+    fall = 0.5 * (1.0 + math.cos(math.pi * min(1.0, step / steps)))
+    return rise * max(0.01, fall)
 
 
 def exponential_average(model: nn.Module, decay: float) -> AveragedModel:

@@ -25,6 +25,7 @@ class TrainingRecipe:
         model: settings of the network.
         start: checkpoint whose weights to start from, a name or a folder; its settings are the model's. It is
             also what is kept until the training gives a better one. Without it they are random.
+        steps: number of training steps; the learning rate falls with them.
         batch: clips a step.
         seconds: length of a clip.
         learning_rate: of AdamW at its highest.
@@ -38,6 +39,7 @@ class TrainingRecipe:
 
     model: dict[str, Any] = field(default_factory=dict)
     start: str = ""
+    steps: int = 19_400
     batch: int = 6
     seconds: float = 1.3
     learning_rate: float = 1e-3
@@ -64,8 +66,8 @@ class TrainingRecipe:
         for name, value in vars(self).items():
             if isinstance(value, list):  # a pair, as YAML gives it
                 object.__setattr__(self, name, tuple(value))
-        names = ("batch", "validate_every", "validation_items", "seconds", "learning_rate")
-        wrong = min(self.batch, self.validate_every, self.validation_items) < 1
+        names = ("steps", "batch", "validate_every", "validation_items", "seconds", "learning_rate")
+        wrong = min(self.steps, self.batch, self.validate_every, self.validation_items) < 1
         wrong = wrong or min(self.seconds, self.learning_rate) <= 0.0
         self._refuse(wrong, names, "counts from 1 up, seconds and learning_rate above 0")
         wrong = not all(0.0 <= getattr(self, name) <= 1.0 for name in self.shares)
@@ -136,6 +138,7 @@ class CompensatorRecipe(TrainingRecipe):
     """
 
     kind: Kind = "mapping-compensator"
+    steps: int = 3_000
     batch: int = 2
     seconds: float = 0.6
     learning_rate: float = 3e-3

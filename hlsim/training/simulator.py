@@ -23,15 +23,15 @@ from hlsim.training.batches import (
     simulator_data,
 )
 from hlsim.training.loop import RunOptions, train_network
-from hlsim.training.module import TimedModule, exponential_average, initial_network
+from hlsim.training.module import ScheduledModule, exponential_average, initial_network
 from hlsim.training.recipes import SimulatorRecipe
 
 
-class SimulatorTraining(TimedModule):
+class SimulatorTraining(ScheduledModule):
     """Teaches the network what is heard, ``impaired`` in a batch; the average of its weights is validated and kept."""
 
-    def __init__(self, recipe: SimulatorRecipe, max_minutes: float) -> None:
-        super().__init__(recipe.learning_rate, max_minutes)
+    def __init__(self, recipe: SimulatorRecipe) -> None:
+        super().__init__(recipe.learning_rate, recipe.steps)
         torch.manual_seed(recipe.seed)
         self.recipe = recipe
         self.student = initial_network(
@@ -92,7 +92,6 @@ def train_simulator(
     recipe: SimulatorRecipe,
     *,
     out: str | Path,
-    max_minutes: float,
     teacher: str = "msbg",
     **options: Unpack[RunOptions],
 ) -> Path:
@@ -108,7 +107,7 @@ def train_simulator(
     Raises:
         ValueError: data, recipe or teacher that cannot be used; the message names them.
     """
-    module = SimulatorTraining(recipe, max_minutes)
+    module = SimulatorTraining(recipe)
     if teacher != "msbg" and isinstance(data, PlannedSource) and data.prepared:
         raise ValueError(
             f"teacher {teacher} for what is prepared; allowed: none, for it has been heard already"

@@ -18,7 +18,7 @@ CALLS = {  # of each command one whose values may be replaced; most of them end 
     "prepare": "speech --out new --jobs 1 --layout folder --ears 1 --severities mild=1 --level 65 --rate 16000 "
     "--test-share 0.4 --valid-share 0.1 --shortest 0.5 --seed 0",
     "haspi-report": "--manifest m.csv --out new --measures haspi --jobs 1 --spl 65 --listen 0 --seed 0 --audiogram N3",
-    "train-compensator": "--speech empty --out new --max-steps 1 --max-minutes 0.1 --device cpu --audiogram N3",
+    "train-compensator": "--speech empty --out new --max-steps 1 --device cpu --audiogram N3",
     "train-simulator": "--config r.yaml --speech empty --out new --max-steps 1 --device cpu --teacher msbg",
     "evaluate-simulator": "msbg --speech empty --audiograms e.csv --out new --items 1 --seconds 1 --levels 65",
     "evaluate-compensator": "nalr --speech empty --out new --items 1 --seconds 1 --jobs 1 --audiogram N3",

@@ -49,7 +49,6 @@ def train(source: PlannedSource, out: Path, steps: int) -> list[str]:
         source,
         SimulatorRecipe.from_dict(TINY),
         out=out,
-        max_minutes=1e6,
         max_steps=steps,
         accelerator="cpu",
         progress=False,
@@ -101,7 +100,7 @@ def test_prepared_validation_is_on_what_lies_on_disk_and_needs_no_corpus(
             (batch["impaired"][place], stored.impaired),
         ):
             assert torch.equal(cut[:9600], whole) and not bool(cut[9600:].any())  # shorter than 2 s
-    examples = SimulatorTraining(SimulatorRecipe.from_dict(TINY), 1e6).examples(batch)
+    examples = SimulatorTraining(SimulatorRecipe.from_dict(TINY)).examples(batch)
     assert torch.equal(examples["heard/truth"], batch["impaired"][-1])
     train(source, tmp_path / "out", 1)
 

@@ -40,7 +40,6 @@ def test_a_training_shows_what_was_given_and_heard(tmp_path: Path, speech_dir: P
         TrainingData(speech_dir / "train"),
         SimulatorRecipe.from_dict(recipe),
         out=tmp_path,
-        max_minutes=5.0,
         max_steps=1,
         accelerator="cpu",
         report=lambda line: None,

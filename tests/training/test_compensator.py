@@ -23,14 +23,12 @@ SMALL = {
     "validate_every": 10,
     "validation_items": 4,
 }
-EVER = 1e6  # minutes, so that the learning rate does not fall within a test
 
 
 def train(data: TrainingData, out: Path, **options: object) -> tuple[Path, list[str]]:
     """A few steps through the exact MSBG."""
     lines: list[str] = []
     settings = {
-        "max_minutes": EVER,
         "simulator": "msbg",
         "accelerator": "cpu",
         "progress": False,
@@ -51,7 +49,7 @@ def test_twenty_steps_lower_the_loss(data: TrainingData, tmp_path: Path) -> None
     assert about["audiogram"] == ear.to_dict() and about["simulator"] == "msbg"
 
     recipe = CompensatorRecipe.from_dict(SMALL)
-    module = CompensatorTraining(recipe, EVER, simulator="msbg")
+    module = CompensatorTraining(recipe, simulator="msbg")
     valid = compensator_data(data, recipe, ear).validation
     assert module.validate(valid)["valid_loss"] == pytest.approx(about["start_valid_loss"])
     loaded = load_compensator(folder)
@@ -85,7 +83,6 @@ def test_goes_on_where_it_was_stopped(data: TrainingData, tmp_path: Path) -> Non
             recipe,
             out=tmp_path / "stopped",
             simulator="msbg",
-            max_minutes=EVER,
             accelerator="cpu",
             report=stop,
             progress=False,
@@ -101,7 +98,7 @@ def test_goes_on_where_it_was_stopped(data: TrainingData, tmp_path: Path) -> Non
     )
     assert set(first) == set(second)
     for name, values in first.items():
-        torch.testing.assert_close(second[name], values, rtol=1e-5, atol=1e-7)
+        assert torch.equal(second[name], values)
     assert whole.name == resumed.name == "checkpoint"
 
 
@@ -134,7 +131,7 @@ def test_general_one_draws_ears_and_noise(data: TrainingData, tmp_path: Path) ->
     ears.write_text("\n".join(rows) + "\n")
     noise = data.speech
     recipe = CompensatorRecipe.from_dict(SMALL | {"weights": {"bands": 1.0, "paper": 0.5}})
-    module = CompensatorTraining(recipe, EVER, simulator="msbg")
+    module = CompensatorTraining(recipe, simulator="msbg")
     sources = TrainingData(data.speech, noise=noise, audiograms=ears)
     batches = CompensatorBatches(recipe, sources, None)
     batch = batches.draw(64, torch.Generator().manual_seed(0))
@@ -159,7 +156,7 @@ def test_haspi_joins_the_criteria(data: TrainingData) -> None:
         "batch": 6,
     }
     recipe = CompensatorRecipe.from_dict(SMALL | settings)
-    module = CompensatorTraining(recipe, EVER, simulator="msbg")
+    module = CompensatorTraining(recipe, simulator="msbg")
     batch = CompensatorBatches(recipe, data, None).draw(6, torch.Generator().manual_seed(1))
     assert bool((batch["clean"].count_nonzero(dim=-1) <= 8).any())
     loss = module.training_loss(batch)
@@ -224,7 +221,7 @@ def test_what_a_hearing_aid_is_not_trained_for_stays_as_it_is(
     recipe = CompensatorRecipe.from_dict(
         SMALL | settings | {"weights": weights, "unreduced": unreduced}
     )
-    module = CompensatorTraining(recipe, EVER, simulator="msbg")
+    module = CompensatorTraining(recipe, simulator="msbg")
     noisy = TrainingData(data.speech, noise=data.speech)
     batch = CompensatorBatches(recipe, noisy, None).draw(2, torch.Generator().manual_seed(0))
     module.training_loss(batch).backward()
@@ -299,7 +296,7 @@ def test_sounds_have_no_noise_and_babble_is_the_others_voices(data: TrainingData
 )
 def test_bad_recipes(settings: dict[str, object], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        CompensatorTraining(CompensatorRecipe.from_dict(settings), EVER, simulator="msbg")
+        CompensatorTraining(CompensatorRecipe.from_dict(settings), simulator="msbg")
 
 
 @pytest.mark.parametrize(

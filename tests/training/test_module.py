@@ -27,7 +27,7 @@ SHORT = {
     "validation_items": 4,
     "learning_rate": 1e-6,
 }
-RUN = {"max_minutes": 1e6, "accelerator": "cpu", "progress": False, "report": lambda line: None}
+RUN = {"accelerator": "cpu", "progress": False, "report": lambda line: None}
 
 
 def furthest(one: torch.nn.Module, other: torch.nn.Module) -> float:
@@ -56,7 +56,7 @@ def test_a_simulator_goes_on_from_a_checkpoint(data: TrainingData, tmp_path: Pat
 
 
 def test_all_is_trained_that_is_trained_from_the_beginning() -> None:
-    started = SimulatorTraining(SimulatorRecipe.from_dict(SHORT | {"start": "neuro-msbg"}), 1.0)
+    started = SimulatorTraining(SimulatorRecipe.from_dict(SHORT | {"start": "neuro-msbg"}))
     anew = NeuroMSBG(started.student.config)
     names = [
         {name for name, parameter in model.named_parameters() if parameter.requires_grad}
@@ -76,7 +76,7 @@ def test_a_compensator_for_one_ear_starts_from_that_for_all(
     ]
     valid = compensator_data(data, recipes[0], ear).validation
     general, random = (
-        CompensatorTraining(recipe, 1.0, simulator="msbg").validate(valid) for recipe in recipes
+        CompensatorTraining(recipe, simulator="msbg").validate(valid) for recipe in recipes
     )
     assert general["valid_loss"] < 0.7 * random["valid_loss"]
 
@@ -119,13 +119,13 @@ def test_what_makes_the_start_worse_is_not_kept(data: TrainingData, tmp_path: Pa
 )
 def test_what_cannot_be_started_from(settings: dict[str, Any], said: str) -> None:
     with pytest.raises(ValueError, match=said):
-        CompensatorTraining(CompensatorRecipe.from_dict(SHORT | settings), 1.0, simulator="msbg")
+        CompensatorTraining(CompensatorRecipe.from_dict(SHORT | settings), simulator="msbg")
 
 
 def test_the_model_may_be_given_again() -> None:
     model = load_compensator("compensator-general").config.to_dict()  # type: ignore[union-attr]
     recipe = CompensatorRecipe.from_dict(SHORT | {"start": "compensator-general", "model": model})
-    assert CompensatorTraining(recipe, 1.0, simulator="msbg").compensator.config.to_dict() == model
+    assert CompensatorTraining(recipe, simulator="msbg").compensator.config.to_dict() == model
 
 
 def test_the_program_starts_from_a_checkpoint(
