@@ -15,7 +15,7 @@ from hlsim.audio import find_audio, read_audio, write_audio
 from hlsim.audiogram.table import read_audiograms
 from hlsim.calibration import level_spl, set_level
 from hlsim.evaluation import haspi_report
-from hlsim.report.haspi import markdown, write_report
+from hlsim.report.previous.haspi import markdown, write_report
 
 SPL, SECONDS, LISTENERS = 65.0, 3.0, 4
 

@@ -15,17 +15,18 @@ from hlsim.audio import find_audio, read_audio, write_audio
 from hlsim.audiogram import STANDARD, Audiogram
 from hlsim.calibration import PASCAL_SPL, level_spl, set_level
 from hlsim.dsp.resample import resample
-from hlsim.evaluation import HaspiReport, ItemScore
-from hlsim.evaluation.items import INPUT_LEVELS
-from hlsim.evaluation.judging import NORMAL, AtLevelOf, Unaided
-from hlsim.evaluation.measurements import gain_curves
+from hlsim.evaluation.previous.haspi_report import HaspiReport
+from hlsim.evaluation.previous.items import INPUT_LEVELS
+from hlsim.evaluation.previous.judging import NORMAL, AtLevelOf, Unaided
+from hlsim.evaluation.previous.measurements import gain_curves
+from hlsim.evaluation.previous.scores import ItemScore
 from hlsim.files import write_whole
 from hlsim.metrics.pair import check_pair
 from hlsim.metrics.registry import MEASURES
 from hlsim.msbg import MSBG
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.parallel import one_thread
-from hlsim.report.demo import (
+from hlsim.report.previous.demo import (
     AS_LOUD,
     NORMAL_EAR,
     PRESCRIBED,
@@ -35,8 +36,8 @@ from hlsim.report.demo import (
     demo_front,
     result_table,
 )
-from hlsim.report.haspi import write_report
-from hlsim.report.tables import loss_name
+from hlsim.report.previous.haspi import write_report
+from hlsim.report.previous.tables import loss_name
 from hlsim.training.batches import TrainingData
 from hlsim.training.compensator import train_compensator
 from hlsim.training.recipes import CompensatorRecipe

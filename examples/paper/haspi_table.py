@@ -22,7 +22,7 @@ from hlsim.data.manifest import Utterance
 from hlsim.data.plan import prepare
 from hlsim.data.plan_settings import PlanSettings
 from hlsim.evaluation import haspi_report
-from hlsim.report.haspi import markdown, write_report
+from hlsim.report.previous.haspi import markdown, write_report
 
 
 def main(arguments: list[str] | None = None) -> None:

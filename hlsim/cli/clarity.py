@@ -57,8 +57,8 @@ def _clarity(options: argparse.Namespace) -> None:
     need("eval", "joblib", "matplotlib")
     need_engine(options.engine)
     check_there(folders=(options.scenes,), files=(options.listeners, options.scenes_listeners))
-    from hlsim.evaluation.clarity import evaluate_scenes
-    from hlsim.report.clarity import conditions_table, write_scenes
+    from hlsim.evaluation.previous.clarity import evaluate_scenes
+    from hlsim.report.previous.clarity import conditions_table, write_scenes
 
     aids = dict(map(labelled, options.names))
     if len(aids) < len(options.names):

@@ -56,10 +56,10 @@ def _evaluate_simulator(options: argparse.Namespace) -> None:
     check_there(folders=(options.speech, options.noise), files=(options.audiograms,))
     from compensators import load_compensator
     from hlsim.calibration import PASCAL_SPL
-    from hlsim.evaluation.simulators import evaluate_simulators
+    from hlsim.evaluation.previous.simulators import evaluate_simulators
     from hlsim.losses.frozen_simulator import build_simulator
     from hlsim.neuro.config import NEURO_RATE
-    from hlsim.report.simulators import write_fidelity
+    from hlsim.report.previous.simulators import write_fidelity
 
     simulators = {
         label: build_simulator(name, NEURO_RATE, PASCAL_SPL) for label, name in named.items()
@@ -123,8 +123,8 @@ def _evaluate_compensator(options: argparse.Namespace) -> None:
     need_engine(options.engine)
     check_there(folders=(options.speech, options.noise), files=(options.audiograms,))
     from compensators import load_compensator
-    from hlsim.evaluation.compensators import evaluate_compensators
-    from hlsim.report.compensators import write_compensators
+    from hlsim.evaluation.previous.compensators import evaluate_compensators
+    from hlsim.report.previous.compensators import write_compensators
 
     named = dict(map(labelled, options.names))
     if len(named) < len(options.names):
@@ -231,7 +231,7 @@ def _haspi_report(options: argparse.Namespace) -> None:
         files=(options.manifest, options.audiograms),
     )
     from hlsim.evaluation import haspi_report
-    from hlsim.report.haspi import markdown, write_report
+    from hlsim.report.previous.haspi import markdown, write_report
 
     report = haspi_report(
         clean=options.clean,

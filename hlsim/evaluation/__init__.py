@@ -1,10 +1,9 @@
-"""Scores of what an ear is given and of how true a simulator is; most need the extra ``eval``."""
+"""Studies of hearing aids and simulators: items, conditions and measures in, one table out."""
 
-from hlsim.evaluation.comparison import Comparison
-from hlsim.evaluation.haspi_report import HaspiReport, haspi_report
-from hlsim.evaluation.scores import Failure, ItemScore
-from hlsim.evaluation.scoring import FileItem, score_items
-from hlsim.evaluation.simulators import summarise
+from hlsim.evaluation.comparison import Comparison, compare
+from hlsim.evaluation.measures import MEASURES
+from hlsim.evaluation.recordings import haspi_report
+from hlsim.evaluation.result import Evaluation
 from hlsim.evaluation.statistics import (
     PairedComparison,
     bootstrap_interval,
@@ -12,19 +11,21 @@ from hlsim.evaluation.statistics import (
     paired_comparison,
 )
 from hlsim.evaluation.store import ScoreStore
+from hlsim.evaluation.study import Condition, Item, Measure, run_study
 
 __all__ = [
+    "MEASURES",
     "Comparison",
-    "Failure",
-    "FileItem",
-    "HaspiReport",
-    "ItemScore",
+    "Condition",
+    "Evaluation",
+    "Item",
+    "Measure",
     "PairedComparison",
     "ScoreStore",
     "bootstrap_interval",
+    "compare",
     "haspi_report",
     "holm",
     "paired_comparison",
-    "score_items",
-    "summarise",
+    "run_study",
 ]

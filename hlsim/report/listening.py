@@ -1,8 +1,8 @@
-"""Chosen items of a report as they are heard: signals through MSBG, as pictures and players of a page."""
+"""Chosen items of a study as an ear perceives them: players with spectrograms."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import torch
@@ -10,90 +10,105 @@ from torch import Tensor
 
 from hlsim.audio import encode_flac
 from hlsim.calibration import gain_to_pascals, level_spl
-from hlsim.evaluation.haspi_report import HaspiReport
-from hlsim.evaluation.scores import ItemScore
-from hlsim.evaluation.scoring import read_channel
-from hlsim.msbg.model import MSBG
+from hlsim.evaluation.measures import perceive
+from hlsim.evaluation.result import Evaluation
+from hlsim.evaluation.study import Item
+from hlsim.parallel import reason_of
+from hlsim.report import spectrograms
 from hlsim.report.page import Player, Section
-from hlsim.report.spectrograms import panels, pictures
 
 LONGEST_SECONDS = 8.0
-"""Of an item in a page: longer ones are cut there."""
+"""Length after which an item is cut on a page."""
 
 _PEAK = 0.9
 
-
-def choose_items(report: HaspiReport, count: int) -> list[tuple[str, ItemScore]]:
-    """Items spread over the headline's change, from the largest rise to the largest fall, with the reason for each."""
-    scores = report.scores(report.headline.measure, (report.headline.before, report.headline.after))
-    changes = [
-        (after - before, item)
-        for (before, after), item in zip(scores.tolist(), report.items, strict=True)
-        if item.clean is not None and before == before and after == after
-    ]
-    changes.sort(key=lambda pair: -pair[0])
-    chosen = np.linspace(0, len(changes) - 1, max(0, min(count, len(changes)))).round().astype(int)
-    return [
-        (f"rank {place + 1} of {len(changes)}, change {changes[place][0]:+.3f}", changes[place][1])
-        for place in chosen
-    ]
+_EXPLANATION = (
+    "What the impaired ear perceives, by MSBG, beside the clean speech. All players of an item have the "
+    "same gain, so that what is soft for that ear is soft here. Begin with a low volume: some sounds "
+    "are much louder than others, as the levels beside them say."
+)
 
 
-def heard(item: ItemScore) -> tuple[dict[str, Tensor], int]:
-    """The clean speech and what the ear hears of each condition, in pascals, and the rate in Hz. Shape: (time,) each.
+def listening_section(
+    evaluation: Evaluation, count: int, shown: Sequence[str] = ()
+) -> Section | None:
+    """Return players and spectrograms of some items, from the largest rise of the headline to the largest fall.
 
-    By the exact MSBG of the item's audiogram, aligned; at most the first 8 s. ValueError where a file cannot be read, or
-    a threshold is above the 100 dB HL that MSBG takes.
+    Args:
+        count: number of items; with 0 there is no section.
+        shown: names of the conditions to be played, by default all.
     """
-    if item.clean is None:
-        raise ValueError(f"{item.file}: its files are not known")
-    clean, rate = read_channel(item.clean, item.ear)
-    to_pascals, end = gain_to_pascals(item.full_scale_spl), int(LONGEST_SECONDS * rate)
-    ear = MSBG(item.audiogram, sample_rate=rate)
-    signals = {"original": torch.from_numpy(clean[:end]).float() * to_pascals}
-    for name in item.levels:
-        if name in item.processed and item.levels[name] is not None:
-            samples, _ = read_channel(item.processed[name], item.ear)
-            with torch.no_grad():
-                signals[f"{name}, as heard"] = ear(
-                    torch.from_numpy(samples[:end]).float() * to_pascals
-                )
-    return signals, rate
-
-
-def listening_section(report: HaspiReport, count: int) -> Section | None:
-    """Spectrograms and players of chosen items; None where their files are not known or ``count`` is 0."""
     sections = []
-    for reason, item in choose_items(report, count):
-        title = f"{item.file} ({reason})"
+    for title, number in _choose_items(evaluation, count):
         try:
-            sections.append(_item_section(title, item))
-        except ValueError as error:
-            sections.append(Section(title, [f"Not to be heard here: {error}"]))
-    text = (
-        "What the impaired ear hears, by MSBG, beside the clean speech. Within an item all players have one gain, so "
-        "that what is softer in that ear is softer here; set the volume by the original. "
-        f"Items longer than {LONGEST_SECONDS:g} s are cut."
-    )
-    return Section("Listen", [text], sections=sections) if sections else None
+            signals, item = _perceived(evaluation, number, shown or evaluation.names)
+            sections.append(
+                Section(title, [_about(item)], players=players(signals, item.sample_rate))
+            )
+        except Exception as error:  # a page is not lost to a sound
+            sections.append(Section(title, [f"It cannot be played: {reason_of(error)}"]))
+    if not sections:
+        return None
+    return Section("Listen", [_EXPLANATION], sections=sections)
 
 
-def _item_section(title: str, item: ItemScore) -> Section:
-    signals, rate = heard(item)
-    if not any(
-        bool(signal.any()) for signal in signals.values()
-    ):  # speech that begins later is scored, but cut here
-        raise ValueError(f"the first {LONGEST_SECONDS:g} s are silent")
-    thresholds = ", ".join(f"{level:g}" for level in item.audiogram.levels)
-    text = f"{item.severity} loss, thresholds {thresholds} dB HL."
-    drawn = pictures(panels(signals, rate))
-    return Section(title, [text], pictures=drawn, players=players(signals, rate))
+def players(signals: Mapping[str, Tensor], sample_rate: int) -> list[Player]:
+    """Return players with one gain, each with its spectrogram and its level.
 
-
-def players(signals: Mapping[str, Tensor], rate: int) -> list[Player]:
-    """All at one gain: what is softer in the ear is softer here. Shape: (time,) each, in pascals, not all silent."""
-    gain = _PEAK / max(float(signal.abs().max()) for signal in signals.values())
+    Shape: (time,) each, in pascals.
+    """
+    peak = max(float(signal.abs().max()) for signal in signals.values())
+    if not peak:
+        raise ValueError("all sounds are silent")
+    levels = {name: float(level_spl(signal)) for name, signal in signals.items()}
+    pictures = spectrograms.pictures(spectrograms.panels(signals, sample_rate))
     return [
-        Player(encode_flac(signal * gain, rate), f"{name} ({float(level_spl(signal)):.0f} dB SPL)")
-        for name, signal in signals.items()
+        Player(
+            encode_flac(signal * (_PEAK / peak), sample_rate),
+            f"{name}, {levels[name]:.0f} dB SPL",
+            picture,
+        )
+        for (name, signal), picture in zip(signals.items(), pictures, strict=True)
     ]
+
+
+def _choose_items(evaluation: Evaluation, count: int) -> list[tuple[str, int]]:
+    """Return titles and numbers of items that are spread over the change of the headline's score."""
+    headline = evaluation.headline
+    if headline is None:
+        return []
+    wide = evaluation.wide(headline.measure)
+    changes = (wide[headline.after] - wide[headline.before]).dropna()
+    changes = changes.sort_values(ascending=False, kind="stable")
+    places = np.linspace(0, len(changes) - 1, max(0, min(count, len(changes))))
+    sources = evaluation.table.drop_duplicates("item").set_index("item")
+    chosen = []
+    for place in places.round().astype(int).tolist():
+        row = sources.loc[changes.index[place]]
+        kind = {0: "largest rise", len(changes) - 1: "smallest rise or largest fall"}
+        which = kind.get(place, f"rank {place + 1} of {len(changes)}")
+        title = f"{row['name']} ({which}: {headline.title} {changes.iloc[place]:+.3f})"
+        chosen.append((title, int(row.get("source", row.name))))
+    return chosen
+
+
+def _perceived(
+    evaluation: Evaluation, number: int, shown: Sequence[str]
+) -> tuple[dict[str, Tensor], Item]:
+    """Return clean speech and what the ear perceives of each condition, in pascals."""
+    item = evaluation.items[number].load()
+    gain = gain_to_pascals(item.full_scale_spl)
+    end = int(LONGEST_SECONDS * item.sample_rate)
+    signals = {"clean speech": item.clean[:end].float() * gain}
+    for condition in evaluation.conditions:
+        if condition.name in shown:
+            with torch.no_grad():
+                output = condition.output(item)[:end].float() * gain
+            name = f"{condition.name}, perceived"
+            signals[name] = perceive(output, item.ear, item.sample_rate)
+    return signals, item
+
+
+def _about(item: Item) -> str:
+    thresholds = ", ".join(f"{level:g}" for level in item.ear.thresholds)
+    return f"{item.ear.severity.capitalize()} loss, thresholds {thresholds} dB HL."

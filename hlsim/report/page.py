@@ -1,30 +1,63 @@
-"""Sections of text, tables, pictures and players, as Markdown or as one HTML file, and the files of a report.
+"""Pages: sections of text, tables, pictures and players, as one HTML file or as Markdown.
 
-Nothing is fetched and no script runs in the HTML: pictures and sounds are data in the page, and its policy forbids
-the rest. It reads on a phone's width (wide tables scroll by themselves) and by keyboard (a skip link, regions that take
-the focus).
+The HTML fetches nothing and runs no script: pictures and sounds are data in the page. It can be read on a
+phone, where wide tables scroll by themselves, and with a keyboard.
 """
 
 from __future__ import annotations
 
 import base64
+import json
 import os
 import re
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 from hlsim.extras import require
-from hlsim.files import Whole
-from hlsim.report.tables import Table
+from hlsim.files import write_whole
+
+
+@dataclass(frozen=True)
+class Table:
+    """Cells of text; the first column names the rows. A folded table is shown when it is opened."""
+
+    caption: str
+    header: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    folded: bool = False
+
+    @classmethod
+    def of(cls, caption: str, rows: Sequence[Mapping[str, str]], *, folded: bool = False) -> Table:
+        """Make a table of rows by column title; all rows have the same titles."""
+        header = list(rows[0]) if rows else []
+        return cls(caption, header, [list(row.values()) for row in rows], folded)
+
+    def markdown(self) -> str:
+        """Return the table in Markdown, without the caption."""
+        lines = [self.header, ["---"] * len(self.header), *self.rows]
+        escaped = [[cell.replace("|", "\\|") for cell in line] for line in lines]
+        return "\n".join(f"| {' | '.join(line)} |" for line in escaped)
+
+    def text(self) -> str:
+        """Return the table for a terminal, without the caption."""
+        lines = [self.header, *self.rows]
+        widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+        return "\n".join(_aligned(line, widths) for line in lines)
+
+
+def _aligned(line: Sequence[str], widths: Sequence[int]) -> str:
+    """Align the first cell to the left and the others to the right."""
+    first, *others = [(cell, width) for cell, width in zip(line, widths, strict=True)]
+    cells = [first[0].ljust(first[1]), *(cell.rjust(width) for cell, width in others)]
+    return "  ".join(cells)
 
 
 @dataclass(frozen=True)
 class Picture:
-    """An SVG or PNG file's contents, with the words that stand for it where it is not seen."""
+    """Contents of an SVG or PNG file, a text for readers who do not see it, and a caption."""
 
     data: bytes
     alt: str
@@ -33,18 +66,19 @@ class Picture:
 
 @dataclass(frozen=True)
 class Player:
-    """A FLAC or WAV file's contents, to be played."""
+    """Contents of a FLAC or WAV file to be played, and a picture of the sound."""
 
     data: bytes
     label: str
+    picture: Picture | None = None
 
 
 @dataclass(frozen=True)
 class Section:
-    """A part of a page, in this order: paragraphs, tables, pictures, players, and inner parts.
+    """A part of a page: paragraphs, tables, players, pictures and inner parts, in this order.
 
     Args:
-        folded: shown only when it is opened.
+        folded: whether it is shown only when it is opened.
     """
 
     title: str
@@ -56,49 +90,87 @@ class Section:
     folded: bool = False
 
 
+@dataclass(frozen=True)
+class Page:
+    """A title, a verdict in one sentence, and the sections that support it."""
+
+    title: str
+    verdict: str
+    sections: Sequence[Section]
+
+    def html(self) -> str:
+        """Return the page as one HTML file; all text is escaped."""
+        return (
+            str(_template().render(title=self.title, sections=self.sections, lead=self.verdict))
+            + "\n"
+        )
+
+    def markdown(self) -> str:
+        """Return text and tables without what is played or drawn; HTML tags stay text."""
+        blocks = [f"# {self.title}", self.verdict, *_markdown_blocks(self.sections, depth=2)]
+        return re.sub(r"<(?=[A-Za-z/!?])", "&lt;", "\n\n".join(filter(None, blocks))) + "\n"
+
+
+def _markdown_blocks(sections: Sequence[Section], depth: int) -> list[str]:
+    blocks: list[str] = []
+    for section in sections:
+        inner = [*section.paragraphs]
+        inner += [f"**{table.caption}**\n\n{table.markdown()}" for table in section.tables]
+        inner += _markdown_blocks(section.sections, depth + 1)
+        if inner:
+            blocks += [f"{'#' * depth} {section.title}", *inner]
+    return blocks
+
+
+def write_page(page: Page, data: Mapping[str, Any], out: str | Path) -> Path:
+    """Write ``report.html``, ``report.md`` and ``report.json``, which holds the data, into a folder.
+
+    Files of these names are replaced; others stay.
+
+    Returns: the path of ``report.html``.
+
+    Raises:
+        ValueError: the files cannot be written, or JSON cannot hold the data.
+        MissingExtraError: jinja2 is not installed.
+    """
+    folder = check_out(out)
+    try:
+        text = json.dumps(data, indent=1, ensure_ascii=False, allow_nan=False)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"the results cannot be written as JSON: {error}") from error
+    contents = {
+        "report.json": f"{text}\n",
+        "report.md": page.markdown(),
+        "report.html": page.html(),
+    }
+    for name, content in contents.items():
+        write_whole(folder / name, content)
+    return folder / "report.html"
+
+
 def render_page(title: str, sections: Sequence[Section], lead: str = "") -> str:
-    """HTML. All text is escaped; ``lead`` stands under the title."""
-    return str(_template().render(title=title, sections=sections, lead=lead)) + "\n"
+    return Page(title, lead, sections).html()
 
 
 def render_markdown(title: str, sections: Sequence[Section], lead: str = "") -> str:
-    """Text and tables; what is drawn, played, folded or in parts of parts is on the page alone. Tags stay text."""
-    blocks = [f"# {title}", *([lead] if lead else [])]
-    for section in sections:
-        if (section.paragraphs or section.tables) and not (section.sections or section.folded):
-            blocks += [f"## {section.title}", *section.paragraphs]
-            blocks += [f"**{table.caption}**\n\n{table.markdown()}" for table in section.tables]
-    return re.sub(r"<(?=[A-Za-z/!?])", "&lt;", "\n\n".join(blocks)) + "\n"
+    return Page(title, lead, sections).markdown()
 
 
 def write_files(out: str | Path, contents: Mapping[str, str | bytes]) -> Path:
-    """Write files into a folder, there or not, by name; others in it stay. Returns the folder; ValueError if it cannot.
-
-    All are written under hidden names in it before the first takes its name.
-    """
     folder = check_out(out)
-    there = folder.exists()
-    try:
-        with ExitStack() as stack:
-            files = [stack.enter_context(Whole(folder / name)) for name in contents]
-            for file, data in zip(files, contents.values(), strict=True):
-                file.write(data)
-            for file in files:
-                file.keep()
-    finally:
-        if not there and folder.is_dir() and not any(folder.iterdir()):
-            folder.rmdir()
+    for name, data in contents.items():
+        write_whole(folder / name, data)
     return folder
 
 
 def check_out(out: str | Path) -> Path:
-    """The folder that a report goes to, or ValueError where it cannot be: to be known before hours of scoring."""
+    """Return the folder of a report; ValueError if no report can be written there."""
     folder = Path(out).absolute()
-    there = next(path for path in (folder, *folder.parents) if path.exists())
-    if not there.is_dir():
-        raise ValueError(f"{there}: not a folder; a report needs a folder, there or not")
-    if not os.access(there, os.W_OK | os.X_OK):
-        raise ValueError(f"{there}: no permission to write a report there")
+    existing = next(path for path in (folder, *folder.parents) if path.exists())
+    if not existing.is_dir():
+        raise ValueError(f"{existing} is not a folder, so that no report can be written there")
+    if not os.access(existing, os.W_OK | os.X_OK):
+        raise ValueError(f"there is no permission to write a report into {existing}")
     return folder
 
 
@@ -111,7 +183,7 @@ def _template() -> Any:
 
 
 def _uri(data: bytes) -> str:
-    """Of a file's contents, whose kind its first bytes tell."""
+    """Return the contents of a file as a URI; its first bytes tell its kind."""
     kinds = {b"\x89PNG": "image/png", b"fLaC": "audio/flac", b"RIFF": "audio/wav"}
     kind = kinds.get(data[:4], "image/svg+xml")
     return f"data:{kind};base64,{base64.b64encode(data).decode('ascii')}"

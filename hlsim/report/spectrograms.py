@@ -11,7 +11,7 @@ from torch import Tensor
 
 from hlsim.calibration import PASCAL_SPL
 from hlsim.report.page import Picture
-from hlsim.report.pictures import new_figure, plain, png, svg
+from hlsim.report.plots import new_figure, plain, png, svg
 
 RANGE_DB = 75.0
 """What is drawn of levels, from the loudest bin down: speech and the noise in its pauses."""

@@ -65,8 +65,8 @@ def _parameters() -> dict[str, dict[str, Any]]:
     pytest.importorskip("lightning")
     from hlsim.demo import demo
     from hlsim.evaluation import haspi_report, score_items
-    from hlsim.evaluation.compensators import evaluate_compensators
-    from hlsim.evaluation.simulators import evaluate_simulators
+    from hlsim.evaluation.previous.compensators import evaluate_compensators
+    from hlsim.evaluation.previous.simulators import evaluate_simulators
     from hlsim.training.compensator import train_compensator
     from hlsim.training.loop import RunOptions
     from hlsim.training.simulator import train_simulator

@@ -10,7 +10,7 @@ from compensators import WDRC, HearingAid, HearingAidConfig, load_compensator, s
 from hlsim import Audiogram
 from hlsim.calibration import level_spl, set_level
 from hlsim.dsp.resample import resample
-from hlsim.evaluation.measurements import steady_tones
+from hlsim.evaluation.previous.measurements import steady_tones
 from hlsim.training.ears import draw_thresholds
 from tests.compensators.test_wearable import EAR, trained
 

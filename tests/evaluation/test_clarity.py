@@ -19,14 +19,14 @@ from hlsim.audio import read_audio
 from hlsim.audiogram.listener import Listener, read_listeners
 from hlsim.cli.main import main
 from hlsim.dsp.resample import resample
-from hlsim.evaluation.clarity import (
+from hlsim.evaluation.previous.clarity import (
     _conditions,
     _looks_ahead,
     evaluate_scenes,
     read_pairs,
     read_scenes,
 )
-from hlsim.report.clarity import conditions_table, write_scenes
+from hlsim.report.previous.clarity import conditions_table, write_scenes
 
 RATE = 44100
 SPEECH = Path(hlsim.__file__).parent / "data" / "speech" / "valid"

@@ -7,7 +7,7 @@ import pytest
 
 from hlsim.audiogram import Audiogram
 from hlsim.evaluation import ItemScore, holm, paired_comparison
-from hlsim.evaluation.comparison import Comparison, compare_conditions, p_text
+from hlsim.evaluation.previous.comparison import Comparison, compare_conditions, p_text
 
 
 def item(i: int, scores: dict[str, float], *, listener: str = "", louder: float = 0.0) -> ItemScore:

@@ -18,9 +18,9 @@ from hlsim import MSBG, Audiogram, HearingLossLoss, load_pretrained
 from hlsim.calibration import level_spl, set_level
 from hlsim.cli.main import main
 from hlsim.evaluation import compensators, judging, measurements
-from hlsim.evaluation.compensators import evaluate_compensators
-from hlsim.evaluation.items import INPUT_LEVELS, draw_judged_items, read_ears
-from hlsim.evaluation.judging import (
+from hlsim.evaluation.previous.compensators import evaluate_compensators
+from hlsim.evaluation.previous.items import INPUT_LEVELS, draw_judged_items, read_ears
+from hlsim.evaluation.previous.judging import (
     Equaliser,
     Keys,
     Trial,
@@ -29,13 +29,13 @@ from hlsim.evaluation.judging import (
     judge,
     peak_spl,
 )
-from hlsim.evaluation.measurements import insertion_gain
+from hlsim.evaluation.previous.measurements import insertion_gain
 from hlsim.evaluation.statistics import paired_comparison
 from hlsim.losses.band_levels import band_edges
 from hlsim.metrics import registry
 from hlsim.metrics.pyclarity import pyclarity_score
 from hlsim.pretrained import find_checkpoint, save_checkpoint
-from hlsim.report.compensators import FILES, write_compensators
+from hlsim.report.previous.compensators import FILES, write_compensators
 
 pytest.importorskip("matplotlib")
 pytest.importorskip("joblib")

@@ -18,7 +18,7 @@ from hlsim.evaluation import HaspiReport, haspi_report
 from hlsim.evaluation.store import content_hash
 from hlsim.metrics import registry
 from hlsim.metrics.pyclarity import pyclarity_score
-from hlsim.report.haspi import markdown, write_report
+from hlsim.report.previous.haspi import markdown, write_report
 from hlsim.report.page import check_out
 
 for module in ("joblib", "matplotlib"):

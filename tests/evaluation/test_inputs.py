@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from hlsim.audiogram import Audiogram
-from hlsim.evaluation.inputs import below_root, read_manifest
+from hlsim.evaluation.previous.inputs import below_root, read_manifest
 
 N3 = Audiogram.standard("N3")
 

@@ -9,8 +9,8 @@ from torch import Tensor, nn
 from compensators import NALR
 from hlsim import MSBG, Audiogram
 from hlsim.calibration import level_spl
-from hlsim.evaluation.judging import NORMAL, Unaided
-from hlsim.evaluation.measurements import TONES, steady_tones, tones, wearing
+from hlsim.evaluation.previous.judging import NORMAL, Unaided
+from hlsim.evaluation.previous.measurements import TONES, steady_tones, tones, wearing
 
 N3 = Audiogram.standard("N3")
 

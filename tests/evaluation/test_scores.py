@@ -9,8 +9,8 @@ import torch
 from hlsim.audio import read_audio, write_audio
 from hlsim.audiogram import Audiogram
 from hlsim.evaluation import ItemScore, haspi_report
-from hlsim.evaluation.scores import better_ears, check_both_ears
-from hlsim.report.haspi import html, markdown
+from hlsim.evaluation.previous.scores import better_ears, check_both_ears
+from hlsim.report.previous.haspi import html, markdown
 
 EARS = {"left": Audiogram.standard("N2"), "right": Audiogram.standard("N4")}
 

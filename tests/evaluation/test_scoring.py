@@ -17,7 +17,7 @@ import torch
 
 from hlsim.audio import read_audio, write_audio
 from hlsim.audiogram import FREQUENCIES, Audiogram
-from hlsim.evaluation.scoring import FileItem, Results, score_items
+from hlsim.evaluation.previous.scoring import FileItem, Results, score_items
 from hlsim.evaluation.store import ScoreStore, content_hash
 from hlsim.metrics import registry as measures_module
 from hlsim.metrics.pyclarity import pyclarity_score
@@ -194,7 +194,7 @@ def test_known_scores_are_not_made_again(
     run(items[:1])
     assert sorted(made) == sorted(ALL)
     made.clear()
-    monkeypatch.setattr("hlsim.evaluation.scoring.versions_of", lambda *_: {"pesq": "another"})
+    monkeypatch.setattr("hlsim.evaluation.previous.scoring.versions_of", lambda *_: {"pesq": "another"})
     run(items[:1])
     assert len(made) == 8
 

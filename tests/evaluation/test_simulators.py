@@ -15,11 +15,11 @@ from compensators import NALR
 from hlsim import MSBG, Audiogram
 from hlsim.calibration import level_spl, set_level
 from hlsim.evaluation import simulators
-from hlsim.evaluation.items import LEVELS, draw_items, treat
-from hlsim.evaluation.simulators import evaluate_simulators, summarise
+from hlsim.evaluation.previous.items import LEVELS, draw_items, treat
+from hlsim.evaluation.previous.simulators import evaluate_simulators, summarise
 from hlsim.metrics.fidelity import snr_db
 from hlsim.metrics.reference import pyclarity_msbg
-from hlsim.report.simulators import write_fidelity
+from hlsim.report.previous.simulators import write_fidelity
 
 pytest.importorskip("clarity")
 pytest.importorskip("pesq")

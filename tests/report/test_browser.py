@@ -17,7 +17,7 @@ import torch
 from hlsim.audio import read_audio, write_audio
 from hlsim.audiogram import Audiogram
 from hlsim.evaluation import Failure, HaspiReport, ItemScore
-from hlsim.report.haspi import write_report
+from hlsim.report.previous.haspi import write_report
 from tests.report.test_demo import made_up_page
 
 pytestmark = pytest.mark.browser

@@ -2,12 +2,12 @@
 
 import pytest
 
-from hlsim.evaluation.measurements import TONES
-from hlsim.report.compensators import tone_table
-from hlsim.report.gain_pictures import gain_picture
+from hlsim.evaluation.previous.measurements import TONES
+from hlsim.report.previous.compensators import tone_table
+from hlsim.report.previous.gain_pictures import gain_picture
 from hlsim.report.page import Section, render_page
-from hlsim.report.pictures import condition_colours
-from hlsim.report.tables import Table
+from hlsim.report.previous.pictures import condition_colours
+from hlsim.report.previous.tables import Table
 
 
 def test_table_of_tones() -> None:

@@ -8,7 +8,7 @@ import torch
 from hlsim.audiogram import Audiogram
 from hlsim.evaluation import HaspiReport, ItemScore
 from hlsim.losses.band_levels import band_centres
-from hlsim.report.demo import (
+from hlsim.report.previous.demo import (
     AS_LOUD,
     NORMAL_EAR,
     PRESCRIBED,
@@ -19,7 +19,7 @@ from hlsim.report.demo import (
     demo_verdict,
     result_table,
 )
-from hlsim.report.haspi import Front, html, markdown
+from hlsim.report.previous.haspi import Front, html, markdown
 
 pytest.importorskip("matplotlib")
 

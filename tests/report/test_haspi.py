@@ -16,8 +16,8 @@ from scipy import stats
 from hlsim.audiogram import Audiogram
 from hlsim.evaluation import Failure, HaspiReport, ItemScore, bootstrap_interval
 from hlsim.files import Whole
-from hlsim.report.haspi import REPORT_FILES, html, markdown, write_report
-from hlsim.report.pictures import report_pictures
+from hlsim.report.previous.haspi import REPORT_FILES, html, markdown, write_report
+from hlsim.report.previous.pictures import report_pictures
 
 for module in ("joblib", "matplotlib"):
     pytest.importorskip(module)

@@ -12,7 +12,7 @@ from hlsim import MSBG
 from hlsim.audio import read_audio, write_audio
 from hlsim.audiogram import Audiogram
 from hlsim.evaluation import HaspiReport, ItemScore
-from hlsim.report.listening import choose_items, heard, listening_section
+from hlsim.report.previous.listening import choose_items, heard, listening_section
 
 pytest.importorskip("matplotlib")
 

@@ -4,7 +4,7 @@ import re
 from html.parser import HTMLParser
 
 from hlsim.report.page import Picture, Player, Section, render_page
-from hlsim.report.tables import Table
+from hlsim.report.previous.tables import Table
 
 VOID = {"meta", "link", "img", "input", "br"}
 

@@ -2,8 +2,8 @@
 
 import pytest
 
-from hlsim.evaluation.simulators import summarise
-from hlsim.report.simulators import summary_tables
+from hlsim.evaluation.previous.simulators import summarise
+from hlsim.report.previous.simulators import summary_tables
 
 pytest.importorskip("pandas")
 

@@ -4,9 +4,9 @@ import pytest
 
 from hlsim.audiogram import Audiogram
 from hlsim.evaluation import ItemScore
-from hlsim.evaluation.comparison import compare_conditions
+from hlsim.evaluation.previous.comparison import compare_conditions
 from hlsim.report.page import Section, render_markdown
-from hlsim.report.tables import Table, listener_table, number, severity_table, spread
+from hlsim.report.previous.tables import Table, listener_table, number, severity_table, spread
 
 
 def test_cells_are_escaped() -> None:

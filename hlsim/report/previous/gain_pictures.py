@@ -10,7 +10,7 @@ import numpy as np
 
 from hlsim.audiogram.plot import frequency_axis
 from hlsim.report.page import Picture
-from hlsim.report.pictures import draw_svg, legend, plain
+from hlsim.report.previous.pictures import draw_svg, legend, plain
 
 Colours = Mapping[str, Any]
 """Of each condition, as ``pictures.condition_colours`` gives them."""

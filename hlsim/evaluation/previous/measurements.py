@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from hlsim.audiogram import Audiogram
 from hlsim.calibration import level_spl, set_level
-from hlsim.evaluation.judging import NORMAL
+from hlsim.evaluation.previous.judging import NORMAL
 from hlsim.losses.band_levels import band_centres, band_levels
 from hlsim.msbg import MSBG
 from hlsim.neuro.config import NEURO_RATE

@@ -16,7 +16,7 @@ from hlsim.audiogram import Audiogram
 from hlsim.audiogram.table import read_audiograms
 from hlsim.calibration import level_spl, set_level
 from hlsim.data.plan_settings import TEST_SNRS_DB
-from hlsim.evaluation.store import samples_hash
+from hlsim.evaluation.previous.keys import samples_hash
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.training.augment import compress, mix
 from hlsim.training.clips import Clips

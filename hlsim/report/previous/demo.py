@@ -12,17 +12,17 @@ from torch import Tensor
 
 from hlsim.audiogram import Audiogram
 from hlsim.audiogram.plot import frequency_axis
-from hlsim.evaluation.comparison import EQUAL_DB
-from hlsim.evaluation.haspi_report import HaspiReport
+from hlsim.evaluation.previous.comparison import EQUAL_DB
+from hlsim.evaluation.previous.haspi_report import HaspiReport
 from hlsim.losses.band_levels import band_centres, band_levels, threshold_in_quiet
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.report import spectrograms
-from hlsim.report.gain_pictures import Colours, gain_picture
-from hlsim.report.haspi import Front
-from hlsim.report.listening import players
 from hlsim.report.page import Picture, Section
-from hlsim.report.pictures import condition_colours, draw_svg, legend
-from hlsim.report.tables import Table, verdict
+from hlsim.report.previous.gain_pictures import Colours, gain_picture
+from hlsim.report.previous.haspi import Front
+from hlsim.report.previous.listening import players
+from hlsim.report.previous.pictures import condition_colours, draw_svg, legend
+from hlsim.report.previous.tables import Table, verdict
 
 UNAIDED, PRESCRIBED, AS_LOUD, TRAINED = "unaided", "NAL-R", "NAL-R as loud as trained", "trained"
 """Conditions that the page tells of; there may be others between the first and the last."""

@@ -26,8 +26,8 @@ from hlsim.audio import find_audio
 from hlsim.audiogram import Audiogram
 from hlsim.audiogram.table import numbered_audiograms
 from hlsim.calibration import check_full_scale
-from hlsim.evaluation.scores import EARS
-from hlsim.evaluation.scoring import FileItem
+from hlsim.evaluation.previous.scores import EARS
+from hlsim.evaluation.previous.scoring import FileItem
 from hlsim.files import EXTENSIONS, read_table, resolved
 
 _Name = TypeVar("_Name")

@@ -3,74 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
-from hlsim.evaluation.comparison import ALPHA, Comparison, compare_conditions, p_text
-from hlsim.evaluation.scores import ItemScore
+from hlsim.evaluation.previous.comparison import ALPHA, Comparison, compare_conditions, p_text
+from hlsim.evaluation.previous.scores import ItemScore
 from hlsim.evaluation.statistics import PairedComparison
-
-_LATEX = str.maketrans(
-    {
-        "\\": r"\textbackslash{}",
-        "~": r"\textasciitilde{}",
-        "^": r"\textasciicircum{}",
-        "±": r"$\pm$",
-        "Δ": r"$\Delta$",
-        "<": "$<$",
-        ">": "$>$",
-        **{character: f"\\{character}" for character in "{}&%$#_"},
-    }
-)
+from hlsim.report.page import Table
 
 _CHANGE = "Δ [95 % interval]"
-
-
-@dataclass(frozen=True)
-class Table:
-    """Cells of text; the first column names the rows. On a page a ``folded`` one is shown when it is opened."""
-
-    caption: str
-    header: Sequence[str]
-    rows: Sequence[Sequence[str]]
-    folded: bool = False
-
-    @classmethod
-    def of(cls, caption: str, rows: Sequence[Mapping[str, str]], *, folded: bool = False) -> Table:
-        """Of rows by title of the column, all alike."""
-        return cls(caption, [*rows[0]] if rows else [], [[*row.values()] for row in rows], folded)
-
-    def markdown(self) -> str:
-        """Without the caption."""
-        lines = [self.header, ["---"] * len(self.header), *self.rows]
-        return "\n".join(
-            "| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines
-        )
-
-    def text(self) -> str:
-        """For a terminal: columns of one width each, the first one's cells at the left. Without the caption."""
-        lines = [self.header, *self.rows]
-        widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-        return "\n".join(
-            "  ".join(
-                cell.rjust(width) if i else cell.ljust(width)
-                for i, (cell, width) in enumerate(pairs)
-            )
-            for pairs in ([*zip(line, widths, strict=True)] for line in lines)
-        )
-
-    def latex(self) -> str:
-        """For ``\\input``; needs the package booktabs."""
-        header, *rows = (
-            " & ".join(cell.translate(_LATEX) for cell in line) + r" \\"
-            for line in (self.header, *self.rows)
-        )
-        columns, body = "l" + "r" * (len(self.header) - 1), "\n".join(rows)
-        return (
-            f"\\begin{{table}}\n\\centering\n\\caption{{{self.caption.translate(_LATEX)}.}}\n"
-            f"\\begin{{tabular}}{{{columns}}}\n\\toprule\n{header}\n\\midrule\n{body}\n\\bottomrule\n"
-            "\\end{tabular}\n\\end{table}\n"
-        )
 
 
 def number(value: float | None, form: str, none: str = "n/a") -> str:

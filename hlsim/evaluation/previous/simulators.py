@@ -16,9 +16,10 @@ from torch import Tensor, nn
 from hlsim.audiogram import SEVERITIES
 from hlsim.data.foreign import ForeignTeacher
 from hlsim.data.teacher import Reference, find_teacher
-from hlsim.evaluation.items import LEVELS, Input, Item, draw_items, treat
+from hlsim.evaluation.previous.items import LEVELS, Input, Item, draw_items, treat
+from hlsim.evaluation.previous.keys import weights_hash
 from hlsim.evaluation.statistics import paired_comparison
-from hlsim.evaluation.store import ScoreStore, key_of, weights_hash
+from hlsim.evaluation.store import ScoreStore, key_of
 from hlsim.extras import MissingExtraError, is_installed, require
 from hlsim.metrics.fidelity import (
     linear_correlation,

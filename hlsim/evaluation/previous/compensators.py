@@ -18,10 +18,10 @@ from compensators.wdrc import WDRC
 from hlsim.audiogram import Audiogram
 from hlsim.audiogram.thresholds import as_thresholds
 from hlsim.data.foreign import load_enhancers
-from hlsim.evaluation.compensator_result import MEASURES, compensator_result
-from hlsim.evaluation.haspi_report import HaspiReport
-from hlsim.evaluation.items import INPUT_LEVELS, Item, draw_judged_items, read_ears
-from hlsim.evaluation.judging import (
+from hlsim.evaluation.previous.compensator_result import MEASURES, compensator_result
+from hlsim.evaluation.previous.haspi_report import HaspiReport
+from hlsim.evaluation.previous.items import INPUT_LEVELS, Item, draw_judged_items, read_ears
+from hlsim.evaluation.previous.judging import (
     AtLevelOf,
     Enhanced,
     Equaliser,
@@ -31,14 +31,15 @@ from hlsim.evaluation.judging import (
     judge,
     limit_of,
 )
-from hlsim.evaluation.measurements import (
+from hlsim.evaluation.previous.keys import weights_hash
+from hlsim.evaluation.previous.measurements import (
     draw_utterances,
     gain_curves,
     insertion_gain,
     steady_tones,
     wearing,
 )
-from hlsim.evaluation.store import ScoreStore, key_of, weights_hash
+from hlsim.evaluation.store import ScoreStore, key_of
 from hlsim.extras import require
 from hlsim.losses.band_levels import BANDS
 from hlsim.metrics.pair import check_seed

@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from hlsim.audiogram import SEVERITIES
-from hlsim.evaluation.haspi_report import HaspiReport
-from hlsim.evaluation.items import Item
-from hlsim.evaluation.scores import ItemScore
+from hlsim.evaluation.previous.haspi_report import HaspiReport
+from hlsim.evaluation.previous.items import Item
+from hlsim.evaluation.previous.scores import ItemScore
 from hlsim.extras import require
 from hlsim.metrics.registry import MeasureName
 from hlsim.neuro.config import NEURO_RATE

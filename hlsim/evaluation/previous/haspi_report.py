@@ -12,10 +12,10 @@ import numpy as np
 
 from hlsim.audiogram import Audiogram
 from hlsim.calibration import check_full_scale
-from hlsim.evaluation.comparison import Comparison, compare_conditions
-from hlsim.evaluation.inputs import read_folders, read_manifest
-from hlsim.evaluation.scores import Failure, ItemScore, better_ears, check_both_ears
-from hlsim.evaluation.scoring import FileItem, Result, score_items
+from hlsim.evaluation.previous.comparison import Comparison, compare_conditions
+from hlsim.evaluation.previous.inputs import read_folders, read_manifest
+from hlsim.evaluation.previous.scores import Failure, ItemScore, better_ears, check_both_ears
+from hlsim.evaluation.previous.scoring import FileItem, Result, score_items
 from hlsim.evaluation.statistics import RESAMPLES, PairedComparison
 from hlsim.evaluation.store import ScoreStore
 from hlsim.extras import require
@@ -234,7 +234,7 @@ def haspi_report(
     Args:
         clean, before, after: folders, see ``read_folders``. Of one name, the three files have one rate and one length.
         audiogram, audiograms: the ear of all files or a CSV file of ears, as in ``read_folders`` and ``read_manifest``.
-        manifest, root: in place of the folders, a CSV file with a row a file, see ``hlsim.evaluation.inputs``.
+        manifest, root: in place of the folders, a CSV file with a row a file, see ``hlsim.evaluation.previous.inputs``.
         measures: of ``haspi``, ``hasqi``, ``stoi``, ``pesq``; the first is the headline's.
         engine: of HASPI and HASQI: ``"hlsim"``, which computes what pyclarity 0.9.0 does under the same seed, a rate of
             44.1 kHz taken as 44 with it, and is equal to 1e-7; or ``"pyclarity"`` itself, slower, to check.

@@ -9,11 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
-from hlsim.evaluation.clarity import RULE_MS
-from hlsim.evaluation.haspi_report import HaspiReport
-from hlsim.report.haspi import Front, write_report
+from hlsim.evaluation.previous.clarity import RULE_MS
+from hlsim.evaluation.previous.haspi_report import HaspiReport
 from hlsim.report.page import Section, write_files
-from hlsim.report.tables import Table, number
+from hlsim.report.previous.haspi import Front, write_report
+from hlsim.report.previous.tables import Table, number
 
 _COLUMNS = ("scene", "listener", "condition", "combined", "haspi", "hasqi", "level")
 

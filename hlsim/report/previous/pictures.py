@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 
 from hlsim.audiogram import FREQUENCIES, SEVERITIES
-from hlsim.evaluation.haspi_report import HaspiReport
+from hlsim.evaluation.previous.haspi_report import HaspiReport
 from hlsim.evaluation.statistics import FEWEST, bootstrap_interval
 from hlsim.extras import require
 from hlsim.report.page import Picture
-from hlsim.report.tables import loss_name
+from hlsim.report.previous.tables import loss_name
 
 _MANY = 2000  # points beyond which they are drawn as pixels: the page stays small
 _LABELLED = 40  # listeners up to which each is named

@@ -8,14 +8,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from hlsim.audiogram import SEVERITIES
-from hlsim.evaluation.haspi_report import HaspiReport
-from hlsim.evaluation.scores import ItemScore
+from hlsim.evaluation.previous.haspi_report import HaspiReport
+from hlsim.evaluation.previous.scores import ItemScore
 from hlsim.metrics.registry import MEASURES, Engine
 from hlsim.metrics.words import WordsChange
-from hlsim.report.listening import listening_section
 from hlsim.report.page import Picture, Section, render_markdown, render_page, write_files
-from hlsim.report.pictures import draw_report, report_pictures
-from hlsim.report.tables import (
+from hlsim.report.previous.listening import listening_section
+from hlsim.report.previous.pictures import draw_report, report_pictures
+from hlsim.report.previous.tables import (
     Table,
     comparisons_table,
     listener_table,
@@ -24,7 +24,7 @@ from hlsim.report.tables import (
     severity_table,
 )
 
-REPORT_FILES = ("report.json", "report.md", "report.tex", "report.html", "before-after.png")
+REPORT_FILES = ("report.json", "report.md", "report.html", "before-after.png")
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ def write_report(
         text = json.dumps(report.to_dict(), indent=2, ensure_ascii=False, allow_nan=False)
     except (TypeError, ValueError) as error:
         raise ValueError(f"report cannot be written as JSON: {error}") from error
-    pages = markdown(report, front), latex(report), html(report, listen, front)
+    pages = markdown(report, front), html(report, listen, front)
     contents = (text + "\n", *pages, draw_report(report))
     return write_files(out_dir, dict(zip(REPORT_FILES, contents, strict=True)))
 
@@ -73,15 +73,6 @@ def html(report: HaspiReport, listen: int = 3, front: Front | None = None) -> st
         return render_page(_title(report), sections, report.headline.in_short())
     details = Section("Details", sections=sections, folded=True)
     return render_page(front.title, [*front.sections, details], front.lead)
-
-
-def latex(report: HaspiReport) -> str:
-    """What ``report.tex`` says: tables for ``\\input``, which need the package booktabs."""
-    comments = (f"{_title(report)}. Needs \\usepackage{{booktabs}}.", *_notes(report))
-    tables = [paper_table(report.headline), severity_table(report.headline), *_further(report)]
-    return "".join(f"% {line}\n" for line in comments) + "\n".join(
-        table.latex() for table in tables
-    )
 
 
 def _title(report: HaspiReport) -> str:

@@ -16,7 +16,7 @@ from hlsim.audiogram import Audiogram
 from hlsim.calibration import PASCAL_SPL, level_spl, set_level
 from hlsim.data.foreign import ForeignEnhancer
 from hlsim.dsp.fir import filter_centred
-from hlsim.evaluation.items import Item
+from hlsim.evaluation.previous.items import Item
 from hlsim.losses.band_levels import (
     audibility,
     band_centres,

@@ -14,14 +14,14 @@ import numpy as np
 from torch import Tensor
 
 from hlsim.audiogram import SEVERITIES
-from hlsim.evaluation.items import Item
+from hlsim.evaluation.previous.items import Item
 from hlsim.evaluation.statistics import PairedComparison
 from hlsim.extras import install_command, is_installed
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.report.page import Picture, Section, render_markdown, render_page, write_files
-from hlsim.report.pictures import draw_svg, legend, scatter
+from hlsim.report.previous.pictures import draw_svg, legend, scatter
+from hlsim.report.previous.tables import Table, inner, loss_name, number, paired_cells
 from hlsim.report.spectrograms import composite, panels, pictures
-from hlsim.report.tables import Table, inner, loss_name, number, paired_cells
 
 FILES = ("fidelity.json", "fidelity.md", "fidelity.html", "spectrograms.png")
 

@@ -12,15 +12,20 @@ from typing import Any
 import numpy as np
 
 from hlsim.audiogram import FREQUENCIES
-from hlsim.evaluation.comparison import Comparison
-from hlsim.evaluation.compensator_result import HARD, NOISIER_DB
-from hlsim.evaluation.haspi_report import GAIN_NOTE, HaspiReport
-from hlsim.evaluation.measurements import QUIET, UTTERANCES
-from hlsim.report.gain_pictures import gain_picture, gains_at, input_output_picture, tone_picture
-from hlsim.report.haspi import scored_by
+from hlsim.evaluation.previous.comparison import Comparison
+from hlsim.evaluation.previous.compensator_result import HARD, NOISIER_DB
+from hlsim.evaluation.previous.haspi_report import GAIN_NOTE, HaspiReport
+from hlsim.evaluation.previous.measurements import QUIET, UTTERANCES
 from hlsim.report.page import Section, render_markdown, render_page, write_files
-from hlsim.report.pictures import condition_colours, report_pictures
-from hlsim.report.tables import (
+from hlsim.report.previous.gain_pictures import (
+    gain_picture,
+    gains_at,
+    input_output_picture,
+    tone_picture,
+)
+from hlsim.report.previous.haspi import scored_by
+from hlsim.report.previous.pictures import condition_colours, report_pictures
+from hlsim.report.previous.tables import (
     Table,
     cells,
     change_name,

@@ -1,0 +1,108 @@
+"""What an evaluation returns: the table of its study, the comparisons, and how they were made."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from hlsim.evaluation.comparison import Comparison
+from hlsim.evaluation.measures import LEVEL_COLUMNS
+from hlsim.evaluation.study import Condition, Measure, Source, versions_of
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """A finished study.
+
+    Attributes:
+        items, conditions, measures: what was studied.
+        table: one row per item and condition, see ``run_study``.
+        comparisons: comparisons of the conditions, see ``compare``.
+        settings: what the values depend on, such as the seed.
+        notes: sentences that the report begins with.
+        details: further results for JSON, such as gain curves.
+        groups: the same evaluation of a part of the items, by the name of the part.
+    """
+
+    items: Sequence[Source]
+    conditions: Sequence[Condition]
+    measures: Sequence[Measure]
+    table: DataFrame
+    comparisons: Sequence[Comparison] = ()
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    notes: Sequence[str] = ()
+    details: Mapping[str, Any] = field(default_factory=dict)
+    groups: Mapping[str, Evaluation] = field(default_factory=dict)
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the conditions."""
+        return [condition.name for condition in self.conditions]
+
+    @property
+    def headline(self) -> Comparison | None:
+        """The first planned comparison, or the first of all; None if there is none."""
+        planned = [c for c in self.comparisons if c.planned]
+        return next(iter([*planned, *self.comparisons]), None)
+
+    @property
+    def failures(self) -> DataFrame:
+        """Rows of the table that lack values."""
+        return self.table[self.table["failure"].notna()]
+
+    @property
+    def versions(self) -> dict[str, str]:
+        """Versions of the packages that the values depend on."""
+        packages = [package for measure in self.measures for package in measure.packages]
+        return versions_of(["hlsim", *packages, "scipy"])
+
+    def wide(self, column: str) -> DataFrame:
+        """Return one column with a row per item and a column per condition."""
+        table = self.table.pivot(index="item", columns="condition", values=column)
+        return table.reindex(columns=self.names)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return a plain dictionary for JSON, with None for a missing value."""
+        return {
+            "settings": dict(self.settings),
+            "versions": self.versions,
+            "notes": list(self.notes),
+            "conditions": [condition.record() for condition in self.conditions],
+            "comparisons": [c.to_dict() for c in self.comparisons],
+            "groups": {
+                name: [c.to_dict() for c in group.comparisons]
+                for name, group in self.groups.items()
+            },
+            **self.details,
+            "rows": plain(self.table.to_dict("records")),
+        }
+
+
+def plain(value: Any) -> Any:
+    """Return a value with None in place of each NaN, for JSON."""
+    if isinstance(value, Mapping):
+        return {key: plain(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(entry) for entry in value]
+    return None if isinstance(value, float) and math.isnan(value) else value
+
+
+def score_columns(table: DataFrame, facts: Mapping[str, Any]) -> list[str]:
+    """Return the columns of a study's table that hold scores, those of plug-in measures included."""
+    others = {"item", "name", "condition", "failure", *facts, *LEVEL_COLUMNS}
+    return [column for column in table.columns if column not in others]
+
+
+def check_scored(table: DataFrame, columns: Sequence[str]) -> None:
+    """Raise ValueError unless the table has at least one score."""
+    if not columns or table[list(columns)].isna().all(axis=None):
+        first = table[table["failure"].notna()].iloc[0]
+        raise ValueError(
+            f"none of {table['item'].nunique()} items could be scored; the first, {first['name']} "
+            f"under {first['condition']}: {first['failure']}"
+        )

@@ -1,0 +1,359 @@
+"""A study: items, conditions and measures in, one table out.
+
+Every evaluation in hlsim is a study. ``haspi-report``, ``evaluate-compensator``, ``evaluate-simulator``,
+``clarity`` and the demo differ in their items (files, drawn clips, scenes), their conditions (recorded files,
+hearing aids, simulators) and their measures, and in nothing else.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from importlib import metadata
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+
+import torch
+from torch import Tensor
+
+import hlsim
+from hlsim.audiogram import Audiogram
+from hlsim.audiogram.listener import Listener
+from hlsim.calibration import PASCAL_SPL
+from hlsim.evaluation.fingerprint import combined_fingerprint, fingerprint, samples_hash
+from hlsim.evaluation.store import ScoreStore, key_of
+from hlsim.extras import require
+from hlsim.neuro.config import NEURO_RATE
+from hlsim.parallel import Progress, one_thread, reason_of, run_parallel
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
+
+Values = Mapping[str, float | str]
+"""Values by the name of their column."""
+
+
+class Source(Protocol):
+    """Where an item comes from: memory, as with ``Item`` itself, or files."""
+
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def facts(self) -> Mapping[str, Any]: ...
+
+    def digest(self, condition: str) -> str:
+        """Return a SHA-256 of all that decides the item's values, but for condition and measure."""
+
+    def load(self) -> Item: ...
+
+
+@dataclass(frozen=True)
+class Item:
+    """One signal for one ear or one listener.
+
+    Args:
+        name: name in tables.
+        clean: clean speech, the reference of measures.
+        signal: input of the conditions.
+        ear: audiogram, or listener with two ears.
+        sample_rate: rate in Hz.
+        full_scale_spl: level in dB SPL of a signal with RMS 1.0.
+        seed: seed of random numbers that a measure draws.
+        facts: columns of the table, such as ``listener`` or ``snr``.
+
+    Shape: (time,), or (2, time) for a listener.
+    """
+
+    name: str
+    clean: Tensor
+    signal: Tensor
+    ear: Audiogram | Listener
+    sample_rate: int = NEURO_RATE
+    full_scale_spl: float = PASCAL_SPL
+    seed: int = 0
+    facts: Mapping[str, Any] = field(default_factory=dict)
+    _computed: dict[str, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
+
+    def load(self) -> Item:
+        """Return the item, without what ``once`` has computed."""
+        return replace(self)
+
+    def digest(self, condition: str) -> str:
+        """Return the SHA-256 of samples, ear, rate, level and seed; it is the same for all conditions."""
+        samples = samples_hash(self.clean, self.signal)
+        settings = [self.sample_rate, self.full_scale_spl, self.seed]
+        return key_of({"samples": samples, "ear": self.ear.to_dict(), "settings": settings})
+
+    def once(self, name: str, compute: Callable[[], Any]) -> Any:
+        """Return what ``compute`` returns, computed once per item: a reference that all conditions share."""
+        if name not in self._computed:
+            self._computed[name] = compute()
+        return self._computed[name]
+
+
+@dataclass(frozen=True)
+class Condition:
+    """One way of processing an item, as a record: nothing has to be read from its name.
+
+    Args:
+        name: name in tables.
+        process: function of an input and an ear that returns an output of the same shape.
+        kind: role in the study, such as ``"unaided"``, ``"aid"`` or ``"equaliser"``.
+        of: name of the condition that this one belongs to, such as the aid whose level it has.
+        rivals: names of the conditions that this one is compared with, most important first.
+    """
+
+    name: str
+    process: Callable[[Tensor, Any], Tensor]
+    kind: str = "aid"
+    of: str = ""
+    rivals: Sequence[str] = ()
+
+    @cached_property
+    def fingerprint(self) -> str | None:
+        """Fingerprint of the processing; None if it is unknown, and then no score is stored."""
+        return fingerprint(self.process)
+
+    def output(self, item: Item) -> Tensor:
+        """Process an item."""
+        return self.process(item.signal, item.ear)
+
+    def record(self) -> dict[str, Any]:
+        """Return name, kind, of and rivals, for JSON."""
+        return {
+            "name": self.name,
+            "kind": self.kind,
+            "of": self.of,
+            "rivals": list(self.rivals),
+        }
+
+
+@dataclass(frozen=True)
+class Measure:
+    """A function of an item and an output, and what readers of its values have to know.
+
+    Args:
+        name: name in options and files; a score's column has the same name.
+        compute: function that returns values by column, or raises ValueError if there are none.
+        title: name in tables and plots.
+        packages: packages whose versions decide the values.
+        revision: raise it when a change of hlsim changes a value.
+        settings: fingerprint of what else decides the values, such as a teacher; None if it is unknown.
+        knows_hearing: whether the values depend on audiogram and level.
+        rewards_gain: whether more level alone brings a higher score.
+        ends: lowest and highest score, for the axes of plots.
+    """
+
+    name: str
+    compute: Callable[[Item, Tensor], Values]
+    title: str = ""
+    packages: Sequence[str] = ()
+    revision: int = 1
+    settings: str | None = ""
+    knows_hearing: bool = False
+    rewards_gain: bool = False
+    ends: tuple[float, float] | None = None
+
+    @cached_property
+    def fingerprint(self) -> str | None:
+        """Fingerprint of revision, versions and settings; None if the settings are unknown."""
+        return combined_fingerprint(
+            str(self.revision), str(versions_of(self.packages)), self.settings
+        )
+
+
+def versions_of(packages: Iterable[str]) -> dict[str, str]:
+    """Return the installed version of each package, that of hlsim also if it runs from its sources."""
+    versions = {}
+    for package in dict.fromkeys(packages):
+        try:
+            versions[package] = metadata.version(package)
+        except metadata.PackageNotFoundError:
+            versions[package] = "not installed"
+        if package == "hlsim":
+            versions[package] = hlsim.__version__
+    return versions
+
+
+class _Task(NamedTuple):
+    """One item with the conditions and measures that are still missing."""
+
+    number: int
+    source: Source
+    missing: Sequence[tuple[Condition, Sequence[Measure]]]
+
+
+_Results = dict[tuple[str, str], Values | str]
+"""Values, or the reason why there are none, by the names of condition and measure."""
+
+
+def run_study(
+    items: Sequence[Source],
+    conditions: Sequence[Condition],
+    measures: Sequence[Measure],
+    *,
+    store: ScoreStore | None = None,
+    jobs: int | None = None,
+    dask: str | None = None,
+    progress: Progress | None = None,
+) -> DataFrame:
+    """Measure the output of every condition for every item.
+
+    Items are measured in parallel, and the values do not depend on how many at a time. An error ends only the
+    measure, output or item that it occurs in: it becomes the reason in the column ``failure``, and a later
+    run tries again.
+
+    Args:
+        store: values of earlier runs, to which new ones are added. A value is computed again only if samples,
+            ear, condition or measure have changed.
+        jobs: number of processes; None takes all cores.
+        dask: address of a Dask scheduler whose workers take the place of processes.
+        progress: called with the number of finished outputs and of all.
+
+    Returns: one row per item and condition: ``item`` (its number), ``name``, the item's facts, ``condition``,
+        one column per measured value, and ``failure``, None where every measure has its values.
+
+    Raises:
+        ValueError: no scheduler answers, or the store cannot be written.
+        MissingExtraError: a package is not installed.
+    """
+    store = ScoreStore() if store is None else store
+    _warn_of_unknown(conditions, measures)
+    results: list[_Results] = [{} for _ in items]
+    keys: list[dict[tuple[str, str], str | None]] = [{} for _ in items]
+    tasks = []
+    for number, source in enumerate(items):
+        missing = []
+        for condition in conditions:
+            try:
+                digest = source.digest(condition.name)
+            except ValueError as error:
+                results[number] |= {(condition.name, m.name): str(error) for m in measures}
+                continue
+            wanted = []
+            for measure in measures:
+                place = condition.name, measure.name
+                keys[number][place] = key = _key(digest, condition, measure)
+                record = None if key is None else store.get(key)
+                if record is None:
+                    wanted.append(measure)
+                else:
+                    results[number][place] = record["values"]
+            if wanted:
+                missing.append((condition, wanted))
+        if missing:
+            tasks.append(_Task(number, source, missing))
+    total = len(items) * len(conditions)
+    done = total - sum(len(task.missing) for task in tasks)
+    show = progress or (lambda done, total: None)
+    if tasks:
+        show(done, total)
+    parallel: dict[str, Any] = {"jobs": jobs}
+    if dask is not None:
+        parallel |= {"backend": "dask", "scheduler": dask}
+    for task, measured in run_parallel(_measure_item, tasks, **parallel):
+        for place, values in (measured or _all_failed(task, _DIED)).items():
+            key = keys[task.number][place]
+            if key is not None and not isinstance(values, str):
+                about = {"item": task.source.name, "condition": place[0], "measure": place[1]}
+                store.append(key, {**about, "values": values})
+            results[task.number][place] = values
+        done += len(task.missing)
+        show(done, total)
+    return _table(items, conditions, measures, results)
+
+
+_DIED = "the process that computed it ended (a crash in compiled code, or no memory was left)"
+
+
+def _key(digest: str, condition: Condition, measure: Measure) -> str | None:
+    """Return the key of stored values; None where condition or measure has no fingerprint."""
+    if condition.fingerprint is None or measure.fingerprint is None:
+        return None
+    about = {"item": digest, "condition": condition.fingerprint}
+    return key_of({**about, "measure": measure.name, "of": measure.fingerprint})
+
+
+def _warn_of_unknown(conditions: Iterable[Condition], measures: Iterable[Measure]) -> None:
+    unknown = [thing.name for thing in (*conditions, *measures) if thing.fingerprint is None]
+    if unknown:
+        warnings.warn(
+            f"scores with {', '.join(unknown)} are not stored and will be computed again by the next run; "
+            "to store them, give what computes them an attribute fingerprint, such as a version",
+            stacklevel=3,
+        )
+
+
+@one_thread()
+@torch.no_grad()
+def _measure_item(task: _Task) -> _Results:
+    """Compute the missing values of one item; what fails becomes its reason."""
+    try:
+        item = task.source.load()
+    except Exception as error:  # whatever it is, the other items go on
+        return _all_failed(task, reason_of(error))
+    results: _Results = {}
+    for condition, measures in task.missing:
+        try:
+            output = condition.output(item)
+        except Exception as error:
+            results |= {(condition.name, m.name): reason_of(error) for m in measures}
+            continue
+        for measure in measures:
+            try:
+                values: Values | str = _finite(measure.compute(item, output))
+            except Exception as error:
+                values = reason_of(error)
+            results[condition.name, measure.name] = values
+    return results
+
+
+def _all_failed(task: _Task, reason: str) -> _Results:
+    return {
+        (condition.name, measure.name): reason
+        for condition, measures in task.missing
+        for measure in measures
+    }
+
+
+def _finite(values: Values) -> Values:
+    for name, value in values.items():
+        if not isinstance(value, str) and not math.isfinite(value):
+            raise ValueError(f"{name} is {value}, not a finite number")
+    return values
+
+
+def _table(
+    items: Sequence[Source],
+    conditions: Sequence[Condition],
+    measures: Sequence[Measure],
+    results: Sequence[_Results],
+) -> DataFrame:
+    rows = []
+    for number, (source, found) in enumerate(zip(items, results, strict=True)):
+        for condition in conditions:
+            row = {"item": number, "name": source.name, **source.facts, "condition": condition.name}
+            reasons = {}
+            for measure in measures:
+                values = found[condition.name, measure.name]
+                if isinstance(values, str):
+                    reasons[measure.name] = values
+                else:
+                    row |= values
+            rows.append({**row, "failure": _failure(reasons, len(measures))})
+    table = require("pandas", "eval").DataFrame(rows)
+    table["failure"] = table.pop("failure")  # last, whichever row has which values
+    return table
+
+
+def _failure(reasons: Mapping[str, str], measures: int) -> str | None:
+    """Return the reasons as one text, with the names of the measures unless all failed alike."""
+    if not reasons:
+        return None
+    alike = set(reasons.values())
+    if len(reasons) == measures and len(alike) == 1:
+        return alike.pop()
+    return "; ".join(f"{name}: {reason}" for name, reason in reasons.items())
