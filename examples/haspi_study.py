@@ -15,7 +15,7 @@ from hlsim.audio import find_audio, read_audio, write_audio
 from hlsim.audiogram.table import read_audiograms
 from hlsim.calibration import level_spl, set_level
 from hlsim.evaluation import haspi_report
-from hlsim.report.previous.haspi import markdown, write_report
+from hlsim.report.recordings import write_report
 
 SPL, SECONDS, LISTENERS = 65.0, 3.0, 4
 
@@ -59,10 +59,11 @@ def main() -> None:
         measures=("haspi", "stoi"),
         store=out / "report" / "scores.jsonl",
         jobs=1,
-        progress=lambda done, total: print(f"\r{done} of {total} scores", end="", file=sys.stderr),
+        progress=lambda done, total: print(f"\r{done} of {total} outputs", end="", file=sys.stderr),
     )
-    write_report(report, out / "report")
-    print(markdown(report))
+    assert report.headline is not None
+    print(report.headline.verdict())
+    print(write_report(report, out / "report"))
 
 
 if __name__ == "__main__":

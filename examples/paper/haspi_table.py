@@ -22,7 +22,7 @@ from hlsim.data.manifest import Utterance
 from hlsim.data.plan import prepare
 from hlsim.data.plan_settings import PlanSettings
 from hlsim.evaluation import haspi_report
-from hlsim.report.previous.haspi import markdown, write_report
+from hlsim.report.recordings import write_report
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -93,15 +93,16 @@ def main(arguments: list[str] | None = None) -> None:
                 rows.append({"condition": condition, **files, **ear})
         show(done, len(chosen))
     write_table(out / "table.csv", rows)
-    progress = show_progress("scores")
+    progress = show_progress("outputs")
     report = haspi_report(
         manifest=out / "table.csv",
         store=out / "report" / "scores.jsonl",
         jobs=options.jobs,
         progress=progress,
     )
-    write_report(report, out / "report", listen=0)
-    print(markdown(report))
+    assert report.headline is not None
+    print(report.headline.verdict())
+    print(write_report(report, out / "report", listen=0))
 
 
 def write_table(path: Path, rows: list[dict[str, str]]) -> None:

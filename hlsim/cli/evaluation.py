@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from hlsim.cli.inputs import check_there, need, other_ear, read_ear
 from hlsim.cli.options import (
@@ -17,6 +19,10 @@ from hlsim.cli.options import (
     positive,
 )
 from hlsim.cli.progress import show_progress
+
+if TYPE_CHECKING:
+    from hlsim.evaluation.result import Evaluation
+    from hlsim.report.page import Page
 
 GAIN_EARS = ["N3", "S2"]
 
@@ -183,57 +189,46 @@ def haspi_report(parser: Parser) -> None:
     parser.runs(
         _haspi_report,
         "--clean clean --before noisy --after enhanced --audiogram N3 --out report",
+        "--clean clean --after enhanced --audiogram N3 --out report",
         "--manifest items.csv --measures haspi,hasqi --baseline unaided --out report",
     )
     option = parser.option
-    option("--clean", Path, "folder of clean speech; the file names are the same in all three")
-    option("--before", Path, "folder of what the ear was given")
-    option("--after", Path, "folder of what it is given now")
+    option("--clean", Path, "folder of clean speech; all folders have files of the same names")
+    option(
+        "--before", Path, "folder of speech before the treatment; without it nothing is compared"
+    )
+    option("--after", Path, "folder of speech after the treatment")
     text = (
-        "in place of the folders: CSV with columns condition, clean, processed, and listener, ear, snr, hl_250, ... or "
-        "audiogram, spl or full_scale_spl where known"
+        "CSV file in place of the folders, with the columns condition, clean, processed and, where "
+        "they are known, listener, ear, item, snr, hl_250, ... or audiogram, spl or full_scale_spl"
     )
     option("--manifest", Path, text)
-    option("--root", Path, "folder of the manifest's paths; its own folder by default")
-    parser.audiogram(text=", for all files, or of a manifest for rows that bring none")
-    text = "; and a column file (folders) or columns listener and ear (manifest, for rows without)"
+    option("--root", Path, "folder that the manifest's paths are relative to; by default its own")
+    parser.audiogram(text="; the ear of all files, or of rows of the manifest that name none")
+    text = "; and a column file (for folders) or columns listener and ear (for a manifest)"
     option("--audiograms", Path, EARS_TABLE + text)
-    option(
-        "--measures",
-        str,
-        "of haspi, hasqi, stoi, pesq, separated by commas; the first leads",
-        "haspi",
-    )
-    parser.engine()
-    option("--baseline", str, "condition that all others are compared with; all pairs by default")
-    parser.flag(
-        "--better-ear",
-        "of a manifest with both ears of each utterance, take the better ear's scores",
-    )
+    text = "measures separated by commas, the most important first: haspi, hasqi, stoi, pesq"
+    option("--measures", str, text, "haspi")
+    option("--baseline", str, "condition to compare all others with; by default all pairs")
+    parser.flag("--better-ear", "take the better ear's scores; needs a manifest with both ears")
     level = parser.add_mutually_exclusive_group()
     parser.full_scale(group=level)
-    text = "level of each clean file in dB SPL, in place of --full-scale-spl; of a manifest for rows that bring none"
+    text = "level of every clean file in dB SPL, in place of --full-scale-spl"
     option("--spl", positive, text, group=level)
-    option("--scores", Path, "file of scores made so far; OUT/scores.jsonl by default")
-    parser.parallel()
-    option("--listen", natural, "items with players in report.html", 3)
-    parser.seed()
-    parser.out()
+    option("--scores", Path, "file that scores are stored in (default: OUT/scores.jsonl)")
+    _study_options(parser)
 
 
 def _haspi_report(options: argparse.Namespace) -> None:
-    measures = [name.strip() for name in options.measures.split(",")]
-    need("eval", "joblib", "matplotlib")
-    if {"haspi", "hasqi"} & {*measures}:
-        need_engine(options.engine)
+    _prepare_study(options)
     check_there(
         folders=(options.clean, options.before, options.after, options.root),
         files=(options.manifest, options.audiograms),
     )
-    from hlsim.evaluation import haspi_report
-    from hlsim.report.previous.haspi import markdown, write_report
+    from hlsim.evaluation.recordings import haspi_report
+    from hlsim.report.recordings import report_page
 
-    report = haspi_report(
+    evaluation = haspi_report(
         clean=options.clean,
         before=options.before,
         after=options.after,
@@ -241,8 +236,7 @@ def _haspi_report(options: argparse.Namespace) -> None:
         audiograms=options.audiograms,
         manifest=options.manifest,
         root=options.root,
-        measures=measures,
-        engine=options.engine,
+        measures=[name.strip() for name in options.measures.split(",")] + options.measure,
         baseline=options.baseline,
         better_ear=options.better_ear,
         store=options.scores or options.out / "scores.jsonl",
@@ -250,16 +244,45 @@ def _haspi_report(options: argparse.Namespace) -> None:
         spl=options.spl,
         seed=options.seed,
         jobs=options.jobs,
-        backend=options.backend,
-        scheduler=options.scheduler,
-        progress=show_progress("scores"),
+        dask=options.dask,
+        progress=show_progress("outputs"),
     )
-    write_report(report, options.out, listen=options.listen)
-    print(markdown(report))
-    if failed := len(report.failures):
-        all_ = failed + sum(
-            len(own) for item in report.ears or report.items for own in item.scores.values()
+    finish(evaluation, report_page(evaluation, options.listen), options.out)
+
+
+def _study_options(parser: Parser) -> None:
+    """Declare the options that all evaluations share."""
+    text = (
+        "additional measure of your own, package.module:name, imported from the working directory too: a "
+        "function (item, output) -> dict of numbers"
+    )
+    parser.option("--measure", foreign_name, text, [], nargs="+", metavar="NAME")
+    parser.option("--listen", natural, "number of items with players on the page", 3)
+    parser.jobs()
+    text = "address of a Dask scheduler, such as tcp://host:8786, whose workers are used"
+    parser.option("--dask", str, text, metavar="ADDRESS")
+    parser.seed()
+    parser.out()
+
+
+def _prepare_study(options: argparse.Namespace) -> None:
+    """Check what an evaluation needs before it takes hours."""
+    os.environ["MPLBACKEND"] = "Agg"  # a notebook's backend may not exist in this environment
+    need("eval", "joblib", "pandas", "matplotlib", "jinja2")
+    if options.dask:
+        need("cluster", "distributed")
+
+
+def finish(evaluation: Evaluation, page: Page, out: Path) -> None:
+    """Write the page of an evaluation, and print its verdict and where it is."""
+    from hlsim.report.page import write_page
+
+    path = write_page(page, evaluation.to_dict(), out)
+    tables = [table for section in page.sections for table in section.tables]
+    print(f"{page.verdict}\n\n{tables[0].text()}\n\nThe page: {path}")
+    failed = len(evaluation.failures)
+    if failed:
+        print(
+            f"hlsim: {failed} of {len(evaluation.table)} outputs lack scores; the page lists the reasons",
+            file=sys.stderr,
         )
-        text = f"{failed} of {all_} scores could not be made; the reasons are in {options.out / 'report.md'}"
-        print(f"hlsim: {text}", file=sys.stderr)
-    tell_page(options.out / "report.html")

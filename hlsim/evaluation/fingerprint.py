@@ -19,6 +19,7 @@ import torch
 from torch import Tensor, nn
 
 import hlsim
+from hlsim.plugins import WaveformPlugin
 
 _OWN_PACKAGES = ("hlsim", "compensators")
 _MODULE_ATTRIBUTES = frozenset(vars(nn.Module()))
@@ -36,6 +37,8 @@ def fingerprint(thing: Any) -> str | None:
     Classes of hlsim include the version of hlsim. The fingerprint of a foreign module without tensors,
     ``config`` and ``fingerprint`` is unknown, as is one with a public attribute that cannot be described.
     """
+    if isinstance(thing, WaveformPlugin):
+        thing = thing.function
     stated = getattr(thing, "fingerprint", None)
     if stated is not None:
         return text_hash(f"{_class_name(thing)} {stated}")

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from hlsim.audiogram import Audiogram
 from hlsim.calibration import PASCAL_SPL, level_spl
 from hlsim.evaluation.fingerprint import fingerprint
-from hlsim.evaluation.study import Item, Measure, Values
+from hlsim.evaluation.study import Ear, Item, Measure, Values
 from hlsim.extras import require
 from hlsim.losses.band_levels import audibility, band_level_loss, band_levels, least_audible
 from hlsim.metrics import fidelity
@@ -87,7 +87,7 @@ MEASURES = {
 }
 """The scores of ``--measures`` by name. More is better in all of them."""
 
-_NEEDS = {"stoi": ("pystoi", "eval"), "pesq": ("pesq", "eval")}
+_NEEDS = {"stoi": ("pystoi", "eval"), "pesq": ("pesq", "pesq")}
 
 
 def find_measures(names: Iterable[str]) -> list[Measure]:
@@ -164,7 +164,7 @@ LEVELS = Measure("levels", _levels)
 LEVEL_COLUMNS = ("level", "clean_level", "full_scale_spl", "seconds", "sample_rate", "seed")
 
 
-def perceive(signal: Tensor, ear: Audiogram, sample_rate: int) -> Tensor:
+def perceive(signal: Tensor, ear: Ear, sample_rate: int) -> Tensor:
     """Return what an ear perceives, by the exact MSBG. Shape: (time,) in pascals -> (time,)."""
     with torch.no_grad():
         perceived: Tensor = MSBG(sample_rate=sample_rate)(signal, ear)

@@ -35,6 +35,9 @@ Values = Mapping[str, float | str]
 """Values by the name of their column."""
 
 
+Ear = Audiogram | Listener
+
+
 class Source(Protocol):
     """Where an item comes from: memory, as with ``Item`` itself, or files."""
 
@@ -70,7 +73,7 @@ class Item:
     name: str
     clean: Tensor
     signal: Tensor
-    ear: Audiogram | Listener
+    ear: Ear
     sample_rate: int = NEURO_RATE
     full_scale_spl: float = PASCAL_SPL
     seed: int = 0
@@ -214,7 +217,7 @@ def run_study(
         progress: called with the number of finished outputs and of all.
 
     Returns: one row per item and condition: ``item`` (its number), ``name``, the item's facts, ``condition``,
-        one column per measured value, and ``failure``, None where every measure has its values.
+        one column per measured value, and ``failure``, missing where every measure has its values.
 
     Raises:
         ValueError: no scheduler answers, or the store cannot be written.
@@ -278,7 +281,8 @@ def _key(digest: str, condition: Condition, measure: Measure) -> str | None:
 
 
 def _warn_of_unknown(conditions: Iterable[Condition], measures: Iterable[Measure]) -> None:
-    unknown = [thing.name for thing in (*conditions, *measures) if thing.fingerprint is None]
+    unknown = [condition.name for condition in conditions if condition.fingerprint is None]
+    unknown += [measure.name for measure in measures if measure.fingerprint is None]
     if unknown:
         warnings.warn(
             f"scores with {', '.join(unknown)} are not stored and will be computed again by the next run; "

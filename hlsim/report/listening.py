@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from hlsim.audio import encode_flac
+from hlsim.audiogram import Audiogram
 from hlsim.calibration import gain_to_pascals, level_spl
 from hlsim.evaluation.measures import perceive
 from hlsim.evaluation.result import Evaluation
@@ -110,5 +111,6 @@ def _perceived(
 
 
 def _about(item: Item) -> str:
+    assert isinstance(item.ear, Audiogram)
     thresholds = ", ".join(f"{level:g}" for level in item.ear.thresholds)
     return f"{item.ear.severity.capitalize()} loss, thresholds {thresholds} dB HL."

@@ -17,7 +17,6 @@ from hlsim.data.corpora import Layout
 from hlsim.data.plan_settings import PlanSettings
 from hlsim.data.teacher import TEACHERS, Alignment
 from hlsim.losses.criteria import CRITERIA, CriterionName
-from hlsim.metrics.registry import MEASURES, Engine, MeasureName
 from hlsim.parallel import Backend
 
 
@@ -49,22 +48,15 @@ def test_names_that_are_written_twice_agree() -> None:
     assert choices("prepare", "--layout") == get_args(Layout)
     assert options.TEACHERS == TEACHERS
     assert choices("prepare", "--alignment") == get_args(Alignment)[:2]
-    assert (
-        choices("haspi-report", "--engine")
-        == choices("evaluate-compensator", "--engine")
-        == get_args(Engine)
-    )
-    assert (
-        choices("prepare", "--backend") == choices("haspi-report", "--backend") == get_args(Backend)
-    )
-    assert tuple(MEASURES) == get_args(MeasureName) and tuple(CRITERIA) == get_args(CriterionName)
+    assert choices("prepare", "--backend") == get_args(Backend)
+    assert tuple(CRITERIA) == get_args(CriterionName)
 
 
 def _parameters() -> dict[str, dict[str, Any]]:
     """Defaults by the names of the arguments that each command's functions take."""
     pytest.importorskip("lightning")
     from hlsim.demo import demo
-    from hlsim.evaluation import haspi_report, score_items
+    from hlsim.evaluation import haspi_report
     from hlsim.evaluation.previous.compensators import evaluate_compensators
     from hlsim.evaluation.previous.simulators import evaluate_simulators
     from hlsim.training.compensator import train_compensator
@@ -74,7 +66,7 @@ def _parameters() -> dict[str, dict[str, Any]]:
     functions: dict[str, tuple[Callable[..., Any], ...]] = {
         "prepare": (PlanSettings,),
         "demo": (demo,),
-        "haspi-report": (haspi_report, score_items),
+        "haspi-report": (haspi_report,),
         "evaluate-compensator": (evaluate_compensators,),
         "evaluate-simulator": (evaluate_simulators,),
         "train-compensator": (train_compensator,),

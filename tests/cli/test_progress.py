@@ -1,24 +1,33 @@
-"""What the program says of long work: how much is done, and when the rest will be."""
+"""Progress on stderr: how much is done, and when the rest will be."""
 
 import pytest
 
 from hlsim.cli.progress import show_progress
 
 
-def test_the_end_is_told_from_the_pace_since_the_first_call(
+def test_the_end_follows_from_the_pace_since_the_first_call(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     now = [1_000_000.0]
     monkeypatch.setattr("hlsim.cli.progress.time.time", lambda: now[0])
     show = show_progress("scores")
-    show(50, 100)  # made by an earlier run
-    now[0] += 60.0
-    show(60, 100)
-    now[0] += 240.0
-    show(100, 100)
-    first, second, third = capsys.readouterr().err.removeprefix("\r").split("\r")
-    assert first.strip() == "50 of 100 scores"
-    assert second.startswith("60 of 100 scores, ends about ") and second.rstrip().endswith(
-        "(in 4.0 min)"
-    )
-    assert third.strip() == "100 of 100 scores" and third.endswith("\n")
+    for done, seconds in ((50, 60.0), (60, 1.0), (61, 240.0), (100, 0.0)):
+        show(done, 100)
+        now[0] += seconds
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 3, "a file gets a line every half minute"
+    assert lines[0] == "50 of 100 scores"
+    assert lines[1].startswith("60 of 100 scores, the rest in 4.0 min")
+    assert lines[2] == "100 of 100 scores"
+
+
+def test_a_terminal_gets_one_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("sys.stderr.isatty", lambda: True, raising=False)
+    monkeypatch.setenv("COLUMNS", "30")
+    show = show_progress("outputs of a long name that does not fit")
+    show(1, 2)
+    show(2, 2)
+    text = capsys.readouterr().err
+    assert text.count("\n") == 1 and all(len(line) < 30 for line in text.strip("\r\n").split("\r"))

@@ -7,64 +7,24 @@ system, found by name or in the environment variable ``CHROMIUM``.
 import os
 import shutil
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
-import torch
 
-from hlsim.audio import read_audio, write_audio
-from hlsim.audiogram import Audiogram
-from hlsim.evaluation import Failure, HaspiReport, ItemScore
-from hlsim.report.previous.haspi import write_report
-from tests.report.test_demo import made_up_page
+from hlsim.report.page import write_page
+from hlsim.report.recordings import report_page
+from tests.report.test_recordings import evaluation
 
 pytestmark = pytest.mark.browser
 
 
 @pytest.fixture(scope="module")
-def page_file(tmp_path_factory: pytest.TempPathFactory, speech_dir: Path) -> Path:
-    """A report of three conditions whose files are there; the scores are made up."""
+def page_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A report of three conditions; the scores are made up."""
     root = tmp_path_factory.mktemp("report")
-    waveform, rate = read_audio(speech_dir / "train" / "flite-slt-01.flac")
-    clean = waveform[:, rate : 2 * rate]
-    gains = {"unaided": 1.0, "NAL-R": 4.0, "compensated": 5.0}
-    for name, gain in {"clean": 1.0, **gains}.items():
-        write_audio(root / f"{name}.wav", clean * gain, rate)
-    generator = torch.Generator().manual_seed(0)
-    items = []
-    for i in range(12):
-        low, rise = torch.rand(2, generator=generator).tolist()
-        scores = {
-            "unaided": low / 2,
-            "NAL-R": low / 2 + rise / 3,
-            "compensated": low / 2 + rise / 2,
-        }
-        items.append(
-            ItemScore(
-                file=f"a long name of an utterance/in a folder/{i:02}",
-                audiogram=Audiogram.standard(("N1", "N3", "N4", "S2")[i % 4]),
-                clean_level=65.0,
-                levels={"unaided": 65.0, "NAL-R": 77.0, "compensated": 79.0},
-                scores={
-                    "haspi": scores,
-                    "stoi": {name: 0.7 + value / 10 for name, value in scores.items()},
-                },
-                sample_rate=rate,
-                seconds=1.0,
-                seed=i,
-                listener=f"L{i % 3}",
-                ear="left",
-                snr=(0.0, 5.0, 10.0)[i % 3],
-                clean=root / "clean.wav",
-                processed={name: root / f"{name}.wav" for name in gains},
-            )
-        )
-    failures = [Failure("x", "NAL-R", "haspi", "silent, every sample is zero")]
-    report = HaspiReport(items, failures=failures)
-    out = write_report(replace(report, extra={"note_of_ours": 1}), root / "out", listen=2)
-    return out / "report.html"
+    study = evaluation(root)
+    return write_page(report_page(study, listen=2), study.to_dict(), root / "out")
 
 
 @pytest.fixture(scope="module")
@@ -103,22 +63,6 @@ def opened(request: pytest.FixtureRequest, chromium: Any) -> Iterator[Callable[[
 @pytest.fixture
 def page(opened: Callable[[Path], Any], page_file: Path) -> Any:
     return opened(page_file)
-
-
-def test_the_demos_pictures_and_players_load(opened: Callable[[Path], Any], tmp_path: Path) -> None:
-    report, front = made_up_page()
-    page = opened(write_report(report, tmp_path, front=front) / "report.html")
-    page.locator("summary").first.click()
-    look = "e => [e.naturalWidth, e.getBoundingClientRect().width]"
-    widths = page.evaluate(f"[...document.images].map({look})")
-    inner = page.viewport_size["width"]
-    # of the ear, of what is heard, three pairs of spectrograms, gains; in the report folded below, five
-    assert len(widths) == 2 + 6 + 1 + 5
-    assert all(natural > 0 and 150 < shown <= inner for natural, shown in widths)
-    assert page.evaluate("document.documentElement.scrollWidth") <= inner
-    ready = "[...document.querySelectorAll('audio')].map(e => e.readyState > 0 && e.error === null && e.duration)"
-    page.wait_for_function(f"{ready}.every(Boolean)")
-    assert page.evaluate(ready) == pytest.approx([1.0] * 5, abs=0.02)
 
 
 def test_pictures_are_drawn_and_nothing_is_wider_than_the_screen(page: Any) -> None:

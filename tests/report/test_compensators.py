@@ -3,9 +3,9 @@
 import pytest
 
 from hlsim.evaluation.previous.measurements import TONES
+from hlsim.report.page import Section, render_page
 from hlsim.report.previous.compensators import tone_table
 from hlsim.report.previous.gain_pictures import gain_picture
-from hlsim.report.page import Section, render_page
 from hlsim.report.previous.pictures import condition_colours
 from hlsim.report.previous.tables import Table
 

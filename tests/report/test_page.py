@@ -3,8 +3,7 @@
 import re
 from html.parser import HTMLParser
 
-from hlsim.report.page import Picture, Player, Section, render_page
-from hlsim.report.previous.tables import Table
+from hlsim.report.page import Page, Picture, Player, Section, Table
 
 VOID = {"meta", "link", "img", "input", "br"}
 
@@ -44,7 +43,7 @@ def page() -> str:
         ),
         Section("Folded", paragraphs=["text"], folded=True),
     ]
-    return render_page(NASTY, sections, NASTY)
+    return Page(NASTY, NASTY, sections).html()
 
 
 def test_everything_is_escaped_and_closed() -> None:

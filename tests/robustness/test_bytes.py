@@ -29,7 +29,7 @@ from hlsim.data.corpora import find_utterances
 from hlsim.data.instances import Instance, Plan, is_whole
 from hlsim.data.plan import prepare
 from hlsim.data.plan_settings import PlanSettings
-from hlsim.evaluation.previous.inputs import read_manifest
+from hlsim.evaluation.recordings import read_manifest
 from hlsim.evaluation.store import ScoreStore
 from hlsim.neuro import NeuroConfig
 from hlsim.pretrained import checkpoint_about, checkpoint_digest, save_checkpoint

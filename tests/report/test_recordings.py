@@ -1,0 +1,94 @@
+"""The page of ``haspi-report``: one verdict, the same p everywhere, pictures only of what differs."""
+
+import json
+import math
+import re
+from pathlib import Path
+
+import pytest
+import torch
+
+from hlsim.audio import write_audio
+from hlsim.audiogram import Audiogram
+from hlsim.evaluation import Evaluation, compare
+from hlsim.evaluation.measures import MEASURES
+from hlsim.evaluation.recordings import Recording, recorded_condition
+from hlsim.evaluation.statistics import holm
+from hlsim.report.page import write_page
+from hlsim.report.recordings import report_page
+
+pandas = pytest.importorskip("pandas")
+pytest.importorskip("matplotlib")
+
+NAMES = ("unaided", "NAL-R", "<my> aid")
+
+
+def evaluation(folder: Path, *, ears: tuple[str, ...] = ("N1", "N3", "N4", "S2")) -> Evaluation:
+    """A report of made-up scores of twelve items; all conditions are the same second of noise."""
+    path = folder / "noise.wav"
+    write_audio(path, 0.02 * torch.randn(1, 16000), 16000)
+    items = [
+        Recording(
+            f"s{i}", path, dict.fromkeys(NAMES, path), Audiogram.standard(ears[i % len(ears)])
+        )
+        for i in range(12)
+    ]
+    rows = []
+    for number, item in enumerate(items):
+        low, rise = torch.rand(2).tolist()
+        for place, condition in enumerate(NAMES):
+            facts = {"item": number, "name": item.name, **item.facts, "condition": condition}
+            facts |= {"listener": f"L{number % 3}", "snr": 5.0 * (number % 2)}
+            scores = {"haspi": low / 2 + place * (rise - 0.3) / 4, "level": 65.0 + 6.0 * place}
+            about = {"clean_level": 65.0, "full_scale_spl": 94.0}
+            rows.append({**facts, **scores, **about, "failure": None})
+    rows[-1] |= {"haspi": math.nan, "failure": "the file is silent"}
+    table = pandas.DataFrame(rows)
+    return Evaluation(
+        items=items,
+        conditions=[recorded_condition(name) for name in NAMES],
+        measures=[MEASURES["haspi"]],
+        table=table,
+        comparisons=compare(table, ["haspi"], planned=[("haspi", NAMES[0], NAMES[-1])]),
+        settings={"seed": 0, "measures": ["haspi"]},
+    )
+
+
+def test_a_comparison_has_one_p_wherever_it_appears(tmp_path: Path) -> None:
+    study = evaluation(tmp_path)
+    page = report_page(study, listen=0)
+    planned, others = study.headline, [c for c in study.comparisons if not c.planned]
+    assert planned is not None and planned.p_t == planned.overall.p_t
+    assert [c.p_t for c in others] == holm(c.overall.p_t for c in others)
+    text = page.markdown()
+    assert page.verdict == planned.verdict() and text.count(f"p = {planned.p_t:.5f}") >= 3
+    assert "planned before the scores were known" in text
+
+
+def test_verdict_and_scores_come_first_and_details_are_folded(tmp_path: Path) -> None:
+    page = report_page(evaluation(tmp_path), listen=2)
+    assert [section.title for section in page.sections] == [
+        "Scores",
+        "Listen",
+        "Pictures",
+        "Details",
+    ]
+    assert page.sections[-1].folded
+    listen = page.sections[1].sections
+    assert [len(section.players) for section in listen] == [4, 4], "clean speech, three conditions"
+    path = write_page(page, evaluation(tmp_path).to_dict(), tmp_path / "out")
+    html = path.read_text(encoding="utf-8")
+    assert html.count("<audio") == 8 and "<my>" not in html and "the file is silent" in html
+    data = json.loads(path.with_suffix(".json").read_text(encoding="utf-8"))
+    assert data["rows"][-1]["haspi"] is None and len(data["rows"]) == 36
+    assert {c["name"] for c in data["conditions"]} == set(NAMES)
+
+
+def test_no_picture_shows_a_single_group(tmp_path: Path) -> None:
+    def titles(study: Evaluation) -> str:
+        return " ".join(p.alt for p in report_page(study, 0).sections[1].pictures)
+
+    several, one = titles(evaluation(tmp_path)), titles(evaluation(tmp_path, ears=("N4",)))
+    for word in ("by severity", "Audiograms"):
+        assert word in several and word not in one
+    assert re.search("over SNR", one) and "each of 3 listeners" in one
