@@ -189,7 +189,6 @@ def haspi_report(parser: Parser) -> None:
     parser.runs(
         _haspi_report,
         "--clean clean --before noisy --after enhanced --audiogram N3 --out report",
-        "--clean clean --after enhanced --audiogram N3 --out report",
         "--manifest items.csv --measures haspi,hasqi --baseline unaided --out report",
     )
     option = parser.option

@@ -17,7 +17,7 @@ from compensators import NALR, MappingCompensator, MappingConfig
 from hlsim import MSBG, Audiogram, HearingLossLoss, load_pretrained
 from hlsim.calibration import level_spl, set_level
 from hlsim.cli.main import main
-from hlsim.evaluation import compensators, judging, measurements
+from hlsim.evaluation.previous import compensators, judging, measurements
 from hlsim.evaluation.previous.compensators import evaluate_compensators
 from hlsim.evaluation.previous.items import INPUT_LEVELS, draw_judged_items, read_ears
 from hlsim.evaluation.previous.judging import (

@@ -6,7 +6,8 @@ import pytest
 import torch
 
 from hlsim.audiogram import Audiogram
-from hlsim.evaluation import HaspiReport, ItemScore
+from hlsim.evaluation.previous.haspi_report import HaspiReport
+from hlsim.evaluation.previous.scores import ItemScore
 from hlsim.losses.band_levels import band_centres
 from hlsim.report.previous.demo import (
     AS_LOUD,
