@@ -18,8 +18,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-import hlsim
 from hlsim.plugins import WaveformPlugin
+from hlsim.version import __version__
 
 _OWN_PACKAGES = ("hlsim", "compensators")
 _MODULE_ATTRIBUTES = frozenset(vars(nn.Module()))
@@ -86,7 +86,7 @@ def _describe_part(name: str, part: nn.Module) -> tuple[str, str, list[tuple[str
 def _class_name(thing: Any) -> str:
     kind = type(thing)
     ours = kind.__module__.split(".")[0] in _OWN_PACKAGES
-    return f"{kind.__name__} of hlsim {hlsim.__version__}" if ours else kind.__name__
+    return f"{kind.__name__} of hlsim {__version__}" if ours else kind.__name__
 
 
 def _describe(value: Any) -> str:

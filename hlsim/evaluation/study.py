@@ -18,7 +18,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 import torch
 from torch import Tensor
 
-import hlsim
 from hlsim.audiogram import Audiogram
 from hlsim.audiogram.listener import Listener
 from hlsim.calibration import PASCAL_SPL
@@ -27,6 +26,7 @@ from hlsim.evaluation.store import ScoreStore, key_of
 from hlsim.extras import require
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.parallel import Progress, one_thread, reason_of, run_parallel
+from hlsim.version import __version__
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -177,7 +177,7 @@ def versions_of(packages: Iterable[str]) -> dict[str, str]:
         except metadata.PackageNotFoundError:
             versions[package] = "not installed"
         if package == "hlsim":
-            versions[package] = hlsim.__version__
+            versions[package] = __version__
     return versions
 
 
