@@ -4,6 +4,7 @@ One set of weights a severity, computed from MSBG's formulae; what is trained is
 """
 
 import math
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -59,34 +60,11 @@ class Prior(nn.Module):
     def __init__(self, stft: STFT) -> None:
         super().__init__()
         self.receptive_field = RESPONSE_HALF_LENGTH + _ENVELOPE_HALF_LENGTH * stft.hop
-        points = 160 * stft.fft  # a fine grid that 44.1 kHz shares
-        coarse = slice(None, points // 2 + 1, 160)
-        banks = [BANKS[severity] for severity in SEVERITIES]
-        ear = np.abs(np.fft.rfft(ear_filter(), points * 441 // 160)[coarse]) ** 2
-        self.register_buffer("ear_power", torch.tensor(ear, dtype=torch.float32))
-        fine = 160 * 160  # points of a grid that 44.1 kHz shares, at 16 kHz
-        responses = impulses(
-            np.stack([fixed_response(bank, NEURO_RATE, fine) for bank in banks]), fine, NEURO_RATE
-        )
-        self.register_buffer("response", torch.tensor(responses, dtype=torch.float32))
-
-        excitation, relative, smoothing = [], [], []
-        for severity, bank in zip(SEVERITIES, banks, strict=True):
-            channels = gammatone_response(bank, points * 441 // 160, bins=points // 2 + 1)[
-                :, coarse
-            ]
-            scale = 32.0 / (3.0 * stft.window * stft.fft) * (2.0 / math.pi) ** 2
-            scale *= 10.0 ** (-_FLUCTUATION_DB[severity] / 10.0)
-            excitation.append(_padded(np.abs(channels) ** 2 * scale))
-            relative.append(_padded(channels / channels.sum(0)))
-            smoothing.append(_padded(_smoothing(bank, stft.hop)))
-        parts = np.stack(relative)
-        self._known("excitation", np.stack(excitation))
-        self._known("relative", np.stack((parts.real, parts.imag)))
-        self._known("smoothing", np.stack(smoothing))
-        self._known(
-            "smearing", np.stack([_smearing(severity, stft) for severity in SEVERITIES[1:]])
-        )
+        known = _known_values(stft)
+        for name in ("ear_power", "response"):
+            self.register_buffer(name, torch.tensor(known[name], dtype=torch.float32))
+        for name in ("excitation", "relative", "smoothing", "smearing"):
+            self._known(name, known[name])
 
     def _known(self, name: str, values: NDArray[np.float64]) -> None:
         """What a formula gives, and a trained correction that starts at 0 and is relative to it.
@@ -178,6 +156,38 @@ def _widening(smeared: Tensor, given: Tensor) -> Tensor:
     root = (size / torch.maximum(given + _TINY, size / _WIDEST)).sqrt()
     imaginary = root * (smeared < 0.0)
     return torch.complex(root - imaginary, imaginary)
+
+
+@lru_cache(maxsize=8)
+def _known_values(stft: STFT) -> dict[str, NDArray[np.float64]]:
+    """MSBG's formulae on the frequencies of a transform, by the name of the buffer that holds them.
+
+    They take most of the time in which a network is built, and are the same for each.
+    """
+    points = 160 * stft.fft  # a fine grid that 44.1 kHz shares
+    coarse = slice(None, points // 2 + 1, 160)
+    banks = [BANKS[severity] for severity in SEVERITIES]
+    ear_response = np.fft.rfft(ear_filter(), points * 441 // 160)[coarse]
+    fine = 160 * 160  # points of a grid that 44.1 kHz shares, at 16 kHz
+    responses = np.stack([fixed_response(bank, NEURO_RATE, fine) for bank in banks])
+
+    excitation, relative, smoothing = [], [], []
+    for severity, bank in zip(SEVERITIES, banks, strict=True):
+        channels = gammatone_response(bank, points * 441 // 160, bins=points // 2 + 1)[:, coarse]
+        scale = 32.0 / (3.0 * stft.window * stft.fft) * (2.0 / math.pi) ** 2
+        scale *= 10.0 ** (-_FLUCTUATION_DB[severity] / 10.0)
+        excitation.append(_padded(np.abs(channels) ** 2 * scale))
+        relative.append(_padded(channels / channels.sum(0)))
+        smoothing.append(_padded(_smoothing(bank, stft.hop)))
+    factors = np.stack(relative)
+    return {
+        "ear_power": np.abs(ear_response) ** 2,
+        "response": impulses(responses, fine, NEURO_RATE),
+        "excitation": np.stack(excitation),
+        "relative": np.stack((factors.real, factors.imag)),
+        "smoothing": np.stack(smoothing),
+        "smearing": np.stack([_smearing(severity, stft) for severity in SEVERITIES[1:]]),
+    }
 
 
 def _smoothing(bank: FilterBank, hop: int) -> NDArray[np.float64]:

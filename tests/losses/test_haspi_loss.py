@@ -1,6 +1,7 @@
 """What HASPILoss promises: that of its score, of the level beside it, and of its gradient."""
 
 import copy
+from typing import Any
 
 import pytest
 import torch
@@ -95,20 +96,15 @@ def test_full_scale_is_a_unit(clean: Tensor) -> None:
     )
 
 
-def test_what_it_does_not_take_is_refused(clean: Tensor) -> None:
-    loss = HASPILoss(N3)
-    with pytest.raises(ValueError, match=r"clean, item 0 lasts 0.5 s; HASPI needs 0.7 s or more"):
-        loss(clean[:, :8000], clean[:, :8000])
-    with pytest.raises(
-        ValueError, match=r"haspi goes through no transform of torch.func; allowed: backward"
-    ):
-        torch.func.grad(loss)(clean, clean)
+def test_short_speech_raises_value_error(clean: Tensor) -> None:
+    with pytest.raises(ValueError):
+        HASPILoss(N3)(clean[:, :8000], clean[:, :8000])
 
 
 @pytest.mark.parametrize("options", [{"quality": -1.0}, {"level": float("nan")}, {"quality": "a"}])
-def test_weights_are_numbers(options: dict[str, object]) -> None:
-    with pytest.raises(ValueError, match="allowed: finite numbers, 0 or more"):
-        HASPILoss(N3, **options)  # type: ignore[arg-type]
+def test_a_bad_weight_raises_value_error(options: dict[str, Any]) -> None:
+    with pytest.raises(ValueError):
+        HASPILoss(N3, **options)
 
 
 def test_a_host_does_not_know_what_is_frozen(clean: Tensor) -> None:

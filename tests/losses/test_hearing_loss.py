@@ -6,6 +6,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -229,6 +230,7 @@ def test_copies_are_their_own(
     assert all(t.dtype != torch.float64 for t in host.loss.simulator.parameters())
 
 
+@pytest.mark.slow
 @both
 def test_caller_can_be_compiled(simulator: str, clean: Tensor) -> None:
     loss = HearingLossLoss(N3, simulator=simulator, criterion="bands")
@@ -373,24 +375,23 @@ def test_a_value_for_each_item(simulator: str, criterion: str, clean: Tensor) ->
 
 
 @pytest.mark.parametrize(
-    ("lengths", "message"),
+    "lengths",
     [
-        ([4800, 0], "lengths from 0 to 4800; allowed: whole numbers from 1 to 4800"),
-        (torch.tensor([4801, 4800]), "lengths from 4800 to 4801; allowed: .* 1 to 4800"),
-        ([4800], r"lengths of shape \(1,\); allowed: .* of shape \(2,\), one an item"),
-        (4800, r"lengths of shape \(\); allowed: .* of shape \(2,\)"),
-        ([1.5, 0.5], r"lengths of torch.float32; allowed: whole numbers .*\(samples\)"),
-        ([1.0, 0.0], r"lengths of torch.float32; allowed: whole numbers .*\(samples\)"),
-        ([1.0], r"lengths of shape \(1,\); allowed: .* of shape \(2,\), one an item"),
-        ([True, True], "lengths of torch.bool; allowed: whole numbers"),
-        ("long", "lengths is str; allowed: whole numbers"),
-        ([[1], [2, 3]], "lengths is list; allowed: whole numbers"),
+        [4800, 0],
+        torch.tensor([4801, 4800]),
+        [4800],
+        4800,
+        [1.5, 0.5],
+        [1.0, 0.0],
+        [True, True],
+        "long",
+        [[1], [2, 3]],
     ],
+    ids=str,
 )
-def test_lengths_that_do_not_fit(lengths: object, message: str, clean: Tensor) -> None:
-    with pytest.raises(ValueError, match=message) as error:
+def test_bad_lengths_raise_value_error(lengths: object, clean: Tensor) -> None:
+    with pytest.raises(ValueError):
         HearingLossLoss(N3)(clean, clean, lengths=lengths)
-    assert "\n" not in str(error.value)
 
 
 # Criteria
@@ -576,7 +577,11 @@ class Wrapped(nn.Module):
         return heard
 
 
-@pytest.mark.parametrize("wrap", [Wrapped, lambda model: torch.compile(model, backend="eager")])
+def compiled(model: nn.Module) -> nn.Module:
+    return torch.compile(model, backend="eager")
+
+
+@pytest.mark.parametrize("wrap", [Wrapped, pytest.param(compiled, marks=pytest.mark.slow)])
 def test_a_wrapped_neuro_msbg_judges_the_same_band(
     wrap: Callable[[nn.Module], nn.Module], clean: Tensor
 ) -> None:
@@ -684,154 +689,90 @@ def test_simulator_by_folder_and_as_a_module(clean: Tensor) -> None:
 
 
 @pytest.mark.parametrize(
-    ("options", "message"),
+    "options",
     [
-        ({"simulator": "ear"}, "no checkpoint 'ear'; allowed: msbg, neuro-msbg"),
-        ({"simulator": 3}, "simulator is int; allowed: a name, a folder or a module"),
-        ({"simulator": None}, "simulator is NoneType; allowed: a name, a folder or a module"),
-        ({"simulator": nn.ReLU}, r"simulator is type; allowed: .* a module \(not its class\)"),
-        ({"sample_rate": 8000}, "sample rate 8000 Hz; allowed: 16000 to 48000"),
-        ({"sample_rate": "16k"}, "sample rate '16k' Hz; allowed: 16000 to 48000"),
-        ({"full_scale_spl": 300}, "allowed: 0 to 200"),
-        ({"full_scale_spl": None}, "full_scale_spl is None; allowed: 0 to 200"),
-        ({"reference": ["clean"]}, r"reference \['clean'\]; allowed: clean, normal-hearing"),
-        (
-            {"criterion": ["paper"]},
-            r"criterion is \['paper'\]; allowed: coherent-bands, bands, paper, haspi, hasqi, interaural, weights",
-        ),
-        ({"criterion": nn.L1Loss}, "criterion is <class .*; allowed: .* a callable"),
-        ({"criterion": {}}, r"criterion is \{\}; allowed: coherent-bands"),
-        ({"criterion": {"l1": 1.0}}, r"criterion is \{'l1': 1.0\}; allowed: coherent-bands"),
-        ({"criterion": {"bands": -1.0}}, "'bands': -1.0.*allowed: finite numbers, 0 or more"),
-        (
-            {"criterion": {"bands": 0.0}},
-            "count nothing; allowed: one above 0 at least, of coherent-bands",
-        ),
-        ({"normal": "N0"}, r"normal is str; allowed: a module or callable"),
-        ({"weights": 1.0}, "weights is float; allowed: numbers by name"),
-        ({"weights": [1, 2]}, "weights is list; allowed: numbers by name"),
-        ({"weights": {3: 1.0, "pitch": 1.0}}, "unknown weights 3, pitch"),
-        (
-            {"criterion": "paper", "weights": {"magnitude": None}},
-            "'magnitude': None.*allowed: finite numbers, 0 or more",
-        ),
-        (
-            {"criterion": "paper", "weights": {"magnitude": "a"}},
-            "'magnitude': 'a'.*allowed: finite numbers, 0 or more",
-        ),
-        (
-            {"criterion": "paper", "weights": {"magnitude": True}},
-            "allowed: finite numbers, 0 or more",
-        ),
-        ({"reference": "noisy"}, "reference 'noisy'; allowed: clean, normal-hearing"),
-        ({"reduction": "sum"}, "reduction 'sum'; allowed: mean, none"),
-        ({"reduction": None}, "reduction None; allowed: mean, none"),
-        ({"criterion": "l1"}, "criterion is 'l1'; allowed: coherent-bands, bands, paper"),
-        (
-            {"criterion": "paper", "weights": {"pitch": 1.0}},
-            "pitch .*'paper'; allowed: magnitude, phase, complex, time",
-        ),
-        (
-            {"weights": {"pitch": 1.0}},
-            "pitch .*'coherent-bands'; allowed: incoherence, misalignment, levels, louder, peaks",
-        ),
-        (
-            {"criterion": "bands", "weights": {"phase": 1.0}},
-            "phase .*'bands'; allowed: band_levels",
-        ),
-        ({"criterion": "paper", "weights": {"time": -1.0}}, "allowed: finite numbers, 0 or more"),
-        (
-            {"criterion": "paper", "weights": {"time": float("nan")}},
-            "allowed: finite numbers, 0 or more",
-        ),
-        (
-            {"criterion": "paper", "weights": {}},
-            "count nothing; allowed: one above 0 at least, of magnitude",
-        ),
-        (
-            {"simulator": MSBG(sample_rate=16000, aligned=False)},
-            r"allowed: one that does not, as MSBG\(aligned=True\)",
-        ),
-        ({"audiogram": Audiogram.standard("N7")}, "takes -10 to 100"),
-        ({"audiogram": torch.zeros(7)}, "allowed: .*8"),
-        (
-            {"simulator": MSBG()},
-            "simulator has sample_rate 44100 and the loss 16000; allowed: the same",
-        ),
-        (
-            {"simulator": MSBG(sample_rate=16000, full_scale_spl=120)},
-            "simulator has full_scale_spl 120",
-        ),
+        {"simulator": "ear"},
+        {"simulator": 3},
+        {"simulator": nn.ReLU},
+        {"simulator": MSBG(sample_rate=16000, aligned=False)},
+        {"simulator": MSBG(sample_rate=44100)},
+        {"simulator": MSBG(sample_rate=16000, full_scale_spl=120)},
+        {"normal": "N0"},
+        {"sample_rate": 8000},
+        {"sample_rate": "16k"},
+        {"full_scale_spl": 300},
+        {"full_scale_spl": None},
+        {"reference": "noisy"},
+        {"reference": ["clean"]},
+        {"reduction": "sum"},
+        {"ears": "left"},
+        {"criterion": "l1"},
+        {"criterion": ["paper"]},
+        {"criterion": nn.L1Loss},
+        {"criterion": {}},
+        {"criterion": {"l1": 1.0}},
+        {"criterion": {"bands": -1.0}},
+        {"criterion": {"bands": 0.0}},
+        {"weights": 1.0},
+        {"weights": {3: 1.0, "pitch": 1.0}},
+        {"weights": {"levels": True}},
+        {"weights": {"levels": -1.0}},
+        {"weights": {"levels": float("nan")}},
+        {"weights": {}},
+        {"audiogram": Audiogram.standard("N7")},
+        {"audiogram": torch.zeros(7)},
     ],
+    ids=str,
 )
-def test_what_cannot_be_built(options: dict[str, object], message: str) -> None:
-    with pytest.raises(ValueError, match=message) as error:
-        HearingLossLoss(**options)  # type: ignore[arg-type]
-    assert "\n" not in str(error.value)
+def test_bad_setting_raises_value_error(options: dict[str, Any]) -> None:
+    with pytest.raises(ValueError):
+        HearingLossLoss(**options)
 
 
-@both
-def test_what_cannot_be_compared(simulator: str) -> None:
-    loss = HearingLossLoss(simulator=simulator)
-    signal = torch.randn(2, 1600)
-    for arguments, message in (
-        ((signal, signal), "no audiogram: give one when building the loss or with the call"),
-        (
-            (signal, signal[:, 1:], N3),
-            r"compensated has shape \(2, 1600\), clean \(2, 1599\); allowed: the same",
-        ),
-        ((signal, signal[0], N3), r"\(2, 1600\), clean \(1600,\)"),
-        ((signal.long(), signal, N3), "compensated is torch.int64; allowed"),
-        ((signal[:, :0], signal[:, :0], N3), "at least one sample"),
-        ((signal, signal, [N3, N3, N3]), r"audiograms of shape \(3, 8\)"),
-        ((signal, signal, Audiogram.standard("N7")), "takes -10 to 100"),
-        ((signal, signal, "N3"), "audiogram is str; allowed"),
-    ):
-        with pytest.raises(ValueError, match=message) as error:
-            loss(*arguments)
-        assert "\n" not in str(error.value)
-
-
-def test_simulator_must_keep_the_length() -> None:
-    class Longer(nn.Module):
-        def forward(self, waveform: Tensor, audiogram: Tensor) -> Tensor:
-            return nn.functional.pad(waveform, (0, 100))
-
-    loss = HearingLossLoss(N3, simulator=Longer())
-    with pytest.raises(ValueError, match=r"made 4100 samples of 4000; allowed: .*aligned=True"):
-        loss(torch.randn(4000), torch.randn(4000))
+SIGNAL = torch.randn(2, 1600)
 
 
 @pytest.mark.parametrize(
-    ("returned", "message"),
+    "arguments",
     [
-        (
-            lambda wave: (wave, wave),
-            r"returned is tuple; allowed: a floating-point tensor \(\.\.\., time\)",
-        ),
-        (lambda wave: None, "returned is NoneType; allowed"),
-        (lambda wave: wave.cfloat(), "returned is torch.complex64; allowed"),
-        (lambda wave: wave.mean(), r"returned has shape \(\); allowed"),
-        (
-            lambda wave: wave.mean(0),
-            r"made shape \(4000,\) of \(2, 4000\); allowed: one that keeps the shape",
-        ),
-        (
-            lambda wave: wave.mean(-1),
-            r"made shape \(2,\) of \(2, 4000\); allowed: one that keeps the shape",
-        ),
-        (lambda wave: wave.expand(2, 2, -1), r"made shape \(2, 2, 4000\) of \(2, 4000\); allowed"),
+        (SIGNAL, SIGNAL),
+        (SIGNAL, SIGNAL[:, 1:], N3),
+        (SIGNAL, SIGNAL[0], N3),
+        (SIGNAL, SIGNAL.to("meta"), N3),
+        (SIGNAL.long(), SIGNAL, N3),
+        (SIGNAL[:, :0], SIGNAL[:, :0], N3),
+        (SIGNAL, SIGNAL, [N3, N3, N3]),
+        (SIGNAL, SIGNAL, Audiogram.standard("N7")),
+        (SIGNAL, SIGNAL, 3),
+    ],
+    ids=str,
+)
+def test_bad_call_raises_value_error(arguments: tuple[Any, ...]) -> None:
+    with pytest.raises(ValueError):
+        HearingLossLoss(simulator="msbg")(*arguments)
+
+
+@pytest.mark.parametrize(
+    "function",
+    [
+        lambda wave: nn.functional.pad(wave, (0, 100)),
+        lambda wave: (wave, wave),
+        lambda wave: wave.cfloat(),
+        lambda wave: wave.mean(),
+        lambda wave: wave.mean(0),
+        lambda wave: wave.mean(-1),
+        lambda wave: wave.expand(2, 2, -1),
     ],
 )
-def test_simulator_must_keep_the_shape(returned: Callable[[Tensor], object], message: str) -> None:
+def test_a_simulator_that_changes_the_shape_raises_value_error(
+    function: Callable[[Tensor], object],
+) -> None:
     class Own(nn.Module):
         def forward(self, waveform: Tensor, audiogram: Tensor) -> object:
-            return returned(waveform)
+            return function(waveform)
 
-    loss = HearingLossLoss(N3, simulator=Own())
-    with pytest.raises(ValueError, match=message) as error:
-        loss(torch.randn(2, 4000), torch.randn(2, 4000))
-    assert "\n" not in str(error.value)
+    with pytest.raises(ValueError):
+        HearingLossLoss(N3, simulator=Own())(SIGNAL, SIGNAL)
 
 
 @pytest.mark.parametrize("heard", [(4000,), (3, 4000)])
@@ -845,22 +786,11 @@ def test_own_simulator_may_broadcast_with_the_ears(heard: tuple[int, ...]) -> No
     assert float(loss(wave, wave)) == 0.0
 
 
-@each_criterion
-def test_clean_speech_on_another_device_is_named(criterion: str) -> None:
-    loss, wave = HearingLossLoss(N3, criterion=criterion), torch.randn(4000)
-    with pytest.raises(
-        ValueError, match="compensated is on cpu and clean on meta; allowed: the same device"
-    ):
-        loss(wave, wave.to("meta"))
-
-
-def test_another_device_is_named() -> None:
+def test_a_simulator_on_another_device_raises_value_error() -> None:
     loss = HearingLossLoss(N3)
     loss.simulator.to("meta")
-    with pytest.raises(
-        ValueError, match=r"speech is on cpu and the simulator on meta; move the loss with \.to\(\)"
-    ):
-        loss(torch.randn(4000), torch.randn(4000))
+    with pytest.raises(ValueError):
+        loss(SIGNAL, SIGNAL)
 
 
 def test_a_stored_ear_is_its_own(clean: Tensor) -> None:
@@ -871,6 +801,7 @@ def test_a_stored_ear_is_its_own(clean: Tensor) -> None:
     assert torch.equal(loss(2.0 * clean, clean), before)
 
 
+@pytest.mark.slow
 def test_import_and_simulator_leave_the_compiler_alone() -> None:
     code = (
         "import sys, torch, hlsim, hlsim.evaluation; hlsim.MSBG(torch.zeros(8))(torch.zeros(99)); "
@@ -886,10 +817,7 @@ def test_one_ear_an_item_never_becomes_every_ear_for_every_item() -> None:
     )
     speech = 0.03 * torch.randn(2, 1, 2000)
     many = speech.unsqueeze(1).expand(2, 3, 1, 2000)
-    with pytest.raises(
-        ValueError,
-        match=r"pair each item of .* with each ear; allowed: .*one an item: \(2, 3, 1, 8\)",
-    ):
+    with pytest.raises(ValueError):
         loss(many, many, ears)
     levels = torch.tensor([ear.thresholds for ear in ears])
     # (batch, 1, time), as conv1d has it, with one ear an item
@@ -965,9 +893,7 @@ def test_the_default_compares_what_heard_gives(clean: Tensor) -> None:
 @pytest.mark.parametrize("returned", [torch.zeros(()), torch.zeros(3), 0.5])
 def test_a_criterion_that_gives_no_value_an_item(returned: object, clean: Tensor) -> None:
     loss = HearingLossLoss(N3, criterion=lambda heard, reference: returned)
-    with pytest.raises(
-        ValueError, match=r"criterion returned .* for 2 items; .*\(2,\); .* loss.heard"
-    ):
+    with pytest.raises(ValueError):
         loss(clean, clean)
 
 
@@ -1034,7 +960,7 @@ def test_a_simulator_brings_its_normal_ear(clean: Tensor) -> None:
         )
         assert float(learned(clean, clean)) == pytest.approx(0.0, abs=1e-6)
     broken = HearingLossLoss(N3, normal=lambda waveform: waveform[..., 1:])
-    with pytest.raises(ValueError, match=r"normal ear made 4799 samples of 4800; allowed"):
+    with pytest.raises(ValueError):
         broken(clean, clean)
 
 
@@ -1151,7 +1077,7 @@ def test_what_it_was_built_with_stays() -> None:
         ("normal", nn.Identity()),
         ("criterion", "bands"),
     ):
-        with pytest.raises(AttributeError, match=f"{name} is what the loss was built with"):
+        with pytest.raises(AttributeError):
             setattr(loss, name, other)
     assert not loss.state_dict()
     assert list(HearingLossLoss(N3, criterion={"coherent-bands": 1.0, "haspi": 0.0}).criteria) == [

