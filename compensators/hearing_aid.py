@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Self
+
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
@@ -72,6 +74,16 @@ class HearingAid(Wearable):
             corrections.weight.zero_()
             corrections.bias.zero_()
             self.leave.bias.fill_(_RARELY)
+
+    def train(self, mode: bool = True) -> Self:
+        """Set the mode of all modules but the LSTM, which stays in training mode.
+
+        cuDNN computes no gradient through an LSTM in evaluation mode. The two modes differ in nothing
+        else, because the LSTM has no dropout.
+        """
+        super().train(mode)
+        self.recur.train()
+        return self
 
     def forward(
         self,

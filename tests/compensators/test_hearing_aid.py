@@ -29,6 +29,21 @@ def test_at_0_and_0_the_input_passes_unchanged(utterance: torch.Tensor) -> None:
     assert torch.equal(stream(utterance)[64:], utterance[:-64])
 
 
+def test_a_frozen_aid_passes_gradients_on_a_gpu(utterance: torch.Tensor) -> None:
+    """cuDNN's LSTM has no backward pass in evaluation mode; a hook imitates its error on a CPU."""
+    aid = load_compensator("hearing-aid")
+    assert isinstance(aid, HearingAid)
+
+    def refuse_evaluation_mode(lstm: torch.nn.Module, inputs: tuple[torch.Tensor, ...]) -> None:
+        if inputs[0].requires_grad and not lstm.training:
+            raise RuntimeError("cudnn RNN backward can only be called in training mode")
+
+    aid.recur.register_forward_pre_hook(refuse_evaluation_mode)
+    waveform = utterance[:4000].clone().requires_grad_()
+    aid.eval()(waveform, EAR).square().sum().backward()
+    assert not aid.training and waveform.grad is not None and waveform.grad.isfinite().all()
+
+
 def test_each_slider_does_its_own_and_more_does_more(utterance: torch.Tensor) -> None:
     aid, normal = trained(), Audiogram.standard("NH")
     steps = torch.linspace(0.0, 1.0, 5)
