@@ -29,7 +29,7 @@ KNOWN_EXCEPTIONS = {
 }
 
 # of two rooms that import each other, the one whose imports of the other are to go
-KNOWN_CIRCLES = {("data", "training")}
+KNOWN_CIRCLES: set[tuple[str, str]] = set()
 
 MOST_FILES = 16
 

@@ -26,7 +26,7 @@ COMMANDS = {
     ),
     "prepare": (
         "prepare",
-        "check a corpus and plan training instances: utterances, noise, ears, levels; with --write make them",
+        "recognise the layout of a corpus and write its manifest, a CSV file to train on",
     ),
     "train-simulator": (
         "training",

@@ -11,22 +11,15 @@ from hlsim.cli.inputs import check_there, need, read_ear, read_recipe
 from hlsim.cli.options import Parser, count, natural, positive
 from hlsim.extras import require
 
-FOLDERS = ("speech", "noise", "audiograms", "valid_speech", "valid_noise", "valid_audiograms")
-
 
 def train_simulator(parser: Parser) -> None:
     parser.runs(
         _train_simulator,
         "--config examples/neuro-msbg.yaml --speech speech/train --valid-speech speech/valid --out runs/simulator",
-        "--config examples/neuro-msbg.yaml --manifest plan/manifest.csv --out runs/simulator",
+        "--config examples/neuro-msbg.yaml --manifest VoiceBank/manifest.csv --out runs/simulator",
     )
     parser.option("--config", Path, "recipe, a YAML file (examples/neuro-msbg.yaml)", required=True)
-    text = "manifest.csv that 'hlsim prepare' wrote, instead of folders and files"
-    parser.option("--manifest", Path, text)
-    parser.option("--root", Path, "folder of the manifest's paths, if not where it was prepared")
-    parser.flag("--prepared", "train on what 'hlsim prepare --write' wrote")
     parser.teacher("that says what is heard", "msbg")
-    parser.option("--workers", natural, "processes that read the manifest's files; 1 by default")
     _training_options(parser)
 
 
@@ -41,12 +34,16 @@ def train_compensator(parser: Parser) -> None:
     parser.option(
         "--simulator", str, "msbg (exact), or a checkpoint's name or folder", "neuro-msbg"
     )
-    _training_options(parser, required=True)
+    _training_options(parser)
 
 
-def _training_options(parser: Parser, *, required: bool = False) -> None:
+def _training_options(parser: Parser) -> None:
     option = parser.option
-    option("--speech", Path, "folder of clean speech to train on", required=required)
+    speech = parser.add_mutually_exclusive_group(required=True)
+    option("--speech", Path, "folder of clean speech to train on", group=speech)
+    text = "CSV file of 'hlsim prepare', instead of --speech and --valid-speech; its noisy speech gives the noise"
+    option("--manifest", Path, text, group=speech)
+    option("--root", Path, "folder that the manifest's paths are relative to; its own by default")
     option("--noise", Path, "folder of noises to mix in")
     option("--audiograms", Path, "CSV of measured ears to join the drawn ones")
     option("--valid-speech", Path, "folder of other speakers to validate on")
@@ -62,42 +59,17 @@ def _training_options(parser: Parser, *, required: bool = False) -> None:
     option("--devices", count, "GPUs or processes a machine", 1)
     option("--nodes", count, "machines", 1)
     option("--strategy", str, "Lightning's, e.g. ddp", "auto")
+    option("--workers", natural, "processes that draw batches, beside the one that trains", 0)
     parser.flag("--quiet", "no progress bar, only a line a validation")
     parser.out()
 
 
 def _train_simulator(options: argparse.Namespace) -> None:
-    if options.manifest is None:
-        planned = {
-            "root": options.root,
-            "prepared": options.prepared or None,
-            "workers": options.workers,
-        }
-        if given := _given(planned, planned):
-            raise ValueError(f"{given} without --manifest; allowed: with it alone")
-        if options.speech is None:
-            raise ValueError(
-                "nothing to train on; allowed: --speech, a folder, or --manifest, of 'hlsim prepare'"
-            )
-    elif given := _given(vars(options), FOLDERS):
-        raise ValueError(
-            f"--manifest with {given}; allowed: one or the other, for a manifest has it all"
-        )
-    elif not options.manifest.exists():
-        raise ValueError(
-            f"{options.manifest}: not prepared (no such file); 'hlsim prepare' makes it"
-        )
     _check(options)
-    from hlsim.training.batches import PlannedSource
     from hlsim.training.recipes import SimulatorRecipe
     from hlsim.training.simulator import train_simulator
 
     arguments = _arguments(options) | {"teacher": options.teacher}
-    if options.manifest is not None:
-        workers = 1 if options.workers is None else options.workers
-        arguments["data"] = PlannedSource(
-            options.manifest, options.root, options.prepared, workers=workers
-        )
     folder = train_simulator(recipe=SimulatorRecipe.from_dict(_recipe(options)), **arguments)
     print(f"the best checkpoint is in {folder}")
 
@@ -118,10 +90,20 @@ def _train_compensator(options: argparse.Namespace) -> None:
 
 
 def _check(options: argparse.Namespace) -> None:
+    if options.manifest is not None and options.valid_speech is not None:
+        raise ValueError("--valid-speech and --manifest exclude each other; a manifest has splits")
+    if options.manifest is None and options.root is not None:
+        raise ValueError("--root is of no use without --manifest")
     need("train", "lightning", "tensorboard")
     check_there(
-        folders=(options.speech, options.noise, options.valid_speech, options.valid_noise),
-        files=(options.config, options.audiograms, options.valid_audiograms),
+        folders=(
+            options.speech,
+            options.noise,
+            options.valid_speech,
+            options.valid_noise,
+            options.root,
+        ),
+        files=(options.config, options.manifest, options.audiograms, options.valid_audiograms),
     )
     require("lightning", "train")  # one that is there may be broken
 
@@ -142,16 +124,17 @@ def _arguments(options: argparse.Namespace) -> dict[str, Any]:
     from hlsim.training.batches import TrainingData
 
     keep_freed_memory()
-    data = None
-    if options.speech is not None:
-        data = TrainingData(
-            speech=options.speech,
-            noise=options.noise,
-            audiograms=options.audiograms,
-            valid_speech=options.valid_speech,
-            valid_noise=options.valid_noise,
-            valid_audiograms=options.valid_audiograms,
-        )
+    more: dict[str, Any] = {
+        "noise": options.noise,
+        "audiograms": options.audiograms,
+        "valid_noise": options.valid_noise,
+        "valid_audiograms": options.valid_audiograms,
+        "workers": options.workers,
+    }
+    if options.manifest is not None:
+        data = TrainingData.from_manifest(options.manifest, options.root, **more)
+    else:
+        data = TrainingData(options.speech, valid_speech=options.valid_speech, **more)
     return {
         "data": data,
         "out": options.out,

@@ -1,1 +1,1 @@
-"""Corpora, plans, instances, augmentation: what training reads."""
+"""The bundled speech, in the folder ``speech``."""

@@ -1,7 +1,8 @@
-"""Batches to train and validate on: drawn anew at every step from folders of audio, or from a prepared plan."""
+"""Batches to train and validate on, drawn anew at every step from speech, noise and ears."""
 
 from __future__ import annotations
 
+import hashlib
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
@@ -13,142 +14,222 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from hlsim.audio import find_audio
-from hlsim.audiogram import Audiogram
+from hlsim.audiogram import LOWEST_LEVEL, Audiogram
 from hlsim.audiogram.table import read_audiograms
+from hlsim.audiogram.thresholds import HIGHEST_SIMULATED
 from hlsim.calibration import level_spl, set_level
-from hlsim.data.module import Batch, BatchData, PlanData, Step, collate
-from hlsim.data.teacher import Reference, Teacher
-from hlsim.data.writing import Recipe
 from hlsim.neuro.config import NEURO_RATE
-from hlsim.training.augment import KNOTS, augment_speech, equalise, mix
-from hlsim.training.clips import Clips
+from hlsim.training.augment import EQUALISER_FREQUENCIES, augment_speech, equalise, mix
+from hlsim.training.clips import Clips, NoiseOfPairs
+from hlsim.training.corpora.manifest import read_manifest
+from hlsim.training.data_module import Batch, BatchData, Step
 from hlsim.training.ears import MILDER, draw_thresholds
 from hlsim.training.recipes import CompensatorRecipe, SimulatorRecipe, TrainingRecipe
 from hlsim.training.sounds import draw_sounds
+from hlsim.training.teacher import Reference, Teacher
 
-_VALID_SECONDS = 2.0
-_VOICES = 4  # of babble, at most
+VALIDATION_SECONDS = 2.0
+MAX_BABBLE_VOICES = 4
+
+Files = Path | Sequence[Path]
+"""A folder, or a list of files."""
+
+Pairs = Sequence[tuple[Path, Path]]
+"""Files of clean speech, each with its noisy version."""
 
 
 @dataclass(frozen=True)
 class TrainingData:
-    """Folders and files to train and validate on. Speech is all that is needed, a folder or a list of files.
+    """Speech, noise and ears to train and validate on. Only speech is required.
 
-    Without ``valid_speech`` validation is on the training speech, and says nothing of other speakers; without the other
-    two it takes training's noise and ears. Ears from the CSV files join the drawn ones.
+    Without ``valid_speech``, validation is on the training speech and says nothing about other speakers. Without
+    ``valid_noise`` or ``valid_audiograms`` it has the noise and the ears of the training.
+
+    Attributes:
+        speech, valid_speech: clean speech.
+        noise, valid_noise: noise to mix in, or pairs of clean and noisy speech whose difference is the noise.
+        audiograms, valid_audiograms: CSV files of ears, which join the drawn ones.
+        workers: number of processes that draw batches, beside the one that trains.
     """
 
-    speech: Path | Sequence[Path]
-    noise: Path | None = None
+    speech: Files
+    noise: Files | Pairs | None = None
     audiograms: Path | None = None
-    valid_speech: Path | Sequence[Path] | None = None
-    valid_noise: Path | None = None
+    valid_speech: Files | None = None
+    valid_noise: Files | Pairs | None = None
     valid_audiograms: Path | None = None
+    workers: int = field(default=0, compare=False)
 
-    def validation(self) -> TrainingData:
-        """The same, with what there is to validate on in the place of what there is to train on.
+    @classmethod
+    def from_manifest(
+        cls,
+        manifest: str | Path,
+        root: str | Path | None = None,
+        *,
+        noise: Files | None = None,
+        valid_noise: Files | None = None,
+        audiograms: Path | None = None,
+        valid_audiograms: Path | None = None,
+        workers: int = 0,
+    ) -> TrainingData:
+        """The splits ``train`` and ``valid`` of a manifest.
+
+        Its noisy speech gives the noise, unless ``noise`` is given.
+
+        Args:
+            manifest, root: as for ``read_manifest``.
 
         Raises:
-            ValueError: speech or noise to validate on is also trained on: the best checkpoint would be chosen on it.
+            ValueError: the manifest cannot be used, or has no training speech.
+        """
+        utterances = read_manifest(manifest, root)
+        folder = Path(manifest).parent if root is None else Path(root)
+        speech: dict[str, list[Path]] = {}
+        pairs: dict[str, list[tuple[Path, Path]]] = {}
+        for row in utterances:
+            clean = folder / row.path
+            speech.setdefault(row.split, []).append(clean)
+            if row.noisy:
+                pairs.setdefault(row.split, []).append((clean, folder / row.noisy))
+        if "train" not in speech:
+            raise ValueError(f"{manifest}: no row has the split 'train'")
+        if "valid" not in speech:
+            warnings.warn(
+                f"{manifest}: no row has the split 'valid', so that validation is on training speech; 'hlsim prepare "
+                "--valid-share 0.1' holds speakers out",
+                stacklevel=2,
+            )
+        return cls(
+            speech["train"],
+            noise or pairs.get("train"),
+            audiograms,
+            speech.get("valid"),
+            valid_noise or (None if noise else pairs.get("valid")),
+            valid_audiograms,
+            workers,
+        )
+
+    def validation(self) -> TrainingData:
+        """The data to validate on, as data to train on.
+
+        Raises:
+            ValueError: speech or noise to validate on is also trained on.
         """
         for name in ("speech", "noise"):
             training, validation = getattr(self, name), getattr(self, f"valid_{name}")
             if not training or not validation:
                 continue
-            trained, validated = (
-                {path.resolve() for path in _files(one)} for one in (training, validation)
-            )
-            if shared := len(trained & validated):
+            shared = _resolved_files(training) & _resolved_files(validation)
+            if shared:
                 raise ValueError(
-                    f"{shared} of {len(validated)} files of the {name} to validate on are also trained on; give folders "
-                    f"that share none, or no {name} to validate on"
+                    f"{len(shared)} files of the {name} to validate on are also trained on, such as {min(shared)}; give "
+                    f"other files, or no {name} to validate on"
                 )
-        speech, noise = self.valid_speech or self.speech, self.valid_noise or self.noise
-        return TrainingData(speech, noise, self.valid_audiograms or self.audiograms)
+        return TrainingData(
+            self.valid_speech or self.speech,
+            self.valid_noise or self.noise,
+            self.valid_audiograms or self.audiograms,
+        )
+
+    def identity(self) -> dict[str, str]:
+        """A description that differs for different data; lists of files are described by a hash."""
+        return {
+            entry.name: _describe(getattr(self, entry.name))
+            for entry in fields(self)
+            if entry.compare
+        }
 
 
-def _files(source: Path | Sequence[Path]) -> Sequence[Path]:
-    return find_audio(source) if isinstance(source, str | Path) else source
+def _resolved_files(source: Files | Pairs) -> set[Path]:
+    files = find_audio(source) if isinstance(source, str | Path) else source
+    return {(file[-1] if isinstance(file, tuple) else file).resolve() for file in files}
 
 
-@dataclass(frozen=True)
-class PlannedSource:
-    """A prepared plan, or its ``manifest.csv``, to train and validate on, as ``PlanData`` takes it."""
-
-    manifest: Path
-    root: Path | None = None
-    prepared: bool = False
-    workers: int = field(default=1, compare=False)  # a run may go on with others
+def _describe(source: Any) -> str:
+    if source is None or isinstance(source, str | Path):
+        return str(source)
+    names = "\n".join(map(str, source))
+    return f"{len(source)} files, sha256 {hashlib.sha256(names.encode()).hexdigest()}"
 
 
-def identity_of(data: TrainingData | PlannedSource) -> dict[str, str]:
-    """What a training on them is told from others by."""
-    return {entry.name: str(getattr(data, entry.name)) for entry in fields(data) if entry.compare}
+def _noise_clips(source: Files | Pairs, seconds: float) -> Clips:
+    options: dict[str, Any] = {"sample_rate": NEURO_RATE, "seconds": seconds}
+    if not isinstance(source, str | Path) and isinstance(source[0], tuple):
+        return NoiseOfPairs(source, **options)  # type: ignore[arg-type]
+    return Clips(source, repeat=True, **options)  # type: ignore[arg-type]
 
 
 class DrawnBatches(Dataset[Batch]):
-    """Random speech, noise and ears; a batch depends on seed, step and rank alone."""
+    """Random speech, noise and ears; a batch is a function of seed, step and rank alone."""
 
     recipe: TrainingRecipe
 
     def __init__(self, recipe: TrainingRecipe, data: TrainingData) -> None:
-        self.recipe, self.batch, self.seed = recipe, recipe.batch, recipe.seed
-        options: dict[str, Any] = {"sample_rate": NEURO_RATE, "seconds": recipe.seconds}
-        self.speech = Clips(data.speech, **options)
-        self.noise = Clips(data.noise, repeat=True, **options) if data.noise else None
-        self.ears: Tensor | None = None  # measured ones. Shape: (ears, 8) dB HL
+        self.recipe = recipe
+        self.batch = recipe.batch
+        self.seed = recipe.seed
+        self.speech = Clips(data.speech, sample_rate=NEURO_RATE, seconds=recipe.seconds)
+        self.noise = _noise_clips(data.noise, recipe.seconds) if data.noise else None
+        self.measured_ears: Tensor | None = None  # (ears, 8) dB HL
         if data.audiograms is not None:
             measured = read_audiograms(data.audiograms, simulated=True)
-            self.ears = torch.tensor([ear.thresholds for _, ear in measured])
+            self.measured_ears = torch.tensor([ear.thresholds for _, ear in measured])
 
     def __getitem__(self, step: Step) -> Batch:
-        number = (self.seed * 1_000_003 + step.number) * 64 + step.rank
-        return self.draw(
-            self.batch, torch.Generator().manual_seed(number % 2**63)
-        )  # which takes no more
+        seed = (self.seed * 1_000_003 + step.number) * 64 + step.rank
+        generator = torch.Generator().manual_seed(seed % 2**63)  # the largest seed that it takes
+        return self.draw(self.batch, generator)
 
     def draw(self, count: int, generator: torch.Generator) -> Batch:
         """``clean`` and ``signal`` (count, time) in pascals, ``thresholds`` (count, 8) dB HL."""
         raise NotImplementedError
 
-    def join_measured(
-        self, ears: Tensor, share: float, moved: float, generator: torch.Generator
+    def join_measured_ears(
+        self, ears: Tensor, share: float, shift_db: float, generator: torch.Generator
     ) -> Tensor:
-        """A share of the drawn ears, replaced by measured ones, where there are, moved by up to some dB either way."""
-        if self.ears is None:
+        """Replace a share of drawn ears by measured ones, if there are any, each shifted by up to some dB."""
+        if self.measured_ears is None:
             return ears
-        measured = self.ears[torch.randint(len(self.ears), (len(ears),), generator=generator)]
-        if moved:
-            measured = (
-                measured + 2.0 * moved * torch.rand(len(ears), 1, generator=generator) - moved
-            )
-            measured = measured.clamp(-10.0, 100.0)
+        numbers = torch.randint(len(self.measured_ears), (len(ears),), generator=generator)
+        measured = self.measured_ears[numbers]
+        if shift_db:
+            shift = 2.0 * torch.rand(len(ears), 1, generator=generator) - 1.0
+            measured = (measured + shift_db * shift).clamp(LOWEST_LEVEL, HIGHEST_SIMULATED)
         return torch.where(torch.rand(len(ears), 1, generator=generator) < share, measured, ears)
 
     def join_sounds(self, clips: Tensor, generator: torch.Generator, begun: float = 0.0) -> Tensor:
-        """The recipe's share of the clips, replaced by tones and clicks."""
-        if not (share := self.recipe.sounds):
+        """Replace the recipe's share of clips by tones and clicks."""
+        share = self.recipe.sounds
+        if not share:
             return clips
-        others = draw_sounds(len(clips), clips.shape[-1], NEURO_RATE, generator, begun)
-        return torch.where(torch.rand(len(clips), 1, generator=generator) < share, others, clips)
+        sounds = draw_sounds(len(clips), clips.shape[-1], NEURO_RATE, generator, begun)
+        return torch.where(torch.rand(len(clips), 1, generator=generator) < share, sounds, clips)
 
 
 class SimulatorBatches(DrawnBatches):
-    """What a simulator is to hear: speech, noise, tones and clicks as compensators emit them, at any level."""
+    """Input of a simulator: speech, noise, tones and clicks as compensators emit them, at any level."""
 
     recipe: SimulatorRecipe
 
     def draw(self, count: int, generator: torch.Generator) -> Batch:
-        ears = self.join_measured(draw_thresholds(count, generator), 0.4, 5.0, generator)
+        ears = draw_thresholds(count, generator)
+        ears = self.join_measured_ears(ears, 0.4, 5.0, generator)
         noise = self.noise.draw(count, generator) if self.noise is not None else None
         clips = self.join_sounds(self.speech.draw(count, generator), generator)
-        given = (clips, noise, ears, NEURO_RATE, generator)
-        signal = augment_speech(*given, levels=self.recipe.levels, treated=self.recipe.treated)
+        signal = augment_speech(
+            clips,
+            noise,
+            ears,
+            NEURO_RATE,
+            generator,
+            levels=self.recipe.levels,
+            treated=self.recipe.treated,
+        )
         return {"clean": set_level(clips, level_spl(signal)), "signal": signal, "thresholds": ears}
 
 
 class CompensatorBatches(DrawnBatches):
-    """What a compensator is given: speech, clean or noisy, and the ears that it is for, ``ear`` or drawn ones."""
+    """Input of a compensator: clean or noisy speech, for one ear or for drawn ears."""
 
     recipe: CompensatorRecipe
 
@@ -159,102 +240,119 @@ class CompensatorBatches(DrawnBatches):
         self.ear = None if ear is None else torch.tensor(ear.thresholds)
 
     def draw(self, count: int, generator: torch.Generator) -> Batch:
+        recipe = self.recipe
+
         def uniform(low: float, high: float, *shape: int) -> Tensor:
             return low + (high - low) * torch.rand(count, *shape, generator=generator)
 
-        def equalised(clips: Tensor) -> Tensor:
-            changed = equalise(
-                clips, uniform(-15.0, 15.0, len(KNOTS)), torch.tensor(KNOTS), NEURO_RATE
-            )
-            return torch.where(uniform(0.0, 1.0, 1) < self.recipe.equalised, changed, clips)
+        def equalise_some(clips: Tensor) -> Tensor:
+            gains = uniform(-15.0, 15.0, len(EQUALISER_FREQUENCIES))
+            equalised = equalise(clips, gains, torch.tensor(EQUALISER_FREQUENCIES), NEURO_RATE)
+            return torch.where(uniform(0.0, 1.0, 1) < recipe.equalised, equalised, clips)
 
-        voices = equalised(self.speech.draw(count, generator))
-        # or a hearing aid learns that a tone is one only if it was silent before
-        sounds = self.join_sounds(voices, generator, begun=1.0)
-        signal = clean = set_level(sounds, uniform(*self.recipe.levels))
+        voices = equalise_some(self.speech.draw(count, generator))
+        # some tones begin before the clip, or a hearing aid learns that a tone always follows silence
+        clips = self.join_sounds(voices, generator, begun=1.0)
+        clean = set_level(clips, uniform(*recipe.levels))
+        signal = clean
         if self.noise is not None:
-            noise = equalised(self.noise.draw(count, generator))
-            if self.recipe.babble:
-                others = [voices.roll(apart, 0) for apart in range(1, min(count, _VOICES + 1))]
-                babble = torch.stack([set_level(one, 65.0) for one in others]).sum(0)
-                noise = torch.where(uniform(0.0, 1.0, 1) < self.recipe.babble, babble, noise)
-            noisy = (uniform(0.0, 1.0, 1) < self.recipe.noisy) & (sounds == voices).all(
-                -1, keepdim=True
-            )
-            signal = torch.where(noisy, mix(clean, noise, uniform(*self.recipe.snr)), clean)
+            noise = equalise_some(self.noise.draw(count, generator))
+            if recipe.babble:
+                noise = torch.where(uniform(0.0, 1.0, 1) < recipe.babble, _babble(voices), noise)
+            is_speech = (clips == voices).all(-1, keepdim=True)
+            is_noisy = (uniform(0.0, 1.0, 1) < recipe.noisy) & is_speech
+            noisy = mix(clean, noise, uniform(*recipe.snr), NEURO_RATE)
+            signal = torch.where(is_noisy, noisy, clean)
         if self.ear is not None:
             ears = self.ear.expand(count, -1)
         else:
-            ears = self.join_measured(draw_thresholds(count, generator), 0.5, 0.0, generator)
+            ears = draw_thresholds(count, generator)
+            ears = self.join_measured_ears(ears, 0.5, 0.0, generator)
         batch = {"clean": clean, "signal": signal, "thresholds": ears}
-        if self.recipe.unreduced:
-            batch["noise_reduction"] = (uniform(0.0, 1.0) >= self.recipe.unreduced).to(clean.dtype)
+        if recipe.unreduced:
+            is_reduced = uniform(0.0, 1.0) >= recipe.unreduced
+            batch["noise_reduction"] = is_reduced.to(clean.dtype)
         return batch
 
 
-def simulator_data(
-    data: TrainingData | PlannedSource, recipe: SimulatorRecipe, reference: Reference | None = None
-) -> BatchData:
-    """What a simulator is trained and validated on, with what is heard from the exact MSBG, or another reference.
+def _babble(voices: Tensor) -> Tensor:
+    """For each item, the sum of up to four other items at equal levels."""
+    count = min(len(voices), MAX_BABBLE_VOICES + 1)
+    others = [set_level(voices.roll(shift, 0), 65.0) for shift in range(1, count)]
+    return torch.stack(others).sum(0)
 
-    Raises ValueError of data that cannot be used; the message names it."""
-    if isinstance(data, PlannedSource):
-        return PlannedData(data, recipe, reference)
+
+def simulator_data(
+    data: TrainingData, recipe: SimulatorRecipe, reference: Reference | None = None
+) -> BatchData:
+    """Data to train and validate a simulator on.
+
+    Args:
+        reference: the teacher; by default the exact MSBG.
+
+    Raises:
+        ValueError: the data cannot be used.
+    """
+    validation = speech_to_validate(data, recipe)
+    if recipe.sounds:
+        validation += sounds_to_validate(recipe)
+    teacher = Teacher(NEURO_RATE, reference)
     training = SimulatorBatches(recipe, data)
-    validation = [
-        *speech_to_validate(data, recipe),
-        *(sounds_to_validate(recipe) if recipe.sounds else []),
-    ]
-    return BatchData(training, validation, teacher=Teacher(NEURO_RATE, reference=reference))
+    return BatchData(training, validation, teacher=teacher, workers=data.workers)
 
 
 def compensator_data(
     data: TrainingData, recipe: CompensatorRecipe, ear: Audiogram | None
 ) -> BatchData:
-    """What a compensator for an ear, or else for all, is trained and validated on. Raises ValueError as
-    ``simulator_data``, and where a recipe that trains noise reduction has no noise."""
-    reducing = sorted(
-        {"denoising", "intelligibility"} & {name for name, w in recipe.weights.items() if w}
-    )
-    if data.noise is None and (reducing or recipe.babble):
+    """Data to train and validate a compensator on, for one ear or for all.
+
+    Raises:
+        ValueError: the data cannot be used, or the recipe requires noise and there is none.
+    """
+    needs_noise = [name for name in ("denoising", "intelligibility") if recipe.weights.get(name)]
+    if recipe.babble:
+        needs_noise.append("babble")
+    if data.noise is None and needs_noise:
         raise ValueError(
-            f"no noise, and the recipe's {reducing[0] if reducing else 'babble'} is for it; allowed: --noise DIR"
+            f"the recipe has {needs_noise[0]}, which requires noise; give a folder of noise (--noise)"
         )
-    plain = replace(recipe, equalised=0.0, seconds=_VALID_SECONDS)
-    valid = CompensatorBatches(plain, data.validation(), ear)
+    plain = replace(recipe, equalised=0.0, seconds=VALIDATION_SECONDS)
+    batches = CompensatorBatches(plain, data.validation(), ear)
     generator = torch.Generator().manual_seed(2_000 + recipe.seed)
-    validation = [valid.draw(4, generator) for _ in range(0, recipe.validation_items, 4)]
-    return BatchData(CompensatorBatches(recipe, data, ear), validation)
+    validation = [batches.draw(4, generator) for _ in range(0, recipe.validation_items, 4)]
+    return BatchData(CompensatorBatches(recipe, data, ear), validation, workers=data.workers)
 
 
 def speech_to_validate(data: TrainingData, recipe: SimulatorRecipe) -> list[Batch]:
-    """Fixed items: every second one noisy (0 to 20 dB); measured, standard and drawn ears in turn."""
+    """Fixed items, every second one noisy (0 to 20 dB), for measured, standard and drawn ears in turn."""
     generator = torch.Generator().manual_seed(1_000 + recipe.seed)
-    valid = SimulatorBatches(replace(recipe, seconds=_VALID_SECONDS), data.validation())
+    drawn = SimulatorBatches(replace(recipe, seconds=VALIDATION_SECONDS), data.validation())
     standard = torch.tensor([Audiogram.standard(name).thresholds for name in MILDER])
+    is_noisy = (torch.arange(8) % 2 == 1).unsqueeze(-1)
     batches = []
     for _ in range(0, recipe.validation_items, 8):
-        signal = valid.speech.draw(8, generator)
-        if valid.noise is not None:
-            noisy = mix(
-                signal, valid.noise.draw(8, generator), 20.0 * torch.rand(8, generator=generator)
-            )
-            signal = torch.where((torch.arange(8) % 2 == 1).unsqueeze(-1), noisy, signal)
+        signal = drawn.speech.draw(8, generator)
+        if drawn.noise is not None:
+            noise = drawn.noise.draw(8, generator)
+            noisy = mix(signal, noise, 20.0 * torch.rand(8, generator=generator), NEURO_RATE)
+            signal = torch.where(is_noisy, noisy, signal)
         signal = set_level(signal, _levels_to_validate(recipe, generator))
         ears = draw_thresholds(8, generator)
         ears[0:8:4] = standard[torch.randint(len(standard), (2,), generator=generator)]
-        if valid.ears is not None:
-            ears[1:8:2] = valid.ears[torch.randint(len(valid.ears), (4,), generator=generator)]
+        measured = drawn.measured_ears
+        if measured is not None:
+            ears[1:8:2] = measured[torch.randint(len(measured), (4,), generator=generator)]
         batches.append({"signal": signal, "thresholds": ears})
     return batches
 
 
 def sounds_to_validate(recipe: SimulatorRecipe) -> list[Batch]:
-    """Fixed tones and clicks, marked with ``sounds``, a third as many items as of speech, for drawn ears."""
+    """Fixed tones and clicks for drawn ears, a third as many items as of speech, marked with ``sounds``."""
     generator = torch.Generator().manual_seed(2_000 + recipe.seed)
+    samples = round(VALIDATION_SECONDS * NEURO_RATE)
     batches = []
     for _ in range(0, recipe.validation_items, 24):
-        signal = draw_sounds(8, round(_VALID_SECONDS * NEURO_RATE), NEURO_RATE, generator)
+        signal = draw_sounds(8, samples, NEURO_RATE, generator)
         signal = set_level(signal, _levels_to_validate(recipe, generator))
         batch = {"signal": signal, "thresholds": draw_thresholds(8, generator)}
         batches.append(batch | {"sounds": torch.ones(8, dtype=torch.bool)})
@@ -262,50 +360,6 @@ def sounds_to_validate(recipe: SimulatorRecipe) -> list[Batch]:
 
 
 def _levels_to_validate(recipe: SimulatorRecipe, generator: torch.Generator) -> Tensor:
-    """50 to 80 dB SPL, or the recipe's levels where ``treated`` is off. Shape: -> (8,)."""
+    """50 to 80 dB SPL, or the recipe's levels if it does not amplify and compress. Shape: -> (8,)."""
     low, high = (50.0, 80.0) if recipe.treated else recipe.levels
     return low + (high - low) * torch.rand(8, generator=generator)
-
-
-class PlannedData(PlanData):
-    """A plan's training split, validated on the middle 2 s of instances evenly spread over its validation split, or else
-    over test's, or training's.
-
-    What is prepared is heard as it lies on disk, in validation too, and needs no corpus.
-    """
-
-    def __init__(
-        self, source: PlannedSource, recipe: SimulatorRecipe, reference: Reference | None = None
-    ) -> None:
-        if recipe.sounds:
-            raise ValueError(f"sounds {recipe.sounds} in the recipe, with a manifest; allowed: 0")
-        clips = {
-            name: getattr(recipe, name)
-            for name in ("batch", "seconds", "seed", "levels", "treated")
-        }
-        where = {name: getattr(source, name) for name in ("root", "prepared", "workers")}
-        making = Recipe(reference=reference)
-        super().__init__(source.manifest, recipe=making, **where, **clips)
-        if self.plan.rate != NEURO_RATE:
-            raise ValueError(
-                f"{source.manifest}: prepared at {self.plan.rate} Hz; allowed: {NEURO_RATE}"
-            )
-        split = next(split for split in ("valid", "test", "train") if len(self.plan.indices(split)))
-        if split != "valid":
-            warnings.warn(
-                f"the plan has no split 'valid': the best checkpoint is chosen on {split!r}, whose figures then say too "
-                "much",
-                stacklevel=2,
-            )
-        items = self.items(split)
-        chosen = (
-            torch.linspace(0, len(items) - 1, min(recipe.validation_items, len(items)))
-            .round()
-            .int()
-        )
-        samples = round(_VALID_SECONDS * NEURO_RATE)
-        whole = [items[place] for place in chosen.tolist()]
-        middle = [one.clip(max(0, (len(one.signal) - samples) // 2), samples) for one in whole]
-        self.validation = [collate(middle[i : i + 8]) for i in range(0, len(middle), 8)]
-
-    val_dataloader = BatchData.val_dataloader

@@ -1,4 +1,4 @@
-"""Random clips of recordings, decoded once and kept."""
+"""Random clips of recordings, decoded once and kept in memory."""
 
 import warnings
 from collections.abc import Sequence
@@ -10,24 +10,26 @@ from torch import Tensor
 from hlsim.audio import find_audio, read_audio
 from hlsim.dsp.resample import resample
 
-_TRIES = 100  # draws of files that cannot be used, one after the other, before it ends
-_SILENT_TRIES = 10_000  # more, for a recording may be loud for one second in an hour
+MAX_BAD_FILES = 100  # drawn one after the other
+MAX_SILENT_CLIPS = 10_000  # one after the other: a recording may be loud for one second in an hour
+MAX_SAMPLES_IN_MEMORY = 2**30  # 2 GB, 18 hours at 16 kHz
+SILENT_POWER = 1e-7  # mean square of a clip whose recording has its peak at 1.0
 
 
 class Clips:
-    """Clips of equal length from the recordings under a folder, first channel, resampled to one rate.
+    """Clips of equal length from the recordings in a folder, first channel, resampled to one rate.
 
-    Recordings are decoded when first drawn and kept as 16-bit samples (115 MB an hour at 16 kHz). A file that cannot be
-    used (broken, silent, of another rate) is told of once, and wherever it is drawn another is drawn instead.
+    Recordings are decoded when they are first drawn and kept as 16-bit samples, up to 2 GB. A file that cannot be used
+    (broken, silent, or with an unsupported rate) causes one warning, and whenever it is drawn, another is drawn instead.
 
     Args:
-        source: a folder, searched for wav, flac and ogg files, subfolders too; or the files.
-        sample_rate: Hz.
-        seconds: length of a clip; shorter recordings are repeated where ``repeat``, else followed by silence.
+        source: folder that is searched for audio, with its subfolders; or a list of files.
+        sample_rate: sample rate of the clips in Hz.
+        seconds: length of a clip. Shorter recordings are repeated if ``repeat``, else followed by silence.
 
     Raises:
-        ValueError: no such folder, or no audio in it, or clips of no samples; when clips are drawn, too many files that
-            cannot be used, or too many silent clips; when one recording is asked for, that it cannot be used.
+        ValueError: the folder does not exist or has no audio in it, or the clips would be empty. When clips are drawn:
+            too many files that cannot be used, or too many silent clips.
     """
 
     def __init__(
@@ -39,70 +41,125 @@ class Clips:
         repeat: bool = False,
     ) -> None:
         self.files = find_audio(source) if isinstance(source, str | Path) else list(source)
-        self.sample_rate, self.repeat = sample_rate, repeat
+        self.sample_rate = sample_rate
+        self.repeat = repeat
         self.samples = round(seconds * sample_rate)
         if self.samples < 1:
             raise ValueError(
-                f"clips of {seconds} s; allowed: a sample or more, {1.0 / sample_rate:.2g} s"
+                f"clips of {seconds} s have no samples; choose {1.0 / sample_rate:.2g} s or more"
             )
-        self._kept: dict[int, Tensor] = {}
-        self._bad: dict[int, str] = {}
+        self._recordings: dict[int, Tensor] = {}  # 16-bit samples by number of the file
+        self._errors: dict[int, str] = {}  # by number of the file
 
     def __len__(self) -> int:
         return len(self.files)
 
     def recording(self, index: int) -> Tensor:
-        """The whole recording, peak at 1.0. Shape: -> (time,)."""
-        if index not in self._kept:
-            waveform, rate = read_audio(self.files[index])
-            waveform = resample(waveform[:1], rate, self.sample_rate).squeeze(0)
+        """A whole recording with its peak at 1.0. Shape: -> (time,)."""
+        if index not in self._recordings:
+            waveform = self._decode(index)
             peak = float(waveform.abs().max())
             if peak == 0.0:
                 raise ValueError(f"{self.files[index]}: its first channel is silent")
-            self._kept[index] = (waveform / peak * 32767.0).round().to(torch.int16)
-        return self._kept[index].float() / 32767.0
+            self._recordings[index] = (waveform / peak * 32767.0).round().to(torch.int16)
+            self._limit_memory()
+        return self._recordings[index].float() / 32767.0
 
-    def clip(self, index: int, place: float) -> Tensor:
-        """The clip at a place from 0, the beginning, to 1, the end. Shape: -> (samples,)."""
+    def clip(self, index: int, position: float) -> Tensor:
+        """The clip at a position from 0, the start of the recording, to 1, its end. Shape: -> (samples,)."""
         recording = self.recording(index)
         if self.repeat and len(recording) < self.samples:
             recording = recording.repeat(-(-self.samples // len(recording)))
-        start = int(place * max(0, len(recording) - self.samples))
+        start = int(position * max(0, len(recording) - self.samples))
         clip = recording[start : start + self.samples]
         return torch.nn.functional.pad(clip, (0, self.samples - len(clip)))
 
     def draw(self, count: int, generator: torch.Generator) -> Tensor:
-        """Random clips, none silent. Shape: -> (count, samples)."""
+        """Random clips, none of them silent. Shape: -> (count, samples)."""
         clips: list[Tensor] = []
-        failed = silent = 0
+        bad_files = 0
+        silent_clips = 0
         while len(clips) < count:
             index = int(torch.randint(len(self), (), generator=generator))
-            # drawn for a bad file too: what follows does not depend on when it was found bad
-            place = float(torch.rand((), generator=generator))
-            if not self._usable(index):
-                failed += 1
-                if failed == _TRIES:
+            # drawn for a bad file as well, so that later draws do not depend on when it was found to be bad
+            position = float(torch.rand((), generator=generator))
+            if not self._is_usable(index):
+                bad_files += 1
+                if bad_files == MAX_BAD_FILES:
                     raise ValueError(
-                        f"{self._bad[index]}; {_TRIES} files like it were drawn in a row"
+                        f"{self._errors[index]}; {bad_files} files that cannot be used were drawn in a row"
                     )
                 continue
-            failed, clip = 0, self.clip(index, place)
-            if float(clip.square().mean()) > 1e-7:
-                silent = 0
+            bad_files = 0
+            clip = self.clip(index, position)
+            if float(clip.square().mean()) > SILENT_POWER:
+                silent_clips = 0
                 clips.append(clip)
-            elif (silent := silent + 1) == _SILENT_TRIES:
+                continue
+            silent_clips += 1
+            if silent_clips == MAX_SILENT_CLIPS:
                 raise ValueError(
-                    f"{self.files[index]}: {silent} clips in a row were silent, this one the last; leave silent "
-                    "recordings out, or take longer clips"
+                    f"{self.files[index]}: {silent_clips} clips in a row were silent, the last of them in this file; "
+                    "remove silent recordings, or draw longer clips"
                 )
         return torch.stack(clips)
 
-    def _usable(self, index: int) -> bool:
-        if index not in self._bad:
-            try:
-                self.recording(index)
-                return True
-            except ValueError as error:
-                self._bad[index] = str(error)
-                warnings.warn(f"left out: {error}", stacklevel=3)
-        return False
+    def _decode(self, index: int) -> Tensor:
+        """First channel of a file at the rate of the clips. Shape: -> (time,)."""
+        waveform, rate = read_audio(self.files[index])
+        return resample(waveform[:1], rate, self.sample_rate).squeeze(0)
+
+    def _limit_memory(self) -> None:
+        """Remove the recordings that were decoded first, but not the last one."""
+        total = sum(map(len, self._recordings.values()))
+        while total > MAX_SAMPLES_IN_MEMORY and len(self._recordings) > 1:
+            total -= len(self._recordings.pop(next(iter(self._recordings))))
+
+    def _is_usable(self, index: int) -> bool:
+        if index in self._errors:
+            return False
+        try:
+            self.recording(index)
+        except ValueError as error:
+            self._errors[index] = str(error)
+            warnings.warn(f"left out: {error}", stacklevel=3)
+            return False
+        return True
+
+
+class NoiseOfPairs(Clips):
+    """Clips of the noise in pairs of clean and noisy speech: noisy minus clean.
+
+    Args:
+        pairs: files of clean speech, each with its noisy version, aligned and equally long.
+        sample_rate, seconds: as for ``Clips``.
+    """
+
+    def __init__(
+        self, pairs: Sequence[tuple[Path, Path]], *, sample_rate: int, seconds: float
+    ) -> None:
+        noisy_files = [noisy for _, noisy in pairs]
+        super().__init__(noisy_files, sample_rate=sample_rate, seconds=seconds, repeat=True)
+        self.clean_files = [clean for clean, _ in pairs]
+
+    def _decode(self, index: int) -> Tensor:
+        clean, rate = read_audio(self.clean_files[index])
+        noise = read_noisy(self.files[index], clean, rate) - clean
+        return resample(noise[:1], rate, self.sample_rate).squeeze(0)
+
+
+def read_noisy(path: Path, clean: Tensor, clean_rate: int) -> Tensor:
+    """Read the noisy version of clean speech.
+
+    Shape: (channels, time) -> (channels, time).
+
+    Raises:
+        ValueError: the file cannot be read, or is not as long as the clean speech, or has another sample rate.
+    """
+    noisy, rate = read_audio(path)
+    if (noisy.shape, rate) != (clean.shape, clean_rate):
+        raise ValueError(
+            f"{path}: {noisy.shape[-1]} samples at {rate} Hz, but its clean version has {clean.shape[-1]} at "
+            f"{clean_rate} Hz; both files of a pair have equal lengths, rates and channels"
+        )
+    return noisy

@@ -12,11 +12,11 @@ from torch import Tensor, nn
 from compensators.hearing_aid import HearingAid
 from compensators.pretrained import CONFIGS, build_compensator, load_compensator
 from hlsim.audiogram import Audiogram
-from hlsim.data.module import Batch
 from hlsim.losses.criteria import Criterion
 from hlsim.losses.hearing_loss import HearingLossLoss
 from hlsim.pretrained import checkpoint_digest
-from hlsim.training.batches import TrainingData, compensator_data, identity_of
+from hlsim.training.batches import TrainingData, compensator_data
+from hlsim.training.data_module import Batch
 from hlsim.training.denoising import attenuation_error, missing_intelligibility
 from hlsim.training.loop import RunOptions, train_network
 from hlsim.training.module import ScheduledModule, initial_network
@@ -128,5 +128,5 @@ def train_compensator(
             simulator
         )  # a folder may hold another one next time
     about = trained | {"start_valid_loss": start}
-    how: dict[str, Any] = {"out": out, "identity": identity_of(data) | trained, "about": about}
+    how: dict[str, Any] = {"out": out, "identity": data.identity() | trained, "about": about}
     return train_network(module, batches, recipe, recipe.kind, **how, **options)

@@ -16,9 +16,9 @@ from lightning.pytorch.callbacks import Callback, ModelCheckpoint, Timer
 from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
-from hlsim.data.module import BatchData
 from hlsim.pretrained import checkpoint_digest, save_checkpoint
 from hlsim.training.callbacks import DataWait, History, KeepBest, ShowExamples, StepProgress
+from hlsim.training.data_module import BatchData
 from hlsim.training.module import ScheduledModule
 from hlsim.training.recipes import TrainingRecipe
 from hlsim.training.state import BEST, CHECKPOINT, LAST, WholeStates, claimed

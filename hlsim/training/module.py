@@ -15,8 +15,8 @@ from torch import Tensor, nn
 from torch.optim.lr_scheduler import LambdaLR
 from torch.optim.swa_utils import AveragedModel
 
-from hlsim.data.module import Batch
 from hlsim.neuro.config import ModelConfig
+from hlsim.training.data_module import Batch
 
 Network = TypeVar("Network", bound=nn.Module)
 Config = TypeVar("Config", bound=ModelConfig)

@@ -92,7 +92,6 @@ class SimulatorRecipe(TrainingRecipe):
             a network without a prior want the latter: a severe ear's first errors are 50 dB above its target, and the
             network learns to be silent.
         levels: before amplification.
-        sounds: 0 with a manifest.
         treated: whether clips are equalised, amplified and compressed at random, as compensators do.
         precision: ``float32``, or ``bfloat16`` for the network's own layers: several times faster where the hardware has
             units for it, several times slower where it has not. Transforms, physics, scans and criteria stay in float32.

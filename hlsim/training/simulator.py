@@ -9,22 +9,16 @@ from typing import Any, Unpack
 import torch
 from torch import Tensor
 
-from hlsim.data.module import Batch
-from hlsim.data.teacher import find_teacher, name_of
 from hlsim.losses.paper import paper_parts, weighted_sum
 from hlsim.losses.waveform import log_spectral_distance_db, noise_to_signal_db
 from hlsim.neuro import NeuroConfig, NeuroMSBG
 from hlsim.pretrained import SIMULATOR, load_pretrained
-from hlsim.training.batches import (
-    PlannedData,
-    PlannedSource,
-    TrainingData,
-    identity_of,
-    simulator_data,
-)
+from hlsim.training.batches import TrainingData, simulator_data
+from hlsim.training.data_module import Batch
 from hlsim.training.loop import RunOptions, train_network
 from hlsim.training.module import ScheduledModule, exponential_average, initial_network
 from hlsim.training.recipes import SimulatorRecipe
+from hlsim.training.teacher import find_teacher, name_of
 
 
 class SimulatorTraining(ScheduledModule):
@@ -88,7 +82,7 @@ class SimulatorTraining(ScheduledModule):
 
 
 def train_simulator(
-    data: TrainingData | PlannedSource,
+    data: TrainingData,
     recipe: SimulatorRecipe,
     *,
     out: str | Path,
@@ -98,7 +92,7 @@ def train_simulator(
     """Train, resume, and keep the best checkpoint.
 
     Args:
-        data: folders to draw batches from, or a prepared plan.
+        data: speech, noise and ears to draw batches from.
         teacher: ``"msbg"``, the exact one, ``"pyclarity"``'s, or anyone's simulator, ``package.module:name``, as
             ``hlsim.data.foreign.load_teacher`` takes it.
 
@@ -108,18 +102,13 @@ def train_simulator(
         ValueError: data, recipe or teacher that cannot be used; the message names them.
     """
     module = SimulatorTraining(recipe)
-    if teacher != "msbg" and isinstance(data, PlannedSource) and data.prepared:
-        raise ValueError(
-            f"teacher {teacher} for what is prepared; allowed: none, for it has been heard already"
-        )
     reference = find_teacher(teacher)
     # nothing of hlsim's own: trainings that began before there were others go on
     told = {} if reference is None else {"teacher": name_of(reference)}
     batches = simulator_data(data, recipe, reference)
-    made_of = {"instances": batches.made_of} if isinstance(batches, PlannedData) else {}
     how: dict[str, Any] = {
         "out": out,
-        "identity": identity_of(data) | made_of | told,
+        "identity": data.identity() | told,
         "about": told,
     }
     return train_network(module, batches, recipe, SIMULATOR, **how, **options)

@@ -1,119 +1,111 @@
-"""The command ``prepare``: what they say and write, and one line on bad input."""
+"""The command ``prepare``: what it prints and writes for each layout, and one line for what it rejects."""
 
 from pathlib import Path
 
 import pytest
-import torch
 
-from hlsim.audio import write_audio
 from hlsim.cli.main import main
 
-
-@pytest.fixture
-def corpus(tmp_path: Path) -> Path:
-    """Two speakers, an utterance each, and one file that is no audio."""
-    generator = torch.Generator().manual_seed(0)
-    for name in ("ann", "bob"):
-        (tmp_path / "speech" / name).mkdir(parents=True)
-        write_audio(
-            tmp_path / "speech" / name / "1.wav",
-            0.05 * torch.randn(9600, generator=generator),
-            16000,
-        )
-    (tmp_path / "speech" / "bob" / "2.wav").write_text("x")
-    for kind in ("hum", "hiss"):
-        (tmp_path / "noise" / kind).mkdir(parents=True)
-        write_audio(
-            tmp_path / "noise" / kind / "1.wav",
-            0.05 * torch.randn(9600, generator=generator),
-            16000,
-        )
-    return tmp_path / "speech"
-
-
-def test_prepare_says_what_it_found_and_writes(
-    corpus: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    out = tmp_path / "out"
-    command = [
-        "prepare",
-        str(corpus),
-        "--noise",
-        str(tmp_path / "noise"),
-        "--out",
-        str(out),
-        "--jobs",
-        "1",
-        "--write",
-    ]
-    for _ in range(2):
-        assert main(command) == 0
-        said = capsys.readouterr()
-        assert said.out.splitlines() == [
-            "train: 1 utterances, 0.00 h, 4 instances; ears 50 % mild, 50 % severe",
-            "test: 1 utterances, 0.00 h, 4 instances; ears 50 % mild, 50 % severe",
-            f"1 faults are left out: {out / 'faults.csv'}",
-            f"8 instances are in {out / 'instances'}",
+Lines = list[str]
+TREES: dict[str, tuple[Lines, Lines, Lines]] = {  # files, options, what is printed
+    "VoiceBank-DEMAND": (
+        [
+            f"{kind}_{part}_wav_16k/{name}.wav"
+            for kind in ("clean", "noisy")
+            for part, name in (("trainset_28spk", "p226_001"), ("testset", "p232_001"))
         ]
-        assert "8 of 8 instances" in said.err
-    assert len(list(out.rglob("*.safetensors"))) == 8
+        + ["logfiles/log_testset.txt"],
+        [],
+        [
+            "layout: VoiceBank-DEMAND",
+            "split  speakers  utterances  pairs",
+            "train         1           1      1",
+            "test          1           1      1",
+            "passed over: 1 other files, .txt",
+        ],
+    ),
+    "LibriSpeech": (
+        [
+            "train-clean-100/103/1240/a.flac",
+            "train-clean-100/103/1240/a.txt",
+            "dev-clean/84/1/b.flac",
+        ],
+        [],
+        [
+            "layout: LibriSpeech or LibriTTS",
+            "split  speakers  utterances  pairs",
+            "train         1           1      0",
+            "valid         1           1      0",
+            "passed over: 1 other files, .txt",
+        ],
+    ),
+    "split folders": (
+        ["Train/clean/1.wav", "Train/noisy/1.wav", "Train/noise/1.wav"],
+        [],
+        [
+            "layout: folders train, valid, test",
+            "split  speakers  utterances  pairs",
+            "train   unknown           1      1",
+            "passed over: 1 audio files in Train/noise",
+        ],
+    ),
+    "speakers": (
+        ["id1/a/1.wav", "id1/b/1.wav", "id2/a/1.wav"],
+        ["--folders", "speaker", "--valid-share", "0.5"],
+        [
+            "layout: folders speaker",
+            "split  speakers  utterances  pairs",
+            "train         1           2      0",
+            "valid         1           1      0",
+        ],
+    ),
+}
 
 
-def test_options_reach_the_plan(
-    corpus: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def make(root: Path, files: Lines) -> Path:
+    for file in files:
+        (root / file).parent.mkdir(parents=True, exist_ok=True)
+        (root / file).touch()
+    return root
+
+
+@pytest.mark.parametrize("layout", TREES)
+def test_prepare_prints_what_it_recognised(
+    layout: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    out = tmp_path / "out"
-    options = [
-        "--severities",
-        "none=1,severe=1",
-        "--ears",
-        "4",
-        "--level",
-        "50",
-        "70",
-        "--rate",
-        "22050",
-    ]
-    assert main(["prepare", str(corpus), "--out", str(out), "--jobs", "1", *options]) == 0
-    assert (
-        capsys.readouterr().out.splitlines()[0].endswith("4 instances; ears 50 % none, 50 % severe")
-    )
-    rows = (out / "instances.csv").read_text().splitlines()[1:]
-    assert {row.split(",")[3] for row in rows} == {"clean"}
-    assert all(50.0 <= float(row.split(",")[4]) <= 70.0 for row in rows)
+    files, options, printed = TREES[layout]
+    corpus, out = make(tmp_path / "corpus", files), tmp_path / "manifest.csv"
+    for _ in range(2):
+        assert main(["prepare", str(corpus), "--out", str(out), *options]) == 0
+        *lines, last = capsys.readouterr().out.splitlines()
+        assert lines == printed
+        assert last.endswith(f"--manifest {out} --root {corpus}")
+    rows = sum(int(line.split()[2]) for line in printed[2:] if "passed over" not in line)
+    assert len(out.read_text().splitlines()) == 1 + rows
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
+    ("files", "options", "said"),
     [
-        (["--strict"], "1 faults, the first bob/2.wav: not readable as audio"),
-        (["--severities", "deaf=1"], "unknown severities deaf"),
-        (["--level", "50", "60", "70"], "allowed: one level, or lowest and highest"),
-        (["--backend", "dask"], "needs the scheduler's address"),
-        (["--backend", "dask", "--scheduler", "tcp://127.0.0.1:1"], "no Dask scheduler answers"),
-        (["--root", "."], "not in the root"),
+        (["id1/a/1.wav"], [], "its layout is none of VoiceBank-DEMAND, "),
         (
-            ["--train-snr", "5,10", "--test-snr", "5", "--noise", "NOISE"],
-            "SNRs 5 dB for training and test",
+            ["train/clean/1.wav", "train/noisy/1.wav"],
+            ["--valid-share", "0.1"],
+            "no speakers are known",
         ),
         (
-            ["--train-snr", "5", "--test-types", "1"],
-            "--train-snr, --test-types without --noise; allowed",
+            ["id1/1.wav"],
+            ["--folders", "voices"],
+            "folders voices; write split, speaker, condition, -",
         ),
-        (["--teacher", "pyclarity"], "--teacher without --write; allowed: only with it"),
-        (["--teacher", "nobody:hears", "--write"], "teacher nobody:hears: cannot be had"),
-        (["--rate", "44101", "--write"], "44101 Hz for a teacher; allowed: 16000"),
-        (["--alignment", "impulse"], "--alignment without --write; allowed: only with it"),
+        (["id1/1.txt"], [], "no audio in it"),
     ],
 )
-def test_bad_input_is_one_line(
-    corpus: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str], said: str
+def test_what_is_rejected_is_one_line_and_writes_nothing(
+    files: Lines, options: Lines, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    if "dask" in options:
-        pytest.importorskip("distributed")
-    options = [str(tmp_path / "noise") if option == "NOISE" else option for option in options]
-    where = [] if "dask" in options else ["--jobs", "1"]
-    assert main(["prepare", str(corpus), "--out", str(tmp_path / "out"), *where, *options]) == 2
-    error = capsys.readouterr().err.strip().splitlines()[-1]
+    corpus, out = make(tmp_path / "corpus", files), tmp_path / "manifest.csv"
+    assert main(["prepare", str(corpus), "--out", str(out), *options]) == 2
+    (error,) = capsys.readouterr().err.splitlines()
     assert error.startswith("hlsim: error: ") and said in error
-    assert not (tmp_path / "out" / "manifest.csv").exists()
+    assert not out.exists()

@@ -40,7 +40,7 @@ def test_help_and_refusals_import_nothing_heavy(tmp_path: Path) -> None:
         ["live", "--audiogram", "N9"],
         ["live", "--audiogram", "N3", "--block-ms", "0"],
         ["prepare", missing, "--out", out],
-        ["prepare", str(tmp_path), "--out", out, "--layout", "mine"],
+        ["prepare", str(tmp_path), "--out", out, "--valid-share", "2"],
         ["train-simulator", "--config", missing, "--speech", str(tmp_path), "--out", out],
         ["train-simulator", "--config", str(plain), "--out", out],
         ["train-simulator", "--config", str(plain), "--manifest", missing, "--out", out],

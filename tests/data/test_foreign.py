@@ -13,8 +13,7 @@ from torch import Tensor
 from hlsim import Audiogram
 from hlsim.calibration import set_level
 from hlsim.data.foreign import ForeignTeacher, load_enhancer, load_teacher
-from hlsim.data.teacher import Teacher, find_teacher
-from hlsim.data.writing import Recipe
+from hlsim.training.teacher import Teacher, find_teacher
 
 HALF = """
 import torch
@@ -73,7 +72,6 @@ def test_found_in_the_working_directory_and_asked_at_its_own_rate(write: Write) 
         assert float((heard - expected)[:, 400:-400].norm() / expected.norm()) < 1e-3
     # and as the teacher of a training or of prepared instances
     assert torch.equal(Teacher(16000, reference=half)(speech, ears), half(speech, ears, 16000))
-    assert str(Recipe(reference=half)) == f"teacher {half}, alignment structural"
     assert pickle.loads(pickle.dumps(half)) is half
 
 
@@ -164,6 +162,4 @@ def test_what_is_no_teacher_is_refused(write: Write) -> None:
     ):
         with pytest.raises(ValueError, match=said):
             find_teacher(name)
-    with pytest.raises(ValueError, match=r"alignment 'impulse' of .*; allowed: structural"):
-        Teacher(16000, alignment="impulse", reference=load_teacher(f"{module}:half"))
     assert find_teacher("msbg") is None

@@ -25,18 +25,15 @@ from hlsim import NeuroMSBG, load_pretrained
 from hlsim.audio import read_audio, read_stretch
 from hlsim.audiogram.table import read_audiograms
 from hlsim.cli.inputs import read_recipe
-from hlsim.data.corpora import find_utterances
-from hlsim.data.instances import Instance, Plan, is_whole
-from hlsim.data.plan import prepare
-from hlsim.data.plan_settings import PlanSettings
 from hlsim.evaluation.recordings import read_manifest
 from hlsim.evaluation.store import ScoreStore
 from hlsim.neuro import NeuroConfig
 from hlsim.pretrained import checkpoint_about, checkpoint_digest, save_checkpoint
+from hlsim.training.corpora.manifest import read_manifest as read_training_manifest
 from hlsim.training.recipes import CompensatorRecipe, SimulatorRecipe
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
-CORPUS = "file,id,speaker,split,noisy,noise,snr\na.wav,1,s,train,b.wav,hum,5\nc.wav,2,t,test,,,\n"
+CORPUS = "path,noisy,speaker,split\na.wav,b.wav,s,train\nc.wav,,t,test\n"
 LEVELS = (
     "hl_250,hl_500,hl_1000,hl_2000,hl_3000,hl_4000,hl_6000,hl_8000\n",
     "35,35,40,50,55,60,65,65\n",
@@ -102,10 +99,11 @@ def damaged_table(bench: Any, draw: Random, text: str) -> bytes:
 @pytest.mark.parametrize("kind", ["audiogram tables", "report manifests", "corpus tables"])
 def test_tables(bench: Any, tmp_path: Path, kind: str) -> None:
     path = tmp_path / "t.csv"
+    (tmp_path / "a.wav").touch()
     text, read = {
         "audiogram tables": (EARS, lambda: read_audiograms(path, simulated=True)),
         "report manifests": (MANIFEST, lambda: read_manifest(path)),
-        "corpus tables": (CORPUS, lambda: list(find_utterances(tmp_path, "folder", path))),
+        "corpus tables": (CORPUS, lambda: read_training_manifest(path)),
     }[kind]
 
     def attempt(data: bytes) -> None:
@@ -193,48 +191,13 @@ def test_checkpoints(bench: Any, tmp_path: Path) -> None:
     bench.run("safetensors of checkpoints", make_weights, load, share=4.0)
 
 
-def test_instances_and_scores(bench: Any, tmp_path: Path) -> None:
-    tensors = {name: torch.randn(800) for name in ("clean", "signal", "impaired")}
-    instance = Instance(**tensors, thresholds=torch.zeros(8)).to_bytes()
+def test_scores(bench: Any, tmp_path: Path) -> None:
     scores = 5 * (json.dumps({"key": "k", "score": 0.5, "seed": 1, "seconds": 2.0}) + "\n").encode()
     path = tmp_path / "x"
-
-    def read_instance(data: bytes) -> None:
-        path.write_bytes(data)
-        if is_whole(path):
-            Instance.read(path)
 
     def read_scores(data: bytes) -> None:
         path.write_bytes(data)
         ScoreStore(path).append("new", {"score": 1.0})
         assert ScoreStore(path).get("new") == {"score": 1.0}
 
-    bench.run(
-        "safetensors of instances",
-        lambda draw: bench.damage(draw, instance),
-        read_instance,
-        share=4.0,
-    )
     bench.run("stored scores", lambda draw: bench.damage(draw, scores), read_scores, share=2.0)
-
-
-def test_plans(bench: Any, corpus: Path) -> None:
-    folder = corpus / "plan"
-    prepare(PlanSettings(corpus / "speech"), folder, jobs=1)
-    whole = {
-        name: (folder / name).read_bytes()
-        for name in ("plan.json", "manifest.csv", "instances.csv")
-    }
-
-    def make(draw: Random) -> tuple[str, bytes]:
-        name = draw.choice(list(whole))
-        if name == "plan.json" and draw.random() < 0.7:
-            return name, json.dumps(damaged_values(bench, draw, json.loads(whole[name]))).encode()
-        return name, bench.damage(draw, whole[name])
-
-    def attempt(given: tuple[str, bytes]) -> None:
-        for name, data in (whole | dict([given])).items():
-            (folder / name).write_bytes(data)
-        Plan(folder).instance(0)
-
-    bench.run("prepared plans", make, attempt, share=2.0)

@@ -126,14 +126,6 @@ def moments(draw: Random) -> list[float]:
     return [round(draw.uniform(0.0, 1.1), 3) for _ in range(draw.choice((1, 1, 3)))]
 
 
-def test_prepare(bench: Any, corpus: Path) -> None:
-    options = ["--noise", str(corpus / "noise"), "--write", "--jobs", "1"]
-    command = Command(["prepare", str(corpus / "speech"), *options], corpus)
-    bench.run("kills of prepare --write", moments, command.killed, share=0.2)
-    bench.run("two prepares at once", moments, command.twice, share=0.2)
-    bench.run("prepare --write on a full disk", share_of_a_disk, command.filled, share=0.2)
-
-
 def test_haspi_report(bench: Any, corpus: Path) -> None:
     pytest.importorskip("matplotlib")
     words = ["haspi-report", "--audiogram", "N3", "--jobs", "1", "--listen", "1"]

@@ -15,8 +15,7 @@ from hlsim.cli.main import main
 CALLS = {  # of each command one whose values may be replaced; most of them end early, for want of files
     "simulate": "IN out.wav --audiogram N3 --simulator msbg --full-scale-spl 94",
     "compensate": "IN out.wav --audiogram N3 --compensator nalr --full-scale-spl 94",
-    "prepare": "speech --out new --jobs 1 --layout folder --ears 1 --severities mild=1 --level 65 --rate 16000 "
-    "--test-share 0.4 --valid-share 0.1 --shortest 0.5 --seed 0",
+    "prepare": "speech --out new.csv --folders speaker --valid-share 0.1",
     "haspi-report": "--manifest m.csv --out new --measures haspi --jobs 1 --spl 65 --listen 0 --seed 0 --audiogram N3",
     "train-compensator": "--speech empty --out new --max-steps 1 --device cpu --audiogram N3",
     "train-simulator": "--config r.yaml --speech empty --out new --max-steps 1 --device cpu --teacher msbg",
@@ -26,7 +25,6 @@ CALLS = {  # of each command one whose values may be replaced; most of them end 
 ASIDE = re.compile(r"^\d+ of \d+ |: warning: ")
 LEFT = {
     "scores.jsonl",
-    "faults.csv",
     "lock",
 }  # reports that a refusal names, and what a claim leaves
 
@@ -113,17 +111,12 @@ TABLE: list[tuple[dict[str, str], str, str]] = [
     ({}, "simulate loop out.wav --audiogram N3", "loop: no such file"),
     ({}, "simulate speech loop --audiogram N3", "loop: not a folder"),
     ({}, "compensate speech/s0/0.wav loop/o.wav --audiogram N3", "loop: no such folder"),
-    ({}, "prepare loop --out new", "loop: no such folder"),
-    ({}, "prepare speech --root loop --out new", "loop: no such folder"),
-    ({}, "prepare speech --out loop", "loop: not a folder"),
+    ({}, "prepare loop --out new.csv", "loop: no such folder"),
+    ({}, "prepare speech --out new", "choose a name that ends in .csv"),
+    ({"t.csv": "path\nloop.wav\n"}, "prepare t.csv --out new.csv", "loop.wav, is not in"),
     (
-        {"t.csv": "file\nloop.wav\n"},
-        "prepare speech --table t.csv --jobs 1 --out new",
-        "can be used; ",
-    ),
-    (
-        {"t.csv": "file\na\0.wav\n"},
-        "prepare speech --table t.csv --out new",
+        {"t.csv": "path\na\0.wav\n"},
+        "prepare t.csv --out new.csv",
         "t.csv, line 2: holds a null character",
     ),
     ({}, "compensate speech out --audiogram N3 --compensator loop", "no checkpoint 'loop'"),

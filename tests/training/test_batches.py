@@ -1,167 +1,173 @@
-"""Training from a manifest: on the fly, prepared and resumed, with the wait for data in the log."""
+"""Batches: each a function of seed, step and rank, drawn from folders or from a manifest alike."""
 
-import shutil
+import itertools
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
+from torch import Tensor
 
 from hlsim.audio import write_audio
 
 pytest.importorskip("lightning")
 
 from hlsim.cli.main import main
-from hlsim.data.instances import Instance
-from hlsim.data.plan import prepare
-from hlsim.data.plan_settings import PlanSettings
-from hlsim.data.writing import Recipe, write_instances
-from hlsim.pretrained import load_pretrained
-from hlsim.training.batches import PlannedData, PlannedSource
-from hlsim.training.recipes import SimulatorRecipe
-from hlsim.training.simulator import SimulatorTraining, train_simulator
+from hlsim.training.batches import TrainingData, compensator_data, simulator_data
+from hlsim.training.corpora.manifest import Utterance, write_manifest
+from hlsim.training.data_module import BatchData, Step, Steps
+from hlsim.training.recipes import CompensatorRecipe, SimulatorRecipe
+from hlsim.training.simulator import train_simulator
 
-TINY = {
-    "model": {"channels": 4, "blocks": 1, "stride": [4, 3], "kernel": [3, 3]},
-    "batch": 2,
-    "seconds": 0.25,
-    "validate_every": 4,
-    "validation_items": 8,
-}
+TINY = SimulatorRecipe(
+    model={"channels": 4, "blocks": 1, "stride": [4, 3], "kernel": [3, 3]},
+    batch=2,
+    seconds=0.25,
+    validate_every=4,
+    validation_items=8,
+)
+HUM_HZ = 1000.0
+
+
+def hum(samples: int) -> Tensor:
+    return 0.1 * torch.sin(2 * torch.pi * HUM_HZ / 16000 * torch.arange(samples))
 
 
 @pytest.fixture
-def plan(tmp_path: Path) -> Path:
-    """Five speakers of noise-like speech, with a validation split."""
-    generator = torch.Generator().manual_seed(0)
-    for i in range(10):
-        folder = tmp_path / "speech" / f"s{i % 5}"
-        folder.mkdir(parents=True, exist_ok=True)
-        wave = torch.randn(9600, generator=generator) * torch.linspace(0, 0.1, 9600)
-        write_audio(folder / f"{i}.wav", wave, 16000)
-    prepare(PlanSettings(tmp_path / "speech", valid_share=0.2), tmp_path / "plan", jobs=1)
-    return tmp_path / "plan"
+def manifest(tmp_path: Path) -> Path:
+    """Pairs of noise-like speech and the same with a hum, of four speakers, one of them to validate on."""
+    rows = []
+    for number, split in enumerate(("train", "train", "train", "valid")):
+        clean = torch.randn(9600) * torch.linspace(0, 0.1, 9600)
+        for kind, signal in (("clean", clean), ("noisy", clean + hum(9600))):
+            (tmp_path / kind).mkdir(exist_ok=True)
+            write_audio(tmp_path / kind / f"{number}.wav", signal, 16000)
+        speaker = f"s{number}"
+        rows.append(Utterance(f"clean/{number}.wav", f"noisy/{number}.wav", speaker, split))
+    write_manifest(tmp_path / "manifest.csv", rows)
+    return tmp_path / "manifest.csv"
 
 
-def train(source: PlannedSource, out: Path, steps: int) -> list[str]:
+def share_of_hum(signals: Tensor) -> Tensor:
+    """Share of the power that is at the frequency of the hum. Shape: (items, time) -> (items,)."""
+    spectrum = torch.fft.rfft(signals).abs().square()
+    place = round(HUM_HZ / 16000 * signals.shape[-1])
+    return spectrum[:, place - 2 : place + 3].sum(-1) / spectrum.sum(-1)
+
+
+def test_the_noise_of_a_manifest_is_noisy_minus_clean(manifest: Path) -> None:
+    data = TrainingData.from_manifest(manifest)
+    batches = simulator_data(data, TINY)
+    noise = batches.training.noise.draw(4, torch.Generator())  # type: ignore[attr-defined]
+    assert float(share_of_hum(noise).min()) > 0.999
+    recipe = CompensatorRecipe(batch=40, noisy=0.5, snr=(-10.0, -10.0), sounds=0.0, equalised=0.0)
+    signals = compensator_data(data, recipe, None).training[Step(0)]["signal"]
+    noisy = share_of_hum(signals) > 0.5
+    assert 8 < int(noisy.sum()) < 32 and float(share_of_hum(signals[~noisy]).max()) < 0.1
+
+
+def test_a_manifest_and_folders_of_the_same_files_draw_the_same(manifest: Path) -> None:
+    listed = TrainingData.from_manifest(manifest, noise=manifest.parent / "noisy")
+    folder = TrainingData(
+        [manifest.parent / "clean" / f"{number}.wav" for number in range(3)],
+        noise=manifest.parent / "noisy",
+    )
+    first, second = (simulator_data(data, TINY).training[Step(5)] for data in (listed, folder))
+    for name, values in first.items():
+        assert torch.equal(values, second[name])
+
+
+def test_a_batch_depends_on_seed_step_and_rank_alone(manifest: Path) -> None:
+    data = TrainingData.from_manifest(manifest)
+    training = simulator_data(data, TINY).training
+    again = simulator_data(data, TINY).training
+    order = [Step(3), Step(0), Step(3, 1, 2), Step(1)]
+    signals = {step: training[step]["signal"] for step in order}
+    for step in reversed(order):
+        assert torch.equal(signals[step], again[step]["signal"])
+    for one, other in itertools.combinations(order, 2):
+        assert not torch.equal(signals[one], signals[other])
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_a_loader_gives_the_steps_in_order_and_continues(manifest: Path, workers: int) -> None:
+    data = simulator_data(TrainingData.from_manifest(manifest, workers=workers), TINY)
+    loader = data.train_dataloader()
+    drawn = list(itertools.islice(loader, 3)) + list(itertools.islice(loader, 2))
+    for step, batch in enumerate(drawn):
+        assert torch.equal(batch["signal"], data.training[Step(step)]["signal"])
+    assert data.loader.waited > 0.0
+
+
+def test_steps_of_a_process_are_its_own() -> None:
+    steps = itertools.islice(iter(Steps(5, 1, 2)), 2)
+    assert list(steps) == [(5, 1, 2), (6, 1, 2)]
+
+
+def test_the_teacher_fills_in_what_is_missing(manifest: Path) -> None:
+    data = simulator_data(TrainingData.from_manifest(manifest), TINY)
+    (batch,) = data.val_dataloader()
+    assert batch["impaired"].shape == batch["signal"].shape == (8, 32000)
+    drawn = data.on_after_batch_transfer(data.training[Step(0)], 0)
+    assert drawn["impaired"].shape == drawn["signal"].shape
+    kept = data.on_after_batch_transfer(drawn | {"impaired": torch.ones(1)}, 0)
+    assert torch.equal(kept["impaired"], torch.ones(1))
+    assert "impaired" not in BatchData(data.training).on_after_batch_transfer({"signal": kept}, 0)
+
+
+def test_validation_is_on_other_speech_or_says_that_it_is_not(manifest: Path) -> None:
+    data = TrainingData.from_manifest(manifest)
+    valid = data.validation()
+    assert valid.speech == [manifest.parent / "clean" / "3.wav"]
+    assert valid.noise == [
+        (manifest.parent / "clean" / "3.wav", manifest.parent / "noisy" / "3.wav")
+    ]
+    rows = manifest.read_text().replace("valid", "train")
+    manifest.write_text(rows)
+    with pytest.warns(UserWarning, match="validation is on training speech"):
+        data = TrainingData.from_manifest(manifest)
+    assert data.validation().speech == data.speech
+    manifest.write_text(rows.replace("train", "test"))
+    with pytest.raises(ValueError, match="no row has the split 'train'"):
+        TrainingData.from_manifest(manifest)
+
+
+def test_other_files_are_another_training(manifest: Path) -> None:
+    data = TrainingData.from_manifest(manifest)
+    assert data.identity() == TrainingData.from_manifest(manifest, workers=3).identity()
+    assert len(str(data.identity())) < 1000
+    other = TrainingData(data.speech[:-1], data.noise)  # type: ignore[index]
+    assert data.identity()["speech"] != other.identity()["speech"]
+
+
+def test_a_simulator_is_trained_on_a_manifest(manifest: Path, tmp_path: Path) -> None:
     lines: list[str] = []
     train_simulator(
-        source,
-        SimulatorRecipe.from_dict(TINY),
-        out=out,
-        max_steps=steps,
+        TrainingData.from_manifest(manifest),
+        TINY,
+        out=tmp_path / "out",
+        max_steps=4,
         accelerator="cpu",
         progress=False,
         report=lines.append,
     )
-    return lines
+    assert "valid_snr_median" in lines[0]
 
 
-def state(out: Path) -> dict[str, Any]:
-    loaded: dict[str, Any] = torch.load(out / "last.ckpt", weights_only=True)
-    return loaded
-
-
-def test_stopped_and_resumed_is_as_good_as_uninterrupted(plan: Path, tmp_path: Path) -> None:
-    source = PlannedSource(plan / "manifest.csv", workers=0)
-    lines = train(source, tmp_path / "whole", 8)
-    assert [line.split(",")[0] for line in lines] == ["step 4", "step 8", "step 8"]
-    assert all(word in lines[0] for word in ("data_wait 0.", "valid_snr_median", "loss"))
-    train(source, tmp_path / "parts", 4)
-    train(source, tmp_path / "parts", 8)
-    first, second = (state(tmp_path / name)["state_dict"] for name in ("whole", "parts"))
-    for name, values in first.items():
-        torch.testing.assert_close(second[name], values, rtol=1e-4, atol=1e-6)
-    load_pretrained(tmp_path / "whole" / "checkpoint")
-
-
-def test_prepared_instances_train_too(plan: Path, tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="no instances of this plan"):
-        train(PlannedSource(plan, prepared=True), tmp_path / "out", 1)
-    assert not (tmp_path / "out").exists()
-    write_instances(plan, Recipe(), jobs=1)
-    assert len(train(PlannedSource(plan, prepared=True, workers=0), tmp_path / "out", 4)) == 2
-
-
-def test_prepared_validation_is_on_what_lies_on_disk_and_needs_no_corpus(
-    plan: Path, tmp_path: Path
+def test_options_that_exclude_each_other(
+    manifest: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    write_instances(plan, Recipe(alignment="impulse"), jobs=1)
-    (tmp_path / "speech").rename(tmp_path / "gone")
-    source = PlannedSource(plan, prepared=True, workers=0)
-    data = PlannedData(source, SimulatorRecipe.from_dict(TINY))
-    (batch,) = data.val_dataloader()
-    opened = data.plan
-    for place, index in enumerate(opened.indices("valid").tolist()):
-        stored = Instance.read(opened.path(index))
-        assert stored.impaired is not None
-        for cut, whole in (
-            (batch["signal"][place], stored.signal),
-            (batch["impaired"][place], stored.impaired),
-        ):
-            assert torch.equal(cut[:9600], whole) and not bool(cut[9600:].any())  # shorter than 2 s
-    examples = SimulatorTraining(SimulatorRecipe.from_dict(TINY)).examples(batch)
-    assert torch.equal(examples["heard/truth"], batch["impaired"][-1])
-    train(source, tmp_path / "out", 1)
-
-
-def test_another_plan_in_the_same_folder_is_another_training(plan: Path, tmp_path: Path) -> None:
-    source = PlannedSource(plan, workers=0)
-    train(source, tmp_path / "out", 1)
-    prepare(PlanSettings(tmp_path / "speech", valid_share=0.2, seed=1), plan, jobs=1)
-    with pytest.raises(ValueError, match=r"another recipe \(other instances; see recipe.json\)"):
-        train(source, tmp_path / "out", 2)
-    for name in ("structural", "impulse"):
-        shutil.rmtree(plan / "instances", ignore_errors=True)
-        write_instances(plan, Recipe(name), jobs=1)
-        prepared = PlannedSource(plan, prepared=True, workers=0)
-        if name == "structural":
-            train(prepared, tmp_path / "prepared", 1)
-    with pytest.raises(ValueError, match=r"another recipe \(other instances; see recipe.json\)"):
-        train(prepared, tmp_path / "prepared", 2)
-
-
-def test_the_validation_split_is_used(plan: Path) -> None:
-    data = PlannedData(PlannedSource(plan, workers=0), SimulatorRecipe.from_dict(TINY))
-    assert [(len(batch["signal"]), batch["thresholds"].shape) for batch in data.validation] == [
-        (4, (4, 8))
-    ]
-    opened = data.plan
-    expected = torch.stack([opened.thresholds(int(index)) for index in opened.indices("valid")])
-    assert torch.equal(data.validation[0]["thresholds"], expected)
-
-
-def test_a_plan_has_no_sounds_but_its_own(plan: Path) -> None:
-    recipe = SimulatorRecipe.from_dict(TINY | {"sounds": 0.1})
-    with pytest.raises(ValueError, match=r"sounds 0\.1 in the recipe, with a manifest; allowed: 0"):
-        PlannedData(PlannedSource(plan, workers=0), recipe)
-
-
-def test_a_plan_without_a_validation_split_says_what_it_is_chosen_on(
-    plan: Path, tmp_path: Path
-) -> None:
-    prepare(PlanSettings(tmp_path / "speech"), tmp_path / "other", jobs=1)
-    with pytest.warns(UserWarning, match="chosen on 'test'"):
-        PlannedData(PlannedSource(tmp_path / "other", workers=0), SimulatorRecipe.from_dict(TINY))
-
-
-def test_bad_calls(plan: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     recipe = tmp_path / "recipe.yaml"
     recipe.write_text("batch: 2\n")
     call = ["train-simulator", "--config", str(recipe), "--out", str(tmp_path / "out")]
-    for options, said in (
-        ([], "nothing to train on; allowed: --speech, a folder, or --manifest"),
-        (
-            ["--speech", "s", "--root", "r", "--workers", "0"],
-            "--root, --workers without --manifest",
-        ),
-        (["--speech", "s", "--prepared"], "--prepared without --manifest; allowed: with it alone"),
-        (["--manifest", str(plan), "--noise", "n"], "--manifest with --noise"),
-        (["--manifest", str(tmp_path / "manifest.csv")], "not prepared"),
+    for options in (
+        [],
+        ["--speech", "s", "--manifest", str(manifest)],
+        ["--manifest", str(manifest), "--valid-speech", "v"],
+        ["--speech", str(tmp_path), "--root", "r"],
+        ["--manifest", str(tmp_path / "none.csv")],
     ):
-        assert main([*call, *options]) == 2
-        error = capsys.readouterr().err.strip()
-        assert len(error.splitlines()) == 1 and said in error
-    prepare(PlanSettings(tmp_path / "speech", rate=22050), tmp_path / "fast", jobs=1)
-    assert main([*call, "--manifest", str(tmp_path / "fast")]) == 2
-    assert "prepared at 22050 Hz; allowed: 16000" in capsys.readouterr().err
+        try:
+            status = main([*call, *options])
+        except SystemExit as end:
+            status = int(str(end.code))
+        assert status == 2 and len(capsys.readouterr().err.splitlines()) == 1

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from hlsim.audio import read_audio, write_audio
-from hlsim.training.clips import Clips
+from hlsim.training.clips import Clips, NoiseOfPairs
 
 
 def folder_with(tmp_path: Path, **waves: Tensor) -> Path:
@@ -65,7 +65,7 @@ def test_drawing_depends_on_the_generator_and_reaches_all(speech_dir: Path) -> N
     assert torch.equal(first, again.draw(40, torch.Generator().manual_seed(1)))
     assert not torch.equal(first, clips.draw(40, torch.Generator().manual_seed(2)))
     assert float(first.abs().max()) <= 1.0
-    assert len({index for index in clips._kept}) > 10  # of the 14 recordings
+    assert len({index for index in clips._recordings}) > 10  # of the 14 recordings
 
 
 def test_no_drawn_clip_is_silent(tmp_path: Path) -> None:
@@ -80,16 +80,17 @@ def test_no_drawn_clip_is_silent(tmp_path: Path) -> None:
 def test_drawing_ends_where_all_clips_are_silent_or_empty(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("hlsim.training.clips._SILENT_TRIES", 300)
+    monkeypatch.setattr("hlsim.training.clips.MAX_SILENT_CLIPS", 300)
     wave = torch.zeros(40000)
     wave[-1] = 1.0  # of 24,001 places only the last reaches it
     folder = folder_with(tmp_path, a=wave)
     with pytest.raises(
-        ValueError, match=r"a.wav: 300 clips in a row were silent, this one the last; leave"
+        ValueError,
+        match=r"a.wav: 300 clips in a row were silent, the last of them in this file; remove",
     ) as caught:
         Clips(folder, sample_rate=16000, seconds=1.0).draw(1, torch.Generator().manual_seed(0))
     assert "\n" not in str(caught.value)
-    with pytest.raises(ValueError, match=r"clips of 1e-05 s; allowed: a sample or more, "):
+    with pytest.raises(ValueError, match=r"clips of 1e-05 s have no samples"):
         Clips(folder, sample_rate=16000, seconds=1e-5)
 
 
@@ -98,6 +99,33 @@ def test_recordings_are_decoded_once(tmp_path: Path) -> None:
     before = clips.clip(0, 0.0)
     (tmp_path / "a.wav").unlink()
     assert torch.equal(clips.clip(0, 0.0), before)
+
+
+def test_memory_is_limited_and_changes_no_draw(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = folder_with(tmp_path, a=ramp(2000), b=-ramp(3000), c=ramp(4000))
+    unlimited = Clips(folder, sample_rate=16000, seconds=0.1)
+    expected = unlimited.draw(20, torch.Generator().manual_seed(3))
+    assert len(unlimited._recordings) == 3
+    monkeypatch.setattr("hlsim.training.clips.MAX_SAMPLES_IN_MEMORY", 5000)
+    limited = Clips(folder, sample_rate=16000, seconds=0.1)
+    assert torch.equal(limited.draw(20, torch.Generator().manual_seed(3)), expected)
+    assert sum(map(len, limited._recordings.values())) <= 5000
+
+
+def test_noise_of_pairs_is_noisy_minus_clean(tmp_path: Path) -> None:
+    noise = 0.1 * torch.randn(4000)
+    for name, clean in (("a", ramp(4000)), ("b", -ramp(4000))):
+        write_audio(tmp_path / f"{name}.wav", clean, 16000)
+        write_audio(tmp_path / f"{name} noisy.wav", clean + noise, 16000)
+    write_audio(tmp_path / "c.wav", ramp(3999), 16000)
+    pairs = [(tmp_path / f"{a}.wav", tmp_path / f"{b} noisy.wav") for a, b in ("aa", "bb", "cb")]
+    clips = NoiseOfPairs(pairs, sample_rate=16000, seconds=0.25)
+    with pytest.warns(UserWarning, match=r"b noisy.wav: 4000 samples .* has 3999"):
+        drawn = clips.draw(20, torch.Generator().manual_seed(0))
+    for clip in drawn:
+        torch.testing.assert_close(clip, noise / noise.abs().max(), atol=1e-3, rtol=0)
 
 
 def test_what_is_refused_names_the_path(tmp_path: Path) -> None:
@@ -110,7 +138,7 @@ def test_what_is_refused_names_the_path(tmp_path: Path) -> None:
     with (
         pytest.warns(UserWarning, match="left out: .*bad.wav"),
         pytest.raises(
-            ValueError, match=r"not readable as audio.*; 100 files like it were drawn"
+            ValueError, match=r"not readable as audio.*; 100 files that cannot be used"
         ) as caught,
     ):
         Clips(tmp_path, sample_rate=16000, seconds=1.0).draw(1, torch.Generator())

@@ -8,11 +8,11 @@ import torch
 
 from compensators import HearingAid, MappingCompensator, load_compensator
 from hlsim import Audiogram
-from hlsim.data.module import Batch
 from hlsim.neuro import NeuroConfig, NeuroMSBG
 from hlsim.pretrained import CONFIG, save_checkpoint
 from hlsim.training.batches import CompensatorBatches, TrainingData, compensator_data
 from hlsim.training.compensator import CompensatorTraining, train_compensator
+from hlsim.training.data_module import Batch
 from hlsim.training.recipes import CompensatorRecipe
 
 SMALL = {
@@ -306,6 +306,6 @@ def test_bad_recipes(settings: dict[str, object], message: str) -> None:
 def test_noise_is_not_learned_from_none(speech_dir: Path, settings: dict[str, object]) -> None:
     recipe = CompensatorRecipe.from_dict({"kind": "hearing-aid", "seconds": 1.0, **settings})
     with pytest.raises(
-        ValueError, match=r"no noise, and the recipe.s [a-z]+ is for it; allowed: --noise DIR"
+        ValueError, match=r"the recipe has [a-z]+, which requires noise; give a folder of noise"
     ):
         compensator_data(TrainingData(speech_dir / "train"), recipe, None)

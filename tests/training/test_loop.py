@@ -14,8 +14,8 @@ from torch import Tensor
 
 pytest.importorskip("lightning")
 
-from hlsim.data.module import Batch, BatchData
 from hlsim.training.batches import DrawnBatches
+from hlsim.training.data_module import Batch, BatchData
 from hlsim.training.loop import run
 from hlsim.training.module import ScheduledModule
 from hlsim.training.state import BEST, CHECKPOINT, LAST

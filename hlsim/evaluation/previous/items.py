@@ -15,12 +15,14 @@ from compensators.nalr import NALR
 from hlsim.audiogram import Audiogram
 from hlsim.audiogram.table import read_audiograms
 from hlsim.calibration import level_spl, set_level
-from hlsim.data.plan_settings import TEST_SNRS_DB
 from hlsim.evaluation.previous.keys import samples_hash
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.training.augment import compress, mix
 from hlsim.training.clips import Clips
 from hlsim.training.ears import MILDER, draw_thresholds
+
+TEST_SNRS_DB = (2.5, 7.5, 12.5, 17.5)
+"""Signal-to-noise ratios in dB of VoiceBank-DEMAND's test set."""
 
 LEVELS = (50.0, 60.0, 65.0, 70.0, 80.0)
 """Levels in dB SPL that the items for simulators take in turn."""

@@ -15,7 +15,6 @@ from torch import Tensor, nn
 
 from hlsim.audiogram import SEVERITIES
 from hlsim.data.foreign import ForeignTeacher
-from hlsim.data.teacher import Reference, find_teacher
 from hlsim.evaluation.previous.items import LEVELS, Input, Item, draw_items, treat
 from hlsim.evaluation.previous.keys import weights_hash
 from hlsim.evaluation.statistics import paired_comparison
@@ -35,6 +34,7 @@ from hlsim.metrics.registry import version_of, versions_of
 from hlsim.msbg import MSBG
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.parallel import Failed, Progress, make_missing, reason_of
+from hlsim.training.teacher import Reference, find_teacher
 
 _SCORES = ("snr", "raw_mse", "band_error", "stoi_true", "stoi_sim", "pesq_true", "pesq_sim")
 _KINDS = ("severity", "level", "condition")

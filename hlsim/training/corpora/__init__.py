@@ -1,0 +1,1 @@
+"""Corpora of speech: their layouts, manifests and training instances."""

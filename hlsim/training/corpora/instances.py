@@ -1,0 +1,105 @@
+"""The paper's training instances: every utterance of a corpus, clean and noisy, for several ears."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Sequence
+from itertools import cycle, islice
+from pathlib import Path
+from typing import Literal
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+from torch.utils.data import Dataset
+
+from hlsim.audio import read_audio
+from hlsim.audiogram import Audiogram
+from hlsim.calibration import PASCAL_SPL
+from hlsim.dsp.active_level import active_level_db
+from hlsim.dsp.resample import resample
+from hlsim.neuro.config import NEURO_RATE
+from hlsim.training.clips import read_noisy
+from hlsim.training.corpora.manifest import Utterance
+from hlsim.training.ears import draw_thresholds
+from hlsim.training.teacher import Teacher
+
+Input = Literal["clean", "noisy"]
+SEVERITIES = ("mild", "moderate", "severe")  # "ranging from mild to severe"
+EARS_PER_UTTERANCE = 2
+
+
+class Instances(Dataset[dict[str, Tensor]]):
+    """Instances of utterances, at 16 kHz and 65 dB SPL active speech level, each computed when it is asked for.
+
+    Each utterance has two ears, and for each ear one instance of its clean version and one of its noisy version, if there
+    is one. An instance has ``impaired``, the output of the exact MSBG; ``clean``, the reference, and ``signal``, the
+    normal-hearing input, aligned with it; each (time,) in pascals; and ``thresholds``, (8,) dB HL.
+
+    Args:
+        utterances: rows of a manifest, usually those of one split.
+        root: folder that their paths are relative to.
+        ears: audiograms that the utterances take in turn, two each, such as those of ``draw_ears``.
+        level: active level of the clean speech in dB SPL.
+    """
+
+    def __init__(
+        self,
+        utterances: Sequence[Utterance],
+        root: str | Path,
+        ears: Sequence[Audiogram],
+        *,
+        level: float = 65.0,
+    ) -> None:
+        self.root = Path(root)
+        self.level = level
+        self.teacher = Teacher(NEURO_RATE)
+        self.items: list[tuple[Utterance, Audiogram, Input]] = []
+        turns = cycle(ears)
+        for utterance in utterances:
+            inputs: Sequence[Input] = ("clean", "noisy") if utterance.noisy else ("clean",)
+            for ear in islice(turns, EARS_PER_UTTERANCE):
+                self.items += [(utterance, ear, name) for name in inputs]
+
+    def __len__(self) -> int:
+        return len(self.items)
+
+    def __getitem__(self, index: int) -> dict[str, Tensor]:
+        utterance, ear, name = self.items[index]
+        thresholds = torch.tensor(ear.thresholds)
+        clean, noisy = self.read(utterance)
+        signal = clean if name == "clean" else noisy
+        # lengths in steps of 0.5 s: MSBG computes new filters for each length
+        padding = -len(signal) % (NEURO_RATE // 2)
+        padded = functional.pad(signal, (0, padding))
+        impaired = self.teacher(padded[None], thresholds[None])[0, : len(signal)]
+        return {"clean": clean, "signal": signal, "impaired": impaired, "thresholds": thresholds}
+
+    def read(self, utterance: Utterance) -> tuple[Tensor, Tensor]:
+        """Clean and noisy speech at the level of the instances. Shape: -> (time,) twice."""
+        clean, rate = read_audio(self.root / utterance.path)
+        noisy = clean
+        if utterance.noisy:
+            noisy = read_noisy(self.root / utterance.noisy, clean, rate)
+        gain_db = self.level - PASCAL_SPL - active_level_db(clean[0], rate)
+        pair = torch.stack((clean[0], noisy[0])) * 10.0 ** (gain_db / 20.0)
+        clean, noisy = resample(pair, rate, NEURO_RATE)
+        return clean, noisy
+
+
+def draw_ears(count: int, split: str, seed: int = 0) -> list[Audiogram]:
+    """Random ears with mild, moderate and severe losses in turn; no ear of the test split is in another split."""
+    generator = torch.Generator().manual_seed(seed * 1_000_003 + zlib.crc32(split.encode()))
+    waiting: dict[str, list[Audiogram]] = {severity: [] for severity in SEVERITIES}
+    ears: list[Audiogram] = []
+    while len(ears) < count:
+        severity = SEVERITIES[len(ears) % len(SEVERITIES)]
+        if waiting[severity]:
+            ears.append(waiting[severity].pop())
+            continue
+        for levels in draw_thresholds(256, generator) + 0.0:  # no negative zeros
+            ear = Audiogram(tuple(levels.tolist()))
+            for_test = zlib.crc32(levels.numpy().tobytes()) % 3 == 0
+            if ear.severity in waiting and for_test == (split == "test"):
+                waiting[ear.severity].append(ear)
+    return ears

@@ -1,0 +1,277 @@
+"""Layouts of corpora: each is recognised for what it is, and anything else is rejected, whatever it is called."""
+
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from hlsim.training.corpora.layouts import (
+    Corpus,
+    find_corpus,
+    hold_out_speakers,
+    prepare,
+    recognise,
+)
+from hlsim.training.corpora.manifest import Utterance, check_utterances, read_manifest
+
+Tree = Callable[..., Path]
+
+
+def voicebank(suffix: str = "", within: str = "", train: str = "trainset_28spk") -> list[str]:
+    """Three utterances in the layout of VoiceBank-DEMAND."""
+    names = {train: ("p226_001", "p227_001"), "testset": ("p232_001",)}
+    return [
+        f"{within}{kind}_{part}_wav{suffix}/{name}.wav"
+        for kind in ("clean", "noisy")
+        for part, stems in names.items()
+        for name in stems
+    ]
+
+
+def splits_and_speakers(utterances: list[Utterance]) -> list[tuple[str, str, str]]:
+    return sorted((row.split, row.speaker, Path(row.path).stem) for row in utterances)
+
+
+@pytest.fixture
+def tree(tmp_path: Path) -> Tree:
+    """Make a corpus of empty files."""
+
+    def make(*files: str) -> Path:
+        for file in files:
+            path = tmp_path / "corpus" / file
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.touch()
+        return tmp_path / "corpus"
+
+    return make
+
+
+@pytest.mark.parametrize(
+    "files",
+    [
+        voicebank(),
+        voicebank("_16k"),
+        voicebank("_48k"),
+        voicebank("_16k", within="DS_10283_2791/"),
+        voicebank(train="trainset_56spk"),
+        voicebank("_16k", train="trainset"),
+        [f"{name.split('/')[0]}/{name}" for name in voicebank()],
+    ],
+    ids=["48 kHz", "16k", "48k", "one folder deeper", "56 speakers", "trainset", "folders doubled"],
+)
+def test_voicebank_demand_is_recognised(files: list[str]) -> None:
+    layout, utterances = recognise(files)
+    assert layout == "VoiceBank-DEMAND"
+    assert splits_and_speakers(utterances) == [
+        ("test", "p232", "p232_001"),
+        ("train", "p226", "p226_001"),
+        ("train", "p227", "p227_001"),
+    ]
+    for row in utterances:
+        assert row.noisy == row.path.replace("clean_", "noisy_")
+
+
+def test_voicebank_demands_names_give_the_papers_number_of_utterances() -> None:
+    numbers = {"trainset_28spk": 11_572, "testset": 824}
+    speakers = {"trainset_28spk": 28, "testset": 2}
+    files = [
+        f"{kind}_{part}_wav/p{start + number % speakers[part]}_{number:05d}.wav"
+        for kind in ("clean", "noisy")
+        for part, start in (("trainset_28spk", 226), ("testset", 400))
+        for number in range(numbers[part])
+    ]
+    _, utterances = recognise(files)
+    assert Counter(row.split for row in utterances) == {"train": 11_572, "test": 824}
+    text = Corpus("VoiceBank-DEMAND", utterances, Counter(), Counter()).to_text()
+    assert text.splitlines()[2:] == [
+        "train        28       11572  11572",
+        "test          2         824    824",
+    ]
+
+
+@pytest.mark.parametrize(
+    "files",
+    [
+        [name for name in voicebank("_16k") if "noisy_test" not in name],
+        [name for name in voicebank() if name != "noisy_testset_wav/p232_001.wav"],
+        [*voicebank(), "clean_valset_wav/p1_001.wav", "noisy_valset_wav/p1_001.wav"],
+        [*voicebank(), *voicebank("_16k")],
+        [*voicebank(), "noise/bus/1.wav"],
+        [*voicebank(), "clean_testset_wav/speech.wav", "noisy_testset_wav/speech.wav"],
+    ],
+    ids=["no noisy folder", "a file lacks", "another set", "both rates", "noise", "another name"],
+)
+def test_what_is_not_exactly_voicebank_demand_is_rejected(files: list[str]) -> None:
+    with pytest.raises(ValueError, match=r"move it away|complete them"):
+        recognise(files)
+
+
+@pytest.mark.parametrize("within", ["", "LibriSpeech/"])
+def test_librispeech_and_libritts_are_recognised(within: str) -> None:
+    files = [
+        "train-clean-100/103/1240/a.flac",
+        "train-other-500/20/205/b.flac",
+        "dev-clean/84/1/c.wav",
+    ]
+    files.append("test-other/367/1/d.flac")
+    layout, utterances = recognise([within + file for file in files])
+    assert layout == "LibriSpeech or LibriTTS"
+    assert splits_and_speakers(utterances) == [
+        ("test", "367", "d"),
+        ("train", "103", "a"),
+        ("train", "20", "b"),
+        ("valid", "84", "c"),
+    ]
+    for other in ("noise/1.wav", "train-clean-100/a.flac", "1.wav"):
+        with pytest.raises(ValueError, match="is not where LibriSpeech and LibriTTS have files"):
+            recognise([*files, other])
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("train", "val", "test"),
+        ("Training", "validation", "testing"),
+        ("tr", "cv", "tt"),
+        ("train", "dev", "TEST"),
+        ("TRAIN", "eval", "test"),
+        ("train", "valid", "test"),
+    ],
+)
+def test_split_folders_are_recognised_by_any_of_their_names(names: tuple[str, ...]) -> None:
+    files = [f"{name}/speaker{i}/session/1.wav" for i, name in enumerate(names)]
+    for prefix in ("", "corpus/"):
+        _, utterances = recognise([prefix + file for file in files])
+        assert splits_and_speakers(utterances) == [
+            ("test", "speaker2", "1"),
+            ("train", "speaker0", "1"),
+            ("valid", "speaker1", "1"),
+        ]
+
+
+@pytest.mark.parametrize(
+    "other",
+    ["extra/c/1.wav", "training/c/1.wav", "1.wav"],
+    ids=["no split", "second name of a split", "beside the folders"],
+)
+def test_what_is_beside_split_folders_is_rejected(other: str) -> None:
+    with pytest.raises(ValueError, match="move it away"):
+        recognise(["train/a/1.wav", "test/b/1.wav", other])
+
+
+def test_timits_speakers_are_below_its_regions() -> None:
+    _, utterances = recognise(["TRAIN/DR1/FCJF0/SA1.WAV", "TEST/DR1/FAKS0/SA1.WAV"])
+    assert splits_and_speakers(utterances) == [("test", "FAKS0", "SA1"), ("train", "FCJF0", "SA1")]
+
+
+def test_clean_and_noisy_folders_in_splits_are_pairs(tree: Tree) -> None:
+    files = ("train/clean/1.wav", "train/noisy/1.flac", "test/Clean/s/2.wav", "test/Noisy/s/2.wav")
+    corpus = find_corpus(tree(*files, "train/noise/1.wav", "readme.txt"))
+    assert corpus.utterances == [
+        Utterance("test/Clean/s/2.wav", "test/Noisy/s/2.wav", "s", "test"),
+        Utterance("train/clean/1.wav", "train/noisy/1.flac", "", "train"),
+    ]
+    assert corpus.unused_audio == {"train/noise": 1} and corpus.other_files == {".txt": 1}
+    assert corpus.to_text().splitlines() == [
+        "layout: folders train, valid, test",
+        "split  speakers  utterances  pairs",
+        "train   unknown           1      1",
+        "test          1           1      1",
+        "passed over: 1 audio files in train/noise",
+        "passed over: 1 other files, .txt",
+    ]
+    for extra in ("train/clean/3.wav", "test/noisy/3.wav", "train/mixed/1.wav"):
+        with pytest.raises(ValueError, match=r"complete them|neither clean nor noisy"):
+            recognise([*files, extra])
+
+
+@pytest.mark.parametrize(
+    "files",
+    [
+        ["train-100/mix_clean/a.wav", "train-100/s1/a.wav", "train-100/noise/a.wav"],
+        ["train/mix_both/a.wav", "train/s1/a.wav", "test/mix_both/b.wav"],
+        ["tr/mix/a.wav", "tr/s1/a.wav", "tr/s2/a.wav"],
+        ["clean/clean_fileid_1.wav", "noisy/x_fileid_1.wav", "noise/noise_fileid_1.wav"],
+        ["test/clean/clean_fileid_1.wav", "test/noisy/x_snr5_fileid_1.wav"],
+        ["clean/a.wav", "noise/b.wav"],
+        ["train/noise/a.wav", "train/speech/b.wav"],
+        ["train/noisy/a.wav", "test/noisy/b.wav"],
+        ["clean/a.wav", "noisy/a.wav"],
+        ["id1/session/1.wav", "id2/session/1.wav"],
+        ["train/wav/1.wav", "test/wav/2.wav"],
+        ["train/s1/1.wav", "test/s1/2.wav"],
+    ],
+    ids=[
+        "LibriMix",
+        "LibriMix in split folders",
+        "WSJ0-2mix",
+        "DNS challenge",
+        "DNS challenge in split folders",
+        "clean speech and noise",
+        "noise in a split",
+        "noisy speech alone",
+        "clean and noisy without splits",
+        "speakers without an option",
+        "wav is no speaker",
+        "a speaker in two splits",
+    ],
+)
+def test_any_other_layout_is_rejected_with_the_ways_out(tree: Tree, files: list[str]) -> None:
+    with pytest.raises(
+        ValueError, match=r"list the files in a CSV file .* or say what the folders"
+    ):
+        find_corpus(tree(*files))
+
+
+def test_an_option_says_what_folders_are() -> None:
+    files = ["id1/session1/1.wav", "id1/session2/1.wav", "id2/session1/1.wav"]
+    _, utterances = recognise(files, ["speaker"])
+    assert [row.speaker for row in utterances] == ["id1", "id1", "id2"]
+    _, utterances = recognise(["a/val/s1/1.wav", "b/train/s2/1.wav"], ["-", "split", "speaker"])
+    assert splits_and_speakers(utterances) == [("train", "s2", "1"), ("valid", "s1", "1")]
+    _, utterances = recognise(["clean/s1/1.wav", "noisy/s1/1.wav"], ["condition", "speaker"])
+    assert utterances == [Utterance("clean/s1/1.wav", "noisy/s1/1.wav", "s1", "train")]
+    for folders in (["speakers"], ["speaker", "split"], ["-", "-", "speaker"]):
+        with pytest.raises(ValueError, match=r"write split|is no split|is not in folders"):
+            recognise(files, folders)
+
+
+def test_held_out_speakers_validate_and_no_longer_train() -> None:
+    utterances = [Utterance(f"s{i}/{j}.wav", "", f"s{i}") for i in range(10) for j in range(2)]
+    held_out = hold_out_speakers(utterances, 0.2)
+    check_utterances(held_out)
+    assert held_out == hold_out_speakers(utterances, 0.2)
+    assert Counter(row.split for row in held_out) == {"train": 16, "valid": 4}
+    assert Counter(row.split for row in hold_out_speakers(utterances, 0.01))["valid"] == 2
+    for rows in (held_out, utterances[:2], [Utterance("1.wav"), Utterance("2.wav")]):
+        with pytest.raises(ValueError, match=r"already|none to train|no speakers are known"):
+            hold_out_speakers(rows, 0.2)
+
+
+def test_prepare_writes_what_training_reads(tree: Tree, tmp_path: Path) -> None:
+    corpus = tree(*voicebank("_16k"))
+    prepared = prepare(corpus, tmp_path / "m.csv", valid_share=0.5)
+    assert read_manifest(tmp_path / "m.csv", corpus) == prepared.utterances
+    # a table of one's own is read in the same way, and is not overwritten
+    (corpus / "own.csv").write_text((tmp_path / "m.csv").read_text())
+    assert prepare(corpus / "own.csv", corpus / "manifest.csv").utterances == prepared.utterances
+    (corpus / "notes.csv").write_text("a,b\n")
+    for out in (corpus / "own.csv", corpus / "notes.csv", corpus / "manifest.txt"):
+        with pytest.raises(ValueError, match="choose a"):
+            prepare(corpus / "own.csv", out)
+
+
+def test_links_and_folders_without_audio_are_rejected(tree: Tree, tmp_path: Path) -> None:
+    corpus = tree("train/a/1.wav")
+    (tmp_path / "outside.wav").touch()
+    (tmp_path / "empty").mkdir()
+    (corpus / "train" / "a" / "2.wav").symlink_to(tmp_path / "outside.wav")
+    with pytest.raises(ValueError, match=r"2\.wav is outside"):
+        find_corpus(corpus)
+    (corpus / "train" / "a" / "2.wav").unlink()
+    (corpus / "test").symlink_to(tmp_path / "empty")
+    with pytest.raises(ValueError, match="a link to a folder"):
+        find_corpus(corpus)
+    with pytest.raises(ValueError, match="no audio in it"):
+        find_corpus(tmp_path / "empty")

@@ -1,0 +1,39 @@
+"""Random ears have the variety of measured ones."""
+
+import torch
+
+from hlsim.audiogram import severity_index
+from hlsim.audiogram.thresholds import as_thresholds
+from hlsim.training.ears import draw_thresholds
+
+
+def test_drawn_ears_look_like_measured_ones() -> None:
+    ears = draw_thresholds(20000, torch.Generator().manual_seed(3))
+    assert ears.shape == (20000, 8)
+    assert float(ears.min()) >= -10.0 and float(ears.max()) <= 100.0
+    shares = torch.bincount(severity_index(ears), minlength=4) / len(ears)
+    # the docstring's: 27, 18, 19 and 36 %
+    torch.testing.assert_close(shares, torch.tensor([0.27, 0.18, 0.19, 0.36]), atol=0.015, rtol=0)
+    rounded = (ears % 5.0 == 0.0).all(-1).float().mean()
+    assert 0.73 < float(rounded) < 0.77
+    # high-frequency losses are the rule
+    assert float((ears[:, -2] > ears[:, 0]).float().mean()) > 0.7
+
+
+def test_drawn_ears_are_alike_at_neighbouring_frequencies() -> None:
+    ears = draw_thresholds(5000, torch.Generator().manual_seed(4))
+    correlation = torch.corrcoef(ears.T)
+    neighbours = correlation.diagonal(1)
+    assert float(neighbours.min()) > 0.85
+    assert float(correlation[0, -1]) < float(neighbours.min()) - 0.1
+    # even about a series' own shape: the jump from 3 to 4 kHz is small and its sign varies
+    jump = ears[:, 5] - ears[:, 4]
+    assert float(jump.abs().median()) < 10.0
+
+
+def test_drawing_depends_on_the_generator_alone() -> None:
+    first = draw_thresholds(64, torch.Generator().manual_seed(5))
+    torch.rand(7)
+    assert torch.equal(first, draw_thresholds(64, torch.Generator().manual_seed(5)))
+    assert not torch.equal(first, draw_thresholds(64, torch.Generator().manual_seed(6)))
+    as_thresholds(first)  # every one is fit for a simulator
