@@ -193,18 +193,6 @@ def checked_type(
     return value_of
 
 
-def _read_numbers(text: str) -> tuple[float, ...]:
-    return tuple(float(part) for part in text.split(","))
-
-
-def _read_shares(text: str) -> dict[str, float]:
-    shares = {}
-    for part in text.split(","):
-        name, _, value = part.partition("=")
-        shares[name.strip()] = float(value)
-    return shares
-
-
 _PLUGIN = re.compile(r"\w+(\.\w+)*:\w+")
 
 number = checked_type(float, math.isfinite, "a number such as 65 or 2.5")
@@ -218,16 +206,6 @@ teacher_name = checked_type(
     str,
     lambda text: text in TEACHERS or bool(_PLUGIN.fullmatch(text)),
     f"{', '.join(TEACHERS)} or package.module:name",
-)
-numbers = checked_type(
-    _read_numbers,
-    lambda values: all(math.isfinite(value) for value in values),
-    "numbers separated by commas, such as 0,2.5,5",
-)
-shares = checked_type(
-    _read_shares,
-    lambda shares: all(math.isfinite(value) for value in shares.values()),
-    "severities with a number each, such as mild=1,severe=2",
 )
 
 
