@@ -1,5 +1,6 @@
 """Exported aids give what the stream gives, hop by hop, with the state handed on outside."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +37,7 @@ def test_a_program_gives_what_the_stream_gives(make: Make) -> None:
     assert (torch.cat(found, -1) - whole).abs().max() < 1e-5 * whole.abs().max()
 
 
+@pytest.mark.slow
 @AIDS
 def test_onnxruntime_gives_what_the_stream_gives(make: Make, tmp_path: Path) -> None:
     """A second of steps in level in hops of 4 ms, with sliders that move on the way."""
@@ -66,6 +68,7 @@ def test_onnxruntime_gives_what_the_stream_gives(make: Make, tmp_path: Path) -> 
     assert (torch.cat(found, -1) - whole).abs().max() < 1e-4 * whole.abs().max()
 
 
+@pytest.mark.slow
 def test_a_linked_aid_is_exported_for_two_ears(tmp_path: Path) -> None:
     pytest.importorskip("onnxscript")
     runtime = pytest.importorskip("onnxruntime")
@@ -76,18 +79,23 @@ def test_a_linked_aid_is_exported_for_two_ears(tmp_path: Path) -> None:
     assert session.get_outputs()[0].shape == [2, 64]
 
 
-def test_the_aid_keeps_its_mode_and_what_is_refused(tmp_path: Path) -> None:
+def test_the_aid_keeps_its_mode() -> None:
     aid = HearingAid().train()
     hop_program(aid)
     assert all(module.training for module in aid.modules())
-    with pytest.raises(ValueError, match="at 44100 Hz; allowed: 16000"):
-        hop_program(trained(sample_rate=44100))
-    with pytest.raises(
-        ValueError, match="no slider volume; allowed: noise_reduction, amplification"
-    ):
-        first_inputs(trained(), EAR, volume=1.0)
-    with pytest.raises(ValueError, match=r"there is no folder '.*missing'"):
-        export_aid(trained(), tmp_path / "missing" / "aid.onnx")
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda folder: hop_program(trained(sample_rate=44100)),
+        lambda folder: first_inputs(trained(), EAR, volume=1.0),
+        lambda folder: export_aid(trained(), folder / "missing" / "aid.onnx"),
+    ],
+)
+def test_bad_call_raises_value_error(call: Callable[[Path], object], tmp_path: Path) -> None:
+    with pytest.raises(ValueError):
+        call(tmp_path)
 
 
 def test_every_state_of_an_aid_is_handed_on() -> None:

@@ -154,38 +154,45 @@ def test_batch_equals_its_items(utterance: torch.Tensor) -> None:
     assert model(batch.reshape(3, 1, 12000), ears[:2]).shape == (3, 2, 12000)
 
 
-def test_config_survives_json_and_refuses_nonsense() -> None:
+def test_configuration_survives_json() -> None:
     import json
 
     config = MappingConfig(start=0.4, stride=(1, 2))
     assert MappingConfig.from_dict(json.loads(json.dumps(config.to_dict()))) == config
-    with pytest.raises(ValueError, match="unknown network settings layers"):
-        MappingConfig.from_dict({"layers": 3})
-    for nonsense in (
+
+
+@pytest.mark.parametrize(
+    "setting",
+    [
+        {"layers": 3},
         {"start": "none"},
         {"start": 2.0},
+        {"start": True},
         {"bands": 2},
         {"bands": "a"},
         {"bands": 20.0},
         {"reach_db": None},
-        {"start": True},
         {"limit_spl": 200.0},
-        {"limit_spl": "loud"},
         {"channels": 0},
-    ):
-        with pytest.raises(ValueError, match="allowed"):
-            MappingConfig.from_dict(nonsense)
+        {"fft": 400, "window": 400, "hop": 200},
+        {"phase": "minimum"},
+    ],
+    ids=str,
+)
+def test_bad_setting_raises_value_error(setting: dict[str, Any]) -> None:
+    with pytest.raises(ValueError):
+        MappingConfig.from_dict(setting)
 
 
-def test_hops_that_leave_the_last_samples_to_a_windows_end_are_refused() -> None:
-    with pytest.raises(ValueError, match="hop 200, window 400; allowed: 4 hop <= window"):
-        MappingConfig(fft=400, window=400, hop=200)
-
-
-@pytest.mark.parametrize("config", [5, 0, {}, "small", MappingConfig, NeuroConfig()])
-def test_what_is_no_configuration(config: Any) -> None:
-    with pytest.raises(ValueError, match=r"config is .*; allowed: a MappingConfig"):
+@pytest.mark.parametrize("config", [5, {}, MappingConfig, NeuroConfig()])
+def test_bad_configuration_raises_value_error(config: Any) -> None:
+    with pytest.raises(ValueError):
         MappingCompensator(config)
+
+
+def test_an_ear_beyond_the_range_raises_value_error() -> None:
+    with pytest.raises(ValueError):
+        MappingCompensator(SMALL)(torch.randn(100), Audiogram.standard("N7"))
 
 
 def spectrum_of_a_tone(model: MappingCompensator, hertz: int) -> torch.Tensor:
@@ -219,5 +226,3 @@ def test_phase_stays_or_is_predicted(utterance: torch.Tensor) -> None:
         loud = given.abs() > 0.1 * given.abs().max()
         turned.append((aided * given.conj())[loud].angle().abs().mean().item())
     assert turned[0] < 0.1 < 0.2 < turned[1]
-    with pytest.raises(ValueError, match="phase 'minimum'; allowed: predicted, input"):
-        MappingConfig(phase="minimum")

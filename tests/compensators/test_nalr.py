@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from compensators import NALR, MappingCompensator, MappingConfig
+from compensators import NALR
 from compensators.nalr import nalr_gains_db
 from hlsim import Audiogram
 from hlsim.audiogram import FREQUENCIES
@@ -109,29 +109,26 @@ def test_gradient_is_the_filter_run_backwards_and_finite_on_silence() -> None:
     assert bool(torch.isfinite(gradient).all()) and bool(gradient.any())
 
 
-def test_refuses_what_it_cannot_use() -> None:
-    nalr = NALR()
-    with pytest.raises(ValueError, match="no audiogram"):
-        nalr(torch.randn(100))
-    with pytest.raises(ValueError, match=r"the audiogram is trained, .* allowed: with each call"):
-        NALR(torch.zeros(8, requires_grad=True))
-    with pytest.raises(ValueError, match="broadcast"):
-        nalr(torch.randn(3, 100), torch.zeros(2, 8))
-    with pytest.raises(ValueError, match="16000 to 48000"):
-        NALR(sample_rate=8000)
-    for call in (NALR, lambda ears: nalr(torch.randn(100), ears)):
-        with pytest.raises(ValueError, match=r"121 dB HL; NAL-R takes -10 to 120$"):
-            call(torch.full((8,), 121.0))
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"audiogram": torch.zeros(8, requires_grad=True)},
+        {"audiogram": torch.full((8,), 121.0)},
+        {"sample_rate": 8000},
+        *({"order": order} for order in (221, 2.0, "220", True, 0, 1024)),
+    ],
+    ids=str,
+)
+def test_bad_setting_raises_value_error(options: dict[str, Any]) -> None:
+    with pytest.raises(ValueError):
+        NALR(**options)
 
 
-def test_a_trained_compensator_is_named_where_it_refuses_what_the_prescription_takes() -> None:
-    with pytest.raises(ValueError, match="105 dB HL; MappingCompensator takes -10 to 100"):
-        MappingCompensator(MappingConfig(channels=8, blocks=1))(
-            torch.randn(100), Audiogram.standard("N7")
-        )
-
-
-@pytest.mark.parametrize("order", [221, 2.0, "220", None, True, 0, 1024])
-def test_order_is_an_even_whole_number(order: Any) -> None:
-    with pytest.raises(ValueError, match="allowed: even whole numbers from 2 to 1022"):
-        NALR(order=order)
+@pytest.mark.parametrize(
+    ("samples", "audiogram"),
+    [((100,), None), ((3, 100), torch.zeros(2, 8)), ((100,), torch.full((8,), 121.0))],
+    ids=str,
+)
+def test_bad_call_raises_value_error(samples: tuple[int, ...], audiogram: Any) -> None:
+    with pytest.raises(ValueError):
+        NALR()(torch.randn(samples), audiogram)

@@ -83,14 +83,15 @@ def test_attack_and_release(attack: float, release: float) -> None:
     )
 
 
-def test_by_name_and_what_is_refused() -> None:
+def test_by_name() -> None:
     assert isinstance(load_compensator("wdrc", full_scale_spl=100.0), WDRC)
-    for wrong in (
-        {"bands": 2},
-        {"attack": -1.0},
-        {"release": 0.0},
-        {"knee": 99.0},
-        {"limit_spl": 200.0},
-    ):
-        with pytest.raises(ValueError, match=f"{next(iter(wrong))} is .*; allowed: "):
-            WDRC(**wrong)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    "setting",
+    [{"bands": 2}, {"attack": -1.0}, {"release": 0.0}, {"knee": 99.0}, {"limit_spl": 200.0}],
+    ids=str,
+)
+def test_bad_setting_raises_value_error(setting: dict[str, Any]) -> None:
+    with pytest.raises(ValueError):
+        WDRC(**setting)

