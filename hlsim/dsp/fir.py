@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
-from hlsim.dsp.fft import fft_length, long_irfft, long_rfft
+from hlsim.dsp.fft import fft_length, rfft
 
 BLOCK_POINTS, _HOP = 4096, 3072
 """FFT length of ``filter_blocks``, and samples from block to block."""
@@ -58,8 +58,8 @@ def filter_centred(waveform: Tensor, taps: Tensor) -> Tensor:
         points = (
             1 << (points - 1).bit_length()
         )  # at other lengths onnxruntime is off by 1e-3 to 1e-2
-    product = long_rfft(waveform, points) * long_rfft(taps, points)
-    return long_irfft(product, points)[..., half : half + time]
+    product = rfft(waveform, points) * rfft(taps, points)
+    return torch.fft.irfft(product, points)[..., half : half + time]
 
 
 def filter_blocks(waveform: Tensor, response: Tensor, length: int) -> Tensor:

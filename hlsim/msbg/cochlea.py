@@ -7,7 +7,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from hlsim.dsp.fft import fft_length, long_irfft, long_rfft
+from hlsim.dsp.fft import fft_length, rfft
 from hlsim.msbg.ear import MSBG_RATE
 from hlsim.msbg.envelope import (
     HALF_RATE_STEP,
@@ -100,7 +100,7 @@ def recombine(heard: dict[tuple[int, bool], Tensor], like: Tensor) -> Tensor:
         if analytic:
             bins = torch.fft.fft(torch.view_as_complex(part.unflatten(-1, (-1, 2))))
         else:
-            bins = long_rfft(part, points)
+            bins = rfft(part, points)
         total[..., : bins.shape[-1]].add_(bins[..., : total.shape[-1]])
     return total
 
@@ -112,10 +112,10 @@ def hear_ending(heard: Tensor, ratios: Tensor, bank: FilterBank) -> Tensor:
     """
     length = heard.shape[-1]
     points = fft_length(length + BANK_TAIL, 2 * STEP)
-    spectrum = long_rfft(heard, points).unsqueeze(-2) * constant_like(
+    spectrum = rfft(heard, points).unsqueeze(-2) * constant_like(
         heard, gammatone_response, bank, points
     )
-    channels = long_irfft(spectrum, points) * constant_like(
+    channels = torch.fft.irfft(spectrum, points) * constant_like(
         heard, _not_advanced, bank, points, length
     )
     weights = constant_like(heard, ending_weights, bank)

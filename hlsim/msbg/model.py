@@ -16,7 +16,7 @@ from hlsim.audiogram.thresholds import (
 )
 from hlsim.calibration import PASCAL_SPL, check_full_scale, gain_to_pascals
 from hlsim.checks import check_rate, check_waveform
-from hlsim.dsp.fft import long_irfft, long_rfft
+from hlsim.dsp.fft import rfft
 from hlsim.msbg.blocks import in_blocks
 from hlsim.msbg.cochlea import bank_points, hear, hear_ending
 from hlsim.msbg.ear import MSBG_RATE
@@ -193,7 +193,7 @@ class MSBG(nn.Module):
             return from_cochlea(heard, rate, round(length * rate / MSBG_RATE), gain=gain)
 
         points = bank_points(length * step, rate, step)
-        spectrum = long_rfft(heard, points // step)
+        spectrum = rfft(heard, points // step)
         if none:
             spectrum = spectrum * constant_like(heard, total_response, bank, points, step)
         else:
@@ -202,7 +202,7 @@ class MSBG(nn.Module):
         if smears:
             return from_spectrum(spectrum, points, step, rate, samples, gain=gain, delay=delay)
         # without smearing's delay, the way out reaches samples that the advances put before the first one
-        heard = long_irfft(spectrum, points // step)[..., :length]
+        heard = torch.fft.irfft(spectrum, points // step)[..., :length]
         return from_cochlea(heard, rate, samples, gain=gain, step=step, delay=delay)
 
     def _late(
@@ -215,10 +215,8 @@ class MSBG(nn.Module):
             return hear_ending(heard, ratios, bank)
         points = bank_points(length, MSBG_RATE)
         key = bank, points, 1, MSBG_RATE / 2, heard.dtype, heard.device
-        spectrum = hear(
-            long_rfft(heard, points), ratios, made_once(multirate_bank, *key), not smears
-        )
-        all_but_the_end = long_irfft(spectrum, points)[..., :length]
+        spectrum = hear(rfft(heard, points), ratios, made_once(multirate_bank, *key), not smears)
+        all_but_the_end = torch.fft.irfft(spectrum, points)[..., :length]
         if not last:
             return all_but_the_end
         ending = hear_ending(heard[..., -_ENDING - _ENDING_LEAD :], ratios, bank)

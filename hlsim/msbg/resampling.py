@@ -7,10 +7,11 @@ higher one has twice.
 import math
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from hlsim.dsp.fft import fft_length, long_irfft, long_rfft, soft_end
+from hlsim.dsp.fft import fft_length, rfft, soft_end
 from hlsim.dsp.fir import BLOCK_POINTS, filter_blocks
 from hlsim.msbg.cochlea import shared_multiple
 from hlsim.msbg.ear import EAR_DELAY, MSBG_RATE, ear_filter, lowpass_filter
@@ -30,7 +31,7 @@ def to_cochlea(signals: Tensor, rate: int, length: int, step: int) -> Tensor:
     outer, inner = _grid(least, up, down)
     bins = min(outer, inner) // 2 + 1
     response = constant_like(signals, _inward, inner * step, bins, up / down, rate)
-    return long_irfft(long_rfft(signals, outer)[..., :bins] * response, inner)[..., :length]
+    return torch.fft.irfft(rfft(signals, outer)[..., :bins] * response, inner)[..., :length]
 
 
 def from_spectrum(
@@ -48,11 +49,11 @@ def from_spectrum(
     """
     inner, outer = points // step, points * rate // MSBG_RATE
     if not shared_multiple(rate, step):
-        heard = long_irfft(spectrum, inner)
+        heard = torch.fft.irfft(spectrum, inner)
         return from_cochlea(heard, rate, samples, gain=gain, step=step, delay=delay)
     bins = min(inner, outer) // 2 + 1
     response = constant_like(spectrum, _outward, points, delay, bins, gain * outer / inner, rate)
-    return long_irfft(spectrum[..., :bins] * response, outer)[..., :samples]
+    return torch.fft.irfft(spectrum[..., :bins] * response, outer)[..., :samples]
 
 
 def from_cochlea(
@@ -63,7 +64,7 @@ def from_cochlea(
     outer, inner = _grid(math.ceil((heard.shape[-1] + _FIR_TAIL) * down / up), up, down)
     bins = min(outer, inner) // 2 + 1
     response = constant_like(heard, _outward, inner * step, delay, bins, gain * down / up, rate)
-    return long_irfft(long_rfft(heard, inner)[..., :bins] * response, outer)[..., :samples]
+    return torch.fft.irfft(rfft(heard, inner)[..., :bins] * response, outer)[..., :samples]
 
 
 def to_inner(signals: Tensor, rate: int) -> Tensor:
@@ -74,7 +75,7 @@ def to_inner(signals: Tensor, rate: int) -> Tensor:
     outer, inner = _grid(signals.shape[-1], up, down)
     bins = min(outer, inner) // 2 + 1
     response = constant_like(signals, _resampling, inner, bins, up / down, rate)
-    heard = long_irfft(long_rfft(signals, outer)[..., :bins] * response, inner)
+    heard = torch.fft.irfft(rfft(signals, outer)[..., :bins] * response, inner)
     return heard[..., : math.ceil(signals.shape[-1] * up / down)]
 
 
