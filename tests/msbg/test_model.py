@@ -450,12 +450,14 @@ def test_an_unknown_severity_raises_value_error() -> None:
 
 @pytest.mark.usefixtures("two_threads")
 @pytest.mark.parametrize("rate", [16000, 44100])
-def test_more_threads_change_rounding_alone(rate: int) -> None:
-    model, wave = MSBG(Audiogram.standard("N3"), sample_rate=rate), 0.03 * torch.randn(1, rate)
+@pytest.mark.parametrize("items", [1, 2])
+def test_the_number_of_threads_changes_nothing_but_rounding(rate: int, items: int) -> None:
+    model, wave = MSBG(Audiogram.standard("N3"), sample_rate=rate), 0.03 * torch.randn(items, rate)
     two = model(wave)
     torch.set_num_threads(1)
     one = model(wave)
-    assert relative(two.numpy(), one.numpy()) < 1e-4
+    # MKL transforms a single long row in another order on several threads
+    assert relative(two.numpy(), one.numpy()) <= (5e-6 if items == 1 else 0.0)
 
 
 @pytest.mark.parametrize("rate", [16000, 16001, 22050, 48000])

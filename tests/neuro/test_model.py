@@ -167,7 +167,7 @@ def test_networks_that_look_at_all_of_a_signal_take_it_whole(
 @pytest.mark.parametrize("items", [1, 5])
 def test_compiled_gives_the_same(items: int) -> None:
     model = NeuroMSBG(NeuroConfig(channels=4, blocks=1))
-    # one long row, which goes as complex numbers otherwise; more items than run together otherwise
+    # five items are more than run together when it is not compiled
     waveform, ears = 0.02 * torch.randn(items, 20_000), draw_thresholds(items)
     with torch.no_grad():
         heard = torch.compile(model, backend="eager")(waveform, ears)
