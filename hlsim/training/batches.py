@@ -21,9 +21,9 @@ from hlsim.calibration import level_spl, set_level
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.training.augment import EQUALISER_FREQUENCIES, augment_speech, equalise, mix
 from hlsim.training.clips import Clips, NoiseOfPairs
-from hlsim.training.corpora.manifest import read_manifest
+from hlsim.training.corpora.manifest import SPLITS, read_manifest
 from hlsim.training.data_module import Batch, BatchData, Step
-from hlsim.training.ears import MILDER, draw_thresholds
+from hlsim.training.ears import draw_thresholds
 from hlsim.training.recipes import CompensatorRecipe, SimulatorRecipe, TrainingRecipe
 from hlsim.training.sounds import draw_sounds
 from hlsim.training.teacher import Reference, Teacher
@@ -62,52 +62,37 @@ class TrainingData:
 
     @classmethod
     def from_manifest(
-        cls,
-        manifest: str | Path,
-        root: str | Path | None = None,
-        *,
-        noise: Files | None = None,
-        valid_noise: Files | None = None,
-        audiograms: Path | None = None,
-        valid_audiograms: Path | None = None,
-        workers: int = 0,
+        cls, manifest: str | Path, root: str | Path | None = None, **others: Any
     ) -> TrainingData:
-        """The splits ``train`` and ``valid`` of a manifest.
-
-        Its noisy speech gives the noise, unless ``noise`` is given.
+        """The splits ``train`` and ``valid`` of a manifest; noisy minus clean speech is the noise unless one is given.
 
         Args:
             manifest, root: as for ``read_manifest``.
+            others: other attributes.
 
         Raises:
             ValueError: the manifest cannot be used, or has no training speech.
         """
-        utterances = read_manifest(manifest, root)
         folder = Path(manifest).parent if root is None else Path(root)
-        speech: dict[str, list[Path]] = {}
-        pairs: dict[str, list[tuple[Path, Path]]] = {}
-        for row in utterances:
+        speech: dict[str, list[Path]] = {split: [] for split in SPLITS}
+        pairs: dict[str, list[tuple[Path, Path]]] = {split: [] for split in SPLITS}
+        for row in read_manifest(manifest, root):
             clean = folder / row.path
-            speech.setdefault(row.split, []).append(clean)
+            speech[row.split].append(clean)
             if row.noisy:
-                pairs.setdefault(row.split, []).append((clean, folder / row.noisy))
-        if "train" not in speech:
+                pairs[row.split].append((clean, folder / row.noisy))
+        if not speech["train"]:
             raise ValueError(f"{manifest}: no row has the split 'train'")
-        if "valid" not in speech:
+        if not speech["valid"]:
             warnings.warn(
                 f"{manifest}: no row has the split 'valid', so that validation is on training speech; 'hlsim prepare "
                 "--valid-share 0.1' holds speakers out",
                 stacklevel=2,
             )
-        return cls(
-            speech["train"],
-            noise or pairs.get("train"),
-            audiograms,
-            speech.get("valid"),
-            valid_noise or (None if noise else pairs.get("valid")),
-            valid_audiograms,
-            workers,
-        )
+        if not others.get("noise"):
+            others["noise"] = pairs["train"]
+            others["valid_noise"] = others.get("valid_noise") or pairs["valid"]
+        return cls(speech["train"], valid_speech=speech["valid"], **others)
 
     def validation(self) -> TrainingData:
         """The data to validate on, as data to train on.
@@ -293,12 +278,12 @@ def simulator_data(
     Raises:
         ValueError: the data cannot be used.
     """
-    validation = speech_to_validate(data, recipe)
-    if recipe.sounds:
-        validation += sounds_to_validate(recipe)
-    teacher = Teacher(NEURO_RATE, reference)
-    training = SimulatorBatches(recipe, data)
-    return BatchData(training, validation, teacher=teacher, workers=data.workers)
+    return BatchData(
+        SimulatorBatches(recipe, data),
+        simulator_validation(data, recipe),
+        teacher=Teacher(NEURO_RATE, reference),
+        workers=data.workers,
+    )
 
 
 def compensator_data(
@@ -312,7 +297,7 @@ def compensator_data(
     needs_noise = [name for name in ("denoising", "intelligibility") if recipe.weights.get(name)]
     if recipe.babble:
         needs_noise.append("babble")
-    if data.noise is None and needs_noise:
+    if needs_noise and not data.noise:
         raise ValueError(
             f"the recipe has {needs_noise[0]}, which requires noise; give a folder of noise (--noise)"
         )
@@ -323,43 +308,20 @@ def compensator_data(
     return BatchData(CompensatorBatches(recipe, data, ear), validation, workers=data.workers)
 
 
-def speech_to_validate(data: TrainingData, recipe: SimulatorRecipe) -> list[Batch]:
-    """Fixed items, every second one noisy (0 to 20 dB), for measured, standard and drawn ears in turn."""
+def simulator_validation(data: TrainingData, recipe: SimulatorRecipe) -> list[Batch]:
+    """Fixed items of 2 s, as for training but without equalisation, amplification and compression.
+
+    A recipe that trains on tones and clicks has a third as many items of them, marked with ``sounds``, as of speech.
+    """
+    data = data.validation()
     generator = torch.Generator().manual_seed(1_000 + recipe.seed)
-    drawn = SimulatorBatches(replace(recipe, seconds=VALIDATION_SECONDS), data.validation())
-    standard = torch.tensor([Audiogram.standard(name).thresholds for name in MILDER])
-    is_noisy = (torch.arange(8) % 2 == 1).unsqueeze(-1)
-    batches = []
-    for _ in range(0, recipe.validation_items, 8):
-        signal = drawn.speech.draw(8, generator)
-        if drawn.noise is not None:
-            noise = drawn.noise.draw(8, generator)
-            noisy = mix(signal, noise, 20.0 * torch.rand(8, generator=generator), NEURO_RATE)
-            signal = torch.where(is_noisy, noisy, signal)
-        signal = set_level(signal, _levels_to_validate(recipe, generator))
-        ears = draw_thresholds(8, generator)
-        ears[0:8:4] = standard[torch.randint(len(standard), (2,), generator=generator)]
-        measured = drawn.measured_ears
-        if measured is not None:
-            ears[1:8:2] = measured[torch.randint(len(measured), (4,), generator=generator)]
-        batches.append({"signal": signal, "thresholds": ears})
+    levels = (50.0, 80.0) if recipe.treated else recipe.levels
+    plain = replace(recipe, seconds=VALIDATION_SECONDS, levels=levels, treated=False, sounds=0.0)
+    speech = SimulatorBatches(plain, data)
+    batches = [speech.draw(8, generator) for _ in range(0, recipe.validation_items, 8)]
+    if recipe.sounds:
+        sounds = SimulatorBatches(replace(plain, sounds=1.0), replace(data, noise=None))
+        marked = {"sounds": torch.ones(8, dtype=torch.bool)}
+        for _ in range(0, recipe.validation_items, 24):
+            batches.append(sounds.draw(8, generator) | marked)
     return batches
-
-
-def sounds_to_validate(recipe: SimulatorRecipe) -> list[Batch]:
-    """Fixed tones and clicks for drawn ears, a third as many items as of speech, marked with ``sounds``."""
-    generator = torch.Generator().manual_seed(2_000 + recipe.seed)
-    samples = round(VALIDATION_SECONDS * NEURO_RATE)
-    batches = []
-    for _ in range(0, recipe.validation_items, 24):
-        signal = draw_sounds(8, samples, NEURO_RATE, generator)
-        signal = set_level(signal, _levels_to_validate(recipe, generator))
-        batch = {"signal": signal, "thresholds": draw_thresholds(8, generator)}
-        batches.append(batch | {"sounds": torch.ones(8, dtype=torch.bool)})
-    return batches
-
-
-def _levels_to_validate(recipe: SimulatorRecipe, generator: torch.Generator) -> Tensor:
-    """50 to 80 dB SPL, or the recipe's levels if it does not amplify and compress. Shape: -> (8,)."""
-    low, high = (50.0, 80.0) if recipe.treated else recipe.levels
-    return low + (high - low) * torch.rand(8, generator=generator)

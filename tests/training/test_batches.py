@@ -115,7 +115,7 @@ def test_the_teacher_fills_in_what_is_missing(manifest: Path) -> None:
 
 
 def test_validation_is_on_other_speech_or_says_that_it_is_not(manifest: Path) -> None:
-    data = TrainingData.from_manifest(manifest)
+    data = TrainingData.from_manifest(manifest, noise=None, valid_noise=None)
     valid = data.validation()
     assert valid.speech == [manifest.parent / "clean" / "3.wav"]
     assert valid.noise == [
