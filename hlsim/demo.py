@@ -83,7 +83,7 @@ def demo(
     report(f"training on {len(training)} utterances, {steps} steps, ear {_name(audiogram)}")
     data, where = TrainingData(speech=training), folder / "training"
     with one_thread():  # the steps are small: on a busy machine two threads wait for each other
-        checkpoint = train_compensator(data, recipe, out=where, audiogram=audiogram, report=report)
+        checkpoint = train_compensator(data, recipe, out=where, audiogram=audiogram)
     torch.manual_seed(seed)
     trained, nalr = load_compensator(checkpoint), NALR()
     start = MappingCompensator(MappingConfig.from_dict(recipe.model)).eval()

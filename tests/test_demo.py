@@ -47,9 +47,9 @@ def test_demo_writes_report_audio_and_pictures(tmp_path: Path, short_speech: Pat
         report["compensated_level_mean"], abs=1e-3
     )
     page = (out / "report.html").read_text()
-    assert text.startswith("\nThe trained aid ") and text.endswith(
-        f"\n\nThe page: {out / 'report.html'}"
-    )
+    assert text.startswith("\nThe trained aid ")
+    assert f"seed {seed}, 60 training steps" in text
+    assert text.endswith(f"\nThe page: {out / 'report.html'}")
     assert text.splitlines()[1] in page and page.count("<audio") == 5 and "N4 (severe loss)" in page
     assert report["before_mean"] == pytest.approx(report["unaided_mean"])
     assert report["after_mean"] == pytest.approx(report["compensated_mean"])
@@ -66,7 +66,6 @@ def test_demo_writes_report_audio_and_pictures(tmp_path: Path, short_speech: Pat
     ):
         assert (out / name).stat().st_size > 0
     assert len(list((out / "audio").glob("*.wav"))) == 6 * 8
-    assert any(line.startswith("step") for line in lines)
 
 
 def test_speech_that_cannot_be_scored_is_named_before_the_training(

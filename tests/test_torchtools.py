@@ -1,7 +1,4 @@
-"""Constants are made once for each type and device, and what a mode makes of them is not kept; freed memory is."""
-
-import subprocess
-import sys
+"""Constants are made once for each type and device, and what a mode makes of them is not kept."""
 
 import numpy as np
 import pytest
@@ -115,44 +112,3 @@ def test_what_a_transform_makes_serves_after_it(small: torchtools._Kept) -> None
     assert torch.equal(grad(grad(energy))(gain), second)
     leaf = gain.clone().requires_grad_()
     torch.testing.assert_close(grad(energy)(gain), torch.autograd.grad(energy(leaf), leaf)[0])
-
-
-# a child of its own, for the setting is the process's: megabytes again and again, as a training asks for them
-_FAULTS = """
-import resource, sys, torch
-from hlsim.torchtools import keep_freed_memory
-if sys.argv[1] == "keep" and not keep_freed_memory():
-    sys.exit(7)
-def step():
-    held = [torch.ones(5_000_000) for _ in range(8)]
-for _ in range(2):
-    step()
-before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
-for _ in range(5):
-    step()
-print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
-"""
-
-
-def faults(how: str) -> int:
-    done = subprocess.run(
-        [sys.executable, "-c", _FAULTS, how], capture_output=True, text=True, timeout=120
-    )
-    if done.returncode == 7:
-        pytest.skip("no glibc")
-    assert done.returncode == 0, done.stderr
-    return int(done.stdout)
-
-
-def test_kept_memory_costs_no_page_faults() -> None:
-    assert faults("keep") < faults("as it is") / 10
-
-
-def test_other_c_libraries_are_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    def none(_: object) -> object:
-        raise OSError("no such library")
-
-    monkeypatch.setattr(torchtools.ctypes, "CDLL", none)
-    assert torchtools.keep_freed_memory() is False
-    monkeypatch.setattr(torchtools.ctypes, "CDLL", lambda _: object())
-    assert torchtools.keep_freed_memory() is False

@@ -101,7 +101,7 @@ def test_an_aid_learns_through_a_network_that_learned_another_simulator(
     train, valid, out = speech_dir / "train", speech_dir / "valid", tmp_path / "ear"
     teacher = ("--teacher", "examples.training.dead_region:DeadRegion")
     recipe = tmp_path / "recipe.yaml"
-    shorter = ("batch: 2", "seconds: 0.3", "validate_every: 2", "validation_items: 8")
+    shorter = ("steps: 2", "batch: 2", "seconds: 0.3", "validate_every: 2", "validation_items: 8")
     lines = (EXAMPLES.parent / "any-teacher.yaml").read_text().splitlines()
     for change in shorter:
         lines = [change if line.startswith(change.split()[0]) else line for line in lines]
@@ -112,10 +112,6 @@ def test_an_aid_learns_through_a_network_that_learned_another_simulator(
         "--device",
         "cpu",
         "--quiet",
-        "--max-steps",
-        "2",
-        "--max-minutes",
-        "10",
     )
     assert (
         main(

@@ -31,8 +31,6 @@ def _demo(options: argparse.Namespace) -> None:
     ear = read_ear(options.audiogram)
     require("lightning", "train")  # one that is there may be broken
     from hlsim.demo import demo
-    from hlsim.torchtools import keep_freed_memory
 
-    keep_freed_memory()
     summary = demo(options.out, ear, speech=options.speech, steps=options.steps, seed=options.seed)
     print(summary)

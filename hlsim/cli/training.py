@@ -53,14 +53,12 @@ def _training_options(parser: Parser) -> None:
     option("--start", str, text, metavar="NAME")
     text = "minutes after which to stop, those before a resumption included; the learning rate does not depend on them"
     option("--max-minutes", positive, text)
-    text = "step after which to stop, before the recipe's steps are done; the learning rate does not depend on it"
-    option("--max-steps", count, text)
     option("--device", str, "where to train", "auto", choices=("auto", "cpu", "cuda"))
     option("--devices", count, "GPUs or processes a machine", 1)
     option("--nodes", count, "machines", 1)
     option("--strategy", str, "Lightning's, e.g. ddp", "auto")
     option("--workers", natural, "processes that draw batches, beside the one that trains", 0)
-    parser.flag("--quiet", "no progress bar, only a line a validation")
+    parser.flag("--quiet", "no progress bar, only a line per validation")
     parser.out()
 
 
@@ -120,10 +118,8 @@ def _recipe(options: argparse.Namespace) -> dict[str, Any]:
 
 def _arguments(options: argparse.Namespace) -> dict[str, Any]:
     """Arguments that ``train_simulator`` and ``train_compensator`` have in common."""
-    from hlsim.torchtools import keep_freed_memory
     from hlsim.training.batches import TrainingData
 
-    keep_freed_memory()
     more: dict[str, Any] = {
         "noise": options.noise,
         "audiograms": options.audiograms,
@@ -139,7 +135,6 @@ def _arguments(options: argparse.Namespace) -> dict[str, Any]:
         "data": data,
         "out": options.out,
         "max_minutes": options.max_minutes,
-        "max_steps": options.max_steps,
         "accelerator": "gpu" if options.device == "cuda" else options.device,
         "devices": options.devices,
         "nodes": options.nodes,

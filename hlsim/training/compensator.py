@@ -6,91 +6,94 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Unpack
 
-import torch
 from torch import Tensor, nn
 
 from compensators.hearing_aid import HearingAid
 from compensators.pretrained import CONFIGS, build_compensator, load_compensator
 from hlsim.audiogram import Audiogram
-from hlsim.losses.criteria import Criterion
 from hlsim.losses.hearing_loss import HearingLossLoss
 from hlsim.pretrained import checkpoint_digest
 from hlsim.training.batches import TrainingData, compensator_data
 from hlsim.training.data_module import Batch
 from hlsim.training.denoising import attenuation_error, missing_intelligibility
-from hlsim.training.loop import RunOptions, train_network
-from hlsim.training.module import ScheduledModule, initial_network
+from hlsim.training.module import TrainingModule, initial_network
 from hlsim.training.recipes import CompensatorRecipe
+from hlsim.training.trainer import TrainerOptions, train_network
 
 Simulator = str | Path | nn.Module
 
+NOISE_REDUCTION_CRITERIA = ("denoising", "intelligibility")
+"""Criteria of a hearing aid's noise reduction; all others are those of ``HearingLossLoss``."""
 
-class CompensatorTraining(ScheduledModule):
-    """Hears the compensator's output through the simulator, as ``HearingLossLoss`` takes it, frozen."""
+
+class CompensatorTraining(TrainingModule):
+    """A compensator whose output a frozen simulator perceives.
+
+    Of a hearing aid only the part that a criterion asks for is trained: with the criteria of noise reduction alone,
+    amplification stays as it is, for HASPI would amplify; without them, noise reduction stays, for it would be given up
+    to reach the right level.
+    """
+
+    recipe: CompensatorRecipe
 
     def __init__(self, recipe: CompensatorRecipe, *, simulator: Simulator = "neuro-msbg") -> None:
-        super().__init__(recipe.learning_rate, recipe.steps)
-        torch.manual_seed(recipe.seed)
-        self.recipe = recipe
-        network = (CONFIGS[recipe.kind], build_compensator, load_compensator)
-        self.compensator = initial_network(recipe.start, recipe.model, *network)
-        counted = {name: weight for name, weight in recipe.weights.items() if weight > 0.0}
-        self.denoising, self.intelligibility = (
-            counted.pop(name, 0.0) for name in ("denoising", "intelligibility")
-        )
-        criterion: Criterion = (
-            counted or "coherent-bands"
-        )  # for the examples, where nothing is learned through it
+        kind = CONFIGS[recipe.kind]
+        network = initial_network(recipe, kind, build_compensator, load_compensator)
+        super().__init__(network, recipe)
+        used = {name: weight for name, weight in recipe.weights.items() if weight > 0.0}
+        self.noise_weights = {
+            name: used.pop(name) for name in NOISE_REDUCTION_CRITERIA if name in used
+        }
+        self.trains_amplification = bool(used)
         self.loss = HearingLossLoss(
-            simulator=simulator, reference=recipe.reference, criterion=criterion
+            simulator=simulator, reference=recipe.reference, criterion=used or "coherent-bands"
         )
-        self.hears = bool(counted)
-        if isinstance(aid := self.compensator, HearingAid):
-            if not self.hears:
-                aid.correct.requires_grad_(False)  # or HASPI would amplify
-            elif not (self.denoising or self.intelligibility):
-                for part in (
-                    aid.enter,
-                    aid.recur,
-                    aid.leave,
-                ):  # to be heard at the right level it would not reduce
-                    part.requires_grad_(False)
+        if isinstance(network, HearingAid):
+            self._freeze_parts(network)
+
+    def _freeze_parts(self, aid: HearingAid) -> None:
+        if not self.trains_amplification:
+            aid.correct.requires_grad_(False)
+        elif not self.noise_weights:
+            for part in (aid.enter, aid.recur, aid.leave):
+                part.requires_grad_(False)
 
     def training_loss(self, batch: Batch) -> Tensor:
-        signal, clean, ears = (batch[name] for name in ("signal", "clean", "thresholds"))
-        value = signal.new_zeros(())
-        if self.denoising:
-            assert isinstance(self.compensator, HearingAid)
-            value = (
-                value + self.denoising * attenuation_error(self.compensator, signal, clean).mean()
-            )
-        if self.intelligibility:
-            assert isinstance(self.compensator, HearingAid)
-            missing = missing_intelligibility(self.compensator, signal, clean, ears)
-            value = value + self.intelligibility * missing.mean()
-        if not self.hears:
-            return value
+        signal, clean, ears = batch["signal"], batch["clean"], batch["thresholds"]
+        loss = signal.new_zeros(())
+        if "denoising" in self.noise_weights:
+            error = attenuation_error(self.network, signal, clean)
+            loss = loss + self.noise_weights["denoising"] * error.mean()
+        if "intelligibility" in self.noise_weights:
+            missing = missing_intelligibility(self.network, signal, clean, ears)
+            loss = loss + self.noise_weights["intelligibility"] * missing.mean()
+        if self.trains_amplification:
+            loss = loss + self._amplification_loss(batch)
+        return loss
+
+    def _amplification_loss(self, batch: Batch) -> Tensor:
+        signal, clean, ears = batch["signal"], batch["clean"], batch["thresholds"]
         if "noise_reduction" not in batch:
-            return value + self.loss(self.compensator(signal, ears), clean, ears)
-        given = self.compensator(signal, ears, batch["noise_reduction"])
-        aim = signal + batch["noise_reduction"].unsqueeze(-1) * (clean - signal)
-        return value + self.loss(given, aim, ears)
+            return self.loss(self.network(signal, ears), clean, ears)
+        # without noise reduction the ear is to perceive the noisy speech
+        slider = batch["noise_reduction"]
+        reference = signal + slider.unsqueeze(-1) * (clean - signal)
+        return self.loss(self.network(signal, ears, slider), reference, ears)
 
     def evaluate(self, batch: Batch) -> dict[str, Tensor]:
+        """Compute the training loss of a batch."""
         return {"valid_loss": self.training_loss(batch)[None]}
 
-    def figures(self, values: Mapping[str, Tensor]) -> dict[str, float]:
-        """Mean of the loss over the validation batches."""
+    def summarise(self, values: Mapping[str, Tensor]) -> dict[str, float]:
+        """Compute the mean loss over the validation batches."""
         mean = float(values["valid_loss"].double().mean())
         return {"score": -mean, "valid_loss": mean}
 
     def examples(self, batch: Batch) -> dict[str, Tensor]:
         signal, ears = batch["signal"][:1], batch["thresholds"][:1]
-        aided = self.compensator(signal, ears)
-        return {"given": signal[0], "aided": aided[0], "heard": self.loss.simulator(aided, ears)[0]}
-
-    def released(self) -> nn.Module:
-        return self.compensator
+        output = self.network(signal, ears)
+        perceived = self.loss.simulator(output, ears)
+        return {"input": signal[0], "output": output[0], "perceived": perceived[0]}
 
 
 def train_compensator(
@@ -100,33 +103,39 @@ def train_compensator(
     out: str | Path,
     audiogram: Audiogram | None = None,
     simulator: Simulator = "neuro-msbg",
-    **options: Unpack[RunOptions],
+    **options: Unpack[TrainerOptions],
 ) -> Path:
-    """Train, resume, and keep the best checkpoint.
+    """Train a compensator, or resume its training, and keep the best one by validation.
 
     Args:
-        audiogram: the ear of a personal compensator; None trains a general one on drawn ears.
+        data: speech, noise and ears to draw batches from.
+        recipe: network, criteria and number of steps.
+        out: folder for the results.
+        audiogram: ear of a personal compensator; None trains a general one on drawn ears.
         simulator: ``"neuro-msbg"``, another checkpoint's name or folder, ``"msbg"``, or a module.
 
-    Returns: the folder that ``load_compensator`` takes, ``out/checkpoint``.
+    Returns:
+        The folder that ``load_compensator`` reads, ``out/checkpoint``.
 
     Raises:
-        ValueError: data, recipe or simulator that cannot be used; the message names them.
+        ValueError: data, recipe or simulator cannot be used.
     """
     module = CompensatorTraining(recipe, simulator=simulator)
     batches = compensator_data(data, recipe, audiogram)
-    start = module.validate(batches.val_dataloader())["valid_loss"]
-    options.get("report", print)(f"start: valid_loss {start:.3f}")
-    trained = {
+    is_module = isinstance(simulator, nn.Module)
+    about: dict[str, Any] = {
         "audiogram": audiogram.to_dict() if audiogram else None,
-        "simulator": type(simulator).__name__
-        if isinstance(simulator, nn.Module)
-        else str(simulator),
+        "simulator": type(simulator).__name__ if is_module else str(simulator),
     }
-    if isinstance(simulator, str | Path) and str(simulator) != "msbg":
-        trained["simulator_sha256"] = checkpoint_digest(
-            simulator
-        )  # a folder may hold another one next time
-    about = trained | {"start_valid_loss": start}
-    how: dict[str, Any] = {"out": out, "identity": data.identity() | trained, "about": about}
-    return train_network(module, batches, recipe, recipe.kind, **how, **options)
+    if not is_module and str(simulator) != "msbg":
+        # the same folder may hold another simulator when the training resumes
+        about["simulator_sha256"] = checkpoint_digest(simulator)  # type: ignore[arg-type]
+    return train_network(
+        module,
+        batches,
+        recipe.kind,
+        out=out,
+        identity=data.identity() | about,
+        about=about,
+        **options,
+    )

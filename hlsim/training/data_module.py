@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import count
 from typing import Any, NamedTuple
 
 import lightning as L
@@ -22,6 +20,10 @@ clicks.
 """
 
 
+MANY_STEPS = 10_000_000
+"""Length of the data for a Trainer that has no number of steps."""
+
+
 class Step(NamedTuple):
     """Number of a training step, and rank and number of the processes that train."""
 
@@ -32,42 +34,34 @@ class Step(NamedTuple):
 
 @dataclass(eq=False)
 class Steps(Sampler[Step]):
-    """Endless steps of one process, from ``first`` on."""
+    """Steps of one process, from ``first`` to before ``end``."""
 
     first: int = 0
     rank: int = 0
     processes: int = 1
+    end: int = MANY_STEPS
 
     def __len__(self) -> int:
-        return 10_000_000  # time or steps end a training, not the data
+        return self.end  # Lightning counts those before a resumption, too
 
     def __iter__(self) -> Iterator[Step]:
-        return (Step(number, self.rank, self.processes) for number in count(self.first))
+        return (Step(number, self.rank, self.processes) for number in range(self.first, self.end))
 
 
-class TimedLoader(DataLoader[Any]):
-    """A loader that measures how long training waits for it, and continues with the next step when it is iterated again.
+class ReturnedErrors(Dataset[Any]):
+    """The batches of a data set; an error takes the place of a batch that cannot be drawn.
 
-    Attributes:
-        waited: waiting time in seconds.
+    A DataLoader would raise the error of a worker with a traceback as its message.
     """
 
-    waited = 0.0
+    def __init__(self, batches: Dataset[Batch]) -> None:
+        self.batches = batches
 
-    def __iter__(self) -> Iterator[Any]:  # type: ignore[override]
-        batches = super().__iter__()
-        while True:
-            start = time.perf_counter()
-            try:
-                batch = next(batches, None)
-            except ValueError as error:  # that of a worker has its traceback in its message
-                raise ValueError(str(error).rpartition("ValueError: ")[2].strip()) from error
-            if batch is None:
-                return
-            self.waited += time.perf_counter() - start
-            if isinstance(self.sampler, Steps):
-                self.sampler.first += 1
-            yield batch
+    def __getitem__(self, step: Step) -> Batch | ValueError:
+        try:
+            return self.batches[step]
+        except ValueError as error:
+            return error
 
 
 class BatchData(L.LightningDataModule):
@@ -82,8 +76,6 @@ class BatchData(L.LightningDataModule):
         teacher: computes ``impaired`` for batches without it, on the training device.
         workers: number of processes that draw batches, beside the one that trains.
     """
-
-    loader: TimedLoader
 
     def __init__(
         self,
@@ -100,23 +92,28 @@ class BatchData(L.LightningDataModule):
         self.workers = workers
 
     def train_dataloader(self) -> DataLoader[Any]:
+        trainer = self.trainer
         steps = Steps()
-        if self.trainer is not None:
-            trainer = self.trainer
-            steps = Steps(trainer.global_step, trainer.global_rank, trainer.world_size)
-        self.loader = TimedLoader(
-            self.training,
+        if trainer is not None:
+            end = MANY_STEPS if trainer.max_steps < 0 else trainer.max_steps
+            steps = Steps(trainer.global_step, trainer.global_rank, trainer.world_size, end)
+        return DataLoader(
+            ReturnedErrors(self.training),
             batch_size=None,
             sampler=steps,
             num_workers=self.workers,
             prefetch_factor=4 if self.workers else None,
         )
-        return self.loader
 
     def val_dataloader(self) -> DataLoader[Any]:
         for batch in self.validation:
             self._add_target(batch)
         return DataLoader(self.validation, batch_size=None)  # type: ignore[arg-type]
+
+    def on_before_batch_transfer(self, batch: Any, dataloader_idx: int) -> Any:
+        if isinstance(batch, ValueError):
+            raise batch
+        return batch
 
     def on_after_batch_transfer(self, batch: Any, dataloader_idx: int) -> Any:
         self._add_target(batch)

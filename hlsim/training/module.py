@@ -1,22 +1,21 @@
-"""What is trained: a network's first weights, its steps, its average over steps, and its figures in validation."""
+"""The Lightning module that both trainings share: schedule, validation scores, and initial weights."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, TypeVar
 
 import lightning as L
 import torch
-from lightning.pytorch.callbacks import Timer
 from lightning.pytorch.utilities.types import OptimizerLRScheduler
 from torch import Tensor, nn
 from torch.optim.lr_scheduler import LambdaLR
-from torch.optim.swa_utils import AveragedModel
 
 from hlsim.neuro.config import ModelConfig
 from hlsim.training.data_module import Batch
+from hlsim.training.recipes import TrainingRecipe
 
 Network = TypeVar("Network", bound=nn.Module)
 Config = TypeVar("Config", bound=ModelConfig)
@@ -25,87 +24,92 @@ WARM_UP_STEPS = 50
 """Number of steps over which the learning rate rises."""
 
 
-class ScheduledModule(L.LightningModule):
-    """A module whose learning rate depends on the step alone: a short rise, then half a cosine down to 1 %.
+class TrainingModule(L.LightningModule):
+    """A network in training.
 
-    Subclasses implement ``training_loss``, ``evaluate``, ``figures`` and ``released``.
+    The learning rate depends on the step alone, and the training ends with a validation after the recipe's last step.
+    Subclasses implement ``training_loss``, ``evaluate`` and ``summarise``.
 
     Args:
-        learning_rate: highest learning rate of AdamW.
-        steps: number of steps of the whole training.
+        network: network to train.
+        recipe: learning rate, number of steps and whatever the subclass needs.
+
+    Attributes:
+        validation: values of the last validation, by name. Its ``score`` is highest for the best network.
+        start_validation: the same, before the first step.
+        description: settings and data that make this training differ from others.
     """
 
-    timer: Timer
-
-    def __init__(self, learning_rate: float, steps: int) -> None:
+    def __init__(self, network: nn.Module, recipe: TrainingRecipe) -> None:
         super().__init__()
-        self.learning_rate = learning_rate
-        self.steps = steps
-        self.values: list[dict[str, Tensor]] = []  # of the validation under way
+        self.network: Any = network
+        self.recipe = recipe
+        self.validation: dict[str, float] = {}
+        self.start_validation: dict[str, float] = {}
+        self.description: dict[str, Any] = {}
+        self._evaluations: list[dict[str, Tensor]] = []
 
     def training_loss(self, batch: Batch) -> Tensor:
+        """Compute the loss of a batch. Shape: -> ()."""
         raise NotImplementedError
 
     def evaluate(self, batch: Batch) -> dict[str, Tensor]:
-        """Values of a validation batch by name, one an item or one a batch."""
+        """Compute measures of a validation batch by name, one value per item or per batch."""
         raise NotImplementedError
 
-    def figures(self, values: Mapping[str, Tensor]) -> dict[str, float]:
-        """Figures of all values by name; ``score`` is what the best checkpoint has most of."""
+    def summarise(self, values: Mapping[str, Tensor]) -> dict[str, float]:
+        """Summarise the measures of all validation batches; ``score`` is highest for the best network."""
         raise NotImplementedError
 
     def examples(self, batch: Batch) -> dict[str, Tensor]:
-        """Signals for TensorBoard by name, (time,) in pascals at 16 kHz."""
+        """Return signals for TensorBoard by name, each (time,) in pascals at 16 kHz."""
         return {}
-
-    def released(self) -> nn.Module:
-        """The network that is kept in the checkpoint."""
-        raise NotImplementedError
-
-    def validate(self, batches: Iterable[Batch]) -> dict[str, float]:
-        """The figures on batches, without a Trainer."""
-        with torch.no_grad():
-            placed = (
-                {name: value.to(self.device) for name, value in batch.items()} for batch in batches
-            )
-            return self._figures([self.evaluate(batch) for batch in placed])
 
     def trained_parameters(self) -> list[nn.Parameter]:
         return [parameter for parameter in self.parameters() if parameter.requires_grad]
 
-    def training_step(self, batch: Batch, index: int) -> Tensor:
+    def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         loss = self.training_loss(batch)
-        if not math.isfinite(value := float(loss.detach())):
+        if not math.isfinite(float(loss.detach())):
             raise ValueError(
-                f"the loss is {value} at step {self.global_step}; a lower learning rate may help"
+                f"the loss is {float(loss.detach())} at step {self.global_step}; try a lower learning rate"
             )
         self.log("loss", loss, prog_bar=True)
         return loss
 
-    def on_validation_epoch_start(self) -> None:
-        self.values = []
+    def on_train_batch_end(self, *arguments: Any) -> None:
+        # a stopped Trainer validates and saves its state, also where the last interval is a short one
+        if self.global_step >= self.recipe.steps:
+            self.trainer.should_stop = True
 
-    def validation_step(self, batch: Batch, index: int) -> None:
-        self.values.append(self.evaluate(batch))
+    def on_validation_epoch_start(self) -> None:
+        self._evaluations = []
+
+    def validation_step(self, batch: Batch, batch_idx: int) -> None:
+        self._evaluations.append(self.evaluate(batch))
 
     def on_validation_epoch_end(self) -> None:
-        self.log_dict(self._figures(self.values), prog_bar=True, batch_size=1, sync_dist=True)
+        self.validation = self.summarise(concatenate(self._evaluations))
+        self.log_dict(self.validation, prog_bar=True, batch_size=1, sync_dist=True)
+        shown = [
+            f"{name} {value:.3f}" for name, value in self.validation.items() if name != "score"
+        ]
+        self.print(f"step {self.global_step}: {', '.join(shown)}")
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        checkpoint["validation"] = self.validation
+        checkpoint["start_validation"] = self.start_validation
+        checkpoint["description"] = self.description
 
     def configure_optimizers(self) -> OptimizerLRScheduler:
         optimizer = torch.optim.AdamW(
-            self.trained_parameters(), lr=self.learning_rate, weight_decay=1e-4
+            self.trained_parameters(), lr=self.recipe.learning_rate, weight_decay=1e-4
         )
-        scheduler = LambdaLR(optimizer, partial(relative_learning_rate, steps=self.steps))
+        scheduler = LambdaLR(optimizer, partial(relative_learning_rate, steps=self.recipe.steps))
         return {
             "optimizer": optimizer,
             "lr_scheduler": {"scheduler": scheduler, "interval": "step"},
         }
-
-    def _figures(self, values: Sequence[Mapping[str, Tensor]]) -> dict[str, float]:
-        names = dict.fromkeys(name for one in values for name in one)
-        return self.figures(
-            {name: torch.cat([one[name] for one in values if name in one]) for name in names}
-        )
 
 
 def relative_learning_rate(step: int, steps: int) -> float:
@@ -118,57 +122,47 @@ def relative_learning_rate(step: int, steps: int) -> float:
     return rise * max(0.01, fall)
 
 
-def exponential_average(model: nn.Module, decay: float) -> AveragedModel:
-    """A copy of a model that follows it as an exponential moving average (EMA); ``.module`` is the averaged model.
-
-    The first steps count as much as their number allows, (1 + n) / (10 + n), so that it does not keep its random start.
-
-    Args:
-        decay: weight of the past, 0 to below 1; 0 copies.
-    """
-
-    def follow(kept: Sequence[Tensor], new: Sequence[Tensor], count: Tensor | int) -> None:
-        weight = min(decay, (1.0 + float(count)) / (10.0 + float(count)))
-        for old, now in zip(kept, new, strict=True):
-            old.lerp_(now.to(old), 1.0 - weight)
-
-    average = AveragedModel(model, multi_avg_fn=follow)
-    average.requires_grad_(False)  # several processes would wait for its gradients
-    return average
+def concatenate(evaluations: list[dict[str, Tensor]]) -> dict[str, Tensor]:
+    """Concatenate the values of several batches by name; a batch may lack some names."""
+    lists: dict[str, list[Tensor]] = {}
+    for evaluation in evaluations:
+        for name, values in evaluation.items():
+            lists.setdefault(name, []).append(values)
+    return {name: torch.cat(values) for name, values in lists.items()}
 
 
 def initial_network(
-    start: str,
-    settings: Mapping[str, Any],
+    recipe: TrainingRecipe,
     config_kind: type[Config],
     build: Callable[[Config], Network],
     load: Callable[[str], nn.Module],
 ) -> Network:
-    """The network to train, with random weights or those of a checkpoint.
+    """Build the network to train, with random weights of the recipe's seed or with those of its ``start``.
 
     Args:
-        start: a checkpoint's name or folder; empty for random weights.
-        settings: of the network; with ``start`` those of the checkpoint, or none.
-        load: loads a checkpoint by name, frozen.
+        recipe: ``start``, a checkpoint's name or folder; ``model``, the network's settings; ``seed``.
+        config_kind: class of the network's settings.
+        build: builds a network from its settings.
+        load: loads a checkpoint by name.
 
     Raises:
-        ValueError: no such checkpoint, or one of another kind or with other settings.
+        ValueError: there is no such checkpoint, or it is of another kind or has other settings.
     """
-    config = config_kind.from_dict(settings)
-    if not start:
-        return build(config)
-    network: Any = load(start)
-    what = f"start {start!r} in the recipe"
+    config = config_kind.from_dict(recipe.model)
+    if not recipe.start:
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(recipe.seed)
+            return build(config)
+    network: Any = load(recipe.start)
     if not isinstance(getattr(network, "config", None), config_kind):
         raise ValueError(
-            f"{what} is a {type(network).__name__}; allowed: a checkpoint of the recipe's kind"
+            f"the recipe starts from {recipe.start!r}, a {type(network).__name__}; give a checkpoint of the recipe's kind"
         )
-    if settings and config != network.config:
-        ours, theirs = config.to_dict(), network.config.to_dict()
-        differing = ", ".join(name for name in ours if ours[name] != theirs[name])
+    if recipe.model and config != network.config:
+        given, found = config.to_dict(), network.config.to_dict()
+        differing = ", ".join(name for name in given if given[name] != found[name])
         raise ValueError(
-            f"{what} has other settings of the model than the recipe ({differing}); allowed: the same, or no 'model' in "
-            "the recipe"
+            f"the recipe's model differs from that of its start {recipe.start!r} in {differing}; leave 'model' out"
         )
     trained: Network = network.train().requires_grad_(True)
     return trained

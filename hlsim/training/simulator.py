@@ -1,10 +1,10 @@
-"""Training a Neuro-MSBG on what the exact MSBG, or another teacher, says is heard."""
+"""Training a Neuro-MSBG on the output of the exact MSBG or of another teacher."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Unpack
+from typing import Unpack
 
 import torch
 from torch import Tensor
@@ -14,71 +14,66 @@ from hlsim.losses.waveform import log_spectral_distance_db, noise_to_signal_db
 from hlsim.neuro import NeuroConfig, NeuroMSBG
 from hlsim.pretrained import SIMULATOR, load_pretrained
 from hlsim.training.batches import TrainingData, simulator_data
+from hlsim.training.callbacks import WeightAverage
 from hlsim.training.data_module import Batch
-from hlsim.training.loop import RunOptions, train_network
-from hlsim.training.module import ScheduledModule, exponential_average, initial_network
+from hlsim.training.module import TrainingModule, initial_network
 from hlsim.training.recipes import SimulatorRecipe
 from hlsim.training.teacher import find_teacher, name_of
+from hlsim.training.trainer import TrainerOptions, train_network
+
+POWER_FLOOR = 1e-18
+"""Added to the power of a signal before dividing by it."""
 
 
-class SimulatorTraining(ScheduledModule):
-    """Teaches the network what is heard, ``impaired`` in a batch; the average of its weights is validated and kept."""
+class SimulatorTraining(TrainingModule):
+    """A network that learns the teacher's output, ``impaired`` in a batch."""
+
+    recipe: SimulatorRecipe
 
     def __init__(self, recipe: SimulatorRecipe) -> None:
-        super().__init__(recipe.learning_rate, recipe.steps)
-        torch.manual_seed(recipe.seed)
-        self.recipe = recipe
-        self.student = initial_network(
-            recipe.start, recipe.model, NeuroConfig, NeuroMSBG, load_pretrained
-        )
-        self.student.autocast_dtype = None if recipe.precision == "float32" else torch.bfloat16
-        self.kept = exponential_average(self.student, recipe.average)
+        network = initial_network(recipe, NeuroConfig, NeuroMSBG, load_pretrained)
+        network.autocast_dtype = None if recipe.precision == "float32" else torch.bfloat16
+        super().__init__(network, recipe)
 
     def training_loss(self, batch: Batch) -> Tensor:
         signal, target = batch["signal"], batch["impaired"]
-        heard = self.student(signal, batch["thresholds"])
+        perceived = self.network(signal, batch["thresholds"])
         unit = target if self.recipe.unit_power == "truth" else signal
-        scale = unit.square().mean(-1, keepdim=True).add(1e-18).rsqrt()
-        target, heard = target * scale, heard * scale
+        scale = unit.square().mean(-1, keepdim=True).add(POWER_FLOOR).rsqrt()
+        target, perceived = target * scale, perceived * scale
         weights = self.recipe.weights
-        parts = {"snr": noise_to_signal_db(heard, target) / 10.0}
+        parts = {"snr": noise_to_signal_db(perceived, target) / 10.0}
         self.log("snr", -10.0 * parts["snr"].mean(), prog_bar=True)
         if weights.get("log_spectrum"):
-            parts["log_spectrum"] = log_spectral_distance_db(heard, target) / 10.0
+            parts["log_spectrum"] = log_spectral_distance_db(perceived, target) / 10.0
         if set(weights) - {"snr", "log_spectrum"}:
-            parts |= paper_parts(heard, target)
+            parts |= paper_parts(perceived, target)
         return weighted_sum(parts, weights).mean()
 
     def evaluate(self, batch: Batch) -> dict[str, Tensor]:
-        """SNR in dB of each item."""
-        heard = self.kept.module(batch["signal"], batch["thresholds"])
+        """Compute the SNR of each item in dB, apart for speech and for tones and clicks."""
+        perceived = self.network(batch["signal"], batch["thresholds"])
         name = "valid_sounds_snr" if "sounds" in batch else "valid_snr"
-        return {name: -noise_to_signal_db(heard, batch["impaired"])}
+        return {name: -noise_to_signal_db(perceived, batch["impaired"])}
 
-    def figures(self, values: Mapping[str, Tensor]) -> dict[str, float]:
-        """Median and worst tenth of the SNR over the validation items, and of sounds where it trains on them.
-
-        They score by their share of the training.
-        """
-        figures: dict[str, float] = {}
+    def summarise(self, values: Mapping[str, Tensor]) -> dict[str, float]:
+        """Compute median and lowest tenth of each SNR; the score weights both kinds by their share in training."""
+        summary: dict[str, float] = {}
         score = 0.0
         for name, snr in values.items():
-            median, low = float(snr.median()), float(snr.quantile(0.1))
-            figures |= {f"{name}_median": median, f"{name}_worst_tenth": low}
-            share = self.recipe.sounds if name == "valid_sounds_snr" else 1.0 - self.recipe.sounds
-            score += share * (median + 0.5 * low)
-        return {"score": score, **figures}
+            median = float(snr.median())
+            lowest_tenth = float(snr.quantile(0.1))
+            summary[f"{name}_median"] = median
+            summary[f"{name}_worst_tenth"] = lowest_tenth
+            sounds = self.recipe.sounds
+            share = sounds if name == "valid_sounds_snr" else 1.0 - sounds
+            score += share * (median + 0.5 * lowest_tenth)
+        return {"score": score, **summary}
 
     def examples(self, batch: Batch) -> dict[str, Tensor]:
-        heard = self.kept.module(batch["signal"][-1:], batch["thresholds"][-1:])
-        signal, target = batch["signal"][-1], batch["impaired"][-1]
-        return {"given": signal, "heard/truth": target, "heard/network": heard[0]}
-
-    def released(self) -> Any:
-        return self.kept.module
-
-    def on_train_batch_end(self, *arguments: Any) -> None:
-        self.kept.update_parameters(self.student)
+        signal, target = batch["signal"][-1:], batch["impaired"][-1]
+        perceived = self.network(signal, batch["thresholds"][-1:])
+        return {"input": signal[0], "perceived/teacher": target, "perceived/network": perceived[0]}
 
 
 def train_simulator(
@@ -87,28 +82,33 @@ def train_simulator(
     *,
     out: str | Path,
     teacher: str = "msbg",
-    **options: Unpack[RunOptions],
+    **options: Unpack[TrainerOptions],
 ) -> Path:
-    """Train, resume, and keep the best checkpoint.
+    """Train a simulator, or resume its training, and keep the best one by validation.
 
     Args:
         data: speech, noise and ears to draw batches from.
-        teacher: ``"msbg"``, the exact one, ``"pyclarity"``'s, or anyone's simulator, ``package.module:name``, as
-            ``hlsim.data.foreign.load_teacher`` takes it.
+        recipe: network, criteria and number of steps.
+        out: folder for the results.
+        teacher: ``"msbg"``, the exact one, or any simulator, ``package.module:name``.
 
-    Returns: the folder that ``load_pretrained`` takes, ``out/checkpoint``.
+    Returns:
+        The folder that ``load_pretrained`` reads, ``out/checkpoint``.
 
     Raises:
-        ValueError: data, recipe or teacher that cannot be used; the message names them.
+        ValueError: data, recipe or teacher cannot be used.
     """
     module = SimulatorTraining(recipe)
     reference = find_teacher(teacher)
-    # nothing of hlsim's own: trainings that began before there were others go on
-    told = {} if reference is None else {"teacher": name_of(reference)}
+    described = {} if reference is None else {"teacher": name_of(reference)}
     batches = simulator_data(data, recipe, reference)
-    how: dict[str, Any] = {
-        "out": out,
-        "identity": data.identity() | told,
-        "about": told,
-    }
-    return train_network(module, batches, recipe, SIMULATOR, **how, **options)
+    return train_network(
+        module,
+        batches,
+        SIMULATOR,
+        out=out,
+        identity=data.identity() | described,
+        about=described,
+        callbacks=[WeightAverage(recipe.average)] if recipe.average else [],
+        **options,
+    )

@@ -55,8 +55,8 @@ def _parameters() -> dict[str, dict[str, Any]]:
     from hlsim.evaluation.previous.simulators import evaluate_simulators
     from hlsim.training.compensator import train_compensator
     from hlsim.training.corpora.layouts import prepare
-    from hlsim.training.loop import RunOptions
     from hlsim.training.simulator import train_simulator
+    from hlsim.training.trainer import TrainerOptions
 
     functions: dict[str, tuple[Callable[..., Any], ...]] = {
         "prepare": (prepare,),
@@ -72,7 +72,7 @@ def _parameters() -> dict[str, dict[str, Any]]:
         signatures = [inspect.signature(function).parameters for function in several]
         found[command] = {name: own[name].default for own in signatures for name in own}
         if command.startswith("train-"):
-            found[command] |= dict.fromkeys(RunOptions.__annotations__)
+            found[command] |= dict.fromkeys(TrainerOptions.__annotations__)
     return found
 
 

@@ -17,8 +17,8 @@ CALLS = {  # of each command one whose values may be replaced; most of them end 
     "compensate": "IN out.wav --audiogram N3 --compensator nalr --full-scale-spl 94",
     "prepare": "speech --out new.csv --folders speaker --valid-share 0.1",
     "haspi-report": "--manifest m.csv --out new --measures haspi --jobs 1 --spl 65 --listen 0 --seed 0 --audiogram N3",
-    "train-compensator": "--speech empty --out new --max-steps 1 --device cpu --audiogram N3",
-    "train-simulator": "--config r.yaml --speech empty --out new --max-steps 1 --device cpu --teacher msbg",
+    "train-compensator": "--speech empty --out new --max-minutes 1 --device cpu --audiogram N3",
+    "train-simulator": "--config r.yaml --speech empty --out new --max-minutes 1 --device cpu --teacher msbg",
     "evaluate-simulator": "msbg --speech empty --audiograms e.csv --out new --items 1 --seconds 1 --levels 65",
     "evaluate-compensator": "nalr --speech empty --out new --items 1 --seconds 1 --jobs 1 --audiogram N3",
 }

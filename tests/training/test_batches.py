@@ -1,6 +1,7 @@
 """Batches: each a function of seed, step and rank, drawn from folders or from a manifest alike."""
 
 import itertools
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -89,18 +90,24 @@ def test_a_batch_depends_on_seed_step_and_rank_alone(manifest: Path) -> None:
 
 
 @pytest.mark.parametrize("workers", [0, 2])
-def test_a_loader_gives_the_steps_in_order_and_continues(manifest: Path, workers: int) -> None:
+def test_a_loader_gives_the_steps_in_order(manifest: Path, workers: int) -> None:
     data = simulator_data(TrainingData.from_manifest(manifest, workers=workers), TINY)
-    loader = data.train_dataloader()
-    drawn = list(itertools.islice(loader, 3)) + list(itertools.islice(loader, 2))
-    for step, batch in enumerate(drawn):
+    for step, batch in enumerate(itertools.islice(data.train_dataloader(), 3)):
         assert torch.equal(batch["signal"], data.training[Step(step)]["signal"])
-    assert data.loader.waited > 0.0
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_an_error_of_a_worker_is_raised_as_it_is(manifest: Path, workers: int) -> None:
+    speech = [manifest.parent / "missing.wav"]
+    data = simulator_data(TrainingData(speech, valid_speech=manifest.parent), TINY)
+    data.workers = workers
+    batch = next(iter(data.train_dataloader()))
+    with pytest.raises(ValueError, match=r"^[^\n]*missing\.wav[^\n]*$"):
+        data.on_before_batch_transfer(batch, 0)
 
 
 def test_steps_of_a_process_are_its_own() -> None:
-    steps = itertools.islice(iter(Steps(5, 1, 2)), 2)
-    assert list(steps) == [(5, 1, 2), (6, 1, 2)]
+    assert list(Steps(5, 1, 2, end=7)) == [(5, 1, 2), (6, 1, 2)]
 
 
 def test_the_teacher_fills_in_what_is_missing(manifest: Path) -> None:
@@ -139,18 +146,13 @@ def test_other_files_are_another_training(manifest: Path) -> None:
     assert data.identity()["speech"] != other.identity()["speech"]
 
 
-def test_a_simulator_is_trained_on_a_manifest(manifest: Path, tmp_path: Path) -> None:
-    lines: list[str] = []
-    train_simulator(
-        TrainingData.from_manifest(manifest),
-        TINY,
-        out=tmp_path / "out",
-        max_steps=4,
-        accelerator="cpu",
-        progress=False,
-        report=lines.append,
-    )
-    assert "valid_snr_median" in lines[0]
+def test_a_simulator_is_trained_on_a_manifest(
+    manifest: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recipe = replace(TINY, steps=4)
+    data = TrainingData.from_manifest(manifest)
+    train_simulator(data, recipe, out=tmp_path / "out", accelerator="cpu")
+    assert "step 4: valid_snr_median" in capsys.readouterr().out
 
 
 def test_options_that_exclude_each_other(
