@@ -128,7 +128,8 @@ def nalr_gains_db(thresholds: Tensor) -> Tensor:
 
 
 def _impaired(thresholds: Tensor) -> Tensor:
-    return (_prescribed(thresholds) > 0.0).any(-1, keepdim=True)
+    # NaN, an ear out of range, is to reach the output
+    return ~(_prescribed(thresholds) <= 0.0).all(-1, keepdim=True)
 
 
 def _prescribed(thresholds: Tensor) -> Tensor:

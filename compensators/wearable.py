@@ -173,7 +173,8 @@ class Wearable(nn.Module):
             )
         set_to = dict(zip(self.SLIDERS, sliders, strict=True))
         for name, slider in set_to.items():  # before the first chunk, which has the items' number
-            check_slider(name, slider, slider.shape if isinstance(slider, Tensor) else torch.Size())
+            items = slider.shape if isinstance(slider, Tensor) else torch.Size()
+            check_slider(name, slider, items, torch.empty(0))
         as_thresholds(self._given(audiogram), taker=type(self).__name__)
         # it is asked for again when a slider moves, and a tensor may have been written into
         return Stream(
@@ -194,7 +195,7 @@ class Wearable(nn.Module):
         batch = torch.broadcast_shapes(waveform.shape[:-1], thresholds.shape[:-1])
         check_two_ears(self.linked, waveform)
         settings = [
-            check_slider(name, slider, batch).to(thresholds).expand(batch)
+            check_slider(name, slider, batch, thresholds).expand(batch)
             for name, slider in zip(self.SLIDERS, sliders, strict=True)
         ]
         ears = thresholds.to(dtype).expand(*batch, -1).reshape(-1, len(FREQUENCIES))
@@ -209,12 +210,24 @@ class Wearable(nn.Module):
         return audiogram
 
 
-def check_slider(name: str, slider: Slider, batch: torch.Size) -> Tensor:
-    """A slider as a tensor. Raises ValueError unless all of it lies from 0 to 1 and broadcasts over the items."""
+def check_slider(name: str, slider: Slider, batch: torch.Size, like: Tensor) -> Tensor:
+    """Return a slider as a tensor of the type and on the device of another one.
+
+    The values of a tensor on a GPU are not read, because the host would wait for the GPU. Those that are out of range
+    become NaN.
+
+    Raises:
+        ValueError: values outside 0 to 1, or a shape that does not broadcast over the items.
+    """
     if not (is_finite(slider) or (isinstance(slider, Tensor) and not slider.is_complex())):
         raise ValueError(f"{name} is {slider!r}; allowed: a number or a tensor, 0 to 1")
-    setting = torch.as_tensor(slider)
-    if not bool(((setting >= 0.0) & (setting <= 1.0)).all()):
+    if isinstance(slider, Tensor):
+        setting = slider.to(like.device, like.dtype, non_blocking=like.device.type != "cpu")
+    else:
+        setting = like.new_full((), torch.as_tensor(slider).item())
+    if isinstance(slider, Tensor) and slider.device.type != "cpu":
+        setting = torch.where((setting >= 0.0) & (setting <= 1.0), setting, torch.nan)
+    elif not bool(((torch.as_tensor(slider) >= 0.0) & (torch.as_tensor(slider) <= 1.0)).all()):
         raise ValueError(f"{name} is {slider!r}; allowed: 0 to 1")
     if setting.ndim > len(batch) or any(
         own not in (1, size) for own, size in zip(setting.shape[::-1], batch[::-1], strict=False)

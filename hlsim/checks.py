@@ -193,4 +193,6 @@ def check_lengths(lengths: Lengths, shape: torch.Size) -> Tensor:
 def silent_after(waveform: Tensor, ends: Tensor) -> Tensor:
     """Zeros in place of what follows each item's end. Shape: (..., time), (...) -> (..., time)."""
     places = torch.arange(waveform.shape[-1], device=waveform.device)
-    return torch.where(places < ends.to(waveform.device).unsqueeze(-1), waveform, 0.0)
+    return torch.where(
+        places < ends.to(waveform.device, non_blocking=True).unsqueeze(-1), waveform, 0.0
+    )

@@ -11,6 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from hlsim.audiogram.devices import known_on_host, on_device, on_host
 from hlsim.audiogram.value import (
     FREQUENCIES,
     LOWEST_LEVEL,
@@ -56,6 +57,9 @@ def as_thresholds(
     Args:
         missing: let a listener with one ear through, whose other ear is NaN.
 
+    Reading a tensor on a GPU would make the host wait for the GPU. The values of such a tensor are not validated on the
+    host: an ear with a level out of range becomes NaN there, and so do the outputs that are computed with it.
+
     Returns: (8,) for one ear, (batch, 8) for a sequence, (2, 8) for a ``Listener``, (batch, 2, 8) for a sequence of them,
     the tensor itself otherwise; dB HL.
 
@@ -96,10 +100,13 @@ def as_thresholds(
         raise ValueError(
             f"audiogram tensor of shape {tuple(levels.shape)}; allowed: (..., 8), dB HL at {listed(FREQUENCIES)} Hz"
         )
-    with torch.no_grad():
-        good = ((levels >= LOWEST_LEVEL) & (levels <= highest)).all(-1)
-        if not bool(good.all()):
-            _taken(levels[~good][0].tolist(), highest, taker)
+    known = known_on_host(levels)
+    if known is None:
+        inside = (levels >= LOWEST_LEVEL) & (levels <= highest)
+        return torch.where(inside.all(-1, keepdim=True), levels, math.nan)
+    good = ((known >= LOWEST_LEVEL) & (known <= highest)).all(-1)
+    if not bool(good.all()):
+        _taken(known[~good][0].tolist(), highest, taker)
     return levels
 
 
@@ -108,6 +115,8 @@ def own_thresholds(audiogram: AudiogramLike | None, **limits: Any) -> Tensor | N
     if audiogram is None:
         return None
     with torch.inference_mode(False):  # it may be trained through later
+        if isinstance(audiogram, Tensor):
+            on_host(audiogram)  # so that its values are validated
         levels = as_thresholds(audiogram, **limits)
         return levels if levels.requires_grad else levels.clone()
 
@@ -146,7 +155,7 @@ def resolve_thresholds(
             f"audiograms of shape {tuple(thresholds.shape)} for a waveform of shape {tuple(waveform.shape)}; allowed: "
             "one audiogram, or leading dimensions that broadcast"
         ) from None
-    return thresholds.to(waveform.device)
+    return on_device(thresholds, waveform.device)
 
 
 def one_an_item(thresholds: Tensor, shape: torch.Size) -> Tensor:

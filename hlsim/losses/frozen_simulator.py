@@ -3,6 +3,7 @@
 import math
 import os
 from collections.abc import Callable, Mapping
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal
 
@@ -11,6 +12,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from hlsim.audiogram import FREQUENCIES
+from hlsim.audiogram.devices import on_device
 from hlsim.checks import check_waveform
 from hlsim.dsp.resample import resample
 from hlsim.losses.band_levels import HIGHEST
@@ -19,6 +21,7 @@ from hlsim.msbg.response import hear_normally, with_phase_of_bank
 from hlsim.neuro import NeuroMSBG
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.pretrained import SIMULATOR, find_checkpoint, load_pretrained
+from hlsim.torchtools import lasting
 
 ReferenceName = Literal["clean", "normal-hearing"]
 
@@ -148,7 +151,8 @@ class FrozenEar:
                 items = self._narrowed(clean).expand(*batch, time).reshape(-1, time)
                 return hear_normally(items, ears, self.sample_rate).reshape(*batch, time)
             else:
-                aim = self.hear(clean, clean.new_zeros(len(FREQUENCIES)), listener, ends)
+                no_loss = on_device(_no_loss(clean.dtype), clean.device)
+                aim = self.hear(clean, no_loss, listener, ends)
             if kind == "bands" or not ours:
                 return aim.expand(*batch, time)
             aim = aim.expand(*batch, time).reshape(-1, time)
@@ -181,6 +185,12 @@ class FrozenEar:
         """Move the modules, as ``nn.Module._apply`` does."""
         move(self.simulator, fn)
         move(self.normal, fn)
+
+
+@lru_cache
+def _no_loss(dtype: torch.dtype) -> Tensor:
+    with lasting():
+        return torch.zeros(len(FREQUENCIES), dtype=dtype)
 
 
 def _batches(items: torch.Size, ears: torch.Size) -> list[torch.Size]:

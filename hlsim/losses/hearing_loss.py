@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from hlsim.audiogram import FREQUENCIES
+from hlsim.audiogram.devices import on_device
 from hlsim.audiogram.thresholds import (
     AudiogramLike,
     as_thresholds,
@@ -332,10 +333,14 @@ class HearingLossLoss(nn.Module):
         compensated, clean = compensated.to(dtype), clean.to(dtype)
         if ends is not None:
             compensated, clean = silent_after(compensated, ends), silent_after(clean, ends)
-        ears = ears.to(compensated.device)
-        known = ears.isfinite().all(-1)
-        if bool(known.all()):
+        host_ears = ears
+        ears = on_device(ears, compensated.device)
+        # only a listener, whose ears come from the CPU, may lack an ear
+        listeners = self._two_ears if audiogram is None else of_listeners(audiogram)
+        known = host_ears.isfinite().all(-1) if listeners else None
+        if known is None or bool(known.all()):
             return compensated, clean, ears, ends, None
+        known = known.to(compensated.device, non_blocking=True)
         compensated, clean = (
             torch.where(known.unsqueeze(-1), one, 0.0) for one in (compensated, clean)
         )

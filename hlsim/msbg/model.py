@@ -7,8 +7,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from hlsim.audiogram import SEVERITIES, severity_of
+from hlsim.audiogram import LOWEST_LEVEL, SEVERITIES, severity_of
+from hlsim.audiogram.devices import on_host
 from hlsim.audiogram.thresholds import (
+    HIGHEST_SIMULATED,
     AudiogramLike,
     of_listeners,
     own_thresholds,
@@ -140,12 +142,13 @@ class MSBG(nn.Module):
 
         outputs: list[Tensor] = []
         order: list[int] = []
-        for severity, none, members in _alike(ears):
+        known = on_host(thresholds).to(dtype).expand(*batch, -1).reshape(ears.shape)
+        for severity, none, members in _alike(known, ears.requires_grad):
             process = partial(self._simulate_alike, severity=severity, none=none)
             for some in _portions(members, signals.shape[-1], signals.device.type):
                 chosen: slice | Tensor = slice(some[0], some[-1] + 1)
                 if some[-1] - some[0] != len(some) - 1:  # a list would be copied with each use
-                    chosen = torch.tensor(some, device=signals.device)
+                    chosen = _indices(some, signals.device)
                 outputs.append(in_blocks(process, signals[chosen], ears[chosen], self.sample_rate))
                 order += some
         longest = max(output.shape[-1] for output in outputs)
@@ -156,7 +159,7 @@ class MSBG(nn.Module):
                 [functional.pad(output, (0, longest - output.shape[-1])) for output in outputs]
             )
         if order != list(range(len(order))):
-            heard = heard[torch.tensor(order).argsort().to(heard.device)]
+            heard = heard[_indices(torch.tensor(order).argsort().tolist(), heard.device)]
         if gain != 1.0:
             heard = heard / gain
         return heard.reshape(*batch, longest).to(waveform.dtype)
@@ -249,15 +252,31 @@ def active_rescaling(signals: Tensor) -> Tensor:
     return ratio.sqrt().unsqueeze(-1)
 
 
-def _alike(ears: Tensor) -> list[tuple[str, bool, list[int]]]:
-    """Severity, whether all is 0 dB HL, and the indices of the items with ears like that. Shape: (items, 8)."""
+def _alike(ears: Tensor, trained: bool) -> list[tuple[str, bool, list[int]]]:
+    """Group items by severity of the loss, and by whether there is any loss.
+
+    Args:
+        ears: levels in dB HL, on the CPU. Shape: (items, 8).
+        trained: whether the ears have a gradient. Then no ear counts as one without loss.
+
+    Returns: for each group its severity, whether it has no loss, and the indices of its items.
+
+    Raises:
+        ValueError: levels that were out of range, and which a GPU turned into NaN.
+    """
+    if bool(ears.isnan().any()):
+        raise ValueError(
+            f"an audiogram holds NaN or levels outside {LOWEST_LEVEL:g} to {HIGHEST_SIMULATED:g} dB HL"
+        )
     groups: dict[tuple[str, bool], list[int]] = {}
-    for item, levels in enumerate(
-        ears.tolist()
-    ):  # once a call; the rest asks nothing of the device
-        none = not any(levels) and not ears.requires_grad
+    for item, levels in enumerate(ears.tolist()):
+        none = not any(levels) and not trained
         groups.setdefault((severity_of(levels), none), []).append(item)
     return [(*kind, members) for kind, members in groups.items()]
+
+
+def _indices(items: list[int], device: torch.device) -> Tensor:
+    return torch.tensor(items).to(device, non_blocking=device.type != "cpu")
 
 
 def _portions(members: list[int], samples: int, device: str) -> list[list[int]]:

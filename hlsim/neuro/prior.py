@@ -146,7 +146,8 @@ class Prior(nn.Module):
         Shape: -> (severities, frequencies, frequencies).
         """
         smearing = self._corrected("smearing") * (self.ear_power / self.ear_power.unsqueeze(-1))
-        return torch.cat((torch.eye(smearing.shape[-1]).to(smearing).unsqueeze(0), smearing))
+        identity = torch.eye(smearing.shape[-1], dtype=smearing.dtype, device=smearing.device)
+        return torch.cat((identity.unsqueeze(0), smearing))
 
 
 def _widening(smeared: Tensor, given: Tensor) -> Tensor:
