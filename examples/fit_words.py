@@ -40,7 +40,7 @@ def data() -> pd.DataFrame:
     """A row a response: listener, system, hits, n_words, haspi, and the system's mean of it."""
     spec = find_spec("recipes")
     if spec is None or not spec.submodule_search_locations:
-        raise SystemExit("pyclarity is not installed: pip install 'hlsim[pyclarity]'")
+        raise SystemExit("pyclarity is not installed: pip install 'pyclarity==0.9.*'")
     recipes = Path(spec.submodule_search_locations[0])
     with (
         recipes / "cpc3/baseline/precomputed_haspi/clarity_data.train.haspi.jsonl"

@@ -46,7 +46,8 @@ compare() { # name of the table, options of evaluate-simulator, --, rows
     shift
     for row; do checkpoints+=("$(folder "$row")=$out/$(folder "$row")/checkpoint"); done
     hlsim evaluate-simulator "${checkpoints[@]}" --speech "$corpora/speech/valid" --noise "$corpora/noise/valid" \
-        --audiograms "$corpora/audiograms/valid.csv" --items "$items" --out "$out/$table" "${options[@]}"
+        --audiograms "$corpora/audiograms/valid.csv" --items "$items" --out "$out/$table" \
+        --teacher examples/pyclarity_teacher.py:PyclarityMSBG "${options[@]}"
 }
 
 train_all() { # recipes, JOBS at a time

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+import itertools
 import os
 import re
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import lru_cache
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -64,8 +66,8 @@ class WaveformPlugin:
 
     Attributes:
         function: The object that was loaded.
-        fingerprint: Identifies the plug-in in stored results: its own attribute ``fingerprint`` as
-            text where it has one, else its name. Change it when the results change.
+        fingerprint: The attribute ``fingerprint`` of the object, which its author changes when its
+            outputs change, as text; None if it has none.
 
     Raises:
         ValueError: As ``load_plugin``, or the object is not callable.
@@ -79,13 +81,15 @@ class WaveformPlugin:
             raise ValueError(f"{kind} {name} is of type {type_name}, expected a callable")
         if isinstance(self.function, nn.Module):
             self.function.eval()
-        self.fingerprint = str(getattr(self.function, "fingerprint", name))
+        fingerprint = getattr(self.function, "fingerprint", None)
+        self.fingerprint = None if fingerprint is None else str(fingerprint)
+        self._number = next(_load_numbers)
 
     def __str__(self) -> str:
-        return self.name if self.fingerprint == self.name else f"{self.name} ({self.fingerprint})"
+        return self.name if self.fingerprint is None else f"{self.name} ({self.fingerprint})"
 
     def __reduce__(self) -> Any:
-        return WaveformPlugin, (self.name, self.kind)  # another process loads it again
+        return _load_copy, (self.name, self.kind, self._number)
 
     @torch.no_grad()
     def __call__(self, waveform: Tensor, *arguments: Any) -> Tensor:
@@ -134,6 +138,15 @@ class WaveformPlugin:
                 f"{self.kind} {self.name} delays by {1000 * delay / sample_rate:.1f} ms; its output must "
                 "be time-aligned with its input"
             )
+
+
+_load_numbers = itertools.count()
+
+
+@lru_cache(maxsize=16)
+def _load_copy(name: str, kind: str, number: int) -> WaveformPlugin:
+    """Load a plug-in in another process; the same object for all pickles of one, by its number."""
+    return WaveformPlugin(name, kind)
 
 
 def _import_file(path: Path) -> ModuleType:

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hlsim.extras import require
+from hlsim.extras import MissingExtraError
 
 FREQUENCIES = (250.0, 500.0, 1000.0, 2000.0, 3000.0, 4000.0, 6000.0, 8000.0)
 """The audiometric frequencies in Hz that every simulator uses."""
@@ -197,9 +197,18 @@ class Audiogram:
         return cls(tuple(points.values()), tuple(points))
 
     def to_clarity(self) -> Any:
-        """The same ear as pyclarity's ``Audiogram`` (needs the extra ``pyclarity``)."""
-        clarity = require("clarity.utils.audiogram", "pyclarity")
-        return clarity.Audiogram(
+        """Convert to pyclarity's ``Audiogram``.
+
+        Raises:
+            MissingExtraError: pyclarity is not installed.
+        """
+        try:
+            from clarity.utils.audiogram import Audiogram as ClarityAudiogram
+        except ImportError as error:
+            raise MissingExtraError(
+                f"pyclarity is needed here and not installed ({error}); pip install 'pyclarity==0.9.*'"
+            ) from error
+        return ClarityAudiogram(
             levels=np.array(self.levels), frequencies=np.array(self.frequencies)
         )
 

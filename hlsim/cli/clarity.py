@@ -6,7 +6,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from hlsim.cli.evaluation import labelled, need_engine, tell_page
+from hlsim.cli.evaluation import labelled, tell_page
 from hlsim.cli.inputs import check_there, need
 from hlsim.cli.options import Parser, count, foreign_name, natural, number
 from hlsim.cli.progress import show_progress
@@ -22,7 +22,7 @@ def clarity(parser: Parser) -> None:
     text = "folder of SCENE_mix_CH1.wav, SCENE_target_anechoic_CH1.wav (or SCENE_reference.wav) and SCENE_target_CH1.wav"
     option("scenes", Path, text, metavar="SCENES")
     text = (
-        "compensators, by name or folder, or package.module:name, found from the working directory too: a callable "
+        "compensators, by name or folder, or package.module:name or path/to/file.py:name: a callable "
         "(waveform, listener, sample_rate) -> waveform or its class, of (2, time) at the files' scale; LABEL=NAME is "
         "LABEL in the tables"
     )
@@ -45,7 +45,6 @@ def clarity(parser: Parser) -> None:
     parser.flag(
         "--linked", "the level at both ears sets the gains of each: of a hearing aid or wdrc"
     )
-    parser.engine()
     option("--full-scale-spl", number, "level in dB SPL of a file whose RMS is 1.0", 100.0)
     option("--listen", natural, "items with players in report.html", 3)
     parser.jobs()
@@ -55,7 +54,6 @@ def clarity(parser: Parser) -> None:
 
 def _clarity(options: argparse.Namespace) -> None:
     need("eval", "joblib", "matplotlib")
-    need_engine(options.engine)
     check_there(folders=(options.scenes,), files=(options.listeners, options.scenes_listeners))
     from hlsim.evaluation.previous.clarity import evaluate_scenes
     from hlsim.report.previous.clarity import conditions_table, write_scenes
@@ -72,7 +70,6 @@ def _clarity(options: argparse.Namespace) -> None:
         every=options.every,
         enhancers=options.enhancers,
         linked=options.linked,
-        engine=options.engine,
         full_scale_spl=options.full_scale_spl,
         seed=options.seed,
         jobs=options.jobs,

@@ -39,7 +39,7 @@ def evaluate_simulator(parser: Parser) -> None:
     option("--speech", Path, "folder of clean speech", required=True)
     option("--audiograms", Path, EARS_TABLE, required=True)
     option("--noise", Path, "folder of noises; every second item is then noisy")
-    parser.teacher("what counts as the reference", "pyclarity")
+    parser.teacher("simulator to compare with", "msbg")
     option("--levels", number, "dB SPL that items take in turn", [50, 60, 65, 70, 80], nargs="+")
     text = "what the ear is given: as-is, louder (20 dB), nal-r, compressed (3:1), compensated"
     option("--inputs", str, text, ["as-is"], nargs="+", metavar="INPUT")
@@ -57,8 +57,6 @@ def _evaluate_simulator(options: argparse.Namespace) -> None:
     if options.compensator and "compensated" not in options.inputs:
         raise ValueError("--compensator without --inputs compensated; allowed: only with it")
     need("eval", "pystoi", "pandas", "matplotlib")
-    if options.teacher == "pyclarity":
-        need("pyclarity", "clarity")
     check_there(folders=(options.speech, options.noise), files=(options.audiograms,))
     from compensators import load_compensator
     from hlsim.calibration import PASCAL_SPL
@@ -104,7 +102,7 @@ def evaluate_compensator(parser: Parser) -> None:
     parser.audiogram(text="; one ear in place of all, for a compensator trained for it")
     option("--noise", Path, "folder of noises; every second item is then noisy, at 2.5 to 17.5 dB")
     text = (
-        "what takes noise off before each aid, package.module:name, found from the working directory too: a callable "
+        "what takes noise off before each aid, package.module:name or path/to/file.py:name: a callable "
         "(waveform, sample_rate) -> waveform or its class, of (..., time) in pascals, time-aligned"
     )
     option("--enhancer", foreign_name, text, [], nargs="+", metavar="NAME", dest="enhancers")
@@ -114,7 +112,6 @@ def evaluate_compensator(parser: Parser) -> None:
     option("--seconds", positive, "length of an item", 3.0)
     text = "standard ears of the gain curves and tones; with --audiogram that ear's are drawn"
     option("--gain-ears", str.upper, text, GAIN_EARS, nargs="+", metavar="EAR")
-    parser.engine()
     parser.jobs()
     parser.seed()
     parser.out()
@@ -126,7 +123,6 @@ def _evaluate_compensator(options: argparse.Namespace) -> None:
             "--gain-ears with --audiogram; allowed: without it, for that ear's gains are drawn"
         )
     need("eval", "pandas", "matplotlib")
-    need_engine(options.engine)
     check_there(folders=(options.speech, options.noise), files=(options.audiograms,))
     from compensators import load_compensator
     from hlsim.evaluation.previous.compensators import evaluate_compensators
@@ -149,7 +145,6 @@ def _evaluate_compensator(options: argparse.Namespace) -> None:
         noise=options.noise,
         enhancers=options.enhancers,
         simulator=options.simulator,
-        engine=options.engine,
         items=options.items,
         seconds=options.seconds,
         levels=options.levels,
@@ -172,11 +167,6 @@ def _evaluate_compensator(options: argparse.Namespace) -> None:
 
 def tell_page(path: Path) -> None:
     print(f"The page: {path}")
-
-
-def need_engine(engine: str) -> None:
-    if engine == "pyclarity":
-        need("pyclarity", "clarity")
 
 
 def labelled(text: str) -> tuple[str, str]:

@@ -16,7 +16,7 @@ from typing import Any, NoReturn
 
 STANDARD_EARS = ("NH", "N1", "N2", "N3", "N4", "N5", "N6", "N7", "S1", "S2", "S3")
 
-TEACHERS = ("msbg", "pyclarity")
+TEACHERS = ("msbg",)
 
 EARS_TABLE = (
     "CSV file with columns hl_250, hl_500, ... hl_8000 in dB HL; the level of a missing column is "
@@ -113,8 +113,8 @@ class Parser(argparse.ArgumentParser):
 
     def teacher(self, text: str, default: str) -> None:
         help_ = (
-            f"{text}: msbg (exact), pyclarity, or your own simulator as package.module:name, "
-            "imported from the working directory too: a callable (waveform, audiogram) -> waveform, "
+            f"{text}: msbg (exact), or your own simulator as package.module:name or "
+            "path/to/file.py:name: a callable (waveform, audiogram) -> waveform, "
             "or a class of such callables, time-aligned, for waveforms (items, time) in pascals and "
             "audiograms (items, 8) in dB HL, at its attribute sample_rate or else 16000 Hz"
         )
@@ -144,10 +144,6 @@ class Parser(argparse.ArgumentParser):
         self.option("--noise-reduction", slider, text)
         text = "strength of a hearing aid's amplification, 0 to 1 (default: 1)"
         self.option("--amplification", slider, text)
-
-    def engine(self) -> None:
-        text = "what computes HASPI and HASQI: hlsim, with pyclarity's figures, or pyclarity itself, which is slower"
-        self.option("--engine", str, text, "hlsim", choices=("hlsim", "pyclarity"))
 
     def jobs(self) -> None:
         self.option("--jobs", count, "number of processes; all cores by default")
@@ -193,7 +189,7 @@ def checked_type(
     return value_of
 
 
-_PLUGIN = re.compile(r"\w+(\.\w+)*:\w+")
+_PLUGIN = re.compile(r".+:\w+")
 
 number = checked_type(float, math.isfinite, "a number such as 65 or 2.5")
 positive = checked_type(float, lambda value: 0 < value < math.inf, "a number above 0")
@@ -201,11 +197,13 @@ slider = checked_type(float, lambda value: 0 <= value <= 1, "a number from 0 to 
 integer = checked_type(int, lambda value: True, "a whole number")
 count = checked_type(int, lambda value: value >= 1, "a whole number, 1 or more")
 natural = checked_type(int, lambda value: value >= 0, "a whole number, 0 or more")
-foreign_name = checked_type(str, lambda text: bool(_PLUGIN.fullmatch(text)), "package.module:name")
+foreign_name = checked_type(
+    str, lambda text: bool(_PLUGIN.fullmatch(text)), "package.module:name or path/to/file.py:name"
+)
 teacher_name = checked_type(
     str,
     lambda text: text in TEACHERS or bool(_PLUGIN.fullmatch(text)),
-    f"{', '.join(TEACHERS)} or package.module:name",
+    f"{', '.join(TEACHERS)}, package.module:name or path/to/file.py:name",
 )
 
 

@@ -1,4 +1,4 @@
-"""The measures that a report can hold: HASPI v2 and HASQI v2, by hlsim or by pyclarity, and STOI and PESQ."""
+"""The measures of a report: HASPI and HASQI version 2, STOI and PESQ."""
 
 from __future__ import annotations
 
@@ -11,28 +11,28 @@ import torch
 from torch import Tensor
 
 from hlsim.audiogram import Audiogram
-from hlsim.checks import check_choice, refuse_unknown
+from hlsim.checks import refuse_unknown
 from hlsim.extras import require
 from hlsim.metrics import fidelity
 from hlsim.metrics.haspi_score import haspi
 from hlsim.metrics.hasqi_score import hasqi
 from hlsim.metrics.pair import Signal, check_pair
-from hlsim.metrics.pyclarity import pyclarity_score
 from hlsim.version import __version__
-
-Engine = Literal["hlsim", "pyclarity"]
-"""What computes HASPI and HASQI: hlsim in torch, with pyclarity's figures, or pyclarity itself."""
 
 
 class Measure(NamedTuple):
-    """How a measure is named and computed.
+    """Name, properties and function of a measure.
 
-    ``needs``, a module and its extra, must be installed, and scores depend on the versions of ``packages`` and on the
-    ``revision`` of hlsim's part: to be raised where that changes a score. Whether audiogram, level and seed change it is
-    ``of_an_ear``: STOI and PESQ compare the signal at the ear with the clean speech, and do not say what is heard.
-    ``rewards_gain``: more level alone brings a higher score. ``score`` is of (clean, processed, audiogram, rate in Hz,
-    full_scale_spl, seed), and raises ValueError where there is none. ``engine`` is the ``Engine`` that computes
-    it, empty where there is no choice.
+    Attributes:
+        title: Name in tables.
+        needs: Module that must be installed, and the extra that installs it.
+        packages: Packages whose versions scores depend on.
+        of_an_ear: Whether a score depends on audiogram, level and seed. STOI and PESQ compare the
+            output with clean speech, whatever the ear.
+        rewards_gain: Whether a higher level alone raises the score.
+        score: Function of (clean, processed, audiogram, sample rate in Hz, full_scale_spl, seed),
+            which raises ValueError if there is no score.
+        revision: Version of the computation, to be raised when scores change.
     """
 
     title: str
@@ -41,11 +41,10 @@ class Measure(NamedTuple):
     of_an_ear: bool
     rewards_gain: bool
     score: Callable[[Signal, Signal, Audiogram, int, float, int], float]
-    engine: Engine | Literal[""] = ""
     revision: int = 1
 
 
-def _of_ear(
+def _score_for_ear(
     score: Callable[..., Tensor],
     clean: Signal,
     processed: Signal,
@@ -54,84 +53,80 @@ def _of_ear(
     full_scale_spl: float,
     seed: int,
 ) -> float:
-    """``haspi`` or ``hasqi`` with pyclarity's noise and its rates in whole kHz.
+    """Compute HASPI or HASQI with pyclarity's noise and its rates in whole kHz.
 
-    In double precision: single precision takes half the time, but may align a channel by another sample.
+    In double precision: single precision takes half the time, but may align a channel by another
+    sample.
     """
-    reference, given = map(torch.from_numpy, check_pair(clean, processed, rate, full_scale_spl))
+    reference, output = map(torch.from_numpy, check_pair(clean, processed, rate, full_scale_spl))
     options: dict[str, Any] = {"sample_rate": rate, "full_scale_spl": full_scale_spl, "seed": seed}
     with torch.no_grad():
-        return float(score(given, reference, ear, **options, noise="seeded", whole_khz=True))
+        return float(score(output, reference, ear, **options, noise="seeded", whole_khz=True))
 
 
-def _of_signals(
+def _score_of_signal(
     name: str, clean: Signal, processed: Signal, ear: Audiogram, rate: int, *level_and_seed: float
 ) -> float:
-    """``stoi`` or ``pesq_wb`` of ``fidelity``, of the signal at the ear."""
+    """Compute ``stoi`` or ``pesq_wb`` of ``fidelity``."""
     value, reason = getattr(fidelity, name)(clean, processed, rate)
     if value is None:
         raise ValueError(reason)
     return float(value)
 
 
-# numpy draws the noise
-_HASPI = Measure("HASPI", None, ("numpy",), True, True, partial(_of_ear, haspi), "hlsim")
-_HASQI = Measure("HASQI", None, ("numpy",), True, False, partial(_of_ear, hasqi), "hlsim")
-_STOI, _PESQ = ("pystoi", "numpy", "scipy"), ("pesq", "numpy")
-
 MeasureName = Literal["haspi", "hasqi", "stoi", "pesq"]
 
 MEASURES: dict[str, Measure] = {
-    "haspi": _HASPI,
-    "hasqi": _HASQI,
-    "stoi": Measure("STOI", ("pystoi", "eval"), _STOI, False, False, partial(_of_signals, "stoi")),
-    "pesq": Measure("PESQ", ("pesq", "pesq"), _PESQ, False, False, partial(_of_signals, "pesq_wb")),
+    "haspi": Measure("HASPI", None, ("numpy",), True, True, partial(_score_for_ear, haspi)),
+    "hasqi": Measure("HASQI", None, ("numpy",), True, False, partial(_score_for_ear, hasqi)),
+    "stoi": Measure(
+        "STOI",
+        ("pystoi", "eval"),
+        ("pystoi", "numpy", "scipy"),
+        False,
+        False,
+        partial(_score_of_signal, "stoi"),
+    ),
+    "pesq": Measure(
+        "PESQ",
+        ("pesq", "pesq"),
+        ("pesq", "numpy"),
+        False,
+        False,
+        partial(_score_of_signal, "pesq_wb"),
+    ),
 }
-"""By the names that options and files use. Higher is better in all: HASPI, HASQI and STOI end at 1, PESQ at 4.64."""
-
-_PYCLARITYS = {
-    name: measure._replace(
-        needs=("clarity", "pyclarity"),
-        packages=("pyclarity", "numpy", "scipy"),
-        score=partial(pyclarity_score, name),
-        engine="pyclarity",
-    )
-    for name, measure in (("haspi", _HASPI), ("hasqi", _HASQI))
-}
+"""Measures by the names that options and files use. Higher is better; the best PESQ is 4.64, of all others 1."""
 
 
-def measure_by(engine: Engine, name: str) -> Measure:
-    """A measure of ``MEASURES``; HASPI and HASQI by this engine."""
-    return _PYCLARITYS.get(name, MEASURES[name]) if engine == "pyclarity" else MEASURES[name]
+def check_measures(names: Iterable[MeasureName]) -> tuple[MeasureName, ...]:
+    """Return the names without repetitions.
 
-
-def check_measures(
-    names: Iterable[MeasureName], engine: Engine = "hlsim"
-) -> tuple[MeasureName, ...]:
-    """The names, each once, or ValueError with those that are allowed; MissingExtraError where a package lacks."""
+    Raises:
+        ValueError: A name is unknown, or there is none.
+        MissingExtraError: A package that a measure needs is not installed.
+    """
     chosen = tuple(dict.fromkeys(names))
     refuse_unknown(chosen, MEASURES, "measures")
     if not chosen:
-        raise ValueError(f"no measure; allowed: {', '.join(MEASURES)}")
-    check_choice("engine", engine, Engine)
+        raise ValueError(f"no measure given, expected one or more of {', '.join(MEASURES)}")
     for name in chosen:
-        if needs := measure_by(engine, name).needs:
+        needs = MEASURES[name].needs
+        if needs is not None:
             require(*needs)
     return chosen
 
 
-def versions_of(names: Iterable[str], engine: Engine = "hlsim") -> dict[str, str]:
-    """Versions of the packages that the scores of these measures depend on."""
-    packages = dict.fromkeys(
-        package for name in names for package in measure_by(engine, name).packages
-    )
+def versions_of(names: Iterable[str]) -> dict[str, str]:
+    """Versions of the packages that scores of these measures depend on."""
+    packages = dict.fromkeys(package for name in names for package in MEASURES[name].packages)
     return {package: version_of(package) for package in packages}
 
 
 def version_of(package: str) -> str:
-    """An installed package's version, or that it is not installed; hlsim's own also where it runs from its sources."""
+    """Version of a package, or ``not installed``."""
     if package == "hlsim":
-        return __version__
+        return __version__  # also when it runs from a source tree
     try:
         return metadata.version(package)
     except metadata.PackageNotFoundError:

@@ -90,7 +90,7 @@ def train_simulator(
         data: speech, noise and ears to draw batches from.
         recipe: network, criteria and number of steps.
         out: folder for the results.
-        teacher: ``"msbg"``, the exact one, or any simulator, ``package.module:name``.
+        teacher: ``"msbg"``, the exact one, or the name of a plug-in, see ``PluginTeacher``.
 
     Returns:
         The folder that ``load_pretrained`` reads, ``out/checkpoint``.

@@ -7,16 +7,52 @@ from collections.abc import Callable
 import torch
 from torch import Tensor, nn
 
-from hlsim.audiogram import Audiogram
-from hlsim.checks import refuse_unknown
-from hlsim.data.foreign import ForeignTeacher, load_teacher
-from hlsim.metrics.reference import pyclarity_msbg
+from hlsim.audiogram import FREQUENCIES
+from hlsim.calibration import set_level
+from hlsim.checks import check_rate, refuse_unknown
+from hlsim.dsp.resample import resample
 from hlsim.msbg import MSBG
+from hlsim.neuro.config import NEURO_RATE
+from hlsim.plugins import WaveformPlugin
 
-TEACHERS = ("msbg", "pyclarity")
+TEACHERS = ("msbg",)
 
-Reference = Callable[[Tensor, Audiogram, int], Tensor] | ForeignTeacher
-"""Another simulator than the exact MSBG: of one signal and one ear, as ``pyclarity_msbg``, or a loaded one."""
+Reference = Callable[[Tensor, Tensor, int], Tensor]
+"""A simulator in place of the exact MSBG: (items, time) in pascals, (items, 8) in dB HL and the
+sample rate in Hz -> (items, time)."""
+
+
+class PluginTeacher:
+    """A simulator ``(waveform, audiogram) -> waveform`` of your own, as a ``Reference``.
+
+    It receives (items, time) in pascals at its attribute ``sample_rate``, 16000 Hz if it has none,
+    and (items, 8) in dB HL, and returns the perceived signals, time-aligned with its input.
+
+    Args:
+        name: As for ``load_plugin``.
+
+    Raises:
+        ValueError: As ``WaveformPlugin``, the sample rate is out of range, or the output for half a
+            second of noise and an ear without a loss is no such waveform.
+    """
+
+    def __init__(self, name: str) -> None:
+        self.plugin = WaveformPlugin(name, "teacher")
+        try:
+            rate = check_rate(getattr(self.plugin.function, "sample_rate", NEURO_RATE))
+        except ValueError as error:
+            raise ValueError(f"teacher {name}: {error}") from error
+        self.sample_rate = rate
+        noise = torch.randn(1, rate // 2, generator=torch.Generator().manual_seed(0))
+        self.plugin.check_aligned(set_level(noise, 65.0), rate, torch.zeros(1, len(FREQUENCIES)))
+
+    def __str__(self) -> str:
+        return str(self.plugin)
+
+    def __call__(self, signals: Tensor, thresholds: Tensor, sample_rate: int) -> Tensor:
+        """Perceived signals. Shape: (items, time) in pascals, (items, 8) in dB HL -> (items, time)."""
+        perceived = self.plugin(resample(signals, sample_rate, self.sample_rate), thresholds)
+        return resample(perceived, self.sample_rate, sample_rate)[..., : signals.shape[-1]]
 
 
 class Teacher(nn.Module):
@@ -35,32 +71,25 @@ class Teacher(nn.Module):
 
     @torch.no_grad()
     def forward(self, signals: Tensor, thresholds: Tensor) -> Tensor:
-        """Perceived signals. Shape: (items, time) in pascals, (items, 8) dB HL -> (items, time)."""
-        reference = self.reference
-        if reference is None:
-            perceived: Tensor = self.msbg(signals, thresholds)
-            return perceived
-        if isinstance(reference, ForeignTeacher):
-            return reference(signals, thresholds, self.sample_rate)
-        outputs = []
-        for signal, levels in zip(signals, thresholds, strict=True):
-            ear = Audiogram(tuple(levels.tolist()))
-            outputs.append(reference(signal.cpu(), ear, self.sample_rate))
-        return torch.stack(outputs).to(signals)
+        """Perceived signals. Shape: (items, time) in pascals, (items, 8) in dB HL -> (items, time)."""
+        if self.reference is not None:
+            return self.reference(signals, thresholds, self.sample_rate)
+        perceived: Tensor = self.msbg(signals, thresholds)
+        return perceived
 
 
-def find_teacher(name: str) -> Reference | None:
-    """The simulator with a name: None for ``msbg``, the exact one; pyclarity's; or ``package.module:name``.
+def find_teacher(name: str) -> PluginTeacher | None:
+    """The teacher with a name: None for ``msbg``, the exact one, or a plug-in.
 
     Raises:
-        ValueError: there is no such teacher.
+        ValueError: There is no such teacher.
     """
     if ":" in name:
-        return load_teacher(name)
+        return PluginTeacher(name)
     refuse_unknown([name], (*TEACHERS, "package.module:name"), "teachers")
-    return None if name == "msbg" else pyclarity_msbg
+    return None
 
 
 def name_of(reference: Reference | None) -> str:
-    """Name of a teacher, different for different simulators."""
+    """Name of a teacher, with the fingerprint of a plug-in."""
     return "msbg" if reference is None else str(getattr(reference, "__name__", reference))

@@ -373,7 +373,6 @@ def test_ogg_of_many_channels_is_refused_before_anything_is_loaded(
     [
         ["train-compensator", "--speech", "s"],
         ["train-simulator", "--speech", "s", "--config", "c"],
-        ["prepare", "s"],
         ["demo"],
     ],
 )
@@ -489,23 +488,6 @@ def test_unequal_file_lists(
             ["evaluate-simulator", "msbg", "--speech", "s", "--audiograms", "a", "--out", "o"],
             "pystoi",
         ),
-        (
-            ["evaluate-simulator", "msbg", "--speech", "s", "--audiograms", "a", "--out", "o"],
-            "clarity",
-        ),
-        (
-            [
-                "evaluate-compensator",
-                "nalr",
-                "--speech",
-                "s",
-                "--engine",
-                "pyclarity",
-                "--out",
-                "o",
-            ],
-            "clarity",
-        ),
         (["demo", "--out", "o"], "matplotlib"),
     ],
 )
@@ -523,9 +505,7 @@ def test_missing_extra_names_the_install_command(
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, module, None)
     error = fails(capsys, *command)
-    extra = {"lightning": "train", "tensorboard": "train", "clarity": "pyclarity"}.get(
-        module, "eval"
-    )
+    extra = {"lightning": "train", "tensorboard": "train"}.get(module, "eval")
     assert module in error and f"pip install 'hlsim[{extra}]'" in error
     assert not list(tmp_path.iterdir())
 

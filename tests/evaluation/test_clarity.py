@@ -187,7 +187,7 @@ def unchanged(waveform: torch.Tensor, sample_rate: int) -> torch.Tensor:
 
 
 def test_two_enhancers_of_one_name_are_refused() -> None:
-    with pytest.raises(ValueError, match="one a name after the colon"):
+    with pytest.raises(ValueError, match="the same name after the colon"):
         _conditions({}, [f"{__name__}:unchanged", f"{__name__}:unchanged"], False, RATE, 94.0)
 
 

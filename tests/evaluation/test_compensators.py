@@ -33,9 +33,9 @@ from hlsim.evaluation.previous.measurements import insertion_gain
 from hlsim.evaluation.statistics import paired_comparison
 from hlsim.losses.band_levels import band_edges
 from hlsim.metrics import registry
-from hlsim.metrics.pyclarity import pyclarity_score
 from hlsim.pretrained import find_checkpoint, save_checkpoint
 from hlsim.report.previous.compensators import FILES, write_compensators
+from tests import pyclarity
 
 pytest.importorskip("matplotlib")
 pytest.importorskip("joblib")
@@ -170,10 +170,11 @@ def test_figures_are_those_of_the_measures_and_the_loss(speech_dir: Path) -> Non
     judged, aided = judge(trial, ["most", "of network"]), NALR()(item.signal, ear)
     assert isinstance(judged["most"], dict) and [*judged["of network"]] == ["loss_neuro"]
     figures = judged["most"] | judged["of network"]
-    assert figures["engine"] == "hlsim"
-    for name in ("haspi", "hasqi"):
-        theirs = pyclarity_score(name, item.clean, aided, ear, 16000, seed=7)
-        assert figures[name] == pytest.approx(theirs, abs=1e-6)
+    signals = (item.clean.double().numpy(), aided.double().numpy())
+    haspi, (hasqi, *_) = (
+        score(*signals, ear, 16000, 7) for score in (pyclarity.haspi, pyclarity.hasqi)
+    )
+    assert (figures["haspi"], figures["hasqi"]) == pytest.approx((haspi, hasqi), abs=1e-6)
     for name, simulator in (("neuro", neuro), ("msbg", "msbg")):
         loss = HearingLossLoss(ear, criterion="bands", simulator=simulator)
         assert figures[f"loss_{name}"] == pytest.approx(float(loss(aided, item.clean)), rel=1e-4)
@@ -424,38 +425,6 @@ def test_a_stopped_run_goes_on_and_new_weights_are_judged_anew(
         "hard",
     }
     assert {curve["ear"] for curve in whole["gain_curves"]} == {*whole["ears"]}
-
-
-@pytest.mark.usefixtures("quick")
-def test_engines_are_kept_apart(
-    tmp_path: Path, speech_dir: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    options: dict[str, Any] = {
-        "speech": speech_dir / "valid",
-        "items": 2,
-        "seconds": 0.3,
-        "jobs": 1,
-    }
-    options |= {"audiogram": Audiogram.standard("N4"), "out": tmp_path}
-    both = compare({"own": Gain()}, **options)
-    assert (
-        both["engine"] == "hlsim"
-        and "HASQI v2, by hlsim " in (tmp_path / "compensators.md").read_text()
-    )
-
-    measured: list[str] = []
-    original = judging.measure_by
-    monkeypatch.setattr(
-        judging, "measure_by", lambda *by: (measured.append(by[0]), original("hlsim", by[1]))[1]
-    )
-    monkeypatch.setattr(compensators, "check_measures", lambda *names: None)
-    assert compare({"own": Gain()}, **options)["rows"] == both["rows"] and not measured
-    theirs = compare({"own": Gain()}, **options, engine="pyclarity")
-    assert (
-        {*measured} == {"pyclarity"}
-        and theirs["rows"] == both["rows"]
-        and theirs["engine"] == "pyclarity"
-    )
 
 
 class First(Gain):

@@ -13,12 +13,10 @@ from torch import Tensor
 
 from compensators import NALR
 from hlsim import MSBG, Audiogram
-from hlsim.calibration import level_spl, set_level
-from hlsim.evaluation import simulators
+from hlsim.calibration import level_spl
+from hlsim.evaluation.previous import simulators
 from hlsim.evaluation.previous.items import LEVELS, draw_items, treat
 from hlsim.evaluation.previous.simulators import evaluate_simulators, summarise
-from hlsim.metrics.fidelity import snr_db
-from hlsim.metrics.reference import pyclarity_msbg
 from hlsim.report.previous.simulators import write_fidelity
 
 pytest.importorskip("clarity")
@@ -31,16 +29,6 @@ def ears(tmp_path: Path) -> Path:
     rows = [Audiogram.standard(name).to_row() for name in ("N3", "N5")]
     path.write_text("\n".join([",".join(rows[0]), *(",".join(row.values()) for row in rows)]))
     return path
-
-
-@pytest.mark.parametrize(("name", "level"), [("NH", 65.0), ("N2", 50.0), ("N3", 80.0)])
-def test_truth_is_the_exact_model(
-    speech: list[tuple[Tensor, int]], name: str, level: float
-) -> None:
-    waveform, rate = speech[0]
-    signal = set_level(waveform[0, : 2 * rate], level)
-    ear = Audiogram.standard(name)
-    assert snr_db(pyclarity_msbg(signal, ear, rate), MSBG(ear, sample_rate=rate)(signal)) > 40.0
 
 
 def test_items_are_the_same_for_a_seed_and_cover_what_they_say(
@@ -230,8 +218,16 @@ def test_what_a_simulator_fails_on_is_told(tmp_path: Path, speech_dir: Path, ear
 def test_what_the_truth_fails_on_is_told_and_is_no_picture(
     tmp_path: Path, speech_dir: Path, ears: Path
 ) -> None:
+    (tmp_path / "strict.py").write_text(
+        "def teacher(waveform, audiogram):\n"
+        "    if waveform.square().mean() < 1e-6:\n"
+        "        raise ValueError('too soft')\n"
+        "    return waveform\n"
+    )
+    teacher = f"{tmp_path}/strict.py:teacher"
     result = compare(
         {"identity": Unimpaired(), "exact": MSBG(sample_rate=16000)},
+        teacher=teacher,
         speech=speech_dir / "valid",
         audiograms=ears,
         out=tmp_path,
@@ -244,14 +240,12 @@ def test_what_the_truth_fails_on_is_told_and_is_no_picture(
         soft, loud = (simulator["inputs"][given]["overall"] for given in ("as-is", "louder"))
         assert (soft["n"], soft["snr_n"], loud["n"], loud["snr_n"]) == (2, 0, 2, 2)
     text = (tmp_path / "fidelity.md").read_text()
-    assert (
-        text[text.index("## Failures") :].count("no truth: too soft for pyclarity's active level")
-        == 4
-    )
+    assert text[text.index("## Failures") :].count("too soft") == 4
     assert "20 dB louder, clean, 28 dB SPL" in (tmp_path / "fidelity.html").read_text()
-    with pytest.raises(ValueError, match="no item has a truth: too soft for pyclarity's"):
+    with pytest.raises(ValueError, match=r"no item has a truth: .*too soft"):
         compare(
             {"identity": Unimpaired()},
+            teacher=teacher,
             speech=speech_dir / "valid",
             audiograms=ears,
             out=tmp_path,
@@ -308,10 +302,7 @@ def test_teachers_share_no_stored_scores(
     exact = compare(given, teacher="msbg", **options)
     other = compare(given, teacher="dead_region:DeadRegion", **options)
     assert len((tmp_path / "scores.jsonl").read_text().splitlines()) == 4
-    assert (
-        other["teacher"].startswith("dead_region:DeadRegion (sha256 ")
-        and exact["teacher"] == "msbg"
-    )
+    assert (other["teacher"], exact["teacher"]) == ("dead_region:DeadRegion", "msbg")
     text = (tmp_path / "fidelity.md").read_text()
     assert text.startswith("# Fidelity\n") and f"Against {other['teacher']}: 2 items" in text
     snr = [
@@ -322,9 +313,7 @@ def test_teachers_share_no_stored_scores(
 
 
 def test_unknown_teacher(tmp_path: Path, speech_dir: Path, ears: Path) -> None:
-    with pytest.raises(
-        ValueError, match="unknown teachers nobody; allowed: msbg, pyclarity, package"
-    ):
+    with pytest.raises(ValueError, match="unknown teachers nobody"):
         compare({}, speech=speech_dir, audiograms=ears, out=tmp_path, teacher="nobody")
 
 

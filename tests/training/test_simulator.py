@@ -13,7 +13,6 @@ pytest.importorskip("lightning")
 from hlsim.audio import find_audio, write_audio
 from hlsim.audiogram import Audiogram
 from hlsim.calibration import level_spl, set_level
-from hlsim.data.foreign import load_teacher
 from hlsim.neuro import NeuroMSBG
 from hlsim.pretrained import checkpoint_about, checkpoint_digest, load_pretrained
 from hlsim.training.batches import (
@@ -25,6 +24,7 @@ from hlsim.training.callbacks import spectrogram_image
 from hlsim.training.data_module import Batch, Step
 from hlsim.training.recipes import SimulatorRecipe
 from hlsim.training.simulator import SimulatorTraining, train_simulator
+from hlsim.training.teacher import PluginTeacher
 
 TINY = SimulatorRecipe(
     model={"channels": 4, "blocks": 1, "stride": [4, 3], "kernel": [3, 3]},
@@ -171,11 +171,11 @@ def test_another_teacher_is_recorded_and_needs_another_folder(
     settings: dict[str, Any] = {"out": tmp_path, "accelerator": "cpu"}
     recipe = replace(TINY, steps=1)
     folder = train_simulator(data, recipe, teacher="dead_region:DeadRegion", **settings)
-    assert checkpoint_about(folder)["teacher"].startswith("dead_region:DeadRegion (sha256 ")
+    assert checkpoint_about(folder)["teacher"] == "dead_region:DeadRegion"
     with pytest.raises(ValueError, match="other teacher;"):
         train_simulator(data, recipe, **settings)
     targets = []
-    for teacher in (None, load_teacher("dead_region:DeadRegion")):
+    for teacher in (None, PluginTeacher("dead_region:DeadRegion")):
         batches = simulator_data(data, TINY, teacher)
         targets.append(batches.on_after_batch_transfer(batches.training[Step(0)], 0))
     assert torch.equal(targets[0]["signal"], targets[1]["signal"])

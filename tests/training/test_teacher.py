@@ -1,12 +1,28 @@
 """The teacher: the exact MSBG, or another simulator."""
 
+from pathlib import Path
+
 import pytest
 import torch
 
 from hlsim import MSBG, Audiogram
-from hlsim.training.teacher import Teacher, find_teacher, name_of
+from hlsim.calibration import set_level
+from hlsim.training.teacher import PluginTeacher, Teacher, find_teacher, name_of
 
 EARS = torch.tensor([Audiogram.standard(name).thresholds for name in ("N2", "N5")])
+
+PLUGIN = """
+class Quieter:
+    sample_rate = 44100
+    def __call__(self, waveform, audiogram):
+        return 0.5 * waveform * 10 ** (-audiogram[:, :1] / 20)
+
+class TooFast(Quieter):
+    sample_rate = 96000
+
+def late(waveform, audiogram):
+    return waveform.roll(320, -1)
+"""
 
 
 def test_the_teacher_is_the_exact_msbg() -> None:
@@ -15,16 +31,22 @@ def test_the_teacher_is_the_exact_msbg() -> None:
     assert find_teacher("msbg") is None and name_of(None) == "msbg"
 
 
-def test_another_simulator_is_asked_item_by_item() -> None:
-    def attenuate(signal: torch.Tensor, ear: Audiogram, sample_rate: int) -> torch.Tensor:
-        return signal * 10.0 ** (-ear.thresholds[0] / 20.0) * sample_rate
+def test_a_plug_in_is_asked_at_its_own_rate(tmp_path: Path) -> None:
+    (tmp_path / "plugin.py").write_text(PLUGIN)
+    teacher = find_teacher(f"{tmp_path}/plugin.py:Quieter")
+    speech = set_level(torch.randn(2, 16000), 65.0)
+    # the band that both rates hold
+    low = torch.fft.irfft(torch.fft.rfft(speech) * (torch.arange(8001) < 6000), 16000)
+    perceived = Teacher(16000, teacher)(low, torch.tensor([[0.0] * 8, [20.0] * 8]))
+    expected = low * torch.tensor([[0.5], [0.05]])
+    assert float((perceived - expected)[:, 400:-400].norm() / expected.norm()) < 1e-3
+    assert name_of(teacher) == f"{tmp_path}/plugin.py:Quieter"
 
-    signals = torch.ones(2, 100)
-    expected = signals * 10.0 ** (-EARS[:, :1] / 20.0) * 16000
-    torch.testing.assert_close(Teacher(16000, attenuate)(signals, EARS), expected)
-    assert name_of(attenuate) == "attenuate"
 
-
-def test_unknown_teachers_are_rejected() -> None:
+def test_unknown_late_and_too_fast_teachers_are_rejected(tmp_path: Path) -> None:
+    (tmp_path / "plugin.py").write_text(PLUGIN)
     with pytest.raises(ValueError, match="pyclarty"):
         find_teacher("pyclarty")
+    for name in ("late", "TooFast", "nobody"):
+        with pytest.raises(ValueError, match=f"{tmp_path}/plugin.py:{name}"):
+            PluginTeacher(f"{tmp_path}/plugin.py:{name}")

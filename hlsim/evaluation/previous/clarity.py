@@ -21,7 +21,7 @@ from compensators import load_compensator
 from hlsim.audio import read_audio, write_audio
 from hlsim.audiogram.listener import EARS, Listener, read_listeners
 from hlsim.calibration import check_full_scale, gain_to_pascals, set_level
-from hlsim.data.foreign import ForeignAid, ForeignEnhancer, load_aid, load_enhancers
+from hlsim.evaluation.enhancers import load_enhancers
 from hlsim.evaluation.previous.haspi_report import HaspiReport, report_items
 from hlsim.evaluation.previous.keys import weights_hash
 from hlsim.evaluation.previous.measurements import samples_ahead
@@ -29,8 +29,9 @@ from hlsim.evaluation.previous.scores import Failure
 from hlsim.evaluation.previous.scoring import FileItem
 from hlsim.evaluation.store import ScoreStore, content_hash, key_of
 from hlsim.metrics.pair import check_seed
-from hlsim.metrics.registry import Engine, MeasureName, check_measures
+from hlsim.metrics.registry import MeasureName, check_measures
 from hlsim.parallel import Failed, Progress, check_parallel, make_missing, one_thread, reason_of
+from hlsim.plugins import WaveformPlugin
 
 FULL_SCALE_SPL = 100.0
 """Level in dB SPL of RMS 1.0 in the challenges' files."""
@@ -62,8 +63,8 @@ class Scene:
 class Aids(NamedTuple):
     """What both ears are given of a scene, after an enhancer or at once; None for ``aid`` leaves it as it is."""
 
-    aid: nn.Module | ForeignAid | None
-    enhancer: ForeignEnhancer | None
+    aid: nn.Module | WaveformPlugin | None
+    enhancer: WaveformPlugin | None
     sample_rate: int
     full_scale_spl: float
 
@@ -73,7 +74,7 @@ class Aids(NamedTuple):
         if self.enhancer is not None:
             gain = gain_to_pascals(self.full_scale_spl)
             waveform = self.enhancer(waveform * gain, self.sample_rate) / gain
-        if isinstance(self.aid, ForeignAid):
+        if isinstance(self.aid, WaveformPlugin):
             return self.aid(waveform, listener, self.sample_rate)
         if self.aid is None:
             return waveform
@@ -112,7 +113,6 @@ def evaluate_scenes(
     every: int = 1,
     enhancers: Sequence[str] = (),
     linked: bool = False,
-    engine: Engine = "hlsim",
     full_scale_spl: float = FULL_SCALE_SPL,
     seed: int = 0,
     jobs: int | None = None,
@@ -125,7 +125,8 @@ def evaluate_scenes(
     stopped goes on where it was.
 
     Args:
-        aids: by label, a compensator's name or folder, or ``package.module:name`` of a ``ForeignAid``.
+        aids: by label, a compensator's name or folder, or the name of a plug-in
+            ``(waveform, listener, sample_rate) -> waveform``.
         scenes: folder with ``SCENE_mix_CH1.wav`` (or ``_mixed_CH1``), of two channels, and
             ``SCENE_target_anechoic_CH1.wav`` (or ``_target_anechoic``, ``_reference``), of one or two. With
             ``SCENE_target_CH1.wav`` there, each channel of the former gets that one's level, as in the challenges.
@@ -133,9 +134,8 @@ def evaluate_scenes(
         scenes_listeners: JSON file of the names of each scene's listeners; None takes every listener in every scene.
         every: of the pairs of scene and listener take the first and then each so manyth; the challenges' small test
             has 15.
-        enhancers: ``package.module:name`` of what takes noise off before each aid, see ``ForeignEnhancer``.
+        enhancers: names of plug-ins that remove noise before each aid, see ``load_enhancer``.
         linked: compensators set the gains of both ears by one level.
-        engine: see ``haspi_report``.
         full_scale_spl: level in dB SPL of RMS 1.0.
         jobs: processes; None takes all cores.
         progress: of what it is to tell of, called with how many are done and all.
@@ -146,9 +146,9 @@ def evaluate_scenes(
 
     Raises:
         ValueError: a file is missing, broken or contradicts another, a listener lacks an ear, or nothing could be scored.
-        MissingExtraError: joblib or, for its engine, pyclarity is not installed.
+        MissingExtraError: joblib is not installed.
     """
-    check_measures(_MEASURES, engine)
+    check_measures(_MEASURES)
     check_parallel(jobs, "loky", None)
     check_seed(seed)
     check_full_scale(full_scale_spl)
@@ -217,7 +217,6 @@ def evaluate_scenes(
     return report_items(
         items,
         _MEASURES,
-        engine=engine,
         conditions=[*conditions],
         better_ear=True,
         store=folder / "scores.jsonl",
@@ -309,7 +308,7 @@ def _conditions(
 
     def load(name: str) -> Any:
         if ":" in name and not Path(name).exists():
-            return load_aid(name)
+            return WaveformPlugin(name, "aid")
         return load_compensator(name, **options, linked=linked).eval()
 
     loaded = {

@@ -104,8 +104,7 @@ def _report(rows: Rows, items: Sequence[Item], settings: Mapping[str, Any]) -> H
         )
         for row in rows
     ]
-    about = {"seed": settings["seed"], "engine": settings["engine"]}
-    return HaspiReport(scores, measures=MEASURES, unit="ears", **about)
+    return HaspiReport(scores, measures=MEASURES, unit="ears", seed=settings["seed"])
 
 
 def _frame(rows: Rows, condition: str) -> Any:

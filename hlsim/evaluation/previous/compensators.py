@@ -17,7 +17,7 @@ from compensators.nalr import NALR
 from compensators.wdrc import WDRC
 from hlsim.audiogram import Audiogram
 from hlsim.audiogram.thresholds import as_thresholds
-from hlsim.data.foreign import load_enhancers
+from hlsim.evaluation.enhancers import load_enhancers
 from hlsim.evaluation.previous.compensator_result import MEASURES, compensator_result
 from hlsim.evaluation.previous.haspi_report import HaspiReport
 from hlsim.evaluation.previous.items import INPUT_LEVELS, Item, draw_judged_items, read_ears
@@ -43,7 +43,8 @@ from hlsim.evaluation.store import ScoreStore, key_of
 from hlsim.extras import require
 from hlsim.losses.band_levels import BANDS
 from hlsim.metrics.pair import check_seed
-from hlsim.metrics.registry import Engine, check_measures, measure_by, version_of, versions_of
+from hlsim.metrics.registry import MEASURES as REGISTRY
+from hlsim.metrics.registry import check_measures, version_of, versions_of
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.parallel import Failed, Progress, check_parallel, make_missing
 from hlsim.pretrained import load_pretrained
@@ -77,7 +78,6 @@ def evaluate_compensators(
     noise: str | Path | None = None,
     enhancers: Sequence[str] = (),
     simulator: str | Path = "neuro-msbg",
-    engine: Engine = "hlsim",
     items: int = 400,
     seconds: float = 3.0,
     levels: Sequence[float] = INPUT_LEVELS,
@@ -101,11 +101,10 @@ def evaluate_compensators(
             ``config.limit_spl``, or ``limit_spl``, is held to it.
         speech, noise: folders of recordings; with ``noise`` every second item is noisy, at 2.5 to 17.5 dB.
         store: file of figures, there or not; None keeps nothing.
-        enhancers: ``package.module:name`` of what takes noise off before an aid, see ``ForeignEnhancer``.
+        enhancers: names of plug-ins that remove noise before an aid, see ``load_enhancer``.
         audiograms: CSV file of ears that join Bisgaard's N2 to N6 and S1 to S3.
         audiogram: one ear in place of all, also of the gain curves, for a compensator that was trained for it.
         simulator: the Neuro-MSBG of the surrogate gap, by name or folder.
-        engine: of HASPI and HASQI, see ``haspi_report``.
         items: how many in all. 400 give each main row 200 pairs.
         seconds: length of an item; HASPI is not to be trusted much under 3.
         levels: of the clean speech in dB SPL, in turn.
@@ -116,10 +115,10 @@ def evaluate_compensators(
 
     Raises:
         ValueError: data or settings that cannot be used, or no item could be judged.
-        MissingExtraError: pandas, joblib or, for its engine, pyclarity is not installed.
+        MissingExtraError: pandas or joblib is not installed.
     """
     require("pandas", "eval")
-    check_measures(MEASURES, engine)
+    check_measures(MEASURES)
     check_parallel(jobs, "loky", None)
     check_seed(seed)
     if items < 1 or not compensators or not levels:
@@ -189,13 +188,12 @@ def evaluate_compensators(
         by_ear[ear] = conditions | own
     network = load_pretrained(simulator)
     judged = _judge_all(
-        drawn, by_ear, network, engine, seed, ScoreStore(store), jobs=jobs, progress=progress
+        drawn, by_ear, network, seed, ScoreStore(store), jobs=jobs, progress=progress
     )
     settings: dict[str, Any] = {
         "items": items,
         "seconds": seconds,
         "seed": seed,
-        "engine": engine,
         "levels": [*levels],
     }
     settings |= {"ears": [name for name, _ in ears], "simulator": str(simulator)}
@@ -255,7 +253,6 @@ def _judge_all(
     items: Sequence[Item],
     conditions: Mapping[Audiogram, Mapping[str, nn.Module]],
     simulator: nn.Module,
-    engine: Engine,
     seed: int,
     store: ScoreStore,
     *,
@@ -269,10 +266,10 @@ def _judge_all(
         for ear, own in conditions.items()
     }
     network = weights_hash(simulator)
-    versions = {**versions_of(MEASURES, engine), "hlsim": version_of("hlsim")}
-    revisions = {name: measure_by(engine, name).revision for name in MEASURES}
+    versions = {**versions_of(MEASURES), "hlsim": version_of("hlsim")}
+    revisions = {name: REGISTRY[name].revision for name in MEASURES}
     trials = []
-    by = {"revision": _REVISION, "versions": versions, "engine": engine, "revisions": revisions}
+    by = {"revision": _REVISION, "versions": versions, "revisions": revisions}
     for number, item in enumerate(items):
         trial_seed = (seed + number) % 2**32
         about = {**by, "seed": trial_seed, **item.settings()}
@@ -280,7 +277,7 @@ def _judge_all(
         keys = {
             name: Keys(key_of(it), key_of({**it, "simulator": network})) for name, it in of.items()
         }
-        trials.append(Trial(item, conditions[item.ear], simulator, trial_seed, keys, engine))
+        trials.append(Trial(item, conditions[item.ear], simulator, trial_seed, keys))
     if progress is not None:
         parallel["progress"] = lambda done, total: progress(
             done // 2, total // 2
@@ -292,7 +289,6 @@ def _judge_all(
     def judged(keys: Keys) -> dict[str, float] | Failed:
         if reasons := [failed[key] for key in keys if key in failed]:
             return Failed(reasons[0])
-        figures = store.records[keys.most] | store.records[keys.of_network]
-        return {name: value for name, value in figures.items() if name != "engine"}
+        return store.records[keys.most] | store.records[keys.of_network]
 
     return [{name: judged(keys) for name, keys in trial.keys.items()} for trial in trials]

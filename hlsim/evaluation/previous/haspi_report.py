@@ -19,7 +19,7 @@ from hlsim.evaluation.previous.scoring import FileItem, Result, score_items
 from hlsim.evaluation.statistics import RESAMPLES, PairedComparison
 from hlsim.evaluation.store import ScoreStore
 from hlsim.extras import require
-from hlsim.metrics.registry import Engine, MeasureName, check_measures, version_of, versions_of
+from hlsim.metrics.registry import MeasureName, check_measures, version_of, versions_of
 from hlsim.metrics.words import WordsChange, words_change
 
 _OF_ITEM = ("audiogram", "listener", "ear", "snr", "clean", "processed")
@@ -44,7 +44,6 @@ class HaspiReport:
         extra: further keys for ``report.json`` beside the others, such as ``nalr_mean``; what JSON can hold.
         unit: what the items' listeners are called in sentences, such as ``ears``.
         ears: where the items are the better ears', each ear's.
-        engine: what computed HASPI and HASQI, see ``haspi_report``.
 
     Attributes:
         conditions: their names, in order, from the items' levels.
@@ -69,7 +68,6 @@ class HaspiReport:
     extra: Mapping[str, Any] = field(default_factory=dict)
     unit: str = "listeners"
     ears: Sequence[ItemScore] = ()
-    engine: Engine = "hlsim"
     conditions: Sequence[str] = field(init=False)
     comparisons: Sequence[Comparison] = field(init=False)
     headline: Comparison = field(init=False)
@@ -136,7 +134,7 @@ class HaspiReport:
     @property
     def versions(self) -> dict[str, str]:
         """Of the packages that the scores depend on."""
-        used = versions_of(self.measures, self.engine)
+        used = versions_of(self.measures)
         return {"hlsim": version_of("hlsim"), **used, "scipy": version_of("scipy")}
 
     def scores(self, measure: str, conditions: Sequence[str] | None = None) -> np.ndarray:
@@ -195,7 +193,6 @@ class HaspiReport:
             "words": None if self.words is None else self.words._asdict(),
             "conditions": list(self.conditions),
             "measures": list(self.measures),
-            "engine": self.engine,
             "wilcoxon_zero_method": "wilcox",
             "bootstrap": {"resamples": RESAMPLES, "method": "expanded percentile", "seed": 0},
             **{name: getattr(self, name) for name in (*facts, "versions", "note")},
@@ -216,7 +213,6 @@ def haspi_report(
     manifest: str | Path | None = None,
     root: str | Path | None = None,
     measures: Iterable[MeasureName] = ("haspi",),
-    engine: Engine = "hlsim",
     baseline: str | None = None,
     better_ear: bool = False,
     store: str | Path | None = None,
@@ -236,8 +232,6 @@ def haspi_report(
         audiogram, audiograms: the ear of all files or a CSV file of ears, as in ``read_folders`` and ``read_manifest``.
         manifest, root: in place of the folders, a CSV file with a row a file, see ``hlsim.evaluation.previous.inputs``.
         measures: of ``haspi``, ``hasqi``, ``stoi``, ``pesq``; the first is the headline's.
-        engine: of HASPI and HASQI: ``"hlsim"``, which computes what pyclarity 0.9.0 does under the same seed, a rate of
-            44.1 kHz taken as 44 with it, and is equal to 1e-7; or ``"pyclarity"`` itself, slower, to check.
         baseline: the condition that comes first and that all others are compared with; by default the manifest's first
             comes first, and all are compared with each other.
         better_ear: of a manifest with both ears of each utterance, the better ear's scores are the items'.
@@ -251,9 +245,9 @@ def haspi_report(
     Raises:
         ValueError: names differ between the folders, a manifest's row is wrong, a file has no audiogram, settings
             contradict each other, an ear lacks, or no item could be scored.
-        MissingExtraError: a measure's or the engine's package, joblib or distributed is not installed.
+        MissingExtraError: a measure's package, joblib or distributed is not installed.
     """
-    names = check_measures(measures, engine)
+    names = check_measures(measures)
     check_full_scale(full_scale_spl if spl is None else spl)
     if audiogram is not None and not isinstance(audiogram, Audiogram):
         raise ValueError(
@@ -280,7 +274,6 @@ def haspi_report(
             "give either the folders clean, before and after, or a manifest (and its root)"
         )
     own: dict[str, Any] = {
-        "engine": engine,
         "baseline": baseline,
         "better_ear": better_ear,
         "store": store,
@@ -293,7 +286,6 @@ def report_items(
     items: Sequence[FileItem],
     measures: Sequence[MeasureName],
     *,
-    engine: Engine = "hlsim",
     conditions: Sequence[str] = (),
     baseline: str | None = None,
     better_ear: bool = False,
@@ -319,9 +311,7 @@ def report_items(
         conditions = [baseline, *(name for name in conditions if name != baseline)]
     if better_ear:
         check_both_ears((item.name, item.listener, item.ear) for item in items)
-    scored = score_items(
-        items, measures, engine=engine, store=ScoreStore(store), seed=seed, **running
-    )
+    scored = score_items(items, measures, store=ScoreStore(store), seed=seed, **running)
     pairs = [*zip(items, scored, strict=True)]
     unscored = [
         *failures,
@@ -338,9 +328,7 @@ def report_items(
         raise ValueError(f"none of {len(items)} items could be scored{reasons}")
     ears = scores if better_ear else []
     scores = better_ears(scores) if better_ear else scores
-    return HaspiReport(
-        scores, measures, seed, unscored, baseline, extra or {}, ears=ears, engine=engine
-    )
+    return HaspiReport(scores, measures, seed, unscored, baseline, extra or {}, ears=ears)
 
 
 def _item_score(

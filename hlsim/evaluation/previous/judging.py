@@ -14,7 +14,6 @@ from torch import Tensor, nn
 
 from hlsim.audiogram import Audiogram
 from hlsim.calibration import PASCAL_SPL, level_spl, set_level
-from hlsim.data.foreign import ForeignEnhancer
 from hlsim.dsp.fir import filter_centred
 from hlsim.evaluation.previous.items import Item
 from hlsim.losses.band_levels import (
@@ -24,10 +23,11 @@ from hlsim.losses.band_levels import (
     band_levels,
     least_audible,
 )
-from hlsim.metrics.registry import Engine, measure_by
+from hlsim.metrics.registry import MEASURES
 from hlsim.msbg import MSBG
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.parallel import Failed, one_thread, reason_of
+from hlsim.plugins import WaveformPlugin
 
 OF_NETWORK = "loss_neuro"
 """The figure that depends on the named network; no other does."""
@@ -72,10 +72,10 @@ class AtLevelOf(nn.Module):
 class Enhanced(nn.Module):
     """An aid that is given what an enhancer makes of the input."""
 
-    def __init__(self, enhancer: ForeignEnhancer, aid: nn.Module) -> None:
+    def __init__(self, enhancer: WaveformPlugin, aid: nn.Module) -> None:
         super().__init__()
-        # the digest is a setting, which tells this one's scores from those of a changed enhancer
-        self.enhancer, self.digest, self.aid = enhancer, enhancer.digest, aid
+        self.enhancer, self.aid = enhancer, aid
+        self.fingerprint = enhancer.fingerprint  # part of the keys of stored scores
         self.limit_spl = limit_of(aid)
 
     def forward(self, waveform: Tensor, audiogram: Audiogram) -> Tensor:
@@ -101,7 +101,7 @@ class Trial:
     """An item to be judged as each compensator gives it.
 
     The compensators, by name, and the network are at 16 kHz and 94 dB SPL full scale; ``seed``, the same for all, is of
-    the noise that HASPI and HASQI add; ``keys`` are the figures', by compensator. ``engine`` computes HASPI and HASQI.
+    the noise that HASPI and HASQI add; ``keys`` are the figures', by compensator.
     """
 
     item: Item
@@ -109,13 +109,12 @@ class Trial:
     simulator: nn.Module
     seed: int
     keys: Mapping[str, Keys]
-    engine: Engine = "hlsim"
 
 
 @one_thread()
 @torch.no_grad()
 def judge(trial: Trial, missing: Sequence[str]) -> dict[str, dict[str, Any] | Failed]:
-    """The figures whose keys are missing, and with most of them the ``engine``; what goes wrong is the reason.
+    """The figures whose keys are missing; what goes wrong is the reason.
 
     - ``haspi``, ``hasqi``: v2, of the output against the clean speech, in noise too.
     - ``level``, ``peak``: of the output, RMS and largest sample in dB SPL (a sample of 1.0 is 94).
@@ -149,8 +148,6 @@ def judge(trial: Trial, missing: Sequence[str]) -> dict[str, dict[str, Any] | Fa
             }
             if unknown := [figure for figure, value in figures.items() if not math.isfinite(value)]:
                 raise ValueError(f"{', '.join(unknown)}: not finite")
-            if keys.most in records:
-                records[keys.most]["engine"] = trial.engine
             made |= records
         except Exception as error:
             made |= dict.fromkeys(wanted, Failed(reason_of(error)))
@@ -161,7 +158,7 @@ def _figures(trial: Trial, aided: Tensor, normal: Mapping[str, Tensor]) -> dict[
     """All but ``OF_NETWORK``."""
     item = trial.item
     of_pair = (item.clean, aided, item.ear, NEURO_RATE, PASCAL_SPL, trial.seed)
-    scores = {name: measure_by(trial.engine, name).score(*of_pair) for name in ("haspi", "hasqi")}
+    scores = {name: MEASURES[name].score(*of_pair) for name in ("haspi", "hasqi")}
     heard = _hear(aided, item.ear)
     return {
         **scores,

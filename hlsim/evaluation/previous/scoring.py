@@ -22,7 +22,7 @@ from hlsim.audiogram.listener import EARS
 from hlsim.calibration import check_full_scale, dbfs
 from hlsim.evaluation.store import ScoreStore, content_hash, key_of
 from hlsim.metrics.pair import check_seed
-from hlsim.metrics.registry import Engine, MeasureName, check_measures, measure_by, versions_of
+from hlsim.metrics.registry import MEASURES, MeasureName, check_measures, versions_of
 from hlsim.parallel import (
     Backend,
     Failed,
@@ -92,7 +92,6 @@ class FileTask(NamedTuple):
     item: FileItem
     condition: str
     measure: str
-    engine: Engine
     seed: int
     key: str
 
@@ -105,7 +104,6 @@ def score_items(
     items: Sequence[FileItem],
     measures: Iterable[MeasureName] = ("haspi",),
     *,
-    engine: Engine = "hlsim",
     store: ScoreStore | None = None,
     seed: int = 0,
     jobs: int | None = None,
@@ -122,23 +120,22 @@ def score_items(
     tried again.
 
     Args:
-        engine: of HASPI and HASQI, see ``haspi_report``.
         store: scores made earlier, to which new ones go; None keeps nothing.
         jobs, backend, scheduler: as ``run_parallel``, which raises what is wrong with them.
         progress: called with the number of scores there and of all: first where some were stored, and after each new one.
 
     Raises:
-        ValueError: an unknown measure or engine, a seed that numpy does not take, or the store cannot be written.
+        ValueError: an unknown measure, a seed that numpy does not take, or the store cannot be written.
         MissingExtraError: a measure's package is not installed.
     """
     check_seed(seed)
     check_parallel(jobs, backend, scheduler)
-    names = check_measures(measures, engine)
+    names = check_measures(measures)
     store = ScoreStore() if store is None else store
     results: Results = [{} for _ in items]
     places: list[tuple[int, FileTask]] = []
     hashes = cache(content_hash)
-    about_measures = {name: _about(name, engine) for name in names}
+    about_measures = {name: _about(name) for name in names}
     for index, item in enumerate(items):
         scale = {
             "full_scale_spl": item.full_scale_spl if item.spl is None else None,
@@ -154,8 +151,8 @@ def score_items(
             of_an_ear = {"audiogram": list(item.audiogram.thresholds), **scale, "seed": item_seed}
             for name in names:
                 about = about_measures[name] | files
-                key = key_of(about | (of_an_ear if measure_by(engine, name).of_an_ear else {}))
-                places.append((index, FileTask(item, condition, name, engine, item_seed, key)))
+                key = key_of(about | (of_an_ear if MEASURES[name].of_an_ear else {}))
+                places.append((index, FileTask(item, condition, name, item_seed, key)))
     counts = Counter(task.key for _, task in places)  # the same score may be wanted twice
     failed = make_missing(
         score_task,
@@ -175,18 +172,17 @@ def score_items(
     return results
 
 
-def _about(name: str, engine: Engine) -> dict[str, Any]:
+def _about(name: str) -> dict[str, Any]:
     """What computes a measure, for its scores' keys."""
-    measure = measure_by(engine, name)
-    about = {"revision": measure.revision, "measure": name, "engine": measure.engine}
-    return {**about, "versions": versions_of([name], engine)}
+    about = {"revision": MEASURES[name].revision, "measure": name}
+    return {**about, "versions": versions_of([name])}
 
 
 @one_thread()
 def score_task(task: FileTask, _: Sequence[str] = ()) -> dict[str, dict[str, Any] | Failed]:
     """One score by its key; what goes wrong is the reason."""
     item, processed = task.item, task.item.processed[task.condition]
-    measure = measure_by(task.engine, task.measure)
+    measure = MEASURES[task.measure]
     try:
         (clean, rate), (heard, other) = (
             read_channel(path, item.ear) for path in (item.clean, processed)
@@ -206,7 +202,6 @@ def score_task(task: FileTask, _: Sequence[str] = ()) -> dict[str, dict[str, Any
         return {task.key: Failed(reason_of(error))}
     result = Result(score, None, task.seed, rate, len(clean) / rate, *levels)
     about = {"file": item.name, "condition": task.condition, "measure": task.measure}
-    about |= {"engine": measure.engine} if measure.engine else {}
     return {task.key: about | result._asdict()}
 
 

@@ -14,7 +14,6 @@ import torch
 from torch import Tensor, nn
 
 from hlsim.audiogram import SEVERITIES
-from hlsim.data.foreign import ForeignTeacher
 from hlsim.evaluation.previous.items import LEVELS, Input, Item, draw_items, treat
 from hlsim.evaluation.previous.keys import weights_hash
 from hlsim.evaluation.statistics import paired_comparison
@@ -34,7 +33,7 @@ from hlsim.metrics.registry import version_of, versions_of
 from hlsim.msbg import MSBG
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.parallel import Failed, Progress, make_missing, reason_of
-from hlsim.training.teacher import Reference, find_teacher
+from hlsim.training.teacher import PluginTeacher, find_teacher
 
 _SCORES = ("snr", "raw_mse", "band_error", "stoi_true", "stoi_sim", "pesq_true", "pesq_sim")
 _KINDS = ("severity", "level", "condition")
@@ -68,7 +67,7 @@ def evaluate_simulators(
     audiograms: str | Path,
     store: str | Path | None = None,
     noise: str | Path | None = None,
-    teacher: str = "pyclarity",
+    teacher: str = "msbg",
     items: int = 240,
     seconds: float = 3.0,
     levels: Sequence[float] = LEVELS,
@@ -89,8 +88,8 @@ def evaluate_simulators(
         audiograms: CSV file of ears, half of those used; the milder standard ones (NH, N1, N2, S1) and drawn ones are
             a quarter each.
         store: file of scores, there or not; None keeps nothing.
-        teacher: what counts as the truth: ``"pyclarity"``, the reference itself, ``"msbg"``, hlsim's exact one, or
-            anyone's simulator, ``package.module:name``, as ``hlsim.data.foreign.load_teacher`` takes it.
+        teacher: what simulators are compared with: ``"msbg"``, the exact one, or the name of a plug-in, see
+            ``PluginTeacher``.
         items: how many; each is scored under each of ``inputs``.
         seconds: length of an item; PESQ and STOI want 2 or more.
         levels: dB SPL that the items take in turn.
@@ -100,10 +99,10 @@ def evaluate_simulators(
 
     Raises:
         ValueError: data that cannot be used, an unknown teacher or input, or no item that the truth does not fail on.
-        MissingExtraError: pyclarity or pystoi is not installed.
+        MissingExtraError: pystoi is not installed.
     """
     reference = find_teacher(teacher)
-    told = str(reference) if isinstance(reference, ForeignTeacher) else teacher
+    told = teacher if reference is None else str(reference)
     if items < 1 or not simulators or not inputs or not levels:
         raise ValueError(
             f"{items} items of {len(inputs)} inputs at {len(levels)} levels for {len(simulators)} simulators; allowed: "
@@ -120,8 +119,7 @@ def evaluate_simulators(
         speech, noise, audiograms, items=items, seconds=seconds, seed=seed, levels=levels
     )
     scored = ScoreStore(store)
-    own = {name: version_of(name) for name in ("pyclarity", "hlsim")}  # whose MSBG is the truth
-    versions = {**versions_of(["stoi", "pesq"]), **own}
+    versions = {**versions_of(["stoi", "pesq"]), "hlsim": version_of("hlsim")}
     settings = {"teacher": told, "revision": _REVISION, "versions": versions}
     weights = {name: weights_hash(simulator) for name, simulator in simulators.items()}
     tasks = []
@@ -178,7 +176,7 @@ def _snr_over(
 
 def _score_item(
     simulators: Mapping[str, nn.Module],
-    reference: Reference | None,
+    reference: PluginTeacher | None,
     task: tuple[Item, Mapping[str, str]],
     missing: Sequence[str],
 ) -> dict[str, dict[str, Any] | Failed]:
@@ -204,11 +202,9 @@ def _score_item(
     return made
 
 
-def _truth(item: Item, reference: Reference | None) -> Tensor:
-    if isinstance(reference, ForeignTeacher):
-        return reference(item.signal[None], torch.tensor([item.ear.thresholds]), NEURO_RATE)[0]
+def _truth(item: Item, reference: PluginTeacher | None) -> Tensor:
     if reference is not None:
-        return reference(item.signal, item.ear, NEURO_RATE)
+        return reference(item.signal[None], torch.tensor([item.ear.thresholds]), NEURO_RATE)[0]
     with torch.no_grad():
         heard: Tensor = MSBG(sample_rate=NEURO_RATE)(item.signal, item.ear)
     return heard
@@ -234,7 +230,7 @@ def _both(clean: Tensor, heard: Tensor, whose: str) -> dict[str, Any]:
     return {name: score.value for name, score in scores.items()} | {"reasons": reasons}
 
 
-def _shown(items: Sequence[Item], reference: Reference | None) -> tuple[Item, Tensor]:
+def _shown(items: Sequence[Item], reference: PluginTeacher | None) -> tuple[Item, Tensor]:
     """The item of the spectrograms and its truth: of the first input, a moderate loss, loud and clean where there is one,
     for much is lost of it and much still heard."""
     first, reason = items[0].about["input"], None

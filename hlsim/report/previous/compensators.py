@@ -76,7 +76,7 @@ def _about(result: Result) -> str:
     levels = ", ".join(f"{level:g}" for level in result["levels"])
     # few items do not come to every ear
     ears = len({row["name"] for row in (*result["rows"], *result["failures"])})
-    made_by = scored_by(result["engine"], result["versions"])
+    made_by = scored_by(result["versions"])
     return (
         f"{result['items']} items of {result['seconds']:g} s, {ears} ears in turn, speech at {levels} "
         f"dB SPL in turn, seed {result['seed']}: {', '.join(result['limits'])}. HASPI v2 and HASQI v2, {made_by}, "

@@ -10,7 +10,7 @@ from pathlib import Path
 from hlsim.audiogram import SEVERITIES
 from hlsim.evaluation.previous.haspi_report import HaspiReport
 from hlsim.evaluation.previous.scores import ItemScore
-from hlsim.metrics.registry import MEASURES, Engine
+from hlsim.metrics.registry import MEASURES
 from hlsim.metrics.words import WordsChange
 from hlsim.report.page import Picture, Section, render_markdown, render_page, write_files
 from hlsim.report.previous.listening import listening_section
@@ -128,10 +128,9 @@ def _in_words_understood(words: WordsChange) -> str:
     )
 
 
-def scored_by(engine: Engine, versions: Mapping[str, str]) -> str:
-    """What computed HASPI and HASQI, an ``Engine``."""
-    made = f"by {engine} {versions[engine]}"
-    return made if engine == "pyclarity" else f"{made} as pyclarity 0.9 computes them"
+def scored_by(versions: Mapping[str, str]) -> str:
+    """What computed HASPI and HASQI."""
+    return f"by hlsim {versions['hlsim']} as pyclarity 0.9 computes them"
 
 
 def _further(report: HaspiReport) -> list[Table]:
@@ -177,12 +176,12 @@ def _notes(report: HaspiReport) -> list[str]:
         if isinstance(value, str | int | float)
     ]
     versions = ", ".join(f"{name} {version}" for name, version in report.versions.items())
-    of_ear = [MEASURES[name].title for name in report.measures if MEASURES[name].engine]
-    engine = f"{' and '.join(of_ear)} (v2) {scored_by(report.engine, report.versions)}"
+    of_ear = [MEASURES[name].title for name in report.measures if MEASURES[name].of_an_ear]
+    computed = f"{' and '.join(of_ear)} (v2) {scored_by(report.versions)}"
     if any(item.sample_rate % 1000 for item in report.items):
-        engine += ", the rates rounded to whole kHz (44.1 to 44)"
+        computed += ", the rates rounded to whole kHz (44.1 to 44)"
     return [
-        *([f"{engine}."] if of_ear else []),
+        *([f"{computed}."] if of_ear else []),
         f"Degrees of hearing loss: {ears}. {f'Listeners: {listeners}. ' if listeners else ''}"
         f"Clean speech at {report.clean_level_mean:.1f} dB SPL on average. A signal of RMS 1.0 is taken as {scale}.",
         "Changes are after minus before, so a gain is positive. Deviations with n - 1; tests two-sided; "

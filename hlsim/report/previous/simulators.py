@@ -46,7 +46,7 @@ _GROUPS = {
     "condition": "By condition",
 }
 
-_TEACHERS = {"pyclarity": "pyclarity's MSBG", "msbg": "hlsim's exact MSBG"}
+_TEACHERS = {"msbg": "hlsim's exact MSBG"}
 
 _INPUT_TITLES = {
     "as-is": "Speech as it is",

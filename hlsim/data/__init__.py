@@ -1,1 +1,0 @@
-"""The bundled speech, in the folder ``speech``."""
