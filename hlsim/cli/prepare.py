@@ -25,7 +25,7 @@ def prepare(parser: Parser) -> None:
         "--folders",
         str,
         "meaning of each level of folders in any other corpus, such as speaker, or split/speaker: split, speaker, "
-        "condition (clean and noisy), or - for a level without a meaning",
+        "condition (clean and noisy) or other",
         metavar="LEVEL/LEVEL",
     )
     option(

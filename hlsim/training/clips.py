@@ -10,8 +10,7 @@ from torch import Tensor
 from hlsim.audio import find_audio, read_audio
 from hlsim.dsp.resample import resample
 
-MAX_BAD_FILES = 100  # drawn one after the other
-MAX_SILENT_CLIPS = 10_000  # one after the other: a recording may be loud for one second in an hour
+MAX_FAILURES = 10_000  # draws in a row; a recording may be loud for one second in an hour
 MAX_SAMPLES_IN_MEMORY = 2**30  # 2 GB, 18 hours at 16 kHz
 SILENT_POWER = 1e-7  # mean square of a clip whose recording has its peak at 1.0
 
@@ -29,7 +28,7 @@ class Clips:
 
     Raises:
         ValueError: the folder does not exist or has no audio in it, or the clips would be empty. When clips are drawn:
-            too many files that cannot be used, or too many silent clips.
+            too many draws in a row that give no clip.
     """
 
     def __init__(
@@ -77,30 +76,23 @@ class Clips:
     def draw(self, count: int, generator: torch.Generator) -> Tensor:
         """Random clips, none of them silent. Shape: -> (count, samples)."""
         clips: list[Tensor] = []
-        bad_files = 0
-        silent_clips = 0
+        failures = 0
         while len(clips) < count:
             index = int(torch.randint(len(self), (), generator=generator))
             # drawn for a bad file as well, so that later draws do not depend on when it was found to be bad
             position = float(torch.rand((), generator=generator))
-            if not self._is_usable(index):
-                bad_files += 1
-                if bad_files == MAX_BAD_FILES:
-                    raise ValueError(
-                        f"{self._errors[index]}; {bad_files} files that cannot be used were drawn in a row"
-                    )
-                continue
-            bad_files = 0
-            clip = self.clip(index, position)
-            if float(clip.square().mean()) > SILENT_POWER:
-                silent_clips = 0
-                clips.append(clip)
-                continue
-            silent_clips += 1
-            if silent_clips == MAX_SILENT_CLIPS:
+            if self._is_usable(index):
+                clip = self.clip(index, position)
+                if float(clip.square().mean()) > SILENT_POWER:
+                    clips.append(clip)
+                    failures = 0
+                    continue
+            failures += 1
+            if failures == MAX_FAILURES:
+                reason = self._errors.get(index, f"{self.files[index]}: a clip of it is silent")
                 raise ValueError(
-                    f"{self.files[index]}: {silent_clips} clips in a row were silent, the last of them in this file; "
-                    "remove silent recordings, or draw longer clips"
+                    f"{reason}; this is the last of {failures} draws in a row without a clip to use; remove broken and "
+                    "silent recordings, or draw longer clips"
                 )
         return torch.stack(clips)
 

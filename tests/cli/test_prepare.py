@@ -96,7 +96,7 @@ def test_prepare_prints_what_it_recognised(
         (
             ["id1/1.wav"],
             ["--folders", "voices"],
-            "folders voices; write split, speaker, condition, -",
+            "folders voices; write split, speaker, condition, other",
         ),
         (["id1/1.txt"], [], "no audio in it"),
     ],

@@ -106,7 +106,7 @@ TABLE: list[tuple[dict[str, str], str, str]] = [
     ({"r.yaml": f"a: &a {{x: 1}}\n{LAUGHS}"}, TRAIN, "has an alias"),
     ({"m.csv": f"{HEAD}a,loop,b\nb,loop,b\n"}, REPORT, "loop: cannot be read"),
     ({"m.csv": f"{HEAD}a,{'x' * 300},b\nb,{'x' * 300},b\n"}, REPORT, "File name too long"),
-    ({"m.csv": f'{HEAD}"a\n\\input{{x}}",x,b\nb,x,b\n'}, REPORT, "do not print"),
+    ({"m.csv": f'{HEAD}"a\n\\input{{x}}",x,b\nb,x,b\n'}, REPORT, "not a printable name"),
     ({"x.wav": "RIFF"}, "simulate x.wav out.wav --audiogram N3", "not readable as audio"),
     ({}, "simulate loop out.wav --audiogram N3", "loop: no such file"),
     ({}, "simulate speech loop --audiogram N3", "loop: not a folder"),

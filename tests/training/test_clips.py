@@ -80,13 +80,13 @@ def test_no_drawn_clip_is_silent(tmp_path: Path) -> None:
 def test_drawing_ends_where_all_clips_are_silent_or_empty(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("hlsim.training.clips.MAX_SILENT_CLIPS", 300)
+    monkeypatch.setattr("hlsim.training.clips.MAX_FAILURES", 300)
     wave = torch.zeros(40000)
     wave[-1] = 1.0  # of 24,001 places only the last reaches it
     folder = folder_with(tmp_path, a=wave)
     with pytest.raises(
         ValueError,
-        match=r"a.wav: 300 clips in a row were silent, the last of them in this file; remove",
+        match=r"a.wav: a clip of it is silent; this is the last of 300 draws",
     ) as caught:
         Clips(folder, sample_rate=16000, seconds=1.0).draw(1, torch.Generator().manual_seed(0))
     assert "\n" not in str(caught.value)
@@ -138,7 +138,7 @@ def test_what_is_refused_names_the_path(tmp_path: Path) -> None:
     with (
         pytest.warns(UserWarning, match="left out: .*bad.wav"),
         pytest.raises(
-            ValueError, match=r"not readable as audio.*; 100 files that cannot be used"
+            ValueError, match=r"not readable as audio.*; this is the last of 10000 draws"
         ) as caught,
     ):
         Clips(tmp_path, sample_rate=16000, seconds=1.0).draw(1, torch.Generator())

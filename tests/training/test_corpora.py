@@ -228,11 +228,11 @@ def test_an_option_says_what_folders_are() -> None:
     files = ["id1/session1/1.wav", "id1/session2/1.wav", "id2/session1/1.wav"]
     _, utterances = recognise(files, ["speaker"])
     assert [row.speaker for row in utterances] == ["id1", "id1", "id2"]
-    _, utterances = recognise(["a/val/s1/1.wav", "b/train/s2/1.wav"], ["-", "split", "speaker"])
+    _, utterances = recognise(["a/val/s1/1.wav", "b/train/s2/1.wav"], ["other", "split", "speaker"])
     assert splits_and_speakers(utterances) == [("train", "s2", "1"), ("valid", "s1", "1")]
     _, utterances = recognise(["clean/s1/1.wav", "noisy/s1/1.wav"], ["condition", "speaker"])
     assert utterances == [Utterance("clean/s1/1.wav", "noisy/s1/1.wav", "s1", "train")]
-    for folders in (["speakers"], ["speaker", "split"], ["-", "-", "speaker"]):
+    for folders in (["speakers"], ["speaker", "split"], ["other", "other", "speaker"]):
         with pytest.raises(ValueError, match=r"write split|is no split|is not in folders"):
             recognise(files, folders)
 

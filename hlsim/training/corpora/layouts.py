@@ -29,7 +29,7 @@ SPLIT_NAMES = {
     "valid": ("valid", "validation", "val", "dev", "cv", "eval"),
     "test": ("test", "testing", "tt"),
 }
-LEVELS = ("split", "speaker", "condition", "-")
+LEVELS = ("split", "speaker", "condition", "other")
 """Meanings that a level of folders can have."""
 
 WAYS_OUT = (
@@ -94,7 +94,7 @@ def prepare(
         source: folder of a known layout, or a CSV file as ``read_manifest`` takes it.
         out: CSV file to write. Its paths are relative to the source folder, or to the folder of the CSV file.
         folders: meaning of each level of folders, instead of a known layout: ``split``, ``speaker``, ``condition``
-            (``clean`` and ``noisy``), or ``-`` for a level without a meaning.
+            (``clean`` and ``noisy``), or ``other``.
         valid_share: share of the training speakers to validate on, for a corpus without a validation split.
 
     Raises:
@@ -215,7 +215,7 @@ def read_split_folders(files: Sequence[str]) -> list[Utterance]:
     if below & {"clean", "noisy"}:
         return _read_folders(files, ("split", "condition", "speaker"), optional=1)
     if below and all(map(_TIMIT_REGION.fullmatch, below)):
-        return _read_folders(files, ("split", "-", "speaker"))
+        return _read_folders(files, ("split", "other", "speaker"))
     return _read_folders(files, ("split", "speaker"), optional=1)
 
 
