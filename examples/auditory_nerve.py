@@ -25,7 +25,7 @@ from torch import nn
 from compensators import NALR, WDRC, load_compensator
 from hlsim import Audiogram
 from hlsim.calibration import level_spl, set_level
-from hlsim.evaluation.previous.items import read_ears
+from hlsim.evaluation.items import read_ears
 from hlsim.training.augment import mix
 from hlsim.training.clips import Clips
 

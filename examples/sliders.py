@@ -15,7 +15,7 @@ import torch
 from compensators import load_compensator
 from hlsim import MSBG, Audiogram
 from hlsim.calibration import level_spl
-from hlsim.evaluation.previous.items import draw_judged_items, read_ears
+from hlsim.evaluation.items import draw_judged_items, read_ears
 from hlsim.metrics import haspi, hasqi
 
 FULL, STEPS = {"noise_reduction": 1.0, "amplification": 1.0}, (0.0, 0.25, 0.5, 0.75, 1.0)
@@ -40,7 +40,7 @@ def main(
         for condition in ("clean", "noisy"):
             rows = []
             for item in items:
-                if item.about["condition"] != condition:
+                if item.facts["speech"] != condition:
                     continue
                 given = aid(item.signal, item.ear, **sliders)
                 normal = msbg(item.clean, Audiogram.standard("NH"))

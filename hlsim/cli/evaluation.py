@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import os
 import sys
+import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -95,49 +96,43 @@ def evaluate_compensator(parser: Parser) -> None:
         "mine=runs/n3/checkpoint --audiogram N3 --speech speech/valid --items 40 --out judged",
     )
     option = parser.option
-    text = "compensators, by name or folder; LABEL=FOLDER is LABEL in the tables"
+    text = "compensators, by name or folder; LABEL=FOLDER is called LABEL in the tables"
     option("names", str, text, nargs="+", metavar="NAME")
-    option("--speech", Path, "folder of clean speech of unseen speakers", required=True)
+    option("--speech", Path, "folder of clean speech of speakers not trained on", required=True)
     option("--audiograms", Path, f"{EARS_TABLE}; its ears join Bisgaard's N2 to N6 and S1 to S3")
     parser.audiogram(text="; one ear in place of all, for a compensator trained for it")
     option("--noise", Path, "folder of noises; every second item is then noisy, at 2.5 to 17.5 dB")
     text = (
-        "what takes noise off before each aid, package.module:name or path/to/file.py:name: a callable "
-        "(waveform, sample_rate) -> waveform or its class, of (..., time) in pascals, time-aligned"
+        "noise reduction of your own before each aid, package.module:name or "
+        "path/to/file.py:name: a callable (waveform, sample_rate) -> waveform or its class, for (..., time) "
+        "in pascals, time-aligned"
     )
     option("--enhancer", foreign_name, text, [], nargs="+", metavar="NAME", dest="enhancers")
     option("--simulator", str, "Neuro-MSBG of the surrogate gap, by name or folder", "neuro-msbg")
-    option("--levels", number, "of the speech in dB SPL, in turn", [50, 65, 80], nargs="+")
-    option("--items", count, "how many in all", 400)
+    option("--levels", number, "levels of the speech in dB SPL, in turn", [50, 65, 80], nargs="+")
+    option("--items", count, "number of items", 400)
     option("--seconds", positive, "length of an item", 3.0)
-    text = "standard ears of the gain curves and tones; with --audiogram that ear's are drawn"
+    text = "standard ears of the gain curves and tones; with --audiogram that ear is used"
     option("--gain-ears", str.upper, text, GAIN_EARS, nargs="+", metavar="EAR")
-    parser.jobs()
-    parser.seed()
-    parser.out()
+    _study_options(parser)
 
 
 def _evaluate_compensator(options: argparse.Namespace) -> None:
     if options.audiogram and options.gain_ears != GAIN_EARS:
-        raise ValueError(
-            "--gain-ears with --audiogram; allowed: without it, for that ear's gains are drawn"
-        )
-    need("eval", "pandas", "matplotlib")
+        raise ValueError("--gain-ears has no effect with --audiogram; leave one of them out")
+    _prepare_study(options)
     check_there(folders=(options.speech, options.noise), files=(options.audiograms,))
     from compensators import load_compensator
-    from hlsim.evaluation.previous.compensators import evaluate_compensators
-    from hlsim.report.previous.compensators import write_compensators
+    from hlsim.evaluation.compensators import evaluate_compensators
+    from hlsim.report.compensators import compensators_page
 
-    named = dict(map(labelled, options.names))
-    if len(named) < len(options.names):
-        raise ValueError(f"compensators {', '.join(options.names)}; allowed: one a label")
-    loaded = {label: load_compensator(name) for label, name in named.items()}
+    named = _labelled_names(options.names)
     ear = read_ear(options.audiogram) if options.audiogram else None
     notes = [line for label, name in named.items() for line in other_ear(label, name, ear)]
     for line in notes:
         print(f"hlsim: warning: {line}", file=sys.stderr)
-    done = evaluate_compensators(
-        loaded,
+    evaluation = evaluate_compensators(
+        {label: load_compensator(name) for label, name in named.items()},
         speech=options.speech,
         store=options.out / "scores.jsonl",
         audiograms=options.audiograms,
@@ -145,6 +140,7 @@ def _evaluate_compensator(options: argparse.Namespace) -> None:
         noise=options.noise,
         enhancers=options.enhancers,
         simulator=options.simulator,
+        measures=options.measure,
         items=options.items,
         seconds=options.seconds,
         levels=options.levels,
@@ -152,17 +148,18 @@ def _evaluate_compensator(options: argparse.Namespace) -> None:
         notes=notes,
         seed=options.seed,
         jobs=options.jobs,
+        dask=options.dask,
         progress=show_progress("outputs"),
     )
-    write_compensators(done.result, done.reports, options.out)
-    text = options.out / "compensators.md"
-    print(text.read_text(encoding="utf-8"))
-    if failed := len(done.result["failures"]):
-        print(
-            f"hlsim: {failed} outputs could not be judged; the reasons are in {text}",
-            file=sys.stderr,
-        )
-    tell_page(options.out / "compensators.html")
+    finish(evaluation, compensators_page(evaluation, options.listen), options.out)
+
+
+def _labelled_names(texts: list[str]) -> dict[str, str]:
+    """Return names by label; ValueError if two have the same label."""
+    named = dict(map(labelled, texts))
+    if len(named) < len(texts):
+        raise ValueError(f"two of {', '.join(texts)} have the same label; write LABEL=NAME")
+    return named
 
 
 def tell_page(path: Path) -> None:
@@ -257,6 +254,7 @@ def _study_options(parser: Parser) -> None:
 def _prepare_study(options: argparse.Namespace) -> None:
     """Check what an evaluation needs before it takes hours."""
     os.environ["MPLBACKEND"] = "Agg"  # a notebook's backend may not exist in this environment
+    warnings.formatwarning = lambda message, *_, **__: f"hlsim: warning: {message}\n"
     need("eval", "joblib", "pandas", "matplotlib", "jinja2")
     if options.dask:
         need("cluster", "distributed")

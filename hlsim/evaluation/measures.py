@@ -161,8 +161,6 @@ def _levels(item: Item, output: Tensor) -> Values:
 LEVELS = Measure("levels", _levels)
 """RMS levels of output and clean speech in dB SPL, and the settings of the item."""
 
-LEVEL_COLUMNS = ("level", "clean_level", "full_scale_spl", "seconds", "sample_rate", "seed")
-
 
 def perceive(signal: Tensor, ear: Ear, sample_rate: int) -> Tensor:
     """Return what an ear perceives, by the exact MSBG. Shape: (time,) in pascals -> (time,)."""
@@ -194,6 +192,14 @@ PERCEPTION = Measure("perception", _perception, packages=["hlsim"])
 input for a normal ear, noise included, ``normal_clean_level`` that of the clean speech for a normal ear.
 ``band_error`` compares with the latter by ``band_error_db``, ``loss_msbg`` by ``HearingLossLoss(criterion="bands")``.
 """
+
+
+OTHER_COLUMNS = (
+    *("level", "clean_level", "full_scale_spl", "seconds", "sample_rate", "seed"),
+    *("peak", "perceived_level", "normal_level", "normal_clean_level", "band_error"),
+    *("loss_msbg", "loss_neuro", "loudness_error", "loudness_error_clean"),
+)
+"""Columns of built-in measures that are no scores."""
 
 
 def network_loss(simulator: nn.Module) -> Measure:

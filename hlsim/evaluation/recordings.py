@@ -281,7 +281,7 @@ def score_recordings(
         check_both_ears(recordings)
     studied = [recorded_condition(name) for name in names]
     table = run_study(recordings, studied, [*chosen, LEVELS], **running)
-    columns = score_columns(table, recordings[0].facts)
+    columns = score_columns(table, chosen, recordings[0].facts)
     check_scored(table, columns)
     if better_ear:
         table = better_ears(table, columns)

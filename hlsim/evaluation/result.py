@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from hlsim.evaluation.comparison import Comparison
-from hlsim.evaluation.measures import LEVEL_COLUMNS
+from hlsim.evaluation.measures import OTHER_COLUMNS
 from hlsim.evaluation.study import Condition, Measure, Source, versions_of
 
 if TYPE_CHECKING:
@@ -92,10 +92,13 @@ def plain(value: Any) -> Any:
     return None if isinstance(value, float) and math.isnan(value) else value
 
 
-def score_columns(table: DataFrame, facts: Mapping[str, Any]) -> list[str]:
-    """Return the columns of a study's table that hold scores, those of plug-in measures included."""
-    others = {"item", "name", "condition", "failure", *facts, *LEVEL_COLUMNS}
-    return [column for column in table.columns if column not in others]
+def score_columns(
+    table: DataFrame, measures: Sequence[Measure], facts: Mapping[str, Any]
+) -> list[str]:
+    """Return the columns of scores in a study's table: those of the measures, and of plug-ins."""
+    named = [measure.name for measure in measures if measure.name in table]
+    others = {"item", "name", "condition", "failure", *facts, *OTHER_COLUMNS, *named}
+    return named + [column for column in table.columns if column not in others]
 
 
 def check_scored(table: DataFrame, columns: Sequence[str]) -> None:

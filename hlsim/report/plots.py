@@ -156,6 +156,37 @@ def curves_picture(
     return Picture(draw_svg(draw), alt, caption or alt)
 
 
+def gain_picture(
+    title: str, curves: Sequence[Mapping[str, Any]], colours: Mapping[str, Any]
+) -> Picture:
+    """Draw the insertion gains of ``gain_curves``: one colour per aid, one line style per level."""
+    levels = curves[0]["levels"]
+    styles = ("-", "--", ":", "-.")
+
+    def draw(axes: Any) -> None:
+        for curve in curves:
+            for place, gains in enumerate(curve["gain_db"]):
+                style = {"linestyle": styles[place % 4], "lw": 1.5 * (1 + place // 4)}
+                label = None if place else plain(curve["aid"])
+                colour = colours[curve["aid"]]
+                axes.plot(curve["frequencies"], gains, color=colour, label=label, **style)
+        for place, level in enumerate(levels):
+            style = {"linestyle": styles[place % 4], "lw": 1.5 * (1 + place // 4)}
+            axes.plot([], [], color="black", label=f"input of {level:g} dB SPL", **style)
+        axes.set(ylabel="insertion gain (dB)")
+        frequency_axis(axes, FREQUENCY_TICKS)
+        legend(axes)
+
+    at_2_khz = []
+    for curve in curves:
+        bands = np.log(curve["frequencies"])
+        gains = [np.interp(np.log(2000.0), bands, gains) for gains in curve["gain_db"]]
+        at_2_khz.append(f"{curve['aid']} {', '.join(f'{gain:.0f}' for gain in gains)}")
+    inputs = ", ".join(f"{level:g}" for level in levels)
+    alt = f"Insertion gain, {title}; at 2 kHz for inputs of {inputs} dB SPL: {'; '.join(at_2_khz)} dB."
+    return Picture(draw_svg(draw), alt, f"Insertion gain, {title}.")
+
+
 def study_pictures(evaluation: Evaluation) -> list[Picture]:
     """Draw a study of scores; a picture that would show a single group or item is left out."""
     headline = evaluation.headline

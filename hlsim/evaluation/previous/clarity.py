@@ -22,9 +22,9 @@ from hlsim.audio import read_audio, write_audio
 from hlsim.audiogram.listener import EARS, Listener, read_listeners
 from hlsim.calibration import check_full_scale, gain_to_pascals, set_level
 from hlsim.evaluation.enhancers import load_enhancers
+from hlsim.evaluation.measurements import samples_ahead
 from hlsim.evaluation.previous.haspi_report import HaspiReport, report_items
 from hlsim.evaluation.previous.keys import weights_hash
-from hlsim.evaluation.previous.measurements import samples_ahead
 from hlsim.evaluation.previous.scores import Failure
 from hlsim.evaluation.previous.scoring import FileItem
 from hlsim.evaluation.store import ScoreStore, content_hash, key_of

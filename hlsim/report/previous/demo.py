@@ -18,7 +18,7 @@ from hlsim.losses.band_levels import band_centres, band_levels, threshold_in_qui
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.report import spectrograms
 from hlsim.report.page import Picture, Section
-from hlsim.report.previous.gain_pictures import Colours, gain_picture
+from hlsim.report.plots import gain_picture
 from hlsim.report.previous.haspi import Front
 from hlsim.report.previous.listening import players
 from hlsim.report.previous.pictures import condition_colours, draw_svg, legend
@@ -123,7 +123,7 @@ def demo_front(
     return Front(title, demo_verdict(report), sections), spectrograms.composite(panels)
 
 
-def _ear_picture(ear: Audiogram, sounds: Sounds, colours: Colours) -> Picture:
+def _ear_picture(ear: Audiogram, sounds: Sounds, colours: Mapping[str, Any]) -> Picture:
     def draw(axes: Any) -> None:
         axes.figure.set_figheight(4.0)
         ear.plot(axes, label="threshold", zorder=3, color="black")
@@ -146,7 +146,7 @@ def _ear_picture(ear: Audiogram, sounds: Sounds, colours: Colours) -> Picture:
     )
 
 
-def _heard_picture(sounds: Sounds, colours: Colours) -> Picture:
+def _heard_picture(sounds: Sounds, colours: Mapping[str, Any]) -> Picture:
     levels = {}
     for name in (NORMAL_EAR, *_SHOWN):
         powers = [10.0 ** (band_levels(signal, NEURO_RATE) / 10.0) for signal in sounds.heard[name]]
