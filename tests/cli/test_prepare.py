@@ -91,7 +91,7 @@ def test_prepare_prints_what_it_recognised(
         (
             ["train/clean/1.wav", "train/noisy/1.wav"],
             ["--valid-share", "0.1"],
-            "no speakers are known",
+            "--valid-share needs speakers",
         ),
         (
             ["id1/1.wav"],

@@ -103,7 +103,7 @@ def test_voicebank_demands_names_give_the_papers_number_of_utterances() -> None:
     ids=["no noisy folder", "a file lacks", "another set", "both rates", "noise", "another name"],
 )
 def test_what_is_not_exactly_voicebank_demand_is_rejected(files: list[str]) -> None:
-    with pytest.raises(ValueError, match=r"move it away|complete them"):
+    with pytest.raises(ValueError, match=r"does not belong|clean or in noisy|no name"):
         recognise(files)
 
 
@@ -156,7 +156,7 @@ def test_split_folders_are_recognised_by_any_of_their_names(names: tuple[str, ..
     ids=["no split", "second name of a split", "beside the folders"],
 )
 def test_what_is_beside_split_folders_is_rejected(other: str) -> None:
-    with pytest.raises(ValueError, match="move it away"):
+    with pytest.raises(ValueError, match=r"is no split|is not in folders"):
         recognise(["train/a/1.wav", "test/b/1.wav", other])
 
 
@@ -182,7 +182,7 @@ def test_clean_and_noisy_folders_in_splits_are_pairs(tree: Tree) -> None:
         "passed over: 1 other files, .txt",
     ]
     for extra in ("train/clean/3.wav", "test/noisy/3.wav", "train/mixed/1.wav"):
-        with pytest.raises(ValueError, match=r"complete them|neither clean nor noisy"):
+        with pytest.raises(ValueError, match=r"clean or in noisy|neither clean nor noisy"):
             recognise([*files, extra])
 
 
@@ -245,7 +245,7 @@ def test_held_out_speakers_validate_and_no_longer_train() -> None:
     assert Counter(row.split for row in held_out) == {"train": 16, "valid": 4}
     assert Counter(row.split for row in hold_out_speakers(utterances, 0.01))["valid"] == 2
     for rows in (held_out, utterances[:2], [Utterance("1.wav"), Utterance("2.wav")]):
-        with pytest.raises(ValueError, match=r"already|none to train|no speakers are known"):
+        with pytest.raises(ValueError, match=r"already|none to train|some are unknown"):
             hold_out_speakers(rows, 0.2)
 
 

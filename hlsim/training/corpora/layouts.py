@@ -33,8 +33,9 @@ LEVELS = ("split", "speaker", "condition", "other")
 """Meanings that a level of folders can have."""
 
 WAYS_OUT = (
-    "list the files in a CSV file with the columns path, noisy, speaker and split, and give that instead of the folder; "
-    "or say what the folders are, such as --folders split/speaker, or --folders split if the speakers are unknown"
+    "remove what does not belong to the corpus and complete what does, or list the files in a CSV file with the columns "
+    "path, noisy, speaker and split and give that instead of the folder, or say what the folders are, such as --folders "
+    "split/speaker, or --folders split if the speakers are unknown"
 )
 
 _SPLIT_OF = {name: split for split, names in SPLIT_NAMES.items() for name in names}
@@ -43,8 +44,13 @@ _VOICEBANK_FILE = re.compile(r"(p\d+)_\d+")
 _LIBRISPEECH_FILE = re.compile(r"(train|dev|test)-(clean|other)(-\d+)?/(\d+)/\d+/[^/]+")
 _TIMIT_REGION = re.compile(r"dr\d")
 _UNSUPPORTED = {
-    "LibriMix": re.compile(r"(^|/)mix_(clean|both|single)/"),
-    "the DNS challenge": re.compile(r"(^|/)clean_fileid_\d+\."),
+    re.compile(r"(^|/)mix_(clean|both|single)/"): (
+        "this looks like LibriMix, whose s1 would be the column path and mix_single the column noisy"
+    ),
+    re.compile(r"(^|/)clean_fileid_\d+\."): (
+        "this looks like the DNS challenge, whose clean_fileid_N would be the column path and the noisy file of the same "
+        "number the column noisy"
+    ),
 }
 
 
@@ -124,7 +130,7 @@ def find_corpus(root: Path, folders: Sequence[str] | None = None) -> Corpus:
         check_utterances(utterances)
         check_paths(utterances, root)
     except ValueError as error:
-        raise ValueError(f"{root}: {error}; or {WAYS_OUT}") from error
+        raise ValueError(f"{root}: {error}; {WAYS_OUT}") from error
     used = {name for row in utterances for name in (row.path, row.noisy)}
     unused = Counter(
         os.path.dirname(name) or "the top folder" for name in audio if name not in used
@@ -151,9 +157,9 @@ def recognise(
                 f"folders {'/'.join(folders)}; write {', '.join(LEVELS)}, with / between"
             )
         return f"folders {'/'.join(folders)}", _read_folders(files, folders)
-    for name, pattern in _UNSUPPORTED.items():
+    for pattern, advice in _UNSUPPORTED.items():
         if any(pattern.search(file) for file in files):
-            raise ValueError(f"looks like {name}, which is not read as it is")
+            raise ValueError(advice)
     top = _names(files, 0)
     prefixes = ["", f"{top[0]}/"] if len(top) == 1 else [""]
     for prefix in prefixes:
@@ -173,7 +179,7 @@ def read_voicebank(files: Sequence[str]) -> list[Utterance]:
     for name, match in matches.items():
         if match is None or (match[2], match[1]) in folders:
             raise ValueError(
-                f"the folder {name} does not belong to VoiceBank-DEMAND, or is a second version of one set; move it away"
+                f"the folder {name} does not belong to VoiceBank-DEMAND, or is a second version of one set"
             )
         folders[match[2], match[1]] = name
     utterances = []
@@ -186,7 +192,7 @@ def read_voicebank(files: Sequence[str]) -> list[Utterance]:
         for stem, path in clean.items():
             match = _VOICEBANK_FILE.fullmatch(stem)
             if match is None:
-                raise ValueError(f"{path} has no name such as p226_001.wav; move it away")
+                raise ValueError(f"{path} has no name such as p226_001.wav")
             utterances.append(Utterance(path, noisy[stem], match[1], split))
     return utterances
 
@@ -199,9 +205,7 @@ def read_librispeech(files: Sequence[str]) -> list[Utterance]:
     utterances = []
     for file, match in zip(files, matches, strict=True):
         if match is None:
-            raise ValueError(
-                f"{file} is not where LibriSpeech and LibriTTS have files; move it away"
-            )
+            raise ValueError(f"{file} is not where LibriSpeech and LibriTTS have files")
         utterances.append(Utterance(file, "", match[4], _SPLIT_OF[match[1]]))
     return utterances
 
@@ -236,7 +240,7 @@ def hold_out_speakers(utterances: Sequence[Utterance], share: float) -> list[Utt
     if any(row.split == "valid" for row in utterances):
         raise ValueError("the corpus has a validation split already; leave --valid-share out")
     if "" in speakers:
-        raise ValueError(f"no speakers are known that could be held out to validate on; {WAYS_OUT}")
+        raise ValueError(f"--valid-share needs speakers, and some are unknown; {WAYS_OUT}")
     count = max(1, round(share * len(speakers)))
     if count >= len(speakers):
         raise ValueError(
@@ -260,9 +264,7 @@ def _read_folders(
     for file in files:
         folders = file.split("/")[:-1]
         if len(folders) < required:
-            raise ValueError(
-                f"{file} is not in folders {'/'.join(levels[:required])}; move it away"
-            )
+            raise ValueError(f"{file} is not in folders {'/'.join(levels[:required])}")
         meaning = dict(zip(levels, folders, strict=False))
         split = "train"
         if "split" in levels:
@@ -270,7 +272,7 @@ def _read_folders(
             split = _SPLIT_OF.get(name.lower(), "")
             if split_names.setdefault(split, name) != name or not split:
                 raise ValueError(
-                    f"the folder {name} is no split, or a second folder for the same split; move it away"
+                    f"the folder {name} is no split, or a second folder for the same split"
                 )
         row = Utterance(file, "", meaning.get("speaker", ""), split)
         if "condition" not in levels:
@@ -284,9 +286,7 @@ def _read_folders(
         elif condition.lower() == "noisy":
             noisy[key] = file
         elif condition.lower() not in ("noise", "noises"):
-            raise ValueError(
-                f"the folder {condition} is neither clean nor noisy nor noise; move it away"
-            )
+            raise ValueError(f"the folder {condition} is neither clean nor noisy nor noise")
     if "condition" in levels:
         _check_pairs(clean, noisy, "the corpus")
     return [replace(row, noisy=noisy.get(key, "")) for key, row in clean.items()]
@@ -296,7 +296,7 @@ def _check_pairs(clean: Iterable[str], noisy: Iterable[str], place: str) -> None
     unpaired = sorted(set(clean) ^ set(noisy))
     if unpaired:
         raise ValueError(
-            f"{place}: {len(unpaired)} files are in clean or in noisy speech only, the first {unpaired[0]}; complete them"
+            f"{place}: {len(unpaired)} files are in clean or in noisy speech only, the first {unpaired[0]}"
         )
 
 

@@ -106,14 +106,12 @@ def check_utterances(utterances: Sequence[Utterance]) -> None:
         for folder in utterance.path.split("/")[:-1]:
             if NOT_SPEECH & set(re.split("[^a-z]+", folder.lower())):
                 raise ValueError(
-                    f"{utterance.path} would be clean speech, but is in a folder {folder}; leave it out, or rename it"
+                    f"{utterance.path} would be clean speech, but is in a folder {folder}"
                 )
         for kind, name in (("file", utterance.path), ("speaker", utterance.speaker)):
             other = splits[kind].setdefault(name, utterance.split)
             if name and other != utterance.split:
-                raise ValueError(
-                    f"{kind} {name} is in the splits {other} and {utterance.split}; each {kind} belongs to one split"
-                )
+                raise ValueError(f"{kind} {name} is in the splits {other} and {utterance.split}")
 
 
 def check_paths(utterances: Sequence[Utterance], root: Path) -> None:
