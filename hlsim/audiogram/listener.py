@@ -11,6 +11,8 @@ from typing import Any
 import torch
 
 from hlsim.audiogram import Audiogram
+from hlsim.audiogram.conversion import as_audiogram
+from hlsim.audiogram.plot import draw_png
 from hlsim.audiogram.table import numbered_audiograms
 
 EARS = ("left", "right")
@@ -29,7 +31,7 @@ class Listener:
             whatever else takes a listener refuses one without both.
 
     Raises:
-        ValueError: neither ear, or something else than an ``Audiogram``.
+        ValueError: There is no ear, or one is not valid; ``as_audiogram`` says what an ear may be.
     """
 
     left: Audiogram | None
@@ -37,12 +39,15 @@ class Listener:
 
     def __post_init__(self) -> None:
         for name in EARS:
-            if not isinstance(ear := getattr(self, name), Audiogram | None):
-                raise ValueError(
-                    f"the {name} ear is {type(ear).__name__}; allowed: an Audiogram, or None"
-                )
+            ear = getattr(self, name)
+            if ear is not None:
+                object.__setattr__(self, name, as_audiogram(ear))
         if self.left is None and self.right is None:
             raise ValueError("a listener without ears; allowed: one Audiogram or two")
+
+    def _repr_png_(self) -> bytes | None:
+        """Return the drawn audiograms for a notebook, or ``None`` without matplotlib."""
+        return draw_png(self.plot)
 
     def plot(self, axes: Any = None, **style: Any) -> Any:
         """Both ears as audiologists draw them, left with blue crosses, right with red circles; as ``Audiogram.plot``."""

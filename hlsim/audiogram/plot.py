@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+import io
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
-from hlsim.extras import require
+from hlsim.extras import MissingExtraError, require
 
 _SHADES = (0.0, 0.05, 0.1, 0.16)  # of the degrees of loss
 _TICKS = (250.0, 500.0, 1000.0, 2000.0, 4000.0, 6000.0, 8000.0)
@@ -29,6 +30,19 @@ def plot_audiogram(
         _prepare(axes, degrees)
     axes.plot(frequencies, levels, **{"marker": "o", "color": "black"} | style)
     return axes
+
+
+def draw_png(plot: Callable[[Any], Any]) -> bytes | None:
+    """Return a PNG of what a function draws on axes, or ``None`` if matplotlib is not installed."""
+    try:
+        figure_module = require("matplotlib.figure", "eval")
+    except MissingExtraError:
+        return None
+    figure = figure_module.Figure(figsize=(5.0, 3.5), layout="constrained")
+    plot(figure.subplots())
+    image = io.BytesIO()
+    figure.savefig(image, format="png", dpi=110)
+    return image.getvalue()
 
 
 def _prepare(axes: Any, degrees: Mapping[str, tuple[float, float]]) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, Protocol, TypeGuard
 
 import numpy as np
@@ -11,14 +11,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from hlsim.audiogram.conversion import EarLike, find_audiogram
 from hlsim.audiogram.devices import known_on_host, on_device, on_host
 from hlsim.audiogram.value import (
     FREQUENCIES,
     LOWEST_LEVEL,
-    STANDARD,
     Audiogram,
-    has_two_ears,
-    is_claritys,
     listed,
 )
 from hlsim.torchtools import constant_like
@@ -37,9 +35,9 @@ class TwoEars(Protocol):
     def right(self) -> Audiogram | None: ...
 
 
-AudiogramLike = Audiogram | Sequence[Audiogram] | TwoEars | Sequence[TwoEars] | Tensor
-"""One ear or a ``Listener``'s two, one a batch item, or a (..., 8) tensor of dB HL. pyclarity's ``Audiogram`` is taken as
-ours is."""
+AudiogramLike = EarLike | Sequence[EarLike] | TwoEars | Sequence[TwoEars]
+"""One ear (see ``as_audiogram``), the two ears of a ``Listener``, a sequence with one of these per
+item, or a tensor or an array of thresholds in dB HL, ``(..., 8)``."""
 
 
 def as_thresholds(
@@ -67,7 +65,10 @@ def as_thresholds(
         ValueError: not an audiogram, a listener without one ear, a complex or bool tensor, a last dimension other than
             8, NaN, or levels outside -10 to ``highest`` dB HL.
     """
-    if (ear := _one_ear(audiogram)) is not None:
+    if isinstance(audiogram, np.ndarray):
+        audiogram = torch.from_numpy(audiogram).float()
+    ear = None if isinstance(audiogram, Tensor) else find_audiogram(audiogram)
+    if ear is not None:
         return torch.tensor(_taken(ear.thresholds, highest, taker))
     if is_listener(audiogram):
         return torch.stack([*_both_ears(audiogram, missing, highest, taker)])
@@ -75,11 +76,12 @@ def as_thresholds(
         if all(is_listener(one) for one in audiogram):
             return torch.stack(
                 [
-                    as_thresholds(one, highest=highest, taker=taker, missing=missing)
+                    as_thresholds(one, highest=highest, taker=taker, missing=missing)  # type: ignore[arg-type]
                     for one in audiogram
                 ]
             )
-        ears = [_one_ear(one) for one in audiogram]
+        tensors = any(isinstance(one, Tensor) for one in audiogram)
+        ears = [None if tensors else find_audiogram(one) for one in audiogram]
         if all(ear is not None for ear in ears):
             return torch.tensor(
                 [_taken(ear.thresholds, highest, taker) for ear in ears if ear is not None]
@@ -88,8 +90,9 @@ def as_thresholds(
         audiogram = _stacked(audiogram)
     if not isinstance(audiogram, Tensor):
         raise ValueError(
-            f"audiogram is {type(audiogram).__name__}; allowed: an Audiogram, a sequence of them, or a (..., 8) tensor"
-            + _instead(audiogram)
+            f"expected an audiogram, got {type(audiogram).__name__}; pass an Audiogram, a name such "
+            "as 'N3', a Listener, a sequence with one of these per item, or thresholds in dB HL of "
+            "shape (..., 8)"
         )
     if audiogram.is_complex() or audiogram.dtype == torch.bool:
         raise ValueError(
@@ -206,13 +209,6 @@ def interpolation_weights(hz: tuple[float, ...]) -> NDArray[np.float64]:
     return np.stack([np.interp(hz, FREQUENCIES, row) for row in np.eye(len(FREQUENCIES))])
 
 
-def _one_ear(given: Any) -> Audiogram | None:
-    """An audiogram, ours or pyclarity's, as ours."""
-    if isinstance(given, Audiogram):
-        return given
-    return Audiogram.from_clarity(given) if is_claritys(given) else None
-
-
 def _stacked(tensors: Any) -> Any:
     """One tensor of a list of (8,) tensors, an ear each, or of eight (batch,) ones, a frequency each; else as given."""
     kinds = len(FREQUENCIES)
@@ -237,32 +233,3 @@ def _taken(levels: Sequence[float], highest: float, taker: str) -> Sequence[floa
             f"audiogram levels {listed(levels)} dB HL; {taker} takes {LOWEST_LEVEL:g} to {highest:g}{reason}"
         )
     return levels
-
-
-def _instead(given: object) -> str:
-    """What to write in place of something that is no audiogram but holds one."""
-    several = isinstance(given, list | tuple) and len(given) > 0
-    first: Any = given[0] if several else given  # type: ignore[index]
-    if isinstance(first, str) and first in STANDARD:
-        make = f"Audiogram.standard({first!r})"
-    elif has_two_ears(first):
-        return "; of two ears write Listener.from_clarity(listener), of one Audiogram.from_clarity(listener, 'left')"
-    elif isinstance(first, Mapping) and isinstance(first.get("levels"), Sequence):
-        if any(
-            isinstance(level, Tensor) for level in first["levels"]
-        ):  # as default_collate makes them
-            return "; write torch.stack(audiogram['levels'], -1)"
-        make = "Audiogram.from_dict(...)"
-    elif isinstance(first, Mapping) and any(str(name).startswith("hl_") for name in first):
-        make = "Audiogram.from_row(...)"
-    elif isinstance(first, Mapping):
-        return "; write Audiogram(levels, frequencies)"
-    elif several and isinstance(first, Tensor):
-        return "; write torch.stack(...)"
-    elif isinstance(first, np.ndarray) or (
-        several and isinstance(first, float | int | list | tuple)
-    ):
-        return "; write torch.tensor(...)"
-    else:
-        return ""
-    return f"; write {f'[{make}, ...]' if several else make}"

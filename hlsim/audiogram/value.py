@@ -57,7 +57,7 @@ _ENTRY = (
 )  # of Clarity's listeners.json
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Audiogram:
     """Hearing thresholds of one ear in dB HL, ascending in frequency.
 
@@ -102,14 +102,39 @@ class Audiogram:
 
     @classmethod
     def standard(cls, name: str) -> Audiogram:
-        """A standard audiogram by name: N1 to N7, S1 to S3 (Bisgaard 2010) or NH, 0 dB HL throughout.
+        """Return a standard audiogram.
+
+        Args:
+            name: ``"N1"`` to ``"N7"`` or ``"S1"`` to ``"S3"`` (Bisgaard et al. 2010), or ``"NH"``
+                for 0 dB HL at all frequencies, in upper or lower case.
 
         Raises:
-            ValueError: no such name.
+            ValueError: There is no standard audiogram of this name.
+
+        Example:
+            >>> from hlsim import Audiogram
+            >>> Audiogram.standard("n3")
+            Audiogram('N3')
         """
-        if not isinstance(name, str) or name not in STANDARD:
-            raise ValueError(f"no standard audiogram {name!r}; allowed: {', '.join(STANDARD)}")
-        return cls(tuple(float(level) for level in STANDARD[name]))
+        key = str(name).upper()
+        if key not in STANDARD:
+            names = ", ".join(STANDARD)
+            raise ValueError(f"unknown standard audiogram {name!r}; expected one of {names}")
+        return cls(tuple(float(level) for level in STANDARD[key]))
+
+    def __repr__(self) -> str:
+        for name, levels in STANDARD.items():
+            if self.frequencies == FREQUENCIES and self.levels == tuple(map(float, levels)):
+                return f"Audiogram({name!r})"
+        points = zip(self.frequencies, self.levels, strict=True)
+        levels_by_hz = ", ".join(f"{frequency:g}: {level:g}" for frequency, level in points)
+        return f"Audiogram({{{levels_by_hz}}})"
+
+    def _repr_png_(self) -> bytes | None:
+        """Return the drawn audiogram for a notebook, or ``None`` without matplotlib."""
+        from hlsim.audiogram.plot import draw_png
+
+        return draw_png(self.plot)
 
     @property
     def thresholds(self) -> tuple[float, ...]:

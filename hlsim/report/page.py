@@ -179,10 +179,10 @@ def _template() -> Any:
     jinja2 = require("jinja2", "eval")
     source = Path(__file__).with_name("page.html").read_text(encoding="utf-8")
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
-    return environment.from_string(source, {"uri": _uri})
+    return environment.from_string(source, {"uri": data_uri})
 
 
-def _uri(data: bytes) -> str:
+def data_uri(data: bytes) -> str:
     """Return the contents of a file as a URI; its first bytes tell its kind."""
     kinds = {b"\x89PNG": "image/png", b"fLaC": "audio/flac", b"RIFF": "audio/wav"}
     kind = kinds.get(data[:4], "image/svg+xml")

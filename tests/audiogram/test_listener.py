@@ -190,7 +190,7 @@ def test_bad_listeners(tmp_path: Path, scene: Tensor) -> None:
     with pytest.raises(ValueError):
         Listener(None, None)
     with pytest.raises(ValueError):
-        Listener(LEFT, "N4")  # type: ignore[arg-type]
+        Listener(LEFT, "N9")  # type: ignore[arg-type]
     with pytest.raises(ValueError):
         MSBG()(scene, Listener(None, RIGHT))
     for bad in ({}, {"left": None}, [], {"left": None, "right": None}):

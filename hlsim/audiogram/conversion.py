@@ -1,0 +1,75 @@
+"""Conversion of the ways to write an ear into an ``Audiogram``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from numbers import Real
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from hlsim.audiogram.value import Audiogram, is_claritys
+
+EarLike = Audiogram | str | Sequence[float] | NDArray[Any] | Tensor | Mapping[float, float]
+"""An audiogram, or what ``as_audiogram`` converts into one."""
+
+
+def as_audiogram(ear: EarLike) -> Audiogram:
+    """Return the audiogram of one ear.
+
+    Args:
+        ear: An ``Audiogram`` of hlsim or pyclarity; the name of a standard audiogram, such as
+            ``"N3"`` or ``"n3"``; eight thresholds in dB HL at ``FREQUENCIES``, as a sequence, an
+            array or a tensor; or a mapping of frequencies in Hz to thresholds in dB HL.
+
+    Raises:
+        ValueError: The value is none of these, or its thresholds are not valid.
+
+    Example:
+        >>> from hlsim.audiogram.conversion import as_audiogram
+        >>> as_audiogram("n3")
+        Audiogram('N3')
+        >>> as_audiogram({250: 20, 1000: 30, 8000: 70}).levels
+        (20.0, 30.0, 70.0)
+    """
+    audiogram = find_audiogram(ear)
+    if audiogram is None:
+        raise ValueError(
+            f"expected an ear, got {type(ear).__name__}; pass an Audiogram, a name such as 'N3', "
+            "eight thresholds in dB HL, or a dictionary of frequencies in Hz to thresholds"
+        )
+    return audiogram
+
+
+def find_audiogram(ear: Any) -> Audiogram | None:
+    """Return the audiogram of one ear, or ``None`` if the value does not describe one ear."""
+    if isinstance(ear, Audiogram):
+        return ear
+    if isinstance(ear, str):
+        return Audiogram.standard(ear)
+    if is_claritys(ear):
+        return Audiogram.from_clarity(ear)
+    if isinstance(ear, Mapping):
+        return _from_mapping(ear)
+    if isinstance(ear, np.ndarray | Tensor):
+        return Audiogram(tuple(ear.tolist())) if ear.ndim == 1 else None
+    if isinstance(ear, Sequence) and ear and all(isinstance(level, Real) for level in ear):
+        return Audiogram(tuple(float(level) for level in ear))
+    return None
+
+
+def _from_mapping(levels: Mapping[Any, Any]) -> Audiogram:
+    """Return the audiogram of a mapping, in any order of the frequencies."""
+    if "levels" in levels:
+        return Audiogram.from_dict(levels)
+    try:
+        points = sorted((float(frequency), level) for frequency, level in levels.items())
+    except (TypeError, ValueError):
+        raise ValueError(
+            f"expected a dictionary of frequencies in Hz to thresholds in dB HL, got {levels!r}"
+        ) from None
+    frequencies = tuple(frequency for frequency, _ in points)
+    thresholds = tuple(level for _, level in points)
+    return Audiogram(thresholds, frequencies)

@@ -1,0 +1,277 @@
+"""Functions for a notebook: load speech, simulate a hearing loss, apply a hearing aid, and listen."""
+
+from __future__ import annotations
+
+import platform
+from html import escape
+from importlib import metadata
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from compensators import load_compensator
+from hlsim.audio import read_audio
+from hlsim.audiogram.thresholds import AudiogramLike
+from hlsim.calibration import PASCAL_SPL, gain_to_pascals, level_spl, set_level
+from hlsim.dsp.resample import resample
+from hlsim.losses.frozen_simulator import build_simulator
+from hlsim.neuro.config import NEURO_RATE
+from hlsim.version import __version__
+
+Audio = TypeVar("Audio", Tensor, NDArray[Any])
+
+EXAMPLE_FILE = Path(__file__).parent / "data" / "speech" / "valid" / "flite-rms-01.flac"
+EXAMPLE_SPL = 65.0
+"""Level of conversational speech in dB SPL."""
+
+_REPORTED_PACKAGES = ("torch", "numpy", "scipy", "soundfile", "safetensors", "lightning", "pandas")
+
+
+def load_audio(
+    path: str | Path, *, spl: float | None = EXAMPLE_SPL, sample_rate: int | None = None
+) -> tuple[Tensor, int]:
+    """Load an audio file as a tensor that is calibrated to a presentation level.
+
+    Args:
+        path: A file that libsndfile reads, such as WAV, FLAC, Ogg or MP3.
+        spl: RMS level in dB SPL to which the recording is scaled, with one gain for all channels.
+            ``None`` keeps the samples as they are in the file.
+        sample_rate: Rate in Hz to which the recording is resampled; by default its own.
+
+    Returns:
+        Samples in pascals, ``(time,)`` for a mono file and ``(channels, time)`` otherwise, and
+        their sample rate in Hz.
+
+    Raises:
+        ValueError: The file cannot be read, is empty or silent, or holds NaN or infinity.
+
+    Example:
+        >>> import hlsim
+        >>> speech, rate = hlsim.load_audio(hlsim.shortcuts.EXAMPLE_FILE, spl=65.0)
+        >>> speech.ndim, rate
+        (1, 16000)
+    """
+    channels, rate = read_audio(path, any_rate=sample_rate is not None)
+    if sample_rate is not None:
+        channels = resample(channels, rate, sample_rate)
+        rate = sample_rate
+    if spl is not None:
+        channels = set_level(channels.flatten(), spl).reshape(channels.shape)
+    if len(channels) == 1:
+        channels = channels[0]
+    return channels, rate
+
+
+def example_speech() -> Tensor:
+    """Return a bundled utterance of synthetic speech at 16 kHz and 65 dB SPL.
+
+    Returns:
+        Samples in pascals, ``(time,)``.
+
+    Example:
+        >>> import hlsim
+        >>> hlsim.example_speech().shape
+        torch.Size([64320])
+    """
+    speech, _ = load_audio(EXAMPLE_FILE, spl=EXAMPLE_SPL)
+    return speech
+
+
+def simulate(
+    audio: Audio,
+    ear: AudiogramLike,
+    *,
+    sample_rate: int = NEURO_RATE,
+    simulator: str | Path | torch.nn.Module = "msbg",
+    full_scale_spl: float = PASCAL_SPL,
+) -> Audio:
+    """Simulate what an impaired ear perceives of a signal.
+
+    Args:
+        audio: Tensor or NumPy array of floating-point samples, ``(..., time)``.
+        ear: An audiogram, the name of a standard one (``"N3"``), eight thresholds in dB HL, a
+            mapping of frequencies in Hz to thresholds, or a ``Listener`` for ``(..., 2, time)``.
+        sample_rate: Sample rate in Hz, 16000 to 48000.
+        simulator: ``"msbg"``, the exact model; the name or folder of a checkpoint such as
+            ``"neuro-msbg"``; or a module.
+        full_scale_spl: Level in dB SPL of a signal whose RMS is 1.0.
+
+    Returns:
+        The perceived signal, of the type and shape of ``audio``.
+
+    Raises:
+        ValueError: The audio, the ear, the rate or the simulator is not valid.
+
+    Example:
+        >>> import hlsim
+        >>> perceived = hlsim.simulate(hlsim.example_speech(), "N4")
+        >>> perceived.shape
+        torch.Size([64320])
+    """
+    model = build_simulator(simulator, sample_rate, full_scale_spl)
+    with torch.no_grad():
+        return _as_input(model(_as_tensor(audio), ear), audio)
+
+
+def compensate(
+    audio: Audio,
+    ear: AudiogramLike,
+    *,
+    sample_rate: int = NEURO_RATE,
+    compensator: str | Path = "hearing-aid",
+    full_scale_spl: float = PASCAL_SPL,
+) -> Audio:
+    """Compute the output of a hearing aid for a signal.
+
+    Args:
+        audio: Tensor or NumPy array of floating-point samples, ``(..., time)``.
+        ear: As in ``simulate``.
+        sample_rate: Sample rate in Hz, 16000 to 48000.
+        compensator: ``"hearing-aid"``, ``"nalr"``, ``"wdrc"``, or the name or folder of another
+            checkpoint.
+        full_scale_spl: Level in dB SPL of a signal whose RMS is 1.0.
+
+    Returns:
+        The output of the aid, of the type and shape of ``audio``. It is as loud as the ear needs:
+        turn the volume down before you play it.
+
+    Raises:
+        ValueError: The audio, the ear, the rate or the compensator is not valid.
+
+    Example:
+        >>> import hlsim
+        >>> output = hlsim.compensate(hlsim.example_speech(), "N3")
+        >>> output.shape
+        torch.Size([64320])
+    """
+    aid = load_compensator(compensator, sample_rate=sample_rate, full_scale_spl=full_scale_spl)
+    with torch.no_grad():
+        return _as_input(aid(_as_tensor(audio), ear), audio)
+
+
+def listen(
+    *,
+    sample_rate: int = NEURO_RATE,
+    full_scale_spl: float = PASCAL_SPL,
+    **signals: Tensor | NDArray[Any],
+) -> Players:
+    """Show players and spectrograms of signals in a notebook, all with the same gain.
+
+    The loudest signal sets the gain, so that what is soft for the ear is soft here. Start with a
+    low volume.
+
+    Args:
+        sample_rate: Sample rate in Hz of all signals.
+        full_scale_spl: Level in dB SPL of a signal whose RMS is 1.0.
+        signals: Mono signals by the label to show, ``(time,)`` each.
+
+    Returns:
+        An object that a notebook displays; its ``save`` method writes a page for a browser.
+
+    Raises:
+        ValueError: There is no signal, all signals are silent, or one is not mono.
+        MissingExtraError: The extra ``eval``, which draws the spectrograms, is not installed.
+
+    Example:
+        >>> import hlsim
+        >>> speech = hlsim.example_speech()
+        >>> players = hlsim.listen(original=speech, unaided=hlsim.simulate(speech, "N4"))
+        >>> players.labels
+        ['original', 'unaided']
+    """
+    if not signals:
+        raise ValueError("no signal to play; pass signals by name, as in listen(original=speech)")
+    gain = gain_to_pascals(full_scale_spl)
+    pascals = {}
+    for label, signal in signals.items():
+        tensor = _as_tensor(signal).detach().cpu()
+        if tensor.ndim != 1:
+            raise ValueError(
+                f"expected mono signals of shape (time,), got {tuple(tensor.shape)} for {label!r}; "
+                "pass one channel, such as x[0]"
+            )
+        pascals[label.replace("_", " ")] = tensor * gain
+    return Players(pascals, sample_rate)
+
+
+class Players:
+    """Audio players with spectrograms, displayed by a notebook or saved as a page.
+
+    Args:
+        signals: Signals in pascals by their labels, ``(time,)`` each.
+        sample_rate: Sample rate in Hz of all signals.
+    """
+
+    def __init__(self, signals: dict[str, Tensor], sample_rate: int) -> None:
+        from hlsim.report.listening import players
+
+        self.labels = list(signals)
+        self._players = players(signals, sample_rate)
+        self._levels = {label: float(level_spl(signal)) for label, signal in signals.items()}
+
+    def _repr_html_(self) -> str:
+        from hlsim.report.page import data_uri
+
+        figures = []
+        for player in self._players:
+            picture = ""
+            if player.picture is not None:
+                source = data_uri(player.picture.data)
+                alt = escape(player.picture.alt)
+                picture = f'<br><img src="{source}" alt="{alt}" style="max-width: 30em">'
+            figures.append(
+                f"<figure><figcaption>{escape(player.label)}</figcaption>"
+                f'<audio controls src="{data_uri(player.data)}"></audio>{picture}</figure>'
+            )
+        return "\n".join(figures)
+
+    def __repr__(self) -> str:
+        levels = ", ".join(f"{label} {level:.0f} dB SPL" for label, level in self._levels.items())
+        return f"Players({levels})"
+
+    def save(self, path: str | Path) -> None:
+        """Write the players as one HTML file that a browser opens without a network."""
+        page = f'<!doctype html><html lang="en"><meta charset="utf-8">{self._repr_html_()}</html>\n'
+        Path(path).write_text(page, encoding="utf-8")
+
+
+def info() -> str:
+    """Return the versions of hlsim, Python and the packages it uses, for a bug report.
+
+    Example:
+        >>> import hlsim
+        >>> hlsim.info().startswith("hlsim")
+        True
+    """
+    lines = [f"hlsim {__version__}", f"Python {platform.python_version()}", platform.platform()]
+    for package in _REPORTED_PACKAGES:
+        try:
+            lines.append(f"{package} {metadata.version(package)}")
+        except metadata.PackageNotFoundError:
+            lines.append(f"{package} not installed")
+    cuda = torch.version.cuda if torch.cuda.is_available() else None
+    lines.append(f"CUDA {cuda or 'not available'}")
+    lines.append(f"{torch.get_num_threads()} threads")
+    return "\n".join(lines)
+
+
+def _as_tensor(audio: Tensor | NDArray[Any]) -> Tensor:
+    """Return the samples as a tensor; a NumPy array must hold floating-point numbers."""
+    if isinstance(audio, Tensor):
+        return audio
+    samples = np.asarray(audio)
+    if not np.issubdtype(samples.dtype, np.floating):
+        raise ValueError(
+            f"expected floating-point samples, got an array of {samples.dtype}; divide 16-bit "
+            "samples by 32768 and set their level with hlsim.calibration.set_level"
+        )
+    return torch.from_numpy(np.ascontiguousarray(samples))
+
+
+def _as_input(result: Tensor, audio: Audio) -> Audio:
+    """Return the result as a tensor or an array, as the input was."""
+    return result if isinstance(audio, Tensor) else result.numpy()

@@ -1,0 +1,95 @@
+"""The functions for a notebook give what the modules behind them give, for tensors and arrays."""
+
+import numpy as np
+import pytest
+import soundfile
+import torch
+
+import hlsim
+from hlsim.calibration import level_spl
+from hlsim.shortcuts import EXAMPLE_FILE
+
+SPEECH = hlsim.example_speech()[8000:24000]
+
+
+def test_example_speech_is_speech_of_conversational_level() -> None:
+    assert float(level_spl(hlsim.example_speech())) == pytest.approx(65.0, abs=1e-3)
+
+
+@pytest.mark.parametrize("function", [hlsim.simulate, hlsim.compensate])
+def test_arrays_give_arrays_with_the_values_of_tensors(function) -> None:
+    result = function(SPEECH.numpy(), "n4")
+    assert isinstance(result, np.ndarray)
+    assert result.dtype == np.float32
+    assert np.array_equal(result, function(SPEECH, "N4").numpy())
+
+
+def test_simulate_is_the_exact_model_and_compensate_the_hearing_aid() -> None:
+    ear = hlsim.Audiogram.standard("N4")
+    aid = hlsim.load_compensator("hearing-aid")
+    with torch.no_grad():
+        assert torch.equal(hlsim.simulate(SPEECH, ear), hlsim.MSBG(sample_rate=16000)(SPEECH, ear))
+        assert torch.equal(hlsim.compensate(SPEECH, ear), aid(SPEECH, ear))
+
+
+@pytest.mark.parametrize(
+    "ear",
+    [
+        "N3",
+        "n3",
+        [35, 35, 40, 50, 55, 60, 65, 65],
+        np.array([35.0, 35, 40, 50, 55, 60, 65, 65]),
+        {250: 35, 500: 35, 1000: 40, 2000: 50, 3000: 55, 4000: 60, 6000: 65, 8000: 65},
+        {"levels": [35, 35, 40, 50, 55, 60, 65, 65]},
+    ],
+)
+def test_an_ear_may_be_written_in_several_ways(ear) -> None:
+    expected = hlsim.simulate(SPEECH, hlsim.Audiogram.standard("N3"))
+    assert torch.equal(hlsim.simulate(SPEECH, ear), expected)
+
+
+def test_one_gain_calibrates_all_channels_of_a_file(tmp_path) -> None:
+    left = SPEECH.numpy()
+    stereo = np.stack([left, 0.1 * left], axis=1)
+    soundfile.write(tmp_path / "stereo.wav", stereo, 44100, subtype="FLOAT")
+    channels, rate = hlsim.load_audio(tmp_path / "stereo.wav", spl=70.0, sample_rate=16000)
+    assert (channels.ndim, len(channels), rate) == (2, 2, 16000)
+    assert float(level_spl(channels.flatten())) == pytest.approx(70.0, abs=1e-3)
+    assert float(level_spl(channels[0]) - level_spl(channels[1])) == pytest.approx(20.0, abs=0.01)
+
+
+def test_players_share_one_gain_and_are_saved_as_a_page(tmp_path) -> None:
+    pytest.importorskip("matplotlib")
+    players = hlsim.listen(original=SPEECH, soft_copy=0.1 * SPEECH.numpy())
+    assert players.labels == ["original", "soft copy"]
+    players.save(tmp_path / "page.html")
+    page = (tmp_path / "page.html").read_text()
+    assert page.count("<audio controls") == page.count("<img") == 2
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda: hlsim.simulate((SPEECH * 32768).numpy().astype(np.int16), "N3"),
+        lambda: hlsim.simulate(SPEECH, "N9"),
+        lambda: hlsim.simulate(SPEECH, {"250 Hz": 20}),
+        lambda: hlsim.compensate(SPEECH, "N3", compensator="none"),
+        lambda: hlsim.load_audio("missing.wav"),
+        lambda: hlsim.listen(),
+        lambda: hlsim.listen(stereo=torch.stack([SPEECH, SPEECH])),
+    ],
+)
+def test_bad_input_is_rejected(call) -> None:
+    with pytest.raises(ValueError):
+        call()
+
+
+def test_info_names_the_versions_for_a_bug_report() -> None:
+    assert f"torch {torch.__version__.split('+')[0]}" in hlsim.info()
+
+
+def test_load_audio_can_keep_the_samples_of_the_file() -> None:
+    samples, rate = hlsim.load_audio(EXAMPLE_FILE, spl=None)
+    expected, _ = soundfile.read(EXAMPLE_FILE, dtype="float32")
+    assert rate == 16000
+    assert np.array_equal(samples.numpy(), expected)
