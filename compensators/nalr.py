@@ -5,10 +5,9 @@ from numbers import Integral
 from typing import Any
 
 import numpy as np
+import scipy
 import torch
 from numpy.typing import NDArray
-from scipy.fft import next_fast_len
-from scipy.signal.windows import hamming
 from torch import Tensor, nn
 
 from hlsim.audiogram import FREQUENCIES, HIGHEST_LEVEL
@@ -22,6 +21,7 @@ from hlsim.audiogram.thresholds import (
 from hlsim.calibration import PASCAL_SPL, check_full_scale
 from hlsim.checks import check_rate, check_waveform
 from hlsim.dsp.fir import frequency_sampling_fir
+from hlsim.dsp.windows import hamming
 from hlsim.torchtools import constant, constant_like
 
 _BIAS = {250.0: -17.0, 500.0: -8.0, 1000.0: 1.0, 2000.0: -1.0, 4000.0: -2.0, 6000.0: -2.0}
@@ -88,7 +88,7 @@ class NALR(nn.Module):
         with torch.autocast(waveform.device.type, enabled=False):
             signal = waveform.to(torch.promote_types(waveform.dtype, torch.float32))
             time = signal.shape[-1]
-            points = next_fast_len(time + self.order, real=True)
+            points = scipy.fft.next_fast_len(time + self.order, real=True)
             taps = self.taps(thresholds).to(signal.dtype)
             spectrum = torch.fft.rfft(signal, points) * torch.fft.rfft(taps, points)
             delay = self.order // 2

@@ -26,7 +26,7 @@ from hlsim.audiogram.thresholds import (
     resolve_thresholds,
 )
 from hlsim.calibration import PASCAL_SPL, check_full_scale, gain_to_pascals
-from hlsim.checks import check_rate, check_waveform, is_finite
+from hlsim.checks import broadcast_shape, check_rate, check_waveform, is_finite
 from hlsim.dsp.resample import resample
 
 _GLIDE = 0.04  # of a slider's way, a hop at most: 0.1 s from end to end
@@ -192,7 +192,7 @@ class Wearable(nn.Module):
         thresholds = resolve_thresholds(None, given, waveform, taker=type(self).__name__)
         own = next((weight.dtype for weight in self.parameters()), waveform.dtype)
         dtype = torch.promote_types(own, torch.float32)
-        batch = torch.broadcast_shapes(waveform.shape[:-1], thresholds.shape[:-1])
+        batch = broadcast_shape(waveform.shape[:-1], thresholds.shape[:-1])
         check_two_ears(self.linked, waveform)
         settings = [
             check_slider(name, slider, batch, thresholds).expand(batch)

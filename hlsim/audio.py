@@ -6,9 +6,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import scipy
 import soundfile
 import torch
-from scipy.io import wavfile
 from torch import Tensor
 
 from hlsim.checks import HIGHEST_RATE, HIGHEST_SAMPLE, check_rate, check_waveform, is_finite
@@ -190,10 +190,9 @@ def write_audio(path: str | Path, waveform: Tensor, sample_rate: int) -> None:
     kind = {"subtype": _SUBTYPES[suffix], "format": suffix[1:].upper()}
     with Whole(path, new_folder=False) as file:
         try:
-            if (
-                suffix == ".wav"
-            ):  # by libsndfile the time of day would be in it, and one sound not one file
-                wavfile.write(file.partial, rate, rows)
+            if suffix == ".wav":
+                # libsndfile would store the time of day, so that equal sounds gave different files
+                scipy.io.wavfile.write(file.partial, rate, rows)
             else:
                 soundfile.write(str(file.partial), rows, rate, **kind)
         except (OSError, soundfile.LibsndfileError) as error:

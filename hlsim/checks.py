@@ -24,6 +24,18 @@ Lengths = Tensor | Sequence[int]
 _KINDS = {int: "a whole number", float: "a number", bool: "true or false", str: "text"}
 
 
+def broadcast_shape(*shapes: Sequence[int]) -> torch.Size:
+    """Return the shape to which all shapes broadcast.
+
+    ``torch.broadcast_shapes`` does the same, but its first call imports sympy, which takes a third of a second.
+
+    Raises:
+        RuntimeError: the shapes do not fit.
+    """
+    number = torch.empty(())
+    return torch.broadcast_tensors(*(number.expand(shape) for shape in shapes))[0].shape
+
+
 def refuse_unknown(
     found: Iterable[Any], allowed: Iterable[str], what: str, where: str = ""
 ) -> None:

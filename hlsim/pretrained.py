@@ -52,7 +52,9 @@ def load_pretrained(
     """
 
     def build(config: NeuroConfig) -> NeuroMSBG:
-        return NeuroMSBG(config, sample_rate=sample_rate, full_scale_spl=full_scale_spl)
+        return NeuroMSBG(
+            config, sample_rate=sample_rate, full_scale_spl=full_scale_spl, compute_prior=False
+        )
 
     model = read_checkpoint(name, {SIMULATOR: NeuroConfig}, build)
     return model.eval().requires_grad_(False)

@@ -19,6 +19,7 @@ from hlsim.audiogram.value import (
     Audiogram,
     listed,
 )
+from hlsim.checks import broadcast_shape
 from hlsim.torchtools import constant_like
 
 HIGHEST_SIMULATED = 100.0
@@ -152,7 +153,7 @@ def resolve_thresholds(
     check_two_ears(two_ears if audiogram is None else of_listeners(audiogram), waveform)
     thresholds = one_an_item(thresholds, waveform.shape)
     try:
-        torch.broadcast_shapes(waveform.shape[:-1], thresholds.shape[:-1])
+        broadcast_shape(waveform.shape[:-1], thresholds.shape[:-1])
     except RuntimeError:
         raise ValueError(
             f"audiograms of shape {tuple(thresholds.shape)} for a waveform of shape {tuple(waveform.shape)}; allowed: "

@@ -13,7 +13,7 @@ from torch.nn import functional
 
 from hlsim.audiogram import FREQUENCIES
 from hlsim.audiogram.devices import on_device
-from hlsim.checks import check_waveform
+from hlsim.checks import broadcast_shape, check_waveform
 from hlsim.dsp.resample import resample
 from hlsim.losses.band_levels import HIGHEST
 from hlsim.msbg import MSBG
@@ -200,7 +200,7 @@ def _batches(items: torch.Size, ears: torch.Size) -> list[torch.Size]:
         ValueError: ears broadcast so that each item is heard with each ear: (batch, 1) items, (batch,) ears.
     """
     try:
-        together = torch.broadcast_shapes(items, ears)
+        together = broadcast_shape(items, ears)
     except RuntimeError:  # the simulator's to refuse
         return [items]
     if math.prod(together) > max(math.prod(items), math.prod(ears)):

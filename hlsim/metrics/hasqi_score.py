@@ -14,7 +14,6 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.signal.windows import hamming
 from torch import Tensor
 
 from hlsim.audiogram import FREQUENCIES
@@ -23,6 +22,7 @@ from hlsim.calibration import PASCAL_SPL, check_full_scale
 from hlsim.checks import Lengths, check_choice, check_waveform
 from hlsim.dsp.fft import fft_length
 from hlsim.dsp.fir import frequency_sampling_fir
+from hlsim.dsp.windows import hamming
 from hlsim.metrics.ear import fine_structure
 from hlsim.metrics.ear import model as ear_model
 from hlsim.metrics.ear.clean_speech import CleanItem, CleanSpeech, ItemGroup

@@ -9,7 +9,6 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import lfilter_zi
 from torch import Tensor
 from torch.nn import functional
 
@@ -69,6 +68,7 @@ def _oscillation(numerator: Array, denominator: Array) -> tuple[Array, Array]:
     """
     move = np.array([[-denominator[1], 1.0], [-denominator[2], 0.0]])
     enter = numerator[1:] - denominator[1:] * numerator[0]
+    settled = np.linalg.solve(np.eye(2) - move, enter)  # the state after a constant input of 1
 
     def reflected(state: Array, newest: Array) -> Array:
         """State of the backward pass at the end, from that of the forward pass and the newest nine samples."""
@@ -76,7 +76,7 @@ def _oscillation(numerator: Array, denominator: Array) -> tuple[Array, Array]:
         for sample in 2.0 * newest[0] - newest[1:]:
             outputs.append(state[0] + numerator[0] * sample)
             state = move @ state + enter * sample
-        state = lfilter_zi(numerator, denominator) * outputs[-1]
+        state = settled * outputs[-1]
         for output in reversed(outputs):
             state = move @ state + enter * output
         return state

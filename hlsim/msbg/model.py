@@ -17,7 +17,7 @@ from hlsim.audiogram.thresholds import (
     resolve_thresholds,
 )
 from hlsim.calibration import PASCAL_SPL, check_full_scale, gain_to_pascals
-from hlsim.checks import check_rate, check_waveform
+from hlsim.checks import broadcast_shape, check_rate, check_waveform
 from hlsim.dsp.fft import rfft
 from hlsim.msbg.blocks import in_blocks
 from hlsim.msbg.cochlea import bank_points, hear, hear_ending
@@ -132,7 +132,7 @@ class MSBG(nn.Module):
 
     def _simulate(self, waveform: Tensor, thresholds: Tensor) -> Tensor:
         dtype = waveform.dtype if waveform.dtype == torch.float64 else torch.float32
-        batch = torch.broadcast_shapes(waveform.shape[:-1], thresholds.shape[:-1])
+        batch = broadcast_shape(waveform.shape[:-1], thresholds.shape[:-1])
         signals = waveform.to(dtype).expand(*batch, -1).reshape(-1, waveform.shape[-1])
         ears = thresholds.to(signals).expand(*batch, -1).reshape(-1, thresholds.shape[-1])
         if (gain := gain_to_pascals(self.full_scale_spl)) != 1.0:

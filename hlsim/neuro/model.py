@@ -40,6 +40,8 @@ class NeuroMSBG(EarNetwork):
     Args:
         config: sizes and choices.
         sample_rate, full_scale_spl: as ``EarNetwork``.
+        compute_prior: whether to compute MSBG's known gains, which takes half a second. With False they are undefined
+            until a state dict is loaded.
 
     Raises:
         ValueError: a rate or level out of range, or a configuration of another kind.
@@ -53,13 +55,14 @@ class NeuroMSBG(EarNetwork):
         *,
         sample_rate: int = NEURO_RATE,
         full_scale_spl: float = PASCAL_SPL,
+        compute_prior: bool = True,
     ) -> None:
         super().__init__(sample_rate, full_scale_spl)
         self.config = config = NeuroConfig.given(config)
         self.stft = config.stft
         # training may run the network, not the physics around it, in bfloat16
         self.autocast_dtype: torch.dtype | None = None
-        self.prior = Prior(self.stft) if config.prior else None
+        self.prior = Prior(self.stft, compute_prior) if config.prior else None
         self.bands = BandCorrection(config) if config.structure == "bands" else None
         if self.bands is not None:
             return

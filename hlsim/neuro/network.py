@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from hlsim.audiogram import FREQUENCIES
 from hlsim.audiogram.thresholds import AudiogramLike, resolve_thresholds
 from hlsim.calibration import check_full_scale, gain_to_pascals
-from hlsim.checks import check_rate, check_waveform
+from hlsim.checks import broadcast_shape, check_rate, check_waveform
 from hlsim.dsp.overlap import overlapping
 from hlsim.dsp.resample import resample
 from hlsim.neuro.config import NEURO_RATE, NetworkConfig
@@ -61,7 +61,7 @@ class EarNetwork(nn.Module):
         thresholds = resolve_thresholds(None, audiogram, waveform, taker=type(self).__name__)
         with torch.autocast(waveform.device.type, enabled=False):
             dtype = self._dtype
-            batch = torch.broadcast_shapes(waveform.shape[:-1], thresholds.shape[:-1])
+            batch = broadcast_shape(waveform.shape[:-1], thresholds.shape[:-1])
             signals = waveform.to(dtype).expand(*batch, -1).reshape(-1, waveform.shape[-1])
             ears = thresholds.to(dtype).expand(*batch, -1).reshape(-1, len(FREQUENCIES))
             together = len(signals)

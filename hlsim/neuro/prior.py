@@ -9,7 +9,6 @@ from functools import lru_cache
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.signal import freqz
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -49,6 +48,7 @@ class Prior(nn.Module):
 
     Args:
         stft: the transform; its window should be about as short as MSBG's smearing frame, 5.8 ms.
+        compute: whether to compute the buffers. With False they are undefined until a state dict is loaded.
 
     Attributes:
         receptive_field: samples to either side on which one depends, besides those of the transform.
@@ -57,22 +57,31 @@ class Prior(nn.Module):
     response: Tensor
     ear_power: Tensor
 
-    def __init__(self, stft: STFT) -> None:
+    def __init__(self, stft: STFT, compute: bool = True) -> None:
         super().__init__()
         self.receptive_field = RESPONSE_HALF_LENGTH + _ENVELOPE_HALF_LENGTH * stft.hop
-        known = _known_values(stft)
-        for name in ("ear_power", "response"):
-            self.register_buffer(name, torch.tensor(known[name], dtype=torch.float32))
-        for name in ("excitation", "relative", "smoothing", "smearing"):
-            self._known(name, known[name])
+        severities, frequencies = len(SEVERITIES), stft.frequencies
+        shapes = {
+            "excitation": (severities, CHANNELS, frequencies),
+            "relative": (2, severities, CHANNELS, frequencies),  # real and imaginary parts
+            "smoothing": (severities, CHANNELS, 2 * _ENVELOPE_HALF_LENGTH + 1),
+            "smearing": (severities - 1, frequencies, frequencies),
+        }
+        self._add_buffer("ear_power", (frequencies,))
+        self._add_buffer("response", (severities, 2 * RESPONSE_HALF_LENGTH))
+        for name, shape in shapes.items():
+            # A formula gives the known values. The correction, which is trained, starts at 0 and is relative to them,
+            # because the spectrum of speech spans 60 dB: a small absolute change would let loud frequencies leak
+            # everywhere.
+            self._add_buffer(f"{name}_known", shape)
+            self.register_parameter(f"{name}_learned", nn.Parameter(torch.zeros(shape)))
+        if compute:
+            for name, values in _known_values(stft).items():
+                buffer = self.get_buffer(f"{name}_known" if name in shapes else name)
+                buffer.copy_(torch.from_numpy(values))
 
-    def _known(self, name: str, values: NDArray[np.float64]) -> None:
-        """What a formula gives, and a trained correction that starts at 0 and is relative to it.
-
-        Relative, because the spectrum of speech spans 60 dB: a small absolute change would let the loud leak everywhere.
-        """
-        self.register_buffer(f"{name}_known", torch.tensor(values, dtype=torch.float32))
-        self.register_parameter(f"{name}_learned", nn.Parameter(torch.zeros(values.shape)))
+    def _add_buffer(self, name: str, shape: tuple[int, ...]) -> None:
+        self.register_buffer(name, torch.empty(shape, dtype=torch.float32))
 
     def _corrected(self, name: str) -> Tensor:
         known, learned = getattr(self, f"{name}_known"), getattr(self, f"{name}_learned")
@@ -195,9 +204,11 @@ def _smoothing(bank: FilterBank, hop: int) -> NDArray[np.float64]:
     """The envelope's low-pass at the frame rate. Returns (channels, 2 half lengths + 1)."""
     points = 4096
     omega = 2.0 * np.pi * np.fft.rfftfreq(points) * (NEURO_RATE / hop) / MSBG_RATE
+    delay = np.exp(-1j * omega)
     rows = []
     for numerator, denominator in envelope_filters(bank):
-        impulse = np.fft.irfft(np.abs(freqz(numerator, denominator, omega)[1]) ** 2, points)
+        response = np.polyval(numerator[::-1], delay) / np.polyval(denominator[::-1], delay)
+        impulse = np.fft.irfft(np.abs(response) ** 2, points)
         row = np.roll(impulse, _ENVELOPE_HALF_LENGTH)[: 2 * _ENVELOPE_HALF_LENGTH + 1]
         rows.append(row / row.sum())
     return np.array(rows)

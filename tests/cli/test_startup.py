@@ -82,3 +82,19 @@ except AttributeError as error:
     assert "module 'hlsim' has no attribute 'Audiograms'" in str(error)
 """
     subprocess.run([sys.executable, "-c", script], check=True, cwd=Path(hlsim.__file__).parents[1])
+
+
+def test_models_do_without_modules_that_take_long_to_import() -> None:
+    script = """
+import sys, torch
+slow = {"sympy", "scipy.signal", "scipy.stats", "torch._dynamo"} - set(sys.modules)
+import compensators, hlsim
+for name in hlsim.__all__:
+    getattr(hlsim, name)
+speech, ear = 0.02 * torch.randn(8000), hlsim.Audiogram.standard("N3")
+hlsim.MSBG(ear, sample_rate=16000)(speech)
+hlsim.load_pretrained("neuro-msbg")(speech, ear)
+compensators.NALR(ear)(speech)
+assert not slow & set(sys.modules), slow & set(sys.modules)
+"""
+    subprocess.run([sys.executable, "-c", script], check=True, cwd=Path(hlsim.__file__).parents[1])

@@ -5,12 +5,13 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+import scipy.signal
 import torch
 from torch import Tensor
 
 from hlsim.dsp.erb import erb
 from hlsim.msbg.ear import MSBG_RATE
-from hlsim.msbg.envelope import STEP, detect, envelope, envelope_lowpass
+from hlsim.msbg.envelope import STEP, detect, envelope, envelope_filters, envelope_lowpass
 from hlsim.msbg.filterbank import BANKS, FilterBank
 
 TIME = 2 * STEP * 342
@@ -68,3 +69,12 @@ def test_envelope_of_a_constant_is_the_constant(name: str) -> None:
     channels = torch.full((bank.channels, 40 * STEP), -0.7, dtype=torch.float64)
     expected = torch.full((bank.channels, 40), 0.7 * 10 ** (-0.5 / 20), dtype=torch.float64)
     torch.testing.assert_close(envelope(channels, lowpass(bank, 40 * STEP)), expected)
+
+
+@pytest.mark.parametrize("bank", BANKS.values(), ids=BANKS)
+def test_low_passes_are_scipys(bank: FilterBank) -> None:
+    for width, found in zip(
+        erb(np.array(bank.centre_frequencies)), envelope_filters(bank), strict=True
+    ):
+        expected = scipy.signal.ellip(2, 0.25, 35, 0.75 * min(100.0, width) / 22050.0)
+        np.testing.assert_allclose(found, expected, rtol=1e-13)

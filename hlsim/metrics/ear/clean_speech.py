@@ -13,7 +13,7 @@ from torch import Tensor
 from hlsim.audiogram import HIGHEST_LEVEL
 from hlsim.audiogram.thresholds import AudiogramLike, resolve_thresholds
 from hlsim.calibration import check_full_scale
-from hlsim.checks import Lengths, check_lengths, check_rate, check_waveform
+from hlsim.checks import Lengths, broadcast_shape, check_lengths, check_rate, check_waveform
 from hlsim.metrics.ear import input as ear_input
 from hlsim.metrics.ear import model as ear_model
 from hlsim.metrics.ear.model import CHANNELS, Extent
@@ -138,7 +138,7 @@ class CleanSpeech:
         """Of each item. Returns (items, 8) dB HL."""
         probe = torch.empty((*self.shape, 1), device=self.device)
         ears = resolve_thresholds(None, audiogram, probe, highest=HIGHEST_LEVEL, taker=self._name)
-        if torch.broadcast_shapes(self.shape, ears.shape[:-1]) != self.shape:
+        if broadcast_shape(self.shape, ears.shape[:-1]) != self.shape:
             raise ValueError(
                 f"audiograms of shape {tuple(ears.shape)} for signals of {(*self.shape, self.time)}; allowed: one, or "
                 "leading dimensions that broadcast"

@@ -6,9 +6,9 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
+import scipy
 import torch
 from numpy.typing import NDArray
-from scipy.signal import cheby2, firwin, sosfreqz
 from torch import Tensor
 from torch.nn import functional
 
@@ -65,7 +65,7 @@ def _reach(up: int, down: int) -> int:
 def _kernel(up: int, down: int, periods: int) -> NDArray[np.float64]:
     """Weights of a row of inputs in a row of outputs: (inputs, periods * up)."""
     half = _ZEROS * max(up, down)
-    taps = up * firwin(2 * half + 1, 1.0 / max(up, down), window=("kaiser", _BETA))
+    taps = up * scipy.signal.firwin(2 * half + 1, 1.0 / max(up, down), window=("kaiser", _BETA))
     output = np.arange(periods * up)
     inputs = 2 * _reach(up, down) + down * periods
     # input j of a row lies at (j - reach) * up on the grid that both rates share, output k at k * down
@@ -84,8 +84,8 @@ def _power_below(signal: Tensor, rate: int) -> Tensor:
 
 
 def _chebyshev(rate: int, points: int) -> NDArray[np.complex128]:
-    sections = cheby2(7, 30, 21000.0 / rate, output="sos")
-    response: NDArray[np.complex128] = sosfreqz(
+    sections = scipy.signal.cheby2(7, 30, 21000.0 / rate, output="sos")
+    response: NDArray[np.complex128] = scipy.signal.sosfreqz(
         sections, 2.0 * np.pi * np.arange(points // 2 + 1) / points
     )[1]
     return response

@@ -13,10 +13,9 @@ from functools import lru_cache
 from typing import NamedTuple, ParamSpec, TypeVar, cast
 
 import numpy as np
+import scipy
 import torch
 from numpy.typing import NDArray
-from scipy.linalg import cholesky, solve_discrete_lyapunov
-from scipy.signal import butter, tf2ss
 from torch import Tensor
 from torch.nn import functional
 
@@ -98,8 +97,8 @@ def _accumulated(inputs: Tensor, step: Tensor, memory: int) -> Tensor:
 
 def _recursion(a: Array, b: Array, c: Array, d: float, memory: int) -> Recursion:
     """Of the state-space filter x' = a x + b u, y = c x + d u, its states balanced for single precision."""
-    root = cholesky(solve_discrete_lyapunov(a, b @ b.T), lower=True)
-    seen = root.T @ solve_discrete_lyapunov(a.T, c.T @ c) @ root
+    root = scipy.linalg.cholesky(scipy.linalg.solve_discrete_lyapunov(a, b @ b.T), lower=True)
+    seen = root.T @ scipy.linalg.solve_discrete_lyapunov(a.T, c.T @ c) @ root
     turn, size, _ = np.linalg.svd(seen)
     into = root @ turn / size**0.25
     a, b, c = np.linalg.solve(into, a @ into), np.linalg.solve(into, b), c @ into
@@ -121,15 +120,18 @@ def _recursion(a: Array, b: Array, c: Array, d: float, memory: int) -> Recursion
 @kept
 def middle_ear(device: torch.device, dtype: torch.dtype) -> Recursion:
     """A low-pass of first order at 5 kHz and a high-pass of second order at 350 Hz, both Butterworth (Kates 2013)."""
-    low, high = butter(1, 5000 / (RATE / 2)), butter(2, 350 / (RATE / 2), "high")
-    a, b, c, d = tf2ss(np.convolve(low[0], high[0]), np.convolve(low[1], high[1]))
+    low, high = (
+        scipy.signal.butter(1, 5000 / (RATE / 2)),
+        scipy.signal.butter(2, 350 / (RATE / 2), "high"),
+    )
+    a, b, c, d = scipy.signal.tf2ss(np.convolve(low[0], high[0]), np.convolve(low[1], high[1]))
     return _recursion(a, b, c, float(d[0, 0]), 2048).to(device, dtype)
 
 
 @kept
 def gain_lowpass(device: torch.device, dtype: torch.dtype) -> Recursion:
     """The 0.2 ms that a compressive gain takes: a Butterworth low-pass of first order at 800 Hz."""
-    a, b, c, d = tf2ss(*butter(1, 800 / (RATE / 2)))
+    a, b, c, d = scipy.signal.tf2ss(*scipy.signal.butter(1, 800 / (RATE / 2)))
     return _recursion(a, b, c, float(d[0, 0]), 192).to(device, dtype)
 
 
