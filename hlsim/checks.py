@@ -10,7 +10,6 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import torch
 from torch import Tensor
-from torch.nn import Parameter
 
 LOWEST_RATE, HIGHEST_RATE = 16000, 48000
 """Sample rates in Hz that simulators and compensators take."""
@@ -133,15 +132,15 @@ def check_waveform(
 ) -> Tensor:
     """Return the waveform, or raise ValueError unless it is a floating-point (..., time) tensor with samples up to 1e9.
 
-    NaN and infinity pass, and are NaN in what comes of them. How large samples are is not looked at on a GPU, whose queue
-    it would stop, nor in a compiled or exported program and in transforms of ``torch.func``.
+    NaN and infinity pass, and make their item's results NaN. The values are not checked on a GPU, which would have to wait
+    for them, nor in a compiled program.
     """
     check_floating(waveform, name)
     if waveform.ndim == 0 or waveform.numel() == 0:
         raise ValueError(
             f"{name} has shape {tuple(waveform.shape)}; allowed: (..., time) with at least one sample"
         )
-    if _has_values(waveform):
+    if waveform.device.type == "cpu" and not torch.compiler.is_compiling():
         low, high = torch.aminmax(waveform.detach())
         if highest < (peak := max(-float(low), float(high))) < math.inf:
             raise ValueError(f"{name} has a sample of {peak:.3g}; allowed: up to {highest:g}")
@@ -154,18 +153,6 @@ def check_floating(waveform: Tensor, name: str = "waveform") -> None:
         kind = waveform.dtype if isinstance(waveform, Tensor) else type(waveform).__name__
         scaled = "; divide 16-bit samples by 32768" if "int16" in str(kind) else ""
         raise ValueError(f"{name} is {kind}; allowed: a floating-point tensor (..., time){scaled}")
-
-
-def _has_values(tensor: Tensor) -> bool:
-    """Whether its values can be asked for, and at once."""
-    if (
-        torch.compiler.is_compiling()
-        or torch.jit.is_tracing()
-        or type(tensor) not in (Tensor, Parameter)
-    ):
-        return False
-    plain = tensor.device.type == "cpu" and tensor.layout == torch.strided
-    return plain and torch._C._functorch.maybe_current_level() is None
 
 
 def check_lengths(lengths: Lengths, shape: torch.Size) -> Tensor:

@@ -17,7 +17,6 @@ from hlsim.calibration import PASCAL_SPL
 from hlsim.files import whole_folder
 from hlsim.neuro.config import NEURO_RATE, ModelConfig, NeuroConfig
 from hlsim.neuro.model import NeuroMSBG
-from hlsim.torchtools import lasting
 
 Model = TypeVar("Model", bound=nn.Module)
 Config = TypeVar("Config", bound=ModelConfig)
@@ -108,13 +107,13 @@ def read_checkpoint(
     device = torch.get_default_device()
     try:
         # it may be trained through later, torch.device("meta") would keep no weights, and the random start is not kept
-        with lasting(), torch.device("cpu"), torch.random.fork_rng(devices=[]):
+        with torch.inference_mode(False), torch.device("cpu"), torch.random.fork_rng(devices=[]):
             model = build(config)
             model.load_state_dict(safetensors.torch.load(weights))
     except (TypeError, RuntimeError, safetensors.SafetensorError) as error:
         reason = str(error).splitlines()[0]
         raise ValueError(f"{folder}: weights and configuration do not fit ({reason})") from error
-    with lasting():
+    with torch.inference_mode(False):
         return model if device.type == "meta" else model.to(device)
 
 

@@ -1,10 +1,10 @@
-"""Where torch needs help: what its compiler leaves as it is, and tensors that are made once."""
+"""Helpers for torch: constants that are computed once, and functions that the compiler calls as they are."""
 
 from collections import OrderedDict
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from functools import wraps
-from threading import RLock
+from threading import Lock
 from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
@@ -14,98 +14,113 @@ from torch import Tensor
 P = ParamSpec("P")
 Result = TypeVar("Result")
 
+CACHE_BYTES = 2**28
+"""Size of the cache of constants. MSBG's filters take 5 MiB per second of signal."""
 
-def not_compiled(method: Callable[P, Result]) -> Callable[P, Result]:
-    """``torch.compiler.disable``, but asked for only by a compiler: it takes longer to import than all of hlsim."""
 
-    @wraps(method)
+def not_compiled(function: Callable[P, Result]) -> Callable[P, Result]:
+    """Decorate a function that a compiled program calls as it is, with a break in its graph.
+
+    This is ``torch.compiler.disable`` without its price: as a decorator, it would import the compiler, which takes longer
+    than importing hlsim.
+    """
+
+    @wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> Result:
         if torch.compiler.is_compiling():
-            # with fullgraph=True this is the error, and the next one's would not tell its reason
-            torch._dynamo.graph_break(
-                msg="hlsim runs eagerly here: leave fullgraph out, or compile the network alone"
-            )
-            return torch.compiler.disable(method)(*args, **kwargs)
-        return method(*args, **kwargs)
+            return torch.compiler.disable(function)(*args, **kwargs)
+        return function(*args, **kwargs)
 
     return call
 
 
-@contextmanager
-def lasting() -> Iterator[None]:
-    """For what is kept: plain tensors, also where inference mode or a transform of ``torch.func`` asks first."""
-    with torch.inference_mode(False), torch._C._DisableFuncTorch():
-        yield
+def without_modes(
+    function: Callable[P, Result], /, *arguments: P.args, **options: P.kwargs
+) -> Result:
+    """Call a function outside of inference mode, autocast, ``torch.func`` and other modes of the caller.
+
+    These modes belong to a thread, so the function runs in a thread of its own. Tensors that it creates are plain ones,
+    which can be kept and used under any mode.
+    """
+    with ThreadPoolExecutor(1) as pool:
+        return pool.submit(function, *arguments, **options).result()
 
 
 def constant(
-    make: Callable[..., Any], *arguments: Any, dtype: torch.dtype, device: torch.device
+    function: Callable[..., Any], *arguments: Any, dtype: torch.dtype, device: torch.device
 ) -> Tensor:
-    """What ``make`` returns for these arguments as a tensor that nobody may write into, made once.
+    """Return the values of ``function(*arguments)`` as a tensor, computed once. Nobody may write into it.
 
     Args:
-        make: a function of a module, which returns an array or numbers.
-        dtype: the tensor's, or, where the values are complex, the real type of its parts.
+        function: a module's function that returns an array or numbers.
+        dtype: type of real values, and of the parts of complex ones.
+        device: device of the tensor.
     """
-    tensor: Tensor = made_once(_constant, make, arguments, dtype, device)
+    tensor: Tensor = compute_once(_constant, function, arguments, dtype, device)
     return tensor
 
 
-def constant_like(like: Tensor, make: Callable[..., Any], *arguments: Any) -> Tensor:
-    """``constant`` of the type, complex or not, and on the device of a tensor."""
-    dtype = like.dtype.to_real() if like.is_complex() else like.dtype
-    return constant(make, *arguments, dtype=dtype, device=like.device)
+def constant_like(tensor: Tensor, function: Callable[..., Any], *arguments: Any) -> Tensor:
+    """Return ``constant`` in the precision and on the device of a real or complex tensor."""
+    dtype = tensor.dtype.to_real() if tensor.is_complex() else tensor.dtype
+    return constant(function, *arguments, dtype=dtype, device=tensor.device)
 
 
-def made_once(make: Callable[..., Any], *arguments: Any) -> Any:
-    """What ``make`` returns for these arguments: a tensor or another object with ``nbytes``.
+def compute_once(function: Callable[..., Any], *arguments: Any) -> Any:
+    """Return ``function(*arguments)`` from a cache of the process, which drops what was not used for longest.
 
-    The process keeps what was asked for last, no model does: nothing of it is stored or copied.
+    Args:
+        function: a module's function that returns a tensor or another object with ``nbytes``.
+        arguments: hashable arguments.
     """
-    # what a trace or a mode, as that of fake tensors, makes is of no use to others
-    if torch.compiler.is_compiling() or torch._C._len_torch_dispatch_stack():
-        return make(*arguments)
-    return _KEPT.get(make, arguments)
+    if torch.compiler.is_compiling():  # a program that is traced cannot use tensors from outside
+        return function(*arguments)
+    return _CACHE.get(function, arguments)
 
 
 def as_tensor(values: Any, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """Real or complex values as a tensor of ``dtype`` or its complex counterpart."""
-    tensor = torch.as_tensor(
-        np.ascontiguousarray(values) if isinstance(values, np.ndarray) else values
-    )
+    """Convert real or complex values to a tensor of ``dtype`` or of its complex counterpart."""
+    if isinstance(values, np.ndarray):
+        values = np.ascontiguousarray(values)
+    tensor = torch.as_tensor(values)
     return tensor.to(device=device, dtype=dtype.to_complex() if tensor.is_complex() else dtype)
 
 
 def _constant(
-    make: Callable[..., Any], arguments: tuple[Any, ...], dtype: torch.dtype, device: torch.device
+    function: Callable[..., Any],
+    arguments: tuple[Any, ...],
+    dtype: torch.dtype,
+    device: torch.device,
 ) -> Tensor:
-    return as_tensor(make(*arguments), dtype, device)
+    return as_tensor(function(*arguments), dtype, device)
 
 
-class _Kept:
-    """The results asked for last, up to ``limit`` bytes of them: MSBG's filters take 5 MiB a second of signal."""
+class _Cache:
+    """Results by function and arguments, up to a number of bytes; the last one is kept whatever its size."""
 
     def __init__(self, limit: int) -> None:
         self.limit = limit
         self._results: OrderedDict[Any, Any] = OrderedDict()
-        self._lock = RLock()  # modules may run in threads
+        self._lock = Lock()
 
-    def get(self, make: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:
-        key = make, arguments
+    def get(self, function: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:
+        key = function, arguments
         with self._lock:
             if key in self._results:
                 self._results.move_to_end(key)
-            else:
-                with lasting():
-                    self._results[key] = make(*arguments)
-                while len(self._results) > 1 and self.held > self.limit:
-                    self._results.popitem(last=False)
-            return self._results[key]
+                return self._results[key]
+        # The lock is open meanwhile, because a function may ask for other constants.
+        result = without_modes(function, *arguments)
+        with self._lock:
+            self._results[key] = result
+            while len(self._results) > 1 and self.nbytes > self.limit:
+                self._results.popitem(last=False)
+        return result
 
     @property
-    def held(self) -> int:
-        """Bytes of all."""
+    def nbytes(self) -> int:
+        """Bytes of all results."""
         return sum(result.nbytes for result in self._results.values())
 
 
-_KEPT = _Kept(2**28)
+_CACHE = _Cache(CACHE_BYTES)

@@ -136,8 +136,8 @@ def current_line() -> str:
 
 
 def count_wait(reason: str) -> None:
-    if any(frame.name == "made_once" for frame in traceback.extract_stack()):
-        return  # under a dispatch mode hlsim makes its constants anew, without one it keeps them
+    if any(frame.name == "compute_once" for frame in traceback.extract_stack()):
+        return  # under a dispatch mode hlsim computes its constants anew, without one it keeps them
     waits[f"{reason} @ {current_line()}"] += 1
 
 

@@ -11,8 +11,17 @@ import torch
 from torch import Tensor, nn
 
 from compensators import WDRC, MappingCompensator, load_compensator
-from hlsim import MSBG, Audiogram, HearingLossLoss, load_pretrained
+from hlsim import MSBG, Audiogram, HearingLossLoss, load_pretrained, torchtools
 from tests.pretend_device import DEVICE, PretendDevice, PretendTensor
+
+
+
+@pytest.fixture(autouse=True)
+def constants_on_the_pretended_device(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Compute constants in this thread, the only one that knows the device, and keep them from other tests."""
+    monkeypatch.setattr(torchtools, "without_modes", lambda function, *args: function(*args))
+    monkeypatch.setattr(torchtools, "_CACHE", torchtools._Cache(torchtools.CACHE_BYTES))
+
 
 EARS = torch.tensor([Audiogram.standard(name).thresholds for name in ("N1", "N3", "NH", "N1")])
 N3 = Audiogram.standard("N3")

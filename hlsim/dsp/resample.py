@@ -20,12 +20,12 @@ f from 1.05            -103 dB       -145 dB
 """
 
 import math
-from concurrent.futures import ThreadPoolExecutor
-from functools import lru_cache
 
 import torch
 from torch import Tensor
 from torch.nn import functional
+
+from hlsim.torchtools import compute_once
 
 ROLLOFF = 0.9475937167399596
 """Cut-off frequency over the lower of the two Nyquist frequencies."""
@@ -72,9 +72,7 @@ def resample(waveform: Tensor, source_rate: int, target_rate: int) -> Tensor:
             f"cannot resample from {source_rate} to {target_rate} Hz: their common factor, {common}, is too small; "
             "choose rates such as 16000, 22050, 24000, 32000, 44100 and 48000"
         )
-    # a tracer records how the kernel is made; one that was made before would be a tensor from outside to it
-    kernel_of = sinc_kernel if torch.compiler.is_compiling() else _cached_kernel
-    kernel = kernel_of(source, target, waveform.dtype, waveform.device)
+    kernel = compute_once(sinc_kernel, source, target, waveform.dtype, waveform.device)
 
     *leading, time = waveform.shape
     signals = waveform.reshape(math.prod(leading), 1, time)
@@ -111,14 +109,3 @@ def sinc_kernel(source: int, target: int, dtype: torch.dtype, device: torch.devi
     angle = distance * math.pi
     sinc = torch.where(angle == 0, 1.0, angle.sin() / angle)
     return (sinc * (window * (cutoff / source))).to(dtype)
-
-
-@lru_cache(maxsize=32)
-def _cached_kernel(source: int, target: int, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """``sinc_kernel``, which takes up to forty times as long to compute as to apply to one second.
-
-    Inference mode, transforms of ``torch.func`` and other modes of torch belong to a thread. A kernel that is computed in
-    a thread of its own is a plain tensor, which serves every later caller.
-    """
-    with ThreadPoolExecutor(1) as pool:
-        return pool.submit(sinc_kernel, source, target, dtype, device).result()

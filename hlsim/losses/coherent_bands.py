@@ -140,8 +140,6 @@ def without_spikes(compensated: Tensor, sample_rate: int) -> Tensor:
 
 
 class _WithoutSpikes(torch.autograd.Function):
-    generate_vmap_rule = True
-
     @staticmethod
     def forward(waveform: Tensor, block: int) -> Tensor:
         return waveform.view_as(waveform)
@@ -150,10 +148,6 @@ class _WithoutSpikes(torch.autograd.Function):
     def setup_context(ctx: Any, inputs: tuple[Tensor, int], output: Tensor) -> None:
         waveform, ctx.block = inputs
         ctx.save_for_backward(waveform)
-
-    @staticmethod
-    def jvp(ctx: Any, tangent: Tensor, *others: None) -> Tensor:
-        return tangent.view_as(tangent)
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:

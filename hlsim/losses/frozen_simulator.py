@@ -21,7 +21,7 @@ from hlsim.msbg.response import hear_normally, with_phase_of_bank
 from hlsim.neuro import NeuroMSBG
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.pretrained import SIMULATOR, find_checkpoint, load_pretrained
-from hlsim.torchtools import lasting
+from hlsim.torchtools import without_modes
 
 ReferenceName = Literal["clean", "normal-hearing"]
 
@@ -86,15 +86,7 @@ class FrozenEar:
             name: value.to(waveform.device) if isinstance(value, Tensor) else value
             for name, value in (listener or {}).items()
         }
-        try:
-            heard = self.simulator(waveform, thresholds, **more)
-        except (RuntimeError, NotImplementedError) as error:
-            if torch._C._functorch.maybe_current_level() is None:
-                raise
-            raise ValueError(
-                f"{type(self.simulator).__name__} does not go through this transform of torch.func; allowed: grad, and "
-                "with simulator='msbg' jvp and, of all criteria but 'bands', vmap"
-            ) from error
+        heard = self.simulator(waveform, thresholds, **more)
         return _check_heard(heard, "simulator", waveform, allowed)
 
     def _hear_to_ends(self, waveform: Tensor, thresholds: Tensor, ends: Tensor) -> Tensor:
@@ -139,9 +131,7 @@ class FrozenEar:
                 if ears.ndim > 1
                 else ears.unsqueeze(0)
             )
-        # what torch.func differentiates by does not say so
-        followed = clean.requires_grad or torch._C._functorch.maybe_current_level() is not None
-        with torch.set_grad_enabled(torch.is_grad_enabled() and followed):
+        with torch.set_grad_enabled(torch.is_grad_enabled() and clean.requires_grad):
             if choice == "clean":
                 aim = self._narrowed(clean)
             elif self.normal is not None:
@@ -189,8 +179,7 @@ class FrozenEar:
 
 @lru_cache
 def _no_loss(dtype: torch.dtype) -> Tensor:
-    with lasting():
-        return torch.zeros(len(FREQUENCIES), dtype=dtype)
+    return without_modes(torch.zeros, len(FREQUENCIES), dtype=dtype)
 
 
 def _batches(items: torch.Size, ears: torch.Size) -> list[torch.Size]:

@@ -59,8 +59,8 @@ class HearingLossLoss(nn.Module):
 
     It may be called in an autocast region and works in float32 there; call ``backward()`` outside of it, as torch says:
     inside one of float16, gradients may be NaN. A compiled caller calls it as it is, so that ``fullgraph=True`` and
-    ``torch.export`` refuse it; compile or export the network alone. Of ``torch.func`` it takes ``grad``, and with the
-    exact MSBG ``vmap`` (not of ``"bands"``) and ``jvp``; the network does not, and ``"haspi"`` and ``"hasqi"`` take none.
+    ``torch.export`` refuse it; compile or export the network alone. ``torch.func.grad`` works, except for the criteria
+    ``"haspi"`` and ``"hasqi"``.
 
     Args:
         audiogram: the ear or ears; may be given with each call instead. A tensor that is trained gets its gradient; it is

@@ -45,7 +45,6 @@ def phase_loss(estimate: Tensor, truth: Tensor) -> Tensor:
 
     Shape: complex (items, frames, bins) -> (items,).
     """
-    # always: whether a gradient will be asked for, torch.func and forward mode do not tell
     difference: Tensor = _FadedDifference.apply(estimate, truth)
     instantaneous = anti_wrap(difference).mean((-2, -1))
     group_delay = anti_wrap(difference.diff(dim=-1)).mean((-2, -1))
@@ -118,8 +117,6 @@ class _FadedDifference(torch.autograd.Function):
     The gradient of an angle is i z / |z|^2; here it is times |z|^2 / (|z|^2 + faint), and the same of the other's.
     """
 
-    generate_vmap_rule = True
-
     @staticmethod
     def forward(estimate: Tensor, truth: Tensor) -> Tensor:
         (x, y), (u, v) = _apart(estimate), _apart(truth)
@@ -129,7 +126,6 @@ class _FadedDifference(torch.autograd.Function):
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor], output: Tensor) -> None:
         ctx.save_for_backward(*inputs)
-        ctx.save_for_forward(*inputs)
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, Tensor | None]:
@@ -139,18 +135,6 @@ class _FadedDifference(torch.autograd.Function):
             _turned(estimate, -gradient * _fading(estimate, truth)) if first else None,
             _turned(truth, gradient * _fading(truth, estimate)) if second else None,
         )
-
-    @staticmethod
-    def jvp(ctx: Any, *tangents: Tensor | None) -> Tensor:
-        estimate, truth = ctx.saved_tensors
-        along = torch.zeros_like(estimate.real)
-        for sign, spectrum, other, tangent in zip(
-            (-1.0, 1.0), (estimate, truth), (truth, estimate), tangents, strict=True
-        ):
-            if tangent is not None:
-                across = spectrum.real * tangent.imag - spectrum.imag * tangent.real
-                along = along + sign * across * _fading(spectrum, other)
-        return along
 
 
 def _apart(spectrum: Tensor) -> tuple[Tensor, Tensor]:

@@ -29,8 +29,7 @@ def in_blocks(
     if len(blocks) == 1:
         return process(signals, ears, True)
     heard = []
-    # torch.func's transforms refuse the hooks by which a block is computed again
-    again = torch.is_grad_enabled() and torch._C._functorch.peek_interpreter_stack() is None
+    again = torch.is_grad_enabled() and _hooks_are_allowed()
     for block in blocks:
         last = block.end == samples
         given = _faded(block.given(signals), rate, block.begin > 0, not last)
@@ -40,6 +39,19 @@ def in_blocks(
             output = process(given, ears, last)
         heard.append(block.kept(output))
     return torch.cat(heard, -1)
+
+
+def _hooks_are_allowed() -> bool:
+    """Whether autograd takes the hooks by which checkpointing computes a block again; ``torch.func`` forbids them."""
+    try:
+        with torch.autograd.graph.saved_tensors_hooks(_identity, _identity):
+            return True
+    except RuntimeError:
+        return False
+
+
+def _identity(tensor: Tensor) -> Tensor:
+    return tensor
 
 
 def block_bounds(samples: int, rate: int) -> list[Block]:

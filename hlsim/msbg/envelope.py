@@ -56,8 +56,6 @@ def _detect(signals: Tensor, harmonics: bool) -> tuple[Tensor, ...]:
 class _Detect(torch.autograd.Function):
     """``_detect`` with a gradient of half the steps."""
 
-    generate_vmap_rule = True
-
     @staticmethod
     def forward(signals: Tensor, harmonics: bool) -> tuple[Tensor, ...]:
         return _detect(signals, harmonics)

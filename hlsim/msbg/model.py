@@ -27,7 +27,7 @@ from hlsim.msbg.multirate import multirate_bank, total_response
 from hlsim.msbg.recruitment import expansion_ratios, threshold_weights
 from hlsim.msbg.resampling import from_cochlea, from_spectrum, to_cochlea, to_inner
 from hlsim.msbg.smearing import BROADENING, SMEARING_DELAY, smear, smearing_matrix_below
-from hlsim.torchtools import constant_like, made_once, not_compiled
+from hlsim.torchtools import compute_once, constant_like, not_compiled
 
 STRUCTURAL_DELAY = 1047
 """Delay in samples at 44.1 kHz of the model without smearing, by which ``aligned`` advances the output.
@@ -201,7 +201,7 @@ class MSBG(nn.Module):
             spectrum = spectrum * constant_like(heard, total_response, bank, points, step)
         else:
             key = bank, points, step, highest, heard.dtype, heard.device
-            spectrum = hear(spectrum, ratios, made_once(multirate_bank, *key), not smears)
+            spectrum = hear(spectrum, ratios, compute_once(multirate_bank, *key), not smears)
         if smears:
             return from_spectrum(spectrum, points, step, rate, samples, gain=gain, delay=delay)
         # without smearing's delay, the way out reaches samples that the advances put before the first one
@@ -218,7 +218,7 @@ class MSBG(nn.Module):
             return hear_ending(heard, ratios, bank)
         points = bank_points(length, MSBG_RATE)
         key = bank, points, 1, MSBG_RATE / 2, heard.dtype, heard.device
-        spectrum = hear(rfft(heard, points), ratios, made_once(multirate_bank, *key), not smears)
+        spectrum = hear(rfft(heard, points), ratios, compute_once(multirate_bank, *key), not smears)
         all_but_the_end = torch.fft.irfft(spectrum, points)[..., :length]
         if not last:
             return all_but_the_end

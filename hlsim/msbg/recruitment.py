@@ -116,8 +116,6 @@ def _sum_of_products(channels: Tensor, factors: Tensor) -> Tensor:
 class _SumOfProducts(torch.autograd.Function):
     """``_sum_of_products``, whose steps in place torch cannot differentiate."""
 
-    generate_vmap_rule = True
-
     @staticmethod
     def forward(channels: Tensor, factors: Tensor) -> Tensor:
         return _sum_of_products(channels, factors)

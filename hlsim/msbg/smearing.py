@@ -170,8 +170,6 @@ class _Spread(torch.autograd.Function):
     frequency the factor of others changes. That of A is t p^T / 2.
     """
 
-    generate_vmap_rule = True
-
     @staticmethod
     def forward(spectrum: Tensor, matrix: Tensor, least: float) -> tuple[Tensor, ...]:
         return _spread(spectrum, matrix)

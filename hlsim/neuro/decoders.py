@@ -73,8 +73,6 @@ class _Turning(torch.autograd.Function):
     -y Im q / |z|^2 and (1 + x) Im q / |z|^2.
     """
 
-    generate_vmap_rule = True
-
     @staticmethod
     def forward(log_gain: Tensor, right: Tensor, up: Tensor) -> Tensor:
         right = right + 1.0

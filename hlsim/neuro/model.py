@@ -33,9 +33,7 @@ class NeuroMSBG(EarNetwork):
     ``config.prior``, MSBG's known gains come first and enter as a fourth channel, and the decoders correct them; with the
     structure ``bands`` a smaller network corrects them before they become a mask.
 
-    On a CPU, second derivatives and ``torch.func.grad`` work with ``cnn`` and ``lstm`` blocks, the latter alone with
-    ``transformer`` blocks, and neither with ``mamba`` blocks; ``torch.vmap``, ``torch.func.jvp`` and forward mode work
-    with the structure ``bands`` alone. What does not work raises an error.
+    ``torch.func.grad`` works with all blocks, and on a CPU second derivatives work with ``cnn`` and ``lstm`` blocks.
 
     Args:
         config: sizes and choices.

@@ -130,8 +130,7 @@ class _SelectiveScan(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(ctx: Any, delta: Tensor, u: Tensor, B: Tensor, C: Tensor, A: Tensor) -> Tensor:
-        ctx.save_for_backward(delta, u, B, C, A)
+    def forward(delta: Tensor, u: Tensor, B: Tensor, C: Tensor, A: Tensor) -> Tensor:
         y = u.new_empty(u.shape)
         with torch.autocast(u.device.type, enabled=False):
             for rows, columns, work in _blocks(u, A, back=False):
@@ -140,6 +139,10 @@ class _SelectiveScan(torch.autograd.Function):
                 work.run(d, v, b, A[:, columns])
                 y[rows, :, columns] = (c.unsqueeze(-2) @ work.states).squeeze(-2)
         return y
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor, ...], output: Tensor) -> None:
+        ctx.save_for_backward(*inputs)
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, ...]:
@@ -154,7 +157,7 @@ class _Slopes(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, grad: Tensor, delta: Tensor, u: Tensor, B: Tensor, C: Tensor, A: Tensor
+        grad: Tensor, delta: Tensor, u: Tensor, B: Tensor, C: Tensor, A: Tensor
     ) -> tuple[Tensor, ...]:
         grad_delta, grad_u = u.new_empty(u.shape), u.new_empty(u.shape)
         grad_A, grad_B, grad_C = torch.zeros_like(A), torch.zeros_like(B), torch.zeros_like(C)
@@ -179,6 +182,10 @@ class _Slopes(torch.autograd.Function):
                 # both sums at once, of a slice, take 20 times as long
                 grad_A[:, columns] += exponent.mul_(d[:, 1:].unsqueeze(-2)).sum(1).sum(0)
         return grad_delta, grad_u, grad_B, grad_C, grad_A
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor, ...], output: tuple[Tensor, ...]) -> None:
+        pass
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, ...]:

@@ -15,7 +15,6 @@ from hlsim.dsp.resample import (
     KAISER_BETA,
     ROLLOFF,
     ZERO_CROSSINGS,
-    _cached_kernel,
     resample,
     sinc_kernel,
 )
@@ -164,9 +163,8 @@ def test_a_kernel_made_in_inference_mode_serves_gradients_too() -> None:
 
 def test_a_kernel_made_in_a_transform_serves_others_too() -> None:
     def energy(wave: Tensor) -> Tensor:
-        return resample(wave, 17000, 16000).square().sum()
+        return resample(wave, 18000, 16000).square().sum()  # rates of no other test
 
-    _cached_kernel.cache_clear()
     wave = torch.randn(50)
     torch.func.grad(lambda w: torch.func.grad(energy)(w).sum())(wave)
     (expected,) = torch.autograd.grad(energy(wave.requires_grad_()), wave)

@@ -1044,30 +1044,24 @@ def test_no_sample_takes_the_gradient_over(
             assert bool((slope.abs().amax(-1) < 100.0 * slope.abs().median(-1).values).all())
 
 
-def test_transforms_work_or_say_so(clean: Tensor) -> None:
-    exact, network = (HearingLossLoss(N3, simulator=simulator) for simulator in SIMULATORS[::-1])
-    given = 3.0 * clean
-    for loss in (exact, network):
-        _, slope = gradient(loss, given, clean)
-        torch.testing.assert_close(
-            torch.func.grad(lambda wave, loss=loss: loss(wave, clean))(given), slope
-        )
-    each = torch.stack([exact(one, true) for one, true in zip(given, clean, strict=True)])
-    torch.testing.assert_close(torch.vmap(exact)(given, clean), each, rtol=1e-4, atol=1e-5)
-    _, by_clean = gradient(lambda true, wave: exact(wave, true), clean, given)
-    summed = torch.func.grad(lambda true: torch.vmap(exact)(given, true).mean())(clean)
-    torch.testing.assert_close(summed, by_clean, rtol=1e-3, atol=1e-5 * float(by_clean.abs().max()))
-    along = torch.func.jvp(lambda wave: exact(wave, clean), (given,), (clean,))[1]
-    assert bool(along.isfinite())
-    with pytest.raises(
-        ValueError,
-        match=r"NeuroMSBG does not go through this transform of torch.func; allowed: grad",
-    ):
-        torch.vmap(network)(given, clean)
-    with pytest.raises(ValueError, match="HearingLossLoss is for training, and not exported"):
-        torch.export.export(Host(network).loss, (given, clean))
-    with pytest.raises(RuntimeError, match="hlsim runs eagerly here: leave fullgraph out"):
-        torch.compile(lambda wave: network(wave, clean), backend="eager", fullgraph=True)(given)
+@both
+@each_criterion
+def test_torch_func_gives_the_same_gradients(simulator: str, criterion: str, clean: Tensor) -> None:
+    loss = HearingLossLoss(N3, simulator=simulator, criterion=criterion)
+    compensated = 3.0 * clean
+    for argument, leaf in enumerate((compensated, clean)):
+        signals = [compensated, clean]
+        signals[argument] = leaf.clone().requires_grad_()
+        (expected,) = torch.autograd.grad(loss(*signals), signals[argument])
+        found = torch.func.grad(loss, argnums=argument)(compensated, clean)
+        torch.testing.assert_close(found, expected)
+
+
+@pytest.mark.slow
+def test_a_program_without_breaks_cannot_hold_the_loss(clean: Tensor) -> None:
+    loss = HearingLossLoss(N3)
+    with pytest.raises(RuntimeError):
+        torch.compile(lambda wave: loss(wave, clean), backend="eager", fullgraph=True)(clean)
 
 
 def test_what_it_was_built_with_stays() -> None:

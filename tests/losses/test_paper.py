@@ -146,28 +146,6 @@ def test_phase_gradient_comes_from_what_is_heard(
     assert float(gradient[:, 8500:].norm()) < 0.05 * float(gradient[:, :8000].norm())
 
 
-def test_the_phases_gradient_is_the_same_in_every_mode() -> None:
-    truth = torch.randn(2, 3, 4, dtype=torch.complex128)
-    # faint, so that most of the gradient is faded out
-    estimate, tangent = (1e-2 * torch.randn(2, 3, 4, dtype=torch.complex128) for _ in range(2))
-
-    def loss(spectrum: Tensor) -> Tensor:
-        return phase_loss(spectrum, truth).sum()
-
-    given = estimate.clone().requires_grad_()
-    (expected,) = torch.autograd.grad(loss(given), given)
-    torch.testing.assert_close(torch.func.grad(loss)(estimate), expected)
-
-    def one_by_one(spectrum: Tensor) -> Tensor:
-        return torch.vmap(lambda one, true: phase_loss(one[None], true[None]).sum())(
-            spectrum, truth
-        ).sum()
-
-    torch.testing.assert_close(torch.func.grad(one_by_one)(estimate), expected)
-    along = (expected.conj() * tangent).real.sum()
-    torch.testing.assert_close(torch.func.jvp(loss, (estimate,), (tangent,))[1], along)
-
-
 def test_noise_to_signal_is_the_negative_snr(pair: tuple[Tensor, Tensor]) -> None:
     truth = pair[1]
     for db in (-20.0, 0.0, 30.0):

@@ -366,7 +366,7 @@ def test_autocast_is_left(speech: list[tuple[Tensor, int]]) -> None:
 
 def test_compiled_it_is_called_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
     # empty: what makes filters is called, too
-    monkeypatch.setattr(torchtools, "_KEPT", torchtools._Kept(2**28))
+    monkeypatch.setattr(torchtools, "_CACHE", torchtools._Cache(2**28))
     model, wave = MSBG(Audiogram.standard("N3"), sample_rate=16000), 0.03 * torch.randn(1, 1200)
     heard = torch.compile(model, backend="eager")(wave)
     assert torch.equal(heard, model(wave))

@@ -81,17 +81,3 @@ def test_gradient_is_that_of_differences() -> None:
 def test_settings_that_bands_lack_raise_value_error(wrong: dict[str, object]) -> None:
     with pytest.raises(ValueError):
         light(**wrong)
-
-
-def test_transforms_work() -> None:
-    model, waveform = light(), 0.05 * torch.randn(3, 1000)
-    each = torch.stack([model(one, EARS[2]) for one in waveform])
-    torch.testing.assert_close(
-        torch.vmap(lambda one: model(one, EARS[2]))(waveform), each, atol=1e-6, rtol=1e-4
-    )
-    double, other = model.double(), torch.randn(1, 1000, dtype=torch.float64)
-    hear = lambda given: double(given, EARS[2].double())  # noqa: E731
-    point = waveform[:1].double()
-    along = torch.func.jvp(hear, (point,), (other,))[1]
-    ahead, behind = (hear(point + side * 1e-6 * other) for side in (1.0, -1.0))
-    torch.testing.assert_close(along, (ahead - behind) / 2e-6, atol=1e-6, rtol=1e-4)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
-from hlsim.torchtools import lasting
+from hlsim.torchtools import without_modes
 
 BLOCK = 64
 """Samples of a block; signals are a whole number of them long."""
@@ -37,8 +37,7 @@ def kept(make: Callable[P, Made]) -> Callable[P, Made]:
 
     @lru_cache(maxsize=16)
     def call(*arguments: P.args, **settings: P.kwargs) -> Made:
-        with lasting():
-            return make(*arguments, **settings)
+        return without_modes(make, *arguments, **settings)
 
     return cast(Callable[P, Made], call)
 
