@@ -132,8 +132,8 @@ def check_waveform(
 ) -> Tensor:
     """Return the waveform, or raise ValueError unless it is a floating-point (..., time) tensor with samples up to 1e9.
 
-    NaN and infinity pass, and make their item's results NaN. The values are not checked on a GPU, which would have to wait
-    for them, nor in a compiled program.
+    NaN and infinity pass, and make their item's results NaN. The values are not checked on a GPU,
+    because the host would wait for it, nor in a compiled program.
     """
     check_floating(waveform, name)
     if waveform.ndim == 0 or waveform.numel() == 0:

@@ -15,7 +15,6 @@ from hlsim import MSBG, Audiogram, HearingLossLoss, load_pretrained, torchtools
 from tests.pretend_device import DEVICE, PretendDevice, PretendTensor
 
 
-
 @pytest.fixture(autouse=True)
 def constants_on_the_pretended_device(monkeypatch: pytest.MonkeyPatch) -> None:
     """Compute constants in this thread, the only one that knows the device, and keep them from other tests."""

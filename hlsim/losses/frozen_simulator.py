@@ -179,7 +179,7 @@ class FrozenEar:
 
 @lru_cache
 def _no_loss(dtype: torch.dtype) -> Tensor:
-    return without_modes(torch.zeros, len(FREQUENCIES), dtype=dtype)
+    return without_modes(lambda: torch.zeros(len(FREQUENCIES), dtype=dtype))
 
 
 def _batches(items: torch.Size, ears: torch.Size) -> list[torch.Size]:
