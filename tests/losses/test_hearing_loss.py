@@ -99,14 +99,6 @@ def test_host_does_not_know_the_simulator(simulator: str) -> None:
     host.load_state_dict(bare.state_dict(), strict=True)
 
 
-def test_initialising_the_host_leaves_the_weights_of_the_simulator() -> None:
-    host = Host(HearingLossLoss(N3))
-    before = copy.deepcopy(host.loss.simulator.state_dict())
-    host.apply(lambda module: [nn.init.zeros_(p) for p in module.parameters()] and None)
-    after = host.loss.simulator.state_dict()
-    assert before and all(torch.equal(before[name], after[name]) for name in before)
-
-
 @both
 @each_criterion
 def test_a_step_trains_the_compensator_alone(simulator: str, criterion: str, clean: Tensor) -> None:
@@ -294,12 +286,6 @@ def test_an_ear_can_be_trained(simulator: str, clean: Tensor) -> None:
     torch.testing.assert_close(ear.grad, given.grad)
     assert list(loss.parameters()) == [] and loss.state_dict() == {}
     assert torch.equal(copy.deepcopy(loss)(3.0 * clean, clean), loss(3.0 * clean, clean))
-
-
-def test_one_clip_in_several_ears(clean: Tensor) -> None:
-    loss = HearingLossLoss([N3, N4], criterion="bands")
-    alone = [loss(clean[0], clean[0], ear) for ear in (N3, N4)]
-    assert float(loss(clean[0], clean[0])) == pytest.approx(float(sum(alone)) / 2.0, rel=1e-5)
 
 
 # Padded batches
@@ -665,16 +651,11 @@ def test_autocast_does_not_reach_inside(simulator: str, criterion: str, clean: T
 # Simulators and errors
 
 
-def test_names_may_be_paths() -> None:
-    assert isinstance(HearingLossLoss(N3, simulator=Path("msbg")).simulator, MSBG)
-    assert isinstance(HearingLossLoss(N3, simulator=Path("neuro-msbg")).simulator, NeuroMSBG)
-
-
 def test_simulator_by_folder_and_as_a_module(clean: Tensor) -> None:
     expected = HearingLossLoss(N3)(2.0 * clean, clean)
     folder = find_checkpoint("neuro-msbg")
     model = load_pretrained("neuro-msbg").train().requires_grad_(True)
-    for simulator in (folder, str(folder), model):
+    for simulator in (Path("neuro-msbg"), folder, str(folder), model):
         loss = HearingLossLoss(N3, simulator=simulator)
         torch.testing.assert_close(loss(2.0 * clean, clean), expected)
     assert loss.simulator is model and not model.training
