@@ -51,6 +51,8 @@ def test_the_same_scores_change_nothing_on_average_and_more_sentences_narrow_the
     assert abs(few.change) < 0.02 and few.low < 0.0 < few.high and many.low < 0.0 < many.high
     assert many.high - many.low < 0.7 * (few.high - few.low)
     assert few == words_change([0.6] * 2, [0.6] * 2)  # the same every time
+    drawn = simulate(fitted(), [(np.full(200, 0.6), 0.6)] * 2)
+    assert abs(drawn.mean()) < 0.02
     half = words_change([0.6] * 2, [0.6] * 2, interval=0.5)
     assert few.low < half.low < half.high < few.high
 

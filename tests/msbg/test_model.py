@@ -364,6 +364,7 @@ def test_autocast_is_left(speech: list[tuple[Tensor, int]]) -> None:
     torch.testing.assert_close(half, model(wave.bfloat16().float()).bfloat16())
 
 
+@pytest.mark.slow
 def test_compiled_it_is_called_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
     # empty: what makes filters is called, too
     monkeypatch.setattr(torchtools, "_CACHE", torchtools._Cache(2**28))
@@ -499,10 +500,13 @@ def test_blocks_of_a_rate_that_shares_little_keep_the_length() -> None:
         assert MSBG(Audiogram.standard("N6"), sample_rate=16026)(wave).shape == wave.shape
 
 
-def test_gradients_through_blocks_are_those_of_the_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("aligned", [True, False])
+def test_gradients_through_blocks_are_those_of_the_whole(
+    monkeypatch: pytest.MonkeyPatch, aligned: bool
+) -> None:
     monkeypatch.setattr("hlsim.msbg.blocks._BLOCK_SECONDS", 1.0)
     wave = 0.03 * torch.randn(2 * 44100, dtype=torch.float64)
-    model, gradients = fast_model(Audiogram.standard("N3")), []
+    model, gradients = fast_model(Audiogram.standard("N3"), aligned=aligned), []
     for _ in range(2):
         leaf = wave.clone().requires_grad_()
         model(leaf).square().sum().backward()
