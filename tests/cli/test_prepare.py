@@ -43,7 +43,7 @@ TREES: dict[str, tuple[Lines, Lines, Lines]] = {  # files, options, what is prin
         ["Train/clean/1.wav", "Train/noisy/1.wav", "Train/noise/1.wav"],
         [],
         [
-            "layout: folders train, valid, test",
+            "layout: folders clean and noisy in train, valid, test",
             "split  speakers  utterances  pairs",
             "train   unknown           1      1",
             "passed over: 1 audio files in Train/noise",

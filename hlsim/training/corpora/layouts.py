@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 import re
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from random import Random
@@ -29,8 +29,30 @@ SPLIT_NAMES = {
     "valid": ("valid", "validation", "val", "dev", "cv", "eval"),
     "test": ("test", "testing", "tt"),
 }
-LEVELS = ("split", "speaker", "condition", "other")
-"""Meanings that a level of folders can have."""
+_SPLIT_OF = {name: split for split, names in SPLIT_NAMES.items() for name in names}
+LEVELS = {
+    "split": rf"(?P<split>{'|'.join(_SPLIT_OF)})",
+    "speaker": r"(?P<speaker>[^/]+)",
+    "condition": r"(?P<condition>clean|noisy|noises?)",
+    "other": r"[^/]+",
+}
+"""Meanings that a level of folders can have, with the pattern of its names."""
+
+LAYOUTS = {
+    "VoiceBank-DEMAND": (
+        r"(?P<condition>clean|noisy)(?P<set>_(?P<split>train|test)set(_28spk|_56spk)?_wav(?P<version>_16k|_48k)?)/"
+        r"(?P<doubled>(?P=condition)(?P=set)/)?(?P<speaker>p\d+)_\d+\.\w+"
+    ),
+    "LibriSpeech or LibriTTS": (
+        r"(?P<split>train|dev|test)-(clean|other)(-\d+)?/(?P<speaker>\d+)/\d+/[^/]+"
+    ),
+    "TIMIT": r"(?P<split>train|test)/dr\d/(?P<speaker>\w+)/[^/]+",
+    "folders clean and noisy in train, valid, test": (
+        rf"{LEVELS['split']}/{LEVELS['condition']}/({LEVELS['speaker']}/(.*/)?)?[^/]+"
+    ),
+    "folders train, valid, test": rf"{LEVELS['split']}/({LEVELS['speaker']}/(.*/)?)?[^/]+",
+}
+"""Patterns of paths of audio files, in any case. Files of a pair differ in ``condition``; all have one ``version``."""
 
 WAYS_OUT = (
     "remove what does not belong to the corpus and complete what does, or list the files in a CSV file with the columns "
@@ -38,11 +60,6 @@ WAYS_OUT = (
     "split/speaker, or --folders split if the speakers are unknown"
 )
 
-_SPLIT_OF = {name: split for split, names in SPLIT_NAMES.items() for name in names}
-_VOICEBANK_FOLDER = re.compile(r"(clean|noisy)_((train|test)set(_28spk|_56spk)?)_wav(_16k|_48k)?")
-_VOICEBANK_FILE = re.compile(r"(p\d+)_\d+")
-_LIBRISPEECH_FILE = re.compile(r"(train|dev|test)-(clean|other)(-\d+)?/(\d+)/\d+/[^/]+")
-_TIMIT_REGION = re.compile(r"dr\d")
 _UNSUPPORTED = {
     re.compile(r"(^|/)mix_(clean|both|single)/"): (
         "this looks like LibriMix, whose s1 would be the column path and mix_single the column noisy"
@@ -152,82 +169,22 @@ def recognise(
         ValueError: the files have no known layout, or one that contradicts itself.
     """
     if folders is not None:
-        if not set(folders) <= set(LEVELS):
-            raise ValueError(
-                f"folders {'/'.join(folders)}; write {', '.join(LEVELS)}, with / between"
-            )
-        return f"folders {'/'.join(folders)}", _read_folders(files, folders)
-    for pattern, advice in _UNSUPPORTED.items():
-        if any(pattern.search(file) for file in files):
+        layout = f"folders {'/'.join(folders)}"
+        meanings = [level for level in folders if level != "other"]
+        if not set(folders) <= set(LEVELS) or len(set(meanings)) < len(meanings):
+            raise ValueError(f"{layout}; write {', '.join(LEVELS)}, with / between, each once")
+        pattern = "/".join(LEVELS[level] for level in folders) + "/(.*/)?[^/]+"
+        return layout, _read(files, pattern, layout)
+    for unsupported, advice in _UNSUPPORTED.items():
+        if any(unsupported.search(file) for file in files):
             raise ValueError(advice)
-    top = _names(files, 0)
-    prefixes = ["", f"{top[0]}/"] if len(top) == 1 else [""]
-    for prefix in prefixes:
-        inner = [file.removeprefix(prefix) for file in files]
-        for layout, read in LAYOUTS.items():
-            if utterances := read(inner):
-                return layout, [_below(prefix, row) for row in utterances]
+    top = {file.split("/")[0] for file in files}
+    only_folder = f"({re.escape(top.pop())}/)?" if len(top) == 1 else ""
+    for layout, pattern in LAYOUTS.items():
+        pattern = only_folder + pattern
+        if any(re.fullmatch(pattern, file, re.IGNORECASE) for file in files):
+            return layout, _read(files, pattern, layout)
     raise ValueError(f"its layout is none of {', '.join(LAYOUTS)}")
-
-
-def read_voicebank(files: Sequence[str]) -> list[Utterance]:
-    """VoiceBank-DEMAND: ``clean_trainset_28spk_wav/p226_001.wav`` and so on; empty for another layout."""
-    matches = {name: _VOICEBANK_FOLDER.fullmatch(name) for name in _names(files, 0)}
-    if not any(matches.values()):
-        return []
-    folders: dict[tuple[str, str], str] = {}
-    for name, match in matches.items():
-        if match is None or (match[2], match[1]) in folders:
-            raise ValueError(
-                f"the folder {name} does not belong to VoiceBank-DEMAND, or is a second version of one set"
-            )
-        folders[match[2], match[1]] = name
-    utterances = []
-    for part in sorted({part for part, _ in folders}):
-        clean, noisy = (
-            _files_by_stem(files, folders.get((part, kind))) for kind in ("clean", "noisy")
-        )
-        _check_pairs(clean, noisy, part)
-        split = part.partition("set")[0]
-        for stem, path in clean.items():
-            match = _VOICEBANK_FILE.fullmatch(stem)
-            if match is None:
-                raise ValueError(f"{path} has no name such as p226_001.wav")
-            utterances.append(Utterance(path, noisy[stem], match[1], split))
-    return utterances
-
-
-def read_librispeech(files: Sequence[str]) -> list[Utterance]:
-    """LibriSpeech and LibriTTS: ``train-clean-100/SPEAKER/CHAPTER/NAME``; empty for another layout."""
-    matches = [_LIBRISPEECH_FILE.fullmatch(file) for file in files]
-    if not any(matches):
-        return []
-    utterances = []
-    for file, match in zip(files, matches, strict=True):
-        if match is None:
-            raise ValueError(f"{file} is not where LibriSpeech and LibriTTS have files")
-        utterances.append(Utterance(file, "", match[4], _SPLIT_OF[match[1]]))
-    return utterances
-
-
-def read_split_folders(files: Sequence[str]) -> list[Utterance]:
-    """Folders ``train``, ``valid`` and ``test``, with speakers, or ``clean`` and ``noisy``, below them; empty for another
-    layout."""
-    if not any(name.lower() in _SPLIT_OF for name in _names(files, 0)):
-        return []
-    below = {name.lower() for name in _names(files, 1)}
-    if below & {"clean", "noisy"}:
-        return _read_folders(files, ("split", "condition", "speaker"), optional=1)
-    if below and all(map(_TIMIT_REGION.fullmatch, below)):
-        return _read_folders(files, ("split", "other", "speaker"))
-    return _read_folders(files, ("split", "speaker"), optional=1)
-
-
-LAYOUTS = {
-    "VoiceBank-DEMAND": read_voicebank,
-    "LibriSpeech or LibriTTS": read_librispeech,
-    "folders train, valid, test": read_split_folders,
-}
 
 
 def hold_out_speakers(utterances: Sequence[Utterance], share: float) -> list[Utterance]:
@@ -253,67 +210,38 @@ def hold_out_speakers(utterances: Sequence[Utterance], share: float) -> list[Utt
     ]
 
 
-def _read_folders(
-    files: Sequence[str], levels: Sequence[str], optional: int = 0
-) -> list[Utterance]:
-    """Utterances of files whose first folders have the meanings ``levels``, the last ``optional`` of which may lack."""
-    required = len(levels) - optional
-    split_names: dict[str, str] = {}
+def _read(files: Sequence[str], pattern: str, layout: str) -> list[Utterance]:
+    """Utterances of files whose paths all have the pattern of a layout."""
     clean: dict[str, Utterance] = {}
     noisy: dict[str, str] = {}
+    names: dict[str, str] = {}
     for file in files:
-        folders = file.split("/")[:-1]
-        if len(folders) < required:
-            raise ValueError(f"{file} is not in folders {'/'.join(levels[:required])}")
-        meaning = dict(zip(levels, folders, strict=False))
-        split = "train"
-        if "split" in levels:
-            name = meaning["split"]
-            split = _SPLIT_OF.get(name.lower(), "")
-            if split_names.setdefault(split, name) != name or not split:
+        match = re.fullmatch(pattern, file, re.IGNORECASE)
+        if match is None:
+            raise ValueError(f"{file} does not fit the layout {layout!r}")
+        groups = match.groupdict(default="")
+        split_name = groups.get("split", "train")
+        split = _SPLIT_OF[split_name.lower()]
+        for kind, name in ((split, split_name), ("version", groups.get("version", ""))):
+            if names.setdefault(kind, name) != name:
                 raise ValueError(
-                    f"the folder {name} is no split, or a second folder for the same split"
+                    f"{file}: two names for one part of the corpus, {names[kind]!r} and {name!r}"
                 )
-        row = Utterance(file, "", meaning.get("speaker", ""), split)
-        if "condition" not in levels:
-            clean[file] = row
-            continue
-        level = list(levels).index("condition")
-        condition = folders.pop(level)
-        key = "/".join([*folders, Path(file).stem])
-        if condition.lower() == "clean":
-            clean[key] = row
-        elif condition.lower() == "noisy":
+        key = os.path.splitext(file)[0]
+        for group in ("doubled", "condition"):  # the later part of the path first
+            if groups.get(group):
+                key = key[: match.start(group)] + key[match.end(group) :]
+        condition = groups.get("condition", "clean").lower()
+        if condition == "clean":
+            clean[key] = Utterance(file, "", groups.get("speaker", ""), split)
+        elif condition == "noisy":
             noisy[key] = file
-        elif condition.lower() not in ("noise", "noises"):
-            raise ValueError(f"the folder {condition} is neither clean nor noisy nor noise")
-    if "condition" in levels:
-        _check_pairs(clean, noisy, "the corpus")
-    return [replace(row, noisy=noisy.get(key, "")) for key, row in clean.items()]
-
-
-def _check_pairs(clean: Iterable[str], noisy: Iterable[str], place: str) -> None:
     unpaired = sorted(set(clean) ^ set(noisy))
-    if unpaired:
+    if "(?P<condition>" in pattern and unpaired:
         raise ValueError(
-            f"{place}: {len(unpaired)} files are in clean or in noisy speech only, the first {unpaired[0]}"
+            f"{len(unpaired)} files are in clean or in noisy speech only, the first {unpaired[0]}"
         )
-
-
-def _files_by_stem(files: Sequence[str], folder: str | None) -> dict[str, str]:
-    """Files in a folder, or in a folder of the same name in it, by their names without extension."""
-    places = (folder, f"{folder}/{folder}")
-    return {Path(file).stem: file for file in files if os.path.dirname(file) in places}
-
-
-def _names(files: Sequence[str], level: int) -> list[str]:
-    """Sorted names of the folders at a level."""
-    parts = (file.split("/")[:-1] for file in files)
-    return sorted({folders[level] for folders in parts if len(folders) > level})
-
-
-def _below(prefix: str, row: Utterance) -> Utterance:
-    return replace(row, path=prefix + row.path, noisy=row.noisy and prefix + row.noisy)
+    return [replace(row, noisy=noisy.get(key, "")) for key, row in clean.items()]
 
 
 def _list_files(root: Path) -> tuple[list[str], list[str]]:
