@@ -55,9 +55,8 @@ LAYOUTS = {
 """Patterns of paths of audio files, in any case. Files of a pair differ in ``condition``; all have one ``version``."""
 
 WAYS_OUT = (
-    "remove what does not belong to the corpus and complete what does, or list the files in a CSV file with the columns "
-    "path, noisy, speaker and split and give that instead of the folder, or say what the folders are, such as --folders "
-    "split/speaker, or --folders split if the speakers are unknown"
+    "correct the corpus, or give a CSV file with the columns path, noisy, speaker and split instead of it, or say what "
+    "its folders are, such as --folders split/speaker, or --folders split if the speakers are unknown"
 )
 
 _UNSUPPORTED = {
@@ -238,8 +237,9 @@ def _read(files: Sequence[str], pattern: str, layout: str) -> list[Utterance]:
             noisy[key] = file
     unpaired = sorted(set(clean) ^ set(noisy))
     if "(?P<condition>" in pattern and unpaired:
+        first = noisy.get(unpaired[0]) or clean[unpaired[0]].path
         raise ValueError(
-            f"{len(unpaired)} files are in clean or in noisy speech only, the first {unpaired[0]}"
+            f"{len(unpaired)} files have no counterpart of the same name in clean or noisy speech, the first {first}"
         )
     return [replace(row, noisy=noisy.get(key, "")) for key, row in clean.items()]
 
