@@ -16,10 +16,10 @@ from hlsim.audiogram import STANDARD, Audiogram
 from hlsim.calibration import PASCAL_SPL, level_spl, set_level
 from hlsim.dsp.resample import resample
 from hlsim.evaluation.aids import AtLevelOf, Unaided
+from hlsim.evaluation.items import INPUT_LEVELS
 from hlsim.evaluation.measurements import gain_curves
 from hlsim.evaluation.measures import NORMAL
 from hlsim.evaluation.previous.haspi_report import HaspiReport
-from hlsim.evaluation.previous.items import INPUT_LEVELS
 from hlsim.evaluation.previous.scores import ItemScore
 from hlsim.files import write_whole
 from hlsim.metrics.pair import check_pair

@@ -40,8 +40,8 @@ def test_simulators_are_compared_without_pesq(
 ) -> None:
     for module in ("joblib", "matplotlib", "pandas", "pystoi"):
         pytest.importorskip(module)
-    from hlsim.evaluation.previous.simulators import evaluate_simulators
-    from hlsim.report.previous.simulators import write_fidelity
+    from hlsim.evaluation.simulators import evaluate_simulators, summary
+    from hlsim.report.simulators import simulators_page
 
     monkeypatch.setitem(sys.modules, "pesq", None)
     ears = tmp_path / "ears.csv"
@@ -49,11 +49,10 @@ def test_simulators_are_compared_without_pesq(
     ears.write_text(f"{','.join(row)}\n{','.join(row.values())}\n")
     simulators: dict[str, nn.Module] = {"exact": hlsim.MSBG(sample_rate=16000)}
     speech = speech_dir / "valid"
-    done = evaluate_simulators(
-        simulators, speech=speech, audiograms=ears, teacher="msbg", items=4, seconds=1.0
+    study = evaluate_simulators(
+        simulators, speech=speech, audiograms=ears, items=4, seconds=1.0, jobs=1
     )
-    write_fidelity(done.result, done.heard, done.shown, tmp_path / "out")
-    overall = done.result["simulators"]["exact"]["inputs"]["as-is"]["overall"]
-    assert overall["stoi_n"] == 4 and overall["pesq_n"] == 0 and overall["pesq_lcc"] is None
-    page = (tmp_path / "out" / "fidelity.md").read_text()
-    assert "PESQ was not computed" in page and "pip install 'hlsim[pesq]'" in page
+    values = summary(study.table)
+    assert values["stoi_n"] == 4 and values["pesq_n"] == 0 and values["pesq_lcc"] is None
+    page = simulators_page(study).markdown()
+    assert "PESQ was left out" in page and "pip install 'hlsim[pesq]'" in page

@@ -32,61 +32,58 @@ def evaluate_simulator(parser: Parser) -> None:
     parser.runs(
         _evaluate_simulator,
         "neuro-msbg neuro-msbg-cnn --speech speech/valid --audiograms ears.csv --out judged",
-        "mine=runs/simulator/checkpoint --teacher msbg --speech speech/valid --audiograms ears.csv --out judged",
+        "mine=runs/simulator/checkpoint --speech speech/valid --audiograms ears.csv --out judged",
     )
     option = parser.option
-    text = "checkpoints, by name or folder, or msbg (exact); LABEL=FOLDER is LABEL in the tables"
+    text = "checkpoints, by name or folder, or msbg (exact); LABEL=FOLDER is called LABEL in the tables"
     option("names", str, text, nargs="+", metavar="NAME")
     option("--speech", Path, "folder of clean speech", required=True)
     option("--audiograms", Path, EARS_TABLE, required=True)
     option("--noise", Path, "folder of noises; every second item is then noisy")
     parser.teacher("simulator to compare with", "msbg")
-    option("--levels", number, "dB SPL that items take in turn", [50, 60, 65, 70, 80], nargs="+")
-    text = "what the ear is given: as-is, louder (20 dB), nal-r, compressed (3:1), compensated"
+    levels = [50, 60, 65, 70, 80]
+    option("--levels", number, "levels in dB SPL that items take in turn", levels, nargs="+")
+    text = "input of the simulators: as-is, louder (20 dB), nal-r, compressed (3:1), compensated"
     option("--inputs", str, text, ["as-is"], nargs="+", metavar="INPUT")
-    option("--compensator", str, "its name or folder, for the input compensated")
-    option("--items", count, "how many", 240)
+    option("--compensator", str, "name or folder of the compensator of the input compensated")
+    option("--items", count, "number of items", 240)
     option("--seconds", positive, "length of an item", 3.0)
-    parser.seed()
-    parser.out()
+    _study_options(parser, listen=1)
 
 
 def _evaluate_simulator(options: argparse.Namespace) -> None:
-    named = dict(map(labelled, options.names))
-    if len(named) < len(options.names):
-        raise ValueError(f"simulators {', '.join(options.names)}; allowed: one a label")
     if options.compensator and "compensated" not in options.inputs:
-        raise ValueError("--compensator without --inputs compensated; allowed: only with it")
-    need("eval", "pystoi", "pandas", "matplotlib")
+        raise ValueError("--compensator has no effect without --inputs compensated")
+    _prepare_study(options)
+    need("eval", "pystoi")
     check_there(folders=(options.speech, options.noise), files=(options.audiograms,))
     from compensators import load_compensator
     from hlsim.calibration import PASCAL_SPL
-    from hlsim.evaluation.previous.simulators import evaluate_simulators
+    from hlsim.evaluation.simulators import evaluate_simulators
     from hlsim.losses.frozen_simulator import build_simulator
     from hlsim.neuro.config import NEURO_RATE
-    from hlsim.report.previous.simulators import write_fidelity
+    from hlsim.report.simulators import simulators_page
 
-    simulators = {
-        label: build_simulator(name, NEURO_RATE, PASCAL_SPL) for label, name in named.items()
-    }
-    done = evaluate_simulators(
-        simulators,
+    named = _labelled_names(options.names)
+    evaluation = evaluate_simulators(
+        {label: build_simulator(name, NEURO_RATE, PASCAL_SPL) for label, name in named.items()},
         speech=options.speech,
         audiograms=options.audiograms,
         store=options.out / "scores.jsonl",
         noise=options.noise,
         teacher=options.teacher,
+        measures=options.measure,
         items=options.items,
         seconds=options.seconds,
         levels=options.levels,
         inputs=options.inputs,
         compensator=load_compensator(options.compensator) if options.compensator else None,
         seed=options.seed,
-        progress=show_progress("items"),
+        jobs=options.jobs,
+        dask=options.dask,
+        progress=show_progress("outputs"),
     )
-    write_fidelity(done.result, done.heard, done.shown, options.out)
-    print((options.out / "fidelity.md").read_text(encoding="utf-8"))
-    tell_page(options.out / "fidelity.html")
+    finish(evaluation, simulators_page(evaluation, options.listen), options.out)
 
 
 def evaluate_compensator(parser: Parser) -> None:
@@ -236,14 +233,14 @@ def _haspi_report(options: argparse.Namespace) -> None:
     finish(evaluation, report_page(evaluation, options.listen), options.out)
 
 
-def _study_options(parser: Parser) -> None:
+def _study_options(parser: Parser, listen: int = 3) -> None:
     """Declare the options that all evaluations share."""
     text = (
         "additional measure of your own, package.module:name, imported from the working directory too: a "
         "function (item, output) -> dict of numbers"
     )
     parser.option("--measure", foreign_name, text, [], nargs="+", metavar="NAME")
-    parser.option("--listen", natural, "number of items with players on the page", 3)
+    parser.option("--listen", natural, "number of items with players on the page", listen)
     parser.jobs()
     text = "address of a Dask scheduler, such as tcp://host:8786, whose workers are used"
     parser.option("--dask", str, text, metavar="ADDRESS")

@@ -84,9 +84,10 @@ def _describe_part(name: str, part: nn.Module) -> tuple[str, str, list[tuple[str
 
 
 def _class_name(thing: Any) -> str:
-    kind = type(thing)
+    """Return the name of a function or of an object's class; for hlsim's own with its version."""
+    kind = thing if hasattr(thing, "__qualname__") else type(thing)
     ours = kind.__module__.split(".")[0] in _OWN_PACKAGES
-    return f"{kind.__name__} of hlsim {__version__}" if ours else kind.__name__
+    return f"{kind.__qualname__} of hlsim {__version__}" if ours else str(kind.__qualname__)
 
 
 def _describe(value: Any) -> str:

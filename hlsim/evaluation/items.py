@@ -73,7 +73,7 @@ def draw_items(
             ear = Audiogram(tuple(draw_thresholds(1, generator).squeeze(0).tolist()))
         signal = _mixed(clean, masker, snr)
         gain = 10.0 ** ((level - float(level_spl(signal))) / 20.0)
-        facts = _facts(ear, level, snr)
+        facts = _facts(ear, level, noise_snr=snr)
         name = f"item {number}"
         clean, signal = (clean * gain).squeeze(0), (signal * gain).squeeze(0)
         drawn.append(Item(name, clean, signal, ear, facts=facts))
@@ -112,7 +112,7 @@ def draw_judged_items(
                 signal,
                 ear,
                 seed=(seed + number) % 2**32,
-                facts={"ear": name, **_facts(ear, level, snr)},
+                facts={"ear": name, **_facts(ear, level, snr=snr)},
             )
         )
     return drawn
@@ -200,11 +200,12 @@ def _mixed(clean: Tensor, noise: Tensor | None, snr: float) -> Tensor:
     return clean if noise is None else mix(clean, noise, torch.tensor([snr]))
 
 
-def _facts(ear: Audiogram, level: float, snr: float) -> dict[str, Any]:
+def _facts(ear: Audiogram, level: float, **snr: float) -> dict[str, Any]:
+    clean = all(math.isnan(value) for value in snr.values())
     return {
         "severity": ear.severity,
         "input_level": level,
-        "speech": "clean" if math.isnan(snr) else "noisy",
-        "snr": snr,
+        "speech": "clean" if clean else "noisy",
+        **snr,
         "audiogram": list(ear.thresholds),
     }

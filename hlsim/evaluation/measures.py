@@ -136,7 +136,9 @@ def load_measure(name: str) -> Measure:
 
 def title_of(column: str) -> str:
     """Return the title of a score's column."""
-    return MEASURES[column].title if column in MEASURES else column
+    if column in MEASURES:
+        return MEASURES[column].title
+    return "SNR (dB)" if column == "snr" else column
 
 
 def _built_in(name: str) -> Measure:

@@ -68,7 +68,7 @@ class Evaluation:
 
     def to_dict(self) -> dict[str, Any]:
         """Return a plain dictionary for JSON, with None for a missing value."""
-        return {
+        values = {
             "settings": dict(self.settings),
             "versions": self.versions,
             "notes": list(self.notes),
@@ -79,16 +79,17 @@ class Evaluation:
                 for name, group in self.groups.items()
             },
             **self.details,
-            "rows": plain(self.table.to_dict("records")),
+            "rows": self.table.to_dict("records"),
         }
+        return {name: _without_nan(value) for name, value in values.items()}
 
 
-def plain(value: Any) -> Any:
+def _without_nan(value: Any) -> Any:
     """Return a value with None in place of each NaN, for JSON."""
     if isinstance(value, Mapping):
-        return {key: plain(entry) for key, entry in value.items()}
+        return {key: _without_nan(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):
-        return [plain(entry) for entry in value]
+        return [_without_nan(entry) for entry in value]
     return None if isinstance(value, float) and math.isnan(value) else value
 
 
@@ -103,7 +104,7 @@ def score_columns(
 
 def check_scored(table: DataFrame, columns: Sequence[str]) -> None:
     """Raise ValueError unless the table has at least one score."""
-    if not columns or table[list(columns)].isna().all(axis=None):
+    if table.reindex(columns=list(columns)).isna().all(axis=None):
         first = table[table["failure"].notna()].iloc[0]
         raise ValueError(
             f"none of {table['item'].nunique()} items could be scored; the first, {first['name']} "

@@ -303,6 +303,8 @@ def _measure_item(task: _Task) -> _Results:
     for condition, measures in task.missing:
         try:
             output = condition.output(item)
+            if not output.isfinite().all():
+                raise ValueError("the output has samples that are NaN or infinite")
         except Exception as error:
             results |= {(condition.name, m.name): reason_of(error) for m in measures}
             continue
@@ -345,8 +347,12 @@ def _table(
                 values = found[condition.name, measure.name]
                 if isinstance(values, str):
                     reasons[measure.name] = values
-                else:
-                    row |= values
+                    continue
+                if both := row.keys() & values.keys():
+                    raise ValueError(
+                        f"the measure {measure.name} returns {both.pop()}, a column that exists already"
+                    )
+                row |= values
             rows.append({**row, "failure": _failure(reasons, len(measures))})
     table = require("pandas", "eval").DataFrame(rows)
     table["failure"] = table.pop("failure")  # last, whichever row has which values

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from hlsim.audiogram import SEVERITIES
@@ -113,22 +113,24 @@ def unit_table(c: Comparison) -> Table | None:
     return _paired_table(c, f"with items nested in {c.unit}s, p not adjusted", "Unit", rows)
 
 
-def comparisons_table(comparisons: Iterable[Comparison]) -> Table:
+def comparisons_table(comparisons: Sequence[Comparison]) -> Table:
     """Return one row per comparison, with the p values that the sentences state."""
     rows = []
     for c in comparisons:
-        cells = paired_cells(c.overall, c.p_t, c.p_w)
-        rows.append(
-            {
-                "Comparison": comparison_name(c) + (" (planned)" if c.planned else ""),
-                "n": str(c.overall.n),
-                "From": f"{c.overall.before_mean:.3f}",
-                "To": f"{c.overall.after_mean:.3f}",
-                **cells,
-                "Level change (dB)": number(c.level_change, "+.1f"),
-            }
-        )
-    caption = "All comparisons; p adjusted by Holm within each measure, but for a planned one"
+        row = {
+            "Comparison": comparison_name(c) + (" (planned)" if c.planned else ""),
+            "n": str(c.overall.n),
+            "From": f"{c.overall.before_mean:.3f}",
+            "To": f"{c.overall.after_mean:.3f}",
+            **paired_cells(c.overall, c.p_t, c.p_w),
+        }
+        if not math.isnan(c.level_change):
+            row["Level change (dB)"] = f"{c.level_change:+.1f}"
+        rows.append(row)
+    caption = "Comparisons"
+    if len(comparisons) > 1:
+        caption += "; p adjusted by Holm within each measure"
+        caption += ", but for a planned one" if any(c.planned for c in comparisons) else ""
     return Table.of(caption, rows)
 
 

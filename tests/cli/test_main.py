@@ -393,7 +393,7 @@ def test_options_that_contradict_each_other(
     error = refused(capsys, "haspi-report", "--spl", "65", "--full-scale-spl", "94", *out)
     assert "argument --full-scale-spl: not allowed with argument --spl" in error
     call = ["evaluate-simulator", "msbg", "msbg", "--speech", "s", "--audiograms", "a", *out]
-    assert "simulators msbg, msbg; allowed: one a label" in fails(capsys, *call)
+    assert "have the same label" in fails(capsys, *call)
     call = [
         "evaluate-simulator",
         "msbg",
@@ -405,7 +405,7 @@ def test_options_that_contradict_each_other(
         "nalr",
         *out,
     ]
-    assert "--compensator without --inputs compensated; allowed" in fails(capsys, *call)
+    assert "--compensator has no effect without --inputs compensated" in fails(capsys, *call)
     call = [
         "evaluate-compensator",
         "nalr",
@@ -520,34 +520,6 @@ def test_bad_recipe(tmp_path: Path, speech_dir: Path, capsys: pytest.CaptureFixt
     assert "no such folder" in fails(
         capsys, *call[:3], "--speech", tmp_path / "nowhere", "--out", out
     )
-
-
-def test_evaluate_simulator_writes_both_files(tmp_path: Path, speech_dir: Path) -> None:
-    ears = tmp_path / "ears.csv"
-    ears.write_text(",".join(Audiogram.standard("N3").to_row()) + "\n35,35,40,50,55,60,65,65\n")
-    arguments = [
-        "evaluate-simulator",
-        "exact=msbg",
-        "neuro-msbg",
-        "--speech",
-        str(speech_dir / "valid"),
-    ]
-    arguments += [
-        "--audiograms",
-        str(ears),
-        "--items",
-        "4",
-        "--seconds",
-        "2",
-        "--out",
-        str(tmp_path / "out"),
-    ]
-    assert main(arguments) == 0
-    result = json.loads((tmp_path / "out" / "fidelity.json").read_text())
-    assert list(result["simulators"]) == ["exact", "neuro-msbg"]
-    exact = [row["snr"] for row in result["simulators"]["exact"]["items"]]
-    assert len(exact) == 4 and min(exact) > 40.0
-    assert "neuro-msbg" in (tmp_path / "out" / "fidelity.md").read_text()
 
 
 def test_haspi_report_of_a_manifest(

@@ -52,7 +52,7 @@ def _parameters() -> dict[str, dict[str, Any]]:
     from hlsim.demo import demo
     from hlsim.evaluation import haspi_report
     from hlsim.evaluation.compensators import evaluate_compensators
-    from hlsim.evaluation.previous.simulators import evaluate_simulators
+    from hlsim.evaluation.simulators import evaluate_simulators
     from hlsim.training.compensator import train_compensator
     from hlsim.training.corpora.layouts import prepare
     from hlsim.training.simulator import train_simulator

@@ -65,7 +65,7 @@ def test_settings_of_any_describable_kind_count() -> None:
 
 
 def test_where_a_class_is_defined_does_not_count() -> None:
-    moved = type("Foreign", (Foreign,), {"__module__": "elsewhere"})
+    moved = type("Foreign", (Foreign,), {"__module__": "elsewhere", "__qualname__": "Foreign"})
     assert fingerprint(moved(1.0)) == fingerprint(Foreign(1.0))
 
 

@@ -70,9 +70,9 @@ def test_every_kind_of_ear_of_simulators_meets_every_level_and_ratio(
     settings: dict[str, Any] = {"items": 2 * each, "seconds": 0.1, "seed": 0, "levels": levels}
     drawn = draw_items(speech_dir / "valid", speech_dir / "train", ears, **settings)
     noisy = [item.facts for item in drawn if item.facts["speech"] == "noisy"]
-    kinds = enumerate((facts["input_level"], facts["snr"]) for facts in noisy)
+    kinds = enumerate((facts["input_level"], facts["noise_snr"]) for facts in noisy)
     assert len({(number % 4, *met) for number, met in kinds}) == each == len(noisy)
-    standard = {(tuple(facts["audiogram"]), facts["snr"]) for facts in noisy[2::4]}
+    standard = {(tuple(facts["audiogram"]), facts["noise_snr"]) for facts in noisy[2::4]}
     assert len({ear for ear, _ in standard}) == 4 and len(standard) > 4
 
 
@@ -94,11 +94,12 @@ def test_items_follow_from_the_seed_and_have_the_level_and_ratio_that_they_state
             levelled = item.clean if judged else item.signal
             level = float(level_spl(levelled))
             assert level == pytest.approx(item.facts["input_level"], abs=0.01)
-            if math.isnan(item.facts["snr"]):
+            ratio = item.facts["snr" if judged else "noise_snr"]
+            if math.isnan(ratio):
                 assert torch.equal(item.clean, item.signal)
             else:
                 snr = float(level_spl(item.clean) - level_spl(item.signal - item.clean))
-                assert snr == pytest.approx(item.facts["snr"], abs=0.01)
+                assert snr == pytest.approx(ratio, abs=0.01)
     assert {item.facts["input_level"] for item in drawn} <= set(SIMULATOR_LEVELS)
 
 
