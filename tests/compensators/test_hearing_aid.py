@@ -76,7 +76,7 @@ def test_sliders_move_in_a_stream_without_a_click() -> None:
 
 def test_a_streams_sliders_are_checked_and_a_tensor_may_be_written_into() -> None:
     aid: Any = trained()
-    for wrong in ({"noise_reduction": 2.0}, {"audiogram": "N3"}, {"audiogram": None}):
+    for wrong in ({"noise_reduction": 2.0}, {"audiogram": 3}, {"audiogram": None}):
         with pytest.raises(ValueError):
             aid.stream(**{"audiogram": EAR} | wrong)
     slider = torch.tensor(1.0)

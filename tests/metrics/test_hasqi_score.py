@@ -103,7 +103,7 @@ def test_a_batch_is_its_items(
     clean: Tensor, noisy: Tensor, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     x, y, ends, ears = clean.double(), noisy.double(), [12800, 11300], [N1, N3]
-    for noise in ("expected", "seeded", "none"):
+    for noise in ("seeded", "none"):
         alone = [hasqi(y[i, :n], x[i, :n], ears[i], noise=noise) for i, n in enumerate(ends)]
         together = hasqi(y, x, ears, lengths=ends, noise=noise)
         torch.testing.assert_close(together, torch.stack(alone), rtol=0, atol=1e-13)

@@ -27,7 +27,7 @@ def test_names_and_shapes_are_those_of_mamba_ssm() -> None:
 
 def test_steps_start_between_a_thousandth_and_a_tenth() -> None:
     torch.manual_seed(0)
-    steps = functional.softplus(Mamba(64).dt_proj.bias)
+    steps = functional.softplus(Mamba(64).dt_proj.bias.detach())
     assert 0.001 <= float(steps.min()) < 0.003 and 0.03 < float(steps.max()) <= 0.1
 
 
