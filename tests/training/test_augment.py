@@ -5,7 +5,8 @@ import torch
 from torch import Tensor
 
 from hlsim.audiogram import FREQUENCIES
-from hlsim.calibration import level_spl, set_level
+from hlsim.calibration import dbfs, level_spl, set_level
+from hlsim.dsp.active_level import active_level_db
 from hlsim.training.augment import HIGHEST_LEVEL, augment_speech, compress, equalise, mix
 from hlsim.training.ears import draw_thresholds
 
@@ -25,6 +26,17 @@ def test_mix_has_the_ratio_asked_for_and_leaves_the_speech() -> None:
     torch.testing.assert_close(
         added / added.norm(dim=-1, keepdim=True), noise / noise.norm(dim=-1, keepdim=True)
     )
+
+
+def test_mix_by_the_active_level_does_not_count_pauses() -> None:
+    speech, noise = 0.03 * torch.randn(2, 48000), torch.randn(2, 48000)
+    speech[0, 16000:] = 0.0  # a third is speech, 4.8 dB
+    added = mix(speech, noise, torch.full((2,), 10.0), 16000) - speech
+    for item in range(2):
+        level = active_level_db(speech[item], 16000)
+        assert level - float(dbfs(added[item])) == pytest.approx(10.0, abs=0.01)
+    assert float(level_spl(speech[0]) - level_spl(added[0])) < 7.0
+    assert not bool(mix(0 * speech, noise, torch.zeros(2), 16000).isnan().any())
 
 
 @pytest.mark.parametrize("rate", [16000, 44100])
