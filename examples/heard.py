@@ -48,9 +48,7 @@ def main(folder: Path = ROOT / "docs") -> None:
         heard[f"heard with {name}"] = exact(load_compensator(name)(clean, ear), ear)
     draw(heard, folder / "heard.png")
     ear = Audiogram.standard("N2")
-    family = [
-        name for name, loader in list_pretrained().items() if loader == "hlsim.load_pretrained"
-    ]
+    family = [name for name, loader in list_pretrained().items() if loader == "load_pretrained"]
     heard = {name: load_pretrained(name)(clean, ear) for name in family}
     draw({"clean speech": clean, EXACT: exact(clean, ear)} | heard, folder / "family.png", EXACT)
 

@@ -1,252 +1,183 @@
-"""Reading and writing audio. The only file that imports soundfile."""
+"""Reading and writing audio files. The only module that imports soundfile."""
 
 import io
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager
+import warnings
 from pathlib import Path
 
+import numpy as np
 import scipy
 import soundfile
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
-from hlsim.checks import HIGHEST_RATE, HIGHEST_SAMPLE, check_rate, check_waveform, is_finite
-from hlsim.files import EXTENSIONS, Whole, check_extension
+from hlsim.checks import HIGHEST_RATE, LOWEST_RATE, check_waveform
+from hlsim.files import EXTENSIONS, atomic_path, check_extension
 
-_LARGEST_PAGE, _ENDS = (
-    65_307,
-    4,
-)  # of Ogg: bytes of a page, and the flag of a stream's last one (RFC 3533, 6)
-_STREAMED = 0x7FFF0000  # sizes from here on were written before the length was known: 0x7FFFF000, 0xFFFFFFFF
+HIGHEST_FILE_RATE = 384_000
+"""Highest sample rate in Hz of files that are resampled."""
 
-# what a header may tell, beyond which it is believed to be broken; of samples 16 GB
-_HIGHEST_READ, _MOST_CHANNELS, _MOST_SAMPLES = 384_000, 64, 2**32
-
-_HIGHEST_STORED = {
-    ".wav": 2**31 - 1,
-    ".flac": 655_350,
-    ".ogg": 200_000,
-}  # in Hz; libvorbis crashes beyond
-_SUBTYPES = {".wav": "FLOAT", ".flac": "PCM_24", ".ogg": "VORBIS"}
+# libvorbis rearranges more channels and fails at higher rates
+_OGG_CHANNELS, _OGG_RATE = 2, 192_000
+_BLOCK = 2**20  # frames
+_SUBTYPES = {".flac": "PCM_24", ".ogg": "VORBIS"}
 
 
 def read_audio(path: str | Path, *, any_rate: bool = False) -> tuple[Tensor, int]:
-    """Read a wav, flac or ogg file.
+    """Read an audio file in any format that libsndfile knows.
+
+    A truncated file is read up to where it ends, with a warning.
 
     Args:
-        any_rate: let rates above 48 kHz through.
+        any_rate: Accept sample rates up to 384 kHz, not only up to 48 kHz.
 
-    Returns: float32 samples as they are in the file, (channels, time), and the rate in Hz.
+    Returns: float32 samples at the scale of the file, (channels, time), and the sample rate in Hz.
 
     Raises:
-        ValueError: the file is missing, broken, cut off, empty, silent or holds NaN, infinity or samples over 1e9, it has
-            more than 64 channels, or its rate is below 16 kHz or above 48 kHz (384 kHz with ``any_rate``). The message
-            starts with the path.
+        ValueError: libsndfile cannot read the file; it is empty, silent, or holds NaN or infinity; or
+            its sample rate is below 16 kHz or too high.
     """
-    check_name(path)
     if not os.path.isfile(path):
-        raise ValueError(f"{path}: no such file")
-    with _told(path), soundfile.SoundFile(str(path)) as file:
-        rate = int(file.samplerate)
-        _refuse_header(path, rate, file.channels)
-        if (told := file.frames * file.channels) > _MOST_SAMPLES:
-            raise ValueError(
-                f"{path}: its header tells of {told} samples; allowed: up to {_MOST_SAMPLES}"
-            )
-        samples = file.read(dtype="float32", always_2d=True)
-    if samples.shape[0] == 0:
-        raise ValueError(f"{path}: empty, no samples")
-    waveform = torch.from_numpy(samples.T.copy())
-    if not bool(torch.isfinite(waveform).all()):
-        raise ValueError(f"{path}: holds samples that are NaN or infinite")
-    if not (peak := float(waveform.abs().max())):
-        raise ValueError(f"{path}: silent, every sample is zero")
-    if peak > HIGHEST_SAMPLE:
-        raise ValueError(f"{path}: samples reach {peak:.3g}; allowed: up to {HIGHEST_SAMPLE:g}")
+        raise ValueError(f"{path}: there is no such file")
     try:
-        check_rate(min(rate, HIGHEST_RATE) if any_rate else rate)
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
+        with soundfile.SoundFile(os.fspath(path)) as file:
+            rate, expected = int(file.samplerate), file.frames
+            samples = _read_blocks(file)
+    except (OSError, soundfile.SoundFileError, MemoryError, TypeError, UnicodeError) as error:
+        reason = getattr(error, "error_string", error)
+        raise ValueError(f"{path}: cannot be read as audio: {reason}") from error
+    if not len(samples):
+        raise ValueError(f"{path}: the file is empty, it has no samples")
+    highest = HIGHEST_FILE_RATE if any_rate else HIGHEST_RATE
+    if not LOWEST_RATE <= rate <= highest:
+        raise ValueError(
+            f"{path}: the sample rate is {rate} Hz, expected {LOWEST_RATE} to {highest} Hz"
+        )
+    waveform = torch.from_numpy(samples.T.copy())
+    if not bool(waveform.isfinite().all()):
+        raise ValueError(f"{path}: there are samples that are NaN or infinite")
+    if not bool(waveform.any()):
+        raise ValueError(f"{path}: the file is silent, every sample is zero")
+    if len(samples) < expected:
+        warnings.warn(
+            f"{path}: the file is truncated; its header promises {expected} samples per channel, it has {len(samples)}",
+            stacklevel=2,
+        )
     return waveform, rate
 
 
-def read_stretch(path: str | Path, start: float, seconds: float) -> tuple[Tensor, int]:
-    """Read so many seconds of a recording from a second on; it begins again where it ends.
-
-    Returns: float32 samples (channels, time) and the rate in Hz; silence and any rate are let through.
-
-    Raises:
-        ValueError: the file is missing, broken, cut off (wav) or empty.
-    """
-    with _told(path), soundfile.SoundFile(str(path)) as file:
-        rate, left = int(file.samplerate), max(1, round(seconds * file.samplerate))
-        _refuse_header(path, rate, file.channels)
-        file.seek(int(start * rate) % max(1, file.frames))
-        pieces = []
-        while left > 0:
-            piece = file.read(left, dtype="float32", always_2d=True)
-            if not len(piece) and file.tell() == 0:
-                raise ValueError(f"{path}: empty, no samples")
-            pieces.append(torch.from_numpy(piece.T.copy()))
-            left -= len(piece)
-            file.seek(0)
-    return torch.cat(pieces, -1), rate
-
-
-@contextmanager
-def _told(path: str | Path) -> Iterator[None]:
-    """Raises ValueError, with the path, where the file cannot be read."""
-    try:
-        _refuse_cut(path)
-        yield
-    except (OSError, soundfile.LibsndfileError, RuntimeError, MemoryError) as error:
-        # no memory is enough for the length that a broken header tells
-        raise ValueError(
-            f"{path}: not readable as audio ({error}); allowed: wav, flac, ogg"
-        ) from error
-
-
-def _refuse_header(path: str | Path, rate: int, channels: int) -> None:
-    """Raise ValueError where reading and resampling what a header tells of would take all memory."""
-    if rate > _HIGHEST_READ or channels > _MOST_CHANNELS:
-        raise ValueError(
-            f"{path}: its header tells of {rate} Hz and {channels} channels; allowed: up to {_HIGHEST_READ} Hz and "
-            f"{_MOST_CHANNELS} channels"
-        )
-
-
-def _refuse_cut(path: str | Path) -> None:
-    """Raise ValueError where a wav file holds less than its header tells, or an Ogg file's last page does not end it;
-    libsndfile would read what there is."""
-    with open(path, "rb") as file:
-        start = file.read(12)
-        if start[:4] == b"OggS":
-            file.seek(max(0, os.fstat(file.fileno()).st_size - _LARGEST_PAGE))
-            end = file.read()
-            page = end[end.rfind(b"OggS") :]
-            segments = page[27 : 27 + page[26]] if len(page) > 26 else b""
-            if not (
-                segments and page[5] & _ENDS and len(page) >= 27 + len(segments) + sum(segments)
-            ):
-                raise ValueError(f"{path}: cut off, its last page does not end the stream")
-        if start[:4] != b"RIFF" or start[8:] != b"WAVE":
-            return
-        while len(chunk := file.read(8)) == 8:
-            size = int.from_bytes(chunk[4:], "little")
-            if chunk[:4] == b"data":
-                held = os.fstat(file.fileno()).st_size - file.tell()
-                if held < size < _STREAMED:
-                    told = f"its header tells of {size} bytes of samples, {held} are there"
-                    raise ValueError(f"{path}: cut off, {told}")
-                return
-            file.seek(size + size % 2, os.SEEK_CUR)
-
-
-def check_channels(path: str | Path, channels: int) -> int:
-    """Return the number, or raise ValueError for ogg with more than two: libvorbis takes the sixth for a subwoofer's."""
-    if Path(path).suffix.lower() == ".ogg" and channels > 2:
-        raise ValueError(
-            f"{path}: {channels} channels; allowed: up to 2 in .ogg, more in .wav and .flac"
-        )
-    return channels
-
-
-def _check_stored_rate(rate: int, suffix: str) -> int:
-    """Return the rate, or raise ValueError unless it is a whole number of Hz that such a file holds."""
-    highest = _HIGHEST_STORED[suffix]
-    if not is_finite(rate) or not 1 <= rate <= highest or int(rate) != rate:
-        raise ValueError(
-            f"sample rate {rate!r} Hz; allowed in {suffix}: whole numbers up to {highest}"
-        )
-    return int(rate)
+def _read_blocks(file: soundfile.SoundFile) -> NDArray[np.float32]:
+    """Read to the end, also where the header promises too much or the codec cannot seek. Shape: (time, channels)."""
+    blocks = []
+    while True:
+        block = file.read(_BLOCK, dtype="float32", always_2d=True)
+        blocks.append(block)
+        if len(block) < _BLOCK:
+            return np.concatenate(blocks)
 
 
 def write_audio(path: str | Path, waveform: Tensor, sample_rate: int) -> None:
-    """Write (channels, time) or (time,) samples as wav (32-bit float), flac (24-bit) or ogg, whole or not at all.
+    """Write a wav (32-bit float), flac (24-bit) or ogg (Vorbis) file atomically.
+
+    Shape: (channels, time) or (time,).
 
     Raises:
-        ValueError: unknown extension, another shape, ogg with more than two channels, a rate below 16 kHz or one that
-            such a file cannot hold, samples that are NaN or infinite, or, for flac and ogg, beyond full scale (they would
-            be clipped).
+        ValueError: The extension, the shape or the sample rate is not supported, samples are NaN or
+            infinite, or samples exceed full scale in flac or ogg, which would clip them.
     """
     suffix = check_extension(path)
     if check_waveform(waveform).ndim > 2:
-        raise ValueError(
-            f"{path}: shape {tuple(waveform.shape)}; allowed: (channels, time) or (time,)"
-        )
-    check_channels(path, waveform.shape[:-1].numel())
-    try:
-        check_rate(min(sample_rate, HIGHEST_RATE) if is_finite(sample_rate) else sample_rate)
-        rate = _check_stored_rate(sample_rate, suffix)
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
+        shape = tuple(waveform.shape)
+        raise ValueError(f"{path}: expected shape (channels, time) or (time,), got {shape}")
     samples = waveform.detach().to("cpu", torch.float32)
-    if not bool(torch.isfinite(samples).all()):
-        raise ValueError(f"{path}: samples are NaN or infinite, nothing written")
-    if suffix != ".wav" and (peak := float(samples.abs().max())) > 1.0:
-        raise ValueError(f"{path}: samples reach {peak:.3g}, {suffix} holds 1.0; write .wav")
-    rows = samples.reshape(-1, samples.shape[-1]).mT.numpy()
-    kind = {"subtype": _SUBTYPES[suffix], "format": suffix[1:].upper()}
-    with Whole(path, new_folder=False) as file:
+    samples = samples.reshape(-1, samples.shape[-1])
+    check_written(path, len(samples), sample_rate)
+    if not bool(samples.isfinite().all()):
+        raise ValueError(f"{path}: there are samples that are NaN or infinite; nothing was written")
+    peak = float(samples.abs().max())
+    if suffix != ".wav" and peak > 1.0:
+        raise ValueError(
+            f"{path}: the peak is {peak:.3g} times full scale, which {suffix} would clip; "
+            "write .wav instead"
+        )
+    frames = samples.mT.numpy()
+    with atomic_path(path) as temporary:
+        if suffix == ".wav":
+            # libsndfile would store the time of day, so that equal signals gave different files
+            scipy.io.wavfile.write(temporary, int(sample_rate), frames)
+            return
         try:
-            if suffix == ".wav":
-                # libsndfile would store the time of day, so that equal sounds gave different files
-                scipy.io.wavfile.write(file.partial, rate, rows)
-            else:
-                soundfile.write(str(file.partial), rows, rate, **kind)
-        except (OSError, soundfile.LibsndfileError) as error:
-            raise file.refusal(error) from error
-        file.keep()
+            soundfile.write(
+                temporary, frames, int(sample_rate), _SUBTYPES[suffix], format=suffix[1:].upper()
+            )
+        except soundfile.LibsndfileError as error:
+            raise ValueError(f"{path}: cannot be written: {error.error_string}") from error
+
+
+def check_written(path: str | Path, channels: int, sample_rate: int) -> None:
+    """Raise ValueError unless a file with this extension can hold the channels and the sample rate (Hz)."""
+    is_ogg = Path(path).suffix.lower() == ".ogg"
+    if is_ogg and channels > _OGG_CHANNELS:
+        raise ValueError(
+            f"{path}: ogg files hold up to {_OGG_CHANNELS} channels, got {channels}; "
+            "write .wav or .flac instead"
+        )
+    highest = _OGG_RATE if is_ogg else HIGHEST_FILE_RATE
+    if not LOWEST_RATE <= sample_rate <= highest or int(sample_rate) != sample_rate:
+        raise ValueError(
+            f"{path}: expected a whole sample rate of {LOWEST_RATE} to {highest} Hz, "
+            f"got {sample_rate} Hz"
+        )
 
 
 def encode_flac(waveform: Tensor, sample_rate: int) -> bytes:
-    """The contents of a 16-bit flac file of samples up to 1.0, for a page to play. Shape: (time,).
+    """Encode a signal as a 16-bit flac file, for the players of a page.
+
+    Shape: (time,), samples from -1 to 1.
 
     Raises:
-        ValueError: another shape, a rate that flac cannot hold, or samples that are NaN, infinite or beyond 1.0.
+        ValueError: The shape, the samples or the sample rate do not fit.
     """
-    rate = _check_stored_rate(sample_rate, ".flac")
     samples = check_waveform(waveform).detach().to("cpu", torch.float32)
     if samples.ndim != 1 or not bool((samples.abs() <= 1.0).all()):
         raise ValueError(
-            f"shape {tuple(samples.shape)}; allowed: (time,), samples from -1.0 to 1.0"
+            f"expected shape (time,) and samples from -1 to 1, got shape {tuple(samples.shape)} and a "
+            f"peak of {float(samples.abs().max()):.3g}"
         )
     data = io.BytesIO()
     try:
-        soundfile.write(data, samples.numpy(), rate, format="FLAC", subtype="PCM_16")
-    except soundfile.LibsndfileError as error:  # above 65535 Hz it holds multiples of 10 only
-        raise ValueError(f"sample rate {rate} Hz: cannot be written as flac ({error})") from error
+        soundfile.write(data, samples.numpy(), int(sample_rate), format="FLAC", subtype="PCM_16")
+    except soundfile.LibsndfileError as error:
+        raise ValueError(f"cannot encode flac at {sample_rate} Hz: {error.error_string}") from error
     return data.getvalue()
 
 
 def find_audio(folder: str | Path) -> list[Path]:
-    """All wav, flac and ogg files under a folder, sorted by path.
+    """Find all audio files below a folder, sorted by path.
 
     Raises:
-        ValueError: no such folder, no audio in it, or a file whose name is not UTF-8.
+        ValueError: There is no such folder, or no audio in it.
+    """
+    return list_files(folder)[0]
+
+
+def list_files(folder: str | Path) -> tuple[list[Path], list[Path]]:
+    """List the audio files and all other files below a folder, sorted by path, without hidden ones.
+
+    Raises:
+        ValueError: As ``find_audio``.
     """
     root = Path(folder)
     if not root.is_dir():
-        raise ValueError(f"{folder}: no such folder")
-    files = sorted(
-        path
-        for path in root.rglob("*")
-        if path.suffix.lower() in EXTENSIONS
-        and not any(part.startswith(".") for part in path.relative_to(root).parts)
-        and not path.is_dir()
-    )
-    if not files:
-        raise ValueError(f"{folder}: no audio in it; looked for {', '.join(EXTENSIONS)}")
-    for path in files:
-        check_name(path)
-    return files
-
-
-def check_name(path: str | Path) -> None:
-    """Raise ValueError where a path is not UTF-8: neither soundfile nor a report takes it."""
-    try:
-        str(path).encode()
-    except UnicodeEncodeError as error:
-        shown = os.fsencode(path).decode("utf-8", "backslashreplace")
-        raise ValueError(f"{shown}: its name is not UTF-8; rename it") from error
+        raise ValueError(f"{folder}: there is no such folder")
+    audio: list[Path] = []
+    others: list[Path] = []
+    for path in sorted(root.rglob("*")):
+        is_hidden = any(part.startswith(".") for part in path.relative_to(root).parts)
+        if is_hidden or path.is_dir():
+            continue
+        (audio if path.suffix.lower() in EXTENSIONS else others).append(path)
+    if not audio:
+        raise ValueError(f"{folder}: no audio in it ({', '.join(EXTENSIONS)})")
+    return audio, others

@@ -14,7 +14,7 @@ import torch
 from torch import nn
 
 from hlsim.calibration import PASCAL_SPL
-from hlsim.files import whole_folder
+from hlsim.files import atomic_path
 from hlsim.neuro.config import NEURO_RATE, ModelConfig, NeuroConfig
 from hlsim.neuro.model import NeuroMSBG
 
@@ -25,29 +25,21 @@ Settings = Mapping[str, Any]
 WEIGHTS, CONFIG, CARD = "model.safetensors", "config.json", "README.md"
 
 SIMULATOR = "neuro-msbg"
-"""What ``config.json`` of a checkpoint of a simulator calls it."""
-
-_LOADERS = {SIMULATOR: "hlsim.load_pretrained"}
-_LOADERS |= dict.fromkeys(("mapping-compensator", "hearing-aid"), "compensators.load_compensator")
-_MODELS = {
-    "msbg": "hlsim.MSBG",
-    "nalr": "compensators.NALR",
-    "wdrc": "compensators.WDRC",
-}  # that need no checkpoint
+"""Kind of a simulator's checkpoint in ``config.json``; all other kinds are compensators."""
 
 
 def load_pretrained(
     name: str | Path, *, sample_rate: int = NEURO_RATE, full_scale_spl: float = PASCAL_SPL
 ) -> NeuroMSBG:
-    """A trained Neuro-MSBG, frozen and in eval mode. Nothing is downloaded.
+    """Load a trained Neuro-MSBG, frozen and in eval mode. Nothing is downloaded.
 
     Args:
-        name: of a checkpoint that ships with hlsim, e.g. ``"neuro-msbg"``, or a checkpoint folder.
-        sample_rate: of its inputs and outputs in Hz, 16000 to 48000.
-        full_scale_spl: level in dB SPL of RMS 1.0.
+        name: Name of a checkpoint that ships with hlsim, such as ``"neuro-msbg"``, or a checkpoint folder.
+        sample_rate: Sample rate of inputs and outputs in Hz, 16000 to 48000.
+        full_scale_spl: Level in dB SPL of RMS 1.0.
 
     Raises:
-        ValueError: no such checkpoint, one of another kind, or one that has changed since it was saved.
+        ValueError: There is no such checkpoint, or it is of another kind or damaged.
     """
 
     def build(config: NeuroConfig) -> NeuroMSBG:
@@ -60,8 +52,12 @@ def load_pretrained(
 
 
 def list_pretrained() -> dict[str, str]:
-    """The checkpoints that ship with hlsim, and the function that loads each."""
-    return {name: _LOADERS[_record(folder)["kind"]] for name, folder in shipped().items()}
+    """List the checkpoints that ship with hlsim, with the function that loads each."""
+    return {name: _loader_of(_read_record(folder)["kind"]) for name, folder in shipped().items()}
+
+
+def _loader_of(kind: str) -> str:
+    return "load_pretrained" if kind == SIMULATOR else "load_compensator"
 
 
 def read_checkpoint(
@@ -70,49 +66,54 @@ def read_checkpoint(
     build: Callable[[Config], Model],
     also: Sequence[str] = (),
 ) -> Model:
-    """A model built from a checkpoint's configuration, with its weights, on torch's default device, or the CPU where that
-    is ``meta``.
+    """Build a model from a checkpoint's configuration and load its weights.
+
+    The model is on torch's default device, or on the CPU where that is ``meta``.
 
     Args:
-        kinds: the configuration of each kind that is taken.
+        kinds: Class of the configuration for each accepted kind.
+        build: Function from configuration to model.
+        also: Names that the caller accepts besides checkpoints, for the error message.
 
-    Raises ValueError as ``load_pretrained``."""
+    Raises:
+        ValueError: As ``load_pretrained``.
+    """
     folder = find_checkpoint(name, kinds, also)
-    record = _record(folder)
+    record = _read_record(folder)
+    kind = record.get("kind")
+    if not isinstance(kind, str) or kind not in kinds:
+        hint = f"; load it with {_loader_of(kind)}" if isinstance(kind, str) else ""
+        expected = " or ".join(repr(accepted) for accepted in kinds)
+        raise ValueError(f"{folder}: expected a checkpoint of kind {expected}, got {kind!r}{hint}")
     try:
         weights = (folder / WEIGHTS).read_bytes()
     except OSError as error:
-        raise ValueError(f"{folder}: not readable as a checkpoint ({error})") from error
-    found = record.get("kind")
-    if not isinstance(found, str) or found not in kinds:
-        hint = f" ({_LOADERS[str(found)]} loads the former)" if str(found) in _LOADERS else ""
-        raise ValueError(
-            f"{folder}: a checkpoint of kind {found!r}; needed here: {' or '.join(map(repr, kinds))}{hint}"
-        )
+        raise ValueError(f"{folder}: cannot read the checkpoint: {error}") from error
     settings: Any = record.get("config")
-    changed = "changed since it was saved"
     if hashlib.sha256(weights).hexdigest() != record.get("sha256"):
         raise ValueError(
-            f"{folder / WEIGHTS}: {changed}, its SHA-256 differs from {CONFIG}'s; get it anew"
+            f"{folder / WEIGHTS}: the SHA-256 is not that in {CONFIG}, so the file is damaged or was "
+            "replaced; download or save the checkpoint again"
         )
     if record.get("config_sha256") != _digest(settings):
         raise ValueError(
-            f"{folder / CONFIG}: {changed} or of another version, the SHA-256 of its 'config' is not its "
-            "'config_sha256'; get it anew"
+            f"{folder / CONFIG}: the configuration was changed after saving, because its SHA-256 is not "
+            "'config_sha256'; download or save the checkpoint again"
         )
     try:
-        config = kinds[found].from_dict(settings)
+        config = kinds[kind].from_dict(settings)
     except (TypeError, ValueError) as error:
         raise ValueError(f"{folder / CONFIG}: {error}") from error
     device = torch.get_default_device()
     try:
-        # it may be trained through later, torch.device("meta") would keep no weights, and the random start is not kept
+        # outside inference mode, because gradients may flow through the model later; on the CPU, because
+        # torch.device("meta") would keep no weights; without use of the host's random numbers
         with torch.inference_mode(False), torch.device("cpu"), torch.random.fork_rng(devices=[]):
             model = build(config)
             model.load_state_dict(safetensors.torch.load(weights))
     except (TypeError, RuntimeError, safetensors.SafetensorError) as error:
         reason = str(error).splitlines()[0]
-        raise ValueError(f"{folder}: weights and configuration do not fit ({reason})") from error
+        raise ValueError(f"{folder}: weights and configuration do not fit: {reason}") from error
     with torch.inference_mode(False):
         return model if device.type == "meta" else model.to(device)
 
@@ -120,51 +121,52 @@ def read_checkpoint(
 def find_checkpoint(
     name: str | Path, kinds: Collection[str] | None = None, also: Sequence[str] = ()
 ) -> Path:
-    """The folder of a checkpoint that ships with hlsim, or another.
+    """Find the folder of a checkpoint that ships with hlsim, or accept another folder.
+
+    Args:
+        kinds: Kinds of checkpoints to suggest in the error message; all by default.
+        also: Other names to suggest.
 
     Raises:
-        ValueError: there is none, or it is neither a name nor a path; the message lists those of the kinds that ship, and
-            what the caller takes ``also``.
+        ValueError: There is no such checkpoint.
     """
     if not isinstance(name, str | os.PathLike):
-        raise ValueError(f"checkpoint is {type(name).__name__}; allowed: a name or a folder")
-    if (Path(name) / CONFIG).is_file():
-        return Path(name)
-    if str(name) in (ours := shipped()):
-        return ours[str(name)]
-    names = ", ".join([*also, *shipped(kinds)]) or "none ships"
-    inner = Path(name) / "checkpoint"  # as a training leaves it
-    hint = f", but {str(inner)!r} is one" if (inner / CONFIG).is_file() else ""
-    if str(name) in _MODELS:
-        hint = f": it is {_MODELS[str(name)]}"
-    raise ValueError(
-        f"no checkpoint {str(name)!r}{hint}; allowed: {names}, or a folder with {CONFIG}"
-    )
+        raise ValueError(f"expected a checkpoint's name or folder, got {type(name).__name__}")
+    folder = Path(name)
+    if (folder / CONFIG).is_file():
+        return folder
+    checkpoints = shipped()
+    if str(name) in checkpoints:
+        return checkpoints[str(name)]
+    if (folder / "checkpoint" / CONFIG).is_file():
+        raise ValueError(
+            f"no checkpoint {str(name)!r}; use {str(folder / 'checkpoint')!r}, where training saved it"
+        )
+    names = ", ".join([*also, *shipped(kinds)])
+    raise ValueError(f"no checkpoint {str(name)!r}; expected {names}, or a folder with {CONFIG}")
 
 
 def checkpoint_digest(name: str | Path) -> str:
-    """The SHA-256 of a checkpoint's weights, as it tells it. Raises ValueError where there is none, or it is broken."""
-    return str(_record(find_checkpoint(name)).get("sha256"))
+    """SHA-256 of a checkpoint's weights, as stated in its record. ValueError as ``find_checkpoint``."""
+    return str(_read_record(find_checkpoint(name)).get("sha256"))
 
 
 def checkpoint_about(name: str | Path) -> dict[str, Any]:
-    """How a checkpoint was trained, as it tells it. Raises ValueError where there is none, or it is broken."""
-    about = _record(find_checkpoint(name)).get("about")
+    """Statements of a checkpoint on how it was trained. ValueError as ``find_checkpoint``."""
+    about = _read_record(find_checkpoint(name)).get("about")
     return dict(about) if isinstance(about, dict) else {}
 
 
 def shipped(kinds: Collection[str] | None = None) -> dict[str, Path]:
-    """The checkpoints that ship with hlsim, name and folder; all kinds by default."""
-    folders = (path.parent for path in sorted(checkpoints_folder().glob(f"*/{CONFIG}")))
-    return {
-        folder.name: folder
-        for folder in folders
-        if kinds is None or _record(folder).get("kind") in kinds
-    }
+    """Names and folders of the checkpoints that ship with hlsim, of all kinds by default."""
+    folders = [path.parent for path in sorted(checkpoints_folder().glob(f"*/{CONFIG}"))]
+    if kinds is not None:
+        folders = [folder for folder in folders if _read_record(folder).get("kind") in kinds]
+    return {folder.name: folder for folder in folders}
 
 
 def checkpoints_folder() -> Path:
-    """Where the checkpoints that ship lie: in the installed package, or beside it in a source tree."""
+    """Folder of the checkpoints that ship: inside the installed package, or beside it in a source tree."""
     package = Path(__file__).parent
     installed = package / "checkpoints"
     return installed if installed.is_dir() else package.parent / "checkpoints"
@@ -178,14 +180,14 @@ def save_checkpoint(
     about: Settings,
     card: str = "",
 ) -> None:
-    """Write a checkpoint folder, whole or not at all; an older one of the same name is replaced.
+    """Write a checkpoint folder atomically; an older checkpoint is replaced.
 
     Args:
-        about: how it was trained: data, seed, command, time, metrics, version. Stored beside the configuration.
-        card: text of its README.md; an existing card is kept where this is empty.
+        about: How it was trained: data, seed, command, time, metrics, version.
+        card: Text of README.md. Without it the card of an older checkpoint is kept.
 
     Raises:
-        ValueError: the folder holds something else.
+        ValueError: The folder holds other files, or cannot be written.
     """
     target = check_replaceable(folder)
     state = {
@@ -194,38 +196,40 @@ def save_checkpoint(
     weights, settings = safetensors.torch.save(state), dict(config)
     hashes = {"sha256": hashlib.sha256(weights).hexdigest(), "config_sha256": _digest(settings)}
     record = {"kind": kind, "config": settings, **hashes, "about": dict(about)}
-    with whole_folder(target) as staging:
-        (staging / WEIGHTS).write_bytes(weights)
-        (staging / CONFIG).write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
+    with atomic_path(target) as temporary:
+        temporary.mkdir()
+        (temporary / WEIGHTS).write_bytes(weights)
+        (temporary / CONFIG).write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
         if card:
-            (staging / CARD).write_text(card, encoding="utf-8")
+            (temporary / CARD).write_text(card, encoding="utf-8")
         elif (target / CARD).is_file():
-            shutil.copy(target / CARD, staging / CARD)
+            shutil.copy(target / CARD, temporary / CARD)
 
 
 def check_replaceable(folder: str | Path) -> Path:
-    """The folder, or ValueError where it is a file or holds anything but a checkpoint: it will be replaced as a whole."""
+    """Return the folder, or raise ValueError if it holds anything but a checkpoint, which would be lost."""
     target = Path(folder)
     if target.exists() and not target.is_dir():
-        raise ValueError(f"{target}: not a folder; allowed: a new folder, or that of a checkpoint")
-    found = {path.name for path in target.iterdir()} if target.is_dir() else set()
-    if others := sorted(found - {WEIGHTS, CONFIG, CARD}):
+        raise ValueError(f"{target}: expected a folder for the checkpoint, got a file")
+    names = {path.name for path in target.iterdir()} if target.is_dir() else set()
+    others = sorted(names - {WEIGHTS, CONFIG, CARD})
+    if others:
         raise ValueError(
-            f"{target}: holds something else ({others[0]}); allowed: a new folder, or that of a checkpoint alone"
+            f"{target}: saving would delete {others[0]}; choose a new folder, or that of a checkpoint"
         )
     return target
 
 
-def _record(folder: Path) -> dict[str, Any]:
+def _read_record(folder: Path) -> dict[str, Any]:
     try:
         record = json.loads((folder / CONFIG).read_text(encoding="utf-8"))
         if not isinstance(record, dict):
-            raise ValueError(f"{CONFIG} holds no names with values")
+            raise ValueError(f"{CONFIG} is not a JSON object")
     except (OSError, ValueError, RecursionError) as error:
-        raise ValueError(f"{folder}: not readable as a checkpoint ({error})") from error
+        raise ValueError(f"{folder}: cannot read the checkpoint: {error}") from error
     return record
 
 
 def _digest(config: Any) -> str:
-    """The SHA-256 of a configuration, whatever the order of its names."""
+    """SHA-256 of a configuration, whatever the order of its names."""
     return hashlib.sha256(json.dumps(config, sort_keys=True).encode()).hexdigest()

@@ -2,7 +2,6 @@
 
 import random
 from collections.abc import Iterator
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -48,22 +47,6 @@ def pytest_report_header(config: pytest.Config) -> str | None:
             "run them with pytest -m slow, install, browser, audio"
         )
     return None
-
-
-def pytest_terminal_summary(terminalreporter: Any) -> None:
-    """Count the trials of tests/robustness by kind, whichever process ran them."""
-    tally: dict[str, list[int]] = {}
-    for report in chain(*terminalreporter.stats.values()):
-        for name, value in (
-            getattr(report, "user_properties", ()) if getattr(report, "when", "") == "call" else ()
-        ):
-            if name == "robustness":
-                kind, *counts = value
-                tally[kind] = [
-                    sum(pair) for pair in zip(tally.get(kind, (0, 0)), counts, strict=True)
-                ]
-    for kind, (tried, failed) in sorted(tally.items()):
-        terminalreporter.write_line(f"robustness: {kind}: {tried} tried, {failed} failed")
 
 
 @pytest.fixture(params=["stored", pytest.param("computed", marks=pytest.mark.slow)])

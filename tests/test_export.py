@@ -1,5 +1,6 @@
-"""Exported simulators give the simulator's outputs."""
+"""Exported simulators and aids give the outputs of the modules."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -7,14 +8,27 @@ import pytest
 import torch
 from torch import Tensor
 
-from hlsim import MSBG, NeuroMSBG, load_pretrained
-from hlsim.export import export_onnx, export_program
+from compensators import WDRC, HearingAid
+from hlsim import MSBG, Audiogram, NeuroMSBG, load_pretrained
+from hlsim.export import export_aid, export_onnx, export_program, first_inputs, hop_program
 from hlsim.neuro import NeuroConfig
+from tests.compensators.test_wearable import AIDS, EAR, Make, trained
+
+SMALL = NeuroConfig(channels=4, blocks=1)
 
 
 def example(items: int = 2, seconds: float = 0.5) -> tuple[Tensor, Tensor]:
     ears = torch.tensor([[20.0, 30, 40, 50, 60, 60, 60, 60], [0.0, 5, 10, 15, 20, 20, 20, 20]])
     return 0.03 * torch.randn(items, round(16000 * seconds)), ears[:items]
+
+
+def assert_near(output: Tensor, expected: Tensor, tolerance: float) -> None:
+    assert float((output - expected).abs().max()) < tolerance * float(expected.abs().max())
+
+
+def onnx_session(path: Path) -> Any:
+    runtime = pytest.importorskip("onnxruntime")
+    return runtime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
 
 
 @pytest.mark.parametrize(
@@ -23,82 +37,90 @@ def example(items: int = 2, seconds: float = 0.5) -> tuple[Tensor, Tensor]:
 )
 def test_a_program_gives_the_simulators_outputs(name: str, items: int, seconds: float) -> None:
     simulator = load_pretrained(name, full_scale_spl=100.0)
-    # first of all at this length, so that nothing made in the export may serve the simulator
+    # exported before the first call of this length, so that no cached constant comes from the export
     program = export_program(simulator, seconds=seconds, items=items).module()
     wave, ears = example(items, seconds)
-    expected = simulator(wave, ears)
-    assert float((program(wave, ears) - expected).abs().max()) < 1e-4 * float(expected.abs().max())
+    assert_near(program(wave, ears), simulator(wave, ears), 1e-4)
 
 
-def test_the_simulator_keeps_its_mode_and_its_precision() -> None:
-    simulator = NeuroMSBG(NeuroConfig(channels=4, blocks=1)).double().train()
+def test_an_export_leaves_mode_and_precision_as_they_are() -> None:
+    simulator = NeuroMSBG(SMALL).double().train()
     simulator.encoder.eval()
     before = [module.training for module in simulator.modules()]
     program = export_program(simulator, seconds=0.1, items=2).module()
     assert [module.training for module in simulator.modules()] == before
     wave, ears = (tensor.double() for tensor in example(seconds=0.1))
     torch.testing.assert_close(program(wave, ears), simulator(wave, ears))
+    aid = HearingAid().train()
+    hop_program(aid)
+    assert all(module.training for module in aid.modules())
 
 
-@pytest.mark.parametrize(
-    "options",
-    [{"seconds": -1}, {"seconds": 0}, {"seconds": float("nan")}, {"items": 0}, {"items": 1.5}],
-)
-def test_sizes_of_no_program(options: dict[str, Any]) -> None:
-    with pytest.raises(ValueError, match="allowed: more than 0 seconds, 1 item or more") as caught:
-        export_program(NeuroMSBG(), **options)
-    assert "\n" not in str(caught.value)
-
-
-def test_what_cannot_be_exported_is_said(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="MSBG cannot be exported; allowed: a Neuro-MSBG"):
-        export_program(MSBG())
-    with pytest.raises(ValueError, match="sample_rate 16000"):
-        export_program(load_pretrained("neuro-msbg", sample_rate=44100))
-
-
-def test_a_missing_folder_is_said_before_the_export(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("hlsim.export.export_program", lambda *_, **__: pytest.fail("exported"))
-    with pytest.raises(
-        ValueError, match=r"there is no folder '.*missing'; allowed: a file in a folder"
-    ):
-        export_onnx(
-            NeuroMSBG(NeuroConfig(channels=4, blocks=1)), tmp_path / "missing" / "simulator.onnx"
-        )
+@AIDS
+def test_a_program_of_hops_gives_the_outputs_of_the_stream(make: Make) -> None:
+    """For two ears, at another full scale, with a slider that moves on the way."""
+    aid: Any = make(full_scale_spl=110.0)
+    ears = torch.tensor([EAR.thresholds, Audiogram.standard("S2").thresholds])
+    inputs, stream, outputs, expected = first_inputs(aid, ears, items=2), aid.stream(ears), [], []
+    assert not aid.SLIDERS or set(inputs) >= set(aid.initial(torch.ones(2, 2)))
+    program = hop_program(aid, items=2).module()
+    for number, samples in enumerate((0.005 * torch.randn(2, 6400)).split(64, -1)):
+        if number == 40 and aid.SLIDERS:
+            stream.noise_reduction, inputs["sliders"] = 0.2, torch.tensor([[0.2, 1.0]] * 2)
+        results = program(**inputs | {"samples": samples})
+        outputs.append(results.pop("output"))
+        inputs |= {name.removeprefix("next_"): state for name, state in results.items()}
+        expected.append(stream(samples))
+    assert_near(torch.cat(outputs, -1), torch.cat(expected, -1), 1e-5)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("items", "seconds"), [(2, 0.5), (1, 1.0)])
-def test_onnx_gives_the_outputs(tmp_path: Path, items: int, seconds: float) -> None:
+def test_onnx_gives_the_simulators_outputs(tmp_path: Path, items: int, seconds: float) -> None:
     pytest.importorskip("onnxscript")
-    runtime = pytest.importorskip("onnxruntime")
     simulator, path = load_pretrained("neuro-msbg"), tmp_path / "simulator.onnx"
     wave, ears = example(items, seconds)
     export_onnx(simulator, path, seconds=seconds, items=items)
-    session = runtime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
-    names = [entry.name for entry in session.get_inputs()]
-    heard = session.run(None, dict(zip(names, (wave.numpy(), ears.numpy()), strict=True)))[0]
-    expected = simulator(wave, ears)
-    assert float((torch.from_numpy(heard) - expected).abs().max()) < 1e-4 * float(
-        expected.abs().max()
-    )
+    session = onnx_session(path)
+    inputs = {"waveform": wave.numpy(), "thresholds": ears.numpy()}
+    assert_near(torch.from_numpy(session.run(None, inputs)[0]), simulator(wave, ears), 1e-4)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("broken", "complaint"),
-    [
-        (
-            lambda session, names, given: [0.999 * heard for heard in session(names, given)],
-            "off by 1e-03",
-        ),
-        (lambda session, names, given: 1 / 0, "onnxruntime refuses the file"),
-    ],
-)
-def test_onnx_that_gives_something_else_is_not_written(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, broken: Any, complaint: str
+@AIDS
+def test_onnx_gives_the_outputs_of_the_stream(make: Make, tmp_path: Path) -> None:
+    """For steps in level, with sliders that move on the way."""
+    pytest.importorskip("onnxscript")
+    aid: Any = make()
+    export_aid(aid, tmp_path / "aid.onnx")
+    session = onnx_session(tmp_path / "aid.onnx")
+    names = [entry.name.removeprefix("next_") for entry in session.get_outputs()]
+    inputs = {name: tensor.numpy() for name, tensor in first_inputs(aid, EAR).items()}
+    levels = torch.tensor([20.0, 70.0, 50.0, 90.0, 60.0]).repeat_interleave(3200)
+    signal = torch.randn(1, 16000) * 10.0 ** ((levels - 94.0) / 20.0)
+    stream, outputs, expected = aid.stream(EAR), [], []
+    for number, samples in enumerate(signal.split(64, -1)):
+        if number == 100 and aid.SLIDERS:
+            stream.noise_reduction = 0.2
+            inputs["sliders"] = torch.tensor([[0.2, 1.0]]).numpy()
+        inputs["samples"] = samples.numpy()
+        results = dict(zip(names, session.run(None, inputs), strict=True))
+        outputs.append(torch.from_numpy(results.pop("output")))
+        inputs |= results
+        expected.append(stream(samples))
+    assert_near(torch.cat(outputs, -1), torch.cat(expected, -1), 1e-4)
+
+
+@pytest.mark.slow
+def test_a_linked_aid_is_exported_for_two_ears(tmp_path: Path) -> None:
+    pytest.importorskip("onnxscript")
+    export_aid(WDRC(linked=True), tmp_path / "aid.onnx", items=2)
+    assert onnx_session(tmp_path / "aid.onnx").get_outputs()[0].shape == [2, 64]
+
+
+@pytest.mark.slow
+def test_a_file_with_other_outputs_is_not_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("onnxscript")
     runtime = pytest.importorskip("onnxruntime")
@@ -106,12 +128,25 @@ def test_onnx_that_gives_something_else_is_not_written(
     monkeypatch.setattr(
         runtime.InferenceSession,
         "run",
-        lambda self, names, given: broken(lambda *wanted: run(self, *wanted), names, given),
+        lambda self, names, inputs: [0.999 * output for output in run(self, names, inputs)],
     )
-    with pytest.raises(
-        ValueError, match=f"ONNX cannot take the simulator: .*{complaint}"
-    ) as caught:
-        export_onnx(
-            NeuroMSBG(NeuroConfig(channels=4, blocks=1)), tmp_path / "simulator.onnx", seconds=0.1
-        )
-    assert "\n" not in str(caught.value) and not list(tmp_path.iterdir())
+    with pytest.raises(ValueError, match="differs by 1e-03 of its peak"):
+        export_onnx(NeuroMSBG(SMALL), tmp_path / "simulator.onnx", seconds=0.1)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda: export_program(MSBG()),
+        lambda: export_program(load_pretrained("neuro-msbg", sample_rate=44100)),
+        lambda: export_program(NeuroMSBG(SMALL), seconds=0.0),
+        lambda: export_program(NeuroMSBG(SMALL), seconds=float("nan")),
+        lambda: export_program(NeuroMSBG(SMALL), items=0),
+        lambda: hop_program(trained(sample_rate=44100)),
+        lambda: first_inputs(trained(), EAR, volume=1.0),
+    ],
+)
+def test_what_cannot_be_exported_is_a_value_error(call: Callable[[], object]) -> None:
+    with pytest.raises(ValueError):
+        call()

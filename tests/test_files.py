@@ -1,60 +1,67 @@
-"""Files and folders are there whole or not at all."""
+"""Files and tables."""
 
+import os
 from pathlib import Path
 
 import pytest
 
-from hlsim.files import Whole, file_lock, repair_folder, whole_folder, write_whole
+from hlsim.files import atomic_path, read_table, write_whole
 
 
-def test_a_library_writes_under_the_temporary_name(tmp_path: Path) -> None:
-    with Whole(tmp_path / "a") as file:
-        file.partial.write_bytes(b"by a library")
-        assert not (tmp_path / "a").exists()
-        file.keep()
-    assert [path.name for path in tmp_path.iterdir()] == ["a"]
-    assert (tmp_path / "a").read_bytes() == b"by a library"
-    with Whole(tmp_path / "a") as file:
-        file.write("left without keep")
-    assert [path.name for path in tmp_path.iterdir()] == ["a"]
-
-
-def test_a_folder_is_made_where_that_is_wanted(tmp_path: Path) -> None:
-    write_whole(tmp_path / "new" / "a", "text")
-    assert (tmp_path / "new" / "a").read_text() == "text"
-    with pytest.raises(ValueError, match=r"other/a: cannot be written \(No such file"):
-        Whole(tmp_path / "other" / "a", new_folder=False).__enter__()
-    assert not (tmp_path / "other").exists()
-
-
-def test_a_folder_takes_its_name_at_the_end(tmp_path: Path) -> None:
-    folder = tmp_path / "deep" / "folder"
-    for text in ("first", "second"):
-        with whole_folder(folder) as staging:
-            (staging / "a").write_text(text)
-            assert folder.exists() == (text == "second")
-        assert (folder / "a").read_text() == text
-    with pytest.raises(KeyboardInterrupt), whole_folder(folder) as staging:
-        (staging / "a").write_text("third")
+def test_a_file_takes_its_place_when_it_is_complete(tmp_path: Path) -> None:
+    write_whole(tmp_path / "new" / "a", "old")
+    with pytest.raises(KeyboardInterrupt), atomic_path(tmp_path / "new" / "a") as temporary:
+        temporary.write_text("half")
         raise KeyboardInterrupt
-    assert (folder / "a").read_text() == "second"
-    assert [path.name for path in folder.parent.iterdir()] == ["folder"]
+    assert (tmp_path / "new" / "a").read_text() == "old"
+    write_whole(tmp_path / "new" / "a", b"new")
+    assert os.listdir(tmp_path / "new") == ["a"] and (tmp_path / "new" / "a").read_text() == "new"
 
 
-def test_what_a_kill_left_is_repaired(tmp_path: Path) -> None:
-    for name in (".folder.old", ".folder.abcd_123", ".folder.er.abcd_123"):
-        (tmp_path / name).mkdir()
-    (tmp_path / ".folder.old" / "a").write_text("kept")
-    repair_folder(tmp_path / "folder")
-    assert {path.name for path in tmp_path.iterdir()} == {"folder", ".folder.er.abcd_123"}
-    assert (tmp_path / "folder" / "a").read_text() == "kept"
+def test_a_folder_is_replaced_as_a_whole_or_keeps_its_place(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_whole(tmp_path / "folder" / "old", "old")
+
+    def fill() -> None:
+        with atomic_path(tmp_path / "folder") as temporary:
+            temporary.mkdir()
+            (temporary / "new").touch()
+
+    def fail_at_the_second_rename(source: Path, target: Path) -> None:
+        if source.name == "folder" and target.name == "folder" and source != tmp_path / "folder":
+            raise OSError("disk full")
+        rename(source, target)
+
+    rename = os.replace
+    with monkeypatch.context() as patch, pytest.raises(ValueError, match="disk full"):
+        patch.setattr(os, "replace", fail_at_the_second_rename)
+        fill()
+    assert os.listdir(tmp_path) == ["folder"] and os.listdir(tmp_path / "folder") == ["old"]
+    fill()
+    assert os.listdir(tmp_path) == ["folder"] and os.listdir(tmp_path / "folder") == ["new"]
 
 
-def test_one_process_holds_a_file(tmp_path: Path) -> None:
-    pytest.importorskip("fcntl")
-    (tmp_path / "a").touch()
-    refused = pytest.raises(ValueError, match="another process is writing there")
-    with file_lock(tmp_path / "a"), refused, file_lock(tmp_path / "a"):
-        pass
-    with file_lock(tmp_path / "a"):
-        pass
+def test_a_folder_that_cannot_be_written_is_named(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(ValueError, match=f"^{tmp_path}/file/a: cannot be written"):
+        write_whole(tmp_path / "file" / "a", "text")
+
+
+@pytest.mark.parametrize(
+    "text", ["a,b\n1,2\n\n3\n", "a;b\r\n1;2\r\n3;\r\n", "\ufeff a , b\n 1,2\n3,,\n"]
+)
+def test_tables_of_spreadsheets_are_read(tmp_path: Path, text: str) -> None:
+    (tmp_path / "t.csv").write_text(text, newline="", encoding="utf-8")
+    rows = [row for _, row in read_table(tmp_path / "t.csv", "a table")]
+    assert rows == [{"a": "1", "b": "2"}, {"a": "3", "b": ""}]
+
+
+@pytest.mark.parametrize(
+    "data", [None, b"a,b\n1,2,3\n", "a\nü\n".encode("cp1252"), "a\n1".encode("utf-16")]
+)
+def test_tables_that_cannot_be_read_are_named(tmp_path: Path, data: bytes | None) -> None:
+    if data is not None:
+        (tmp_path / "t.csv").write_bytes(data)
+    with pytest.raises(ValueError, match=r"t\.csv"):
+        read_table(tmp_path / "t.csv", "a table")

@@ -104,7 +104,7 @@ def _pass_through(
     ear = read_ears(options)
     import torch
 
-    from hlsim.audio import check_channels, read_audio, write_audio
+    from hlsim.audio import check_written, read_audio, write_audio
     from hlsim.checks import HIGHEST_RATE, LOWEST_RATE
     from hlsim.dsp.resample import resample
 
@@ -115,7 +115,7 @@ def _pass_through(
     for done, (source, target) in enumerate(pairs, 1):
         try:
             waveform, rate = read_audio(source, any_rate=True)
-            check_channels(target, waveform.shape[0])
+            check_written(target, waveform.shape[0], rate)
             if waveform.shape[0] != 2 and (options.listener or getattr(options, "linked", False)):
                 asked = "--listener" if options.listener else "--linked"
                 raise ValueError(

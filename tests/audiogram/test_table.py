@@ -57,7 +57,7 @@ def test_csv_with_blanks_after_its_commas(tmp_path: Path) -> None:
         ("hl_250,hl_500, hl_500\n10,20,30\n", "line 1"),
         ("hl_500,hl_500.0\n10,20\n", "line 2"),
         ("hl_250,hl_500\n10,2,5\n", "line 2"),
-        ("\nhl_250,hl_500\n\n\n10,x\n", "line 5"),
+        ("hl_250,hl_500\n\n\n10,x\n", "line 4"),
     ],
 )
 def test_csv_errors_begin_with_the_file_and_name_the_line(

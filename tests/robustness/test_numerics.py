@@ -1,5 +1,6 @@
 """Odd signals, from silence to 1e38 Pa and from one sample up: finite sound and finite gradients, or a refusal."""
 
+from contextlib import suppress
 from functools import cache
 from random import Random
 from typing import Any
@@ -65,10 +66,6 @@ class Case:
                 self.clean.shape, generator=torch.Generator().manual_seed(0)
             ).to(kind)
 
-    def __repr__(self) -> str:
-        peaks = [f"{float(one.abs().max()):.3g}" for one in (*self.given, *self.clean)]
-        return f"{self.name}, {self.ear}, {tuple(self.given.shape)}, {self.given.dtype}, peaks {', '.join(peaks)}"
-
 
 @cache
 def module(name: str) -> Any:
@@ -92,8 +89,10 @@ def check(case: Case) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_numerics(bench: Any, kind: str) -> None:
-    bench.run(kind, lambda draw: Case(draw, KINDS[kind]), check)
+def test_outputs_and_gradients_are_finite_or_a_value_error_is_raised(kind: str) -> None:
+    for seed in range(25):
+        with suppress(ValueError):
+            check(Case(Random(f"{kind}:{seed}"), KINDS[kind]))
 
 
 @pytest.mark.parametrize(

@@ -138,7 +138,7 @@ def test_what_is_refused_names_the_path(tmp_path: Path) -> None:
     with (
         pytest.warns(UserWarning, match="left out: .*bad.wav"),
         pytest.raises(
-            ValueError, match=r"not readable as audio.*; this is the last of 10000 draws"
+            ValueError, match=r"cannot be read as audio.*; this is the last of 10000 draws"
         ) as caught,
     ):
         Clips(tmp_path, sample_rate=16000, seconds=1.0).draw(1, torch.Generator())

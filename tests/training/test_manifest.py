@@ -46,7 +46,6 @@ def test_columns_but_the_path_may_lack(tmp_path: Path) -> None:
         "",
         "path,split\n",
         "file\n1.wav\n",
-        "path;split\n1.wav;train\n",
         "path,split\n1.wav,dev\n",
         "path,split\n1.wav,\n",
         "path\n../1.wav\n",

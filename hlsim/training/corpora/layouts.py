@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from random import Random
 
-from hlsim.audio import check_name
 from hlsim.files import EXTENSIONS
 from hlsim.training.corpora.manifest import (
     SPLITS,
@@ -248,7 +247,7 @@ def _list_files(root: Path) -> tuple[list[str], list[str]]:
     """Sorted relative paths of the audio files below a folder, and of all other files, without hidden ones.
 
     Raises:
-        ValueError: there is no audio, a folder is a link, or a name is not UTF-8.
+        ValueError: there is no audio, or a folder is a link.
     """
     audio: list[str] = []
     others: list[str] = []
@@ -261,7 +260,6 @@ def _list_files(root: Path) -> tuple[list[str], list[str]]:
             if path.is_symlink():
                 raise ValueError(f"{path}: a link to a folder; put the folder itself there")
             continue
-        check_name(path)
         is_audio = path.suffix.lower() in EXTENSIONS
         (audio if is_audio else others).append(name)
     if not audio:
