@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
-from hlsim.checks import is_finite
+from hlsim.checks import check_number, is_finite
 from hlsim.neuro.config import ModelConfig, NetworkConfig, Phase
 
 
@@ -39,7 +38,8 @@ class MappingConfig(NetworkConfig):
             raise ValueError(
                 f"start is {self.start!r}; allowed: 'nalr', or a share of the loss from 0 to 1"
             )
-        refuse_outside({"bands": (self.bands, 4, 40), "limit_spl": (self.limit_spl, 60.0, 140.0)})
+        check_number("bands", self.bands, 4, 40, whole=True)
+        check_number("limit_spl", self.limit_spl, 60.0, 140.0)
         if not (is_finite(self.reach_db) and 0.0 < self.reach_db <= 60.0):
             raise ValueError(f"reach_db is {self.reach_db!r}; allowed: more than 0, to 60 dB")
 
@@ -95,16 +95,5 @@ class HearingAidConfig(ModelConfig):
             "quiet_spl": (0.0, 80.0),
             "limit_spl": (60.0, 140.0),
         }
-        refuse_outside({name: (getattr(self, name), *limits) for name, limits in ranges.items()})
-
-
-def refuse_outside(ranges: Mapping[str, tuple[float, float, float]]) -> None:
-    """Raise ValueError unless each value is a number from its lowest to its highest: (value, lowest, highest) by name.
-
-    Where the lowest is an int, whole numbers alone pass.
-    """
-    for name, (value, low, high) in ranges.items():
-        whole = isinstance(low, int)
-        if not (is_finite(value) and low <= value <= high) or (whole and type(value) is not int):
-            kind = "whole numbers from " if whole else ""
-            raise ValueError(f"{name} is {value!r}; allowed: {kind}{low:g} to {high:g}")
+        for name, (lowest, highest) in ranges.items():
+            check_number(name, getattr(self, name), lowest, highest, whole=isinstance(lowest, int))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from compensators.config import refuse_outside
 from compensators.filter_bank import FRAME, level_db, shares
 from compensators.prescription import (
     above_speech,
@@ -19,6 +18,7 @@ from compensators.stream import State, Stream
 from compensators.wearable import Wearable
 from hlsim.audiogram.thresholds import AudiogramLike
 from hlsim.calibration import PASCAL_SPL
+from hlsim.checks import check_number
 from hlsim.torchtools import constant_like
 
 
@@ -52,14 +52,11 @@ class WDRC(Wearable):
         linked: bool = False,
     ) -> None:
         super().__init__(sample_rate, full_scale_spl, linked)
-        ranges = {
-            "bands": (bands, 4, 40),
-            "attack": (attack, 0.0, 1.0),
-            "release": (release, 0.01, 2.0),
-            "knee": (knee, 0.0, 60.0),
-            "limit_spl": (limit_spl, 60.0, 140.0),
-        }
-        refuse_outside(ranges)
+        check_number("bands", bands, 4, 40, whole=True)
+        check_number("attack", attack, 0.0, 1.0)
+        check_number("release", release, 0.01, 2.0)
+        check_number("knee", knee, 0.0, 60.0)
+        check_number("limit_spl", limit_spl, 60.0, 140.0)
         self.bands, self.attack, self.release = bands, attack, release
         self.knee, self.limit_spl = knee, limit_spl
 

@@ -7,7 +7,7 @@ as 94): RMS 1.0 is 94 dB SPL. ``full_scale_spl`` says what RMS 1.0 is in somebod
 import torch
 from torch import Tensor
 
-from hlsim.checks import check_floating, is_finite
+from hlsim.checks import check_time_last, is_finite
 
 PASCAL_SPL = 94.0
 """Level in dB SPL of a signal in pascals whose RMS is 1.0."""
@@ -61,7 +61,7 @@ def set_level(waveform: Tensor, spl: float | Tensor, full_scale_spl: float = PAS
 
 def _whole(waveform: Tensor) -> Tensor:
     """In float32 at least: float16 holds neither the power of soft speech nor that of silence."""
-    check_floating(waveform)
+    check_time_last(waveform)
     return waveform.float() if waveform.dtype in (torch.float16, torch.bfloat16) else waveform
 
 

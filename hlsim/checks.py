@@ -1,26 +1,26 @@
-"""Checks of values: settings first, then rates, waveforms and lengths; what is refused is told with what is allowed."""
+"""Validation of settings, sample rates, waveforms and lengths."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import fields
 from numbers import Real
-from typing import Any, Literal, get_args, get_origin, get_type_hints
+from typing import Any, get_args
 
 import torch
 from torch import Tensor
 
 LOWEST_RATE, HIGHEST_RATE = 16000, 48000
-"""Sample rates in Hz that simulators and compensators take."""
+"""Sample rates in Hz that simulators and compensators accept."""
 
 HIGHEST_SAMPLE = 1e9
-"""Largest sample that is taken. From 1e14 on, a power of five or a product of powers leaves float32."""
+"""Largest accepted sample. From 1e14 on, products of powers exceed the range of float32."""
+
+MOST_CHANNELS = 8
+"""A last dimension of at most this many values behind a longer one holds channels, not time."""
 
 Lengths = Tensor | Sequence[int]
-"""Samples of each item, in the shape of the leading dimensions."""
-
-_KINDS = {int: "a whole number", float: "a number", bool: "true or false", str: "text"}
+"""Number of samples of each item, in the shape of the leading dimensions."""
 
 
 def broadcast_shape(*shapes: Sequence[int]) -> torch.Size:
@@ -35,94 +35,114 @@ def broadcast_shape(*shapes: Sequence[int]) -> torch.Size:
     return torch.broadcast_tensors(*(number.expand(shape) for shape in shapes))[0].shape
 
 
-def refuse_unknown(
-    found: Iterable[Any], allowed: Iterable[str], what: str, where: str = ""
+def check_names(
+    names: Iterable[Any], known: Iterable[str], description: str, place: str = ""
 ) -> None:
-    """Raise ValueError unless every name is allowed; ``what`` they are and ``where`` they stand is for the message."""
-    allowed = list(allowed)
-    if unknown := sorted({str(name) for name in found} - set(allowed)):
-        place = f" {where}" if where else ""
+    """Raise ValueError unless all names are known.
+
+    Args:
+        names: names to validate.
+        known: accepted names.
+        description: what the names stand for, in the plural, for the message.
+        place: where the names were found, for the message.
+    """
+    known = list(known)
+    unknown = sorted({str(name) for name in names} - set(known))
+    if unknown:
         raise ValueError(
-            f"unknown {what} {', '.join(unknown)}{place}; allowed: {', '.join(allowed)}"
+            f"unknown {description}{_after_space(place)}: {', '.join(unknown)}; "
+            f"expected some of {', '.join(known)}"
         )
 
 
-def check_choice(name: str, value: Any, choice: Any, where: str = "") -> None:
-    """Raise ValueError unless a value is one of those of a ``Literal``."""
-    if not isinstance(value, str) or value not in get_args(choice):
-        place = f" {where}" if where else ""
-        raise ValueError(f"{name} {value!r}{place}; allowed: {', '.join(get_args(choice))}")
+def check_choice(name: str, value: Any, choice: Any, place: str = "") -> None:
+    """Raise ValueError unless a value is one of the strings of a ``Literal``.
 
-
-def refuse_other_kinds(settings: Any, where: str) -> None:
-    """Raise ValueError unless every field of a dataclass holds what it is annotated with: an int, a float, a bool, a str,
-    one of a few, a pair of floats (ascending) or a dict of them."""
-    kinds = get_type_hints(type(settings))
-    for name in (entry.name for entry in fields(settings)):
-        kind, value = kinds[name], getattr(settings, name)
-        origin = get_origin(kind)
-        if origin is Literal:
-            check_choice(name, value, kind, where)
-        elif origin is tuple:
-            if not isinstance(value, tuple | list) or len(value) != 2:
-                raise ValueError(
-                    f"{name} {value!r} {where}; allowed: a lowest and a highest, as [0, 20]"
-                )
-            for one in value:
-                _refuse(one, float, name, where)
-            if value[0] > value[1]:
-                raise ValueError(
-                    f"{name} {list(value)} {where}; allowed: a lowest and a highest, ascending"
-                )
-        elif origin is dict:
-            if not isinstance(value, Mapping):
-                raise ValueError(f"{name} {value!r} {where}; allowed: 'name: value' lines below it")
-            for key, one in value.items() if float in kind.__args__ else ():
-                _refuse(one, float, f"{name}: {key}", where)
-        else:
-            _refuse(value, kind, name, where)
-
-
-def refuse_weights(weights: Mapping[str, float], allowed: Iterable[str], where: str) -> None:
-    """Raise ValueError unless all are of known criteria, none is negative and one or more is above 0."""
-    refuse_unknown(weights, allowed, "criteria", where)
-    if min(weights.values(), default=0.0) < 0.0 or not any(weights.values()):
+    Args:
+        name: name of the setting, for the message.
+        value: value to validate.
+        choice: the ``Literal``.
+        place: where the value was found, for the message.
+    """
+    choices = get_args(choice)
+    if not isinstance(value, str) or value not in choices:
         raise ValueError(
-            f"weights {dict(weights)} {where}; allowed: 0 or more, one or more above 0"
+            f"expected {name}{_after_space(place)} to be one of {', '.join(choices)}, got {value!r}"
         )
 
 
-def refuse_seed(seed: int, where: str) -> None:
-    """Raise ValueError for a seed that torch's generators do not take."""
-    if not -(2**62) < seed < 2**62:
-        raise ValueError(f"seed {seed} {where}; allowed: whole numbers between -2**62 and 2**62")
+def check_number(
+    name: str, value: Any, lowest: float, highest: float = math.inf, *, whole: bool = False
+) -> None:
+    """Raise ValueError unless a value is a finite number in a range that includes both ends.
 
-
-def _refuse(value: Any, kind: type, name: str, where: str) -> None:
-    if is_finite(value) if kind is float else type(value) is kind:
+    Args:
+        name: name of the setting, for the message.
+        value: value to validate.
+        lowest: smallest accepted number.
+        highest: largest accepted number.
+        whole: accept integers only.
+    """
+    accepted = is_finite(value) and lowest <= value <= highest
+    if accepted and not (whole and type(value) is not int):
         return
-    wanted = f"allowed: {_KINDS[kind]}"
-    if kind is float and isinstance(value, str):
-        wanted += " (YAML takes 1e-3 for text; write 1.0e-3)"
-    raise ValueError(f"{name} {value!r} {where}; {wanted}")
+    kind = "a whole number" if whole else "a number"
+    limits = "" if lowest == -math.inf else f" from {lowest:g}"
+    if highest < math.inf:
+        limits += f" to {highest:g}"
+    raise ValueError(f"expected {name} to be {kind}{limits}, got {describe(value)}")
+
+
+def check_weights(weights: Any, known: Iterable[str], description: str) -> dict[str, float]:
+    """Return weights by name as floats.
+
+    Args:
+        weights: mapping of names to finite numbers of 0 or more, of which one is above 0.
+        known: accepted names.
+        description: what the names stand for, in the plural, for messages.
+
+    Raises:
+        ValueError: the weights are not as described.
+    """
+    if not isinstance(weights, Mapping):
+        raise ValueError(
+            f"expected weights of {description} by name, such as {{{next(iter(known))!r}: 1.0}}, "
+            f"got {describe(weights)}"
+        )
+    check_names(weights, known, description)
+    for name, weight in weights.items():
+        check_number(f"the weight of {name}", weight, 0.0)
+    if not any(weights.values()):
+        raise ValueError(f"expected a weight above 0 for one of the {description}, got {weights}")
+    return {name: float(weight) for name, weight in weights.items()}
 
 
 def is_finite(value: Any) -> bool:
-    """Whether it is a finite number, Python's or numpy's; a bool is none."""
+    """Return whether a value is a finite real number of Python or NumPy. A bool is not one."""
     if not isinstance(value, Real) or isinstance(value, bool):
         return False
     try:
         return math.isfinite(value)
-    except OverflowError:  # a whole number that no float holds
+    except OverflowError:  # an integer beyond the range of floats
         return False
 
 
+def describe(value: Any) -> str:
+    """Return a value as messages show it, with its type unless it is a number."""
+    return repr(value) if is_finite(value) else f"{value!r} ({type(value).__name__})"
+
+
 def check_rate(sample_rate: int) -> int:
-    """Return the rate, or raise ValueError unless it is a whole number of Hz from 16000 to 48000."""
-    inside = is_finite(sample_rate) and LOWEST_RATE <= sample_rate <= HIGHEST_RATE
-    if not inside or int(sample_rate) != sample_rate:
+    """Return a sample rate as an int.
+
+    Raises:
+        ValueError: the rate is not a whole number of Hz from 16000 to 48000.
+    """
+    accepted = is_finite(sample_rate) and LOWEST_RATE <= sample_rate <= HIGHEST_RATE
+    if not accepted or int(sample_rate) != sample_rate:
         raise ValueError(
-            f"sample rate {sample_rate!r} Hz; allowed: {LOWEST_RATE} to {HIGHEST_RATE}"
+            f"expected a sample rate from {LOWEST_RATE} to {HIGHEST_RATE} Hz as a whole number, "
+            f"got {describe(sample_rate)}"
         )
     return int(sample_rate)
 
@@ -130,68 +150,95 @@ def check_rate(sample_rate: int) -> int:
 def check_waveform(
     waveform: Tensor, name: str = "waveform", *, highest: float = HIGHEST_SAMPLE
 ) -> Tensor:
-    """Return the waveform, or raise ValueError unless it is a floating-point (..., time) tensor with samples up to 1e9.
+    """Return a waveform that can be processed.
 
     NaN and infinity pass, and make their item's results NaN. The values are not checked on a GPU,
     because the host would wait for it, nor in a compiled program.
+
+    Shape: (..., time).
+
+    Args:
+        waveform: tensor to validate.
+        name: name of the argument, for messages.
+        highest: largest accepted magnitude of a finite sample.
+
+    Raises:
+        ValueError: it is not a floating-point tensor with time last, has no samples, or has a
+            sample above ``highest``.
     """
-    check_floating(waveform, name)
+    check_time_last(waveform, name)
     if waveform.ndim == 0 or waveform.numel() == 0:
         raise ValueError(
-            f"{name} has shape {tuple(waveform.shape)}; allowed: (..., time) with at least one sample"
+            f"expected {name} to have the shape (..., time) with at least one sample, "
+            f"got {tuple(waveform.shape)}"
         )
     if waveform.device.type == "cpu" and not torch.compiler.is_compiling():
         low, high = torch.aminmax(waveform.detach())
-        if highest < (peak := max(-float(low), float(high))) < math.inf:
-            raise ValueError(f"{name} has a sample of {peak:.3g}; allowed: up to {highest:g}")
+        peak = max(-float(low), float(high))
+        if highest < peak < math.inf:
+            raise ValueError(
+                f"expected samples of {name} up to {highest:g}, got {peak:.3g}; scale it to pascals"
+            )
     return waveform
 
 
-def check_floating(waveform: Tensor, name: str = "waveform") -> None:
-    """Raise ValueError unless it is a floating-point tensor."""
-    if not isinstance(waveform, Tensor) or not waveform.is_floating_point():
-        kind = waveform.dtype if isinstance(waveform, Tensor) else type(waveform).__name__
-        scaled = "; divide 16-bit samples by 32768" if "int16" in str(kind) else ""
-        raise ValueError(f"{name} is {kind}; allowed: a floating-point tensor (..., time){scaled}")
+def check_time_last(waveform: Tensor, name: str = "waveform") -> None:
+    """Raise ValueError unless an argument is a floating-point tensor whose last dimension can be time."""
+    if not isinstance(waveform, Tensor):
+        raise ValueError(
+            f"expected {name} to be a floating-point tensor with time last, "
+            f"got {type(waveform).__name__}"
+        )
+    if not waveform.is_floating_point():
+        fix = "; divide 16-bit samples by 32768" if waveform.dtype == torch.int16 else ""
+        raise ValueError(
+            f"expected {name} to be a floating-point tensor, got {waveform.dtype}{fix}"
+        )
+    shape = tuple(waveform.shape)
+    if len(shape) > 1 and shape[-1] <= MOST_CHANNELS < shape[-2]:
+        fix = "x.T" if len(shape) == 2 else "x.mT"
+        raise ValueError(f"expected {name} with time last, got shape {shape}; transpose it: {fix}")
 
 
 def check_lengths(lengths: Lengths, shape: torch.Size) -> Tensor:
-    """The lengths in samples as a tensor on the CPU.
+    """Return the number of samples of each item as integers on the CPU.
 
     Args:
-        lengths: whole numbers of samples, or shares of ``time`` above 0 to 1, as SpeechBrain has them; (batch,) serves a
-            batch of shape (batch, 1, time), too.
-        shape: of the batch, (..., time).
+        lengths: whole numbers of samples from 1 to ``time``, or shares of ``time`` above 0 and up
+            to 1, as SpeechBrain defines them. The shape is that of the batch without time;
+            (batch,) also serves a batch of shape (batch, 1, time).
+        shape: shape of the batch, (..., time).
 
     Returns: (...), int64.
 
     Raises:
-        ValueError: other numbers, of another shape, or outside 1 to time.
+        ValueError: the numbers, their type or their shape are not as described.
     """
     *items, time = shape
-    allowed = (
-        f"allowed: whole numbers from 1 to {time} (samples) of shape {tuple(items)}, one an item"
-    )
+    expected = f"expected lengths to be whole numbers from 1 to {time} of shape {tuple(items)}"
     try:
         ends = torch.as_tensor(lengths, device="cpu")
     except (TypeError, ValueError, RuntimeError):
-        raise ValueError(f"lengths is {type(lengths).__name__}; {allowed}") from None
+        raise ValueError(f"{expected}, got {type(lengths).__name__}") from None
     if ends.is_floating_point() and bool(((ends > 0.0) & (ends <= 1.0)).all()):
         ends = (ends.double() * time).round().long().clamp_min(1)
     if len(shape) == 3 and shape[1] == 1 and ends.shape == shape[:1]:
         ends = ends.unsqueeze(-1)
     if ends.is_floating_point() or ends.is_complex() or ends.dtype == torch.bool:
-        raise ValueError(f"lengths of {ends.dtype}; {allowed}")
+        raise ValueError(f"{expected}, got {ends.dtype}")
     if ends.shape != shape[:-1]:
-        raise ValueError(f"lengths of shape {tuple(ends.shape)}; {allowed}")
+        raise ValueError(f"{expected}, got shape {tuple(ends.shape)}")
     if not bool(((ends >= 1) & (ends <= time)).all()):
-        raise ValueError(f"lengths from {int(ends.min())} to {int(ends.max())}; {allowed}")
+        raise ValueError(f"{expected}, got {int(ends.min())} to {int(ends.max())}")
     return ends.long()
 
 
-def silent_after(waveform: Tensor, ends: Tensor) -> Tensor:
-    """Zeros in place of what follows each item's end. Shape: (..., time), (...) -> (..., time)."""
-    places = torch.arange(waveform.shape[-1], device=waveform.device)
-    return torch.where(
-        places < ends.to(waveform.device, non_blocking=True).unsqueeze(-1), waveform, 0.0
-    )
+def silence_after(waveform: Tensor, ends: Tensor) -> Tensor:
+    """Replace the samples behind the end of each item by zeros. Shape: (..., time), (...) -> (..., time)."""
+    samples = torch.arange(waveform.shape[-1], device=waveform.device)
+    ends = ends.to(waveform.device, non_blocking=True)
+    return torch.where(samples < ends.unsqueeze(-1), waveform, 0.0)
+
+
+def _after_space(place: str) -> str:
+    return f" {place}" if place else ""

@@ -96,7 +96,7 @@ def test_level_and_gain_are_differentiable() -> None:
 @pytest.mark.parametrize("given", [torch.zeros(8, dtype=torch.int16), [0.0, 1.0]])
 def test_levels_of_samples_that_are_no_floats_are_refused(given: Any) -> None:
     for call in (level_spl, lambda waveform: set_level(waveform, 65.0)):
-        with pytest.raises(ValueError, match=r"waveform is .*; allowed: a floating-point tensor"):
+        with pytest.raises(ValueError, match="floating-point tensor"):
             call(given)
 
 

@@ -8,8 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import torch
-
 from hlsim.audiogram import Audiogram
 from hlsim.audiogram.conversion import as_audiogram
 from hlsim.audiogram.plot import draw_png
@@ -86,9 +84,6 @@ class Listener:
     def from_clarity(cls, given: Any) -> Listener:
         """From pyclarity's ``Listener`` or an entry of Clarity's ``listeners.json``. Raises ValueError of all else."""
         return cls(*(Audiogram.from_clarity(given, ear) for ear in EARS))
-
-
-torch.serialization.add_safe_globals([Listener])  # as of Audiogram
 
 
 def read_listeners(path: str | Path) -> dict[str, Listener]:

@@ -282,10 +282,6 @@ def has_two_ears(given: Any) -> bool:
     return hasattr(given, "audiogram_left") and hasattr(given, "audiogram_right")
 
 
-# numbers alone: checkpoints that hold ears as hyperparameters load as those of plain tensors do
-torch.serialization.add_safe_globals([Audiogram])
-
-
 def severity_of(levels: Sequence[float]) -> str:
     """``Audiogram.severity`` of eight levels in dB HL."""
     high = [round(level * _FINE) / _FINE for level in levels[FREQUENCIES.index(2000.0) :]]

@@ -5,7 +5,7 @@ from typing import Any, Literal
 
 from torch import Tensor
 
-from hlsim.checks import is_finite
+from hlsim.checks import check_weights
 from hlsim.losses import coherent_bands, paper
 
 CriterionName = Literal["coherent-bands", "bands", "paper", "haspi", "hasqi", "interaural"]
@@ -39,47 +39,35 @@ def check_values(values: Any, items: int) -> Tensor:
 
 
 def check_criterion(criterion: Any) -> dict[str, Any]:
-    """The criteria by name, each with its weight unless that is 0; a callable as itself, under the name criterion."""
+    """Return the criteria by name, each with its weight unless that is 0, or a callable under the name ``criterion``.
+
+    Raises:
+        ValueError: an unknown criterion or a bad weight.
+    """
     if callable(criterion) and not isinstance(criterion, type):
         return {"criterion": criterion}
     named = {criterion: 1.0} if isinstance(criterion, str) else criterion
-    if not isinstance(named, Mapping) or not named or not set(named) <= set(CRITERIA):
-        raise ValueError(
-            f"criterion is {criterion!r}; allowed: {', '.join(CRITERIA)}, weights by these names, or a callable "
-            "(heard, reference) -> (items,)"
-        )
-    return {name: weight for name, weight in _check_numbers(named, "criterion").items() if weight}
+    weights = check_weights(named, CRITERIA, "criteria")
+    return {name: weight for name, weight in weights.items() if weight}
 
 
-def check_weights(
-    weights: Mapping[str, float] | None, criteria: Mapping[str, Any], criterion: Any
+def combine_weights(
+    weights: Mapping[str, float] | None, criteria: Mapping[str, Any]
 ) -> dict[str, float]:
-    """The weight of each part, times that of its criterion."""
-    of = {part: name for name in criteria for part in CRITERIA.get(name, {name: 1.0})}
-    if weights is None:
-        weights = {part: CRITERIA.get(name, {name: 1.0})[part] for part, name in of.items()}
-    if not isinstance(weights, Mapping):
-        allowed = {part: 1.0 for part in of}
-        raise ValueError(
-            f"weights is {type(weights).__name__}; allowed: numbers by name, as {allowed}"
-        )
-    if unknown := sorted(map(str, set(weights) - set(of))):
-        raise ValueError(
-            f"unknown weights {', '.join(unknown)} for criterion {criterion!r}; allowed: {', '.join(of)}"
-        )
-    checked = _check_numbers(weights, "weights", of)
-    scales = {name: 1.0 if callable(scale) else scale for name, scale in criteria.items()}
-    return {part: weight * scales[of[part]] for part, weight in checked.items()}
+    """Return the weight of each part of the loss, multiplied by that of its criterion.
 
+    Args:
+        weights: weights of the parts; the defaults of the criteria if None.
+        criteria: what ``check_criterion`` returned.
 
-def _check_numbers(
-    weights: Mapping[str, float], what: str, allowed: Any = CRITERIA
-) -> dict[str, float]:
-    if not all(is_finite(weight) and weight >= 0.0 for weight in weights.values()):
-        raise ValueError(f"{what} {dict(weights)}; allowed: finite numbers, 0 or more")
-    checked = {name: float(weight) for name, weight in weights.items()}
-    if not any(checked.values()):
-        raise ValueError(
-            f"{what} {checked} count nothing; allowed: one above 0 at least, of {', '.join(allowed)}"
-        )
-    return checked
+    Raises:
+        ValueError: an unknown part or a bad weight.
+    """
+    defaults: dict[str, float] = {}
+    scales: dict[str, float] = {}
+    for name, scale in criteria.items():
+        for part, weight in CRITERIA.get(name, {name: 1.0}).items():
+            defaults[part] = weight
+            scales[part] = 1.0 if callable(scale) else scale
+    chosen = check_weights(defaults if weights is None else weights, defaults, "parts of the loss")
+    return {part: weight * scales[part] for part, weight in chosen.items()}

@@ -25,11 +25,11 @@ from hlsim.checks import (
     check_lengths,
     check_rate,
     check_waveform,
-    silent_after,
+    silence_after,
 )
 from hlsim.losses import coherent_bands, paper
 from hlsim.losses.band_levels import band_level_loss
-from hlsim.losses.criteria import Criterion, check_criterion, check_values, check_weights
+from hlsim.losses.criteria import Criterion, check_criterion, check_values, combine_weights
 from hlsim.losses.frozen_simulator import FrozenEar, Hearing, ReferenceName, move
 from hlsim.metrics.interaural import interaural_loss
 from hlsim.metrics.objective import SCORES, missing_score
@@ -122,7 +122,7 @@ class HearingLossLoss(nn.Module):
         self.reduction, self.ears = reduction, ears
         self._two_ears = of_listeners(audiogram)
         self.criteria = check_criterion(criterion)
-        self.weights = check_weights(weights, self.criteria, criterion)
+        self.weights = combine_weights(weights, self.criteria)
         with torch.device(
             "cpu"
         ):  # where the host is made on ``meta``, nobody gives the ear its values later
@@ -286,7 +286,7 @@ class HearingLossLoss(nn.Module):
                 "criterion", clean, ears, heard.shape[:-1], listener, ends
             )
             if ends is not None:
-                heard, reference = silent_after(heard, ends), silent_after(reference, ends)
+                heard, reference = silence_after(heard, ends), silence_after(reference, ends)
             gain = gain_to_pascals(self.full_scale_spl)
             return heard * gain, reference * gain
 
@@ -332,7 +332,7 @@ class HearingLossLoss(nn.Module):
         )
         compensated, clean = compensated.to(dtype), clean.to(dtype)
         if ends is not None:
-            compensated, clean = silent_after(compensated, ends), silent_after(clean, ends)
+            compensated, clean = silence_after(compensated, ends), silence_after(clean, ends)
         host_ears = ears
         ears = on_device(ears, compensated.device)
         # only a listener, whose ears come from the CPU, may lack an ear

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from hlsim.audiogram import Audiogram
-from hlsim.checks import refuse_unknown
+from hlsim.checks import check_names
 from hlsim.extras import require
 from hlsim.metrics import fidelity
 from hlsim.metrics.haspi_score import haspi
@@ -107,7 +107,7 @@ def check_measures(names: Iterable[MeasureName]) -> tuple[MeasureName, ...]:
         MissingExtraError: A package that a measure needs is not installed.
     """
     chosen = tuple(dict.fromkeys(names))
-    refuse_unknown(chosen, MEASURES, "measures")
+    check_names(chosen, MEASURES, "measures")
     if not chosen:
         raise ValueError(f"no measure given, expected one or more of {', '.join(MEASURES)}")
     for name in chosen:

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from typing import Any, Literal, Self, get_origin, get_type_hints
 
-from hlsim.checks import check_choice, refuse_unknown
+from hlsim.checks import check_choice, check_names
 from hlsim.dsp.stft import STFT
 
 NEURO_RATE = 16000
@@ -49,7 +49,7 @@ class ModelConfig:
         """Read what ``to_dict`` wrote. Raises ValueError where a name is unknown, or a value none that is allowed."""
         if not isinstance(data, Mapping):
             raise ValueError(f"network settings {data!r}; allowed: names with values")
-        refuse_unknown(data, (field.name for field in fields(cls)), "network settings")
+        check_names(data, (field.name for field in fields(cls)), "network settings")
         return cls(**dict(data))
 
 

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any, ClassVar, Literal, Self
 
-from hlsim.checks import refuse_other_kinds, refuse_seed, refuse_unknown, refuse_weights
+from hlsim.checks import check_choice, check_names, check_number, check_weights, describe
 from hlsim.losses.frozen_simulator import ReferenceName
 from hlsim.metrics.pair import SHORTEST_SECONDS
 
 _WHERE = "in the recipe"
+_SMALLEST = 1e-9  # of a duration or a learning rate
 
 Kind = Literal["mapping-compensator", "hearing-aid"]
 Precision = Literal["float32", "bfloat16"]
@@ -52,26 +54,32 @@ class TrainingRecipe:
 
     criteria: ClassVar[tuple[str, ...]]
     shares: ClassVar[tuple[str, ...]] = ("sounds",)
+    ranges: ClassVar[tuple[str, ...]] = ("levels",)
+    choices: ClassVar[dict[str, Any]] = {}
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Self:
         """Raises ValueError where a name is unknown or a value is not allowed."""
-        refuse_unknown(data, (entry.name for entry in fields(cls)), "settings", _WHERE)
+        check_names(data, (entry.name for entry in fields(cls)), "settings", _WHERE)
         return cls(**data)
 
     def __post_init__(self) -> None:
-        refuse_other_kinds(self, _WHERE)
-        refuse_weights(self.weights, self.criteria, _WHERE)
-        refuse_seed(self.seed, _WHERE)
-        for name, value in vars(self).items():
-            if isinstance(value, list):  # a pair, as YAML gives it
-                object.__setattr__(self, name, tuple(value))
-        names = ("steps", "batch", "validate_every", "validation_items", "seconds", "learning_rate")
-        wrong = min(self.steps, self.batch, self.validate_every, self.validation_items) < 1
-        wrong = wrong or min(self.seconds, self.learning_rate) <= 0.0
-        self._refuse(wrong, names, "counts from 1 up, seconds and learning_rate above 0")
-        wrong = not all(0.0 <= getattr(self, name) <= 1.0 for name in self.shares)
-        self._refuse(wrong, self.shares, "0 to 1")
+        for name in ("steps", "batch", "validate_every", "validation_items"):
+            check_number(name, getattr(self, name), 1, whole=True)
+        for name in ("seconds", "learning_rate"):
+            check_number(name, getattr(self, name), _SMALLEST)
+        for name in self.shares:
+            check_number(name, getattr(self, name), 0.0, 1.0)
+        for name in self.ranges:
+            object.__setattr__(self, name, _check_range(name, getattr(self, name)))
+        for name, choice in self.choices.items():
+            check_choice(name, getattr(self, name), choice, _WHERE)
+        check_number("seed", self.seed, 1 - 2**62, 2**62 - 1, whole=True)
+        check_weights(self.weights, self.criteria, "criteria")
+        if not isinstance(self.model, Mapping):
+            raise ValueError(f"expected model to hold settings by name, got {describe(self.model)}")
+        if not isinstance(self.start, str):
+            raise ValueError(f"expected start to be a name or a folder, got {describe(self.start)}")
 
     def _refuse(self, wrong: bool, names: tuple[str, ...], allowed: str) -> None:
         if wrong:
@@ -106,10 +114,13 @@ class SimulatorRecipe(TrainingRecipe):
     average: float = 0.99
 
     criteria = ("complex", "log_spectrum", "magnitude", "phase", "snr", "time")
+    choices: ClassVar[dict[str, Any]] = {"unit_power": Unit, "precision": Precision}
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._refuse(not 0.0 <= self.average < 1.0, ("average",), "from 0 to below 1")
+        check_number("average", self.average, 0.0, 0.99999)
+        if not isinstance(self.treated, bool):
+            raise ValueError(f"expected treated to be true or false, got {describe(self.treated)}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -163,6 +174,8 @@ class CompensatorRecipe(TrainingRecipe):
         "intelligibility",
     )
     shares = ("sounds", "equalised", "noisy", "babble", "unreduced")
+    ranges = ("levels", "snr")
+    choices: ClassVar[dict[str, Any]] = {"kind": Kind, "reference": ReferenceName}
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -187,3 +200,14 @@ class CompensatorRecipe(TrainingRecipe):
             ("babble", "batch"),
             "batches of 2 or more with babble",
         )
+
+
+def _check_range(name: str, limits: Any) -> tuple[float, float]:
+    """Return a lowest and a highest number, or raise ValueError unless there are two, ascending."""
+    if not isinstance(limits, list | tuple) or len(limits) != 2:
+        raise ValueError(f"expected {name} to be a pair such as [0, 20], got {describe(limits)}")
+    for limit in limits:
+        check_number(name, limit, -math.inf)
+    if limits[0] > limits[1]:
+        raise ValueError(f"expected {name} in ascending order, got {list(limits)}")
+    return limits[0], limits[1]

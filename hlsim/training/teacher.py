@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from hlsim.audiogram import FREQUENCIES
 from hlsim.calibration import set_level
-from hlsim.checks import check_rate, refuse_unknown
+from hlsim.checks import check_names, check_rate
 from hlsim.dsp.resample import resample
 from hlsim.msbg import MSBG
 from hlsim.neuro.config import NEURO_RATE
@@ -86,7 +86,7 @@ def find_teacher(name: str) -> PluginTeacher | None:
     """
     if ":" in name:
         return PluginTeacher(name)
-    refuse_unknown([name], (*TEACHERS, "package.module:name"), "teachers")
+    check_names([name], (*TEACHERS, "package.module:name"), "teachers")
     return None
 
 

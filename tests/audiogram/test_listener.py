@@ -160,7 +160,8 @@ def _saved(listener: Listener) -> bytes:
 def test_written_and_read(tmp_path: Path) -> None:
     for listener in (BOTH, Listener(LEFT, None)):
         assert Listener.from_dict(json.loads(json.dumps(listener.to_dict()))) == listener
-    assert torch.load(io.BytesIO(_saved(BOTH)), weights_only=True) == BOTH
+    with torch.serialization.safe_globals([Audiogram, Listener]):
+        assert torch.load(io.BytesIO(_saved(BOTH)), weights_only=True) == BOTH
     assert Listener.from_clarity(ENTRY) == BOTH
     (tmp_path / "listeners.json").write_text(json.dumps({"L0001": ENTRY}))
     assert read_listeners(tmp_path / "listeners.json") == {"L0001": BOTH}

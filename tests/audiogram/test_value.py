@@ -198,12 +198,15 @@ def test_dictionary_round_trip_through_json() -> None:
     assert Audiogram.from_dict({"levels": range(8)}) == Audiogram(tuple(range(8)))
 
 
-def test_ears_in_a_checkpoint_load_without_trust_in_pickles() -> None:
+def test_ears_in_a_checkpoint_load_where_their_class_is_allowed() -> None:
     ear = Audiogram((10.5, 30.0, 61.25), (300.0, 1500.0, 7000.0))
     file = io.BytesIO()
     torch.save({"ear": ear, "ears": [Audiogram.standard("N3")]}, file)
     file.seek(0)
-    assert torch.load(file, weights_only=True) == {"ear": ear, "ears": [Audiogram.standard("N3")]}
+    with torch.serialization.safe_globals([Audiogram]):
+        loaded = torch.load(file, weights_only=True)
+    assert loaded == {"ear": ear, "ears": [Audiogram.standard("N3")]}
+    assert Audiogram not in torch.serialization.get_safe_globals()
 
 
 def test_an_ear_is_a_hyperparameter_of_lightnings(tmp_path: Path) -> None:
@@ -218,7 +221,8 @@ def test_an_ear_is_a_hyperparameter_of_lightnings(tmp_path: Path) -> None:
     trainer = lightning.Trainer(accelerator="cpu", logger=False, enable_progress_bar=False)
     trainer.strategy.connect(Module(Audiogram.standard("N3")))
     trainer.save_checkpoint(tmp_path / "kept.ckpt")
-    loaded = Module.load_from_checkpoint(tmp_path / "kept.ckpt", weights_only=True)
+    with torch.serialization.safe_globals([Audiogram]):
+        loaded = Module.load_from_checkpoint(tmp_path / "kept.ckpt", weights_only=True)
     assert loaded.hparams.ear == Audiogram.standard("N3")
 
 

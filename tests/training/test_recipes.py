@@ -24,6 +24,19 @@ AID = {"kind": "hearing-aid"}
         (SimulatorRecipe, {"levels": [80, 60]}),
         (SimulatorRecipe, {"sounds": 1.1}),
         (SimulatorRecipe, {"start": 3}),
+        (SimulatorRecipe, {"learning_rate": "1e-3"}),  # text to YAML, which asks for 1.0e-3
+        (SimulatorRecipe, {"learning_rate": float("nan")}),
+        (SimulatorRecipe, {"learning_rate": True}),
+        (SimulatorRecipe, {"batch": 2.5}),
+        (SimulatorRecipe, {"batch": None}),
+        (SimulatorRecipe, {"levels": 65}),
+        (SimulatorRecipe, {"levels": [50, "loud"]}),
+        (SimulatorRecipe, {"weights": None}),
+        (SimulatorRecipe, {"weights": {"snr": "1"}}),
+        (SimulatorRecipe, {"model": "small"}),
+        (SimulatorRecipe, {"treated": "no way"}),
+        (SimulatorRecipe, {1: 2}),
+        (CompensatorRecipe, {"snr": 5}),
         (CompensatorRecipe, {"sounds": -0.5}),
         (CompensatorRecipe, {"noisy": 1.5}),
         (CompensatorRecipe, {"weights": {"bands": 0.0}}),
@@ -38,3 +51,8 @@ AID = {"kind": "hearing-aid"}
 def test_bad_recipes(recipe: Any, settings: dict[str, Any]) -> None:
     with pytest.raises(ValueError):
         recipe.from_dict(settings)
+
+
+def test_numbers_of_a_recipe_may_be_whole() -> None:
+    recipe = SimulatorRecipe(weights={"snr": 2}, learning_rate=1, levels=[50, 60])  # type: ignore[arg-type]
+    assert recipe.levels == (50, 60)
