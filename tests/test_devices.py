@@ -12,17 +12,21 @@ from torch import Tensor, nn
 
 from compensators import WDRC, MappingCompensator, load_compensator
 from hlsim import MSBG, Audiogram, HearingLossLoss, load_pretrained, torchtools
+from hlsim.metrics import haspi, hasqi, mbstoi
+from hlsim.metrics.ear import recursions
 from tests.pretend_device import DEVICE, PretendDevice, PretendTensor
 
 
 @pytest.fixture(autouse=True)
 def constants_on_the_pretended_device(monkeypatch: pytest.MonkeyPatch) -> None:
     """Compute constants in this thread, the only one that knows the device, and keep them from other tests."""
-    monkeypatch.setattr(torchtools, "without_modes", lambda function, *args: function(*args))
+    for module in (torchtools, recursions):
+        monkeypatch.setattr(module, "without_modes", lambda function, *args: function(*args))
     monkeypatch.setattr(torchtools, "_CACHE", torchtools._Cache(torchtools.CACHE_BYTES))
 
 
 EARS = torch.tensor([Audiogram.standard(name).thresholds for name in ("N1", "N3", "NH", "N1")])
+LENGTHS = [12000, 11500, 11987, 11400]
 N3 = Audiogram.standard("N3")
 
 
@@ -67,6 +71,14 @@ def judge_two_ears(module: Any, wave: Tensor, clean: Tensor, ears: Tensor) -> Te
     return module(wave.unflatten(0, (2, 2)), clean.unflatten(0, (2, 2)), ears.unflatten(0, (2, 2)))
 
 
+def score(measure: Callable[..., Tensor]) -> Callable[..., Tensor]:
+    return lambda module, wave, clean, ears: measure(wave, clean, ears, lengths=LENGTHS)
+
+
+def score_two_ears(module: Any, wave: Tensor, clean: Tensor, ears: Tensor) -> Tensor:
+    return mbstoi(wave.unflatten(0, (2, 2)), clean.unflatten(0, (2, 2)), lengths=LENGTHS[::2])
+
+
 CALLS: dict[str, Call] = {
     # the exact model reads the severity of ears that it does not know from the CPU
     "msbg": Call(partial(MSBG, sample_rate=16000), simulate, waits=1),
@@ -81,6 +93,10 @@ CALLS: dict[str, Call] = {
     "mapping": Call(MappingCompensator, simulate),
     "linked wdrc": Call(partial(WDRC, linked=True), simulate_two_ears),
 }
+# the number of waits of scores does not depend on the number of items
+CALLS["haspi"] = Call(nn.Identity, score(haspi), waits=3)
+CALLS["hasqi"] = Call(nn.Identity, score(hasqi), waits=4)
+CALLS["mbstoi"] = Call(nn.Identity, score_two_ears, waits=2)
 for name in ("neuro-msbg", "neuro-msbg-mamba", "neuro-msbg-lstm", "neuro-msbg-transformer"):
     CALLS[name] = Call(partial(load_pretrained, name), simulate)
 CALLS["neuro-msbg at 44.1 kHz"] = Call(
@@ -110,7 +126,7 @@ def test_module_keeps_to_its_device_and_does_not_wait(name: str) -> None:
     call = CALLS[name]
     torch.manual_seed(0)
     module = call.build()
-    signals = 0.02 * torch.randn(2, 4, 9000)
+    signals = 0.02 * torch.randn(2, 4, 12000)
     # two unlike ears of a pair, or differences between the ears would be next to nothing
     signals[0, 1::2] += 0.5 * signals[0, 0::2]
     on_cpu = value_and_gradient(call, module, *signals, EARS)

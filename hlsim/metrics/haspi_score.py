@@ -31,8 +31,8 @@ from hlsim.calibration import PASCAL_SPL
 from hlsim.checks import Lengths, check_choice, check_waveform
 from hlsim.metrics.ear import envelope_modulation as envelopes
 from hlsim.metrics.ear import model as ear_model
-from hlsim.metrics.ear.clean_speech import CleanItem, CleanSpeech, ItemGroup
-from hlsim.metrics.ear.model import CHANNELS
+from hlsim.metrics.ear.clean_speech import CleanBatch, CleanSpeech, ItemGroup
+from hlsim.metrics.ear.model import CHANNELS, Extent
 from hlsim.metrics.pair import check_seed
 from hlsim.torchtools import constant, not_compiled
 
@@ -120,10 +120,7 @@ class HaspiReference:
     ) -> None:
         self._signals = CleanSpeech(clean, sample_rate, full_scale_spl, lengths, whole_khz, "HASPI")
         with torch.autocast(clean.device.type, enabled=False):
-            self._groups = [_Group(self._signals, items) for items in self._signals.groups()]
-            if keep:
-                for group in self._groups:
-                    group.keep()
+            self._parts = [_Batch(self._signals, batch, keep) for batch in self._signals.batches]
 
     def score(
         self,
@@ -140,15 +137,11 @@ class HaspiReference:
         ears = ear_model.hair_cells(signals.thresholds(audiogram))
         seeds = item_seeds(seed, signals.shape)
         with torch.autocast(processed.device.type, enabled=False):
-            features = [
-                features
-                for group in self._groups
-                for features in group.compare(given, ears, noise, seeds)
-            ]
-            return understood(torch.stack(features)).reshape(signals.shape)
+            features = [part.compare(given, ears, noise, seeds) for part in self._parts]
+            return understood(torch.cat(features)).reshape(signals.shape)
 
 
-# -- items that are worked on together --------------------------------------------------------------------------------
+# -- items that are processed together --------------------------------------------------------------------------------
 
 
 class _Channels(NamedTuple):
@@ -167,14 +160,53 @@ class _Channels(NamedTuple):
     course: envelopes.Course
 
 
-class _Group(ItemGroup[_Channels]):
-    """Items that are worked on together, each with what a normal ear makes of the clean speech."""
+class _Batch:
+    """Clean signals of a batch, each as a normal ear hears it.
 
-    def __init__(self, signals: CleanSpeech, items: list[CleanItem]) -> None:
-        super().__init__(signals, items)
+    Args:
+        keep: compute now what the ear makes of them, and keep it.
+    """
+
+    def __init__(self, signals: CleanSpeech, batch: CleanBatch, keep: bool) -> None:
+        self._signals, self._batch = signals, batch
+        self._groups = [_Group(signals, batch, items) for items in signals.groups(batch)]
+        if keep:
+            for group in self._groups:
+                group.keep()
+
+    def compare(
+        self, processed: Tensor, ears: ear_model.HairCells, noise: Noise, seeds: list[int]
+    ) -> Tensor:
+        """Compute the features of each item.
+
+        Shape: (items, time) and (items, 32) of the whole input -> (items of the batch, 10).
+        """
+        batch = self._batch
+        given = self._signals.matched(processed, batch)
+        ear = ears.items(batch.items)
+        pairs = [group.courses(given, ear) for group in self._groups]
+        reference, heard = (envelopes.joined(courses) for courses in zip(*pairs, strict=True))
+        places, extent = envelopes.audible_frames(reference.loudness, batch.audible)
+        x = envelopes.chosen_frames(reference.cosines, places)
+        y = envelopes.chosen_frames(heard.cosines, places)
+        if noise == "seeded":
+            counts = [2 * CHANNELS * end for end in batch.audible.ends]
+            drawn = _drawn_pairs(seeds[batch.items], counts, extent, x)
+            x, y = x + drawn[0], y + drawn[1]
+        found = envelopes.agreement(x, y, extent)
+        if noise == "expected":
+            return envelopes.expected_correlation(found)
+        return envelopes.correlation(found)
+
+
+class _Group(ItemGroup[_Channels]):
+    """Items whose ears are computed together, each with what a normal ear makes of the clean speech."""
+
+    def __init__(self, signals: CleanSpeech, batch: CleanBatch, items: slice) -> None:
+        super().__init__(signals, batch, items)
         with torch.no_grad():
             self._ear = ear_model.hair_cells(torch.zeros(8, device=signals.device))
-            self._heard = signals.through_middle_ear([item.heard for item in items], self._extent)
+            self._heard = signals.through_middle_ear(batch.signals[items], self._extent)
             self._latest = ear_model.longest_group_delay(self._heard, self._ear, self._extent)
 
     @torch.no_grad()
@@ -186,15 +218,16 @@ class _Group(ItemGroup[_Channels]):
         frames = envelopes.frames(levels, delays, self._extent)
         return _Channels(chosen, spectrum, delays, envelopes.course(frames, chosen))
 
-    def compare(
-        self, processed: Tensor, ears: ear_model.HairCells, noise: Noise, seeds: list[int]
-    ) -> list[Tensor]:
-        """Features of each item. Shape: (items, time) and (items, 32) of the whole batch -> (10,) each."""
-        extent, signals = self._extent, self._signals
-        places = [item.index for item in self._items]
-        ear = ears.items(places)
-        given = [signals.matched(processed[item.index], item) for item in self._items]
-        sound = signals.through_middle_ear(given, extent)
+    def courses(
+        self, processed: Tensor, ears: ear_model.HairCells
+    ) -> tuple[envelopes.Course, envelopes.Course]:
+        """Compute the courses of the clean and of the processed signals.
+
+        Shape: (items, padded) and (items, 32) of the batch.
+        """
+        extent = self._extent
+        ear = ears.items(self.items)
+        sound = self._signals.through_middle_ear(processed[self.items], extent)
         x: envelopes.Course | None = None
         y: envelopes.Course | None = None
         for part in self._channels():
@@ -206,32 +239,40 @@ class _Group(ItemGroup[_Channels]):
             frames = envelopes.frames(levels, part.delays, extent)
             y = envelopes.added(y, envelopes.course(frames, part.chosen))
         assert x is not None and y is not None
-        features = []
-        for loudness, *waves, place, end in zip(
-            x.loudness, x.cosines, y.cosines, places, extent.ends, strict=True
-        ):
-            kept = envelopes.audible_frames(loudness[: -(-end // envelopes.STRIDE)])
-            pair = [cosines[:, kept] for cosines in waves]
-            if noise == "seeded":
-                random = generator_after(seeds[place], 2 * CHANNELS * end)
-                pair = [cosines + _drawn(random, cosines) for cosines in pair]
-            found = envelopes.agreement(*pair)
-            mean = envelopes.expected_correlation if noise == "expected" else envelopes.correlation
-            features.append(mean(found))
-        return features
+        return x, y
 
 
 # -- noise -------------------------------------------------------------------------------------------------------------
 
-_DRAWN = 2**16  # deviates, about, that are drawn at once
+_DRAWN = 2**16
+"""Number of deviates, about, that are drawn at once."""
 
 
-def _drawn(random: np.random.RandomState, like: Tensor) -> Tensor:
-    """Cosines of noise on all channels, frame by frame. Shape: (5, kept) -> the same."""
+def _drawn_pairs(seeds: list[int], skipped: list[int], extent: Extent, like: Tensor) -> Tensor:
+    """Draw the noise of the clean and of the processed signals.
+
+    Args:
+        skipped: deviates that pyclarity draws before, by item.
+        extent: frames of each item.
+        like: cosines of the signals. Shape: (items, 5, kept).
+
+    Returns: (2, items, 5, kept).
+    """
+    noise = torch.zeros((2, *like.shape), dtype=like.dtype)
+    for item, (seed, count, kept) in enumerate(zip(seeds, skipped, extent.ends, strict=True)):
+        random = generator_after(seed, count)
+        for side in (0, 1):
+            noise[side, item, :, :kept] = _drawn(random, kept, like.dtype)
+    return noise.to(like.device, non_blocking=like.device.type != "cpu")
+
+
+def _drawn(random: np.random.RandomState, frames: int, dtype: torch.dtype) -> Tensor:
+    """Draw noise on all channels, frame by frame, and return its cosines. Shape: -> (5, frames)."""
     parts = []
-    for start in range(0, like.shape[-1], _DRAWN // CHANNELS):
-        frames = min(_DRAWN // CHANNELS, like.shape[-1] - start)
-        parts.append(torch.from_numpy(random.standard_normal((frames, CHANNELS))).to(like))
+    step = _DRAWN // CHANNELS
+    for start in range(0, frames, step):
+        deviates = random.standard_normal((min(step, frames - start), CHANNELS))
+        parts.append(torch.from_numpy(deviates).to(dtype))
     return envelopes.NOISE_DB * torch.cat([envelopes.cosines(part.mT) for part in parts], -1)
 
 

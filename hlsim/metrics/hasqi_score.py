@@ -9,12 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+from torch.nn import functional
 
 from hlsim.audiogram import FREQUENCIES
 from hlsim.audiogram.thresholds import AudiogramLike
@@ -25,7 +27,7 @@ from hlsim.dsp.fir import frequency_sampling_fir
 from hlsim.dsp.windows import hamming
 from hlsim.metrics.ear import fine_structure
 from hlsim.metrics.ear import model as ear_model
-from hlsim.metrics.ear.clean_speech import CleanItem, CleanSpeech, ItemGroup
+from hlsim.metrics.ear.clean_speech import CleanBatch, CleanSpeech, ItemGroup
 from hlsim.metrics.ear.model import AUDIOMETRIC_HZ, CHANNELS, Extent
 from hlsim.metrics.ear.recursions import RATE
 from hlsim.metrics.haspi_score import Noise, generator_after, item_seeds
@@ -40,8 +42,8 @@ _FROZEN = 2**17  # samples of noise that all channels take theirs from
 _APART = 4001
 
 
-_Source = Callable[[int, int], Tensor]
-"""Noise of the next so many channels, each so many samples long."""
+_Source = Callable[[slice, Extent], Tensor]
+"""Returns noise of some channels, (items or 1, channels, longest). Channels come in ascending order."""
 
 
 class HasqiParts(NamedTuple):
@@ -125,15 +127,15 @@ class HasqiReference:
         keep: bool = True,
     ) -> None:
         self._signals = CleanSpeech(clean, sample_rate, full_scale_spl, lengths, whole_khz, "HASQI")
-        thresholds = self._signals.thresholds(audiogram)
+        signals = self._signals
+        ears = signals.thresholds(audiogram)
+        host_ears = signals.thresholds(audiogram, host=True).detach().double().numpy()
         unit = 10.0 ** (-check_full_scale(full_scale_spl) / 20.0)
         with torch.autocast(clean.device.type, enabled=False):
-            self._groups = [
-                _Group(self._signals, items, thresholds, unit) for items in self._signals.groups()
+            self._parts = [
+                _Batch(signals, batch, ears[batch.items], host_ears[batch.items], unit, keep)
+                for batch in signals.batches
             ]
-            if keep:
-                for group in self._groups:
-                    group.keep()
 
     def score(
         self, processed: Tensor, *, noise: Noise = "expected", seed: int | Sequence[int] = 0
@@ -149,14 +151,12 @@ class HasqiReference:
         given = self._signals.check(processed)
         seeds = item_seeds(seed, self._signals.shape)
         with torch.autocast(processed.device.type, enabled=False):
-            scores = [
-                score for group in self._groups for score in group.compare(given, noise, seeds)
-            ]
-            nonlinear, linear = torch.stack(scores).reshape(*self._signals.shape, 2).unbind(-1)
+            scores = torch.cat([part.compare(given, noise, seeds) for part in self._parts])
+            nonlinear, linear = scores.reshape(*self._signals.shape, 2).unbind(-1)
             return HasqiParts(nonlinear * linear, nonlinear, linear)
 
 
-# -- items that are worked on together ---------------------------------------------------------------------------------
+# -- items that are processed together ---------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -167,9 +167,9 @@ class _Channels:
         chosen: the channels.
         envelope, motion: spectra for the lags of the processed ones.
         delays: that match the filters' group delays. Shape: (items, channels).
-        smoothed: levels of each item. Shape: (channels, segments).
+        smoothed: smoothed levels. Shape: (items, channels, segments).
         moving: the adapted motion. Shape: (items, channels, padded).
-        segments: of that, of each item.
+        segments: ``segment_spectra`` of that.
         level: long-term, in dB over threshold. Shape: (items, channels).
     """
 
@@ -177,25 +177,101 @@ class _Channels:
     envelope: Tensor
     motion: Tensor
     delays: Tensor
-    smoothed: list[Tensor]
+    smoothed: Tensor
     moving: Tensor
-    segments: list[tuple[Tensor, Tensor]]
+    segments: tuple[Tensor, Tensor]
     level: Tensor
 
 
-class _Group(ItemGroup[_Channels]):
-    """Items that are worked on together, each with what the ear makes of the clean speech."""
+class _Comparison(NamedTuple):
+    """What a score is computed from, over all channels.
+
+    Attributes:
+        clean, processed: smoothed levels. Shape: (items, 32, segments).
+        coherence: coherence of the motion of both. Shape: (items, 32, segments).
+        energy: mean squares of the segments of the clean signal. Shape: (items, 32, segments).
+        clean_level, processed_level: long-term levels in dB over threshold. Shape: (items, 32).
+    """
+
+    clean: Tensor
+    processed: Tensor
+    coherence: Tensor
+    energy: Tensor
+    clean_level: Tensor
+    processed_level: Tensor
+
+
+class _Batch:
+    """Clean signals of a batch, each as an impaired ear hears it.
+
+    Args:
+        ears, host_ears: ears of the items, on the device of the signals and on the CPU. Shape: (items, 8) dB HL.
+        unit: amplitude that 20 uPa have in the signals.
+        keep: compute now what the ears make of the signals, and keep it.
+    """
 
     def __init__(
-        self, signals: CleanSpeech, items: list[CleanItem], thresholds: Tensor, unit: float
+        self,
+        signals: CleanSpeech,
+        batch: CleanBatch,
+        ears: Tensor,
+        host_ears: NDArray[np.float64],
+        unit: float,
+        keep: bool,
     ) -> None:
-        super().__init__(signals, items)
-        self._unit, self._noise = unit, unit * 10.0 ** (_THRESHOLD_NOISE / 20.0)
-        chosen = thresholds[[item.index for item in items]]
+        self._signals, self._batch = signals, batch
         with torch.no_grad():
-            self._ear = ear_model.hair_cells(chosen)
-            taps = [_nalr(ear) for ear in chosen.double().cpu().numpy()]
-            amplified = [_amplified(item.heard, fir) for item, fir in zip(items, taps, strict=True)]
+            amplified = _amplified(batch.signals, host_ears, batch.audible)
+            cells = ear_model.hair_cells(ears)
+        self._groups = [
+            _Group(signals, batch, items, amplified[items], cells.items(items), unit)
+            for items in signals.groups(batch)
+        ]
+        if keep:
+            for group in self._groups:
+                group.keep()
+
+    def compare(self, processed: Tensor, noise: Noise, seeds: list[int]) -> Tensor:
+        """Compute the nonlinear and the linear part of each item.
+
+        Shape: (items, time) of the whole input -> (items of the batch, 2).
+        """
+        given = self._signals.matched(processed, self._batch)
+        own_seeds = seeds[self._batch.items]
+        found = [group.compare(given, noise, own_seeds) for group in self._groups]
+        counts = fine_structure.segments_of(self._batch.audible)
+        joined = _Comparison(*(_joined(parts, counts) for parts in zip(*found, strict=True)))
+        envelopes = fine_structure.envelope_correlation(joined.clean, joined.processed, counts)
+        fine = fine_structure.synchrony(joined.coherence, joined.energy, counts)
+        likeness = fine_structure.spectral_likeness(joined.clean_level, joined.processed_level)
+        return torch.stack((envelopes.square() * fine, likeness), -1)
+
+
+def _joined(parts: Sequence[Tensor], counts: Extent) -> Tensor:
+    """Join tensors of several groups of items; segments that a group lacks are zero."""
+    if len(parts) == 1 or parts[0].ndim == 2:
+        return torch.cat(list(parts))
+    longest = counts.longest
+    return torch.cat([functional.pad(part, (0, longest - part.shape[-1])) for part in parts])
+
+
+class _Group(ItemGroup[_Channels]):
+    """Items whose ears are computed together, each with what the ear makes of the clean speech."""
+
+    def __init__(
+        self,
+        signals: CleanSpeech,
+        batch: CleanBatch,
+        items: slice,
+        amplified: Tensor,
+        cells: ear_model.HairCells,
+        unit: float,
+    ) -> None:
+        super().__init__(signals, batch, items)
+        self._unit, self._noise = unit, unit * 10.0 ** (_THRESHOLD_NOISE / 20.0)
+        self._counts = fine_structure.segments_of(self._extent)
+        self._ear = cells
+        with torch.no_grad():
             self._heard = signals.through_middle_ear(amplified, self._extent)
             self._latest = ear_model.longest_group_delay(self._heard, self._ear, self._extent)
 
@@ -218,32 +294,28 @@ class _Group(ItemGroup[_Channels]):
             ear_model.mean_level(heard, cells),
         )
 
-    def _smoothed(self, levels: Tensor, delays: Tensor) -> list[Tensor]:
-        ends = self._extent.ends
-        late = ear_model.shift(levels, delays, ends, ends, self._extent.longest)
-        return [fine_structure.smoothed(late[i, :, :end]) for i, end in enumerate(ends)]
+    def _smoothed(self, levels: Tensor, delays: Tensor) -> Tensor:
+        extent = self._extent
+        late = ear_model.shift(levels, delays, extent.ends, extent.ends, extent.longest)
+        return fine_structure.smoothed(late, extent)
 
     def _segments(
-        self, moving: Tensor, delays: Tensor, sources: Sequence[_Source] | None = None
-    ) -> list[tuple[Tensor, Tensor]]:
-        """``segment_spectra`` of each item, delayed to match, with noise at the threshold of hearing."""
-        made = []
-        for i, end in enumerate(self._extent.ends):
-            item = moving[i : i + 1, :, :end]
-            if sources is not None:
-                item = item + self._noise * sources[i](item.shape[1], end).to(item)
-            late = ear_model.shift(item, delays[i : i + 1], (end,), (end,), end)
-            made.append(fine_structure.segment_spectra(late[0]))
-        return made
+        self, moving: Tensor, delays: Tensor, noise: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """``segment_spectra`` of the motion, delayed to match, with noise at the threshold of hearing."""
+        extent = self._extent
+        motion = moving[..., : extent.longest]
+        if noise is not None:
+            motion = motion + self._noise * noise
+        late = ear_model.shift(motion, delays, extent.ends, extent.ends, extent.longest)
+        return fine_structure.segment_spectra(late, extent)
 
-    def compare(self, processed: Tensor, noise: Noise, seeds: list[int]) -> list[Tensor]:
-        """Nonlinear and linear part of each item. Shape: (items, time) of the whole batch -> (2,) each."""
+    def compare(self, processed: Tensor, noise: Noise, seeds: list[int]) -> _Comparison:
+        """Compare all channels. Shape: (items, padded) of the batch."""
         extent, signals = self._extent, self._signals
-        places = [item.index for item in self._items]
-        given = [signals.matched(processed[item.index], item) for item in self._items]
-        sound = signals.through_middle_ear(given, extent)
-        first, second = _sources(noise, [seeds[place] for place in places], extent)
-        found: list[list[tuple[Tensor, ...]]] = [[] for _ in places]
+        sound = signals.through_middle_ear(processed[self.items], extent)
+        clean_noise, processed_noise = _sources(noise, seeds[self.items], extent, sound)
+        found: list[_Comparison] = []
         for part in self._channels():
             cells = self._ear[part.chosen]
             heard = ear_model.listen(sound, self._ear, part.chosen, extent, motion=True)
@@ -253,74 +325,58 @@ class _Group(ItemGroup[_Channels]):
             lags = ear_model.channel_lags(part.motion, heard.motion.detach(), extent)
             motion = ear_model.shift(heard.motion, lags, extent.ends, extent.ends, extent.padded)
             levels = ear_model.adapted(ear_model.sensation(power, cells.inner))
+            moving = _moving(motion, power, levels, self._unit)
             smoothed = self._smoothed(levels, part.delays)
-            y = self._segments(_moving(motion, power, levels, self._unit), part.delays, second)
-            x = part.segments if first is None else self._segments(part.moving, part.delays, first)
+            drawn = None if processed_noise is None else processed_noise(part.chosen, extent)
+            y = self._segments(moving, part.delays, drawn)
+            x = part.segments
+            if clean_noise is not None:
+                x = self._segments(part.moving, part.delays, clean_noise(part.chosen, extent))
+            coherence = fine_structure.coherence(x, y, self._counts)
             level = ear_model.mean_level(heard, cells)
-            for i, rows in enumerate(found):
-                both = fine_structure.coherence(x[i], y[i])
-                rows.append((part.smoothed[i], smoothed[i], both, x[i][1], part.level[i], level[i]))
-        return [
-            self._score(*(torch.cat(column) for column in zip(*rows, strict=True)))
-            for rows in found
-        ]
-
-    def _score(
-        self,
-        clean: Tensor,
-        heard: Tensor,
-        coherence: Tensor,
-        energy: Tensor,
-        before: Tensor,
-        after: Tensor,
-    ) -> Tensor:
-        envelopes = fine_structure.envelope_correlation(clean, heard)
-        fine = fine_structure.synchrony(coherence, energy)
-        return torch.stack(
-            (envelopes.square() * fine, fine_structure.spectral_likeness(before, after))
-        )
+            found.append(_Comparison(part.smoothed, smoothed, coherence, x[1], part.level, level))
+        return _Comparison(*(torch.cat(parts, 1) for parts in zip(*found, strict=True)))
 
 
 # -- noise -------------------------------------------------------------------------------------------------------------
 
 
 def _sources(
-    noise: Noise, seeds: list[int], extent: Extent
-) -> tuple[list[_Source] | None, list[_Source] | None]:
-    """Noise of the clean signals, where it is drawn, and of the processed ones."""
+    noise: Noise, seeds: list[int], extent: Extent, like: Tensor
+) -> tuple[_Source | None, _Source | None]:
+    """Return sources of noise for the clean signals, where it is drawn, and for the processed ones."""
     if noise == "none":
         return None, None
-    if (
-        noise == "expected"
-    ):  # only what is heard of the clean signal counts, and there noise is nothing
-        return None, [_frozen() for _ in seeds]
-    drawn = [
-        [_drawn(seed, start * CHANNELS * end) for seed, end in zip(seeds, extent.ends, strict=True)]
-        for start in (0, 1)
+    if noise == "expected":
+        # only what is heard of the clean signal counts, and there noise is nothing
+        return None, partial(_frozen, like=like)
+    return _drawn(seeds, extent, like, 0), _drawn(seeds, extent, like, 1)
+
+
+def _drawn(seeds: list[int], extent: Extent, like: Tensor, start: int) -> _Source:
+    """Draw noise as pyclarity does, after ``start`` times as many deviates as a signal takes."""
+    generators = [
+        generator_after(seed, start * CHANNELS * end)
+        for seed, end in zip(seeds, extent.ends, strict=True)
     ]
-    return drawn[0], drawn[1]
 
-
-def _drawn(seed: int, start: int) -> _Source:
-    """As pyclarity draws it."""
-    generator = generator_after(seed, start)
-    return lambda channels, end: torch.from_numpy(generator.standard_normal((channels, end)))
-
-
-def _frozen() -> _Source:
-    """The same each time: every channel takes its part of one stretch of noise."""
-    table = constant(_frozen_noise, dtype=torch.float32, device=torch.device("cpu"))
-    taken = 0
-
-    def source(channels: int, end: int) -> Tensor:
-        nonlocal taken
-        starts = range(taken * _APART, (taken + channels) * _APART, _APART)
-        taken += channels
-        return table.repeat(-(-(starts[-1] + end) // _FROZEN))[starts[0] :].unfold(0, end, _APART)[
-            :channels
-        ]
+    def source(channels: slice, extent: Extent) -> Tensor:
+        count = channels.stop - channels.start
+        noise = torch.zeros(len(extent.ends), count, extent.longest, dtype=like.dtype)
+        for row, generator, end in zip(noise, generators, extent.ends, strict=True):
+            row[:, :end] = torch.from_numpy(generator.standard_normal((count, end)))
+        return noise.to(like.device, non_blocking=like.device.type != "cpu")
 
     return source
+
+
+def _frozen(channels: slice, extent: Extent, *, like: Tensor) -> Tensor:
+    """Return the same noise each time: every channel takes its part of one stretch of noise."""
+    table = constant(_frozen_noise, dtype=torch.float32, device=like.device)
+    first, last = channels.start * _APART, (channels.stop - 1) * _APART
+    repeated = table.repeat(-(-(last + extent.longest) // _FROZEN))[first:]
+    count = channels.stop - channels.start
+    return repeated.unfold(0, extent.longest, _APART)[:count].to(like)
 
 
 def _frozen_noise() -> NDArray[np.float64]:
@@ -356,10 +412,14 @@ def _nalr(thresholds: NDArray[np.float64]) -> NDArray[np.float64]:
     return frequency_sampling_fir(len(grid), grid, 10.0 ** (decibels / 20.0), hamming(len(grid)))
 
 
-def _amplified(signal: Tensor, taps: NDArray[np.float64]) -> Tensor:
-    """Filtered, from the filter's last sample on, as pyclarity takes it. Shape: (time,) -> (time,)."""
-    time = signal.shape[-1]
-    points = fft_length(time + _NALR_ORDER, 2)
-    fir = torch.from_numpy(taps).to(signal)
-    filtered = torch.fft.irfft(torch.fft.rfft(signal, points) * torch.fft.rfft(fir, points), points)
-    return filtered[_NALR_ORDER : _NALR_ORDER + time]
+def _amplified(signals: Tensor, ears: NDArray[np.float64], extent: Extent) -> Tensor:
+    """Amplify by NAL-R, from the filter's last sample on, as pyclarity does.
+
+    Shape: (items, padded), (items, 8) dB HL -> (items, padded).
+    """
+    points = fft_length(extent.longest + _NALR_ORDER, 2)
+    taps = torch.from_numpy(np.stack([_nalr(ear) for ear in ears]))
+    fir = taps.to(signals.device, signals.dtype, non_blocking=signals.device.type != "cpu")
+    spectrum = torch.fft.rfft(signals[:, : extent.longest], points) * torch.fft.rfft(fir, points)
+    filtered = torch.fft.irfft(spectrum, points)[:, _NALR_ORDER : _NALR_ORDER + extent.longest]
+    return functional.pad(filtered, (0, extent.padded - extent.longest))

@@ -24,6 +24,7 @@ from torch.nn import functional
 
 from hlsim.checks import Lengths, check_lengths, check_rate, check_waveform
 from hlsim.dsp.fft import power, rfft
+from hlsim.metrics.ear.model import Extent, integers
 from hlsim.torchtools import constant_like
 
 _RATE = 10000  # Hz that the measure works at
@@ -44,7 +45,7 @@ _TOGETHER_CPU, _TOGETHER_GPU = 2**17, 2**25
 
 # of the left and the right ear's power and the real and the imaginary part of their cross-spectrum
 _PAIRS = ((0, 0), (0, 1), (0, 2), (0, 3), (1, 1), (1, 2), (1, 3), (2, 2), (2, 3), (3, 3))
-_EARS = [_PAIRS.index((0, 0)), _PAIRS.index((1, 1))]
+_EARS = (_PAIRS.index((0, 0)), _PAIRS.index((1, 1)))
 
 
 def mbstoi(
@@ -68,7 +69,7 @@ def mbstoi(
         ValueError: signals of other shapes, too short, not finite; the clean one silent; rate or lengths out of range.
     """
     rate = check_rate(sample_rate)
-    _check(processed, clean)
+    _check_shapes(processed, clean)
     items = clean.shape[:-2]
     ends = [clean.shape[-1]] * items.numel()
     if lengths is not None:
@@ -77,36 +78,40 @@ def mbstoi(
     precision = torch.float32 if processed.device.type == "mps" else torch.float64
     with torch.autocast(processed.device.type, enabled=False):
         signals = torch.stack([clean, processed], -3).to(precision).reshape(-1, 4, clean.shape[-1])
-        frames, count = _without_silence(
-            [_resample(row[:, :end], rate) for row, end in zip(signals, ends, strict=True)]
-        )
+        _check_values(signals)
+        resampled, extent = _resample_items(signals, tuple(ends), rate)
+        frames, counts = _without_silence(resampled, extent)
         envelopes = _band_envelopes(frames.unflatten(1, (2, 2)))
-        # of each item and each start the frames from there on that make a segment
+        # for each item and each start the frames from there on that make a segment
         windows = envelopes.unfold(1, _SEGMENT, 1)
-        segments = count - _SEGMENT
-        starts = torch.arange(windows.shape[1], device=signals.device)
-        item, start = (starts < segments[:, None]).nonzero(as_tuple=True)
+        segments = np.array(counts) - _SEGMENT
         # the last segment of an item is left to the equalisation-cancellation stage, as in the reference
-        single = start < segments[item] - 1
+        item = np.repeat(np.arange(len(segments)), segments)
+        start = np.concatenate([np.arange(count) for count in segments])
+        chosen = np.stack((item, start, start < segments[item] - 1))
         together = _TOGETHER_CPU if signals.device.type == "cpu" else _TOGETHER_GPU
         step = together // (len(_DELAYS) * len(_LEVELS))
+        places = _moved(chosen, signals.device)
         scores = [
-            _correlations(windows[i, s], may)
-            for i, s, may in zip(*(part.split(step) for part in (item, start, single)), strict=True)
+            _correlations(windows[part[0], part[1]], part[2].bool())
+            for part in places.split(step, -1)
         ]
-        total = signals.new_zeros(len(segments)).index_add(0, item, torch.cat(scores))
-        return (total / segments).to(dtype).reshape(items)
+        total = signals.new_zeros(len(segments)).index_add(0, places[0], torch.cat(scores))
+        return (total / _moved(segments, signals.device)).to(dtype).reshape(items)
 
 
-def _check(processed: Tensor, clean: Tensor) -> None:
+def _moved(values: NDArray[np.int64], device: torch.device) -> Tensor:
+    """Return whole numbers on a device, without making the host wait for it."""
+    return torch.from_numpy(values).to(device, non_blocking=device.type != "cpu")
+
+
+def _check_shapes(processed: Tensor, clean: Tensor) -> None:
     for signal, name in ((processed, "processed"), (clean, "clean")):
         check_waveform(signal, name)
         if signal.ndim < 2 or signal.shape[-2] != 2:
             raise ValueError(
                 f"{name} has shape {tuple(signal.shape)}; allowed: (..., 2, time), the left and the right ear"
             )
-        if not bool(signal.detach().isfinite().all()):
-            raise ValueError(f"{name} holds samples that are NaN or infinite")
     if processed.shape != clean.shape:
         raise ValueError(
             f"processed has shape {tuple(processed.shape)}, clean {tuple(clean.shape)}; allowed: equal shapes"
@@ -115,8 +120,41 @@ def _check(processed: Tensor, clean: Tensor) -> None:
         raise ValueError(
             f"processed is on {processed.device}, clean on {clean.device}; allowed: one device"
         )
-    if not bool(clean.detach().flatten(-2).any(-1).all()):
+
+
+def _check_values(signals: Tensor) -> None:
+    """Validate clean and processed signals. The host waits for the device once. Shape: (items, 4, time)."""
+    finite = signals.detach().isfinite().all(-1).all(0)
+    sounding = signals.detach()[:, :2].flatten(1).any(-1).all()
+    values = torch.cat((finite, sounding[None])).tolist()
+    for name, ears in (("processed", values[2:4]), ("clean", values[:2])):
+        if not all(ears):
+            raise ValueError(f"{name} holds samples that are NaN or infinite")
+    if not values[4]:
         raise ValueError("clean is silent, every sample of an item is zero")
+
+
+def _resample_items(signals: Tensor, ends: tuple[int, ...], rate: int) -> tuple[Tensor, Extent]:
+    """Resample items, those of one length together, for the method depends on the length.
+
+    Shape: (items, 4, time) -> (items, 4, longest), zero after the ends.
+    """
+    if min(ends) == max(ends):
+        resampled = _resample(signals[..., : ends[0]], rate)
+        return resampled, Extent((resampled.shape[-1],) * len(ends))
+    by_end: dict[int, list[int]] = {}
+    for item, end in enumerate(ends):
+        by_end.setdefault(end, []).append(item)
+    rows: dict[int, Tensor] = {}
+    for end, members in by_end.items():
+        chosen = signals.index_select(0, integers(tuple(members), signals.device))
+        rows |= zip(members, _resample(chosen[..., :end], rate), strict=True)
+    extent = Extent(tuple(rows[item].shape[-1] for item in range(len(ends))))
+    padded = [
+        functional.pad(rows[item], (0, extent.longest - rows[item].shape[-1]))
+        for item in range(len(ends))
+    ]
+    return torch.stack(padded), extent
 
 
 def _resample(signals: Tensor, rate: int) -> Tensor:
@@ -129,41 +167,42 @@ def _resample(signals: Tensor, rate: int) -> Tensor:
     return torch.fft.irfft(spectrum, points) * (points / time)
 
 
-def _without_silence(signals: list[Tensor]) -> tuple[Tensor, Tensor]:
+def _without_silence(signals: Tensor, extent: Extent) -> tuple[Tensor, list[int]]:
     """Leave out the frames where the clean speech is silent at both ears, and overlap and add the others.
 
-    Shape: (4, time) each, the left and the right ear's clean signal, then the processed -> (items, 4, frames, samples),
-        and how many frames there are of each item, (items,).
+    The host waits for the device once.
+
+    Args:
+        signals: the left and the right ear's clean signal, then the processed ones. Shape: (items, 4, time).
+
+    Returns: (items, 4, frames, samples), and the number of frames of each item.
     """
     # the reference leaves out a frame that ends with the signal
-    frames_of = torch.tensor(
-        [max(0, (signal.shape[-1] - 1 - _FRAME) // _HOP + 1) for signal in signals]
-    )
-    padded = max(_FRAME, *(signal.shape[-1] - 1 for signal in signals))
-    rows = torch.stack(
-        [functional.pad(signal, (0, padded - signal.shape[-1])) for signal in signals]
-    )
+    frames_of = tuple(max(0, (end - 1 - _FRAME) // _HOP + 1) for end in extent.ends)
+    padded = max(_FRAME, extent.longest - 1)
+    rows = functional.pad(signals, (0, max(0, padded - signals.shape[-1])))[..., :padded]
     window = constant_like(rows, _window)
     frames = rows.unfold(-1, _FRAME, _HOP) * window
-    there = torch.arange(frames.shape[2], device=rows.device) < frames_of.to(rows.device)[:, None]
+    places = torch.arange(frames.shape[2], device=rows.device)
+    there = places < integers(frames_of, rows.device)[:, None]
     norms = frames.detach()[:, :2].norm(dim=-1) * there[:, None]
     levels = 20.0 * torch.log10(norms + np.finfo(np.float64).eps)
     active = (levels.amax(-1, keepdim=True) - _RANGE_DB < levels).any(1) & there
-    count = active.sum(-1)
-    if bool((count <= _SEGMENT).any()):
-        worst = int(count.argmin())
+    counts = active.sum(-1).tolist()
+    fewest = min(counts)
+    if fewest <= _SEGMENT:
+        item = f", item {counts.index(fewest)}," if len(counts) > 1 else ""
         raise ValueError(
-            f"clean{f', item {worst},' if len(signals) > 1 else ''} has {_seconds(int(count[worst])):.2g} s of speech "
-            f"within {_RANGE_DB:g} dB of its loudest; allowed: {_seconds(_SEGMENT + 1):.2g} s or more"
+            f"clean{item} has {_seconds(fewest):.2g} s of speech within {_RANGE_DB:g} dB of its loudest; allowed: "
+            f"{_seconds(_SEGMENT + 1):.2g} s or more"
         )
-    longest = int(count.max())
-    order = (~active).byte().argsort(dim=-1, stable=True)[:, :longest]
-    used = torch.arange(longest, device=rows.device) < count[:, None]
+    order = (~active).byte().argsort(dim=-1, stable=True)[:, : max(counts)]
+    used = Extent(tuple(counts)).inside(rows.device)
     kept = frames.take_along_dim(order[:, None, :, None], 2) * used[:, None, :, None]
     hops = functional.pad(kept[..., :_HOP], (0, 0, 0, 1)) + functional.pad(
         kept[..., _HOP:], (0, 0, 1, 0)
     )
-    return torch.cat([hops[..., :-1, :], hops[..., 1:, :]], -1) * window, count
+    return torch.cat([hops[..., :-1, :], hops[..., 1:, :]], -1) * window, counts
 
 
 def _seconds(frames: int) -> float:
@@ -194,7 +233,8 @@ def _correlations(windows: Tensor, single: Tensor) -> Tensor:
     """
     centred = windows - windows.mean(-1, keepdim=True)
     products = centred @ centred.transpose(-1, -2)
-    first, second = zip(*_PAIRS, strict=True)
+    first, second = (integers(places, windows.device) for places in zip(*_PAIRS, strict=True))
+    ears = integers(_EARS, windows.device)
     clean, both, given = (
         (part + part.transpose(-1, -2))[..., first, second]
         for part in (products[..., :4, :4], products[..., :4, 4:], products[..., 4:, 4:])
@@ -204,7 +244,7 @@ def _correlations(windows: Tensor, single: Tensor) -> Tensor:
         place, gain = _best(clean, given, grid)
         nothing = ~(clean.any(-1) & given.any(-1))
         gain = torch.where(nothing, 0.0, gain)
-        left, right = (clean[..., _EARS] / given[..., _EARS]).unbind(-1)
+        left, right = (clean.index_select(-1, ears) / given.index_select(-1, ears)).unbind(-1)
         # NaN, where both signals of an ear are silent, is no better
         alone = (torch.maximum(left, right) > gain) & single[:, None]
         ear = torch.where(left > right, _EARS[0], _EARS[1]).unsqueeze(-1)

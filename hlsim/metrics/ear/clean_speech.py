@@ -1,9 +1,9 @@
-"""A batch of clean speech, checked and brought to Kates' ear, and processed speech that is made to match it."""
+"""Batches of clean speech, validated and brought to Kates' ear, and processed speech that is made to match them."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
@@ -11,45 +11,52 @@ import torch
 from torch import Tensor
 
 from hlsim.audiogram import HIGHEST_LEVEL
+from hlsim.audiogram.devices import on_host
 from hlsim.audiogram.thresholds import AudiogramLike, resolve_thresholds
 from hlsim.calibration import check_full_scale
 from hlsim.checks import Lengths, broadcast_shape, check_lengths, check_rate, check_waveform
 from hlsim.metrics.ear import input as ear_input
 from hlsim.metrics.ear import model as ear_model
-from hlsim.metrics.ear.model import CHANNELS, Extent
+from hlsim.metrics.ear.model import Extent, integers
 from hlsim.metrics.ear.recursions import RATE, middle_ear
 from hlsim.metrics.pair import LOWEST_REFERENCE_SPL, SHORTEST_SECONDS
 
-_LEAST = 384  # samples at 24 kHz: HASQI's segment
-
-_TOGETHER = 2**27  # samples of all channels that a GPU works on at once
+_SHORTEST_PART = 384
+"""Samples at 24 kHz of a segment of HASQI."""
 
 
 class UnscorableError(ValueError):
-    """A clean signal of which no score means anything, for nobody hears enough of it."""
+    """A clean signal that is too soft or too short for a score to mean anything."""
 
 
 @dataclass(frozen=True)
-class CleanItem:
-    """One clean signal, prepared.
+class CleanBatch:
+    """Clean signals that are processed together.
 
     Attributes:
-        index: among the items of the batch, flattened.
-        length: in samples at the rate that it was given at.
-        part: of the signal at 24 kHz that is not silent.
-        spectrum: for the bulk alignment.
-        heard: that part in multiples of 20 uPa, at 24 kHz.
+        items: their place among all items.
+        extent: lengths at the rate of the input.
+        resampled: lengths at 24 kHz.
+        starts: first samples at 24 kHz that are not silence.
+        audible: lengths at 24 kHz from there to the last sample that is not silence.
+        spectrum: spectra for the bulk alignment.
+        signals: the audible parts in multiples of 20 uPa, in double precision. Shape: (items, padded).
     """
 
-    index: int
-    length: int
-    part: slice
+    items: slice
+    extent: Extent
+    resampled: Extent
+    starts: tuple[int, ...]
+    audible: Extent
     spectrum: Tensor
-    heard: Tensor
+    signals: Tensor
 
 
 class CleanSpeech:
-    """A batch of clean signals, checked, at 24 kHz and freed of silent ends; and processed ones made to match."""
+    """Clean signals at 24 kHz without silence at their ends, and processed signals that are made to match.
+
+    On a CPU each item is a batch of its own, because its caches hold no more. On a GPU all items are one batch.
+    """
 
     def __init__(
         self,
@@ -61,66 +68,87 @@ class CleanSpeech:
         name: str,
     ) -> None:
         self._name = name
-        rate = check_rate(sample_rate)
-        full_scale = check_full_scale(full_scale_spl)
+        self._given_rate = check_rate(sample_rate)
+        self._full_scale = check_full_scale(full_scale_spl)
         check_waveform(clean, "clean")
         self.shape, self.time = clean.shape[:-1], clean.shape[-1]
         self.dtype, self.device = torch.promote_types(clean.dtype, torch.float32), clean.device
         ends = [self.time] * self.shape.numel()
         if lengths is not None:
             ends = check_lengths(lengths, clean.shape).flatten().tolist()
-        self._rate = 1000 * round(rate / 1000) if whole_khz else rate
-        self._gain = 10.0 ** (full_scale / 20.0)
+        self._rate = self._given_rate
+        if whole_khz:
+            self._rate = 1000 * round(self._given_rate / 1000)
+        self._gain = 10.0 ** (self._full_scale / 20.0)
         with torch.no_grad():
             # in double precision, for a sample more or less at an end would move all frames
             rows = clean.detach().double().reshape(-1, self.time)
-            self.items = [
-                self._item(i, rows[i, :end], end, full_scale, rate) for i, end in enumerate(ends)
+            self.batches = [
+                self._batch(rows[items], items, Extent(tuple(ends[items])))
+                for items in self._together(len(rows))
             ]
 
-    def _item(
-        self, index: int, signal: Tensor, length: int, full_scale: float, rate: int
-    ) -> CleanItem:
-        name = "clean" if self.shape.numel() == 1 else f"clean, item {index}"
-        if length < SHORTEST_SECONDS * rate:
-            raise ValueError(
-                f"{name} lasts {length / rate:.2g} s; {self._name} needs {SHORTEST_SECONDS} s or more to mean anything"
-            )
-        if not bool(signal.isfinite().all()):
-            raise ValueError(f"{name} holds samples that are NaN or infinite")
-        if not bool(signal.any()):
-            raise UnscorableError(f"{name} is silent, every sample is zero")
-        level = 10.0 * math.log10(max(float(signal.var(correction=0)), 1e-30)) + full_scale
-        if level < LOWEST_REFERENCE_SPL:
-            raise UnscorableError(
-                f"{name} is at {level:.1f} dB SPL with full_scale_spl {full_scale:g}; {self._name} needs "
-                f"{LOWEST_REFERENCE_SPL:g} or more to mean anything"
-            )
-        at_ear = ear_input.to_ear_rate(signal, self._rate) * self._gain
-        part = ear_input.audible_part(at_ear)
-        if (lasts := part.stop - part.start) < _LEAST:
-            raise UnscorableError(
-                f"{name} sounds for {1000.0 * lasts / RATE:.2g} ms alone; {self._name} needs "
-                f"{1000.0 * _LEAST / RATE:g} ms or more to be defined"
-            )
-        return CleanItem(
-            index,
-            length,
-            part,
-            ear_input.spectrum_for_alignment(at_ear.to(self.dtype)),
-            at_ear[part],
+    def _together(self, items: int) -> list[slice]:
+        if self.device.type == "cpu":
+            return [slice(item, item + 1) for item in range(items)]
+        return [slice(0, items)]
+
+    def _batch(self, signals: Tensor, items: slice, extent: Extent) -> CleanBatch:
+        """Validate and prepare signals. The host waits for the device once."""
+        for index, end in enumerate(extent.ends, start=items.start):
+            if end < SHORTEST_SECONDS * self._given_rate:
+                raise ValueError(
+                    f"{self._label(index)} lasts {end / self._given_rate:.2g} s; {self._name} needs {SHORTEST_SECONDS} s "
+                    "or more to mean anything"
+                )
+        signals = extent.cut(signals)
+        variance = extent.mean(extent.centred(signals).square())
+        at_ear = ear_input.to_ear_rate(signals, self._rate, extent) * self._gain
+        first, last = ear_input.audible_ends(at_ear)
+        finite, sounding = signals.isfinite().all(-1), signals.any(-1)
+        summary = torch.stack([one.double() for one in (finite, sounding, variance, first, last)])
+        starts, lasts = [], []
+        for index, values in enumerate(summary.mT.tolist(), start=items.start):
+            self._validate(index, *values)
+            starts.append(int(values[3]))
+            lasts.append(int(values[4]))
+        resampled = ear_input.at_ear_rate(extent, self._rate)
+        audible = Extent(tuple(b - a + 1 for a, b in zip(starts, lasts, strict=True)))
+        spectrum = ear_input.spectrum_for_alignment(at_ear.to(self.dtype), resampled)
+        delays = -integers(tuple(starts), self.device)[:, None]
+        parts = ear_model.shift(
+            at_ear[:, None], delays, resampled.ends, audible.ends, audible.padded
+        )
+        return CleanBatch(
+            items, extent, resampled, tuple(starts), audible, spectrum, parts.squeeze(1)
         )
 
-    def groups(self) -> list[list[CleanItem]]:
-        """Items to be worked on together: one by one on a CPU, many on a GPU."""
-        if self.device.type == "cpu":
-            return [[item] for item in self.items]
-        longest = max(len(item.heard) for item in self.items)
-        step = max(1, _TOGETHER // (CHANNELS * longest))
-        return [self.items[start : start + step] for start in range(0, len(self.items), step)]
+    def _label(self, index: int) -> str:
+        return "clean" if self.shape.numel() == 1 else f"clean, item {index}"
+
+    def _validate(
+        self, index: int, finite: float, sounding: float, variance: float, first: float, last: float
+    ) -> None:
+        """Raise an error unless the score of a signal means something."""
+        label = self._label(index)
+        if not finite:
+            raise ValueError(f"{label} holds samples that are NaN or infinite")
+        if not sounding:
+            raise UnscorableError(f"{label} is silent, every sample is zero")
+        level = 10.0 * math.log10(max(variance, 1e-30)) + self._full_scale
+        if level < LOWEST_REFERENCE_SPL:
+            raise UnscorableError(
+                f"{label} is at {level:.1f} dB SPL with full_scale_spl {self._full_scale:g}; {self._name} needs "
+                f"{LOWEST_REFERENCE_SPL:g} or more to mean anything"
+            )
+        if (length := last - first + 1) < _SHORTEST_PART:
+            raise UnscorableError(
+                f"{label} sounds for {1000.0 * length / RATE:.2g} ms alone; {self._name} needs "
+                f"{1000.0 * _SHORTEST_PART / RATE:g} ms or more to be defined"
+            )
 
     def check(self, processed: Tensor) -> Tensor:
-        """Processed signals as rows. Shape: (..., time) -> (items, time)."""
+        """Validate processed signals and return them as rows. Shape: (..., time) -> (items, time)."""
         check_waveform(processed, "processed")
         if processed.shape != (*self.shape, self.time):
             raise ValueError(
@@ -134,8 +162,12 @@ class CleanSpeech:
             raise ValueError("processed holds samples that are NaN or infinite")
         return processed.reshape(-1, self.time)
 
-    def thresholds(self, audiogram: AudiogramLike) -> Tensor:
-        """Of each item. Returns (items, 8) dB HL."""
+    def thresholds(self, audiogram: AudiogramLike, *, host: bool = False) -> Tensor:
+        """Return the ear of each item. Shape: -> (items, 8) dB HL.
+
+        Args:
+            host: on the CPU. The host waits for the device where the ears come from there.
+        """
         probe = torch.empty((*self.shape, 1), device=self.device)
         ears = resolve_thresholds(None, audiogram, probe, highest=HIGHEST_LEVEL, taker=self._name)
         if broadcast_shape(self.shape, ears.shape[:-1]) != self.shape:
@@ -143,17 +175,31 @@ class CleanSpeech:
                 f"audiograms of shape {tuple(ears.shape)} for signals of {(*self.shape, self.time)}; allowed: one, or "
                 "leading dimensions that broadcast"
             )
+        ears = on_host(ears) if host else ears
         return ears.expand(*self.shape, 8).reshape(-1, 8)
 
-    def matched(self, processed: Tensor, item: CleanItem) -> Tensor:
-        """The part of a processed signal that the clean one's is compared with, at 24 kHz. Shape: (time,) -> (part,)."""
-        at_ear = ear_input.to_ear_rate(processed[: item.length].double(), self._rate) * self._gain
-        delay = ear_input.bulk_delay(item.spectrum, at_ear.detach().to(self.dtype))
-        return ear_input.moved(at_ear, delay, item.part)
+    def matched(self, processed: Tensor, batch: CleanBatch) -> Tensor:
+        """Return the parts of processed signals that are compared with the audible parts of the clean ones.
 
-    def through_middle_ear(self, signals: Sequence[Tensor], extent: Extent) -> Tensor:
-        """Shape: (time,) each -> (items, padded)."""
-        rows = ear_input.stacked(signals, extent.padded).to(self.dtype)
+        Shape: (items, time) of the whole input -> (items of the batch, padded), in multiples of 20 uPa.
+        """
+        signals = batch.extent.cut(processed[batch.items].double())
+        at_ear = ear_input.to_ear_rate(signals, self._rate, batch.extent) * self._gain
+        delays = ear_input.bulk_delays(
+            batch.spectrum, at_ear.detach().to(self.dtype), batch.resampled
+        )
+        delays = (delays - integers(batch.starts, self.device))[:, None]
+        ends, stops = batch.resampled.ends, batch.audible.ends
+        parts = ear_model.shift(at_ear[:, None], delays, ends, stops, batch.audible.padded)
+        return parts.squeeze(1)
+
+    def groups(self, batch: CleanBatch) -> Iterator[slice]:
+        """Items of a batch whose channels are computed together."""
+        return ear_model.item_chunks(batch.audible)
+
+    def through_middle_ear(self, signals: Tensor, extent: Extent) -> Tensor:
+        """Shape: (items, padded or more) -> (items, padded)."""
+        rows = signals[:, : extent.padded].to(self.dtype)
         return middle_ear(self.device, self.dtype)(rows).flatten(-2)
 
 
@@ -162,11 +208,15 @@ Channels = TypeVar("Channels")
 
 
 class ItemGroup(Generic[Channels]):
-    """Items that are worked on together, some channels at a time."""
+    """Items of a batch whose ears are computed together, some channels at a time.
 
-    def __init__(self, signals: CleanSpeech, items: list[CleanItem]) -> None:
-        self._signals, self._items = signals, items
-        self._extent = Extent(tuple(len(item.heard) for item in items))
+    Args:
+        items: their place in the batch.
+    """
+
+    def __init__(self, signals: CleanSpeech, batch: CleanBatch, items: slice) -> None:
+        self._signals, self.items = signals, items
+        self._extent = batch.audible[items]
         self._kept: list[Channels] | None = None
 
     def keep(self) -> None:
@@ -178,7 +228,7 @@ class ItemGroup(Generic[Channels]):
             yield from self._kept
             return
         for chosen in ear_model.channel_chunks(
-            len(self._items), self._extent.padded, self._signals.device
+            len(self._extent.ends), self._extent.padded, self._signals.device
         ):
             yield self._hear(chosen)
 

@@ -8,17 +8,19 @@ in five cosines over frequency; ten band-passes of the cosines' course in time, 
 from __future__ import annotations
 
 import math
-from functools import partial
+from collections.abc import Sequence
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+from torch.nn import functional
 
 from hlsim.dsp.fft import fft_length
 from hlsim.metrics.ear.clean_speech import UnscorableError
-from hlsim.metrics.ear.model import CHANNELS, Extent, shift
+from hlsim.metrics.ear.model import CHANNELS, Extent, integers, shift
 from hlsim.torchtools import constant
 
 STRIDE = 9
@@ -93,16 +95,46 @@ def added(sum_so_far: Course | None, part: Course) -> Course:
     return Course(sum_so_far.loudness + part.loudness, sum_so_far.cosines + part.cosines)
 
 
-def audible_frames(loudness: Tensor) -> Tensor:
-    """Places of the frames that count. Shape: (frames,) -> (kept,).
+def joined(parts: Sequence[Course]) -> Course:
+    """Join the courses of several groups of items. Those that are shorter end in zeros."""
+    if len(parts) == 1:
+        return parts[0]
+    longest = max(part.loudness.shape[-1] for part in parts)
+    return Course(*(_padded_and_joined(tensors, longest) for tensors in zip(*parts, strict=True)))
+
+
+def _padded_and_joined(tensors: Sequence[Tensor], longest: int) -> Tensor:
+    return torch.cat([functional.pad(one, (0, longest - one.shape[-1])) for one in tensors])
+
+
+def audible_frames(loudness: Tensor, extent: Extent) -> tuple[Tensor, Extent]:
+    """Choose the frames that count: those in which the reference exceeds the threshold of hearing.
+
+    The host waits for the device once.
+
+    Args:
+        loudness: ``Course.loudness`` of the reference. Shape: (items, frames).
+        extent: samples of each item.
+
+    Returns: places of the frames of each item, followed by other places, (items, kept), and how many there are of each.
 
     Raises:
-        UnscorableError: there are none or one.
+        UnscorableError: an item has none or one.
     """
-    places = (loudness > 10.0 ** (_SILENCE / 20.0)).nonzero()[:, 0]
-    if len(places) < 2:
+    frames_of = Extent(tuple(-(-end // STRIDE) for end in extent.ends))
+    loudness = frames_of.cut(loudness)
+    audible = loudness > 10.0 ** (_SILENCE / 20.0)
+    counts = audible.sum(-1).tolist()
+    if min(counts) < 2:
         raise UnscorableError("clean is below the threshold of hearing")
-    return places
+    kept = Extent(tuple(counts))
+    places = (~audible).byte().argsort(dim=-1, stable=True)
+    return places[:, : kept.longest], kept
+
+
+def chosen_frames(waves: Tensor, places: Tensor) -> Tensor:
+    """Return the frames at the places of each item. Shape: (items, 5, frames), (items, kept) -> (items, 5, kept)."""
+    return waves.take_along_dim(places[:, None], -1)
 
 
 def _cosines() -> NDArray[np.float64]:
@@ -115,36 +147,40 @@ def _cosines() -> NDArray[np.float64]:
 
 
 class Agreement(NamedTuple):
-    """How the filtered cosines of two signals go together.
+    """How the filtered cosines of two signals correspond.
 
     Attributes:
-        xx, yy, xy: energies of both and their product, without the means. Shape: (10, 5).
-        spectra: of the cosines before the filters. Shape: (5, bins) twice.
-        kept: frames.
+        xx, yy, xy: energies of both and of their product, without the means. Shape: (items, 10, 5).
+        waves: the cosines without their means, before the filters. Shape: (items, 5, kept) twice.
+        spectra: spectra of these. Shape: (items, 5, bins) twice.
+        extent: frames of each item.
     """
 
     xx: Tensor
     yy: Tensor
     xy: Tensor
+    waves: tuple[Tensor, Tensor]
     spectra: tuple[Tensor, Tensor]
-    kept: int
+    extent: Extent
 
 
-def agreement(reference: Tensor, processed: Tensor) -> Agreement:
-    """Filter the cosines' course in time by ten band-passes without delay and compare. Shape: (5, kept) twice."""
-    kept = reference.shape[-1]
-    points = _points(kept)
-    a, b = (
-        torch.fft.rfft(waves - waves.mean(-1, keepdim=True), points)
-        for waves in (reference, processed)
-    )
+def agreement(reference: Tensor, processed: Tensor, extent: Extent) -> Agreement:
+    """Filter the course of the cosines in time by ten band-passes without delay, and compare.
+
+    Shape: (items, 5, kept) twice.
+    """
+    kept, points = extent.longest, _points(extent.longest)
+    waves = extent.centred(reference), extent.centred(processed)
+    a, b = (torch.fft.rfft(one, points) for one in waves)
     sums = []
     for response in constant(_responses, points, dtype=reference.dtype, device=reference.device):
-        x, y = (torch.fft.irfft(spectrum * response, points)[..., :kept] for spectrum in (a, b))
-        x, y = (filtered - filtered.mean(-1, keepdim=True) for filtered in (x, y))
+        x, y = (
+            extent.centred(torch.fft.irfft(spectrum * response, points)[..., :kept])
+            for spectrum in (a, b)
+        )
         sums.append(torch.stack((x.square().sum(-1), y.square().sum(-1), (x * y).sum(-1))))
-    xx, yy, xy = torch.stack(sums, 1)
-    return Agreement(xx, yy, xy, (a, b), kept)
+    xx, yy, xy = torch.stack(sums, 2)
+    return Agreement(xx, yy, xy, waves, (a, b), extent)
 
 
 def _points(kept: int) -> int:
@@ -178,29 +214,29 @@ def _responses(points: int) -> NDArray[np.float64]:
 
 
 def correlation(found: Agreement) -> Tensor:
-    """Magnitude of the correlation by rate, mean over the cosines; 0 where one of them is constant. Returns (10,)."""
+    """Magnitude of the correlation by rate, mean over the cosines; 0 where one of them is constant.
+
+    Returns: (items, 10).
+    """
     there = (found.xx >= _NOTHING) & (found.yy >= _NOTHING)
     norm = torch.where(there, found.xx, 1.0).sqrt() * torch.where(there, found.yy, 1.0).sqrt()
     return torch.where(there, found.xy.abs() / norm, 0.0).mean(-1)
 
 
 def expected_correlation(found: Agreement) -> Tensor:
-    """Mean of ``correlation`` over the noise that the hair cells add to both, without drawing it. Returns (10,).
+    """Mean of ``correlation`` over the noise that the hair cells add to both, without drawing it.
 
     The noise adds to the energies that the correlation is divided by, and what it adds to the product is as often
     negative: the mean and the variance of the quotient are taken to second order, and that of a magnitude is the folded
     normal distribution's mean.
+
+    Returns: (items, 10).
     """
-    kept, xy = found.kept, found.xy
-    fixed = partial(constant, dtype=xy.dtype, device=xy.device)
     variance = NOISE_DB**2
-    noise = variance * fixed(_noise_energy, kept)[:, None]
-    xx, yy = found.xx + noise, found.yy + noise
-    # energies of the filtered cosines filtered again: how far noise of the filters' colour goes along with them
-    twice = fixed(_twice_filtered, _points(kept))
-    a, b = (torch.view_as_real(spectrum) for spectrum in found.spectra)
-    xx2, yy2, xy2 = (twice @ product.sum(-1).mT for product in (a.square(), b.square(), a * b))
-    own = variance**2 * kept * twice.sum(-1, keepdim=True)
+    noise = variance * _noise_energies(found)
+    xx, yy, xy = found.xx + noise, found.yy + noise, found.xy
+    xx2, yy2, xy2, own = _energies_filtered_twice(found)
+    own = variance**2 * own
     spread_x = (4.0 * variance * xx2 + 2.0 * own) / xx.square()
     spread_y = (4.0 * variance * yy2 + 2.0 * own) / yy.square()
     norm = xx.sqrt() * yy.sqrt()
@@ -218,6 +254,53 @@ def expected_correlation(found: Agreement) -> Tensor:
     return (folded + mean * torch.erf(mean / (2.0 * spread).sqrt())).mean(-1)
 
 
+def _noise_energies(found: Agreement) -> Tensor:
+    """``_noise_energy`` of each item. Shape: -> (items, 10, 1)."""
+    energies = torch.from_numpy(np.stack([_noise_energy(kept) for kept in found.extent.ends]))
+    device = found.xy.device
+    energies = energies.to(device, found.xy.dtype, non_blocking=device.type != "cpu")
+    return energies.unsqueeze(-1)
+
+
+def _energies_filtered_twice(found: Agreement) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Energies of the filtered cosines filtered again, and of white noise.
+
+    They say how far noise of the filters' colour goes along with the cosines. The filters are circular, so that an item
+    is transformed with as many points as it is alone.
+
+    Returns: xx, yy and xy, (items, 10, 5), and that of noise, (items, 10, 1).
+    """
+    device = found.xy.device
+    members: dict[int, list[int]] = {}
+    for item, kept in enumerate(found.extent.ends):
+        members.setdefault(_points(kept), []).append(item)
+    parts: list[tuple[Tensor, ...]] = []
+    for points, items in members.items():
+        a, b = found.spectra
+        if len(members) > 1:
+            chosen = integers(tuple(items), device)
+            kept = max(found.extent.ends[item] for item in items)
+            a, b = (
+                torch.fft.rfft(one.index_select(0, chosen)[..., :kept], points)
+                for one in found.waves
+            )
+        weights = constant(_twice_filtered, points, dtype=found.xy.dtype, device=device)
+        x, y = torch.view_as_real(a), torch.view_as_real(b)
+        energies = [(weights @ product.sum(-1).mT) for product in (x.square(), y.square(), x * y)]
+        counts = integers(tuple(found.extent.ends[item] for item in items), device)
+        own = counts.to(weights)[:, None, None] * weights.sum(-1, keepdim=True)
+        parts.append((*energies, own))
+    if len(parts) == 1:
+        return parts[0]
+    order = [item for items in members.values() for item in items]
+    back = integers(tuple(sorted(range(len(order)), key=order.__getitem__)), device)
+    xx, yy, xy, own = (
+        torch.cat(tensors).index_select(0, back) for tensors in zip(*parts, strict=True)
+    )
+    return xx, yy, xy, own
+
+
+@lru_cache(maxsize=1024)
 def _noise_energy(kept: int) -> NDArray[np.float64]:
     """Energy of each filter's output for white noise of variance 1, both without their means. Returns (10,)."""
     energies = []

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
-from hlsim.metrics.ear.model import CHANNELS, centre_frequencies
+from hlsim.metrics.ear.model import CHANNELS, Extent, centre_frequencies, integers
 from hlsim.metrics.ear.recursions import RATE
 from hlsim.torchtools import constant
 
@@ -35,15 +35,23 @@ def segments(time: int) -> int:
     return 1 + time // SEGMENT + (time - _HALF) // SEGMENT
 
 
-def smoothed(levels: Tensor) -> Tensor:
-    """Hann-weighted means. Shape: (channels, time) -> (channels, segments)."""
-    count = segments(levels.shape[-1])
+def segments_of(extent: Extent) -> Extent:
+    """Return the number of segments of each item."""
+    return Extent(tuple(segments(end) for end in extent.ends))
+
+
+def smoothed(levels: Tensor, extent: Extent) -> Tensor:
+    """Compute Hann-weighted means. Shape: (items, channels, longest) -> (items, channels, segments)."""
+    counts = segments_of(extent)
     window = constant(_halves, dtype=levels.dtype, device=levels.device)
-    rising, falling = (levels[..., : count * _HALF].unflatten(-1, (count, _HALF)) @ window).unbind(
-        -1
-    )
+    halves = levels[..., : counts.longest * _HALF].unflatten(-1, (counts.longest, _HALF))
+    rising, falling = (halves @ window).unbind(-1)
     inner = 0.5 * (rising[..., 1:-1] + falling[..., 2:])
-    return torch.cat((falling[..., :1], inner, rising[..., -1:]), -1)
+    means = torch.cat((falling[..., :1], inner, rising[..., -1:]), -1)
+    if counts.is_even:
+        return means
+    is_last = _segment_kinds(counts, levels.device)[:, None] == _LAST
+    return counts.cut(torch.where(is_last, rising, means))
 
 
 def _halves() -> NDArray[np.float64]:
@@ -53,22 +61,37 @@ def _halves() -> NDArray[np.float64]:
     return halves
 
 
-def envelope_correlation(reference: Tensor, processed: Tensor) -> Tensor:
-    """Mean magnitude of the correlation of five cosines over frequency. Shape: (32, segments) twice -> ().
+def envelope_correlation(reference: Tensor, processed: Tensor, counts: Extent) -> Tensor:
+    """Mean magnitude of the correlation of five cosines over frequency.
 
-    Segments that are silent in the reference are left out; 0 where no two are left.
+    Segments that are silent in the reference are left out; the value is 0 where no two are left. The host waits for the
+    device once.
+
+    Args:
+        reference, processed: by ``smoothed``. Shape: (items, 32, segments).
+        counts: segments of each item.
+
+    Returns: (items,).
     """
-    loudness = (reference.detach() * (math.log(10.0) / 20.0)).exp().mean(0)
-    kept = loudness > 10.0 ** (_SILENCE / 20.0)
-    if int(kept.sum()) < 2:
-        return processed.sum() * 0.0
+    places = _loud(reference, counts)
+    loud = Extent(tuple(places.sum(-1).tolist()))
+    kept = Extent(tuple(max(1, count) for count in loud.ends))
+    order = (~places).byte().argsort(dim=-1, stable=True)[:, None, : kept.longest]
     basis = constant(_cosines, dtype=reference.dtype, device=reference.device)
-    x, y = (basis @ levels[:, kept] for levels in (reference, processed))
-    x, y = (cosines - cosines.mean(-1, keepdim=True) for cosines in (x, y))
+    x, y = (
+        kept.centred(basis @ levels.take_along_dim(order, -1)) for levels in (reference, processed)
+    )
     xx, yy, xy = x.square().sum(-1), y.square().sum(-1), (x * y).sum(-1)
     there = (xx >= _NOTHING) & (yy >= _NOTHING)
     norm = torch.where(there, xx, 1.0).sqrt() * torch.where(there, yy, 1.0).sqrt()
-    return torch.where(there, xy.abs() / norm, 0.0).mean()
+    correlation = torch.where(there, xy.abs() / norm, 0.0).mean(-1)
+    return torch.where(integers(loud.ends, reference.device) < 2, 0.0, correlation)
+
+
+def _loud(levels: Tensor, counts: Extent) -> Tensor:
+    """Whether a segment exceeds the threshold of hearing. Shape: (items, 32, segments) -> (items, segments), bool."""
+    loudness = (levels.detach() * (math.log(10.0) / 20.0)).exp().mean(1)
+    return counts.inside(levels.device) & (loudness > 10.0 ** (_SILENCE / 20.0))
 
 
 def _cosines() -> NDArray[np.float64]:
@@ -79,46 +102,67 @@ def _cosines() -> NDArray[np.float64]:
 # -- motion ------------------------------------------------------------------------------------------------------------
 
 
-def segment_spectra(motion: Tensor) -> tuple[Tensor, Tensor]:
-    """Of windowed segments without their means, and their mean squares as of an envelope.
+_FIRST, _INNER, _LAST = 0, 1, 2
+"""Kinds of segments: the first and the last one are half as long."""
 
-    Shape: (channels, time) -> (channels, segments, bins), (channels, segments).
+
+def _segment_kinds(counts: Extent, device: torch.device) -> Tensor:
+    """Shape: -> (items, segments), int64."""
+    places = torch.arange(counts.longest, device=device)
+    is_last = places == integers(counts.ends, device)[:, None] - 1
+    return torch.where(is_last, _LAST, (places > 0).long())
+
+
+def segment_spectra(motion: Tensor, extent: Extent) -> tuple[Tensor, Tensor]:
+    """Compute spectra of windowed segments without their means, and mean squares of the segments as of an envelope.
+
+    Args:
+        motion: zero after the end of each item. Shape: (items, channels, longest).
+
+    Returns: (items, channels, segments, bins), (items, channels, segments).
     """
-    time = motion.shape[-1]
-    count = segments(time)
+    counts = segments_of(extent)
     fixed = partial(constant, dtype=motion.dtype, device=motion.device)
-    window = fixed(_windows, count)
-    padded = functional.pad(motion, (0, max(0, (count + 1) * _HALF - time)))
-    parts = padded.unfold(-1, SEGMENT, _HALF)[..., :count, :] * window
-    inside = fixed(_inside, count)
+    kinds = _segment_kinds(counts, motion.device)
+    window, inside = (fixed(make)[kinds][:, None] for make in (_windows, _inside))
+    behind = (counts.longest + 1) * _HALF - motion.shape[-1]
+    padded = functional.pad(motion, (0, max(0, behind)))
+    parts = padded.unfold(-1, SEGMENT, _HALF)[..., : counts.longest, :] * window
     means = parts.sum(-1, keepdim=True) / inside.sum(-1, keepdim=True)
     parts = torch.addcmul(parts, means, inside, value=-1.0)
     energy = parts.square().sum(-1) / window.square().sum(-1)
-    return torch.fft.rfft(parts, _POINTS), 2.0 * energy
+    return torch.fft.rfft(parts, _POINTS), counts.cut(2.0 * energy)
 
 
-def _windows(count: int) -> NDArray[np.float64]:
-    """One a segment: the first is the falling half, the last the rising half, padded. Returns (count, SEGMENT)."""
+def _windows() -> NDArray[np.float64]:
+    """Windows by kind: the first is the falling half, the last the rising half, padded. Returns (3, SEGMENT)."""
     window = np.hanning(SEGMENT)
-    windows = np.tile(window, (count, 1))
-    windows[0] = np.concatenate((window[_HALF:], np.zeros(_HALF)))
-    windows[-1] = np.concatenate((window[:_HALF], np.zeros(_HALF)))
-    return windows
+    falling = np.concatenate((window[_HALF:], np.zeros(_HALF)))
+    rising = np.concatenate((window[:_HALF], np.zeros(_HALF)))
+    return np.stack((falling, window, rising))
 
 
-def _inside(count: int) -> NDArray[np.float64]:
-    inside = np.ones((count, SEGMENT))
-    inside[[0, -1], _HALF:] = 0.0
+def _inside() -> NDArray[np.float64]:
+    """1 for the samples of a segment, by kind. Returns (3, SEGMENT)."""
+    inside = np.ones((3, SEGMENT))
+    inside[[_FIRST, _LAST], _HALF:] = 0.0
     return inside
 
 
-def coherence(reference: tuple[Tensor, Tensor], processed: tuple[Tensor, Tensor]) -> Tensor:
-    """Largest normalised cross-covariance over lags of up to 1 ms, 0 to 1.
+def coherence(
+    reference: tuple[Tensor, Tensor], processed: tuple[Tensor, Tensor], counts: Extent
+) -> Tensor:
+    """Compute the largest normalised cross-covariance over lags of up to 1 ms, 0 to 1.
 
-    Shape: ``segment_spectra`` of both -> (channels, segments).
+    Args:
+        reference, processed: by ``segment_spectra``.
+        counts: segments of each item.
+
+    Returns: (items, channels, segments).
     """
     (x, xx), (y, yy) = reference, processed
-    weights = constant(_lag_weights, x.shape[-2], dtype=xx.dtype, device=xx.device)
+    kinds = _segment_kinds(counts, xx.device)
+    weights = constant(_lag_weights, dtype=xx.dtype, device=xx.device)[kinds][:, None]
     covariance = torch.fft.irfft(x * y.conj(), _POINTS)
     near = torch.cat((covariance[..., : _LAGS + 1], covariance[..., -_LAGS:]), -1) * weights
     there = (xx > 2.0 * _NOTHING) & (yy > 2.0 * _NOTHING)
@@ -126,32 +170,33 @@ def coherence(reference: tuple[Tensor, Tensor], processed: tuple[Tensor, Tensor]
     return torch.where(there, near.abs().amax(-1) / norm, 0.0).clamp(0.0, 1.0)
 
 
-def _lag_weights(count: int) -> NDArray[np.float64]:
-    """The windows' autocorrelations inverted, at lags 0 to 24 and -24 to -1: (count, 49)."""
+def _lag_weights() -> NDArray[np.float64]:
+    """Inverse autocorrelations of the windows at lags 0 to 24 and -24 to -1. Returns (3, 49)."""
     lags = [*range(_LAGS + 1), *range(_LAGS, 0, -1)]
-    made = []
-    for window in _windows(3):
-        both = np.correlate(window, window, "full")[SEGMENT - 1 :]
-        made.append(1.0 / both[lags])
-    first, inner, last = made
-    return np.stack([first, *[inner] * (count - 2), last])
+    rows = []
+    for window in _windows():
+        autocorrelation = np.correlate(window, window, "full")[SEGMENT - 1 :]
+        rows.append(1.0 / autocorrelation[lags])
+    return np.stack(rows)
 
 
-def synchrony(coherences: Tensor, mean_square: Tensor) -> Tensor:
-    """Mean of what lies over threshold in the reference, less where hair cells lose synchrony. Returns ().
-
-    Shape: (32, segments) twice.
+def synchrony(coherences: Tensor, mean_square: Tensor, counts: Extent) -> Tensor:
+    """Mean of what lies over threshold in the reference, less where hair cells lose synchrony.
 
     Args:
-        mean_square: of the reference's segments.
+        coherences: (items, 32, segments).
+        mean_square: that of the reference's segments. Shape: (items, 32, segments).
+        counts: segments of each item.
+
+    Returns: (items,); 0 where no two segments are over threshold.
     """
     rms = mean_square.detach().sqrt()
-    loud = (rms * (math.log(10.0) / 20.0)).exp().mean(0) > 10.0 ** (_SILENCE / 20.0)
+    loud = _loud(rms, counts)
     weights = constant(_synchronous, dtype=rms.dtype, device=rms.device)[:, None]
-    weights = weights * ((rms > _SILENCE) & loud)
-    if int(loud.sum()) < 2:
-        return coherences.sum() * 0.0
-    return (weights * coherences).sum() / weights.sum().clamp_min(_NOTHING)
+    weights = weights * ((rms > _SILENCE) & loud[:, None])
+    total = (weights * coherences).sum((-2, -1))
+    mean = total / weights.sum((-2, -1)).clamp_min(_NOTHING)
+    return torch.where(loud.sum(-1) < 2, 0.0, mean)
 
 
 def _synchronous() -> NDArray[np.float64]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 import numpy as np
 import scipy
@@ -13,6 +12,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from hlsim.dsp.fft import fft_length
+from hlsim.metrics.ear.model import Extent
 from hlsim.metrics.ear.recursions import RATE
 from hlsim.torchtools import constant
 
@@ -26,35 +26,44 @@ _HEADROOM = RATE // 500
 _AUDIBLE_PART = 0.001  # of the reference's maximum: what is quieter at its ends is cut
 
 
-def to_ear_rate(signal: Tensor, sample_rate: int) -> Tensor:
-    """One signal at 24 kHz, its RMS kept; from rates above, the RMS of what lies below 10.5 kHz.
+def at_ear_rate(extent: Extent, sample_rate: int) -> Extent:
+    """Return the lengths of resampled items."""
+    return Extent(tuple(-(-end * RATE // sample_rate) for end in extent.ends))
 
-    A Kaiser-windowed sinc as in scipy's ``resample_poly``; the level is matched afterwards, as Kates does.
 
-    Shape: (time,) -> (ceil(time * 24000 / sample_rate),).
+def to_ear_rate(signals: Tensor, sample_rate: int, extent: Extent) -> Tensor:
+    """Resample signals to 24 kHz and keep their RMS; from higher rates, the RMS of what lies below 10.5 kHz.
+
+    The filter is a Kaiser-windowed sinc as in scipy's ``resample_poly``. The level is matched afterwards, as Kates does.
+
+    Args:
+        signals: zero after the end of each item.
+        extent: lengths of the items at ``sample_rate``.
+
+    Shape: (items, time) -> (items, longest of ``at_ear_rate(extent, sample_rate)``), zero after the ends.
     """
     if sample_rate == RATE:
-        return signal
+        return signals
+    resampled_extent = at_ear_rate(extent, sample_rate)
     common = math.gcd(RATE, sample_rate)
     up, down = RATE // common, sample_rate // common
-    length = -(-signal.shape[-1] * up // down)
     periods = max(1, _TOGETHER // up)
-    kernel = constant(_kernel, up, down, periods, dtype=signal.dtype, device=signal.device)
+    kernel = constant(_kernel, up, down, periods, dtype=signals.dtype, device=signals.device)
     inputs, outputs = kernel.shape
-    rows = -(-length // outputs)
+    rows = -(-resampled_extent.longest // outputs)
     lead = _reach(up, down)
-    padded = functional.pad(
-        signal, (lead, max(0, (rows - 1) * down * periods + inputs - lead - len(signal)))
-    )
-    resampled = (padded.unfold(-1, inputs, down * periods)[:rows] @ kernel).flatten()[:length]
+    behind = (rows - 1) * down * periods + inputs - lead - signals.shape[-1]
+    padded = functional.pad(signals, (lead, max(0, behind)))
+    windows = padded.unfold(-1, inputs, down * periods)[:, :rows]
+    resampled = resampled_extent.cut((windows @ kernel).flatten(1))
     if sample_rate < RATE:
-        powers = (signal.square().mean(), resampled.square().mean())
+        before, after = extent.mean(signals.square()), resampled_extent.mean(resampled.square())
     else:
-        powers = (_power_below(signal, sample_rate), _power_below(resampled, RATE))
-    heard = powers[1] > 0.0  # of silence there is no level to match
-    return (
-        resampled * torch.where(heard, powers[0] / torch.where(heard, powers[1], 1.0), 1.0).sqrt()
-    )
+        before = _power_below(signals, sample_rate, extent)
+        after = _power_below(resampled, RATE, resampled_extent)
+    is_audible = after > 0.0  # silence has no level to match
+    ratio = torch.where(is_audible, before / torch.where(is_audible, after, 1.0), 1.0)
+    return resampled * ratio.sqrt().unsqueeze(-1)
 
 
 def _reach(up: int, down: int) -> int:
@@ -74,13 +83,15 @@ def _kernel(up: int, down: int, periods: int) -> NDArray[np.float64]:
     return np.where(inside, taps[np.clip(place, 0, 2 * half)], 0.0)
 
 
-def _power_below(signal: Tensor, rate: int) -> Tensor:
-    """Mean power of what lies below 10.5 kHz, by Kates' Chebyshev filter of seventh order."""
-    time = signal.shape[-1]
-    points = fft_length(time + _RING, 2)
-    response = constant(_chebyshev, rate, points, dtype=torch.complex128, device=signal.device)
-    spectrum = torch.fft.rfft(signal, points) * response.to(signal.dtype.to_complex())
-    return torch.fft.irfft(spectrum, points)[:time].square().mean()
+def _power_below(signals: Tensor, rate: int, extent: Extent) -> Tensor:
+    """Mean power of what lies below 10.5 kHz, by Kates' Chebyshev filter of seventh order.
+
+    Shape: (items, time) -> (items,).
+    """
+    points = fft_length(extent.longest + _RING, 2)
+    response = constant(_chebyshev, rate, points, dtype=torch.complex128, device=signals.device)
+    spectrum = torch.fft.rfft(signals, points) * response.to(signals.dtype.to_complex())
+    return extent.mean(torch.fft.irfft(spectrum, points).square())
 
 
 def _chebyshev(rate: int, points: int) -> NDArray[np.complex128]:
@@ -91,47 +102,39 @@ def _chebyshev(rate: int, points: int) -> NDArray[np.complex128]:
     return response
 
 
-def audible_part(reference: Tensor) -> slice:
-    """Where a reference begins and ends, silence left out. Shape: (time,)."""
-    loud = reference.detach().abs()
-    places = (loud > _AUDIBLE_PART * loud.max()).nonzero()
-    return slice(int(places[0]), int(places[-1]) + 1)
+def audible_ends(references: Tensor) -> tuple[Tensor, Tensor]:
+    """First and last sample of each reference that is not silence. Shape: (items, time) -> (items,) twice."""
+    magnitude = references.detach().abs()
+    time = references.shape[-1]
+    loud = magnitude > _AUDIBLE_PART * magnitude.amax(-1, keepdim=True)
+    places = torch.arange(time, device=references.device)
+    return torch.where(loud, places, time).amin(-1), torch.where(loud, places, -1).amax(-1)
 
 
-def spectrum_for_alignment(signal: Tensor) -> Tensor:
-    """Of a signal without its mean, long enough for lags of its whole length. Shape: (time,) -> (bins,)."""
-    steady = signal.detach() - signal.detach().mean()
-    return torch.fft.rfft(steady, fft_length(2 * signal.shape[-1], 2))
+def spectrum_for_alignment(signals: Tensor, extent: Extent) -> Tensor:
+    """Spectra of signals without their means, fine enough for lags of their whole length.
+
+    Shape: (items, time) -> (items, bins).
+    """
+    points = fft_length(2 * extent.longest, 2)
+    return torch.fft.rfft(extent.centred(signals.detach()), points)
 
 
-def bulk_delay(reference_spectrum: Tensor, processed: Tensor) -> int:
-    """Samples by which the processed signal is to be moved, later where positive: to 2 ms behind the reference.
+def bulk_delays(reference_spectrum: Tensor, processed: Tensor, extent: Extent) -> Tensor:
+    """Samples by which processed signals are to be moved, later where positive: to 2 ms behind the reference.
 
-    By the largest magnitude of the cross-covariance; of equal ones the first.
+    The largest magnitude of the cross-covariance decides, and the first one of several that are equal.
 
     Args:
-        reference_spectrum: by ``spectrum_for_alignment``, of a reference as long as the processed signal.
+        reference_spectrum: returned by ``spectrum_for_alignment`` for references of the same lengths.
+        processed: (items, time).
+
+    Returns: (items,), int64.
     """
-    time, points = processed.shape[-1], fft_length(2 * processed.shape[-1], 2)
+    time, points = extent.longest, fft_length(2 * extent.longest, 2)
     with torch.no_grad():
-        spectrum = reference_spectrum * spectrum_for_alignment(processed).conj()
+        spectrum = reference_spectrum * spectrum_for_alignment(processed, extent).conj()
         covariance = torch.fft.irfft(spectrum, points).abs()
         # by ascending lag, from 1 - time to time - 1
-        place = int(torch.cat((covariance[points - time + 1 :], covariance[:time])).argmax())
-    return place - (time - 1) + _HEADROOM
-
-
-def moved(signal: Tensor, delay: int, part: slice) -> Tensor:
-    """A part of a signal moved later by ``delay`` samples (earlier where negative), with zeros for what is not there."""
-    time = signal.shape[-1]
-    start, stop = part.start - delay, part.stop - delay
-    inside = signal[..., min(max(start, 0), time) : max(min(stop, time), 0)]
-    before = min(max(-start, 0), stop - start)
-    return functional.pad(inside, (before, stop - start - before - inside.shape[-1]))
-
-
-def stacked(signals: Sequence[Tensor], length: int) -> Tensor:
-    """Signals of several lengths in one tensor, silent after their ends. Shape: (time,) each -> (items, length)."""
-    return torch.stack(
-        [functional.pad(signal, (0, length - signal.shape[-1])) for signal in signals]
-    )
+        by_lag = torch.cat((covariance[:, points - time + 1 :], covariance[:, :time]), -1)
+        return by_lag.argmax(-1) - (time - 1) + _HEADROOM

@@ -16,6 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -50,7 +51,7 @@ _WIDEST_LOSS = 100.0  # dB HL of the control filters
 
 _LONGEST_LAG = 2400  # samples by which a channel may be moved: 100 ms
 
-_ON_CPU, _ON_GPU = 2**19, 2**27  # samples that are worked on together
+_ON_CPU, _ON_GPU = 2**19, 2**25  # samples of all channels that are processed together
 
 
 def centre_frequencies() -> NDArray[np.float64]:
@@ -88,16 +89,16 @@ class HairCells:
     def __getitem__(self, channels: slice) -> HairCells:
         return HairCells(*(field[..., channels] for field in vars(self).values()))
 
-    def items(self, chosen: Sequence[int]) -> HairCells:
-        """Of some of the items of (items, 32)."""
-        return HairCells(*(field[list(chosen)] for field in vars(self).values()))
+    def items(self, chosen: slice) -> HairCells:
+        """Return those of some items. Shape of all: (items, 32)."""
+        return HairCells(*(field[chosen] for field in vars(self).values()))
 
 
 def hair_cells(thresholds: Tensor) -> HairCells:
     """Shares a loss out to outer and inner hair cells, after Moore et al. 1999, JASA 106. Shape: (..., 8) dB HL."""
-    places = [FREQUENCIES.index(hz) for hz in AUDIOMETRIC_HZ]
+    places = integers(tuple(FREQUENCIES.index(hz) for hz in AUDIOMETRIC_HZ), thresholds.device)
     between = constant(_interpolation, dtype=torch.float64, device=thresholds.device)
-    loss = (thresholds.detach().double()[..., places] @ between).clamp_min(0.0)
+    loss = (thresholds.detach().double().index_select(-1, places) @ between).clamp_min(0.0)
     normal = torch.linspace(1.25, 3.5, CHANNELS, dtype=torch.float64, device=loss.device)
     most = 70.0 * (1.0 - 1.0 / normal)  # outer hair cells' loss without any compression left
     outer = torch.minimum(0.8 * loss, most)
@@ -119,15 +120,25 @@ def _widest(device: torch.device) -> Tensor:
     return hair_cells(torch.full((8,), _WIDEST_LOSS, device=device)).bandwidth
 
 
+@lru_cache(maxsize=64)
+def integers(values: tuple[int, ...], device: torch.device) -> Tensor:
+    """Return whole numbers as a tensor, without making the host wait for the device. Shape: (len(values),)."""
+    with torch.inference_mode(False):  # or training could not use what it keeps
+        return torch.tensor(values).to(device, non_blocking=device.type != "cpu")
+
+
 @dataclass(frozen=True)
 class Extent:
-    """How long the items of a batch are.
+    """Lengths of the items of a padded batch.
 
     Args:
-        ends: samples of each.
+        ends: number of samples of each item.
     """
 
     ends: tuple[int, ...]
+
+    def __getitem__(self, items: slice) -> Extent:
+        return Extent(self.ends[items])
 
     @property
     def longest(self) -> int:
@@ -139,18 +150,40 @@ class Extent:
         return -(-self.longest // BLOCK) * BLOCK
 
     def cut(self, signal: Tensor) -> Tensor:
-        """Up to the longest end, silent after each item's. Shape: (items, ..., padded) -> (items, ..., longest)."""
+        """Cut the padding off, and set to zero what follows the end of each item.
+
+        Shape: (items, ..., padded) -> (items, ..., longest).
+        """
         signal = signal[..., : self.longest]
-        if min(self.ends) == self.longest:
+        if self.is_even:
             return signal
-        places = torch.arange(self.longest, device=signal.device)
-        ends = torch.tensor(self.ends, device=signal.device).view(-1, *[1] * (signal.ndim - 1))
-        return torch.where(places < ends, signal, 0.0)
+        inside = self.inside(signal.device).view(-1, *[1] * (signal.ndim - 2), self.longest)
+        return torch.where(inside, signal, 0.0)
 
     def mean(self, signal: Tensor) -> Tensor:
-        """Over each item's time. Shape: (items, ..., padded) -> (items, ...)."""
-        ends = torch.tensor(self.ends, dtype=signal.dtype, device=signal.device)
+        """Mean over the time of each item. Shape: (items, ..., padded) -> (items, ...)."""
+        ends = integers(self.ends, signal.device).to(signal.dtype)
         return self.cut(signal).sum(-1) / ends.view(-1, *[1] * (signal.ndim - 2))
+
+    def centred(self, signal: Tensor) -> Tensor:
+        """Subtract the mean of each item. Shape: (items, ..., padded) -> (items, ..., longest), zero after the ends."""
+        return self.cut(signal[..., : self.longest] - self.mean(signal).unsqueeze(-1))
+
+    def inside(self, device: torch.device) -> Tensor:
+        """Whether a sample belongs to its item. Shape: -> (items, longest), bool."""
+        return torch.arange(self.longest, device=device) < integers(self.ends, device)[:, None]
+
+    @property
+    def is_even(self) -> bool:
+        """Whether all items are equally long."""
+        return min(self.ends) == self.longest
+
+
+def item_chunks(extent: Extent) -> Iterator[slice]:
+    """Split the items of a batch on a GPU so that what is computed of all channels fits in memory."""
+    step = max(1, _ON_GPU // (CHANNELS * extent.padded))
+    items = len(extent.ends)
+    return (slice(start, min(start + step, items)) for start in range(0, items, step))
 
 
 def channel_chunks(items: int, samples: int, device: torch.device) -> Iterator[slice]:
@@ -345,7 +378,7 @@ def shift(
 
     Returns: (items, channels, size).
     """
-    moved: Tensor = _Shift.apply(signal, delays.cpu(), tuple(ends), tuple(stops), size)
+    moved: Tensor = _Shift.apply(signal, delays, tuple(ends), tuple(stops), size)
     return moved
 
 
@@ -391,8 +424,8 @@ def _gathered(
 ) -> Tensor:
     device = signal.device
     target = torch.arange(size, device=device)
-    source = target - delays.to(device).unsqueeze(-1)
-    end, stop = (torch.tensor(limits, device=device)[:, None, None] for limits in (ends, stops))
+    source = target - delays.unsqueeze(-1)
+    end, stop = (integers(limits, device)[:, None, None] for limits in (ends, stops))
     inside = (source >= 0) & (source < end) & (target < stop)
     return torch.where(inside, signal.gather(-1, source.clamp(0, signal.shape[-1] - 1)), 0.0)
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
-from hlsim.torchtools import without_modes
+from hlsim.torchtools import constant, without_modes
 
 BLOCK = 64
 """Samples of a block; signals are a whole number of them long."""
@@ -75,7 +75,10 @@ class Recursion(NamedTuple):
 
     def to(self, device: torch.device, dtype: torch.dtype) -> Recursion:
         """The same on a device."""
-        through, inward, outward, step = (part.to(device, dtype) for part in self[:4])
+        waits = device.type == "cpu"
+        through, inward, outward, step = (
+            part.to(device, dtype, non_blocking=not waits) for part in self[:4]
+        )
         return Recursion(through, inward, outward, step, self.memory)
 
 
@@ -157,8 +160,12 @@ def adaptation(device: torch.device, dtype: torch.dtype) -> Recursion:
 # -- gammatone filters -------------------------------------------------------------------------------------------------
 
 _ORDER = 4
-# C(d, e) in row e: how the powers of a distance grow by a block
-_BINOMIALS = [[math.comb(d, e) for d in range(_ORDER)] for e in range(_ORDER)]
+
+
+def _binomials() -> Array:
+    """C(d, e) in row e and column d: how the powers of a distance grow by a block. Returns (4, 4)."""
+    orders = range(_ORDER)
+    return np.array([[float(math.comb(d, e)) for d in orders] for e in orders])
 
 
 def gammatone(decay: Tensor, angle: Tensor, memory: int, dtype: torch.dtype) -> Recursion:
@@ -201,7 +208,7 @@ def gammatone(decay: Tensor, angle: Tensor, memory: int, dtype: torch.dtype) -> 
     weight = after[:, None] * p * (float(BLOCK) ** power)[:, None]
     real, imaginary = weight * turn.cos()[:, None], weight * turn.sin()[:, None]
     outward = torch.cat((torch.cat((real, imaginary), -1), torch.cat((-imaginary, real), -1)), -2)
-    binomials = torch.tensor(_BINOMIALS, dtype=decay.dtype, device=decay.device)
+    binomials = constant(_binomials, dtype=decay.dtype, device=decay.device)
     whole = torch.exp(-BLOCK * decay)[:, None, None] * binomials
     cosine, sine = (whole * wave(BLOCK * angle)[:, None, None] for wave in (torch.cos, torch.sin))
     step = torch.cat((torch.cat((cosine, sine), -1), torch.cat((-sine, cosine), -1)), -2)

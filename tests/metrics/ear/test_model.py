@@ -44,26 +44,36 @@ def of_clarity(name: str = "eb") -> object:
 @pytest.mark.parametrize("rate", [16000, 24000, 32000, 44000, 48000])
 def test_rate_and_alignment_are_those_of_pyclarity(pair: tuple[Tensor, Tensor], rate: int) -> None:
     eb = of_clarity()
-    clean, late = (ear_input.to_ear_rate(signal, rate) for signal in pair)
+    extent = ear_model.Extent((len(pair[0]),))
+    clean, late = (ear_input.to_ear_rate(signal[None], rate, extent) for signal in pair)
     before = [eb.resample_24khz(signal.numpy(), rate)[0] for signal in pair]
-    np.testing.assert_allclose(clean.numpy(), before[0], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(clean[0].numpy(), before[0], rtol=0, atol=1e-12)
     expected = eb.input_align(*before)
-    part = ear_input.audible_part(clean)
-    delay = ear_input.bulk_delay(
-        ear_input.spectrum_for_alignment(clean), -late
-    )  # the sign does not count
-    np.testing.assert_allclose(clean[part].numpy(), expected[0], rtol=0, atol=1e-12)
-    np.testing.assert_allclose(
-        ear_input.moved(late, delay, part).numpy(), expected[1], rtol=0, atol=1e-12
-    )
+    extent = ear_input.at_ear_rate(extent, rate)
+    spectrum = ear_input.spectrum_for_alignment(clean, extent)
+    delay = ear_input.bulk_delays(spectrum, -late, extent)  # the sign does not count
+    first, last = ear_input.audible_ends(clean)
+    length = int(last - first) + 1
+    for signal, moved, wanted in ((clean, -first, expected[0]), (late, delay - first, expected[1])):
+        part = ear_model.shift(signal[None], moved[None], extent.ends, (length,), length)
+        np.testing.assert_allclose(part[0, 0].numpy(), wanted, rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize("delay", [-5000, -7, 0, 3, 5000])
-def test_moved_is_a_slice_of_what_is_there(delay: int) -> None:
-    signal = torch.arange(1.0, 101.0)
-    moved = ear_input.moved(signal, delay, slice(10, 90))
-    wanted = [signal[t - delay].item() if 0 <= t - delay < 100 else 0.0 for t in range(10, 90)]
-    assert moved.tolist() == wanted
+@pytest.mark.parametrize("rate", [16000, 44100, 48000])
+def test_padded_items_are_resampled_and_aligned_as_alone(rate: int) -> None:
+    ends = (3000, 2001)
+    extent = ear_model.Extent(ends)
+    signals = extent.cut(torch.randn(2, 3000, dtype=torch.float64))
+    together = ear_input.to_ear_rate(signals, rate, extent)
+    both = ear_input.at_ear_rate(extent, rate)
+    late = both.cut(together.roll(40, -1))
+    delays = ear_input.bulk_delays(ear_input.spectrum_for_alignment(together, both), late, both)
+    for item, end in enumerate(ends):
+        own = extent[item : item + 1]
+        alone = ear_input.to_ear_rate(signals[item : item + 1, :end], rate, own)[0]
+        torch.testing.assert_close(together[item, : len(alone)], alone, rtol=0, atol=1e-13)
+        assert not together[item, len(alone) :].any()
+    assert (delays + 40 == ear_input._HEADROOM).all()
 
 
 @pytest.mark.parametrize(("dtype", "error"), [(torch.float64, 1e-12), (torch.float32, 1e-6)])
@@ -133,7 +143,8 @@ def test_the_ear_as_a_whole(pair: tuple[Tensor, Tensor], name: str) -> None:
     clean, late = eb.input_align(clean, late)
     extent = ear_model.Extent((len(clean),))
     gain = 10.0 ** (SPL / 20.0)
-    x, y = (ear_input.stacked([torch.tensor(one)], extent.padded) * gain for one in (clean, late))
+    x, y = (torch.tensor(one)[None] * gain for one in (clean, late))
+    x, y = (torch.nn.functional.pad(one, (0, extent.padded - extent.longest)) for one in (x, y))
     x, y = (recursions.middle_ear(CPU, torch.float64)(one).flatten(-2) for one in (x, y))
     normal, ours = (
         ear_model.hair_cells(torch.tensor(a.thresholds)) for a in (Audiogram.standard("NH"), ear)
@@ -175,8 +186,8 @@ def test_frames_and_modulation() -> None:
     ]
     before = ebm.fir_modulation_filter(*six, 2560.0)
     wanted = ebm.modulation_cross_correlation(before[0].copy(), before[1].copy())
-    found = envelopes.agreement(x, y)
-    np.testing.assert_allclose(envelopes.correlation(found).numpy(), wanted, rtol=0, atol=1e-12)
+    found = envelopes.agreement(x[None], y[None], ear_model.Extent((x.shape[-1],)))
+    np.testing.assert_allclose(envelopes.correlation(found)[0].numpy(), wanted, rtol=0, atol=1e-12)
 
 
 def test_channels_may_come_in_chunks() -> None:
@@ -190,7 +201,8 @@ def test_channels_may_come_in_chunks() -> None:
 
 def test_expected_noise_adds_what_noise_has_on_average() -> None:
     noise = torch.randn(300, 5, 900, dtype=torch.float64)
-    energy = torch.stack([envelopes.agreement(one, one).xx.mean(-1) for one in noise]).mean(0)
+    extent = ear_model.Extent((900,) * 300)
+    energy = envelopes.agreement(noise, noise, extent).xx.mean((0, -1))
     torch.testing.assert_close(
         energy, torch.from_numpy(envelopes._noise_energy(900)), rtol=0.05, atol=0.0
     )
