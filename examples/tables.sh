@@ -3,37 +3,26 @@
 # them. Killed, it goes on with the same command. Results are in docs/paper-tables.md, but for the paper's rows at full
 # width, which want a GPU.
 #
-#   [STEPS=10000] [NARROW=4] [JOBS=2] [ROWS="paper/cnn neuro-msbg-lstm:phase=input:seed=1"] \
-#       examples/tables.sh CORPORA OUT [ITEMS]
+#   [STEPS=10000] [JOBS=2] [ROWS="paper/cnn neuro-msbg-lstm:model.phase=input:seed=1"] examples/tables.sh CORPORA OUT [ITEMS]
 #
 # CORPORA holds speech/{train,valid}, noise/{train,valid} and audiograms/{train,valid}.csv.
-# STEPS: of each row, instead of those of its recipe. NARROW: the paper's rows with as
-# many times fewer channels and heads. JOBS: rows trained at a time. ROWS: these alone, compared as Table I; what follows a
-# colon changes the recipe's network, seed or precision.
+# STEPS: steps of each row, instead of those of its recipe. JOBS: rows trained at a time. ROWS: these alone, compared as
+# Table I; what follows a colon changes a setting of the recipe.
 set -euo pipefail
 corpora=$1 out=$2 items=${3:-80}
 here=$(dirname "${BASH_SOURCE[0]}")
 export OMP_NUM_THREADS=${OMP_NUM_THREADS:-1}
-mkdir -p "$out/recipes"
 
 folder() { # row
     basename "${1//[:=]/-}"
 }
 
 train() { # row: recipe[:setting=value[...]]
-    local name=$(folder "$1") given=${1#"${1%%:*}"}${STEPS:+:steps=$STEPS}
-    local recipe="$out/recipes/$name.yaml"
-    awk -v by="$([[ $1 == paper/* ]] && echo "${NARROW:-1}" || echo 1)" -v given="${given#:}" '
-        function of_recipe(name) { return name ~ /^(seed|precision|steps):$/ }  # others are of the network
-        BEGIN { for (n = split(given, pairs, ":"); n; n--) { split(pairs[n], pair, "="); value[pair[1] ":"] = pair[2] } }
-        $1 == "channels:" && by > 1 { $0 = "  channels: " 4 * int($2 / by / 4 + 0.5) }
-        $1 == "heads:" && by > 1 { $0 = "  heads: " int(($2 + by - 1) / by) }  # heads stay as wide
-        /^[a-z]/ { part = $1 }
-        !($1 in value) || part == "weights:"
-        $1 == "model:" { for (name in value) if (!of_recipe(name)) print "  " name, value[name] }
-        END { for (name in value) if (of_recipe(name)) print name, value[name] }
-    ' "$here/${1%%:*}.yaml" >"$recipe"
-    hlsim train-simulator --config "$recipe" --quiet --out "$out/$name" \
+    local parts settings
+    IFS=: read -ra parts <<<"$1${STEPS:+:steps=$STEPS}"
+    settings=("${parts[@]:1}")
+    hlsim train-simulator --recipe "$here/${parts[0]}.yaml" "${settings[@]/#/--recipe.}" \
+        --quiet --out "$out/$(folder "$1")" \
         --speech "$corpora/speech/train" --valid-speech "$corpora/speech/valid" \
         --noise "$corpora/noise/train" --valid-noise "$corpora/noise/valid" \
         --audiograms "$corpora/audiograms/train.csv" --valid-audiograms "$corpora/audiograms/valid.csv"
@@ -62,7 +51,7 @@ train_all() { # recipes, JOBS at a time
 }
 
 if [[ -n ${ROWS:-} ]]; then
-    read -ra rows <<<"$ROWS"
+    read -rd "" -a rows <<<"$ROWS" || true
     train_all "${rows[@]}"
     compare table-1 --levels 65 --seconds 2 -- "${rows[@]}"
     exit

@@ -89,7 +89,7 @@ def test_recipes_are_readable() -> None:
     for path in (ROOT / "examples").glob("*.yaml"):
         settings = yaml.safe_load(path.read_text(encoding="utf-8"))
         if path.name.startswith(("neuro-msbg", "any-teacher")):
-            NeuroConfig.from_dict(SimulatorRecipe.from_dict(settings).model)
+            NeuroConfig.from_dict(SimulatorRecipe(**settings).model)
         else:
-            recipe = CompensatorRecipe.from_dict(settings)
+            recipe = CompensatorRecipe(**settings)
             CONFIGS[recipe.kind].from_dict(recipe.model)

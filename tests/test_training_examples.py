@@ -115,7 +115,7 @@ def test_an_aid_learns_through_a_network_that_learned_another_simulator(
     )
     assert (
         main(
-            ["train-simulator", *teacher, "--config", str(recipe), "--speech", str(train), *common]
+            ["train-simulator", *teacher, "--recipe", str(recipe), "--speech", str(train), *common]
         )
         == 0
     )

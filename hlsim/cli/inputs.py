@@ -142,33 +142,3 @@ def read_compensator(
             f"{', '.join(idle)} of {name}, which has no such slider; allowed: with a hearing aid"
         )
     return compensator, sliders
-
-
-def read_recipe(path: Path | None) -> dict[str, Any]:
-    """The settings in a YAML file. Raises ValueError where it cannot be read, has an alias, or names one twice."""
-    if path is None:
-        return {}
-    yaml: Any = require("yaml", "train")
-
-    class Loader(yaml.SafeLoader):
-        def compose_node(self, parent: Any, index: Any) -> Any:
-            # a few lines of aliases of aliases stand for more values than any memory holds
-            if self.check_event(yaml.AliasEvent):
-                raise ValueError("has an alias (*name); allowed: values written out")
-            return super().compose_node(parent, index)
-
-        def construct_mapping(self, node: Any, deep: bool = False) -> Any:
-            names = [name.value for name, _ in node.value if isinstance(name.value, str)]
-            if twice := next((name for name in names if names.count(name) > 1), None):
-                raise ValueError(f"{twice} is there twice; allowed: once")
-            return super().construct_mapping(node, deep)
-
-    try:
-        data = yaml.load(path.read_text(encoding="utf-8"), Loader)
-    except (OSError, UnicodeDecodeError, RecursionError, yaml.YAMLError) as error:
-        raise ValueError(f"{path}: not readable as YAML ({error})") from error
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
-    if not isinstance(data, dict):
-        raise ValueError(f"{path}: holds no settings; allowed: 'name: value' lines")
-    return data

@@ -53,11 +53,17 @@ class Parser(argparse.ArgumentParser):
         super().__init__(**settings)
         self._declare = declare
         self._examples: tuple[str, ...] = ()
+        self._passed_on: tuple[str, ...] = ()
 
     def runs(self, run: Callable[[argparse.Namespace], None], *examples: str) -> None:
         """Set the function that runs the command, and the arguments that the help shows as examples."""
         self.set_defaults(run=run)
         self._examples = examples
+
+    def passes_on(self, *prefixes: str) -> None:
+        """Keep undeclared options that begin with a prefix, and their values, as ``passed_on``."""
+        self.set_defaults(passed_on=[])
+        self._passed_on = prefixes
 
     def format_help(self) -> str:
         text = super().format_help()
@@ -71,6 +77,9 @@ class Parser(argparse.ArgumentParser):
             declare, self._declare = self._declare, None
             declare(self)
         options, unknown = super().parse_known_args(args, namespace)
+        if unknown and unknown[0].startswith(self._passed_on):
+            options.passed_on = unknown
+            unknown = []
         if unknown:  # reported here, by the command's parser, so that the message names the command
             self.error(f"unrecognized arguments: {' '.join(unknown)}")
         return options, unknown

@@ -7,34 +7,36 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from hlsim.cli.inputs import check_there, need, read_ear, read_recipe
+from hlsim.cli.inputs import check_there, need, read_ear
 from hlsim.cli.options import Parser, count, natural, positive
+from hlsim.cli.recipes import add_recipe, read_recipe
 from hlsim.extras import require
+from hlsim.training.recipes import CompensatorRecipe, SimulatorRecipe
 
 
 def train_simulator(parser: Parser) -> None:
     parser.runs(
         _train_simulator,
-        "--config examples/neuro-msbg.yaml --speech speech/train --valid-speech speech/valid --out runs/simulator",
-        "--config examples/neuro-msbg.yaml --manifest VoiceBank/manifest.csv --out runs/simulator",
+        "--speech speech/train --valid-speech speech/valid --out runs/simulator",
+        "--recipe examples/neuro-msbg-light.yaml --recipe.batch 4 --manifest VoiceBank/manifest.csv --out runs/light",
     )
-    parser.option("--config", Path, "recipe, a YAML file (examples/neuro-msbg.yaml)", required=True)
     parser.teacher("that says what is heard", "msbg")
     _training_options(parser)
+    add_recipe(parser, SimulatorRecipe, "examples/neuro-msbg.yaml")
 
 
 def train_compensator(parser: Parser) -> None:
     parser.runs(
         _train_compensator,
         "--speech speech/train --valid-speech speech/valid --audiogram N3 --out runs/n3",
-        "--config examples/hearing-aid.yaml --start hearing-aid --speech speech --noise noise --out runs/aid",
+        "--recipe examples/hearing-aid.yaml --start hearing-aid --speech speech --noise noise --out runs/aid",
     )
-    parser.option("--config", Path, "recipe, a YAML file (examples/compensator.yaml)")
     parser.audiogram(text="; without it one compensator for all ears is trained")
     parser.option(
         "--simulator", str, "msbg (exact), or a checkpoint's name or folder", "neuro-msbg"
     )
     _training_options(parser)
+    add_recipe(parser, CompensatorRecipe, "examples/compensator.yaml")
 
 
 def _training_options(parser: Parser) -> None:
@@ -49,8 +51,6 @@ def _training_options(parser: Parser) -> None:
     option("--valid-speech", Path, "folder of other speakers to validate on")
     option("--valid-noise", Path, "folder of noises to validate with")
     option("--valid-audiograms", Path, "CSV of ears to validate with")
-    text = "checkpoint whose weights to start from, instead of random ones"
-    option("--start", str, text, metavar="NAME")
     text = "minutes after which to stop, those before a resumption included; the learning rate does not depend on them"
     option("--max-minutes", positive, text)
     option("--device", str, "where to train", "auto", choices=("auto", "cpu", "cuda"))
@@ -64,11 +64,11 @@ def _training_options(parser: Parser) -> None:
 
 def _train_simulator(options: argparse.Namespace) -> None:
     _check(options)
-    from hlsim.training.recipes import SimulatorRecipe
+    recipe = read_recipe(options, SimulatorRecipe)
+    require("lightning", "train")  # if it is broken, this says so
     from hlsim.training.simulator import train_simulator
 
-    arguments = _arguments(options) | {"teacher": options.teacher}
-    folder = train_simulator(recipe=SimulatorRecipe.from_dict(_recipe(options)), **arguments)
+    folder = train_simulator(recipe=recipe, teacher=options.teacher, **_arguments(options))
     print(f"the best checkpoint is in {folder}")
 
 
@@ -76,11 +76,11 @@ def _train_compensator(options: argparse.Namespace) -> None:
     if options.audiogram and (given := _given(vars(options), ("audiograms", "valid_audiograms"))):
         raise ValueError(f"--audiogram with {given}; allowed: one ear, or a CSV of ears, not both")
     _check(options)
+    recipe = read_recipe(options, CompensatorRecipe)
     ear = read_ear(options.audiogram) if options.audiogram else None
+    require("lightning", "train")
     from hlsim.training.compensator import train_compensator
-    from hlsim.training.recipes import CompensatorRecipe
 
-    recipe = CompensatorRecipe.from_dict(_recipe(options))
     folder = train_compensator(
         recipe=recipe, audiogram=ear, simulator=options.simulator, **_arguments(options)
     )
@@ -101,19 +101,13 @@ def _check(options: argparse.Namespace) -> None:
             options.valid_noise,
             options.root,
         ),
-        files=(options.config, options.manifest, options.audiograms, options.valid_audiograms),
+        files=(options.recipe, options.manifest, options.audiograms, options.valid_audiograms),
     )
-    require("lightning", "train")  # one that is there may be broken
 
 
 def _given(options: dict[str, Any], names: Iterable[str]) -> str:
     """Those of the options that were given, as they are written."""
     return ", ".join(f"--{name.replace('_', '-')}" for name in names if options[name] is not None)
-
-
-def _recipe(options: argparse.Namespace) -> dict[str, Any]:
-    """What the recipe's file holds, and what options say instead."""
-    return read_recipe(options.config) | ({} if options.start is None else {"start": options.start})
 
 
 def _arguments(options: argparse.Namespace) -> dict[str, Any]:

@@ -370,7 +370,7 @@ def test_ogg_of_many_channels_is_refused_before_anything_is_loaded(
     "command",
     [
         ["train-compensator", "--speech", "s"],
-        ["train-simulator", "--speech", "s", "--config", "c"],
+        ["train-simulator", "--speech", "s", "--recipe", "c"],
         ["demo"],
     ],
 )
@@ -478,8 +478,8 @@ def test_unequal_file_lists(
 @pytest.mark.parametrize(
     ("command", "module"),
     [
-        (["train-simulator", "--config", "c", "--speech", "s", "--out", "o"], "lightning"),
-        (["train-simulator", "--config", "c", "--speech", "s", "--out", "o"], "tensorboard"),
+        (["train-simulator", "--recipe", "c", "--speech", "s", "--out", "o"], "lightning"),
+        (["train-simulator", "--recipe", "c", "--speech", "s", "--out", "o"], "tensorboard"),
         (["train-compensator", "--speech", "s", "--out", "o"], "tensorboard"),
         (["demo", "--out", "o"], "tensorboard"),
         (
@@ -506,18 +506,6 @@ def test_missing_extra_names_the_install_command(
     extra = {"lightning": "train", "tensorboard": "train"}.get(module, "eval")
     assert module in error and f"pip install 'hlsim[{extra}]'" in error
     assert not list(tmp_path.iterdir())
-
-
-def test_bad_recipe(tmp_path: Path, speech_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    recipe = tmp_path / "recipe.yaml"
-    recipe.write_text("learning_rat: 1\n")
-    out = tmp_path / "out"
-    call = ("train-simulator", "--config", recipe, "--speech", speech_dir / "train", "--out", out)
-    assert "learning_rat" in fails(capsys, *call) and not out.exists()
-    recipe.write_text("batch: 2\n")
-    assert "no such folder" in fails(
-        capsys, *call[:3], "--speech", tmp_path / "nowhere", "--out", out
-    )
 
 
 def test_haspi_report_of_a_manifest(
@@ -555,25 +543,6 @@ def test_haspi_report_of_a_manifest(
         (["--clean", tmp_path], "or a manifest"),
     ):
         assert says in fails(capsys, *call, *extra)
-
-
-def test_a_recipe_of_brackets_or_with_a_name_twice(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    recipe = tmp_path / "recipe.yaml"
-    call = [
-        "train-compensator",
-        "--speech",
-        tmp_path,
-        "--out",
-        tmp_path / "out",
-        "--config",
-        recipe,
-    ]
-    recipe.write_text("[" * 3000)
-    assert "not readable as YAML" in fails(capsys, *call)
-    recipe.write_text("batch: 2\nweights:\n  bands: 1.0\n  bands: 2.0\n")
-    assert "recipe.yaml: bands is there twice; allowed: once" in fails(capsys, *call)
 
 
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])

@@ -41,9 +41,9 @@ def test_help_and_refusals_import_nothing_heavy(tmp_path: Path) -> None:
         ["live", "--audiogram", "N3", "--block-ms", "0"],
         ["prepare", missing, "--out", out],
         ["prepare", str(tmp_path), "--out", out, "--valid-share", "2"],
-        ["train-simulator", "--config", missing, "--speech", str(tmp_path), "--out", out],
-        ["train-simulator", "--config", str(plain), "--out", out],
-        ["train-simulator", "--config", str(plain), "--manifest", missing, "--out", out],
+        ["train-simulator", "--recipe", missing, "--speech", str(tmp_path), "--out", out],
+        ["train-simulator", "--recipe", str(plain), "--out", out],
+        ["train-simulator", "--recipe", str(plain), "--manifest", missing, "--out", out],
         ["train-compensator", "--speech", missing, "--out", out],
         [
             "evaluate-simulator",

@@ -61,7 +61,7 @@ def network(kind: str) -> NeuroMSBG:
 
 
 def recipe(name: str) -> SimulatorRecipe:
-    return SimulatorRecipe.from_dict(yaml.safe_load(SIMULATORS[name].read_text(encoding="utf-8")))
+    return SimulatorRecipe(**yaml.safe_load(SIMULATORS[name].read_text(encoding="utf-8")))
 
 
 @pytest.mark.parametrize("name", MILLIONS)

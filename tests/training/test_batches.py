@@ -160,7 +160,7 @@ def test_options_that_exclude_each_other(
 ) -> None:
     recipe = tmp_path / "recipe.yaml"
     recipe.write_text("batch: 2\n")
-    call = ["train-simulator", "--config", str(recipe), "--out", str(tmp_path / "out")]
+    call = ["train-simulator", "--recipe", str(recipe), "--out", str(tmp_path / "out")]
     for options in (
         [],
         ["--speech", "s", "--manifest", str(manifest)],
