@@ -48,13 +48,13 @@ def evaluate_simulator(parser: Parser) -> None:
     option("--compensator", str, "name or folder of the compensator of the input compensated")
     option("--items", count, "number of items", 240)
     option("--seconds", positive, "length of an item", 3.0)
-    _study_options(parser, listen=1)
+    study_options(parser, listen=1)
 
 
 def _evaluate_simulator(options: argparse.Namespace) -> None:
     if options.compensator and "compensated" not in options.inputs:
         raise ValueError("--compensator has no effect without --inputs compensated")
-    _prepare_study(options)
+    prepare_study(options)
     need("eval", "pystoi")
     check_there(folders=(options.speech, options.noise), files=(options.audiograms,))
     from compensators import load_compensator
@@ -64,7 +64,7 @@ def _evaluate_simulator(options: argparse.Namespace) -> None:
     from hlsim.neuro.config import NEURO_RATE
     from hlsim.report.simulators import simulators_page
 
-    named = _labelled_names(options.names)
+    named = labelled_names(options.names)
     evaluation = evaluate_simulators(
         {label: build_simulator(name, NEURO_RATE, PASCAL_SPL) for label, name in named.items()},
         speech=options.speech,
@@ -111,19 +111,19 @@ def evaluate_compensator(parser: Parser) -> None:
     option("--seconds", positive, "length of an item", 3.0)
     text = "standard ears of the gain curves and tones; with --audiogram that ear is used"
     option("--gain-ears", str.upper, text, GAIN_EARS, nargs="+", metavar="EAR")
-    _study_options(parser)
+    study_options(parser)
 
 
 def _evaluate_compensator(options: argparse.Namespace) -> None:
     if options.audiogram and options.gain_ears != GAIN_EARS:
         raise ValueError("--gain-ears has no effect with --audiogram; leave one of them out")
-    _prepare_study(options)
+    prepare_study(options)
     check_there(folders=(options.speech, options.noise), files=(options.audiograms,))
     from compensators import load_compensator
     from hlsim.evaluation.compensators import evaluate_compensators
     from hlsim.report.compensators import compensators_page
 
-    named = _labelled_names(options.names)
+    named = labelled_names(options.names)
     ear = read_ear(options.audiogram) if options.audiogram else None
     notes = [line for label, name in named.items() for line in other_ear(label, name, ear)]
     for line in notes:
@@ -151,16 +151,12 @@ def _evaluate_compensator(options: argparse.Namespace) -> None:
     finish(evaluation, compensators_page(evaluation, options.listen), options.out)
 
 
-def _labelled_names(texts: list[str]) -> dict[str, str]:
+def labelled_names(texts: list[str]) -> dict[str, str]:
     """Return names by label; ValueError if two have the same label."""
     named = dict(map(labelled, texts))
     if len(named) < len(texts):
         raise ValueError(f"two of {', '.join(texts)} have the same label; write LABEL=NAME")
     return named
-
-
-def tell_page(path: Path) -> None:
-    print(f"The page: {path}")
 
 
 def labelled(text: str) -> tuple[str, str]:
@@ -199,11 +195,11 @@ def haspi_report(parser: Parser) -> None:
     text = "level of every clean file in dB SPL, in place of --full-scale-spl"
     option("--spl", positive, text, group=level)
     option("--scores", Path, "file that scores are stored in (default: OUT/scores.jsonl)")
-    _study_options(parser)
+    study_options(parser)
 
 
 def _haspi_report(options: argparse.Namespace) -> None:
-    _prepare_study(options)
+    prepare_study(options)
     check_there(
         folders=(options.clean, options.before, options.after, options.root),
         files=(options.manifest, options.audiograms),
@@ -233,7 +229,7 @@ def _haspi_report(options: argparse.Namespace) -> None:
     finish(evaluation, report_page(evaluation, options.listen), options.out)
 
 
-def _study_options(parser: Parser, listen: int = 3) -> None:
+def study_options(parser: Parser, listen: int = 3) -> None:
     """Declare the options that all evaluations share."""
     text = (
         "additional measure of your own, package.module:name, imported from the working directory too: a "
@@ -248,7 +244,7 @@ def _study_options(parser: Parser, listen: int = 3) -> None:
     parser.out()
 
 
-def _prepare_study(options: argparse.Namespace) -> None:
+def prepare_study(options: argparse.Namespace) -> None:
     """Check what an evaluation needs before it takes hours."""
     os.environ["MPLBACKEND"] = "Agg"  # a notebook's backend may not exist in this environment
     warnings.formatwarning = lambda message, *_, **__: f"hlsim: warning: {message}\n"

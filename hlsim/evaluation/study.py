@@ -199,6 +199,7 @@ def run_study(
     measures: Sequence[Measure],
     *,
     store: ScoreStore | None = None,
+    is_kept: Callable[[Source, Condition], bool] | None = None,
     jobs: int | None = None,
     dask: str | None = None,
     progress: Progress | None = None,
@@ -212,6 +213,7 @@ def run_study(
     Args:
         store: values of earlier runs, to which new ones are added. A value is computed again only if samples,
             ear, condition or measure have changed.
+        is_kept: whether what a condition has written of an item still exists; if not, it is processed again.
         jobs: number of processes; None takes all cores.
         dask: address of a Dask scheduler whose workers take the place of processes.
         progress: called with the number of finished outputs and of all.
@@ -237,10 +239,11 @@ def run_study(
                 results[number] |= {(condition.name, m.name): str(error) for m in measures}
                 continue
             wanted = []
+            exists = is_kept is None or is_kept(source, condition)
             for measure in measures:
                 place = condition.name, measure.name
                 keys[number][place] = key = _key(digest, condition, measure)
-                record = None if key is None else store.get(key)
+                record = store.get(key) if exists and key is not None else None
                 if record is None:
                     wanted.append(measure)
                 else:

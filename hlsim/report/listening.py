@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -10,6 +11,7 @@ from torch import Tensor
 
 from hlsim.audio import encode_flac
 from hlsim.audiogram import Audiogram
+from hlsim.audiogram.listener import EARS
 from hlsim.calibration import gain_to_pascals, level_spl
 from hlsim.evaluation.measures import perceive
 from hlsim.evaluation.result import Evaluation
@@ -40,12 +42,10 @@ def listening_section(
         shown: names of the conditions to be played, by default all.
     """
     sections = []
-    for title, number in _choose_items(evaluation, count):
+    for title, row in _choose_items(evaluation, count):
         try:
-            signals, item = _perceived(evaluation, number, shown or evaluation.names)
-            sections.append(
-                Section(title, [_about(item)], players=players(signals, item.sample_rate))
-            )
+            signals, ear, rate = _perceived(evaluation, row, shown or evaluation.names)
+            sections.append(Section(title, [_about(ear)], players=players(signals, rate)))
         except Exception as error:  # a page is not lost to a sound
             sections.append(Section(title, [f"It cannot be played: {reason_of(error)}"]))
     if not sections:
@@ -73,8 +73,8 @@ def players(signals: Mapping[str, Tensor], sample_rate: int) -> list[Player]:
     ]
 
 
-def _choose_items(evaluation: Evaluation, count: int) -> list[tuple[str, int]]:
-    """Return titles and numbers of items that are spread over the change of the headline's score."""
+def _choose_items(evaluation: Evaluation, count: int) -> list[tuple[str, Any]]:
+    """Return titles and rows of items that are spread over the change of the headline's score."""
     headline = evaluation.headline
     if headline is None:
         return []
@@ -82,35 +82,43 @@ def _choose_items(evaluation: Evaluation, count: int) -> list[tuple[str, int]]:
     changes = (wide[headline.after] - wide[headline.before]).dropna()
     changes = changes.sort_values(ascending=False, kind="stable")
     places = np.linspace(0, len(changes) - 1, max(0, min(count, len(changes))))
-    sources = evaluation.table.drop_duplicates("item").set_index("item")
+    rows = evaluation.table[evaluation.table["condition"] == headline.after].set_index("item")
     chosen = []
     for place in places.round().astype(int).tolist():
-        row = sources.loc[changes.index[place]]
+        row = rows.loc[changes.index[place]]
         kind = {0: "largest rise", len(changes) - 1: "smallest rise or largest fall"}
         which = kind.get(place, f"rank {place + 1} of {len(changes)}")
         title = f"{row['name']} ({which}: {headline.title} {changes.iloc[place]:+.3f})"
-        chosen.append((title, int(row.get("source", row.name))))
+        chosen.append((title, row))
     return chosen
 
 
 def _perceived(
-    evaluation: Evaluation, number: int, shown: Sequence[str]
-) -> tuple[dict[str, Tensor], Item]:
-    """Return clean speech and what the ear perceives of each condition, in pascals."""
-    item = evaluation.items[number].load()
-    gain = gain_to_pascals(item.full_scale_spl)
-    end = int(LONGEST_SECONDS * item.sample_rate)
-    signals = {"clean speech": item.clean[:end].float() * gain}
+    evaluation: Evaluation, row: Any, shown: Sequence[str]
+) -> tuple[dict[str, Tensor], Audiogram, int]:
+    """Return clean speech and what one ear perceives of each condition, in pascals, the ear and the rate."""
+    item = evaluation.items[int(row.get("source", row.name))].load()
+    rate = item.sample_rate
+    ear, channel = _ear_to_play(item, row)
+    gain, end = gain_to_pascals(item.full_scale_spl), int(LONGEST_SECONDS * rate)
+    signals = {"clean speech": item.clean[channel][..., :end].float() * gain}
     for condition in evaluation.conditions:
         if condition.name in shown:
             with torch.no_grad():
-                output = condition.output(item)[:end].float() * gain
-            name = f"{condition.name}, perceived"
-            signals[name] = perceive(output, item.ear, item.sample_rate)
-    return signals, item
+                output = condition.output(item)[channel][..., :end].float() * gain
+            signals[f"{condition.name}, perceived"] = perceive(output, ear, rate)
+    return signals, ear, rate
 
 
-def _about(item: Item) -> str:
-    assert isinstance(item.ear, Audiogram)
-    thresholds = ", ".join(f"{level:g}" for level in item.ear.thresholds)
-    return f"{item.ear.severity.capitalize()} loss, thresholds {thresholds} dB HL."
+def _ear_to_play(item: Item, row: Any) -> tuple[Audiogram, Any]:
+    """Return the ear of an item, the better one of a listener's two, and the index of its channel."""
+    if isinstance(item.ear, Audiogram):
+        return item.ear, ...
+    name = row["better_ear"]
+    ear: Audiogram = getattr(item.ear, name)
+    return ear, EARS.index(name)
+
+
+def _about(ear: Audiogram) -> str:
+    thresholds = ", ".join(f"{level:g}" for level in ear.thresholds)
+    return f"{ear.severity.capitalize()} loss, thresholds {thresholds} dB HL."

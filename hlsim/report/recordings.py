@@ -115,22 +115,27 @@ def _words(evaluation: Evaluation, c: Comparison) -> list[str]:
 
 def _notes(evaluation: Evaluation) -> list[str]:
     """Say how the scores were made."""
-    table = evaluation.table
-    items = table.drop_duplicates("item")
-    listeners = items["listener"][items["listener"] != ""].nunique() if "listener" in items else 0
-    scales = table["full_scale_spl"].dropna()
-    scale = f"{scales.min():.1f} dB SPL"
-    if scales.max() > scales.min():
-        scale = f"{scales.min():.1f} to {scales.max():.1f} dB SPL, depending on the item"
+    items = evaluation.table.drop_duplicates("item")
+    listeners = items["listener"][items["listener"] != ""].nunique()
+    better_ear = "Each score is that of the better ear."
     notes = [
         scored_by(evaluation),
         severity_counts(evaluation),
         f"Listeners: {listeners}." if listeners else "",
-        f"The clean speech has {table['clean_level'].mean():.1f} dB SPL on average; RMS 1.0 stands for "
-        f"{scale}.",
-        "Each score is that of the better ear." if evaluation.settings.get("better_ear") else "",
+        _about_level(evaluation),
+        better_ear if evaluation.settings.get("better_ear") else "",
         *STATISTICS_NOTES,
-        f"The seed is {evaluation.settings['seed']}; each item's own is in report.json. "
-        f"{versions_text(evaluation.versions)}",
+        f"The seed is {evaluation.settings['seed']}. {versions_text(evaluation.versions)}",
     ]
     return [note for note in notes if note]
+
+
+def _about_level(evaluation: Evaluation) -> str:
+    if "full_scale_spl" in evaluation.settings:
+        return f"RMS 1.0 stands for {evaluation.settings['full_scale_spl']:g} dB SPL."
+    scales = evaluation.table["full_scale_spl"].dropna().round(1)
+    scale = f"{scales.min():.1f} dB SPL"
+    if scales.max() > scales.min():
+        scale = f"{scales.min():.1f} to {scales.max():.1f} dB SPL, depending on the item"
+    clean = f"{evaluation.table['clean_level'].mean():.1f} dB SPL"
+    return f"The clean speech has {clean} on average; RMS 1.0 stands for {scale}."

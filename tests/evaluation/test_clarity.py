@@ -1,32 +1,35 @@
-"""Clarity's scenes, made here in the challenges' layout: names, levels, scores beside pyclarity's, resuming, errors."""
+"""Clarity's scenes, made in the challenges' layout: names, levels, parity with pyclarity, resuming, errors."""
 
 from __future__ import annotations
 
 import csv
 import hashlib
 import json
+import math
+import shutil
+from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 import soundfile
 import torch
+from torch import Tensor
 
 import hlsim
 from hlsim.audio import read_audio
 from hlsim.audiogram.listener import Listener, read_listeners
 from hlsim.cli.main import main
 from hlsim.dsp.resample import resample
-from hlsim.evaluation.previous.clarity import (
+from hlsim.evaluation.clarity import (
     _conditions,
-    _looks_ahead,
+    _look_ahead,
     evaluate_scenes,
     read_pairs,
     read_scenes,
 )
-from hlsim.report.previous.clarity import conditions_table, write_scenes
+from hlsim.report.clarity import conditions_table, scenes_page
 
 RATE = 44100
 SPEECH = Path(hlsim.__file__).parent / "data" / "speech" / "valid"
@@ -152,247 +155,195 @@ def pyclaritys(folder: Path, scene: str, listener: str) -> dict[str, float]:
 def test_the_challenges_baseline_has_its_scores(clarity: Path, tmp_path: Path) -> None:
     pytest.importorskip("clarity")
     aids = {"baseline": f"{__name__}:Baseline"}
-    report = evaluate_scenes(aids, out=tmp_path, **options(clarity))
-    assert not report.failures and len(report.items) == 3
-    for item in report.items:
-        scene = item.file.removeprefix(f"{item.listener} ")
-        for measure, expected in pyclaritys(clarity, scene, item.listener).items():
-            assert item.scores[measure]["baseline"] == pytest.approx(expected, abs=1e-3), (
-                item.file,
-                measure,
-            )
-    assert report.extra["looks_ahead_ms"]["baseline"] == 0.0  # late by 2.5 ms, but never early
-    assert 2.0 < report.extra["looks_ahead_ms"]["NAL-R"] <= 5.0
-
-
-def test_a_scene_that_begins_in_silence_still_tells_how_far_an_aid_looks_ahead(
-    tmp_path: Path,
-) -> None:
-    mix = tmp_path / "mix.wav"
-    soundfile.write(
-        mix,
-        np.concatenate(
-            [np.zeros((5 * RATE, 2)), 0.02 * np.sin(np.arange(2.0 * RATE)).reshape(-1, 2)]
-        ),
-        RATE,
-    )
-    (tmp_path / "listeners.json").write_text(json.dumps(LISTENERS))
-    listener = read_listeners(tmp_path / "listeners.json")["L0001"]
-    ahead = _looks_ahead(_conditions({}, [], False, RATE, 94.0), mix, listener)
-    assert ahead["unaided"] == 0.0 and 1.0 < ahead["NAL-R"] <= 5.0
-
-
-def unchanged(waveform: torch.Tensor, sample_rate: int) -> torch.Tensor:
-    return waveform
-
-
-def test_two_enhancers_of_one_name_are_refused() -> None:
-    with pytest.raises(ValueError, match="the same name after the colon"):
-        _conditions({}, [f"{__name__}:unchanged", f"{__name__}:unchanged"], False, RATE, 94.0)
+    study = evaluate_scenes(aids, out=tmp_path, **options(clarity))
+    assert study.failures.empty and len(study.items) == 3
+    for row in study.table[study.table.condition == "baseline"].itertuples():
+        for measure, expected in pyclaritys(clarity, row.scene, row.listener).items():
+            assert getattr(row, measure) == pytest.approx(expected, abs=1e-3), (row.name, measure)
+    ahead = study.details["look_ahead_ms"]
+    assert ahead["baseline"] == 0.0, "2.5 ms late, but never early"
+    assert 2.0 < ahead["NAL-R"] <= 5.0
 
 
 class FromTheFuture:
     """An aid that knows what comes in 8 ms."""
 
-    def __call__(
-        self, waveform: torch.Tensor, listener: Listener, sample_rate: int
-    ) -> torch.Tensor:
+    fingerprint = "1"
+
+    def __call__(self, waveform: Tensor, listener: Listener, sample_rate: int) -> Tensor:
         return 4.0 * waveform.roll(-(sample_rate * 8 // 1000), -1)
 
 
 class HalfTheNoise:
-    """An enhancer, which is given pascals."""
+    """An enhancer, which gets pascals."""
 
-    def __call__(self, waveform: torch.Tensor, sample_rate: int) -> torch.Tensor:
-        if sample_rate == RATE:
-            assert (
-                0.02 < float(waveform.square().mean().sqrt()) < 0.06
-            )  # 0.014 in the file: 100 to 94 dB SPL
+    fingerprint = "1"
+
+    def __call__(self, waveform: Tensor, sample_rate: int) -> Tensor:
+        if sample_rate == RATE:  # 0.014 in the file: 100 to 94 dB SPL
+            assert 0.02 < float(waveform.square().mean().sqrt()) < 0.06
         return 0.5 * waveform
 
 
-def test_the_command_writes_page_scores_and_signals_and_goes_on(
+def test_the_command_writes_page_scores_and_signals_and_continues(
     clarity: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "out"
     arguments = ["clarity", clarity / "scenes", "soft=wdrc", f"early={__name__}:FromTheFuture"]
-    arguments += [
-        "--listeners",
-        clarity / "listeners.json",
-        "--scenes-listeners",
-        clarity / "pairs.json",
-    ]
-    arguments += [
-        "--enhancer",
-        f"{__name__}:HalfTheNoise",
-        "--out",
-        out,
-        "--jobs",
-        "1",
-        "--every",
-        "2",
-    ]
-    text = [*map(str, arguments)]
-    assert main(text) == 0
+    arguments += ["--listeners", clarity / "listeners.json", "--jobs", "1", "--every", "2"]
+    arguments += ["--scenes-listeners", clarity / "pairs.json", "--listen", "1", "--out", out]
+    command = [*map(str, arguments), "--enhancer", f"{__name__}:HalfTheNoise"]
+    assert main(command) == 0
     printed = capsys.readouterr().out
     assert "HalfTheNoise + soft" in printed and "8.0 no" in " ".join(printed.split())
-    assert {"report.html", "report.json", "scores.csv"} <= {path.name for path in out.iterdir()}
     with open(out / "scores.csv", newline="") as file:
         rows = [*csv.DictReader(file)]
-    assert [(row["scene"], row["listener"]) for row in rows[::7]] == [
-        ("S06001", "L0001"),
-        ("S06002", "L0001"),
-    ]
+    pairs = [(row["scene"], row["listener"]) for row in rows[::7]]
+    assert pairs == [("S06001", "L0001"), ("S06002", "L0001")]
     for row in rows:
-        assert float(row["combined"]) == pytest.approx(
-            (float(row["haspi"]) + float(row["hasqi"])) / 2, abs=1e-5
-        )
+        mean = (float(row["haspi"]) + float(row["hasqi"])) / 2
+        assert float(row["combined"]) == pytest.approx(mean, abs=1e-5)
     levels = {row["condition"]: float(row["level"]) for row in rows[:7]}
     assert levels["early"] - levels["unaided"] == pytest.approx(20 * np.log10(4), abs=0.1)
     signal = out / "signals" / "early" / "S06001_L0001_HA-output.wav"
     mix, _ = soundfile.read(str(clarity / "scenes" / "S06001_mix_CH1.wav"))
-    made, rate = soundfile.read(str(signal))
-    assert rate == RATE and np.allclose(made, 4 * np.roll(mix, -352, 0), atol=1e-6)
+    output, rate = soundfile.read(str(signal))
+    assert rate == RATE and np.allclose(output, 4 * np.roll(mix, -352, 0), atol=1e-6)
+    assert (out / "report.html").read_text().count("<audio") == 5
+    stored, report = (out / "scores.jsonl").read_text(), (out / "report.json").read_text()
+    signal.unlink()
+    other = out / "signals" / "soft" / "S06001_L0001_HA-output.wav"
+    written = other.stat().st_mtime_ns
+    assert main(command) == 0
+    assert np.allclose(soundfile.read(str(signal))[0], output), "a lost signal is written again"
+    assert other.stat().st_mtime_ns == written and (out / "report.json").read_text() == report
+    assert (out / "scores.jsonl").read_text().startswith(stored)
 
-    stored = {
-        name: (out / name).read_text() for name in ("signals.jsonl", "scores.jsonl", "report.json")
-    }
-    signal.write_bytes(b"gone")
-    assert main(text) == 0
-    assert np.allclose(soundfile.read(str(signal))[0], made)  # made anew; no other, and no score
-    assert (out / "scores.jsonl").read_text() == stored["scores.jsonl"]
-    assert (out / "report.json").read_text() == stored["report.json"]
-    assert (
-        len((out / "signals.jsonl").read_text().splitlines())
-        == len(stored["signals.jsonl"].splitlines()) + 1
-    )
+
+def test_signals_of_another_aid_of_the_same_label_are_replaced(
+    clarity: Path, tmp_path: Path
+) -> None:
+    signal = tmp_path / "signals" / "aid" / "S06001_L0001_HA-output.wav"
+    outputs = []
+    for name in ("wdrc", f"{__name__}:FromTheFuture", "wdrc"):
+        evaluate_scenes({"aid": name}, out=tmp_path, **options(clarity, every=4))
+        outputs.append(signal.read_bytes())
+    assert outputs[0] == outputs[2] != outputs[1]
 
 
 def test_linked_gains_and_a_reference_of_one_channel(clarity: Path, tmp_path: Path) -> None:
-    folder = tmp_path / "third"  # the third challenge's names: the reference has its level
+    folder = tmp_path / "third"  # names of the third challenge: the reference has its level
     folder.mkdir()
     for scene in PAIRS:
         signal, _ = soundfile.read(str(clarity / "scenes" / f"{scene}_target_anechoic_CH1.wav"))
         soundfile.write(str(folder / f"{scene}_reference.wav"), signal[:, 0], RATE)
-        (folder / f"{scene}_mix_CH1.wav").symlink_to(clarity / "scenes" / f"{scene}_mix_CH1.wav")
-        (folder / f"{scene}_target_CH1.wav").symlink_to(
-            clarity / "scenes" / f"{scene}_target_CH1.wav"
-        )
-    given = options(clarity, scenes=folder, scenes_listeners=None, every=4)
+        for ending in ("_mix_CH1.wav", "_target_CH1.wav"):
+            (folder / f"{scene}{ending}").symlink_to(clarity / "scenes" / f"{scene}{ending}")
+    settings = options(clarity, scenes=folder, scenes_listeners=None, every=4)
     apart, linked = (
-        evaluate_scenes({"aid": "wdrc"}, out=tmp_path / str(own), linked=own, **given)
+        evaluate_scenes({"aid": "wdrc"}, out=tmp_path / str(own), linked=own, **settings).table
         for own in (False, True)
     )
-    assert [item.file for item in apart.items] == ["L0001 S06001"]
-    assert apart.items[0].scores["haspi"]["unaided"] == linked.items[0].scores["haspi"]["unaided"]
-    assert apart.items[0].scores["hasqi"]["aid"] != linked.items[0].scores["hasqi"]["aid"]
-    made, _ = soundfile.read(str(tmp_path / "True" / "reference" / "S06001.wav"))
+    assert set(apart.name) == {"L0001 S06001"}
+    assert (apart.haspi == linked.haspi).tolist() == [True, True, False]
+    written, _ = soundfile.read(str(tmp_path / "True" / "reference" / "S06001.wav"))
     original, _ = soundfile.read(str(folder / "S06001_reference.wav"))
-    assert np.allclose(made, original[:, None])
-
-
-def test_one_broken_scene_is_told_and_the_others_go_on(clarity: Path, tmp_path: Path) -> None:
-    folder = tmp_path / "scenes"
-    folder.mkdir()
-    for path in (clarity / "scenes").iterdir():
-        (folder / path.name).write_bytes(path.read_bytes())
-    cut, rate = soundfile.read(str(folder / "S06002_target_CH1.wav"))
-    soundfile.write(str(folder / "S06002_target_CH1.wav"), cut[:-5], rate)
-    report = evaluate_scenes(
-        {"aid": "wdrc"}, out=tmp_path / "out", **options(clarity, scenes=folder, every=2)
-    )
-    assert [item.file for item in report.items] == ["L0001 S06001"]
-    assert len(report.failures) == 6 and "allowed: the mix's" in report.failures[0].reason
-    write_scenes(report, tmp_path / "page", listen=0)
-    assert "S06002" in (tmp_path / "page" / "report.md").read_text()
-    assert len(conditions_table(report).rows) == 3
+    assert np.allclose(written, original[:, None])
 
 
 class Choosy:
-    """Refuses the first listener's second scene, and so does not look ahead on the first pair."""
+    """Refuses loud scenes."""
 
-    def __call__(
-        self, waveform: torch.Tensor, listener: Listener, sample_rate: int
-    ) -> torch.Tensor:
-        if waveform.abs().max() > float(LOUDEST[0]):
+    def __call__(self, waveform: Tensor, listener: Listener, sample_rate: int) -> Tensor:
+        if waveform.abs().max() > LOUDEST[0]:
             raise ValueError("too loud for me")
         return 2.0 * waveform
 
 
-LOUDEST = [torch.inf]
+LOUDEST = [math.inf]
 
 
-def test_means_are_of_the_pairs_that_all_have_and_a_refused_pair_stops_nothing(
+def test_a_pair_that_one_aid_refuses_counts_in_no_mean_and_stops_nothing(
     clarity: Path, tmp_path: Path
 ) -> None:
-    peaks = [
-        np.abs(soundfile.read(str(clarity / "scenes" / f"{name}_mix_CH1.wav"))[0]).max()
-        for name in PAIRS
-    ]
+    mixes = [clarity / "scenes" / f"{name}_mix_CH1.wav" for name in PAIRS]
+    peaks = [np.abs(soundfile.read(str(mix))[0]).max() for mix in mixes]
     LOUDEST[0] = sum(peaks) / 2
-    own = options(clarity, every=2)
-    report = evaluate_scenes(
-        {"choosy": f"{__name__}:Choosy", "soft": "wdrc"}, out=tmp_path / "out", **own
-    )
-    assert (
-        report.conditions == ("unaided", "NAL-R", "choosy", "soft")
-        and report.headline.after == "soft"
-    )
-    table = conditions_table(report)
-    assert (
-        table.caption == "Means of the 1 that all have scores of, of 2 pairs of scene and listener"
-    )
-    kept = int(np.isfinite(report.scores("haspi")[:, 2]).argmax())
-    assert [row[1] for row in table.rows] == [
-        f"{score:.3f}" for score in report.scores("haspi")[kept]
-    ]
-    scores = np.array([[0.1, 0.2, np.nan, 0.4], [0.3, 0.4, np.nan, 0.6]])
-    none = SimpleNamespace(
-        scores=lambda measure: scores,
-        levels=lambda: 100.0 * scores,
-        **{name: getattr(report, name) for name in ("items", "conditions", "extra")},
-    )
-    assert [row[1] for row in conditions_table(none).rows] == ["0.200", "0.300", "n/a", "0.500"]
-    looks = report.extra["looks_ahead_ms"]
-    assert (looks["choosy"] is None) == (peaks[0] > peaks[1]) and looks["soft"] > 0.0
+    aids = {"choosy": f"{__name__}:Choosy", "soft": "wdrc"}
+    with pytest.warns(UserWarning, match="choosy are not stored"):
+        study = evaluate_scenes(aids, out=tmp_path / "out", **options(clarity, every=2))
+    (failure,) = study.failures.itertuples()
+    assert failure.condition == "choosy" and "too loud for me" in failure.failure
+    table = conditions_table(study)
+    caption = "Means of the 1 that all conditions have scores of, of 2 pairs of scene and listener"
+    assert table.caption == caption
+    kept = study.table[study.table.item != failure.item]
+    assert [row[1] for row in table.rows] == [f"{score:.3f}" for score in kept.haspi]
+    assert (study.details["look_ahead_ms"]["choosy"] is None) == (peaks[0] > peaks[1])
+    nothing = study.table.assign(haspi=study.table.haspi.where(study.table.condition != "choosy"))
+    cells = [row[1] for row in conditions_table(replace(study, table=nothing)).rows]
+    assert cells[2] == "n/a" and "n/a" not in (cells[0], cells[1], cells[3])
+
+
+def test_a_broken_scene_is_a_failure_with_its_file(clarity: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "scenes"
+    shutil.copytree(clarity / "scenes", folder)
+    signal, rate = soundfile.read(str(folder / "S06002_target_CH1.wav"))
+    soundfile.write(str(folder / "S06002_target_CH1.wav"), signal[:-5], rate)
+    settings = options(clarity, scenes=folder, every=2)
+    study = evaluate_scenes({"aid": "wdrc"}, out=tmp_path / "out", **settings)
+    assert set(study.failures.name) == {"L0001 S06002"}
+    assert study.failures.failure.str.contains("S06002_target_CH1.wav has").all()
+    assert "S06002_target_CH1.wav has" in scenes_page(study, listen=0).markdown()
+
+
+def test_the_look_ahead_is_known_for_a_scene_that_begins_in_silence(tmp_path: Path) -> None:
+    sound = 0.02 * np.sin(np.arange(2.0 * RATE)).reshape(-1, 2)
+    soundfile.write(tmp_path / "mix.wav", np.concatenate([np.zeros((5 * RATE, 2)), sound]), RATE)
+    (tmp_path / "listeners.json").write_text(json.dumps(LISTENERS))
+    listener = read_listeners(tmp_path / "listeners.json")["L0001"]
+    conditions = _conditions({}, [], False, RATE, 94.0, tmp_path)
+    ahead = _look_ahead(conditions, tmp_path / "mix.wav", listener)
+    assert ahead["unaided"] == 0.0 and 1.0 < ahead["NAL-R"] <= 5.0
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
         ({"scenes": "listeners.json"}, "no such folder"),
-        ({"scenes": "."}, "no scenes"),
+        ({"scenes": "."}, "has no files"),
         ({"scenes_listeners": {"S06001": ["L0009"]}}, "no listener 'L0009'"),
         ({"scenes_listeners": {"S9": ["L0001"]}}, "no scene 'S9'"),
         ({"scenes_listeners": []}, "cannot be read"),
         ({"scenes_listeners": {}}, "no scene has a listener"),
         ({"every": 0}, "every is 0"),
-        ({"aids": {"NAL-R": "wdrc"}}, "other names"),
-        ({"aids": {"a b": "wdrc", "a-b": "wdrc"}}, "letters and digits"),
+        ({"aids": {"NAL-R": "wdrc"}}, "another label"),
+        ({"aids": {"a b": "wdrc", "a-b": "wdrc"}}, "different names"),
         ({"aids": {"a": "no.such:thing"}}, "aid no.such:thing"),
         ({"full_scale_spl": float("nan")}, "full_scale_spl"),
     ],
 )
-def test_what_cannot_be_is_refused_before_anything_is_written(
+def test_what_cannot_be_judged_is_rejected_before_anything_is_written(
     clarity: Path, tmp_path: Path, change: dict[str, Any], message: str
 ) -> None:
-    given = options(clarity, aids={"aid": "wdrc"}) | change
-    if isinstance(pairs := given["scenes_listeners"], dict | list):
+    settings = options(clarity, aids={"aid": "wdrc"}) | change
+    if isinstance(pairs := settings["scenes_listeners"], dict | list):
         (tmp_path / "own.json").write_text(json.dumps(pairs))
-        given["scenes_listeners"] = tmp_path / "own.json"
-    given["scenes"] = clarity / given["scenes"]
+        settings["scenes_listeners"] = tmp_path / "own.json"
+    settings["scenes"] = clarity / settings["scenes"]
     with pytest.raises(ValueError, match=message):
-        evaluate_scenes(given.pop("aids"), out=tmp_path / "out", **given)
+        evaluate_scenes(settings.pop("aids"), out=tmp_path / "out", **settings)
     assert not (tmp_path / "out").exists()
 
 
-def test_listeners_without_an_ear_or_of_odd_names_are_refused(clarity: Path) -> None:
+def test_listeners_without_an_ear_or_with_odd_names_are_rejected(
+    clarity: Path, tmp_path: Path
+) -> None:
     scenes, people = read_scenes(clarity / "scenes"), read_listeners(clarity / "listeners.json")
-    with pytest.raises(ValueError, match="the right ear is missing"):
+    with pytest.raises(ValueError, match="the right ear of listener one is missing"):
         read_pairs(None, scenes, {"one": Listener(people["L0001"].left, None)})
-    with pytest.raises(ValueError, match="a name that a file can have"):
+    with pytest.raises(ValueError, match="a name that no file can have"):
         read_pairs(None, scenes, {"../x": people["L0001"]})
-    (clarity / "lost").mkdir()
-    (clarity / "lost" / "S1_mix_CH1.wav").write_bytes(b"")
-    with pytest.raises(ValueError, match=r"no reference; allowed: S1_target_anechoic_CH1\.wav or"):
-        read_scenes(clarity / "lost")
+    (tmp_path / "S1_mix_CH1.wav").write_bytes(b"")
+    with pytest.raises(ValueError, match=r"no reference; put S1_target_anechoic_CH1\.wav or"):
+        read_scenes(tmp_path)
