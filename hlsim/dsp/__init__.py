@@ -1,1 +1,1 @@
-"""Signal code that knows nothing of hearing: transforms, filters, blocks, rates, levels."""
+"""Signal processing that is independent of hearing: transforms, filters, blocks, rates, levels."""

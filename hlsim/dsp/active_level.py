@@ -3,49 +3,90 @@
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d
 from scipy.signal import lfilter
 from torch import Tensor
 
-_TIME_CONSTANT = 0.03  # s, of each of the two smoothings
-_HANGOVER = 0.2  # s for which speech counts as active after its envelope has fallen
-_MARGIN_DB = 15.9  # of the active level over the threshold of activity
-_THRESHOLDS = 2.0 ** -np.arange(16.0)[::-1]  # of the envelope's maximum, ascending
+_TIME_CONSTANT = 0.03
+"""Time constant in seconds of each of the two filters that smooth the envelope."""
+
+_HANGOVER = 0.2
+"""Seconds for which speech counts as active after its envelope has fallen."""
+
+_MARGIN_DB = 15.9
+"""Active speech level minus the threshold of activity in dB."""
+
+_THRESHOLDS = 2.0 ** -np.arange(16.0)[::-1]
+"""Thresholds of activity relative to the envelope's maximum, in ascending order."""
 
 
 def active_level_db(waveform: Tensor | np.ndarray, sample_rate: int) -> float:
-    """Active speech level in dB relative to RMS 1.0.
+    """Compute the active speech level in dB relative to RMS 1.0.
 
-    The standard's thresholds are fractions of full scale; these are fractions of the envelope's maximum, so that a gain
-    changes the result by exactly that gain.
+    The standard's thresholds are fractions of full scale. Here they are fractions of the envelope's
+    maximum, so that a gain of the waveform changes the result by exactly this gain.
 
-    Shape: (time,).
+    Source: ITU-T P.56, method B.
+
+    Args:
+        waveform: samples of one channel. Shape: (time,).
+        sample_rate: sample rate in Hz.
 
     Raises:
-        ValueError: the waveform is silent or not (time,).
+        ValueError: the waveform is silent, empty or not one-dimensional.
+
+    >>> speech = np.sin(np.arange(16000.0))
+    >>> with_pause = np.concatenate((speech, np.zeros(64000)))
+    >>> round(active_level_db(with_pause, 16000) - active_level_db(speech, 16000))
+    -1
     """
     samples = np.asarray(waveform, dtype=np.float64)
-    if samples.ndim != 1 or not samples.any():
+    if samples.ndim != 1:
         raise ValueError(
-            f"waveform of shape {samples.shape}{'' if samples.ndim != 1 else ', silent'}; allowed: (time,), not silent"
+            f"expected a waveform of shape (time,), got shape {samples.shape}; pass one channel"
         )
-    pole = math.exp(-1.0 / (sample_rate * _TIME_CONSTANT))
-    smooth = ([1.0 - pole], [1.0, -pole])
-    envelope = lfilter(*smooth, lfilter(*smooth, np.abs(samples)))
-    width = max(1, round(_HANGOVER * sample_rate))
-    held = maximum_filter1d(
-        envelope, width, mode="constant", origin=(width - 1) // 2
-    )  # over the last 0.2 s
+    if not samples.any():
+        raise ValueError("expected speech, got a waveform that is silent or empty")
+    envelope = _smooth(_smooth(np.abs(samples), sample_rate), sample_rate)
     thresholds = _THRESHOLDS * envelope.max()
-    active = len(held) - np.searchsorted(np.sort(held), thresholds)
-    levels = 10.0 * np.log10(np.square(samples).sum() / np.maximum(active, 1))
-    margins = levels - 20.0 * np.log10(thresholds)  # they fall as the threshold rises
-    above = (
-        int(np.argmax(margins <= _MARGIN_DB))
-        if bool((margins <= _MARGIN_DB).any())
-        else len(margins) - 1
-    )
-    if above == 0 or margins[above] > _MARGIN_DB:
-        return float(levels[above])
-    share = (margins[above - 1] - _MARGIN_DB) / (margins[above - 1] - margins[above])
-    return float(levels[above - 1] + share * (levels[above] - levels[above - 1]))
+    active_samples = _count_active_samples(envelope, thresholds, round(_HANGOVER * sample_rate))
+    levels = 10.0 * np.log10(np.square(samples).sum() / np.maximum(active_samples, 1))
+    margins = levels - 20.0 * np.log10(thresholds)
+
+    # The margin falls as the threshold rises. The active speech level lies where the margin is
+    # 15.9 dB, and is interpolated between the two thresholds around this point.
+    candidates = np.flatnonzero(margins <= _MARGIN_DB)
+    if len(candidates) == 0:
+        return float(levels[-1])
+    after = int(candidates[0])
+    if after == 0:
+        return float(levels[0])
+    before = after - 1
+    fraction = (margins[before] - _MARGIN_DB) / (margins[before] - margins[after])
+    return float(levels[before] + fraction * (levels[after] - levels[before]))
+
+
+def _smooth(values: NDArray[np.float64], sample_rate: int) -> NDArray[np.float64]:
+    """Smooth values exponentially with the standard's time constant. Shape: (time,) -> (time,)."""
+    pole = math.exp(-1.0 / (sample_rate * _TIME_CONSTANT))
+    smoothed: NDArray[np.float64] = lfilter([1.0 - pole], [1.0, -pole], values)
+    return smoothed
+
+
+def _count_active_samples(
+    envelope: NDArray[np.float64], thresholds: NDArray[np.float64], hangover: int
+) -> NDArray[np.int64]:
+    """Count the samples that are active at each threshold.
+
+    A sample is active if the envelope reaches the threshold there or within the hangover before it.
+
+    Shape: (time,), (thresholds,) -> (thresholds,).
+
+    Args:
+        hangover: length of the hangover in samples.
+    """
+    width = max(1, hangover)
+    recent_maximum = maximum_filter1d(envelope, width, mode="constant", origin=(width - 1) // 2)
+    inactive_samples = np.searchsorted(np.sort(recent_maximum), thresholds)
+    return len(envelope) - inactive_samples

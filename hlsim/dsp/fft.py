@@ -1,4 +1,4 @@
-"""Fourier transforms with cheap gradients, suitable transform lengths, and power spectra."""
+"""Fourier transforms with cheap gradients, fast transform lengths, and power spectra."""
 
 from functools import lru_cache
 from typing import Any
@@ -9,16 +9,27 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 FADE_HZ = 80.0
-"""Width in Hz of the fade at the end of a spectrum that is cut off."""
+"""Width in Hz of the fade-out at the end of a spectrum that is cut off."""
 
 MAX_POWER_OF_TWO = 256
-"""Largest power of two in a transform length: MKL takes up to three times as long for 2^10 * 49 as for 2^4 * 3125."""
+"""Largest power of two in a fast transform length.
+
+MKL takes up to three times as long for 2^10 * 49 points as for 2^4 * 3125 points.
+"""
 
 
 def rfft(signals: Tensor, points: int | None = None) -> Tensor:
-    """Real Fourier transform, equal to ``torch.fft.rfft``, with a cheaper gradient.
+    """Compute the Fourier transform of real signals.
+
+    The result equals that of ``torch.fft.rfft``, but its gradient is cheaper.
 
     Shape: (..., time) -> complex (..., points // 2 + 1).
+
+    Args:
+        points: length of the transform, by default that of the signals.
+
+    >>> rfft(torch.tensor([1.0, 0.0, -1.0, 0.0]))
+    tensor([0.+0.j, 2.+0.j, 0.+0.j])
     """
     points = signals.shape[-1] if points is None else points
     if signals.requires_grad and torch.is_grad_enabled():
@@ -28,7 +39,10 @@ def rfft(signals: Tensor, points: int | None = None) -> Tensor:
 
 
 class _RFFT(torch.autograd.Function):
-    """Real transform whose gradient is a real transform; torch's is a complex one of twice the length."""
+    """Real Fourier transform whose gradient is a real transform as well.
+
+    The gradient of ``torch.fft.rfft`` is a complex transform of twice the length.
+    """
 
     @staticmethod
     def forward(signals: Tensor, points: int) -> Tensor:
@@ -36,7 +50,8 @@ class _RFFT(torch.autograd.Function):
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Tensor, int], output: Tensor) -> None:
-        ctx.time, ctx.points = inputs[0].shape[-1], inputs[1]
+        signals, ctx.points = inputs
+        ctx.time = signals.shape[-1]
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
@@ -51,7 +66,17 @@ class _RFFT(torch.autograd.Function):
 
 @lru_cache(maxsize=256)
 def fft_length(minimum: int, multiple: int = 1) -> int:
-    """Smallest length of at least ``minimum`` samples that is a fast transform length and a multiple of ``multiple``."""
+    """Smallest length of a fast Fourier transform within limits.
+
+    The length has no prime factors above 7, apart from those of ``multiple``.
+
+    Args:
+        minimum: smallest length allowed.
+        multiple: number of which the length is a multiple.
+
+    >>> fft_length(1001)
+    1008
+    """
     twos_in_multiple = multiple & -multiple
     odd_factors = [3**a * 5**b * 7**c for a in range(9) for b in range(6) for c in range(2)]
     lengths = []
@@ -63,7 +88,11 @@ def fft_length(minimum: int, multiple: int = 1) -> int:
 
 
 def power(spectrum: Tensor) -> Tensor:
-    """Squared modulus. Shape: complex (...) -> (...)."""
+    """Compute the squared modulus of complex values. Shape: complex (...) -> real (...).
+
+    >>> power(torch.tensor([3.0 + 4.0j]))
+    tensor([25.])
+    """
     if spectrum.requires_grad and torch.is_grad_enabled():
         powers: Tensor = _Power.apply(spectrum)
         return powers
@@ -76,7 +105,7 @@ def _squared_modulus(spectrum: Tensor) -> Tensor:
 
 
 class _Power(torch.autograd.Function):
-    """Squared modulus with a gradient in one step; that of separate real and imaginary parts takes six."""
+    """Squared modulus whose gradient takes one step instead of torch's six."""
 
     @staticmethod
     def forward(spectrum: Tensor) -> Tensor:
@@ -92,17 +121,21 @@ class _Power(torch.autograd.Function):
         return spectrum * (2.0 * gradient)
 
 
-def soft_end(bins: int, spacing: float, end: float) -> NDArray[np.float64]:
-    """Weights that fade a spectrum out towards the frequency where it is cut off: 1, then down to 0 within 80 Hz.
+def fade_out_weights(bins: int, spacing: float, end: float) -> NDArray[np.float64]:
+    """Compute weights that fade a spectrum out below the frequency where it is cut off.
 
-    A sharp end would ring for seconds, and the FFT's length would decide how much of the ringing wraps around.
+    They are 1 up to 80 Hz below this frequency, and then fall to 0. A sharp end would ring for
+    seconds, and the length of the transform would decide how much of the ringing wraps around.
 
     Args:
         bins: number of frequencies of the spectrum.
         spacing: distance between two frequencies in Hz.
         end: frequency in Hz at which the weights reach 0.
 
-    Returns: (bins,).
+    Returns: weights of shape (bins,).
+
+    >>> print(fade_out_weights(5, spacing=40.0, end=160.0).round(2))
+    [1.  1.  1.  0.5 0. ]
     """
     distance_to_end = np.clip((end - spacing * np.arange(bins)) / FADE_HZ, 0.0, 1.0)
     weights: NDArray[np.float64] = np.sin(0.5 * np.pi * distance_to_end) ** 2

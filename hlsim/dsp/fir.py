@@ -1,4 +1,4 @@
-"""FIR filters: designed by frequency sampling, and run through Fourier transforms."""
+"""FIR filters: design by frequency sampling, and filtering with Fourier transforms."""
 
 import math
 
@@ -10,10 +10,14 @@ from torch.nn import functional
 
 from hlsim.dsp.fft import fft_length, rfft
 
-BLOCK_POINTS, _HOP = 4096, 3072
-"""FFT length of ``filter_blocks``, and samples from block to block."""
+BLOCK_POINTS = 4096
+"""Length of the Fourier transforms of ``filter_in_blocks``."""
 
-_GRID = 512
+_BLOCK_HOP = 3072
+"""Samples from the start of one block of ``filter_in_blocks`` to the start of the next."""
+
+_GRID_POINTS = 513
+"""Frequencies of the grid on which a filter is designed, from 0 Hz to the Nyquist frequency."""
 
 
 def frequency_sampling_fir(
@@ -22,56 +26,77 @@ def frequency_sampling_fir(
     gains: NDArray[np.float64],
     window: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """FIR filter with given gains at given frequencies, as MATLAB's ``fir2`` designs it.
+    """Design a linear-phase FIR filter from gains at some frequencies, as MATLAB's ``fir2`` does.
 
-    The gains are put on a grid of 513 points with the break points moved to grid points, joined by straight lines,
-    inverse transformed with a delay of (taps - 1) / 2 samples, and windowed. scipy's ``firwin2`` interpolates between
-    the break points themselves, which differs by up to a few tenths of a dB where they are close; MSBG and pyclarity's
-    NAL-R follow ``fir2``.
+    The frequencies are moved to points of a grid of 513 frequencies, the gains between them follow
+    straight lines, and the windowed inverse Fourier transform is the filter. scipy's ``firwin2``
+    does not move the frequencies, and its gain differs by up to a few tenths of a decibel where
+    they are close. MSBG and pyclarity's NAL-R follow ``fir2``.
 
     Args:
-        taps: odd number of coefficients, at most 1023.
-        frequencies: ascending, 0 to 1 with 1 the Nyquist frequency.
+        taps: number of coefficients, odd and at most 1023. The delay is (taps - 1) / 2 samples.
+        frequencies: ascending frequencies from 0 to 1, where 1 is the Nyquist frequency.
         gains: linear gain at each frequency.
-        window: (taps,).
+        window: window of the coefficients. Shape: (taps,).
+
+    Returns: coefficients of shape (taps,).
+
+    >>> flat = frequency_sampling_fir(3, np.array([0.0, 1.0]), np.array([2.0, 2.0]), np.ones(3))
+    >>> print(abs(flat).round(6))
+    [0. 2. 0.]
     """
-    points = _GRID + 1
-    response = np.zeros(points)
-    response[0] = gains[0]
+    grid_gains = np.zeros(_GRID_POINTS)
+    grid_gains[0] = gains[0]
     start = 0
     for i in range(len(frequencies) - 1):
-        end = int(frequencies[i + 1] * points) - 1
+        end = int(frequencies[i + 1] * _GRID_POINTS) - 1
         if end >= start:
-            place = np.linspace(0.0, 1.0, end - start + 1) if end > start else np.zeros(1)
-            response[start : end + 1] = place * gains[i + 1] + (1.0 - place) * gains[i]
+            position = np.linspace(0.0, 1.0, end - start + 1) if end > start else np.zeros(1)
+            grid_gains[start : end + 1] = position * gains[i + 1] + (1.0 - position) * gains[i]
         start = end + 1
-    delay = np.exp(-0.5j * (taps - 1) * np.pi * np.arange(points) / _GRID)
-    impulse = np.fft.irfft(response * delay, 2 * _GRID)
-    return impulse[:taps] * window
+    intervals = _GRID_POINTS - 1
+    delay = np.exp(-0.5j * (taps - 1) * np.pi * np.arange(_GRID_POINTS) / intervals)
+    impulse_response = np.fft.irfft(grid_gains * delay, 2 * intervals)
+    return impulse_response[:taps] * window
 
 
-def filter_centred(waveform: Tensor, taps: Tensor) -> Tensor:
-    """FIR of as many samples before as after, which does not delay. Shape: (..., time), (..., 2 half) -> (..., time)."""
-    time, half = waveform.shape[-1], taps.shape[-1] // 2
+def filter_without_delay(waveform: Tensor, taps: Tensor) -> Tensor:
+    """Filter with impulse responses that are centred on time 0.
+
+    Shape: (..., time), (..., 2 half) -> (..., time).
+
+    Args:
+        taps: impulse responses, from ``half`` samples before time 0 to ``half - 1`` after it.
+
+    >>> filter_without_delay(torch.ones(3), torch.tensor([0.0, 0.0, 1.0, 0.0])).round(decimals=3)
+    tensor([1., 1., 1.])
+    """
+    time = waveform.shape[-1]
+    half = taps.shape[-1] // 2
     points = fft_length(time + 2 * half, 4)
     if torch.compiler.is_exporting():
-        points = (
-            1 << (points - 1).bit_length()
-        )  # at other lengths onnxruntime is off by 1e-3 to 1e-2
+        # At other lengths than powers of two, onnxruntime's results are off by 1e-3 to 1e-2.
+        points = 1 << (points - 1).bit_length()
     product = rfft(waveform, points) * rfft(taps, points)
     return torch.fft.irfft(product, points)[..., half : half + time]
 
 
-def filter_blocks(waveform: Tensor, response: Tensor, length: int) -> Tensor:
-    """Causal FIR by overlapping blocks, whose short transforms take a quarter of a long one's time.
+def filter_in_blocks(waveform: Tensor, response: Tensor, length: int) -> Tensor:
+    """Filter causally in overlapping blocks, which take a quarter of the time of one transform.
 
     Shape: (..., time), (2049,) -> (..., length).
 
     Args:
-        response: of at most 1025 taps, by an rfft of ``BLOCK_POINTS``.
+        response: transform by ``rfft`` of ``BLOCK_POINTS`` points of at most 1025 taps.
+        length: number of samples to return.
+
+    >>> delay_by_one = torch.fft.rfft(torch.tensor([0.0, 1.0]), BLOCK_POINTS)
+    >>> filter_in_blocks(torch.tensor([1.0, 2.0]), delay_by_one, 3).round(decimals=3).abs()
+    tensor([0., 1., 2.])
     """
-    lead = BLOCK_POINTS - _HOP
-    blocks = math.ceil(length / _HOP)
-    padded = functional.pad(waveform, (lead, blocks * _HOP - waveform.shape[-1]))
-    frames = torch.fft.rfft(padded.unfold(-1, BLOCK_POINTS, _HOP)) * response
-    return torch.fft.irfft(frames, BLOCK_POINTS)[..., lead:].flatten(-2)[..., :length]
+    lead = BLOCK_POINTS - _BLOCK_HOP
+    blocks = math.ceil(length / _BLOCK_HOP)
+    padded = functional.pad(waveform, (lead, blocks * _BLOCK_HOP - waveform.shape[-1]))
+    spectra = torch.fft.rfft(padded.unfold(-1, BLOCK_POINTS, _BLOCK_HOP)) * response
+    filtered = torch.fft.irfft(spectra, BLOCK_POINTS)[..., lead:]
+    return filtered.flatten(-2)[..., :length]

@@ -1,4 +1,4 @@
-"""Long signals in overlapping blocks, so that memory does not grow with them."""
+"""Processing of long signals in overlapping blocks, which bounds the memory that they need."""
 
 import math
 from typing import NamedTuple
@@ -7,40 +7,78 @@ from torch import Tensor
 
 
 class Block(NamedTuple):
-    """Samples ``begin`` to ``end`` go in; of what comes out, ``start`` to ``stop`` are kept."""
+    """Part of a signal that is processed at once, and the part of the result that is used.
 
-    begin: int
-    start: int
-    stop: int
-    end: int
+    The input is longer than the used output, because samples near its ends lack the context that
+    the processing needs.
 
-    def given(self, signals: Tensor) -> Tensor:
-        """Shape: (..., time) -> (..., end - begin)."""
-        return signals[..., self.begin : self.end]
+    Attributes:
+        input_start: first sample of the input.
+        output_start: first sample of the output that is used.
+        output_stop: sample after the last one of the output that is used.
+        input_stop: sample after the last one of the input.
 
-    def kept(self, output: Tensor) -> Tensor:
-        """Shape: (..., end - begin or more) -> (..., stop - start); of the last block all that follows."""
-        return output[
-            ..., self.start - self.begin : None if self.stop == self.end else self.stop - self.begin
-        ]
+    >>> import torch
+    >>> block = Block(input_start=2, output_start=4, output_stop=6, input_stop=8)
+    >>> signal = torch.arange(10)
+    >>> block.cut_input(signal)
+    tensor([2, 3, 4, 5, 6, 7])
+    >>> block.cut_output(block.cut_input(signal))
+    tensor([4, 5])
+    """
+
+    input_start: int
+    output_start: int
+    output_stop: int
+    input_stop: int
+
+    def cut_input(self, signals: Tensor) -> Tensor:
+        """Cut the block's input out of whole signals.
+
+        Shape: (..., time) -> (..., input_stop - input_start).
+        """
+        return signals[..., self.input_start : self.input_stop]
+
+    def cut_output(self, output: Tensor) -> Tensor:
+        """Cut the used part out of the result of processing the block's input.
+
+        Nothing is cut off the end of the last block, whose result may be longer than its input.
+
+        Shape: (..., time) -> (..., output_stop - output_start).
+        """
+        start = self.output_start - self.input_start
+        if self.output_stop == self.input_stop:
+            return output[..., start:]
+        return output[..., start : self.output_stop - self.input_start]
 
 
-def overlapping(samples: int, hop: int, lead: float, lag: float, unit: int = 1) -> list[Block]:
-    """Blocks that together make up a signal.
+def split_into_blocks(
+    samples: int, hop: int, lead: float, lag: float, unit: int = 1
+) -> list[Block]:
+    """Split a signal into overlapping blocks, whose used outputs together cover it.
+
+    A signal of up to one and a half hops is one block, and so is any signal if the hop is 0. The
+    last block covers half a hop to one and a half hops.
 
     Args:
-        samples: of the signal; up to one and a half ``hop``, or with a ``hop`` of 0, it is one block.
-        hop: samples from the start of one block to that of the next; the last has from half to one and a half of it.
-        lead, lag: samples that a block needs before its start and behind its stop.
-        unit: blocks begin and start at multiples of it: the hop is rounded down, lead and lag are rounded up.
+        samples: length of the signal.
+        hop: samples from the start of one used output to the start of the next.
+        lead: samples of context that a block needs before its used output.
+        lag: samples of context that a block needs after its used output.
+        unit: number of samples of which inputs and used outputs start at multiples. The hop is
+            rounded down to a multiple of it, lead and lag are rounded up.
+
+    >>> split_into_blocks(100, hop=50, lead=10, lag=5)[1]
+    Block(input_start=40, output_start=50, output_stop=100, input_stop=100)
     """
     hop = hop // unit * unit
-    before, behind = (math.ceil(side / unit) * unit for side in (lead, lag))
     if hop == 0 or samples <= 1.5 * hop:
         return [Block(0, 0, samples, samples)]
+    lead_samples = math.ceil(lead / unit) * unit
+    lag_samples = math.ceil(lag / unit) * unit
     starts = list(range(0, samples - hop // 2, hop))
     stops = [*starts[1:], samples]
     return [
-        Block(max(0, start - before), start, stop, min(samples, stop + behind))
+        Block(max(0, start - lead_samples), start, stop, min(samples, stop + lag_samples))
         for start, stop in zip(starts, stops, strict=True)
     ]

@@ -1,11 +1,13 @@
 """Resampling by a windowed sinc.
 
-The kernel is that of torchaudio's ``sinc_interp_kaiser`` (J. O. Smith, *Digital Audio Resampling*): a sinc whose cut-off
-lies at 94.8 % of the lower Nyquist frequency, over 64 of its zero crossings to either side, under a Kaiser window with
-beta = 14.77. These are the parameters that resampy calls ``kaiser_best``.
+The kernel is that of torchaudio's ``sinc_interp_kaiser`` (J. O. Smith, *Digital Audio Resampling*).
+It is a sinc whose cut-off frequency is 94.8 % of the lower Nyquist frequency, cut to 64 zero
+crossings on either side of its centre and multiplied by a Kaiser window with beta = 14.77. resampy
+calls these parameters ``kaiser_best``.
 
-The response of the kernels between all pairs of 16, 22.05, 24, 32, 44.1 and 48 kHz, with f the frequency over the lower
-Nyquist frequency (``tests/dsp/test_resample.py`` measures it):
+The table shows the gain of the kernels between all pairs of 16, 22.05, 24, 32, 44.1 and 48 kHz,
+where f is the frequency divided by the lower Nyquist frequency. ``tests/dsp/test_resample.py``
+measures these values.
 
 =====================  ============  ============
 gain                   float32       float64
@@ -28,24 +30,29 @@ from torch.nn import functional
 from hlsim.torchtools import compute_once
 
 ROLLOFF = 0.9475937167399596
-"""Cut-off frequency over the lower of the two Nyquist frequencies."""
+"""Cut-off frequency divided by the lower of the two Nyquist frequencies."""
 
 ZERO_CROSSINGS = 64
-"""Zero crossings of the sinc to either side of its centre: half the kernel's length."""
+"""Number of zero crossings of the sinc on either side of its centre."""
 
 KAISER_BETA = 14.769656459379492
+"""Shape parameter of the Kaiser window."""
 
-# Values, 0.4 GB in float32. From 44100 to 16000 Hz the kernel has 0.13 million, from 44056 Hz 12 million and from
-# 44101 Hz it would have 710 million.
-_LARGEST_KERNEL = 100_000_000
+MAX_KERNEL_VALUES = 100_000_000
+"""Largest number of values of a kernel, 0.4 GB in float32.
+
+To 16000 Hz, the kernel has 0.13 million values from 44100 Hz and 12 million from 44056 Hz. From
+44101 Hz it would have 710 million.
+"""
 
 
 def resample(waveform: Tensor, source_rate: int, target_rate: int) -> Tensor:
-    """Resample by a windowed sinc, time-aligned and differentiable.
+    """Resample waveforms by a windowed sinc, without delay.
 
-    The gain is flat within 0.023 dB up to 90 % of the lower Nyquist frequency, and at most -61 dB at that frequency and
-    -90 dB from 101 % of it on. On a GPU whose convolutions use TF32, torch's default, the last figure is -69 dB;
-    ``torch.backends.cudnn.allow_tf32 = False`` keeps the -90 dB.
+    The gain is flat within 0.023 dB up to 90 % of the lower Nyquist frequency. It is at most -61 dB
+    at this frequency and -90 dB from 101 % of it on. On a GPU whose convolutions use TF32, which is
+    torch's default, the last value is -69 dB; ``torch.backends.cudnn.allow_tf32 = False`` restores
+    -90 dB.
 
     Shape: (..., time) -> (..., ceil(time * target_rate / source_rate)).
 
@@ -56,21 +63,24 @@ def resample(waveform: Tensor, source_rate: int, target_rate: int) -> Tensor:
 
     Raises:
         TypeError: the samples are integers or complex.
-        ValueError: the rates have so small a common factor, as 44101 and 16000 Hz have, that the kernel would take
-            gigabytes.
+        ValueError: the common factor of the rates is so small that the kernel would take gigabytes,
+            as for 44101 and 16000 Hz.
+
+    >>> resample(torch.randn(2, 44100), 44100, 16000).shape
+    torch.Size([2, 16000])
     """
     if source_rate == target_rate:
         return waveform
     if not waveform.is_floating_point():
         raise TypeError(
-            f"expected a floating-point waveform, got {waveform.dtype}; convert it with .float()"
+            f"expected a floating-point waveform, got {waveform.dtype}; call waveform.float()"
         )
     common = math.gcd(source_rate, target_rate)
     source, target = source_rate // common, target_rate // common
-    if source * target > _LARGEST_KERNEL:
+    if source * target > MAX_KERNEL_VALUES:
         raise ValueError(
-            f"cannot resample from {source_rate} to {target_rate} Hz: their common factor, {common}, is too small; "
-            "choose rates such as 16000, 22050, 24000, 32000, 44100 and 48000"
+            f"cannot resample from {source_rate} to {target_rate} Hz: their common factor, {common}"
+            ", is too small; choose rates such as 16000, 22050, 24000, 32000, 44100 and 48000"
         )
     kernel = compute_once(sinc_kernel, source, target, waveform.dtype, waveform.device)
 
@@ -78,29 +88,33 @@ def resample(waveform: Tensor, source_rate: int, target_rate: int) -> Tensor:
     signals = waveform.reshape(math.prod(leading), 1, time)
     reach = (kernel.shape[-1] - source) // 2
     padded = functional.pad(signals, (reach, reach + source))
-    # each block of ``source`` samples gives ``target`` samples, one per row of the kernel
+    # Each block of ``source`` samples gives ``target`` samples, one per row of the kernel.
     blocks = functional.conv1d(padded, kernel, stride=source)
     resampled = blocks.mT.reshape(*leading, -1)
     return resampled[..., : -(-time * target // source)]
 
 
 def sinc_kernel(source: int, target: int, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """Compute the filter of each of the ``target`` output phases.
+    """Compute one filter for each of the ``target`` samples that a block of input gives.
 
     Args:
         source: source rate divided by the common factor of both rates.
-        target: target rate divided by it.
-        dtype: type of the result; the kernel is computed in float32 at least.
+        target: target rate divided by the common factor of both rates.
+        dtype: type of the result. The kernel is computed in float32 at least.
         device: device of the result.
 
-    Returns: (target, 1, 2 * reach + source), to be applied with a stride of ``source``.
+    Returns: filters of shape (target, 1, 2 * reach + source), for a convolution with a stride of
+        ``source``.
+
+    >>> sinc_kernel(3, 1, torch.float32, torch.device("cpu")).shape
+    torch.Size([1, 1, 409])
     """
     computed = torch.promote_types(dtype, torch.float32)
     cutoff = min(source, target) * ROLLOFF
     reach = math.ceil(ZERO_CROSSINGS * source / cutoff)
     taps = torch.arange(-reach, reach + source, dtype=computed, device=device) / source
     phases = torch.arange(0, -target, -1, dtype=computed, device=device) / target
-    # the distance of each tap from the output sample, in zero crossings of the sinc
+    # distance of each tap from the output sample, in zero crossings of the sinc
     distance = (phases[:, None, None] + taps) * cutoff
     distance = distance.clamp(-ZERO_CROSSINGS, ZERO_CROSSINGS)
 

@@ -1,4 +1,4 @@
-"""The short-time Fourier transform and its inverse, for models and criteria alike."""
+"""The short-time Fourier transform and its inverse, for models and criteria."""
 
 from dataclasses import dataclass
 
@@ -14,16 +14,27 @@ from hlsim.torchtools import constant_like
 
 @dataclass(frozen=True)
 class STFT:
-    """A short-time Fourier transform with a Hann window, centred frames and zeros beyond the ends.
+    """A short-time Fourier transform with a Hann window and centred frames.
+
+    Samples before the beginning and after the end of a signal count as zeros.
 
     Args:
-        fft: points of the transform; fft // 2 + 1 frequencies.
-        window: samples of the Hann window, at most ``fft``.
-        hop: samples from frame to frame, at most half of ``window``; a quarter where spectra are changed and then
-            synthesised, or the last samples may be divided by almost nothing.
+        fft: length of the Fourier transform in samples, an even number.
+        window: length of the Hann window in samples, at most ``fft``.
+        hop: samples from one frame to the next, at most half of ``window``. Where spectra are
+            modified before synthesis, take a quarter of it: with longer hops, the last samples may
+            be divided by a number close to zero.
 
     Raises:
-        ValueError: lengths that do not fit together.
+        ValueError: the lengths do not fit together.
+
+    >>> stft = STFT(fft=400, window=400, hop=100)
+    >>> waveform = torch.randn(1, 1600)
+    >>> spectrum = stft.analyse(waveform)
+    >>> spectrum.shape
+    torch.Size([1, 17, 201])
+    >>> torch.allclose(stft.synthesise(spectrum, 1600), waveform, atol=1e-5)
+    True
     """
 
     fft: int = 400
@@ -33,48 +44,71 @@ class STFT:
     def __post_init__(self) -> None:
         if not 0 < 2 * self.hop <= self.window <= self.fft or self.fft % 2:
             raise ValueError(
-                f"STFT of fft {self.fft}, window {self.window}, hop {self.hop}; allowed: 2 hop <= window <= fft, fft even"
+                "expected 2 * hop <= window <= fft with an even fft and a positive hop, got "
+                f"fft={self.fft}, window={self.window}, hop={self.hop}"
             )
 
     @property
     def frequencies(self) -> int:
+        """Number of frequencies of a spectrum, ``fft // 2 + 1``."""
         return self.fft // 2 + 1
 
     def analyse(self, waveform: Tensor) -> Tensor:
-        """Spectrum. Shape: (items, time) -> complex (items, frames, frequencies), frames = time // hop + 1."""
-        # as torch.stft, whose gradient takes half as long again
-        side, before = self.fft // 2, (self.fft - self.window) // 2
-        behind = self.fft - self.window - before
-        padded = functional.pad(waveform, (side - before, side - behind))
-        windowed = padded.unfold(-1, self.window, self.hop) * self._hann(waveform)
-        return rfft(functional.pad(windowed, (before, behind)))
+        """Compute the spectrum of waveforms.
+
+        The result equals that of ``torch.stft``, whose gradient takes half as long again.
+
+        Shape: (items, time) -> complex (items, time // hop + 1, frequencies).
+        """
+        margin = self.fft - self.window
+        margin_before = margin // 2
+        margin_after = margin - margin_before
+        half = self.fft // 2
+        padded = functional.pad(waveform, (half - margin_before, half - margin_after))
+        windowed = padded.unfold(-1, self.window, self.hop) * self._hann_window(waveform)
+        return rfft(functional.pad(windowed, (margin_before, margin_after)))
 
     def synthesise(self, spectrum: Tensor, length: int) -> Tensor:
-        """Waveform by overlap-add. Shape: complex (items, frames, frequencies) -> (items, length)."""
-        # as torch.istft, which takes longer, and of which ONNX gets an index that its runtime refuses
-        window, before = self._hann(spectrum.real), (self.fft - self.window) // 2
-        frames = torch.fft.irfft(spectrum, self.fft)[..., before : before + self.window] * window
+        """Compute waveforms from their spectra by overlap-add.
+
+        The result equals that of ``torch.istft``, which takes longer and exports to an ONNX graph
+        with an index that onnxruntime rejects.
+
+        Shape: complex (items, frames, frequencies) -> (items, length).
+        """
+        window = self._hann_window(spectrum.real)
+        margin_before = (self.fft - self.window) // 2
+        frames = torch.fft.irfft(spectrum, self.fft)
+        windowed = frames[..., margin_before : margin_before + self.window] * window
         weights = window.square().expand(1, spectrum.shape[-2], -1)
-        kept = slice(self.fft // 2 - before, self.fft // 2 - before + length)
-        return self._overlap_add(frames)[:, kept] / self._overlap_add(weights)[:, kept]
+        start = self.fft // 2 - margin_before
+        total = self._overlap_add(windowed)[:, start : start + length]
+        total_weight = self._overlap_add(weights)[:, start : start + length]
+        return total / total_weight
 
     def _overlap_add(self, frames: Tensor) -> Tensor:
-        """Shape: (items, frames, window) -> (items, time)."""
+        """Add frames that begin one hop apart. Shape: (items, frames, window) -> (items, time).
+
+        Each frame is cut into parts of one hop. Part p of frame k belongs to hop k + p of the
+        result, so that the row of all frames' parts p is to be delayed by p hops and added. Zeros
+        behind each row, cut to rows that are one hop shorter, delay each row by one hop more than
+        the row before.
+        """
         items, count, window = frames.shape
-        parts = -(
-            -window // self.hop
-        )  # of a frame, each added to the next part of the frame before
+        parts = -(-window // self.hop)
         if window % self.hop:
             frames = functional.pad(frames, (0, parts * self.hop - window))
         rows = frames.reshape(items, count, parts, self.hop).transpose(1, 2)
-        # zeros after each row, and rows that are one shorter than that: each begins one place later than the one before
-        places = count + parts - 1
-        late = functional.pad(rows, (0, 0, 0, parts)).flatten(1, 2)[:, : parts * places]
-        return late.reshape(items, parts, places, self.hop).sum(1).flatten(1)
+        hops = count + parts - 1
+        padded_rows = functional.pad(rows, (0, 0, 0, parts)).flatten(1, 2)
+        delayed_rows = padded_rows[:, : parts * hops].reshape(items, parts, hops, self.hop)
+        return delayed_rows.sum(1).flatten(1)
 
-    def _hann(self, like: Tensor) -> Tensor:
+    def _hann_window(self, like: Tensor) -> Tensor:
+        """Hann window in the precision and on the device of a tensor. Shape: (window,)."""
         return constant_like(like, _hann, self.window)
 
 
 def _hann(points: int) -> NDArray[np.float64]:
+    """Compute a periodic Hann window of shape (points,)."""
     return 0.5 - 0.5 * np.cos(2.0 * np.pi * np.arange(points) / points)

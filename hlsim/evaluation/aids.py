@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from hlsim.audiogram import Audiogram
 from hlsim.calibration import level_spl, set_level
-from hlsim.dsp.fir import filter_centred
+from hlsim.dsp.fir import filter_without_delay
 from hlsim.evaluation.measurements import insertion_gain
 from hlsim.losses.band_levels import band_centres
 from hlsim.neuro.config import NEURO_RATE
@@ -82,7 +82,7 @@ def equalise_bands(waveform: Tensor, gains_db: Sequence[float]) -> Tensor:
     hertz = np.linspace(0.0, NEURO_RATE / 2.0, _TAPS)
     gains = np.interp(np.log(hertz.clip(1.0)), np.log(band_centres()), gains_db)
     taps = firwin2(_TAPS, hertz, 10.0 ** (gains / 20.0), fs=NEURO_RATE)
-    return filter_centred(waveform, torch.from_numpy(taps).to(waveform))
+    return filter_without_delay(waveform, torch.from_numpy(taps).to(waveform))
 
 
 class Enhanced(nn.Module):

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from hlsim.dsp.overlap import Block, overlapping
+from hlsim.dsp.overlap import Block, split_into_blocks
 from hlsim.msbg.ear import MSBG_RATE
 from hlsim.msbg.envelope import HALF_RATE_STEP, STEP
 from hlsim.msbg.smearing import HOP
@@ -31,13 +31,13 @@ def in_blocks(
     heard = []
     again = torch.is_grad_enabled() and _hooks_are_allowed()
     for block in blocks:
-        last = block.end == samples
-        given = _faded(block.given(signals), rate, block.begin > 0, not last)
+        last = block.input_stop == samples
+        given = _faded(block.cut_input(signals), rate, block.input_start > 0, not last)
         if again and (given.requires_grad or ears.requires_grad):
             output = checkpoint(process, given, ears, last, use_reentrant=False)
         else:
             output = process(given, ears, last)
-        heard.append(block.kept(output))
+        heard.append(block.cut_output(output))
     return torch.cat(heard, -1)
 
 
@@ -60,7 +60,7 @@ def block_bounds(samples: int, rate: int) -> list[Block]:
     unit = (
         common * rate // math.gcd(common * rate, MSBG_RATE)
     )  # samples in a whole number of hops and of steps
-    return overlapping(
+    return split_into_blocks(
         samples, round(_BLOCK_SECONDS * rate), _LEAD_SECONDS * rate, _LAG_SECONDS * rate, unit
     )
 

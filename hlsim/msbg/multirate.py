@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from hlsim.dsp.erb import erb
-from hlsim.dsp.fft import soft_end
+from hlsim.dsp.fft import fade_out_weights
 from hlsim.msbg.ear import MSBG_RATE
 from hlsim.msbg.envelope import HALF_RATE_STEP, STEP, decimation_kernel, envelope_lowpass
 from hlsim.msbg.filterbank import FilterBank, gammatone_response
@@ -159,7 +159,7 @@ def multirate_bank(
             response[:, 1:] *= 2.0
             decimation = decimation * (2.0 / math.pi)
         if samples < STEP:
-            response *= soft_end(
+            response *= fade_out_weights(
                 bins, MSBG_RATE / points, count / (1 if analytic else 2) * MSBG_RATE / points
             )
         kernels = tensor(decimation), tensor(interpolation)

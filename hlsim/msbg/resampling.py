@@ -11,8 +11,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from hlsim.dsp.fft import fft_length, rfft, soft_end
-from hlsim.dsp.fir import BLOCK_POINTS, filter_blocks
+from hlsim.dsp.fft import fade_out_weights, fft_length, rfft
+from hlsim.dsp.fir import BLOCK_POINTS, filter_in_blocks
 from hlsim.msbg.cochlea import shared_multiple
 from hlsim.msbg.ear import EAR_DELAY, MSBG_RATE, ear_filter, lowpass_filter
 from hlsim.torchtools import constant_like
@@ -23,7 +23,7 @@ _FIR_TAIL = 2 * EAR_DELAY + 132  # with the low-pass on the way out
 def to_cochlea(signals: Tensor, rate: int, length: int, step: int) -> Tensor:
     """Resample to 44.1 kHz / step and pass outer and middle ear. Shape: (items, time) -> (items, length)."""
     if rate == MSBG_RATE and step == 1:
-        return filter_blocks(signals, constant_like(signals, _inward_blocks), length)
+        return filter_in_blocks(signals, constant_like(signals, _inward_blocks), length)
     up, down = _ratio(rate, step)
     least = max(signals.shape[-1], math.ceil(length * down / up)) + math.ceil(
         _FIR_TAIL * down / up / step
@@ -80,7 +80,7 @@ def to_inner(signals: Tensor, rate: int) -> Tensor:
 
 
 def _inward_blocks() -> NDArray[np.complex128]:
-    """The way in for ``filter_blocks``."""
+    """The way in for ``filter_in_blocks``."""
     return np.fft.rfft(ear_filter(), BLOCK_POINTS)
 
 
@@ -107,7 +107,7 @@ def _end(points: int, bins: int, rate: int) -> NDArray[np.float64]:
     """How the spectrum ends where a signal's rate is not the model's."""
     if rate == MSBG_RATE:
         return np.ones(bins)
-    return soft_end(bins, MSBG_RATE / points, min(rate, MSBG_RATE) / 2)
+    return fade_out_weights(bins, MSBG_RATE / points, min(rate, MSBG_RATE) / 2)
 
 
 def _ratio(rate: int, step: int) -> tuple[int, int]:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from hlsim.audiogram import SEVERITIES, severity_index
-from hlsim.dsp.fir import filter_centred
+from hlsim.dsp.fir import filter_without_delay
 from hlsim.msbg.ear import MSBG_RATE, ear_filter, lowpass_filter
 from hlsim.msbg.filterbank import BANKS, FilterBank, gammatone_response
 from hlsim.msbg.model import STRUCTURAL_DELAY
@@ -56,7 +56,7 @@ def with_phase_of_bank(
     """
     severity = severity_index(thresholds)
     taps = constant_like(waveform, _phases, rate, normal)[severity]
-    moved = filter_centred(waveform, taps)
+    moved = filter_without_delay(waveform, taps)
     # a normal ear's stays as it is to the bit, for phases of what is nearly silent depend on rounding
     return torch.where((severity == 0).unsqueeze(-1), waveform, moved) if normal else moved
 
@@ -69,7 +69,7 @@ def hear_normally(waveform: Tensor, thresholds: Tensor, rate: int) -> Tensor:
 
     Shape: (items, time), (items, 8) dB HL -> (items, time).
     """
-    return filter_centred(
+    return filter_without_delay(
         waveform, constant_like(waveform, _as_normal, rate)[severity_index(thresholds)]
     )
 

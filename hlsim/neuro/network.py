@@ -9,7 +9,7 @@ from hlsim.audiogram import FREQUENCIES
 from hlsim.audiogram.thresholds import AudiogramLike, resolve_thresholds
 from hlsim.calibration import check_full_scale, gain_to_pascals
 from hlsim.checks import broadcast_shape, check_rate, check_waveform
-from hlsim.dsp.overlap import overlapping
+from hlsim.dsp.overlap import split_into_blocks
 from hlsim.dsp.resample import resample
 from hlsim.neuro.config import NEURO_RATE, NetworkConfig
 
@@ -88,8 +88,10 @@ class EarNetwork(nn.Module):
             return self._process(signals, ears)
         unit, field = self._receptive_field
         hop = self._at_once if signals.device.type == "cpu" else _DEVICE_SAMPLES
-        blocks = overlapping(signals.shape[-1], hop, field, field, unit)
-        outputs = [block.kept(self._process(block.given(signals), ears)) for block in blocks]
+        blocks = split_into_blocks(signals.shape[-1], hop, field, field, unit)
+        outputs = [
+            block.cut_output(self._process(block.cut_input(signals), ears)) for block in blocks
+        ]
         return outputs[0] if len(outputs) == 1 else torch.cat(outputs, -1)
 
     @property

@@ -14,7 +14,7 @@ from torch.nn import functional
 
 from hlsim.audiogram import SEVERITIES
 from hlsim.calibration import PASCAL_SPL
-from hlsim.dsp.fir import filter_centred
+from hlsim.dsp.fir import filter_without_delay
 from hlsim.dsp.stft import STFT
 from hlsim.msbg.ear import MSBG_RATE, ear_filter
 from hlsim.msbg.envelope import envelope_filters
@@ -93,7 +93,7 @@ class Prior(nn.Module):
 
     def filter(self, waveform: Tensor, severity: Tensor) -> Tensor:
         """Apply the fixed response of each item's bank. Shape: (items, time), (items,) -> (items, time)."""
-        return filter_centred(waveform, self.response[severity].to(waveform))
+        return filter_without_delay(waveform, self.response[severity].to(waveform))
 
     def forward(self, powers: Tensor, thresholds: Tensor, severity: Tensor) -> Tensor:
         """Complex factor on the filtered signal's spectrum, of its powers.

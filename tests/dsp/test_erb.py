@@ -1,4 +1,4 @@
-"""The ERB scale's three functions fit together."""
+"""The three functions of the ERB scale agree with each other."""
 
 import numpy as np
 

@@ -1,3 +1,5 @@
+"""The real transform and the power have the values and gradients of torch's functions."""
+
 import pytest
 import torch
 from torch import Tensor
@@ -38,3 +40,9 @@ def test_second_derivatives(function: torch.autograd.Function) -> None:
         return power(spectrum) if function is power else spectrum
 
     assert torch.autograd.gradgradcheck(energy, source)
+
+
+def test_the_gradient_of_the_power_of_silence_is_zero() -> None:
+    silence = torch.zeros(3, 5, dtype=torch.complex128, requires_grad=True)
+    weights = torch.ones(3, 5, dtype=torch.float64)
+    assert not bool(gradient(power(silence), silence, weights).any())

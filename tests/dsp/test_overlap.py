@@ -1,23 +1,24 @@
-"""Blocks make up the signal, and each has around it what it needs."""
+"""Blocks cover the signal, and each has the context that it needs."""
 
 import pytest
 import torch
 
-from hlsim.dsp.overlap import overlapping
+from hlsim.dsp.overlap import split_into_blocks
 
 
 @pytest.mark.parametrize("samples", [1, 149, 151, 1000, 1049, 1051])
 @pytest.mark.parametrize("unit", [1, 7])
-def test_what_is_kept_is_the_signal(samples: int, unit: int) -> None:
+def test_outputs_of_all_blocks_make_up_the_signal(samples: int, unit: int) -> None:
     signal = torch.arange(samples).expand(2, -1)
-    blocks = overlapping(samples, 100, 20.5, 30, unit)
-    assert torch.equal(torch.cat([block.kept(block.given(signal)) for block in blocks], -1), signal)
+    blocks = split_into_blocks(samples, 100, 20.5, 30, unit)
+    outputs = [block.cut_output(block.cut_input(signal)) for block in blocks]
+    assert torch.equal(torch.cat(outputs, -1), signal)
     assert (len(blocks) == 1) == (samples <= 1.5 * (100 // unit * unit))
     for block in blocks:
-        assert block.begin % unit == 0 and block.start % unit == 0
-        assert block.start - block.begin >= 20.5 or block.begin == 0
-        assert block.end - block.stop >= 30 or block.end == samples
+        assert block.input_start % unit == 0 and block.output_start % unit == 0
+        assert block.output_start - block.input_start >= 20.5 or block.input_start == 0
+        assert block.input_stop - block.output_stop >= 30 or block.input_stop == samples
 
 
-def test_a_hop_of_nothing_is_one_block() -> None:
-    assert overlapping(1000, 6, 1, 1, unit=7) == [(0, 0, 1000, 1000)]
+def test_a_hop_that_rounds_to_zero_gives_one_block() -> None:
+    assert split_into_blocks(1000, 6, 1, 1, unit=7) == [(0, 0, 1000, 1000)]

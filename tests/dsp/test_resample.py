@@ -1,4 +1,4 @@
-"""Resampling against scipy, torchaudio, tones and finite differences."""
+"""Resampling equals that of torchaudio and scipy, and its filter has the documented response."""
 
 import itertools
 import math
@@ -44,11 +44,12 @@ def test_tones_keep_their_phase_and_amplitude(source: int, target: int) -> None:
 
 
 def frequency_response(kernel: Tensor, source: int, target: int) -> tuple[NDArray, NDArray]:
-    """Frequencies over the lower Nyquist frequency, and the gain in dB of the filter whose phases the kernel holds."""
+    """Frequencies relative to the lower Nyquist frequency, and the gain of a kernel in dB."""
     phases = kernel[:, 0].double().numpy()
     reach = (phases.shape[1] - source) // 2
     taps = (np.arange(phases.shape[1]) - reach) * target
-    positions = taps - np.arange(target)[:, None] * source  # at source * target samples per unit
+    # in samples at the common multiple of both rates
+    positions = taps - np.arange(target)[:, None] * source
     filter_taps = np.zeros(scipy.fft.next_fast_len(8 * phases.size))
     filter_taps[positions - positions.min()] = phases / target
     gain = 20 * np.log10(np.abs(np.fft.rfft(filter_taps)) + 1e-15)
@@ -128,7 +129,7 @@ def test_length_is_rounded_up_and_leading_dimensions_stay(
     assert ours.shape == (2, 3, math.ceil(time * target / source))
 
 
-def test_one_of_a_stack_of_batches_is_resampled() -> None:
+def test_a_waveform_with_gaps_in_memory_is_resampled() -> None:
     batch = torch.randn(3, 2, 2, 1600)[:, 0]
     torch.testing.assert_close(
         resample(batch, 16000, 24000)[1, 1], resample(batch[1, 1], 16000, 24000)
@@ -152,7 +153,7 @@ def test_resampling_is_differentiable() -> None:
     assert torch.autograd.gradcheck(lambda w: resample(w, 48000, 16000), wave)
 
 
-def test_a_kernel_made_in_inference_mode_serves_gradients_too() -> None:
+def test_a_kernel_computed_in_inference_mode_passes_gradients() -> None:
     with torch.inference_mode():
         expected = resample(torch.ones(50), 17000, 16000)
     wave = torch.ones(50, requires_grad=True)
@@ -161,9 +162,10 @@ def test_a_kernel_made_in_inference_mode_serves_gradients_too() -> None:
     assert wave.grad is not None and torch.equal(resampled.detach(), expected)
 
 
-def test_a_kernel_made_in_a_transform_serves_others_too() -> None:
+def test_a_kernel_computed_in_a_transform_passes_other_gradients() -> None:
     def energy(wave: Tensor) -> Tensor:
-        return resample(wave, 18000, 16000).square().sum()  # rates of no other test
+        # No other test uses these rates, so that the kernel is computed in this call.
+        return resample(wave, 18000, 16000).square().sum()
 
     wave = torch.randn(50)
     torch.func.grad(lambda w: torch.func.grad(energy)(w).sum())(wave)
@@ -180,7 +182,7 @@ def test_low_precision_is_as_close_as_its_type_allows(dtype: torch.dtype) -> Non
     assert float((resampled - expected).abs().max()) < 8 * torch.finfo(dtype).eps
 
 
-def test_a_compiler_traces_it_whole() -> None:
+def test_resampling_compiles_to_one_graph() -> None:
     waveform = torch.randn(2, 500)
     compiled = torch.compile(
         lambda x: resample(x, 44100, 16000), backend="aot_eager", fullgraph=True
@@ -188,7 +190,7 @@ def test_a_compiler_traces_it_whole() -> None:
     torch.testing.assert_close(compiled(waveform), resample(waveform, 44100, 16000))
 
 
-def test_arguments_that_are_refused() -> None:
+def test_bad_arguments_are_rejected() -> None:
     with pytest.raises(TypeError, match="expected a floating-point waveform"):
         resample(torch.ones(50, dtype=torch.int16), 44100, 16000)
     with pytest.raises(ValueError, match="cannot resample from 44101 to 16000 Hz"):

@@ -1,4 +1,4 @@
-"""Windows against scipy's, to the bit: filters and everything after them depend on it."""
+"""Windows equal scipy's to the bit, because the bits of all filters depend on them."""
 
 import numpy as np
 import pytest
