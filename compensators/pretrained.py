@@ -22,7 +22,7 @@ CONFIGS: dict[str, type[MappingConfig | HearingAidConfig]] = {
 }
 """What ``config.json`` of a checkpoint calls the kind of compensator, and what it is made of."""
 
-_UNTRAINED = {"nalr": NALR, "wdrc": WDRC}
+_UNTRAINED: dict[str, type[NALR | WDRC]] = {"nalr": NALR, "wdrc": WDRC}
 
 
 def build_compensator(
@@ -65,8 +65,13 @@ def load_compensator(
     return loaded
 
 
+def _untrained(name: str | Path) -> type[NALR | WDRC] | None:
+    """Class of a compensator without checkpoint; its name may be written as ``NAL-R``."""
+    return _UNTRAINED.get(str(name).lower().replace("-", ""))
+
+
 def _load(name: str | Path, sample_rate: int, full_scale_spl: float) -> Trained | NALR | WDRC:
-    if kind := _UNTRAINED.get(str(name)):
+    if kind := _untrained(name):
         return kind(sample_rate=sample_rate, full_scale_spl=full_scale_spl).eval()
 
     def build(config: MappingConfig | HearingAidConfig) -> Trained:
@@ -107,5 +112,5 @@ def trained_for(name: str | Path) -> Audiogram | None:
     Raises:
         ValueError: no such checkpoint, or what it tells is no ear.
     """
-    told = None if str(name) in _UNTRAINED else checkpoint_about(name).get("audiogram")
+    told = None if _untrained(name) else checkpoint_about(name).get("audiogram")
     return None if told is None else Audiogram.from_dict(told)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from hlsim.cli.evaluation import finish, labelled_names, prepare_study, study_options
 from hlsim.cli.inputs import check_there
-from hlsim.cli.options import Parser, count, foreign_name, number
+from hlsim.cli.options import Parser, count, number, plugin_name
 from hlsim.cli.progress import show_progress
 
 
@@ -39,7 +39,7 @@ def clarity(parser: Parser) -> None:
         "noise reduction of your own before each aid, package.module:name or path/to/file.py:name: a "
         "callable (waveform, sample_rate) -> waveform or its class, for (2, time) in pascals"
     )
-    option("--enhancer", foreign_name, text, [], nargs="+", metavar="NAME", dest="enhancers")
+    option("--enhancer", plugin_name, text, [], nargs="+", metavar="NAME", dest="enhancers")
     text = "let one level set the gains of both ears, in a hearing aid or wdrc"
     parser.flag("--linked", text)
     option("--full-scale-spl", number, "level in dB SPL of a file whose RMS is 1.0", 100.0)

@@ -14,9 +14,9 @@ from hlsim.cli.options import (
     EARS_TABLE,
     Parser,
     count,
-    foreign_name,
     natural,
     number,
+    plugin_name,
     positive,
 )
 from hlsim.cli.progress import show_progress
@@ -104,7 +104,7 @@ def evaluate_compensator(parser: Parser) -> None:
         "path/to/file.py:name: a callable (waveform, sample_rate) -> waveform or its class, for (..., time) "
         "in pascals, time-aligned"
     )
-    option("--enhancer", foreign_name, text, [], nargs="+", metavar="NAME", dest="enhancers")
+    option("--enhancer", plugin_name, text, [], nargs="+", metavar="NAME", dest="enhancers")
     option("--simulator", str, "Neuro-MSBG of the surrogate gap, by name or folder", "neuro-msbg")
     option("--levels", number, "levels of the speech in dB SPL, in turn", [50, 65, 80], nargs="+")
     option("--items", count, "number of items", 400)
@@ -235,7 +235,7 @@ def study_options(parser: Parser, listen: int = 3) -> None:
         "additional measure of your own, package.module:name, imported from the working directory too: a "
         "function (item, output) -> dict of numbers"
     )
-    parser.option("--measure", foreign_name, text, [], nargs="+", metavar="NAME")
+    parser.option("--measure", plugin_name, text, [], nargs="+", metavar="NAME")
     parser.option("--listen", natural, "number of items with players on the page", listen)
     parser.jobs()
     text = "address of a Dask scheduler, such as tcp://host:8786, whose workers are used"

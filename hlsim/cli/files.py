@@ -1,186 +1,231 @@
-"""The commands ``simulate`` and ``compensate``: a file in, a file out, or a folder of them."""
+"""The commands ``simulate`` and ``compensate``: a file in, a file out, or a folder of files."""
 
 from __future__ import annotations
 
 import argparse
+import math
 import sys
+import warnings
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from hlsim.cli.inputs import check_files, check_folders, read_compensator, read_ears
+from hlsim.cli.inputs import read_compensator, read_ears
 from hlsim.cli.options import Parser
 from hlsim.files import check_extension, resolved
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-_UPPER_BAND = 8500.0  # Hz, from where on nothing of a model at 16 kHz comes
-_HEARD, _LOST = (
-    1e-6,
-    1e-3,
-)  # share of the upper band in the power, and what of that share counts as gone
+    Model = Callable[..., Tensor]
+
+UPPER_BAND_HZ = 8500.0  # models at 16 kHz remove everything from here on
+AUDIBLE_SHARE = 1e-6  # share of the input's power above which its upper band is worth a warning
+REMOVED_SHARE = 1e-3  # share of the upper band below which it counts as removed
 
 
 def simulate(parser: Parser) -> None:
-    _in_and_out(
+    _files(
         parser,
         _simulate,
-        "speech.wav heard.wav --audiogram N3",
-        "scenes heard --listener listeners.json:L0001 --simulator msbg",
+        "speech.wav perceived.wav --audiogram N3",
+        "scenes perceived --listener listeners.json:L0001 --simulator msbg",
     )
-    parser.option(
-        "--simulator", str, "msbg (exact), or a checkpoint's name or folder", "neuro-msbg"
-    )
+    text = "msbg (exact), or a checkpoint's name or folder"
+    parser.option("--simulator", str, text, "neuro-msbg")
 
 
 def compensate(parser: Parser) -> None:
-    _in_and_out(
+    _files(
         parser,
         _compensate,
         "speech.wav aided.wav --audiogram N3 --noise-reduction 0.5",
-        "speech aided --audiogram N4 --compensator nalr",
+        "speech aided --audiogram N4 --compensator nal-r",
     )
     text = (
-        "a checkpoint's name or folder (one of one ear alone warns of another), wdrc (compression in bands), or nalr "
-        "(the prescription)"
+        "nal-r (the prescription), wdrc (compression in bands), or a checkpoint's name or folder "
+        "(a checkpoint trained for one ear warns if used with another)"
     )
     parser.option("--compensator", str, text, "hearing-aid")
     parser.sliders()
-    parser.flag(
-        "--linked",
-        "the level of both channels of a stereo file sets the gains of each: of a hearing aid or wdrc",
-    )
+    text = "link the gains of both ears (stereo files; hearing aids and wdrc only)"
+    parser.flag("--linked", text)
 
 
-def _in_and_out(parser: Parser, run: Callable[[argparse.Namespace], None], *examples: str) -> None:
+def _files(parser: Parser, run: Callable[[argparse.Namespace], None], *examples: str) -> None:
     parser.runs(run, *examples)
-    text = "wav, flac or ogg, 16 kHz or more, any number of channels; or a folder of them, with those in it"
+    text = "audio file of 16 kHz or more (wav, flac, ogg, mp3, ...), or a folder of such files"
     parser.option("input", Path, text, metavar="IN")
-    text = "wav (32-bit float), flac, or ogg, which takes two channels; for a folder one that takes wav files alike"
+    text = (
+        "output file (.wav with 32-bit float, .flac, or .ogg with up to 2 channels), or a folder for wav files "
+        "if IN is a folder"
+    )
     parser.option("output", Path, text, metavar="OUT")
     ears = parser.add_mutually_exclusive_group(required=True)
     parser.audiogram(group=ears)
-    parser.listener("two ears, of stereo files, left first", group=ears)
+    parser.listener("both ears, for stereo files, left first", group=ears)
     parser.full_scale()
 
 
 def _simulate(options: argparse.Namespace) -> None:
-    def build(rate: int, _: bool) -> Callable[..., Tensor]:
+    def build(rate: int, is_first: bool) -> Model:
         from hlsim.losses.frozen_simulator import build_simulator
 
         return build_simulator(options.simulator, rate, options.full_scale_spl)
 
-    # above 8 kHz msbg leaves little to many ears, and all that they hear
-    _pass_through(
-        options, build, "" if options.simulator == "msbg" else "--simulator msbg keeps it"
-    )
+    # MSBG keeps the band above 8 kHz, but to many ears little of it is audible
+    hint = "" if options.simulator == "msbg" else "use --simulator msbg to keep it"
+    _process(options, build, hint)
 
 
 def _compensate(options: argparse.Namespace) -> None:
-    def build(rate: int, first: bool) -> Callable[..., Tensor]:
-        compensator, sliders = read_compensator(options, rate, warn=first)
+    def build(rate: int, is_first: bool) -> Model:
+        compensator, sliders = read_compensator(options, rate, warn=is_first)
         return partial(compensator, **sliders)
 
-    _pass_through(options, build, "--compensator hearing-aid, wdrc and nalr keep it")
+    _process(options, build, "use --compensator hearing-aid, wdrc or nal-r to keep it")
 
 
-def _pass_through(
-    options: argparse.Namespace, build: Callable[[int, bool], Callable[..., Tensor]], keeper: str
+def _process(
+    options: argparse.Namespace, build: Callable[[int, bool], Model], upper_band_hint: str
 ) -> None:
-    """Read, run what ``build`` makes for a rate, the first or not, write at each file's own, and say how loud it is.
+    """Process the file, or each file of the folder, and print levels and warnings.
 
-    ``keeper`` says what keeps the band above 8 kHz; empty where its loss is no surprise.
+    Args:
+        build: Function from sample rate, and whether it is the first call, to the model.
+        upper_band_hint: Advice for a file whose band above 8 kHz was removed; no warning if empty.
     """
-    whole = options.input.is_dir()
-    if whole:
-        check_folders(options.input, options.output)
-    else:
-        if options.output.is_dir():
-            raise ValueError(f"{options.output}: a folder; allowed: a file, for IN is one")
-        check_extension(options.output)
-        check_files(options.input, options.output)
-    ear = read_ears(options)
+    _check_paths(options.input, options.output)
+    ears = read_ears(options)
+    is_folder = options.input.is_dir()
+    pairs = [(options.input, options.output)]
+    if is_folder:
+        pairs = _pairs(options.input, options.output)
+    from hlsim.checks import LOWEST_RATE
+
+    models: dict[int, Model] = {}
+    if is_folder:  # a model that cannot be loaded is reported before the first file
+        models[LOWEST_RATE] = build(LOWEST_RATE, True)
+    failures = 0
+    for number, (source, target) in enumerate(pairs, 1):
+        try:
+            waveform, result, rate = _process_file(options, source, target, ears, models, build)
+        except ValueError as error:
+            if not is_folder:
+                raise
+            failures += 1
+            print(f"hlsim: warning: left out: {error}", file=sys.stderr)
+            continue
+        count = f"{number} of {len(pairs)}: " if is_folder else ""
+        levels = _levels(waveform, result, options.full_scale_spl)
+        print(f"{count}{target}: {levels}", flush=True)
+        for line in _output_warnings(waveform, result, rate, upper_band_hint):
+            print(f"hlsim: warning: {target}: {line}", file=sys.stderr)
+    if failures:
+        raise ValueError(f"{failures} of {len(pairs)} files were left out, see the warnings above")
+
+
+def _process_file(
+    options: argparse.Namespace,
+    source: Path,
+    target: Path,
+    ears: object,
+    models: dict[int, Model],
+    build: Callable[[int, bool], Model],
+) -> tuple[Tensor, Tensor, int]:
+    """Write the output for one file; return the input, the output and their sample rate."""
     import torch
 
     from hlsim.audio import check_written, read_audio, write_audio
-    from hlsim.checks import HIGHEST_RATE, LOWEST_RATE
+    from hlsim.checks import HIGHEST_RATE
     from hlsim.dsp.resample import resample
 
-    pairs = _pairs(options.input, options.output) if whole else [(options.input, options.output)]
-    # one that cannot be loaded is no fault of a file
-    models = {LOWEST_RATE: build(LOWEST_RATE, True)} if whole else {}
-    left_out = 0
-    for done, (source, target) in enumerate(pairs, 1):
-        try:
-            waveform, rate = read_audio(source, any_rate=True)
-            check_written(target, waveform.shape[0], rate)
-            if waveform.shape[0] != 2 and (options.listener or getattr(options, "linked", False)):
-                asked = "--listener" if options.listener else "--linked"
-                raise ValueError(
-                    f"{source}: {waveform.shape[0]} channels; allowed with {asked}: 2, left and right"
-                )
-            inner = min(rate, HIGHEST_RATE)
-            if inner not in models:
-                models[inner] = build(inner, not models)
-            with torch.no_grad():
-                result = models[inner](resample(waveform, rate, inner), ear)
-            result = resample(result, inner, rate)[..., : waveform.shape[-1]]
-            if whole:
-                target.parent.mkdir(parents=True, exist_ok=True)
-            write_audio(target, result, rate)
-        except ValueError as error:
-            if not whole:
-                raise
-            left_out += 1
-            print(f"hlsim: warning: left out: {error}", file=sys.stderr)
-            continue
-        count = f"{done} of {len(pairs)}: " if whole else ""
-        print(f"{count}{target}: {_levels(waveform, result, options.full_scale_spl)}", flush=True)
-        for line in _surprises(waveform, result, rate, keeper):
-            print(f"hlsim: warning: {target}: {line}", file=sys.stderr)
-    if left_out:
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        waveform, rate = read_audio(source, any_rate=True)
+    for warning in caught:
+        print(f"hlsim: warning: {warning.message}", file=sys.stderr)
+    channels, samples = waveform.shape
+    check_written(target, channels, rate)
+    needs_stereo = "--listener" if options.listener else ""
+    if getattr(options, "linked", False):
+        needs_stereo = "--linked"
+    if needs_stereo and channels != 2:
         raise ValueError(
-            f"{left_out} of {len(pairs)} files were left out, each told above; the others are written"
+            f"{source}: {needs_stereo} needs 2 channels, left and right, got {channels}"
         )
+    inner_rate = min(rate, HIGHEST_RATE)
+    if inner_rate not in models:
+        models[inner_rate] = build(inner_rate, not models)
+    with torch.no_grad():
+        result = models[inner_rate](resample(waveform, rate, inner_rate), ears)
+        result = resample(result, inner_rate, rate)[..., :samples]
+    write_audio(target, result, rate)
+    return waveform, result, rate
+
+
+def _check_paths(source: Path, target: Path) -> None:
+    """Raise ValueError if OUT could not be written after the work, or would replace a file of IN."""
+    if not source.exists():
+        raise ValueError(f"{source}: there is no such file or folder")
+    if source.is_dir():
+        if target.exists() and not target.is_dir():
+            raise ValueError(f"{target}: expected a folder, because {source} is one")
+        inner, outer = resolved(source), resolved(target)
+        if inner.is_relative_to(outer) or outer.is_relative_to(inner):
+            raise ValueError(f"{target}: choose a folder outside {source} that does not contain it")
+        return
+    if target.is_dir():
+        raise ValueError(f"{target}: expected a file, because {source} is one")
+    check_extension(target)
+    if not target.parent.is_dir():
+        raise ValueError(f"{target.parent}: there is no such folder")
+    if target.exists() and target.samefile(source):
+        raise ValueError(f"{target}: refusing to overwrite the input; choose another file")
 
 
 def _pairs(source: Path, target: Path) -> list[tuple[Path, Path]]:
-    """Each file under a folder, and its place under the other as wav, which holds what is over full scale."""
-    from hlsim.audio import find_audio
+    """Each audio file of a folder, and its place as a wav file in the other folder."""
+    from hlsim.audio import list_files
 
-    made: dict[Path, Path] = {}
-    for path in find_audio(source):
-        one = (target / path.relative_to(source)).with_suffix(".wav")
-        if one in made:
-            raise ValueError(f"{path} and {made[one]} would both be {one}; rename one")
-        made[one] = path
-    read = {resolved(path) for path in made.values()}
-    for one, path in made.items():
-        if resolved(one) in read:
-            raise ValueError(
-                f"{one}: made of {path}, a file of IN would be lost; allowed: another OUT"
-            )
-    return [(path, one) for one, path in made.items()]
+    audio, others = list_files(source)
+    if others:
+        endings = ", ".join(sorted({path.suffix or path.name for path in others})[:5])
+        print(f"files that are not audio, passed over: {len(others)} ({endings})", file=sys.stderr)
+    sources: dict[Path, Path] = {}
+    for path in audio:
+        output = (target / path.relative_to(source)).with_suffix(".wav")
+        if output in sources:
+            raise ValueError(f"{path} and {sources[output]} would both be written to {output}")
+        sources[output] = path
+    return [(path, output) for output, path in sources.items()]
 
 
 def _levels(before: Tensor, after: Tensor, full_scale_spl: float) -> str:
     from hlsim.calibration import level_spl
 
-    given, made = (float(level_spl(one.flatten(), full_scale_spl)) for one in (before, after))
+    levels = [float(level_spl(signal.flatten(), full_scale_spl)) for signal in (before, after)]
     peak = float(level_spl(after.abs().max().reshape(1), full_scale_spl))
-    return f"{given:.1f} dB SPL in, {made:.1f} out, peak {peak:.1f}"
+    return f"input {levels[0]:.1f} dB SPL, output {levels[1]:.1f} dB SPL, peak {peak:.1f} dB SPL"
 
 
-def _surprises(before: Tensor, after: Tensor, rate: int, keeper: str) -> Iterator[str]:
-    """What a listener would not expect of the file."""
+def _output_warnings(
+    before: Tensor, after: Tensor, rate: int, upper_band_hint: str
+) -> Iterator[str]:
     import torch
 
-    if (peak := float(after.abs().max())) > 1.0:
-        yield f"reaches {peak:.3g} of full scale; a player clips it, unless it is turned down first"
-    first = round(_UPPER_BAND / rate * before.shape[-1])
-    powers = [torch.fft.rfft(one.double()).abs().square().sum(0) for one in (before, after)]
-    given, made = (float(power[first:].sum() / power.sum()) for power in powers)
-    if keeper and given > _HEARD and made < _LOST * given:
-        yield f"what IN has above 8 kHz is missing; {keeper}"
+    peak = float(after.abs().max())
+    if peak > 1.0:
+        decibels = 20.0 * math.log10(peak)
+        yield (
+            f"the peak is {peak:.3g} times full scale; most players will clip it, so lower it by "
+            f"{math.ceil(decibels)} dB before playing"
+        )
+    first = round(UPPER_BAND_HZ / rate * before.shape[-1])
+    shares = []
+    for signal in (before, after):
+        power = torch.fft.rfft(signal.double()).abs().square().sum(0)
+        shares.append(float(power[first:].sum() / power.sum()))
+    if upper_band_hint and shares[0] > AUDIBLE_SHARE and shares[1] < REMOVED_SHARE * shares[0]:
+        yield f"the band above 8 kHz was removed, because the model is limited to it; {upper_band_hint}"

@@ -7,14 +7,14 @@ import math
 from types import ModuleType
 
 from hlsim.cli.inputs import read_compensator, read_ears
-from hlsim.cli.options import STANDARD_EARS, Parser, checked_type, number, positive
+from hlsim.cli.options import Parser, checked_type, number, positive
 from hlsim.extras import require
 
-_RATE = 16000
+RATE = 16000  # Hz
 _device = checked_type(
     lambda text: int(text) if text.isdecimal() else text,
     lambda device: device != "",
-    "a number or part of a name",
+    "a device's number or part of its name",
 )
 
 
@@ -24,65 +24,58 @@ def live(parser: Parser) -> None:
         "--audiogram N3",
         "--listener listeners.json:L0001 --simulate --seconds 60",
     )
+    option = parser.option
     ears = parser.add_mutually_exclusive_group()
-    parser.audiogram(text="; this or --listener is needed but for --list-devices", group=ears)
-    parser.listener(
-        "two ears, left first, of headphones and of microphones, where those are two", group=ears
-    )
-    either = parser.add_mutually_exclusive_group()
-    text = "what runs chunk by chunk: a hearing aid's checkpoint, name or folder, or wdrc (compression in bands)"
-    parser.option("--compensator", str, text, "hearing-aid", group=either)
-    text = "hear what that ear hears instead, by neuro-msbg, in blocks of 96 ms and 200 ms late"
-    either.add_argument("--simulate", action="store_true", help=text)
+    parser.audiogram(group=ears)
+    parser.listener("both ears, left first, for stereo headphones", group=ears)
+    models = parser.add_mutually_exclusive_group()
+    text = "a streaming aid: wdrc (compression in bands), or a hearing aid's name or folder"
+    option("--compensator", str, text, "hearing-aid", group=models)
+    text = "simulate the hearing loss with neuro-msbg instead, in blocks of 96 ms and with a delay of 200 ms"
+    parser.flag("--simulate", text, group=models)
     parser.sliders()
-    text = "level in dB SPL of samples whose RMS is 1.0, of microphone and headphones alike; to be measured"
-    parser.option("--full-scale-spl", number, text, 100.0)
-    parser.option(
-        "--input", _device, "microphone: number or part of its name; the system's by default"
-    )
-    parser.option(
-        "--output", _device, "headphones: number or part of their name; the system's by default"
-    )
-    parser.option("--block-ms", positive, "of an aid", 4.0)
-    parser.option(
-        "--buffer-ms",
-        positive,
-        "that each device is asked to hold: more, where there are drop-outs",
-        20.0,
-    )
-    parser.option("--seconds", positive, "until it ends by itself")
-    parser.flag("--list-devices", "show what there is, and end")
+    text = "level in dB SPL of samples whose RMS is 1.0, at microphone and headphones; measure it"
+    option("--full-scale-spl", number, text, 100.0, metavar="DB")
+    text = "microphone, by number or part of its name; the system's by default"
+    option("--input", _device, text, metavar="DEVICE")
+    text = "headphones, by number or part of their name; the system's by default"
+    option("--output", _device, text, metavar="DEVICE")
+    option("--block-ms", positive, "block size of an aid in ms", 4.0)
+    text = "buffer of each device in ms; raise it if there are drop-outs"
+    option("--buffer-ms", positive, text, 20.0)
+    option("--seconds", positive, "stop after this many seconds")
+    parser.flag("--list-devices", "list the devices and exit")
 
 
 def _live(options: argparse.Namespace) -> None:
-    if not options.list_devices:
-        if options.audiogram is None and options.listener is None:
-            raise ValueError(
-                "no --audiogram and no --listener; allowed: "
-                f"{', '.join(STANDARD_EARS)}, or eight levels in dB HL, or a listener's file"
-            )
-        ears = read_ears(options)
-    sounddevice = _sounddevice()
+    sounddevice = None
     if options.list_devices:
+        sounddevice = _sounddevice()
         print(sounddevice.query_devices() or "no devices")
         return
+    if options.audiogram is None and options.listener is None:
+        raise ValueError("give an ear with --audiogram, or both ears with --listener")
+    if options.simulate and (
+        options.noise_reduction is not None or options.amplification is not None
+    ):
+        raise ValueError("--noise-reduction and --amplification have no effect with --simulate")
+    ears = read_ears(options)
+    sounddevice = _sounddevice()
     import torch
 
     from hlsim.live import Live, Simulated, play
     from hlsim.losses.frozen_simulator import build_simulator
 
-    torch.set_num_threads(1)  # others would only wait for one another in 4 ms
-    block = max(1, round(options.block_ms * _RATE / 1000))
+    torch.set_num_threads(1)  # several threads spend more than 4 ms waiting for each other
+    block = max(1, round(options.block_ms * RATE / 1000))
     if options.simulate:
-        if options.noise_reduction is not None or options.amplification is not None:
-            raise ValueError("sliders with --simulate; allowed: with a hearing aid")
-        stream = Simulated(build_simulator("neuro-msbg", _RATE, options.full_scale_spl), ears)
+        stream = Simulated(build_simulator("neuro-msbg", RATE, options.full_scale_spl), ears)
         block, latency = 12 * stream.block, stream.latency
     else:
-        aid, sliders = read_compensator(options, _RATE)
+        aid, sliders = read_compensator(options, RATE)
         if not hasattr(aid, "stream"):
             raise ValueError(
-                f"{options.compensator} takes whole signals; allowed: wdrc, or a hearing aid"
+                f"{options.compensator} cannot run in blocks; use wdrc, or a hearing aid"
             )
         stream, latency = aid.stream(ears, **sliders), aid.latency
     play(
@@ -98,7 +91,7 @@ def _live(options: argparse.Namespace) -> None:
 def _sounddevice() -> ModuleType:
     try:
         return require("sounddevice", "live")
-    except OSError as error:  # of its own, where the wheel brings no PortAudio
+    except OSError as error:  # raised by sounddevice itself, if the wheel brings no PortAudio
         raise ValueError(
-            f"no PortAudio ({error}); allowed: with it, on Debian apt install libportaudio2"
+            f"PortAudio not found ({error}); install it (Debian: apt install libportaudio2)"
         ) from error

@@ -1,7 +1,9 @@
-"""The program ``hlsim``. Bad input ends with exit status 2 and one line."""
+"""The program ``hlsim``. Bad input ends with exit status 2 and a message of one line."""
 
 from __future__ import annotations
 
+import argparse
+import os
 import signal
 import sys
 import threading
@@ -14,85 +16,94 @@ from hlsim.extras import MissingExtraError
 from hlsim.version import __version__
 
 COMMANDS = {
+    "simulate": ("files", "simulate a hearing loss on a file or a folder of files"),
+    "compensate": ("files", "apply a hearing aid to a file or a folder of files"),
+    "live": ("live", "run a hearing aid or a simulated hearing loss from microphone to headphones"),
     "demo": (
         "demo",
-        "train a compensator for one ear on the embedded speech and score it by HASPI",
+        "train a compensator for one ear on bundled speech, and compare it with NAL-R",
     ),
-    "simulate": ("files", "write what an impaired ear hears of a file"),
-    "compensate": ("files", "write what an impaired ear is to be given of a file"),
-    "live": (
-        "live",
-        "give an impaired ear what it needs, or hear as it does: microphone to headphones",
+    "haspi-report": (
+        "evaluation",
+        "compare recordings by HASPI, HASQI, STOI or PESQ, with paired tests",
     ),
+    "evaluate-compensator": ("evaluation", "compare hearing aids with no aid, NAL-R and WDRC"),
+    "evaluate-simulator": ("evaluation", "compare simulators with MSBG or another teacher"),
+    "clarity": ("clarity", "evaluate pairs of aids on scenes of the Clarity challenges"),
     "prepare": (
         "prepare",
         "recognise the layout of a corpus and write its manifest, a CSV file to train on",
     ),
-    "train-simulator": (
-        "training",
-        "train a Neuro-MSBG on targets from the exact MSBG or another teacher",
-    ),
-    "train-compensator": ("training", "train a compensator through a frozen simulator"),
-    "evaluate-simulator": (
-        "evaluation",
-        "compare simulators with MSBG or another teacher: SNR, STOI, PESQ, bands",
-    ),
-    "evaluate-compensator": (
-        "evaluation",
-        "judge compensators beside no aid and NAL-R: HASPI, HASQI, loudness as heard, surrogate gap, gain curves, tones",
-    ),
-    "haspi-report": (
-        "evaluation",
-        "HASPI (HASQI, STOI, PESQ) before and after a treatment, with paired tests",
-    ),
-    "clarity": (
-        "clarity",
-        "judge pairs of aids on scenes of Clarity's challenges: the better ear's HASPI and HASQI",
-    ),
+    "train-simulator": ("training", "train a Neuro-MSBG to reproduce MSBG or another teacher"),
+    "train-compensator": ("training", "train a hearing aid through a frozen simulator"),
 }
-"""Each command's module in ``hlsim.cli``, where a function of its name declares its options, and what it does."""
+"""For each command its module in ``hlsim.cli``, where a function of the command's name declares its options, and a
+description."""
+
+GROUPS = {
+    "listen": ("simulate", "compensate", "live", "demo"),
+    "evaluate": ("haspi-report", "evaluate-compensator", "evaluate-simulator", "clarity"),
+    "train": ("prepare", "train-simulator", "train-compensator"),
+}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the program; returns its exit status."""
-    terminated: list[int] = []
+    """Run the program.
 
-    def end(number: int, frame: object) -> None:
-        terminated.append(number)
+    Args:
+        arguments: Command and options; those of the process by default.
+
+    Returns: exit status, 0 after success and 2 after an error.
+    """
+    if "matplotlib" not in sys.modules:
+        os.environ["MPLBACKEND"] = "Agg"  # a notebook's backend may be missing in this environment
+    signals: list[int] = []
+
+    def stop(number: int, frame: object) -> None:
+        signals.append(number)
         raise KeyboardInterrupt
 
-    main_thread = threading.current_thread() is threading.main_thread()
-    before = signal.signal(signal.SIGTERM, end) if main_thread else None
+    is_main_thread = threading.current_thread() is threading.main_thread()
+    previous_handler = signal.signal(signal.SIGTERM, stop) if is_main_thread else None
     try:
+        parser = _parser()
         given = sys.argv[1:] if arguments is None else arguments
-        options = _parser().parse_args(join_negative_values(given))
+        options = parser.parse_args(join_negative_values(given))
+        if not hasattr(options, "run"):
+            parser.print_help()
+            return 0
         options.run(options)
     except (ValueError, MissingExtraError, OSError) as error:
         print(f"hlsim: error: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        print(
-            "hlsim: stopped; what was finished is kept, and training and reports go on from there with the same command",
-            file=sys.stderr,
-        )
-        return 128 + (terminated[0] if terminated else signal.SIGINT)
+        text = "stopped; run the same command again to continue a training or an evaluation"
+        print(f"\nhlsim: {text}", file=sys.stderr)
+        return 128 + (signals[0] if signals else signal.SIGINT)
     finally:
-        if main_thread:
-            signal.signal(signal.SIGTERM, before)
+        if is_main_thread:
+            signal.signal(signal.SIGTERM, previous_handler)
     return 0
 
 
 def _parser() -> Parser:
-    parser = Parser(prog="hlsim", description="Hear through an impaired ear, and train through it.")
+    lines = []
+    for group, names in GROUPS.items():
+        lines += [f"\n{group}:", *(f"  {name:<22}{COMMANDS[name][1]}" for name in names)]
+    parser = Parser(
+        prog="hlsim",
+        usage="hlsim COMMAND ...",
+        description="Simulate hearing losses, apply, train and evaluate hearing aids.",
+        epilog="\n".join(lines) + "\n\nhlsim COMMAND --help describes the options of a command.",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
     parser.add_argument("--version", action="version", version=f"hlsim {__version__}")
-    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+    commands = parser.add_subparsers(
+        prog="hlsim", metavar="COMMAND", help="one of the commands below"
+    )
     for command, (module, text) in COMMANDS.items():
-        commands.add_parser(
-            command,
-            help=text,
-            description=text,
-            declare=partial(_declare, module, command.replace("-", "_")),
-        )
+        declare = partial(_declare, module, command.replace("-", "_"))
+        commands.add_parser(command, description=text, declare=declare)
     return parser
 
 

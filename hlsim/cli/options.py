@@ -54,6 +54,7 @@ class Parser(argparse.ArgumentParser):
         self._declare = declare
         self._examples: tuple[str, ...] = ()
         self._passed_on: tuple[str, ...] = ()
+        self._required: Any = None
 
     def runs(self, run: Callable[[argparse.Namespace], None], *examples: str) -> None:
         """Set the function that runs the command, and the arguments that the help shows as examples."""
@@ -99,7 +100,7 @@ class Parser(argparse.ArgumentParser):
     ) -> None:
         """Declare an option or, if the name has no dashes, a positional argument.
 
-        The help text ends with the default, or says that the option is required.
+        The help text ends with the default; required options are listed in a group of their own.
 
         Args:
             kind: Function that reads the value.
@@ -107,11 +108,13 @@ class Parser(argparse.ArgumentParser):
             settings: Other arguments of ``add_argument``.
         """
         if settings.get("required"):
-            text += " (required)"
+            group = self._required = self._required or self.add_argument_group("required options")
         elif default not in (None, []):
             text += f" (default: {_shown(default, separator=' ' if 'nargs' in settings else ',')})"
         if name.startswith("-"):
             settings["default"] = default
+        if "choices" not in settings and kind in _METAVARS:
+            settings.setdefault("metavar", _METAVARS[kind])
         (group or self).add_argument(name, type=kind, help=text, **settings)
 
     def flag(self, name: str, text: str, group: Any = None) -> None:
@@ -131,11 +134,10 @@ class Parser(argparse.ArgumentParser):
 
     def audiogram(self, default: str | None = None, text: str = "", **settings: Any) -> None:
         help_ = (
-            "NH, N1 to N7 (simulators and trained compensators take up to N6), S1 to S3, or eight "
-            "levels in dB HL at 250, 500, 1000, 2000, 3000, 4000, 6000 and 8000 Hz, separated by "
-            f"commas{text}"
+            "NH, N1 to N7, S1 to S3, or eight levels in dB HL at 250, 500, 1000, 2000, 3000, 4000, 6000 "
+            f"and 8000 Hz, separated by commas{text}"
         )
-        self.option("--audiogram", str, help_, default, **settings)
+        self.option("--audiogram", str, help_, default, metavar="EAR", **settings)
 
     def listener(self, text: str, **settings: Any) -> None:
         help_ = (
@@ -146,7 +148,7 @@ class Parser(argparse.ArgumentParser):
 
     def full_scale(self, **settings: Any) -> None:
         text = "level in dB SPL of a file whose RMS is 1.0"
-        self.option("--full-scale-spl", number, text, 94.0, **settings)
+        self.option("--full-scale-spl", number, text, 94.0, metavar="DB", **settings)
 
     def sliders(self) -> None:
         text = "strength of a hearing aid's noise reduction, 0 to 1 (default: 1)"
@@ -156,13 +158,6 @@ class Parser(argparse.ArgumentParser):
 
     def jobs(self) -> None:
         self.option("--jobs", count, "number of processes; all cores by default")
-
-    def parallel(self) -> None:
-        self.jobs()
-        text = "where to run: processes on this machine, or a Dask cluster"
-        self.option("--backend", str, text, "loky", choices=("loky", "dask"))
-        text = "address of the Dask scheduler, such as tcp://host:8786"
-        self.option("--scheduler", str, text)
 
     def seed(self) -> None:
         self.option("--seed", integer, "seed of every random draw", 0)
@@ -206,7 +201,7 @@ slider = checked_type(float, lambda value: 0 <= value <= 1, "a number from 0 to 
 integer = checked_type(int, lambda value: True, "a whole number")
 count = checked_type(int, lambda value: value >= 1, "a whole number, 1 or more")
 natural = checked_type(int, lambda value: value >= 0, "a whole number, 0 or more")
-foreign_name = checked_type(
+plugin_name = checked_type(
     str, lambda text: bool(_PLUGIN.fullmatch(text)), "package.module:name or path/to/file.py:name"
 )
 teacher_name = checked_type(
@@ -227,3 +222,16 @@ def folder(text: str) -> Path:
     if not os.access(existing, os.W_OK | os.X_OK):
         raise argparse.ArgumentTypeError(f"no permission to write to {existing}")
     return path
+
+
+_METAVARS: dict[Callable[[str], Any], str] = {
+    Path: "PATH",
+    folder: "DIR",
+    str: "NAME",
+    count: "N",
+    natural: "N",
+    integer: "N",
+    number: "X",
+    positive: "X",
+    slider: "X",
+}

@@ -10,9 +10,8 @@ import pytest
 
 from hlsim.audiogram import STANDARD
 from hlsim.cli import options
-from hlsim.cli.inputs import read_ear
-from hlsim.cli.main import COMMANDS
-from hlsim.cli.options import Parser
+from hlsim.cli.main import COMMANDS, GROUPS, main
+from hlsim.cli.options import Parser, join_negative_values
 from hlsim.losses.criteria import CRITERIA, CriterionName
 from hlsim.training.teacher import TEACHERS
 
@@ -21,11 +20,6 @@ def declared(command: str) -> Parser:
     parser = Parser(prog=command)
     getattr(import_module(f"hlsim.cli.{COMMANDS[command][0]}"), command.replace("-", "_"))(parser)
     return parser
-
-
-def choices(command: str, option: str) -> tuple[str, ...]:
-    (action,) = (action for action in declared(command)._actions if option in action.option_strings)
-    return tuple(action.choices or ())
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -93,11 +87,22 @@ def test_defaults_of_the_program_are_the_functions() -> None:
     assert compared > 20
 
 
-def test_required_options_are_shown_as_required() -> None:
-    text = " ".join(declared("evaluate-simulator").format_help().split())
-    assert "folder of clean speech (required)" in text and "None" not in text
-    assert "(default: 50 60 65 70 80)" in text
+def test_required_options_are_a_group_of_their_own() -> None:
+    text = declared("evaluate-simulator").format_help()
+    assert text.index("required options:") < text.index("folder of clean speech")
+    assert "None" not in text and "(default: 50 60 65 70 80)" in " ".join(text.split())
 
 
-def test_names_of_ears_may_be_written_small() -> None:
-    assert read_ear("n3") == read_ear("N3") and read_ear("nh") == read_ear("NH")
+def test_every_command_is_in_one_group(capsys: pytest.CaptureFixture[str]) -> None:
+    assert sorted(name for names in GROUPS.values() for name in names) == sorted(COMMANDS)
+    assert main([]) == 0
+    text = capsys.readouterr().out
+    assert all(f"  {name} " in text for name in COMMANDS)
+
+
+def test_lists_that_begin_with_a_minus_are_values() -> None:
+    assert join_negative_values(["--audiogram", "-10,0,5", "--levels", "-5"]) == [
+        "--audiogram=-10,0,5",
+        "--levels",
+        "-5",
+    ]

@@ -22,45 +22,25 @@ for arguments, status in json.loads(sys.argv[1]):
 
 
 def test_help_and_refusals_import_nothing_heavy(tmp_path: Path) -> None:
-    plain, missing, out = (
-        tmp_path / "plain.wav",
-        str(tmp_path / "missing"),
-        str(tmp_path / "out.wav"),
-    )
+    plain, missing, out = tmp_path / "plain.wav", tmp_path / "missing", tmp_path / "out.wav"
     plain.touch()
-    refused: list[list[str]] = [
-        [],
-        ["nothing"],
-        ["simulate", str(plain), out, "--audiogram", "N3", "--loud"],
-        ["simulate", missing, out, "--audiogram", "N3"],
-        ["simulate", str(plain), out, "--audiogram", "N9"],
-        ["simulate", str(plain), out + ".mp3", "--audiogram", "N3"],
-        ["compensate", missing, out, "--audiogram", "n3"],
-        ["live"],
-        ["live", "--audiogram", "N9"],
-        ["live", "--audiogram", "N3", "--block-ms", "0"],
-        ["prepare", missing, "--out", out],
-        ["prepare", str(tmp_path), "--out", out, "--valid-share", "2"],
-        ["train-simulator", "--recipe", missing, "--speech", str(tmp_path), "--out", out],
-        ["train-simulator", "--recipe", str(plain), "--out", out],
-        ["train-simulator", "--recipe", str(plain), "--manifest", missing, "--out", out],
-        ["train-compensator", "--speech", missing, "--out", out],
-        [
-            "evaluate-simulator",
-            "msbg",
-            "--speech",
-            str(tmp_path),
-            "--audiograms",
-            missing,
-            "--out",
-            out,
-        ],
-        ["evaluate-compensator", "nalr", "--speech", missing, "--out", out],
-        ["haspi-report", "--manifest", missing, "--out", out],
-        ["demo", "--speech", missing],
+    lines = [
+        "nothing",
+        f"simulate {plain} {out} --audiogram N3 --loud",
+        f"simulate {missing} {out} --audiogram N3",
+        f"simulate {plain} {out} --audiogram N9",
+        f"simulate {plain} {out}.mp3 --audiogram N3",
+        "live",
+        "live --audiogram N9",
+        f"prepare {missing} --out {out}",
+        f"train-compensator --speech {missing} --out {out}",
+        f"evaluate-simulator msbg --speech {tmp_path} --audiograms {missing} --out {out}",
+        f"evaluate-compensator nalr --speech {missing} --out {out}",
+        f"haspi-report --manifest {missing} --out {out}",
+        f"demo --speech {missing}",
     ]
-    shown = [["--help"], ["--version"], *([command, "--help"] for command in COMMANDS)]
-    calls = [(call, 0) for call in shown] + [(call, 2) for call in refused]
+    helps = [[], ["--help"], ["--version"], *([command, "--help"] for command in COMMANDS)]
+    calls = [(call, 0) for call in helps] + [(line.split(), 2) for line in lines]
     command = [sys.executable, "-c", SCRIPT, json.dumps(calls)]
     ended = subprocess.run(
         command, capture_output=True, text=True, cwd=Path(hlsim.__file__).parents[1]
