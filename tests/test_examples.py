@@ -31,7 +31,6 @@ def load(name: str) -> ModuleType:
 def test_own_network_trains(
     tmp_path: Path, speech_dir: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert len((EXAMPLES / "train_compensator.py").read_text().splitlines()) < 60
     example, out = load("train_compensator.py"), tmp_path / "network.pt"
     example.main(str(speech_dir / "train"), str(out), "N4", "2")
     assert [line.split(":")[0] for line in capsys.readouterr().out.splitlines()] == [

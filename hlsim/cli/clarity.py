@@ -33,7 +33,7 @@ def clarity(parser: Parser) -> None:
     option("--listeners", Path, text, required=True)
     text = "JSON file with each scene's listeners; by default every listener in every scene"
     option("--scenes-listeners", Path, text)
-    text = "take the first pair of scene and listener, and then each one so many further"
+    text = "use every N-th pair of scene and listener"
     option("--every", count, text, 1)
     text = (
         "noise reduction of your own before each aid, package.module:name or path/to/file.py:name: a "

@@ -232,7 +232,7 @@ def _haspi_report(options: argparse.Namespace) -> None:
 def study_options(parser: Parser, listen: int = 3) -> None:
     """Declare the options that all evaluations share."""
     text = (
-        "additional measure of your own, package.module:name, imported from the working directory too: a "
+        "additional measure of your own, package.module:name or path/to/file.py:name: a "
         "function (item, output) -> dict of numbers"
     )
     parser.option("--measure", plugin_name, text, [], nargs="+", metavar="NAME")
