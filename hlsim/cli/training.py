@@ -54,9 +54,7 @@ def _training_options(parser: Parser) -> None:
     text = "minutes after which to stop, those before a resumption included; the learning rate does not depend on them"
     option("--max-minutes", positive, text)
     option("--device", str, "where to train", "auto", choices=("auto", "cpu", "cuda"))
-    option("--devices", count, "GPUs or processes a machine", 1)
-    option("--nodes", count, "machines", 1)
-    option("--strategy", str, "Lightning's, e.g. ddp", "auto")
+    option("--devices", count, "number of GPUs or processes; each draws batches of its own", 1)
     option("--workers", natural, "processes that draw batches, beside the one that trains", 0)
     parser.flag("--quiet", "no progress bar, only a line per validation")
     parser.out()
@@ -131,7 +129,5 @@ def _arguments(options: argparse.Namespace) -> dict[str, Any]:
         "max_minutes": options.max_minutes,
         "accelerator": "gpu" if options.device == "cuda" else options.device,
         "devices": options.devices,
-        "nodes": options.nodes,
-        "strategy": options.strategy,
         "progress": not options.quiet,
     }

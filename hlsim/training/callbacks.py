@@ -1,7 +1,8 @@
-"""Callbacks of a training: averaged weights, the best network as a checkpoint folder, examples, and a progress bar."""
+"""Callbacks of a training: averaged weights, the best network as a checkpoint folder, and a progress bar."""
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -9,19 +10,13 @@ from typing import Any
 
 import lightning as L
 import torch
-from lightning.pytorch.callbacks import (
-    Callback,
-    ModelCheckpoint,
-    TQDMProgressBar,
-    WeightAveraging,
-)
+from lightning.pytorch.callbacks import ModelCheckpoint, TQDMProgressBar, WeightAveraging
 from torch import Tensor
 
-from hlsim.calibration import PASCAL_SPL
-from hlsim.neuro.config import NEURO_RATE
+from hlsim.pretrained import save_checkpoint
 
-IMAGE_RANGE_SPL = (0.0, 70.0)
-"""Levels in dB SPL per frequency that are black and white in a spectrogram."""
+CHECKPOINT = "checkpoint"
+"""Folder of the best network, which ``load_pretrained`` or ``load_compensator`` reads."""
 
 
 class WeightAverage(WeightAveraging):
@@ -54,17 +49,15 @@ class BestCheckpoint(ModelCheckpoint):
     """Lightning's state with the highest validation score, and its network as a folder that hlsim loads.
 
     Args:
-        folder: folder for ``best.ckpt``.
-        release: writes the network's folder, given its weights, the step and the validation.
-        score_to_beat: score below which nothing is released.
+        folder: folder of the training, for ``best.ckpt`` and ``checkpoint``.
+        kind: kind of the network's checkpoint.
+        record: how the network was trained, for its ``config.json``.
+
+    Attributes:
+        score_to_beat: score up to which no network is released.
     """
 
-    def __init__(
-        self,
-        folder: Path,
-        release: Callable[[Mapping[str, Tensor], int, Mapping[str, float]], None],
-        score_to_beat: float = -math.inf,
-    ) -> None:
+    def __init__(self, folder: Path, kind: str, record: Mapping[str, Any]) -> None:
         super().__init__(
             dirpath=folder,
             filename="best",
@@ -73,50 +66,49 @@ class BestCheckpoint(ModelCheckpoint):
             save_on_train_epoch_end=False,
             enable_version_counter=False,
         )
-        self.release = release
-        self.score_to_beat = score_to_beat
+        self.released = folder / CHECKPOINT
+        self.kind = kind
+        self.record = record
+        self.score_to_beat = -math.inf
 
-    def on_validation_end(self, trainer: L.Trainer, module: L.LightningModule) -> None:
+    def on_validation_end(self, trainer: L.Trainer, module: Any) -> None:
         previous_score = self.best_model_score
         super().on_validation_end(trainer, module)
         score = self.best_model_score
-        if not trainer.is_global_zero or score is None or score is previous_score:
+        if score is None or score is previous_score or not trainer.is_global_zero:
             return
         if float(score) > self.score_to_beat:
             state = torch.load(self.best_model_path, map_location="cpu", weights_only=True)
-            prefix = "network."
-            weights = {
-                name.removeprefix(prefix): tensor
-                for name, tensor in state["state_dict"].items()
-                if name.startswith(prefix)
-            }
-            self.release(weights, state["global_step"], state["validation"])
+            seconds = state["callbacks"]["Timer"]["time_elapsed"]["train"]
+            self.release(module, state["state_dict"], state["global_step"], seconds)
 
-
-class ShowExamples(Callback):
-    """Sounds and spectrograms of the module's ``examples``, for TensorBoard."""
-
-    def on_validation_batch_end(
-        self,
-        trainer: L.Trainer,
-        module: Any,
-        outputs: Any,
-        batch: Any,
-        batch_idx: int,
-        dataloader_idx: int = 0,
+    def release(
+        self, module: Any, weights: Mapping[str, Tensor], step: int, seconds: float
     ) -> None:
-        logger: Any = trainer.logger
-        if batch_idx > 0 or logger is None or not trainer.is_global_zero:
-            return
-        writer = logger.experiment
-        with torch.no_grad():
-            examples = module.examples(batch)
-        for name, signal in examples.items():
-            sound = signal.detach().float().cpu()
-            # what an ear perceives may be too soft to be played; the spectrogram shows the level
-            loud = sound / sound.abs().max().clamp_min(1e-9)
-            writer.add_audio(name, loud, trainer.global_step, NEURO_RATE)
-            writer.add_image(name, spectrogram_image(sound), trainer.global_step)
+        """Write the network of a module, with other weights, as a checkpoint.
+
+        Args:
+            module: the module in training.
+            weights: its state dict at the step.
+            step: number of steps taken.
+            seconds: duration of the training until then.
+        """
+        network = copy.deepcopy(module.network)
+        network.load_state_dict(
+            {name.removeprefix("network."): tensor for name, tensor in weights.items()}
+        )
+        record = {
+            **self.record,
+            "start_validation": without_score(module.start_validation),
+            "steps": step,
+            "minutes": round(seconds / 60.0, 1),
+            "validation": without_score(module.validation),
+        }
+        save_checkpoint(self.released, self.kind, network, network.config.to_dict(), record)
+
+
+def without_score(validation: Mapping[str, float]) -> dict[str, float]:
+    return {name: value for name, value in validation.items() if name != "score"}
 
 
 class ProgressBar(TQDMProgressBar):
@@ -130,18 +122,3 @@ class ProgressBar(TQDMProgressBar):
     def on_train_epoch_start(self, trainer: L.Trainer, *arguments: Any) -> None:
         super().on_train_epoch_start(trainer, *arguments)
         self.train_progress_bar.set_description("Training")
-
-
-def spectrogram_image(signal: Tensor) -> Tensor:
-    """Draw a spectrogram, from black at 0 to white at 70 dB SPL per frequency.
-
-    Shape: (time,) in pascals -> (1, frequencies, frames), with 8 kHz at the top.
-    """
-    points = NEURO_RATE // 50
-    window = torch.hann_window(points)
-    padded = torch.nn.functional.pad(signal, (0, max(0, points - len(signal))))
-    spectrum = torch.stft(padded, points, points // 4, window=window, return_complex=True)
-    rms = spectrum.abs() * 2.0**0.5 / window.sum()
-    level = 20.0 * torch.log10(rms + 1e-9) + PASCAL_SPL
-    low, high = IMAGE_RANGE_SPL
-    return ((level - low) / (high - low)).clamp(0.0, 1.0).flip(0).unsqueeze(0)

@@ -89,12 +89,6 @@ class CompensatorTraining(TrainingModule):
         mean = float(values["valid_loss"].double().mean())
         return {"score": -mean, "valid_loss": mean}
 
-    def examples(self, batch: Batch) -> dict[str, Tensor]:
-        signal, ears = batch["signal"][:1], batch["thresholds"][:1]
-        output = self.network(signal, ears)
-        perceived = self.loss.simulator(output, ears)
-        return {"input": signal[0], "output": output[0], "perceived": perceived[0]}
-
 
 def train_compensator(
     data: TrainingData,

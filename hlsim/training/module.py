@@ -61,10 +61,6 @@ class TrainingModule(L.LightningModule):
         """Summarise the measures of all validation batches; ``score`` is highest for the best network."""
         raise NotImplementedError
 
-    def examples(self, batch: Batch) -> dict[str, Tensor]:
-        """Return signals for TensorBoard by name, each (time,) in pascals at 16 kHz."""
-        return {}
-
     def trained_parameters(self) -> list[nn.Parameter]:
         return [parameter for parameter in self.parameters() if parameter.requires_grad]
 
@@ -90,14 +86,13 @@ class TrainingModule(L.LightningModule):
 
     def on_validation_epoch_end(self) -> None:
         self.validation = self.summarise(concatenate(self._evaluations))
-        self.log_dict(self.validation, prog_bar=True, batch_size=1, sync_dist=True)
+        self.log_dict(self.validation, batch_size=1, sync_dist=True)
         shown = [
             f"{name} {value:.3f}" for name, value in self.validation.items() if name != "score"
         ]
         self.print(f"step {self.global_step}: {', '.join(shown)}")
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        checkpoint["validation"] = self.validation
         checkpoint["start_validation"] = self.start_validation
         checkpoint["description"] = self.description
 

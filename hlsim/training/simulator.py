@@ -70,11 +70,6 @@ class SimulatorTraining(TrainingModule):
             score += share * (median + 0.5 * lowest_tenth)
         return {"score": score, **summary}
 
-    def examples(self, batch: Batch) -> dict[str, Tensor]:
-        signal, target = batch["signal"][-1:], batch["impaired"][-1]
-        perceived = self.network(signal, batch["thresholds"][-1:])
-        return {"input": signal[0], "perceived/teacher": target, "perceived/network": perceived[0]}
-
 
 def train_simulator(
     data: TrainingData,

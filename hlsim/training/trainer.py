@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import logging
 import sys
 import warnings
@@ -18,48 +17,37 @@ import torch
 from lightning.pytorch.callbacks import Callback, ModelCheckpoint, Timer
 from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
-from torch import Tensor
 
-from hlsim.pretrained import checkpoint_digest, save_checkpoint
-from hlsim.training.callbacks import BestCheckpoint, ProgressBar, ShowExamples
+from hlsim.pretrained import checkpoint_digest
+from hlsim.training.callbacks import CHECKPOINT, BestCheckpoint, ProgressBar
 from hlsim.training.data_module import BatchData
 from hlsim.training.module import TrainingModule
+from hlsim.training.recipes import TrainingRecipe
 from hlsim.version import __version__
-
-CHECKPOINT = "checkpoint"
-"""Folder of the best network, which ``load_pretrained`` or ``load_compensator`` reads."""
 
 LAST_STATE = "last.ckpt"
 """File of the state from which a training resumes."""
 
-EXPECTED_WARNINGS = "|".join(
-    (
-        "does not have many workers",  # drawing a batch takes little time beside a step
-        "Checkpoint directory .* exists",  # as it does when a training resumes
-        "GPU available but not used",
-        "ended before the epoch ended",  # batches are functions of the step: nothing is repeated
-        "smaller than the logging interval",
-        "LeafSpec",  # Lightning with recent versions of torch
-    )
+EXPECTED_WARNINGS = (
+    "many workers|directory .* exists|not used|before the epoch ended|logging interval|LeafSpec"
 )
+"""What Lightning warns of, of things that hlsim does on purpose."""
 
 
 class TrainerOptions(TypedDict, total=False):
-    """How a training runs; none of these changes its result, but for the number of processes.
+    """How a training runs.
 
     Attributes:
         max_minutes: minutes after which training stops, those before a resumption included. By default it ends after
             the recipe's steps.
-        accelerator, devices, nodes, strategy: as for Lightning's ``Trainer``, by default "auto" and 1. Each process
-            draws its own batches, so that the batch grows with their number.
-        progress: whether a terminal shows a progress bar, the default.
+        accelerator: as for Lightning's ``Trainer``, by default "auto".
+        devices: number of devices, by default 1. Each draws its own batches, so that the batch grows with their number.
+        progress: whether a terminal shows a progress bar, as by default.
     """
 
     max_minutes: float | None
     accelerator: str
     devices: int
-    nodes: int
-    strategy: str
     progress: bool
 
 
@@ -95,44 +83,27 @@ def train_network(
     recipe = module.recipe
     folder = Path(out)
     start = {"start_sha256": checkpoint_digest(recipe.start)} if recipe.start else {}
+    record = {"hlsim": __version__, "recipe": asdict(recipe), **start, **about}
     module.description = asdict(recipe) | start | dict(identity)
+
     last_path = folder / LAST_STATE
     last_state = read_state(last_path) if last_path.exists() else None
     if last_state is not None:
         check_description(last_path, last_state["description"], module.description)
+        module.start_validation = last_state["start_validation"]
 
-    timer = make_timer(options.get("max_minutes"))
-
-    def release(weights: Mapping[str, Tensor], step: int, validation: Mapping[str, float]) -> None:
-        network = copy.deepcopy(module.network)
-        network.load_state_dict(weights)
-        record = {"hlsim": __version__, "recipe": asdict(recipe), **start, **about}
-        record |= {"start_validation": without_score(module.start_validation)}
-        record |= {"steps": step, "minutes": round(timer.time_elapsed("train") / 60.0, 1)}
-        record |= {"validation": without_score(validation)}
-        save_checkpoint(folder / CHECKPOINT, kind, network, network.config.to_dict(), record)
-
-    best = BestCheckpoint(folder, release)
-    last = ModelCheckpoint(
-        dirpath=folder,
-        filename=Path(LAST_STATE).stem,
-        save_on_train_epoch_end=False,
-        enable_version_counter=False,
-    )
+    best = BestCheckpoint(folder, kind, record)
     with quiet_lightning():
-        # the last state holds what the callbacks before it have done
-        trainer = make_trainer(folder, module, [timer, *callbacks, best, last], options)
+        trainer = make_trainer(folder, recipe, [*callbacks, best], options)
         try:
             if last_state is None:
                 trainer.validate(module, datamodule=data, verbose=False)
                 module.start_validation = module.validation
-            else:
-                module.start_validation = last_state["start_validation"]
             if recipe.start:
-                # its network is the best one until training finds a better one
+                # that network is the best one until training finds a better one
                 best.score_to_beat = module.start_validation["score"]
                 if last_state is None and trainer.is_global_zero:
-                    release(module.network.state_dict(), 0, module.start_validation)
+                    best.release(module, module.state_dict(), step=0, seconds=0.0)
             ckpt_path = None if last_state is None else last_path
             trainer.fit(module, datamodule=data, ckpt_path=ckpt_path, weights_only=True)
         except SystemExit:
@@ -143,41 +114,43 @@ def train_network(
 
 
 def make_trainer(
-    folder: Path, module: TrainingModule, callbacks: Sequence[Callback], options: TrainerOptions
+    folder: Path, recipe: TrainingRecipe, callbacks: Sequence[Callback], options: TrainerOptions
 ) -> L.Trainer:
-    """Make a Trainer of the recipe's steps. Raises ValueError if the options do not fit the machine."""
-    progress = options.get("progress", True) and sys.stdout.isatty()
-    where = {
-        "accelerator": options.get("accelerator", "auto"),
-        "devices": options.get("devices", 1),
-        "num_nodes": options.get("nodes", 1),
-        "strategy": options.get("strategy", "auto"),
-    }
+    """Make a Trainer of a recipe's steps. Raises ValueError if the options do not fit the machine."""
+    max_minutes = options.get("max_minutes")
+    duration = None if max_minutes is None else timedelta(minutes=max_minutes)
+    last = ModelCheckpoint(
+        dirpath=folder,
+        filename=Path(LAST_STATE).stem,
+        save_on_train_epoch_end=False,
+        enable_version_counter=False,
+    )
+    # the last state holds what the callbacks before it have done
+    all_callbacks = [Timer(duration, verbose=False), *callbacks, last]
+    show_progress = options.get("progress", True) and sys.stdout.isatty()
+    if show_progress:
+        all_callbacks.append(ProgressBar())
+    accelerator, devices = options.get("accelerator", "auto"), options.get("devices", 1)
     try:
         return L.Trainer(
-            **where,  # type: ignore[arg-type]
+            accelerator=accelerator,
+            devices=devices,
             use_distributed_sampler=False,  # each process draws its own batches
             max_epochs=-1,
-            max_steps=module.recipe.steps,
-            val_check_interval=module.recipe.validate_every,
+            max_steps=recipe.steps,
+            val_check_interval=recipe.validate_every,
             check_val_every_n_epoch=None,  # the interval may be longer than the training
             num_sanity_val_steps=0,
             gradient_clip_val=1.0,
-            callbacks=[ShowExamples(), *callbacks, *([ProgressBar()] if progress else [])],
-            enable_progress_bar=progress,
+            callbacks=all_callbacks,
+            enable_progress_bar=show_progress,
             enable_model_summary=False,
             logger=TensorBoardLogger(str(folder), name="", version="events"),
             log_every_n_steps=10,
             default_root_dir=folder,
         )
     except MisconfigurationException as error:
-        described = ", ".join(f"{name} {value}" for name, value in where.items())
-        raise ValueError(f"cannot train with {described}: {error}") from error
-
-
-def make_timer(max_minutes: float | None) -> Timer:
-    duration = None if max_minutes is None else timedelta(minutes=max_minutes)
-    return Timer(duration, verbose=False)
+        raise ValueError(f"cannot train on {devices} of {accelerator}: {error}") from error
 
 
 def read_state(path: Path) -> dict[str, Any]:
@@ -200,10 +173,6 @@ def check_description(path: Path, found: Mapping[str, Any], expected: Mapping[st
         raise ValueError(
             f"{path} is the state of a training with other {', '.join(differing)}; choose another output folder"
         )
-
-
-def without_score(validation: Mapping[str, float]) -> dict[str, float]:
-    return {name: value for name, value in validation.items() if name != "score"}
 
 
 @contextmanager

@@ -12,7 +12,7 @@ pytest.importorskip("lightning")
 
 from hlsim.audio import find_audio, write_audio
 from hlsim.audiogram import Audiogram
-from hlsim.calibration import level_spl, set_level
+from hlsim.calibration import level_spl
 from hlsim.neuro import NeuroMSBG
 from hlsim.pretrained import checkpoint_about, checkpoint_digest, load_pretrained
 from hlsim.training.batches import (
@@ -20,7 +20,6 @@ from hlsim.training.batches import (
     simulator_data,
     simulator_validation,
 )
-from hlsim.training.callbacks import spectrogram_image
 from hlsim.training.data_module import Batch, Step
 from hlsim.training.recipes import SimulatorRecipe
 from hlsim.training.simulator import SimulatorTraining, train_simulator
@@ -253,25 +252,3 @@ def test_validation_has_the_levels_of_speech_before_treatment(
     levels = torch.cat([level_spl(batch["signal"]) for batch in batches])
     assert len(levels) == 64 and sum("sounds" in batch for batch in batches) == 2
     assert low - 0.01 <= float(levels.min()) < float(levels.max()) <= high + 0.01
-
-
-def test_tensorboard_has_sounds_and_spectrograms(data: TrainingData, tmp_path: Path) -> None:
-    event_accumulator = pytest.importorskip(
-        "tensorboard.backend.event_processing.event_accumulator"
-    )
-    train_simulator(data, replace(TINY, steps=1), out=tmp_path, accelerator="cpu")
-    events = event_accumulator.EventAccumulator(str(tmp_path / "events"))
-    events.Reload()
-    names = {"input", "perceived/teacher", "perceived/network"}
-    assert set(events.Tags()["audio"]) == names and set(events.Tags()["images"]) == names
-    assert events.Audio("perceived/teacher")[0].sample_rate == 16000.0
-
-
-def test_a_tone_is_a_line_in_the_spectrogram_and_silence_is_black() -> None:
-    time = torch.arange(16000) / 16000.0
-    image = spectrogram_image(set_level(torch.sin(2.0 * torch.pi * 2000.0 * time), 60.0))
-    assert image.shape[:2] == (1, 161)
-    row = int(image[0, :, 20:-20].mean(-1).argmax())
-    assert row == 160 - 40  # 50 Hz per row, the highest frequency first
-    assert float(image[0, row, 50]) == pytest.approx(60.0 / 70.0, abs=0.01)
-    assert not bool(spectrogram_image(torch.zeros(50)).any())

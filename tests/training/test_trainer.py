@@ -216,7 +216,6 @@ def test_a_broken_state_is_named(tmp_path: Path, content: bytes) -> None:
     "options",
     [
         {"devices": 0},
-        {"strategy": "none"},
         pytest.param(
             {"accelerator": "gpu"},
             marks=pytest.mark.skipif(torch.cuda.is_available(), reason="has a GPU"),
