@@ -13,10 +13,10 @@ from torch import Tensor, nn
 from hlsim.audiogram import FREQUENCIES, HIGHEST_LEVEL
 from hlsim.audiogram.thresholds import (
     AudiogramLike,
+    has_listeners,
     interpolate,
-    of_listeners,
-    own_thresholds,
     resolve_thresholds,
+    store_thresholds,
 )
 from hlsim.calibration import PASCAL_SPL, check_full_scale
 from hlsim.checks import check_rate, check_waveform
@@ -25,7 +25,7 @@ from hlsim.dsp.windows import hamming
 from hlsim.torchtools import constant, constant_like
 
 _BIAS = {250.0: -17.0, 500.0: -8.0, 1000.0: 1.0, 2000.0: -1.0, 4000.0: -2.0, 6000.0: -2.0}
-_LIMITS: dict[str, Any] = {"highest": HIGHEST_LEVEL, "taker": "NAL-R"}
+_LIMITS: dict[str, Any] = {"highest": HIGHEST_LEVEL, "consumer": "NAL-R"}
 _PRESCRIBED = tuple(FREQUENCIES.index(hz) for hz in _BIAS)
 
 
@@ -65,13 +65,13 @@ class NALR(nn.Module):
                 f"order of the NAL-R filter is {order!r}; allowed: even whole numbers from 2 to 1022"
             )
         self.order: int = int(order)
-        levels = own_thresholds(audiogram, **_LIMITS)
+        levels = store_thresholds(audiogram, **_LIMITS)
         if levels is not None and levels.requires_grad:
             raise ValueError(
                 "the audiogram is trained, and a prescription's own stays; allowed: with each call"
             )
         self.register_buffer("thresholds", levels, persistent=False)
-        self._two_ears = of_listeners(audiogram)
+        self._two_ears = has_listeners(audiogram)
 
     def forward(self, waveform: Tensor, audiogram: AudiogramLike | None = None) -> Tensor:
         """The amplified waveform.

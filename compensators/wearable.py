@@ -22,7 +22,7 @@ from hlsim.audiogram import FREQUENCIES
 from hlsim.audiogram.thresholds import (
     AudiogramLike,
     as_thresholds,
-    check_two_ears,
+    check_two_channels,
     resolve_thresholds,
 )
 from hlsim.calibration import PASCAL_SPL, check_full_scale, gain_to_pascals
@@ -175,7 +175,7 @@ class Wearable(nn.Module):
         for name, slider in set_to.items():  # before the first chunk, which has the items' number
             items = slider.shape if isinstance(slider, Tensor) else torch.Size()
             check_slider(name, slider, items, torch.empty(0))
-        as_thresholds(self._given(audiogram), taker=type(self).__name__)
+        as_thresholds(self._given(audiogram), consumer=type(self).__name__)
         # it is asked for again when a slider moves, and a tensor may have been written into
         return Stream(
             self, audiogram.clone() if isinstance(audiogram, Tensor) else audiogram, set_to
@@ -189,11 +189,12 @@ class Wearable(nn.Module):
         Shape: (..., time), (..., 8), (...) each -> (...), (items, n), (items, sliders).
         """
         given = self._given(audiogram)
-        thresholds = resolve_thresholds(None, given, waveform, taker=type(self).__name__)
+        thresholds = resolve_thresholds(None, given, waveform, consumer=type(self).__name__)
         own = next((weight.dtype for weight in self.parameters()), waveform.dtype)
         dtype = torch.promote_types(own, torch.float32)
         batch = broadcast_shape(waveform.shape[:-1], thresholds.shape[:-1])
-        check_two_ears(self.linked, waveform)
+        if self.linked:
+            check_two_channels(waveform)
         settings = [
             check_slider(name, slider, batch, thresholds).expand(batch)
             for name, slider in zip(self.SLIDERS, sliders, strict=True)

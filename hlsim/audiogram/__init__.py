@@ -9,7 +9,6 @@ from hlsim.audiogram.value import (
     STANDARD,
     Audiogram,
     severity_index,
-    severity_of,
 )
 
 __all__ = [
@@ -21,5 +20,4 @@ __all__ = [
     "STANDARD",
     "Audiogram",
     "severity_index",
-    "severity_of",
 ]

@@ -1,10 +1,10 @@
-"""Thresholds as tensors: of whatever is taken as an audiogram, checked, stored, and interpolated between frequencies."""
+"""Thresholds of ears as tensors: conversion, validation, storage, and interpolation."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
-from typing import Any, Protocol, TypeGuard
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -13,30 +13,15 @@ from torch import Tensor
 
 from hlsim.audiogram.conversion import EarLike, find_audiogram
 from hlsim.audiogram.devices import known_on_host, on_device, on_host
-from hlsim.audiogram.value import (
-    FREQUENCIES,
-    LOWEST_LEVEL,
-    Audiogram,
-    listed,
-)
+from hlsim.audiogram.listener import Listener
+from hlsim.audiogram.value import FREQUENCIES, LOWEST_LEVEL, join_numbers
 from hlsim.checks import broadcast_shape
 from hlsim.torchtools import constant_like
 
 HIGHEST_SIMULATED = 100.0
-"""What a simulator takes, in dB HL: MSBG's expansion ratio 105 / (105 - level) is singular at 105."""
+"""Highest level in dB HL that simulators accept: MSBG's expansion ratio 105 / (105 - level) is singular at 105."""
 
-
-class TwoEars(Protocol):
-    """A ``Listener``, to which imports from here would point upwards."""
-
-    @property
-    def left(self) -> Audiogram | None: ...
-
-    @property
-    def right(self) -> Audiogram | None: ...
-
-
-AudiogramLike = EarLike | Sequence[EarLike] | TwoEars | Sequence[TwoEars]
+AudiogramLike = EarLike | Listener | Sequence[EarLike] | Sequence[Listener]
 """One ear (see ``as_audiogram``), the two ears of a ``Listener``, a sequence with one of these per
 item, or a tensor or an array of thresholds in dB HL, ``(..., 8)``."""
 
@@ -45,83 +30,69 @@ def as_thresholds(
     audiogram: AudiogramLike,
     *,
     highest: float = HIGHEST_SIMULATED,
-    taker: str = "a simulator",
-    missing: bool = False,
+    consumer: str = "a simulator",
+    allow_missing: bool = False,
 ) -> Tensor:
-    """Thresholds that a simulator takes, or another ``taker``, up to ``highest`` dB HL.
+    """Convert ears to thresholds in dB HL.
 
-    A list of (8,) tensors holds an ear each, and one of eight (batch,) tensors a frequency each, as torch's
-    ``default_collate`` makes it of thresholds; a list of eight (8,) tensors may be either and is refused.
-
-    Args:
-        missing: let a listener with one ear through, whose other ear is NaN.
+    A list of tensors holds one ear per tensor, (8,), or one frequency per tensor, (batch,), as
+    torch's ``default_collate`` arranges them. Eight tensors of shape (8,) could be either, and are
+    rejected.
 
     Reading a tensor on a GPU would make the host wait for the GPU. The values of such a tensor are not validated on the
     host: an ear with a level out of range becomes NaN there, and so do the outputs that are computed with it.
 
-    Returns: (8,) for one ear, (batch, 8) for a sequence, (2, 8) for a ``Listener``, (batch, 2, 8) for a sequence of them,
-    the tensor itself otherwise; dB HL.
+    Args:
+        audiogram: ear or ears.
+        highest: highest accepted level in dB HL.
+        consumer: what needs the thresholds, for messages.
+        allow_missing: accept a listener with one ear, whose other ear becomes NaN.
+
+    Returns: (8,) for one ear, (batch, 8) for a sequence, (2, 8) for a ``Listener``, (batch, 2, 8)
+        for a sequence of listeners, and a tensor itself.
 
     Raises:
-        ValueError: not an audiogram, a listener without one ear, a complex or bool tensor, a last dimension other than
-            8, NaN, or levels outside -10 to ``highest`` dB HL.
+        ValueError: the value is not an audiogram, a listener lacks an ear, a tensor is complex or
+            bool, has another last dimension than 8 or holds NaN, or a level is out of range.
     """
+    limits: dict[str, Any] = {"highest": highest, "consumer": consumer}
+    if isinstance(audiogram, Listener):
+        return _listener_thresholds(audiogram, allow_missing, limits)
     if isinstance(audiogram, np.ndarray):
         audiogram = torch.from_numpy(audiogram).float()
-    ear = None if isinstance(audiogram, Tensor) else find_audiogram(audiogram)
-    if ear is not None:
-        return torch.tensor(_taken(ear.thresholds, highest, taker))
-    if is_listener(audiogram):
-        return torch.stack([*_both_ears(audiogram, missing, highest, taker)])
-    if isinstance(audiogram, Sequence) and audiogram:
-        if all(is_listener(one) for one in audiogram):
-            return torch.stack(
-                [
-                    as_thresholds(one, highest=highest, taker=taker, missing=missing)  # type: ignore[arg-type]
-                    for one in audiogram
+    if not isinstance(audiogram, Tensor):
+        ear = find_audiogram(audiogram)
+        if ear is not None:
+            return torch.tensor(_check_levels(ear.thresholds, **limits))
+        if isinstance(audiogram, list | tuple) and audiogram:
+            first = audiogram[0]
+            if isinstance(first, Tensor):
+                audiogram = _stack(audiogram)
+            elif isinstance(first, Listener) or find_audiogram(first) is not None:
+                ears = [
+                    as_thresholds(ear, **limits, allow_missing=allow_missing) for ear in audiogram
                 ]
-            )
-        tensors = any(isinstance(one, Tensor) for one in audiogram)
-        ears = [None if tensors else find_audiogram(one) for one in audiogram]
-        if all(ear is not None for ear in ears):
-            return torch.tensor(
-                [_taken(ear.thresholds, highest, taker) for ear in ears if ear is not None]
-            )
-    if isinstance(audiogram, list | tuple):
-        audiogram = _stacked(audiogram)
+                return torch.stack(ears)
     if not isinstance(audiogram, Tensor):
         raise ValueError(
             f"expected an audiogram, got {type(audiogram).__name__}; pass an Audiogram, a name such "
             "as 'N3', a Listener, a sequence with one of these per item, or thresholds in dB HL of "
             "shape (..., 8)"
         )
-    if audiogram.is_complex() or audiogram.dtype == torch.bool:
-        raise ValueError(
-            f"audiogram tensor of {audiogram.dtype}; allowed: floating-point or integer dB HL"
-        )
-    levels = audiogram if audiogram.is_floating_point() else audiogram.float()
-    if levels.ndim == 0 or levels.shape[-1] != len(FREQUENCIES) or not levels.numel():
-        raise ValueError(
-            f"audiogram tensor of shape {tuple(levels.shape)}; allowed: (..., 8), dB HL at {listed(FREQUENCIES)} Hz"
-        )
-    known = known_on_host(levels)
-    if known is None:
-        inside = (levels >= LOWEST_LEVEL) & (levels <= highest)
-        return torch.where(inside.all(-1, keepdim=True), levels, math.nan)
-    good = ((known >= LOWEST_LEVEL) & (known <= highest)).all(-1)
-    if not bool(good.all()):
-        _taken(known[~good][0].tolist(), highest, taker)
-    return levels
+    return _check_tensor(audiogram, **limits)
 
 
-def own_thresholds(audiogram: AudiogramLike | None, **limits: Any) -> Tensor | None:
-    """``as_thresholds`` to keep: a copy, for the caller may write into its tensor; one that is trained stays itself."""
+def store_thresholds(audiogram: AudiogramLike | None, **options: Any) -> Tensor | None:
+    """Return ``as_thresholds`` for a module to keep, or None for None.
+
+    It is a copy, because the caller may write into a tensor, unless the tensor is trained.
+    """
     if audiogram is None:
         return None
-    with torch.inference_mode(False):  # it may be trained through later
+    with torch.inference_mode(False):  # the module may be trained through later
         if isinstance(audiogram, Tensor):
             on_host(audiogram)  # so that its values are validated
-        levels = as_thresholds(audiogram, **limits)
+        levels = as_thresholds(audiogram, **options)
         return levels if levels.requires_grad else levels.clone()
 
 
@@ -131,106 +102,139 @@ def resolve_thresholds(
     waveform: Tensor,
     *,
     two_ears: bool = False,
-    **limits: Any,
+    **options: Any,
 ) -> Tensor:
-    """The call's audiogram, or else the stored one, on the waveform's device, checked to fit its leading dimensions.
+    """Return the thresholds for a waveform, on its device: those of the call, else the stored ones.
 
-    Of (batch, 1, time) and (batch, 8) each item has its ear.
+    A waveform (batch, 1, time) with thresholds (batch, 8) has one ear per item.
 
     Args:
-        two_ears: the stored one is of a listener, or of several.
-        limits: of ``as_thresholds``.
+        stored: thresholds that a module keeps.
+        audiogram: ear or ears that were passed to the call.
+        waveform: (..., time).
+        two_ears: whether the stored thresholds are those of listeners.
+        options: keyword arguments of ``as_thresholds``.
 
     Raises:
-        ValueError: there is neither, the shapes do not broadcast, or a listener's waveform is not (..., 2, time).
+        ValueError: there are no thresholds, their shape does not broadcast with the leading
+            dimensions, or a listener's waveform is not (..., 2, time).
     """
-    if audiogram is None and stored is None:
+    if audiogram is not None:
+        two_ears = has_listeners(audiogram)
+        thresholds = as_thresholds(audiogram, **options)
+    elif stored is not None:
+        thresholds = stored
+    else:
         raise ValueError(
-            "no audiogram: give one with the call, or when building what keeps one (MSBG, NALR)"
+            "no audiogram; pass one with the call, or to the constructor of MSBG and NALR"
         )
-    thresholds = as_thresholds(audiogram, **limits) if audiogram is not None else stored
-    assert thresholds is not None
-    check_two_ears(two_ears if audiogram is None else of_listeners(audiogram), waveform)
-    thresholds = one_an_item(thresholds, waveform.shape)
+    if two_ears:
+        check_two_channels(waveform)
+    thresholds = unsqueeze_mono(thresholds, waveform.shape)
     try:
         broadcast_shape(waveform.shape[:-1], thresholds.shape[:-1])
     except RuntimeError:
         raise ValueError(
-            f"audiograms of shape {tuple(thresholds.shape)} for a waveform of shape {tuple(waveform.shape)}; allowed: "
-            "one audiogram, or leading dimensions that broadcast"
+            f"expected one audiogram or one per item, got audiograms of shape "
+            f"{tuple(thresholds.shape)} for a waveform of shape {tuple(waveform.shape)}"
         ) from None
     return on_device(thresholds, waveform.device)
 
 
-def one_an_item(thresholds: Tensor, shape: torch.Size) -> Tensor:
-    """As many ears as items of (batch, 1, time) belong to one each. Shape: (batch, 8) -> (batch, 1, 8), else as it is."""
+def unsqueeze_mono(thresholds: Tensor, shape: torch.Size) -> Tensor:
+    """Give thresholds the channel dimension of a mono batch.
+
+    Shape: (batch, 8) with waveforms (batch, 1, time) -> (batch, 1, 8), otherwise unchanged.
+    """
     mono = len(shape) == 3 and shape[1] == 1
     return thresholds.unsqueeze(1) if mono and thresholds.shape[:-1] == shape[:1] else thresholds
 
 
-def is_listener(audiogram: Any) -> TypeGuard[TwoEars]:
-    """Whether it is a ``Listener``."""
-    return hasattr(audiogram, "left") and hasattr(audiogram, "right")
+def has_listeners(audiogram: AudiogramLike | None) -> bool:
+    """Return whether a value is a ``Listener`` or a sequence of listeners."""
+    if isinstance(audiogram, list | tuple) and audiogram:
+        return isinstance(audiogram[0], Listener)
+    return isinstance(audiogram, Listener)
 
 
-def of_listeners(audiogram: AudiogramLike | None) -> bool:
-    """Whether it is a ``Listener`` or a sequence of them."""
-    several = isinstance(audiogram, list | tuple) and len(audiogram) > 0
-    return is_listener(audiogram[0] if several else audiogram)  # type: ignore[index]
-
-
-def _both_ears(listener: TwoEars, missing: bool, highest: float, taker: str) -> Iterator[Tensor]:
-    """Left and right, (8,) each; NaN where one is missing, or ValueError unless it may."""
-    if not missing and (listener.left is None or listener.right is None):
-        gone, there, place = ("left", "right", 1) if listener.left is None else ("right", "left", 0)
+def check_two_channels(waveform: Tensor) -> None:
+    """Raise ValueError unless a waveform has the shape (..., 2, time)."""
+    if waveform.shape[-2:-1] != (2,):
         raise ValueError(
-            f"the listener's {gone} ear is missing; give listener.{there} with waveform[..., {place}, :]"
-        )
-    for ear in (listener.left, listener.right):
-        lacks = torch.full((len(FREQUENCIES),), math.nan)
-        yield lacks if ear is None else as_thresholds(ear, highest=highest, taker=taker)
-
-
-def check_two_ears(asked: bool, waveform: Tensor) -> None:
-    """Raise ValueError where a listener's two ears are ``asked`` for of a waveform that is not (..., 2, time)."""
-    if asked and waveform.shape[-2:-1] != (2,):
-        raise ValueError(
-            f"a waveform of shape {tuple(waveform.shape)} for a listener's two ears; allowed: (..., 2, time), left first"
+            "expected a waveform of shape (..., 2, time) for two ears, left first, "
+            f"got {tuple(waveform.shape)}"
         )
 
 
-def interpolate(levels: Tensor, hz: tuple[float, ...]) -> Tensor:
-    """Levels between the audiometric frequencies, linear in Hz and flat beyond. Shape: (..., 8) -> (..., frequencies)."""
-    # no matrix product, which a GPU may be allowed to round to ten bits
-    return (levels.unsqueeze(-1) * constant_like(levels, interpolation_weights, hz)).sum(-2)
+def interpolate(levels: Tensor, frequencies: tuple[float, ...]) -> Tensor:
+    """Interpolate thresholds linearly in Hz, flat beyond the ends. Shape: (..., 8) -> (..., frequencies)."""
+    # A GPU may round matrix products to ten bits, so this is a sum of products.
+    weights = constant_like(levels, interpolation_weights, frequencies)
+    return (levels.unsqueeze(-1) * weights).sum(-2)
 
 
-def interpolation_weights(hz: tuple[float, ...]) -> NDArray[np.float64]:
-    """``interpolate`` as a matrix. Returns (8, frequencies)."""
-    return np.stack([np.interp(hz, FREQUENCIES, row) for row in np.eye(len(FREQUENCIES))])
+def interpolation_weights(frequencies: tuple[float, ...]) -> NDArray[np.float64]:
+    """Return ``interpolate`` as a matrix, (8, frequencies)."""
+    rows = np.eye(len(FREQUENCIES))
+    return np.stack([np.interp(frequencies, FREQUENCIES, row) for row in rows])
 
 
-def _stacked(tensors: Any) -> Any:
-    """One tensor of a list of (8,) tensors, an ear each, or of eight (batch,) ones, a frequency each; else as given."""
-    kinds = len(FREQUENCIES)
-    if not all(isinstance(one, Tensor) and one.ndim == 1 for one in tensors):
+def _listener_thresholds(listener: Listener, allow_missing: bool, limits: dict[str, Any]) -> Tensor:
+    ears = [listener.left, listener.right]
+    if None in ears and not allow_missing:
+        place = 1 if listener.left is None else 0
+        name, other = ("left", "right") if listener.left is None else ("right", "left")
+        raise ValueError(
+            f"the listener has no {name} ear; pass listener.{other} with waveform[..., {place}, :]"
+        )
+    unknown = torch.full((len(FREQUENCIES),), math.nan)
+    return torch.stack([unknown if ear is None else as_thresholds(ear, **limits) for ear in ears])
+
+
+def _stack(tensors: Sequence[Any]) -> Any:
+    """Stack tensors of one ear each or of one frequency each, or return what is neither."""
+    shapes = {tuple(tensor.shape) for tensor in tensors if isinstance(tensor, Tensor)}
+    count = len(FREQUENCIES)
+    if len(shapes) != 1 or not all(isinstance(tensor, Tensor) for tensor in tensors):
         return tensors
-    if len({len(one) for one in tensors}) != 1:
-        return tensors
-    ears, frequencies = len(tensors[0]) == kinds, len(tensors) == kinds
-    if ears and frequencies:
+    (shape,) = shapes
+    one_ear_each = shape == (count,)
+    one_frequency_each = len(shape) == 1 and len(tensors) == count
+    if one_ear_each and one_frequency_each:
         raise ValueError(
-            "audiogram is eight tensors of 8 levels, an ear each or a frequency each; allowed: torch.stack(audiogram) of "
-            "ears, torch.stack(audiogram, -1) of frequencies"
+            "expected one tensor, got a list of eight tensors of 8 levels, which may be ears or "
+            "frequencies; stack ears with torch.stack(audiogram), frequencies with "
+            "torch.stack(audiogram, -1)"
         )
-    return torch.stack(tuple(tensors), 0 if ears else -1) if ears or frequencies else tensors
+    if not one_ear_each and not one_frequency_each:
+        return tensors
+    return torch.stack(tuple(tensors), 0 if one_ear_each else -1)
 
 
-def _taken(levels: Sequence[float], highest: float, taker: str) -> Sequence[float]:
-    """The levels, or ValueError where the taker does not take them."""
+def _check_tensor(audiogram: Tensor, highest: float, consumer: str) -> Tensor:
+    if audiogram.is_complex() or audiogram.dtype == torch.bool:
+        raise ValueError(f"expected thresholds as real numbers, got {audiogram.dtype}")
+    levels = audiogram if audiogram.is_floating_point() else audiogram.float()
+    if levels.ndim == 0 or levels.shape[-1] != len(FREQUENCIES) or not levels.numel():
+        raise ValueError(
+            f"expected thresholds of shape (..., 8), at {join_numbers(FREQUENCIES)} Hz, "
+            f"got {tuple(levels.shape)}"
+        )
+    known = known_on_host(levels)
+    if known is None:
+        inside = (levels >= LOWEST_LEVEL) & (levels <= highest)
+        return torch.where(inside.all(-1, keepdim=True), levels, math.nan)
+    inside = ((known >= LOWEST_LEVEL) & (known <= highest)).all(-1)
+    if not bool(inside.all()):
+        _check_levels(known[~inside][0].tolist(), highest, consumer)
+    return levels
+
+
+def _check_levels(levels: Sequence[float], highest: float, consumer: str) -> Sequence[float]:
     if not all(LOWEST_LEVEL <= level <= highest for level in levels):
-        reason = " (MSBG is singular at 105)" if highest == HIGHEST_SIMULATED else ""
+        reason = ", as MSBG is singular at 105" if highest == HIGHEST_SIMULATED else ""
         raise ValueError(
-            f"audiogram levels {listed(levels)} dB HL; {taker} takes {LOWEST_LEVEL:g} to {highest:g}{reason}"
+            f"expected levels from {LOWEST_LEVEL:g} to {highest:g} dB HL for {consumer}{reason}, "
+            f"got {join_numbers(levels)}"
         )
     return levels

@@ -1,15 +1,12 @@
-"""Hearing thresholds of one ear: validated, read, written, interpolated, and as a degree of loss."""
+"""The hearing thresholds of one ear, and the severity of its loss."""
 
 from __future__ import annotations
 
 import math
 import re
-from bisect import bisect_left
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from functools import reduce
 from itertools import pairwise
-from operator import add
 from typing import Any
 
 import numpy as np
@@ -19,18 +16,19 @@ from torch import Tensor
 from hlsim.extras import MissingExtraError
 
 FREQUENCIES = (250.0, 500.0, 1000.0, 2000.0, 3000.0, 4000.0, 6000.0, 8000.0)
-"""The audiometric frequencies in Hz that every simulator uses."""
+"""Audiometric frequencies in Hz that every simulator uses."""
 
 LOWEST_LEVEL, HIGHEST_LEVEL = -10.0, 120.0
-"""What an audiogram may hold, in dB HL."""
+"""Range of the thresholds of an audiogram in dB HL."""
 
 SEVERITIES = ("none", "mild", "moderate", "severe")
 """MSBG's degrees of loss, by the mean threshold from 2 to 8 kHz."""
 
 SEVERITY_LIMITS = (15.0, 35.0, 56.0)
-"""Mean thresholds in dB HL above which the loss is mild, moderate, severe (pyclarity 0.9.0, ``Audiogram.severity``)."""
+"""Mean thresholds in dB HL above which a loss is mild, moderate and severe (pyclarity 0.9.0)."""
 
-_FINE = 1e4  # parts of a dB that levels count in for the severity: single precision's 19.7 is to be 19.7 on a limit, too
+STEPS_PER_DB = 1e4
+"""Resolution of thresholds for the severity, so that 19.7 dB HL in single precision counts as 19.7."""
 
 # Bisgaard, Vlaming, Dahlquist 2010, Trends in Amplification 14(2), doi 10.1177/1084713810379609, Tables 1 and 2, at the
 # frequencies above; they end at 6 kHz, so that 8 kHz is our flat extension.
@@ -48,54 +46,57 @@ STANDARD = {
     "S3": (30, 35, 60, 75, 80, 80, 85, 85),
 }
 
-_COLUMN = re.compile(r"hl_(\d+\.?\d*|\.\d+)(_.+)?")  # the frequency, and the name of a remark on it
+COLUMN = re.compile(r"hl_(\d+\.?\d*|\.\d+)(_.+)?")
+"""Column of a CSV file: a frequency, and the name of a remark on it."""
 
-_ENTRY = (
-    "audiogram_cfs",
-    "audiogram_levels_l",
-    "audiogram_levels_r",
-)  # of Clarity's listeners.json
+CLARITY_KEYS = ("audiogram_cfs", "audiogram_levels_l", "audiogram_levels_r")
+"""Keys of an entry of Clarity's ``listeners.json``."""
 
 
 @dataclass(frozen=True, repr=False)
 class Audiogram:
     """Hearing thresholds of one ear in dB HL, ascending in frequency.
 
+    Checkpoints that hold audiograms, say as hyperparameters, are loaded with ``weights_only=True``
+    inside ``torch.serialization.safe_globals([Audiogram])``.
+
     Args:
-        levels: thresholds in dB HL, -10 to 120, one a frequency.
-        frequencies: Hz; by default the eight that simulators use. Other grids are kept as given and interpolated by
-            ``thresholds`` (linearly over log frequency, flat beyond the ends).
+        levels: thresholds in dB HL from -10 to 120, one per frequency.
+        frequencies: frequencies in Hz, by default the eight that simulators use. Other grids are
+            kept as given; ``thresholds`` interpolates them linearly over log frequency, flat beyond
+            the ends.
 
     Raises:
-        ValueError: the counts differ, a value is not finite or out of range, or the frequencies do not ascend or lie all
-            under 250 or over 8000 Hz.
+        ValueError: the numbers of levels and frequencies differ, a value is not finite or out of
+            range, or the frequencies do not ascend, or all lie below 250 or above 8000 Hz.
     """
 
     levels: tuple[float, ...]
     frequencies: tuple[float, ...] = FREQUENCIES
 
     def __post_init__(self) -> None:
-        levels = _numbers(self.levels, "levels")
-        frequencies = _numbers(self.frequencies, "frequencies")
+        levels = _as_numbers(self.levels, "levels")
+        frequencies = _as_numbers(self.frequencies, "frequencies")
         if len(levels) != len(frequencies) or not levels:
             raise ValueError(
-                f"an audiogram needs one level a frequency, got {len(levels)} levels and {len(frequencies)} frequencies "
-                f"(by default the {len(FREQUENCIES)} of {listed(FREQUENCIES)} Hz)"
+                f"expected one level per frequency, got {len(levels)} levels and "
+                f"{len(frequencies)} frequencies; by default there are {len(FREQUENCIES)}: "
+                f"{join_numbers(FREQUENCIES)} Hz"
             )
-        if any(not LOWEST_LEVEL <= level <= HIGHEST_LEVEL for level in levels):
+        if min(levels) < LOWEST_LEVEL or max(levels) > HIGHEST_LEVEL:
             raise ValueError(
-                f"audiogram levels {listed(levels)} dB HL; allowed: {LOWEST_LEVEL:g} to {HIGHEST_LEVEL:g}"
+                f"expected levels from {LOWEST_LEVEL:g} to {HIGHEST_LEVEL:g} dB HL, "
+                f"got {join_numbers(levels)}"
             )
-        if frequencies[0] <= 0 or any(b <= a for a, b in pairwise(frequencies)):
+        ascending = all(low < high for low, high in pairwise(frequencies))
+        if frequencies[0] <= 0 or not ascending:
             raise ValueError(
-                f"audiogram frequencies {listed(frequencies)} Hz; allowed: positive and ascending"
+                f"expected positive, ascending frequencies in Hz, got {join_numbers(frequencies)}"
             )
-        if (
-            frequencies[-1] < FREQUENCIES[0] or frequencies[0] > FREQUENCIES[-1]
-        ):  # in kHz, as a rule
+        if frequencies[-1] < FREQUENCIES[0] or frequencies[0] > FREQUENCIES[-1]:
             raise ValueError(
-                f"audiogram frequencies {listed(frequencies)} Hz; allowed: Hz, not all under {FREQUENCIES[0]:g} or all "
-                f"over {FREQUENCIES[-1]:g}"
+                f"expected a frequency from {FREQUENCIES[0]:g} to {FREQUENCIES[-1]:g} Hz, "
+                f"got {join_numbers(frequencies)}; give frequencies in Hz, not kHz"
             )
         object.__setattr__(self, "levels", levels)
         object.__setattr__(self, "frequencies", frequencies)
@@ -141,20 +142,21 @@ class Audiogram:
         """Levels in dB HL at the eight frequencies that simulators use."""
         if self.frequencies == FREQUENCIES:
             return self.levels
-        values = np.interp(np.log(FREQUENCIES), np.log(self.frequencies), self.levels)
-        return tuple(float(value) for value in values)
+        levels = np.interp(np.log(FREQUENCIES), np.log(self.frequencies), self.levels)
+        return tuple(float(level) for level in levels)
 
     @property
     def severity(self) -> str:
         """MSBG's degree of loss: none, mild, moderate or severe, by the mean threshold from 2 to 8 kHz."""
-        return severity_of(self.thresholds)
+        thresholds = torch.tensor(self.thresholds, dtype=torch.float64, device="cpu")
+        return SEVERITIES[int(severity_index(thresholds))]
 
     def plot(self, axes: Any = None, **style: Any) -> Any:
-        """Draw it: dB HL downwards over octaves, with MSBG's degrees of loss (``SEVERITY_LIMITS``) as bands.
+        """Draw the audiogram: dB HL downwards over octaves, with bands for MSBG's degrees of loss.
 
         Args:
-            axes: matplotlib's, which may hold other ears; by default those of a new figure of pyplot.
-            style: of the line, such as ``color="tab:red"`` and ``label="right"``.
+            axes: matplotlib axes, which may hold other ears; by default those of a new figure.
+            style: properties of the line, such as ``color="tab:red"`` and ``label="right"``.
 
         Returns: the axes.
 
@@ -168,57 +170,58 @@ class Audiogram:
         return plot_audiogram(self.frequencies, self.levels, degrees, axes, **style)
 
     def to_dict(self) -> dict[str, list[float]]:
-        """A plain dictionary that JSON can hold."""
+        """Return a dictionary that JSON can hold."""
         return {"levels": list(self.levels), "frequencies": list(self.frequencies)}
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Audiogram:
-        """Read what ``to_dict`` wrote. Raises ValueError where it is no mapping or ``levels`` is missing."""
+        """Return the audiogram of a dictionary that ``to_dict`` made.
+
+        Raises:
+            ValueError: the value is not a mapping, or has no ``levels``.
+        """
         if not isinstance(data, Mapping) or "levels" not in data:
-            got = list(data) if isinstance(data, Mapping) else type(data).__name__
-            raise ValueError(f"an audiogram dictionary needs 'levels', got {got}")
+            found = list(data) if isinstance(data, Mapping) else type(data).__name__
+            raise ValueError(f"expected a dictionary with 'levels', got {found}")
         return cls(data["levels"], data.get("frequencies", FREQUENCIES))
 
     def to_row(self) -> dict[str, str]:
-        """Columns ``hl_250`` and so on for a CSV file."""
-        return {
-            f"hl_{_exact(f)}": _exact(v) for f, v in zip(self.frequencies, self.levels, strict=True)
-        }
+        """Return the columns ``hl_250`` and so on for a CSV file."""
+        points = zip(self.frequencies, self.levels, strict=True)
+        return {f"hl_{_shortest(frequency)}": _shortest(level) for frequency, level in points}
 
     @classmethod
     def from_row(cls, row: Mapping[str, str]) -> Audiogram:
-        """Read the columns ``hl_<frequency in Hz>`` of a CSV row.
+        """Return the audiogram of a row of a CSV file, from its columns ``hl_<frequency in Hz>``.
 
-        Others are ignored, and so are remarks on a frequency, ``hl_8000_extrapolated_flat``: what they hold was not
-        measured.
+        Other columns are ignored, as are remarks on a frequency such as
+        ``hl_8000_extrapolated_flat``, whose values were not measured.
 
         Raises:
-            ValueError: the row has no such column, one that holds no number, two of a frequency, or one that begins with
-                ``hl`` and is neither a threshold nor a remark.
+            ValueError: there is no such column, one holds no number, two have the same frequency,
+                or a column begins with ``hl`` and is neither a threshold nor a remark.
         """
         points: dict[float, float] = {}
         for column, value in row.items():
-            found = _COLUMN.fullmatch(str(column))
-            if found is None and str(column).lower().startswith("hl"):
+            match = COLUMN.fullmatch(str(column))
+            if match is None and str(column).lower().startswith("hl"):
                 raise ValueError(
-                    f"audiogram column {column!r}; allowed: hl_ and a frequency in Hz, hl_500"
+                    f"expected columns of thresholds such as hl_500, got {column!r}; write hl_ and "
+                    "the frequency in Hz"
                 )
-            if found is None or found[2]:
+            if match is None or match[2]:
                 continue
-            if float(found[1]) in points:
-                raise ValueError(
-                    f"audiogram column {column}: a second one of {float(found[1]):g} Hz"
-                )
+            frequency = float(match[1])
+            if frequency in points:
+                raise ValueError(f"column {column}: {frequency:g} Hz has two columns")
             try:
-                points[float(found[1])] = float(value)
+                points[frequency] = float(value)
             except (TypeError, ValueError):
                 raise ValueError(
-                    f"audiogram column {column} holds {value!r}; allowed: a level in dB HL"
+                    f"column {column}: expected a level in dB HL, got {value!r}"
                 ) from None
         if not points:
-            raise ValueError(
-                f"a row of audiograms needs columns hl_250, hl_500, ..., got {list(row)}"
-            )
+            raise ValueError(f"expected columns hl_250, hl_500 and so on, got {list(row)}")
         return cls(tuple(points.values()), tuple(points))
 
     def to_clarity(self) -> Any:
@@ -231,94 +234,90 @@ class Audiogram:
             from clarity.utils.audiogram import Audiogram as ClarityAudiogram
         except ImportError as error:
             raise MissingExtraError(
-                f"pyclarity is needed here and not installed ({error}); pip install 'pyclarity==0.9.*'"
+                f"pyclarity is needed here and not installed ({error}); "
+                "pip install 'pyclarity==0.9.*'"
             ) from error
         return ClarityAudiogram(
             levels=np.array(self.levels), frequencies=np.array(self.frequencies)
         )
 
     @classmethod
-    def from_clarity(cls, given: Any, ear: str | None = None) -> Audiogram:
-        """From pyclarity's ``Audiogram``, or one ear of its ``Listener`` or of an entry of Clarity's ``listeners.json``.
+    def from_clarity(cls, source: Any, ear: str | None = None) -> Audiogram:
+        """Return the audiogram of an object or an entry of Clarity.
 
         Args:
-            ear: ``"left"`` or ``"right"``, of a listener.
+            source: pyclarity's ``Audiogram``, its ``Listener``, or an entry of ``listeners.json``.
+            ear: ``"left"`` or ``"right"`` for a listener, None for an audiogram.
 
         Raises:
-            ValueError: none of these, a listener without ``ear``, or an audiogram with it.
+            ValueError: the source is none of these, or ``ear`` does not fit it.
         """
-        if isinstance(given, Mapping) and (lack := [key for key in _ENTRY if key not in given]):
+        if isinstance(source, Mapping):
+            missing = [key for key in CLARITY_KEYS if key not in source]
+            if missing:
+                raise ValueError(
+                    f"expected an entry of listeners.json, but {', '.join(missing)} is missing"
+                )
+        two_ears = has_two_ears(source)
+        if not two_ears and not is_claritys(source):
             raise ValueError(
-                f"an entry of listeners.json without {', '.join(lack)}; needs {', '.join(_ENTRY)}"
+                "expected pyclarity's Audiogram or Listener, or an entry of listeners.json, "
+                f"got {type(source).__name__}"
             )
-        two = has_two_ears(given)
-        if not two and not is_claritys(given):
+        if two_ears and ear not in ("left", "right"):
             raise ValueError(
-                f"{type(given).__name__} is none of pyclarity's; allowed: its Audiogram or Listener, or an entry of "
-                "listeners.json"
+                f"expected ear='left' or ear='right', as the source has two ears, got {ear!r}"
             )
-        if ear not in (("left", "right") if two else (None,)):
-            allowed = (
-                "ear='left' or ear='right', for a listener has two"
-                if two
-                else "None, for it is one ear"
-            )
-            raise ValueError(f"ear is {ear!r}; allowed: {allowed}")
-        if two and isinstance(given, Mapping):
-            return cls(given[f"audiogram_levels_{ear[0]}"], given["audiogram_cfs"])  # type: ignore[index]
-        own = getattr(given, f"audiogram_{ear}") if two else given
-        return cls(own.levels, own.frequencies)
+        if not two_ears and ear is not None:
+            raise ValueError(f"expected no ear, as the source has only one, got {ear!r}")
+        if isinstance(source, Mapping):
+            side = str(ear)[0]
+            return cls(source[f"audiogram_levels_{side}"], source["audiogram_cfs"])
+        audiogram = getattr(source, f"audiogram_{ear}") if two_ears else source
+        return cls(audiogram.levels, audiogram.frequencies)
 
 
-def is_claritys(given: Any) -> bool:
-    """Whether it is pyclarity's ``Audiogram``, without importing it."""
-    return hasattr(given, "levels") and hasattr(given, "frequencies")
+def is_claritys(value: Any) -> bool:
+    """Return whether a value is pyclarity's ``Audiogram``, without importing pyclarity."""
+    return hasattr(value, "levels") and hasattr(value, "frequencies")
 
 
-def has_two_ears(given: Any) -> bool:
-    """Whether it is pyclarity's ``Listener`` or an entry of ``listeners.json``."""
-    if isinstance(given, Mapping):
-        return set(_ENTRY) <= given.keys()
-    return hasattr(given, "audiogram_left") and hasattr(given, "audiogram_right")
-
-
-def severity_of(levels: Sequence[float]) -> str:
-    """``Audiogram.severity`` of eight levels in dB HL."""
-    high = [round(level * _FINE) / _FINE for level in levels[FREQUENCIES.index(2000.0) :]]
-    total = reduce(add, high)  # Python's own sum rounds in other ways from 3.12 on
-    return SEVERITIES[bisect_left(SEVERITY_LIMITS, total / len(high))]
+def has_two_ears(value: Any) -> bool:
+    """Return whether a value is pyclarity's ``Listener`` or an entry of ``listeners.json``."""
+    if isinstance(value, Mapping):
+        return set(CLARITY_KEYS) <= value.keys()
+    return hasattr(value, "audiogram_left") and hasattr(value, "audiogram_right")
 
 
 def severity_index(thresholds: Tensor) -> Tensor:
-    """Index into ``SEVERITIES`` of each ear. Shape: (..., 8) dB HL -> (...), int64."""
+    """Return the index into ``SEVERITIES`` of each ear. Shape: (..., 8) dB HL -> (...), int64."""
     high = thresholds[..., FREQUENCIES.index(2000.0) :].double()
-    # by tensors: CUDA multiplies by a number's reciprocal instead of dividing by it, which is off by the last bit
-    fine, count = (high.new_full((), value) for value in (_FINE, high.shape[-1]))
-    levels = ((high * _FINE).round() / fine).unbind(-1)
-    mean = (
-        sum(levels[1:], start=levels[0]) / count
-    )  # in the order of ``severity_of``, for the same last bit
+    # Tensors, because CUDA multiplies by the reciprocal of a number, which changes the last bit.
+    steps_per_db = high.new_full((), STEPS_PER_DB)
+    count = high.new_full((), high.shape[-1])
+    first, *others = ((high * STEPS_PER_DB).round() / steps_per_db).unbind(-1)
+    mean = sum(others, start=first) / count
     return torch.stack([mean > limit for limit in SEVERITY_LIMITS]).sum(0)
 
 
-def _numbers(values: Iterable[float], what: str) -> tuple[float, ...]:
+def join_numbers(values: Iterable[float]) -> str:
+    """Return numbers as messages show them."""
+    return ", ".join(f"{value:g}" for value in values)
+
+
+def _as_numbers(values: Iterable[float], name: str) -> tuple[float, ...]:
     try:
-        if isinstance(values, str | Mapping):  # whose characters or keys are no levels
+        if isinstance(values, str | Mapping):  # their characters or keys are not levels
             raise TypeError
         numbers = tuple(float(value) for value in values)
     except (TypeError, ValueError):
-        raise ValueError(f"audiogram {what} {values!r}; allowed: numbers") from None
+        raise ValueError(f"expected {name} of an audiogram as numbers, got {values!r}") from None
     if not all(math.isfinite(number) for number in numbers):
-        raise ValueError(f"audiogram {what} {listed(numbers)}; allowed: finite numbers")
+        raise ValueError(f"expected finite {name} of an audiogram, got {join_numbers(numbers)}")
     return numbers
 
 
-def _exact(value: float) -> str:
-    """The shortest text that is read as the same number."""
-    short = f"{value:g}"
-    return short if float(short) == value else repr(value)
-
-
-def listed(values: Iterable[float]) -> str:
-    """Numbers as messages have them."""
-    return ", ".join(f"{value:g}" for value in values)
+def _shortest(value: float) -> str:
+    """Return the shortest text that is read as the same number."""
+    text = f"{value:g}"
+    return text if float(text) == value else repr(value)

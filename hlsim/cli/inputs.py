@@ -82,7 +82,7 @@ def read_listener(text: str) -> Listener:
         raise ValueError(
             f"--listener {text}: there is no such file; for one ear, use --audiogram instead"
         )
-    from hlsim.audiogram.listener import read_listeners
+    from hlsim.audiogram.table import read_listeners
 
     listeners = read_listeners(file)
     if not name and len(listeners) == 1:

@@ -19,7 +19,8 @@ from torch import Tensor, nn
 
 from compensators import load_compensator
 from hlsim.audio import read_audio, write_audio
-from hlsim.audiogram.listener import EARS, Listener, read_listeners
+from hlsim.audiogram.listener import EARS, Listener
+from hlsim.audiogram.table import read_listeners
 from hlsim.calibration import check_full_scale, gain_to_pascals, level_spl, set_level
 from hlsim.evaluation.comparison import compare
 from hlsim.evaluation.enhancers import load_enhancers

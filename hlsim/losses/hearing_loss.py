@@ -13,10 +13,10 @@ from hlsim.audiogram.devices import on_device
 from hlsim.audiogram.thresholds import (
     AudiogramLike,
     as_thresholds,
-    check_two_ears,
-    of_listeners,
-    one_an_item,
-    own_thresholds,
+    check_two_channels,
+    has_listeners,
+    store_thresholds,
+    unsqueeze_mono,
 )
 from hlsim.calibration import PASCAL_SPL, check_full_scale, gain_to_pascals
 from hlsim.checks import (
@@ -120,13 +120,13 @@ class HearingLossLoss(nn.Module):
         check_choice("reduction", reduction, Reduction)
         check_choice("ears", ears, EarsName)
         self.reduction, self.ears = reduction, ears
-        self._two_ears = of_listeners(audiogram)
+        self._two_ears = has_listeners(audiogram)
         self.criteria = check_criterion(criterion)
         self.weights = combine_weights(weights, self.criteria)
         with torch.device(
             "cpu"
         ):  # where the host is made on ``meta``, nobody gives the ear its values later
-            thresholds = own_thresholds(audiogram, missing=True)
+            thresholds = store_thresholds(audiogram, allow_missing=True)
         self._ear = FrozenEar(simulator, self.sample_rate, self.full_scale_spl, normal, reference)
         # in a tuple, nn.Module does not see them
         self._unregistered = (thresholds, criterion)
@@ -320,13 +320,17 @@ class HearingLossLoss(nn.Module):
                 f"compensated is on {compensated.device} and clean on {clean.device}; allowed: the same device"
             )
         shape = compensated.shape
-        check_two_ears(self.ears == "better" or "interaural" in self.criteria, clean)
+        if self.ears == "better" or "interaural" in self.criteria:
+            check_two_channels(clean)
         ends = None if lengths is None else check_lengths(lengths, shape)
-        check_two_ears(self._two_ears if audiogram is None else of_listeners(audiogram), clean)
-        ears = self.thresholds if audiogram is None else as_thresholds(audiogram, missing=True)
+        if self._two_ears if audiogram is None else has_listeners(audiogram):
+            check_two_channels(clean)
+        ears = (
+            self.thresholds if audiogram is None else as_thresholds(audiogram, allow_missing=True)
+        )
         if ears is None:
             raise ValueError("no audiogram: give one when building the loss or with the call")
-        ears = one_an_item(ears, shape)
+        ears = unsqueeze_mono(ears, shape)
         dtype = torch.promote_types(
             torch.promote_types(compensated.dtype, clean.dtype), torch.float32
         )
@@ -336,7 +340,7 @@ class HearingLossLoss(nn.Module):
         host_ears = ears
         ears = on_device(ears, compensated.device)
         # only a listener, whose ears come from the CPU, may lack an ear
-        listeners = self._two_ears if audiogram is None else of_listeners(audiogram)
+        listeners = self._two_ears if audiogram is None else has_listeners(audiogram)
         known = host_ears.isfinite().all(-1) if listeners else None
         if known is None or bool(known.all()):
             return compensated, clean, ears, ends, None

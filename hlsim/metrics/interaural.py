@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from hlsim.audiogram.thresholds import check_two_ears
+from hlsim.audiogram.thresholds import check_two_channels
 from hlsim.checks import check_rate, check_waveform
 from hlsim.dsp.fft import power
 from hlsim.dsp.stft import STFT
@@ -49,7 +49,7 @@ def interaural(waveform: Tensor, *, sample_rate: int = 16000) -> Interaural:
         ValueError: another shape, or a rate out of range.
     """
     check_rate(sample_rate)
-    check_two_ears(True, check_waveform(waveform))
+    check_two_channels(check_waveform(waveform))
     left, right, cross, octaves = _spectra(waveform.detach().double(), sample_rate)
     delays = torch.arange(-_LONGEST, _LONGEST + 1, device=waveform.device)
     hz = torch.linspace(0.0, sample_rate / 2.0, len(octaves), dtype=left.dtype, device=left.device)

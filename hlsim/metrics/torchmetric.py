@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from hlsim.audiogram import FREQUENCIES, HIGHEST_LEVEL, Audiogram
-from hlsim.audiogram.thresholds import AudiogramLike, as_thresholds, of_listeners
+from hlsim.audiogram.thresholds import AudiogramLike, as_thresholds, has_listeners
 from hlsim.calibration import check_full_scale, level_spl
 from hlsim.checks import Lengths, check_lengths, check_rate, check_waveform
 from hlsim.extras import require
@@ -272,9 +272,9 @@ def _ears(audiogram: AudiogramLike, batch: int, sides: int) -> list[dict[int, Au
     """Each item's ears by channel, without those that are missing."""
     shapes = [(*lead, *((2,) if sides == 2 else ()), len(FREQUENCIES)) for lead in ((), (batch,))]
     levels = as_thresholds(
-        audiogram, highest=HIGHEST_LEVEL, taker="a score", missing=sides == 2
+        audiogram, highest=HIGHEST_LEVEL, consumer="a score", allow_missing=sides == 2
     ).detach()
-    if levels.shape not in shapes or (sides == 1 and of_listeners(audiogram)):
+    if levels.shape not in shapes or (sides == 1 and has_listeners(audiogram)):
         found, (alone, each) = tuple(levels.shape), shapes
         raise ValueError(f"audiogram of shape {found}; allowed: {alone} or {each} dB HL")
     rows = levels.expand(shapes[1]).reshape(batch, sides, -1).double().tolist()

@@ -7,14 +7,14 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from hlsim.audiogram import LOWEST_LEVEL, SEVERITIES, severity_of
+from hlsim.audiogram import LOWEST_LEVEL, SEVERITIES, severity_index
 from hlsim.audiogram.devices import on_host
 from hlsim.audiogram.thresholds import (
     HIGHEST_SIMULATED,
     AudiogramLike,
-    of_listeners,
-    own_thresholds,
+    has_listeners,
     resolve_thresholds,
+    store_thresholds,
 )
 from hlsim.calibration import PASCAL_SPL, check_full_scale, gain_to_pascals
 from hlsim.checks import broadcast_shape, check_rate, check_waveform
@@ -91,13 +91,13 @@ class MSBG(nn.Module):
         self.full_scale_spl = check_full_scale(full_scale_spl)
         self.aligned = aligned
         self.rescale_active = rescale_active
-        levels = own_thresholds(audiogram)
+        levels = store_thresholds(audiogram)
         trained = levels is not None and levels.requires_grad
         self.register_buffer("_levels", None if trained else levels, persistent=False)
         self._trained = (
             levels if trained else None,
         )  # a buffer that moves would be another tensor
-        self._two_ears = of_listeners(audiogram)
+        self._two_ears = has_listeners(audiogram)
 
     @property
     def thresholds(self) -> Tensor | None:
@@ -269,9 +269,11 @@ def _alike(ears: Tensor, trained: bool) -> list[tuple[str, bool, list[int]]]:
             f"an audiogram holds NaN or levels outside {LOWEST_LEVEL:g} to {HIGHEST_SIMULATED:g} dB HL"
         )
     groups: dict[tuple[str, bool], list[int]] = {}
-    for item, levels in enumerate(ears.tolist()):
-        none = not any(levels) and not trained
-        groups.setdefault((severity_of(levels), none), []).append(item)
+    severities = severity_index(ears).tolist()
+    without_loss = (ears == 0.0).all(-1).tolist()
+    for item, severity in enumerate(severities):
+        none = without_loss[item] and not trained
+        groups.setdefault((SEVERITIES[severity], none), []).append(item)
     return [(*kind, members) for kind, members in groups.items()]
 
 

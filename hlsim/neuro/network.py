@@ -58,7 +58,7 @@ class EarNetwork(nn.Module):
                 f"the waveform is on {waveform.device} and {type(self).__name__} on {weight.device}; allowed: the same "
                 "device, move either with .to()"
             )
-        thresholds = resolve_thresholds(None, audiogram, waveform, taker=type(self).__name__)
+        thresholds = resolve_thresholds(None, audiogram, waveform, consumer=type(self).__name__)
         with torch.autocast(waveform.device.type, enabled=False):
             dtype = self._dtype
             batch = broadcast_shape(waveform.shape[:-1], thresholds.shape[:-1])

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from compensators import NALR, WDRC, load_compensator
 from hlsim import MSBG, Audiogram, HASPILoss, HearingLossLoss, Listener, load_pretrained
-from hlsim.audiogram.listener import read_listeners
+from hlsim.audiogram.table import read_listeners
 from hlsim.calibration import set_level
 from hlsim.metrics import haspi, hasqi
 

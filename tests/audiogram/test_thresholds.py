@@ -119,7 +119,5 @@ def test_ears_as_lists_of_tensors_and_as_a_loader_collates_them() -> None:
     assert len(collated) == 8
     assert torch.equal(as_thresholds(collated), torch.tensor(ears, dtype=torch.float64))
     assert torch.equal(as_thresholds([torch.tensor(ear) for ear in ears]), torch.tensor(ears))
-    with pytest.raises(
-        ValueError, match=r"eight tensors of 8 levels.*allowed: torch\.stack\(audiogram\) of ears"
-    ):
+    with pytest.raises(ValueError, match="which may be ears or frequencies"):
         as_thresholds(torch.utils.data.default_collate([ears[0]] * 8))

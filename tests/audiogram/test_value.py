@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from hlsim.audiogram import FREQUENCIES, SEVERITIES, Audiogram, severity_index, severity_of
+from hlsim.audiogram import FREQUENCIES, SEVERITIES, Audiogram, severity_index
 from hlsim.audiogram.thresholds import as_thresholds
 
 # Bisgaard, Vlaming and Dahlquist 2010, Tables 1 and 2, all ten frequencies
@@ -140,8 +140,11 @@ def test_severity_is_the_same_to_the_last_bit_of_the_mean() -> None:
         last = (5.0 * limit - sum(ear[3:7]) for limit in (15.0, 35.0, 56.0))
         ear[7] = next((level for level in last if 0.0 <= level <= 100.0), ear[7])
     index = severity_index(torch.tensor(ears, dtype=torch.float64)).tolist()
-    assert [SEVERITIES[i] for i in index] == [severity_of(ear) for ear in ears]
-    assert [severity_of(ear) for ear in ears] == [Audiogram(tuple(ear)).severity for ear in ears]
+    assert [SEVERITIES[i] for i in index] == [Audiogram(tuple(ear)).severity for ear in ears]
+    for ear, found in zip(ears, index, strict=True):
+        high = [round(level * 1e4) / 1e4 for level in ear[3:]]
+        mean = (high[0] + high[1] + high[2] + high[3] + high[4]) / 5
+        assert found == sum(mean > limit for limit in (15.0, 35.0, 56.0))
 
 
 def test_severity_on_a_limit_is_pyclaritys_in_single_precision_too() -> None:
@@ -161,7 +164,6 @@ def test_severity_on_a_limit_is_pyclaritys_in_single_precision_too() -> None:
     assert [Audiogram(tuple(ear)).severity for ear in ears] == expected
     single = as_thresholds([Audiogram(tuple(ear)) for ear in ears])
     assert single.dtype == torch.float32
-    assert [severity_of(ear) for ear in single.tolist()] == expected
     assert [SEVERITIES[i] for i in severity_index(single).tolist()] == expected
     assert [
         SEVERITIES[i] for i in severity_index(torch.tensor(ears, dtype=torch.float64)).tolist()
@@ -184,7 +186,7 @@ def test_severity_on_a_limit_is_the_same_where_a_division_is_a_product() -> None
     assert len(ears) > 1000
     with DividesAsCUDA():
         index = severity_index(ears)
-    assert [SEVERITIES[i] for i in index.tolist()] == [severity_of(ear) for ear in ears.tolist()]
+    assert torch.equal(index, severity_index(ears))
 
 
 def test_severity_of_many_ears_keeps_leading_dimensions() -> None:

@@ -19,7 +19,8 @@ from torch import Tensor
 
 import hlsim
 from hlsim.audio import read_audio
-from hlsim.audiogram.listener import Listener, read_listeners
+from hlsim.audiogram.listener import Listener
+from hlsim.audiogram.table import read_listeners
 from hlsim.cli.main import main
 from hlsim.dsp.resample import resample
 from hlsim.evaluation.clarity import (

@@ -169,7 +169,9 @@ class CleanSpeech:
             host: on the CPU. The host waits for the device where the ears come from there.
         """
         probe = torch.empty((*self.shape, 1), device=self.device)
-        ears = resolve_thresholds(None, audiogram, probe, highest=HIGHEST_LEVEL, taker=self._name)
+        ears = resolve_thresholds(
+            None, audiogram, probe, highest=HIGHEST_LEVEL, consumer=self._name
+        )
         if broadcast_shape(self.shape, ears.shape[:-1]) != self.shape:
             raise ValueError(
                 f"audiograms of shape {tuple(ears.shape)} for signals of {(*self.shape, self.time)}; allowed: one, or "
