@@ -86,7 +86,7 @@ def test_of_two_channels_the_better_ear_counts(clean: Tensor) -> None:
     assert float(metric.compute()) == pytest.approx(float(expected[1].mean()), abs=1e-6)
     assert int(metric.failed) == 0 and bool(metric.ears.isnan()[0])
     for wrong in (N3, [N3], torch.zeros(2, 8, 1)):
-        with pytest.raises(ValueError, match="thresholds|audiogram"):
+        with pytest.raises(ValueError, match=r"thresholds|audiogram"):
             metric.update(given, both, wrong)
 
 
