@@ -172,14 +172,16 @@ def agreement(reference: Tensor, processed: Tensor, extent: Extent) -> Agreement
     kept, points = extent.longest, _points(extent.longest)
     waves = extent.centred(reference), extent.centred(processed)
     a, b = (torch.fft.rfft(one, points) for one in waves)
+    responses = constant(_responses, points, dtype=reference.dtype, device=reference.device)
+    together = 1 if reference.device.type == "cpu" else len(responses)
     sums = []
-    for response in constant(_responses, points, dtype=reference.dtype, device=reference.device):
+    for part in responses.split(together):
         x, y = (
-            extent.centred(torch.fft.irfft(spectrum * response, points)[..., :kept])
+            extent.centred(torch.fft.irfft(spectrum[:, None] * part[:, None], points)[..., :kept])
             for spectrum in (a, b)
         )
         sums.append(torch.stack((x.square().sum(-1), y.square().sum(-1), (x * y).sum(-1))))
-    xx, yy, xy = torch.stack(sums, 2)
+    xx, yy, xy = torch.cat(sums, 2)
     return Agreement(xx, yy, xy, waves, (a, b), extent)
 
 
@@ -274,7 +276,7 @@ def _energies_filtered_twice(found: Agreement) -> tuple[Tensor, Tensor, Tensor, 
     members: dict[int, list[int]] = {}
     for item, kept in enumerate(found.extent.ends):
         members.setdefault(_points(kept), []).append(item)
-    parts: list[tuple[Tensor, ...]] = []
+    parts: list[tuple[Tensor, Tensor, Tensor, Tensor]] = []
     for points, items in members.items():
         a, b = found.spectra
         if len(members) > 1:
@@ -286,10 +288,10 @@ def _energies_filtered_twice(found: Agreement) -> tuple[Tensor, Tensor, Tensor, 
             )
         weights = constant(_twice_filtered, points, dtype=found.xy.dtype, device=device)
         x, y = torch.view_as_real(a), torch.view_as_real(b)
-        energies = [(weights @ product.sum(-1).mT) for product in (x.square(), y.square(), x * y)]
+        xx, yy, xy = (weights @ product.sum(-1).mT for product in (x.square(), y.square(), x * y))
         counts = integers(tuple(found.extent.ends[item] for item in items), device)
         own = counts.to(weights)[:, None, None] * weights.sum(-1, keepdim=True)
-        parts.append((*energies, own))
+        parts.append((xx, yy, xy, own))
     if len(parts) == 1:
         return parts[0]
     order = [item for items in members.values() for item in items]

@@ -228,7 +228,7 @@ def _filtered(filters: Recursion, signal: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _power(real: Tensor, imaginary: Tensor) -> Tensor:
-    return torch.addcmul(real * real, imaginary, imaginary).flatten(-2)
+    return (real * real).addcmul_(imaginary, imaginary).flatten(-2)
 
 
 def control_power(signal: Tensor, channels: slice) -> Tensor:
@@ -307,7 +307,7 @@ def compression_gain(control: Tensor, cells: HairCells) -> Tensor:
     # in nepers: -loss - (level - knee) (1 - 1 / ratio)
     exponent = 0.5 * (1.0 / ratio - 1.0)
     neper = math.log(10.0) / 20.0
-    gain = torch.addcmul(-neper * (loss + 2.0 * exponent * knee), level, exponent).exp()
+    gain = torch.addcmul(-neper * (loss + 2.0 * exponent * knee), level, exponent).exp_()
     return gain_lowpass(control.device, control.dtype)(gain).flatten(-2)
 
 
@@ -457,9 +457,8 @@ def longest_group_delay(signal: Tensor, ear: HairCells, extent: Extent) -> Tenso
 def sensation(power: Tensor, inner: Tensor) -> Tensor:
     """Level over the threshold in dB, 0 or more. Shape: (items, channels, padded), (items or 1, channels) -> as power."""
     floor = 10.0 ** (inner.to(power).unsqueeze(-1) / 10.0)
-    return torch.maximum(power, floor).log() * (10.0 / math.log(10.0)) - inner.to(power).unsqueeze(
-        -1
-    )
+    level = torch.maximum(power, floor).log().mul_(10.0 / math.log(10.0))
+    return level.sub_(inner.to(power).unsqueeze(-1))
 
 
 def adapted(level: Tensor) -> Tensor:

@@ -66,7 +66,8 @@ class Recursion(NamedTuple):
         blocks = signal.unflatten(-1, (-1, BLOCK))
         states = _accumulated(blocks @ self.inward, self.step, self.memory // BLOCK)
         before = functional.pad(states[..., :-1, :], (0, 0, 1, 0))
-        return blocks @ self.through + before @ self.outward
+        # in place, for these are the largest tensors of all
+        return (blocks @ self.through).add_(before @ self.outward)
 
     def repeated(self, items: int) -> Recursion:
         """The same filters for each of several items."""
@@ -89,7 +90,8 @@ def _accumulated(inputs: Tensor, step: Tensor, memory: int) -> Tensor:
     """
     states, reach = inputs, 1
     while reach < min(inputs.shape[-2], memory + 1):
-        states = states + functional.pad(states[..., :-reach, :] @ step, (0, 0, reach, 0))
+        later = states[..., reach:, :] + states[..., :-reach, :] @ step
+        states = torch.cat((states[..., :reach, :], later), -2)
         step, reach = step @ step, 2 * reach
     return states
 
