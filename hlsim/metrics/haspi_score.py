@@ -33,7 +33,7 @@ from hlsim.metrics.ear import envelope_modulation as envelopes
 from hlsim.metrics.ear import model as ear_model
 from hlsim.metrics.ear.clean_speech import CleanBatch, CleanSpeech, ItemGroup
 from hlsim.metrics.ear.model import CHANNELS, Extent
-from hlsim.metrics.pair import check_seed
+from hlsim.metrics.pair import check_seed, cut_to_common_length
 from hlsim.torchtools import constant, not_compiled
 
 Noise = Literal["expected", "seeded", "none"]
@@ -53,33 +53,38 @@ def haspi(
     seed: int | Sequence[int] = 0,
     whole_khz: bool = False,
 ) -> Tensor:
-    """HASPI v2 of each item: how much of clean speech is understood as this ear hears the processed, 0 to 1.
+    """Compute HASPI v2 of each item: how much of the speech an impaired ear understands, 0 to 1.
 
-    A delay of ``processed`` of its own is allowed for. Differentiable in ``processed``, with the delays that align it
-    held; an ear that hears nothing of a band gives it no gradient. A silent ``processed`` has a score, of noise alone.
-    Clean speech that is scored against often is prepared once: see ``HaspiReference``.
+    The score compares the processed signal in the impaired ear with clean speech in a normal ear. A delay of
+    ``processed`` does not count. A silent ``processed`` has a score, that of the noise in the ear. The score is
+    differentiable in ``processed``, while the delays that align it are constant; a band in which the ear hears nothing
+    has no gradient. ``HaspiReference`` prepares clean speech once for many scores.
+
+    The result is float64 if one of the signals is, and float32 otherwise. On CUDA, leave
+    ``torch.backends.cuda.matmul.allow_tf32`` off, as it is by default. An ear on a GPU that is out of range has the score
+    NaN, because the host does not read its levels.
 
     Args:
-        processed: what the impaired ear is given.
-        clean: clean speech, not amplified, as a normal ear would hear it.
-        audiogram: of the impaired ear, -10 to 120 dB HL; one, or one an item.
-        sample_rate: Hz, 16000 to 48000.
+        processed: signal at the impaired ear, at least 0.7 s long.
+        clean: clean speech, not amplified. Lengths of both that differ by 0.1 s at most are cut to the shorter one, with
+            a warning.
+        audiogram: the impaired ear, -10 to 120 dB HL; one ear, or one for each item.
+        sample_rate: sample rate in Hz, 16000 to 48000.
         full_scale_spl: level in dB SPL of a signal with RMS 1.0 (pyclarity's ``level1``).
-        lengths: samples of each item, where they are padded.
-        noise: "expected" gives the mean over seeds, smooth and the same every time; "seeded" draws what pyclarity draws
-            under ``seed`` (scores vary by up to 0.007); "none" leaves it out.
-        seed: of every item, or one an item.
-        whole_khz: take the rate rounded to whole kHz, as pyclarity does: 44.1 kHz as 44, which moved scores by up to
-            0.005.
+        lengths: number of samples of each item in a padded batch.
+        noise: ``"expected"`` computes the mean over seeds, which is smooth and the same every time; ``"seeded"`` draws
+            the noise that pyclarity draws with ``seed`` (scores vary by up to 0.007); ``"none"`` leaves it out.
+        seed: one seed, or one for each item.
+        whole_khz: round the rate to whole kHz, as pyclarity does. 44.1 kHz becomes 44, which moved scores by up to 0.005.
 
-    Shape: (..., time) twice and one audiogram or (..., 8) dB HL -> (...,); at least 0.7 s. Computed in float64 if either
-        is, in float32 otherwise; on CUDA leave ``torch.backends.cuda.matmul.allow_tf32`` off, as it is by default.
+    Shape: (..., time) twice, and (..., 8) dB HL -> (...,).
 
     Raises:
-        ValueError: signals of other shapes, too short, not finite; the clean one silent or below 20 dB SPL; rate, level,
-            audiogram, lengths or seed out of range.
+        ValueError: signals of other shapes, too short, or not finite; clean speech that is silent or below 20 dB SPL; a
+            rate, level, audiogram, length or seed out of range.
     """
     check_waveform(processed, "processed")
+    processed, clean, lengths = cut_to_common_length(processed, clean, sample_rate, lengths)
     reference = HaspiReference(
         clean.to(torch.promote_types(clean.dtype, processed.dtype))
         if isinstance(clean, Tensor)

@@ -31,6 +31,7 @@ from hlsim.metrics.ear.clean_speech import CleanBatch, CleanSpeech, ItemGroup
 from hlsim.metrics.ear.model import AUDIOMETRIC_HZ, CHANNELS, Extent
 from hlsim.metrics.ear.recursions import RATE
 from hlsim.metrics.haspi_score import Noise, generator_after, item_seeds
+from hlsim.metrics.pair import cut_to_common_length
 from hlsim.torchtools import constant, not_compiled
 
 _NALR_ORDER = 140
@@ -86,6 +87,7 @@ def hasqi(
         ValueError: as ``haspi``.
     """
     check_waveform(processed, "processed")
+    processed, clean, lengths = cut_to_common_length(processed, clean, sample_rate, lengths)
     reference = HasqiReference(
         clean.to(torch.promote_types(clean.dtype, processed.dtype))
         if isinstance(clean, Tensor)

@@ -25,6 +25,7 @@ from torch.nn import functional
 from hlsim.checks import Lengths, check_lengths, check_rate, check_waveform
 from hlsim.dsp.fft import power, rfft
 from hlsim.metrics.ear.model import Extent, integers
+from hlsim.metrics.pair import cut_to_common_length
 from hlsim.torchtools import constant_like
 
 _RATE = 10000  # Hz that the measure works at
@@ -69,6 +70,7 @@ def mbstoi(
         ValueError: signals of other shapes, too short, not finite; the clean one silent; rate or lengths out of range.
     """
     rate = check_rate(sample_rate)
+    processed, clean, lengths = cut_to_common_length(processed, clean, rate, lengths)
     _check_shapes(processed, clean)
     items = clean.shape[:-2]
     ends = [clean.shape[-1]] * items.numel()
