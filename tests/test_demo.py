@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from statistics import fmean
 
 import pytest
 import soundfile
@@ -25,46 +26,32 @@ def short_speech(tmp_path: Path, speech_dir: Path) -> Path:
     return folder
 
 
-def test_demo_writes_report_audio_and_pictures(tmp_path: Path, short_speech: Path) -> None:
+def test_demo_writes_page_and_sounds_that_agree(tmp_path: Path, short_speech: Path) -> None:
     out = tmp_path / "out"
-    lines: list[str] = []
     ear, seed = Audiogram.standard("N4"), 2**32 - 2
-    text = demo(out, ear, speech=short_speech, steps=60, seed=seed, report=lines.append)
+    text = demo(out, ear, speech=short_speech, steps=60, seed=seed, report=lambda line: None)
     report = json.loads((out / "report.json").read_text())
-    assert report["n"] == len(report["items"]) == 8
+    rows = report["rows"]
+    names = ["unaided", "NAL-R", "NAL-R at the trained aid's level", "untrained start", "trained"]
+    assert [row["condition"] for row in rows] == names * 8
     # after numpy's last seed comes its first
-    assert [item["seed"] for item in report["items"]] == [seed, seed + 1, 0, 1, 2, 3, 4, 5]
-    names = {"unaided": "unaided", "nalr": "NAL-R", "nalr_as_loud": "NAL-R as loud as trained"}
-    names |= {"initial": "untrained start", "compensated": "trained"}
-    rows = {line[:24].strip(): line[24:].split() for line in text.splitlines()}
-    for key, name in names.items():
-        assert 0.0 <= report[f"{key}_mean"] <= 1.0
-        assert rows[name][:2] == [
-            f"{report[f'{key}_mean']:.3f}",
-            f"{report[f'{key}_level_mean']:.1f}",
-        ]
-    assert report["nalr_as_loud_level_mean"] == pytest.approx(
-        report["compensated_level_mean"], abs=1e-3
-    )
+    assert [row["seed"] for row in rows[::5]] == [seed, seed + 1, 0, 1, 2, 3, 4, 5]
+    assert rows[2]["level"] == pytest.approx(rows[4]["level"], abs=1e-3)
+    means = {
+        name: fmean(row["haspi"] for row in rows if row["condition"] == name) for name in names
+    }
+    printed = {line[:32].strip(): line[32:].split() for line in text.splitlines()}
+    for name, mean in means.items():
+        assert printed[name][0] == f"{mean:.3f}"
+    # NAL-R, and an aid that starts from it, make speech easier to understand for this ear
+    assert means["NAL-R"] > means["unaided"] and means["trained"] > means["unaided"]
+    (planned,) = (c for c in report["comparisons"] if c["planned"])
+    assert (planned["before"], planned["after"]) == (names[2], "trained")
     page = (out / "report.html").read_text()
-    assert text.startswith("\nThe trained aid ")
-    assert f"seed {seed}, 60 training steps" in text
+    assert text.startswith("\nThe trained aid ") and f"seed {seed}, 60 training steps" in text
     assert text.endswith(f"\nThe page: {out / 'report.html'}")
     assert text.splitlines()[1] in page and page.count("<audio") == 5 and "N4 (severe loss)" in page
-    assert report["before_mean"] == pytest.approx(report["unaided_mean"])
-    assert report["after_mean"] == pytest.approx(report["compensated_mean"])
-    # NAL-R and what starts from it make speech louder and easier to understand for this ear
-    assert report["nalr_mean"] > report["unaided_mean"]
-    assert report["compensated_mean"] > report["unaided_mean"]
-    assert report["nalr_level_mean"] > report["unaided_level_mean"] + 10.0
-    assert report["unaided_heard_difference_db"] < -20.0
-    for name in (
-        "report.md",
-        "before-after.png",
-        "spectrograms.png",
-        "training/checkpoint/model.safetensors",
-    ):
-        assert (out / name).stat().st_size > 0
+    assert (out / "training" / "checkpoint" / "model.safetensors").stat().st_size > 0
     assert len(list((out / "audio").glob("*.wav"))) == 6 * 8
 
 
@@ -86,6 +73,6 @@ def test_names_tell_speakers_apart(tmp_path: Path) -> None:
 
 
 def test_too_little_speech(tmp_path: Path, speech_dir: Path) -> None:
-    with pytest.raises(ValueError, match="allowed: 22 or more"):
+    with pytest.raises(ValueError, match="needs 22 or more"):
         demo(tmp_path / "out", Audiogram.standard("N4"), speech=speech_dir / "valid")
     assert not (tmp_path / "out").exists()

@@ -18,10 +18,10 @@ for package in (compensators, hlsim):
         if not found.name.endswith("__main__"):
             importlib.import_module(found.name)
 import torch
-from hlsim.metrics.registry import MEASURES
+from hlsim.evaluation import MEASURES, Item
 speech = torch.sin(torch.arange(16000) * 0.2) * 0.05
-score = MEASURES["haspi"].score(speech, speech, hlsim.Audiogram.standard("N1"), 16000, 94.0, 0)
-assert 0.0 < score <= 1.0
+item = Item("speech", speech, speech, hlsim.Audiogram.standard("N1"))
+assert 0.0 < MEASURES["haspi"].compute(item, speech)["haspi"] <= 1.0
 """
 
 

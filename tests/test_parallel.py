@@ -1,14 +1,13 @@
-"""One function over many tasks: its order, its laziness, a process that dies, a cluster of two workers, and a store."""
+"""One function over many tasks: its results, its laziness, a process that dies, a cluster."""
 
 import os
 import signal
 import time
-from collections.abc import Iterator, Sequence
-from typing import Any
+from collections.abc import Iterator
 
 import pytest
 
-from hlsim.parallel import Failed, make_missing, run_parallel
+from hlsim.parallel import run_parallel
 
 pytest.importorskip("joblib")
 
@@ -71,7 +70,7 @@ def test_a_cluster_of_two_workers() -> None:
             n_workers=2, threads_per_worker=1, dashboard_address=None, host="127.0.0.1"
         ) as cluster,
     ):
-        made = run_parallel(where, range(12), backend="dask", scheduler=cluster.scheduler_address)
+        made = run_parallel(where, range(12), dask=cluster.scheduler_address)
         results = [result for _, result in made if result is not None]
         assert sorted(number for number, _ in results) == list(range(12))
         assert len({process for _, process in results} - {os.getpid()}) == 2
@@ -82,73 +81,19 @@ def where(number: int) -> tuple[int, int]:
     return number, os.getpid()
 
 
-def test_bad_settings() -> None:
-    for options, message in (
-        ({"jobs": 0}, "jobs is 0; allowed: 1 or more"),
-        ({"backend": "ray"}, "no backend 'ray'; allowed: loky, dask"),
-        ({"backend": "dask"}, "needs the scheduler's address"),
-        ({"scheduler": "tcp://127.0.0.1:1"}, "needs the scheduler's address"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            list(run_parallel(square, [1], **options))
+def test_fewer_than_one_process_is_rejected() -> None:
+    with pytest.raises(ValueError, match="jobs is 0"):
+        list(run_parallel(square, [1], jobs=0))
 
 
 def test_no_scheduler(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("distributed")
     monkeypatch.setattr("hlsim.parallel._PATIENCE", 0.5)
     with pytest.raises(ValueError, match=r"no Dask scheduler answers at tcp://127\.0\.0\.1:9"):
-        list(run_parallel(square, [1], backend="dask", scheduler="tcp://127.0.0.1:9"))
+        list(run_parallel(square, [1], dask="tcp://127.0.0.1:9"))
 
 
 @pytest.mark.slow
 def test_a_task_that_ends_its_process_is_found_and_the_others_go_on() -> None:
     results = dict(run_parallel(die_at_three, range(8), jobs=2))
     assert results == {n: None if n == 3 else n * n for n in range(8)}
-
-
-class Kept(dict[str, dict[str, Any]]):
-    """A store in memory."""
-
-    append = dict.__setitem__
-
-
-def square_but_three(number: int, missing: Sequence[str]) -> dict[str, dict[str, int] | Failed]:
-    square = Failed("three") if number == 3 else {"square": number * number}
-    return dict.fromkeys(missing, square)
-
-
-def square_and_die_at_three(number: int, missing: Sequence[str]) -> dict[str, dict[str, int]]:
-    return {key: {"square": die_at_three(number)} for key in missing}
-
-
-def test_what_is_stored_is_not_made_again() -> None:
-    store, seen = Kept({"1": {"square": 1}}), []
-
-    def run() -> dict[str, str]:
-        seen.clear()
-        return make_missing(
-            square_but_three,
-            range(4),
-            lambda number: [str(number)] * (1 + number % 2),  # odd ones count twice
-            store,
-            jobs=1,
-            progress=lambda done, total: seen.append((done, total)),
-        )
-
-    assert run() == {"3": "three"}
-    assert store == {str(n): {"square": n * n} for n in range(3)}
-    assert seen == [(2, 6), (3, 6), (4, 6), (6, 6)]
-    # what failed is tried again, the rest is known
-    assert run() == {"3": "three"} and seen == [(4, 6), (6, 6)]
-    store["3"] = {"square": 9}
-    assert run() == {} and seen == []
-
-
-@pytest.mark.slow
-def test_a_process_that_dies_is_a_reason_and_the_others_are_stored() -> None:
-    store = Kept()
-    failed = make_missing(
-        square_and_die_at_three, range(8), lambda number: [str(number)], store, jobs=2
-    )
-    assert list(failed) == ["3"] and "the process that made it died" in failed["3"]
-    assert store == {str(n): {"square": n * n} for n in range(8) if n != 3}

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import os
 from pathlib import Path
 
 from hlsim.cli.inputs import check_there, need, read_ear
 from hlsim.cli.options import Parser, count, folder
+from hlsim.cli.progress import show_progress
 from hlsim.extras import require
 
 
@@ -25,6 +27,7 @@ def demo(parser: Parser) -> None:
 
 
 def _demo(options: argparse.Namespace) -> None:
+    os.environ["MPLBACKEND"] = "Agg"  # a notebook's backend may not exist in this environment
     need("train", "lightning", "tensorboard")
     need("eval", "joblib", "matplotlib")
     check_there(folders=(options.speech,))
@@ -32,5 +35,13 @@ def _demo(options: argparse.Namespace) -> None:
     require("lightning", "train")  # one that is there may be broken
     from hlsim.demo import demo
 
-    summary = demo(options.out, ear, speech=options.speech, steps=options.steps, seed=options.seed)
+    summary = demo(
+        options.out,
+        ear,
+        speech=options.speech,
+        steps=options.steps,
+        seed=options.seed,
+        jobs=None,
+        progress=show_progress("outputs"),
+    )
     print(summary)

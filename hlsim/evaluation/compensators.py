@@ -24,7 +24,7 @@ from hlsim.evaluation.comparison import compare
 from hlsim.evaluation.enhancers import load_enhancers
 from hlsim.evaluation.items import INPUT_LEVELS, draw_judged_items, read_ears
 from hlsim.evaluation.measurements import draw_utterances, gain_curves, steady_tones, wearing
-from hlsim.evaluation.measures import PERCEPTION, find_measures, network_loss
+from hlsim.evaluation.measures import LEVELS, PERCEPTION, find_measures, network_loss
 from hlsim.evaluation.result import Evaluation, score_columns
 from hlsim.evaluation.store import ScoreStore
 from hlsim.evaluation.study import Condition, run_study
@@ -126,18 +126,16 @@ def evaluate_compensators(
     table = run_study(
         drawn,
         conditions,
-        [*scores, PERCEPTION, network],
+        [*scores, LEVELS, PERCEPTION, network],
         store=ScoreStore(store),
         jobs=jobs,
         dask=dask,
         progress=progress,
     )
-    table["loudness_error"] = table["perceived_level"] - table["normal_level"]
-    table["loudness_error_clean"] = table["perceived_level"] - table["normal_clean_level"]
     evaluation = Evaluation(
         items=drawn,
         conditions=conditions,
-        measures=[*scores, PERCEPTION, network],
+        measures=[*scores, LEVELS, PERCEPTION, network],
         table=table,
         settings={
             "items": items,

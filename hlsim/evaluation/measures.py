@@ -176,12 +176,15 @@ def _perception(item: Item, output: Tensor) -> Values:
     reference = item.once("normal clean", lambda: perceive(item.clean, NORMAL, rate))
     normal_input = item.once("normal input", lambda: perceive(item.signal, NORMAL, rate))
     perceived = perceive(output, item.ear, rate)
+    level = float(level_spl(perceived))
+    normal, normal_clean = float(level_spl(normal_input)), float(level_spl(reference))
     return {
-        "level": float(level_spl(output)),
         "peak": peak_spl(output),
-        "perceived_level": float(level_spl(perceived)),
-        "normal_level": float(level_spl(normal_input)),
-        "normal_clean_level": float(level_spl(reference)),
+        "perceived_level": level,
+        "normal_level": normal,
+        "normal_clean_level": normal_clean,
+        "loudness_error": level - normal,
+        "loudness_error_clean": level - normal_clean,
         "band_error": band_error_db(perceived, reference, rate),
         "loss_msbg": float(band_level_loss(perceived, reference, rate)),
     }
@@ -190,11 +193,11 @@ def _perception(item: Item, output: Tensor) -> Values:
 PERCEPTION = Measure("perception", _perception, packages=["hlsim"])
 """What the exact MSBG says of an output, in dB SPL or dB.
 
-``level`` and ``peak`` are those of the output; ``perceived_level`` is its level after MSBG, ``normal_level`` that of the
-input for a normal ear, noise included, ``normal_clean_level`` that of the clean speech for a normal ear.
-``band_error`` compares with the latter by ``band_error_db``, ``loss_msbg`` by ``HearingLossLoss(criterion="bands")``.
+``peak`` is the largest sample of the output; ``perceived_level`` the level after MSBG, ``normal_level`` that of
+the input for a normal ear, noise included, ``normal_clean_level`` that of the clean speech for a normal ear;
+``loudness_error`` and ``loudness_error_clean`` are the differences from them. ``band_error`` compares with the
+clean speech for a normal ear by ``band_error_db``, ``loss_msbg`` by ``HearingLossLoss(criterion="bands")``.
 """
-
 
 OTHER_COLUMNS = (
     *("level", "clean_level", "full_scale_spl", "seconds", "sample_rate", "seed"),

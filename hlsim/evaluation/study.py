@@ -257,10 +257,7 @@ def run_study(
     show = progress or (lambda done, total: None)
     if tasks:
         show(done, total)
-    parallel: dict[str, Any] = {"jobs": jobs}
-    if dask is not None:
-        parallel |= {"backend": "dask", "scheduler": dask}
-    for task, measured in run_parallel(_measure_item, tasks, **parallel):
+    for task, measured in run_parallel(_measure_item, tasks, jobs=jobs, dask=dask):
         for place, values in (measured or _all_failed(task, _DIED)).items():
             key = keys[task.number][place]
             if key is not None and not isinstance(values, str):

@@ -18,7 +18,7 @@ from hlsim.extras import require
 from hlsim.metrics.haspi_score import haspi
 from hlsim.metrics.hasqi_score import hasqi
 from hlsim.metrics.pair import check_pair, check_seed
-from hlsim.parallel import check_parallel, one_thread, run_parallel
+from hlsim.parallel import check_jobs, one_thread, run_parallel
 
 _Metric: Any = require("torchmetrics", "train").Metric
 
@@ -55,7 +55,7 @@ class _MeanScore(_Metric):
         super().__init__(**options)
         if limit is not None and (type(limit) is not int or limit < 1):
             raise ValueError(f"limit is {limit!r}; allowed: a whole number of 1 or more, or None")
-        check_parallel(jobs, "loky", None)
+        check_jobs(jobs)
         self.sample_rate = check_rate(sample_rate)
         self.full_scale_spl = check_full_scale(full_scale_spl)
         self.seed, self.limit, self.jobs = check_seed(seed), limit, jobs

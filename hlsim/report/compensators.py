@@ -300,8 +300,10 @@ def _gain_pictures(evaluation: Evaluation) -> list[Picture]:
         levels = clean.table.groupby(["condition", "input_level"])["level"].mean()
         over_input = {name: (list(levels[name].index), list(levels[name])) for name in names}
         text = "Output level over input level, clean speech, means over all ears."
-        axes = {"axis": "output (dB SPL)", "over": "speech (dB SPL)"}
-        pictures.append(curves_picture(over_input, colours, text, **axes))
+        picture = curves_picture(
+            over_input, colours, text, axis="output (dB SPL)", over="speech (dB SPL)"
+        )
+        pictures.append(picture)
     return pictures
 
 

@@ -138,6 +138,7 @@ def curves_picture(
     over: str = "",
     caption: str = "",
     dashed: Sequence[str] = (),
+    lowest: float | None = None,
 ) -> Picture:
     """Draw curves of (x, y) by name, over frequency unless ``over`` names another axis."""
 
@@ -145,7 +146,7 @@ def curves_picture(
         for name, (x, y) in curves.items():
             style = {"linestyle": "--"} if name in dashed else {"marker": "." if over else ""}
             axes.plot(x, y, color=colours.get(name, "black"), label=plain(name), **style)
-        axes.set(ylabel=axis)
+        axes.set(ylabel=axis, ylim=(lowest, None))
         if over:
             axes.set(xlabel=over)
             axes.grid(alpha=0.3)

@@ -116,7 +116,8 @@ def _words(evaluation: Evaluation, c: Comparison) -> list[str]:
 def _notes(evaluation: Evaluation) -> list[str]:
     """Say how the scores were made."""
     items = evaluation.table.drop_duplicates("item")
-    listeners = items["listener"][items["listener"] != ""].nunique()
+    named = items["listener"] if "listener" in items else items["name"].iloc[:0]
+    listeners = named[named != ""].nunique()
     better_ear = "Each score is that of the better ear."
     notes = [
         scored_by(evaluation),

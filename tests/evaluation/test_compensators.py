@@ -71,7 +71,6 @@ def test_perception_is_that_of_the_exact_model_and_of_the_loss(
     ear, normal = MSBG(N3, sample_rate=16000), MSBG(Audiogram.standard("NH"), sample_rate=16000)
     with torch.no_grad():
         levels = {
-            "level": output,
             "perceived_level": ear(output),
             "normal_level": normal(noisy),
             "normal_clean_level": normal(clean),
@@ -179,7 +178,7 @@ def test_a_further_compensator_is_judged_alone(tmp_path: Path, options: dict[str
         evaluate_compensators(aids, **options, audiogram=N3, items=1, store=store)
         return store.read_text().count("\n") - before
 
-    values = 4  # of each output: HASPI, HASQI, perception, the network's loss
+    values = 5  # of each output: HASPI, HASQI, levels, perception, the network's loss
     assert lines(a=Gain()) == values * 6
     assert lines(a=Gain()) == 0
     assert lines(a=Gain(), b=Gain(10.0)) == values * 3
