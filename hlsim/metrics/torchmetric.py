@@ -1,30 +1,38 @@
-"""HASPI and HASQI as metrics of torchmetrics, for validation loops. Needs the extra ``train`` (torchmetrics)."""
+"""HASPI and HASQI as metrics of torchmetrics, for validation loops. They need the extra ``train``."""
 
 from __future__ import annotations
 
+import math
 import warnings
 import zlib
 from collections.abc import Callable
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
-from hlsim.audiogram import FREQUENCIES, HIGHEST_LEVEL, Audiogram
+from hlsim.audiogram import FREQUENCIES, HIGHEST_LEVEL
 from hlsim.audiogram.thresholds import AudiogramLike, as_thresholds, has_listeners
-from hlsim.calibration import check_full_scale, level_spl
-from hlsim.checks import Lengths, check_lengths, check_rate, check_waveform
+from hlsim.calibration import PASCAL_SPL, check_full_scale, level_spl
+from hlsim.checks import (
+    Lengths,
+    check_choice,
+    check_lengths,
+    check_number,
+    check_rate,
+    check_waveform,
+    silence_after,
+)
 from hlsim.extras import require
-from hlsim.metrics.haspi_score import haspi
+from hlsim.metrics.haspi_score import Noise, haspi
 from hlsim.metrics.hasqi_score import hasqi
-from hlsim.metrics.pair import check_pair, check_seed
-from hlsim.parallel import check_jobs, one_thread, run_parallel
+from hlsim.metrics.pair import check_seed
 
 _Metric: Any = require("torchmetrics", "train").Metric
 
 
 class _MeanScore(_Metric):
-    """What ``HASPI`` and ``HASQI`` share; ``score`` is the function that each is the mean of."""
+    """Mean of a score over all items since the last ``reset``; ``score`` is its function."""
 
     is_differentiable = False
     higher_is_better = True
@@ -46,33 +54,48 @@ class _MeanScore(_Metric):
         self,
         sample_rate: int = 16000,
         *,
-        full_scale_spl: float = 94.0,
+        full_scale_spl: float = PASCAL_SPL,
+        noise: Noise = "expected",
         seed: int = 0,
+        whole_khz: bool = False,
         limit: int | None = None,
-        jobs: int | None = 1,
         **options: Any,
     ) -> None:
         super().__init__(**options)
-        if limit is not None and (type(limit) is not int or limit < 1):
-            raise ValueError(f"limit is {limit!r}; allowed: a whole number of 1 or more, or None")
-        check_jobs(jobs)
+        if limit is not None:
+            check_number("limit", limit, 1, whole=True)
+        check_choice("noise", noise, Noise)
         self.sample_rate = check_rate(sample_rate)
         self.full_scale_spl = check_full_scale(full_scale_spl)
-        self.seed, self.limit, self.jobs = check_seed(seed), limit, jobs
+        self.noise: Noise = noise
+        self.seed = check_seed(seed)
+        self.whole_khz = whole_khz
+        self.limit = limit
         for name in ("total", "total_level"):
             self.add_state(name, torch.tensor(0.0), dist_reduce_fx="sum")
         for name in ("count", "seen", "failed"):
             self.add_state(name, torch.tensor(0), dist_reduce_fx="sum")
         for name in ("total_ears", "count_ears"):
             self.add_state(name, torch.zeros(2), dist_reduce_fx="sum")
-        # a MetricCollection merges metrics whose states are equal, as after a batch of which none has a score
-        made_as = repr((type(self), self.sample_rate, self.full_scale_spl, self.seed, self.limit))
-        self.add_state("made_as", torch.tensor(zlib.crc32(made_as.encode())), dist_reduce_fx="max")
+        # A MetricCollection merges metrics with equal states, such as those of a batch without any
+        # score. This state keeps metrics with different settings apart.
+        settings = (
+            type(self),
+            self.sample_rate,
+            self.full_scale_spl,
+            noise,
+            seed,
+            whole_khz,
+            limit,
+        )
+        signature = torch.tensor(zlib.crc32(repr(settings).encode()))
+        self.add_state("signature", signature, dist_reduce_fx="max")
 
     def forward(self, *args: Any, **kwargs: Any) -> Tensor:
-        """``update``, and the mean score of this batch alone, in this process.
+        """Update, and return the mean score of this batch alone, in this process.
 
-        torchmetrics' own resets before each: ``limit`` and ``seed`` would begin anew.
+        The method of torchmetrics resets the metric before each batch, so that ``limit`` and
+        ``seed`` would begin again.
         """
         total, count = self.total.clone(), self.count.clone()
         self.update(*args, **kwargs)
@@ -88,196 +111,176 @@ class _MeanScore(_Metric):
     ) -> None:
         """Score a batch.
 
-        An item of which there is no score (its clean speech silent or soft, NaN, less than 0.7 s) is left out, counted in
-        ``failed``, and said; silence in place of speech is scored, as ``haspi`` scores it. Of two channels, left and
-        right, the better ear's score and level count, and ``ears`` tells each ear's.
+        An item that cannot be scored (clean speech that is silent or soft, NaN, less than 0.7 s) is
+        left out with a warning and counted in ``failed``. Silence in place of processed speech is
+        scored. With two channels, left and right, the score and the level of the better ear count,
+        and ``ears`` has the mean of each ear.
 
         Args:
-            audiogram: one ear for all, one an item, or (batch, 8) dB HL; of two channels a ``Listener`` or one an item,
-                whose missing ear is left out, a pair of left and right, (2, 8) or (batch, 2, 8) dB HL.
-            lengths: samples of each item, or shares of the time above 0 to 1, where the batch is padded.
+            processed: what the ears are given.
+            clean: clean speech of the same shape.
+            audiogram: one ear, or one per item. For two channels a ``Listener``, whose missing ear is
+                left out, a pair of left and right ear, or one of these per item.
+            lengths: number of samples of each item, or its share of the time, for a padded batch.
 
-        Shape: (batch, time) or (time,), or (batch, 2, time), the same for both; ``lengths`` (batch,). ValueError for
-        others, for signals that ``haspi`` does not take, for audiograms that are none, or not one or one an item, and for
-        lengths beyond the signals.
+        Shape: (time,), (batch, time) or (batch, 2, time) twice; ``lengths`` (batch,).
+
+        Raises:
+            ValueError: the shapes do not fit, the signals are not what ``haspi`` accepts, or
+                ``audiogram`` or ``lengths`` are not as described.
         """
         check_waveform(processed, "processed")
         check_waveform(clean, "clean")
         shape = processed.shape
-        if (
-            shape != clean.shape
-            or len(shape) not in (1, 2, 3)
-            or (len(shape) == 3 and shape[1] != 2)
-        ):
+        two_ears = len(shape) == 3 and shape[1] == 2
+        if shape != clean.shape or not (two_ears or len(shape) in (1, 2)):
             raise ValueError(
-                f"processed {tuple(shape)} and clean {tuple(clean.shape)}; allowed: (batch, time), (time,) or (batch, 2, "
-                "time), the same for both"
+                "expected processed and clean of the same shape, (time,), (batch, time) or "
+                f"(batch, 2, time), got {tuple(shape)} and {tuple(clean.shape)}"
             )
-        sides = 2 if len(shape) == 3 else 1
-        heard, reference = (
-            torch.atleast_2d(signal.detach())
-            .to(processed.device, torch.float64)
-            .reshape(-1, sides, shape[-1])
-            for signal in (processed, clean)
-        )
-        ears = _ears(audiogram, len(heard), sides)
-        items_and_time = torch.Size((len(heard), shape[-1]))
-        ends = (
-            [shape[-1]] * len(heard)
-            if lengths is None
-            else check_lengths(lengths, items_and_time).tolist()
-        )
-        items: list[_Item] = []
-        pairs = zip(heard, reference, ears, ends, strict=True)
-        for number, (signals, targets, own, end) in enumerate(pairs, start=int(self.seen)):
-            if self.limit is not None and number >= self.limit:
-                break
-            reasons = []
-            for side, ear in own.items():
-                item = _Item(
-                    number,
-                    side,
-                    signals[side, :end],
-                    targets[side, :end],
-                    ear,
-                    (self.seed + number) % 2**32,
-                )
-                try:
-                    check_pair(item.clean, item.processed, self.sample_rate, self.full_scale_spl)
-                    items.append(item)
-                except ValueError as error:
-                    reasons.append(error)
-            if len(reasons) == len(own):
+        items = 1 if len(shape) == 1 else shape[0]
+        time = shape[-1]
+        sides = 2 if two_ears else 1
+        thresholds = _thresholds(audiogram, items, sides)
+        ends = torch.full((items,), time)
+        if lengths is not None:
+            ends = check_lengths(lengths, torch.Size((items, time)))
+
+        first = int(self.seen)
+        self.seen += items
+        if self.limit is not None:
+            items = max(0, min(items, self.limit - first))
+        signals = []
+        for signal in (processed, clean):
+            rows = signal.detach().to(processed.device, torch.float64).reshape(-1, sides, time)
+            signals.append(silence_after(rows, ends.unsqueeze(-1).expand(-1, sides)))
+
+        known = thresholds.isfinite().all(-1)
+        scores = torch.full((items, sides), math.nan, dtype=torch.float64)
+        reasons: dict[int, str] = {}
+        pairs = [(item, side) for item, side in known[:items].nonzero().tolist()]
+        results = self._score(pairs, first, signals[0], signals[1], thresholds, ends)
+        for (item, side), result in zip(pairs, results, strict=True):
+            if isinstance(result, str):
+                reasons.setdefault(item, result)
+            else:
+                scores[item, side] = result
+        scored = ~scores.isnan()
+        for item in range(items):
+            if not scored[item].any():
                 self.failed += 1
-                name = self.score.__name__.upper()
-                warnings.warn(f"{name} leaves out item {number}: {reasons[0]}", stacklevel=2)
-        self.seen += len(heard)
-        best: dict[int, tuple[float, _Item]] = {}
-        for item, score in zip(items, self._scores(items), strict=True):
-            if sides == 2:
-                self.total_ears[item.side] += score
-                self.count_ears[item.side] += 1
-            if item.number not in best or score > best[item.number][0]:
-                best[item.number] = score, item
-        self.count += len(best)
-        self.total += sum(score for score, _ in best.values())
-        self.total_level += sum(
-            float(level_spl(item.processed, self.full_scale_spl)) for _, item in best.values()
-        )
+                warnings.warn(
+                    f"{type(self).__name__} leaves out item {first + item}: {reasons[item]}",
+                    stacklevel=2,
+                )
+                continue
+            score, side = scores[item].nan_to_num(-math.inf).max(-1)
+            samples = signals[0][item, int(side), : int(ends[item])]
+            self.total += float(score)
+            self.total_level += float(level_spl(samples, self.full_scale_spl))
+            self.count += 1
+        if two_ears:
+            self.total_ears += scores.nan_to_num(0.0).sum(0).to(self.total_ears)
+            self.count_ears += scored.sum(0).to(self.count_ears)
 
     def compute(self) -> Tensor:
-        """Mean score, float32; NaN where nothing was scored."""
+        """Return the mean score in float32, NaN if nothing was scored."""
         return self.total / self.count
 
     @property
     def ears(self) -> Tensor:
-        """Mean score of the left and of the right ear, of this process; NaN without two channels. Shape: (2,)."""
+        """Mean score of the left and of the right ear in this process, NaN for a mono batch. Shape: (2,)."""
         return self.total_ears / self.count_ears
 
     @property
     def level(self) -> Tensor:
-        """Mean level in dB SPL of what was scored, of this process; NaN where nothing was."""
+        """Mean level in dB SPL of the scored signals in this process, NaN if nothing was scored."""
         return self.total_level / self.count
 
-    def _scores(self, items: list[_Item]) -> list[float]:
-        """In the items' order: a CPU scores one by one anyway, a GPU all at once."""
-        together = 1 if items and items[0].clean.device.type == "cpu" else max(1, len(items))
-        batches = [items[start : start + together] for start in range(0, len(items), together)]
-        tasks = [
-            _Task(number, self.score, batch, self.sample_rate, self.full_scale_spl)
-            for number, batch in enumerate(batches)
-        ]
-        made: dict[int, list[float]] = {}
-        for task, scores in run_parallel(_score, tasks, jobs=1 if len(tasks) < 2 else self.jobs):
-            if scores is None:
-                raise ValueError(
-                    f"item {task.number} of the batch: the process that scored it died"
-                )
-            made[task.number] = scores
-        return [score for number in range(len(tasks)) for score in made[number]]
+    @torch.no_grad()
+    def _score(
+        self,
+        pairs: list[tuple[int, int]],
+        first: int,
+        processed: Tensor,
+        clean: Tensor,
+        thresholds: Tensor,
+        ends: Tensor,
+    ) -> list[float | str]:
+        """Return for each item and side its score, or the reason why there is none."""
+        if not pairs:
+            return []
+        rows, sides = zip(*pairs, strict=True)
+        items = list(rows)
+        try:
+            scores = type(self).score(
+                processed[items, list(sides)],
+                clean[items, list(sides)],
+                thresholds[items, list(sides)],
+                sample_rate=self.sample_rate,
+                full_scale_spl=self.full_scale_spl,
+                lengths=ends[items],
+                noise=self.noise,
+                seed=[(self.seed + first + item) % 2**32 for item in items],
+                whole_khz=self.whole_khz,
+            )
+        except ValueError as error:
+            if len(pairs) == 1:
+                return [str(error)]
+            # One pair without a score stops them all, so they are scored one by one.
+            alone = (processed, clean, thresholds, ends)
+            return [self._score([pair], first, *alone)[0] for pair in pairs]
+        results: list[float | str] = scores.tolist()
+        return results
 
 
 class HASPI(_MeanScore):
     """Mean HASPI v2 of processed speech over all items since the last ``reset``.
 
-    It rewards any gain: log ``level``, the mean level in dB SPL, beside it. The figures are pyclarity's, which takes
-    44.1 kHz for 44: its noise is drawn, and the precision is double. On a CPU a second of audio
-    takes about 0.12 s, on one core; ``limit`` bounds what a validation epoch costs.
+    It rewards any gain, so log ``level``, the mean level in dB SPL, next to it. The score of an item
+    is that of ``haspi`` with the same settings, in double precision. On a CPU one second of audio
+    takes about 0.12 s on one core; ``limit`` bounds the cost of a validation epoch.
 
     In a LightningModule ``self.haspi = HASPI(sample_rate=16000)``, in ``validation_step``
     ``self.haspi.update(aided, clean, audiogram); self.log("haspi", self.haspi)``.
 
     Args:
-        sample_rate, full_scale_spl: as ``haspi``.
-        seed: item i since the last reset takes ``seed`` + i, so that epochs can be compared.
-        limit: items scored since the last reset, in each process; the others are passed over. None scores all.
-        jobs: processes, where the signals are on a CPU; None takes all cores. More than one need joblib (extra ``eval``).
-        options: of ``torchmetrics.Metric``.
+        sample_rate: sample rate in Hz, 16000 to 48000.
+        full_scale_spl: level in dB SPL of a signal with RMS 1.0.
+        noise: treatment of the ear's internal noise, as in ``haspi``. ``"seeded"`` gives the scores of
+            pyclarity.
+        seed: with ``noise="seeded"``, item i since the last reset takes ``seed`` + i, so that epochs
+            can be compared.
+        whole_khz: round the rate to whole kHz, as pyclarity does.
+        limit: number of items that are scored from one reset to the next in each process; the others
+            are passed over. None scores all.
+        options: keyword arguments of ``torchmetrics.Metric``.
     """
 
     score = staticmethod(haspi)
 
 
 class HASQI(_MeanScore):
-    """Mean HASQI v2 of processed speech over all items since the last ``reset``; all else as ``HASPI``.
+    """Mean HASQI v2 of processed speech over all items since the last ``reset``, with the arguments of ``HASPI``.
 
-    Its reference is the clean speech with NAL-R, and whether enough is heard does not count. About 0.2 s for a second of
-    audio.
+    Its reference is clean speech with NAL-R. Whether enough is audible does not count. On a CPU one
+    second of audio takes about 0.2 s.
     """
 
     score = staticmethod(hasqi)
 
 
-class _Item(NamedTuple):
-    """One ear of an item, (time,) each; ``side`` is 0 or, of a right ear, 1."""
-
-    number: int
-    side: int
-    processed: Tensor
-    clean: Tensor
-    ear: Audiogram
-    seed: int
-
-
-class _Task(NamedTuple):
-    """Items that are scored together."""
-
-    number: int
-    score: Callable[..., Tensor]
-    items: list[_Item]
-    sample_rate: int
-    full_scale_spl: float
-
-
-@one_thread()
-@torch.no_grad()
-def _score(task: _Task) -> list[float]:
-    _, _, processed, clean, ears, seeds = zip(*task.items, strict=True)
-    pad = torch.nn.utils.rnn.pad_sequence
-    scores = task.score(
-        pad(list(processed), batch_first=True),
-        pad(list(clean), batch_first=True),
-        list(ears),
-        sample_rate=task.sample_rate,
-        full_scale_spl=task.full_scale_spl,
-        lengths=[len(signal) for signal in clean],
-        noise="seeded",
-        seed=list(seeds),
-        whole_khz=True,
-    )
-    return [float(score) for score in scores]
-
-
-def _ears(audiogram: AudiogramLike, batch: int, sides: int) -> list[dict[int, Audiogram]]:
-    """Each item's ears by channel, without those that are missing."""
-    shapes = [(*lead, *((2,) if sides == 2 else ()), len(FREQUENCIES)) for lead in ((), (batch,))]
+def _thresholds(audiogram: AudiogramLike, items: int, sides: int) -> Tensor:
+    """Return thresholds (items, sides, 8) on the CPU, NaN for missing ears."""
     levels = as_thresholds(
         audiogram, highest=HIGHEST_LEVEL, consumer="a score", allow_missing=sides == 2
-    ).detach()
-    if levels.shape not in shapes or (sides == 1 and has_listeners(audiogram)):
-        found, (alone, each) = tuple(levels.shape), shapes
-        raise ValueError(f"audiogram of shape {found}; allowed: {alone} or {each} dB HL")
-    rows = levels.expand(shapes[1]).reshape(batch, sides, -1).double().tolist()
-    return [
-        {side: Audiogram(row) for side, row in enumerate(own) if row[0] == row[0]} for own in rows
-    ]
+    )
+    one_for_all = (2, len(FREQUENCIES)) if sides == 2 else (len(FREQUENCIES),)
+    fits = levels.shape in (one_for_all, (items, *one_for_all))
+    if not fits or (sides == 1 and has_listeners(audiogram)):
+        raise ValueError(
+            f"expected an audiogram of shape {one_for_all} or {(items, *one_for_all)}, "
+            f"got {tuple(levels.shape)}"
+        )
+    levels = levels.detach().cpu().expand(items, *one_for_all)
+    return levels.reshape(items, sides, len(FREQUENCIES))

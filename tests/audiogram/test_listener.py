@@ -142,9 +142,8 @@ def test_the_better_ears_metric_leaves_a_missing_ear_out(scene: Tensor) -> None:
 
     given, metric = 0.3 * torch.stack((scene, scene)), HASPI()
     metric.update(given, torch.stack((scene, scene)), [BOTH, Listener(None, RIGHT)])
-    options: dict[str, Any] = {"noise": "seeded", "whole_khz": True}
-    scores = [haspi(given[0].double(), scene.double(), BOTH, seed=0, **options).amax()]
-    scores += [haspi(given[1, 1].double(), scene[1].double(), RIGHT, seed=1, **options)]
+    scores = [haspi(given[0].double(), scene.double(), BOTH).amax()]
+    scores += [haspi(given[1, 1].double(), scene[1].double(), RIGHT)]
     assert float(metric.compute()) == pytest.approx(float(sum(scores)) / 2.0, abs=1e-5)
     assert metric.count_ears.tolist() == [1, 2] and int(metric.failed) == 0
     with pytest.raises(ValueError):
