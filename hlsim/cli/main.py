@@ -55,6 +55,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     Returns: exit status, 0 after success and 2 after an error.
     """
+    # NumPy solves only small systems here, for which OpenBLAS's threads would wait longer than they compute
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     if "matplotlib" not in sys.modules:
         os.environ["MPLBACKEND"] = "Agg"  # a notebook's backend may be missing in this environment
     signals: list[int] = []
