@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +19,7 @@ def train_simulator(parser: Parser) -> None:
         "--speech speech/train --valid-speech speech/valid --out runs/simulator",
         "--recipe examples/neuro-msbg-light.yaml --recipe.batch 4 --manifest VoiceBank/manifest.csv --out runs/light",
     )
-    parser.teacher("that says what is heard", "msbg")
+    parser.teacher("simulator whose output is learned", "msbg")
     _training_options(parser)
     add_recipe(parser, SimulatorRecipe, "examples/neuro-msbg.yaml")
 
@@ -71,8 +70,10 @@ def _train_simulator(options: argparse.Namespace) -> None:
 
 
 def _train_compensator(options: argparse.Namespace) -> None:
-    if options.audiogram and (given := _given(vars(options), ("audiograms", "valid_audiograms"))):
-        raise ValueError(f"--audiogram with {given}; allowed: one ear, or a CSV of ears, not both")
+    if options.audiogram and (options.audiograms or options.valid_audiograms):
+        raise ValueError(
+            "--audiogram trains for one ear; leave out either it or --audiograms and --valid-audiograms"
+        )
     _check(options)
     recipe = read_recipe(options, CompensatorRecipe)
     ear = read_ear(options.audiogram) if options.audiogram else None
@@ -86,10 +87,11 @@ def _train_compensator(options: argparse.Namespace) -> None:
 
 
 def _check(options: argparse.Namespace) -> None:
+    """Reject options that exclude each other and files that do not exist, before slow imports."""
     if options.manifest is not None and options.valid_speech is not None:
-        raise ValueError("--valid-speech and --manifest exclude each other; a manifest has splits")
+        raise ValueError("--manifest has its own validation speech; leave out --valid-speech")
     if options.manifest is None and options.root is not None:
-        raise ValueError("--root is of no use without --manifest")
+        raise ValueError("--root has no effect without --manifest; leave it out")
     need("train", "lightning", "tensorboard")
     check_there(
         folders=(
@@ -103,13 +105,8 @@ def _check(options: argparse.Namespace) -> None:
     )
 
 
-def _given(options: dict[str, Any], names: Iterable[str]) -> str:
-    """Those of the options that were given, as they are written."""
-    return ", ".join(f"--{name.replace('_', '-')}" for name in names if options[name] is not None)
-
-
 def _arguments(options: argparse.Namespace) -> dict[str, Any]:
-    """Arguments that ``train_simulator`` and ``train_compensator`` have in common."""
+    """Return the arguments that ``train_simulator`` and ``train_compensator`` have in common."""
     from hlsim.training.batches import TrainingData
 
     more: dict[str, Any] = {
