@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from hlsim.cli.evaluation import finish, labelled_names, prepare_study, study_options
-from hlsim.cli.inputs import check_there
+from hlsim.cli.inputs import check_paths_exist
 from hlsim.cli.options import Parser, count, number, plugin_name
 from hlsim.cli.progress import show_progress
 
@@ -48,7 +48,9 @@ def clarity(parser: Parser) -> None:
 
 def _clarity(options: argparse.Namespace) -> None:
     prepare_study(options)
-    check_there(folders=(options.scenes,), files=(options.listeners, options.scenes_listeners))
+    check_paths_exist(
+        folders=(options.scenes,), files=(options.listeners, options.scenes_listeners)
+    )
     from hlsim.evaluation.clarity import evaluate_scenes
     from hlsim.report.clarity import scenes_page, write_scores
 

@@ -6,7 +6,7 @@ import argparse
 import os
 from pathlib import Path
 
-from hlsim.cli.inputs import check_there, need, read_ear
+from hlsim.cli.inputs import check_paths_exist, read_ear, require_installed
 from hlsim.cli.options import Parser, count, folder
 from hlsim.cli.progress import show_progress
 from hlsim.extras import require
@@ -28,9 +28,9 @@ def demo(parser: Parser) -> None:
 
 def _demo(options: argparse.Namespace) -> None:
     os.environ["MPLBACKEND"] = "Agg"  # a notebook's backend may not exist in this environment
-    need("train", "lightning", "tensorboard")
-    need("eval", "joblib", "matplotlib")
-    check_there(folders=(options.speech,))
+    require_installed("train", "lightning", "tensorboard")
+    require_installed("eval", "joblib", "matplotlib")
+    check_paths_exist(folders=(options.speech,))
     ear = read_ear(options.audiogram)
     require("lightning", "train")  # one that is there may be broken
     from hlsim.demo import demo

@@ -9,7 +9,7 @@ import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from hlsim.cli.inputs import check_there, need, other_ear, read_ear
+from hlsim.cli.inputs import check_paths_exist, other_ear_warnings, read_ear, require_installed
 from hlsim.cli.options import (
     EARS_TABLE,
     Parser,
@@ -55,8 +55,8 @@ def _evaluate_simulator(options: argparse.Namespace) -> None:
     if options.compensator and "compensated" not in options.inputs:
         raise ValueError("--compensator has no effect without --inputs compensated")
     prepare_study(options)
-    need("eval", "pystoi")
-    check_there(folders=(options.speech, options.noise), files=(options.audiograms,))
+    require_installed("eval", "pystoi")
+    check_paths_exist(folders=(options.speech, options.noise), files=(options.audiograms,))
     from compensators import load_compensator
     from hlsim.calibration import PASCAL_SPL
     from hlsim.evaluation.simulators import evaluate_simulators
@@ -118,14 +118,14 @@ def _evaluate_compensator(options: argparse.Namespace) -> None:
     if options.audiogram and options.gain_ears != GAIN_EARS:
         raise ValueError("--gain-ears has no effect with --audiogram; leave one of them out")
     prepare_study(options)
-    check_there(folders=(options.speech, options.noise), files=(options.audiograms,))
+    check_paths_exist(folders=(options.speech, options.noise), files=(options.audiograms,))
     from compensators import load_compensator
     from hlsim.evaluation.compensators import evaluate_compensators
     from hlsim.report.compensators import compensators_page
 
     named = labelled_names(options.names)
     ear = read_ear(options.audiogram) if options.audiogram else None
-    notes = [line for label, name in named.items() for line in other_ear(label, name, ear)]
+    notes = [line for label, name in named.items() for line in other_ear_warnings(label, name, ear)]
     for line in notes:
         print(f"hlsim: warning: {line}", file=sys.stderr)
     evaluation = evaluate_compensators(
@@ -200,7 +200,7 @@ def haspi_report(parser: Parser) -> None:
 
 def _haspi_report(options: argparse.Namespace) -> None:
     prepare_study(options)
-    check_there(
+    check_paths_exist(
         folders=(options.clean, options.before, options.after, options.root),
         files=(options.manifest, options.audiograms),
     )
@@ -248,9 +248,9 @@ def prepare_study(options: argparse.Namespace) -> None:
     """Check what an evaluation needs before it takes hours."""
     os.environ["MPLBACKEND"] = "Agg"  # a notebook's backend may not exist in this environment
     warnings.formatwarning = lambda message, *_, **__: f"hlsim: warning: {message}\n"
-    need("eval", "joblib", "pandas", "matplotlib", "jinja2")
+    require_installed("eval", "joblib", "pandas", "matplotlib", "jinja2")
     if options.dask:
-        need("cluster", "distributed")
+        require_installed("cluster", "distributed")
 
 
 def finish(evaluation: Evaluation, page: Page, out: Path) -> None:

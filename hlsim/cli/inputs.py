@@ -20,14 +20,14 @@ if TYPE_CHECKING:
     from hlsim.audiogram.listener import Listener
 
 
-def need(extra: str, *modules: str) -> None:
+def require_installed(extra: str, *modules: str) -> None:
     """Raise MissingExtraError unless the modules are installed, without the seconds of importing them."""
     for module in modules:
         if find_spec(module) is None:
             require(module, extra)
 
 
-def check_there(
+def check_paths_exist(
     *, folders: tuple[Path | None, ...] = (), files: tuple[Path | None, ...] = ()
 ) -> None:
     """Raise ValueError unless the folders and files exist; None stands for an option that was not given."""
@@ -100,7 +100,7 @@ def read_listener(text: str) -> Listener:
     return listener
 
 
-def other_ear(label: str, name: str, ear: Audiogram | None) -> list[str]:
+def other_ear_warnings(label: str, name: str, ear: Audiogram | None) -> list[str]:
     """Warn if a compensator was trained for one ear and is used with another, or with several (None)."""
     from compensators import trained_for
 
@@ -125,7 +125,7 @@ def read_compensator(
     settings = {"sample_rate": sample_rate, "full_scale_spl": options.full_scale_spl}
     compensator = load_compensator(name, **settings, linked=getattr(options, "linked", False))
     ear = read_ear(options.audiogram) if options.audiogram else None
-    for line in other_ear(name, name, ear) if warn else ():
+    for line in other_ear_warnings(name, name, ear) if warn else ():
         print(f"hlsim: warning: {line}", file=sys.stderr)
     values = {
         "noise_reduction": options.noise_reduction,

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from hlsim.cli.inputs import check_there, need, read_ear
+from hlsim.cli.inputs import check_paths_exist, read_ear, require_installed
 from hlsim.cli.options import Parser, count, natural, positive
 from hlsim.cli.recipes import add_recipe, read_recipe
 from hlsim.extras import require
@@ -92,8 +92,8 @@ def _check(options: argparse.Namespace) -> None:
         raise ValueError("--manifest has its own validation speech; leave out --valid-speech")
     if options.manifest is None and options.root is not None:
         raise ValueError("--root has no effect without --manifest; leave it out")
-    need("train", "lightning", "tensorboard")
-    check_there(
+    require_installed("train", "lightning", "tensorboard")
+    check_paths_exist(
         folders=(
             options.speech,
             options.noise,
