@@ -16,6 +16,17 @@ MODULES = [
     "hlsim.dsp.resample",
     "hlsim.dsp.stft",
     "hlsim.dsp.windows",
+    "hlsim.msbg.cochlea",
+    "hlsim.msbg.delay",
+    "hlsim.msbg.ear",
+    "hlsim.msbg.envelope",
+    "hlsim.msbg.filterbank",
+    "hlsim.msbg.filtfilt_end",
+    "hlsim.msbg.multirate",
+    "hlsim.msbg.recruitment",
+    "hlsim.msbg.resampling",
+    "hlsim.msbg.response",
+    "hlsim.msbg.smearing",
 ]
 
 

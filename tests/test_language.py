@@ -14,9 +14,14 @@ ROOT = Path(__file__).parents[1]
 # Folders and files that keep the rules. Add yours when it is finished.
 FINISHED = [
     "hlsim/dsp",
+    "hlsim/msbg",
     "tests/dsp",
+    "tests/msbg",
     "tests/test_doctests.py",
 ]
+
+# Files of these folders that are still to be rewritten.
+UNFINISHED = {"hlsim/msbg/model.py", "hlsim/msbg/blocks.py"}
 
 # Rows of (file, rule, text) that may stay. A row that is no longer needed fails the test.
 EXCEPTIONS: set[tuple[str, str, str]] = set()
@@ -99,7 +104,7 @@ def finished_files() -> list[Path]:
     for name in FINISHED:
         path = ROOT / name
         files.update([path] if path.is_file() else path.rglob("*.py"))
-    return sorted(files)
+    return sorted(files - {ROOT / name for name in UNFINISHED})
 
 
 @pytest.mark.parametrize("path", finished_files(), ids=lambda path: str(path.relative_to(ROOT)))

@@ -17,7 +17,7 @@ from hlsim.checks import broadcast_shape, check_waveform
 from hlsim.dsp.resample import resample
 from hlsim.losses.band_levels import HIGHEST
 from hlsim.msbg import MSBG
-from hlsim.msbg.response import hear_normally, with_phase_of_bank
+from hlsim.msbg.response import apply_bank_phase, simulate_normal_ear
 from hlsim.neuro import NeuroMSBG
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.pretrained import SIMULATOR, find_checkpoint, load_pretrained
@@ -139,7 +139,7 @@ class FrozenEar:
                 return aim.expand(*batch, time)
             elif ours and kind not in ("bands", "paper"):
                 items = self._narrowed(clean).expand(*batch, time).reshape(-1, time)
-                return hear_normally(items, ears, self.sample_rate).reshape(*batch, time)
+                return simulate_normal_ear(items, ears, self.sample_rate).reshape(*batch, time)
             else:
                 no_loss = on_device(_no_loss(clean.dtype), clean.device)
                 aim = self.hear(clean, no_loss, listener, ends)
@@ -147,7 +147,7 @@ class FrozenEar:
                 return aim.expand(*batch, time)
             aim = aim.expand(*batch, time).reshape(-1, time)
             normal = choice == "normal-hearing"
-            return with_phase_of_bank(aim, ears, self.sample_rate, normal=normal).reshape(
+            return apply_bank_phase(aim, ears, self.sample_rate, normal=normal).reshape(
                 *batch, time
             )
 

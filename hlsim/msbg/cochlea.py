@@ -1,4 +1,4 @@
-"""The nonlinear half of MSBG: gammatone filter bank and recruitment, each channel at the rate it needs."""
+"""The nonlinear stages of MSBG, filter bank and recruitment, with each channel at its own rate."""
 
 import math
 
@@ -19,112 +19,193 @@ from hlsim.msbg.envelope import (
     smooth,
 )
 from hlsim.msbg.filterbank import FilterBank, gammatone_response
-from hlsim.msbg.filtfilt_end import ending, ending_response, ending_weights
+from hlsim.msbg.filtfilt_end import end_oscillation, end_responses, end_weights
 from hlsim.msbg.multirate import MultirateBank, RateBand
-from hlsim.msbg.recruitment import around, expand, gains, weigh
+from hlsim.msbg.recruitment import apply_gains, expand, pad_periodically, recruitment_gains
 from hlsim.torchtools import constant_like
 
 BANK_TAIL = 3200
-"""Samples, 73 ms: the longest advance, and what it takes the narrowest channel to decay by 80 dB."""
+"""Samples of silence behind a signal on an FFT grid, 73 ms.
 
-_SHARED_MULTIPLE = 10000
-"""Samples up to which the lengths that a rate shares with 44.1 kHz may be multiples of."""
+This is as long as the longest advance, and as the narrowest channel takes to decay by 80 dB.
+"""
+
+MAX_SHARED_MULTIPLE = 10000
+"""Largest number of samples of which FFT lengths that two rates share are multiples."""
 
 
 def bank_points(length: int, rate: int, step: int = 1) -> int:
-    """FFT length at 44.1 kHz for a signal of ``length``: one that ``rate`` shares, if that costs little.
+    """Choose the FFT length at 44.1 kHz for a signal.
+
+    If this costs little, the length is a whole number of samples at another rate, too.
 
     Args:
-        step: the signal runs at 44.1 kHz / step.
+        length: number of samples of the signal at 44.1 kHz.
+        rate: the other rate in Hz.
+        step: 1 for signals at 44.1 kHz, 2 for signals at 22.05 kHz.
+
+    >>> bank_points(44100, rate=16000)
+    49392
     """
-    multiple = shared_multiple(rate, step) or _whole_steps(step)
-    odd, even = (fft_length(length + BANK_TAIL, some) for some in (multiple, 2 * multiple))
-    # MKL takes twice as long for odd numbers of steps, but few of its transforms are of steps
+    multiple = shared_multiple(rate, step) or _samples_of_whole_steps(step)
+    odd = fft_length(length + BANK_TAIL, multiple)
+    even = fft_length(length + BANK_TAIL, 2 * multiple)
+    # MKL takes twice as long for odd numbers of steps, but few transforms have this length.
     return odd if 1.1 * odd < even else even
 
 
 def shared_multiple(rate: int, step: int = 1) -> int:
-    """Samples at 44.1 kHz, whole steps of the envelopes, that are a whole number of ``rate``'s; 0 if too many."""
-    multiple = math.lcm(_whole_steps(step), MSBG_RATE // math.gcd(MSBG_RATE, rate))
-    return multiple if multiple <= _SHARED_MULTIPLE else 0
+    """Find the number of samples at 44.1 kHz that are whole steps and whole samples at a rate.
+
+    Args:
+        rate: sample rate in Hz.
+        step: 1 for signals at 44.1 kHz, 2 for signals at 22.05 kHz.
+
+    Returns: the smallest such number, or 0 if it is above ``MAX_SHARED_MULTIPLE``.
+
+    >>> shared_multiple(16000)
+    3528
+    """
+    samples_of_whole_number = MSBG_RATE // math.gcd(MSBG_RATE, rate)
+    multiple = math.lcm(_samples_of_whole_steps(step), samples_of_whole_number)
+    return multiple if multiple <= MAX_SHARED_MULTIPLE else 0
 
 
-def _whole_steps(step: int) -> int:
-    """Samples at 44.1 kHz that are whole steps of the envelopes, and an even number at 44.1 kHz / step."""
+def _samples_of_whole_steps(step: int) -> int:
+    """Samples at 44.1 kHz that are whole steps, and an even number at 44.1 kHz / step."""
     return STEP if step == 1 else round(8 * HALF_RATE_STEP)
 
 
-def hear(spectrum: Tensor, ratios: Tensor, bank: MultirateBank, slight: bool) -> Tensor:
-    """Filter bank and recruitment of a periodic signal.
+def simulate_cochlea(spectrum: Tensor, ratios: Tensor, bank: MultirateBank, slight: bool) -> Tensor:
+    """Apply filter bank and recruitment to periodic signals, with each channel at its own rate.
 
-    Shape: (items, points // (2 step) + 1), (items, channels) -> as the first, where points and step are the bank's.
+    Shape: complex (items, bins), (items, channels) -> complex (items, bins).
 
     Args:
-        slight: look after the kinks of slight losses, which a smeared signal buries.
+        spectrum: spectrum of the signals.
+        ratios: expansion ratio of each channel.
+        slight: correct the gain's kinks with slight losses (see ``apply_gains``). After smearing,
+            they are masked.
+
+    >>> from hlsim.msbg.filterbank import BANKS
+    >>> from hlsim.msbg.multirate import multirate_bank
+    >>> options = {"dtype": torch.float32, "device": torch.device("cpu")}
+    >>> bank = multirate_bank(BANKS["severe"], points=4800, step=1, highest=22050.0, **options)
+    >>> spectrum = torch.fft.rfft(torch.randn(1, 4800))
+    >>> simulate_cochlea(spectrum, torch.full((1, 19), 2.0), bank, slight=False).shape
+    torch.Size([1, 2401])
     """
-    waves, sums = zip(*(filter_and_rectify(spectrum, band) for band in bank.bands), strict=True)
+    waves = []
+    sums = []
+    for band in bank.bands:
+        wave, band_sums = filter_and_rectify(spectrum, band)
+        waves.append(wave)
+        sums.append(band_sums)
     envelopes = smooth(torch.cat(sums, -3), bank.lowpass)
     ratios = ratios[..., : len(bank.lowpass)]
-    recruitment = around(gains(envelopes, ratios))
-    heard: dict[tuple[int, bool], Tensor] = {}
+    gains = pad_periodically(recruitment_gains(envelopes, ratios))
+
+    # Bands at the same rate are added up before their common Fourier transform.
+    expanded: dict[tuple[int, bool], Tensor] = {}
     for band, wave in zip(bank.bands, waves, strict=True):
-        channels, kind = band.channels, (band.points, band.detector == "modulus")
-        kinks = (envelopes[..., channels, :], ratios[..., channels]) if slight else None
-        part = weigh(wave, recruitment[..., channels, :], band.interpolation, kinks)
-        heard[kind] = heard[kind] + part if kind in heard else part
-    return recombine(heard, spectrum)
+        channels = band.channels
+        slight_loss = (envelopes[..., channels, :], ratios[..., channels]) if slight else None
+        part = apply_gains(wave, gains[..., channels, :], band.interpolation, slight_loss)
+        is_analytic = band.detector == "modulus"
+        kind = (band.points, is_analytic)
+        expanded[kind] = expanded[kind] + part if kind in expanded else part
+    return add_spectra(expanded, spectrum)
 
 
 def filter_and_rectify(spectrum: Tensor, band: RateBand) -> tuple[Tensor, Tensor]:
-    """A rate band's channels as signals, analytic ones with their parts in turn, and for ``smooth`` their rectified sums.
+    """Compute the channels of a rate band, and the sums of their rectified samples per step.
 
-    Shape: (items, bins) -> (items, channels, points or 2 points), (items, channels, 3, steps).
+    Shape: complex (items, bins) -> (items, channels, time), (items, channels, 3, steps), where time
+        is points or, for analytic signals, 2 * points.
+
+    Returns: the channels, where real and imaginary parts of analytic signals alternate, and the
+        sums for ``smooth``.
+
+    >>> from hlsim.msbg.filterbank import BANKS
+    >>> from hlsim.msbg.multirate import multirate_bank
+    >>> options = {"dtype": torch.float32, "device": torch.device("cpu")}
+    >>> bank = multirate_bank(BANKS["severe"], points=4800, step=1, highest=22050.0, **options)
+    >>> channels, sums = filter_and_rectify(torch.fft.rfft(torch.randn(1, 4800)), bank.bands[0])
+    >>> channels.shape, sums.shape
+    (torch.Size([1, 4, 1200]), torch.Size([1, 4, 3, 200]))
     """
-    bins = spectrum[..., None, : band.response.shape[-1]] * band.response
+    band_spectrum = spectrum[..., None, : band.response.shape[-1]] * band.response
     if band.detector == "itself":
-        wave = torch.fft.irfft(bins, band.points)
-        return wave, decimate(wave.abs(), band.decimation)
-    both = torch.fft.ifft(bins, band.points)
-    rectified = detect(both, harmonics=band.detector == "harmonics")
-    wave = torch.view_as_real(both).flatten(-2) if band.detector == "modulus" else both.real
-    return wave, decimate(rectified, band.decimation)
+        channels = torch.fft.irfft(band_spectrum, band.points)
+        return channels, decimate(channels.abs(), band.decimation)
+    analytic = torch.fft.ifft(band_spectrum, band.points)
+    rectified = detect(analytic, harmonics=band.detector == "harmonics")
+    sums = decimate(rectified, band.decimation)
+    if band.detector == "modulus":
+        return torch.view_as_real(analytic).flatten(-2), sums
+    return analytic.real, sums
 
 
-def recombine(heard: dict[tuple[int, bool], Tensor], like: Tensor) -> Tensor:
-    """The spectrum of the sum of signals at several rates, by their FFT lengths and whether they are analytic.
+def add_spectra(signals: dict[tuple[int, bool], Tensor], like: Tensor) -> Tensor:
+    """Compute the spectrum of the sum of signals at several rates.
 
-    Shape: (items, time) each, ``like`` (items, bins) -> as ``like``.
+    Shape: (items, time) each, complex (items, bins) -> complex (items, bins).
+
+    Args:
+        signals: signals by FFT length and by whether they are analytic.
+        like: tensor with the shape and the type of the result.
+
+    >>> tone = torch.tensor([[1.0, 0.0, -1.0, 0.0]])
+    >>> add_spectra({(4, False): tone}, like=torch.zeros(1, 3, dtype=torch.complex64)).real
+    tensor([[0., 2., 0.]])
     """
     total = torch.zeros_like(like)
-    for (points, analytic), part in heard.items():
-        if analytic:
-            bins = torch.fft.fft(torch.view_as_complex(part.unflatten(-1, (-1, 2))))
+    for (points, is_analytic), signal in signals.items():
+        if is_analytic:
+            pairs = signal.unflatten(-1, (-1, 2))
+            spectrum = torch.fft.fft(torch.view_as_complex(pairs))
         else:
-            bins = rfft(part, points)
-        total[..., : bins.shape[-1]].add_(bins[..., : total.shape[-1]])
+            spectrum = rfft(signal, points)
+        total[..., : spectrum.shape[-1]].add_(spectrum[..., : total.shape[-1]])
     return total
 
 
-def hear_ending(heard: Tensor, ratios: Tensor, bank: FilterBank) -> Tensor:
-    """Filter bank and recruitment of a signal that ends as the reference's do, all channels at 44.1 kHz.
+def simulate_cochlea_at_full_rate(waveform: Tensor, ratios: Tensor, bank: FilterBank) -> Tensor:
+    """Apply filter bank and recruitment as the reference does, up to the last sample.
+
+    All channels run at 44.1 kHz, and the envelopes end as those of ``filtfilt``.
 
     Shape: (items, time), (items, channels) -> (items, time).
+
+    Args:
+        waveform: signals at 44.1 kHz in Pa.
+        ratios: expansion ratio of each channel.
+
+    >>> from hlsim.msbg.filterbank import BANKS
+    >>> waveform = torch.randn(1, 1000)
+    >>> simulate_cochlea_at_full_rate(waveform, torch.full((1, 19), 2.0), BANKS["severe"]).shape
+    torch.Size([1, 1000])
     """
-    length = heard.shape[-1]
+    length = waveform.shape[-1]
     points = fft_length(length + BANK_TAIL, 2 * STEP)
-    spectrum = rfft(heard, points).unsqueeze(-2) * constant_like(
-        heard, gammatone_response, bank, points
-    )
-    channels = torch.fft.irfft(spectrum, points) * constant_like(
-        heard, _not_advanced, bank, points, length
-    )
-    weights = constant_like(heard, ending_weights, bank)
-    response = constant_like(heard, ending_response, bank, (length - 1) % STEP + 1)
-    envelopes = envelope(channels, constant_like(heard, envelope_lowpass, bank, points))
-    envelopes = envelopes + ending(channels, weights, response, length)
+    response = constant_like(waveform, gammatone_response, bank, points)
+    spectrum = rfft(waveform, points).unsqueeze(-2) * response
+    before_end = constant_like(waveform, _before_advanced_end, bank, points, length)
+    channels = torch.fft.irfft(spectrum, points) * before_end
+
+    envelopes = envelope(channels, constant_like(waveform, envelope_lowpass, bank, points))
+    weights = constant_like(waveform, end_weights, bank)
+    length_in_step = (length - 1) % STEP + 1
+    responses = constant_like(waveform, end_responses, bank, length_in_step)
+    envelopes = envelopes + end_oscillation(channels, weights, responses, length)
     return expand(channels, envelopes, ratios)[..., :length]
 
 
-def _not_advanced(bank: FilterBank, points: int, length: int) -> NDArray[np.bool]:
-    """The advance has nothing to bring in at the end, where the reference puts zeros. Returns (channels, points)."""
+def _before_advanced_end(bank: FilterBank, points: int, length: int) -> NDArray[np.bool]:
+    """Compute a mask that is 0 from the advanced end of each channel on.
+
+    The reference advances each channel by dropping its first samples, and fills the end with zeros.
+
+    Returns: mask of shape (channels, points).
+    """
     return np.arange(points) < length - np.array(bank.advances)[:, None]

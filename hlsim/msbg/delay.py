@@ -1,4 +1,4 @@
-"""The paper's impulse method for the delay of a simulator."""
+"""Measurement of a simulator's delay with an impulse, as in the Neuro-MSBG paper."""
 
 import torch
 from torch import nn
@@ -10,37 +10,46 @@ from hlsim.audiogram.thresholds import AudiogramLike
 def estimate_delay(
     simulator: nn.Module, audiogram: AudiogramLike | None = None, *, level: float = 94.0
 ) -> int:
-    """Delay in samples by a unit impulse: where the output's largest magnitude lies after the impulse.
+    """Estimate the delay of a simulator in samples from its response to an impulse.
 
-    The impulse stands in the middle of a second of silence (Section III-A of the paper). What comes back depends on ear
-    and level, for the sum of MSBG's channels is dispersive: 1078 with no loss and 1237 to 1271 with one at 44.1 kHz. To
-    align signals use ``MSBG.delay``, which does not.
+    The input is one second of silence with an impulse in the middle. The delay is the time from the
+    impulse to the largest magnitude of the output. It depends on the ear and on the level, because
+    the sum of MSBG's channels is dispersive: at 44.1 kHz it is 1078 samples without a hearing loss
+    and 1237 to 1271 samples with one. To align signals, use ``MSBG.delay``, which does not depend
+    on the ear within a severity.
+
+    Source: the Neuro-MSBG paper, Section III-A.
 
     Args:
-        simulator: one with ``sample_rate`` and ``full_scale_spl``; give ``MSBG(..., aligned=False)``, for the aligned
-            ones have no delay left.
-        audiogram: the ear; by default the simulator's own, or 0 dB HL.
-        level: of the impulse's peak, in dB SPL of a steady signal of that RMS.
+        simulator: simulator with the attributes ``sample_rate`` and ``full_scale_spl``. Build MSBG
+            with ``aligned=False``, because aligned simulators have no delay.
+        audiogram: hearing loss of one ear. By default, it is the simulator's stored one, or 0 dB HL
+            if there is none.
+        level: peak of the impulse, as the level in dB SPL of a constant signal of this value.
 
     Raises:
-        ValueError: the simulator has no rate, or more than one ear is given.
+        ValueError: the simulator lacks an attribute, or the audiogram has more than one ear.
+
+    >>> from hlsim import MSBG
+    >>> estimate_delay(MSBG("NH", sample_rate=44100, aligned=False))
+    1078
     """
-    rate, full_scale = (
-        getattr(simulator, "sample_rate", None),
-        getattr(simulator, "full_scale_spl", None),
-    )
-    if not isinstance(rate, int) or full_scale is None:
+    rate = getattr(simulator, "sample_rate", None)
+    full_scale_spl = getattr(simulator, "full_scale_spl", None)
+    if not isinstance(rate, int) or full_scale_spl is None:
         raise ValueError(
-            f"{type(simulator).__name__} has no sample_rate and full_scale_spl; allowed: hlsim's simulators"
+            f"expected one of hlsim's simulators, got {type(simulator).__name__} without the "
+            "attributes sample_rate and full_scale_spl"
         )
     if audiogram is None and getattr(simulator, "thresholds", None) is None:
         audiogram = Audiogram.standard("NH")
-    place = rate // 2
-    device = next((weights.device for weights in simulator.parameters()), None)
+    position = rate // 2
+    device = next((parameter.device for parameter in simulator.parameters()), None)
     impulse = torch.zeros(rate, device=device)
-    impulse[place] = 10.0 ** ((level - float(full_scale)) / 20.0)
+    impulse[position] = 10.0 ** ((level - float(full_scale_spl)) / 20.0)
     with torch.no_grad():
-        heard = simulator(impulse, audiogram)
-    if (ears := heard.shape[:-1].numel()) != 1:
-        raise ValueError(f"audiograms of {ears} ears; allowed: one")
-    return int(heard.abs().argmax()) - place
+        output = simulator(impulse, audiogram)
+    ears = output.shape[:-1].numel()
+    if ears != 1:
+        raise ValueError(f"expected the audiogram of one ear, got audiograms of {ears} ears")
+    return int(output.abs().argmax()) - position

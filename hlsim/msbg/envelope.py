@@ -1,4 +1,7 @@
-"""Envelopes of the channels: rectified, and low-passed at 75 Hz or less, so that every 24th sample or so tells all."""
+"""Envelopes of the channels: rectified signals after a low-pass of at most 75 Hz.
+
+Envelopes are so slow that they are computed at every 24th sample only.
+"""
 
 from functools import lru_cache
 from typing import Any, cast
@@ -15,29 +18,47 @@ from hlsim.msbg.filterbank import FilterBank
 from hlsim.torchtools import constant_like
 
 STEP = 24
-"""Samples at 44.1 kHz from one value of an envelope, and of the gain that follows it, to the next."""
+"""Samples at 44.1 kHz from one value of an envelope, and of the gain from it, to the next."""
 
 HALF_RATE_STEP = 24.5
-"""The same where signals run at 22.05 kHz: 1800 values a second, so that FFTs which 16 kHz shares have fewer sevens."""
+"""Same as ``STEP``, where signals run at 22.05 kHz: the envelopes have 1800 values per second.
 
-# scipy.signal.ellipap(2, 0.25, 35): the analogue filter with its cut-off at 1 rad/s
+With this step, the FFT lengths that 22.05 kHz shares with 16 kHz have fewer factors of 7.
+"""
+
+# Analogue prototype of the low-pass with its cut-off at 1 rad/s: scipy.signal.ellipap(2, 0.25, 35)
 _PROTOTYPE_ZEROS = np.array([10.769854436276223j, -10.769854436276223j])
 _PROTOTYPE_POLES = np.array(
     [-0.8899906387998329 - 1.1535893623216336j, -0.8899906387998329 + 1.1535893623216336j]
 )
 _PROTOTYPE_GAIN = 0.017782794100389257
 
-_BOXES = 3  # running means of a step's samples put zeros of third order where decimation would alias to 0 Hz
-_TINY = 1e-30  # Pa^2, keeps the gradients of silence finite
+_RUNNING_MEANS = 3
+"""Number of running means over one step before decimation.
+
+Together they have zeros of third order at the frequencies that alias to 0 Hz.
+"""
+
+POWER_FLOOR = 1e-30
+"""Power in Pa^2 added to that of the signals, which keeps the gradients of silence finite."""
 
 
 def detect(signals: Tensor, harmonics: bool) -> Tensor:
-    """What a full-wave rectifier makes of the real part of analytic signals, times pi / 2, less its harmonics.
+    """Compute pi / 2 times the full-wave rectified real part of signals, without high frequencies.
 
-    Shape: complex (...) -> (...).
+    A rectified cosine is |cos a| = 2 / pi (1 + 2/3 cos 2a - 2/15 cos 4a + ...). Its slow part,
+    times pi / 2, is the modulus of the analytic signal.
+
+    Shape: complex (...) -> real (...).
 
     Args:
-        harmonics: with the lower two: |cos a| is 2 / pi (1 + 2/3 cos 2a - 2/15 cos 4a ...); otherwise the modulus.
+        signals: analytic signals.
+        harmonics: include the terms of cos 2a and cos 4a. Channels need them if they are so wide
+            for their centre frequency that these terms reach down to the frequencies of the
+            envelope.
+
+    >>> detect(torch.tensor([3.0 + 4.0j]), harmonics=False)
+    tensor([5.])
     """
     if signals.requires_grad and torch.is_grad_enabled():
         return cast(Tensor, _Detect.apply(signals, harmonics)[0])
@@ -45,16 +66,20 @@ def detect(signals: Tensor, harmonics: bool) -> Tensor:
 
 
 def _detect(signals: Tensor, harmonics: bool) -> tuple[Tensor, ...]:
-    """What is detected; with harmonics also the modulus, and the squared cosine of the angle."""
-    squared = power(signals).add_(_TINY)
+    """Compute ``detect``, and for harmonics the modulus and squared cosine of the phase."""
+    squared_modulus = power(signals).add_(POWER_FLOOR)
     if not harmonics:
-        return (squared.sqrt_(),)  # torch's modulus takes four times as long
-    cosine, modulus = signals.real.square() / squared, squared.sqrt()
-    return modulus * ((cosine * (-16 / 15) + 12 / 5) * cosine + 1 / 5), modulus, cosine
+        # torch's modulus of complex numbers takes four times as long.
+        return (squared_modulus.sqrt_(),)
+    squared_cosine = signals.real.square() / squared_modulus
+    modulus = squared_modulus.sqrt()
+    # The sum of the constant and both cosines, as a polynomial in the squared cosine of the phase
+    shape = (squared_cosine * (-16 / 15) + 12 / 5) * squared_cosine + 1 / 5
+    return modulus * shape, modulus, squared_cosine
 
 
 class _Detect(torch.autograd.Function):
-    """``_detect`` with a gradient of half the steps."""
+    """``_detect`` with a gradient that takes half as many steps as torch's."""
 
     @staticmethod
     def forward(signals: Tensor, harmonics: bool) -> tuple[Tensor, ...]:
@@ -62,43 +87,75 @@ class _Detect(torch.autograd.Function):
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Tensor, bool], output: tuple[Tensor, ...]) -> None:
-        ctx.harmonics = inputs[1]
+        signals, ctx.harmonics = inputs
         ctx.mark_non_differentiable(*output[1:])
-        ctx.save_for_backward(inputs[0], *output)
+        ctx.save_for_backward(signals, *output)
 
     @staticmethod
-    def backward(ctx: Any, gradient: Tensor, *others: Tensor) -> tuple[Tensor, None]:
-        signals, *detected = ctx.saved_tensors
+    def backward(ctx: Any, gradient: Tensor, *_: Tensor) -> tuple[Tensor, None]:
+        signals, *outputs = ctx.saved_tensors
         if not ctx.harmonics:
-            return signals * (gradient / detected[0]), None
-        # where the gradient is differentiated, what is constant here comes from the signals anew
-        _, modulus, cosine = _detect(signals, True) if torch.is_grad_enabled() else detected
-        share = gradient / modulus
-        along = share * ((cosine * (16 / 5) - 20 / 3) * cosine + 5)
-        across = share * ((cosine * (16 / 5) - 12 / 5) * cosine + 1 / 5)
-        return torch.complex(signals.real * along, signals.imag * across), None
+            (modulus,) = outputs
+            return signals * (gradient / modulus), None
+        if torch.is_grad_enabled():
+            # This gradient is itself differentiated, so it must depend on the signals.
+            outputs = list(_detect(signals, True))
+        _, modulus, squared_cosine = outputs
+        scaled = gradient / modulus
+        real_factor = scaled * ((squared_cosine * (16 / 5) - 20 / 3) * squared_cosine + 5)
+        imag_factor = scaled * ((squared_cosine * (16 / 5) - 12 / 5) * squared_cosine + 1 / 5)
+        return torch.complex(signals.real * real_factor, signals.imag * imag_factor), None
 
 
 def decimate(rectified: Tensor, kernel: Tensor) -> Tensor:
-    """Weighted sums of each step's samples, for ``smooth``. Shape: (..., time), (3, samples) -> (..., 3, steps)."""
+    """Compute three weighted sums of the samples of each step.
+
+    ``smooth`` adds the sums of neighbouring steps, which gives one value per step of the running
+    means.
+
+    Shape: (..., time), (3, samples) -> (..., 3, steps).
+
+    Args:
+        kernel: weights from ``decimation_kernel``.
+
+    >>> decimate(torch.ones(1, 48), torch.from_numpy(decimation_kernel()).float()).shape
+    torch.Size([1, 3, 2])
+    """
     return kernel @ rectified.unflatten(-1, (-1, kernel.shape[-1])).mT
 
 
 def smooth(sums: Tensor, lowpass: Tensor) -> Tensor:
-    """Envelopes at samples 0, 24, ... from the sums of ``decimate``; periodic.
+    """Compute envelopes at the beginning of each step from the sums of ``decimate``.
+
+    The signals count as periodic.
 
     Shape: (..., channels, 3, steps), (channels, steps // 2 + 1) -> (..., channels, steps).
+
+    Args:
+        lowpass: frequency responses from ``envelope_lowpass``.
+
+    >>> smooth(torch.ones(1, 3, 4), torch.ones(1, 3))
+    tensor([[3., 3., 3., 3.]])
     """
-    before, here, after = sums.unbind(-2)
-    slow = (here + before.roll(1, -1)).add_(after.roll(-1, -1))
-    return torch.fft.irfft(rfft(slow).mul_(lowpass), slow.shape[-1])
+    for_step_after, for_same_step, for_step_before = sums.unbind(-2)
+    means = for_same_step + for_step_after.roll(1, -1)
+    means.add_(for_step_before.roll(-1, -1))
+    return torch.fft.irfft(rfft(means).mul_(lowpass), means.shape[-1])
 
 
 def envelope(channels: Tensor, lowpass: Tensor) -> Tensor:
-    """Full-wave rectify at 44.1 kHz and low-pass, zero-phase, at a 24th of the rate.
+    """Compute the envelopes of channels at 44.1 kHz at every 24th sample.
 
-    Shape: (..., channels, time), (channels, time // 48 + 1) -> (..., channels, time // 24), the values at samples 0, 24,
-    ...; ``time`` is a multiple of 24 and the signal is taken as periodic.
+    The channels are rectified and low-passed without delay. They count as periodic.
+
+    Shape: (..., channels, time), (channels, time // 48 + 1) -> (..., channels, time // 24), where
+        time is a multiple of 24.
+
+    Args:
+        lowpass: frequency responses from ``envelope_lowpass``.
+
+    >>> envelope(torch.full((1, 96), -2.0), torch.ones(1, 3)).round(decimals=3)
+    tensor([[2., 2., 2., 2.]])
     """
     kernel = constant_like(channels, decimation_kernel)
     return smooth(decimate(channels.abs(), kernel), lowpass)
@@ -111,63 +168,99 @@ def envelope_lowpass(
     channels: slice = slice(None),
     step: float = STEP,
 ) -> NDArray[np.complex128]:
-    """Response that turns the rfft of ``decimate``'s means into that of the envelope at the steps.
+    """Compute the responses that turn spectra of ``smooth``'s means into spectra of envelopes.
 
-    The low-pass is ``ellip(2, 0.25, 35)`` at 3/4 of 100 Hz or of the channel's ERB if less, run forwards and backwards
-    as pyclarity does with ``filtfilt``; what that does at the end is in ``hlsim.msbg.filtfilt_end``.
+    They contain the low-pass of each channel and compensate for the running means. The low-pass is
+    run forwards and backwards, as by pyclarity with ``filtfilt``. The effect of ``filtfilt`` on the
+    end of a signal is computed in ``hlsim.msbg.filtfilt_end``.
 
     Args:
         points: FFT length at 44.1 kHz, a whole number of steps.
-        samples: of the rectified signal in each step.
-        channels: which of the bank's; all by default.
-        step: samples at 44.1 kHz.
+        samples: number of samples of the rectified signal per step.
+        channels: channels of the bank, by default all of them.
+        step: length of a step in samples at 44.1 kHz.
 
-    Returns: (channels, steps // 2 + 1).
+    Returns: responses of shape (channels, steps // 2 + 1).
+
+    >>> from hlsim.msbg.filterbank import BANKS
+    >>> envelope_lowpass(BANKS["mild"], points=4800).shape
+    (36, 101)
     """
     omega = 2.0 * np.pi * np.arange(round(points / step) // 2 + 1) / points
-    powers = np.exp(-1j * omega) ** np.arange(3)[:, None]
+    z_powers = np.exp(-1j * omega) ** np.arange(3)[:, None]
     numerators, denominators = np.array(envelope_filters(bank)[channels]).swapaxes(0, 1)
-    rows = np.abs((numerators @ powers) / (denominators @ powers)) ** 2
+    forward_and_backward = np.abs((numerators @ z_powers) / (denominators @ z_powers)) ** 2
     with np.errstate(invalid="ignore"):
-        box = np.sin(step * omega / 2.0) / (samples * np.sin(step / samples * omega / 2.0))
-    box[0] = 1.0
-    return rows / box**_BOXES * np.exp(-0.5j * (step - step / samples) * omega)
+        mean_response = np.sin(step * omega / 2.0) / (
+            samples * np.sin(step / samples * omega / 2.0)
+        )
+    mean_response[0] = 1.0
+    # The means are centred on the middle of a step, and the envelope is wanted at its beginning.
+    shift = np.exp(-0.5j * (step - step / samples) * omega)
+    return forward_and_backward / mean_response**_RUNNING_MEANS * shift
 
 
 @lru_cache(maxsize=4)
 def envelope_filters(bank: FilterBank) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
-    """Numerator and denominator of each channel's low-pass."""
+    """Design the low-pass of each channel's envelope.
+
+    Its cut-off frequency is 75 Hz, or three quarters of the channel's ERB if this is lower.
+
+    Returns: numerator and denominator for each channel, three coefficients each.
+
+    >>> from hlsim.msbg.filterbank import BANKS
+    >>> len(envelope_filters(BANKS["mild"]))
+    36
+    """
     widths = erb(np.array(bank.centre_frequencies))
     return [elliptic_lowpass(0.75 * min(100.0, width) / (MSBG_RATE / 2.0)) for width in widths]
 
 
 def elliptic_lowpass(cutoff: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The elliptic low-pass of second order with 0.25 dB ripple and 35 dB attenuation.
+    """Design an elliptic low-pass of second order with 0.25 dB ripple and 35 dB attenuation.
 
-    The result is that of ``scipy.signal.ellip(2, 0.25, 35, cutoff)``, whose import takes half a second.
+    The result equals that of ``scipy.signal.ellip(2, 0.25, 35, cutoff)``. Importing this function
+    would take half a second.
 
     Args:
-        cutoff: over the Nyquist frequency.
+        cutoff: cut-off frequency relative to the Nyquist frequency.
 
     Returns: numerator and denominator, three coefficients each.
+
+    >>> numerator, denominator = elliptic_lowpass(0.1)
+    >>> print((numerator.sum() / denominator.sum()).round(3))  # -0.25 dB at 0 Hz
+    0.972
     """
+    # The analogue prototype is scaled to the cut-off frequency. The bilinear transform with a
+    # sample rate of 2 makes it digital.
     scale = 4.0 * np.tan(np.pi * cutoff / 2.0)
-    zeros, poles = scale * _PROTOTYPE_ZEROS, scale * _PROTOTYPE_POLES
-    # the bilinear transform with a sample rate of 2
+    zeros = scale * _PROTOTYPE_ZEROS
+    poles = scale * _PROTOTYPE_POLES
     gain = _PROTOTYPE_GAIN * np.real(np.prod(4.0 - zeros) / np.prod(4.0 - poles))
-    numerator, denominator = (
-        np.convolve([1.0, -first], [1.0, -second]).real
-        for first, second in ((4.0 + zeros) / (4.0 - zeros), (4.0 + poles) / (4.0 - poles))
-    )
+    numerator = _polynomial_with_roots((4.0 + zeros) / (4.0 - zeros))
+    denominator = _polynomial_with_roots((4.0 + poles) / (4.0 - poles))
     return gain * numerator, denominator
+
+
+def _polynomial_with_roots(roots: NDArray[np.complex128]) -> NDArray[np.float64]:
+    """Coefficients of (x - a) (x - b) for two complex conjugate roots. Shape: (2,) -> (3,)."""
+    first, second = roots
+    return np.convolve([1.0, -first], [1.0, -second]).real
 
 
 @lru_cache(maxsize=8)
 def decimation_kernel(samples: int = STEP) -> NDArray[np.float64]:
-    """Weights of a step's samples in the mean around the step after it, itself and the one before.
+    """Compute the weights with which the samples of a step contribute to the running means.
 
-    Returns: (3, samples).
+    Args:
+        samples: number of samples per step.
+
+    Returns: weights of shape (3, samples). The rows are the contributions to the mean at the step
+        after, at the same step and at the step before.
+
+    >>> print(decimation_kernel(3).sum(-1).round(3))
+    [0.148 0.704 0.148]
     """
     box = np.full(samples, 1.0 / samples)
-    kernel = np.pad(np.convolve(np.convolve(box, box), box), 1)
-    return np.ascontiguousarray(kernel.reshape(_BOXES, samples))
+    weights = np.pad(np.convolve(np.convolve(box, box), box), 1)
+    return np.ascontiguousarray(weights.reshape(_RUNNING_MEANS, samples))

@@ -1,8 +1,14 @@
-"""What ``filtfilt``, pyclarity's way to run the envelope's low-pass, makes of a signal that ends in mid-speech.
+"""Effect of ``filtfilt`` on the envelopes of a signal that ends abruptly.
 
-Behind the last sample it goes on with eight, those before it reflected about it, and then with a constant. Seen
-from the samples before, that differs from silence by a free oscillation of the low-pass, which is of second order: two
-numbers a channel, linear in the last samples. With severe losses it moves the last 50 ms by up to 1e-2 of the whole.
+pyclarity runs the envelope's low-pass forwards and backwards with ``scipy.signal.filtfilt``. At the
+end of a signal, ``filtfilt`` adds eight samples, the last ones reflected about the last sample, and
+starts the backward pass as if the signal had been constant after them. On an FFT grid, a signal is
+followed by silence instead.
+
+Before the end, the two results differ by a free oscillation of the low-pass. The low-pass is of
+second order, so that two numbers per channel describe the oscillation. They depend linearly on the
+last samples of the channel. With a severe loss, the oscillation changes the last 50 ms by up to
+1e-2 of the whole signal.
 """
 
 from functools import lru_cache
@@ -17,85 +23,134 @@ from hlsim.msbg.filterbank import FilterBank
 from hlsim.msbg.recruitment import AHEAD
 
 LOOK_BACK = 4096
-"""Samples that the slowest low-pass looks back, to 70 dB."""
+"""Number of last samples that matter, after which the slowest low-pass has decayed by 70 dB."""
 
 _PADDING = 8
+"""Number of samples that ``filtfilt`` adds."""
 
 Array = NDArray[np.float64]
 
 
-def ending(channels: Tensor, weights: Tensor, response: Tensor, length: int) -> Tensor:
-    """What the end adds to the envelopes of ``hlsim.msbg.envelope.envelope``.
+def end_oscillation(channels: Tensor, weights: Tensor, response: Tensor, length: int) -> Tensor:
+    """Compute the oscillation to add to envelopes from ``hlsim.msbg.envelope.envelope``.
 
-    Shape: (..., channels, time), (channels, 2, samples), (channels, steps, 2) -> (..., channels, time // 24).
+    Shape: (..., channels, time), (channels, 2, samples), (channels, steps, 2) -> (..., channels,
+        time // 24).
 
     Args:
-        channels: zero from sample ``length`` on.
-        weights, response: ``ending_weights`` and, for this length, ``ending_response``.
+        channels: channels that are 0 from sample ``length`` on.
+        weights: weights of the last samples from ``end_weights``.
+        response: oscillations from ``end_responses`` for this length.
+        length: number of samples of the signal.
+
+    >>> import torch
+    >>> from hlsim.msbg.filterbank import BANKS
+    >>> bank, channels = BANKS["severe"], torch.zeros(19, 240)
+    >>> weights = torch.from_numpy(end_weights(bank)).float()
+    >>> response = torch.from_numpy(end_responses(bank, 100)).float()
+    >>> end_oscillation(channels, weights, response, 100).shape
+    torch.Size([19, 10])
     """
-    last = channels[..., max(0, length - LOOK_BACK) : length].abs().unsqueeze(-1)
-    oscillation = (response @ (weights[..., -last.shape[-2] :] @ last)).squeeze(-1)
+    first = max(0, length - LOOK_BACK)
+    last_samples = channels[..., first:length].abs().unsqueeze(-1)
+    amplitudes = weights[..., -last_samples.shape[-2] :] @ last_samples
+    oscillation = (response @ amplitudes).squeeze(-1)
     steps = channels.shape[-1] // STEP
     end = (length - 1) // STEP + AHEAD + 1
     oscillation = oscillation[..., -end:]
     return functional.pad(oscillation, (end - oscillation.shape[-1], steps - end))
 
 
-def ending_weights(bank: FilterBank) -> Array:
-    """Weights of the last samples, the newest last, in the oscillation. Returns (channels, 2, 4096)."""
+def end_weights(bank: FilterBank) -> Array:
+    """Compute the weights of the last samples in the two amplitudes of the oscillation.
+
+    Returns: weights of shape (channels, 2, 4096), with the last sample last.
+
+    >>> from hlsim.msbg.filterbank import BANKS
+    >>> end_weights(BANKS["severe"]).shape
+    (19, 2, 4096)
+    """
     return np.stack([weights for weights, _ in _oscillations(bank)])
 
 
-def ending_response(bank: FilterBank, length: int) -> Array:
-    """The oscillation at the steps up to ``AHEAD`` behind the end. Returns (channels, 170, 2)."""
+def end_responses(bank: FilterBank, length: int) -> Array:
+    """Compute two oscillations per channel at the steps before and shortly behind the end.
+
+    Args:
+        length: number of samples of the signal, or this number up to whole steps.
+
+    Returns: oscillations of shape (channels, 170, 2), whose last step is ``AHEAD`` steps behind the
+        end.
+
+    >>> from hlsim.msbg.filterbank import BANKS
+    >>> end_responses(BANKS["severe"], 100).shape
+    (19, 170, 2)
+    """
     first = (length - 1) % STEP
-    return np.stack(
-        [response[first::STEP][: LOOK_BACK // STEP][::-1] for _, response in _oscillations(bank)]
-    )
+    count = LOOK_BACK // STEP
+    responses = [response[first::STEP][:count] for _, response in _oscillations(bank)]
+    return np.stack([response[::-1] for response in responses])
 
 
 @lru_cache(maxsize=4)
 def _oscillations(bank: FilterBank) -> list[tuple[Array, Array]]:
+    """``_oscillation`` of each channel's low-pass."""
     return [_oscillation(*coefficients) for coefficients in envelope_filters(bank)]
 
 
 def _oscillation(numerator: Array, denominator: Array) -> tuple[Array, Array]:
-    """Weights, and the oscillation from ``AHEAD`` steps behind the end backwards.
+    """Compute the oscillation of a low-pass and the weights of the last samples in it.
 
-    The filter's state z moves by z' = move z + enter u, and its output is y = z[0] + b0 u.
+    The low-pass has a state z of two numbers. With the input u, its output is z[0] + b0 u, and its
+    next state is transition z + input_vector u.
 
-    Returns: (2, 4096), (4096 and the samples ahead, 2).
+    Args:
+        numerator: three coefficients b0, b1, b2.
+        denominator: three coefficients 1, a1, a2.
+
+    Returns: weights of shape (2, 4096), and oscillations of shape (samples, 2), which run backwards
+        in time from ``AHEAD`` steps behind the end.
     """
-    move = np.array([[-denominator[1], 1.0], [-denominator[2], 0.0]])
-    enter = numerator[1:] - denominator[1:] * numerator[0]
-    settled = np.linalg.solve(np.eye(2) - move, enter)  # the state after a constant input of 1
+    transition = np.array([[-denominator[1], 1.0], [-denominator[2], 0.0]])
+    input_vector = numerator[1:] - denominator[1:] * numerator[0]
+    state_of_constant = np.linalg.solve(np.eye(2) - transition, input_vector)
 
-    def reflected(state: Array, newest: Array) -> Array:
-        """State of the backward pass at the end, from that of the forward pass and the newest nine samples."""
+    def filter_padding(state: Array, newest: Array) -> Array:
+        """Compute the state of the backward pass at the end of the signal.
+
+        Args:
+            state: state of the forward pass at the end of the signal.
+            newest: last nine samples of the signal, the last one first.
+        """
         outputs = []
         for sample in 2.0 * newest[0] - newest[1:]:
             outputs.append(state[0] + numerator[0] * sample)
-            state = move @ state + enter * sample
-        state = settled * outputs[-1]
+            state = transition @ state + input_vector * sample
+        state = state_of_constant * outputs[-1]
         for output in reversed(outputs):
-            state = move @ state + enter * output
+            state = transition @ state + input_vector * output
         return state
 
-    # in silence the forward pass rings on, z, move z, ..., and the backward pass has S z: S = enter [1 0] + move S move
-    silent = np.linalg.solve(np.eye(4) - np.kron(move, move.T), np.outer(enter, [1.0, 0.0]).ravel())
-    nothing = np.zeros(_PADDING + 1)
-    from_state = np.stack([reflected(unit, nothing) for unit in np.eye(2)], 1) - silent.reshape(
-        2, 2
+    # If silence follows, the forward pass goes through the states z, transition z, ... The backward
+    # pass then ends in the state S z, where S = input_vector [1 0] + transition S transition.
+    silence = np.linalg.solve(
+        np.eye(4) - np.kron(transition, transition.T), np.outer(input_vector, [1.0, 0.0]).ravel()
     )
-    from_newest = np.stack([reflected(np.zeros(2), unit) for unit in np.eye(_PADDING + 1)], 1)
+    no_samples = np.zeros(_PADDING + 1)
+    padding = np.stack([filter_padding(unit, no_samples) for unit in np.eye(2)], 1)
+    from_state = padding - silence.reshape(2, 2)
+    no_state = np.zeros(2)
+    units = np.eye(_PADDING + 1)
+    from_newest = np.stack([filter_padding(no_state, unit) for unit in units], 1)
 
-    behind = AHEAD * STEP
-    powers = np.empty((behind + LOOK_BACK, 2, 2))
-    powers[0] = np.linalg.matrix_power(np.linalg.inv(move), behind)
+    samples_behind = AHEAD * STEP
+    powers = np.empty((samples_behind + LOOK_BACK, 2, 2))
+    powers[0] = np.linalg.matrix_power(np.linalg.inv(transition), samples_behind)
     for k in range(1, len(powers)):
-        powers[k] = move @ powers[k - 1]
-    weights = from_state @ (powers[behind:] @ enter).T
+        powers[k] = transition @ powers[k - 1]
+    weights = from_state @ (powers[samples_behind:] @ input_vector).T
     weights[:, : _PADDING + 1] += from_newest
-    # an orthonormal basis, for the states of such slow filters are too alike for single precision
+    # The two states of a slow filter are nearly proportional to each other, too close for single
+    # precision. An orthonormal basis separates them.
     response, basis = np.linalg.qr(powers[:, 0])
     return (basis @ weights)[:, ::-1], response

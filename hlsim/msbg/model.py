@@ -20,12 +20,12 @@ from hlsim.calibration import PASCAL_SPL, check_full_scale, gain_to_pascals
 from hlsim.checks import broadcast_shape, check_rate, check_waveform
 from hlsim.dsp.fft import rfft
 from hlsim.msbg.blocks import in_blocks
-from hlsim.msbg.cochlea import bank_points, hear, hear_ending
+from hlsim.msbg.cochlea import bank_points, simulate_cochlea, simulate_cochlea_at_full_rate
 from hlsim.msbg.ear import MSBG_RATE
 from hlsim.msbg.filterbank import BANKS, FilterBank
 from hlsim.msbg.multirate import multirate_bank, total_response
 from hlsim.msbg.recruitment import expansion_ratios, threshold_weights
-from hlsim.msbg.resampling import from_cochlea, from_spectrum, to_cochlea, to_inner
+from hlsim.msbg.resampling import from_cochlea, from_spectrum, resample_to_model_rate, to_cochlea
 from hlsim.msbg.smearing import BROADENING, SMEARING_DELAY, smear, smearing_matrix_below
 from hlsim.torchtools import compute_once, constant_like, not_compiled
 
@@ -138,7 +138,7 @@ class MSBG(nn.Module):
         if (gain := gain_to_pascals(self.full_scale_spl)) != 1.0:
             signals = signals * gain
         if self.rescale_active:
-            signals = signals * active_rescaling(to_inner(signals, self.sample_rate))
+            signals = signals * active_rescaling(resample_to_model_rate(signals, self.sample_rate))
 
         outputs: list[Tensor] = []
         order: list[int] = []
@@ -201,7 +201,9 @@ class MSBG(nn.Module):
             spectrum = spectrum * constant_like(heard, total_response, bank, points, step)
         else:
             key = bank, points, step, highest, heard.dtype, heard.device
-            spectrum = hear(spectrum, ratios, compute_once(multirate_bank, *key), not smears)
+            spectrum = simulate_cochlea(
+                spectrum, ratios, compute_once(multirate_bank, *key), not smears
+            )
         if smears:
             return from_spectrum(spectrum, points, step, rate, samples, gain=gain, delay=delay)
         # without smearing's delay, the way out reaches samples that the advances put before the first one
@@ -215,14 +217,16 @@ class MSBG(nn.Module):
         length = heard.shape[-1]
         # with a slight loss and no smearing, nothing buries what the lower rates change where the envelope is next to 0
         if last and (length <= _ENDING + _ENDING_LEAD or not smears):
-            return hear_ending(heard, ratios, bank)
+            return simulate_cochlea_at_full_rate(heard, ratios, bank)
         points = bank_points(length, MSBG_RATE)
         key = bank, points, 1, MSBG_RATE / 2, heard.dtype, heard.device
-        spectrum = hear(rfft(heard, points), ratios, compute_once(multirate_bank, *key), not smears)
+        spectrum = simulate_cochlea(
+            rfft(heard, points), ratios, compute_once(multirate_bank, *key), not smears
+        )
         all_but_the_end = torch.fft.irfft(spectrum, points)[..., :length]
         if not last:
             return all_but_the_end
-        ending = hear_ending(heard[..., -_ENDING - _ENDING_LEAD :], ratios, bank)
+        ending = simulate_cochlea_at_full_rate(heard[..., -_ENDING - _ENDING_LEAD :], ratios, bank)
         return torch.cat((all_but_the_end[..., :-_ENDING], ending[..., -_ENDING:]), -1)
 
 

@@ -1,19 +1,25 @@
-"""The multirate filter bank: a gammatone channel is a band, and only the widest need 44.1 kHz.
+"""The filter bank with each channel at a sample rate that its band needs.
 
-A channel is kept up to five bandwidths above its frequency, where it is 57 dB down, or to the highest frequency of
-interest. Narrow ones run as analytic signals at about 5.5 or 11 kHz, or 9 where that is enough, whose modulus is the
-envelope: what a rectifier adds, harmonics of the band, lies above its low-pass. It does not where bands are so wide for
-their frequency that they come down to 0 Hz: with severe losses two harmonics complete the modulus. The lowest channels,
-and the widest at 44.1 kHz, are rectified as they are, as the reference does: at that rate its harmonics fold, too.
+A gammatone channel occupies a band. It is kept up to five bandwidths above its centre frequency,
+where its gain is -57 dB, or up to the highest frequency of interest. The rate, and the computation
+of the envelope, depend on the channel:
 
-Channels centred far above the highest frequency of interest all hear what there is next to it, by their skirts, and
-expand it alike, by the threshold at 8 kHz: they run as one, the sum of them.
+- Narrow channels are analytic signals at about 5.5 kHz, or at about 11 kHz (9 kHz where the highest
+  frequency of interest allows it). The modulus of an analytic signal is its envelope. A rectifier
+  would add harmonics of the band, but the low-pass of the envelope removes them.
+- With severe losses, channels are so wide for their centre frequency that harmonics reach down to
+  0 Hz. Two harmonics complete the modulus of these channels.
+- The lowest channels, and the widest ones at 44.1 kHz, are rectified as in the reference, whose
+  harmonics alias at this rate.
+
+Channels whose centre frequency is far above the highest frequency of interest respond to the
+frequencies next to it with their skirts, and all of them expand by the threshold at 8 kHz. They are
+computed as one channel, their sum.
 """
 
 import itertools
 import math
 from dataclasses import dataclass
-from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -30,31 +36,61 @@ from hlsim.msbg.recruitment import interpolation_kernel
 from hlsim.msbg.smearing import SKIRT_HZ
 from hlsim.torchtools import as_tensor
 
-_KEPT = 5.0  # bandwidths above its frequency to which a channel is kept
-_WIDE = 2.5  # broadening above which bands come so near to 0 Hz that a rectifier's harmonics count
-_TRUE_HZ = 400.0  # below, channels are rectified as they are
-_FAR = 1.75  # times the highest frequency of interest, above which channels run as one
-_FAR_RATIO = 1.3  # expansion, of a loss of 24 dB, at which their gain is right; with more they are heard less
-_CACHED = (
-    2_000_000  # samples of a rate band on a CPU, for each step to find the last one's in its cache
-)
+_BANDWIDTHS_ABOVE_CENTRE = 5.0
+"""Bandwidths above its centre frequency up to which a channel is kept."""
 
+_MAX_BROADENING_WITHOUT_HARMONICS = 2.5
+"""Broadening of channels above which a rectifier's harmonics reach down to 0 Hz."""
+
+_RECTIFIED_BELOW_HZ = 400.0
+"""Centre frequency below which the channels themselves are rectified."""
+
+_MERGED_ABOVE = 1.75
+"""Centre frequency above which channels are merged, relative to the highest of interest."""
+
+_MERGED_RATIO = 1.3
+"""Expansion ratio at which the gain of merged channels is exact, that of a loss of 24 dB.
+
+At larger ratios they are softer, so that errors matter less.
+"""
+
+_SAMPLES_PER_BAND = 2_000_000
+"""Samples of a rate band on a CPU, few enough for its cache."""
+
+_SLOW_SAMPLES = 3
+"""Samples per step of channels at about 5.5 kHz."""
+
+_FAST_SAMPLES = 6
+"""Samples per step of channels at about 11 kHz."""
+
+_WINDOW_STEPS = (8, 9, 7, 10, 6, 5)
+"""Numbers of steps that one row of a matrix product may interpolate, the preferred one first."""
 
 Detector = Literal["itself", "modulus", "harmonics"]
-"""What a channel's envelope is taken from: the rectified signal, or the analytic one, alone or with harmonics."""
+"""Signal from which the envelope is computed: the rectified channel itself, the modulus of the
+analytic signal, or this modulus with two harmonics."""
 
 
 @dataclass(frozen=True)
 class RateBand:
-    """Channels that run together, at one rate.
+    """Neighbouring channels that run at one sample rate.
 
     Attributes:
-        channels: which of the bank's.
-        points: its FFT length.
-        detector: how they are rectified.
-        response: of the channels, (channels, points // 2 + 1), or of their analytic signals, (channels, points).
-        decimation: weights of a step's samples, (3, samples).
-        interpolation: ``interpolation_kernel``, each weight twice for analytic signals' two parts.
+        channels: indices of the channels in the bank.
+        points: FFT length at the band's rate.
+        detector: signal from which envelopes are computed.
+        response: responses of the channels with shape (channels, points // 2 + 1), or of their
+            analytic signals with shape (channels, points).
+        decimation: weights of the samples of a step. Shape: (3, samples).
+        interpolation: weights from ``interpolation_kernel``, repeated for the real and imaginary
+            parts of analytic signals.
+
+    >>> from hlsim.msbg.filterbank import BANKS
+    >>> device = torch.device("cpu")
+    >>> bank = multirate_bank(BANKS["severe"], 4800, 1, 22050.0, torch.float32, device)
+    >>> lowest = bank.bands[0]
+    >>> lowest.channels, lowest.detector
+    (slice(0, 4, None), 'itself')
     """
 
     channels: slice
@@ -67,11 +103,18 @@ class RateBand:
 
 @dataclass(frozen=True)
 class MultirateBank:
-    """A bank on the FFT grid of a length.
+    """Filter bank for signals of one length.
 
     Attributes:
-        bands: from the lowest channels up.
-        lowpass: of the envelopes, (channels, steps // 2 + 1), as many channels as the bands have.
+        bands: rate bands, from the lowest channels up.
+        lowpass: responses of the envelopes' low-passes, one row per channel of the bands. Shape:
+            (channels, steps // 2 + 1).
+
+    >>> from hlsim.msbg.filterbank import BANKS
+    >>> device = torch.device("cpu")
+    >>> bank = multirate_bank(BANKS["severe"], 4800, 1, 22050.0, torch.float32, device)
+    >>> bank.lowpass.shape
+    torch.Size([19, 101])
     """
 
     bands: tuple[RateBand, ...]
@@ -79,41 +122,64 @@ class MultirateBank:
 
     @property
     def nbytes(self) -> int:
+        """Size of the largest tensors in bytes."""
         return self.lowpass.nbytes + sum(band.response.nbytes for band in self.bands)
 
 
 def assign_rates(
     bank: FilterBank, step: int, highest: float = MSBG_RATE / 2
 ) -> list[tuple[slice, int, Detector]]:
-    """Channels, samples in each of an envelope's steps and how they are rectified, from the lowest channels up.
+    """Divide the channels of a bank into bands with a common rate and detector.
 
-    Where the bank has more, the last one stands for those, too.
+    The last channel stands for all channels above it, if there are any.
 
     Args:
-        step: of the signal: 1, or 2 where nothing above 11 kHz is of interest.
-        highest: frequency of interest in Hz.
+        step: 1 for signals at 44.1 kHz, 2 for signals at 22.05 kHz.
+        highest: highest frequency of interest in Hz, at most 11025 if ``step`` is 2.
+
+    Returns: channels, samples per step and detector of each band, from the lowest channels up.
+
+    >>> from hlsim.msbg.filterbank import BANKS
+    >>> for channels, samples, detector in assign_rates(BANKS["moderate"], step=2, highest=8000.0):
+    ...     print(channels.start, channels.stop, samples, detector)
+    0 6 6 itself
+    6 15 3 modulus
+    15 27 5 modulus
     """
-    a_second = MSBG_RATE / envelope_step(step)
-    slow, fast = 3, 6
-    widest = int((highest + SKIRT_HZ) / a_second) + 1
-    kinds: list[tuple[int, Detector]] = []
-    for hz, width in zip(
-        bank.centre_frequencies, erb(np.array(bank.centre_frequencies)), strict=True
-    ):
-        top = hz + _KEPT * bank.broadening * float(width)
-        if hz < _TRUE_HZ:
-            kinds.append((fast, "itself"))
-        elif top <= slow * a_second:
-            kinds.append((fast, "harmonics") if bank.broadening > _WIDE else (slow, "modulus"))
-        elif step == 2:
-            kinds.append((widest, "modulus"))
-        elif top <= fast * a_second and bank.broadening <= _WIDE:
-            kinds.append((fast, "modulus"))
-        else:
-            kinds.append((STEP, "itself"))
-    kinds = kinds[: _count_kept(bank, highest)]
-    bounds = [0, *(i for i in range(1, len(kinds)) if kinds[i] != kinds[i - 1]), len(kinds)]
-    return [(slice(a, b), *kinds[a]) for a, b in itertools.pairwise(bounds)]
+    centre_hz = np.array(bank.centre_frequencies)
+    bandwidths_above = _BANDWIDTHS_ABOVE_CENTRE * bank.broadening
+    is_wide = bank.broadening > _MAX_BROADENING_WITHOUT_HARMONICS
+    kinds = [
+        _rate_and_detector(hz, hz + bandwidths_above * float(width), is_wide, step, highest)
+        for hz, width in zip(bank.centre_frequencies, erb(centre_hz), strict=True)
+    ]
+    kinds = kinds[: _count_channels(bank, highest)]
+    changes = [channel for channel in range(1, len(kinds)) if kinds[channel] != kinds[channel - 1]]
+    bounds = [0, *changes, len(kinds)]
+    return [(slice(start, stop), *kinds[start]) for start, stop in itertools.pairwise(bounds)]
+
+
+def _rate_and_detector(
+    centre: float, top: float, is_wide: bool, step: int, highest: float
+) -> tuple[int, Detector]:
+    """Choose the samples per step and the detector of a channel.
+
+    Args:
+        centre: centre frequency in Hz.
+        top: frequency in Hz up to which the channel is kept.
+        is_wide: whether harmonics of the channel reach down to 0 Hz.
+        step, highest: arguments of ``assign_rates``.
+    """
+    steps_per_second = MSBG_RATE / envelope_step(step)
+    if centre < _RECTIFIED_BELOW_HZ:
+        return _FAST_SAMPLES, "itself"
+    if top <= _SLOW_SAMPLES * steps_per_second:
+        return (_FAST_SAMPLES, "harmonics") if is_wide else (_SLOW_SAMPLES, "modulus")
+    if step == 2:
+        return int((highest + SKIRT_HZ) / steps_per_second) + 1, "modulus"
+    if top <= _FAST_SAMPLES * steps_per_second and not is_wide:
+        return _FAST_SAMPLES, "modulus"
+    return STEP, "itself"
 
 
 def multirate_bank(
@@ -124,91 +190,143 @@ def multirate_bank(
     dtype: torch.dtype,
     device: torch.device,
 ) -> MultirateBank:
-    """A bank's channels, each at the rate that it needs.
+    """Build a filter bank for signals of one length, with each channel at its own rate.
 
     Args:
         points: FFT length at 44.1 kHz, a whole number of the envelopes' steps.
-        step, highest: as in ``assign_rates``.
-    """
+        step: 1 for signals at 44.1 kHz, 2 for signals at 22.05 kHz.
+        highest: highest frequency of interest in Hz.
+        dtype: precision of real tensors, and of the parts of complex ones.
+        device: device of the tensors.
 
-    tensor = partial(as_tensor, dtype=dtype, device=device)
-    last = _count_kept(bank, highest)
+    >>> from hlsim.msbg.filterbank import BANKS
+    >>> device = torch.device("cpu")
+    >>> bank = multirate_bank(BANKS["severe"], 4800, 1, 22050.0, torch.float32, device)
+    >>> [band.points for band in bank.bands]
+    [1200, 1200, 4800]
+    """
     steps = round(points / envelope_step(step))
-    together = next((count for count in (8, 9, 7, 10, 6, 5) if steps % count == 0), 8)
-    bands, lowpass = [], []
-    for channels, samples, detector in _cut_for_cache(
+    bands = []
+    lowpasses = []
+    for channels, samples, detector in _split_for_cache(
         assign_rates(bank, step, highest), steps, device
     ):
-        count, analytic = steps * samples, detector != "itself"
-        bins = min(count if analytic else count // 2 + 1, points // step // 2 + 1)
-        # signals are too loud by the ratio of the rates, as their sum's spectrum is to be; those that are to be
-        # transformed as analytic ones half of it, the other half being in negative frequencies
+        is_analytic = detector != "itself"
+        band_points = steps * samples
+        bins_of_band = band_points if is_analytic else band_points // 2 + 1
+        bins = min(bins_of_band, points // step // 2 + 1)
         response = gammatone_response(bank, points, channels, bins)
-        smoothing = envelope_lowpass(bank, points, samples, channels, envelope_step(step))
-        if channels.stop == last < bank.channels:
-            far = gammatone_response(bank, points, slice(last - 1, None), bins)
-            response[-1] = far.sum(0)
-            smoothing[-1] *= _far_level(far[:, round(highest * points / MSBG_RATE)])
-        # by how much slower than the signal's the channels' rate is
+        lowpass = envelope_lowpass(bank, points, samples, channels, envelope_step(step))
+        count = _count_channels(bank, highest)
+        if channels.stop == count < bank.channels:
+            merged = gammatone_response(bank, points, slice(count - 1, None), bins)
+            response[-1] = merged.sum(0)
+            lowpass[-1] *= _merged_envelope_factor(merged[:, round(highest * points / MSBG_RATE)])
+
+        # The inverse transform of a band divides by fewer points than that of the signal, so that
+        # the channels are too loud by the ratio of the rates. The spectrum of their sum is to have
+        # this scale, but the envelopes are not.
         decimation = decimation_kernel(samples) * (step * samples / envelope_step(step))
-        interpolation = interpolation_kernel(samples, 2 if detector == "modulus" else 1, together)
         if detector == "modulus":
+            # These analytic signals are half as large as usual, so that their spectrum is that of
+            # the real signal. The mean of a rectified signal is 2 / pi times twice their modulus.
             response[:, 0] *= 0.5
             decimation = decimation * (4.0 / math.pi)
         elif detector == "harmonics":
             response[:, 1:] *= 2.0
             decimation = decimation * (2.0 / math.pi)
         if samples < STEP:
+            band_rate = band_points * MSBG_RATE / points
             response *= fade_out_weights(
-                bins, MSBG_RATE / points, count / (1 if analytic else 2) * MSBG_RATE / points
+                bins, MSBG_RATE / points, band_rate if is_analytic else band_rate / 2
             )
-        kernels = tensor(decimation), tensor(interpolation)
-        bands.append(RateBand(channels, count, detector, tensor(response), *kernels))
-        lowpass.append(smoothing)
-    return MultirateBank(tuple(bands), tensor(np.concatenate(lowpass)))
+        steps_per_window = next((n for n in _WINDOW_STEPS if steps % n == 0), _WINDOW_STEPS[0])
+        repeats = 2 if detector == "modulus" else 1
+        interpolation = interpolation_kernel(samples, repeats, steps_per_window)
+        bands.append(
+            RateBand(
+                channels,
+                band_points,
+                detector,
+                as_tensor(response, dtype, device),
+                as_tensor(decimation, dtype, device),
+                as_tensor(interpolation, dtype, device),
+            )
+        )
+        lowpasses.append(lowpass)
+    return MultirateBank(tuple(bands), as_tensor(np.concatenate(lowpasses), dtype, device))
 
 
 def envelope_step(step: int) -> float:
-    """Samples at 44.1 kHz from one value of an envelope to the next, of signals at 44.1 kHz / ``step``."""
+    """Samples at 44.1 kHz from one value of an envelope to the next.
+
+    Args:
+        step: 1 for signals at 44.1 kHz, 2 for signals at 22.05 kHz.
+
+    >>> envelope_step(2)
+    24.5
+    """
     return STEP if step == 1 else HALF_RATE_STEP
 
 
-def _count_kept(bank: FilterBank, highest: float) -> int:
-    """Channels, those far above the highest frequency of interest as one."""
-    return min(bank.channels, 1 + sum(hz <= _FAR * highest for hz in bank.centre_frequencies))
+def _count_channels(bank: FilterBank, highest: float) -> int:
+    """Count the channels, where all that are far above the highest frequency count as one."""
+    limit = _MERGED_ABOVE * highest
+    return min(bank.channels, 1 + sum(hz <= limit for hz in bank.centre_frequencies))
 
 
-def _far_level(responses: NDArray[np.complex128]) -> float:
-    """Factor on the envelope of a sum of channels, for it to be expanded as they are.
+def _merged_envelope_factor(responses: NDArray[np.complex128]) -> float:
+    """Compute the factor on the envelope of merged channels that gives them the gain of their sum.
 
     Args:
-        responses: of the channels at one frequency.
+        responses: responses of the channels at one frequency. Shape: (channels,).
     """
-    more = _FAR_RATIO - 1.0
+    exponent = _MERGED_RATIO - 1.0
     total = abs(responses.sum())
-    expanded = abs((responses * np.abs(responses) ** more).sum()) / total
-    return float(expanded ** (1.0 / more) / total)
+    expanded = abs((responses * np.abs(responses) ** exponent).sum())
+    gain = expanded / total
+    return float(gain ** (1.0 / exponent) / total)
 
 
 def total_response(bank: FilterBank, points: int, step: int) -> NDArray[np.complex128]:
-    """The sum of all channels, for ears with no loss at all. Returns (points // step // 2 + 1,)."""
-    total = gammatone_response(bank, points, bins=points // step // 2 + 1).sum(0)
-    if step > 1 and (points // step) % 2 == 0:
+    """Compute the response of the sum of all channels, for ears without any loss.
+
+    Args:
+        points: FFT length at 44.1 kHz.
+        step: 1 for signals at 44.1 kHz, 2 for signals at 22.05 kHz.
+
+    Returns: response of shape (points // step // 2 + 1,).
+
+    >>> from hlsim.msbg.filterbank import BANKS
+    >>> total_response(BANKS["none"], points=4800, step=2).shape
+    (1201,)
+    """
+    signal_points = points // step
+    total = gammatone_response(bank, points, bins=signal_points // 2 + 1).sum(0)
+    if step > 1 and signal_points % 2 == 0:
         total[-1] = 0.0
     return total
 
 
-def _cut_for_cache(
+def _split_for_cache(
     bands: list[tuple[slice, int, Detector]], steps: int, device: torch.device
 ) -> list[tuple[slice, int, Detector]]:
-    """The rate bands, on a CPU cut to what its cache holds."""
+    """Split bands on a CPU into parts whose samples fit into its cache.
+
+    Args:
+        bands: result of ``assign_rates``.
+        steps: number of steps of the envelopes.
+    """
     if device.type != "cpu":
         return bands
     parts = []
     for channels, samples, detector in bands:
         count = channels.stop - channels.start
-        size = count * (1 if detector == "itself" else 2) * steps * samples
-        pieces = min(count, math.ceil(size / _CACHED))
-        cuts = [channels.start + count * piece // pieces for piece in range(pieces + 1)]
-        parts += [(slice(a, b), samples, detector) for a, b in itertools.pairwise(cuts)]
+        values_per_sample = 1 if detector == "itself" else 2
+        pieces = min(
+            count, math.ceil(count * values_per_sample * steps * samples / _SAMPLES_PER_BAND)
+        )
+        bounds = [channels.start + count * piece // pieces for piece in range(pieces + 1)]
+        for start, stop in itertools.pairwise(bounds):
+            parts.append((slice(start, stop), samples, detector))
     return parts

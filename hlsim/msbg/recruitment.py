@@ -1,7 +1,10 @@
 """Loudness recruitment: each channel is expanded by a gain that follows its envelope.
 
-The envelope is low-passed at 75 Hz or less, so that it and the gain are computed at a 24th of the rate and the gain
-is interpolated, or, where the envelope is near zero, the envelope.
+The envelope is so slow that it and the gain are computed at every 24th sample at 44.1 kHz. The gain
+is interpolated between these samples. Where a small envelope makes the gain change fast, the
+envelope is interpolated instead.
+
+Source: Moore and Glasberg (1993), Journal of the Acoustical Society of America 94, 2050-2062.
 """
 
 from functools import lru_cache
@@ -20,101 +23,173 @@ from hlsim.msbg.filterbank import FilterBank
 from hlsim.torchtools import constant_like
 
 CATCH_UP_SPL = 105.0
-"""Level in dB SPL at which the impaired ear hears as loud as a normal one."""
+"""Level in dB SPL at which an impaired ear perceives sounds as loud as a normal one."""
 
-# pyclarity limits the envelope to 1e-9 of its full scale of 120 dB SPL
-_LOWEST_ENVELOPE = 1e-9 * 10.0 ** ((120.0 - PASCAL_SPL) / 20.0)
-_HIGHEST_ENVELOPE = 10.0 ** ((CATCH_UP_SPL - PASCAL_SPL) / 20.0)
+# pyclarity limits the envelope to 1e-9 of its full scale, which is 120 dB SPL.
+_MIN_ENVELOPE = 1e-9 * 10.0 ** ((120.0 - PASCAL_SPL) / 20.0)
+"""Smallest value of an envelope in Pa that changes the gain."""
+
+_MAX_ENVELOPE = 10.0 ** ((CATCH_UP_SPL - PASCAL_SPL) / 20.0)
+"""Largest value of an envelope in Pa that changes the gain, where the gain reaches 1."""
+
 _TAPS = 6
+"""Number of values from which one is interpolated."""
 
 AHEAD = _TAPS // 2
-"""Steps ahead of a sample that its gain is interpolated from."""
+"""Number of later steps from which the gain of a sample is interpolated."""
 
-_SLIGHT = 1.3  # expansion ratio at 24 dB HL
+_SLIGHT_RATIO = 1.3
+"""Expansion ratio at 24 dB HL, below which kinks of the gain are not masked."""
+
+_DIP_RATIO = 0.3
+"""Value of an envelope relative to its neighbours below which it counts as a dip."""
 
 
 def expansion_ratios(thresholds: Tensor, weights: Tensor) -> Tensor:
-    """Ratio 105 / (105 - threshold) by which each channel's level is expanded.
+    """Compute the ratio 105 / (105 - threshold) by which the level in each channel is expanded.
 
-    Shape: (..., 8) dB HL, ``threshold_weights`` -> (..., channels).
+    Shape: (..., 8), (8, channels) -> (..., channels).
+
+    Args:
+        thresholds: audiograms in dB HL.
+        weights: interpolation weights from ``threshold_weights``.
+
+    >>> expansion_ratios(torch.full((8,), 35.0), torch.full((8, 1), 0.125))
+    tensor([1.5000])
     """
-    # no matrix product, which a GPU may be allowed to round to ten bits: next to 105 dB HL every bit counts
-    return CATCH_UP_SPL / (CATCH_UP_SPL - (thresholds.unsqueeze(-1) * weights).sum(-2))
+    # This is no matrix product, because a GPU may round factors of a product to ten bits. Next to
+    # 105 dB HL, the ratio depends on every bit of the thresholds.
+    channel_thresholds = (thresholds.unsqueeze(-1) * weights).sum(-2)
+    return CATCH_UP_SPL / (CATCH_UP_SPL - channel_thresholds)
 
 
 def threshold_weights(bank: FilterBank) -> NDArray[np.float64]:
-    """Weights of the eight thresholds in that of each channel. Returns (8, channels)."""
+    """Compute the weights of the eight thresholds in the threshold of each channel.
+
+    Returns: weights of shape (8, channels).
+
+    >>> from hlsim.msbg.filterbank import BANKS
+    >>> threshold_weights(BANKS["severe"]).shape
+    (8, 19)
+    """
     return interpolation_weights(bank.centre_frequencies)
 
 
-def gains(envelopes: Tensor, ratios: Tensor) -> Tensor:
-    """The recruitment gain (envelope / catch-up level) ** (ratio - 1).
+def recruitment_gains(envelopes: Tensor, ratios: Tensor) -> Tensor:
+    """Compute the gains (envelope / catch-up level) ** (ratio - 1).
 
     Shape: (..., channels, steps), (..., channels) -> (..., channels, steps).
+
+    Args:
+        envelopes: envelopes in Pa.
+        ratios: expansion ratio of each channel.
+
+    >>> envelopes = torch.tensor([[100.0, 3.5481, 0.35481]])
+    >>> recruitment_gains(envelopes, torch.tensor([2.0])).round(decimals=3)
+    tensor([[1.0000, 1.0000, 0.1000]])
     """
-    level = envelopes.clamp(_LOWEST_ENVELOPE, _HIGHEST_ENVELOPE).div_(_HIGHEST_ENVELOPE).log()
-    return (level * (ratios.unsqueeze(-1) - 1.0)).exp_()
+    limited = envelopes.clamp(_MIN_ENVELOPE, _MAX_ENVELOPE)
+    log_level = limited.div_(_MAX_ENVELOPE).log()
+    return (log_level * (ratios.unsqueeze(-1) - 1.0)).exp_()
 
 
 def interpolate(values: Tensor, kernel: Tensor) -> Tensor:
-    """Values between the steps' ones.
+    """Interpolate values at the beginning of each step to all samples.
 
-    Shape: ``around``'s (..., steps + 5), ``interpolation_kernel`` -> (..., time).
-    """
-    width, columns = kernel.shape
-    together = width - _TAPS + 1
-    steps = values.shape[-1] - _TAPS + 1
-    if steps % together:
-        values = functional.pad(values, (0, -steps % together))
-    windows = values.unfold(-1, width, together)
-    # as one product, for matmul makes one a channel of it, at twice the cost
-    fine = (windows.reshape(-1, width) @ kernel).view(*windows.shape[:-2], -1)
-    return fine if steps % together == 0 else fine[..., : steps * columns // together]
-
-
-def weigh(
-    channels: Tensor, gain: Tensor, kernel: Tensor, slight: tuple[Tensor, Tensor] | None = None
-) -> Tensor:
-    """Interpolate the gains, apply them and sum the channels.
-
-    Shape: (..., channels, time), ``around``'s (..., channels, steps + 5), ``interpolation_kernel`` -> (..., time).
+    Shape: (..., steps + 5), (rows, columns) -> (..., time).
 
     Args:
-        slight: envelopes (..., channels, steps) and ratios (..., channels), where some ratios are slight. The low-pass
-            overshoots, and where the envelope goes through zero the gain has kinks. A small loss does not bury them,
-            and the way out of the ear lifts their upper end by 40 dB, so that there the envelope is interpolated instead.
+        values: values from ``pad_periodically``.
+        kernel: weights from ``interpolation_kernel``.
+
+    >>> kernel = torch.from_numpy(interpolation_kernel(samples=2)).float()
+    >>> interpolate(pad_periodically(torch.ones(8)), kernel)[:3].round(decimals=3)
+    tensor([1., 1., 1.])
     """
-    full = interpolate(gain, kernel)
+    width, columns = kernel.shape
+    steps_per_window = width - _TAPS + 1
+    steps = values.shape[-1] - _TAPS + 1
+    if steps % steps_per_window:
+        values = functional.pad(values, (0, -steps % steps_per_window))
+    windows = values.unfold(-1, width, steps_per_window)
+    # All windows are rows of one matrix product. Otherwise torch computes one product per channel,
+    # which takes twice as long.
+    interpolated = (windows.reshape(-1, width) @ kernel).view(*windows.shape[:-2], -1)
+    if steps % steps_per_window == 0:
+        return interpolated
+    return interpolated[..., : steps * columns // steps_per_window]
+
+
+def apply_gains(
+    channels: Tensor, gains: Tensor, kernel: Tensor, slight: tuple[Tensor, Tensor] | None = None
+) -> Tensor:
+    """Interpolate gains, apply them to the channels and add up the channels.
+
+    Where the envelope goes through zero, because its low-pass overshoots, the gain has kinks. With
+    a slight loss they are not masked, and the inverse of the middle ear amplifies their upper
+    frequencies by 40 dB. There, the envelope is interpolated instead of the gain.
+
+    Shape: (..., channels, time), (..., channels, steps + 5), (rows, columns) -> (..., time).
+
+    Args:
+        gains: gains at each step from ``pad_periodically``.
+        kernel: weights from ``interpolation_kernel``.
+        slight: envelopes of shape (..., channels, steps) and ratios of shape (..., channels), which
+            are needed if some ears have a slight loss.
+
+    >>> kernel = torch.from_numpy(interpolation_kernel()).float()
+    >>> gains = pad_periodically(torch.full((2, 8), 0.5))
+    >>> apply_gains(torch.ones(2, 8 * STEP), gains, kernel)[:3].round(decimals=3)
+    tensor([1., 1., 1.])
+    """
+    sample_gains = interpolate(gains, kernel)
     if slight is not None:
         envelopes, ratios = slight
-        steep = _steep(envelopes) & ((ratios != 1.0) & (ratios < _SLIGHT)).unsqueeze(-1)
-        every = full.shape[-1] // steep.shape[-1]
-        if steep.device.type == "cpu":
-            theirs = ratios.unsqueeze(-1).expand(steep.shape)[steep]
-            about = around(envelopes).unfold(-1, _TAPS, 1)[steep]
-            full.unflatten(-1, (-1, every))[steep] = gains(about @ kernel[:_TAPS, :every], theirs)
-        else:  # indices would have to come back from the device
-            fine = gains(interpolate(around(envelopes), kernel), ratios)
-            full = torch.where(steep.repeat_interleave(every, -1), fine, full)
-    if torch.is_grad_enabled() and (channels.requires_grad or full.requires_grad):
-        return cast(Tensor, _SumOfProducts.apply(channels, full))
-    return _sum_of_products(channels, full)
+        sample_gains = _correct_kinks(sample_gains, envelopes, ratios, kernel)
+    if torch.is_grad_enabled() and (channels.requires_grad or sample_gains.requires_grad):
+        return cast(Tensor, _SumOfProducts.apply(channels, sample_gains))
+    return _sum_of_products(channels, sample_gains)
+
+
+def _correct_kinks(
+    sample_gains: Tensor, envelopes: Tensor, ratios: Tensor, kernel: Tensor
+) -> Tensor:
+    """Replace gains where a slight loss meets a small envelope by those of interpolated envelopes.
+
+    Shape: (..., channels, time), (..., channels, steps), (..., channels), (rows, columns) ->
+        (..., channels, time).
+    """
+    is_slight = (ratios != 1.0) & (ratios < _SLIGHT_RATIO)
+    has_kink = _find_dips(envelopes) & is_slight.unsqueeze(-1)
+    samples = sample_gains.shape[-1] // has_kink.shape[-1]
+    if has_kink.device.type == "cpu":
+        kink_ratios = ratios.unsqueeze(-1).expand(has_kink.shape)[has_kink]
+        kink_windows = pad_periodically(envelopes).unfold(-1, _TAPS, 1)[has_kink]
+        kink_envelopes = kink_windows @ kernel[:_TAPS, :samples]
+        kink_gains = recruitment_gains(kink_envelopes, kink_ratios)
+        sample_gains.unflatten(-1, (-1, samples))[has_kink] = kink_gains
+        return sample_gains
+    # Indexing by a mask would make the host wait for the device.
+    sample_envelopes = interpolate(pad_periodically(envelopes), kernel)
+    corrected = recruitment_gains(sample_envelopes, ratios)
+    return torch.where(has_kink.repeat_interleave(samples, -1), corrected, sample_gains)
 
 
 def _sum_of_products(channels: Tensor, factors: Tensor) -> Tensor:
-    """Shape: (..., channels, time) twice -> (..., time)."""
+    """Add up channels times factors. Shape: (..., channels, time) twice -> (..., time)."""
     if channels.device.type != "cpu":
         return (channels * factors).sum(-2)
-    first, *others = zip(channels.unbind(-2), factors.unbind(-2), strict=True)
+    # One channel at a time and in place, the sum stays in the processor's cache. torch's sum takes
+    # eight times as long.
+    first, *remaining = zip(channels.unbind(-2), factors.unbind(-2), strict=True)
     total = torch.mul(*first)
-    # in place, a channel at a time: it stays in the processor's cache, and torch's sum takes eight times as long
-    for channel, factor in others:
+    for channel, factor in remaining:
         total.addcmul_(channel, factor)
     return total
 
 
 class _SumOfProducts(torch.autograd.Function):
-    """``_sum_of_products``, whose steps in place torch cannot differentiate."""
+    """``_sum_of_products`` with a gradient, which torch cannot derive from in-place steps."""
 
     @staticmethod
     def forward(channels: Tensor, factors: Tensor) -> Tensor:
@@ -127,52 +202,83 @@ class _SumOfProducts(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, Tensor | None]:
         channels, factors = ctx.saved_tensors
-        every, (first, second) = gradient.unsqueeze(-2), ctx.needs_input_grad
-        return every * factors if first else None, every * channels if second else None
+        channels_needed, factors_needed = ctx.needs_input_grad
+        expanded = gradient.unsqueeze(-2)
+        return (
+            expanded * factors if channels_needed else None,
+            expanded * channels if factors_needed else None,
+        )
 
 
-def around(values: Tensor) -> Tensor:
-    """With those that the interpolation at the ends needs; periodic. Shape: (..., steps) -> (..., steps + 5)."""
+def pad_periodically(values: Tensor) -> Tensor:
+    """Add the values that interpolation needs at both ends of periodic values.
+
+    Shape: (..., steps) -> (..., steps + 5).
+
+    >>> pad_periodically(torch.arange(4))
+    tensor([2, 3, 0, 1, 2, 3, 0, 1, 2])
+    """
     return torch.cat((values[..., 1 - AHEAD :], values, values[..., :AHEAD]), -1)
 
 
-def _steep(envelopes: Tensor) -> Tensor:
-    """Where an envelope goes through zero. Shape: (..., steps) -> (..., steps)."""
-    floored = envelopes.detach().clamp_min(_LOWEST_ENVELOPE)
-    low = torch.minimum(floored, floored.roll(-1, -1))
-    high = torch.maximum(floored, floored.roll(-1, -1))
-    return low < 0.3 * torch.maximum(high.roll(1, -1), high.roll(-1, -1))
+def _find_dips(envelopes: Tensor) -> Tensor:
+    """Find the steps where an envelope goes through or close to zero.
+
+    Shape: (..., steps) -> bool (..., steps).
+    """
+    limited = envelopes.detach().clamp_min(_MIN_ENVELOPE)
+    following = limited.roll(-1, -1)
+    low = torch.minimum(limited, following)
+    high = torch.maximum(limited, following)
+    neighbouring_high = torch.maximum(high.roll(1, -1), high.roll(-1, -1))
+    return low < _DIP_RATIO * neighbouring_high
 
 
 def expand(channels: Tensor, envelopes: Tensor, ratios: Tensor) -> Tensor:
-    """Apply the recruitment gain at 44.1 kHz and sum the channels.
+    """Apply recruitment to channels at 44.1 kHz and add up the channels.
 
     Shape: (..., channels, time), (..., channels, time // 24), (..., channels) -> (..., time).
+
+    Args:
+        envelopes: envelopes in Pa at the beginning of each step.
+        ratios: expansion ratio of each channel.
+
+    >>> tone = torch.ones(1, 8 * STEP)
+    >>> expand(tone, torch.full((1, 8), 0.35481), torch.tensor([2.0]))[:3].round(decimals=3)
+    tensor([0.1000, 0.1000, 0.1000])
     """
     kernel = constant_like(channels, interpolation_kernel)
-    return weigh(channels, around(gains(envelopes, ratios)), kernel, (envelopes, ratios))
+    gains = pad_periodically(recruitment_gains(envelopes, ratios))
+    return apply_gains(channels, gains, kernel, (envelopes, ratios))
 
 
 @lru_cache(maxsize=16)
 def interpolation_kernel(
-    samples: int = STEP, parts: int = 1, together: int = 8
+    samples: int = STEP, repeats: int = 1, steps_per_window: int = 8
 ) -> NDArray[np.float64]:
-    """Weights of the values about some steps for the samples of these: six count for each, after Lagrange.
+    """Compute weights that interpolate values at the beginning of each step to all samples.
+
+    Each sample is interpolated from six values by Lagrange's polynomial of fifth order.
 
     Args:
-        samples: in each step.
-        parts: of a sample, one after the other, that weigh alike.
-        together: steps that a matrix product interpolates at once; best a divisor of their number.
+        samples: number of samples per step.
+        repeats: number of times that each interpolated value is repeated. Analytic signals need 2,
+            for their real and imaginary parts.
+        steps_per_window: number of steps that one row of the matrix product interpolates. A
+            divisor of the number of all steps is best.
 
-    Returns: (together + 5, together * samples * parts).
+    Returns: weights of shape (steps_per_window + 5, steps_per_window * samples * repeats).
+
+    >>> interpolation_kernel().shape
+    (13, 192)
     """
     nodes = np.arange(_TAPS) - (_TAPS // 2 - 1.0)
-    place = np.arange(samples) / samples
-    weights = np.ones((_TAPS, len(place)))
+    positions = np.arange(samples) / samples
+    weights = np.ones((_TAPS, samples))
     for i, node in enumerate(nodes):
-        for other in np.delete(nodes, i):
-            weights[i] *= (place - other) / (node - other)
-    kernel = np.zeros((_TAPS + together - 1, together, len(place)))
-    for i in range(together):
-        kernel[i : i + _TAPS, i] = weights
-    return kernel.reshape(len(kernel), -1).repeat(parts, -1)
+        for other_node in np.delete(nodes, i):
+            weights[i] *= (positions - other_node) / (node - other_node)
+    kernel = np.zeros((steps_per_window + _TAPS - 1, steps_per_window, samples))
+    for step in range(steps_per_window):
+        kernel[step : step + _TAPS, step] = weights
+    return kernel.reshape(len(kernel), -1).repeat(repeats, -1)

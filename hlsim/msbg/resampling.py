@@ -1,7 +1,7 @@
 """The way into the cochlea and out of it, with resampling on the same FFT grids.
 
-Where two rates meet, the lower one's spectrum ends softly, and so with nothing at half that rate, a frequency that the
-higher one has twice.
+Where two rates meet, the spectrum at the lower rate fades out towards its Nyquist frequency, and is
+0 at this frequency. The spectrum at the higher rate has this frequency twice.
 """
 
 import math
@@ -17,106 +17,187 @@ from hlsim.msbg.cochlea import shared_multiple
 from hlsim.msbg.ear import EAR_DELAY, MSBG_RATE, ear_filter, lowpass_filter
 from hlsim.torchtools import constant_like
 
-_FIR_TAIL = 2 * EAR_DELAY + 132  # with the low-pass on the way out
+_FIR_TAIL = 2 * EAR_DELAY + 132
+"""Samples at 44.1 kHz by which the filters of the way out lengthen a signal."""
 
 
 def to_cochlea(signals: Tensor, rate: int, length: int, step: int) -> Tensor:
-    """Resample to 44.1 kHz / step and pass outer and middle ear. Shape: (items, time) -> (items, length)."""
+    """Resample signals and filter them with the outer and the middle ear.
+
+    Shape: (items, time) -> (items, length).
+
+    Args:
+        rate: sample rate of the signals in Hz.
+        length: number of samples of the result.
+        step: 1 for a result at 44.1 kHz, 2 for a result at 22.05 kHz.
+
+    >>> to_cochlea(torch.randn(2, 16000), rate=16000, length=44100, step=1).shape
+    torch.Size([2, 44100])
+    """
     if rate == MSBG_RATE and step == 1:
-        return filter_in_blocks(signals, constant_like(signals, _inward_blocks), length)
+        return filter_in_blocks(signals, constant_like(signals, _inward_block_response), length)
     up, down = _ratio(rate, step)
-    least = max(signals.shape[-1], math.ceil(length * down / up)) + math.ceil(
-        _FIR_TAIL * down / up / step
-    )
-    outer, inner = _grid(least, up, down)
-    bins = min(outer, inner) // 2 + 1
-    response = constant_like(signals, _inward, inner * step, bins, up / down, rate)
-    return torch.fft.irfft(rfft(signals, outer)[..., :bins] * response, inner)[..., :length]
+    tail = math.ceil(_FIR_TAIL * down / up / step)
+    samples = max(signals.shape[-1], math.ceil(length * down / up)) + tail
+    outer_points, inner_points = _fft_grid(samples, up, down)
+    bins = min(outer_points, inner_points) // 2 + 1
+    gain = up / down
+    response = constant_like(signals, _inward_response, inner_points * step, bins, gain, rate)
+    spectrum = rfft(signals, outer_points)[..., :bins] * response
+    return torch.fft.irfft(spectrum, inner_points)[..., :length]
 
 
 def from_spectrum(
     spectrum: Tensor, points: int, step: int, rate: int, samples: int, *, gain: float, delay: int
 ) -> Tensor:
-    """Back out of the ear, low-pass, advance by ``delay`` and return to ``rate``, from the cochlea's spectrum.
+    """Compute the output of MSBG from the spectrum of the cochlea's output.
 
-    Shape: (items, points // (2 step) + 1) -> (items, samples).
+    The way out filters with the inverse of the ear and the low-pass, removes the delay and
+    resamples.
+
+    Shape: complex (items, points // (2 * step) + 1) -> (items, samples).
 
     Args:
-        gain: factor on all of it.
-        points: FFT length at 44.1 kHz of the spectrum.
-        step: the spectrum is of a signal at 44.1 kHz / step.
-        delay: samples at 44.1 kHz.
+        points: FFT length of the spectrum, in samples at 44.1 kHz.
+        step: 1 for the spectrum of a signal at 44.1 kHz, 2 for that of a signal at 22.05 kHz.
+        rate: sample rate of the result in Hz.
+        samples: number of samples of the result.
+        gain: linear gain of the result.
+        delay: samples at 44.1 kHz by which the result is advanced.
+
+    >>> spectrum = torch.fft.rfft(torch.randn(1, 49392))
+    >>> from_spectrum(spectrum, 49392, 1, 16000, 16000, gain=1.0, delay=1047).shape
+    torch.Size([1, 16000])
     """
-    inner, outer = points // step, points * rate // MSBG_RATE
+    inner_points = points // step
     if not shared_multiple(rate, step):
-        heard = torch.fft.irfft(spectrum, inner)
-        return from_cochlea(heard, rate, samples, gain=gain, step=step, delay=delay)
-    bins = min(inner, outer) // 2 + 1
-    response = constant_like(spectrum, _outward, points, delay, bins, gain * outer / inner, rate)
-    return torch.fft.irfft(spectrum[..., :bins] * response, outer)[..., :samples]
+        waveform = torch.fft.irfft(spectrum, inner_points)
+        return from_cochlea(waveform, rate, samples, gain=gain, step=step, delay=delay)
+    outer_points = points * rate // MSBG_RATE
+    bins = min(inner_points, outer_points) // 2 + 1
+    total_gain = gain * outer_points / inner_points
+    response = constant_like(spectrum, _outward_response, points, delay, bins, total_gain, rate)
+    return torch.fft.irfft(spectrum[..., :bins] * response, outer_points)[..., :samples]
 
 
 def from_cochlea(
-    heard: Tensor, rate: int, samples: int, *, gain: float, step: int = 1, delay: int = 0
+    waveform: Tensor, rate: int, samples: int, *, gain: float, step: int = 1, delay: int = 0
 ) -> Tensor:
-    """``from_spectrum`` of a waveform. Shape: (items, length) -> (items, samples)."""
+    """Compute the output of MSBG from the cochlea's output.
+
+    Shape: (items, length) -> (items, samples).
+
+    Args:
+        rate: sample rate of the result in Hz.
+        samples: number of samples of the result.
+        gain: linear gain of the result.
+        step: 1 for a waveform at 44.1 kHz, 2 for a waveform at 22.05 kHz.
+        delay: samples at 44.1 kHz by which the result is advanced.
+
+    >>> from_cochlea(torch.randn(1, 44100), rate=16000, samples=16000, gain=1.0).shape
+    torch.Size([1, 16000])
+    """
     up, down = _ratio(rate, step)
-    outer, inner = _grid(math.ceil((heard.shape[-1] + _FIR_TAIL) * down / up), up, down)
-    bins = min(outer, inner) // 2 + 1
-    response = constant_like(heard, _outward, inner * step, delay, bins, gain * down / up, rate)
-    return torch.fft.irfft(rfft(heard, inner)[..., :bins] * response, outer)[..., :samples]
+    outer_samples = math.ceil((waveform.shape[-1] + _FIR_TAIL) * down / up)
+    outer_points, inner_points = _fft_grid(outer_samples, up, down)
+    bins = min(outer_points, inner_points) // 2 + 1
+    points = inner_points * step
+    total_gain = gain * down / up
+    response = constant_like(waveform, _outward_response, points, delay, bins, total_gain, rate)
+    spectrum = rfft(waveform, inner_points)[..., :bins] * response
+    return torch.fft.irfft(spectrum, outer_points)[..., :samples]
 
 
-def to_inner(signals: Tensor, rate: int) -> Tensor:
-    """Resample to 44.1 kHz. Shape: (items, time) -> (items, ceil(time * 44100 / rate))."""
+def resample_to_model_rate(signals: Tensor, rate: int) -> Tensor:
+    """Resample signals to 44.1 kHz. Shape: (items, time) -> (items, ceil(time * 44100 / rate)).
+
+    Args:
+        rate: sample rate of the signals in Hz.
+
+    >>> resample_to_model_rate(torch.randn(2, 1600), rate=16000).shape
+    torch.Size([2, 4410])
+    """
     if rate == MSBG_RATE:
         return signals
     up, down = _ratio(rate, 1)
-    outer, inner = _grid(signals.shape[-1], up, down)
-    bins = min(outer, inner) // 2 + 1
-    response = constant_like(signals, _resampling, inner, bins, up / down, rate)
-    heard = torch.fft.irfft(rfft(signals, outer)[..., :bins] * response, inner)
-    return heard[..., : math.ceil(signals.shape[-1] * up / down)]
+    outer_points, inner_points = _fft_grid(signals.shape[-1], up, down)
+    bins = min(outer_points, inner_points) // 2 + 1
+    response = constant_like(signals, _resampling_response, inner_points, bins, up / down, rate)
+    spectrum = rfft(signals, outer_points)[..., :bins] * response
+    resampled = torch.fft.irfft(spectrum, inner_points)
+    return resampled[..., : math.ceil(signals.shape[-1] * up / down)]
 
 
-def _inward_blocks() -> NDArray[np.complex128]:
-    """The way in for ``filter_in_blocks``."""
+def _inward_block_response() -> NDArray[np.complex128]:
+    """Response of outer and middle ear for ``filter_in_blocks``."""
     return np.fft.rfft(ear_filter(), BLOCK_POINTS)
 
 
-def _inward(points: int, bins: int, gain: float, rate: int) -> NDArray[np.complex128]:
-    """The way in, on an FFT grid of ``points`` at 44.1 kHz. Returns (bins,)."""
-    return gain * np.fft.rfft(ear_filter(), points)[:bins] * _end(points, bins, rate)
+def _inward_response(points: int, bins: int, gain: float, rate: int) -> NDArray[np.complex128]:
+    """Compute the response of outer and middle ear with a gain.
+
+    Args:
+        points: FFT length at 44.1 kHz.
+        rate: sample rate in Hz from which signals are resampled.
+
+    Returns: response of shape (bins,).
+    """
+    return gain * np.fft.rfft(ear_filter(), points)[:bins] * _band_end(points, bins, rate)
 
 
-def _outward(points: int, delay: int, bins: int, gain: float, rate: int) -> NDArray[np.complex128]:
-    """The way out with the low-pass, ahead by ``delay``. Returns (bins,)."""
-    response = np.fft.rfft(ear_filter(backward=True), points) * np.fft.rfft(
-        lowpass_filter(), points
-    )
+def _outward_response(
+    points: int, delay: int, bins: int, gain: float, rate: int
+) -> NDArray[np.complex128]:
+    """Compute the response of the inverse ear and the low-pass with a gain and an advance.
+
+    Args:
+        points: FFT length at 44.1 kHz.
+        delay: samples at 44.1 kHz by which signals are advanced.
+        rate: sample rate in Hz to which signals are resampled.
+
+    Returns: response of shape (bins,).
+    """
+    inverse_ear = np.fft.rfft(ear_filter(backward=True), points)
+    response = inverse_ear * np.fft.rfft(lowpass_filter(), points)
     advance = np.exp(2j * np.pi * np.arange(bins) * delay / points)
-    return gain * response[:bins] * advance * _end(points, bins, rate)
+    return gain * response[:bins] * advance * _band_end(points, bins, rate)
 
 
-def _resampling(points: int, bins: int, gain: float, rate: int) -> NDArray[np.float64]:
-    """No filter but the end of the lower rate's band. Returns (bins,)."""
-    return gain * _end(points, bins, rate)
+def _resampling_response(points: int, bins: int, gain: float, rate: int) -> NDArray[np.float64]:
+    """Compute the response of resampling alone, with a gain. Returns (bins,)."""
+    return gain * _band_end(points, bins, rate)
 
 
-def _end(points: int, bins: int, rate: int) -> NDArray[np.float64]:
-    """How the spectrum ends where a signal's rate is not the model's."""
+def _band_end(points: int, bins: int, rate: int) -> NDArray[np.float64]:
+    """Compute weights that fade a spectrum out at the lower Nyquist frequency.
+
+    They are 1 where nothing is resampled.
+
+    Args:
+        points: FFT length at 44.1 kHz.
+        rate: sample rate in Hz of signals outside the model.
+
+    Returns: weights of shape (bins,).
+    """
     if rate == MSBG_RATE:
         return np.ones(bins)
     return fade_out_weights(bins, MSBG_RATE / points, min(rate, MSBG_RATE) / 2)
 
 
 def _ratio(rate: int, step: int) -> tuple[int, int]:
-    """Smallest whole numbers in proportion to 44.1 kHz / step and ``rate``."""
-    common = math.gcd(MSBG_RATE // step, rate)
-    return MSBG_RATE // step // common, rate // common
+    """Smallest whole numbers in proportion to the rate inside the model and to ``rate``."""
+    inner_rate = MSBG_RATE // step
+    common = math.gcd(inner_rate, rate)
+    return inner_rate // common, rate // common
 
 
-def _grid(samples: int, up: int, down: int) -> tuple[int, int]:
-    """FFT lengths at ``down`` and at ``up`` that span the same time, at least ``samples`` at ``down``."""
-    parts = fft_length(math.ceil(samples / down), 4)
-    return parts * down, parts * up
+def _fft_grid(samples: int, up: int, down: int) -> tuple[int, int]:
+    """FFT lengths outside and inside the model that span the same time.
+
+    Args:
+        samples: smallest length outside the model.
+        up: rate inside the model, in the same unit as ``down``.
+        down: rate outside the model.
+    """
+    units = fft_length(math.ceil(samples / down), 4)
+    return units * down, units * up

@@ -1,8 +1,9 @@
-"""The fixed response of MSBG with every gain at 1: what a normal ear hears, and what a filter bank does to any signal.
+"""The linear response that MSBG has where the gains of all channels are 1.
 
-The bank's channels add up to a level response within a few dB, but not to a linear phase: at 1 to 2 kHz what is heard is
-nearer to the polarity-inverted signal than to the signal. Waveforms, phases and complex spectra can only be compared with
-a signal that has the same phase.
+This is the response of MSBG for a normal ear. The channels of its filter bank add up to a flat
+magnitude within a few decibels, but not to a linear phase: at 1 to 2 kHz the output resembles the
+polarity-inverted input more than the input. Waveforms, phases and complex spectra of the output can
+therefore only be compared with signals that have the same phase.
 """
 
 import math
@@ -19,93 +20,155 @@ from hlsim.msbg.filterbank import BANKS, FilterBank, gammatone_response
 from hlsim.msbg.model import STRUCTURAL_DELAY
 from hlsim.torchtools import constant_like
 
-_HALF_SECONDS = 0.064
-_SPACING = 2.5  # Hz, at most: of the grid, whose period is several times what the responses last
-_FAINT = 0.1
+HALF_LENGTH_SECONDS = 0.064
+"""Time in seconds that impulse responses cover before and after time 0."""
+
+MAX_SPACING_HZ = 2.5
+"""Largest distance in Hz between frequencies on which responses are computed.
+
+Its reciprocal is several times as long as the impulse responses.
+"""
+
+MIN_RELATIVE_MAGNITUDE = 0.1
+"""Magnitude of a response relative to its maximum, below which the magnitude is not normalised."""
 
 
 def fixed_response(bank: FilterBank, rate: int, points: int) -> NDArray[np.complex128]:
-    """Response of all of MSBG, aligned, with every gain at 1, on the grid of ``rfft`` at a rate.
+    """Compute the response of aligned MSBG with a gain of 1 in all channels.
 
     Args:
-        points: FFT length at ``rate`` that is a whole number of samples at 44.1 kHz too.
+        rate: sample rate in Hz.
+        points: FFT length at ``rate``, whose duration is a whole number of samples at 44.1 kHz.
 
-    Returns: (points // 2 + 1,), 0 above 22.05 kHz.
+    Returns: response of shape (points // 2 + 1,), which is 0 above 22.05 kHz.
+
+    >>> response = fixed_response(BANKS["none"], rate=16000, points=16000)
+    >>> print(abs(response[1000]).round(2))
+    1.04
     """
-    inner = points * MSBG_RATE // rate
-    bins = min(points, inner) // 2 + 1
-    omega = 2.0 * np.pi * np.arange(bins) / inner
-    total = gammatone_response(bank, inner, bins=bins).sum(0)
+    inner_points = points * MSBG_RATE // rate
+    bins = min(points, inner_points) // 2 + 1
+    omega = 2.0 * np.pi * np.arange(bins) / inner_points
+    response = gammatone_response(bank, inner_points, bins=bins).sum(0)
     for taps in (ear_filter(), ear_filter(backward=True), lowpass_filter()):
-        total = total * np.fft.rfft(taps, inner)[:bins]
-    total = total * np.exp(1j * omega * STRUCTURAL_DELAY) * 10.0 ** (-bank.recombination_db / 20.0)
-    return np.pad(total, (0, points // 2 + 1 - bins))
+        response = response * np.fft.rfft(taps, inner_points)[:bins]
+    advance = np.exp(1j * omega * STRUCTURAL_DELAY)
+    response = response * advance * 10.0 ** (-bank.recombination_db / 20.0)
+    return np.pad(response, (0, points // 2 + 1 - bins))
 
 
-def with_phase_of_bank(
+def apply_bank_phase(
     waveform: Tensor, thresholds: Tensor, rate: int, *, normal: bool = False
 ) -> Tensor:
-    """A signal with the phase that MSBG's bank of each ear's severity gives it, and the magnitude as it is.
+    """Apply the phase of MSBG's filter bank for each ear, and keep the magnitude.
 
-    Where the response ends, from 20 dB down, the magnitude goes with it.
+    Where the response of the bank is more than 20 dB below its maximum, the magnitude falls with
+    it.
 
-    Shape: (items, time), (items, 8) dB HL -> (items, time).
+    Shape: (items, time), (items, 8) -> (items, time).
 
     Args:
-        normal: the signal is what a normal ear hears: the phase of that ear's bank is taken off.
+        thresholds: audiograms in dB HL, whose severity selects the bank.
+        rate: sample rate in Hz.
+        normal: the waveform is MSBG's output for a normal ear, so that the phase of the bank for
+            normal ears is removed.
+
+    >>> apply_bank_phase(torch.randn(1, 1600), torch.full((1, 8), 40.0), 16000).shape
+    torch.Size([1, 1600])
     """
     severity = severity_index(thresholds)
-    taps = constant_like(waveform, _phases, rate, normal)[severity]
-    moved = filter_without_delay(waveform, taps)
-    # a normal ear's stays as it is to the bit, for phases of what is nearly silent depend on rounding
-    return torch.where((severity == 0).unsqueeze(-1), waveform, moved) if normal else moved
+    taps = constant_like(waveform, _phase_taps, rate, normal)[severity]
+    filtered = filter_without_delay(waveform, taps)
+    if not normal:
+        return filtered
+    # For ears without a loss, the waveform keeps its bits, because rounding changes the phase of
+    # frequencies that are nearly silent.
+    has_no_loss = (severity == 0).unsqueeze(-1)
+    return torch.where(has_no_loss, waveform, filtered)
 
 
-def hear_normally(waveform: Tensor, thresholds: Tensor, rate: int) -> Tensor:
-    """What MSBG makes of a signal at 0 dB HL, where it is linear, with the phase of the bank of each ear's severity.
+def simulate_normal_ear(waveform: Tensor, thresholds: Tensor, rate: int) -> Tensor:
+    """Simulate a normal ear with the phase of the filter bank for each impaired ear.
 
-    The phase is that of what this ear hears, with which it is to be compared. Without a loss it is MSBG's output, 69 dB
-    SNR at 16 kHz and 105 dB at 44.1 kHz, for the time of two transforms.
+    The result can be compared with MSBG's output for the impaired ear. It takes two Fourier
+    transforms, because MSBG is linear at 0 dB HL. For ears without a loss it equals MSBG's output
+    with an SNR of 69 dB at 16 kHz and 105 dB at 44.1 kHz.
 
-    Shape: (items, time), (items, 8) dB HL -> (items, time).
+    Shape: (items, time), (items, 8) -> (items, time).
+
+    Args:
+        thresholds: audiograms in dB HL, whose severity selects the bank.
+        rate: sample rate in Hz.
+
+    >>> simulate_normal_ear(torch.randn(1, 1600), torch.full((1, 8), 40.0), 16000).shape
+    torch.Size([1, 1600])
     """
-    return filter_without_delay(
-        waveform, constant_like(waveform, _as_normal, rate)[severity_index(thresholds)]
-    )
+    taps = constant_like(waveform, _normal_ear_taps, rate)[severity_index(thresholds)]
+    return filter_without_delay(waveform, taps)
 
 
-def _as_normal(rate: int) -> NDArray[np.float64]:
-    """Impulse response of a normal ear with each severity's phase. Returns as ``impulses``."""
+def _normal_ear_taps(rate: int) -> NDArray[np.float64]:
+    """Compute impulse responses with a normal ear's magnitude and each severity's phase.
+
+    Returns: taps of shape (severities, 2 * half).
+    """
     responses, points = _responses(rate)
-    return impulses(np.abs(responses[0]) * np.exp(1j * np.angle(responses)), points, rate)
+    phases = np.exp(1j * np.angle(responses))
+    return impulse_responses(np.abs(responses[0]) * phases, points, rate)
 
 
-def _phases(rate: int, normal: bool) -> NDArray[np.float64]:
-    """Impulse response of each severity's phase. Returns as ``impulses``."""
+def _phase_taps(rate: int, normal: bool) -> NDArray[np.float64]:
+    """Compute impulse responses with each severity's phase.
+
+    Args:
+        normal: subtract the phase of the bank for normal ears.
+
+    Returns: taps of shape (severities, 2 * half).
+    """
     responses, points = _responses(rate)
     if normal:
         phases = np.exp(1j * (np.angle(responses) - np.angle(responses[0])))
     else:
         magnitude = np.abs(responses)
-        phases = responses / np.maximum(magnitude, _FAINT * magnitude.max(-1, keepdims=True))
-    return impulses(phases, points, rate)
+        floor = MIN_RELATIVE_MAGNITUDE * magnitude.max(-1, keepdims=True)
+        phases = responses / np.maximum(magnitude, floor)
+    return impulse_responses(phases, points, rate)
 
 
 def _responses(rate: int) -> tuple[NDArray[np.complex128], int]:
-    """Response of each severity's bank, (severities, points // 2 + 1), and the points of the grid."""
-    shared = math.gcd(rate, MSBG_RATE)
-    points = rate // shared * 2 * math.ceil(shared / (2.0 * _SPACING))
-    return np.stack(
-        [fixed_response(BANKS[severity], rate, points) for severity in SEVERITIES]
-    ), points
+    """Compute the response of each severity's bank.
+
+    Returns: responses of shape (severities, points // 2 + 1), and the FFT length ``points``.
+    """
+    common = math.gcd(rate, MSBG_RATE)
+    points = rate // common * 2 * math.ceil(common / (2.0 * MAX_SPACING_HZ))
+    responses = [fixed_response(BANKS[severity], rate, points) for severity in SEVERITIES]
+    return np.stack(responses), points
 
 
 def half_length(rate: int) -> int:
-    """Samples of the impulse responses to either side of zero."""
-    return math.ceil(_HALF_SECONDS * rate)
+    """Number of samples that impulse responses have before time 0, and from it on.
+
+    >>> half_length(16000)
+    1024
+    """
+    return math.ceil(HALF_LENGTH_SECONDS * rate)
 
 
-def impulses(spectra: NDArray[np.complex128], points: int, rate: int) -> NDArray[np.float64]:
-    """Impulse response of each, its zero in the middle. Returns (severities, 2 half)."""
+def impulse_responses(
+    spectra: NDArray[np.complex128], points: int, rate: int
+) -> NDArray[np.float64]:
+    """Compute impulse responses with time 0 in the middle from frequency responses.
+
+    Shape: (severities, points // 2 + 1) -> (severities, 2 * half).
+
+    Args:
+        points: FFT length of the responses.
+        rate: sample rate in Hz.
+
+    >>> impulse_responses(np.ones((1, 4001)), points=8000, rate=16000)[0, 1023:1026]
+    array([0., 1., 0.])
+    """
     half = half_length(rate)
-    return np.roll(np.fft.irfft(spectra, points), half, -1)[:, : 2 * half]
+    centred = np.roll(np.fft.irfft(spectra, points), half, -1)
+    return centred[:, : 2 * half]

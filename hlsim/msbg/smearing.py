@@ -1,4 +1,7 @@
-"""Spectral smearing (Baer and Moore 1993): each 5.8 ms frame's power spectrum is spread over wider auditory filters."""
+"""Spectral smearing: the power spectrum of each 5.8 ms frame is spread over wider auditory filters.
+
+Source: Baer and Moore (1993), Journal of the Acoustical Society of America 94, 1229-1241.
+"""
 
 import math
 from functools import lru_cache
@@ -15,42 +18,68 @@ from hlsim.dsp.fft import power, rfft
 from hlsim.msbg.ear import MSBG_RATE
 from hlsim.torchtools import constant_like
 
-FRAME, HOP, FFT = 256, 64, 512
+FRAME = 256
+"""Length of a frame in samples at 44.1 kHz."""
+
+HOP = 64
+"""Samples at 44.1 kHz from one frame to the next."""
+
+FFT = 512
+"""Length of a frame's Fourier transform, of which the second half is zeros."""
 
 SMEARING_DELAY = 3 * HOP
-"""Samples by which smearing delays: its frames are read three hops late."""
+"""Delay of smearing in samples at 44.1 kHz, because its frames are read three hops late."""
 
 BROADENING = {"mild": (1.6, 1.1), "moderate": (2.4, 1.6), "severe": (4.0, 2.0)}
-"""Widening of the lower and the upper side of the auditory filters; with no loss nothing is smeared (pyclarity 0.9.0)."""
+"""Factors by which the lower and the upper sides of the auditory filters are wider than normal.
+
+Without a hearing loss, nothing is smeared. The values are those of pyclarity 0.9.0.
+"""
 
 SKIRT_HZ = 800.0
-"""How far above what it is given smearing reaches, by the skirts of its frames' spectra."""
+"""Distance in Hz by which smearing reaches beyond its input, through the skirts of the spectra."""
 
-_TINY = 1e-24  # Pa^2
-_MOST = 1e30
-_NEVER = 1e-36  # Pa^2, keeps a division from one by 0
-_CACHED = 1200  # frames
+POWER_FLOOR = 1e-24
+"""Power in Pa^2 that is added to powers before and after smearing, so that silence stays silent."""
+
+MIN_POWER_RATIO = 1e-24
+"""Smallest ratio of powers whose square root is computed, because square roots of 0 are slow."""
+
+MAX_POWER_RATIO = 1e30
+"""Largest ratio of powers, in place of infinity where silence lies next to very loud sounds."""
+
+DIVISION_EPS = 1e-36
+"""Power in Pa^2 that keeps divisors away from 0."""
+
+FRAMES_PER_CHUNK = 1200
+"""Number of frames that are smeared at once on a CPU, few enough for its cache."""
 
 
 def roex_filters(lower: float, upper: float, count: int, spacing: float) -> NDArray[np.float64]:
-    """Auditory filters (1 + g) exp(-g), divided by their bandwidth, at equally spaced frequencies.
+    """Compute rounded-exponential auditory filters (1 + g) exp(-g) divided by their bandwidths.
 
     Args:
-        lower, upper: widening of the lower and the upper side.
-        count: filters, and frequencies of each.
-        spacing: Hz between frequencies, which begin at 0.
+        lower: factor by which the lower sides of the filters are wider than normal.
+        upper: factor by which the upper sides of the filters are wider than normal.
+        count: number of filters, and of frequencies.
+        spacing: distance in Hz between frequencies, the first of which is 0 Hz.
 
-    Returns: (count, count), a row a filter.
+    Returns: filters of shape (count, count), one filter per row.
+
+    >>> roex_filters(1.0, 1.0, count=256, spacing=44100 / 512).shape
+    (256, 256)
     """
     bins = np.arange(count, dtype=float)
+    centre_bins = bins[:, None]
     hz = bins * spacing
-    bandwidth = erb(hz)
+    bandwidth = erb(hz)[:, None]
+    # The filter at 0 Hz divides by 0. It is set below.
     with np.errstate(divide="ignore", invalid="ignore"):
-        distance = (
-            np.abs(bins[:, None] - bins) / bins[:, None] * 4.0 * hz[:, None] / bandwidth[:, None]
-        )
-    g = distance / np.where(bins < bins[:, None], lower, upper)
-    filters = (1.0 + g) * np.exp(-g) / (bandwidth * (lower + upper) / (2.0 * ERB_AT_0_HZ))[:, None]
+        relative_distance = np.abs(centre_bins - bins) / centre_bins
+        distance = relative_distance * 4.0 * hz[:, None] / bandwidth
+    g = distance / np.where(bins < centre_bins, lower, upper)
+    relative_bandwidth = bandwidth * (lower + upper) / (2.0 * ERB_AT_0_HZ)
+    filters = (1.0 + g) * np.exp(-g) / relative_bandwidth
     filters[0] = 0.0
     filters[0, 0] = 2.0 / (lower + upper)
     return filters
@@ -59,199 +88,287 @@ def roex_filters(lower: float, upper: float, count: int, spacing: float) -> NDAr
 def smearing_from_filters(
     normal: NDArray[np.float64], wide: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """The wide filters with the normal ones divided out: what, seen through normal filters, looks like the wide ones.
+    """Compute the matrix that smears a power spectrum from normal and wide auditory filters.
 
-    Shape: (count, count) twice -> (count, count), to be multiplied with a power spectrum.
+    A normal ear perceives a smeared spectrum as an impaired ear perceives the original spectrum. To
+    this end, the matrix divides the normal filters out of the wide ones.
+
+    Shape: (count, count), (count, count) -> (count, count).
+
+    Args:
+        normal: filters of a normal ear, one per row.
+        wide: filters of an impaired ear, one per row.
+
+    >>> filters = roex_filters(1.0, 1.0, count=8, spacing=1000.0)
+    >>> print(smearing_from_filters(filters, filters).shape)
+    (8, 8)
     """
     count = len(normal)
     half = count // 2
-    # the filters go on above the highest frequency as mirror images of their lower sides, or the division rings
+    # Above the highest frequency, each filter continues with the mirror image of its lower side.
+    # Without this continuation, the division would ring.
     extended = np.concatenate((normal, np.zeros((count, half))), axis=1)
     for i in range(half, count):
         stop = min(2 * i - 1, 3 * half)
         mirrored = normal[i, 2 * i - count : max(1, 2 * i - 3 * half) : -1]
         extended[i, count:stop] = mirrored[: stop - count]
-    matrix = np.asarray(np.linalg.lstsq(extended, wide, rcond=-1)[0][:count], dtype=np.float64)
-    return matrix
+    solution = np.linalg.lstsq(extended, wide, rcond=-1)[0]
+    return np.asarray(solution[:count], dtype=np.float64)
 
 
 @lru_cache(maxsize=4)
 def smearing_matrix(lower: float, upper: float) -> NDArray[np.float64]:
-    """The matrix for MSBG's 512-point spectra. Returns (256, 256)."""
-    normal, wide = (
-        roex_filters(*sides, FFT // 2, MSBG_RATE / FFT) for sides in ((1.0, 1.0), (lower, upper))
-    )
+    """Compute the matrix that smears MSBG's power spectra.
+
+    Args:
+        lower: factor by which the lower sides of the filters are wider than normal.
+        upper: factor by which the upper sides of the filters are wider than normal.
+
+    Returns: matrix of shape (256, 256).
+
+    >>> smearing_matrix(*BROADENING["mild"]).shape
+    (256, 256)
+    """
+    count = FFT // 2
+    spacing = MSBG_RATE / FFT
+    normal = roex_filters(1.0, 1.0, count, spacing)
+    wide = roex_filters(lower, upper, count, spacing)
     return smearing_from_filters(normal, wide)
 
 
 def smearing_matrix_below(severity: str, step: int, highest: float) -> NDArray[np.float64]:
-    """The part of the matrix on which what is below ``highest`` Hz depends, by the window's skirts.
+    """Cut the part for low frequencies out of the smearing matrix of a severity.
 
     Args:
-        step: the signal runs at 44.1 kHz / step.
+        severity: a key of ``BROADENING``.
+        step: 1 for signals at 44.1 kHz, 2 for signals at 22.05 kHz.
+        highest: highest frequency in Hz of the input. The part is larger by the skirts of the
+            spectra.
+
+    >>> smearing_matrix_below("mild", step=2, highest=8000.0).shape
+    (103, 103)
     """
     bins = min(FFT // 2 // step, math.ceil((highest + SKIRT_HZ) * FFT / MSBG_RATE))
     return smearing_matrix(*BROADENING[severity])[:bins, :bins]
 
 
 def smear(waveform: Tensor, matrix: Tensor, step: int = 1) -> Tensor:
-    """Smear a waveform as pyclarity's ``smear3`` does at 44.1 kHz, its delay and its first, irregular frames included.
+    """Smear the spectra of waveforms.
 
-    Shape: (..., time), (bins, bins) -> (..., hop * (ceil(time / hop) + 3)) with hop = 64 // step.
+    At 44.1 kHz, the result equals that of pyclarity's ``smear3``, with its delay and its irregular
+    first frames.
+
+    Shape: (..., time), (bins, bins) -> (..., hop * (ceil(time / hop) + 3)), where hop is 64 / step.
 
     Args:
-        matrix: ``smearing_matrix``, or the part of it for the lowest frequencies; the others, and the Nyquist frequency,
-            are left out. At most (256 // step, 256 // step).
-        step: 1 at 44.1 kHz; 2 at 22.05 kHz, where the same frames are taken at every other sample and nothing above
-            11 kHz is known.
+        matrix: ``smearing_matrix`` or its part for the lowest frequencies, at most
+            (256 // step, 256 // step). Higher frequencies, and always the Nyquist frequency, are
+            removed.
+        step: 1 for waveforms at 44.1 kHz, 2 for waveforms at 22.05 kHz.
+
+    >>> matrix = torch.from_numpy(smearing_matrix(*BROADENING["severe"])).float()
+    >>> smear(torch.randn(2, 640), matrix).shape
+    torch.Size([2, 832])
     """
     hop = HOP // step
     count = math.ceil(waveform.shape[-1] / hop)
     window = constant_like(waveform, _window, step)
-    frames = _frames(waveform, count, hop, window)
-    # on a CPU a few frames at a time, for the steps from one to the next to find them in its cache
-    size = (
-        max(1, _CACHED * step // waveform[..., 0].numel())
-        if waveform.device.type == "cpu"
-        else count
-    )
-    if size >= count:
-        return _overlap_add(_widen(frames, window, matrix), hop)
-    return _overlap_add(
-        torch.cat([_widen(part, window, matrix) for part in frames.split(size, -2)], -2), hop
-    )
+    frames = _cut_frames(waveform, count, hop, window)
+    frames_per_chunk = count
+    if waveform.device.type == "cpu":
+        # Each step of the computation should find the result of the last one in the cache.
+        items = waveform[..., 0].numel()
+        frames_per_chunk = max(1, FRAMES_PER_CHUNK * step // items)
+    if frames_per_chunk >= count:
+        return _overlap_add(_smear_frames(frames, window, matrix), hop)
+    chunks = frames.split(frames_per_chunk, -2)
+    smeared = torch.cat([_smear_frames(chunk, window, matrix) for chunk in chunks], -2)
+    return _overlap_add(smeared, hop)
 
 
-def _widen(frames: Tensor, window: Tensor, matrix: Tensor) -> Tensor:
-    """Smear each frame's power. Shape: (..., frames, 2 n), (2 n,), (bins, bins) -> (..., frames, n)."""
-    spectrum, _ = spread(rfft(frames)[..., : len(matrix)], matrix)
-    half = len(window) // 2
-    return torch.fft.irfft(spectrum, len(window))[..., :half] * window[:half]
+def _smear_frames(frames: Tensor, window: Tensor, matrix: Tensor) -> Tensor:
+    """Smear the spectra of frames.
+
+    Shape: (..., frames, 2 n), (2 n,), (bins, bins) -> (..., frames, n).
+    """
+    bins = len(matrix)
+    samples = len(window)
+    spectrum, _ = smear_spectrum(rfft(frames)[..., :bins], matrix)
+    half = samples // 2
+    return torch.fft.irfft(spectrum, samples)[..., :half] * window[:half]
 
 
-def spread(spectrum: Tensor, matrix: Tensor, least: float = 0.0) -> tuple[Tensor, Tensor]:
-    """The spectrum with its power smeared and its phase kept, and that power.
+def smear_spectrum(
+    spectrum: Tensor, matrix: Tensor, gradient_floor: float = 0.0
+) -> tuple[Tensor, Tensor]:
+    """Smear the power of spectra and keep their phase.
 
-    Silence counts as a power of 1e-24 Pa^2, and stays as it is.
+    Smearing can give a negative power. Its square root is imaginary, so that the phase turns by 90
+    degrees. Silence counts as a power of 1e-24 Pa^2 and stays as it is.
 
-    Shape: complex (..., bins), (bins, bins) or one an item (items, bins, bins) -> complex (..., bins), (..., bins).
+    Shape: complex (..., bins), (bins, bins) or (items, bins, bins) -> complex (..., bins),
+        (..., bins).
 
     Args:
-        least: gradients are held to those of powers that smearing divides or multiplies by 1 / ``least`` at most; with 0
-            they have no bound where it turns a power's sign, or fills what was empty.
+        matrix: smearing matrix of all items, or one per item.
+        gradient_floor: bound of the gradients, which are computed as if smearing multiplied each
+            power by this factor at least and by its reciprocal at most. With 0, gradients have no
+            bound where smearing changes the sign of a power or fills an empty frequency.
+
+    Returns: the smeared spectrum and its power.
+
+    >>> spectrum = torch.tensor([3.0 + 4.0j, 0.0])
+    >>> mixing = torch.tensor([[0.5, 0.5], [0.0, 1.0]])
+    >>> smear_spectrum(spectrum, mixing)[1]
+    tensor([1.2500e+01, 1.0000e-24])
     """
     if torch.is_grad_enabled() and (spectrum.requires_grad or matrix.requires_grad):
-        widened, smeared, *_ = _Spread.apply(spectrum, matrix, least)
+        smeared, smeared_power, *_ = _SmearSpectrum.apply(spectrum, matrix, gradient_floor)
     else:
-        widened, smeared, *_ = _spread(spectrum, matrix)
-    return widened, smeared
+        smeared, smeared_power, *_ = _smear_spectrum(spectrum, matrix)
+    return smeared, smeared_power
 
 
-def _spread(spectrum: Tensor, matrix: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """``spread``'s two; the factor on the spectrum, real and imaginary part, and the power that it had."""
-    given = power(spectrum)
-    smeared = (given @ matrix.mT).add_(_TINY)
-    # a matrix that is learned keeps what it was multiplied with
-    given = given + _TINY if matrix.requires_grad else given.add_(_TINY)
-    quotient = smeared / given
-    # the square root of a negative power is imaginary; of 0 it takes long, and beside 1e9 Pa silence counts as nothing
-    real, imaginary = (
-        quotient.clamp(_TINY, _MOST).sqrt_(),
-        quotient.neg().clamp_(_TINY, _MOST).sqrt_(),
-    )
-    return spectrum * torch.complex(real, imaginary), smeared, real, imaginary, given
+def _smear_spectrum(
+    spectrum: Tensor, matrix: Tensor
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Compute ``smear_spectrum`` and what its gradient needs.
+
+    Returns: the smeared spectrum, its power, the real and the imaginary part of the factor on the
+        spectrum, and the power of the spectrum.
+    """
+    spectrum_power = power(spectrum)
+    smeared_power = (spectrum_power @ matrix.mT).add_(POWER_FLOOR)
+    if matrix.requires_grad:
+        # The gradient of the matrix product needs the power unchanged.
+        spectrum_power = spectrum_power + POWER_FLOOR
+    else:
+        spectrum_power = spectrum_power.add_(POWER_FLOOR)
+    ratio = smeared_power / spectrum_power
+    # The square root of a negative ratio is imaginary.
+    real = ratio.clamp(MIN_POWER_RATIO, MAX_POWER_RATIO).sqrt_()
+    imaginary = ratio.neg().clamp_(MIN_POWER_RATIO, MAX_POWER_RATIO).sqrt_()
+    factor = torch.complex(real, imaginary)
+    return spectrum * factor, smeared_power, real, imaginary, spectrum_power
 
 
-class _Spread(torch.autograd.Function):
-    """``_spread`` with a gradient of a third of the steps.
+class _SmearSpectrum(torch.autograd.Function):
+    """``_smear_spectrum`` with a gradient that takes a third of the steps of torch's.
 
-    Of z = f x with |f|^2 = s / p, s = A p and p = |x|^2, and g the conjugate of f times the gradient at z, it is
-    g + x (A^T t - e / p) with e = Re(conj(x) g) and t = e / s + 2 h, h the gradient at s: with the power of one
-    frequency the factor of others changes. That of A is t p^T / 2.
+    Let x be the spectrum, p = |x|^2 its power, A the matrix, s = A p the smeared power, f the
+    factor with |f|^2 = s / p and z = f x the smeared spectrum. Let h be the gradient with respect
+    to s, and g the gradient with respect to z times the conjugate of f. Then, with
+    e = Re(conj(x) g) and t = e / s + 2 h,
+
+    - the gradient with respect to x is g + x (A^T t - e / p), because the power of one frequency
+      changes the factors of others;
+    - the gradient with respect to A is t p^T / 2.
     """
 
     @staticmethod
-    def forward(spectrum: Tensor, matrix: Tensor, least: float) -> tuple[Tensor, ...]:
-        return _spread(spectrum, matrix)
+    def forward(spectrum: Tensor, matrix: Tensor, gradient_floor: float) -> tuple[Tensor, ...]:
+        return _smear_spectrum(spectrum, matrix)
 
     @staticmethod
     def setup_context(
         ctx: Any, inputs: tuple[Tensor, Tensor, float], output: tuple[Tensor, ...]
     ) -> None:
-        ctx.least = inputs[2]
+        spectrum, matrix, ctx.gradient_floor = inputs
         ctx.mark_non_differentiable(*output[2:])
-        ctx.set_materialize_grads(
-            False
-        )  # nobody asks for the power's where signals are smeared alone
-        ctx.save_for_backward(*inputs[:2], *output[1:])
+        # Where only signals are smeared, the power has no gradient, which is then None.
+        ctx.set_materialize_grads(False)
+        ctx.save_for_backward(spectrum, matrix, *output[1:])
 
     @staticmethod
     def backward(
-        ctx: Any, gradient: Tensor | None, of_power: Tensor | None, *others: None
+        ctx: Any, gradient: Tensor | None, power_gradient: Tensor | None, *_: None
     ) -> tuple[Tensor | None, Tensor | None, None]:
-        spectrum, matrix, *made = ctx.saved_tensors
-        # where the gradient is differentiated, what is constant here comes from the spectrum anew
-        smeared, real, imaginary, given = (
-            _spread(spectrum, matrix)[1:] if torch.is_grad_enabled() else made
-        )
-        if ctx.least:
-            size = smeared.abs()
-            divisor = torch.copysign(torch.maximum(size, ctx.least * given), smeared)
-            held = (given / (ctx.least * size + _NEVER)).clamp_max(1.0).sqrt()
-            divisor, real, imaginary = divisor * held, real * held, imaginary * held
+        spectrum, matrix, *outputs = ctx.saved_tensors
+        if torch.is_grad_enabled():
+            # This gradient is itself differentiated, so it must depend on the spectrum.
+            outputs = list(_smear_spectrum(spectrum, matrix)[1:])
+        smeared_power, real, imaginary, spectrum_power = outputs
+        floor = ctx.gradient_floor
+        if floor:
+            magnitude = smeared_power.abs()
+            bounded = torch.maximum(magnitude, floor * spectrum_power)
+            divisor = torch.copysign(bounded, smeared_power)
+            # Where smearing amplifies by more than 1 / floor, the factor counts as 1 / floor.
+            limit = spectrum_power / (floor * magnitude + DIVISION_EPS)
+            limit = limit.clamp_max(1.0).sqrt()
+            divisor = divisor * limit
+            real = real * limit
+            imaginary = imaginary * limit
         else:
-            divisor = smeared + torch.copysign(smeared.new_full((), _NEVER), smeared)
-        # real and imaginary part apart: a product of complex and real numbers first makes the real ones complex
-        right, up = spectrum.real, spectrum.imag
+            eps = smeared_power.new_full((), DIVISION_EPS)
+            divisor = smeared_power + torch.copysign(eps, smeared_power)
+
+        # Real and imaginary parts are computed separately, because torch would first convert the
+        # real factors of a complex product to complex numbers.
         if gradient is None:
-            along_right = along_up = torch.zeros_like(given)
+            g_real = g_imag = torch.zeros_like(spectrum_power)
         else:
-            along_right = torch.addcmul(gradient.real * real, gradient.imag, imaginary)
-            along_up = torch.addcmul(gradient.imag * real, gradient.real, imaginary, value=-1.0)
-        changed = torch.addcmul(right * along_right, up, along_up)
-        toward = changed / divisor
-        if of_power is not None:
-            toward = toward + 2.0 * of_power
-        share = toward @ matrix - changed / given
-        of_matrix = None
+            g_real = torch.addcmul(gradient.real * real, gradient.imag, imaginary)
+            g_imag = torch.addcmul(gradient.imag * real, gradient.real, imaginary, value=-1.0)
+        e = torch.addcmul(spectrum.real * g_real, spectrum.imag, g_imag)
+        t = e / divisor
+        if power_gradient is not None:
+            t = t + 2.0 * power_gradient
+        weight = t @ matrix - e / spectrum_power
+        matrix_gradient = None
         if ctx.needs_input_grad[1]:
-            every = 0.5 * toward.mT @ given
-            of_matrix = every.sum_to_size(matrix.shape)
-        of_spectrum = torch.complex(
-            torch.addcmul(along_right, right, share), torch.addcmul(along_up, up, share)
+            gradient_per_item = 0.5 * t.mT @ spectrum_power
+            matrix_gradient = gradient_per_item.sum_to_size(matrix.shape)
+        spectrum_gradient = torch.complex(
+            torch.addcmul(g_real, spectrum.real, weight),
+            torch.addcmul(g_imag, spectrum.imag, weight),
         )
-        return of_spectrum, of_matrix, None
+        return spectrum_gradient, matrix_gradient, None
 
 
 def _window(step: int) -> Tensor:
-    """Of analysis and synthesis: their product adds up to 1 over four frames; then zeros. Returns (512 // step,)."""
-    place = 2.0 * math.pi * (torch.arange(0, FRAME, step, dtype=torch.float64) + 0.5) / FRAME
-    window = (0.5 - 0.5 * place.cos()) / math.sqrt(1.5)
+    """Compute the window of analysis and synthesis, followed by as many zeros.
+
+    The squares of four windows that are one hop apart add up to 1.
+
+    Returns: window of shape (512 // step,).
+    """
+    phase = 2.0 * math.pi * (torch.arange(0, FRAME, step, dtype=torch.float64) + 0.5) / FRAME
+    window = (0.5 - 0.5 * phase.cos()) / math.sqrt(1.5)
     return functional.pad(window, (0, (FFT - FRAME) // step))
 
 
-def _frames(waveform: Tensor, count: int, hop: int, window: Tensor) -> Tensor:
-    """Frame k covers hops k - 3 to k from the fifth on, and what follows, which the window takes away.
+def _cut_frames(waveform: Tensor, count: int, hop: int, window: Tensor) -> Tensor:
+    """Cut waveforms into windowed frames in the order in which ``smear3`` reads them.
 
-    The first four are as ``smear3`` fills them, as if hops 1 to 3 came again after the first four.
+    From the fifth frame on, frame k covers hops k - 3 to k. The first four frames of ``smear3`` are
+    irregular, as if hops 1 to 3 were repeated after the first four hops. Each frame is followed by
+    as many samples again, which the window sets to 0.
 
     Shape: (..., time), (8 * hop,) -> (..., count, 8 * hop).
     """
     padded = functional.pad(waveform, (0, hop * (max(count, 4) + 4) - waveform.shape[-1]))
-    again = torch.cat((padded[..., : 4 * hop], padded[..., hop:]), -1)
-    return again.unfold(-1, 8 * hop, hop)[..., :count, :] * window
+    with_repetition = torch.cat((padded[..., : 4 * hop], padded[..., hop:]), -1)
+    return with_repetition.unfold(-1, 8 * hop, hop)[..., :count, :] * window
 
 
 def _overlap_add(frames: Tensor, hop: int) -> Tensor:
-    parts, count = frames.unflatten(-1, (4, hop)), frames.shape[-2]
-    hops = parts.unbind(-2)
+    """Add frames in the order in which ``smear3`` writes them.
+
+    Shape: (..., count, 4 * hop) -> (..., hop * (count + 3)).
+    """
+    count = frames.shape[-2]
+    parts = frames.unflatten(-1, (4, hop))
+    first_parts, second_parts, third_parts, fourth_parts = parts.unbind(-2)
     total = frames.new_zeros(*frames.shape[:-2], count + 3, hop)
-    for j in range(3):
-        total[..., j : j + count, :].add_(hops[j])
+    total[..., :count, :].add_(first_parts)
+    total[..., 1 : count + 1, :].add_(second_parts)
+    total[..., 2 : count + 2, :].add_(third_parts)
     if count == 1:
-        total[..., 1, :].add_(hops[2][..., 0, :])
+        total[..., 1, :].add_(third_parts[..., 0, :])
     if count >= 4:
-        total[..., 3:count, :].add_(hops[3][..., : count - 3, :])
-        # in smear3's last three hops the fourth last frame's first parts stand for the last parts of the last three
+        total[..., 3:count, :].add_(fourth_parts[..., : count - 3, :])
+        # In the last three hops, smear3 adds the first three parts of the fourth last frame instead
+        # of the fourth parts of the last three frames.
         total[..., count:, :].add_(parts[..., count - 4, :3, :])
     return total.flatten(-2)

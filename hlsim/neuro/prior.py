@@ -20,8 +20,8 @@ from hlsim.msbg.ear import MSBG_RATE, ear_filter
 from hlsim.msbg.envelope import envelope_filters
 from hlsim.msbg.filterbank import BANKS, FilterBank, gammatone_response
 from hlsim.msbg.recruitment import CATCH_UP_SPL, expansion_ratios, threshold_weights
-from hlsim.msbg.response import fixed_response, half_length, impulses
-from hlsim.msbg.smearing import BROADENING, roex_filters, smearing_from_filters, spread
+from hlsim.msbg.response import fixed_response, half_length, impulse_responses
+from hlsim.msbg.smearing import BROADENING, roex_filters, smear_spectrum, smearing_from_filters
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.torchtools import constant_like
 
@@ -111,7 +111,7 @@ class Prior(nn.Module):
 
         Shape: complex (items, frames, frequencies), (items,) -> the same, real (items, frames, frequencies).
         """
-        return spread(spectrum, self._smearing()[severity], _LEAST)
+        return smear_spectrum(spectrum, self._smearing()[severity], _LEAST)
 
     def levels(self, smeared: Tensor, severity: Tensor) -> Tensor:
         """Root of the power in each channel. Shape: (items, frames, frequencies) -> (items, channels, frames)."""
@@ -192,7 +192,7 @@ def _known_values(stft: STFT) -> dict[str, NDArray[np.float64]]:
     factors = np.stack(relative)
     return {
         "ear_power": np.abs(ear_response) ** 2,
-        "response": impulses(responses, fine, NEURO_RATE),
+        "response": impulse_responses(responses, fine, NEURO_RATE),
         "excitation": np.stack(excitation),
         "relative": np.stack((factors.real, factors.imag)),
         "smoothing": np.stack(smoothing),

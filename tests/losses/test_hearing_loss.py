@@ -20,7 +20,7 @@ from hlsim.losses.band_levels import band_level_loss
 from hlsim.losses.coherent_bands import DEFAULT_WEIGHTS as COHERENT_WEIGHTS
 from hlsim.losses.coherent_bands import coherent_band_parts
 from hlsim.losses.paper import DEFAULT_WEIGHTS, paper_parts
-from hlsim.msbg.response import with_phase_of_bank
+from hlsim.msbg.response import apply_bank_phase
 from hlsim.pretrained import find_checkpoint
 
 SIMULATORS = ("neuro-msbg", "msbg")
@@ -422,7 +422,7 @@ def test_what_is_heard_is_compared_with_the_reference(simulator: str, clean: Ten
         heard = loss.simulator(2.0 * clean, N3)
         normal = reference == "normal-hearing"
         aim = loss.simulator(clean, Audiogram.standard("NH")) if normal else clean
-        aim = with_phase_of_bank(aim, torch.tensor([N3.thresholds] * 2), 16000, normal=normal)
+        aim = apply_bank_phase(aim, torch.tensor([N3.thresholds] * 2), 16000, normal=normal)
         for name, part in paper_parts(heard, aim).items():
             torch.testing.assert_close(loss.parts(2.0 * clean, clean)[name], part.mean(), msg=name)
         loss = HearingLossLoss(N3, simulator=simulator, criterion="bands", reference=reference)

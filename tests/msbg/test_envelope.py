@@ -1,4 +1,4 @@
-"""Detection against its formula, envelopes against pyclarity's."""
+"""Detection obeys its formula, and envelopes equal pyclarity's."""
 
 import math
 from collections.abc import Callable
@@ -15,7 +15,8 @@ from hlsim.msbg.envelope import STEP, detect, envelope, envelope_filters, envelo
 from hlsim.msbg.filterbank import BANKS, FilterBank
 
 TIME = 2 * STEP * 342
-EDGE = 3000  # samples from each end that filtfilt treats its own way
+EDGE = 3000
+"""Samples at each end that depend on the padding of ``filtfilt``."""
 
 BANK_NAMES = ["mild", "moderate", "severe"]
 
@@ -24,23 +25,24 @@ def lowpass(bank: FilterBank, time: int = TIME) -> Tensor:
     return torch.from_numpy(envelope_lowpass(bank, time))
 
 
-def test_what_a_rectifier_makes_of_an_analytic_signal() -> None:
+def test_detection_gives_the_low_harmonics_of_a_rectified_cosine() -> None:
     phase = torch.arange(2400, dtype=torch.float64) * (2.0 * math.pi / 2400.0)
     signal = 0.3 * torch.polar(torch.ones_like(phase), phase)
     torch.testing.assert_close(detect(signal, harmonics=False), signal.abs())
-    fine = torch.fft.rfft(detect(signal, harmonics=True) * (2.0 / math.pi))[:5]
-    torch.testing.assert_close(fine, torch.fft.rfft(signal.real.abs())[:5], atol=1e-4, rtol=1e-5)
+    rectified = detect(signal, harmonics=True) * (2.0 / math.pi)
+    expected = torch.fft.rfft(signal.real.abs())[:5]
+    torch.testing.assert_close(torch.fft.rfft(rectified)[:5], expected, atol=1e-4, rtol=1e-5)
 
 
 @pytest.mark.parametrize("harmonics", [False, True])
-def test_gradients_of_detection(harmonics: bool) -> None:
+def test_gradients_of_detection_are_exact(harmonics: bool) -> None:
     signals = torch.randn(2, 5, dtype=torch.complex128, requires_grad=True)
     assert torch.equal(detect(signals, harmonics), detect(signals.detach(), harmonics))
     assert torch.autograd.gradcheck(lambda z: detect(z, harmonics), signals)
     assert torch.autograd.gradgradcheck(lambda z: detect(z, harmonics), signals)
 
 
-def test_detection_of_silence_has_a_gradient() -> None:
+def test_detection_of_silence_has_finite_gradients() -> None:
     silence = torch.zeros(16, dtype=torch.complex64, requires_grad=True)
     for harmonics in (False, True):
         (gradient,) = torch.autograd.grad(detect(silence, harmonics).sum(), silence)
@@ -48,23 +50,27 @@ def test_detection_of_silence_has_a_gradient() -> None:
 
 
 @pytest.mark.parametrize("name", BANK_NAMES)
-def test_envelope(name: str, band_noise: Callable[[FilterBank, int], np.ndarray]) -> None:
+def test_envelopes_equal_pyclaritys(
+    name: str, band_noise: Callable[[FilterBank, int], np.ndarray]
+) -> None:
     cochlea = pytest.importorskip("clarity.evaluator.msbg.cochlea")
     bank = BANKS[name]
     channels = band_noise(bank, TIME)
     theirs = cochlea.compute_envelope(channels, erb(np.array(bank.centre_frequencies)), MSBG_RATE)
     ours = envelope(torch.from_numpy(channels), lowpass(bank)).numpy()
     assert ours.shape == (bank.channels, TIME // STEP)
-    kept = slice(EDGE // STEP, -(EDGE // STEP))
-    error = (ours - theirs[:, ::STEP])[:, kept]
-    relative = np.sqrt((error**2).mean(-1) / (theirs[:, ::STEP][:, kept] ** 2).mean(-1))
-    # folding at the decimation: 2.2e-4 in wide bands, whose rectified carrier is noise; 1.1e-5 in the narrowest
+    inner = slice(EDGE // STEP, -(EDGE // STEP))
+    expected = theirs[:, ::STEP][:, inner]
+    error = ours[:, inner] - expected
+    relative = np.sqrt((error**2).mean(-1) / (expected**2).mean(-1))
+    # The error is aliasing of the decimation: 2.2e-4 in wide bands, whose rectified carrier is
+    # noise, and 1.1e-5 in the narrowest one.
     assert relative.max() < 3e-4 and relative[0] < 1.2e-5
 
 
 @pytest.mark.parametrize("name", BANK_NAMES)
-def test_envelope_of_a_constant_is_the_constant(name: str) -> None:
-    # the elliptic low-pass of even order is 0.25 dB down at 0 Hz, and it is run twice
+def test_envelope_of_a_constant_is_constant(name: str) -> None:
+    # The elliptic low-pass of even order has -0.25 dB at 0 Hz, and it is run twice.
     bank = BANKS[name]
     channels = torch.full((bank.channels, 40 * STEP), -0.7, dtype=torch.float64)
     expected = torch.full((bank.channels, 40), 0.7 * 10 ** (-0.5 / 20), dtype=torch.float64)
@@ -72,9 +78,8 @@ def test_envelope_of_a_constant_is_the_constant(name: str) -> None:
 
 
 @pytest.mark.parametrize("bank", BANKS.values(), ids=BANKS)
-def test_low_passes_are_scipys(bank: FilterBank) -> None:
-    for width, found in zip(
-        erb(np.array(bank.centre_frequencies)), envelope_filters(bank), strict=True
-    ):
+def test_lowpasses_equal_scipys(bank: FilterBank) -> None:
+    widths = erb(np.array(bank.centre_frequencies))
+    for width, coefficients in zip(widths, envelope_filters(bank), strict=True):
         expected = scipy.signal.ellip(2, 0.25, 35, 0.75 * min(100.0, width) / 22050.0)
-        np.testing.assert_allclose(found, expected, rtol=1e-13)
+        np.testing.assert_allclose(coefficients, expected, rtol=1e-13)

@@ -1,4 +1,4 @@
-"""The gammatone banks against the coefficients that pyclarity ships."""
+"""The gammatone filter banks equal those of pyclarity's coefficients."""
 
 from typing import Any
 
@@ -19,13 +19,13 @@ POINTS = 8192
 
 @pytest.fixture(params=SEVERITIES)
 def both(request: pytest.FixtureRequest) -> tuple[FilterBank, dict[str, Any]]:
-    """Our bank of a severity and the reference's."""
+    """Filter bank of a severity, and pyclarity's table of it."""
     severity = request.param
     name = cochlea.HL_PARAMS["NOTHING" if severity == "none" else severity.upper()]["gtfbank_file"]
     return BANKS[severity], msbg_utils.read_gtf_file(f"msbg_hparams/{name}.json")
 
 
-def test_tables(both: tuple[FilterBank, dict[str, Any]]) -> None:
+def test_tables_equal_pyclaritys(both: tuple[FilterBank, dict[str, Any]]) -> None:
     bank, theirs = both
     np.testing.assert_allclose(bank.centre_frequencies, theirs["GTn_CentFrq"], rtol=1e-7)
     assert list(bank.advances) == theirs["GTnDelays"].tolist()
@@ -33,13 +33,14 @@ def test_tables(both: tuple[FilterBank, dict[str, Any]]) -> None:
     assert bank.broadening == theirs["BROADEN"]
     assert bank.first_highpass == theirs["Start2PoleHP"] - 1
     assert (theirs["NGAMMA"], theirs["Fs"]) == (4, MSBG_RATE)
-    # its "ERBn_CentFrq" are bandwidths
-    np.testing.assert_allclose(
-        erb(np.array(bank.centre_frequencies)), theirs["ERBn_CentFrq"], rtol=1e-6
-    )
+    # The entry "ERBn_CentFrq" holds bandwidths.
+    bandwidths = erb(np.array(bank.centre_frequencies))
+    np.testing.assert_allclose(bandwidths, theirs["ERBn_CentFrq"], rtol=1e-6)
 
 
-def test_responses_with_advances_and_highpasses(both: tuple[FilterBank, dict[str, Any]]) -> None:
+def test_responses_equal_those_of_pyclaritys_coefficients(
+    both: tuple[FilterBank, dict[str, Any]],
+) -> None:
     bank, theirs = both
     omega = 2 * np.pi * np.fft.rfftfreq(POINTS)
     ours = gammatone_response(bank, POINTS)
@@ -48,26 +49,24 @@ def test_responses_with_advances_and_highpasses(both: tuple[FilterBank, dict[str
     for i in range(bank.channels):
         response = scipy.signal.freqz(theirs["GTn_nums"][i], theirs["GTn_denoms"][i], omega)[1] ** 4
         response = response * np.exp(1j * omega * theirs["GTnDelays"][i])
-        place = i - (theirs["Start2PoleHP"] - 1)
-        if place >= 0:
-            response *= scipy.signal.freqz(
-                theirs["HP_nums"][place], theirs["HP_denoms"][place], omega
-            )[1]
+        row = i - (theirs["Start2PoleHP"] - 1)
+        if row >= 0:
+            highpass = scipy.signal.freqz(theirs["HP_nums"][row], theirs["HP_denoms"][row], omega)
+            response *= highpass[1]
         np.testing.assert_allclose(ours[i], response, atol=2e-7 * np.abs(response).max())
 
 
-def test_a_click_through_the_reference_bank(both: tuple[FilterBank, dict[str, Any]]) -> None:
-    """In the time domain, away from the ends, where the reference puts zeros."""
+def test_a_click_equals_the_output_of_pyclaritys_bank(
+    both: tuple[FilterBank, dict[str, Any]],
+) -> None:
+    """The ends are left out, because pyclarity sets the end of each advanced channel to zero."""
     bank, theirs = both
     click = np.zeros(POINTS)
     click[2000] = 1.0
-    filters = (
-        cochlea.FilterBank(theirs[f"{kind}_nums"], theirs[f"{kind}_denoms"])
-        for kind in ("GTn", "HP")
-    )
-    first, second = filters
+    gammatone = cochlea.FilterBank(theirs["GTn_nums"], theirs["GTn_denoms"])
+    highpass = cochlea.FilterBank(theirs["HP_nums"], theirs["HP_denoms"])
     expected = cochlea.gammatone_filterbank(
-        click, theirs["NGAMMA"], first, theirs["GTnDelays"], theirs["Start2PoleHP"], second
+        click, theirs["NGAMMA"], gammatone, theirs["GTnDelays"], theirs["Start2PoleHP"], highpass
     )
     ours = np.fft.irfft(gammatone_response(bank, POINTS) * np.fft.rfft(click), POINTS)
     np.testing.assert_allclose(
@@ -75,13 +74,12 @@ def test_a_click_through_the_reference_bank(both: tuple[FilterBank, dict[str, An
     )
 
 
-def test_channels_have_unit_gain_at_their_frequency_and_the_sum_is_what_the_table_says() -> None:
+def test_channels_have_unit_gain_and_their_sum_the_gain_of_the_table() -> None:
     for bank in (BANKS["mild"], BANKS["moderate"], BANKS["severe"]):
-        response = gammatone_response(bank, MSBG_RATE)  # a bin a hertz
+        response = gammatone_response(bank, MSBG_RATE)  # one frequency per hertz
         for channel, hz in zip(response, bank.centre_frequencies, strict=True):
-            assert np.interp(hz, np.arange(len(channel)), np.abs(channel)) == pytest.approx(
-                1.0, abs=1e-3
-            )
+            gain = np.interp(hz, np.arange(len(channel)), np.abs(channel))
+            assert gain == pytest.approx(1.0, abs=1e-3)
         level = 20 * np.log10(np.abs(response.sum(0)[300:8000])) - bank.recombination_db
         assert abs(level.mean()) < 0.5 and np.abs(level).max() < 3.0
 

@@ -1,4 +1,4 @@
-"""The end of the envelopes against pyclarity's, to the last sample."""
+"""Envelopes equal pyclarity's up to the last sample of a signal that ends abruptly."""
 
 import numpy as np
 import pytest
@@ -9,19 +9,20 @@ from hlsim.dsp.erb import erb
 from hlsim.msbg.ear import MSBG_RATE
 from hlsim.msbg.envelope import STEP, envelope, envelope_lowpass
 from hlsim.msbg.filterbank import BANKS, FilterBank
-from hlsim.msbg.filtfilt_end import LOOK_BACK, ending, ending_response, ending_weights
+from hlsim.msbg.filtfilt_end import LOOK_BACK, end_oscillation, end_responses, end_weights
+from hlsim.msbg.recruitment import AHEAD
 
 cochlea = pytest.importorskip("clarity.evaluator.msbg.cochlea")
 
 
-def added(channels: Tensor, bank: FilterBank, length: int) -> Tensor:
-    weights = torch.from_numpy(ending_weights(bank)).to(channels)
-    response = torch.from_numpy(ending_response(bank, length)).to(channels)
-    return ending(channels, weights, response, length)
+def oscillation(channels: Tensor, bank: FilterBank, length: int) -> Tensor:
+    weights = torch.from_numpy(end_weights(bank)).to(channels)
+    responses = torch.from_numpy(end_responses(bank, length)).to(channels)
+    return end_oscillation(channels, weights, responses, length)
 
 
 def tones(bank: FilterBank, length: int, points: int) -> np.ndarray:
-    """A tone a channel that begins softly and ends abruptly at ``length``."""
+    """One tone per channel that begins softly and ends abruptly at ``length``."""
     time = np.arange(points)
     hz = np.array(bank.centre_frequencies)[:, None]
     channels = np.sin(2 * np.pi * hz * time / MSBG_RATE + 0.3) * np.minimum(1.0, time / 3000.0) ** 2
@@ -31,44 +32,46 @@ def tones(bank: FilterBank, length: int, points: int) -> np.ndarray:
 
 @pytest.mark.parametrize("name", ["mild", "moderate", "severe"])
 @pytest.mark.parametrize("length", [8000, 8001, 8011, 8015])
-def test_envelopes_of_what_ends_abruptly(name: str, length: int) -> None:
+def test_envelopes_of_an_abrupt_end_equal_pyclaritys(name: str, length: int) -> None:
     bank = BANKS[name]
-    channels = tones(bank, length, 2 * STEP * 342)
-    theirs = cochlea.compute_envelope(
-        channels[:, :length], erb(np.array(bank.centre_frequencies)), MSBG_RATE
-    )
-    ours = torch.from_numpy(channels)
-    silent = envelope(ours, torch.from_numpy(envelope_lowpass(bank, channels.shape[-1])))
-    held = (silent + added(ours, bank, length)).numpy()[:, : -(-length // STEP)]
-    error = np.abs(held - theirs[:, ::STEP])[:, 50:]
-    assert error.max() < 2e-3  # of 0.64; folding at the decimation, most at the abrupt end itself
-    without = np.abs(silent.numpy()[:, : -(-length // STEP)] - theirs[:, ::STEP])
-    assert without.max() > 0.2
+    tone = tones(bank, length, 2 * STEP * 342)
+    bandwidths = erb(np.array(bank.centre_frequencies))
+    expected = cochlea.compute_envelope(tone[:, :length], bandwidths, MSBG_RATE)[:, ::STEP]
+    channels = torch.from_numpy(tone)
+    before_silence = envelope(channels, torch.from_numpy(envelope_lowpass(bank, tone.shape[-1])))
+    ours = before_silence + oscillation(channels, bank, length)
+    steps = expected.shape[-1]
+    error = np.abs(ours.numpy()[:, :steps] - expected)[:, 50:]
+    # The envelope is 0.64. The error is aliasing of the decimation, mostly at the abrupt end.
+    assert error.max() < 2e-3
+    error_without_oscillation = np.abs(before_silence.numpy()[:, :steps] - expected)
+    assert error_without_oscillation.max() > 0.2
 
 
 def test_single_precision_is_enough() -> None:
     bank = BANKS["mild"]
     channels = torch.from_numpy(tones(bank, 8000, 2 * STEP * 342))
-    wide = added(channels, bank, 8000)
-    assert float((added(channels.float(), bank, 8000) - wide).abs().max()) < 1e-5
+    expected = oscillation(channels, bank, 8000)
+    rounded = oscillation(channels.float(), bank, 8000)
+    assert float((rounded - expected).abs().max()) < 1e-5
 
 
 @pytest.mark.parametrize("length", [1, 5, STEP, STEP + 1, 100, LOOK_BACK - 1, LOOK_BACK + 1])
-def test_short_signals_and_leading_dimensions(length: int) -> None:
+def test_oscillation_has_the_shape_of_the_envelopes_and_stops_behind_the_end(length: int) -> None:
     bank = BANKS["severe"]
     points = 2 * STEP * (length // 32 + 100)
     channels = torch.from_numpy(tones(bank, length, points)).expand(2, 3, -1, -1)
-    extra = added(channels, bank, length)
-    assert extra.shape == (2, 3, bank.channels, points // STEP)
-    assert bool(torch.isfinite(extra).all())
-    # nothing beyond what the interpolation needs
-    assert not bool(extra[..., (length - 1) // STEP + 4 :].any())
+    oscillations = oscillation(channels, bank, length)
+    assert oscillations.shape == (2, 3, bank.channels, points // STEP)
+    assert bool(torch.isfinite(oscillations).all())
+    last_step = (length - 1) // STEP
+    assert not bool(oscillations[..., last_step + AHEAD + 1 :].any())
 
 
 def test_silence_adds_nothing_and_gradients_are_exact() -> None:
     bank = BANKS["severe"]
-    assert not bool(added(torch.zeros(bank.channels, 320), bank, 100).any())
+    assert not bool(oscillation(torch.zeros(bank.channels, 320), bank, 100).any())
     channels = torch.randn(bank.channels, 320, dtype=torch.float64)
     channels[:, 100:] = 0.0
     channels.requires_grad_()
-    assert torch.autograd.gradcheck(lambda c: added(c, bank, 100), channels, fast_mode=True)
+    assert torch.autograd.gradcheck(lambda c: oscillation(c, bank, 100), channels, fast_mode=True)

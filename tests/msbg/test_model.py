@@ -1,4 +1,4 @@
-"""The whole model against pyclarity's ``Ear``, and the laws it keeps."""
+"""The whole model equals pyclarity's ``Ear`` and obeys laws."""
 
 import copy
 import math
@@ -20,12 +20,14 @@ from hlsim.calibration import gain_to_pascals, level_spl, set_level
 from hlsim.msbg import MSBG
 from hlsim.msbg.blocks import block_bounds
 from hlsim.msbg.model import STRUCTURAL_DELAY, active_rescaling
-from hlsim.msbg.resampling import to_inner
+from hlsim.msbg.resampling import resample_to_model_rate
 from hlsim.msbg.smearing import HOP
 from hlsim.training.ears import draw_thresholds
 from tests.pyclarity import STRIDE, PyclarityOutputs, msbg
 
-EARS = {"none": "NH", "mild": "N1", "moderate": "N2", "severe": "N4"}  # one a severity
+EARS = {"none": "NH", "mild": "N1", "moderate": "N2", "severe": "N4"}
+"""Name of an ear by severity."""
+
 RATE = 44100
 
 Wave = NDArray[np.float64]
@@ -35,37 +37,37 @@ fast_model = partial(MSBG, sample_rate=RATE)
 
 @pytest.fixture(scope="module")
 def recordings(speech_dir: Path) -> list[tuple[Wave, int]]:
-    """All embedded speech: waveform and rate."""
+    """Waveform and sample rate of each bundled utterance."""
     pairs = [read_audio(path) for path in find_audio(speech_dir)]
     return [(wave[0].double().numpy(), rate) for wave, rate in pairs]
 
 
 @pytest.fixture(scope="module")
 def ears() -> list[Audiogram]:
-    """48: the standard ones that simulators take, and drawn ones of all severities."""
+    """48 ears: the standard ones within the range of simulators, and random ones."""
     standard = [Audiogram.standard(name) for name in STANDARD if name != "N7"]
-    drawn = draw_thresholds(48 - len(standard), torch.Generator().manual_seed(1)).tolist()
-    return standard + [Audiogram(tuple(levels)) for levels in drawn]
+    thresholds = draw_thresholds(48 - len(standard), torch.Generator().manual_seed(1)).tolist()
+    return standard + [Audiogram(tuple(levels)) for levels in thresholds]
 
 
 def clip(
     recordings: list[tuple[Wave, int]], rng: np.random.Generator, seconds: float, rate: int = RATE
 ) -> Wave:
-    """Random piece of speech of 50 to 80 dB SPL where RMS 1.0 is 120 dB SPL, at ``rate``."""
-    wave, own = recordings[rng.integers(len(recordings))]
-    common = math.gcd(rate, own)
-    wave = scipy.signal.resample_poly(wave, rate // common, own // common)
+    """Random clip of speech at 50 to 80 dB SPL, where RMS 1.0 is 120 dB SPL. Shape: (time,)."""
+    wave, source_rate = recordings[rng.integers(len(recordings))]
+    common = math.gcd(rate, source_rate)
+    wave = scipy.signal.resample_poly(wave, rate // common, source_rate // common)
     start = rng.integers(len(wave) - round(seconds * rate))
     wave = wave[start : start + round(seconds * rate)]
     return wave / np.sqrt(np.mean(wave**2)) * 10 ** ((rng.uniform(50, 80) - 120) / 20)
 
 
-def relative(ours: NDArray[Any], theirs: NDArray[Any]) -> float:
+def relative_error(ours: NDArray[Any], theirs: NDArray[Any]) -> float:
     return float(np.linalg.norm(ours - theirs) / np.linalg.norm(theirs))
 
 
 def speech_at(speech: list[tuple[Tensor, int]], spl: float = 65.0, seconds: float = 0.5) -> Tensor:
-    """Speech of an utterance at 44.1 kHz in pascals. Shape: (time,)."""
+    """Part of an utterance at 44.1 kHz in pascals. Shape: (time,)."""
     wave, rate = speech[0]
     start = round(0.5 * rate)
     piece = wave[0, start : start + round(seconds * rate)].double().numpy()
@@ -74,7 +76,7 @@ def speech_at(speech: list[tuple[Tensor, int]], spl: float = 65.0, seconds: floa
     )
 
 
-def test_equals_pyclarity_sample_for_sample(
+def test_output_equals_pyclaritys_sample_by_sample(
     recordings: list[tuple[Wave, int]], ears: list[Audiogram], pyclarity: PyclarityOutputs
 ) -> None:
     rng = np.random.default_rng(0)
@@ -87,9 +89,9 @@ def test_equals_pyclarity_sample_for_sample(
         )
         ours = model(torch.tensor(wave, dtype=torch.float32))[::STRIDE]
         assert ours.shape == theirs.shape and ours.dtype == torch.float32
-        errors.append(relative(ours.numpy(), theirs))
+        errors.append(relative_error(ours.numpy(), theirs))
     assert len(errors) >= 40
-    # measured: 2e-4 and 1.5e-3
+    # We measured a median of 2e-4 and a maximum of 1.5e-3.
     assert np.median(errors) < 5e-4
     assert max(errors) < 3e-3
 
@@ -97,7 +99,7 @@ def test_equals_pyclarity_sample_for_sample(
 def spectrum_of_reference(
     ear: Audiogram, wave: Wave, rate: int, highest: float
 ) -> NDArray[np.complex128]:
-    """Resample to 44.1 kHz by a Fourier transform, process, take the delay off, and resample back."""
+    """Spectrum of pyclarity's output without its delay, for an input resampled to 44.1 kHz."""
     fast = scipy.signal.resample(wave, len(wave) * RATE // rate)
     theirs = msbg(ear, fast)
     delay = 1047 + (192 if ear.severity != "none" else 0)
@@ -107,7 +109,7 @@ def spectrum_of_reference(
 
 
 def band_spectrum(wave: Wave, rate: int, highest: float) -> NDArray[np.complex128]:
-    """Some frequencies of the spectrum below ``highest``."""
+    """Every ``STRIDE``-th frequency of the spectrum below ``highest``."""
     return np.fft.rfft(wave)[np.fft.rfftfreq(len(wave), 1 / rate) < highest][::STRIDE]
 
 
@@ -121,7 +123,7 @@ def band_spectrum(wave: Wave, rate: int, highest: float) -> NDArray[np.complex12
         (48000, 3, 16000.0),
     ],
 )
-def test_other_rates_equal_pyclarity_on_the_resampled_input(
+def test_other_rates_equal_pyclarity_with_resampled_input(
     recordings: list[tuple[Wave, int]],
     ears: list[Audiogram],
     pyclarity: PyclarityOutputs,
@@ -142,46 +144,47 @@ def test_other_rates_equal_pyclarity_on_the_resampled_input(
         model = MSBG(ear, sample_rate=rate, full_scale_spl=120.0, rescale_active=True)
         ours = model(torch.tensor(wave, dtype=torch.float32)).numpy()
         assert ours.shape == wave.shape
-        errors.append(relative(band_spectrum(ours, rate, highest), theirs))
+        errors.append(relative_error(band_spectrum(ours, rate, highest), theirs))
     assert np.median(errors) < 5e-4
     assert max(errors) < 5e-3
 
 
 @pytest.mark.parametrize("severity", EARS)
-def test_aligned_is_the_reference_without_its_delay(
+def test_aligned_output_is_the_unaligned_one_without_its_delay(
     speech: list[tuple[Tensor, int]], severity: str
 ) -> None:
     ear = Audiogram.standard(EARS[severity])
     assert ear.severity == severity
     wave = speech_at(speech)
-    aligned = fast_model(ear)
+    model = fast_model(ear)
     delay = STRUCTURAL_DELAY + (0 if severity == "none" else 192)
-    assert (STRUCTURAL_DELAY, aligned.delay(severity)) == (1047, delay)
-    heard = aligned(wave)
-    late = fast_model(ear, aligned=False)(torch.cat((wave, torch.zeros(9000))))
-    late = late[delay : delay + len(wave)]
-    assert heard.shape == wave.shape
-    # where it ends, the aligned one has nothing to move channels ahead from
-    assert relative(heard[:-500].numpy(), late[:-500].numpy()) < 3e-5
-    assert relative(heard.numpy(), late.numpy()) < 5e-4
+    assert (STRUCTURAL_DELAY, model.delay(severity)) == (1047, delay)
+    aligned = model(wave)
+    unaligned = fast_model(ear, aligned=False)(torch.cat((wave, torch.zeros(9000))))
+    expected = unaligned[delay : delay + len(wave)]
+    assert aligned.shape == wave.shape
+    # At the end of the aligned output, channels are advanced by samples that are missing.
+    assert relative_error(aligned[:-500].numpy(), expected[:-500].numpy()) < 3e-5
+    assert relative_error(aligned.numpy(), expected.numpy()) < 5e-4
 
 
 @pytest.mark.parametrize("time", [1, 63, 64, 441, 1000, 4410])
 @pytest.mark.parametrize("severity", EARS)
-def test_lengths(severity: str, time: int) -> None:
+def test_outputs_have_their_length_and_are_finite(severity: str, time: int) -> None:
     ear = Audiogram.standard(EARS[severity])
     wave = 0.01 * torch.randn(time)
     for rescale in (False, True):
-        heard = fast_model(ear, rescale_active=rescale)(wave)
-        assert heard.shape == wave.shape and bool(torch.isfinite(heard).all())
-    late = fast_model(ear, aligned=False)(wave)
-    assert len(late) == (time if severity == "none" else HOP * (-(-time // HOP) + 3))
-    slow = MSBG(ear, sample_rate=16000)(wave)
-    assert slow.shape == wave.shape and bool(torch.isfinite(slow).all())
+        output = fast_model(ear, rescale_active=rescale)(wave)
+        assert output.shape == wave.shape and bool(torch.isfinite(output).all())
+    unaligned = fast_model(ear, aligned=False)(wave)
+    assert len(unaligned) == (time if severity == "none" else HOP * (-(-time // HOP) + 3))
+    output_at_16_khz = MSBG(ear, sample_rate=16000)(wave)
+    assert output_at_16_khz.shape == wave.shape
+    assert bool(torch.isfinite(output_at_16_khz).all())
 
 
 @pytest.mark.parametrize("spl", [38.0, 50.0, 65.0, 100.0])
-def test_rescaling_is_measure_rms(recordings: list[tuple[Wave, int]], spl: float) -> None:
+def test_rescaling_equals_pyclaritys(recordings: list[tuple[Wave, int]], spl: float) -> None:
     measure_rms = pytest.importorskip("clarity.evaluator.msbg.msbg_utils").measure_rms
     rng = np.random.default_rng(5)
     for _ in range(6):
@@ -193,16 +196,16 @@ def test_rescaling_is_measure_rms(recordings: list[tuple[Wave, int]], spl: float
         assert float(ours) == pytest.approx(expected, rel=1e-9)
 
 
-def test_rescaling_leaves_silence_and_very_short_clips_alone() -> None:
+def test_rescaling_does_not_change_silence_and_very_short_clips() -> None:
     assert active_rescaling(torch.zeros(2, 3, 1000)).eq(1.0).all()
-    # under 40 dB SPL no frame counts as active, of which the reference makes NaN
-    faint = set_level(torch.randn(1000), 20.0)
-    assert active_rescaling(faint).eq(1.0).all()
+    # Below 40 dB SPL, no frame counts as active, and pyclarity returns NaN.
+    soft_noise = set_level(torch.randn(1000), 20.0)
+    assert active_rescaling(soft_noise).eq(1.0).all()
     assert active_rescaling(torch.ones(2, 10)).eq(1.0).all()
 
 
-def mixed(count: int) -> Tensor:
-    """Ears of all severities in turn. Shape: (count, 8)."""
+def ears_of_all_severities(count: int) -> Tensor:
+    """Audiograms of all severities in turn in dB HL. Shape: (count, 8)."""
     names = list(EARS.values())
     return torch.tensor([STANDARD[names[i % 4]] for i in range(count)], dtype=torch.float32)
 
@@ -213,39 +216,41 @@ def mixed(count: int) -> Tensor:
 def test_a_mixed_batch_equals_its_items(
     speech: list[tuple[Tensor, int]], options: dict[str, Any]
 ) -> None:
-    ears = mixed(6).reshape(2, 3, 8)
+    ears = ears_of_all_severities(6).reshape(2, 3, 8)
     waves = torch.stack(
         [set_level(speech_at(speech, seconds=0.3).roll(500 * i), 50.0 + 6 * i) for i in range(6)]
     )
     waves = waves.reshape(2, 3, -1)
     model = fast_model(**options)
-    together = model(waves, ears)
-    assert together.shape[:2] == (2, 3)
+    batch = model(waves, ears)
+    assert batch.shape[:2] == (2, 3)
     if options.get("aligned", True):
-        assert together.shape == waves.shape
+        assert batch.shape == waves.shape
     for i in range(2):
         for j in range(3):
-            alone = model(waves[i, j], Audiogram(tuple(ears[i, j].tolist())))
-            assert relative(together[i, j, : len(alone)].numpy(), alone.numpy()) < 1e-5
-            assert not bool(together[i, j, len(alone) :].any())
+            item = model(waves[i, j], Audiogram(tuple(ears[i, j].tolist())))
+            assert relative_error(batch[i, j, : len(item)].numpy(), item.numpy()) < 1e-5
+            assert not bool(batch[i, j, len(item) :].any())
 
 
 def test_ears_and_waveforms_broadcast(speech: list[tuple[Tensor, int]]) -> None:
     wave = speech_at(speech, seconds=0.1)
-    ears = mixed(4)
+    ears = ears_of_all_severities(4)
     model = fast_model()
-    each = model(wave, ears)
-    assert each.shape == (4, len(wave))
+    output_per_ear = model(wave, ears)
+    assert output_per_ear.shape == (4, len(wave))
     sequence = [Audiogram(tuple(levels)) for levels in ears.tolist()]
-    torch.testing.assert_close(model(wave.expand(4, -1), sequence), each)
+    torch.testing.assert_close(model(wave.expand(4, -1), sequence), output_per_ear)
     grid = model(wave.expand(2, 4, -1), ears)
-    torch.testing.assert_close(grid, each.expand(2, 4, -1))
-    one = model(wave.expand(3, 2, -1), sequence[2])
-    torch.testing.assert_close(one, each[2].expand(3, 2, -1))
+    torch.testing.assert_close(grid, output_per_ear.expand(2, 4, -1))
+    single_ear = model(wave.expand(3, 2, -1), sequence[2])
+    torch.testing.assert_close(single_ear, output_per_ear[2].expand(3, 2, -1))
     torch.testing.assert_close(model(wave.expand(2, 4, -1), ears.expand(2, 4, 8)), grid)
 
 
-def test_the_ear_of_the_call_comes_before_the_stored_one(speech: list[tuple[Tensor, int]]) -> None:
+def test_the_audiogram_of_the_call_replaces_the_stored_one(
+    speech: list[tuple[Tensor, int]],
+) -> None:
     wave = speech_at(speech, seconds=0.1)
     n3, s1 = Audiogram.standard("N3"), Audiogram.standard("S1")
     torch.testing.assert_close(fast_model(n3)(wave, s1), fast_model(s1)(wave), atol=0, rtol=0)
@@ -255,10 +260,10 @@ def test_the_ear_of_the_call_comes_before_the_stored_one(speech: list[tuple[Tens
 @pytest.mark.parametrize(
     "options", [{}, {"aligned": False}, {"sample_rate": 16000}, {"rescale_active": True}]
 )
-def test_gradcheck(severity: str, options: dict[str, Any]) -> None:
+def test_gradients_are_exact(severity: str, options: dict[str, Any]) -> None:
     model = fast_model(Audiogram.standard(EARS[severity]), **options)
     wave = 0.3 * torch.randn(1, 600, dtype=torch.float64)
-    # what a severe loss leaves is faint: measured in its own unit, or nothing would be checked
+    # The output of a severe loss is so soft that without scaling it would be within the tolerance.
     scale = 1.0 / float(model(wave).abs().max())
     assert torch.autograd.gradcheck(
         lambda w: scale * model(w),
@@ -271,29 +276,30 @@ def test_gradcheck(severity: str, options: dict[str, Any]) -> None:
 
 
 @pytest.mark.parametrize("severity", ["mild", "moderate", "severe"])
-def test_a_loss_expands(speech: list[tuple[Tensor, int]], severity: str) -> None:
-    """More gain in, more level out, and 1 dB in is more than 1 dB out."""
+def test_a_loss_attenuates_and_expands(speech: list[tuple[Tensor, int]], severity: str) -> None:
+    """More input level gives more output level, and 1 dB more input more than 1 dB more output."""
     model = fast_model(Audiogram.standard(EARS[severity]))
     wave = speech_at(speech)
     levels = torch.arange(45.0, 91.0, 5.0)
-    heard = level_spl(model(torch.stack([set_level(wave, level) for level in levels])))
-    steps = heard.diff()
-    assert bool((steps > 5.0).all())
-    assert bool((heard < levels).all())
-    worse = level_spl(fast_model(Audiogram.standard("N6"))(wave))
-    assert float(worse) < float(level_spl(model(wave)))
+    output_levels = level_spl(model(torch.stack([set_level(wave, level) for level in levels])))
+    assert bool((output_levels.diff() > 5.0).all())
+    assert bool((output_levels < levels).all())
+    level_of_worse_ear = level_spl(fast_model(Audiogram.standard("N6"))(wave))
+    assert float(level_of_worse_ear) < float(level_spl(model(wave)))
 
 
-def test_no_loss_is_linear_and_close_to_the_input(speech: list[tuple[Tensor, int]]) -> None:
+def test_without_a_loss_the_model_is_linear_and_keeps_the_level(
+    speech: list[tuple[Tensor, int]],
+) -> None:
     model = fast_model(Audiogram.standard("NH"))
     wave = speech_at(speech).double()
     torch.testing.assert_close(model(10.0 * wave), 10.0 * model(wave))
     torch.testing.assert_close(model(wave + wave.flip(-1)), model(wave) + model(wave.flip(-1)))
-    # not the input itself: the filter bank's ripple remains
+    # The output differs from the input by the ripple of the filter bank.
     assert abs(float(level_spl(model(wave)) - level_spl(wave))) < 2.0
 
 
-def test_full_scale_changes_the_unit_and_nothing_else(speech: list[tuple[Tensor, int]]) -> None:
+def test_full_scale_changes_only_the_unit(speech: list[tuple[Tensor, int]]) -> None:
     wave = speech_at(speech, seconds=0.2)
     ear = Audiogram.standard("N3")
     gain = gain_to_pascals(110.0)
@@ -304,31 +310,30 @@ def test_full_scale_changes_the_unit_and_nothing_else(speech: list[tuple[Tensor,
 
 @pytest.mark.parametrize("severity", EARS)
 @pytest.mark.parametrize("hops", [1, 7])
-def test_a_later_signal_is_heard_later(
+def test_a_shift_of_the_input_by_whole_hops_shifts_the_output(
     speech: list[tuple[Tensor, int]], severity: str, hops: int
 ) -> None:
-    """By whole hops of the smearing, 64 samples; its first frames are irregular, so that some silence comes first."""
+    """The input begins with silence, because the first frames of the smearing are irregular."""
     wave = torch.cat((torch.zeros(512), speech_at(speech, seconds=0.3), torch.zeros(3000)))
     model = fast_model(Audiogram.standard(EARS[severity]))
     shift = 64 * hops
-    heard = model(torch.stack((wave, wave.roll(shift))))
-    assert (
-        relative(heard[1].roll(-shift)[1000:-shift].numpy(), heard[0][1000:-shift].numpy()) < 1e-4
-    )
+    expected, shifted = model(torch.stack((wave, wave.roll(shift))))
+    inner = slice(1000, -shift)
+    assert relative_error(shifted.roll(-shift)[inner].numpy(), expected[inner].numpy()) < 1e-4
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("rate", [16000, 44100])
-def test_silence_is_heard_as_silence_with_finite_gradients(rate: int, dtype: torch.dtype) -> None:
+def test_silence_gives_silence_with_finite_gradients(rate: int, dtype: torch.dtype) -> None:
     for rescale in (False, True):
         waves = torch.zeros(4, 3000, dtype=dtype, requires_grad=True)
-        heard = MSBG(sample_rate=rate, rescale_active=rescale)(waves, mixed(4))
-        assert not bool(heard.any())
-        heard.sum().backward()
+        output = MSBG(sample_rate=rate, rescale_active=rescale)(waves, ears_of_all_severities(4))
+        assert not bool(output.any())
+        output.sum().backward()
         assert waves.grad is not None and bool(torch.isfinite(waves.grad).all())
 
 
-def test_gradients_are_finite_from_faint_to_clipped(speech: list[tuple[Tensor, int]]) -> None:
+def test_gradients_are_finite_for_soft_and_clipped_inputs(speech: list[tuple[Tensor, int]]) -> None:
     wave = speech_at(speech, seconds=0.2)
     levels = torch.tensor([-20.0, 20.0, 60.0, 100.0, 120.0])
     waves = torch.stack([set_level(wave, level) for level in levels])
@@ -336,44 +341,47 @@ def test_gradients_are_finite_from_faint_to_clipped(speech: list[tuple[Tensor, i
     waves = waves.unsqueeze(1).expand(-1, 4, -1).clone()
     waves[:, :, 2000:4000] = 0.0
     waves.requires_grad_()
-    heard = fast_model()(waves, mixed(4))
-    assert bool(torch.isfinite(heard).all())
-    heard.square().sum().backward()
+    output = fast_model()(waves, ears_of_all_severities(4))
+    assert bool(torch.isfinite(output).all())
+    output.square().sum().backward()
     assert waves.grad is not None and bool(torch.isfinite(waves.grad).all())
     assert bool((waves.grad.abs().amax(-1) > 0).all())
 
 
 @pytest.mark.parametrize("severity", EARS)
-def test_float32_is_float64_to_rounding(speech: list[tuple[Tensor, int]], severity: str) -> None:
+def test_float32_equals_float64_up_to_rounding(
+    speech: list[tuple[Tensor, int]], severity: str
+) -> None:
     model = fast_model(Audiogram.standard(EARS[severity]))
     wave = speech_at(speech)
-    wide = model(wave.double())
-    assert wide.dtype == torch.float64
-    assert relative(model(wave).double().numpy(), wide.numpy()) < 2e-5
+    expected = model(wave.double())
+    assert expected.dtype == torch.float64
+    assert relative_error(model(wave).double().numpy(), expected.numpy()) < 2e-5
 
 
-def test_autocast_is_left(speech: list[tuple[Tensor, int]]) -> None:
+def test_autocast_has_no_effect_inside(speech: list[tuple[Tensor, int]]) -> None:
     wave = speech_at(speech, seconds=0.2)
     model = fast_model(Audiogram.standard("N3"))
     with torch.autocast("cpu", dtype=torch.bfloat16):
-        heard = model(wave)
-        half = model(wave.bfloat16())
-    assert heard.dtype == torch.float32
-    assert torch.equal(heard, model(wave))
-    assert half.dtype == torch.bfloat16
-    torch.testing.assert_close(half, model(wave.bfloat16().float()).bfloat16())
+        output = model(wave)
+        bfloat16_output = model(wave.bfloat16())
+    assert output.dtype == torch.float32
+    assert torch.equal(output, model(wave))
+    assert bfloat16_output.dtype == torch.bfloat16
+    expected = model(wave.bfloat16().float()).bfloat16()
+    torch.testing.assert_close(bfloat16_output, expected)
 
 
 @pytest.mark.slow
-def test_compiled_it_is_called_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
-    # empty: what makes filters is called, too
+def test_a_compiled_model_runs_uncompiled(monkeypatch: pytest.MonkeyPatch) -> None:
+    # With an empty cache, the functions that compute filters are called, too.
     monkeypatch.setattr(torchtools, "_CACHE", torchtools._Cache(2**28))
     model, wave = MSBG(Audiogram.standard("N3"), sample_rate=16000), 0.03 * torch.randn(1, 1200)
-    heard = torch.compile(model, backend="eager")(wave)
-    assert torch.equal(heard, model(wave))
+    output = torch.compile(model, backend="eager")(wave)
+    assert torch.equal(output, model(wave))
 
 
-def test_nothing_is_trained_or_stored_and_copies_are_alike(
+def test_the_model_has_no_parameters_and_copies_are_equal(
     speech: list[tuple[Tensor, int]],
 ) -> None:
     model = fast_model(Audiogram.standard("N3"))
@@ -383,7 +391,7 @@ def test_nothing_is_trained_or_stored_and_copies_are_alike(
     assert "sample_rate=44100" in repr(model)
 
 
-def test_an_ear_that_is_trained_is_followed_after_a_move() -> None:
+def test_the_model_follows_a_trained_audiogram() -> None:
     ear = torch.nn.Parameter(torch.full((8,), 40.0))
     model = MSBG(ear, sample_rate=16000).double()
     assert model.thresholds is ear and not list(model.parameters())
@@ -452,71 +460,73 @@ def test_an_unknown_severity_raises_value_error() -> None:
 @pytest.mark.usefixtures("two_threads")
 @pytest.mark.parametrize("rate", [16000, 44100])
 @pytest.mark.parametrize("items", [1, 2])
-def test_the_number_of_threads_changes_nothing_but_rounding(rate: int, items: int) -> None:
+def test_the_number_of_threads_changes_only_rounding(rate: int, items: int) -> None:
     model, wave = MSBG(Audiogram.standard("N3"), sample_rate=rate), 0.03 * torch.randn(items, rate)
-    two = model(wave)
+    output = model(wave)
     torch.set_num_threads(1)
-    one = model(wave)
-    # MKL transforms a single long row in another order on several threads
-    assert relative(two.numpy(), one.numpy()) <= (5e-6 if items == 1 else 0.0)
+    expected = model(wave)
+    # On several threads, MKL transforms a single long row in another order.
+    assert relative_error(output.numpy(), expected.numpy()) <= (5e-6 if items == 1 else 0.0)
 
 
 @pytest.mark.parametrize("rate", [16000, 16001, 22050, 48000])
-def test_resampling_keeps_all_but_the_last_80_hz(rate: int) -> None:
+def test_resampling_preserves_all_but_the_last_80_hz(rate: int) -> None:
     spectrum = torch.fft.rfft(torch.randn(rate, dtype=torch.float64))
-    spectrum[min(rate, 44100) // 2 - 100 :] = 0.0  # one second: a bin a Hz
-    # silent at the ends, for scipy takes it as periodic
+    # The signal lasts one second, so that the frequencies are 1 Hz apart.
+    spectrum[min(rate, 44100) // 2 - 100 :] = 0.0
+    # It is silent at its ends, because it is periodic for scipy.
     signal = torch.fft.irfft(spectrum, rate) * torch.hann_window(rate, dtype=torch.float64)
-    truth = scipy.signal.resample(signal.numpy(), 44100)
-    assert relative(to_inner(signal, rate).numpy(), truth) < 1e-5
+    expected = scipy.signal.resample(signal.numpy(), 44100)
+    assert relative_error(resample_to_model_rate(signal, rate).numpy(), expected) < 1e-5
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("rate", [16000, 44100])
 @pytest.mark.parametrize("aligned", [True, False])
-def test_long_signals_go_by_blocks_that_equal_the_whole(
+def test_processing_in_blocks_equals_processing_at_once(
     monkeypatch: pytest.MonkeyPatch, rate: int, aligned: bool
 ) -> None:
     samples = 14 * rate
-    place = torch.arange(samples) / rate
-    # noise up to half the rate with the rhythm of syllables; in double precision, for single precision rounds by 1e-5 on
-    # another FFT grid
+    time = torch.arange(samples) / rate
+    # White noise with the rhythm of syllables. It has double precision, because the rounding of
+    # single precision depends on the FFT grid and amounts to 1e-5.
     noise = torch.randn(samples, dtype=torch.float64)
-    wave = set_level(noise * (8.0 * torch.pi * place).sin().clamp_min(0.02), 65.0)
+    wave = set_level(noise * (8.0 * torch.pi * time).sin().clamp_min(0.02), 65.0)
     model = MSBG(Audiogram.standard("N2"), sample_rate=rate, aligned=aligned)
     with torch.no_grad():
-        blocks = model(wave)
+        output = model(wave)
         assert len(block_bounds(samples, rate)) == 2
         monkeypatch.setattr("hlsim.msbg.blocks.block_bounds", lambda n, _: [(0, 0, n, n)])
-        whole = model(wave)
-    assert blocks.shape == whole.shape
-    assert relative(blocks.numpy(), whole.numpy()) < 1e-5
+        expected = model(wave)
+    assert output.shape == expected.shape
+    assert relative_error(output.numpy(), expected.numpy()) < 1e-5
 
 
 @pytest.mark.slow
-def test_blocks_of_a_rate_that_shares_little_keep_the_length() -> None:
+def test_blocks_have_the_length_of_the_input_at_an_unusual_rate() -> None:
     wave = 0.03 * torch.randn(10 * 16026)
     with torch.no_grad():
         assert MSBG(Audiogram.standard("N6"), sample_rate=16026)(wave).shape == wave.shape
 
 
 @pytest.mark.parametrize("aligned", [True, False])
-def test_gradients_through_blocks_are_those_of_the_whole(
+def test_gradients_through_blocks_equal_those_at_once(
     monkeypatch: pytest.MonkeyPatch, aligned: bool
 ) -> None:
     monkeypatch.setattr("hlsim.msbg.blocks._BLOCK_SECONDS", 1.0)
     wave = 0.03 * torch.randn(2 * 44100, dtype=torch.float64)
-    model, gradients = fast_model(Audiogram.standard("N3"), aligned=aligned), []
+    model = fast_model(Audiogram.standard("N3"), aligned=aligned)
+    gradients = []
     for _ in range(2):
         leaf = wave.clone().requires_grad_()
         model(leaf).square().sum().backward()
         assert leaf.grad is not None
         gradients.append(leaf.grad.numpy())
         monkeypatch.setattr("hlsim.msbg.blocks.block_bounds", lambda n, _: [(0, 0, n, n)])
-    assert relative(gradients[0], gradients[1]) < 1e-4
+    assert relative_error(gradients[0], gradients[1]) < 1e-4
 
 
-def test_gradients_through_blocks_are_the_same_by_a_transform(
+def test_gradients_through_blocks_equal_those_of_a_transform(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("hlsim.msbg.blocks._BLOCK_SECONDS", 1.0)
@@ -529,9 +539,9 @@ def test_gradients_through_blocks_are_the_same_by_a_transform(
 
 
 @pytest.mark.parametrize("rate", [16000, 17000, 18000, 20000])
-# as slight as each bank is used for, where its skirts count most
+# These are the slightest losses of each bank, at which its skirts matter most.
 @pytest.mark.parametrize(("level", "error"), [(16.0, 1e-3), (36.0, 2.5e-3), (57.0, 6e-3)])
-def test_half_the_rate_inside_changes_little(
+def test_half_the_rate_inside_changes_the_output_little(
     monkeypatch: pytest.MonkeyPatch, rate: int, level: float, error: float
 ) -> None:
     noise = 0.02 * torch.randn(1, rate // 2, dtype=torch.float64)
@@ -540,16 +550,16 @@ def test_half_the_rate_inside_changes_little(
     ear, model = torch.full((8,), level, dtype=torch.float64), MSBG(sample_rate=rate)
     for signal in (noise, torch.fft.irfft(spectrum, rate // 2))[: 1 if rate == 16000 else 2]:
         monkeypatch.undo()
-        heard = model(signal, ear)
+        output = model(signal, ear)
         monkeypatch.setattr("hlsim.msbg.model._HALF_RATE_HZ", 0)
-        truth = model(signal, ear)
-        assert 0.0 < float((heard - truth).norm()) < error * float(truth.norm())
+        expected = model(signal, ear)
+        assert 0.0 < float((output - expected).norm()) < error * float(expected.norm())
 
 
 @pytest.mark.parametrize("rate", [16000, 16001, 44100])
 @pytest.mark.parametrize("ears", [["N3"], ["N1", "N3"], ["NH", "NH"]])
-def test_outputs_hold_no_more_than_themselves(rate: int, ears: list[str]) -> None:
+def test_outputs_share_no_memory_with_larger_tensors(rate: int, ears: list[str]) -> None:
     model = MSBG([Audiogram.standard(name) for name in ears], sample_rate=rate)
-    heard = model(0.01 * torch.randn(len(ears), 400))
-    assert heard.is_contiguous()
-    assert heard.untyped_storage().nbytes() == heard.nbytes
+    output = model(0.01 * torch.randn(len(ears), 400))
+    assert output.is_contiguous()
+    assert output.untyped_storage().nbytes() == output.nbytes

@@ -1,4 +1,4 @@
-"""Expansion and gain against pyclarity's functions."""
+"""Expansion ratios and gains equal those of pyclarity's functions."""
 
 from collections.abc import Callable
 from typing import Any
@@ -17,11 +17,11 @@ from hlsim.msbg.envelope import STEP, envelope, envelope_lowpass
 from hlsim.msbg.filterbank import BANKS, FilterBank
 from hlsim.msbg.recruitment import (
     CATCH_UP_SPL,
-    around,
     expand,
     expansion_ratios,
     interpolate,
     interpolation_kernel,
+    pad_periodically,
     threshold_weights,
 )
 from hlsim.training.ears import draw_thresholds
@@ -30,14 +30,15 @@ cochlea = pytest.importorskip("clarity.evaluator.msbg.cochlea")
 clarity_audiogram = pytest.importorskip("clarity.utils.audiogram")
 
 TIME = 2 * STEP * 342
-EDGE = 3000  # samples from each end that filtfilt treats its own way
+EDGE = 3000
+"""Samples at each end that depend on the padding of ``filtfilt``."""
 
 BANK_NAMES = ["mild", "moderate", "severe"]
 TO_PASCALS = gain_to_pascals(120.0)
 
 
 @pytest.mark.parametrize("name", BANK_NAMES)
-def test_expansion_ratios(name: str) -> None:
+def test_expansion_ratios_equal_pyclaritys(name: str) -> None:
     bank = BANKS[name]
     ears = draw_thresholds(20, torch.Generator().manual_seed(0)).double()
     ours = expansion_ratios(ears.reshape(4, 5, 8), torch.from_numpy(threshold_weights(bank)))
@@ -51,8 +52,8 @@ def test_expansion_ratios(name: str) -> None:
         np.testing.assert_allclose(ratios.numpy(), theirs, rtol=1e-12)
 
 
-class RoundsProducts(TorchFunctionMode):
-    """Matrix products of what is rounded to ten bits, as TF32 has it."""
+class RoundedProducts(TorchFunctionMode):
+    """Mode that rounds the factors of matrix products to ten bits, as GPUs do with TF32."""
 
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         if func in (torch.matmul, Tensor.matmul, Tensor.__matmul__):
@@ -66,38 +67,41 @@ class RoundsProducts(TorchFunctionMode):
 def test_expansion_ratios_are_exact_where_matrix_products_are_rounded() -> None:
     ears = torch.linspace(93.3, 99.9, 80).reshape(10, 8)
     weights = torch.from_numpy(threshold_weights(BANKS["severe"])).float()
-    with RoundsProducts():
+    with RoundedProducts():
         ours = expansion_ratios(ears, weights)
-    assert (ours / expansion_ratios(ears.double(), weights.double()) - 1.0).abs().max() < 1e-5
+    expected = expansion_ratios(ears.double(), weights.double())
+    assert (ours / expected - 1.0).abs().max() < 1e-5
 
 
 @pytest.mark.parametrize("name", BANK_NAMES)
-def test_recruitment(name: str, band_noise: Callable[[FilterBank, int], np.ndarray]) -> None:
-    """The gain of envelopes that pyclarity computed at the full rate, sampled a step apart."""
+def test_recruitment_equals_pyclaritys(
+    name: str, band_noise: Callable[[FilterBank, int], np.ndarray]
+) -> None:
+    """Our gains follow every 24th value of the envelopes that pyclarity computes."""
     bank = BANKS[name]
     channels = band_noise(bank, TIME)
-    theirs = np.maximum(
-        cochlea.compute_envelope(channels, erb(np.array(bank.centre_frequencies)), MSBG_RATE), 1e-7
-    )
+    bandwidths = erb(np.array(bank.centre_frequencies))
+    envelopes = np.maximum(cochlea.compute_envelope(channels, bandwidths, MSBG_RATE), 1e-7)
     ratios = expansion_ratios(
         torch.linspace(20.0, 70.0, 8, dtype=torch.float64),
         torch.from_numpy(threshold_weights(bank)),
     )
     expected = cochlea.recruitment(
-        channels.copy(), theirs.copy(), 120.0, ratios.numpy(), np.full(bank.channels, 105.0)
+        channels.copy(), envelopes.copy(), 120.0, ratios.numpy(), np.full(bank.channels, 105.0)
     ).sum(0)
     ours = expand(
         TO_PASCALS * torch.from_numpy(channels),
-        TO_PASCALS * torch.from_numpy(theirs[:, ::STEP]),
+        TO_PASCALS * torch.from_numpy(envelopes[:, ::STEP]),
         ratios,
     )
-    error = (ours.numpy() / TO_PASCALS - expected)[EDGE:-EDGE]
-    assert np.sqrt((error**2).mean() / (expected[EDGE:-EDGE] ** 2).mean()) < 2e-4
+    inner = slice(EDGE, -EDGE)
+    error = (ours.numpy() / TO_PASCALS - expected)[inner]
+    assert np.sqrt((error**2).mean() / (expected[inner] ** 2).mean()) < 2e-4
 
 
 @pytest.mark.parametrize("level", [1e-12, 1e-9, 1e-4, 10 ** (-15 / 20), 3.0])
-def test_limits_of_the_envelope_are_the_references(level: float) -> None:
-    """From its lowest, 1e-9 of its full scale, to the catch-up level, above which nothing is expanded."""
+def test_limits_of_the_envelope_equal_pyclaritys(level: float) -> None:
+    """The lower limit is 1e-9 of full scale, and the upper one is the catch-up level."""
     channels = np.random.default_rng(2).standard_normal((2, 336))
     ratios = np.array([1.0, 1.6])
     theirs = cochlea.recruitment(
@@ -111,20 +115,18 @@ def test_limits_of_the_envelope_are_the_references(level: float) -> None:
     np.testing.assert_allclose(ours.numpy(), theirs, rtol=1e-9, atol=1e-12)
 
 
-def test_one_db_in_is_the_ratio_of_db_out() -> None:
+def test_one_db_more_input_gives_the_expansion_ratio_in_db_more_output() -> None:
     tone = torch.cos(torch.arange(40 * STEP, dtype=torch.float64)).unsqueeze(0)
     ratio = torch.tensor([105.0 / (105.0 - 60.0)], dtype=torch.float64)
-    heard = [
-        expand(
-            10 ** (db / 20) * tone, torch.full((1, 40), 10 ** (db / 20), dtype=torch.float64), ratio
-        )
-        for db in (-40.0, -39.0)
-    ]
-    gain_db = 20 * torch.log10(heard[1].norm() / heard[0].norm())
+    norms = []
+    for gain in (10 ** (-40 / 20), 10 ** (-39 / 20)):
+        envelopes = torch.full((1, 40), gain, dtype=torch.float64)
+        norms.append(expand(gain * tone, envelopes, ratio).norm())
+    gain_db = 20 * torch.log10(norms[1] / norms[0])
     assert float(gain_db) == pytest.approx(float(ratio), abs=1e-9)
 
 
-def test_gradients() -> None:
+def test_gradients_are_exact() -> None:
     bank = BANKS["severe"]
     channels = torch.randn(bank.channels, 4 * STEP, dtype=torch.float64, requires_grad=True)
     response = torch.from_numpy(envelope_lowpass(bank, 4 * STEP))
@@ -136,29 +138,28 @@ def test_gradients() -> None:
 
 
 @pytest.mark.parametrize("steps", [16, 21, 40])
-@pytest.mark.parametrize("each", [3, 5, 6, 24])
-@pytest.mark.parametrize("together", [5, 8])
+@pytest.mark.parametrize("samples", [3, 5, 6, 24])
+@pytest.mark.parametrize("steps_per_window", [5, 8])
 def test_interpolation_is_exact_for_polynomials_of_fifth_order(
-    steps: int, each: int, together: int
+    steps: int, samples: int, steps_per_window: int
 ) -> None:
-    powers = torch.randn(6, dtype=torch.float64)
+    coefficients = torch.randn(6, dtype=torch.float64)
 
-    def polynomial(place: torch.Tensor) -> torch.Tensor:
-        return (powers * ((place - steps / 2) / steps).unsqueeze(-1) ** torch.arange(6)).sum(-1)
+    def polynomial(position: Tensor) -> Tensor:
+        x = ((position - steps / 2) / steps).unsqueeze(-1)
+        return (coefficients * x ** torch.arange(6)).sum(-1)
 
-    places = torch.arange(steps * each, dtype=torch.float64) / each
-    kernel = torch.from_numpy(interpolation_kernel(each, together=together))
-    fine = interpolate(around(polynomial(torch.arange(steps, dtype=torch.float64))[None]), kernel)[
-        0
-    ]
-    inside = slice(2 * each, (steps - 3) * each)  # it is taken as periodic
-    torch.testing.assert_close(fine[inside], polynomial(places)[inside])
+    values = polynomial(torch.arange(steps, dtype=torch.float64))[None]
+    kernel = torch.from_numpy(interpolation_kernel(samples, steps_per_window=steps_per_window))
+    interpolated = interpolate(pad_periodically(values), kernel)[0]
+    expected = polynomial(torch.arange(steps * samples, dtype=torch.float64) / samples)
+    # The polynomial is not periodic, so that the values at the ends differ.
+    inner = slice(2 * samples, (steps - 3) * samples)
+    torch.testing.assert_close(interpolated[inner], expected[inner])
 
 
-def test_interpolation_of_two_parts_gives_both_the_same() -> None:
-    values = torch.randn(3, 24, dtype=torch.float64)
-    once, twice = (
-        interpolate(around(values), torch.from_numpy(interpolation_kernel(6, parts)))
-        for parts in (1, 2)
-    )
-    torch.testing.assert_close(twice, once.repeat_interleave(2, -1))
+def test_repeated_interpolation_gives_each_value_twice() -> None:
+    values = pad_periodically(torch.randn(3, 24, dtype=torch.float64))
+    single = interpolate(values, torch.from_numpy(interpolation_kernel(6)))
+    double = interpolate(values, torch.from_numpy(interpolation_kernel(6, repeats=2)))
+    torch.testing.assert_close(double, single.repeat_interleave(2, -1))

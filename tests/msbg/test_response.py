@@ -1,4 +1,4 @@
-"""The fixed response of the bank, and its phase alone."""
+"""The linear response equals MSBG's for normal ears and has the phase of its outputs."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ from hlsim import MSBG, Audiogram
 from hlsim.calibration import set_level
 from hlsim.dsp.resample import resample
 from hlsim.msbg.filterbank import BANKS
-from hlsim.msbg.response import fixed_response, with_phase_of_bank
+from hlsim.msbg.response import apply_bank_phase, fixed_response
 
 EARS = ("NH", "N1", "N3", "N5")
 
@@ -29,50 +29,50 @@ def utterance(speech: list[tuple[Tensor, int]]) -> Tensor:
 
 
 @pytest.mark.parametrize("rate", [16000, 22050, 44100, 48000])
-def test_a_normal_ears_response_is_msbgs(rate: int) -> None:
-    """Of an impulse in float64: MSBG is linear there."""
+def test_response_equals_msbgs_for_a_normal_ear(rate: int) -> None:
     impulse = torch.zeros(rate // 2, dtype=torch.float64)
     impulse[rate // 4] = 1.0
-    heard = MSBG(Audiogram.standard("NH"), sample_rate=rate).double()(impulse)
-    points = rate  # 44.1 kHz shares it
-    later = np.exp(-2j * np.pi * (rate // 4) / points * np.arange(points // 2 + 1))
-    expected = fixed_response(BANKS["none"], rate, points) * later
-    below = slice(100, 7800)
-    found = np.fft.rfft(heard.numpy(), points)[below]
-    assert np.linalg.norm(found - expected[below]) < 2e-3 * np.linalg.norm(expected[below])
+    output = MSBG(Audiogram.standard("NH"), sample_rate=rate).double()(impulse)
+    points = rate  # one second, which is a whole number of samples at 44.1 kHz, too
+    delay = np.exp(-2j * np.pi * (rate // 4) / points * np.arange(points // 2 + 1))
+    expected = fixed_response(BANKS["none"], rate, points) * delay
+    band = slice(100, 7800)
+    spectrum = np.fft.rfft(output.numpy(), points)[band]
+    assert np.linalg.norm(spectrum - expected[band]) < 2e-3 * np.linalg.norm(expected[band])
 
 
 @pytest.mark.parametrize("name", EARS)
-def test_what_is_heard_has_this_phase(name: str, utterance: Tensor) -> None:
-    """Loud enough for the gains to be 1: after smearing too, and unlike the signal itself."""
+def test_msbgs_output_has_this_phase(name: str, utterance: Tensor) -> None:
+    """The output resembles the result more than the input, if all gains are 1. Smearing remains."""
     loud = 1000.0 * utterance
-    heard = MSBG(Audiogram.standard(name), sample_rate=16000)(loud)
-    moved = with_phase_of_bank(loud, thresholds(name), 16000)
-    assert cosine(heard, moved) > {"NH": 0.97, "N1": 0.9, "N3": 0.75, "N5": 0.6}[name]
-    assert cosine(heard, moved) > cosine(heard, loud) + 0.1
+    output = MSBG(Audiogram.standard(name), sample_rate=16000)(loud)
+    shifted = apply_bank_phase(loud, thresholds(name), 16000)
+    assert cosine(output, shifted) > {"NH": 0.97, "N1": 0.9, "N3": 0.75, "N5": 0.6}[name]
+    assert cosine(output, shifted) > cosine(output, loud) + 0.1
 
 
 def test_normal_speech_gets_the_phase_of_the_impaired_bank(utterance: Tensor) -> None:
     normal = MSBG(Audiogram.standard("NH"), sample_rate=16000)(utterance)
     for name in EARS[1:]:
-        moved = with_phase_of_bank(normal, thresholds(name), 16000, normal=True)
-        assert cosine(moved, with_phase_of_bank(utterance, thresholds(name), 16000)) > 0.97
-    assert torch.equal(with_phase_of_bank(normal, thresholds("NH"), 16000, normal=True), normal)
+        shifted = apply_bank_phase(normal, thresholds(name), 16000, normal=True)
+        assert cosine(shifted, apply_bank_phase(utterance, thresholds(name), 16000)) > 0.97
+    assert torch.equal(apply_bank_phase(normal, thresholds("NH"), 16000, normal=True), normal)
 
 
 @pytest.mark.parametrize("rate", [16000, 44100])
-def test_magnitude_stays(rate: int) -> None:
+def test_magnitude_is_unchanged(rate: int) -> None:
     noise = torch.randn(1, rate, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     noise[:, : rate // 4] = noise[:, -rate // 4 :] = 0.0
     for name in EARS:
-        moved = with_phase_of_bank(noise, thresholds(name), rate)
-        before, after = (torch.fft.rfft(signal).abs()[0, 150:7500] for signal in (noise, moved))
+        shifted = apply_bank_phase(noise, thresholds(name), rate)
+        before = torch.fft.rfft(noise).abs()[0, 150:7500]
+        after = torch.fft.rfft(shifted).abs()[0, 150:7500]
         assert float((after - before).norm() / before.norm()) < 0.02
 
 
-def test_each_item_by_its_own_ear(utterance: Tensor) -> None:
+def test_each_item_has_the_phase_of_its_ear(utterance: Tensor) -> None:
     ears = torch.cat([thresholds(name) for name in EARS])
-    together = with_phase_of_bank(utterance.expand(4, -1), ears, 16000)
-    alone = torch.cat([with_phase_of_bank(utterance, ear[None], 16000) for ear in ears])
-    torch.testing.assert_close(together, alone)
-    assert cosine(together[0], together[2]) < 0.9
+    batch = apply_bank_phase(utterance.expand(4, -1), ears, 16000)
+    items = torch.cat([apply_bank_phase(utterance, ear[None], 16000) for ear in ears])
+    torch.testing.assert_close(batch, items)
+    assert cosine(batch[0], batch[2]) < 0.9
