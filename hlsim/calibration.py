@@ -1,70 +1,130 @@
-"""The one place for dB full scale, pascals and dB SPL.
+"""Conversion between samples, pascals, dB SPL and dB relative to full scale.
 
-A signal inside hlsim is in pascals over the root-mean-square pressure of 94 dB SPL (1 Pa re 20 uPa is 93.98 dB SPL, taken
-as 94): RMS 1.0 is 94 dB SPL. ``full_scale_spl`` says what RMS 1.0 is in somebody else's file or tensor.
+Inside hlsim, a sample is a sound pressure in pascals, and an RMS of 1.0 is 94 dB SPL. (To be exact,
+1 Pa is 93.98 dB above 20 uPa.) Where a signal has another scale, ``full_scale_spl`` is the level in
+dB SPL of an RMS of 1.0.
 """
 
 import torch
 from torch import Tensor
 
-from hlsim.checks import check_time_last, is_finite
+from hlsim.checks import check_number, check_time_last, describe, is_finite
 
 PASCAL_SPL = 94.0
 """Level in dB SPL of a signal in pascals whose RMS is 1.0."""
 
-_LOWEST_POWER = 1e-20  # -106 dB SPL: keeps the level of silence finite
+POWER_FLOOR = 1e-20
+"""Power of -106 dB SPL in Pa^2, to which lower powers are raised, so that all levels are finite."""
 
 
 def check_full_scale(full_scale_spl: float) -> float:
-    """Return ``full_scale_spl`` as a float, or raise ValueError where it cannot be a level in dB SPL (0 to 200)."""
-    if not (is_finite(full_scale_spl) and 0.0 <= full_scale_spl <= 200.0):
-        raise ValueError(
-            f"full_scale_spl is {full_scale_spl!r}; allowed: 0 to 200 dB SPL at RMS 1.0"
-        )
+    """Return ``full_scale_spl`` as a float.
+
+    Args:
+        full_scale_spl: level in dB SPL of RMS 1.0, from 0 to 200.
+
+    Raises:
+        ValueError: the level is not a number, or out of range.
+
+    >>> check_full_scale(120)
+    120.0
+    """
+    check_number("full_scale_spl", full_scale_spl, 0.0, 200.0)
     return float(full_scale_spl)
 
 
 def gain_to_pascals(full_scale_spl: float) -> float:
-    """Linear factor that turns samples with RMS 1.0 at ``full_scale_spl`` dB SPL into pascals."""
+    """Compute the linear gain that converts samples to pascals.
+
+    Args:
+        full_scale_spl: level in dB SPL of samples whose RMS is 1.0.
+
+    Raises:
+        ValueError: the level is not a number, or out of range.
+
+    >>> gain_to_pascals(114.0)
+    10.0
+    """
     return float(10.0 ** ((check_full_scale(full_scale_spl) - PASCAL_SPL) / 20.0))
 
 
 def level_spl(waveform: Tensor, full_scale_spl: float = PASCAL_SPL) -> Tensor:
-    """RMS level of a waveform in dB SPL.
+    """Compute the RMS level of waveforms in dB SPL.
 
-    Shape: (..., time) -> (...). Silence gives -106 dB SPL at the default scale, never infinity. Raises ValueError for
-    what is no floating-point tensor.
+    Silence has a finite level, -106 dB SPL at the default scale.
+
+    Shape: (..., time) -> (...).
+
+    Args:
+        full_scale_spl: level in dB SPL of samples whose RMS is 1.0.
+
+    Raises:
+        ValueError: the waveform is not a floating-point tensor with time last.
+
+    >>> level_spl(torch.tensor([1.0, -1.0]))
+    tensor(94.)
     """
-    power = _whole(waveform).square().mean(-1).clamp_min(_LOWEST_POWER)
-    return (10.0 * torch.log10(power) + check_full_scale(full_scale_spl)).to(waveform.dtype)
+    power = _as_float32_or_wider(waveform).square().mean(-1).clamp_min(POWER_FLOOR)
+    level = 10.0 * torch.log10(power) + check_full_scale(full_scale_spl)
+    return level.to(waveform.dtype)
 
 
 def set_level(waveform: Tensor, spl: float | Tensor, full_scale_spl: float = PASCAL_SPL) -> Tensor:
-    """Scale a waveform to an RMS level in dB SPL.
+    """Scale waveforms to an RMS level in dB SPL. Silence stays silent.
 
-    Shape: (..., time) -> (..., time); ``spl`` is a number or (...). Silence stays silent. Raises ValueError
-    as ``level_spl``, and for another ``spl``.
+    Shape: (..., time) -> (..., time).
+
+    Args:
+        spl: level in dB SPL of all items, or a tensor of levels that broadcasts to the leading
+            dimensions.
+        full_scale_spl: level in dB SPL of samples whose RMS is 1.0.
+
+    Raises:
+        ValueError: the waveform is not a floating-point tensor with time last, or ``spl`` is not a
+            level or does not fit the items.
+
+    >>> level_spl(set_level(torch.randn(2, 16000), torch.tensor([65.0, 80.0]))).round()
+    tensor([65., 80.])
     """
-    whole = _whole(waveform)
+    samples = _as_float32_or_wider(waveform)
     if not isinstance(spl, Tensor) and not is_finite(spl):
-        raise ValueError(f"spl is {spl!r}; allowed: a level in dB SPL, or a tensor of one an item")
-    levels, wanted = level_spl(whole, full_scale_spl), torch.as_tensor(spl, device=waveform.device)
+        raise ValueError(
+            "expected spl to be a level in dB SPL or a tensor of one level per item, "
+            f"got {describe(spl)}"
+        )
+    levels = level_spl(samples, full_scale_spl)
+    target_levels = torch.as_tensor(spl, device=waveform.device)
     try:
-        gain_db = wanted.expand_as(levels) - levels
+        gain_db = target_levels.expand_as(levels) - levels
     except RuntimeError as error:
-        shapes = f"spl of shape {tuple(wanted.shape)} for items of {tuple(levels.shape)}"
-        raise ValueError(f"{shapes}; allowed: one for all, or one an item") from error
-    silent = whole.square().mean(-1) <= _LOWEST_POWER
-    gain = torch.where(silent, torch.ones_like(gain_db), 10.0 ** (gain_db / 20.0))
-    return (whole * gain.unsqueeze(-1).to(whole.dtype)).to(waveform.dtype)
-
-
-def _whole(waveform: Tensor) -> Tensor:
-    """In float32 at least: float16 holds neither the power of soft speech nor that of silence."""
-    check_time_last(waveform)
-    return waveform.float() if waveform.dtype in (torch.float16, torch.bfloat16) else waveform
+        raise ValueError(
+            f"expected spl to broadcast to the items' shape {tuple(levels.shape)}, "
+            f"got shape {tuple(target_levels.shape)}"
+        ) from error
+    is_silent = samples.square().mean(-1) <= POWER_FLOOR
+    gain = torch.where(is_silent, torch.ones_like(gain_db), 10.0 ** (gain_db / 20.0))
+    return (samples * gain.unsqueeze(-1).to(samples.dtype)).to(waveform.dtype)
 
 
 def dbfs(waveform: Tensor) -> Tensor:
-    """RMS level in dB relative to RMS 1.0. Shape: (..., time) -> (...)."""
+    """Compute the RMS level of waveforms in dB relative to RMS 1.0.
+
+    Shape: (..., time) -> (...).
+
+    Raises:
+        ValueError: the waveform is not a floating-point tensor with time last.
+
+    >>> dbfs(torch.tensor([0.1, -0.1])).round()
+    tensor(-20.)
+    """
     return level_spl(waveform, 0.0)
+
+
+def _as_float32_or_wider(waveform: Tensor) -> Tensor:
+    """Convert half precision to float32, because float16 cannot represent the power of soft speech.
+
+    Raises:
+        ValueError: the waveform is not a floating-point tensor with time last.
+    """
+    check_time_last(waveform)
+    return waveform.float() if waveform.dtype in (torch.float16, torch.bfloat16) else waveform

@@ -1,4 +1,4 @@
-"""Optional dependencies, and one error that names the command that installs them."""
+"""Optional dependencies, and an error that shows the command to install them."""
 
 from importlib import import_module
 from importlib.util import find_spec
@@ -6,11 +6,18 @@ from types import ModuleType
 
 
 class MissingExtraError(ImportError):
-    """An optional dependency is not installed."""
+    """Error that an optional dependency is not installed.
+
+    >>> try:
+    ...     require("no_such_module", extra="eval")
+    ... except MissingExtraError as error:
+    ...     print(str(error).split("; ")[1])
+    install it with: pip install 'hlsim[eval]'
+    """
 
 
 def require(module: str, extra: str) -> ModuleType:
-    """Import an optional module, or raise an error that says how to install it.
+    """Import an optional module, or raise an error that shows how to install it.
 
     Args:
         module: dotted module name, e.g. ``"matplotlib.figure"``.
@@ -18,21 +25,34 @@ def require(module: str, extra: str) -> ModuleType:
 
     Raises:
         MissingExtraError: the module, or one that it imports, is not installed.
+
+    >>> require("json", extra="eval").dumps([1])
+    '[1]'
     """
     try:
         return import_module(module)
     except ImportError as error:
         package = module.split(".")[0]
         raise MissingExtraError(
-            f"{package} is needed here and not installed ({error}); install it: {install_command(extra)}"
+            f"{package} is not installed ({error}); install it with: {install_command(extra)}"
         ) from error
 
 
 def is_installed(module: str) -> bool:
-    """Whether a top-level module can be found; it is not imported, which may take seconds."""
+    """Return whether a top-level module is installed, without importing it.
+
+    An import may take seconds.
+
+    >>> is_installed("json")
+    True
+    """
     return find_spec(module) is not None
 
 
 def install_command(extra: str) -> str:
-    """The command that installs one of hlsim's extras."""
+    """Build the shell command that installs one of hlsim's extras.
+
+    >>> install_command("eval")
+    "pip install 'hlsim[eval]'"
+    """
     return f"pip install 'hlsim[{extra}]'"

@@ -1,4 +1,4 @@
-"""Plug-ins: teachers, enhancers, aids and measures of your own, loaded by name."""
+"""Plug-ins: teachers, enhancers, aids and measures from your own code, loaded by name."""
 
 from __future__ import annotations
 
@@ -18,59 +18,71 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-MAX_DELAY = 2e-3  # seconds between input and output of a plug-in that must be time-aligned
+MAX_DELAY_SECONDS = 2e-3
+"""Largest delay of a plug-in that must be time-aligned."""
 
 _NAME = re.compile(r"(?P<source>.+):(?P<attribute>\w+)")
+"""Names of plug-ins: a module or a file, and one of its attributes."""
 
 
 def load_plugin(name: str, kind: str) -> Any:
-    """Load the object that a name means; a class is called without arguments.
+    """Load the object that a name refers to. A class is called without arguments.
 
-    Modules are searched for in the working directory first, and files import their neighbours, but
-    only during the import: import at the top of the module, not inside its functions.
+    Python searches for modules in the working directory first, and a file can import modules beside
+    it. This holds during the import only, so a plug-in should import its modules at the top of the
+    file, not inside functions.
 
     Args:
-        name: ``package.module:name``, or ``path/to/file.py:name``.
-        kind: What the object is called in errors, such as ``"teacher"``.
+        name: ``package.module:name`` or ``path/to/file.py:name``.
+        kind: noun for the object in error messages, such as ``"teacher"``.
 
     Raises:
-        ValueError: The name has another form, the import fails, or there is no such object.
+        ValueError: the name has another form, the import fails, or the object does not exist.
+
+    >>> load_plugin("math:pi", kind="measure")
+    3.141592653589793
     """
     parts = _NAME.fullmatch(name)
     if parts is None:
         raise ValueError(
-            f"{kind} {name!r} is not a plug-in's name; write package.module:name or path/to/file.py:name"
+            f"expected the name of a {kind} as package.module:name or path/to/file.py:name, "
+            f"got {name!r}"
         )
     source, attribute = parts["source"], parts["attribute"]
     try:
         if source.endswith(".py"):
             module = _import_file(Path(source))
         else:
-            with _searched_first(os.getcwd()):
-                importlib.invalidate_caches()  # the file may be new
+            with _prepend_to_path(os.getcwd()):
+                # Otherwise Python may not find a module that was written a moment ago.
+                importlib.invalidate_caches()
                 module = importlib.import_module(source)
         plugin = getattr(module, attribute)
         return plugin() if isinstance(plugin, type) else plugin
-    except Exception as error:  # the code of others may raise anything
+    except Exception as error:  # because code of a plug-in may raise anything
         raise ValueError(f"cannot load the {kind} {name}: {_describe(error)}") from error
 
 
 class WaveformPlugin:
-    """A plug-in from waveform to waveform, whose output is checked at every call.
+    """A plug-in from waveform to waveform, whose output is validated at every call.
 
-    It is called without gradients. A module is set to eval mode and follows the device of its input.
+    Calls compute no gradients. A module is in evaluation mode and moves to the device of its input.
 
     Args:
-        name: As for ``load_plugin``.
-        kind: ``"teacher"``, ``"enhancer"`` or ``"aid"``, for errors.
+        name: ``package.module:name`` or ``path/to/file.py:name``.
+        kind: noun for the plug-in in error messages: ``"teacher"``, ``"enhancer"`` or ``"aid"``.
 
     Attributes:
-        function: The object that was loaded.
-        fingerprint: The attribute ``fingerprint`` of the object, which its author changes when its
-            outputs change, as text; None if it has none.
+        function: callable that was loaded.
+        fingerprint: attribute ``fingerprint`` of the callable as text, which its author changes
+            when its outputs change. None if there is no such attribute.
 
     Raises:
-        ValueError: As ``load_plugin``, or the object is not callable.
+        ValueError: the plug-in cannot be loaded or called.
+
+    >>> rectifier = WaveformPlugin("torch:abs", kind="aid")
+    >>> rectifier(torch.tensor([1.0, -2.0]))
+    tensor([1., 2.])
     """
 
     def __init__(self, name: str, kind: str) -> None:
@@ -78,7 +90,7 @@ class WaveformPlugin:
         self.function: Callable[..., Tensor] = load_plugin(name, kind)
         if not callable(self.function):
             type_name = type(self.function).__name__
-            raise ValueError(f"{kind} {name} is of type {type_name}, expected a callable")
+            raise ValueError(f"expected {kind} {name} to be callable, got type {type_name}")
         if isinstance(self.function, nn.Module):
             self.function.eval()
         fingerprint = getattr(self.function, "fingerprint", None)
@@ -95,21 +107,26 @@ class WaveformPlugin:
     def __call__(self, waveform: Tensor, *arguments: Any) -> Tensor:
         """Call the plug-in.
 
-        Shape: (..., time) -> (..., time), in the waveform's dtype.
+        Shape: (..., time) -> (..., time), in the precision of the waveform.
+
+        Args:
+            waveform: first argument of the plug-in.
+            arguments: further arguments of the plug-in.
 
         Raises:
-            ValueError: The plug-in fails, or its output is not a real, finite tensor of the same shape.
+            ValueError: the plug-in fails, or its output is not a real, finite tensor of the same
+                shape.
         """
         if isinstance(self.function, nn.Module):
             self.function.to(waveform.device)
         try:
             output = self.function(waveform, *arguments)
-        except Exception as error:  # the code of others may raise anything
+        except Exception as error:  # because code of a plug-in may raise anything
             raise ValueError(f"{self.kind} {self.name} failed: {_describe(error)}") from error
         if not isinstance(output, Tensor) or output.is_complex() or output.shape != waveform.shape:
             raise ValueError(
-                f"{self.kind} {self.name} returned {_describe_output(output)}, expected a real tensor "
-                f"of shape {tuple(waveform.shape)}"
+                f"{self.kind} {self.name} returned {_describe_output(output)}, expected a real "
+                f"tensor of shape {tuple(waveform.shape)}"
             )
         if not bool(output.isfinite().all()):
             raise ValueError(f"{self.kind} {self.name} returned samples that are NaN or infinite")
@@ -118,60 +135,72 @@ class WaveformPlugin:
     def check_aligned(self, waveform: Tensor, sample_rate: int, *arguments: Any) -> None:
         """Call the plug-in and reject an output that is delayed or advanced by more than 2 ms.
 
-        Shape: (..., time); the first channel is compared.
+        The delay is the maximum of the cross-correlation of the first channels.
+
+        Args:
+            waveform: first argument of the plug-in. Shape: (..., time).
+            sample_rate: sample rate in Hz.
+            arguments: further arguments of the plug-in.
 
         Raises:
-            ValueError: As for a call, or the output is not time-aligned.
+            ValueError: the call fails, or the output is not time-aligned.
         """
         output = self(waveform, *arguments)
-        samples = 2 * waveform.shape[-1]
-        spectra = [
-            torch.fft.rfft(signal.reshape(-1, signal.shape[-1])[0].float(), samples)
-            for signal in (waveform, output)
-        ]
-        correlation = torch.fft.irfft(spectra[1] * spectra[0].conj(), samples)
+        points = 2 * waveform.shape[-1]
+        input_spectrum = torch.fft.rfft(_first_channel(waveform), points)
+        output_spectrum = torch.fft.rfft(_first_channel(output), points)
+        correlation = torch.fft.irfft(output_spectrum * input_spectrum.conj(), points)
         delay = int(correlation.abs().argmax())
-        if delay > samples // 2:
-            delay -= samples
-        if abs(delay) > MAX_DELAY * sample_rate:
+        if delay > points // 2:
+            delay -= points
+        if abs(delay) > MAX_DELAY_SECONDS * sample_rate:
             raise ValueError(
-                f"{self.kind} {self.name} delays by {1000 * delay / sample_rate:.1f} ms; its output must "
-                "be time-aligned with its input"
+                f"{self.kind} {self.name} delays by {1000 * delay / sample_rate:.1f} ms, expected "
+                "an output that is time-aligned with the input"
             )
 
 
+def _first_channel(waveform: Tensor) -> Tensor:
+    """First channel in float32. Shape: (..., time) -> (time,)."""
+    return waveform.reshape(-1, waveform.shape[-1])[0].float()
+
+
 _load_numbers = itertools.count()
+"""Numbers that distinguish plug-ins that were loaded under one name."""
 
 
 @lru_cache(maxsize=16)
 def _load_copy(name: str, kind: str, number: int) -> WaveformPlugin:
-    """Load a plug-in in another process; the same object for all pickles of one, by its number."""
+    """Load a pickled plug-in in another process, once for all pickles of the same object."""
     return WaveformPlugin(name, kind)
 
 
 def _import_file(path: Path) -> ModuleType:
+    """Import a file, which can import modules from its folder."""
     spec = importlib.util.spec_from_file_location(f"_hlsim_plugin_{path.stem}", path)
     if spec is None or spec.loader is None:
         raise ImportError(f"{path} cannot be imported")
     module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module  # dataclasses and pickle look their module up by name
-    with _searched_first(str(path.resolve().parent)):
+    # Dataclasses and pickle look up their module by its name.
+    sys.modules[spec.name] = module
+    with _prepend_to_path(str(path.resolve().parent)):
         spec.loader.exec_module(module)
     return module
 
 
 @contextmanager
-def _searched_first(folder: str) -> Iterator[None]:
-    before = list(sys.path)
+def _prepend_to_path(folder: str) -> Iterator[None]:
+    """Search for modules in a folder first, and restore the search path afterwards."""
+    original_path = list(sys.path)
     sys.path.insert(0, folder)
     try:
         yield
     finally:
-        sys.path[:] = before
+        sys.path[:] = original_path
 
 
 def _describe(error: Exception) -> str:
-    """Type and text of an exception in one line, with the place where it was raised."""
+    """Describe an exception in one line: its type, its text, and where it was raised."""
     text = f"{type(error).__name__}: {' '.join(str(error).split())}"
     traceback = error.__traceback__
     while traceback is not None and traceback.tb_next is not None:
@@ -183,6 +212,7 @@ def _describe(error: Exception) -> str:
 
 
 def _describe_output(output: Any) -> str:
+    """Describe the output of a plug-in in words for an error message."""
     if not isinstance(output, Tensor):
         return f"an object of type {type(output).__name__}"
     number = "complex" if output.is_complex() else "real"

@@ -1,4 +1,4 @@
-"""Levels in dB SPL, dB FS and pascals."""
+"""Levels in dB SPL and dB relative to full scale, and scales of samples."""
 
 import math
 from typing import Any
@@ -23,8 +23,8 @@ def test_a_full_scale_sine_is_3_db_below_full_scale() -> None:
     assert float(level_spl(sine, 110.0)) == pytest.approx(110 + 10 * math.log10(0.5))
 
 
-def test_gain_to_pascals_is_pyclaritys_full_scale() -> None:
-    # pyclarity: 100 + 20 dB SPL at RMS 1.0
+def test_gain_to_pascals_is_26_db_at_pyclaritys_full_scale() -> None:
+    # RMS 1.0 is 100 + 20 dB SPL in pyclarity.
     assert gain_to_pascals(120.0) == pytest.approx(10 ** (26 / 20))
     assert gain_to_pascals(94.0) == 1.0
     wave = torch.randn(3, 500)
@@ -35,33 +35,30 @@ def test_gain_to_pascals_is_pyclaritys_full_scale() -> None:
     "value",
     [-0.1, 200.1, math.nan, math.inf, -math.inf, 10**400, None, "a", "94", True, [94.0], 94 + 0j],
 )
-def test_full_scales_that_are_none(value: Any) -> None:
-    with pytest.raises(ValueError, match=r"full_scale_spl is .*; allowed: 0 to 200 dB SPL"):
+def test_bad_full_scales_are_rejected(value: Any) -> None:
+    with pytest.raises(ValueError):
         check_full_scale(value)
 
 
-def test_ends_of_full_scale_are_allowed() -> None:
+def test_both_ends_of_the_range_of_full_scales_are_accepted() -> None:
     assert (check_full_scale(0), check_full_scale(200)) == (0.0, 200.0)
 
 
 @pytest.mark.parametrize("value", [94, np.float32(94), np.int64(94)])
-def test_numbers_of_numpy_are_full_scales(value: Any) -> None:
+def test_numpy_numbers_are_accepted_as_full_scales(value: Any) -> None:
     assert check_full_scale(value) == 94.0 and type(check_full_scale(value)) is float
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_set_level_gives_each_item_its_own(dtype: torch.dtype) -> None:
-    wave = torch.randn(2, 3, 400, dtype=dtype) * 10 ** torch.linspace(
-        -3, 2, 6, dtype=dtype
-    ).reshape(2, 3, 1)
-    wanted = torch.tensor([[40.0, 55.0, 60.0], [75.0, 90.0, 115.0]])
-    out = set_level(wave, wanted, 107.0)
-    assert out.dtype == dtype
-    torch.testing.assert_close(level_spl(out, 107.0), wanted.to(dtype), atol=1e-3, rtol=0)
-    # only the level changes
-    torch.testing.assert_close(
-        out / out.norm(dim=-1, keepdim=True), wave / wave.norm(dim=-1, keepdim=True)
-    )
+def test_set_level_gives_each_item_its_level(dtype: torch.dtype) -> None:
+    gains = 10 ** torch.linspace(-3, 2, 6, dtype=dtype).reshape(2, 3, 1)
+    wave = gains * torch.randn(2, 3, 400, dtype=dtype)
+    levels = torch.tensor([[40.0, 55.0, 60.0], [75.0, 90.0, 115.0]])
+    scaled = set_level(wave, levels, 107.0)
+    assert scaled.dtype == dtype
+    torch.testing.assert_close(level_spl(scaled, 107.0), levels.to(dtype), atol=1e-3, rtol=0)
+    scaled_shape = scaled / scaled.norm(dim=-1, keepdim=True)
+    torch.testing.assert_close(scaled_shape, wave / wave.norm(dim=-1, keepdim=True))
     assert float(level_spl(set_level(wave, 65), 94.0).sub(65).abs().max()) < 1e-3
 
 
@@ -75,15 +72,15 @@ def test_silence_has_a_finite_level_and_stays_silent() -> None:
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
-def test_half_precision_is_levelled_too(dtype: torch.dtype) -> None:
-    wave = 1e-5 * torch.randn(4000).to(dtype)  # its power is less than half precision holds
+def test_half_precision_has_exact_levels(dtype: torch.dtype) -> None:
+    # The power of this noise is too small for half precision.
+    wave = 1e-5 * torch.randn(4000).to(dtype)
     level = level_spl(wave)
     assert level.dtype == dtype and float(level) == pytest.approx(-6.0, abs=0.5)
     assert float(level_spl(torch.zeros(10, dtype=dtype))) == -106.0
     louder = set_level(wave, 65.0)
-    assert louder.dtype == dtype and float(level_spl(louder.float())) == pytest.approx(
-        65.0, abs=0.05
-    )
+    assert louder.dtype == dtype
+    assert float(level_spl(louder.float())) == pytest.approx(65.0, abs=0.05)
     assert not bool(set_level(torch.zeros(10, dtype=dtype), 65.0).any())
 
 
@@ -93,20 +90,19 @@ def test_level_and_gain_are_differentiable() -> None:
     assert torch.autograd.gradcheck(lambda w: set_level(w, 70.0), wave)
 
 
-@pytest.mark.parametrize("given", [torch.zeros(8, dtype=torch.int16), [0.0, 1.0]])
-def test_levels_of_samples_that_are_no_floats_are_refused(given: Any) -> None:
-    for call in (level_spl, lambda waveform: set_level(waveform, 65.0)):
-        with pytest.raises(ValueError, match="floating-point tensor"):
-            call(given)
+@pytest.mark.parametrize("waveform", [torch.zeros(8, dtype=torch.int16), [0.0, 1.0]], ids=str)
+def test_waveforms_without_floats_are_rejected(waveform: Any) -> None:
+    with pytest.raises(ValueError):
+        level_spl(waveform)
+    with pytest.raises(ValueError):
+        set_level(waveform, 65.0)
 
 
-@pytest.mark.parametrize("value", [math.nan, math.inf, "65", None, [65.0, 70.0], True])
-def test_levels_that_are_none(value: Any) -> None:
-    with pytest.raises(ValueError, match=r"spl is .*; allowed: a level in dB SPL"):
-        set_level(torch.randn(2, 100), value)
+BAD_LEVELS = [math.nan, math.inf, "65", None, [65.0, 70.0], True]
+BAD_SHAPES = [torch.zeros(3, 1), torch.zeros(3), torch.zeros(2, 100)]
 
 
-@pytest.mark.parametrize("shape", [(3, 1), (3,), (2, 100)])
-def test_levels_in_a_shape_that_is_not_the_items(shape: tuple[int, ...]) -> None:
-    with pytest.raises(ValueError, match=r"spl of shape .* for items of \(2,\)"):
-        set_level(torch.randn(2, 100), torch.zeros(shape))
+@pytest.mark.parametrize("spl", [*BAD_LEVELS, *BAD_SHAPES], ids=str)
+def test_bad_levels_are_rejected(spl: Any) -> None:
+    with pytest.raises(ValueError):
+        set_level(torch.randn(2, 100), spl)

@@ -8,6 +8,7 @@ import pytest
 
 # Modules whose examples are tested. Add yours when each public function and class has an example.
 MODULES = [
+    "hlsim.calibration",
     "hlsim.dsp.active_level",
     "hlsim.dsp.erb",
     "hlsim.dsp.fft",
@@ -16,6 +17,7 @@ MODULES = [
     "hlsim.dsp.resample",
     "hlsim.dsp.stft",
     "hlsim.dsp.windows",
+    "hlsim.extras",
     "hlsim.msbg.cochlea",
     "hlsim.msbg.delay",
     "hlsim.msbg.ear",
@@ -27,6 +29,7 @@ MODULES = [
     "hlsim.msbg.resampling",
     "hlsim.msbg.response",
     "hlsim.msbg.smearing",
+    "hlsim.plugins",
 ]
 
 

@@ -1,4 +1,4 @@
-"""Plug-ins: how they are found, and how their outputs are checked."""
+"""Plug-ins are loaded by name, and their outputs are validated."""
 
 import pickle
 import sys
@@ -62,14 +62,15 @@ def noise() -> Tensor:
     return set_level(torch.randn(2, 8000), 65.0)
 
 
-def test_a_module_and_a_file_give_the_same_plugin_and_leave_no_path_behind(module: str) -> None:
-    paths, waveform = list(sys.path), noise()
+def test_a_module_and_a_file_give_the_same_plugin_and_restore_the_path(module: str) -> None:
+    paths = list(sys.path)
+    waveform = noise()
     for name in (f"{module}:half", f"{module}.py:half", f"./{module}.py:Quieter"):
         torch.testing.assert_close(WaveformPlugin(name, "teacher")(waveform), waveform / 2)
     assert sys.path == paths
 
 
-def test_a_changed_file_is_loaded_anew(module: str) -> None:
+def test_a_changed_file_is_loaded_again(module: str) -> None:
     assert load_plugin(f"{module}.py:number", "measure") == 3
     Path(f"{module}.py").write_text("number = 4")
     assert load_plugin(f"{module}.py:number", "measure") == 4
@@ -84,7 +85,7 @@ def test_another_process_loads_the_plugin_once_under_the_same_fingerprint(module
 
 
 @pytest.mark.parametrize("attribute", ["short", "complex_numbers", "array", "infinite", "broken"])
-def test_outputs_that_are_no_waveform_are_rejected_by_name(module: str, attribute: str) -> None:
+def test_outputs_that_are_no_waveform_are_rejected(module: str, attribute: str) -> None:
     plugin = WaveformPlugin(f"{module}:{attribute}", "teacher")
     with pytest.raises(ValueError, match=f"^teacher {module}:{attribute} "):
         plugin(noise())
@@ -102,5 +103,5 @@ def test_names_that_cannot_be_loaded_are_rejected(module: str, name: str) -> Non
         load_plugin(name, "teacher")
     with pytest.raises(ValueError, match="nobody"):
         load_plugin(f"{module}:nobody", "teacher")
-    with pytest.raises(ValueError, match="expected a callable"):
+    with pytest.raises(ValueError, match="to be callable"):
         WaveformPlugin(f"{module}:number", "teacher")
