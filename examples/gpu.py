@@ -71,8 +71,8 @@ from torch import Tensor, nn
 from compensators import load_compensator
 from hlsim import MSBG, Audiogram, HASPILoss, HearingLossLoss, NeuroMSBG, load_pretrained
 from hlsim.calibration import set_level
-from hlsim.losses.criteria import CRITERIA
-from hlsim.losses.paper import paper_parts, weighted_sum
+from hlsim.losses.criteria import CRITERIA, weighted_sum
+from hlsim.losses.paper import paper_parts
 from hlsim.metrics import haspi, hasqi, mbstoi
 from hlsim.neuro import NeuroConfig
 from hlsim.neuro.scan import _kernel as mamba_kernel

@@ -1,1 +1,1 @@
-"""What a loss compares of two waveforms."""
+"""Training losses that compare two waveforms."""

@@ -1,22 +1,25 @@
-"""Whether what is heard follows, band by band, what a normal ear hears, and has its level: the default criterion.
+"""The default criterion: in each band, coherence with the output of a normal ear, and the difference in level.
 
-Both are cut into 24 ERB-wide bands (``hlsim.losses.band_levels``) and overlapping stretches of 96 ms. With ``H`` and
-``R`` the spectra of what the impaired and the normal ear hear, in frames of 32 ms, each band and stretch has
+Both signals are cut into 24 ERB-wide bands (``hlsim.losses.band_levels``) and overlapping segments
+of 96 ms. With ``H`` and ``R`` the spectra of the impaired and the normal ear's outputs, in frames of
+32 ms, each band and segment has
 
-- ``incoherence``, ``1 - (sum |mean H R*|)^2 / (sum mean |H|^2 * sum mean |R|^2)``, the means over the stretch's frames,
-  the sums over the band's frequencies. It is 0 where what is heard is the reference times any gain and any fixed phase,
-  and rises with noise, late reverberation and distortion, however soft: noise that fills a band which is heard too
-  softly does not lower it.
-- ``misalignment``, how much of the coherence's square root the phase takes away. Little of it counts, for nobody hears
-  the sign or a millisecond's delay; it leads a model whose phase is arbitrary to none.
-- ``levels``, ``10 log(1 + abs(d) / 10)`` of the difference ``d`` of their levels in dB. Its slope falls with the
-  difference, so that a severe ear, which hears 100 dB too little and 2.5 dB more for each dB of gain, counts like a mild
-  one.
-- ``louder``, the dB by which what is heard exceeds both the reference and what is audible: too much gain, and noise in
-  pauses.
+- ``incoherence``, ``1 - (sum |mean H R*|)^2 / (sum mean |H|^2 * sum mean |R|^2)``, with means over
+  the frames of the segment and sums over the frequencies of the band. It is 0 if the perceived
+  signal is the reference times any gain and any fixed phase. It rises with noise, late reverberation
+  and distortion, however soft: noise in a band that is perceived too softly does not lower it.
+- ``misalignment``, the part of the square root of the coherence that is lost to the phase. It has a
+  small weight, as nobody hears the sign or a delay of one millisecond; it leads a model with an
+  arbitrary phase to none.
+- ``levels``, ``10 log(1 + abs(d) / 10)`` of the difference ``d`` of the levels in dB. The slope falls
+  with the difference, so that a severe ear, which perceives 100 dB too little and 2.5 dB more per
+  dB of gain, counts like a mild one.
+- ``louder``, the excess in dB of the perceived level over both the reference and the threshold of
+  audibility: too much gain, and noise in pauses.
 
-Incoherence and levels are weighted by how audible the reference is, ``P / (P + least)`` of its power ``P``: above 0
-wherever there is any, and so little of what is faint that it does not take the gradient over.
+Incoherence and levels are weighted by the audibility of the reference, ``P / (P + threshold)`` of its
+power ``P``. It is above 0 wherever there is power, and so small in faint bands that they do not
+dominate the gradient.
 """
 
 import math
@@ -30,8 +33,7 @@ from torch.nn import functional
 
 from hlsim.calibration import PASCAL_SPL
 from hlsim.dsp.fft import power
-from hlsim.dsp.stft import STFT
-from hlsim.losses.band_levels import FRAME_SECONDS, band_shares, threshold_in_quiet
+from hlsim.losses.band_levels import band_analysis, spectrum_scale, threshold_in_quiet
 from hlsim.torchtools import constant
 
 DEFAULT_WEIGHTS = {
@@ -41,105 +43,118 @@ DEFAULT_WEIGHTS = {
     "louder": 0.03,
     "peaks": 1.0,
 }
-"""What follows nothing costs 1, what is heard 40 dB too softly 0.48, and 40 dB too loud some 1.6."""
+"""Speech that is unrelated to the reference costs 1, a level 40 dB too low 0.48, and one 40 dB too high about 1.6."""
 
 DEPTH = 41.0
-"""dB under an item's loudest band, as a normal ear hears it, where the weight of a band has fallen to a half."""
+"""Level in dB below the strongest band of an item, for a normal ear, at which the weight of a band is one half."""
 
 KNEE = 10.0
-"""Difference of levels in dB at which a further dB costs half of the first."""
+"""Difference in level in dB at which one more dB costs half as much as the first."""
 
 LOWEST_POWER = 1e-22
-"""Power, -126 dB SPL, that is added before the logarithm: soft speech in an N5 ear has -110, and keeps its gradient."""
+"""Power, -126 dB SPL, added before the logarithm. Soft speech in an N5 ear has -110, and keeps its gradient."""
 
 HIGHEST_PEAK = 10.0 ** ((120.0 - PASCAL_SPL) / 20.0)
-"""Pressure in pascals, 120 dB SPL, over which peaks begin to hurt."""
+"""Pressure in pascals, 120 dB SPL, above which peaks cost."""
 
 MARGIN = 3.0
-"""Excess of the level in dB that is not counted as louder."""
+"""Excess of the level in dB that does not count as louder."""
 
-HIGHEST_GRADIENT = 6.0
-"""Of a sample, over the 0.9 quantile of those of its item that sound; in pauses it is held to that."""
+MAX_GRADIENT_RATIO = 6.0
+"""Gradients above this multiple of the item's 90th percentile (sounding samples) are scaled down to it."""
 
-_BLOCK = 3
-"""Frames from stretch to stretch; each stretch is twice as long."""
+FRAMES_PER_HOP = 3
+"""Frames from one segment to the next; a segment is twice as long."""
 
-_LIMITER_SECONDS = 0.005
-_SOUNDING = 1e-3  # of the power of the loudest 5 ms
-_SIGN = 0.1
-_TINY = 1e-36  # a product of two powers, far under those of a heard band
-_LEAST_WEIGHT = 1e-9  # of all of an item: that of a reference at some -160 dB SPL
+LIMITER_SECONDS = 0.005
+"""Length of the blocks whose gradients are scaled together."""
+
+SOUNDING = 1e-3
+"""Power of a block over that of the loudest one from which it counts as sounding."""
+
+LIMITER_SAMPLES = 4096
+"""Approximate number of samples from which the percentile of an item's gradients is taken."""
+
+SIGN_WEIGHT = 0.1
+"""Weight of the term of the misalignment that tells a signal from its negative."""
+
+PRODUCT_FLOOR = 1e-36
+"""Added to products of two powers; far below the products of audible bands."""
+
+LOWEST_TOTAL_WEIGHT = 1e-9
+"""Smallest sum of weights by which a part is divided: that of a reference at about -160 dB SPL."""
 
 
-def coherent_band_parts(heard: Tensor, normal: Tensor, sample_rate: int) -> dict[str, Tensor]:
-    """Incoherence (0 to 1), error of the level (dB, compressed) and excess of the level (dB) by name, of each item.
+def coherent_band_parts(perceived: Tensor, normal: Tensor, sample_rate: int) -> dict[str, Tensor]:
+    """Return the incoherence, misalignment, compressed level error and excess level of each item.
 
     Args:
-        heard: what the impaired ear hears.
-        normal: what a normal ear hears of the clean speech.
+        perceived: output of the impaired ear.
+        normal: output of a normal ear for the clean speech.
+        sample_rate: sample rate in Hz.
 
-    Shape: (items, time) twice, in pascals -> (items,) each. The weights carry no gradient; where the reference is silent,
-    what is audible has one all the same.
+    Shape: (items, time) twice, in pascals -> (items,) each. The weights carry no gradient; audible
+        sound where the reference is silent has a gradient all the same.
     """
-    hop = round(FRAME_SECONDS / 2.0 * sample_rate)
-    stft = STFT(2 * hop, 2 * hop, hop)
-    shares = constant(band_shares, stft.fft, sample_rate, dtype=heard.dtype, device=heard.device)
-    # both halves of the spectrum; the squares of a Hann window of n samples sum to 3 n / 8
-    shares = shares * (2.0 / (stft.fft * 0.375 * stft.window))
-    ear, reference = (stft.analyse(waveform) for waveform in (heard, normal))
-    level, truth = (_stretches(power(spectrum) @ shares) for spectrum in (ear, reference))
-    cross = _stretches(ear * reference.conj())
-    common, aligned = (power(cross) + _TINY).sqrt() @ shares, cross.real.contiguous() @ shares
-    product = (level + LOWEST_POWER) * truth + _TINY
+    stft, shares = band_analysis(perceived, sample_rate)
+    shares = shares * spectrum_scale(stft)
+    spectrum, reference = stft.analyse(perceived), stft.analyse(normal)
+    level = _average_segments(power(spectrum) @ shares)
+    reference_level = _average_segments(power(reference) @ shares)
+    cross = _average_segments(spectrum * reference.conj())
+    common = (power(cross) + PRODUCT_FLOOR).sqrt() @ shares
+    aligned = cross.real.contiguous() @ shares
+    product = (level + LOWEST_POWER) * reference_level + PRODUCT_FLOOR
 
-    quiet = constant(_quiet_power, dtype=heard.dtype, device=heard.device)
-    least = torch.maximum(
-        quiet, 10.0 ** (-DEPTH / 10.0) * truth.detach().amax((-2, -1), keepdim=True)
-    )
-    weights, own_weights = _audibility(truth, least), _audibility(level, least)
-    total = weights.sum((-2, -1)).clamp_min(_LEAST_WEIGHT)
-    error = (_decibels(level) - _decibels(truth)).abs()
-    excess = (_decibels(level) - _decibels(torch.maximum(truth, least)) - MARGIN).clamp_min(0.0)
-    return {
-        "incoherence": (weights * (1.0 - common.square() / product)).sum((-2, -1)) / total,
-        "misalignment": (
-            weights
-            * (
-                (common.square() - aligned.square()) / product
-                + _SIGN * (common - aligned) / product.sqrt()
-            )
-        ).sum((-2, -1))
-        / total,
-        "levels": (weights * (KNEE * torch.log1p(error / KNEE))).sum((-2, -1)) / total,
-        # noise against silence has no audible reference to be divided by
-        "louder": (own_weights * excess).sum((-2, -1))
-        / torch.maximum(total, own_weights.sum((-2, -1)) / 10.0),
+    quiet = constant(_quiet_power, dtype=perceived.dtype, device=perceived.device)
+    strongest = reference_level.detach().amax((-2, -1), keepdim=True)
+    threshold = torch.maximum(quiet, 10.0 ** (-DEPTH / 10.0) * strongest)
+    weights = _audibility(reference_level, threshold)
+    own_weights = _audibility(level, threshold)
+    total = weights.sum((-2, -1)).clamp_min(LOWEST_TOTAL_WEIGHT)
+    # Noise in a silent reference has no audible reference whose weight it could be divided by.
+    louder_total = torch.maximum(total, own_weights.sum((-2, -1)) / 10.0)
+
+    error = (_decibels(level) - _decibels(reference_level)).abs()
+    audible_level = torch.maximum(reference_level, threshold)
+    excess = (_decibels(level) - _decibels(audible_level) - MARGIN).clamp_min(0.0)
+    incoherence = 1.0 - common.square() / product
+    phase_loss = (common.square() - aligned.square()) / product
+    sign_loss = SIGN_WEIGHT * (common - aligned) / product.sqrt()
+    parts = {
+        "incoherence": weights * incoherence,
+        "misalignment": weights * (phase_loss + sign_loss),
+        "levels": weights * (KNEE * torch.log1p(error / KNEE)),
     }
+    sums = {name: part.sum((-2, -1)) / total for name, part in parts.items()}
+    sums["louder"] = (own_weights * excess).sum((-2, -1)) / louder_total
+    return sums
 
 
 def peak_excess(compensated: Tensor) -> Tensor:
-    """By how much the samples given to the ear exceed 120 dB SPL, relative to that, on average.
+    """Return the mean excess of the samples over 120 dB SPL, relative to that pressure.
 
     Shape: (items, time) in pascals -> (items,).
     """
     return (compensated.abs() / HIGHEST_PEAK - 1.0).clamp_min(0.0).mean(-1)
 
 
-def without_spikes(compensated: Tensor, sample_rate: int) -> Tensor:
-    """The same waveform, whose gradient is turned down where it is large beside that of the other samples of its item.
+def limit_gradient_spikes(compensated: Tensor, sample_rate: int) -> Tensor:
+    """Return the same waveform with a limiter on its gradient.
 
-    Where an ear hears next to nothing, a recruiting band or a network gives a few samples a thousand times that, and all
-    others no part of the step. Stretches of 5 ms are turned down as a whole: samples cut one by one leave a mean, and a
-    convolutional network grows a constant pressure from it that no ear hears. What sounds is what is within 30 dB of the
-    loudest stretch given. NaN stays.
+    In ears that perceive next to nothing, a recruiting band or a network gives a few samples a
+    gradient a thousand times as large as the others', which then have no part in the step. Blocks
+    of 5 ms are scaled down as a whole: limiting single samples leaves a mean, from which a
+    convolutional network grows a constant pressure that is inaudible. In pauses, blocks 30 dB or more
+    below the loudest one of the item, the limit is six times as low. NaN stays.
 
     Shape: (..., time) -> (..., time).
     """
-    limited: Tensor = _WithoutSpikes.apply(compensated, round(_LIMITER_SECONDS * sample_rate))
+    limited: Tensor = _GradientLimiter.apply(compensated, round(LIMITER_SECONDS * sample_rate))
     return limited
 
 
-class _WithoutSpikes(torch.autograd.Function):
+class _GradientLimiter(torch.autograd.Function):
     @staticmethod
     def forward(waveform: Tensor, block: int) -> Tensor:
         return waveform.view_as(waveform)
@@ -151,41 +166,46 @@ class _WithoutSpikes(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
-        (waveform,), time = ctx.saved_tensors, gradient.shape[-1]
-        powers = _blocks(waveform, ctx.block).square().mean(-1)
-        sizes = _blocks(gradient.abs(), ctx.block)
-        sounding = powers >= _SOUNDING * powers.amax(-1, keepdim=True)
-        # of what follows an item's end there is none
-        present = torch.where(sounding.unsqueeze(-1) & (sizes > 0.0), sizes, math.nan).flatten(-2)
-        usual = present[..., :: max(1, time // 4096)].nanquantile(0.9, -1, keepdim=True)
-        limit = usual.nan_to_num(nan=math.inf) * torch.where(sounding, HIGHEST_GRADIENT, 1.0)
+        (waveform,) = ctx.saved_tensors
+        time = gradient.shape[-1]
+        powers = _split(waveform, ctx.block).square().mean(-1)
+        sizes = _split(gradient.abs(), ctx.block)
+        sounding = powers >= SOUNDING * powers.amax(-1, keepdim=True)
+        # Samples behind the end of an item have no gradient, and do not count.
+        counted = sounding.unsqueeze(-1) & (sizes > 0.0)
+        candidates = torch.where(counted, sizes, math.nan).flatten(-2)
+        sample = candidates[..., :: max(1, time // LIMITER_SAMPLES)]
+        usual = sample.nanquantile(0.9, -1, keepdim=True).nan_to_num(nan=math.inf)
+        limit = usual * torch.where(sounding, MAX_GRADIENT_RATIO, 1.0)
         factor = (limit / sizes.amax(-1)).clamp_max(1.0)
-        # on straight lines between the blocks' edges, none of which is over either block's
-        edges = torch.minimum(
-            functional.pad(factor, (1, 0), value=1.0), functional.pad(factor, (0, 1), value=1.0)
-        )
-        ramp = torch.arange(ctx.block, device=gradient.device) / ctx.block
-        factors = torch.lerp(edges[..., :-1, None], edges[..., 1:, None], ramp.to(edges)).flatten(
-            -2
-        )
+
+        # The factors go linearly from edge to edge; at an edge the smaller one of both blocks holds.
+        before = functional.pad(factor, (1, 0), value=1.0)
+        after = functional.pad(factor, (0, 1), value=1.0)
+        edges = torch.minimum(before, after)
+        ramp = (torch.arange(ctx.block, device=gradient.device) / ctx.block).to(edges)
+        factors = torch.lerp(edges[..., :-1, None], edges[..., 1:, None], ramp).flatten(-2)
         return gradient * factors[..., :time], None
 
 
-def _blocks(samples: Tensor, block: int) -> Tensor:
-    """Zeros where the last one goes on. Shape: (..., time) -> (..., blocks, block)."""
+def _split(samples: Tensor, block: int) -> Tensor:
+    """Split into blocks, the last one filled with zeros. Shape: (..., time) -> (..., blocks, block)."""
     return functional.pad(samples, (0, -samples.shape[-1] % block)).unflatten(-1, (-1, block))
 
 
-def _stretches(frames: Tensor) -> Tensor:
-    """Means over stretches of 96 ms, every 48 ms. Shape: (items, frames, n) -> (items, stretches, n)."""
-    missing = -frames.shape[-2] % _BLOCK
-    blocks = functional.pad(frames, (0, 0, 0, missing)).unflatten(-2, (-1, _BLOCK)).mean(-2)
-    return blocks if blocks.shape[-2] < 2 else 0.5 * (blocks[..., 1:, :] + blocks[..., :-1, :])
+def _average_segments(frames: Tensor) -> Tensor:
+    """Average over segments of 96 ms, every 48 ms. Shape: (items, frames, n) -> (items, segments, n)."""
+    missing = -frames.shape[-2] % FRAMES_PER_HOP
+    padded = functional.pad(frames, (0, 0, 0, missing))
+    halves = padded.unflatten(-2, (-1, FRAMES_PER_HOP)).mean(-2)
+    if halves.shape[-2] < 2:
+        return halves
+    return 0.5 * (halves[..., 1:, :] + halves[..., :-1, :])
 
 
-def _audibility(powers: Tensor, least: Tensor) -> Tensor:
+def _audibility(powers: Tensor, threshold: Tensor) -> Tensor:
     powers = powers.detach()
-    return powers / (powers + least)
+    return powers / (powers + threshold)
 
 
 def _decibels(powers: Tensor) -> Tensor:
@@ -193,6 +213,6 @@ def _decibels(powers: Tensor) -> Tensor:
 
 
 def _quiet_power() -> NDArray[np.float64]:
-    """Power of each band at the threshold of hearing. Returns (24,)."""
-    power_in_quiet: NDArray[np.float64] = 10.0 ** ((threshold_in_quiet() - PASCAL_SPL) / 10.0)
-    return power_in_quiet
+    """Return the power of each band at the threshold of hearing, (24,)."""
+    powers: NDArray[np.float64] = 10.0 ** ((threshold_in_quiet() - PASCAL_SPL) / 10.0)
+    return powers

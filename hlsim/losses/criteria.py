@@ -1,8 +1,9 @@
-"""Which criterion a loss has: by name, several weighed by name, or a callable, and the weights of their parts."""
+"""Criteria of ``HearingLossLoss`` by name, and the weights of their parts."""
 
 from collections.abc import Callable, Mapping
 from typing import Any, Literal
 
+import torch
 from torch import Tensor
 
 from hlsim.checks import check_weights
@@ -18,31 +19,17 @@ CRITERIA: dict[str, Mapping[str, float]] = {
     "hasqi": {"hasqi": 1.0},
     "interaural": {"interaural": 1.0},
 }
-"""Criteria by name: their parts and the default weight of each."""
-
+"""Parts of each criterion with their default weights."""
 
 Criterion = CriterionName | Mapping[str, float] | Callable[[Tensor, Tensor], Tensor]
-"""A name, weights by name, or a callable: what is heard and the reference, (items, time) in pascals -> (items,)."""
-
-
-def check_values(values: Any, items: int) -> Tensor:
-    """What a callable criterion returned, or ValueError unless it is a value for each item."""
-    if not isinstance(values, Tensor) or values.shape != (items,):
-        found = (
-            f"shape {tuple(values.shape)}" if isinstance(values, Tensor) else type(values).__name__
-        )
-        raise ValueError(
-            f"the criterion returned {found} for {items} items; allowed: a value for each, ({items},); one that gives "
-            "a mean goes on what loss.heard(...) returns"
-        )
-    return values
+"""A name, weights by name, or a function of the perceived speech and its reference, (items, time) in pascals -> (items,)."""
 
 
 def check_criterion(criterion: Any) -> dict[str, Any]:
-    """Return the criteria by name, each with its weight unless that is 0, or a callable under the name ``criterion``.
+    """Return the criteria by name: each with its weight unless that is 0, or a function as ``criterion``.
 
     Raises:
-        ValueError: an unknown criterion or a bad weight.
+        ValueError: an unknown name, or a weight that is negative or not finite.
     """
     if callable(criterion) and not isinstance(criterion, type):
         return {"criterion": criterion}
@@ -57,11 +44,11 @@ def combine_weights(
     """Return the weight of each part of the loss, multiplied by that of its criterion.
 
     Args:
-        weights: weights of the parts; the defaults of the criteria if None.
-        criteria: what ``check_criterion`` returned.
+        weights: weights of the parts by name; the defaults of the criteria if None.
+        criteria: result of ``check_criterion``.
 
     Raises:
-        ValueError: an unknown part or a bad weight.
+        ValueError: an unknown part, or a weight that is negative or not finite.
     """
     defaults: dict[str, float] = {}
     scales: dict[str, float] = {}
@@ -71,3 +58,27 @@ def combine_weights(
             scales[part] = 1.0 if callable(scale) else scale
     chosen = check_weights(defaults if weights is None else weights, defaults, "parts of the loss")
     return {part: weight * scales[part] for part, weight in chosen.items()}
+
+
+def check_values(values: Any, items: int) -> Tensor:
+    """Return the result of a criterion of the user's own.
+
+    Raises:
+        ValueError: it is not a tensor with one value per item.
+    """
+    if not isinstance(values, Tensor) or values.shape != (items,):
+        found = tuple(values.shape) if isinstance(values, Tensor) else type(values).__name__
+        raise ValueError(
+            f"expected the criterion to return one value per item, shape ({items},), got {found}; "
+            "apply a criterion that returns a mean to the result of loss.heard(...)"
+        )
+    return values
+
+
+def weighted_sum(parts: Mapping[str, Tensor], weights: Mapping[str, float]) -> Tensor:
+    """Return the sum of the parts of a loss times their weights. Parts without a weight do not count."""
+    total = torch.zeros_like(next(iter(parts.values())))
+    for name, weight in weights.items():
+        if weight:
+            total = total + weight * parts[name]
+    return total

@@ -29,7 +29,13 @@ from hlsim.checks import (
 )
 from hlsim.losses import coherent_bands, paper
 from hlsim.losses.band_levels import band_level_loss
-from hlsim.losses.criteria import Criterion, check_criterion, check_values, combine_weights
+from hlsim.losses.criteria import (
+    Criterion,
+    check_criterion,
+    check_values,
+    combine_weights,
+    weighted_sum,
+)
 from hlsim.losses.frozen_simulator import FrozenEar, Hearing, ReferenceName, move
 from hlsim.metrics.interaural import interaural_loss
 from hlsim.metrics.objective import SCORES, missing_score
@@ -195,7 +201,7 @@ class HearingLossLoss(nn.Module):
                 1 to time, or a simulator, normal ear or criterion that does not return the shape it should; with
                 ``"haspi"`` or ``"hasqi"`` items shorter than 0.7 s.
         """
-        return paper.weighted_sum(
+        return weighted_sum(
             self.parts(compensated, clean, audiogram, lengths, listener=listener), self.weights
         )
 
@@ -222,7 +228,7 @@ class HearingLossLoss(nn.Module):
         with torch.autocast(given.device.type, enabled=False):
             output = given
             if {"coherent-bands", *SCORES} & self.criteria.keys():
-                given = coherent_bands.without_spikes(given, self.sample_rate)
+                given = coherent_bands.limit_gradient_spikes(given, self.sample_rate)
             heard = self._ear.hear(given, ears, listener, ends)
             batch, time = heard.shape[:-1], heard.shape[-1]
             signals = {
@@ -355,7 +361,7 @@ class HearingLossLoss(nn.Module):
         if known is not None:
             known = known.expand(next(iter(parts.values())).shape)
         if self.ears == "better":
-            value = paper.weighted_sum(parts, self.weights).detach()
+            value = weighted_sum(parts, self.weights).detach()
             if known is not None:
                 value = value.masked_fill(~known, math.inf)
             shares = torch.softmax(-value / TEMPERATURE, -1)

@@ -1,18 +1,20 @@
 """The training criteria of the Neuro-MSBG paper: Equations 2 to 9.
 
-They are what a simulator learns by. As the criterion of a compensator through ``HearingLossLoss`` they have faults:
+Simulators learn by them. As the criterion of a compensator in ``HearingLossLoss`` they have faults:
 
-- They are not balanced. The gradient on eight band gains from none is 6.9e-3 for N1, 2.0e-3 for N3 and 3.5e-6 for N5, and
-  2.9e-5 at 50 dB SPL to 0.139 at 80: a mixed batch trains for mild ears and loud speech. The weights come from a paper
-  that scales its speech to unit power, which would mend the levels of the speech, and not the ears.
-- Of their value, 0.70 of 0.87 is phase, whose gradient is faded where it is faint: value and gradient disagree, and Adam
-  on a free waveform raises the value. Polarity-inverted speech (1.36) costs more than noise at -5 dB SNR (1.34).
-- Rank correlation with HASPI and HASQI over 17 degradations is .50 and .70. A filter bank trained by them from zero is
-  behind the prescription NAL-R (HASPI .877, .950), and learns no compression.
+- They are not balanced. The gradient on eight band gains that start at 0 dB is 6.9e-3 for N1, 2.0e-3
+  for N3 and 3.5e-6 for N5, and 2.9e-5 at 50 dB SPL to 0.139 at 80: a mixed batch trains for mild
+  ears and loud speech. The weights come from a paper that scales its speech to unit power, which
+  would balance the levels of the speech, but not the ears.
+- Of their value, 0.70 of 0.87 is phase, whose gradient is faded out in faint bins: value and gradient
+  disagree, and Adam on a free waveform raises the value. Speech with inverted polarity (1.36) costs
+  more than noise at -5 dB SNR (1.34).
+- Their rank correlations with HASPI and HASQI over 17 degradations are .50 and .70. A filter bank
+  trained by them from zero is worse than the prescription NAL-R (HASPI .877, .950), and learns no
+  compression.
 """
 
 import math
-from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -25,102 +27,106 @@ PAPER_STFT = STFT(400, 400, 100)
 """The paper's transform at 16 kHz: 201 frequencies."""
 
 DEFAULT_WEIGHTS = {"magnitude": 0.9, "phase": 0.3, "complex": 0.1, "time": 0.2}
-"""The paper leaves its weights open; these are those of MP-SENet (Lu, Ai and Ling 2023), on which it builds."""
+"""Weights of MP-SENet (Lu, Ai and Ling 2023), on which the paper builds; the paper does not state its own."""
 
-_TINY = 1e-12
+POWER_FLOOR = 1e-12
 
-_FAINT = 8e-4  # squared magnitude of a tone of 20 dB SPL in the paper's transform
+FAINT_POWER = 8e-4
+"""Squared magnitude of a tone of 20 dB SPL in the paper's transform."""
 
-
-def magnitude_loss(estimate: Tensor, truth: Tensor) -> Tensor:
-    """Mean square of the difference of magnitudes (Equation 2). Shape: complex (items, frames, bins) -> (items,)."""
-    return (_magnitude(estimate) - _magnitude(truth)).square().mean((-2, -1))
+SILENT_MAGNITUDE = 1e-7
 
 
-def phase_loss(estimate: Tensor, truth: Tensor) -> Tensor:
+def magnitude_loss(estimate: Tensor, target: Tensor) -> Tensor:
+    """Mean square of the difference of magnitudes (Equation 2). Shape: complex (items, frames, bins) twice -> (items,)."""
+    return (_magnitude(estimate) - _magnitude(target)).square().mean((-2, -1))
+
+
+def phase_loss(estimate: Tensor, target: Tensor) -> Tensor:
     """Anti-wrapped phase error: instantaneous phase + group delay + instantaneous frequency (Equations 3 to 6).
 
-    The value is the paper's. Its gradient is 1 / magnitude, so that all of it would come from the bins that nobody hears;
-    it is faded out where estimate or truth is fainter than a tone of 20 dB SPL.
+    The value is the paper's. Its gradient is 1 / magnitude, so that the inaudible bins would dominate
+    it; it is faded out where the estimate or the target is fainter than a tone of 20 dB SPL.
 
-    Shape: complex (items, frames, bins) -> (items,).
+    Shape: complex (items, frames, bins) twice -> (items,).
     """
-    difference: Tensor = _FadedDifference.apply(estimate, truth)
+    difference: Tensor = _FadedPhaseDifference.apply(estimate, target)
     instantaneous = anti_wrap(difference).mean((-2, -1))
     group_delay = anti_wrap(difference.diff(dim=-1)).mean((-2, -1))
+    total = instantaneous + group_delay
     if difference.shape[-2] < 2:
-        return instantaneous + group_delay
-    return instantaneous + group_delay + anti_wrap(difference.diff(dim=-2)).mean((-2, -1))
+        return total
+    return total + anti_wrap(difference.diff(dim=-2)).mean((-2, -1))
 
 
-def complex_loss(estimate: Tensor, truth: Tensor) -> Tensor:
-    """Twice the mean square of real and imaginary differences (Equation 7). Shape: (items, frames, bins) -> (items,)."""
-    difference = torch.view_as_real(estimate - truth)
+def complex_loss(estimate: Tensor, target: Tensor) -> Tensor:
+    """Twice the mean square of real and imaginary differences (Equation 7). Shape: (items, frames, bins) twice -> (items,)."""
+    difference = torch.view_as_real(estimate - target)
     return 2.0 * difference.square().mean((-3, -2, -1))
 
 
-def time_loss(estimate: Tensor, truth: Tensor) -> Tensor:
-    """Mean absolute difference of waveforms (Equation 8). Shape: (items, time) -> (items,)."""
-    return (estimate - truth).abs().mean(-1)
+def time_loss(estimate: Tensor, target: Tensor) -> Tensor:
+    """Mean absolute difference of waveforms (Equation 8). Shape: (items, time) twice -> (items,)."""
+    return (estimate - target).abs().mean(-1)
 
 
 def anti_wrap(angle: Tensor) -> Tensor:
-    """Distance of an angle to the nearest multiple of 2 pi (Ai and Ling 2023). Any shape, radians."""
+    """Distance of an angle from the nearest multiple of 2 pi (Ai and Ling 2023). Any shape, in radians."""
     turns = (angle.detach() / (2.0 * math.pi)).round_()
     return torch.sub(angle, turns, alpha=2.0 * math.pi).abs()
 
 
 def paper_stft(sample_rate: int) -> STFT:
-    """The paper's transform at another rate: windows of 25 ms every 6.25 ms, to the nearest sample."""
+    """Return the paper's transform at another rate: windows of 25 ms every 6.25 ms, to the nearest sample."""
     hop = round(sample_rate * PAPER_STFT.hop / 16000)
     return STFT(4 * hop, 4 * hop, hop)
 
 
 def paper_parts(
-    estimate: Tensor, truth: Tensor, stft: STFT = PAPER_STFT, frequencies: int | None = None
+    estimate: Tensor, target: Tensor, stft: STFT = PAPER_STFT, frequencies: int | None = None
 ) -> dict[str, Tensor]:
-    """The paper's four losses by name, of each item. Shape: (items, time) twice -> (items,) each.
+    """Return the paper's four losses of each item by name.
 
     Args:
-        stft: spectra are scaled to the magnitudes of the paper's transform, so that a rate changes no level; magnitude
-            and complex loss to its number of frequencies, so that an empty band does not change them either.
-        frequencies: how many of the transform's to compare, from 0 Hz up; all if None.
+        estimate: waveform to judge.
+        target: waveform that it should equal.
+        stft: transform. Spectra are scaled to the magnitudes of the paper's transform, so that the
+            sample rate changes no level, and the magnitude and complex losses to its number of
+            frequencies, so that an empty band changes nothing.
+        frequencies: number of frequencies to compare, from 0 Hz up; all if None.
+
+    Shape: (items, time) twice -> (items,) each.
     """
-    first, second = (stft.analyse(waveform)[..., :frequencies] for waveform in (estimate, truth))
-    if (scale := PAPER_STFT.window / stft.window) != 1.0:
-        first, second = first * scale, second * scale
-    share = first.shape[-1] / PAPER_STFT.frequencies
+    spectrum = stft.analyse(estimate)[..., :frequencies]
+    target_spectrum = stft.analyse(target)[..., :frequencies]
+    scale = PAPER_STFT.window / stft.window
+    if scale != 1.0:
+        spectrum, target_spectrum = spectrum * scale, target_spectrum * scale
+    share = spectrum.shape[-1] / PAPER_STFT.frequencies
     return {
-        "magnitude": magnitude_loss(first, second) * share,
-        "phase": phase_loss(first, second),
-        "complex": complex_loss(first, second) * share,
-        "time": time_loss(estimate, truth),
+        "magnitude": magnitude_loss(spectrum, target_spectrum) * share,
+        "phase": phase_loss(spectrum, target_spectrum),
+        "complex": complex_loss(spectrum, target_spectrum) * share,
+        "time": time_loss(estimate, target),
     }
 
 
-def weighted_sum(parts: Mapping[str, Tensor], weights: Mapping[str, float]) -> Tensor:
-    """Sum of parts times weights (Equation 9); parts without a weight do not count."""
-    total = torch.zeros_like(next(iter(parts.values())))
-    for name, weight in weights.items():
-        if weight:
-            total = total + weight * parts[name]
-    return total
-
-
 def _magnitude(spectrum: Tensor) -> Tensor:
-    return (power(spectrum) + _TINY).sqrt()
+    return (power(spectrum) + POWER_FLOOR).sqrt()
 
 
-class _FadedDifference(torch.autograd.Function):
-    """Angle of the truth's product with the estimate's conjugate: that from the one's phase to the other's.
+class _FadedPhaseDifference(torch.autograd.Function):
+    """Phase of the target minus that of the estimate, as the angle of one complex product.
 
-    The gradient of an angle is i z / |z|^2; here it is times |z|^2 / (|z|^2 + faint), and the same of the other's.
+    The gradient of the angle of z is i z / |z|^2. Here it is multiplied by |z|^2 / (|z|^2 + faint), and
+    by the same factor of the other spectrum.
     """
 
     @staticmethod
-    def forward(estimate: Tensor, truth: Tensor) -> Tensor:
-        (x, y), (u, v) = _apart(estimate), _apart(truth)
-        # one angle, where that of each takes as long again as all the rest
+    def forward(estimate: Tensor, target: Tensor) -> Tensor:
+        x, y = _real_imag(estimate)
+        u, v = _real_imag(target)
+        # One angle, because that of each spectrum takes as long as everything else.
         return torch.atan2(x * v - y * u, x * u + y * v)
 
     @staticmethod
@@ -129,26 +135,28 @@ class _FadedDifference(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, Tensor | None]:
-        estimate, truth = ctx.saved_tensors
-        first, second = ctx.needs_input_grad
-        return (
-            _turned(estimate, -gradient * _fading(estimate, truth)) if first else None,
-            _turned(truth, gradient * _fading(truth, estimate)) if second else None,
-        )
+        estimate, target = ctx.saved_tensors
+        estimate_slope = target_slope = None
+        if ctx.needs_input_grad[0]:
+            estimate_slope = _times_i(estimate, -gradient * _fade_weight(estimate, target))
+        if ctx.needs_input_grad[1]:
+            target_slope = _times_i(target, gradient * _fade_weight(target, estimate))
+        return estimate_slope, target_slope
 
 
-def _apart(spectrum: Tensor) -> tuple[Tensor, Tensor]:
-    """Real and imaginary parts; next to silence, where the angle is rounding, the real one is small and positive."""
-    # contiguous, for torch takes twenty times as long where every second number is another's
+def _real_imag(spectrum: Tensor) -> tuple[Tensor, Tensor]:
+    """Return both parts. Near silence, where the angle is rounding, the real part is small and positive."""
+    # Contiguous, because torch takes twenty times as long with interleaved numbers.
     real, imaginary = spectrum.real.contiguous(), spectrum.imag.contiguous()
-    return torch.where(real.abs().add_(imaginary.abs()) < 1e-7, 1e-7, real), imaginary
+    silent = real.abs().add_(imaginary.abs()) < SILENT_MAGNITUDE
+    return torch.where(silent, SILENT_MAGNITUDE, real), imaginary
 
 
-def _turned(spectrum: Tensor, share: Tensor) -> Tensor:
-    """i times the spectrum times real numbers."""
-    return torch.complex(-spectrum.imag * share, spectrum.real * share)
+def _times_i(spectrum: Tensor, factor: Tensor) -> Tensor:
+    """Multiply a spectrum by i and by real numbers."""
+    return torch.complex(-spectrum.imag * factor, spectrum.real * factor)
 
 
-def _fading(spectrum: Tensor, other: Tensor) -> Tensor:
+def _fade_weight(spectrum: Tensor, other: Tensor) -> Tensor:
     level = power(other)
-    return level / ((level + _FAINT) * (power(spectrum) + _FAINT))
+    return level / ((level + FAINT_POWER) * (power(spectrum) + FAINT_POWER))

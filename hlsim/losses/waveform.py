@@ -1,4 +1,4 @@
-"""How far a simulator's waveform is from the truth, in dB."""
+"""Differences in dB between the output of a simulator and that of its teacher."""
 
 import torch
 from torch import Tensor
@@ -6,26 +6,33 @@ from torch import Tensor
 from hlsim.dsp.fft import power
 from hlsim.losses.paper import PAPER_STFT
 
-_TINY = 1e-12
-_SILENT = 1e-20
+POWER_FLOOR = 1e-20
+RELATIVE_FLOOR = 1e-6
+SPECTRAL_FLOOR = 1e-12
 
 
-def noise_to_signal_db(estimate: Tensor, truth: Tensor) -> Tensor:
-    """Power of the error over that of the truth in dB: the negative SNR. Shape: (items, time) twice -> (items,).
+def noise_to_signal_db(estimate: Tensor, target: Tensor) -> Tensor:
+    """Power of the error over that of the target in dB: the negative signal-to-noise ratio.
 
-    It falls no further than -60 dB, so that the silent and the perfect do not outweigh the rest.
-    """
-    signal = truth.square().mean(-1)
-    error = (estimate - truth).square().mean(-1)
-    return 10.0 * torch.log10((error + 1e-6 * signal + _SILENT) / (signal + _SILENT))
-
-
-def log_spectral_distance_db(estimate: Tensor, truth: Tensor) -> Tensor:
-    """Mean absolute difference of log magnitudes in dB, from 60 dB under each item's loudest bin up.
+    It is -60 dB at least, so that silent items and perfect ones do not outweigh the others.
 
     Shape: (items, time) twice -> (items,).
     """
-    powers = [power(spectrum) for spectrum in map(PAPER_STFT.analyse, (estimate, truth))]
-    floor = powers[1].amax((-2, -1), keepdim=True) * 1e-6 + _TINY
-    first, second = (10.0 * torch.log10(own + floor) for own in powers)
-    return (first - second).abs().mean((-2, -1))
+    signal = target.square().mean(-1)
+    error = (estimate - target).square().mean(-1)
+    ratio = (error + RELATIVE_FLOOR * signal + POWER_FLOOR) / (signal + POWER_FLOOR)
+    return 10.0 * torch.log10(ratio)
+
+
+def log_spectral_distance_db(estimate: Tensor, target: Tensor) -> Tensor:
+    """Mean absolute difference of log spectra in dB, down to 60 dB below the strongest bin of each item.
+
+    Shape: (items, time) twice -> (items,).
+    """
+    estimate_power = power(PAPER_STFT.analyse(estimate))
+    target_power = power(PAPER_STFT.analyse(target))
+    strongest = target_power.amax((-2, -1), keepdim=True)
+    floor = strongest * RELATIVE_FLOOR + SPECTRAL_FLOOR
+    estimate_db = 10.0 * torch.log10(estimate_power + floor)
+    target_db = 10.0 * torch.log10(target_power + floor)
+    return (estimate_db - target_db).abs().mean((-2, -1))

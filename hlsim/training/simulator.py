@@ -9,7 +9,8 @@ from typing import Unpack
 import torch
 from torch import Tensor
 
-from hlsim.losses.paper import paper_parts, weighted_sum
+from hlsim.losses.criteria import weighted_sum
+from hlsim.losses.paper import paper_parts
 from hlsim.losses.waveform import log_spectral_distance_db, noise_to_signal_db
 from hlsim.neuro import NeuroConfig, NeuroMSBG
 from hlsim.pretrained import SIMULATOR, load_pretrained

@@ -11,6 +11,7 @@ from scipy.signal import get_window
 from torch import Tensor
 
 from hlsim.dsp.resample import resample
+from hlsim.losses.criteria import weighted_sum
 from hlsim.losses.paper import (
     DEFAULT_WEIGHTS,
     PAPER_STFT,
@@ -21,7 +22,6 @@ from hlsim.losses.paper import (
     paper_stft,
     phase_loss,
     time_loss,
-    weighted_sum,
 )
 from hlsim.losses.waveform import log_spectral_distance_db, noise_to_signal_db
 
