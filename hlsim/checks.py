@@ -26,7 +26,8 @@ Lengths = Tensor | Sequence[int]
 def broadcast_shape(*shapes: Sequence[int]) -> torch.Size:
     """Return the shape to which all shapes broadcast.
 
-    ``torch.broadcast_shapes`` does the same, but its first call imports sympy, which takes a third of a second.
+    ``torch.broadcast_shapes`` does the same, but its first call imports sympy, which takes a third
+    of a second.
 
     Raises:
         RuntimeError: the shapes do not fit.
@@ -183,7 +184,7 @@ def check_waveform(
 
 
 def check_time_last(waveform: Tensor, name: str = "waveform") -> None:
-    """Raise ValueError unless an argument is a floating-point tensor whose last dimension can be time."""
+    """Raise ValueError unless a value is a floating-point tensor that can have time last."""
     if not isinstance(waveform, Tensor):
         raise ValueError(
             f"expected {name} to be a floating-point tensor with time last, "
@@ -234,7 +235,10 @@ def check_lengths(lengths: Lengths, shape: torch.Size) -> Tensor:
 
 
 def silence_after(waveform: Tensor, ends: Tensor) -> Tensor:
-    """Replace the samples behind the end of each item by zeros. Shape: (..., time), (...) -> (..., time)."""
+    """Replace the samples behind the end of each item by zeros.
+
+    Shape: (..., time), (...) -> (..., time).
+    """
     samples = torch.arange(waveform.shape[-1], device=waveform.device)
     ends = ends.to(waveform.device, non_blocking=True)
     return torch.where(samples < ends.unsqueeze(-1), waveform, 0.0)

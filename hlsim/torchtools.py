@@ -1,4 +1,4 @@
-"""Helpers for torch: constants that are computed once, and functions that the compiler calls as they are."""
+"""Constants that are computed once, and functions that torch's compiler runs as they are."""
 
 from collections import OrderedDict
 from collections.abc import Callable
@@ -21,8 +21,8 @@ CACHE_BYTES = 2**28
 def not_compiled(function: Callable[P, Result]) -> Callable[P, Result]:
     """Decorate a function that a compiled program calls as it is, with a break in its graph.
 
-    This is ``torch.compiler.disable`` without its price: as a decorator, it would import the compiler, which takes longer
-    than importing hlsim.
+    This is ``torch.compiler.disable`` without its price: as a decorator, it would import the
+    compiler, which takes longer than importing hlsim.
     """
 
     @wraps(function)
@@ -37,10 +37,10 @@ def not_compiled(function: Callable[P, Result]) -> Callable[P, Result]:
 def without_modes(
     function: Callable[P, Result], /, *arguments: P.args, **options: P.kwargs
 ) -> Result:
-    """Call a function outside of inference mode, autocast, ``torch.func`` and other modes of the caller.
+    """Call a function outside of inference mode, ``torch.func`` and other modes of the caller.
 
-    These modes belong to a thread, so the function runs in a thread of its own. Tensors that it creates are plain ones,
-    which can be kept and used under any mode.
+    These modes belong to a thread, so the function runs in a thread of its own. Tensors that it
+    creates are plain ones, which can be kept and used under any mode.
     """
     with ThreadPoolExecutor(1) as pool:
         return pool.submit(function, *arguments, **options).result()
@@ -49,7 +49,7 @@ def without_modes(
 def constant(
     function: Callable[..., Any], *arguments: Any, dtype: torch.dtype, device: torch.device
 ) -> Tensor:
-    """Return the values of ``function(*arguments)`` as a tensor, computed once. Nobody may write into it.
+    """Return the values of ``function(*arguments)`` as a tensor that nobody may write into.
 
     Args:
         function: a module's function that returns an array or numbers.
@@ -67,7 +67,7 @@ def constant_like(tensor: Tensor, function: Callable[..., Any], *arguments: Any)
 
 
 def compute_once(function: Callable[..., Any], *arguments: Any) -> Any:
-    """Return ``function(*arguments)`` from a cache of the process, which drops what was not used for longest.
+    """Return ``function(*arguments)`` from a cache that drops the least recently used results.
 
     Args:
         function: a module's function that returns a tensor or another object with ``nbytes``.
@@ -96,7 +96,7 @@ def _constant(
 
 
 class _Cache:
-    """Results by function and arguments, up to a number of bytes; the last one is kept whatever its size."""
+    """Results by function and arguments, up to a number of bytes and at least the latest one."""
 
     def __init__(self, limit: int) -> None:
         self.limit = limit

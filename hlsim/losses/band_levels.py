@@ -16,7 +16,10 @@ from hlsim.torchtools import constant
 BANDS = 24
 
 LOWEST, HIGHEST = 80.0, 7500.0
-"""Lowest edge of the lowest band and highest edge of the highest one in Hz. Neuro-MSBG returns nothing above 8 kHz."""
+"""Lowest edge of the lowest band and highest edge of the highest one in Hz.
+
+Neuro-MSBG returns nothing above 8 kHz.
+"""
 
 FRAME_SECONDS = 0.032
 
@@ -59,8 +62,8 @@ def band_level_loss(perceived: Tensor, normal: Tensor, sample_rate: int) -> Tens
     of hearing, a band that the impaired ear misses altogether would have no gradient, and no
     compensator would learn to restore it.
 
-    The weight of a band is its audibility for a normal ear, or that of the perceived signal if it is
-    higher: noise that fills a pause is an error, too. Such an error counts down to 40 dB below
+    The weight of a band is its audibility for a normal ear, or that of the perceived signal if it
+    is higher: noise that fills a pause is an error, too. Such an error counts down to 40 dB below
     audibility.
 
     Args:
@@ -92,7 +95,7 @@ def least_audible(levels: Tensor) -> Tensor:
 
 
 def audibility(levels: Tensor, threshold: Tensor) -> Tensor:
-    """Return weights without gradient, 0 up to the threshold of audibility and 1 from 20 dB above it.
+    """Return weights, 0 up to the threshold of audibility and 1 from 20 dB above, without gradient.
 
     Shape: (..., frames, 24), (..., 1, 24) in dB SPL -> (..., frames, 24).
     """
@@ -100,7 +103,7 @@ def audibility(levels: Tensor, threshold: Tensor) -> Tensor:
 
 
 def band_analysis(like: Tensor, sample_rate: int) -> tuple[STFT, Tensor]:
-    """Return the transform, and the share of each of its frequencies in each band, (frequencies, 24).
+    """Return the transform and the share of each frequency in each band, (frequencies, 24).
 
     Args:
         like: tensor with the type and the device of the shares.
@@ -145,7 +148,7 @@ def band_shares(fft: int, sample_rate: int) -> NDArray[np.float64]:
 
 @lru_cache(maxsize=1)
 def threshold_in_quiet() -> NDArray[np.float64]:
-    """Return the threshold of a normal ear at the centre of each band in dB SPL, (24,) (Terhardt 1979, Equation 1)."""
+    """Return a normal ear's threshold in each band in dB SPL, (24,) (Terhardt 1979, Equation 1)."""
     khz = band_centres() / 1000.0
     levels: NDArray[np.float64] = (
         3.64 * khz**-0.8 - 6.5 * np.exp(-0.6 * (khz - 3.3) ** 2) + 1e-3 * khz**4

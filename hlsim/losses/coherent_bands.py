@@ -1,24 +1,25 @@
-"""The default criterion: in each band, coherence with the output of a normal ear, and the difference in level.
+"""The default criterion: coherence and difference in level with a normal ear in each band.
 
 Both signals are cut into 24 ERB-wide bands (``hlsim.losses.band_levels``) and overlapping segments
-of 96 ms. With ``H`` and ``R`` the spectra of the impaired and the normal ear's outputs, in frames of
-32 ms, each band and segment has
+of 96 ms. With ``H`` and ``R`` the spectra of the impaired and the normal ear's outputs, in frames
+of 32 ms, each band and segment has
 
 - ``incoherence``, ``1 - (sum |mean H R*|)^2 / (sum mean |H|^2 * sum mean |R|^2)``, with means over
   the frames of the segment and sums over the frequencies of the band. It is 0 if the perceived
-  signal is the reference times any gain and any fixed phase. It rises with noise, late reverberation
-  and distortion, however soft: noise in a band that is perceived too softly does not lower it.
+  signal is the reference times any gain and any fixed phase. It rises with noise, late
+  reverberation and distortion, however soft: noise in a band that is perceived too softly does not
+  lower it.
 - ``misalignment``, the part of the square root of the coherence that is lost to the phase. It has a
   small weight, as nobody hears the sign or a delay of one millisecond; it leads a model with an
   arbitrary phase to none.
-- ``levels``, ``10 log(1 + abs(d) / 10)`` of the difference ``d`` of the levels in dB. The slope falls
-  with the difference, so that a severe ear, which perceives 100 dB too little and 2.5 dB more per
-  dB of gain, counts like a mild one.
+- ``levels``, ``10 log(1 + abs(d) / 10)`` of the difference ``d`` of the levels in dB. The slope
+  falls with the difference, so that a severe ear, which perceives 100 dB too little and 2.5 dB more
+  per dB of gain, counts like a mild one.
 - ``louder``, the excess in dB of the perceived level over both the reference and the threshold of
   audibility: too much gain, and noise in pauses.
 
-Incoherence and levels are weighted by the audibility of the reference, ``P / (P + threshold)`` of its
-power ``P``. It is above 0 wherever there is power, and so small in faint bands that they do not
+Incoherence and levels are weighted by the audibility of the reference, ``P / (P + threshold)`` of
+its power ``P``. It is above 0 wherever there is power, and so small in faint bands that they do not
 dominate the gradient.
 """
 
@@ -43,16 +44,23 @@ DEFAULT_WEIGHTS = {
     "louder": 0.03,
     "peaks": 1.0,
 }
-"""Speech that is unrelated to the reference costs 1, a level 40 dB too low 0.48, and one 40 dB too high about 1.6."""
+"""Weights of the parts.
+
+Speech that is unrelated to the reference costs 1, a level that is 40 dB too low 0.48, and one
+that is 40 dB too high about 1.6.
+"""
 
 DEPTH = 41.0
-"""Level in dB below the strongest band of an item, for a normal ear, at which the weight of a band is one half."""
+"""Level in dB below the strongest band of an item at which the weight of a band is one half."""
 
 KNEE = 10.0
 """Difference in level in dB at which one more dB costs half as much as the first."""
 
 LOWEST_POWER = 1e-22
-"""Power, -126 dB SPL, added before the logarithm. Soft speech in an N5 ear has -110, and keeps its gradient."""
+"""Power, -126 dB SPL, added before the logarithm.
+
+Soft speech in an N5 ear has -110, and keeps its gradient.
+"""
 
 HIGHEST_PEAK = 10.0 ** ((120.0 - PASCAL_SPL) / 20.0)
 """Pressure in pascals, 120 dB SPL, above which peaks cost."""
@@ -61,7 +69,10 @@ MARGIN = 3.0
 """Excess of the level in dB that does not count as louder."""
 
 MAX_GRADIENT_RATIO = 6.0
-"""Gradients above this multiple of the item's 90th percentile (sounding samples) are scaled down to it."""
+"""Gradients above this multiple of the item's 90th percentile are scaled down to it.
+
+The percentile is that of the sounding samples.
+"""
 
 FRAMES_PER_HOP = 3
 """Frames from one segment to the next; a segment is twice as long."""
@@ -145,8 +156,8 @@ def limit_gradient_spikes(compensated: Tensor, sample_rate: int) -> Tensor:
     In ears that perceive next to nothing, a recruiting band or a network gives a few samples a
     gradient a thousand times as large as the others', which then have no part in the step. Blocks
     of 5 ms are scaled down as a whole: limiting single samples leaves a mean, from which a
-    convolutional network grows a constant pressure that is inaudible. In pauses, blocks 30 dB or more
-    below the loudest one of the item, the limit is six times as low. NaN stays.
+    convolutional network grows a constant pressure that is inaudible. In pauses, blocks 30 dB or
+    more below the loudest one of the item, the limit is six times as low. NaN stays.
 
     Shape: (..., time) -> (..., time).
     """
@@ -179,7 +190,7 @@ class _GradientLimiter(torch.autograd.Function):
         limit = usual * torch.where(sounding, MAX_GRADIENT_RATIO, 1.0)
         factor = (limit / sizes.amax(-1)).clamp_max(1.0)
 
-        # The factors go linearly from edge to edge; at an edge the smaller one of both blocks holds.
+        # The factors go linearly from edge to edge, where the smaller one of both blocks holds.
         before = functional.pad(factor, (1, 0), value=1.0)
         after = functional.pad(factor, (0, 1), value=1.0)
         edges = torch.minimum(before, after)
@@ -189,12 +200,18 @@ class _GradientLimiter(torch.autograd.Function):
 
 
 def _split(samples: Tensor, block: int) -> Tensor:
-    """Split into blocks, the last one filled with zeros. Shape: (..., time) -> (..., blocks, block)."""
+    """Split into blocks, the last one filled with zeros.
+
+    Shape: (..., time) -> (..., blocks, block).
+    """
     return functional.pad(samples, (0, -samples.shape[-1] % block)).unflatten(-1, (-1, block))
 
 
 def _average_segments(frames: Tensor) -> Tensor:
-    """Average over segments of 96 ms, every 48 ms. Shape: (items, frames, n) -> (items, segments, n)."""
+    """Average over segments of 96 ms, every 48 ms.
+
+    Shape: (items, frames, n) -> (items, segments, n).
+    """
     missing = -frames.shape[-2] % FRAMES_PER_HOP
     padded = functional.pad(frames, (0, 0, 0, missing))
     halves = padded.unflatten(-2, (-1, FRAMES_PER_HOP)).mean(-2)

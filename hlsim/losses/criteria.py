@@ -22,11 +22,14 @@ CRITERIA: dict[str, Mapping[str, float]] = {
 """Parts of each criterion with their default weights."""
 
 Criterion = CriterionName | Mapping[str, float] | Callable[[Tensor, Tensor], Tensor]
-"""A name, weights by name, or a function of the perceived speech and its reference, (items, time) in pascals -> (items,)."""
+"""A name, weights by name, or a function of the perceived speech and its reference.
+
+Shape of the function: (items, time) twice, in pascals -> (items,).
+"""
 
 
 def check_criterion(criterion: Any) -> dict[str, Any]:
-    """Return the criteria by name: each with its weight unless that is 0, or a function as ``criterion``.
+    """Return the weights of the criteria by name, without those of 0, or a function by itself.
 
     Raises:
         ValueError: an unknown name, or a weight that is negative or not finite.
@@ -76,7 +79,10 @@ def check_values(values: Any, items: int) -> Tensor:
 
 
 def weighted_sum(parts: Mapping[str, Tensor], weights: Mapping[str, float]) -> Tensor:
-    """Return the sum of the parts of a loss times their weights. Parts without a weight do not count."""
+    """Return the sum of the parts of a loss times their weights.
+
+    Parts without a weight do not count.
+    """
     total = torch.zeros_like(next(iter(parts.values())))
     for name, weight in weights.items():
         if weight:

@@ -1,4 +1,4 @@
-"""What an ear hears of speech through a frozen simulator, and the reference that it is compared with."""
+"""A frozen simulator, and the reference with which its output is compared."""
 
 import math
 import os
@@ -18,27 +18,30 @@ from hlsim.dsp.resample import resample
 from hlsim.losses.band_levels import HIGHEST
 from hlsim.msbg import MSBG
 from hlsim.msbg.response import apply_bank_phase, simulate_normal_ear
-from hlsim.neuro import NeuroMSBG
-from hlsim.neuro.config import NEURO_RATE
 from hlsim.pretrained import SIMULATOR, find_checkpoint, load_pretrained
 from hlsim.torchtools import without_modes
 
 ReferenceName = Literal["clean", "normal-hearing"]
 
 Hearing = Callable[[Tensor], Tensor]
-"""(..., time) -> (..., time), as a normal ear hears."""
+"""A normal ear: (..., time) -> (..., time)."""
 
 
-class FrozenEar:
+class FrozenSimulator:
     """A simulator in eval mode without trainable parameters, and the normal ear that belongs to it.
 
-    No module, so that what holds it does not register its parameters; the holder moves it by ``apply``.
+    It is not a module, so that its owner does not register its parameters. The owner moves it with
+    ``apply``.
 
     Args:
-        simulator, sample_rate, full_scale_spl, normal, reference: as ``HearingLossLoss``.
+        simulator: as in ``HearingLossLoss``, which describes the attributes that a module may have.
+        sample_rate: sample rate in Hz.
+        full_scale_spl: level in dB SPL of RMS 1.0.
+        normal: normal ear, as in ``HearingLossLoss``.
+        reference: reference of the criteria that have a choice, as in ``HearingLossLoss``.
 
     Raises:
-        ValueError: as ``HearingLossLoss``, of these.
+        ValueError: an argument is not as ``HearingLossLoss`` describes it.
     """
 
     def __init__(
@@ -51,190 +54,203 @@ class FrozenEar:
     ) -> None:
         if normal is not None and not callable(normal):
             raise ValueError(
-                f"normal is {type(normal).__name__}; allowed: a module or callable (waveform) -> waveform"
+                "expected normal to be a module or a function of a waveform, "
+                f"got {type(normal).__name__}"
             )
-        self.sample_rate, self.normal, self.choice = sample_rate, normal, reference
-        self.simulator = (
-            build_simulator(simulator, sample_rate, full_scale_spl).eval().requires_grad_(False)
-        )
+        self.sample_rate = sample_rate
+        self.normal = normal
+        self.choice = reference
+        simulator = build_simulator(simulator, sample_rate, full_scale_spl)
+        self.simulator = simulator.eval().requires_grad_(False)
         if isinstance(normal, nn.Module):
             normal.eval().requires_grad_(False)
 
-    def hear(
+    def simulate(
         self,
         waveform: Tensor,
         thresholds: Tensor,
-        listener: Mapping[str, Any] | None,
+        options: Mapping[str, Any] | None,
         ends: Tensor | None = None,
     ) -> Tensor:
-        """What the simulator makes of it. Shape: (..., time), (..., 8) -> (..., time), leading dimensions broadcast.
+        """Return the output of the simulator.
 
         Args:
-            listener: more arguments of the simulator, by name.
-            ends: samples of each item; hlsim's networks hear nothing after them.
+            waveform: speech.
+            thresholds: ears in dB HL.
+            options: more arguments of the simulator by name.
+            ends: number of samples of each item, for simulators that need exact lengths.
+
+        Shape: (..., time), (..., 8) -> (..., time); the leading dimensions broadcast.
         """
         weight = next(self.simulator.parameters(), None)
         if weight is not None and weight.device != waveform.device:
             raise ValueError(
-                f"the speech is on {waveform.device} and the simulator on {weight.device}; move the loss with .to()"
+                f"the speech is on {waveform.device} and the simulator on {weight.device}; "
+                "move the loss with .to()"
             )
-        allowed = _batches(waveform.shape[:-1], thresholds.shape[:-1])
-        apart = not listener and len(allowed) == 2 and self._holds(NeuroMSBG)
-        if apart and ends is not None and bool((ends != waveform.shape[-1]).any()):
-            return self._hear_to_ends(waveform, thresholds, ends.expand(allowed[1]))
-        more = {
+        allowed = _allowed_batches(waveform.shape[:-1], thresholds.shape[:-1])
+        by_length = len(allowed) == 2 and not options and self._needs_exact_lengths
+        if by_length and ends is not None and bool((ends != waveform.shape[-1]).any()):
+            return self._simulate_by_length(waveform, thresholds, ends.expand(allowed[1]))
+        options = {
             name: value.to(waveform.device) if isinstance(value, Tensor) else value
-            for name, value in (listener or {}).items()
+            for name, value in (options or {}).items()
         }
-        heard = self.simulator(waveform, thresholds, **more)
-        return _check_heard(heard, "simulator", waveform, allowed)
+        output = self.simulator(waveform, thresholds, **options)
+        return _check_output(output, "simulator", waveform, allowed)
 
-    def _hear_to_ends(self, waveform: Tensor, thresholds: Tensor, ends: Tensor) -> Tensor:
-        """``hear``, items of one length at a time: to a network, silence after an end is not the end itself.
+    def _simulate_by_length(self, waveform: Tensor, thresholds: Tensor, ends: Tensor) -> Tensor:
+        """Simulate the items of each length separately, without the silence after their ends.
 
-        Shape: (..., time), (..., 8), (*batch) -> (*batch, time), zeros after each item's end.
+        Shape: (..., time), (..., 8), (*batch) -> (*batch, time), with zeros after each end.
         """
-        batch, time, places = ends.shape, waveform.shape[-1], ends.flatten()
+        batch, time = ends.shape, waveform.shape[-1]
         items = waveform.expand(*batch, -1).reshape(-1, time)
         ears = thresholds.expand(*batch, -1).reshape(-1, len(FREQUENCIES))
-        heard: dict[int, Tensor] = {}
-        for end in places.unique().tolist():
-            members = (places == end).nonzero().flatten()
+        outputs: dict[int, Tensor] = {}
+        for end in ends.flatten().unique().tolist():
+            members = (ends.flatten() == end).nonzero().flatten()
             chosen = members.to(items.device)
-            alone = self.hear(items[chosen, :end], ears[chosen], None)
-            heard |= zip(members.tolist(), functional.pad(alone, (0, time - end)), strict=True)
-        return torch.stack([heard[item] for item in range(len(items))]).reshape(*batch, time)
+            group = self.simulate(items[chosen, :end], ears[chosen], None)
+            padded = functional.pad(group, (0, time - end))
+            outputs |= zip(members.tolist(), padded, strict=True)
+        return torch.stack([outputs[item] for item in range(len(items))]).reshape(*batch, time)
 
     def reference(
         self,
-        kind: str,
+        criterion: str,
         clean: Tensor,
         ears: Tensor,
         batch: torch.Size,
-        listener: Mapping[str, Any] | None,
+        options: Mapping[str, Any] | None,
         ends: Tensor | None,
     ) -> Tensor:
-        """What the heard is compared with. Shape: (..., time), (..., 8) -> (*batch, time).
+        """Return the reference with which a criterion compares the output of the simulator.
 
         Args:
-            kind: ``bands``, ``paper``, ``coherent-bands``, or of another criterion.
+            criterion: ``coherent-bands``, ``bands``, ``paper``, or the name of another criterion.
+            clean: clean speech.
+            ears: thresholds in dB HL.
+            batch: leading dimensions of the result.
+            options: more arguments of the simulator by name.
+            ends: number of samples of each item.
+
+        Shape: (..., time), (..., 8) -> (*batch, time).
         """
-        time, choice = clean.shape[-1], self.choice
-        ours = self.normal is None and self._holds(MSBG, NeuroMSBG)
-        if kind in ("coherent-bands", "bands"):
-            choice = "normal-hearing"
-        elif choice is None:
-            choice = "clean" if kind == "paper" else "normal-hearing"
-        if ours:
-            ears = (
-                ears.expand(*batch, -1).reshape(-1, len(FREQUENCIES))
-                if ears.ndim > 1
-                else ears.unsqueeze(0)
-            )
+        time = clean.shape[-1]
+        with_phase = self.normal is None and self._emulates_msbg
+        choice = self._choice(criterion)
+        if with_phase and ears.ndim > 1:
+            ears = ears.expand(*batch, -1).reshape(-1, len(FREQUENCIES))
+        elif with_phase:
+            ears = ears.unsqueeze(0)
         with torch.set_grad_enabled(torch.is_grad_enabled() and clean.requires_grad):
             if choice == "clean":
-                aim = self._narrowed(clean)
+                reference = self._limit_band(clean)
             elif self.normal is not None:
-                aim = _check_heard(self.normal(clean), "normal ear", clean, [clean.shape[:-1]])
-                return aim.expand(*batch, time)
-            elif ours and kind not in ("bands", "paper"):
-                items = self._narrowed(clean).expand(*batch, time).reshape(-1, time)
+                normal = self.normal(clean)
+                normal = _check_output(normal, "normal ear", clean, [clean.shape[:-1]])
+                return normal.expand(*batch, time)
+            elif with_phase and criterion not in ("bands", "paper"):
+                items = self._limit_band(clean).expand(*batch, time).reshape(-1, time)
                 return simulate_normal_ear(items, ears, self.sample_rate).reshape(*batch, time)
             else:
                 no_loss = on_device(_no_loss(clean.dtype), clean.device)
-                aim = self.hear(clean, no_loss, listener, ends)
-            if kind == "bands" or not ours:
-                return aim.expand(*batch, time)
-            aim = aim.expand(*batch, time).reshape(-1, time)
-            normal = choice == "normal-hearing"
-            return apply_bank_phase(aim, ears, self.sample_rate, normal=normal).reshape(
-                *batch, time
-            )
-
-    def _narrowed(self, clean: Tensor) -> Tensor:
-        """In the same band as what is heard."""
-        if not self._narrow:
-            return clean
-        low = resample(clean, self.sample_rate, NEURO_RATE)
-        return resample(low, NEURO_RATE, self.sample_rate)[..., : clean.shape[-1]]
-
-    def _holds(self, *kinds: type[nn.Module]) -> bool:
-        """Whether the simulator is one of these or, compiled or in somebody's module, holds one."""
-        return any(isinstance(module, kinds) for module in self.simulator.modules())
-
-    @property
-    def _narrow(self) -> bool:
-        """Whether the simulator leaves part of the band out."""
-        return self.sample_rate > NEURO_RATE and self._holds(NeuroMSBG)
+                reference = self.simulate(clean, no_loss, options, ends)
+            if criterion == "bands" or not with_phase:
+                return reference.expand(*batch, time)
+            items = reference.expand(*batch, time).reshape(-1, time)
+            normal_hearing = choice == "normal-hearing"
+            items = apply_bank_phase(items, ears, self.sample_rate, normal=normal_hearing)
+            return items.reshape(*batch, time)
 
     def frequencies(self, fft: int) -> int | None:
-        """Number of the transform's frequencies to compare: those that the simulator gives back."""
-        return int(HIGHEST * fft / self.sample_rate) + 1 if self._narrow else None
+        """Return the number of a transform's frequencies to compare, or None for all of them."""
+        return int(HIGHEST * fft / self.sample_rate) + 1 if self._limits_band else None
 
-    def apply(self, fn: Callable[[Tensor], Tensor]) -> None:
+    def apply(self, function: Callable[[Tensor], Tensor]) -> None:
         """Move the modules, as ``nn.Module._apply`` does."""
-        move(self.simulator, fn)
-        move(self.normal, fn)
+        apply_to_module(self.simulator, function)
+        apply_to_module(self.normal, function)
+
+    def _choice(self, criterion: str) -> ReferenceName:
+        if criterion in ("coherent-bands", "bands"):
+            return "normal-hearing"
+        if self.choice is not None:
+            return self.choice
+        return "clean" if criterion == "paper" else "normal-hearing"
+
+    def _limit_band(self, clean: Tensor) -> Tensor:
+        """Remove the band that the simulator does not return."""
+        if not self._limits_band:
+            return clean
+        rate = round(2.0 * self._highest_frequency)
+        low = resample(clean, self.sample_rate, rate)
+        return resample(low, rate, self.sample_rate)[..., : clean.shape[-1]]
+
+    @property
+    def _limits_band(self) -> bool:
+        return 2.0 * self._highest_frequency < self.sample_rate
+
+    @property
+    def _highest_frequency(self) -> float:
+        return float(getattr(self.simulator, "highest_frequency", math.inf))
+
+    @property
+    def _emulates_msbg(self) -> bool:
+        return bool(getattr(self.simulator, "emulates_msbg", False))
+
+    @property
+    def _needs_exact_lengths(self) -> bool:
+        return bool(getattr(self.simulator, "needs_exact_lengths", False))
 
 
-@lru_cache
-def _no_loss(dtype: torch.dtype) -> Tensor:
-    return without_modes(lambda: torch.zeros(len(FREQUENCIES), dtype=dtype))
+def apply_to_module(value: object, function: Callable[[Tensor], Tensor]) -> None:
+    """Apply a function to the tensors of a module, but keep float32 or float64.
 
-
-def _batches(items: torch.Size, ears: torch.Size) -> list[torch.Size]:
-    """Leading dimensions that what is heard may have.
-
-    Raises:
-        ValueError: ears broadcast so that each item is heard with each ear: (batch, 1) items, (batch,) ears.
+    Values that are not modules are ignored.
     """
-    try:
-        together = broadcast_shape(items, ears)
-    except RuntimeError:  # the simulator's to refuse
-        return [items]
-    if math.prod(together) > max(math.prod(items), math.prod(ears)):
-        raise ValueError(
-            f"audiograms of shape {(*ears, len(FREQUENCIES))} would pair each item of {tuple(items)} with each ear; "
-            f"allowed: one audiogram, or one an item: {(*items, len(FREQUENCIES))}"
-        )
-    return [items, together]
 
+    def move(tensor: Tensor) -> Tensor:
+        moved = function(tensor)
+        halved = moved.is_floating_point() and moved.dtype not in (torch.float32, torch.float64)
+        return tensor.to(moved.device) if halved else moved
 
-def move(kept: object, fn: Callable[[Tensor], Tensor]) -> None:
-    """Move what is kept unregistered with its host, if it is a module."""
-    if isinstance(kept, nn.Module):
-        kept._apply(lambda tensor: _moved(fn, tensor))
-
-
-def _moved(fn: Callable[[Tensor], Tensor], tensor: Tensor) -> Tensor:
-    """Move a tensor of a simulator with its host, but never to half precision, which it does not work in.
-
-    Its values stay: where the host goes to ``meta`` it stays too, and follows when ``to_empty`` calls the host back.
-    """
-    moved = fn(tensor)
-    device = tensor.device if moved.is_meta else moved.device
-    halved = moved.is_floating_point() and moved.dtype not in (torch.float32, torch.float64)
-    return tensor.to(device) if halved else tensor.to(device, moved.dtype)
+    if isinstance(value, nn.Module):
+        value._apply(move)
 
 
 def build_simulator(
     simulator: str | Path | nn.Module, sample_rate: int, full_scale_spl: float
 ) -> nn.Module:
-    """The simulator of that name or folder, ``"msbg"`` being the exact one; a module is checked and returned."""
+    """Build the simulator of a name or a folder, or validate a module and return it.
+
+    Args:
+        simulator: ``"msbg"`` for the exact model, the name or the folder of a checkpoint, or a
+            module.
+        sample_rate: sample rate in Hz.
+        full_scale_spl: level in dB SPL of RMS 1.0.
+
+    Raises:
+        ValueError: there is no such checkpoint, or the module was built for another rate or level,
+            or delays its output.
+    """
     if isinstance(simulator, nn.Module):
-        for name, own in (("sample_rate", sample_rate), ("full_scale_spl", full_scale_spl)):
-            if getattr(simulator, name, own) != own:
+        settings = {"sample_rate": sample_rate, "full_scale_spl": full_scale_spl}
+        for name, value in settings.items():
+            if getattr(simulator, name, value) != value:
                 raise ValueError(
-                    f"the simulator has {name} {getattr(simulator, name):g} and the loss {own:g}; allowed: the same"
+                    f"expected a simulator with {name}={value:g}, got {getattr(simulator, name):g}"
                 )
         if getattr(simulator, "aligned", True) is False:
             raise ValueError(
-                "the simulator delays what it hears; allowed: one that does not, as MSBG(aligned=True)"
+                "expected a simulator that does not delay its output, such as MSBG(aligned=True)"
             )
         return simulator
     if not isinstance(simulator, str | os.PathLike):
         raise ValueError(
-            f"simulator is {type(simulator).__name__}; allowed: a name, a folder or a module (not its class)"
+            "expected a simulator as a name, a folder or a module (not its class), "
+            f"got {type(simulator).__name__}"
         )
     if str(simulator) == "msbg":
         return MSBG(sample_rate=sample_rate, full_scale_spl=full_scale_spl)
@@ -242,17 +258,36 @@ def build_simulator(
     return load_pretrained(folder, sample_rate=sample_rate, full_scale_spl=full_scale_spl)
 
 
-def _check_heard(heard: Any, what: str, waveform: Tensor, allowed: list[torch.Size]) -> Tensor:
-    """What a simulator or normal ear returned, or ValueError unless it is a waveform like the one that it was given."""
-    check_waveform(heard, f"what the {what} returned", highest=math.inf)
-    if heard.shape[:-1] not in allowed:
+@lru_cache
+def _no_loss(dtype: torch.dtype) -> Tensor:
+    return without_modes(lambda: torch.zeros(len(FREQUENCIES), dtype=dtype))
+
+
+def _allowed_batches(items: torch.Size, ears: torch.Size) -> list[torch.Size]:
+    """Return the leading dimensions that the output of a simulator may have.
+
+    Raises:
+        ValueError: the ears would broadcast so that each item is simulated for each ear, as
+            (batch,) ears with (batch, 1) items would.
+    """
+    try:
+        together = broadcast_shape(items, ears)
+    except RuntimeError:  # the simulator rejects them
+        return [items]
+    if math.prod(together) > max(math.prod(items), math.prod(ears)):
         raise ValueError(
-            f"the {what} made shape {tuple(heard.shape)} of {tuple(waveform.shape)}; allowed: one that keeps the "
-            "shape, or broadcasts it with the audiograms'"
+            f"expected one audiogram, or one per item in the shape {(*items, len(FREQUENCIES))}, "
+            f"got {(*ears, len(FREQUENCIES))}, which would pair each item with each ear"
         )
-    if heard.shape[-1] != waveform.shape[-1]:
+    return [items, together]
+
+
+def _check_output(output: Any, source: str, waveform: Tensor, allowed: list[torch.Size]) -> Tensor:
+    """Return an output, or raise ValueError unless it is a waveform with the shape of its input."""
+    check_waveform(output, f"the output of the {source}", highest=math.inf)
+    if output.shape[:-1] not in allowed or output.shape[-1] != waveform.shape[-1]:
         raise ValueError(
-            f"the {what} made {heard.shape[-1]} samples of {waveform.shape[-1]}; allowed: one that keeps the "
-            "length, as MSBG(aligned=True)"
+            f"expected the {source} to return the shape {tuple(waveform.shape)}, or to broadcast "
+            f"it with the audiograms, got {tuple(output.shape)}"
         )
-    return heard
+    return output

@@ -1,38 +1,40 @@
-"""HASPI as a training loss, with what it lacks: a heard level, a limit of peaks and, where wanted, quality."""
+"""HASPI as a training loss, with terms for the perceived level, peaks and quality."""
 
-from pathlib import Path
-
-from torch import nn
+from typing import Any
 
 from hlsim.audiogram.thresholds import AudiogramLike
-from hlsim.calibration import PASCAL_SPL
-from hlsim.losses.frozen_simulator import Hearing
-from hlsim.losses.hearing_loss import EarsName, HearingLossLoss, Reduction
-from hlsim.neuro.config import NEURO_RATE
+from hlsim.losses.hearing_loss import HearingLossLoss
 
-_LEVEL = {"levels": 0.03, "louder": 0.06, "peaks": 1.0}
-"""What is too loud costs twice what it costs by default, for HASPI rewards gain."""
+LEVEL_WEIGHTS = {"levels": 0.03, "louder": 0.06, "peaks": 1.0}
+"""Weights of the terms of the level.
+
+Excess level costs twice its default, as HASPI rewards gain.
+"""
 
 
 class HASPILoss(HearingLossLoss):
-    """1 less HASPI, a share of 1 less HASQI, and how far the heard level is from a normal ear's.
+    """1 minus HASPI, optionally 1 minus HASQI, and the error of the perceived level.
 
-    HASPI alone rewards any gain. What is heard through ``simulator`` is therefore compared, in level only, with what a
-    normal ear hears of the clean speech, and samples over 120 dB SPL cost: the parts levels, louder and peaks of
-    ``hlsim.losses.coherent_bands``. HASPI and HASQI are of what the ear is given (``hlsim.metrics``), with the hair
-    cells' noise as expected; an item whose clean speech nobody hears counts 0 there (``hlsim.metrics.objective``).
+    HASPI alone rewards any gain. Therefore the level that is perceived through ``simulator`` is
+    compared with that of a normal ear for the clean speech, and samples above 120 dB SPL cost: the
+    parts levels, louder and peaks of ``hlsim.losses.coherent_bands``. HASPI and HASQI score the
+    compensated speech (``hlsim.metrics``) with the expected effect of the ear's internal noise.
+    Items with inaudible clean speech count 0 there (``hlsim.metrics.objective``).
 
-    It is a ``HearingLossLoss`` and is called as one, ``loss(compensated, clean, audiogram=None, lengths=None)``, with its
-    shapes, conventions and errors; items last 0.7 s or more, and no gradient of HASPI reaches ``clean``. A step costs
-    some 10 times the default loss's, with HASQI some 23 times.
+    It is called as ``HearingLossLoss`` is, ``loss(compensated, clean, audiogram=None,
+    lengths=None)``, with the same shapes, conventions and errors. Items last 0.7 s or more, and no
+    gradient of HASPI reaches ``clean``. A step costs about 10 times that of the default loss, with
+    HASQI 23 times.
 
     Args:
-        quality: weight of 1 less HASQI, beside 1 of 1 less HASPI.
-        level: weight of level and peaks. Without them, 0, a model learns to be as loud as it can.
-        audiogram, simulator, sample_rate, full_scale_spl, reduction, normal, ears: as ``HearingLossLoss``.
+        audiogram: ear or ears, as in ``HearingLossLoss``.
+        quality: weight of 1 minus HASQI, beside 1 for 1 minus HASPI.
+        level: weight of level and peaks. With 0 a model learns to be as loud as it can.
+        options: ``simulator``, ``sample_rate``, ``full_scale_spl``, ``reduction``, ``normal`` and
+            ``ears`` of ``HearingLossLoss``.
 
     Raises:
-        ValueError: as ``HearingLossLoss``; a weight that is negative or not finite.
+        ValueError: as ``HearingLossLoss``, or a weight is negative or not finite.
     """
 
     def __init__(
@@ -41,23 +43,12 @@ class HASPILoss(HearingLossLoss):
         *,
         quality: float = 0.0,
         level: float = 1.0,
-        simulator: str | Path | nn.Module = "neuro-msbg",
-        sample_rate: int = NEURO_RATE,
-        full_scale_spl: float = PASCAL_SPL,
-        reduction: Reduction = "mean",
-        normal: Hearing | None = None,
-        ears: EarsName = "mean",
+        **options: Any,
     ) -> None:
+        weights = {"haspi": 1.0}
+        if quality:
+            weights["hasqi"] = 1.0
+        if level:
+            weights |= LEVEL_WEIGHTS
         criterion = {"haspi": 1.0, "hasqi": quality, "coherent-bands": level}
-        parts = {"haspi": 1.0} | ({"hasqi": 1.0} if quality else {}) | (_LEVEL if level else {})
-        super().__init__(
-            audiogram,
-            simulator=simulator,
-            sample_rate=sample_rate,
-            full_scale_spl=full_scale_spl,
-            criterion=criterion,
-            weights=parts,
-            reduction=reduction,
-            normal=normal,
-            ears=ears,
-        )
+        super().__init__(audiogram, criterion=criterion, weights=weights, **options)

@@ -2,13 +2,13 @@
 
 Simulators learn by them. As the criterion of a compensator in ``HearingLossLoss`` they have faults:
 
-- They are not balanced. The gradient on eight band gains that start at 0 dB is 6.9e-3 for N1, 2.0e-3
-  for N3 and 3.5e-6 for N5, and 2.9e-5 at 50 dB SPL to 0.139 at 80: a mixed batch trains for mild
-  ears and loud speech. The weights come from a paper that scales its speech to unit power, which
-  would balance the levels of the speech, but not the ears.
-- Of their value, 0.70 of 0.87 is phase, whose gradient is faded out in faint bins: value and gradient
-  disagree, and Adam on a free waveform raises the value. Speech with inverted polarity (1.36) costs
-  more than noise at -5 dB SNR (1.34).
+- They are not balanced. The gradient on eight band gains that start at 0 dB is 6.9e-3 for N1,
+  2.0e-3 for N3 and 3.5e-6 for N5, and 2.9e-5 at 50 dB SPL to 0.139 at 80: a mixed batch trains for
+  mild ears and loud speech. The weights come from a paper that scales its speech to unit power,
+  which would balance the levels of the speech, but not the ears.
+- Of their value, 0.70 of 0.87 is phase, whose gradient is faded out in faint bins: value and
+  gradient disagree, and Adam on a free waveform raises the value. Speech with inverted polarity
+  (1.36) costs more than noise at -5 dB SNR (1.34).
 - Their rank correlations with HASPI and HASQI over 17 degradations are .50 and .70. A filter bank
   trained by them from zero is worse than the prescription NAL-R (HASPI .877, .950), and learns no
   compression.
@@ -27,7 +27,10 @@ PAPER_STFT = STFT(400, 400, 100)
 """The paper's transform at 16 kHz: 201 frequencies."""
 
 DEFAULT_WEIGHTS = {"magnitude": 0.9, "phase": 0.3, "complex": 0.1, "time": 0.2}
-"""Weights of MP-SENet (Lu, Ai and Ling 2023), on which the paper builds; the paper does not state its own."""
+"""Weights of MP-SENet (Lu, Ai and Ling 2023), on which the paper builds.
+
+The paper does not state its own.
+"""
 
 POWER_FLOOR = 1e-12
 
@@ -38,15 +41,19 @@ SILENT_MAGNITUDE = 1e-7
 
 
 def magnitude_loss(estimate: Tensor, target: Tensor) -> Tensor:
-    """Mean square of the difference of magnitudes (Equation 2). Shape: complex (items, frames, bins) twice -> (items,)."""
+    """Mean square of the difference of magnitudes (Equation 2).
+
+    Shape: complex (items, frames, bins) twice -> (items,).
+    """
     return (_magnitude(estimate) - _magnitude(target)).square().mean((-2, -1))
 
 
 def phase_loss(estimate: Tensor, target: Tensor) -> Tensor:
-    """Anti-wrapped phase error: instantaneous phase + group delay + instantaneous frequency (Equations 3 to 6).
+    """Sum of the anti-wrapped errors of phase, group delay and frequency (Equations 3 to 6).
 
-    The value is the paper's. Its gradient is 1 / magnitude, so that the inaudible bins would dominate
-    it; it is faded out where the estimate or the target is fainter than a tone of 20 dB SPL.
+    The value is the paper's. Its gradient is 1 / magnitude, so that the inaudible bins would
+    dominate it; it is faded out where the estimate or the target is fainter than a tone of 20 dB
+    SPL.
 
     Shape: complex (items, frames, bins) twice -> (items,).
     """
@@ -60,24 +67,33 @@ def phase_loss(estimate: Tensor, target: Tensor) -> Tensor:
 
 
 def complex_loss(estimate: Tensor, target: Tensor) -> Tensor:
-    """Twice the mean square of real and imaginary differences (Equation 7). Shape: (items, frames, bins) twice -> (items,)."""
+    """Twice the mean square of real and imaginary differences (Equation 7).
+
+    Shape: (items, frames, bins) twice -> (items,).
+    """
     difference = torch.view_as_real(estimate - target)
     return 2.0 * difference.square().mean((-3, -2, -1))
 
 
 def time_loss(estimate: Tensor, target: Tensor) -> Tensor:
-    """Mean absolute difference of waveforms (Equation 8). Shape: (items, time) twice -> (items,)."""
+    """Mean absolute difference of waveforms (Equation 8).
+
+    Shape: (items, time) twice -> (items,).
+    """
     return (estimate - target).abs().mean(-1)
 
 
 def anti_wrap(angle: Tensor) -> Tensor:
-    """Distance of an angle from the nearest multiple of 2 pi (Ai and Ling 2023). Any shape, in radians."""
+    """Distance of an angle from the nearest multiple of 2 pi (Ai and Ling 2023).
+
+    Any shape, in radians.
+    """
     turns = (angle.detach() / (2.0 * math.pi)).round_()
     return torch.sub(angle, turns, alpha=2.0 * math.pi).abs()
 
 
 def paper_stft(sample_rate: int) -> STFT:
-    """Return the paper's transform at another rate: windows of 25 ms every 6.25 ms, to the nearest sample."""
+    """Return the paper's transform, windows of 25 ms every 6.25 ms, at another sample rate."""
     hop = round(sample_rate * PAPER_STFT.hop / 16000)
     return STFT(4 * hop, 4 * hop, hop)
 
@@ -118,8 +134,8 @@ def _magnitude(spectrum: Tensor) -> Tensor:
 class _FadedPhaseDifference(torch.autograd.Function):
     """Phase of the target minus that of the estimate, as the angle of one complex product.
 
-    The gradient of the angle of z is i z / |z|^2. Here it is multiplied by |z|^2 / (|z|^2 + faint), and
-    by the same factor of the other spectrum.
+    The gradient of the angle of z is i z / |z|^2. Here it is multiplied by |z|^2 / (|z|^2 + faint),
+    and by the same factor of the other spectrum.
     """
 
     @staticmethod
@@ -145,7 +161,10 @@ class _FadedPhaseDifference(torch.autograd.Function):
 
 
 def _real_imag(spectrum: Tensor) -> tuple[Tensor, Tensor]:
-    """Return both parts. Near silence, where the angle is rounding, the real part is small and positive."""
+    """Return both parts.
+
+    Near silence, where the angle is rounding, the real part is small and positive.
+    """
     # Contiguous, because torch takes twenty times as long with interleaved numbers.
     real, imaginary = spectrum.real.contiguous(), spectrum.imag.contiguous()
     silent = real.abs().add_(imaginary.abs()) < SILENT_MAGNITUDE

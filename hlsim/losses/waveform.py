@@ -25,7 +25,7 @@ def noise_to_signal_db(estimate: Tensor, target: Tensor) -> Tensor:
 
 
 def log_spectral_distance_db(estimate: Tensor, target: Tensor) -> Tensor:
-    """Mean absolute difference of log spectra in dB, down to 60 dB below the strongest bin of each item.
+    """Mean absolute difference of log spectra in dB, down to 60 dB below each item's strongest bin.
 
     Shape: (items, time) twice -> (items,).
     """

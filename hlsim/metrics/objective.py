@@ -1,4 +1,4 @@
-"""HASPI and HASQI as parts of a loss, of batches that hold silence and sounds, too."""
+"""HASPI and HASQI as parts of a loss, for batches that may hold silence and clicks."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from hlsim.metrics.haspi_score import haspi
 from hlsim.metrics.hasqi_score import hasqi
 
 SCORES: dict[str, Callable[..., Tensor]] = {"haspi": haspi, "hasqi": hasqi}
-"""Scores by name that are the less a loss, the higher they are."""
+"""Scores between 0 and 1 by name, the higher the better."""
 
 
-def missing_score(
+def score_loss(
     name: str,
     processed: Tensor,
     clean: Tensor,
@@ -24,29 +24,32 @@ def missing_score(
     ends: Sequence[int],
     sample_rate: int,
 ) -> Tensor:
-    """What a score lacks of 1, of each item, with the hair cells' noise as expected.
+    """Compute 1 minus a score of each item, with the expected effect of the ear's internal noise.
 
-    An item whose clean signal nobody hears enough of (silent, under 20 dB SPL, a click, for HASPI under the threshold of
-    hearing) counts 0 and has no gradient, for no score of it means anything. One processed to NaN or infinity gives NaN.
+    An item whose clean signal is hardly audible (silent, below 20 dB SPL, a click, or for HASPI
+    below the threshold of hearing) has no meaningful score. It counts 0 and has no gradient. An
+    item with NaN or infinity in ``processed`` gives NaN.
 
     Args:
-        name: of ``SCORES``.
-        processed, clean: (items, time) in pascals.
-        ears: (items, 8) dB HL.
-        ends: samples of each item.
+        name: key of ``SCORES``.
+        processed: output of the compensator in pascals.
+        clean: clean speech in pascals, whose gradient is not followed.
+        ears: thresholds in dB HL.
+        ends: number of samples of each item.
+        sample_rate: sample rate in Hz.
 
-    Returns: (items,). The gradient of ``clean`` is not followed.
+    Shape: (items, time) twice, (items, 8) -> (items,).
 
     Raises:
         ValueError: an item is shorter than 0.7 s.
     """
-    sound = processed.detach().isfinite().all(-1)
-    given = torch.where(sound.unsqueeze(-1), processed, 0.0)
-    missing = _missing(SCORES[name], given, clean, ears, ends, sample_rate=sample_rate)
-    return torch.where(sound, missing, torch.nan)
+    finite = processed.detach().isfinite().all(-1)
+    processed = torch.where(finite.unsqueeze(-1), processed, 0.0)
+    losses = _score_loss(SCORES[name], processed, clean, ears, ends, sample_rate=sample_rate)
+    return torch.where(finite, losses, torch.nan)
 
 
-def _missing(
+def _score_loss(
     score: Callable[..., Tensor],
     processed: Tensor,
     clean: Tensor,
@@ -59,8 +62,9 @@ def _missing(
     except UnscorableError:
         if len(clean) == 1:
             return (0.0 * processed).sum(-1)
-    each = [
-        _missing(score, processed[i, None], clean[i, None], ears[i, None], [end], **options)
-        for i, end in enumerate(ends)
-    ]
-    return torch.cat(each)
+    # One item without a score stops the batch, so the items are scored one by one.
+    losses = []
+    for item, end in enumerate(ends):
+        signals = processed[item, None], clean[item, None], ears[item, None]
+        losses.append(_score_loss(score, *signals, [end], **options))
+    return torch.cat(losses)

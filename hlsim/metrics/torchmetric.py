@@ -1,4 +1,7 @@
-"""HASPI and HASQI as metrics of torchmetrics, for validation loops. They need the extra ``train``."""
+"""HASPI and HASQI as metrics of torchmetrics, for validation loops.
+
+They need the extra ``train``.
+"""
 
 from __future__ import annotations
 
@@ -119,8 +122,8 @@ class _MeanScore(_Metric):
         Args:
             processed: what the ears are given.
             clean: clean speech of the same shape.
-            audiogram: one ear, or one per item. For two channels a ``Listener``, whose missing ear is
-                left out, a pair of left and right ear, or one of these per item.
+            audiogram: one ear, or one per item. For two channels a ``Listener``, whose missing ear
+                is left out, a pair of left and right ear, or one of these per item.
             lengths: number of samples of each item, or its share of the time, for a padded batch.
 
         Shape: (time,), (batch, time) or (batch, 2, time) twice; ``lengths`` (batch,).
@@ -189,7 +192,10 @@ class _MeanScore(_Metric):
 
     @property
     def ears(self) -> Tensor:
-        """Mean score of the left and of the right ear in this process, NaN for a mono batch. Shape: (2,)."""
+        """Mean score of the left and of the right ear in this process, NaN for a mono batch.
+
+        Shape: (2,).
+        """
         return self.total_ears / self.count_ears
 
     @property
@@ -237,9 +243,9 @@ class _MeanScore(_Metric):
 class HASPI(_MeanScore):
     """Mean HASPI v2 of processed speech over all items since the last ``reset``.
 
-    It rewards any gain, so log ``level``, the mean level in dB SPL, next to it. The score of an item
-    is that of ``haspi`` with the same settings, in double precision. On a CPU one second of audio
-    takes about 0.12 s on one core; ``limit`` bounds the cost of a validation epoch.
+    It rewards any gain, so log ``level``, the mean level in dB SPL, next to it. The score of an
+    item is that of ``haspi`` with the same settings, in double precision. On a CPU one second of
+    audio takes about 0.12 s on one core; ``limit`` bounds the cost of a validation epoch.
 
     In a LightningModule ``self.haspi = HASPI(sample_rate=16000)``, in ``validation_step``
     ``self.haspi.update(aided, clean, audiogram); self.log("haspi", self.haspi)``.
@@ -247,13 +253,13 @@ class HASPI(_MeanScore):
     Args:
         sample_rate: sample rate in Hz, 16000 to 48000.
         full_scale_spl: level in dB SPL of a signal with RMS 1.0.
-        noise: treatment of the ear's internal noise, as in ``haspi``. ``"seeded"`` gives the scores of
-            pyclarity.
-        seed: with ``noise="seeded"``, item i since the last reset takes ``seed`` + i, so that epochs
-            can be compared.
+        noise: treatment of the ear's internal noise, as in ``haspi``. ``"seeded"`` gives the scores
+            of pyclarity.
+        seed: with ``noise="seeded"``, item i since the last reset takes ``seed`` + i, so that
+            epochs can be compared.
         whole_khz: round the rate to whole kHz, as pyclarity does.
-        limit: number of items that are scored from one reset to the next in each process; the others
-            are passed over. None scores all.
+        limit: number of items that are scored from one reset to the next in each process; the
+            others are passed over. None scores all.
         options: keyword arguments of ``torchmetrics.Metric``.
     """
 
@@ -261,10 +267,10 @@ class HASPI(_MeanScore):
 
 
 class HASQI(_MeanScore):
-    """Mean HASQI v2 of processed speech over all items since the last ``reset``, with the arguments of ``HASPI``.
+    """Mean HASQI v2 of processed speech over all items since the last ``reset``.
 
-    Its reference is clean speech with NAL-R. Whether enough is audible does not count. On a CPU one
-    second of audio takes about 0.2 s.
+    The arguments are those of ``HASPI``. The reference is clean speech with NAL-R. Whether enough
+    is audible does not count. On a CPU one second of audio takes about 0.2 s.
     """
 
     score = staticmethod(hasqi)

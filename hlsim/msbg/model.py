@@ -74,6 +74,8 @@ class MSBG(nn.Module):
         ValueError: a rate, level or audiogram out of range.
     """
 
+    emulates_msbg = True
+
     _levels: Tensor | None
     _two_ears: bool
 

@@ -45,6 +45,10 @@ class NeuroMSBG(EarNetwork):
         ValueError: a rate or level out of range, or a configuration of another kind.
     """
 
+    emulates_msbg = True
+    highest_frequency = NEURO_RATE / 2.0
+    needs_exact_lengths = True
+
     config: NeuroConfig
 
     def __init__(

@@ -9,7 +9,7 @@ from torch.nn import functional
 from compensators.filter_bank import FRAME, HISTORY, HOP, frame_power, shares
 from compensators.hearing_aid import HearingAid
 from hlsim.calibration import PASCAL_SPL, level_spl, set_level
-from hlsim.metrics.objective import missing_score
+from hlsim.metrics.objective import score_loss
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.torchtools import constant_like
 
@@ -60,4 +60,4 @@ def missing_intelligibility(aid: HearingAid, signal: Tensor, clean: Tensor, ears
     with torch.no_grad():
         level = level_spl(aid(clean, ears, noise_reduction=0.0))
     lengths = [signal.shape[-1]] * len(signal)
-    return missing_score("haspi", set_level(output, level), clean, ears, lengths, NEURO_RATE)
+    return score_loss("haspi", set_level(output, level), clean, ears, lengths, NEURO_RATE)

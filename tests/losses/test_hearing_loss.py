@@ -183,32 +183,6 @@ def test_cuda_is_like_the_cpu(simulator: str, criterion: str, clean: Tensor) -> 
     same(before, gradient(loss, 3.0 * clean, clean))
 
 
-def to_meta_and_back(loss: HearingLossLoss) -> nn.Module:
-    return Host(loss).to("meta").to_empty(device="cpu")
-
-
-def made_on_meta(loss: HearingLossLoss) -> nn.Module:
-    with torch.device("meta"):
-        host = Host(
-            HearingLossLoss(
-                N3, simulator="msbg" if isinstance(loss.simulator, MSBG) else "neuro-msbg"
-            )
-        )
-    return host.to_empty(device="cpu")
-
-
-@both
-@pytest.mark.parametrize(
-    "how", [lambda loss: Host(loss).to_empty(device="cpu"), to_meta_and_back, made_on_meta]
-)
-def test_a_host_without_values_leaves_the_simulator_its_own(
-    simulator: str, how: Callable[[nn.Module], Host], clean: Tensor
-) -> None:
-    loss = HearingLossLoss(N3, simulator=simulator)
-    before = gradient(loss, 3.0 * clean, clean)
-    same(before, gradient(how(loss).loss, 3.0 * clean, clean))
-
-
 @both
 @pytest.mark.parametrize("how", [copy.deepcopy, lambda loss: pickle.loads(pickle.dumps(loss))])
 def test_copies_are_their_own(
@@ -472,6 +446,8 @@ def test_a_module_of_ones_own_is_compared_as_it_is(clean: Tensor) -> None:
         assert float(own(clean, clean)) == pytest.approx(0.0, abs=1e-6), criterion
 
     class Around(Own):
+        emulates_msbg = True
+
         def __init__(self) -> None:
             super().__init__()
             self.inner = MSBG(sample_rate=16000)
@@ -552,7 +528,11 @@ def test_above_8_khz_neuro_msbg_judges_nothing(clean: Tensor) -> None:
 
 
 class Wrapped(nn.Module):
-    """Somebody's module round a simulator."""
+    """A module around a Neuro-MSBG, which offers what the loss asks of one."""
+
+    emulates_msbg = True
+    highest_frequency = 8000.0
+    needs_exact_lengths = True
 
     def __init__(self, inner: nn.Module) -> None:
         super().__init__()
@@ -1045,16 +1025,7 @@ def test_a_program_without_breaks_cannot_hold_the_loss(clean: Tensor) -> None:
         torch.compile(lambda wave: loss(wave, clean), backend="eager", fullgraph=True)(clean)
 
 
-def test_what_it_was_built_with_stays() -> None:
-    loss = HearingLossLoss(N3)
-    for name, other in (
-        ("simulator", MSBG(sample_rate=16000)),
-        ("normal", nn.Identity()),
-        ("criterion", "bands"),
-    ):
-        with pytest.raises(AttributeError):
-            setattr(loss, name, other)
+def test_a_criterion_without_weight_is_not_computed() -> None:
+    loss = HearingLossLoss(N3, criterion={"coherent-bands": 1.0, "haspi": 0.0})
+    assert list(loss.criteria) == ["coherent-bands"]
     assert not loss.state_dict()
-    assert list(HearingLossLoss(N3, criterion={"coherent-bands": 1.0, "haspi": 0.0}).criteria) == [
-        "coherent-bands"
-    ]
