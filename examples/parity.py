@@ -14,9 +14,8 @@ from clarity.evaluator.msbg.msbg import Ear
 from pyclarity_teacher import pyclarity_msbg
 
 from hlsim import MSBG, Audiogram
-from hlsim.audiogram import LOWEST_LEVEL, STANDARD
+from hlsim.audiogram import HIGHEST_SIMULATED, LOWEST_LEVEL, STANDARD
 from hlsim.audiogram.table import read_audiograms
-from hlsim.audiogram.thresholds import HIGHEST_SIMULATED
 from hlsim.calibration import set_level
 from hlsim.training.clips import Clips
 from hlsim.training.ears import draw_thresholds

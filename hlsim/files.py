@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import codecs
 import csv
 import hashlib
+import io
 import os
 import tempfile
 from collections.abc import Iterator
@@ -75,7 +77,7 @@ def sha256(path: Path) -> str:
 
 
 def read_table(path: str | Path, what: str) -> list[tuple[int, dict[str, str]]]:
-    """Read a CSV file in UTF-8 with commas or semicolons.
+    """Read a table with commas, semicolons or tabs, in UTF-8, UTF-16 or Windows' cp1252.
 
     Args:
         what: Description of the contents, for errors.
@@ -88,9 +90,9 @@ def read_table(path: str | Path, what: str) -> list[tuple[int, dict[str, str]]]:
     """
     rows = []
     try:
-        with open(path, newline="", encoding="utf-8-sig") as file:
+        with io.StringIO(_decode(Path(path).read_bytes()), newline="") as file:
             header = file.readline()
-            delimiter = ";" if ";" in header and "," not in header else ","
+            delimiter = max(",;\t", key=header.count)
             file.seek(0)
             reader = csv.DictReader(file, delimiter=delimiter, restval="")
             names = [name.strip() for name in reader.fieldnames or ()]
@@ -106,7 +108,19 @@ def read_table(path: str | Path, what: str) -> list[tuple[int, dict[str, str]]]:
                 values = {name: value.strip() for name, value in row.items() if name}
                 rows.append((reader.line_num, values))
     except UnicodeDecodeError as error:
-        raise ValueError(f"{path}: {what} must be a CSV file in UTF-8 ({error})") from error
+        raise ValueError(
+            f"{path}: {what} must be a CSV file in UTF-8 or cp1252 ({error})"
+        ) from error
     except (OSError, csv.Error) as error:
         raise ValueError(f"{path}: cannot read {what}: {error}") from error
     return rows
+
+
+def _decode(data: bytes) -> str:
+    """Return the text of a file, in UTF-8 or else in one of the encodings that spreadsheets write."""
+    if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        return data.decode("utf-16")
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return data.decode("cp1252")

@@ -1,8 +1,9 @@
-"""Hearing thresholds of an ear: as a value, as tensors, in tables, as a picture."""
+"""Hearing thresholds of ears: as values, as tensors, in tables and as plots."""
 
 from hlsim.audiogram.value import (
     FREQUENCIES,
     HIGHEST_LEVEL,
+    HIGHEST_SIMULATED,
     LOWEST_LEVEL,
     SEVERITIES,
     SEVERITY_LIMITS,
@@ -14,6 +15,7 @@ from hlsim.audiogram.value import (
 __all__ = [
     "FREQUENCIES",
     "HIGHEST_LEVEL",
+    "HIGHEST_SIMULATED",
     "LOWEST_LEVEL",
     "SEVERITIES",
     "SEVERITY_LIMITS",

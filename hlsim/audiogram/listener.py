@@ -1,4 +1,4 @@
-"""The two ears of a listener."""
+"""A listener's two ears, as a value and in files."""
 
 from __future__ import annotations
 
@@ -6,103 +6,104 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from hlsim.audiogram.value import Audiogram
+from hlsim.audiogram.conversion import as_audiogram
+from hlsim.audiogram.plot import draw_png
+from hlsim.audiogram.value import Audiogram, EarName
 
-EARS = ("left", "right")
+EARS: tuple[EarName, EarName] = ("left", "right")
+
+EAR_NAMES: dict[str, EarName] = {
+    "l": "left",
+    "le": "left",
+    "left": "left",
+    "r": "right",
+    "re": "right",
+    "right": "right",
+}
+"""Texts for an ear in a table, in lower case."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Listener:
-    """Hearing thresholds of two ears, for waveforms (..., 2, time) with the left ear first.
+    """Two audiograms, for waveforms ``(..., 2, time)`` with the left ear first.
 
-    A listener is accepted wherever an audiogram is, as thresholds of shape (2, 8):
-    ``simulator(waveform, listener)``, ``HearingLossLoss(listener)``, ``aid(waveform, listener)``,
-    ``haspi(processed, clean, listener)``. Scores have one value per ear; ``.amax(-1)`` gives that of
-    the better ear. A sequence of listeners holds one per item, (items, 2, 8).
+    A listener may be passed wherever an audiogram may. Its thresholds have the shape (2, 8), those
+    of a sequence with one listener per item (items, 2, 8). ``haspi`` and ``hasqi`` return one score
+    per ear; ``.amax(-1)`` is that of the better ear.
 
     Args:
-        left: left ear, or None if it is not known. Losses and ``hlsim.metrics.HASPI`` and ``HASQI``
-            leave an unknown ear out; everything else rejects a listener without both ears.
-        right: right ear, or None.
+        left: Audiogram of the left ear, as ``as_audiogram`` takes it, or ``None`` if it is unknown.
+            Losses and the metrics ``HASPI`` and ``HASQI`` leave an unknown ear out; everything else
+            needs both ears.
+        right: Audiogram of the right ear, likewise.
 
     Raises:
-        ValueError: both ears are None, or one is neither an ``Audiogram`` nor None.
+        ValueError: Both ears are ``None``, or one is not valid.
+
+    Example:
+        >>> from hlsim import Listener
+        >>> Listener(left="N2", right=[20, 25, 30, 40, 50, 55, 60, 60]).left.pta
+        31.25
     """
 
     left: Audiogram | None
     right: Audiogram | None
 
     def __post_init__(self) -> None:
-        for name, ear in self._ears().items():
-            if not isinstance(ear, Audiogram | None):
-                raise ValueError(
-                    f"expected the {name} ear to be an Audiogram or None, got {type(ear).__name__}"
-                )
-        if self.left is None and self.right is None:
-            raise ValueError("expected an Audiogram for one ear at least, got None for both")
+        for name, ear in self.ears().items():
+            object.__setattr__(self, name, as_audiogram(ear))
+        if not self.ears():
+            raise ValueError("expected an audiogram of at least one ear of the listener, got none")
+
+    def __repr__(self) -> str:
+        ears = [f"{name}={ear and ear.short_text()}" for name, ear in vars(self).items()]
+        return f"Listener({', '.join(ears)})"
+
+    def ears(self) -> dict[EarName, Audiogram]:
+        """Return the ears that are known, by name."""
+        ears = zip(EARS, (self.left, self.right), strict=True)
+        return {name: ear for name, ear in ears if ear is not None}
+
+    def _repr_png_(self) -> bytes | None:
+        """Return the drawn audiograms for a notebook, or ``None`` without matplotlib."""
+        return draw_png(self.plot)
 
     def plot(self, axes: Any = None, **style: Any) -> Any:
-        """Draw both ears as audiologists do: left with blue crosses, right with red circles.
-
-        Args:
-            axes: matplotlib axes; by default those of a new figure.
-            style: properties of both lines.
-
-        Returns: the axes.
-
-        Raises:
-            MissingExtraError: matplotlib is not installed.
-        """
-        looks = {
-            "left": {"marker": "x", "color": "tab:blue"},
-            "right": {"marker": "o", "color": "tab:red"},
-        }
-        for name, ear in self._ears().items():
-            if ear is not None:
-                look = {**looks[name], "fillstyle": "none", "label": name}
-                axes = ear.plot(axes, **look | style)
-        axes.legend()
+        """Draw both ears with their pure-tone averages, as ``Audiogram.plot(ear=...)`` does."""
+        for name, ear in self.ears().items():
+            axes = ear.plot(axes, ear=name, **style)
         return axes
 
     def to_dict(self) -> dict[str, Any]:
-        """Return a dictionary that JSON can hold."""
-        return {name: ear and ear.to_dict() for name, ear in self._ears().items()}
+        """Return a JSON-serialisable dictionary, the inverse of ``from_dict``."""
+        return {name: None if ear is None else ear.to_dict() for name, ear in vars(self).items()}
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Listener:
-        """Return the listener of a dictionary that ``to_dict`` made.
+        """Return the listener of a dictionary with ``left`` and ``right``.
 
         Raises:
-            ValueError: the value is not a mapping with ``left`` and ``right``.
+            ValueError: The data is not such a dictionary.
         """
         if not isinstance(data, Mapping) or set(data) != set(EARS):
-            raise ValueError(
-                "expected a dictionary with 'left' and 'right', each the dictionary of an "
-                f"audiogram or None, got {data!r}"
-            )
-        ears = {name: data[name] and Audiogram.from_dict(data[name]) for name in EARS}
-        return cls(**ears)
+            raise ValueError(f"expected a dictionary with 'left' and 'right', got {data!r}")
+        ears = [None if data[name] is None else Audiogram.from_dict(data[name]) for name in EARS]
+        return cls(*ears)
 
     def to_rows(self, name: str) -> list[dict[str, str]]:
-        """Return one row per ear for a CSV file that ``read_listeners`` reads.
+        """Return one row of a CSV file per ear, as ``read_listeners`` reads them.
 
         Args:
-            name: name of the listener in the file.
+            name: Name of the listener in the file.
         """
-        rows = []
-        for side, ear in self._ears().items():
-            if ear is not None:
-                rows.append({"listener": name, "ear": side, **ear.to_row()})
-        return rows
+        ears = self.ears().items()
+        return [{"listener": name, "ear": side, **ear.to_row()} for side, ear in ears]
 
     @classmethod
     def from_clarity(cls, source: Any) -> Listener:
-        """Return the listener of pyclarity's ``Listener`` or of an entry of ``listeners.json``.
+        """Return pyclarity's ``Listener``, or an entry of Clarity's ``listeners.json``.
 
         Raises:
-            ValueError: the source is neither.
+            ValueError: The source is neither.
         """
-        return cls(Audiogram.from_clarity(source, "left"), Audiogram.from_clarity(source, "right"))
-
-    def _ears(self) -> dict[str, Audiogram | None]:
-        return {"left": self.left, "right": self.right}
+        return cls(*(Audiogram.from_clarity(source, name) for name in EARS))

@@ -1,42 +1,49 @@
-"""Drawing an audiogram as audiologists do, and the frequency axis that other plots share."""
+"""Audiograms drawn as audiologists do."""
 
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable
+from itertools import pairwise
 from typing import Any
 
+from hlsim.audiogram.value import (
+    HIGHEST_LEVEL,
+    LOWEST_LEVEL,
+    SEVERITIES,
+    SEVERITY_LIMITS,
+    Audiogram,
+    EarName,
+)
 from hlsim.extras import MissingExtraError, require
 
-DEGREE_SHADES = (0.0, 0.05, 0.1, 0.16)
-"""Opacity of the bands of the degrees of loss, the mildest first."""
+_SHADES = (0.0, 0.05, 0.1, 0.16)
+"""Opacity of the band of each degree of loss."""
 
-FREQUENCY_TICKS = (250.0, 500.0, 1000.0, 2000.0, 4000.0, 6000.0, 8000.0)
+_TICKS_HZ = (250.0, 500.0, 1000.0, 2000.0, 4000.0, 6000.0, 8000.0)
+
+_STYLES: dict[EarName | None, dict[str, Any]] = {
+    None: {"marker": "o", "color": "black"},
+    "left": {"marker": "x", "color": "tab:blue"},
+    "right": {"marker": "o", "color": "tab:red", "fillstyle": "none"},
+}
+"""Matplotlib's properties of the line of an ear."""
 
 
 def plot_audiogram(
-    frequencies: Sequence[float],
-    levels: Sequence[float],
-    degrees: Mapping[str, tuple[float, float]],
-    axes: Any = None,
-    **style: Any,
+    audiogram: Audiogram, axes: Any = None, ear: EarName | None = None, **style: Any
 ) -> Any:
-    """Draw thresholds over frequency, as ``Audiogram.plot``, which calls this, describes it.
-
-    Args:
-        frequencies: frequencies in Hz.
-        levels: thresholds in dB HL.
-        degrees: lowest and highest level in dB HL of each degree of loss by name, the mildest first.
-        axes: matplotlib axes; by default those of a new figure.
-        style: properties of the line.
-
-    Returns: the axes.
-    """
+    """Draw an audiogram, as ``Audiogram.plot``."""
     if axes is None:
         _, axes = require("matplotlib.pyplot", "eval").subplots(layout="constrained")
-    if not axes.yaxis_inverted():  # no audiogram was drawn there before
-        _prepare(axes, degrees)
-    axes.plot(frequencies, levels, **{"marker": "o", "color": "black"} | style)
+    if not axes.yaxis_inverted():  # axes on which no audiogram has been drawn
+        _prepare(axes)
+    style = _STYLES[ear] | style
+    if ear is not None:
+        style = {"label": f"{ear}, PTA {audiogram.pta:.0f} dB HL"} | style
+    axes.plot(audiogram.frequencies, audiogram.levels, **style)
+    if ear is not None:
+        axes.legend()
     return axes
 
 
@@ -53,23 +60,23 @@ def draw_png(plot: Callable[[Any], Any]) -> bytes | None:
     return image.getvalue()
 
 
-def frequency_axis(axes: Any, frequencies: Iterable[float]) -> None:
-    """Make the horizontal axis logarithmic in kHz, with ticks at frequencies in Hz."""
-    ticks = list(frequencies)
+def frequency_axis(axes: Any, ticks: Iterable[float]) -> None:
+    """Give axes a logarithmic frequency axis in kHz with ticks at frequencies in Hz."""
+    hertz = list(ticks)
     axes.set(xscale="log", xlabel="frequency (kHz)")
-    axes.set_xticks(ticks, [f"{frequency / 1000:g}" for frequency in ticks])
+    axes.set_xticks(hertz, [f"{tick / 1000:g}" for tick in hertz])
     axes.minorticks_off()
     axes.grid(alpha=0.3)
 
 
-def _prepare(axes: Any, degrees: Mapping[str, tuple[float, float]]) -> None:
-    """Draw the degrees of loss and both axes."""
-    text = {"rotation": 90, "ha": "left", "va": "center", "fontsize": "small", "color": "0.35"}
-    for (name, (lowest, highest)), shade in zip(degrees.items(), DEGREE_SHADES, strict=True):
-        axes.axhspan(lowest, highest, color="tab:blue", alpha=shade, linewidth=0)
-        middle = (lowest + highest) / 2
-        axes.text(1.02, middle, name, transform=axes.get_yaxis_transform(), **text)
-    frequency_axis(axes, FREQUENCY_TICKS)
-    limits = [level for degree in degrees.values() for level in degree]
-    axes.set(xlim=(180.0, 11000.0), ylim=(max(limits), min(limits)), ylabel="threshold (dB HL)")
+def _prepare(axes: Any) -> None:
+    """Draw the axes and the bands of the degrees of loss."""
+    bounds = pairwise((LOWEST_LEVEL, *SEVERITY_LIMITS, HIGHEST_LEVEL))
+    label = {"transform": axes.get_yaxis_transform(), "ha": "left", "va": "center"}
+    for severity, (low, high), shade in zip(SEVERITIES, bounds, _SHADES, strict=True):
+        axes.axhspan(low, high, color="tab:blue", alpha=shade, linewidth=0)
+        middle = (low + high) / 2
+        axes.text(1.02, middle, severity, fontsize="small", color="0.35", rotation=90, **label)
+    frequency_axis(axes, _TICKS_HZ)
+    axes.set(xlim=(180.0, 11000.0), ylim=(HIGHEST_LEVEL, LOWEST_LEVEL), ylabel="threshold (dB HL)")
     axes.set_yticks(range(0, 121, 20))

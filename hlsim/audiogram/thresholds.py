@@ -1,4 +1,4 @@
-"""Thresholds of ears as tensors: conversion, validation, storage, and interpolation."""
+"""Thresholds as tensors: converted, validated, stored, and interpolated between frequencies."""
 
 from __future__ import annotations
 
@@ -13,13 +13,17 @@ from torch import Tensor
 
 from hlsim.audiogram.conversion import EarLike, find_audiogram
 from hlsim.audiogram.devices import known_on_host, on_device, on_host
-from hlsim.audiogram.listener import Listener
-from hlsim.audiogram.value import FREQUENCIES, LOWEST_LEVEL, join_numbers
+from hlsim.audiogram.listener import EARS, Listener
+from hlsim.audiogram.value import (
+    FREQUENCIES,
+    HIGHEST_SIMULATED,
+    LOWEST_LEVEL,
+    Audiogram,
+    check_range,
+    join_numbers,
+)
 from hlsim.checks import broadcast_shape
 from hlsim.torchtools import constant_like
-
-HIGHEST_SIMULATED = 100.0
-"""Highest level in dB HL that simulators accept: MSBG's expansion ratio 105 / (105 - level) is singular at 105."""
 
 AudiogramLike = EarLike | Listener | Sequence[EarLike] | Sequence[Listener]
 """One ear (see ``as_audiogram``), the two ears of a ``Listener``, a sequence with one of these per
@@ -33,63 +37,124 @@ def as_thresholds(
     consumer: str = "a simulator",
     allow_missing: bool = False,
 ) -> Tensor:
-    """Convert ears to thresholds in dB HL.
+    """Return the thresholds of one or more ears at the eight ``FREQUENCIES``.
 
-    A list of tensors holds one ear per tensor, (8,), or one frequency per tensor, (batch,), as
-    torch's ``default_collate`` arranges them. Eight tensors of shape (8,) could be either, and are
-    rejected.
+    An ``Audiogram`` with other frequencies is interpolated over log frequency
+    (``Audiogram.thresholds``). In a list of tensors, (8,) tensors are one ear each, and eight
+    (batch,) tensors are one frequency each, as torch's ``default_collate`` stacks them.
 
-    Reading a tensor on a GPU would make the host wait for the GPU. The values of such a tensor are not validated on the
-    host: an ear with a level out of range becomes NaN there, and so do the outputs that are computed with it.
+    Reading a tensor on a GPU would make the host wait for the GPU. The values of such a tensor are
+    not validated on the host: an ear with a level out of range becomes NaN, and so do the outputs
+    that are computed with it.
 
     Args:
-        audiogram: ear or ears.
-        highest: highest accepted level in dB HL.
-        consumer: what needs the thresholds, for messages.
-        allow_missing: accept a listener with one ear, whose other ear becomes NaN.
+        audiogram: One or more ears.
+        highest: Highest level allowed, in dB HL.
+        consumer: What takes the thresholds, for messages.
+        allow_missing: Accept listeners with one ear. The thresholds of the other ear are NaN.
 
-    Returns: (8,) for one ear, (batch, 8) for a sequence, (2, 8) for a ``Listener``, (batch, 2, 8)
-        for a sequence of listeners, and a tensor itself.
+    Returns:
+        Thresholds in dB HL: (8,) for one ear, (2, 8) for a ``Listener``, (batch, 8) and
+        (batch, 2, 8) for sequences of them, and a tensor itself.
 
     Raises:
-        ValueError: the value is not an audiogram, a listener lacks an ear, a tensor is complex or
-            bool, has another last dimension than 8 or holds NaN, or a level is out of range.
+        ValueError: The value does not describe ears, an ear is missing, a tensor does not hold
+            eight real numbers per ear, or a level is NaN or outside -10 to ``highest`` dB HL.
     """
-    limits: dict[str, Any] = {"highest": highest, "consumer": consumer}
-    if isinstance(audiogram, Listener):
-        return _listener_thresholds(audiogram, allow_missing, limits)
     if isinstance(audiogram, np.ndarray):
         audiogram = torch.from_numpy(audiogram).float()
-    if not isinstance(audiogram, Tensor):
-        ear = find_audiogram(audiogram)
-        if ear is not None:
-            return torch.tensor(_check_levels(ear.thresholds, **limits))
-        if isinstance(audiogram, list | tuple) and audiogram:
-            first = audiogram[0]
-            if isinstance(first, Tensor):
-                audiogram = _stack(audiogram)
-            elif isinstance(first, Listener) or find_audiogram(first) is not None:
-                ears = [
-                    as_thresholds(ear, **limits, allow_missing=allow_missing) for ear in audiogram
-                ]
-                return torch.stack(ears)
-    if not isinstance(audiogram, Tensor):
+    found = list_ears(audiogram)
+    if found is not None:
+        ears, shape = found
+        if not allow_missing and None in ears:
+            _raise_missing_ear(ears.index(None))
+        unknown = (math.nan,) * len(FREQUENCIES)
+        rows = [unknown if ear is None else ear.thresholds for ear in ears]
+        for row in rows:
+            if row is not unknown:
+                check_range(row, highest, consumer)
+        return torch.tensor(rows).reshape(*shape, len(FREQUENCIES))
+    levels = _stacked(audiogram)
+    if not isinstance(levels, Tensor):
         raise ValueError(
-            f"expected an audiogram, got {type(audiogram).__name__}; pass an Audiogram, a name such "
+            f"expected an audiogram, got {type(levels).__name__}; pass an Audiogram, a name such "
             "as 'N3', a Listener, a sequence with one of these per item, or thresholds in dB HL of "
             "shape (..., 8)"
         )
-    return _check_tensor(audiogram, **limits)
+    if levels.is_complex() or levels.dtype == torch.bool:
+        raise ValueError(
+            f"expected an audiogram tensor of real numbers in dB HL, got {levels.dtype}"
+        )
+    if levels.ndim == 0 or levels.shape[-1] != len(FREQUENCIES) or not levels.numel():
+        raise ValueError(
+            f"expected an audiogram tensor of shape (..., 8), dB HL at {join_numbers(FREQUENCIES)} Hz, got shape "
+            f"{tuple(levels.shape)}; pass an Audiogram for other frequencies"
+        )
+    if not levels.is_floating_point():
+        levels = levels.float()
+    known = known_on_host(levels)
+    if known is None:
+        in_range = ((levels >= LOWEST_LEVEL) & (levels <= highest)).all(-1, keepdim=True)
+        return torch.where(in_range, levels, math.nan)
+    in_range = ((known >= LOWEST_LEVEL) & (known <= highest)).all(-1)
+    if not bool(in_range.all()):
+        check_range(known[~in_range][0].tolist(), highest, consumer)
+    return levels
+
+
+def list_ears(audiogram: Any) -> tuple[list[Audiogram | None], tuple[int, ...]] | None:
+    """Return the audiograms of a value, and the shape of their thresholds without the last dimension.
+
+    The missing ear of a listener is ``None``. The result is ``None`` for a tensor, for a sequence of
+    tensors, and for what does not describe ears.
+    """
+    if isinstance(audiogram, Tensor):
+        return None
+    ear = find_audiogram(audiogram)
+    if ear is not None:
+        return [ear], ()
+    if isinstance(audiogram, Listener):
+        return [audiogram.left, audiogram.right], (len(EARS),)
+    if not isinstance(audiogram, Sequence):
+        return None
+    ears: list[Audiogram | None] = []
+    shapes = set()
+    for part in audiogram:
+        found = list_ears(part)
+        if found is None:
+            return None
+        ears += found[0]
+        shapes.add(found[1])
+    return (ears, (len(audiogram), *shapes.pop())) if len(shapes) == 1 else None
+
+
+def other_grids(audiogram: AudiogramLike | None) -> list[Audiogram | None]:
+    """Return the ears that were measured at other than the eight frequencies, for the exact MSBG.
+
+    Returns:
+        One audiogram per ear, in the order of ``as_thresholds``, or ``None`` for an ear at the
+        eight frequencies; an empty list if all ears are at the eight frequencies.
+
+    Raises:
+        ValueError: A level is above 100 dB HL, at whatever frequency.
+    """
+    ears, _ = list_ears(audiogram) or ([], ())
+    others = [None if ear is None or ear.frequencies == FREQUENCIES else ear for ear in ears]
+    for ear in others:
+        if ear is not None:
+            check_range(ear.levels, HIGHEST_SIMULATED, "a simulator")
+    return others if any(others) else []
 
 
 def store_thresholds(audiogram: AudiogramLike | None, **options: Any) -> Tensor | None:
-    """Return ``as_thresholds`` for a module to keep, or None for None.
+    """Return ``as_thresholds`` for a module to store.
 
-    It is a copy, because the caller may write into a tensor, unless the tensor is trained.
+    The result is a copy, because the caller may write into a tensor later. A tensor that requires a
+    gradient stays itself.
     """
     if audiogram is None:
         return None
-    with torch.inference_mode(False):  # the module may be trained through later
+    with torch.inference_mode(False):  # the module may be trained later
         if isinstance(audiogram, Tensor):
             on_host(audiogram)  # so that its values are validated
         levels = as_thresholds(audiogram, **options)
@@ -104,54 +169,50 @@ def resolve_thresholds(
     two_ears: bool = False,
     **options: Any,
 ) -> Tensor:
-    """Return the thresholds for a waveform, on its device: those of the call, else the stored ones.
-
-    A waveform (batch, 1, time) with thresholds (batch, 8) has one ear per item.
+    """Return the thresholds of a call, or else the stored ones, on the waveform's device.
 
     Args:
-        stored: thresholds that a module keeps.
-        audiogram: ear or ears that were passed to the call.
-        waveform: (..., time).
-        two_ears: whether the stored thresholds are those of listeners.
-        options: keyword arguments of ``as_thresholds``.
+        stored: Thresholds of the module, ``(..., 8)``.
+        audiogram: Ears of the call.
+        waveform: Signals, ``(..., time)``.
+        two_ears: Whether the stored thresholds are those of listeners.
+        options: Keyword arguments of ``as_thresholds``.
+
+    Returns:
+        Thresholds that broadcast with the leading dimensions of the waveform, ``(..., 8)``; one ear
+        per item for (batch, 1, time) and (batch, 8).
 
     Raises:
-        ValueError: there are no thresholds, their shape does not broadcast with the leading
-            dimensions, or a listener's waveform is not (..., 2, time).
+        ValueError: There are no ears, the shapes do not broadcast, or the waveform of a listener is
+            not (..., 2, time).
     """
-    if audiogram is not None:
-        two_ears = has_listeners(audiogram)
-        thresholds = as_thresholds(audiogram, **options)
-    elif stored is not None:
-        thresholds = stored
-    else:
+    if audiogram is None and stored is None:
         raise ValueError(
-            "no audiogram; pass one with the call, or to the constructor of MSBG and NALR"
+            "no audiogram; pass one with the call, or to MSBG or NALR when building it"
         )
-    if two_ears:
+    thresholds = stored if audiogram is None else as_thresholds(audiogram, **options)
+    assert thresholds is not None
+    if two_ears if audiogram is None else has_listeners(audiogram):
         check_two_channels(waveform)
     thresholds = unsqueeze_mono(thresholds, waveform.shape)
     try:
         broadcast_shape(waveform.shape[:-1], thresholds.shape[:-1])
     except RuntimeError:
         raise ValueError(
-            f"expected one audiogram or one per item, got audiograms of shape "
-            f"{tuple(thresholds.shape)} for a waveform of shape {tuple(waveform.shape)}"
+            f"audiograms of shape {tuple(thresholds.shape)} do not fit a waveform of shape "
+            f"{tuple(waveform.shape)}; pass one audiogram, or leading dimensions that broadcast"
         ) from None
     return on_device(thresholds, waveform.device)
 
 
 def unsqueeze_mono(thresholds: Tensor, shape: torch.Size) -> Tensor:
-    """Give thresholds the channel dimension of a mono batch.
-
-    Shape: (batch, 8) with waveforms (batch, 1, time) -> (batch, 1, 8), otherwise unchanged.
-    """
+    """Give each mono item of (batch, 1, time) its ear. Shape: (batch, 8) -> (batch, 1, 8)."""
     mono = len(shape) == 3 and shape[1] == 1
     return thresholds.unsqueeze(1) if mono and thresholds.shape[:-1] == shape[:1] else thresholds
 
 
 def has_listeners(audiogram: AudiogramLike | None) -> bool:
-    """Return whether a value is a ``Listener`` or a sequence of listeners."""
+    """Whether ears are those of a ``Listener`` or of a sequence of listeners."""
     if isinstance(audiogram, list | tuple) and audiogram:
         return isinstance(audiogram[0], Listener)
     return isinstance(audiogram, Listener)
@@ -167,74 +228,47 @@ def check_two_channels(waveform: Tensor) -> None:
 
 
 def interpolate(levels: Tensor, frequencies: tuple[float, ...]) -> Tensor:
-    """Interpolate thresholds linearly in Hz, flat beyond the ends. Shape: (..., 8) -> (..., frequencies)."""
+    """Interpolate levels at the eight frequencies, linearly in Hz and flat beyond them.
+
+    Shape: (..., 8) -> (..., frequencies).
+    """
     # A GPU may round matrix products to ten bits, so this is a sum of products.
     weights = constant_like(levels, interpolation_weights, frequencies)
     return (levels.unsqueeze(-1) * weights).sum(-2)
 
 
-def interpolation_weights(frequencies: tuple[float, ...]) -> NDArray[np.float64]:
-    """Return ``interpolate`` as a matrix, (8, frequencies)."""
-    rows = np.eye(len(FREQUENCIES))
-    return np.stack([np.interp(frequencies, FREQUENCIES, row) for row in rows])
+def interpolation_weights(
+    frequencies: tuple[float, ...], grid: tuple[float, ...] = FREQUENCIES
+) -> NDArray[np.float64]:
+    """Return the weights of the levels of a grid in those at other frequencies, (grid, frequencies)."""
+    return np.stack([np.interp(frequencies, grid, row) for row in np.eye(len(grid))])
 
 
-def _listener_thresholds(listener: Listener, allow_missing: bool, limits: dict[str, Any]) -> Tensor:
-    ears = [listener.left, listener.right]
-    if None in ears and not allow_missing:
-        place = 1 if listener.left is None else 0
-        name, other = ("left", "right") if listener.left is None else ("right", "left")
-        raise ValueError(
-            f"the listener has no {name} ear; pass listener.{other} with waveform[..., {place}, :]"
-        )
-    unknown = torch.full((len(FREQUENCIES),), math.nan)
-    return torch.stack([unknown if ear is None else as_thresholds(ear, **limits) for ear in ears])
+def _raise_missing_ear(index: int) -> None:
+    """Raise ValueError for the ear with an index among the ears of listeners."""
+    missing, other = EARS[index % 2], 1 - index % 2
+    raise ValueError(
+        f"the listener's {missing} ear is missing; pass listener.{EARS[other]} with "
+        f"waveform[..., {other}, :]"
+    )
 
 
-def _stack(tensors: Sequence[Any]) -> Any:
-    """Stack tensors of one ear each or of one frequency each, or return what is neither."""
-    shapes = {tuple(tensor.shape) for tensor in tensors if isinstance(tensor, Tensor)}
-    count = len(FREQUENCIES)
-    if len(shapes) != 1 or not all(isinstance(tensor, Tensor) for tensor in tensors):
+def _stacked(tensors: Any) -> Any:
+    """Stack a sequence of (8,) tensors, one per ear, or of eight (batch,) tensors, one per frequency.
+
+    Anything else is returned as it is.
+    """
+    if not isinstance(tensors, list | tuple):
         return tensors
-    (shape,) = shapes
-    one_ear_each = shape == (count,)
-    one_frequency_each = len(shape) == 1 and len(tensors) == count
-    if one_ear_each and one_frequency_each:
+    lengths = {len(one) if isinstance(one, Tensor) and one.ndim == 1 else -1 for one in tensors}
+    per_ear, per_frequency = lengths == {len(FREQUENCIES)}, len(tensors) == len(FREQUENCIES)
+    if per_ear and per_frequency:
         raise ValueError(
-            "expected one tensor, got a list of eight tensors of 8 levels, which may be ears or "
-            "frequencies; stack ears with torch.stack(audiogram), frequencies with "
-            "torch.stack(audiogram, -1)"
+            "eight tensors of 8 levels may be one ear or one frequency each; pass "
+            "torch.stack(audiogram) if they are ears, torch.stack(audiogram, -1) if frequencies"
         )
-    if not one_ear_each and not one_frequency_each:
-        return tensors
-    return torch.stack(tuple(tensors), 0 if one_ear_each else -1)
-
-
-def _check_tensor(audiogram: Tensor, highest: float, consumer: str) -> Tensor:
-    if audiogram.is_complex() or audiogram.dtype == torch.bool:
-        raise ValueError(f"expected thresholds as real numbers, got {audiogram.dtype}")
-    levels = audiogram if audiogram.is_floating_point() else audiogram.float()
-    if levels.ndim == 0 or levels.shape[-1] != len(FREQUENCIES) or not levels.numel():
-        raise ValueError(
-            f"expected thresholds of shape (..., 8), at {join_numbers(FREQUENCIES)} Hz, "
-            f"got {tuple(levels.shape)}"
-        )
-    known = known_on_host(levels)
-    if known is None:
-        inside = (levels >= LOWEST_LEVEL) & (levels <= highest)
-        return torch.where(inside.all(-1, keepdim=True), levels, math.nan)
-    inside = ((known >= LOWEST_LEVEL) & (known <= highest)).all(-1)
-    if not bool(inside.all()):
-        _check_levels(known[~inside][0].tolist(), highest, consumer)
-    return levels
-
-
-def _check_levels(levels: Sequence[float], highest: float, consumer: str) -> Sequence[float]:
-    if not all(LOWEST_LEVEL <= level <= highest for level in levels):
-        reason = ", as MSBG is singular at 105" if highest == HIGHEST_SIMULATED else ""
-        raise ValueError(
-            f"expected levels from {LOWEST_LEVEL:g} to {highest:g} dB HL for {consumer}{reason}, "
-            f"got {join_numbers(levels)}"
-        )
-    return levels
+    if per_ear:
+        return torch.stack(tuple(tensors))
+    if per_frequency and len(lengths) == 1 and -1 not in lengths:
+        return torch.stack(tuple(tensors), -1)
+    return tensors

@@ -1,13 +1,14 @@
-"""The hearing thresholds of one ear, and the severity of its loss."""
+"""Hearing thresholds of one ear: validated, converted, and classified by severity of the loss."""
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
-from typing import Any
+from itertools import compress, pairwise
+from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -15,23 +16,28 @@ from torch import Tensor
 
 from hlsim.extras import MissingExtraError
 
+EarName = Literal["left", "right"]
+
 FREQUENCIES = (250.0, 500.0, 1000.0, 2000.0, 3000.0, 4000.0, 6000.0, 8000.0)
-"""Audiometric frequencies in Hz that every simulator uses."""
+"""The eight audiometric frequencies in Hz at which networks, losses and aids take thresholds."""
 
 LOWEST_LEVEL, HIGHEST_LEVEL = -10.0, 120.0
 """Range of the thresholds of an audiogram in dB HL."""
+
+HIGHEST_SIMULATED = 100.0
+"""Highest threshold that a simulator takes, in dB HL. MSBG is singular at 105 dB HL."""
 
 SEVERITIES = ("none", "mild", "moderate", "severe")
 """MSBG's degrees of loss, by the mean threshold from 2 to 8 kHz."""
 
 SEVERITY_LIMITS = (15.0, 35.0, 56.0)
-"""Mean thresholds in dB HL above which a loss is mild, moderate and severe (pyclarity 0.9.0)."""
+"""Mean thresholds in dB HL above which a loss is mild, moderate and severe, as in pyclarity 0.9.0."""
 
 STEPS_PER_DB = 1e4
-"""Resolution of thresholds for the severity, so that 19.7 dB HL in single precision counts as 19.7."""
+"""Resolution of levels for the severity, so that 19.7 dB HL in single precision counts as 19.7."""
 
-# Bisgaard, Vlaming, Dahlquist 2010, Trends in Amplification 14(2), doi 10.1177/1084713810379609, Tables 1 and 2, at the
-# frequencies above; they end at 6 kHz, so that 8 kHz is our flat extension.
+# Bisgaard, Vlaming, Dahlquist 2010, Trends in Amplification 14(2), doi 10.1177/1084713810379609,
+# Tables 1 and 2, at the frequencies above. The tables end at 6 kHz; 8 kHz repeats that threshold.
 STANDARD = {
     "NH": (0, 0, 0, 0, 0, 0, 0, 0),
     "N1": (10, 10, 10, 15, 20, 30, 40, 40),
@@ -46,57 +52,59 @@ STANDARD = {
     "S3": (30, 35, 60, 75, 80, 80, 85, 85),
 }
 
-COLUMN = re.compile(r"hl_(\d+\.?\d*|\.\d+)(_.+)?")
-"""Column of a CSV file: a frequency, and the name of a remark on it."""
-
-CLARITY_KEYS = ("audiogram_cfs", "audiogram_levels_l", "audiogram_levels_r")
-"""Keys of an entry of Clarity's ``listeners.json``."""
+# a frequency, "k" for kHz, and the name of a remark on the frequency
+_COLUMN = re.compile(r"(?:hl[_ ]?)?(\d+\.?\d*|\.\d+) ?(k?)(?:hz)?(_.+)?", re.IGNORECASE)
+_UNMEASURED = ("", "na", "n/a", "null", "none", "nan")
 
 
 @dataclass(frozen=True, repr=False)
 class Audiogram:
-    """Hearing thresholds of one ear in dB HL, ascending in frequency.
+    """Hearing thresholds of one ear in dB HL, at any frequencies.
 
     Checkpoints that hold audiograms, say as hyperparameters, are loaded with ``weights_only=True``
     inside ``torch.serialization.safe_globals([Audiogram])``.
 
+    The frequencies are kept as they are given. The exact MSBG interpolates the thresholds linearly
+    in Hz, as pyclarity does. Everything else takes ``thresholds``, the levels at eight frequencies.
+
     Args:
-        levels: thresholds in dB HL from -10 to 120, one per frequency.
-        frequencies: frequencies in Hz, by default the eight that simulators use. Other grids are
-            kept as given; ``thresholds`` interpolates them linearly over log frequency, flat beyond
-            the ends.
+        levels: Thresholds in dB HL, -10 to 120, one per frequency, or ``None`` for a frequency that
+            was not measured and is left out.
+        frequencies: Ascending frequencies in Hz, by default the eight ``FREQUENCIES``.
 
     Raises:
-        ValueError: the numbers of levels and frequencies differ, a value is not finite or out of
+        ValueError: The numbers of levels and frequencies differ, a value is not finite or out of
             range, or the frequencies do not ascend, or all lie below 250 or above 8000 Hz.
+
+    Example:
+        >>> from hlsim import Audiogram
+        >>> ear = Audiogram([15, 20, 25, 30, 40, 35], [250, 500, 1000, 2000, 4000, 8000])
+        >>> ear.severity, ear.pta
+        ('mild', 28.75)
     """
 
     levels: tuple[float, ...]
     frequencies: tuple[float, ...] = FREQUENCIES
 
     def __post_init__(self) -> None:
-        levels = _as_numbers(self.levels, "levels")
-        frequencies = _as_numbers(self.frequencies, "frequencies")
-        if len(levels) != len(frequencies) or not levels:
+        values, hertz = _as_list(self.levels), _as_list(self.frequencies)
+        if len(values) != len(hertz):
             raise ValueError(
-                f"expected one level per frequency, got {len(levels)} levels and "
-                f"{len(frequencies)} frequencies; by default there are {len(FREQUENCIES)}: "
-                f"{join_numbers(FREQUENCIES)} Hz"
+                f"expected one level per frequency, got {len(values)} levels for {len(hertz)} "
+                f"frequencies: {hertz}"
             )
-        if min(levels) < LOWEST_LEVEL or max(levels) > HIGHEST_LEVEL:
+        measured = [value is not None for value in values]
+        levels = _finite_numbers(compress(values, measured), "levels")
+        frequencies = _finite_numbers(compress(hertz, measured), "frequencies")
+        check_range(levels, HIGHEST_LEVEL, "an audiogram")
+        if frequencies[0] <= 0 or any(high <= low for low, high in pairwise(frequencies)):
             raise ValueError(
-                f"expected levels from {LOWEST_LEVEL:g} to {HIGHEST_LEVEL:g} dB HL, "
-                f"got {join_numbers(levels)}"
-            )
-        ascending = all(low < high for low, high in pairwise(frequencies))
-        if frequencies[0] <= 0 or not ascending:
-            raise ValueError(
-                f"expected positive, ascending frequencies in Hz, got {join_numbers(frequencies)}"
+                f"expected positive, ascending frequencies, got {join_numbers(frequencies)} Hz"
             )
         if frequencies[-1] < FREQUENCIES[0] or frequencies[0] > FREQUENCIES[-1]:
             raise ValueError(
-                f"expected a frequency from {FREQUENCIES[0]:g} to {FREQUENCIES[-1]:g} Hz, "
-                f"got {join_numbers(frequencies)}; give frequencies in Hz, not kHz"
+                f"expected frequencies in Hz with one from {FREQUENCIES[0]:g} to "
+                f"{FREQUENCIES[-1]:g}, got {join_numbers(frequencies)}; multiply kHz by 1000"
             )
         object.__setattr__(self, "levels", levels)
         object.__setattr__(self, "frequencies", frequencies)
@@ -123,13 +131,32 @@ class Audiogram:
             raise ValueError(f"unknown standard audiogram {name!r}; expected one of {names}")
         return cls(tuple(float(level) for level in STANDARD[key]))
 
+    @classmethod
+    def from_csv(cls, path: str | Path, name: str | None = None) -> Audiogram:
+        """Read one ear from a CSV file.
+
+        Args:
+            path: A table as for ``read_audiograms``.
+            name: Text in any column of the row to read, such as ``"N3"``. It may be left out if
+                the table has one row.
+
+        Raises:
+            ValueError: The table is not valid, or not exactly one row has the name.
+        """
+        from hlsim.audiogram.table import read_audiogram
+
+        return read_audiogram(path, name)
+
     def __repr__(self) -> str:
+        return f"Audiogram({self.short_text()})"
+
+    def short_text(self) -> str:
+        """Return the name of a standard audiogram in quotes, or a dictionary of thresholds by Hz."""
         for name, levels in STANDARD.items():
-            if self.frequencies == FREQUENCIES and self.levels == tuple(map(float, levels)):
-                return f"Audiogram({name!r})"
+            if self.frequencies == FREQUENCIES and self.levels == levels:
+                return repr(name)
         points = zip(self.frequencies, self.levels, strict=True)
-        levels_by_hz = ", ".join(f"{frequency:g}: {level:g}" for frequency, level in points)
-        return f"Audiogram({{{levels_by_hz}}})"
+        return f"{{{', '.join(f'{frequency:g}: {level:g}' for frequency, level in points)}}}"
 
     def _repr_png_(self) -> bytes | None:
         """Return the drawn audiogram for a notebook, or ``None`` without matplotlib."""
@@ -139,93 +166,111 @@ class Audiogram:
 
     @property
     def thresholds(self) -> tuple[float, ...]:
-        """Levels in dB HL at the eight frequencies that simulators use."""
+        """Thresholds in dB HL at the eight ``FREQUENCIES``.
+
+        Between other frequencies they are interpolated linearly over log frequency; beyond the
+        lowest and the highest frequency they stay constant.
+        """
         if self.frequencies == FREQUENCIES:
             return self.levels
-        levels = np.interp(np.log(FREQUENCIES), np.log(self.frequencies), self.levels)
-        return tuple(float(level) for level in levels)
+        values = np.interp(np.log(FREQUENCIES), np.log(self.frequencies), self.levels)
+        return tuple(float(value) for value in values)
 
     @property
     def severity(self) -> str:
-        """MSBG's degree of loss: none, mild, moderate or severe, by the mean threshold from 2 to 8 kHz."""
-        thresholds = torch.tensor(self.thresholds, dtype=torch.float64, device="cpu")
-        return SEVERITIES[int(severity_index(thresholds))]
+        """MSBG's degree of loss: none, mild, moderate or severe.
 
-    def plot(self, axes: Any = None, **style: Any) -> Any:
-        """Draw the audiogram: dB HL downwards over octaves, with bands for MSBG's degrees of loss.
+        It follows from the mean of the levels that were measured from 2 to 8 kHz, and is none if
+        there is no such level, as in pyclarity.
+        """
+        levels = torch.tensor(self.levels, dtype=torch.float64, device="cpu")
+        return SEVERITIES[int(severity_index(levels, self.frequencies))]
+
+    @property
+    def pta(self) -> float:
+        """Pure-tone average in dB HL: mean threshold at 500, 1000, 2000 and 4000 Hz."""
+        levels = dict(zip(FREQUENCIES, self.thresholds, strict=True))
+        return (levels[500.0] + levels[1000.0] + levels[2000.0] + levels[4000.0]) / 4.0
+
+    def plot(self, axes: Any = None, *, ear: EarName | None = None, **style: Any) -> Any:
+        """Draw the thresholds downwards over octaves, with MSBG's degrees of loss as bands.
 
         Args:
-            axes: matplotlib axes, which may hold other ears; by default those of a new figure.
-            style: properties of the line, such as ``color="tab:red"`` and ``label="right"``.
+            axes: Matplotlib axes to draw on, which may show other ears; by default new ones.
+            ear: ``"left"`` draws blue crosses and ``"right"`` red circles, as audiologists do, with
+                the ear and its pure-tone average in the legend.
+            style: Matplotlib's properties of the line, such as ``color="tab:green"``.
 
-        Returns: the axes.
+        Returns:
+            The axes.
 
         Raises:
-            MissingExtraError: matplotlib is not installed.
+            MissingExtraError: Matplotlib is not installed.
         """
         from hlsim.audiogram.plot import plot_audiogram
 
-        limits = pairwise((LOWEST_LEVEL, *SEVERITY_LIMITS, HIGHEST_LEVEL))
-        degrees = dict(zip(SEVERITIES, limits, strict=True))
-        return plot_audiogram(self.frequencies, self.levels, degrees, axes, **style)
+        return plot_audiogram(self, axes, ear, **style)
 
     def to_dict(self) -> dict[str, list[float]]:
-        """Return a dictionary that JSON can hold."""
+        """Return a JSON-serialisable dictionary, the inverse of ``from_dict``."""
         return {"levels": list(self.levels), "frequencies": list(self.frequencies)}
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Audiogram:
-        """Return the audiogram of a dictionary that ``to_dict`` made.
+        """Return the audiogram of a dictionary with ``levels`` and, optionally, ``frequencies``.
 
         Raises:
-            ValueError: the value is not a mapping, or has no ``levels``.
+            ValueError: The data is not such a dictionary.
         """
         if not isinstance(data, Mapping) or "levels" not in data:
-            found = list(data) if isinstance(data, Mapping) else type(data).__name__
-            raise ValueError(f"expected a dictionary with 'levels', got {found}")
+            raise ValueError(f"expected a dictionary with 'levels', got {data!r}")
         return cls(data["levels"], data.get("frequencies", FREQUENCIES))
 
     def to_row(self) -> dict[str, str]:
-        """Return the columns ``hl_250`` and so on for a CSV file."""
+        """Return a row of a CSV file with the columns ``hl_250``, ``hl_500`` and so on."""
         points = zip(self.frequencies, self.levels, strict=True)
         return {f"hl_{_shortest(frequency)}": _shortest(level) for frequency, level in points}
 
     @classmethod
-    def from_row(cls, row: Mapping[str, str]) -> Audiogram:
-        """Return the audiogram of a row of a CSV file, from its columns ``hl_<frequency in Hz>``.
+    def from_row(cls, row: Mapping[str, str], *, highest: float = HIGHEST_LEVEL) -> Audiogram:
+        """Return the audiogram of a row of a table.
 
-        Other columns are ignored, as are remarks on a frequency such as
-        ``hl_8000_extrapolated_flat``, whose values were not measured.
+        A column of thresholds is called ``hl_250``, ``250``, ``250 Hz`` or ``1k``, in any order
+        and case. Other columns are ignored, and so are remarks on a frequency, such as
+        ``hl_8000_extrapolated_flat``. A frequency was not measured if its value is empty, ``NA``,
+        ``null``, ``None`` or ``nan``.
+
+        Args:
+            row: Texts by column.
+            highest: Highest level allowed, in dB HL.
 
         Raises:
-            ValueError: there is no such column, one holds no number, two have the same frequency,
-                or a column begins with ``hl`` and is neither a threshold nor a remark.
+            ValueError: The row has no measured threshold, two of one frequency, one that is not a
+                number from -10 to ``highest``, or a column that begins with ``hl`` by mistake.
         """
         points: dict[float, float] = {}
-        for column, value in row.items():
-            match = COLUMN.fullmatch(str(column))
-            if match is None and str(column).lower().startswith("hl"):
-                raise ValueError(
-                    f"expected columns of thresholds such as hl_500, got {column!r}; write hl_ and "
-                    "the frequency in Hz"
-                )
-            if match is None or match[2]:
+        columns: dict[float, str] = {}
+        for column, text in row.items():
+            frequency = _column_frequency(column)
+            if frequency is None:
                 continue
-            frequency = float(match[1])
-            if frequency in points:
-                raise ValueError(f"column {column}: {frequency:g} Hz has two columns")
-            try:
-                points[frequency] = float(value)
-            except (TypeError, ValueError):
+            if frequency in columns:
                 raise ValueError(
-                    f"column {column}: expected a level in dB HL, got {value!r}"
-                ) from None
+                    f"columns {columns[frequency]!r} and {column!r} have the same frequency"
+                )
+            columns[frequency] = column
+            if str(text).strip().lower() not in _UNMEASURED:
+                points[frequency] = _parse_level(text, column, highest)
         if not points:
-            raise ValueError(f"expected columns hl_250, hl_500 and so on, got {list(row)}")
-        return cls(tuple(points.values()), tuple(points))
+            raise ValueError(
+                "expected measured thresholds in columns such as hl_250, hl_500 and hl_1000, got "
+                f"the columns {', '.join(row)}"
+            )
+        frequencies = tuple(sorted(points))
+        return cls(tuple(points[frequency] for frequency in frequencies), frequencies)
 
     def to_clarity(self) -> Any:
-        """Convert to pyclarity's ``Audiogram``.
+        """Return pyclarity's ``Audiogram`` with the same levels and frequencies.
 
         Raises:
             MissingExtraError: pyclarity is not installed.
@@ -234,90 +279,125 @@ class Audiogram:
             from clarity.utils.audiogram import Audiogram as ClarityAudiogram
         except ImportError as error:
             raise MissingExtraError(
-                f"pyclarity is needed here and not installed ({error}); "
+                f"pyclarity is needed and cannot be imported ({error}); "
                 "pip install 'pyclarity==0.9.*'"
             ) from error
-        return ClarityAudiogram(
-            levels=np.array(self.levels), frequencies=np.array(self.frequencies)
-        )
+        return ClarityAudiogram(np.array(self.levels), np.array(self.frequencies))
 
     @classmethod
-    def from_clarity(cls, source: Any, ear: str | None = None) -> Audiogram:
-        """Return the audiogram of an object or an entry of Clarity.
+    def from_clarity(cls, source: Any, ear: EarName | None = None) -> Audiogram:
+        """Return the audiogram of an ear of pyclarity.
 
         Args:
-            source: pyclarity's ``Audiogram``, its ``Listener``, or an entry of ``listeners.json``.
-            ear: ``"left"`` or ``"right"`` for a listener, None for an audiogram.
+            source: pyclarity's ``Audiogram``; or, with ``ear``, its ``Listener`` or an entry of
+                Clarity's ``listeners.json``.
+            ear: Ear of a listener, ``"left"`` or ``"right"``.
 
         Raises:
-            ValueError: the source is none of these, or ``ear`` does not fit it.
+            ValueError: The source is none of these, or ``ear`` does not fit.
         """
-        if isinstance(source, Mapping):
-            missing = [key for key in CLARITY_KEYS if key not in source]
-            if missing:
-                raise ValueError(
-                    f"expected an entry of listeners.json, but {', '.join(missing)} is missing"
-                )
-        two_ears = has_two_ears(source)
-        if not two_ears and not is_claritys(source):
-            raise ValueError(
-                "expected pyclarity's Audiogram or Listener, or an entry of listeners.json, "
-                f"got {type(source).__name__}"
+        if ear in ("left", "right") and isinstance(source, Mapping):
+            levels, frequencies = (
+                source.get(f"audiogram_levels_{ear[0]}"),
+                source.get("audiogram_cfs"),
             )
-        if two_ears and ear not in ("left", "right"):
+        else:
+            audiogram = source if ear is None else getattr(source, f"audiogram_{ear}", None)
+            levels, frequencies = (getattr(audiogram, n, None) for n in ("levels", "frequencies"))
+        if levels is None or frequencies is None:
             raise ValueError(
-                f"expected ear='left' or ear='right', as the source has two ears, got {ear!r}"
+                "expected pyclarity's Audiogram, or ear='left' or ear='right' with its Listener or "
+                f"an entry of listeners.json, got {type(source).__name__} with ear={ear!r}"
             )
-        if not two_ears and ear is not None:
-            raise ValueError(f"expected no ear, as the source has only one, got {ear!r}")
-        if isinstance(source, Mapping):
-            side = str(ear)[0]
-            return cls(source[f"audiogram_levels_{side}"], source["audiogram_cfs"])
-        audiogram = getattr(source, f"audiogram_{ear}") if two_ears else source
-        return cls(audiogram.levels, audiogram.frequencies)
+        return cls(levels, frequencies)
 
 
-def is_claritys(value: Any) -> bool:
-    """Return whether a value is pyclarity's ``Audiogram``, without importing pyclarity."""
-    return hasattr(value, "levels") and hasattr(value, "frequencies")
+def severity_index(levels: Tensor, frequencies: Sequence[float] = FREQUENCIES) -> Tensor:
+    """Return the index into ``SEVERITIES`` for each ear.
 
+    Args:
+        levels: Thresholds in dB HL.
+        frequencies: Frequencies of the last dimension in Hz.
 
-def has_two_ears(value: Any) -> bool:
-    """Return whether a value is pyclarity's ``Listener`` or an entry of ``listeners.json``."""
-    if isinstance(value, Mapping):
-        return set(CLARITY_KEYS) <= value.keys()
-    return hasattr(value, "audiogram_left") and hasattr(value, "audiogram_right")
-
-
-def severity_index(thresholds: Tensor) -> Tensor:
-    """Return the index into ``SEVERITIES`` of each ear. Shape: (..., 8) dB HL -> (...), int64."""
-    high = thresholds[..., FREQUENCIES.index(2000.0) :].double()
+    Shape: (..., frequencies) -> (...), int64.
+    """
     # Tensors, because CUDA multiplies by the reciprocal of a number, which changes the last bit.
-    steps_per_db = high.new_full((), STEPS_PER_DB)
-    count = high.new_full((), high.shape[-1])
-    first, *others = ((high * STEPS_PER_DB).round() / steps_per_db).unbind(-1)
-    mean = sum(others, start=first) / count
+    steps_per_db = levels.new_full((), STEPS_PER_DB, dtype=torch.float64)
+    rounded = ((levels.double() * STEPS_PER_DB).round() / steps_per_db).unbind(-1)
+    pairs = zip(rounded, frequencies, strict=True)
+    high = [level for level, hz in pairs if 2000.0 <= hz <= 8000.0]
+    zero = steps_per_db.new_zeros(levels.shape[:-1])
+    mean = sum(high, start=zero) / steps_per_db.new_full((), max(1, len(high)))
     return torch.stack([mean > limit for limit in SEVERITY_LIMITS]).sum(0)
 
 
+def is_clarity_audiogram(value: Any) -> bool:
+    """Whether a value is pyclarity's ``Audiogram``, without importing pyclarity."""
+    return hasattr(value, "levels") and hasattr(value, "frequencies")
+
+
+def check_range(levels: Sequence[float], highest: float, user: str) -> None:
+    """Validate levels in dB HL.
+
+    Raises:
+        ValueError: A level is below -10 or above ``highest``, or NaN.
+    """
+    if not all(LOWEST_LEVEL <= level <= highest for level in levels):
+        raise ValueError(
+            f"{user} takes levels from {LOWEST_LEVEL:g} to {highest:g} dB HL, got {join_numbers(levels)}"
+        )
+
+
 def join_numbers(values: Iterable[float]) -> str:
-    """Return numbers as messages show them."""
+    """Return numbers as text for a message."""
     return ", ".join(f"{value:g}" for value in values)
 
 
-def _as_numbers(values: Iterable[float], name: str) -> tuple[float, ...]:
+def _column_frequency(column: str) -> float | None:
+    """Return the frequency in Hz of a column of thresholds, or ``None`` for another column."""
+    match = _COLUMN.fullmatch(column)
+    if match is None and re.match(r"hl[_ ]?\d", column, re.IGNORECASE):
+        raise ValueError(f"column {column!r}: expected hl_ and a frequency in Hz, such as hl_500")
+    if match is None or match[3]:
+        return None
+    return float(match[1]) * (1000.0 if match[2] else 1.0)
+
+
+def _parse_level(text: str, column: str, highest: float) -> float:
+    """Return a threshold. Tables with semicolons may have decimal commas."""
     try:
-        if isinstance(values, str | Mapping):  # their characters or keys are not levels
-            raise TypeError
+        level = float(text.replace(",", "."))
+    except ValueError:
+        level = math.nan
+    if not LOWEST_LEVEL <= level <= highest:
+        raise ValueError(
+            f"column {column} is {text!r}; expected a level from {LOWEST_LEVEL:g} to {highest:g} "
+            "dB HL. For no response write the highest level that was presented; for a frequency "
+            "that was not measured leave the value empty, and it will be interpolated"
+        )
+    return level
+
+
+def _as_list(values: Any) -> list[Any]:
+    """Return values as a list. The characters of a text and the keys of a dictionary are no values."""
+    if isinstance(values, str | Mapping) or not isinstance(values, Iterable):
+        raise ValueError(f"expected a sequence of numbers for an audiogram, got {values!r}")
+    return list(values)
+
+
+def _finite_numbers(values: Iterable[Any], name: str) -> tuple[float, ...]:
+    """Return values as numbers; raise ValueError if there are none or one is not a finite number."""
+    values = list(values)
+    try:
         numbers = tuple(float(value) for value in values)
     except (TypeError, ValueError):
-        raise ValueError(f"expected {name} of an audiogram as numbers, got {values!r}") from None
-    if not all(math.isfinite(number) for number in numbers):
-        raise ValueError(f"expected finite {name} of an audiogram, got {join_numbers(numbers)}")
+        numbers = ()
+    if not numbers or not all(math.isfinite(number) for number in numbers):
+        raise ValueError(f"expected finite numbers as {name} of an audiogram, got {values!r}")
     return numbers
 
 
 def _shortest(value: float) -> str:
-    """Return the shortest text that is read as the same number."""
-    text = f"{value:g}"
-    return text if float(text) == value else repr(value)
+    """Return the shortest text that reads as the same number."""
+    short = f"{value:g}"
+    return short if float(short) == value else repr(value)

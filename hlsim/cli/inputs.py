@@ -35,7 +35,8 @@ def check_paths_exist(
         if path is not None and not path.is_dir():
             raise ValueError(f"{path}: there is no such folder")
     for path in files:
-        if path is not None and not path.exists():
+        # --audiograms standard names no file
+        if path is not None and str(path) != "standard" and not path.exists():
             raise ValueError(f"{path}: there is no such file")
 
 
@@ -84,13 +85,11 @@ def read_listener(text: str) -> Listener:
         )
     from hlsim.audiogram.table import read_listeners
 
-    listeners = read_listeners(file)
-    if not name and len(listeners) == 1:
-        name = next(iter(listeners))
-    if name not in listeners:
+    listeners = read_listeners(file, [name] if name else None)
+    if len(listeners) != 1:
         names = ", ".join([*listeners][:5]) + (", ..." if len(listeners) > 5 else "")
         raise ValueError(f"--listener {text}: write {file}:NAME, where NAME is one of {names}")
-    listener = listeners[name]
+    listener = next(iter(listeners.values()))
     for missing, other in (("left", "right"), ("right", "left")):
         if getattr(listener, missing) is None:
             raise ValueError(

@@ -19,8 +19,8 @@ STANDARD_EARS = ("NH", "N1", "N2", "N3", "N4", "N5", "N6", "N7", "S1", "S2", "S3
 TEACHERS = ("msbg",)
 
 EARS_TABLE = (
-    "CSV file with columns hl_250, hl_500, ... hl_8000 in dB HL; the level of a missing column is "
-    "interpolated over log frequency, or extended flat beyond the ends"
+    "CSV file of ears with columns hl_250, hl_500, ... in dB HL, an empty value where a frequency "
+    "was not measured; or standard for Bisgaard's ears N1 to N6 and S1 to S3"
 )
 
 _NEGATIVE_LIST = re.compile(r"-\.?\d.*[,e]")

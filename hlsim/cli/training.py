@@ -46,10 +46,14 @@ def _training_options(parser: Parser) -> None:
     option("--manifest", Path, text, group=speech)
     option("--root", Path, "folder that the manifest's paths are relative to; its own by default")
     option("--noise", Path, "folder of noises to mix in")
-    option("--audiograms", Path, "CSV of measured ears to join the drawn ones")
+    option(
+        "--audiograms",
+        Path,
+        "CSV file of measured ears to join the drawn ones, or standard for Bisgaard's",
+    )
     option("--valid-speech", Path, "folder of other speakers to validate on")
     option("--valid-noise", Path, "folder of noises to validate with")
-    option("--valid-audiograms", Path, "CSV of ears to validate with")
+    option("--valid-audiograms", Path, "CSV file of ears to validate with, or standard")
     text = "minutes after which to stop, those before a resumption included; the learning rate does not depend on them"
     option("--max-minutes", positive, text)
     option("--device", str, "where to train", "auto", choices=("auto", "cpu", "cuda"))

@@ -121,12 +121,14 @@ def draw_judged_items(
 def read_ears(audiograms: str | Path | None) -> list[tuple[str, Audiogram]]:
     """Return the standard ears and those of a CSV file, named by listener and ear or by row.
 
-    No two ears have the same name.
+    No two ears have the same name. A standard ear that is in the file too is returned once.
     """
     ears = [(name, Audiogram.standard(name)) for name in STANDARD_EARS]
     rows = read_audiograms(audiograms, simulated=True) if audiograms is not None else []
     for number, (row, ear) in enumerate(rows, start=1):
         name = " ".join(filter(None, (row.get("listener"), row.get("ear"))))
+        if (name, ear) in ears:
+            continue
         if name in (known for known, _ in ears):
             name += f", row {number}"
         ears.append((name or f"row {number}", ear))

@@ -2,17 +2,25 @@
 
 import math
 from functools import partial
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from hlsim.audiogram import LOWEST_LEVEL, SEVERITIES, severity_index
+from hlsim.audiogram import (
+    FREQUENCIES,
+    HIGHEST_SIMULATED,
+    LOWEST_LEVEL,
+    SEVERITIES,
+    Audiogram,
+    severity_index,
+)
 from hlsim.audiogram.devices import on_host
 from hlsim.audiogram.thresholds import (
-    HIGHEST_SIMULATED,
     AudiogramLike,
     has_listeners,
+    other_grids,
     resolve_thresholds,
     store_thresholds,
 )
@@ -49,6 +57,20 @@ _CPU_SAMPLES = 384_000
 _DEVICE_SAMPLES = 12_000_000
 
 
+class _Group(NamedTuple):
+    """Properties that the ears of items must share so that the items can run together.
+
+    Attributes:
+        severity: Severity of the loss, one of ``SEVERITIES``.
+        no_loss: Whether all thresholds are 0 dB HL.
+        frequencies: Frequencies of the thresholds in Hz.
+    """
+
+    severity: str
+    no_loss: bool
+    frequencies: tuple[float, ...] = FREQUENCIES
+
+
 class MSBG(nn.Module):
     """The Moore, Stone, Baer and Glasberg model of an impaired ear, as pyclarity's ``Ear.process`` computes it.
 
@@ -57,7 +79,10 @@ class MSBG(nn.Module):
     evaluated on an FFT grid.
 
     Args:
-        audiogram: the ear; may be given with each call instead.
+        audiogram: Ear or ears; they may be passed with each call instead. Like pyclarity, the model
+            takes an ``Audiogram`` at the frequencies at which it was measured: the severity from those
+            that lie between 2 and 8 kHz, and the threshold of each channel by linear interpolation
+            in Hz. A tensor has the thresholds at the eight ``FREQUENCIES``.
         sample_rate: of inputs and outputs in Hz, 16000 to 48000. Inside, the model runs at 44.1 kHz; aligned, and at
             20000 or less, at 22.05 kHz. Under 44100, the last 80 Hz below half the rate fade out.
         full_scale_spl: level in dB SPL of RMS 1.0.
@@ -100,10 +125,11 @@ class MSBG(nn.Module):
             levels if trained else None,
         )  # a buffer that moves would be another tensor
         self._two_ears = has_listeners(audiogram)
+        self._other_grids = other_grids(audiogram)
 
     @property
     def thresholds(self) -> Tensor | None:
-        """The ear or ears given to the constructor. Shape: (..., 8) dB HL."""
+        """The ear or ears given to the constructor, at ``FREQUENCIES``. Shape: (..., 8) dB HL."""
         return self._levels if self._trained[0] is None else self._trained[0]
 
     @not_compiled  # it depends on the ear's values, and its filters are made by numpy
@@ -120,8 +146,9 @@ class MSBG(nn.Module):
             self._trained[0] if audiogram is None else audiogram
         )  # what is trained may leave the range
         thresholds = resolve_thresholds(self._levels, given, waveform, two_ears=self._two_ears)
+        grids = self._other_grids if audiogram is None else other_grids(audiogram)
         with torch.autocast(waveform.device.type, enabled=False):
-            return self._simulate(waveform, thresholds)
+            return self._simulate(waveform, thresholds, grids)
 
     def delay(self, severity: str) -> int:
         """Structural delay in samples at 44.1 kHz at a severity, one of ``SEVERITIES``; ValueError for others."""
@@ -132,7 +159,14 @@ class MSBG(nn.Module):
     def extra_repr(self) -> str:
         return f"sample_rate={self.sample_rate}, full_scale_spl={self.full_scale_spl:g}, aligned={self.aligned}"
 
-    def _simulate(self, waveform: Tensor, thresholds: Tensor) -> Tensor:
+    def _simulate(
+        self, waveform: Tensor, thresholds: Tensor, grids: list[Audiogram | None]
+    ) -> Tensor:
+        """Perceived signals. Shape: (..., time), (..., 8) -> (..., time).
+
+        Args:
+            grids: Ears at other than the eight frequencies, as ``other_grids`` returns them.
+        """
         dtype = waveform.dtype if waveform.dtype == torch.float64 else torch.float32
         batch = broadcast_shape(waveform.shape[:-1], thresholds.shape[:-1])
         signals = waveform.to(dtype).expand(*batch, -1).reshape(-1, waveform.shape[-1])
@@ -145,13 +179,19 @@ class MSBG(nn.Module):
         outputs: list[Tensor] = []
         order: list[int] = []
         known = on_host(thresholds).to(dtype).expand(*batch, -1).reshape(ears.shape)
-        for severity, none, members in _alike(known, ears.requires_grad):
-            process = partial(self._simulate_alike, severity=severity, none=none)
+        if grids:
+            ear_of_item = torch.arange(len(grids)).reshape(thresholds.shape[:-1]).expand(batch)
+            grids = [grids[ear] for ear in ear_of_item.flatten().tolist()]
+        for group, members in _alike(known, ears.requires_grad, grids).items():
+            process = partial(self._simulate_alike, group=group)
             for some in _portions(members, signals.shape[-1], signals.device.type):
                 chosen: slice | Tensor = slice(some[0], some[-1] + 1)
                 if some[-1] - some[0] != len(some) - 1:  # a list would be copied with each use
                     chosen = _indices(some, signals.device)
-                outputs.append(in_blocks(process, signals[chosen], ears[chosen], self.sample_rate))
+                levels = ears[chosen]
+                if group.frequencies != FREQUENCIES:
+                    levels = _levels(grids, some).to(ears, non_blocking=True)
+                outputs.append(in_blocks(process, signals[chosen], levels, self.sample_rate))
                 order += some
         longest = max(output.shape[-1] for output in outputs)
         if len(outputs) == 1:  # a copy, or it would hold all that the last transform made
@@ -166,16 +206,16 @@ class MSBG(nn.Module):
             heard = heard / gain
         return heard.reshape(*batch, longest).to(waveform.dtype)
 
-    def _simulate_alike(
-        self, signals: Tensor, ears: Tensor, last: bool, severity: str, none: bool
-    ) -> Tensor:
-        """All items have the same severity. Shape: (items, time), (items, 8) -> (items, time).
+    def _simulate_alike(self, signals: Tensor, ears: Tensor, last: bool, group: _Group) -> Tensor:
+        """Perceived signals of items of one group.
 
         Args:
-            last: the signals end where they end, and are not cut from longer ones.
-            none: they hear everything at its level: 0 dB HL throughout.
+            last: Whether the signals end here, and are not cut from longer ones.
+
+        Shape: (items, time), (items, levels) dB HL at the group's frequencies -> (items, time).
         """
         samples, rate = signals.shape[-1], self.sample_rate
+        severity = group.severity
         bank, smears = BANKS[severity], severity in BROADENING
         step = 2 if self.aligned and rate <= _HALF_RATE_HZ else 1
         delay = self.delay(severity) if self.aligned else 0
@@ -190,7 +230,8 @@ class MSBG(nn.Module):
                 heard, constant_like(heard, smearing_matrix_below, severity, step, highest), step
             )
         heard = heard.to(signals.dtype)
-        ratios = expansion_ratios(ears, constant_like(signals, threshold_weights, bank))
+        weights = constant_like(signals, threshold_weights, bank, group.frequencies)
+        ratios = expansion_ratios(ears, weights)
         gain = 10.0 ** (-bank.recombination_db / 20.0)
         length = heard.shape[-1]
         if not self.aligned:
@@ -199,7 +240,7 @@ class MSBG(nn.Module):
 
         points = bank_points(length * step, rate, step)
         spectrum = rfft(heard, points // step)
-        if none:
+        if group.no_loss:
             spectrum = spectrum * constant_like(heard, total_response, bank, points, step)
         else:
             key = bank, points, step, highest, heard.dtype, heard.device
@@ -258,29 +299,43 @@ def active_rescaling(signals: Tensor) -> Tensor:
     return ratio.sqrt().unsqueeze(-1)
 
 
-def _alike(ears: Tensor, trained: bool) -> list[tuple[str, bool, list[int]]]:
-    """Group items by severity of the loss, and by whether there is any loss.
+def _alike(ears: Tensor, trained: bool, grids: list[Audiogram | None]) -> dict[_Group, list[int]]:
+    """Group items that can run together.
 
     Args:
-        ears: levels in dB HL, on the CPU. Shape: (items, 8).
-        trained: whether the ears have a gradient. Then no ear counts as one without loss.
+        ears: Thresholds on the CPU. Shape: (items, 8) dB HL.
+        trained: Whether the ears require a gradient. Then no ear counts as one without a loss.
+        grids: Per item its ear, if it is not at the eight frequencies; or an empty list.
 
-    Returns: for each group its severity, whether it has no loss, and the indices of its items.
+    Returns:
+        Indices of the items of each group.
 
     Raises:
-        ValueError: levels that were out of range, and which a GPU turned into NaN.
+        ValueError: A threshold was out of range, and a GPU has turned it into NaN.
     """
     if bool(ears.isnan().any()):
         raise ValueError(
-            f"an audiogram holds NaN or levels outside {LOWEST_LEVEL:g} to {HIGHEST_SIMULATED:g} dB HL"
+            f"expected thresholds from {LOWEST_LEVEL:g} to {HIGHEST_SIMULATED:g} dB HL, got NaN or "
+            "levels outside this range"
         )
-    groups: dict[tuple[str, bool], list[int]] = {}
+    groups: dict[_Group, list[int]] = {}
     severities = severity_index(ears).tolist()
     without_loss = (ears == 0.0).all(-1).tolist()
     for item, severity in enumerate(severities):
-        none = without_loss[item] and not trained
-        groups.setdefault((SEVERITIES[severity], none), []).append(item)
-    return [(*kind, members) for kind, members in groups.items()]
+        grid = grids[item] if grids else None
+        if grid is None:
+            group = _Group(SEVERITIES[severity], without_loss[item] and not trained)
+        else:
+            group = _Group(grid.severity, not any(grid.levels), grid.frequencies)
+        groups.setdefault(group, []).append(item)
+    return groups
+
+
+def _levels(grids: list[Audiogram | None], items: list[int]) -> Tensor:
+    """Return the levels of items with one grid. Shape: (items, frequencies) dB HL."""
+    ears = [grids[item] for item in items]
+    levels = [ear.levels for ear in ears if ear is not None]
+    return torch.tensor(levels, dtype=torch.float64)
 
 
 def _indices(items: list[int], device: torch.device) -> Tensor:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
+from hlsim.audiogram import FREQUENCIES
 from hlsim.audiogram.thresholds import interpolation_weights
 from hlsim.calibration import PASCAL_SPL
 from hlsim.msbg.envelope import STEP
@@ -48,7 +49,7 @@ _DIP_RATIO = 0.3
 def expansion_ratios(thresholds: Tensor, weights: Tensor) -> Tensor:
     """Compute the ratio 105 / (105 - threshold) by which the level in each channel is expanded.
 
-    Shape: (..., 8), (8, channels) -> (..., channels).
+    Shape: (..., frequencies), (frequencies, channels) -> (..., channels).
 
     Args:
         thresholds: audiograms in dB HL.
@@ -63,16 +64,18 @@ def expansion_ratios(thresholds: Tensor, weights: Tensor) -> Tensor:
     return CATCH_UP_SPL / (CATCH_UP_SPL - channel_thresholds)
 
 
-def threshold_weights(bank: FilterBank) -> NDArray[np.float64]:
-    """Compute the weights of the eight thresholds in the threshold of each channel.
+def threshold_weights(
+    bank: FilterBank, frequencies: tuple[float, ...] = FREQUENCIES
+) -> NDArray[np.float64]:
+    """Compute the weights of the thresholds at some frequencies in the threshold of each channel.
 
-    Returns: weights of shape (8, channels).
+    Returns: weights of shape (frequencies, channels).
 
     >>> from hlsim.msbg.filterbank import BANKS
     >>> threshold_weights(BANKS["severe"]).shape
     (8, 19)
     """
-    return interpolation_weights(bank.centre_frequencies)
+    return interpolation_weights(bank.centre_frequencies, frequencies)
 
 
 def recruitment_gains(envelopes: Tensor, ratios: Tensor) -> Tensor:

@@ -14,9 +14,8 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from hlsim.audio import find_audio
-from hlsim.audiogram import LOWEST_LEVEL, Audiogram
+from hlsim.audiogram import HIGHEST_SIMULATED, LOWEST_LEVEL, Audiogram
 from hlsim.audiogram.table import read_audiograms
-from hlsim.audiogram.thresholds import HIGHEST_SIMULATED
 from hlsim.calibration import level_spl, set_level
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.training.augment import EQUALISER_FREQUENCIES, augment_speech, equalise, mix

@@ -7,8 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from hlsim.audiogram import LOWEST_LEVEL, STANDARD
-from hlsim.audiogram.thresholds import HIGHEST_SIMULATED
+from hlsim.audiogram import HIGHEST_SIMULATED, LOWEST_LEVEL, STANDARD
 
 MILDER = ("NH", "N1", "N2", "S1")
 """Standard ears that join measured ones in validation, since those are mostly moderate and severe."""

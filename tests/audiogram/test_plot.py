@@ -1,15 +1,15 @@
-"""An audiogram as drawn: the axes, the bands, the line."""
+"""Drawn audiograms: axes, bands, and the symbols of audiology."""
 
 import sys
 
 import pytest
 
-from hlsim import Audiogram
+from hlsim import Audiogram, Listener
 from hlsim.audiogram import SEVERITIES, SEVERITY_LIMITS
 from hlsim.extras import MissingExtraError
 
 
-def test_axes_are_the_fields_and_are_made_once() -> None:
+def test_axes_are_those_of_audiology_and_are_prepared_once() -> None:
     figure = pytest.importorskip("matplotlib.figure")
     axes = figure.Figure().subplots()
     right, left = Audiogram.standard("N3"), Audiogram((10, 40), (500, 3000))
@@ -35,6 +35,18 @@ def test_axes_are_the_fields_and_are_made_once() -> None:
     assert [text.get_text() for text in axes.texts] == [*SEVERITIES]
     bounds = [sorted({patch.get_y(), patch.get_y() + patch.get_height()}) for patch in axes.patches]
     assert [pair[1] for pair in bounds] == [*SEVERITY_LIMITS, 120.0]
+
+
+def test_the_right_ear_has_red_circles_and_the_left_ear_blue_crosses() -> None:
+    pytest.importorskip("matplotlib")
+    listener = Listener("N2", "N4")
+    left, right = listener.plot().get_lines()
+    assert (left.get_marker(), left.get_color()) == ("x", "tab:blue")
+    assert (right.get_marker(), right.get_color()) == ("o", "tab:red")
+    assert left.get_label() == "left, PTA 31 dB HL"
+    assert right.get_label() == "right, PTA 62 dB HL"
+    (alone,) = listener.right.plot(ear="right").get_lines()
+    assert alone.get_marker() == "o" and tuple(alone.get_ydata()) == listener.right.levels
 
 
 def test_without_matplotlib_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,4 +1,4 @@
-"""Thresholds as simulators take them: what is taken and what refused, stored, interpolated as by numpy."""
+"""Thresholds as tensors: converted, validated, stored, and interpolated as numpy interpolates."""
 
 from typing import Any
 
@@ -47,13 +47,13 @@ def test_thresholds_for_a_simulator() -> None:
         np.zeros(7),
     ],
 )
-def test_what_is_no_ear_for_a_simulator_is_rejected(audiogram: Any) -> None:
+def test_values_that_are_not_ears_for_a_simulator_are_rejected(audiogram: Any) -> None:
     with pytest.raises(ValueError):
         as_thresholds(audiogram)
 
 
-def test_mono_channels_have_one_ear_an_item() -> None:
-    """(batch, 1, time) and (batch, 8), whatever is called."""
+def test_mono_items_have_one_ear_each() -> None:
+    """Waveforms of shape (batch, 1, time) take thresholds of shape (batch, 8) everywhere."""
     waveform, ears = (
         0.02 * torch.randn(2, 1, 16000),
         torch.stack((torch.full((8,), 20.0), torch.full((8,), 60.0))),
@@ -119,5 +119,5 @@ def test_ears_as_lists_of_tensors_and_as_a_loader_collates_them() -> None:
     assert len(collated) == 8
     assert torch.equal(as_thresholds(collated), torch.tensor(ears, dtype=torch.float64))
     assert torch.equal(as_thresholds([torch.tensor(ear) for ear in ears]), torch.tensor(ears))
-    with pytest.raises(ValueError, match="which may be ears or frequencies"):
+    with pytest.raises(ValueError, match=r"torch\.stack\(audiogram\) if they are ears"):
         as_thresholds(torch.utils.data.default_collate([ears[0]] * 8))

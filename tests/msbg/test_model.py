@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from hlsim import torchtools
+from hlsim import Listener, torchtools
 from hlsim.audio import find_audio, read_audio
 from hlsim.audiogram import STANDARD, Audiogram
 from hlsim.calibration import gain_to_pascals, level_spl, set_level
@@ -94,6 +94,58 @@ def test_output_equals_pyclaritys_sample_by_sample(
     # We measured a median of 2e-4 and a maximum of 1.5e-3.
     assert np.median(errors) < 5e-4
     assert max(errors) < 3e-3
+
+
+HALF_OCTAVES = (
+    *(125, 250, 500, 750, 1000, 1500, 2000, 3000, 4000, 6000, 8000),
+    *(10000, 12000, 14000, 16000),
+)
+OTHER_GRIDS = {
+    "six frequencies": Audiogram((15, 20, 25, 30, 40, 35), (250, 500, 1000, 2000, 4000, 8000)),
+    "three frequencies": Audiogram((20, 35, 60), (500, 1500, 5000)),
+    "pyclarity's mild": Audiogram(
+        (5, 10, 15, 18, 19, 22, 25, 28, 31, 35, 38, 40, 40, 45, 50), HALF_OCTAVES
+    ),
+    "pyclarity's moderate": Audiogram(
+        (15, 20, 20, 22.5, 25, 30, 35, 40, 45, 50, 55, 55, 60, 65, 65), HALF_OCTAVES
+    ),
+    "pyclarity's moderate to severe": Audiogram(
+        (19, 19, 28, 35, 40, 47, 52, 56, 58, 58, 63, 70, 75, 80, 80), HALF_OCTAVES
+    ),
+}
+
+
+@pytest.mark.parametrize("name", OTHER_GRIDS)
+def test_equals_pyclarity_for_ears_at_other_frequencies(
+    recordings: list[tuple[Wave, int]], pyclarity: PyclarityOutputs, name: str
+) -> None:
+    ear, wave = OTHER_GRIDS[name], clip(recordings, np.random.default_rng(5), 0.8)
+    theirs = pyclarity(f"msbg, {name}", msbg, ear, wave, STRIDE)
+    model = MSBG(ear, sample_rate=RATE, full_scale_spl=120.0, aligned=False, rescale_active=True)
+    ours = model(torch.tensor(wave, dtype=torch.float32))[::STRIDE]
+    assert ours.shape == theirs.shape
+    assert relative(ours.numpy(), theirs) < 1e-3
+
+
+def test_ears_at_other_frequencies_may_share_a_batch(speech: list[tuple[Tensor, int]]) -> None:
+    six, mild = OTHER_GRIDS["six frequencies"], OTHER_GRIDS["pyclarity's mild"]
+    ears: list[Any] = [six, "N3", mild, six]
+    waves = torch.stack([speech_at(speech, spl) for spl in (50.0, 60.0, 70.0, 80.0)])
+    together = fast_model()(waves, ears)
+    for wave, ear, perceived in zip(waves, ears, together, strict=True):
+        torch.testing.assert_close(perceived, fast_model(ear)(wave), rtol=1e-4, atol=1e-6)
+    pairs = [Listener(six, "N3"), Listener(mild, six)]  # type: ignore[arg-type]
+    binaural = waves.reshape(2, 2, -1)
+    for perceived in (fast_model()(binaural, pairs), fast_model(pairs)(binaural)):
+        torch.testing.assert_close(perceived.flatten(0, 1), together, rtol=1e-4, atol=1e-6)
+    mono = fast_model()(waves.unsqueeze(1), ears)
+    torch.testing.assert_close(mono[:, 0], together, rtol=1e-4, atol=1e-6)
+    assert relative(fast_model(six.thresholds)(waves[0]).numpy(), together[0].numpy()) > 0.1
+
+
+def test_levels_that_msbg_does_not_take_are_rejected_at_any_frequency() -> None:
+    with pytest.raises(ValueError, match="-10 to 100 dB HL"):
+        MSBG(Audiogram((20, 40, 110), (500, 4000, 14000)))
 
 
 def spectrum_of_reference(
