@@ -31,8 +31,8 @@ GAIN_EARS = ["N3", "S2"]
 def evaluate_simulator(parser: Parser) -> None:
     parser.runs(
         _evaluate_simulator,
-        "neuro-msbg neuro-msbg-cnn --speech speech/valid --audiograms ears.csv --out judged",
-        "mine=runs/simulator/checkpoint --speech speech/valid --audiograms ears.csv --out judged",
+        "neuro-msbg neuro-msbg-cnn --speech speech/valid --audiograms standard --out judged",
+        "mine=runs/simulator/checkpoint --speech speech/valid --audiograms standard --out judged",
     )
     option = parser.option
     text = "checkpoints, by name or folder, or msbg (exact); LABEL=FOLDER is called LABEL in the tables"
@@ -89,7 +89,7 @@ def _evaluate_simulator(options: argparse.Namespace) -> None:
 def evaluate_compensator(parser: Parser) -> None:
     parser.runs(
         _evaluate_compensator,
-        "hearing-aid --audiograms ears.csv --speech speech/valid --noise noise/valid --out judged",
+        "hearing-aid --audiograms standard --speech speech/valid --noise noise/valid --out judged",
         "mine=runs/n3/checkpoint --audiogram N3 --speech speech/valid --items 40 --out judged",
     )
     option = parser.option

@@ -146,7 +146,7 @@ def test_listeners_that_do_not_fit_are_rejected(
     call = ("compensate", utterance, tmp_path / "out.wav")
     for options, part in (
         (("--listener", path), "NAME is one of a, b"),
-        (("--listener", f"{path}:c"), "NAME is one of a, b"),
+        (("--listener", f"{path}:c"), "expected one of a, b"),
         (("--listener", f"{path}:b"), "the left ear is missing"),
         (("--listener", f"{path}:a"), "needs 2 channels"),
         (("--listener", "N3"), "use --audiogram"),
