@@ -90,7 +90,10 @@ def test_level_and_gain_are_differentiable() -> None:
     assert torch.autograd.gradcheck(lambda w: set_level(w, 70.0), wave)
 
 
-@pytest.mark.parametrize("waveform", [torch.zeros(8, dtype=torch.int16), [0.0, 1.0]], ids=str)
+@pytest.mark.parametrize(
+    "waveform",
+    [torch.zeros(8, dtype=torch.int16), [0.0, 1.0]],
+)
 def test_waveforms_without_floats_are_rejected(waveform: Any) -> None:
     with pytest.raises(ValueError):
         level_spl(waveform)
@@ -102,7 +105,10 @@ BAD_LEVELS = [math.nan, math.inf, "65", None, [65.0, 70.0], True]
 BAD_SHAPES = [torch.zeros(3, 1), torch.zeros(3), torch.zeros(2, 100)]
 
 
-@pytest.mark.parametrize("spl", [*BAD_LEVELS, *BAD_SHAPES], ids=str)
+@pytest.mark.parametrize(
+    "spl",
+    [*BAD_LEVELS, *BAD_SHAPES],
+)
 def test_bad_levels_are_rejected(spl: Any) -> None:
     with pytest.raises(ValueError):
         set_level(torch.randn(2, 100), spl)

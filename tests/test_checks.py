@@ -49,7 +49,6 @@ def test_rates_in_range_come_back_whole(rate: int) -> None:
         torch.full((2, 10), 1.1e9),
         torch.full((2, 10), -1e18, dtype=torch.float64),
     ],
-    ids=str,
 )
 def test_what_is_no_waveform_raises_value_error(wave: Any) -> None:
     with pytest.raises(ValueError, match=r"expected .*perceived"):

@@ -90,7 +90,6 @@ def test_the_ends_of_the_range_are_allowed(edge: float) -> None:
         (30.0, FREQUENCIES),
         ("12345678", FREQUENCIES),
     ],
-    ids=str,
 )
 def test_bad_ear_raises_value_error(levels: Any, frequencies: Any) -> None:
     with pytest.raises(ValueError):
@@ -252,7 +251,8 @@ def test_an_ear_is_a_hyperparameter_of_lightnings(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "data", [3, ["levels"], {1: 2, "a": 3}, {"frequencies": FREQUENCIES}, {"levels": 3}], ids=str
+    "data",
+    [3, ["levels"], {1: 2, "a": 3}, {"frequencies": FREQUENCIES}, {"levels": 3}],
 )
 def test_bad_dictionary_raises_value_error(data: Any) -> None:
     with pytest.raises(ValueError):
@@ -278,7 +278,8 @@ def test_row_keeps_all_digits_and_adds_none() -> None:
 
 
 @pytest.mark.parametrize(
-    "row", [{"file": "a.wav"}, {"hl_250": "10", "hl_500": "loud"}, {"hl_250": ""}], ids=str
+    "row",
+    [{"file": "a.wav"}, {"hl_250": "10", "hl_500": "loud"}, {"hl_250": ""}],
 )
 def test_bad_row_raises_value_error(row: Any) -> None:
     with pytest.raises(ValueError):

@@ -158,7 +158,6 @@ def test_saved_and_loaded_is_the_same_to_the_bit(tmp_path: Path, utterance: torc
         {"hidden": 0},
         {"limit_spl": "loud"},
     ],
-    ids=str,
 )
 def test_bad_setting_raises_value_error(setting: dict[str, Any]) -> None:
     with pytest.raises(ValueError):

@@ -177,7 +177,6 @@ def test_configuration_survives_json() -> None:
         {"fft": 400, "window": 400, "hop": 200},
         {"phase": "minimum"},
     ],
-    ids=str,
 )
 def test_bad_setting_raises_value_error(setting: dict[str, Any]) -> None:
     with pytest.raises(ValueError):

@@ -117,7 +117,6 @@ def test_gradient_is_the_filter_run_backwards_and_finite_on_silence() -> None:
         {"sample_rate": 8000},
         *({"order": order} for order in (221, 2.0, "220", True, 0, 1024)),
     ],
-    ids=str,
 )
 def test_bad_setting_raises_value_error(options: dict[str, Any]) -> None:
     with pytest.raises(ValueError):
@@ -127,7 +126,6 @@ def test_bad_setting_raises_value_error(options: dict[str, Any]) -> None:
 @pytest.mark.parametrize(
     ("samples", "audiogram"),
     [((100,), None), ((3, 100), torch.zeros(2, 8)), ((100,), torch.full((8,), 121.0))],
-    ids=str,
 )
 def test_bad_call_raises_value_error(samples: tuple[int, ...], audiogram: Any) -> None:
     with pytest.raises(ValueError):

@@ -90,7 +90,6 @@ def test_by_name() -> None:
 @pytest.mark.parametrize(
     "setting",
     [{"bands": 2}, {"attack": -1.0}, {"release": 0.0}, {"knee": 99.0}, {"limit_spl": 200.0}],
-    ids=str,
 )
 def test_bad_setting_raises_value_error(setting: dict[str, Any]) -> None:
     with pytest.raises(ValueError):

@@ -217,7 +217,6 @@ def test_linked_gains_keep_levels_between_the_ears(make: Make, noise: torch.Tens
         ((100,), Audiogram.standard("N7")),
         ((3, 100), torch.zeros(2, 8)),
     ],
-    ids=str,
 )
 def test_bad_call_raises_value_error(samples: tuple[int, ...], audiogram: Any) -> None:
     with pytest.raises(ValueError):

@@ -54,7 +54,10 @@ def test_level_is_close_to_pyclaritys_level_of_active_frames(
         assert -0.5 < difference < 1.5
 
 
-@pytest.mark.parametrize("waveform", [np.zeros(100), np.zeros(0), np.ones((2, 100))], ids=str)
+@pytest.mark.parametrize(
+    "waveform",
+    [np.zeros(100), np.zeros(0), np.ones((2, 100))],
+)
 def test_silence_and_several_channels_are_rejected(waveform: np.ndarray) -> None:
     with pytest.raises(ValueError):
         active_level_db(waveform, 16000)

@@ -347,7 +347,6 @@ def test_a_value_for_each_item(simulator: str, criterion: str, clean: Tensor) ->
         "long",
         [[1], [2, 3]],
     ],
-    ids=str,
 )
 def test_bad_lengths_raise_value_error(lengths: object, clean: Tensor) -> None:
     with pytest.raises(ValueError):
@@ -683,7 +682,6 @@ def test_simulator_by_folder_and_as_a_module(clean: Tensor) -> None:
         {"audiogram": Audiogram.standard("N7")},
         {"audiogram": torch.zeros(7)},
     ],
-    ids=str,
 )
 def test_bad_setting_raises_value_error(options: dict[str, Any]) -> None:
     with pytest.raises(ValueError):
@@ -706,7 +704,6 @@ SIGNAL = torch.randn(2, 1600)
         (SIGNAL, SIGNAL, Audiogram.standard("N7")),
         (SIGNAL, SIGNAL, 3),
     ],
-    ids=str,
 )
 def test_bad_call_raises_value_error(arguments: tuple[Any, ...]) -> None:
     with pytest.raises(ValueError):

@@ -156,7 +156,6 @@ def test_no_utterance_is_a_reason() -> None:
         (torch.ones(0), torch.ones(0)),
         (torch.ones(9), torch.full((9,), float("nan"))),
     ],
-    ids=str,
 )
 def test_bad_waveforms_raise_value_error(truth: Tensor, estimate: Tensor) -> None:
     for measure in (snr_db, raw_mse, lambda a, b: third_octave_error_db(a, b, 16000)):

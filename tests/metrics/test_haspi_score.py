@@ -272,7 +272,6 @@ def test_a_delay_does_not_count(clean: Tensor, noisy: Tensor) -> None:
         {"seed": None},
         {"seed": -1},
     ],
-    ids=str,
 )
 def test_bad_input_raises_value_error(clean: Tensor, change: dict[str, Any]) -> None:
     signals = {"clean": change.get("clean", clean[0])}

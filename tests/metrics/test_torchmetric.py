@@ -187,7 +187,6 @@ def test_silence_in_place_of_speech_counts(clean: Tensor) -> None:
         (torch.randn(2, 100), torch.randn(2, 100), 3),
         (torch.randn(2, 100), torch.randn(2, 100), torch.zeros(3, 8)),
     ],
-    ids=str,
 )
 def test_bad_update_raises_value_error(processed: Any, clean: Any, audiogram: Any) -> None:
     with pytest.raises(ValueError):
@@ -195,7 +194,8 @@ def test_bad_update_raises_value_error(processed: Any, clean: Any, audiogram: An
 
 
 @pytest.mark.parametrize(
-    "lengths", [[12800], [12800, -5], [12801, 12800], [12799.5, 12800.0]], ids=str
+    "lengths",
+    [[12800], [12800, -5], [12801, 12800], [12799.5, 12800.0]],
 )
 def test_bad_lengths_raise_value_error(clean: Tensor, lengths: list[float]) -> None:
     with pytest.raises(ValueError):
@@ -213,7 +213,6 @@ def test_bad_lengths_raise_value_error(clean: Tensor, lengths: list[float]) -> N
         {"noise": "loud"},
         {"sample_rate": 8000},
     ],
-    ids=str,
 )
 def test_bad_setting_raises_value_error(options: dict[str, Any]) -> None:
     with pytest.raises(ValueError):

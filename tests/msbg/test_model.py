@@ -480,7 +480,6 @@ N3 = Audiogram.standard("N3")
         (torch.zeros(3, 100), torch.zeros(2, 8)),
         (torch.zeros(3, 100), [N3, N3]),
     ],
-    ids=str,
 )
 def test_bad_call_raises_value_error(wave: Any, audiogram: Any) -> None:
     with pytest.raises(ValueError):
@@ -497,7 +496,6 @@ def test_bad_call_raises_value_error(wave: Any, audiogram: Any) -> None:
         {"audiogram": Audiogram.standard("N7")},
         {"audiogram": torch.zeros(7)},
     ],
-    ids=str,
 )
 def test_bad_setting_raises_value_error(options: dict[str, Any]) -> None:
     with pytest.raises(ValueError):

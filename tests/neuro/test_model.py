@@ -315,7 +315,6 @@ def test_faster_input_gives_the_band_under_8_khz(trained: NeuroMSBG, clips: Tens
         (torch.zeros(100), None),
         (torch.zeros(4000, device="meta"), N3),
     ],
-    ids=str,
 )
 def test_bad_call_raises_value_error(
     trained: NeuroMSBG, waveform: Tensor, ear: Audiogram | Tensor | None
@@ -324,7 +323,10 @@ def test_bad_call_raises_value_error(
         trained(waveform, ear)
 
 
-@pytest.mark.parametrize("options", [{"config": 5}, {"sample_rate": 8000}], ids=str)
+@pytest.mark.parametrize(
+    "options",
+    [{"config": 5}, {"sample_rate": 8000}],
+)
 def test_bad_setting_raises_value_error(options: dict[str, Any]) -> None:
     with pytest.raises(ValueError):
         NeuroMSBG(**options)
