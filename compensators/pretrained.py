@@ -78,7 +78,9 @@ def _load(name: str | Path, sample_rate: int, full_scale_spl: float) -> Trained 
         return build_compensator(config, sample_rate=sample_rate, full_scale_spl=full_scale_spl)
 
     return (
-        read_checkpoint(name, CONFIGS, build, also=tuple(_UNTRAINED)).eval().requires_grad_(False)
+        read_checkpoint(name, CONFIGS, build, other_names=tuple(_UNTRAINED))
+        .eval()
+        .requires_grad_(False)
     )
 
 

@@ -76,7 +76,7 @@ from hlsim.losses.paper import paper_parts
 from hlsim.metrics import haspi, hasqi, mbstoi
 from hlsim.neuro import NeuroConfig
 from hlsim.neuro.scan import _kernel as mamba_kernel
-from hlsim.pretrained import SIMULATOR, shipped
+from hlsim.pretrained import SIMULATOR, shipped_checkpoints
 
 Row = dict[str, Any]
 Step = Callable[[], Any]
@@ -200,7 +200,7 @@ def simulators() -> list[Subject]:
         Subject("MSBG 16 kHz", lambda: MSBG(sample_rate=16000), simulate),
         Subject("MSBG 44.1 kHz", lambda: MSBG(sample_rate=44100), simulate, 44100),
     ]
-    for name in shipped([SIMULATOR]):
+    for name in shipped_checkpoints([SIMULATOR]):
         found.append(Subject(name, lambda name=name: load_pretrained(name), simulate))
     return found
 
@@ -539,7 +539,7 @@ def table_two(run: Run) -> None:
                 NeuroMSBG(NeuroConfig(**settings), sample_rate=44100), PAPER_GPU_MS.get(name)
             ),
         )
-    for name in shipped([SIMULATOR]):
+    for name in shipped_checkpoints([SIMULATOR]):
         run.take(
             "table-2", name, lambda name=name: measure(load_pretrained(name, sample_rate=44100))
         )

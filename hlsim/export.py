@@ -1,19 +1,31 @@
 """Neuro-MSBG and wearable aids as ``torch.export`` programs and as ONNX files, for inference.
 
-A simulator becomes a program for one number of items and one length. A wearable aid becomes a program of one hop,
-``HOP`` = 64 samples (4 ms at 16 kHz) of each item (left and right ear, say), with its state explicit. By name, float32:
+The program of a simulator processes a fixed number of items with a fixed length.
 
-- inputs: ``samples`` (items, 64), where RMS 1.0 is ``aid.full_scale_spl`` dB SPL; ``fitted`` (items, n), which holds
-  what the aid needs of the ear; ``sliders`` (items, sliders), 0 to 1, in the order of ``aid.SLIDERS``, if it has any;
-  and the state, (items, ...) each, such as ``past`` (items, 192), the preceding samples in pascals;
-- outputs: ``output`` (items, 64), delayed by ``aid.latency`` = 64 samples, and each state as ``next_past`` and so on,
-  which the next call takes as ``past``.
+The program of a wearable aid processes one hop, ``HOP`` = 64 samples (4 ms at 16 kHz), of each
+item, such as the left and the right ear. Its state is an input and an output. All tensors are
+float32.
 
-``first_inputs`` gives all inputs of the first hop. On a machine without torch, numpy and onnxruntime run the file
-(``np.savez`` stores the inputs):
+Inputs by name:
+
+- ``samples`` (items, 64): the input, where RMS 1.0 is ``aid.full_scale_spl`` dB SPL
+- ``fitted`` (items, n): the aid's parameters for the ear
+- ``sliders`` (items, sliders): values from 0 to 1 in the order of ``aid.SLIDERS``, if the aid has
+    any
+- state, (items, ...) each: for example ``past`` (items, 192), the preceding samples in pascals
+
+Outputs by name:
+
+- ``output`` (items, 64): the aid's output, delayed by ``aid.latency`` = 64 samples
+- each state with the prefix ``next_``: for example ``next_past``, the input ``past`` of the next
+    call
+
+``first_inputs`` returns all inputs of the first hop. On a machine without torch, numpy and
+onnxruntime run the file (``np.savez`` stores the inputs):
 
     export_aid(aid, "aid.onnx")
-    inputs = {name: tensor.numpy() for name, tensor in first_inputs(aid, Audiogram.standard("N3")).items()}
+    tensors = first_inputs(aid, Audiogram.standard("N3"))
+    inputs = {name: tensor.numpy() for name, tensor in tensors.items()}
     session = onnxruntime.InferenceSession("aid.onnx")
     names = [entry.name.removeprefix("next_") for entry in session.get_outputs()]
     for inputs["samples"] in hops:
@@ -46,9 +58,14 @@ from hlsim.neuro.config import NEURO_RATE
 TOLERANCE = 1e-4
 """Largest error of an ONNX file, relative to the peak of the output."""
 
-_NOISE_RMS = 0.03  # Pa, 64 dB SPL
-_CHECKED_HOPS = 16
-_NOT_STATE = ("samples", "fitted", "sliders")
+NOISE_RMS = 0.03
+"""RMS in pascals (64 dB SPL) of the noise with which ONNX files are checked."""
+
+CHECKED_HOPS = 16
+"""Number of hops of noise with which the program of an aid is checked."""
+
+STATELESS_INPUTS = ("samples", "fitted", "sliders")
+"""Names of the inputs of an aid's program that are not part of its state."""
 
 
 class _SimulatorCall(nn.Module):
@@ -71,12 +88,14 @@ class _HopCall(nn.Module):
         self.aid = aid
 
     def forward(self, **inputs: Tensor) -> dict[str, Tensor]:
-        gain, empty = gain_to_pascals(self.aid.full_scale_spl), inputs["samples"][:, :0]
-        samples, fitted = inputs["samples"] * gain, inputs["fitted"]
-        state = {"gliding": empty} | inputs  # an aid without sliders has no such state
-        output, after = self.aid.step(samples, fitted, inputs.get("sliders", empty), state)
-        states = {f"next_{name}": after[name] for name in inputs if name not in _NOT_STATE}
-        return {"output": output / gain} | states
+        gain = gain_to_pascals(self.aid.full_scale_spl)
+        samples = inputs["samples"] * gain
+        empty = inputs["samples"][:, :0]
+        sliders = inputs.get("sliders", empty)
+        state = {"gliding": empty} | inputs  # An aid without sliders has no such state.
+        output, next_state = self.aid.step(samples, inputs["fitted"], sliders, state)
+        names = [name for name in inputs if name not in STATELESS_INPUTS]
+        return {"output": output / gain} | {f"next_{name}": next_state[name] for name in names}
 
 
 def export_program(
@@ -84,16 +103,23 @@ def export_program(
 ) -> torch.export.ExportedProgram:
     """Export a Neuro-MSBG at 16 kHz as a ``torch.export`` program.
 
-    Its inputs are a waveform (items, time) and thresholds (items, 8) in dB HL, its output has the
-    waveform's shape.
+    The inputs of the program are a waveform (items, time) and thresholds (items, 8) in dB HL. Its
+    output has the shape of the waveform.
+
+    Args:
+        simulator: Neuro-MSBG at 16 kHz.
+        seconds: Duration of the waveforms.
+        items: Number of waveforms.
 
     Raises:
         ValueError: The simulator is no Neuro-MSBG at 16 kHz, or there is no sample or no item.
     """
     if not isinstance(simulator, NeuroMSBG) or simulator.sample_rate != NEURO_RATE:
         raise ValueError(
-            f"cannot export a {type(simulator).__name__}; expected a NeuroMSBG with sample_rate {NEURO_RATE} "
-            "(the exact model chooses its filters by the audiogram's values)"
+            f"expected a NeuroMSBG with sample_rate {NEURO_RATE}, got a "
+            f"{type(simulator).__name__}; "
+            "the exact MSBG cannot be exported, because its filters depend on the audiogram's "
+            "values"
         )
     if not (seconds * NEURO_RATE >= 1 and items >= 1):
         raise ValueError(
@@ -109,37 +135,48 @@ def export_program(
 def export_onnx(
     simulator: nn.Module, path: str | Path, *, seconds: float = 1.0, items: int = 1
 ) -> None:
-    """Write the program of ``export_program`` as an ONNX file; with Mamba blocks that takes minutes.
+    """Write the program of ``export_program`` as an ONNX file. Mamba blocks take minutes.
+
+    Args:
+        simulator: Neuro-MSBG at 16 kHz.
+        path: File to write.
+        seconds: Duration of the waveforms.
+        items: Number of waveforms.
 
     Raises:
-        ValueError: As ``export_program``; ONNX lacks an operation; or the output of onnxruntime for
-            noise at 64 dB SPL differs by more than ``TOLERANCE``.
+        ValueError: The simulator or the size is unsuitable, see ``export_program``; ONNX lacks an
+            operation; or the output of onnxruntime for noise at 64 dB SPL differs by more than
+            ``TOLERANCE``.
         MissingExtraError: onnx, onnxscript or onnxruntime is not installed.
     """
     _require_onnx()
     program = export_program(simulator, seconds=seconds, items=items)
     assert isinstance(simulator, NeuroMSBG)
-    like = next(simulator.parameters())
-    rms = _NOISE_RMS / gain_to_pascals(simulator.full_scale_spl)
-    noise = torch.randn(items, round(seconds * NEURO_RATE), generator=_generator())
+    weight = next(simulator.parameters())
+    rms = NOISE_RMS / gain_to_pascals(simulator.full_scale_spl)
+    generator = torch.Generator().manual_seed(0)
+    noise = torch.randn(items, round(seconds * NEURO_RATE), generator=generator)
     ears = torch.linspace(20.0, 90.0, len(FREQUENCIES)).expand(items, -1)
-    inputs = {"waveform": (rms * noise).to(like), "thresholds": ears.to(like)}
+    inputs = {"waveform": (rms * noise).to(weight), "thresholds": ears.to(weight)}
     with torch.no_grad():
-        expected = [_SimulatorCall(simulator)(*inputs.values())]
-    _write_onnx(program, path, inputs, {"perceived": expected[0]})
+        perceived = _SimulatorCall(simulator)(*inputs.values())
+    _write_onnx(program, path, inputs, {"perceived": perceived})
 
 
 def first_inputs(
     aid: Wearable, audiogram: AudiogramLike, *, items: int = 1, **sliders: Slider
 ) -> dict[str, Tensor]:
-    """Inputs of an aid's program for the first hop: fitted to the ear, after silence, with samples of 0.
+    """Return the inputs of an aid's program for the first hop: fitted to the ear, with silence.
 
     Args:
-        audiogram: One ear for all items, or one for each.
-        sliders: Values by name, 0 to 1, one for all items or one for each; 1 by default.
+        aid: Aid at 16 kHz.
+        audiogram: One ear for all items, or one per item.
+        items: Number of signals that the program processes.
+        sliders: Values from 0 to 1 by name, one for all items or one per item; 1 by default.
 
     Raises:
-        ValueError: As the aid's call, the aid's sample rate is not 16000 Hz, or it has no such slider.
+        ValueError: The aid's sample rate is not 16000 Hz, it has no such slider, or it rejects the
+            ear or a value.
     """
     if aid.sample_rate != RATE:
         raise ValueError(f"expected an aid at {RATE} Hz, got one at {aid.sample_rate} Hz")
@@ -149,10 +186,10 @@ def first_inputs(
             f"a {type(aid).__name__} has no slider {', '.join(unknown)}; its sliders are: "
             f"{', '.join(aid.SLIDERS) or 'none'}"
         )
-    like = next(aid.parameters(), torch.empty(0))
+    weight = next(aid.parameters(), torch.empty(0))
     values = [sliders.get(name, 1.0) for name in aid.SLIDERS]
     with torch.no_grad():
-        samples = like.new_zeros(items, HOP)
+        samples = weight.new_zeros(items, HOP)
         _, fitted, settings = aid.prepare(samples, audiogram, values)
         inputs = {
             "samples": samples,
@@ -160,19 +197,23 @@ def first_inputs(
             "sliders": settings,
             **aid.initial(settings),
         }
-    # torch.export would merge two inputs that are the same tensor
+    # Copies, because torch.export would merge two inputs that are the same tensor.
     return {name: tensor.clone() for name, tensor in inputs.items() if tensor.numel()}
 
 
 def hop_program(aid: Wearable, *, items: int = 1) -> torch.export.ExportedProgram:
-    """Export one hop of an aid: ``program.module()(**inputs)`` returns the outputs by name.
+    """Export one hop of an aid as a program; ``program.module()(**inputs)`` returns the outputs.
+
+    Args:
+        aid: Aid at 16 kHz.
+        items: Number of signals that the program processes.
 
     Raises:
         ValueError: The aid's sample rate is not 16000 Hz.
     """
     inputs = first_inputs(aid, torch.zeros(len(FREQUENCIES)), items=items)
     with torch.no_grad(), warnings.catch_warnings():
-        # nn.LSTM keeps a list of its weights
+        # torch.export warns of the list of weights in nn.LSTM, which does no harm.
         warnings.filterwarnings("ignore", r"The tensor attributes .*_flat_weights")
         return torch.export.export(_HopCall(aid), (), inputs)
 
@@ -180,30 +221,34 @@ def hop_program(aid: Wearable, *, items: int = 1) -> torch.export.ExportedProgra
 def export_aid(aid: Wearable, path: str | Path, *, items: int = 1) -> None:
     """Write the program of ``hop_program`` as an ONNX file.
 
+    Args:
+        aid: Aid at 16 kHz.
+        path: File to write.
+        items: Number of signals that the program processes.
+
     Raises:
-        ValueError: As ``hop_program``; or an output or state of onnxruntime differs by more than
-            ``TOLERANCE`` in the last of 16 hops of noise at 64 dB SPL.
+        ValueError: The aid's sample rate is not 16000 Hz, or an output or state of onnxruntime
+            differs by more than ``TOLERANCE`` in the last of 16 hops of noise at 64 dB SPL.
         MissingExtraError: onnx, onnxscript or onnxruntime is not installed.
     """
     _require_onnx()
-    program, call = hop_program(aid, items=items), _HopCall(aid)
+    program = hop_program(aid, items=items)
+    call = _HopCall(aid)
     inputs = first_inputs(aid, torch.linspace(20.0, 90.0, len(FREQUENCIES)), items=items)
-    if "sliders" in inputs:  # so that they are moving
+    if "sliders" in inputs:
+        # Sliders that move, so that their state is checked as well.
         inputs["sliders"] = 0.2 * inputs["sliders"]
-    rms = _NOISE_RMS / gain_to_pascals(aid.full_scale_spl)
-    noise = rms * torch.randn(_CHECKED_HOPS, items, HOP, generator=_generator())
+    rms = NOISE_RMS / gain_to_pascals(aid.full_scale_spl)
+    generator = torch.Generator().manual_seed(0)
+    noise = rms * torch.randn(CHECKED_HOPS, items, HOP, generator=generator)
+    state_names = [name for name in inputs if name not in STATELESS_INPUTS]
     with torch.no_grad():
         for samples in noise.to(inputs["samples"]):
             inputs["samples"] = samples
             expected = call(**inputs)
             last_inputs = inputs
-            states = {name: expected[f"next_{name}"] for name in inputs if name not in _NOT_STATE}
-            inputs = inputs | states
+            inputs = inputs | {name: expected[f"next_{name}"] for name in state_names}
     _write_onnx(program, path, last_inputs, expected)
-
-
-def _generator() -> torch.Generator:
-    return torch.Generator().manual_seed(0)
 
 
 def _require_onnx() -> None:
@@ -217,10 +262,11 @@ def _write_onnx(
     inputs: dict[str, Tensor],
     expected: dict[str, Tensor],
 ) -> None:
-    """Write a program atomically, once onnxruntime has computed the expected outputs from the inputs."""
+    """Write a program, unless onnxruntime computes other outputs than expected from the inputs."""
     with atomic_path(path) as temporary:
         try:
-            # not optimised: onnxscript's rules take a constant below 1e-8 for zero, and log(x + 1e-12) for log(x)
+            # The optimiser of onnxscript would turn log(x + 1e-12) into log(x), because it treats
+            # constants below 1e-8 as zero.
             converted = torch.onnx.export(
                 program, dynamo=True, verbose=False, optimize=False, output_names=[*expected]
             )
@@ -234,7 +280,7 @@ def _write_onnx(
 def _check_onnx(path: Path, inputs: dict[str, Tensor], expected: Sequence[Tensor]) -> None:
     runtime = require("onnxruntime", "dev")
     options = runtime.SessionOptions()
-    options.log_severity_level = 3  # errors only
+    options.log_severity_level = 3  # Only errors are logged.
     session = runtime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
     arrays = {name: tensor.cpu().numpy() for name, tensor in inputs.items()}
     for array, reference in zip(session.run(None, arrays), expected, strict=True):
@@ -242,6 +288,7 @@ def _check_onnx(path: Path, inputs: dict[str, Tensor], expected: Sequence[Tensor
         peak = reference.abs().max().clamp_min(torch.finfo(reference.dtype).tiny)
         if not error <= TOLERANCE * peak:
             raise ValueError(
-                f"{path.name}: onnxruntime's output differs by {float(error / peak):.0e} of its peak, "
-                f"more than {TOLERANCE:g}; the file was not written"
+                f"{path.name}: the output of onnxruntime differs by {float(error / peak):.0e} "
+                "of its "
+                f"peak, expected {TOLERANCE:g} or less; the file was not written"
             )

@@ -15,25 +15,30 @@ from pathlib import Path
 EXTENSIONS = tuple(
     ".wav .flac .ogg .oga .opus .mp3 .aif .aiff .aifc .au .snd .caf .w64 .rf64 .sph .voc".split()
 )
-"""Extensions of audio files that are looked for in folders; libsndfile reads all of them."""
+"""Extensions by which audio files are found in folders. libsndfile reads all of these formats."""
 
 WRITTEN_EXTENSIONS = (".wav", ".flac", ".ogg")
+"""Extensions of the audio files that hlsim writes."""
 
 
 @contextmanager
 def atomic_path(path: str | Path) -> Iterator[Path]:
-    """Yield a temporary path for a file or folder, which takes the place of ``path`` afterwards.
+    """Yield a temporary path for a file or folder, which replaces ``path`` when the block ends.
 
     If the block raises, ``path`` stays as it was.
 
+    Args:
+        path: File or folder to write.
+
     Raises:
-        ValueError: The file system refuses, because the disk is full or the folder is write-protected, say.
+        ValueError: The path cannot be written, for example because the disk is full.
     """
     path = Path(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=".hlsim-", dir=path.parent) as folder:
-            temporary, previous = Path(folder) / path.name, Path(folder) / "previous"
+            temporary = Path(folder) / path.name
+            previous = Path(folder) / "previous"
             yield temporary
             if path.is_dir():
                 os.replace(path, previous)
@@ -47,26 +52,38 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         raise ValueError(f"{path}: cannot be written: {error.strerror or error}") from error
 
 
-def write_whole(path: str | Path, data: str | bytes) -> None:
-    """Write a file; the file is complete or, if writing fails, as it was before. ValueError as ``atomic_path``."""
+def write_atomically(path: str | Path, data: str | bytes) -> None:
+    """Write a file that is complete or, if writing fails, as it was before.
+
+    Args:
+        path: File to write.
+        data: Contents. Text is encoded as UTF-8.
+
+    Raises:
+        ValueError: The file cannot be written.
+    """
+    contents = data.encode() if isinstance(data, str) else data
     with atomic_path(path) as temporary:
-        temporary.write_bytes(data.encode() if isinstance(data, str) else data)
+        temporary.write_bytes(contents)
 
 
-def resolved(path: str | Path) -> Path:
-    """Follow links. Unlike ``Path.resolve`` before Python 3.13, a link to itself raises nothing."""
+def resolve_links(path: str | Path) -> Path:
+    """Return the absolute path without links.
+
+    Unlike ``Path.resolve`` before Python 3.13, this raises nothing for a link to itself.
+    """
     return Path(os.path.realpath(path))
 
 
 def check_extension(path: str | Path) -> str:
-    """Return the extension in lower case.
+    """Return the extension of an audio file to write, in lower case.
 
     Raises:
-        ValueError: Files with this extension are not written.
+        ValueError: The extension is not in ``WRITTEN_EXTENSIONS``.
     """
     suffix = Path(path).suffix.lower()
     if suffix not in WRITTEN_EXTENSIONS:
-        raise ValueError(f"{path}: expected the extension .wav, .flac or .ogg")
+        raise ValueError(f"{path}: expected the extension .wav, .flac or .ogg, got {suffix!r}")
     return suffix
 
 
@@ -76,14 +93,16 @@ def sha256(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def read_table(path: str | Path, what: str) -> list[tuple[int, dict[str, str]]]:
+def read_table(path: str | Path, contents: str) -> list[tuple[int, dict[str, str]]]:
     """Read a table with commas, semicolons or tabs, in UTF-8, UTF-16 or Windows' cp1252.
 
     Args:
-        what: Description of the contents, for errors.
+        path: CSV file, whose first line names the columns.
+        contents: Description of the contents for error messages, such as "the manifest".
 
-    Returns: for each row, the number of its last line and its values by column, without surrounding
-        blanks. Missing values are empty.
+    Returns:
+        The number of its last line, and the values by column without surrounding blanks, for each
+        row. Missing values are empty.
 
     Raises:
         ValueError: The file cannot be read, a column appears twice, or a row has too many values.
@@ -97,11 +116,12 @@ def read_table(path: str | Path, what: str) -> list[tuple[int, dict[str, str]]]:
             reader = csv.DictReader(file, delimiter=delimiter, restval="")
             names = [name.strip() for name in reader.fieldnames or ()]
             reader.fieldnames = names
-            for name in filter(None, names):
-                if names.count(name) > 1:
+            for name in names:
+                if name and names.count(name) > 1:
                     raise ValueError(f"{path}, line 1: the column {name} appears twice")
             for row in reader:
-                if any(row.pop(None, ())):
+                surplus_values = row.pop(None, ())
+                if any(surplus_values):
                     raise ValueError(
                         f"{path}, line {reader.line_num}: expected {len(names)} values, got more"
                     )
@@ -109,10 +129,10 @@ def read_table(path: str | Path, what: str) -> list[tuple[int, dict[str, str]]]:
                 rows.append((reader.line_num, values))
     except UnicodeDecodeError as error:
         raise ValueError(
-            f"{path}: {what} must be a CSV file in UTF-8 or cp1252 ({error})"
+            f"{path}: {contents} must be a CSV file in UTF-8 or cp1252 ({error})"
         ) from error
     except (OSError, csv.Error) as error:
-        raise ValueError(f"{path}: cannot read {what}: {error}") from error
+        raise ValueError(f"{path}: cannot read {contents}: {error}") from error
     return rows
 
 

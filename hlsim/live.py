@@ -1,4 +1,4 @@
-"""Streaming from microphone to headphones: what happens to each block, and the loop around it."""
+"""Streams from microphone to headphones: the processing of each block, and the loop around it."""
 
 from __future__ import annotations
 
@@ -26,21 +26,26 @@ KEYS = {"noise_reduction": ("n", "N"), "amplification": ("a", "A")}
 """Keys that lower and raise each slider."""
 
 SLIDER_STEP = 0.1
-_WARM_UP_BLOCKS = 20  # blocks of silence before the first: the first calls take longest
+"""Change of a slider per pressed key."""
+
+WARM_UP_BLOCKS = 20
+"""Number of blocks of silence that are processed before the start, because early calls are slow."""
+
+DEVICE_HINT = f"choose one of hlsim live --list-devices that supports {NEURO_RATE} Hz"
 
 
 class Live:
     """Callback of sounddevice that processes each block.
 
     Args:
-        stream: Function (time,) -> (time,), or of (2, time) for two ears. Its attributes named in
-            ``KEYS`` are its sliders.
+        stream: Function from a block to its output, both with shape (time,) for one ear or
+            (2, time) for two. Its attributes that are named in ``KEYS`` are its sliders.
         full_scale_spl: Level in dB SPL of RMS 1.0, at microphone and headphones.
-        ears: 1; or 2, left and right, each from its own microphone if there are two.
+        ears: Number of ears, 1 or 2. Left and right ear have a microphone each if there are two.
         latency: Delay of the stream's output in samples.
 
     Attributes:
-        drop_outs: Number of blocks that were lost.
+        drop_outs: Number of lost blocks.
         error: Message of an exception in the stream; empty if there was none.
     """
 
@@ -60,21 +65,30 @@ class Live:
         self._blocks: list[Tensor] = []
 
     def __call__(self, recorded: Any, played: Any, frames: int, clock: Any, status: Any) -> None:
-        """Process a block. Shape: arrays ``recorded`` (frames, microphones) and ``played`` (frames, channels)."""
+        """Process a block, as sounddevice calls it.
+
+        Args:
+            recorded: Array (frames, microphones), the input.
+            played: Array (frames, channels), which receives the output.
+            frames: Number of samples per channel.
+            clock: Times of the block, which are not used.
+            status: Flags of lost samples.
+        """
         underflow = status.input_underflow or status.output_underflow
-        self.drop_outs += bool(underflow or status.input_overflow or status.output_overflow)
+        overflow = status.input_overflow or status.output_overflow
+        self.drop_outs += bool(underflow or overflow)
         try:
             samples = torch.from_numpy(recorded.T.copy())
             samples = samples.expand(2, -1) if self.ears == 2 else samples[0]
             output = self.stream(samples).clamp(-1.0, 1.0)
             played[:] = torch.atleast_2d(output).mT.numpy()
             self._blocks.append(torch.stack((samples, output)))
-        except Exception as error:  # raised in the device's thread, where nobody would see it
+        except Exception as error:  # It would be lost in the thread of the device.
             played.fill(0.0)
             self.error = str(error) or type(error).__name__
 
     def press(self, key: str) -> None:
-        """Move the slider that a key belongs to."""
+        """Move the slider of a key by one step."""
         for name, (down, up) in KEYS.items():
             if key in (down, up) and hasattr(self.stream, name):
                 step = SLIDER_STEP if key == up else -SLIDER_STEP
@@ -82,8 +96,10 @@ class Live:
                 setattr(self.stream, name, round(value, 3))
 
     def status(self) -> str:
-        """Describe the levels since the last call, the sliders, and the drop-outs since the start."""
-        blocks, self._blocks = self._blocks, []
+        """Describe the levels since the last call, the sliders, and the drop-outs since the
+        start."""
+        blocks = self._blocks
+        self._blocks = []
         parts = []
         if blocks:
             levels = level_spl(torch.cat(blocks, -1), self.full_scale_spl).clamp_min(0.0)
@@ -99,33 +115,39 @@ class Live:
         return ", ".join([*parts, f"drop-outs {self.drop_outs}"])
 
 
-class Simulated:
-    """A stream of what an ear perceives. Each block is delayed until everything that it depends on is known.
+class SimulatedStream:
+    """A stream that simulates a hearing loss block by block.
+
+    The output is delayed by the simulator's look-ahead, so that each block depends on past input
+    only.
 
     Args:
-        simulator: A Neuro-MSBG at 16 kHz with a finite receptive field, such as ``neuro-msbg``.
+        simulator: Neuro-MSBG at 16 kHz with a finite receptive field, such as ``neuro-msbg``.
+        audiogram: One ear, or a listener with two.
 
     Attributes:
         latency: Delay of the output in samples.
-        block: Number of samples of which chunks must be a multiple.
+        block: Number of samples of which the length of every chunk is a multiple.
 
     Raises:
-        ValueError: Another simulator.
+        ValueError: The simulator is no such network.
     """
 
     def __init__(self, simulator: torch.nn.Module, audiogram: Audiogram | Listener) -> None:
         field = simulator._receptive_field if isinstance(simulator, NeuroMSBG) else None
         if field is None or simulator.sample_rate != NEURO_RATE:
             raise ValueError(
-                f"expected a Neuro-MSBG at {NEURO_RATE} Hz with a finite receptive field, such as neuro-msbg"
+                f"expected a Neuro-MSBG at {NEURO_RATE} Hz with a finite receptive field, such "
+                "as neuro-msbg"
             )
-        self._simulator, self._audiogram = simulator, audiogram
-        self.block, needed = field
-        self.latency = math.ceil(needed / self.block) * self.block
+        self._simulator = simulator
+        self._audiogram = audiogram
+        self.block, look_ahead = field
+        self.latency = math.ceil(look_ahead / self.block) * self.block
         self._past = torch.zeros(2 * self.latency)
 
     def __call__(self, chunk: Tensor) -> Tensor:
-        """Shape: (time,), or (2, time) of a listener -> the same."""
+        """Simulate a chunk. Shape: (time,), or (2, time) for a listener -> the same."""
         samples = chunk.shape[-1]
         window = torch.cat((self._past.expand(*chunk.shape[:-1], -1), chunk), -1)
         self._past = window[..., samples:]
@@ -146,22 +168,27 @@ def play(
     """Run until the time is up, or until ``q`` or Ctrl-C is pressed, with a status line.
 
     Args:
-        devices: Microphone and headphones, by number or part of their names; None for the system's.
-        block: Samples per block at 16 kHz.
-        buffer: Seconds that each device is asked to buffer.
+        live: Callback that processes the blocks.
+        sounddevice: The imported package.
+        devices: Microphone and headphones, by number or part of their names. None stands for the
+            device of the system.
+        block: Number of samples per block at 16 kHz.
+        buffer: Buffer of each device in seconds.
+        seconds: Duration after which to stop.
 
     Raises:
-        ValueError: A device does not exist, does not support 16 kHz, or has one channel for two ears;
-            or the stream failed.
+        ValueError: A device does not exist, does not support 16 kHz, or has too few channels; or
+            the stream failed.
     """
-    microphones = _channels(sounddevice, "input", devices[0])
-    headphones = _channels(sounddevice, "output", devices[1])
+    microphones = _count_channels(sounddevice, "input", devices[0])
+    headphones = _count_channels(sounddevice, "output", devices[1])
     if headphones < live.ears:
         raise ValueError(
-            "the headphones have one channel for two ears; use --audiogram for one ear"
+            "the headphones have one channel, expected two; use --audiogram for one ear"
         )
-    for _ in range(_WARM_UP_BLOCKS):
-        live.stream(torch.zeros(2, block) if live.ears == 2 else torch.zeros(block))
+    silence = torch.zeros(2, block) if live.ears == 2 else torch.zeros(block)
+    for _ in range(WARM_UP_BLOCKS):
+        live.stream(silence)
     stream = sounddevice.Stream
     options = {
         "samplerate": NEURO_RATE,
@@ -172,56 +199,60 @@ def play(
         "latency": buffer,
     }
     try:
-        with suppress(KeyboardInterrupt), _keys() as key, stream(callback=live, **options) as audio:
+        with (
+            suppress(KeyboardInterrupt),
+            _key_reader() as read_key,
+            stream(callback=live, **options) as audio,
+        ):
             delay_ms = 1000.0 * (sum(audio.latency) + live.latency / NEURO_RATE)
             block_ms = 1000.0 * block / NEURO_RATE
             print(f"blocks of {block_ms:g} ms, delay {delay_ms:.0f} ms; q or Ctrl-C stops")
-            _show_status(live, audio, key, time.monotonic() + seconds)
+            _show_status(live, audio, read_key, time.monotonic() + seconds)
     except sounddevice.PortAudioError as error:
-        raise ValueError(f"the devices stopped: {error}; {_DEVICE_HINT}") from error
+        raise ValueError(f"the devices stopped: {error}; {DEVICE_HINT}") from error
     print(f"\nstopped, drop-outs {live.drop_outs}")
     if live.error:
         raise ValueError(live.error)
 
 
-def _show_status(live: Live, audio: Any, key: Callable[[float], str], end: float) -> None:
-    """Print a status line five times a second, or each second if the output is not a terminal."""
+def _show_status(live: Live, audio: Any, read_key: Callable[[float], str], end: float) -> None:
+    """Print a status line five times per second, or once per second outside a terminal."""
     is_terminal = sys.stdout.isatty()
     interval = 0.2 if is_terminal else 1.0
-    pressed = ""
-    while pressed != "q" and not live.error and time.monotonic() < end:
-        pressed = key(max(0.0, min(interval, end - time.monotonic())))
-        live.press(pressed)
+    key = ""
+    while key != "q" and not live.error and time.monotonic() < end:
+        key = read_key(max(0.0, min(interval, end - time.monotonic())))
+        live.press(key)
         text = live.status()
         if is_terminal:
             width = shutil.get_terminal_size().columns - 1
             print(f"\r{text[:width]:<{width}}", end="", flush=True)
         else:
             print(text, flush=True)
-        if not audio.active:  # PortAudio may stop after a drop-out on ALSA
+        if not audio.active:  # With ALSA, PortAudio may stop after a drop-out.
             live.drop_outs += 1
             audio.stop()
             audio.start()
 
 
-_DEVICE_HINT = f"choose one of hlsim live --list-devices that supports {NEURO_RATE} Hz"
-
-
-def _channels(sounddevice: ModuleType, kind: str, device: int | str | None) -> int:
-    """Number of channels of a device; ValueError unless it exists and supports 16 kHz."""
+def _count_channels(sounddevice: ModuleType, kind: str, device: int | str | None) -> int:
+    """Return the number of channels of a device; raise ValueError unless it supports 16 kHz."""
     name = f"the system's {kind}" if device is None else f"--{kind} {device}"
     try:
         channels = int(sounddevice.query_devices(device, kind)[f"max_{kind}_channels"])
         check = getattr(sounddevice, f"check_{kind}_settings")
         check(device=device, channels=1, dtype="float32", samplerate=NEURO_RATE)
     except (ValueError, sounddevice.PortAudioError) as error:
-        raise ValueError(f"{name} cannot be used: {error}; {_DEVICE_HINT}") from error
+        raise ValueError(f"{name} cannot be used: {error}; {DEVICE_HINT}") from error
     return channels
 
 
 @contextmanager
-def _keys() -> Iterator[Callable[[float], str]]:
-    """Yield a function that waits up to some seconds for a key of the terminal and returns it, or an empty text."""
+def _key_reader() -> Iterator[Callable[[float], str]]:
+    """Yield a function that waits for a key for up to some seconds.
+
+    The function returns the key. If none was pressed, or stdin is no terminal, it returns "".
+    """
 
     def wait(seconds: float) -> str:
         time.sleep(seconds)
@@ -230,13 +261,13 @@ def _keys() -> Iterator[Callable[[float], str]]:
     try:
         import termios
         import tty
-    except ImportError:  # Windows
+    except ImportError:  # Windows has no such modules.
         yield wait
         return
     try:
         terminal = sys.stdin.fileno()
         before = termios.tcgetattr(terminal)
-    except (AttributeError, OSError, ValueError, termios.error):  # stdin is no terminal
+    except (AttributeError, OSError, ValueError, termios.error):
         yield wait
         return
 

@@ -1,4 +1,7 @@
-"""Checkpoints: a folder of safetensors, a JSON configuration with its hash, and a model card. No pickle."""
+"""Checkpoints: folders with weights (safetensors), a hashed JSON configuration and a model card.
+
+No pickles are read or written.
+"""
 
 import hashlib
 import json
@@ -22,24 +25,27 @@ Model = TypeVar("Model", bound=nn.Module)
 Config = TypeVar("Config", bound=ModelConfig)
 Settings = Mapping[str, Any]
 
-WEIGHTS, CONFIG, CARD = "model.safetensors", "config.json", "README.md"
+WEIGHTS = "model.safetensors"
+CONFIG = "config.json"
+CARD = "README.md"
 
 SIMULATOR = "neuro-msbg"
-"""Kind of a simulator's checkpoint in ``config.json``; all other kinds are compensators."""
+"""Kind of a simulator's checkpoint in ``config.json``. All other kinds are compensators."""
 
 
 def load_pretrained(
     name: str | Path, *, sample_rate: int = NEURO_RATE, full_scale_spl: float = PASCAL_SPL
 ) -> NeuroMSBG:
-    """Load a trained Neuro-MSBG, frozen and in eval mode. Nothing is downloaded.
+    """Load a trained Neuro-MSBG, frozen and in eval mode, without downloads.
 
     Args:
-        name: Name of a checkpoint that ships with hlsim, such as ``"neuro-msbg"``, or a checkpoint folder.
+        name: Name of a checkpoint that ships with hlsim, such as ``"neuro-msbg"``, or a checkpoint
+            folder.
         sample_rate: Sample rate of inputs and outputs in Hz, 16000 to 48000.
         full_scale_spl: Level in dB SPL of RMS 1.0.
 
     Raises:
-        ValueError: There is no such checkpoint, or it is of another kind or damaged.
+        ValueError: There is no such checkpoint, it is damaged, or it is no simulator.
     """
 
     def build(config: NeuroConfig) -> NeuroMSBG:
@@ -52,11 +58,12 @@ def load_pretrained(
 
 
 def list_pretrained() -> dict[str, str]:
-    """List the checkpoints that ship with hlsim, with the function that loads each."""
-    return {name: _loader_of(_read_record(folder)["kind"]) for name, folder in shipped().items()}
+    """List the checkpoints that ship with hlsim, and the name of the function that loads each."""
+    folders = shipped_checkpoints()
+    return {name: _loader_name(_read_record(folder)["kind"]) for name, folder in folders.items()}
 
 
-def _loader_of(kind: str) -> str:
+def _loader_name(kind: str) -> str:
     return "load_pretrained" if kind == SIMULATOR else "load_compensator"
 
 
@@ -64,25 +71,26 @@ def read_checkpoint(
     name: str | Path,
     kinds: Mapping[str, type[Config]],
     build: Callable[[Config], Model],
-    also: Sequence[str] = (),
+    other_names: Sequence[str] = (),
 ) -> Model:
     """Build a model from a checkpoint's configuration and load its weights.
 
-    The model is on torch's default device, or on the CPU where that is ``meta``.
+    The model is on torch's default device, or on the CPU if that is ``meta``.
 
     Args:
-        kinds: Class of the configuration for each accepted kind.
+        name: Name of a checkpoint that ships with hlsim, or a checkpoint folder.
+        kinds: Class of the configuration by accepted kind of checkpoint.
         build: Function from configuration to model.
-        also: Names that the caller accepts besides checkpoints, for the error message.
+        other_names: Names that the caller accepts in addition, for the error message.
 
     Raises:
-        ValueError: As ``load_pretrained``.
+        ValueError: There is no such checkpoint, it is damaged, or its kind is not accepted.
     """
-    folder = find_checkpoint(name, kinds, also)
+    folder = find_checkpoint(name, kinds, other_names)
     record = _read_record(folder)
     kind = record.get("kind")
     if not isinstance(kind, str) or kind not in kinds:
-        hint = f"; load it with {_loader_of(kind)}" if isinstance(kind, str) else ""
+        hint = f"; load it with {_loader_name(kind)}" if isinstance(kind, str) else ""
         expected = " or ".join(repr(accepted) for accepted in kinds)
         raise ValueError(f"{folder}: expected a checkpoint of kind {expected}, got {kind!r}{hint}")
     try:
@@ -92,12 +100,14 @@ def read_checkpoint(
     settings: Any = record.get("config")
     if hashlib.sha256(weights).hexdigest() != record.get("sha256"):
         raise ValueError(
-            f"{folder / WEIGHTS}: the SHA-256 is not that in {CONFIG}, so the file is damaged or was "
-            "replaced; download or save the checkpoint again"
+            f"{folder / WEIGHTS}: the file is damaged or was replaced, because its SHA-256 is "
+            "not that "
+            f"in {CONFIG}; download or save the checkpoint again"
         )
     if record.get("config_sha256") != _digest(settings):
         raise ValueError(
-            f"{folder / CONFIG}: the configuration was changed after saving, because its SHA-256 is not "
+            f"{folder / CONFIG}: the configuration was changed after saving, because its "
+            "SHA-256 is not "
             "'config_sha256'; download or save the checkpoint again"
         )
     try:
@@ -106,8 +116,9 @@ def read_checkpoint(
         raise ValueError(f"{folder / CONFIG}: {error}") from error
     device = torch.get_default_device()
     try:
-        # outside inference mode, because gradients may flow through the model later; on the CPU, because
-        # torch.device("meta") would keep no weights; without use of the host's random numbers
+        # Gradients may flow through the model later, hence no inference mode. A default device
+        # "meta"
+        # would discard the weights. Initialisation must not advance the caller's random numbers.
         with torch.inference_mode(False), torch.device("cpu"), torch.random.fork_rng(devices=[]):
             model = build(config)
             model.load_state_dict(safetensors.torch.load(weights))
@@ -119,13 +130,14 @@ def read_checkpoint(
 
 
 def find_checkpoint(
-    name: str | Path, kinds: Collection[str] | None = None, also: Sequence[str] = ()
+    name: str | Path, kinds: Collection[str] | None = None, other_names: Sequence[str] = ()
 ) -> Path:
-    """Find the folder of a checkpoint that ships with hlsim, or accept another folder.
+    """Find the folder of a checkpoint.
 
     Args:
-        kinds: Kinds of checkpoints to suggest in the error message; all by default.
-        also: Other names to suggest.
+        name: Name of a checkpoint that ships with hlsim, or a checkpoint folder.
+        kinds: Kinds of checkpoints that the error message suggests; all by default.
+        other_names: Names that the error message suggests in addition.
 
     Raises:
         ValueError: There is no such checkpoint.
@@ -135,30 +147,43 @@ def find_checkpoint(
     folder = Path(name)
     if (folder / CONFIG).is_file():
         return folder
-    checkpoints = shipped()
+    checkpoints = shipped_checkpoints()
     if str(name) in checkpoints:
         return checkpoints[str(name)]
     if (folder / "checkpoint" / CONFIG).is_file():
         raise ValueError(
-            f"no checkpoint {str(name)!r}; use {str(folder / 'checkpoint')!r}, where training saved it"
+            f"no checkpoint {str(name)!r}; use {str(folder / 'checkpoint')!r}, where training "
+            "saved it"
         )
-    names = ", ".join([*also, *shipped(kinds)])
+    names = ", ".join([*other_names, *shipped_checkpoints(kinds)])
     raise ValueError(f"no checkpoint {str(name)!r}; expected {names}, or a folder with {CONFIG}")
 
 
 def checkpoint_digest(name: str | Path) -> str:
-    """SHA-256 of a checkpoint's weights, as stated in its record. ValueError as ``find_checkpoint``."""
+    """Return the SHA-256 of a checkpoint's weights, as its ``config.json`` states it.
+
+    Raises:
+        ValueError: There is no such checkpoint.
+    """
     return str(_read_record(find_checkpoint(name)).get("sha256"))
 
 
 def checkpoint_about(name: str | Path) -> dict[str, Any]:
-    """Statements of a checkpoint on how it was trained. ValueError as ``find_checkpoint``."""
+    """Return a checkpoint's training record: data, seed, command, time, measures and version.
+
+    Raises:
+        ValueError: There is no such checkpoint.
+    """
     about = _read_record(find_checkpoint(name)).get("about")
     return dict(about) if isinstance(about, dict) else {}
 
 
-def shipped(kinds: Collection[str] | None = None) -> dict[str, Path]:
-    """Names and folders of the checkpoints that ship with hlsim, of all kinds by default."""
+def shipped_checkpoints(kinds: Collection[str] | None = None) -> dict[str, Path]:
+    """Return the folders of the checkpoints that ship with hlsim by name.
+
+    Args:
+        kinds: Kinds of checkpoints to include; all by default.
+    """
     folders = [path.parent for path in sorted(checkpoints_folder().glob(f"*/{CONFIG}"))]
     if kinds is not None:
         folders = [folder for folder in folders if _read_record(folder).get("kind") in kinds]
@@ -166,7 +191,8 @@ def shipped(kinds: Collection[str] | None = None) -> dict[str, Path]:
 
 
 def checkpoints_folder() -> Path:
-    """Folder of the checkpoints that ship: inside the installed package, or beside it in a source tree."""
+    """Return the folder of the checkpoints: in an installed package, or next to it in a source
+    tree."""
     package = Path(__file__).parent
     installed = package / "checkpoints"
     return installed if installed.is_dir() else package.parent / "checkpoints"
@@ -183,17 +209,22 @@ def save_checkpoint(
     """Write a checkpoint folder atomically; an older checkpoint is replaced.
 
     Args:
-        about: How it was trained: data, seed, command, time, metrics, version.
-        card: Text of README.md. Without it the card of an older checkpoint is kept.
+        folder: Folder to write.
+        kind: Kind of the checkpoint.
+        model: Model whose state dict is written.
+        config: Configuration from which the model can be built.
+        about: Training record: data, seed, command, time, measures and version.
+        card: Text of README.md. If it is empty, the card of an older checkpoint is kept.
 
     Raises:
-        ValueError: The folder holds other files, or cannot be written.
+        ValueError: The folder contains other files, or cannot be written.
     """
     target = check_replaceable(folder)
     state = {
         name: tensor.detach().cpu().contiguous() for name, tensor in model.state_dict().items()
     }
-    weights, settings = safetensors.torch.save(state), dict(config)
+    weights = safetensors.torch.save(state)
+    settings = dict(config)
     hashes = {"sha256": hashlib.sha256(weights).hexdigest(), "config_sha256": _digest(settings)}
     record = {"kind": kind, "config": settings, **hashes, "about": dict(about)}
     with atomic_path(target) as temporary:
@@ -207,15 +238,20 @@ def save_checkpoint(
 
 
 def check_replaceable(folder: str | Path) -> Path:
-    """Return the folder, or raise ValueError if it holds anything but a checkpoint, which would be lost."""
+    """Return the folder.
+
+    Raises:
+        ValueError: The folder contains files that no checkpoint has, and saving would delete them.
+    """
     target = Path(folder)
     if target.exists() and not target.is_dir():
         raise ValueError(f"{target}: expected a folder for the checkpoint, got a file")
     names = {path.name for path in target.iterdir()} if target.is_dir() else set()
-    others = sorted(names - {WEIGHTS, CONFIG, CARD})
-    if others:
+    other_files = sorted(names - {WEIGHTS, CONFIG, CARD})
+    if other_files:
         raise ValueError(
-            f"{target}: saving would delete {others[0]}; choose a new folder, or that of a checkpoint"
+            f"{target}: saving would delete {other_files[0]}; choose a new folder, or that of a "
+            "checkpoint"
         )
     return target
 
@@ -231,5 +267,5 @@ def _read_record(folder: Path) -> dict[str, Any]:
 
 
 def _digest(config: Any) -> str:
-    """SHA-256 of a configuration, whatever the order of its names."""
+    """Compute the SHA-256 of a configuration, independent of the order of its settings."""
     return hashlib.sha256(json.dumps(config, sort_keys=True).encode()).hexdigest()

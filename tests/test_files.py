@@ -5,23 +5,23 @@ from pathlib import Path
 
 import pytest
 
-from hlsim.files import atomic_path, read_table, write_whole
+from hlsim.files import atomic_path, read_table, write_atomically
 
 
 def test_a_file_takes_its_place_when_it_is_complete(tmp_path: Path) -> None:
-    write_whole(tmp_path / "new" / "a", "old")
+    write_atomically(tmp_path / "new" / "a", "old")
     with pytest.raises(KeyboardInterrupt), atomic_path(tmp_path / "new" / "a") as temporary:
         temporary.write_text("half")
         raise KeyboardInterrupt
     assert (tmp_path / "new" / "a").read_text() == "old"
-    write_whole(tmp_path / "new" / "a", b"new")
+    write_atomically(tmp_path / "new" / "a", b"new")
     assert os.listdir(tmp_path / "new") == ["a"] and (tmp_path / "new" / "a").read_text() == "new"
 
 
 def test_a_folder_is_replaced_as_a_whole_or_keeps_its_place(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    write_whole(tmp_path / "folder" / "old", "old")
+    write_atomically(tmp_path / "folder" / "old", "old")
 
     def fill() -> None:
         with atomic_path(tmp_path / "folder") as temporary:
@@ -45,7 +45,7 @@ def test_a_folder_is_replaced_as_a_whole_or_keeps_its_place(
 def test_a_folder_that_cannot_be_written_is_named(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(ValueError, match=f"^{tmp_path}/file/a: cannot be written"):
-        write_whole(tmp_path / "file" / "a", "text")
+        write_atomically(tmp_path / "file" / "a", "text")
 
 
 @pytest.mark.parametrize(

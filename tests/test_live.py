@@ -22,7 +22,7 @@ from hlsim import Audiogram, Listener, load_pretrained
 from hlsim.calibration import set_level
 from hlsim.cli.main import main
 from hlsim.extras import MissingExtraError
-from hlsim.live import Live, Simulated, _keys, play
+from hlsim.live import Live, SimulatedStream, _key_reader, play
 from tests.compensators.test_wearable import trained
 
 EAR = Audiogram.standard("N3")
@@ -146,7 +146,7 @@ def test_two_ears_each_have_their_own(
 
     devices.played = devices.played[:0]
     assert main([*call, "--simulate"]) == 0
-    stream = Simulated(load_pretrained("neuro-msbg", full_scale_spl=100.0), listener)
+    stream = SimulatedStream(load_pretrained("neuro-msbg", full_scale_spl=100.0), listener)
     heard = (
         torch.cat([stream(chunk) for chunk in both.split(1536, -1)], -1).clamp(-1.0, 1.0).numpy()
     )
@@ -222,7 +222,7 @@ def test_ctrl_c_ends_it_and_devices_that_stop_are_started_again_or_told(
 
 def test_without_terminals_there_are_no_keys(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "termios", None)
-    with _keys() as key:
+    with _key_reader() as key:
         assert key(0.0) == ""
 
 
@@ -232,7 +232,7 @@ def test_a_terminal_gives_its_keys_and_is_left_as_it_was(monkeypatch: pytest.Mon
     before = termios.tcgetattr(theirs)
     with open(theirs, closefd=False) as terminal, monkeypatch.context() as patch:
         patch.setattr(sys, "stdin", terminal)
-        with _keys() as key:
+        with _key_reader() as key:
             os.write(ours, b"Nq")
             assert [key(1.0), key(1.0), key(0.01)] == ["N", "q", ""]
     assert termios.tcgetattr(theirs) == before
@@ -242,7 +242,7 @@ def test_a_terminal_gives_its_keys_and_is_left_as_it_was(monkeypatch: pytest.Mon
 
 def test_simulated_blocks_are_what_is_heard_of_the_whole() -> None:
     simulator = load_pretrained("neuro-msbg")
-    stream, signal = Simulated(simulator, EAR), 0.03 * torch.randn(24 * 1024)
+    stream, signal = SimulatedStream(simulator, EAR), 0.03 * torch.randn(24 * 1024)
     assert (stream.latency, stream.block) == (3200, 128)
     found = torch.cat([stream(chunk) for chunk in signal.split(1536)])
     whole = simulator(signal, EAR)
@@ -250,7 +250,7 @@ def test_simulated_blocks_are_what_is_heard_of_the_whole() -> None:
     found = found[stream.latency :][middle]
     assert (found - whole[: -stream.latency][middle]).abs().max() < 1e-4 * whole.abs().max()
     with pytest.raises(ValueError, match="finite receptive field"):
-        Simulated(load_pretrained("neuro-msbg-lstm"), EAR)
+        SimulatedStream(load_pretrained("neuro-msbg-lstm"), EAR)
 
 
 @pytest.mark.parametrize(
@@ -282,7 +282,7 @@ def test_devices_that_do_not_fit_are_rejected(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     mono: Any = Devices(torch.zeros(64), plays=1)
-    with pytest.raises(ValueError, match="one channel for two ears"):
+    with pytest.raises(ValueError, match="one channel, expected two"):
         play(Live(lambda samples: samples, 94.0, ears=2), mono)
     monkeypatch.setitem(sys.modules, "sounddevice", Devices(torch.zeros(64), takes=48000))
     assert main(["live", "--audiogram", "N3"]) == 2

@@ -17,7 +17,7 @@ from hlsim.pretrained import (
     checkpoints_folder,
     find_checkpoint,
     save_checkpoint,
-    shipped,
+    shipped_checkpoints,
 )
 
 SMALL = NeuroConfig(channels=4, blocks=1)
@@ -191,7 +191,7 @@ def test_names_do_not_lead_out_of_the_folder_that_ships(
             find_checkpoint(name)
 
 
-@pytest.mark.parametrize("name", sorted(shipped()))
+@pytest.mark.parametrize("name", sorted(shipped_checkpoints()))
 def test_what_ships_has_its_hash_and_is_loaded_by_what_is_listed(name: str) -> None:
     record = json.loads((checkpoints_folder() / name / "config.json").read_text())
     text = json.dumps(record["config"], sort_keys=True)

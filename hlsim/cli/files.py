@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from hlsim.cli.inputs import read_compensator, read_ears
 from hlsim.cli.options import Parser
-from hlsim.files import check_extension, resolved
+from hlsim.files import check_extension, resolve_links
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -137,7 +137,7 @@ def _process_file(
     """Write the output for one file; return the input, the output and their sample rate."""
     import torch
 
-    from hlsim.audio import check_written, read_audio, write_audio
+    from hlsim.audio import check_writable, read_audio, write_audio
     from hlsim.checks import HIGHEST_RATE
     from hlsim.dsp.resample import resample
 
@@ -147,7 +147,7 @@ def _process_file(
     for warning in caught:
         print(f"hlsim: warning: {warning.message}", file=sys.stderr)
     channels, samples = waveform.shape
-    check_written(target, channels, rate)
+    check_writable(target, channels, rate)
     needs_stereo = "--listener" if options.listener else ""
     if getattr(options, "linked", False):
         needs_stereo = "--linked"
@@ -172,7 +172,7 @@ def _check_paths(source: Path, target: Path) -> None:
     if source.is_dir():
         if target.exists() and not target.is_dir():
             raise ValueError(f"{target}: expected a folder, because {source} is one")
-        inner, outer = resolved(source), resolved(target)
+        inner, outer = resolve_links(source), resolve_links(target)
         if inner.is_relative_to(outer) or outer.is_relative_to(inner):
             raise ValueError(f"{target}: choose a folder outside {source} that does not contain it")
         return

@@ -63,13 +63,13 @@ def _live(options: argparse.Namespace) -> None:
     sounddevice = _sounddevice()
     import torch
 
-    from hlsim.live import Live, Simulated, play
+    from hlsim.live import Live, SimulatedStream, play
     from hlsim.losses.frozen_simulator import build_simulator
 
     torch.set_num_threads(1)  # several threads spend more than 4 ms waiting for each other
     block = max(1, round(options.block_ms * RATE / 1000))
     if options.simulate:
-        stream = Simulated(build_simulator("neuro-msbg", RATE, options.full_scale_spl), ears)
+        stream = SimulatedStream(build_simulator("neuro-msbg", RATE, options.full_scale_spl), ears)
         block, latency = 12 * stream.block, stream.latency
     else:
         aid, sliders = read_compensator(options, RATE)

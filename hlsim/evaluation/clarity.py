@@ -30,7 +30,7 @@ from hlsim.evaluation.measures import find_measures
 from hlsim.evaluation.result import Evaluation, check_scored, score_columns
 from hlsim.evaluation.store import ScoreStore, content_hash, key_of
 from hlsim.evaluation.study import Condition, Item, Measure, Source, Values, run_study
-from hlsim.files import write_whole
+from hlsim.files import write_atomically
 from hlsim.metrics.pair import check_seed
 from hlsim.parallel import Progress
 from hlsim.plugins import WaveformPlugin
@@ -166,7 +166,7 @@ class Written(Condition):
         if not note.is_file() or note.read_text() != str(self.fingerprint):
             for path in self.folder.glob("*_HA-output.wav"):
                 path.unlink()
-            write_whole(note, str(self.fingerprint))
+            write_atomically(note, str(self.fingerprint))
 
 
 class BetterEar:

@@ -33,7 +33,7 @@ from hlsim.evaluation.measures import LEVELS, find_measures
 from hlsim.evaluation.result import Evaluation, check_scored, score_columns
 from hlsim.evaluation.store import ScoreStore, content_hash, key_of
 from hlsim.evaluation.study import Condition, Item, run_study
-from hlsim.files import EXTENSIONS, read_table, resolved
+from hlsim.files import EXTENSIONS, read_table, resolve_links
 from hlsim.metrics.pair import check_seed
 from hlsim.parallel import Progress
 
@@ -404,7 +404,7 @@ def read_manifest(
     Raises:
         ValueError: a row is wrong; the message names its line.
     """
-    folder = resolved(Path(path).parent if root is None else root)
+    folder = resolve_links(Path(path).parent if root is None else root)
     if not folder.is_dir():
         raise ValueError(f"{folder}: no such folder; the paths of the manifest are relative to it")
     ears = {} if audiograms is None else _read_ears(audiograms, _listener_and_ear)
@@ -477,7 +477,7 @@ def _read_row(
 
 def _below(root: Path, name: str) -> Path:
     """Return a path below the root, with links followed; ValueError if it leaves it."""
-    path = resolved(root / name)
+    path = resolve_links(root / name)
     if not name or not path.is_relative_to(root):
         raise ValueError(f"{name!r} is not a path below {root}")
     return path

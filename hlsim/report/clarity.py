@@ -7,7 +7,7 @@ from pathlib import Path
 from hlsim.evaluation.clarity import RULE_MS
 from hlsim.evaluation.measures import title_of
 from hlsim.evaluation.result import Evaluation
-from hlsim.files import write_whole
+from hlsim.files import write_atomically
 from hlsim.report.listening import listening_section
 from hlsim.report.page import Page, Section, Table, write_page
 from hlsim.report.plots import study_pictures
@@ -34,7 +34,7 @@ def write_scores(evaluation: Evaluation, out: str | Path) -> None:
     )
     columns = ["scene", "listener", "condition", "combined", "haspi", "hasqi", "level"]
     text = table[columns].to_csv(index=False, float_format="%.6f")
-    write_whole(Path(out) / "scores.csv", text)
+    write_atomically(Path(out) / "scores.csv", text)
 
 
 def scenes_page(evaluation: Evaluation, listen: int = 3) -> Page:

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from hlsim.extras import require
-from hlsim.files import write_whole
+from hlsim.files import write_atomically
 
 
 @dataclass(frozen=True)
@@ -144,7 +144,7 @@ def write_page(page: Page, data: Mapping[str, Any], out: str | Path) -> Path:
         "report.html": page.html(),
     }
     for name, content in contents.items():
-        write_whole(folder / name, content)
+        write_atomically(folder / name, content)
     return folder / "report.html"
 
 
@@ -159,7 +159,7 @@ def render_markdown(title: str, sections: Sequence[Section], lead: str = "") -> 
 def write_files(out: str | Path, contents: Mapping[str, str | bytes]) -> Path:
     folder = check_out(out)
     for name, data in contents.items():
-        write_whole(folder / name, data)
+        write_atomically(folder / name, data)
     return folder
 
 

@@ -12,7 +12,7 @@ from torch import nn
 from compensators import NALR, WDRC, load_compensator
 from hlsim import MSBG, Audiogram
 from hlsim.evaluation.fingerprint import combined_fingerprint, fingerprint
-from hlsim.pretrained import SIMULATOR, load_pretrained, shipped
+from hlsim.pretrained import SIMULATOR, load_pretrained, shipped_checkpoints
 
 
 def test_settings_and_ears_tell_modules_apart() -> None:
@@ -33,7 +33,7 @@ def test_settings_and_ears_tell_modules_apart() -> None:
     assert None not in map(fingerprint, modules)
 
 
-@pytest.mark.parametrize("name", [*shipped([SIMULATOR])])
+@pytest.mark.parametrize("name", [*shipped_checkpoints([SIMULATOR])])
 def test_a_checkpoint_is_the_same_whenever_it_is_loaded(name: str) -> None:
     once, again = load_pretrained(name), load_pretrained(name)
     again(torch.full((1600,), 0.01), Audiogram.standard("N3"))  # use does not change it

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import astuple, dataclass
 from pathlib import Path, PurePosixPath
 
-from hlsim.files import read_table, resolved, write_whole
+from hlsim.files import read_table, resolve_links, write_atomically
 
 SPLITS = ("train", "valid", "test")
 COLUMNS = ("path", "noisy", "speaker", "split")
@@ -90,7 +90,7 @@ def write_manifest(path: str | Path, utterances: Sequence[Utterance]) -> None:
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(COLUMNS)
     writer.writerows(astuple(utterance) for utterance in utterances)
-    write_whole(path, text.getvalue())
+    write_atomically(path, text.getvalue())
 
 
 def check_utterances(utterances: Sequence[Utterance]) -> None:
@@ -116,12 +116,12 @@ def check_utterances(utterances: Sequence[Utterance]) -> None:
 
 def check_paths(utterances: Sequence[Utterance], root: Path) -> None:
     """Raise ValueError where a path leads out of the root, through ``..`` or a link."""
-    inside = resolved(root)
+    inside = resolve_links(root)
     for utterance in utterances:
         for name in (utterance.path, utterance.noisy):
             path = PurePosixPath(name)
             outside = path.is_absolute() or ".." in path.parts
-            if outside or not resolved(root / path).is_relative_to(inside):
+            if outside or not resolve_links(root / path).is_relative_to(inside):
                 raise ValueError(
                     f"{name} is outside {root}; paths are relative to that folder and stay in it"
                 )
