@@ -14,6 +14,7 @@ SHOWN = (
     "examples/*.sh",
     "CHANGELOG.md",
     "CONTRIBUTING.md",
+    "SECURITY.md",
 )
 
 

@@ -80,7 +80,7 @@ def test_linked_files_exist(page: Path) -> None:
 @pytest.mark.parametrize("card", sorted((ROOT / "checkpoints").glob("*/README.md")), ids=_named)
 def test_cards_are_short(card: Path) -> None:
     text = card.read_text(encoding="utf-8")
-    assert len(text.splitlines()) <= 120 and "CC BY 4.0" in text
+    assert len(text.splitlines()) <= 60 and "CC BY 4.0" in text
 
 
 def test_recipes_are_readable() -> None:
