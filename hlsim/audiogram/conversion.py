@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from hlsim.audiogram.value import Audiogram, is_clarity_audiogram
+from hlsim.audiogram.value import Audiogram
 
 EarLike = Audiogram | str | Sequence[float] | NDArray[Any] | Tensor | Mapping[float, float]
 """An audiogram, or what ``as_audiogram`` converts into one."""
@@ -49,7 +49,7 @@ def find_audiogram(ear: Any) -> Audiogram | None:
         return ear
     if isinstance(ear, str):
         return Audiogram.standard(ear)
-    if is_clarity_audiogram(ear):
+    if hasattr(ear, "levels") and hasattr(ear, "frequencies"):  # pyclarity's
         return Audiogram.from_clarity(ear)
     if isinstance(ear, Mapping):
         return _from_mapping(ear)

@@ -46,7 +46,7 @@ _HOST = torch.device("cpu")
 
 
 def on_device(levels: Tensor, device: torch.device) -> Tensor:
-    """Return ears on a device. The host does not wait, and remembers the values of ears that it had.
+    """Return ears on a device. The host does not wait, and remembers the values of its own ears.
 
     Shape: any -> the same.
     """

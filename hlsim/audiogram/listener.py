@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from hlsim.audiogram.conversion import as_audiogram
+from hlsim.audiogram.conversion import EarLike, as_audiogram
 from hlsim.audiogram.plot import draw_png
 from hlsim.audiogram.value import Audiogram, EarName
 
@@ -49,6 +48,10 @@ class Listener:
     left: Audiogram | None
     right: Audiogram | None
 
+    if TYPE_CHECKING:
+
+        def __init__(self, left: EarLike | None, right: EarLike | None) -> None: ...
+
     def __post_init__(self) -> None:
         for name, ear in self.ears().items():
             object.__setattr__(self, name, as_audiogram(ear))
@@ -75,20 +78,8 @@ class Listener:
         return axes
 
     def to_dict(self) -> dict[str, Any]:
-        """Return a JSON-serialisable dictionary, the inverse of ``from_dict``."""
-        return {name: None if ear is None else ear.to_dict() for name, ear in vars(self).items()}
-
-    @classmethod
-    def from_dict(cls, data: Mapping[str, Any]) -> Listener:
-        """Return the listener of a dictionary with ``left`` and ``right``.
-
-        Raises:
-            ValueError: The data is not such a dictionary.
-        """
-        if not isinstance(data, Mapping) or set(data) != set(EARS):
-            raise ValueError(f"expected a dictionary with 'left' and 'right', got {data!r}")
-        ears = [None if data[name] is None else Audiogram.from_dict(data[name]) for name in EARS]
-        return cls(*ears)
+        """Return a JSON-serialisable dictionary; ``Listener(**dictionary)`` is its inverse."""
+        return {name: ear and ear.to_dict() for name, ear in vars(self).items()}
 
     def to_rows(self, name: str) -> list[dict[str, str]]:
         """Return one row of a CSV file per ear, as ``read_listeners`` reads them.

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from hlsim.audiogram.listener import EAR_NAMES, Listener
-from hlsim.audiogram.value import HIGHEST_LEVEL, HIGHEST_SIMULATED, STANDARD, Audiogram, EarName
+from hlsim.audiogram.value import HIGHEST_LEVEL, HIGHEST_SIMULATED, STANDARD, Audiogram
 from hlsim.files import read_table
 
-STANDARD_TABLE = "standard"
-"""Name that ``read_audiograms`` takes in place of a file for Bisgaard's audiograms."""
+Result = TypeVar("Result")
 
 
 def read_audiograms(
@@ -42,50 +41,51 @@ def read_audiograms(
         ({'listener': 'N4'}, Audiogram('N4'))
     """
     highest = HIGHEST_SIMULATED if simulated else HIGHEST_LEVEL
-    if str(path) == STANDARD_TABLE:
-        names = [
-            name for name, levels in STANDARD.items() if name != "NH" and max(levels) <= highest
-        ]
-        return [({"listener": name}, Audiogram.standard(name)) for name in names]
-    rows = read_rows(path)
-    return [(row, parse_row(path, line, row, highest)) for line, row in rows]
+    if str(path) == "standard":
+        ears = [(name, Audiogram.standard(name)) for name in STANDARD if name != "NH"]
+        return [({"listener": name}, ear) for name, ear in ears if max(ear.levels) <= highest]
+    return [(row, ear) for _, row, ear in numbered_audiograms(path, highest)]
+
+
+def numbered_audiograms(
+    path: str | Path, highest: float = HIGHEST_LEVEL
+) -> list[tuple[int, dict[str, str], Audiogram]]:
+    """Read the rows of ``read_audiograms``, each after the number of its line for messages."""
+    ears = []
+    for line, row in read_rows(path):
+        ear = convert_at(f"{path}, line {line}", Audiogram.from_row, row, highest)
+        ears.append((line, row, ear))
+    return ears
 
 
 def read_audiogram(path: str | Path, name: str | None = None) -> Audiogram:
     """Read one ear from a table, as ``Audiogram.from_csv``."""
     rows = read_audiograms(path)
-    found = [ear for row, ear in rows if name is None or name in row.values()]
-    if len(found) != 1:
-        wanted = "row" if name is None else f"row with {name!r} in a column"
+    ears = [ear for row, ear in rows if name is None or name in row.values()]
+    if len(ears) != 1:
         raise ValueError(
-            f"{path}: expected one {wanted}, found {len(found)}; pass the name of a row"
+            f"{path}: expected one row with the name {name!r} in a column, found {len(ears)} rows; "
+            "pass the name of one row"
         )
-    return found[0]
+    return ears[0]
 
 
 def read_rows(path: str | Path) -> list[tuple[int, dict[str, str]]]:
-    """Read the rows of a table of audiograms with the numbers of their lines, not yet converted."""
+    """Read the rows of a table of audiograms, each after the number of its line."""
     rows = read_table(path, "audiograms")
     if not rows:
         raise ValueError(
-            f"{path}: expected a header such as hl_250,hl_500,... and one row per ear, found no rows"
+            f"{path}: no audiograms; expected a header such as hl_250,hl_500 and one row per ear"
         )
     return rows
 
 
-def parse_row(
-    path: str | Path, line: int, row: dict[str, str], highest: float = HIGHEST_LEVEL
-) -> Audiogram:
-    """Return the audiogram of a row, or raise ValueError with the file and the line."""
+def convert_at(place: str, convert: Callable[..., Result], *arguments: Any) -> Result:
+    """Return ``convert(*arguments)``, or raise its ValueError with the place in front."""
     try:
-        return Audiogram.from_row(row, highest=highest)
+        return convert(*arguments)
     except ValueError as error:
-        raise ValueError(f"{path}, line {line}: {error}") from error
-
-
-def lower_columns(row: Mapping[str, str]) -> dict[str, str]:
-    """Return a row with the names of its columns in lower case."""
-    return {column.lower(): text for column, text in row.items()}
+        raise ValueError(f"{place}: {error}") from error
 
 
 def read_listeners(path: str | Path, names: Collection[str] | None = None) -> dict[str, Listener]:
@@ -107,17 +107,22 @@ def read_listeners(path: str | Path, names: Collection[str] | None = None) -> di
             listener.
     """
     is_json = str(path).lower().endswith(".json")
-    sources = _read_entries(path) if is_json else _read_rows_by_listener(path)
+    sources = _read_entries(path) if is_json else _group_rows(path)
     unknown = sorted(set(names or ()) - sources.keys())
     if unknown:
         few = ", ".join(list(sources)[:5]) + (", ..." if len(sources) > 5 else "")
         raise ValueError(f"{path}: no listener {unknown[0]!r}; expected one of {few}")
-    convert = _convert_entry if is_json else _convert_rows
-    wanted = [name for name in sources if names is None or name in names]
-    return {name: convert(path, name, sources[name]) for name in wanted}
+    wanted = sources if names is None else names
+    if not is_json:
+        return {name: _join_ears(sources[name]) for name in wanted}
+    return {
+        name: convert_at(f"{path}, listener {name}", Listener.from_clarity, sources[name])
+        for name in wanted
+    }
 
 
 def _read_entries(path: str | Path) -> Mapping[str, Any]:
+    """Read the entries of Clarity's ``listeners.json``."""
     try:
         entries = json.loads(Path(path).read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, RecursionError, json.JSONDecodeError) as error:
@@ -127,34 +132,29 @@ def _read_entries(path: str | Path) -> Mapping[str, Any]:
     return entries
 
 
-def _convert_entry(path: str | Path, name: str, entry: Any) -> Listener:
-    try:
-        return Listener.from_clarity(entry)
-    except ValueError as error:
-        raise ValueError(f"{path}, listener {name}: {error}") from error
-
-
-def _read_rows_by_listener(path: str | Path) -> dict[str, list[tuple[int, dict[str, str]]]]:
-    rows: dict[str, list[tuple[int, dict[str, str]]]] = {}
+def _group_rows(path: str | Path) -> dict[str, list[tuple[str, dict[str, str]]]]:
+    """Read the rows of each listener of a CSV file."""
+    rows: dict[str, list[tuple[str, dict[str, str]]]] = {}
     for line, row in read_rows(path):
-        name = lower_columns(row).get("listener")
+        place = f"{path}, line {line}"
+        columns = {column.lower(): text for column, text in row.items()}
+        name = columns.get("listener")
         if not name:
-            raise ValueError(f"{path}, line {line}: expected a name in the column listener")
-        rows.setdefault(name, []).append((line, row))
+            raise ValueError(f"{place}: expected a name in the column listener")
+        rows.setdefault(name, []).append((place, columns))
     return rows
 
 
-def _convert_rows(
-    path: str | Path, name: str, rows: Sequence[tuple[int, dict[str, str]]]
-) -> Listener:
-    ears: dict[EarName, Audiogram] = {}
-    for line, row in rows:
-        text = lower_columns(row).get("ear", "")
+def _join_ears(rows: Sequence[tuple[str, dict[str, str]]]) -> Listener:
+    """Return the listener of one or two rows."""
+    ears: dict[str, Audiogram | None] = {"left": None, "right": None}
+    for place, row in rows:
+        text = row.get("ear", "")
         ear = EAR_NAMES.get(text.lower())
-        if ear is None or ear in ears:
+        if ear is None or ears[ear] is not None:
             raise ValueError(
-                f"{path}, line {line}: expected one row per ear of {name}, with left or right in the "
-                f"column ear, got {text!r}" + (" again" if ear else "")
+                f"{place}: expected left or right in the column ear and one row for each, "
+                f"got {text!r}"
             )
-        ears[ear] = parse_row(path, line, row)
-    return Listener(ears.get("left"), ears.get("right"))
+        ears[ear] = convert_at(place, Audiogram.from_row, row)
+    return Listener(**ears)

@@ -50,7 +50,7 @@ def as_thresholds(
     Args:
         audiogram: One or more ears.
         highest: Highest level allowed, in dB HL.
-        consumer: What takes the thresholds, for messages.
+        consumer: Name of the model or metric that takes the thresholds, for messages.
         allow_missing: Accept listeners with one ear. The thresholds of the other ear are NaN.
 
     Returns:
@@ -63,50 +63,29 @@ def as_thresholds(
     """
     if isinstance(audiogram, np.ndarray):
         audiogram = torch.from_numpy(audiogram).float()
-    found = list_ears(audiogram)
-    if found is not None:
-        ears, shape = found
-        if not allow_missing and None in ears:
-            _raise_missing_ear(ears.index(None))
-        unknown = (math.nan,) * len(FREQUENCIES)
-        rows = [unknown if ear is None else ear.thresholds for ear in ears]
-        for row in rows:
-            if row is not unknown:
-                check_range(row, highest, consumer)
-        return torch.tensor(rows).reshape(*shape, len(FREQUENCIES))
-    levels = _stacked(audiogram)
-    if not isinstance(levels, Tensor):
-        raise ValueError(
-            f"expected an audiogram, got {type(levels).__name__}; pass an Audiogram, a name such "
-            "as 'N3', a Listener, a sequence with one of these per item, or thresholds in dB HL of "
-            "shape (..., 8)"
-        )
-    if levels.is_complex() or levels.dtype == torch.bool:
-        raise ValueError(
-            f"expected an audiogram tensor of real numbers in dB HL, got {levels.dtype}"
-        )
-    if levels.ndim == 0 or levels.shape[-1] != len(FREQUENCIES) or not levels.numel():
-        raise ValueError(
-            f"expected an audiogram tensor of shape (..., 8), dB HL at {join_numbers(FREQUENCIES)} Hz, got shape "
-            f"{tuple(levels.shape)}; pass an Audiogram for other frequencies"
-        )
-    if not levels.is_floating_point():
-        levels = levels.float()
-    known = known_on_host(levels)
-    if known is None:
-        in_range = ((levels >= LOWEST_LEVEL) & (levels <= highest)).all(-1, keepdim=True)
-        return torch.where(in_range, levels, math.nan)
-    in_range = ((known >= LOWEST_LEVEL) & (known <= highest)).all(-1)
-    if not bool(in_range.all()):
-        check_range(known[~in_range][0].tolist(), highest, consumer)
-    return levels
+    listed = list_ears(audiogram)
+    if listed is None:
+        return _check_tensor(_stack(audiogram), highest, consumer)
+    ears, shape = listed
+    rows = []
+    for index, ear in enumerate(ears):
+        if ear is not None:
+            check_range(ear.thresholds, highest, consumer)
+        elif not allow_missing:
+            channel = 1 - index % 2
+            raise ValueError(
+                f"the listener has no {EARS[index % 2]} ear; pass listener.{EARS[channel]} with "
+                f"waveform[..., {channel}, :]"
+            )
+        rows.append((math.nan,) * len(FREQUENCIES) if ear is None else ear.thresholds)
+    return torch.tensor(rows).reshape(*shape, len(FREQUENCIES))
 
 
 def list_ears(audiogram: Any) -> tuple[list[Audiogram | None], tuple[int, ...]] | None:
-    """Return the audiograms of a value, and the shape of their thresholds without the last dimension.
+    """Return the audiograms that a value holds, and the leading shape of their thresholds.
 
-    The missing ear of a listener is ``None``. The result is ``None`` for a tensor, for a sequence of
-    tensors, and for what does not describe ears.
+    The missing ear of a listener is ``None``. The result is ``None`` for a tensor, a sequence of
+    tensors, and a value that does not describe ears.
     """
     if isinstance(audiogram, Tensor):
         return None
@@ -120,30 +99,30 @@ def list_ears(audiogram: Any) -> tuple[list[Audiogram | None], tuple[int, ...]] 
     ears: list[Audiogram | None] = []
     shapes = set()
     for part in audiogram:
-        found = list_ears(part)
-        if found is None:
+        listed = list_ears(part)
+        if listed is None:
             return None
-        ears += found[0]
-        shapes.add(found[1])
+        ears += listed[0]
+        shapes.add(listed[1])
     return (ears, (len(audiogram), *shapes.pop())) if len(shapes) == 1 else None
 
 
-def other_grids(audiogram: AudiogramLike | None) -> list[Audiogram | None]:
-    """Return the ears that were measured at other than the eight frequencies, for the exact MSBG.
+def ears_on_other_grids(audiogram: AudiogramLike | None) -> list[Audiogram | None]:
+    """Return the ears that were not measured at the eight ``FREQUENCIES``, for the exact MSBG.
 
     Returns:
-        One audiogram per ear, in the order of ``as_thresholds``, or ``None`` for an ear at the
-        eight frequencies; an empty list if all ears are at the eight frequencies.
+        One audiogram per ear, in the order of ``as_thresholds``, with ``None`` for an ear at the
+        eight frequencies. The list is empty if all ears are at the eight frequencies.
 
     Raises:
-        ValueError: A level is above 100 dB HL, at whatever frequency.
+        ValueError: A level is above 100 dB HL, at any frequency.
     """
     ears, _ = list_ears(audiogram) or ([], ())
-    others = [None if ear is None or ear.frequencies == FREQUENCIES else ear for ear in ears]
-    for ear in others:
+    grids = [None if ear is None or ear.frequencies == FREQUENCIES else ear for ear in ears]
+    for ear in grids:
         if ear is not None:
-            check_range(ear.levels, HIGHEST_SIMULATED, "a simulator")
-    return others if any(others) else []
+            check_range(ear.levels, HIGHEST_SIMULATED, "MSBG")
+    return grids if any(grids) else []
 
 
 def store_thresholds(audiogram: AudiogramLike | None, **options: Any) -> Tensor | None:
@@ -240,35 +219,55 @@ def interpolate(levels: Tensor, frequencies: tuple[float, ...]) -> Tensor:
 def interpolation_weights(
     frequencies: tuple[float, ...], grid: tuple[float, ...] = FREQUENCIES
 ) -> NDArray[np.float64]:
-    """Return the weights of the levels of a grid in those at other frequencies, (grid, frequencies)."""
+    """Return the weights of levels on a grid in those at some frequencies, (grid, frequencies)."""
     return np.stack([np.interp(frequencies, grid, row) for row in np.eye(len(grid))])
 
 
-def _raise_missing_ear(index: int) -> None:
-    """Raise ValueError for the ear with an index among the ears of listeners."""
-    missing, other = EARS[index % 2], 1 - index % 2
-    raise ValueError(
-        f"the listener's {missing} ear is missing; pass listener.{EARS[other]} with "
-        f"waveform[..., {other}, :]"
-    )
+def _stack(tensors: Any) -> Any:
+    """Stack tensors of one ear each, (8,), or eight tensors of one frequency each, (batch,).
 
-
-def _stacked(tensors: Any) -> Any:
-    """Stack a sequence of (8,) tensors, one per ear, or of eight (batch,) tensors, one per frequency.
-
-    Anything else is returned as it is.
+    Any other value is returned as it is.
     """
     if not isinstance(tensors, list | tuple):
         return tensors
-    lengths = {len(one) if isinstance(one, Tensor) and one.ndim == 1 else -1 for one in tensors}
-    per_ear, per_frequency = lengths == {len(FREQUENCIES)}, len(tensors) == len(FREQUENCIES)
-    if per_ear and per_frequency:
+    shapes = {tuple(tensor.shape) if isinstance(tensor, Tensor) else None for tensor in tensors}
+    shape = shapes.pop() if len(shapes) == 1 else None
+    if shape is None or len(shape) != 1:
+        return tensors
+    has_ears, has_frequencies = shape[0] == len(FREQUENCIES), len(tensors) == len(FREQUENCIES)
+    if has_ears and has_frequencies:
         raise ValueError(
-            "eight tensors of 8 levels may be one ear or one frequency each; pass "
-            "torch.stack(audiogram) if they are ears, torch.stack(audiogram, -1) if frequencies"
+            "expected one tensor, got a list of eight tensors of 8 levels, which may be ears or "
+            "frequencies; stack ears with torch.stack(audiogram), frequencies with "
+            "torch.stack(audiogram, -1)"
         )
-    if per_ear:
-        return torch.stack(tuple(tensors))
-    if per_frequency and len(lengths) == 1 and -1 not in lengths:
-        return torch.stack(tuple(tensors), -1)
-    return tensors
+    if not has_ears and not has_frequencies:
+        return tensors
+    return torch.stack(tuple(tensors), 0 if has_ears else -1)
+
+
+def _check_tensor(levels: Any, highest: float, consumer: str) -> Tensor:
+    """Validate a tensor of thresholds, as ``as_thresholds`` describes."""
+    if not isinstance(levels, Tensor):
+        raise ValueError(
+            f"expected an audiogram, got {type(levels).__name__}; pass an Audiogram, a name such "
+            "as 'N3', a Listener, a sequence with one of these per item, or thresholds in dB HL of "
+            "shape (..., 8)"
+        )
+    if levels.is_complex() or levels.dtype == torch.bool:
+        raise ValueError(f"expected an audiogram of real numbers in dB HL, got {levels.dtype}")
+    if levels.ndim == 0 or levels.shape[-1] != len(FREQUENCIES) or not levels.numel():
+        raise ValueError(
+            f"expected an audiogram tensor of shape (..., 8), at {join_numbers(FREQUENCIES)} Hz, "
+            f"got {tuple(levels.shape)}; pass an Audiogram for other frequencies"
+        )
+    if not levels.is_floating_point():
+        levels = levels.float()
+    known = known_on_host(levels)
+    if known is None:
+        in_range = (levels >= LOWEST_LEVEL) & (levels <= highest)
+        return torch.where(in_range.all(-1, keepdim=True), levels, math.nan)
+    in_range = ((known >= LOWEST_LEVEL) & (known <= highest)).all(-1)
+    if not bool(in_range.all()):
+        check_range(known[~in_range][0].tolist(), highest, consumer)
+    return levels

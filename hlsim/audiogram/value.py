@@ -6,15 +6,15 @@ import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import compress, pairwise
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
-from hlsim.extras import MissingExtraError
+from hlsim.extras import require
 
 EarName = Literal["left", "right"]
 
@@ -31,10 +31,10 @@ SEVERITIES = ("none", "mild", "moderate", "severe")
 """MSBG's degrees of loss, by the mean threshold from 2 to 8 kHz."""
 
 SEVERITY_LIMITS = (15.0, 35.0, 56.0)
-"""Mean thresholds in dB HL above which a loss is mild, moderate and severe, as in pyclarity 0.9.0."""
+"""Mean thresholds in dB HL above which a loss is mild, moderate and severe (pyclarity 0.9.0)."""
 
 STEPS_PER_DB = 1e4
-"""Resolution of levels for the severity, so that 19.7 dB HL in single precision counts as 19.7."""
+"""Resolution of levels for the severity: 19.7 dB HL in single precision counts as 19.7."""
 
 # Bisgaard, Vlaming, Dahlquist 2010, Trends in Amplification 14(2), doi 10.1177/1084713810379609,
 # Tables 1 and 2, at the frequencies above. The tables end at 6 kHz; 8 kHz repeats that threshold.
@@ -68,13 +68,13 @@ class Audiogram:
     in Hz, as pyclarity does. Everything else takes ``thresholds``, the levels at eight frequencies.
 
     Args:
-        levels: Thresholds in dB HL, -10 to 120, one per frequency, or ``None`` for a frequency that
-            was not measured and is left out.
+        levels: Thresholds in dB HL, -10 to 120, one per frequency. A frequency with ``None`` or
+            NaN was not measured, and is left out.
         frequencies: Ascending frequencies in Hz, by default the eight ``FREQUENCIES``.
 
     Raises:
-        ValueError: The numbers of levels and frequencies differ, a value is not finite or out of
-            range, or the frequencies do not ascend, or all lie below 250 or above 8000 Hz.
+        ValueError: The numbers of levels and frequencies differ, no level was measured, one is out
+            of range, or the frequencies do not ascend, or all lie below 250 or above 8000 Hz.
 
     Example:
         >>> from hlsim import Audiogram
@@ -87,27 +87,27 @@ class Audiogram:
     frequencies: tuple[float, ...] = FREQUENCIES
 
     def __post_init__(self) -> None:
-        values, hertz = _as_list(self.levels), _as_list(self.frequencies)
-        if len(values) != len(hertz):
+        levels, frequencies = _as_array(self.levels), _as_array(self.frequencies)
+        if len(levels) != len(frequencies):
             raise ValueError(
-                f"expected one level per frequency, got {len(values)} levels for {len(hertz)} "
-                f"frequencies: {hertz}"
+                f"expected one level per frequency, got {len(levels)} levels for "
+                f"{len(frequencies)} frequencies"
             )
-        measured = [value is not None for value in values]
-        levels = _finite_numbers(compress(values, measured), "levels")
-        frequencies = _finite_numbers(compress(hertz, measured), "frequencies")
+        is_measured = ~np.isnan(levels)
+        levels, frequencies = levels[is_measured], frequencies[is_measured]
         check_range(levels, HIGHEST_LEVEL, "an audiogram")
-        if frequencies[0] <= 0 or any(high <= low for low, high in pairwise(frequencies)):
+        if not len(levels) or not frequencies[0] > 0 or not (np.diff(frequencies) > 0).all():
             raise ValueError(
-                f"expected positive, ascending frequencies, got {join_numbers(frequencies)} Hz"
+                "expected measured levels at positive, ascending frequencies in Hz, got levels at "
+                f"{join_numbers(frequencies)} Hz"
             )
         if frequencies[-1] < FREQUENCIES[0] or frequencies[0] > FREQUENCIES[-1]:
             raise ValueError(
                 f"expected frequencies in Hz with one from {FREQUENCIES[0]:g} to "
                 f"{FREQUENCIES[-1]:g}, got {join_numbers(frequencies)}; multiply kHz by 1000"
             )
-        object.__setattr__(self, "levels", levels)
-        object.__setattr__(self, "frequencies", frequencies)
+        object.__setattr__(self, "levels", tuple(levels.tolist()))
+        object.__setattr__(self, "frequencies", tuple(frequencies.tolist()))
 
     @classmethod
     def standard(cls, name: str) -> Audiogram:
@@ -151,7 +151,7 @@ class Audiogram:
         return f"Audiogram({self.short_text()})"
 
     def short_text(self) -> str:
-        """Return the name of a standard audiogram in quotes, or a dictionary of thresholds by Hz."""
+        """Return the name of a standard audiogram in quotes, or a dictionary of levels by Hz."""
         for name, levels in STANDARD.items():
             if self.frequencies == FREQUENCIES and self.levels == levels:
                 return repr(name)
@@ -232,7 +232,7 @@ class Audiogram:
         return {f"hl_{_shortest(frequency)}": _shortest(level) for frequency, level in points}
 
     @classmethod
-    def from_row(cls, row: Mapping[str, str], *, highest: float = HIGHEST_LEVEL) -> Audiogram:
+    def from_row(cls, row: Mapping[str, str], highest: float = HIGHEST_LEVEL) -> Audiogram:
         """Return the audiogram of a row of a table.
 
         A column of thresholds is called ``hl_250``, ``250``, ``250 Hz`` or ``1k``, in any order
@@ -275,14 +275,8 @@ class Audiogram:
         Raises:
             MissingExtraError: pyclarity is not installed.
         """
-        try:
-            from clarity.utils.audiogram import Audiogram as ClarityAudiogram
-        except ImportError as error:
-            raise MissingExtraError(
-                f"pyclarity is needed and cannot be imported ({error}); "
-                "pip install 'pyclarity==0.9.*'"
-            ) from error
-        return ClarityAudiogram(np.array(self.levels), np.array(self.frequencies))
+        module = require("clarity.utils.audiogram", "dev")
+        return module.Audiogram(np.array(self.levels), np.array(self.frequencies))
 
     @classmethod
     def from_clarity(cls, source: Any, ear: EarName | None = None) -> Audiogram:
@@ -296,14 +290,14 @@ class Audiogram:
         Raises:
             ValueError: The source is none of these, or ``ear`` does not fit.
         """
-        if ear in ("left", "right") and isinstance(source, Mapping):
-            levels, frequencies = (
-                source.get(f"audiogram_levels_{ear[0]}"),
-                source.get("audiogram_cfs"),
-            )
+        if isinstance(source, Mapping):
+            side = {"left": "l", "right": "r"}.get(str(ear))
+            levels = source.get(f"audiogram_levels_{side}")
+            frequencies = source.get("audiogram_cfs")
         else:
             audiogram = source if ear is None else getattr(source, f"audiogram_{ear}", None)
-            levels, frequencies = (getattr(audiogram, n, None) for n in ("levels", "frequencies"))
+            levels = getattr(audiogram, "levels", None)
+            frequencies = getattr(audiogram, "frequencies", None)
         if levels is None or frequencies is None:
             raise ValueError(
                 "expected pyclarity's Audiogram, or ear='left' or ear='right' with its Listener or "
@@ -331,12 +325,7 @@ def severity_index(levels: Tensor, frequencies: Sequence[float] = FREQUENCIES) -
     return torch.stack([mean > limit for limit in SEVERITY_LIMITS]).sum(0)
 
 
-def is_clarity_audiogram(value: Any) -> bool:
-    """Whether a value is pyclarity's ``Audiogram``, without importing pyclarity."""
-    return hasattr(value, "levels") and hasattr(value, "frequencies")
-
-
-def check_range(levels: Sequence[float], highest: float, user: str) -> None:
+def check_range(levels: Iterable[float], highest: float, user: str) -> None:
     """Validate levels in dB HL.
 
     Raises:
@@ -344,7 +333,8 @@ def check_range(levels: Sequence[float], highest: float, user: str) -> None:
     """
     if not all(LOWEST_LEVEL <= level <= highest for level in levels):
         raise ValueError(
-            f"{user} takes levels from {LOWEST_LEVEL:g} to {highest:g} dB HL, got {join_numbers(levels)}"
+            f"expected levels from {LOWEST_LEVEL:g} to {highest:g} dB HL for {user}, "
+            f"got {join_numbers(levels)}"
         )
 
 
@@ -378,22 +368,14 @@ def _parse_level(text: str, column: str, highest: float) -> float:
     return level
 
 
-def _as_list(values: Any) -> list[Any]:
-    """Return values as a list. The characters of a text and the keys of a dictionary are no values."""
-    if isinstance(values, str | Mapping) or not isinstance(values, Iterable):
-        raise ValueError(f"expected a sequence of numbers for an audiogram, got {values!r}")
-    return list(values)
-
-
-def _finite_numbers(values: Iterable[Any], name: str) -> tuple[float, ...]:
-    """Return values as numbers; raise ValueError if there are none or one is not a finite number."""
-    values = list(values)
+def _as_array(values: Any) -> NDArray[np.float64]:
+    """Return a sequence of numbers as an array with NaN in place of ``None``."""
     try:
-        numbers = tuple(float(value) for value in values)
+        numbers = np.array(values, dtype=np.float64)
     except (TypeError, ValueError):
-        numbers = ()
-    if not numbers or not all(math.isfinite(number) for number in numbers):
-        raise ValueError(f"expected finite numbers as {name} of an audiogram, got {values!r}")
+        numbers = np.array(math.nan)
+    if numbers.ndim != 1 or np.isinf(numbers).any():
+        raise ValueError(f"expected finite numbers for an audiogram, got {values!r}")
     return numbers
 
 

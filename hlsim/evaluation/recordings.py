@@ -26,7 +26,7 @@ from torch import Tensor
 from hlsim.audio import find_audio, read_audio
 from hlsim.audiogram import Audiogram
 from hlsim.audiogram.listener import EAR_NAMES, EARS
-from hlsim.audiogram.table import parse_row, read_rows
+from hlsim.audiogram.table import numbered_audiograms
 from hlsim.calibration import check_full_scale, dbfs
 from hlsim.evaluation.comparison import compare
 from hlsim.evaluation.measures import LEVELS, find_measures
@@ -508,14 +508,14 @@ def _read_ears(
 ) -> dict[Any, Audiogram]:
     """Read the audiograms of a CSV file by what ``name_of`` makes of a row."""
     ears: dict[Any, Audiogram] = {}
-    for line, row in read_rows(path):
+    for line, row, audiogram in numbered_audiograms(path):
         try:
             name = name_of(row)
         except ValueError as error:
             raise ValueError(f"{path}, line {line}: {error}") from error
         if name in ears:
             raise ValueError(f"{path}, line {line}: a second row of {name}")
-        ears[name] = parse_row(path, line, row)
+        ears[name] = audiogram
     return ears
 
 

@@ -19,8 +19,8 @@ from hlsim.audiogram import (
 from hlsim.audiogram.devices import on_host
 from hlsim.audiogram.thresholds import (
     AudiogramLike,
+    ears_on_other_grids,
     has_listeners,
-    other_grids,
     resolve_thresholds,
     store_thresholds,
 )
@@ -125,7 +125,7 @@ class MSBG(nn.Module):
             levels if trained else None,
         )  # a buffer that moves would be another tensor
         self._two_ears = has_listeners(audiogram)
-        self._other_grids = other_grids(audiogram)
+        self._other_grids = ears_on_other_grids(audiogram)
 
     @property
     def thresholds(self) -> Tensor | None:
@@ -146,7 +146,7 @@ class MSBG(nn.Module):
             self._trained[0] if audiogram is None else audiogram
         )  # what is trained may leave the range
         thresholds = resolve_thresholds(self._levels, given, waveform, two_ears=self._two_ears)
-        grids = self._other_grids if audiogram is None else other_grids(audiogram)
+        grids = self._other_grids if audiogram is None else ears_on_other_grids(audiogram)
         with torch.autocast(waveform.device.type, enabled=False):
             return self._simulate(waveform, thresholds, grids)
 
@@ -165,7 +165,7 @@ class MSBG(nn.Module):
         """Perceived signals. Shape: (..., time), (..., 8) -> (..., time).
 
         Args:
-            grids: Ears at other than the eight frequencies, as ``other_grids`` returns them.
+            grids: Ears at other than the eight frequencies, as ``ears_on_other_grids`` returns them.
         """
         dtype = waveform.dtype if waveform.dtype == torch.float64 else torch.float32
         batch = broadcast_shape(waveform.shape[:-1], thresholds.shape[:-1])

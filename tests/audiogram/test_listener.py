@@ -3,6 +3,7 @@
 import io
 import json
 import math
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,100 +29,94 @@ ENTRY = {
 
 @pytest.fixture
 def scene(speech: list[tuple[Tensor, int]]) -> Tensor:
-    """Two channels of other speech each. Shape: (2, 12000)."""
-    return torch.cat([set_level(one[:, 8000:20000], 65.0) for one, _ in speech[:2]])
+    """Two channels of different speech. Shape: (2, 12000)."""
+    return torch.cat([set_level(wave[:, 8000:20000], 65.0) for wave, _ in speech[:2]])
+
+
+def build_module(name: str) -> Any:
+    """Build a simulator or an aid by its name."""
+    if name in ("msbg", "nalr"):
+        return {"msbg": MSBG, "nalr": NALR}[name](sample_rate=16000)
+    if name == "wdrc":
+        return WDRC()
+    return (load_pretrained if name == "neuro-msbg" else load_compensator)(name)
 
 
 @pytest.mark.parametrize(
     "name", ["msbg", "neuro-msbg", "nalr", "wdrc", "hearing-aid", "compensator-general"]
 )
 def test_both_ears_in_one_call_are_each_ear_alone(name: str, scene: Tensor) -> None:
-    made: dict[str, Any] = {
-        "msbg": lambda: MSBG(sample_rate=16000),
-        "nalr": lambda: NALR(sample_rate=16000),
-        "wdrc": WDRC,
-    }
-    make = made.get(
-        name, lambda: (load_pretrained if name == "neuro-msbg" else load_compensator)(name)
-    )
-    module = make()
+    module = build_module(name)
+    close = partial(torch.testing.assert_close, rtol=1e-4, atol=1e-6)
     with torch.no_grad():
         both = module(scene, BOTH)
         for channel, ear in enumerate((LEFT, RIGHT)):
-            torch.testing.assert_close(
-                both[channel], module(scene[channel], ear), rtol=1e-4, atol=1e-6
-            )
-        swapped = module(scene.flip(0), Listener(RIGHT, LEFT))
-        torch.testing.assert_close(swapped.flip(0), both, rtol=1e-4, atol=1e-6)
+            close(both[channel], module(scene[channel], ear))
+        close(module(scene.flip(0), Listener(RIGHT, LEFT)).flip(0), both)
         items = module(torch.stack((scene, scene.flip(0))), [BOTH, Listener(RIGHT, LEFT)])
-        torch.testing.assert_close(items[0], both, rtol=1e-4, atol=1e-6)
-        torch.testing.assert_close(items[1].flip(0), both, rtol=1e-4, atol=1e-6)
+        close(items[0], both)
+        close(items[1].flip(0), both)
         with pytest.raises(ValueError):
             module(scene[0], BOTH)
 
 
 @pytest.mark.parametrize("kind", [HearingLossLoss, HASPILoss])
 def test_the_loss_is_the_mean_over_both_ears_and_reaches_both(kind: Any, scene: Tensor) -> None:
-    loss, given = kind(), (0.5 * scene).requires_grad_()
-    value = loss(given[None], scene[None], BOTH)
-    alone = [
-        loss(given[i : i + 1], scene[i : i + 1], ear).detach()
-        for i, ear in enumerate((LEFT, RIGHT))
-    ]
-    assert float(value.detach()) == pytest.approx(float(sum(alone)) / 2.0, rel=1e-4)
+    loss, output = kind(), (0.5 * scene).requires_grad_()
+    value = loss(output[None], scene[None], BOTH)
+    left = loss(output[:1], scene[:1], LEFT).detach()
+    right = loss(output[1:], scene[1:], RIGHT).detach()
+    assert float(value.detach()) == pytest.approx(float(left + right) / 2.0, rel=1e-4)
     value.backward()
-    assert given.grad is not None and bool(given.grad.isfinite().all())
-    assert bool((given.grad.abs().amax(-1) > 0.0).all())
-    assert float(kind(BOTH)(given[None], scene[None]).detach()) == pytest.approx(
-        float(value.detach()), rel=1e-5
-    )
+    assert output.grad is not None and bool(output.grad.isfinite().all())
+    assert bool((output.grad.abs().amax(-1) > 0.0).all())
+    stored = kind(BOTH)(output[None], scene[None]).detach()
+    assert float(stored) == pytest.approx(float(value.detach()), rel=1e-5)
     for mono in (loss, kind(BOTH)):
         with pytest.raises(ValueError):
-            mono(given[0], scene[0], BOTH if mono is loss else None)
+            mono(output[0], scene[0], BOTH if mono is loss else None)
 
 
 def test_the_better_ear_counts_more_and_both_have_a_gradient(scene: Tensor) -> None:
-    scenes, given = torch.stack((scene, scene.flip(0))), 0.5 * torch.stack((scene, scene.flip(0)))
-    given.requires_grad_()
+    scenes = torch.stack((scene, scene.flip(0)))
+    outputs = (0.5 * scenes).requires_grad_()
     listeners = [BOTH, Listener(RIGHT, LEFT)]
-    each = HearingLossLoss(reduction="none")(given, scenes, listeners)
-    value = HearingLossLoss(reduction="none", ears="better")(given, scenes, listeners)
-    shares = torch.softmax(-each.detach() / 0.1, -1)
-    torch.testing.assert_close(value, (shares * each).sum(-1))
-    assert bool((each.amin(-1) < value).all()) and bool((value < each.mean(-1)).all())
+    losses = HearingLossLoss(reduction="none")(outputs, scenes, listeners)
+    value = HearingLossLoss(reduction="none", ears="better")(outputs, scenes, listeners)
+    shares = torch.softmax(-losses.detach() / 0.1, -1)
+    torch.testing.assert_close(value, (shares * losses).sum(-1))
+    assert bool((losses.amin(-1) < value).all()) and bool((value < losses.mean(-1)).all())
     torch.testing.assert_close(value[0], value[1], rtol=1e-4, atol=0)
-    gradient, alone = (
-        torch.autograd.grad(one.sum(), given, retain_graph=True)[0] for one in (value, each)
-    )
+    (gradient,) = torch.autograd.grad(value.sum(), outputs, retain_graph=True)
+    (gradient_of_mean,) = torch.autograd.grad(losses.sum(), outputs)
     assert bool((gradient.abs().amax(-1) > 0.0).all())
-    torch.testing.assert_close(gradient, shares.unsqueeze(-1) * alone)
+    torch.testing.assert_close(gradient, shares.unsqueeze(-1) * gradient_of_mean)
     with pytest.raises(ValueError):
-        HearingLossLoss(LEFT, ears="better")(given[:, :1], scenes[:, :1])
+        HearingLossLoss(LEFT, ears="better")(outputs[:, :1], scenes[:, :1])
     with pytest.raises(ValueError):
         HearingLossLoss(ears="best")  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("kind", [HearingLossLoss, HASPILoss])
 def test_the_loss_leaves_a_missing_ear_out(kind: Any, scene: Tensor) -> None:
-    one, scenes = Listener(None, RIGHT), torch.stack((scene, scene))
-    given = (0.5 * scenes).requires_grad_()
-    given.data[1, 0] = math.nan  # whatever is there
-    loss, alone = kind(), float(kind()(0.5 * scene[1:], scene[1:], RIGHT))
-    value = loss(given[1], scene, one)
-    assert float(value.detach()) == pytest.approx(alone, rel=1e-4)
+    right_only, scenes = Listener(None, RIGHT), torch.stack((scene, scene))
+    outputs = (0.5 * scenes).requires_grad_()
+    outputs.data[1, 0] = math.nan  # the channel of the missing ear does not count
+    loss, expected = kind(), float(kind()(0.5 * scene[1:], scene[1:], RIGHT))
+    value = loss(outputs[1], scene, right_only)
+    assert float(value.detach()) == pytest.approx(expected, rel=1e-4)
     value.backward()
-    assert given.grad is not None and bool(given.grad.isfinite().all())
-    assert [bool(row.any()) for row in given.grad[1]] == [False, True]
-    each = kind(reduction="none")(given, scenes, [BOTH, one]).detach()
-    assert each.isnan().tolist() == [[False, False], [True, False]]
-    assert float(loss(given, scenes, [BOTH, one]).detach()) == pytest.approx(
-        float(each.nanmean()), rel=1e-5
-    )
-    better = kind(one, ears="better")(given[1], scene)
-    assert float(better.detach()) == pytest.approx(alone, rel=1e-4)
+    assert outputs.grad is not None and bool(outputs.grad.isfinite().all())
+    assert [bool(row.any()) for row in outputs.grad[1]] == [False, True]
+    losses = kind(reduction="none")(outputs, scenes, [BOTH, right_only]).detach()
+    assert losses.isnan().tolist() == [[False, False], [True, False]]
+    mean = loss(outputs, scenes, [BOTH, right_only]).detach()
+    assert float(mean) == pytest.approx(float(losses.nanmean()), rel=1e-5)
+    better = kind(right_only, ears="better")(outputs[1], scene)
+    assert float(better.detach()) == pytest.approx(expected, rel=1e-4)
 
 
-def test_two_channels_of_one_listener_stored(scene: Tensor) -> None:
+def test_a_stored_listener_needs_two_channels(scene: Tensor) -> None:
     for make in (lambda ear: MSBG(ear, sample_rate=16000), NALR):
         torch.testing.assert_close(make(BOTH)(scene), make(None)(scene, BOTH))
         with pytest.raises(ValueError):
@@ -129,25 +124,25 @@ def test_two_channels_of_one_listener_stored(scene: Tensor) -> None:
 
 
 @pytest.mark.parametrize("score", [haspi, hasqi])
-def test_scores_are_one_an_ear(score: Any, scene: Tensor) -> None:
-    given = scene + 0.02 * torch.randn(scene.shape, generator=torch.Generator().manual_seed(0))
-    scores = score(given, scene, BOTH)
-    alone = [float(score(given[i], scene[i], ear)) for i, ear in enumerate((LEFT, RIGHT))]
-    assert scores.tolist() == pytest.approx(alone, abs=1e-5)
+def test_scores_have_one_value_per_ear(score: Any, scene: Tensor) -> None:
+    output = scene + 0.02 * torch.randn(scene.shape, generator=torch.Generator().manual_seed(0))
+    scores = score(output, scene, BOTH)
+    expected = [float(score(output[i], scene[i], ear)) for i, ear in enumerate((LEFT, RIGHT))]
+    assert scores.tolist() == pytest.approx(expected, abs=1e-5)
 
 
 def test_the_better_ears_metric_leaves_a_missing_ear_out(scene: Tensor) -> None:
     pytest.importorskip("torchmetrics")
     from hlsim.metrics import HASPI
 
-    given, metric = 0.3 * torch.stack((scene, scene)), HASPI()
-    metric.update(given, torch.stack((scene, scene)), [BOTH, Listener(None, RIGHT)])
-    scores = [haspi(given[0].double(), scene.double(), BOTH).amax()]
-    scores += [haspi(given[1, 1].double(), scene[1].double(), RIGHT)]
+    outputs, metric = 0.3 * torch.stack((scene, scene)), HASPI()
+    metric.update(outputs, torch.stack((scene, scene)), [BOTH, Listener(None, RIGHT)])
+    scores = [haspi(outputs[0].double(), scene.double(), BOTH).amax()]
+    scores += [haspi(outputs[1, 1].double(), scene[1].double(), RIGHT)]
     assert float(metric.compute()) == pytest.approx(float(sum(scores)) / 2.0, abs=1e-5)
     assert metric.count_ears.tolist() == [1, 2] and int(metric.failed) == 0
     with pytest.raises(ValueError):
-        metric.update(given[:1], scene[None], [BOTH, BOTH])
+        metric.update(outputs[:1], scene[None], [BOTH, BOTH])
 
 
 def _saved(listener: Listener) -> bytes:
@@ -158,7 +153,7 @@ def _saved(listener: Listener) -> bytes:
 
 def test_written_and_read(tmp_path: Path) -> None:
     for listener in (BOTH, Listener(LEFT, None)):
-        assert Listener.from_dict(json.loads(json.dumps(listener.to_dict()))) == listener
+        assert Listener(**json.loads(json.dumps(listener.to_dict()))) == listener
     with torch.serialization.safe_globals([Audiogram, Listener]):
         assert torch.load(io.BytesIO(_saved(BOTH)), weights_only=True) == BOTH
     assert Listener.from_clarity(ENTRY) == BOTH
@@ -211,12 +206,9 @@ def test_only_the_listeners_that_are_asked_for_are_validated(tmp_path: Path) -> 
 def test_bad_listeners(tmp_path: Path, scene: Tensor) -> None:
     for ears in ((None, None), (LEFT, "N9"), (LEFT, 3)):
         with pytest.raises(ValueError):
-            Listener(*ears)  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="left ear is missing"):
+            Listener(*ears)
+    with pytest.raises(ValueError, match="no left ear"):
         MSBG()(scene, Listener(None, RIGHT))
-    for bad in ({}, {"left": None}, [], {"left": None, "right": None}):
-        with pytest.raises(ValueError):
-            Listener.from_dict(bad)  # type: ignore[arg-type]
     one_ear = {key: value for key, value in ENTRY.items() if key != "audiogram_levels_r"}
     with pytest.raises(ValueError):
         Listener.from_clarity(one_ear)

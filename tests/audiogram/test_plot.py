@@ -45,8 +45,9 @@ def test_the_right_ear_has_red_circles_and_the_left_ear_blue_crosses() -> None:
     assert (right.get_marker(), right.get_color()) == ("o", "tab:red")
     assert left.get_label() == "left, PTA 31 dB HL"
     assert right.get_label() == "right, PTA 62 dB HL"
-    (alone,) = listener.right.plot(ear="right").get_lines()
-    assert alone.get_marker() == "o" and tuple(alone.get_ydata()) == listener.right.levels
+    ear = Audiogram.standard("N4")
+    (line,) = ear.plot(ear="right").get_lines()
+    assert line.get_marker() == "o" and tuple(line.get_ydata()) == ear.levels
 
 
 def test_without_matplotlib_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

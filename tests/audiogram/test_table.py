@@ -69,8 +69,8 @@ def test_an_unmeasured_threshold_is_interpolated_as_a_missing_column_is(
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("", ["no rows"]),
-        ("hl_250,hl_500\n", ["no rows"]),
+        ("", ["no audiograms"]),
+        ("hl_250,hl_500\n", ["no audiograms"]),
         ("hl_250,hl_500\n10,20\n10,x\n", ["line 3", "hl_500", "'x'"]),
         ("hl_250,hl_500\n\n\n10,NR\n", ["line 4", "hl_500", "'NR'", "no response"]),
         ("hl_250,8 kHz\n10,110+\n", ["line 2", "8 kHz", "110+", "highest level"]),

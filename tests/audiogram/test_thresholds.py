@@ -19,8 +19,8 @@ def test_thresholds_for_a_simulator() -> None:
     assert as_thresholds(n1).tolist() == list(n1.levels)
     assert as_thresholds([n1, s1]).tolist() == [list(n1.levels), list(s1.levels)]
     assert as_thresholds((Audiogram((7.0,), (1000.0,)),)).tolist() == [[7.0] * 8]
-    given = torch.zeros(2, 3, 8, dtype=torch.float64)
-    assert as_thresholds(given) is given
+    levels = torch.zeros(2, 3, 8, dtype=torch.float64)
+    assert as_thresholds(levels) is levels
     assert as_thresholds(torch.full((8,), 100)).dtype == torch.float32
 
 
@@ -54,34 +54,31 @@ def test_values_that_are_not_ears_for_a_simulator_are_rejected(audiogram: Any) -
 
 def test_mono_items_have_one_ear_each() -> None:
     """Waveforms of shape (batch, 1, time) take thresholds of shape (batch, 8) everywhere."""
-    waveform, ears = (
-        0.02 * torch.randn(2, 1, 16000),
-        torch.stack((torch.full((8,), 20.0), torch.full((8,), 60.0))),
-    )
+    waveform = 0.02 * torch.randn(2, 1, 16000)
+    ears = torch.tensor([20.0, 60.0]).unsqueeze(-1).expand(2, 8)
     for module in (
         MSBG(sample_rate=16000),
         NALR(),
         load_compensator("hearing-aid"),
         load_pretrained("neuro-msbg"),
     ):
-        together = module(waveform, ears)
-        assert together.shape == waveform.shape
-        torch.testing.assert_close(
-            together[:, 0], module(waveform[:, 0], ears), atol=1e-6, rtol=1e-4
-        )
+        output = module(waveform, ears)
+        assert output.shape == waveform.shape
+        expected = module(waveform[:, 0], ears)
+        torch.testing.assert_close(output[:, 0], expected, atol=1e-6, rtol=1e-4)
     assert MSBG(sample_rate=16000)(waveform, ears[:, None].expand(2, 3, 8)).shape == (2, 3, 16000)
     assert torch.equal(
         haspi(waveform, waveform, ears), haspi(waveform[:, 0], waveform[:, 0], ears)[:, None]
     )
-    with pytest.raises(ValueError, match="allowed: one, or"):
+    with pytest.raises(ValueError):
         haspi(waveform, waveform, ears.expand(2, 2, 8))
 
 
 @pytest.mark.parametrize("make", [MSBG, NALR])
-def test_a_stored_ear_is_its_own(make: Any) -> None:
-    given = torch.full((8,), 40.0)
-    module = make(given)
-    given.fill_(105.0)
+def test_a_stored_ear_is_a_copy(make: Any) -> None:
+    levels = torch.full((8,), 40.0)
+    module = make(levels)
+    levels.fill_(105.0)
     assert torch.equal(module.thresholds, torch.full((8,), 40.0))
 
 
@@ -105,9 +102,9 @@ def test_interpolation_is_linear_in_hz_and_flat_beyond() -> None:
         [np.interp(hz, FREQUENCIES, ear) for ear in levels.reshape(6, 8).double().numpy()]
     )
     for ears in (levels, levels.double()):
-        found = interpolate(ears, hz)
-        assert found.shape == (2, 3, 9) and found.dtype == ears.dtype
-        np.testing.assert_allclose(found.reshape(6, 9).numpy(), expected, rtol=1e-5)
+        interpolated = interpolate(ears, hz)
+        assert interpolated.shape == (2, 3, 9) and interpolated.dtype == ears.dtype
+        np.testing.assert_allclose(interpolated.reshape(6, 9).numpy(), expected, rtol=1e-5)
     np.testing.assert_allclose(
         levels.reshape(6, 8).double().numpy() @ interpolation_weights(hz), expected, rtol=1e-12
     )
@@ -119,5 +116,5 @@ def test_ears_as_lists_of_tensors_and_as_a_loader_collates_them() -> None:
     assert len(collated) == 8
     assert torch.equal(as_thresholds(collated), torch.tensor(ears, dtype=torch.float64))
     assert torch.equal(as_thresholds([torch.tensor(ear) for ear in ears]), torch.tensor(ears))
-    with pytest.raises(ValueError, match=r"torch\.stack\(audiogram\) if they are ears"):
+    with pytest.raises(ValueError, match=r"stack ears with torch\.stack\(audiogram\)"):
         as_thresholds(torch.utils.data.default_collate([ears[0]] * 8))

@@ -14,6 +14,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from hlsim.audiogram import FREQUENCIES, SEVERITIES, Audiogram, severity_index
 from hlsim.audiogram.thresholds import as_thresholds
+from hlsim.audiogram.value import EarName
 
 # Bisgaard, Vlaming and Dahlquist 2010, Tables 1 and 2, all ten frequencies
 BISGAARD_HZ = (250, 375, 500, 750, 1000, 1500, 2000, 3000, 4000, 6000)
@@ -77,7 +78,7 @@ def test_the_ends_of_the_range_are_allowed(edge: float) -> None:
         ((), ()),
         ((0.0,) * 7 + (120.5,), FREQUENCIES),
         ((-10.5,) + (0.0,) * 7, FREQUENCIES),
-        ((float("nan"),) + (0.0,) * 7, FREQUENCIES),
+        ((float("inf"),) + (0.0,) * 7, FREQUENCIES),
         ((0.0, 0.0), (250.0, float("nan"))),
         ((0.0, 0.0), (500.0, 250.0)),
         ((0.0, 0.0), (500.0, 500.0)),
@@ -106,8 +107,10 @@ def test_other_grids_are_interpolated_linearly_over_log_frequency_and_flat_beyon
 
 
 def test_an_unmeasured_level_is_left_out() -> None:
-    ear = Audiogram((10.0, None, 30.0), (500.0, 2000.0, 4000.0))  # type: ignore[arg-type]
-    assert ear == Audiogram((10.0, 30.0), (500.0, 4000.0))
+    expected = Audiogram((10.0, 30.0), (500.0, 4000.0))
+    for level in (None, float("nan")):
+        levels: Any = (10.0, level, 30.0)
+        assert Audiogram(levels, (500.0, 2000.0, 4000.0)) == expected
     assert Audiogram.from_dict({"levels": [None, 20], "frequencies": [250, 500]}).levels == (20,)
 
 
@@ -163,10 +166,10 @@ def test_severity_is_the_same_to_the_last_bit_of_the_mean() -> None:
         ear[7] = next((level for level in last if 0.0 <= level <= 100.0), ear[7])
     index = severity_index(torch.tensor(ears, dtype=torch.float64)).tolist()
     assert [SEVERITIES[i] for i in index] == [Audiogram(tuple(ear)).severity for ear in ears]
-    for ear, found in zip(ears, index, strict=True):
+    for ear, severity in zip(ears, index, strict=True):
         high = [round(level * 1e4) / 1e4 for level in ear[3:]]
         mean = (high[0] + high[1] + high[2] + high[3] + high[4]) / 5
-        assert found == sum(mean > limit for limit in (15.0, 35.0, 56.0))
+        assert severity == sum(mean > limit for limit in (15.0, 35.0, 56.0))
 
 
 def test_severity_on_a_limit_is_pyclaritys_in_single_precision_too() -> None:
@@ -313,17 +316,18 @@ def test_an_ear_of_pyclaritys_listeners() -> None:
         "audiogram_levels_r": [40, 40, 30, 40, 55, 60, 65, 60],
     }
     listener = clarity.Listener.from_dict(entry)
-    for given in (entry, listener):
-        for side in ("left", "right"):
-            ear = Audiogram.from_clarity(given, side)
+    sides: tuple[EarName, EarName] = ("left", "right")
+    for source in (entry, listener):
+        for side in sides:
+            ear = Audiogram.from_clarity(source, side)
             assert list(ear.levels) == entry[f"audiogram_levels_{side[0]}"]
         with pytest.raises(ValueError):
-            Audiogram.from_clarity(given)
+            Audiogram.from_clarity(source)
         with pytest.raises(ValueError):
-            Audiogram.from_clarity(given, "l")
-        for several in (given, [given, given]):
+            Audiogram.from_clarity(source, "l")  # type: ignore[arg-type]
+        for several in (source, [source, source]):
             with pytest.raises(ValueError):
-                as_thresholds(several)
+                as_thresholds(several)  # type: ignore[arg-type]
     with pytest.raises(ValueError):
         Audiogram.from_clarity(listener.audiogram_left, "left")
     with pytest.raises(ValueError):

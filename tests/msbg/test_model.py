@@ -134,7 +134,7 @@ def test_ears_at_other_frequencies_may_share_a_batch(speech: list[tuple[Tensor, 
     expected = fast_model()(waves, ears)
     for wave, ear, perceived in zip(waves, ears, expected, strict=True):
         torch.testing.assert_close(perceived, fast_model(ear)(wave), rtol=1e-4, atol=1e-6)
-    pairs = [Listener(six, "N3"), Listener(mild, six)]  # type: ignore[arg-type]
+    pairs = [Listener(six, "N3"), Listener(mild, six)]
     binaural = waves.reshape(2, 2, -1)
     for perceived in (fast_model()(binaural, pairs), fast_model(pairs)(binaural)):
         torch.testing.assert_close(perceived.flatten(0, 1), expected, rtol=1e-4, atol=1e-6)
