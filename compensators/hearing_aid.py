@@ -54,7 +54,7 @@ class HearingAid(Wearable):
         linked: bool = False,
     ) -> None:
         super().__init__(sample_rate, full_scale_spl, linked)
-        self.config = config = HearingAidConfig.given(config)
+        self.config = config = HearingAidConfig.from_optional(config)
         self.bands, self.limit_spl = config.bands, config.limit_spl
         width, inner, corrections = (
             config.width,

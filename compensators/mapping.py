@@ -54,7 +54,7 @@ class MappingCompensator(EarNetwork):
         full_scale_spl: float = PASCAL_SPL,
     ) -> None:
         super().__init__(sample_rate, full_scale_spl)
-        self.config = config = MappingConfig.given(config)
+        self.config = config = MappingConfig.from_optional(config)
         self.stft = config.stft
         size, depth, stride = config.channels, config.dense_depth, config.stride
         self.audiogram_encoder = AudiogramEncoder(self.stft.frequencies)

@@ -29,6 +29,16 @@ MODULES = [
     "hlsim.msbg.resampling",
     "hlsim.msbg.response",
     "hlsim.msbg.smearing",
+    "hlsim.neuro.bands",
+    "hlsim.neuro.blocks",
+    "hlsim.neuro.config",
+    "hlsim.neuro.decoders",
+    "hlsim.neuro.encoder",
+    "hlsim.neuro.mamba",
+    "hlsim.neuro.model",
+    "hlsim.neuro.network",
+    "hlsim.neuro.prior",
+    "hlsim.neuro.scan",
     "hlsim.plugins",
 ]
 

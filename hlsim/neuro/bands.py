@@ -1,4 +1,4 @@
-"""A small network that corrects MSBG's known gains in its bands: a fraction of a network's cost on a spectrogram."""
+"""A small network that corrects MSBG's known gains at a fraction of the full network's cost."""
 
 import math
 
@@ -10,24 +10,40 @@ from hlsim.audiogram import SEVERITIES
 from hlsim.neuro.config import NeuroConfig
 from hlsim.neuro.prior import CHANNELS, Prior
 
-_STEEPEST = 6.0
+MAX_SLOPE = 6.0
+"""Limit of the difference between the log envelopes of neighbouring channels."""
 
 
 class BandCorrection(nn.Module):
-    """What is heard of a spectrum: smeared, and each channel weighed by a corrected gain.
+    """Network that simulates MSBG on a spectrum by correcting the gains of its prior.
 
-    A network reads how the channels' levels fluctuate about their envelopes, and how these differ from channel to
-    channel, which does not change with the level. It gives each channel's envelope a correction, its gain a factor, and
-    a phase. Each severity has filters of its own, hence its own first and last layer; the last is 0 before training.
+    The spectrum is smeared and multiplied by the corrected gains of MSBG's channels. The network
+    reads the fluctuation of each channel's level about its envelope, and the difference of the
+    envelopes of neighbouring channels, neither of which depends on the level. It predicts a
+    correction of each channel's envelope, a factor on its gain and, optionally, a phase.
+
+    Severities have different filters, so each has its own first and last layer. The last layer is 0
+    before training, and the output is that of the prior.
 
     Args:
-        config: ``channels`` is the width, ``blocks`` how many, ``kernel[0]`` their length in steps of ``stride[0]``
-            frames.
+        config: ``channels`` is the width of the network, ``blocks`` the number of its blocks,
+            ``stride[0]`` the number of frames per step, and ``kernel[0]`` the length of the
+            convolutions in steps.
+
+    >>> import torch
+    >>> from hlsim.audiogram import severity_index
+    >>> config = NeuroConfig(structure="bands", channels=8)
+    >>> network = BandCorrection(config)
+    >>> spectrum = torch.randn(2, 50, 65, dtype=torch.complex64)
+    >>> ears = torch.full((2, 8), 40.0)
+    >>> network(spectrum, ears, severity_index(ears), Prior(config.stft)).shape
+    torch.Size([2, 50, 65])
     """
 
     def __init__(self, config: NeuroConfig) -> None:
         super().__init__()
-        width, severities = config.channels, len(SEVERITIES)
+        width = config.channels
+        severities = len(SEVERITIES)
         self.step = config.stride[0]
         inputs = (self.step + 1) * CHANNELS
         self.enter = nn.Parameter(
@@ -39,39 +55,73 @@ class BandCorrection(nn.Module):
         self.leave = nn.Parameter(torch.zeros(severities, outputs, width))
 
     def forward(self, spectrum: Tensor, ears: Tensor, severity: Tensor, prior: Prior) -> Tensor:
-        """Shape: complex (items, frames, frequencies), (items, 8) dB HL, (items,) -> as the first."""
-        widened, smeared = prior.spread(spectrum, severity)
-        given = prior.levels(smeared, severity)
-        level = prior.smooth(given, severity, self.step).log()
-        # each of a step's frames, and the last one again where the step is cut short
-        frames = given.log()
-        if short := -frames.shape[-1] % self.step:
-            frames = functional.pad(frames, (0, short), mode="replicate")
-        about = frames.unflatten(-1, (-1, self.step)).unbind(-1)
-        slope = functional.pad(level.diff(dim=1), (0, 0, 0, 1)).clamp(-_STEEPEST, _STEEPEST)
-        features = self.enter[severity] @ torch.cat([*(frame - level for frame in about), slope], 1)
+        """Simulate MSBG on the spectra of filtered signals.
+
+        Shape: complex (items, frames, frequencies), (items, 8), (items,) -> complex (items, frames,
+            frequencies).
+
+        Args:
+            spectrum: spectra of the output of ``prior.filter``.
+            ears: audiograms in dB HL.
+            severity: index of each ear's severity.
+            prior: known gains of MSBG.
+        """
+        smeared, smeared_power = prior.smear(spectrum, severity)
+        levels = prior.channel_levels(smeared_power, severity)
+        log_envelope = prior.smooth(levels, severity, self.step).log()
+        features = self._features(levels.log(), log_envelope)
+        features = self.enter[severity] @ features
         features = features + self.bias[severity]
         for block in self.blocks:
             features = block(features)
-        envelope, factor, *phase = (self.leave[severity] @ features).split(CHANNELS, 1)
-        gain = (prior.log_gain(level + envelope, ears, severity) + factor).exp()
-        turned = (
-            (gain * phase[0].cos(), gain * phase[0].sin())
-            if phase
-            else (gain, torch.zeros_like(gain))
+
+        envelope_correction, gain_correction, *phases = (self.leave[severity] @ features).split(
+            CHANNELS, 1
         )
-        factors = _between(prior.weigh(torch.cat(turned, 1), severity), self.step)
-        return widened * torch.view_as_complex(factors[:, : widened.shape[1]])
+        log_gain = prior.log_gain(log_envelope + envelope_correction, ears, severity)
+        gain = (log_gain + gain_correction).exp()
+        if phases:
+            (phase,) = phases
+            real = gain * phase.cos()
+            imaginary = gain * phase.sin()
+        else:
+            real = gain
+            imaginary = torch.zeros_like(gain)
+        factors = prior.gains_to_factors(torch.cat((real, imaginary), 1), severity)
+        frames = smeared.shape[1]
+        factors = _interpolate_steps(factors, self.step)[:, :frames]
+        return smeared * torch.view_as_complex(factors)
+
+    def _features(self, log_levels: Tensor, log_envelope: Tensor) -> Tensor:
+        """Compute the input of the network.
+
+        The last frame is repeated where the last step is incomplete.
+
+        Shape: (items, channels, frames), (items, channels, steps) -> (items, (step + 1) channels,
+            steps).
+        """
+        missing_frames = -log_levels.shape[-1] % self.step
+        if missing_frames:
+            log_levels = functional.pad(log_levels, (0, missing_frames), mode="replicate")
+        frames = log_levels.unflatten(-1, (-1, self.step)).unbind(-1)
+        slope = functional.pad(log_envelope.diff(dim=1), (0, 0, 0, 1)).clamp(-MAX_SLOPE, MAX_SLOPE)
+        fluctuations = [frame - log_envelope for frame in frames]
+        return torch.cat([*fluctuations, slope], 1)
 
 
 class _Block(nn.Module):
-    """Along time in each map, then across maps, each beside what came. Shape: (items, channels, steps) -> the same."""
+    """Residual convolution along time in each channel, and residual layers across channels.
+
+    Shape: (items, channels, steps) -> (items, channels, steps).
+    """
 
     def __init__(self, config: NeuroConfig) -> None:
         super().__init__()
-        width, inner, length = config.channels, config.channels * config.expansion, config.kernel[0]
+        width = config.channels
+        inner = config.channels * config.expansion
+        length = config.kernel[0]
         self.time = nn.Conv1d(width, width, length, padding=length // 2, groups=width)
-        # not convolutions of length 1, which take twice as long
+        # These are matrix products, because convolutions of length 1 take twice as long.
         self.widen = nn.Parameter(torch.randn(inner, width) / math.sqrt(width))
         self.narrow = nn.Parameter(torch.randn(width, inner) / (2.0 * math.sqrt(inner)))
         self.bias = nn.Parameter(torch.zeros(inner, 1))
@@ -81,12 +131,14 @@ class _Block(nn.Module):
         return features + self.narrow @ functional.silu(self.widen @ features + self.bias)
 
 
-def _between(values: Tensor, step: int) -> Tensor:
-    """Values at every frame, on straight lines from step to step.
+def _interpolate_steps(values: Tensor, step: int) -> Tensor:
+    """Interpolate values at the first frame of each step linearly to all frames.
 
     Shape: (items, steps, ...) -> (items, steps * step, ...).
+
+    Args:
+        step: number of frames per step.
     """
-    later = torch.cat((values[:, 1:], values[:, -1:]), 1)
-    return torch.stack(
-        [values, *(values.lerp(later, k / step) for k in range(1, step))], 2
-    ).flatten(1, 2)
+    following = torch.cat((values[:, 1:], values[:, -1:]), 1)
+    interpolated = [values.lerp(following, frame / step) for frame in range(1, step)]
+    return torch.stack([values, *interpolated], 2).flatten(1, 2)

@@ -1,6 +1,7 @@
-"""Dual-path blocks: first along time, then along frequency, by convolution, Mamba, LSTM or Transformer.
+"""Dual-path blocks along time and along frequency: convolutional, Mamba, LSTM or Transformer.
 
-Feature maps lie (items, time, frequency, channels): the pointwise layers are then plain matrix products.
+Feature maps have the shape (items, time, frequency, channels), for which layers across channels are
+matrix products.
 """
 
 from typing import Any, Self, cast
@@ -14,44 +15,61 @@ from hlsim.neuro.mamba import Mamba
 
 
 class ConvPath(nn.Module):
-    """The paper's CNN block along one axis: local convolution, expansion, activation, back by ConvTranspose1d, residual.
+    """The paper's convolutional block along one axis.
 
-    Shape: (items, time, frequency, channels) -> the same.
+    It is a residual sequence of a convolution per channel, a linear expansion, a ReLU and a
+    transposed convolution of length 1.
+
+    Shape: (items, time, frequency, channels) -> (items, time, frequency, channels).
 
     Args:
+        channels: number of channels.
         axis: 0 for time, 1 for frequency.
-        kernel: length of the local convolution, odd.
-        expansion: channels between the two pointwise layers over ``channels``.
+        kernel: length of the convolution, an odd number.
+        expansion: factor by which the linear expansion increases the number of channels.
+
+    >>> ConvPath(8, axis=0, kernel=7, expansion=2)(torch.randn(1, 20, 5, 8)).shape
+    torch.Size([1, 20, 5, 8])
     """
 
     def __init__(self, channels: int, axis: int, kernel: int, expansion: int) -> None:
         super().__init__()
         size = (kernel, 1) if axis == 0 else (1, kernel)
-        around = (size[0] // 2, size[1] // 2)
-        self.local = nn.Conv2d(channels, channels, size, padding=around, groups=channels)
+        padding = (size[0] // 2, size[1] // 2)
+        self.local = nn.Conv2d(channels, channels, size, padding=padding, groups=channels)
         self.expand = nn.Linear(channels, channels * expansion)
         self.restore = nn.ConvTranspose1d(channels * expansion, channels, 1)
 
     def forward(self, features: Tensor) -> Tensor:
         hidden = self.local(features.permute(0, 3, 1, 2)).permute(0, 2, 3, 1)
         hidden = self.expand(hidden).relu_()
-        return features + _restore(self.restore, hidden)
+        return features + _apply_pointwise(self.restore, hidden)
 
 
 class SequencePath(nn.Module):
-    """A layer for sequences along one axis: normalise, run, back by ConvTranspose1d, residual.
+    """A layer for sequences along one axis.
 
-    Shape: (items, time, frequency, channels) -> the same.
+    It is a residual sequence of layer normalisation, the layer, and a transposed convolution of
+    length 1.
+
+    Shape: (items, time, frequency, channels) -> (items, time, frequency, channels).
 
     Args:
-        axis: 0 for time, 1 for frequency; each row along it is a sequence.
-        core: (sequences, length, channels) -> (sequences, length, width).
+        channels: number of channels.
+        axis: 0 for time, 1 for frequency. Each row along this axis is a sequence.
+        core: layer for sequences, (sequences, length, channels) -> (sequences, length, width).
+        width: number of channels of the layer's output.
+
+    >>> path = SequencePath(8, axis=0, core=BidirectionalLSTM(8, hidden=4), width=8)
+    >>> path(torch.randn(1, 20, 5, 8)).shape
+    torch.Size([1, 20, 5, 8])
     """
 
     def __init__(self, channels: int, axis: int, core: nn.Module, width: int) -> None:
         super().__init__()
         self.axis = axis
-        # over channels, not time: the level of a sound stays visible in how they lie to each other
+        # The normalisation is across channels, not time, so that the ratios between the channels
+        # still depend on the level of a sound.
         self.norm = nn.LayerNorm(channels)
         self.core = core
         self.restore = nn.ConvTranspose1d(width, channels, 1)
@@ -60,11 +78,22 @@ class SequencePath(nn.Module):
         rows = features.transpose(1, 2) if self.axis == 0 else features
         hidden = self.core(self.norm(rows).flatten(0, 1)).unflatten(0, rows.shape[:2])
         hidden = hidden.transpose(1, 2) if self.axis == 0 else hidden
-        return features + _restore(self.restore, hidden)
+        return features + _apply_pointwise(self.restore, hidden)
 
 
 class BidirectionalMamba(nn.Module):
-    """Two Mambas, one of them backwards. Shape: (sequences, length, channels) -> (..., 2 channels)."""
+    """Two Mambas, one of them backwards in time.
+
+    Shape: (sequences, length, channels) -> (sequences, length, 2 * channels).
+
+    Args:
+        channels: number of channels of the input.
+        states: number of states per inner channel.
+        expansion: number of inner channels relative to ``channels``.
+
+    >>> BidirectionalMamba(8, states=4, expansion=2)(torch.randn(3, 20, 8)).shape
+    torch.Size([3, 20, 16])
+    """
 
     def __init__(self, channels: int, states: int, expansion: int) -> None:
         super().__init__()
@@ -76,20 +105,32 @@ class BidirectionalMamba(nn.Module):
 
 
 class BidirectionalLSTM(nn.Module):
-    """An LSTM in both directions. Shape: (sequences, length, channels) -> (..., 2 hidden)."""
+    """An LSTM in both directions. Shape: (sequences, length, channels) -> (..., 2 * hidden).
+
+    Args:
+        channels: number of channels of the input.
+        hidden: size of the state in each direction.
+
+    >>> BidirectionalLSTM(8, hidden=4)(torch.randn(3, 20, 8)).shape
+    torch.Size([3, 20, 8])
+    """
 
     def __init__(self, channels: int, hidden: int) -> None:
         super().__init__()
         self.lstm = nn.LSTM(channels, hidden, batch_first=True, bidirectional=True)
 
     def train(self, mode: bool = True) -> Self:
-        """The LSTM stays in training mode: cuDNN gives no gradient otherwise, and there is no dropout in it."""
+        """Set the mode, and leave the LSTM in training mode.
+
+        Otherwise cuDNN computes no gradient. The mode has no other effect, because there is no
+        dropout.
+        """
         super().train(mode)
         self.lstm.train()
         return self
 
     def forward(self, sequence: Tensor) -> Tensor:
-        # where the rest runs in bfloat16, cuDNN would run it in float16
+        # Where other layers run in bfloat16, cuDNN would run the LSTM in float16.
         with torch.autocast(sequence.device.type, enabled=False):
             weight = cast(Tensor, self.lstm.weight_hh_l0)
             output: Tensor = self.lstm(sequence.to(weight.dtype))[0]
@@ -97,9 +138,20 @@ class BidirectionalLSTM(nn.Module):
 
 
 class EncoderLayer(nn.TransformerEncoderLayer):
-    """Torch's, without dropout. Shape: (sequences, length, channels) -> the same.
+    """Transformer encoder layer without dropout, always in training mode.
 
-    It stays in training mode: in evaluation torch's shortcut holds every pair of times, 64 GiB for a minute of signal.
+    In evaluation mode, torch would keep the attention of all pairs of times in memory, 64 GiB for
+    one minute of signal.
+
+    Shape: (sequences, length, channels) -> (sequences, length, channels).
+
+    Args:
+        channels: number of channels.
+        heads: number of attention heads, a divisor of ``channels``.
+        hidden: width of the feed-forward layer.
+
+    >>> EncoderLayer(8, heads=2, hidden=16)(torch.randn(3, 20, 8)).shape
+    torch.Size([3, 20, 8])
     """
 
     def __init__(self, channels: int, heads: int, hidden: int) -> None:
@@ -107,47 +159,61 @@ class EncoderLayer(nn.TransformerEncoderLayer):
         super().__init__(channels, heads, hidden, dropout=0.0, **options)
 
     def train(self, mode: bool = True) -> Self:
+        """Leave the layer in training mode."""
         return super().train(True)
 
     def forward(self, src: Tensor, *args: Any, **options: Any) -> Tensor:
-        # where the rest runs in bfloat16: on a CPU the attention's backward pass takes four times as long in it
+        # Where other layers run in bfloat16, the backward pass of attention would take four times
+        # as long on a CPU as in float32.
         with torch.autocast("cpu", enabled=False):
-            whole = src if src.is_cuda else src.to(self.linear1.weight.dtype)
-            return super().forward(whole, *args, **options)
-
-
-def _path(config: NetworkConfig, axis: int) -> nn.Module:
-    """The path that ``config.block`` names, along time (0) or frequency (1)."""
-    channels, expansion = config.channels, config.expansion
-    core: nn.Module
-    match config.block:
-        case "cnn":
-            return ConvPath(channels, axis, config.kernel[axis], expansion)
-        case "mamba":
-            core, width = BidirectionalMamba(channels, config.states, expansion), 2 * channels
-        case "lstm":
-            core, width = (
-                BidirectionalLSTM(channels, expansion * channels),
-                2 * expansion * channels,
-            )
-        case _:
-            core, width = EncoderLayer(channels, config.heads, expansion * channels), channels
-    return SequencePath(channels, axis, core, width)
+            sequence = src if src.is_cuda else src.to(self.linear1.weight.dtype)
+            return super().forward(sequence, *args, **options)
 
 
 class DualPathBlock(nn.Sequential):
-    """A path over time, then one over frequency, or, for the monolithic baselines, over time alone.
+    """A path along time, followed by a path along frequency.
 
-    Shape: (items, time, frequency, channels) -> the same.
+    Shape: (items, time, frequency, channels) -> (items, time, frequency, channels).
+
+    Args:
+        config: kind and sizes of the paths.
+        time_alone: leave out the path along frequency, as in the monolithic baselines.
+
+    >>> from hlsim.neuro.config import NeuroConfig
+    >>> DualPathBlock(NeuroConfig(channels=8))(torch.randn(1, 20, 5, 8)).shape
+    torch.Size([1, 20, 5, 8])
     """
 
     def __init__(self, config: NetworkConfig, *, time_alone: bool = False) -> None:
         super().__init__()
-        self.time = _path(config, 0)
+        self.time = _build_path(config, 0)
         if not time_alone:
-            self.frequency = _path(config, 1)
+            self.frequency = _build_path(config, 1)
 
 
-def _restore(layer: nn.ConvTranspose1d, hidden: Tensor) -> Tensor:
-    # a ConvTranspose1d of length 1 is a matrix product, and faster as one
+def _build_path(config: NetworkConfig, axis: int) -> nn.Module:
+    """Build the path that ``config.block`` names, along time (0) or frequency (1)."""
+    channels = config.channels
+    inner = config.expansion * channels
+    core: nn.Module
+    match config.block:
+        case "cnn":
+            return ConvPath(channels, axis, config.kernel[axis], config.expansion)
+        case "mamba":
+            core = BidirectionalMamba(channels, config.states, config.expansion)
+            width = 2 * channels
+        case "lstm":
+            core = BidirectionalLSTM(channels, inner)
+            width = 2 * inner
+        case _:
+            core = EncoderLayer(channels, config.heads, inner)
+            width = channels
+    return SequencePath(channels, axis, core, width)
+
+
+def _apply_pointwise(layer: nn.ConvTranspose1d, hidden: Tensor) -> Tensor:
+    """Apply a transposed convolution of length 1 as a matrix product, which is faster.
+
+    Shape: (..., inputs) -> (..., outputs).
+    """
     return functional.linear(hidden, layer.weight.squeeze(-1).T, layer.bias)

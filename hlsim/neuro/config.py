@@ -1,4 +1,4 @@
-"""What a network of this family is made of, as JSON can hold it."""
+"""Settings of the networks, which can be saved as JSON."""
 
 from __future__ import annotations
 
@@ -6,18 +6,18 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from typing import Any, Literal, Self, get_origin, get_type_hints
 
-from hlsim.checks import check_choice, check_names
+from hlsim.checks import check_choice, check_names, check_number, describe
 from hlsim.dsp.stft import STFT
 
 NEURO_RATE = 16000
-"""The sample rate in Hz at which the networks work."""
+"""Sample rate in Hz at which the networks work."""
 
 Block = Literal["cnn", "mamba", "lstm", "transformer"]
 Structure = Literal["dual-path", "monolithic", "bands"]
 AudiogramInput = Literal["channel", "concatenated"]
 Phase = Literal["predicted", "input"]
 
-_COUNTS = {
+_MAX_SIZES = {
     "fft": 1024,
     "window": 1024,
     "hop": 1024,
@@ -25,30 +25,56 @@ _COUNTS = {
     "dense_depth": 8,
     "blocks": 64,
     "expansion": 16,
+    "states": 256,
+    "heads": 64,
+    "stride": 64,
+    "kernel": 127,
 }
-_COUNTS |= {"states": 256, "heads": 64, "stride": 64, "kernel": 127}
-"""The most of each: beyond, a configuration is a mistake, or is to fill the memory."""
+"""Largest accepted value of each size, which protects from mistakes and from exhausted memory."""
 
 
 @dataclass(frozen=True)
 class ModelConfig:
-    """What a model is made of, as a dataclass that JSON can hold."""
+    """Base of the settings of a model, a dataclass that can be saved as JSON.
+
+    >>> NeuroConfig.from_dict({"channels": 32}).to_dict()["channels"]
+    32
+    """
 
     @classmethod
-    def given(cls, config: Self | None) -> Self:
-        """What a network was given, or the default. Raises ValueError where it is of another kind."""
-        if config is not None and not isinstance(config, cls):
-            raise ValueError(f"config is {type(config).__name__}; allowed: a {cls.__name__}")
-        return config or cls()
+    def from_optional(cls, config: Self | None) -> Self:
+        """Return a configuration, or the default one in place of None.
+
+        Raises:
+            ValueError: the configuration is of another class.
+        """
+        if config is None:
+            return cls()
+        if not isinstance(config, cls):
+            raise ValueError(
+                f"expected config to be a {cls.__name__}, got {type(config).__name__}; build one "
+                f"with {cls.__name__}.from_dict"
+            )
+        return config
 
     def to_dict(self) -> dict[str, Any]:
+        """Convert the settings to a dictionary of JSON values."""
         return asdict(self)
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Self:
-        """Read what ``to_dict`` wrote. Raises ValueError where a name is unknown, or a value none that is allowed."""
+        """Build a configuration from a dictionary of ``to_dict``.
+
+        Args:
+            data: values of settings by name. Missing settings have their default values.
+
+        Raises:
+            ValueError: a name is unknown, or a value is not accepted.
+        """
         if not isinstance(data, Mapping):
-            raise ValueError(f"network settings {data!r}; allowed: names with values")
+            raise ValueError(
+                f"expected network settings as a mapping of names to values, got {describe(data)}"
+            )
         check_names(data, (field.name for field in fields(cls)), "network settings")
         return cls(**dict(data))
 
@@ -58,17 +84,26 @@ class NetworkConfig(ModelConfig):
     """Sizes that simulators and compensators share.
 
     Attributes:
-        fft, window, hop: of the transform at 16 kHz, in samples; ``hop`` is at most a quarter of ``window``.
-        channels: feature maps of the network.
-        dense_depth: dilated convolutions of the encoder and of each decoder, 0 for none.
-        stride: (time, frequency) steps of the encoder; the decoders undo them.
-        block: what runs along each axis: ``cnn``, ``mamba``, ``lstm`` or ``transformer``.
-        blocks: how many of them.
-        kernel: (time, frequency) lengths of a cnn block's convolutions, odd.
-        expansion: width inside a block over ``channels``: of the pointwise layers (cnn), of the scan (mamba), of an
-            LSTM's state in each direction, of a transformer's feed-forward layer.
-        states: a channel of mamba's scan.
-        heads: of a transformer's attention; they divide ``channels``.
+        fft: length of the Fourier transform in samples at 16 kHz.
+        window: length of the window in samples at 16 kHz.
+        hop: samples at 16 kHz from one frame to the next, at most a quarter of ``window``.
+        channels: number of feature maps of the network.
+        dense_depth: number of dilated convolutions of the encoder and of each decoder.
+        stride: time and frequency steps of the encoder, which the decoders undo.
+        block: kind of the layers along each axis.
+        blocks: number of dual-path blocks.
+        kernel: lengths of a ``cnn`` block's convolutions along time and frequency, odd numbers.
+        expansion: width inside a block relative to ``channels``. It applies to the pointwise layers
+            of a ``cnn`` block, the scan of a ``mamba`` block, the state of an ``lstm`` block in
+            each direction, and the feed-forward layer of a ``transformer`` block.
+        states: number of states per channel of a ``mamba`` block's scan.
+        heads: number of attention heads of a ``transformer`` block, a divisor of ``channels``.
+
+    Raises:
+        ValueError: a value is out of range, or values do not fit together.
+
+    >>> NetworkConfig(fft=400, hop=100, stride=(2, 3)).step
+    200
     """
 
     fft: int = 400
@@ -89,62 +124,67 @@ class NetworkConfig(ModelConfig):
             pair = getattr(self, name)
             if not isinstance(pair, list | tuple) or len(pair) != 2:
                 raise ValueError(
-                    f"{name} {pair!r}; allowed: two whole numbers, of time and of frequency"
+                    f"expected {name} to be two whole numbers, for time and frequency, "
+                    f"got {describe(pair)}"
                 )
             object.__setattr__(self, name, tuple(pair))
-        for name, most in _COUNTS.items():
-            values, least = getattr(self, name), 0 if name == "dense_depth" else 1
-            for value in values if isinstance(values, tuple) else (values,):
-                if (
-                    not isinstance(value, int)
-                    or isinstance(value, bool)
-                    or not least <= value <= most
-                ):
-                    raise ValueError(
-                        f"{name} {values!r}; allowed: whole numbers from {least} to {most}"
-                    )
-        uneven = self.block == "transformer" and self.channels % self.heads
-        if any(k % 2 == 0 for k in self.kernel) or uneven:
+        for name, highest in _MAX_SIZES.items():
+            lowest = 0 if name == "dense_depth" else 1
+            value = getattr(self, name)
+            for size in value if isinstance(value, tuple) else (value,):
+                check_number(name, size, lowest, highest, whole=True)
+        if any(length % 2 == 0 for length in self.kernel):
+            raise ValueError(f"expected odd lengths of kernel, got {self.kernel}")
+        if self.block == "transformer" and self.channels % self.heads:
             raise ValueError(
-                f"kernel {self.kernel}, {self.heads} heads of {self.channels} channels; allowed: odd kernels, heads that "
-                "divide the channels"
+                f"expected heads to divide the {self.channels} channels, got heads={self.heads}"
             )
-        _ = self.stft
-        # with longer hops the last samples may lie where the only window is almost zero, which the inverse divides by
+        STFT(self.fft, self.window, self.hop)  # raises ValueError unless these fit together
+        # With longer hops, the last samples may lie where the only window is close to 0, by which
+        # the inverse transform divides.
         if 4 * self.hop > self.window:
-            raise ValueError(f"hop {self.hop}, window {self.window}; allowed: 4 hop <= window")
+            raise ValueError(
+                f"expected a hop of at most a quarter of the window, got hop={self.hop}, "
+                f"window={self.window}"
+            )
         for name, kind in get_type_hints(type(self)).items():
             if get_origin(kind) is Literal:
                 check_choice(name, getattr(self, name), kind)
 
     @property
     def stft(self) -> STFT:
+        """Short-time Fourier transform of the network."""
         return STFT(self.fft, self.window, self.hop)
 
     @property
     def hz(self) -> tuple[float, ...]:
-        """The transform's frequencies."""
+        """Frequencies of the transform in Hz."""
         return tuple(NEURO_RATE * k / self.fft for k in range(self.fft // 2 + 1))
 
     @property
     def step(self) -> int:
-        """Samples from one place of the feature maps to the next."""
+        """Samples at 16 kHz from one point of the feature maps to the next."""
         return self.hop * self.stride[0]
 
     @property
     def density(self) -> float:
-        """Values of the widest feature map a sample."""
+        """Number of values of the widest feature map per sample."""
         rows = -(-self.stft.frequencies // self.stride[1])
         return self.channels * self.expansion * rows / self.step
 
     @property
     def receptive_field(self) -> int | None:
-        """Samples to either side on which one depends by transform and network; None where it is all of them."""
+        """Number of samples on either side on which a sample of the output depends.
+
+        None if the output depends on the whole signal.
+        """
         if self.block != "cnn":
             return None
-        # by blocks, dense encoder and decoder, and the patches into which the encoder's and the decoders' strides cut
-        steps = self.blocks * (self.kernel[0] // 2) + 2 * (2**self.dense_depth - 1) + 2
-        return self.step * steps + self.window
+        block_steps = self.blocks * (self.kernel[0] // 2)
+        dense_steps = 2 * (2**self.dense_depth - 1)
+        # The strides of the encoder and of the decoders cut time into patches.
+        patch_steps = 2
+        return self.step * (block_steps + dense_steps + patch_steps) + self.window
 
 
 @dataclass(frozen=True)
@@ -152,16 +192,26 @@ class NeuroConfig(NetworkConfig):
     """Sizes and choices of a Neuro-MSBG.
 
     Attributes:
-        structure: ``dual-path``, or ``monolithic``: no encoder and no frequency axis, each frame one vector of
-            ``channels``, blocks along time only (the paper's baselines); or ``bands``: a network along time that
-            corrects the prior's gains (``hlsim.neuro.bands``), at a third of the cost.
-        audiogram: encoded as an input ``channel`` (Equation 1), or its eight levels ``concatenated`` to magnitude and
-            phase along frequency (the paper's Table IV).
-        phase: ``predicted``, or the ``input``'s reused: magnitude only (the paper's Table III).
-        prior: start from what is known of MSBG (``hlsim.neuro.prior``) and let the network correct it. Without it the
-            network learns everything, as in the paper.
-        level_aware: log magnitude and no normalisation. Otherwise each utterance is scaled to unit RMS and back, and
-            instance normalisation follows the convolutions, as in MP-SENet: a level is then invisible.
+        structure: ``dual-path``, ``monolithic`` or ``bands``. The monolithic baselines of the paper
+            have no encoder and no frequency axis: each frame is a vector of ``channels`` values,
+            and the blocks run along time only. ``bands`` is a network along time that corrects the
+            gains of the prior (``hlsim.neuro.bands``) at a third of the cost.
+        audiogram: ``channel`` for an encoded audiogram as an input channel (the paper's Equation
+            1), or ``concatenated`` for eight levels next to magnitude and phase along frequency
+            (its Table IV).
+        phase: ``predicted``, or ``input`` for a network that changes the magnitude only (Table
+            III).
+        prior: start from MSBG's known gains (``hlsim.neuro.prior``), which the network corrects.
+            Without them it learns everything, as in the paper.
+        level_aware: use the log magnitude and no normalisation. Otherwise the level does not affect
+            the network, as in MP-SENet: each utterance is scaled to unit RMS and back, and instance
+            normalisation follows the convolutions.
+
+    Raises:
+        ValueError: a value is out of range, or values do not fit together.
+
+    >>> NeuroConfig(block="lstm").hop
+    32
     """
 
     fft: int = 128
@@ -179,18 +229,18 @@ class NeuroConfig(NetworkConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         for name in ("prior", "level_aware"):
-            if not isinstance(getattr(self, name), bool):
-                raise ValueError(f"{name} {getattr(self, name)!r}; allowed: true or false")
-        if self.structure == "bands" and not (
-            self.prior and self.level_aware and self.block == "cnn"
-        ):
+            value = getattr(self, name)
+            if not isinstance(value, bool):
+                raise ValueError(f"expected {name} to be true or false, got {describe(value)}")
+        supports_bands = self.prior and self.level_aware and self.block == "cnn"
+        if self.structure == "bands" and not supports_bands:
             raise ValueError(
-                f"structure 'bands' with prior {self.prior}, level_aware {self.level_aware}, block {self.block!r}; "
-                "allowed: true, true, 'cnn'"
+                "expected prior=True, level_aware=True and block='cnn' with structure='bands', got "
+                f"prior={self.prior}, level_aware={self.level_aware}, block={self.block!r}"
             )
 
     @property
     def density(self) -> float:
-        return (
-            2.0 * self.stft.frequencies / self.hop if self.structure == "bands" else super().density
-        )
+        if self.structure == "bands":
+            return 2.0 * self.stft.frequencies / self.hop
+        return super().density

@@ -1,4 +1,4 @@
-"""The decoders: feature maps to a magnitude factor, a magnitude, or a phase on the transform's grid."""
+"""Decoders that turn feature maps into factors on the magnitude and shifts of the phase."""
 
 from typing import Any
 
@@ -7,13 +7,28 @@ from torch import Tensor, nn
 
 from hlsim.neuro.encoder import DenseBlock
 
-_TINY = 1e-8
+EPS_SQUARE = 1e-8
+"""Smallest squared modulus by which a phase shift is normalised."""
 
 
 class Decoder(nn.Module):
-    """Feature maps back to the transform's grid, each point to a patch of ``stride``; zero before training.
+    """Decoder from feature maps to the grid of a spectrum, whose output is 0 before training.
 
-    Shape: (items, channels, time / stride, frequency / stride) -> (items, outputs, time, frequency).
+    Each point of the feature maps becomes a patch of ``stride`` points.
+
+    Shape: (items, channels, time / stride, frequency / stride) -> (items, outputs, time,
+        frequency).
+
+    Args:
+        channels: number of channels of the feature maps.
+        outputs: number of values per point of the spectrum.
+        depth: number of convolutions of the dense block.
+        stride: time and frequency steps of the encoder, which the decoder undoes.
+        normalise: normalise the features in the dense block.
+
+    >>> decoder = Decoder(8, 1, depth=0, stride=(4, 3), normalise=False)
+    >>> decoder(torch.randn(2, 8, 5, 22), (20, 65)).shape
+    torch.Size([2, 1, 20, 65])
     """
 
     def __init__(
@@ -27,18 +42,24 @@ class Decoder(nn.Module):
         nn.init.zeros_(self.leave.bias)
 
     def forward(self, features: Tensor, size: tuple[int, int]) -> Tensor:
+        """Decode feature maps to a grid of the given time and frequency size."""
         patches = self.leave(self.dense(features).permute(0, 2, 3, 1))
-        # (items, time, frequency, (outputs, step, step)) -> (items, outputs, time, step, frequency, step)
+        # (items, time, frequency, outputs * steps) -> (items, outputs, time, step, frequency, step)
         grid = patches.unflatten(-1, (-1, *self.stride)).permute(0, 3, 1, 4, 2, 5)
         return grid.flatten(4, 5).flatten(2, 3)[..., : size[0], : size[1]]
 
 
 class MaskDecoder(Decoder):
-    """Logarithm of the factor on the magnitude, starting at 0.
+    """Decoder of the logarithm of a factor on the magnitude.
 
     Args:
-        recruiting: two maps a, b: the factor is exp(a x + b) with x the recruitment exponent of the ear at each
-            frequency, since errors of an envelope grow with it. Otherwise one map.
+        recruiting: decode two maps a and b, and return a x + b, where x is the exponent of
+            recruitment at each frequency. The effect of an error of the envelope is proportional to
+            it. Otherwise decode one map.
+
+    >>> decoder = MaskDecoder(8, 0, (4, 3), normalise=False, recruiting=True)
+    >>> decoder.log_mask(torch.randn(2, 8, 5, 22), (20, 65), torch.ones(2, 65)).shape
+    torch.Size([2, 20, 65])
     """
 
     def __init__(
@@ -48,47 +69,75 @@ class MaskDecoder(Decoder):
         self.recruiting = recruiting
 
     def log_mask(self, features: Tensor, size: tuple[int, int], exponents: Tensor) -> Tensor:
-        """Shape: as ``Decoder``, and (items, frequency) -> (items, time, frequency)."""
+        """Decode the logarithm of the factor.
+
+        Shape: (items, channels, time / stride, frequency / stride), (items, frequency) -> (items,
+            time, frequency).
+
+        Args:
+            size: number of frames and frequencies of the spectrum.
+            exponents: exponent of recruitment at each frequency.
+        """
         maps = self(features, size).to(exponents.dtype)
-        return maps[:, 0] * exponents.unsqueeze(1) + maps[:, 1] if self.recruiting else maps[:, 0]
+        if not self.recruiting:
+            return maps[:, 0]
+        return maps[:, 0] * exponents.unsqueeze(1) + maps[:, 1]
 
 
 class PhaseDecoder(Decoder):
-    """A phase shift, as the angle of two maps, starting at 0. The paper's decoder predicts shifts too."""
+    """Decoder of a phase shift, the angle of 1 + x + j y for two maps x and y.
+
+    The paper's decoder predicts phase shifts, too.
+
+    >>> decoder = PhaseDecoder(8, 0, (4, 3), normalise=False)
+    >>> decoder.factor(torch.randn(2, 8, 5, 22), (20, 65), torch.zeros(2, 20, 65)).shape
+    torch.Size([2, 20, 65])
+    """
 
     def __init__(self, channels: int, depth: int, stride: tuple[int, int], normalise: bool) -> None:
         super().__init__(channels, 2, depth, stride, normalise)
 
     def factor(self, features: Tensor, size: tuple[int, int], log_gain: Tensor) -> Tensor:
-        """exp(log gain + j shift). Shape: as ``Decoder``, (items, time, frequency) -> complex, the same."""
-        dtype = self.leave.weight.dtype  # of the weights, whatever autocast makes of the maps
-        result: Tensor = _Turning.apply(log_gain, *self(features, size).to(dtype).unbind(1))
-        return result
+        """Decode a complex factor exp(log gain + j shift).
+
+        Shape: (items, channels, time / stride, frequency / stride), (items, time, frequency) ->
+            complex (items, time, frequency).
+
+        Args:
+            size: number of frames and frequencies of the spectrum.
+            log_gain: logarithm of the factor's magnitude.
+        """
+        # Autocast may return maps of lower precision than that of the weights.
+        maps = self(features, size).to(self.leave.weight.dtype)
+        factor: Tensor = _PhaseFactor.apply(log_gain, *maps.unbind(1))
+        return factor
 
 
-class _Turning(torch.autograd.Function):
-    """exp(a) z / |z| of z = 1 + x + j y, with a gradient of a third of the steps.
+class _PhaseFactor(torch.autograd.Function):
+    """exp(a) z / |z| for z = 1 + x + j y, with a gradient that takes a third of torch's steps.
 
-    With the result f, the gradient g at it, and q = g conj(f), it is Re q for a, and for x and y that of the angle:
-    -y Im q / |z|^2 and (1 + x) Im q / |z|^2.
+    Let f be the result, g the gradient with respect to f, and q = g conj(f). The gradient is Re q
+    with respect to a, -y Im q / |z|^2 with respect to x, and (1 + x) Im q / |z|^2 with respect to
+    y.
     """
 
     @staticmethod
-    def forward(log_gain: Tensor, right: Tensor, up: Tensor) -> Tensor:
-        right = right + 1.0
-        scale = (
-            torch.addcmul(right.square(), up, up).clamp_min_(_TINY).rsqrt_().mul_(log_gain.exp())
-        )
-        return torch.complex(right.mul_(scale), scale.mul_(up))
+    def forward(log_gain: Tensor, x: Tensor, y: Tensor) -> Tensor:
+        real = x + 1.0
+        square = torch.addcmul(real.square(), y, y).clamp_min_(EPS_SQUARE)
+        scale = square.rsqrt_().mul_(log_gain.exp())
+        return torch.complex(real.mul_(scale), scale.mul_(y))
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor, Tensor], output: Tensor) -> None:
-        ctx.save_for_backward(*inputs[1:], output)
+        _, x, y = inputs
+        ctx.save_for_backward(x, y, output)
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        right, up, factor = ctx.saved_tensors
-        along = gradient * factor.conj()
-        right = right + 1.0
-        turn = along.imag / torch.addcmul(right.square(), up, up).clamp_min(_TINY)
-        return along.real, -up * turn, right * turn
+        x, y, factor = ctx.saved_tensors
+        q = gradient * factor.conj()
+        real = x + 1.0
+        square = torch.addcmul(real.square(), y, y).clamp_min(EPS_SQUARE)
+        angle_gradient = q.imag / square
+        return q.real, -y * angle_gradient, real * angle_gradient

@@ -1,4 +1,4 @@
-"""Input channels, among them the encoded audiogram, and the dense encoder that turns them into feature maps."""
+"""Encoders of input channels, among them the audiogram, to feature maps."""
 
 import torch
 from torch import Tensor, nn
@@ -6,20 +6,45 @@ from torch.nn import functional
 
 
 def log_magnitude(squared: Tensor) -> Tensor:
-    """Half the logarithm of a magnitude, from its square. Any shape; silence gives -6.3."""
+    """Compute half the logarithm of magnitudes from their squares. Silence gives -6.3.
+
+    Shape: (...) -> (...).
+
+    >>> log_magnitude(torch.tensor([1.0, 0.0])).round(decimals=1)
+    tensor([ 0.0000, -6.3000])
+    """
     return (squared + 1e-11).log() / 4.0
 
 
 def sine_of_phase(spectrum: Tensor, squared: Tensor) -> Tensor:
-    """Faded out near silence: its gradient stays finite, and unlike the phase it has no jump at pi. Any shape."""
+    """Compute the sine of the phase of spectra, which fades to 0 in silence.
+
+    Its gradient is finite in silence. Unlike the phase, it has no jump at pi.
+
+    Shape: complex (...), (...) -> (...).
+
+    Args:
+        squared: squared magnitude of the spectra.
+
+    >>> spectrum = torch.tensor([2.0j, 0.0j])
+    >>> sine_of_phase(spectrum, torch.tensor([4.0, 0.0])).round(decimals=3)
+    tensor([1., 0.])
+    """
     return spectrum.imag * (squared + 1e-6).rsqrt()
 
 
 class AudiogramEncoder(nn.Module):
-    """Thresholds to one value a frequency: linear(flatten(average pool(ReLU(conv)))), 16 feature maps (Equation 1).
+    """Encoder of an audiogram to one value per frequency.
+
+    It is a convolution with 16 feature maps, a ReLU, average pooling, and a linear layer.
+
+    Source: the Neuro-MSBG paper, Equation 1.
 
     Args:
-        frequencies: F, the frequencies of the transform.
+        frequencies: number of frequencies of the spectrum.
+
+    >>> AudiogramEncoder(201)(torch.full((2, 8), 40.0)).shape
+    torch.Size([2, 201])
     """
 
     def __init__(self, frequencies: int) -> None:
@@ -29,14 +54,25 @@ class AudiogramEncoder(nn.Module):
         self.project = nn.Linear(16 * 4, frequencies)
 
     def forward(self, thresholds: Tensor) -> Tensor:
-        """Shape: (items, 8) dB HL -> (items, F)."""
+        """Encode audiograms in dB HL. Shape: (items, 8) -> (items, frequencies)."""
         features = torch.relu(self.conv(thresholds.unsqueeze(1) / 100.0))
         encoded: Tensor = self.project(self.pool(features).flatten(1))
         return encoded
 
 
 class Unit(nn.Sequential):
-    """Convolution, instance normalisation where the level may go, PReLU. Shape: (items, channels, time, frequency)."""
+    """A convolution, optional instance normalisation, and a PReLU.
+
+    Shape: (items, inputs, time, frequency) -> (items, channels, time, frequency).
+
+    Args:
+        conv: the convolution.
+        channels: number of channels of its output.
+        normalise: add the normalisation, which makes the output independent of the level.
+
+    >>> Unit(DilatedConv(2, 8, 1), 8, normalise=True)(torch.randn(1, 2, 20, 5)).shape
+    torch.Size([1, 8, 20, 5])
+    """
 
     def __init__(self, conv: nn.Module, channels: int, normalise: bool) -> None:
         norm = [nn.InstanceNorm2d(channels, affine=True)] if normalise else []
@@ -44,28 +80,49 @@ class Unit(nn.Sequential):
 
 
 class DilatedConv(nn.Conv2d):
-    """A convolution of 3 x 3, dilated in time, as long as its input. Shape: (items, channels, time, frequency)."""
+    """A 3 x 3 convolution that is dilated in time and keeps the size of its input.
+
+    Shape: (items, inputs, time, frequency) -> (items, outputs, time, frequency).
+
+    Args:
+        inputs: number of channels of the input.
+        outputs: number of channels of the output.
+        dilation: frames between the points of the kernel.
+
+    >>> DilatedConv(2, 8, dilation=4)(torch.randn(1, 2, 20, 5)).shape
+    torch.Size([1, 8, 20, 5])
+    """
 
     def __init__(self, inputs: int, outputs: int, dilation: int) -> None:
         super().__init__(inputs, outputs, 3, padding=(dilation, 1), dilation=(dilation, 1))
 
     def forward(self, features: Tensor) -> Tensor:
-        step, time = self.dilation[0], features.shape[2]
-        trained = torch.is_grad_enabled() and self.weight.requires_grad
-        if step == 1 or not trained or features.device.type != "cpu":
+        step = self.dilation[0]
+        is_trained = torch.is_grad_enabled() and self.weight.requires_grad
+        if step == 1 or not is_trained or features.device.type != "cpu":
             return super().forward(features)
-        # on a CPU the weights' gradient takes three to six times as long with dilation as of every step-th time by itself
-        phases = (
-            functional.pad(features, (0, 0, 0, -time % step)).unflatten(2, (-1, step)).movedim(3, 1)
-        )
+        # On a CPU, the gradient of the weights takes three to six times as long with dilation as
+        # for separate convolutions of every step-th frame.
+        time = features.shape[2]
+        padded = functional.pad(features, (0, 0, 0, -time % step))
+        phases = padded.unflatten(2, (-1, step)).movedim(3, 1)
         convolved = functional.conv2d(phases.flatten(0, 1), self.weight, self.bias, padding=1)
-        return convolved.unflatten(0, (-1, step)).movedim(1, 3).flatten(2, 3)[:, :, :time]
+        interleaved = convolved.unflatten(0, (-1, step)).movedim(1, 3).flatten(2, 3)
+        return interleaved[:, :, :time]
 
 
 class DenseBlock(nn.Module):
-    """Convolutions over time and frequency, dilated 1, 2, 4, ... in time, each fed with all before it.
+    """Convolutions with dilations 1, 2, 4, ... in time, each of which reads all earlier outputs.
 
-    Shape: (items, channels, time, frequency) -> the same. A depth of 0 changes nothing.
+    Shape: (items, channels, time, frequency) -> (items, channels, time, frequency).
+
+    Args:
+        channels: number of channels.
+        depth: number of convolutions. With 0, the output is the input.
+        normalise: normalise the output of each convolution.
+
+    >>> DenseBlock(8, depth=2, normalise=False)(torch.randn(1, 8, 20, 5)).shape
+    torch.Size([1, 8, 20, 5])
     """
 
     def __init__(self, channels: int, depth: int, normalise: bool) -> None:
@@ -83,9 +140,23 @@ class DenseBlock(nn.Module):
 
 
 class DenseEncoder(nn.Module):
-    """Input channels to feature maps on a coarser grid (Lu, Ai and Ling 2023).
+    """Encoder of input channels to feature maps on a coarser grid.
 
-    Shape: (items, inputs, time, frequency) -> (items, channels, time / stride, frequency / stride), rounded up.
+    Shape: (items, inputs, time, frequency) -> (items, channels, ceil(time / stride[0]),
+        ceil(frequency / stride[1])).
+
+    Source: MP-SENet (Lu, Ai and Ling 2023).
+
+    Args:
+        inputs: number of input channels.
+        channels: number of feature maps.
+        depth: number of convolutions of the dense block.
+        stride: time and frequency steps of the feature maps.
+        normalise: normalise the output of each convolution.
+
+    >>> encoder = DenseEncoder(3, 8, depth=0, stride=(4, 3), normalise=False)
+    >>> encoder(torch.randn(1, 3, 20, 65)).shape
+    torch.Size([1, 8, 5, 22])
     """
 
     def __init__(
@@ -93,9 +164,8 @@ class DenseEncoder(nn.Module):
     ) -> None:
         super().__init__()
         kernel = (2 * stride[0] + 1, 2 * stride[1] + 1)
-        self.enter = Unit(
-            nn.Conv2d(inputs, channels, kernel, stride, padding=stride), channels, normalise
-        )
+        conv = nn.Conv2d(inputs, channels, kernel, stride, padding=stride)
+        self.enter = Unit(conv, channels, normalise)
         self.dense = DenseBlock(channels, depth, normalise)
 
     def forward(self, features: Tensor) -> Tensor:
@@ -104,9 +174,17 @@ class DenseEncoder(nn.Module):
 
 
 class FrameEncoder(nn.Module):
-    """A linear map of each frame, all of its frequencies and input channels together: the monolithic baselines' entry.
+    """Linear encoder of each frame to one vector, for the monolithic baselines.
 
     Shape: (items, inputs, time, frequency) -> (items, channels, time, 1).
+
+    Args:
+        inputs: number of input channels.
+        frequencies: number of frequencies.
+        channels: length of the vectors.
+
+    >>> FrameEncoder(3, 65, 8)(torch.randn(1, 3, 20, 65)).shape
+    torch.Size([1, 8, 20, 1])
     """
 
     def __init__(self, inputs: int, frequencies: int, channels: int) -> None:

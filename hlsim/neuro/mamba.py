@@ -1,4 +1,7 @@
-"""Mamba (Gu and Dao 2023), with the parameters of ``mamba_ssm.Mamba`` by name and shape."""
+"""The Mamba layer, with parameters of the same names and shapes as ``mamba_ssm.Mamba``.
+
+Source: Gu and Dao (2023), arXiv:2312.00752.
+"""
 
 import math
 
@@ -10,17 +13,23 @@ from hlsim.neuro.scan import selective_scan
 
 
 class Mamba(nn.Module):
-    """A selective state space along a sequence, causal. Shape: (items, time, d_model) -> the same.
+    """A causal selective state space model along sequences.
+
+    Shape: (items, time, d_model) -> (items, time, d_model).
 
     Args:
-        d_model: channels of the sequence.
-        d_state: states a channel.
-        expand: channels inside over ``d_model``.
+        d_model: number of channels of the sequence.
+        d_state: number of states per inner channel.
+        expand: number of inner channels relative to ``d_model``.
+
+    >>> Mamba(16, d_state=4)(torch.randn(2, 20, 16)).shape
+    torch.Size([2, 20, 16])
     """
 
     def __init__(self, d_model: int, d_state: int = 16, expand: int = 2) -> None:
         super().__init__()
-        inner, rank = expand * d_model, math.ceil(d_model / 16)
+        inner = expand * d_model
+        rank = math.ceil(d_model / 16)
         self.sizes = (rank, d_state, d_state)
         self.in_proj = nn.Linear(d_model, 2 * inner, bias=False)
         self.conv1d = nn.Conv1d(inner, inner, 4, groups=inner, padding=3)
@@ -29,27 +38,27 @@ class Mamba(nn.Module):
         self.A_log = nn.Parameter(torch.arange(1.0, d_state + 1.0).log().repeat(inner, 1))
         self.D = nn.Parameter(torch.ones(inner))
         self.out_proj = nn.Linear(inner, d_model, bias=False)
-        # steps from 0.001 to 0.1 at the start, evenly in their logarithm
+        # Before training, step sizes lie between 0.001 and 0.1, uniformly in their logarithm.
         nn.init.uniform_(self.dt_proj.weight, -(rank**-0.5), rank**-0.5)
         step = torch.exp(torch.rand(inner) * math.log(100.0) + math.log(0.001))
+        inverse_softplus = step + torch.log(-torch.expm1(-step))
         with torch.no_grad():
-            self.dt_proj.bias.copy_(step + torch.log(-torch.expm1(-step)))
+            self.dt_proj.bias.copy_(inverse_softplus)
 
     def forward(self, sequence: Tensor) -> Tensor:
         time = sequence.shape[1]
         signal, gate = self.in_proj(sequence).chunk(2, -1)
         signal = functional.silu(self.conv1d(signal.mT)[..., :time].mT.contiguous())
-        step, entry, leave = self.x_proj(signal).split(self.sizes, -1)
-        with torch.autocast(
-            sequence.device.type, enabled=False
-        ):  # powers of decays want their precision
+        step, B, C = self.x_proj(signal).split(self.sizes, -1)
+        # The scan multiplies many decays, for which bfloat16 is too imprecise.
+        with torch.autocast(sequence.device.type, enabled=False):
             dtype = self.A_log.dtype
             y = selective_scan(
                 signal.to(dtype).mT,
                 functional.linear(step.to(dtype), self.dt_proj.weight).mT,
                 -self.A_log.exp(),
-                entry.to(dtype).mT,
-                leave.to(dtype).mT,
+                B.to(dtype).mT,
+                C.to(dtype).mT,
                 self.D,
                 z=gate.to(dtype).mT,
                 delta_bias=self.dt_proj.bias,

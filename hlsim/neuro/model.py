@@ -1,4 +1,4 @@
-"""Neuro-MSBG: the network that learned MSBG."""
+"""Neuro-MSBG, a neural network that emulates MSBG."""
 
 import torch
 from torch import Tensor, nn
@@ -22,27 +22,51 @@ from hlsim.neuro.encoder import (
 from hlsim.neuro.network import EarNetwork
 from hlsim.neuro.prior import Prior
 
-_TINY = 1e-11
+POWER_FLOOR = 1e-11
+"""Power in Pa^2 that is added to powers before square roots."""
+
+MIN_LOG_MASK = -12.0
+"""Smallest natural logarithm of the network's factor on a magnitude."""
+
+MAX_LOG_MASK = 4.0
+"""Largest natural logarithm of the network's factor on a magnitude."""
 
 
 class NeuroMSBG(EarNetwork):
-    """Waveform and audiogram to what the impaired ear hears, time-aligned.
+    """Simulator of an impaired ear: a neural network that emulates MSBG, time-aligned.
 
-    Magnitude, phase and encoded audiogram (Equation 1) enter as three channels, a dense encoder and dual-path blocks
-    follow, and two decoders give a mask for the magnitude and a phase; the inverse transform makes a waveform. With
-    ``config.prior``, MSBG's known gains come first and enter as a fourth channel, and the decoders correct them; with the
-    structure ``bands`` a smaller network corrects them before they become a mask.
+    The input channels are the magnitude, the phase and the encoded audiogram. A dense encoder and
+    dual-path blocks follow. Two decoders predict a mask for the magnitude and a phase shift, and
+    the inverse transform computes the waveform.
 
-    ``torch.func.grad`` works with all blocks, and on a CPU second derivatives work with ``cnn`` and ``lstm`` blocks.
+    With ``config.prior``, the spectrum is first multiplied by MSBG's known gains, which are also
+    the fourth input channel, and the decoders correct them. With the structure ``bands``, a smaller
+    network corrects the gains of MSBG's channels.
+
+    ``torch.func.grad`` works with all blocks. On a CPU, second derivatives work with ``cnn`` and
+    ``lstm`` blocks.
+
+    Source: the Neuro-MSBG paper, Section III and Equation 1.
 
     Args:
         config: sizes and choices.
-        sample_rate, full_scale_spl: as ``EarNetwork``.
-        compute_prior: whether to compute MSBG's known gains, which takes half a second. With False they are undefined
-            until a state dict is loaded.
+        sample_rate: sample rate of inputs and outputs in Hz, from 16000 to 48000. Outputs contain
+            the frequencies below 8 kHz only.
+        full_scale_spl: level in dB SPL of samples whose RMS is 1.0.
+        compute_prior: compute MSBG's known gains, which takes half a second. Otherwise they are
+            undefined until a state dict is loaded.
+
+    Attributes:
+        emulates_msbg: whether the simulator emulates MSBG.
+        highest_frequency: highest frequency of outputs in Hz.
+        needs_exact_lengths: whether silence after the end of a signal changes the output before.
 
     Raises:
-        ValueError: a rate or level out of range, or a configuration of another kind.
+        ValueError: the rate or the level is out of range, or the configuration is of another class.
+
+    >>> simulator = NeuroMSBG(NeuroConfig(channels=8, blocks=1))
+    >>> simulator(torch.randn(2, 16000), "N3").shape
+    torch.Size([2, 16000])
     """
 
     emulates_msbg = True
@@ -60,32 +84,35 @@ class NeuroMSBG(EarNetwork):
         compute_prior: bool = True,
     ) -> None:
         super().__init__(sample_rate, full_scale_spl)
-        self.config = config = NeuroConfig.given(config)
+        self.config = config = NeuroConfig.from_optional(config)
         self.stft = config.stft
-        # training may run the network, not the physics around it, in bfloat16
+        # Training may run the network in bfloat16, but not the prior and the transforms.
         self.autocast_dtype: torch.dtype | None = None
         self.prior = Prior(self.stft, compute_prior) if config.prior else None
         self.bands = BandCorrection(config) if config.structure == "bands" else None
         if self.bands is not None:
             return
-        frequencies, channels = self.stft.frequencies, config.channels
-        monolithic, normalise = config.structure == "monolithic", not config.level_aware
-        encoded = config.audiogram == "channel"
-        rows = frequencies + (0 if encoded else len(FREQUENCIES))
-        inputs = 2 + encoded + config.prior
-        depth = 0 if monolithic else config.dense_depth
-        stride = (1, rows) if monolithic else config.stride
-        self.audiogram_encoder = AudiogramEncoder(frequencies) if encoded else None
+        frequencies = self.stft.frequencies
+        channels = config.channels
+        is_monolithic = config.structure == "monolithic"
+        normalise = not config.level_aware
+        encodes_audiogram = config.audiogram == "channel"
+        rows = frequencies if encodes_audiogram else frequencies + len(FREQUENCIES)
+        inputs = 2 + encodes_audiogram + config.prior
+        depth = 0 if is_monolithic else config.dense_depth
+        stride = (1, rows) if is_monolithic else config.stride
+        self.audiogram_encoder = AudiogramEncoder(frequencies) if encodes_audiogram else None
         self.encoder: nn.Module
-        if monolithic:
+        if is_monolithic:
             self.encoder = FrameEncoder(inputs, rows, channels)
         else:
             self.encoder = DenseEncoder(inputs, channels, depth, stride, normalise)
-        blocks = (DualPathBlock(config, time_alone=monolithic) for _ in range(config.blocks))
+        blocks = (DualPathBlock(config, time_alone=is_monolithic) for _ in range(config.blocks))
         self.blocks = nn.ModuleList(blocks)
         self.mask_decoder = MaskDecoder(channels, depth, stride, normalise, config.prior)
-        predicted = config.phase == "predicted"
-        self.phase_decoder = PhaseDecoder(channels, depth, stride, normalise) if predicted else None
+        self.phase_decoder = None
+        if config.phase == "predicted":
+            self.phase_decoder = PhaseDecoder(channels, depth, stride, normalise)
         self.severity = nn.Embedding(len(SEVERITIES), channels) if config.prior else None
         if self.severity is not None:
             nn.init.zeros_(self.severity.weight)
@@ -94,69 +121,89 @@ class NeuroMSBG(EarNetwork):
     def _receptive_field(self) -> tuple[int, int] | None:
         if self.config.receptive_field is None or not self.config.level_aware:
             return None
-        known = self.prior.receptive_field if self.prior is not None else 0
-        return self.config.step, self.config.receptive_field + known
+        field_of_prior = self.prior.receptive_field if self.prior is not None else 0
+        return self.config.step, self.config.receptive_field + field_of_prior
 
     @property
     def _dtype(self) -> torch.dtype:
-        return (self.mask_decoder.leave.weight if self.bands is None else self.bands.enter).dtype
+        weight = self.mask_decoder.leave.weight if self.bands is None else self.bands.enter
+        return weight.dtype
 
     def _process(self, signals: Tensor, ears: Tensor) -> Tensor:
-        scale = None
-        if not self.config.level_aware:
-            scale = signals.square().mean(-1, keepdim=True).add(_TINY).sqrt()
-            signals = signals / scale
+        if self.config.level_aware:
+            return self._simulate(signals, ears)
+        rms = signals.square().mean(-1, keepdim=True).add(POWER_FLOOR).sqrt()
+        return self._simulate(signals / rms, ears) * rms
+
+    def _simulate(self, signals: Tensor, ears: Tensor) -> Tensor:
+        """Compute outputs from inputs in the scale of the network.
+
+        Shape: (items, time), (items, 8) -> (items, time).
+        """
+        samples = signals.shape[-1]
         severity = severity_index(ears)
         if self.prior is not None:
             signals = self.prior.filter(signals, severity)
         spectrum = self.stft.analyse(signals)
         if self.bands is not None and self.prior is not None:
-            return self.stft.synthesise(
-                self.bands(spectrum, ears, severity, self.prior), signals.shape[-1]
-            )
-        squared = power(spectrum)
-        factor = self.prior(squared, ears, severity) if self.prior is not None else None
-        features = self._features(spectrum, squared, ears, factor)
+            output_spectrum = self.bands(spectrum, ears, severity, self.prior)
+            return self.stft.synthesise(output_spectrum, samples)
+        powers = power(spectrum)
+        prior_factor = self.prior(powers, ears, severity) if self.prior is not None else None
+        correction = self._correction(spectrum, powers, ears, severity, prior_factor)
+        if prior_factor is not None:
+            correction = prior_factor * correction
+        return self.stft.synthesise(spectrum * correction, samples)
+
+    def _correction(
+        self,
+        spectrum: Tensor,
+        powers: Tensor,
+        ears: Tensor,
+        severity: Tensor,
+        prior_factor: Tensor | None,
+    ) -> Tensor:
+        """Predict the factor on the spectrum, besides that of the prior.
+
+        Shape: (items, frames, frequencies), the same, (items, 8), (items,), (items, frames,
+            frequencies) -> complex (items, frames, frequencies), or real without a predicted phase.
+        """
+        features = self._features(spectrum, powers, ears, prior_factor)
         size = (spectrum.shape[-2], spectrum.shape[-1])
-        # of recruitment, ratio - 1, at the transform's frequencies
-        exponents = CATCH_UP_SPL / (CATCH_UP_SPL - interpolate(ears, self.config.hz)) - 1.0
-        lower = self.autocast_dtype
-        with torch.autocast(
-            signals.device.type, lower or torch.bfloat16, enabled=lower is not None
-        ):
-            features = self.encoder(features.contiguous(memory_format=torch.channels_last)).permute(
-                0, 2, 3, 1
-            )
+        ratios = CATCH_UP_SPL / (CATCH_UP_SPL - interpolate(ears, self.config.hz))
+        recruitment_exponents = ratios - 1.0
+        device = spectrum.device.type
+        autocast_dtype = self.autocast_dtype or torch.bfloat16
+        with torch.autocast(device, autocast_dtype, enabled=self.autocast_dtype is not None):
+            encoded = self.encoder(features.contiguous(memory_format=torch.channels_last))
+            hidden = encoded.permute(0, 2, 3, 1)
             if self.severity is not None:
-                features = features + self.severity(severity)[:, None, None]
+                hidden = hidden + self.severity(severity)[:, None, None]
             for block in self.blocks:
-                features = block(features)
-            features = features.permute(0, 3, 1, 2)
-            log_mask = self.mask_decoder.log_mask(features, size, exponents).clamp(-12.0, 4.0)
+                hidden = block(hidden)
+            hidden = hidden.permute(0, 3, 1, 2)
+            log_mask = self.mask_decoder.log_mask(hidden, size, recruitment_exponents)
+            log_mask = log_mask.clamp(MIN_LOG_MASK, MAX_LOG_MASK)
             if self.phase_decoder is None:
-                correction = log_mask.exp()
-            else:
-                correction = self.phase_decoder.factor(features, size, log_mask)
-        if factor is not None:
-            correction = factor * correction
-        heard = self.stft.synthesise(spectrum * correction, signals.shape[-1])
-        return heard if scale is None else heard * scale
+                return log_mask.exp()
+            return self.phase_decoder.factor(hidden, size, log_mask)
 
     def _features(
-        self, spectrum: Tensor, squared: Tensor, ears: Tensor, factor: Tensor | None
+        self, spectrum: Tensor, powers: Tensor, ears: Tensor, prior_factor: Tensor | None
     ) -> Tensor:
-        """The input channels.
+        """Compute the input channels.
 
-        Shape: (items, frames, frequencies) twice, (items, 8) -> (items, 2 to 4, frames, rows).
+        Shape: (items, frames, frequencies), the same, (items, 8), (items, frames, frequencies) ->
+            (items, 2 to 4, frames, rows).
         """
         if self.config.level_aware:
-            channels = [log_magnitude(squared), sine_of_phase(spectrum, squared)]
+            channels = [log_magnitude(powers), sine_of_phase(spectrum, powers)]
         else:
-            channels = [(squared + _TINY).sqrt(), torch.angle(spectrum)]
+            channels = [(powers + POWER_FLOOR).sqrt(), torch.angle(spectrum)]
         if self.audiogram_encoder is not None:
-            channels.append(self.audiogram_encoder(ears).unsqueeze(1).expand(squared.shape))
-        if factor is not None:
-            channels.append((power(factor) + 1e-12).log() / 4.0)
+            channels.append(self.audiogram_encoder(ears).unsqueeze(1).expand(powers.shape))
+        if prior_factor is not None:
+            channels.append((power(prior_factor) + 1e-12).log() / 4.0)
         features = torch.stack(channels, 1)
         if self.audiogram_encoder is not None:
             return features

@@ -1,4 +1,4 @@
-"""What every network here does with a waveform and an ear before and after its work."""
+"""Base of all networks that process a waveform for an ear."""
 
 from __future__ import annotations
 
@@ -13,26 +13,41 @@ from hlsim.dsp.overlap import split_into_blocks
 from hlsim.dsp.resample import resample
 from hlsim.neuro.config import NEURO_RATE, NetworkConfig
 
-# Values of the widest feature map of all items that run together on a CPU, and the samples at 16 kHz that this is at
-# least and at most. Larger maps the C library gives back to the system, and pays for their pages anew with every one; of
-# smaller ones the steps from one to the next take longer than the sums.
-_CPU_VALUES, _CPU_SAMPLES = 1_100_000, (16_000, 128_000)
-_DEVICE_SAMPLES = 960_000  # of a long item that run together elsewhere
+# On a CPU, larger feature maps take time because the C library returns their memory to the system
+# after each operation. For smaller ones, the overhead of each operation exceeds its computation.
+_CPU_VALUES = 1_100_000
+"""Number of values of the widest feature map that run at once on a CPU."""
+
+_MIN_CPU_SAMPLES = 16_000
+"""Smallest number of samples at 16 kHz that run at once on a CPU."""
+
+_MAX_CPU_SAMPLES = 128_000
+"""Largest number of samples at 16 kHz that run at once on a CPU."""
+
+_DEVICE_SAMPLES = 960_000
+"""Number of samples of a long item that run at once on other devices."""
 
 
 class EarNetwork(nn.Module):
-    """Waveform and audiogram to waveform, in pascals at 16 kHz inside. Subclasses give ``config`` and ``_process``.
+    """Network from waveform and audiogram to waveform, which works in pascals at 16 kHz.
 
-    On a CPU a few items run at a time. Long signals go through in overlapping blocks where the network looks no farther
-    than these overlap (``cnn`` blocks): the output is the same, and without gradients memory grows by it alone.
+    Subclasses set ``config`` and implement ``_process``.
+
+    On a CPU, a few items run at a time. Long signals run in overlapping blocks if the network's
+    receptive field is limited (``cnn`` blocks). Blocks change neither the output nor, without
+    gradients, the memory that the network needs beside its output.
 
     Args:
-        sample_rate: of inputs and outputs in Hz, 16000 to 48000; inside it is 16000, so that only the band under 8 kHz
-            of faster input comes back.
-        full_scale_spl: level in dB SPL of RMS 1.0.
+        sample_rate: sample rate of inputs and outputs in Hz, from 16000 to 48000. Outputs contain
+            the frequencies below 8 kHz only.
+        full_scale_spl: level in dB SPL of samples whose RMS is 1.0.
 
     Raises:
-        ValueError: a rate or level out of range.
+        ValueError: the rate or the level is out of range.
+
+    >>> from hlsim import NeuroMSBG
+    >>> isinstance(NeuroMSBG(), EarNetwork)
+    True
     """
 
     config: NetworkConfig
@@ -43,20 +58,25 @@ class EarNetwork(nn.Module):
         self.full_scale_spl = check_full_scale(full_scale_spl)
 
     def forward(self, waveform: Tensor, audiogram: AudiogramLike) -> Tensor:
-        """What the ear hears of a waveform, or is to be given.
+        """Process waveforms for ears.
 
-        Shape: (..., time) and one audiogram or (..., 8) that broadcasts over the leading dimensions -> (..., time).
+        Shape: (..., time) -> (..., time).
+
+        Args:
+            audiogram: one audiogram, or audiograms of shape (..., 8) in dB HL that broadcast to the
+                leading dimensions of the waveform.
 
         Raises:
-            ValueError: no audiogram, levels outside -10 to 100 dB HL, shapes that do not fit, or a waveform on another
-                device than the weights.
+            ValueError: there is no audiogram, its levels are outside -10 to 100 dB HL, the shapes
+                do not broadcast, or the waveform is on another device than the weights.
         """
         check_waveform(waveform)
-        weight = next(self.parameters(), None)  # replicas of nn.DataParallel list none
+        # Replicas of nn.DataParallel list no parameters.
+        weight = next(self.parameters(), None)
         if weight is not None and weight.device != waveform.device:
             raise ValueError(
-                f"the waveform is on {waveform.device} and {type(self).__name__} on {weight.device}; allowed: the same "
-                "device, move either with .to()"
+                f"expected the waveform on {weight.device}, the device of {type(self).__name__}, "
+                f"got {waveform.device}; move either with .to()"
             )
         thresholds = resolve_thresholds(None, audiogram, waveform, consumer=type(self).__name__)
         with torch.autocast(waveform.device.type, enabled=False):
@@ -64,30 +84,41 @@ class EarNetwork(nn.Module):
             batch = broadcast_shape(waveform.shape[:-1], thresholds.shape[:-1])
             signals = waveform.to(dtype).expand(*batch, -1).reshape(-1, waveform.shape[-1])
             ears = thresholds.to(dtype).expand(*batch, -1).reshape(-1, len(FREQUENCIES))
-            together = len(signals)
-            if signals.device.type == "cpu" and not torch.compiler.is_compiling():
-                together = max(
-                    1, self._at_once * self.sample_rate // (NEURO_RATE * signals.shape[-1])
+            items = self._items_at_once(signals)
+            outputs = [
+                self._run(item_signals, item_ears)
+                for item_signals, item_ears in zip(
+                    signals.split(items), ears.split(items), strict=True
                 )
-            parts = zip(signals.split(together), ears.split(together), strict=True)
-            result = torch.cat([self._run(some, theirs) for some, theirs in parts])
-            return result.reshape(*batch, -1).to(waveform.dtype)
+            ]
+            return torch.cat(outputs).reshape(*batch, -1).to(waveform.dtype)
+
+    def _items_at_once(self, signals: Tensor) -> int:
+        """Number of items that run at once."""
+        if signals.device.type != "cpu" or torch.compiler.is_compiling():
+            return len(signals)
+        samples_per_item = NEURO_RATE * signals.shape[-1]
+        return max(1, self._samples_at_once * self.sample_rate // samples_per_item)
 
     def _run(self, signals: Tensor, ears: Tensor) -> Tensor:
-        """``_process`` at the waveform's rate and level. Shape: (items, time), (items, 8) -> (items, time)."""
-        gain = gain_to_pascals(self.full_scale_spl)
-        result = self._in_blocks(resample(signals * gain, self.sample_rate, NEURO_RATE), ears)
-        return (
-            self._finish(resample(result, NEURO_RATE, self.sample_rate)[..., : signals.shape[-1]])
-            / gain
-        )
+        """Convert to pascals at 16 kHz, process, and convert back.
 
-    def _in_blocks(self, signals: Tensor, ears: Tensor) -> Tensor:
-        """``_process``, of long signals by blocks where that is the same. Shapes as ``_process``'s."""
+        Shape: (items, time), (items, 8) -> (items, time).
+        """
+        gain = gain_to_pascals(self.full_scale_spl)
+        output = self._run_blocks(resample(signals * gain, self.sample_rate, NEURO_RATE), ears)
+        output = resample(output, NEURO_RATE, self.sample_rate)[..., : signals.shape[-1]]
+        return self._finish(output) / gain
+
+    def _run_blocks(self, signals: Tensor, ears: Tensor) -> Tensor:
+        """Process long signals in blocks if the output is the same, and others at once.
+
+        Shape: (items, time), (items, 8) -> (items, time).
+        """
         if self._receptive_field is None or torch.compiler.is_compiling():
             return self._process(signals, ears)
         unit, field = self._receptive_field
-        hop = self._at_once if signals.device.type == "cpu" else _DEVICE_SAMPLES
+        hop = self._samples_at_once if signals.device.type == "cpu" else _DEVICE_SAMPLES
         blocks = split_into_blocks(signals.shape[-1], hop, field, field, unit)
         outputs = [
             block.cut_output(self._process(block.cut_input(signals), ears)) for block in blocks
@@ -95,25 +126,28 @@ class EarNetwork(nn.Module):
         return outputs[0] if len(outputs) == 1 else torch.cat(outputs, -1)
 
     @property
-    def _at_once(self) -> int:
-        """Samples at 16 kHz that run together on a CPU."""
-        least, most = _CPU_SAMPLES
-        return min(max(int(_CPU_VALUES / self.config.density), least), most)
+    def _samples_at_once(self) -> int:
+        """Number of samples at 16 kHz that run at once on a CPU."""
+        samples = int(_CPU_VALUES / self.config.density)
+        return min(max(samples, _MIN_CPU_SAMPLES), _MAX_CPU_SAMPLES)
 
     @property
     def _receptive_field(self) -> tuple[int, int] | None:
-        """Samples of which blocks begin at multiples, and on how many to either side one depends; None if on all."""
+        """Unit of blocks, and samples on either side on which a sample of the output depends.
+
+        Blocks start at multiples of the unit. None if the output depends on the whole signal.
+        """
         raise NotImplementedError
 
     @property
     def _dtype(self) -> torch.dtype:
-        """Of the weights, by one that has a name: replicas of ``nn.DataParallel`` list none."""
+        """Precision of a weight. Replicas of ``nn.DataParallel`` have weights, but list none."""
         raise NotImplementedError
 
     def _process(self, signals: Tensor, ears: Tensor) -> Tensor:
-        """Shape: (items, time) pascals at 16 kHz, (items, 8) dB HL -> (items, time)."""
+        """Process pascals at 16 kHz. Shape: (items, time), (items, 8) -> (items, time)."""
         raise NotImplementedError
 
     def _finish(self, result: Tensor) -> Tensor:
-        """The last step, in pascals at the output's rate. Shape: (items, time) -> the same."""
+        """Process the result at the sample rate. Shape: (items, time) -> (items, time)."""
         return result

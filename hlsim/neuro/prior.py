@@ -1,6 +1,7 @@
-"""What is known of MSBG, as the starting point of a network: smearing, band envelopes and gains on short frames.
+"""MSBG's known gains, from which a network starts: smearing, envelopes and gains on short frames.
 
-One set of weights a severity, computed from MSBG's formulae; what is trained is a correction to them.
+The weights are computed from MSBG's formulae for each severity. A network learns corrections of
+them.
 """
 
 import math
@@ -26,32 +27,64 @@ from hlsim.neuro.config import NEURO_RATE
 from hlsim.torchtools import constant_like
 
 RESPONSE_HALF_LENGTH = half_length(NEURO_RATE)
-"""Samples at 16 kHz of the fixed responses to either side of zero."""
+"""Number of samples at 16 kHz that fixed responses have before time 0, and from it on."""
 
 CHANNELS = max(bank.channels for bank in BANKS.values())
-_ENVELOPE_HALF_LENGTH = 20  # frames
-_LOG_CATCH_UP = (CATCH_UP_SPL - PASCAL_SPL) / 20.0 * math.log(10.0)
-_TINY = 1e-14
-_LEAST = 1e-4  # 40 dB by which smearing changes a power at most, for its gradient
-_WIDEST = 1e16  # of powers, by smearing
+"""Number of channels of the largest filter bank. Smaller banks are padded with zeros."""
 
-# By how much MSBG's envelope of speech is lower than a sinusoid's of the same power, since it fluctuates and smeared
-# frames partly cancel where they overlap: dB, read off the channels of 32 clips to about 0.5 dB.
+_ENVELOPE_HALF_LENGTH = 20
+"""Number of frames that the low-pass of the envelopes has before and after time 0."""
+
+_LOG_CATCH_UP = (CATCH_UP_SPL - PASCAL_SPL) / 20.0 * math.log(10.0)
+"""Natural logarithm of the catch-up level in Pa."""
+
+POWER_FLOOR = 1e-14
+"""Power in Pa^2 that is added to powers before divisions and square roots."""
+
+MIN_ENVELOPE = 1e-7
+"""Smallest value of an envelope in Pa."""
+
+SMEARING_GRADIENT_FLOOR = 1e-4
+"""Smallest factor of smearing on a power, -40 dB, that gradients take into account."""
+
+MAX_POWER_RATIO = 1e16
+"""Largest factor of smearing on a power."""
+
 _FLUCTUATION_DB = {"none": 0.0, "mild": 1.0, "moderate": 2.2, "severe": 3.3}
+"""Level in dB by which MSBG's envelope of speech is below that of a tone of the same power.
+
+Speech fluctuates, and smeared frames partly cancel each other where they overlap. The values were
+measured in the channels of 32 clips to about 0.5 dB.
+"""
+
+_GRID_RATIO = 160
+"""Ratio by which responses are computed on a finer grid than that of the transform.
+
+44.1 kHz is 441 / 160 times 16 kHz, so that both rates share this grid.
+"""
 
 
 class Prior(nn.Module):
     """MSBG's gains, estimated on the frames of a short transform.
 
-    Power is smeared by a matrix, summed into the bank's channels, its root smoothed over time, and expanded; the gains
-    weigh the channels' complex responses relative to their sum, which is a fixed filter and applied beforehand.
+    A matrix smears the power of each frame. The sum of the power in each channel of the filter bank
+    gives its level, whose smoothed values are the envelope, which recruitment turns into a gain.
+    The channels are added up with these gains, relative to their sum without gains. That sum is a
+    fixed filter, which ``filter`` applies to the waveform beforehand.
 
     Args:
-        stft: the transform; its window should be about as short as MSBG's smearing frame, 5.8 ms.
-        compute: whether to compute the buffers. With False they are undefined until a state dict is loaded.
+        stft: transform whose window is about as short as MSBG's smearing frame, 5.8 ms.
+        compute: compute the known values. Otherwise they are undefined until a state dict is
+            loaded.
 
     Attributes:
-        receptive_field: samples to either side on which one depends, besides those of the transform.
+        receptive_field: number of samples on either side on which a sample of the output depends,
+            besides those of the transform.
+
+    >>> stft = STFT(128, 128, 32)
+    >>> factor = Prior(stft)(torch.ones(1, 50, 65), torch.full((1, 8), 40.0), torch.tensor([2]))
+    >>> factor.shape
+    torch.Size([1, 50, 65])
     """
 
     response: Tensor
@@ -60,7 +93,8 @@ class Prior(nn.Module):
     def __init__(self, stft: STFT, compute: bool = True) -> None:
         super().__init__()
         self.receptive_field = RESPONSE_HALF_LENGTH + _ENVELOPE_HALF_LENGTH * stft.hop
-        severities, frequencies = len(SEVERITIES), stft.frequencies
+        severities = len(SEVERITIES)
+        frequencies = stft.frequencies
         shapes = {
             "excitation": (severities, CHANNELS, frequencies),
             "relative": (2, severities, CHANNELS, frequencies),  # real and imaginary parts
@@ -70,9 +104,9 @@ class Prior(nn.Module):
         self._add_buffer("ear_power", (frequencies,))
         self._add_buffer("response", (severities, 2 * RESPONSE_HALF_LENGTH))
         for name, shape in shapes.items():
-            # A formula gives the known values. The correction, which is trained, starts at 0 and is relative to them,
-            # because the spectrum of speech spans 60 dB: a small absolute change would let loud frequencies leak
-            # everywhere.
+            # A formula gives the known values. The correction, which is trained, starts at 0 and is
+            # relative to them, because the spectrum of speech spans 60 dB: a small absolute change
+            # would let loud frequencies leak everywhere.
             self._add_buffer(f"{name}_known", shape)
             self.register_parameter(f"{name}_learned", nn.Parameter(torch.zeros(shape)))
         if compute:
@@ -81,152 +115,226 @@ class Prior(nn.Module):
                 buffer.copy_(torch.from_numpy(values))
 
     def _add_buffer(self, name: str, shape: tuple[int, ...]) -> None:
+        """Register an uninitialised buffer."""
         self.register_buffer(name, torch.empty(shape, dtype=torch.float32))
 
     def _corrected(self, name: str) -> Tensor:
-        known, learned = getattr(self, f"{name}_known"), getattr(self, f"{name}_learned")
-        if name == "relative":  # a complex factor 1 + learned
-            real = known[0] * learned[0] - known[1] * learned[1]
-            imaginary = known[0] * learned[1] + known[1] * learned[0]
-            return known + torch.stack((real, imaginary))
-        return known * learned.exp()
+        """Apply the learned correction to known values."""
+        known = getattr(self, f"{name}_known")
+        learned = getattr(self, f"{name}_learned")
+        if name != "relative":
+            return known * learned.exp()
+        # The correction is a complex factor 1 + learned.
+        real = known[0] * learned[0] - known[1] * learned[1]
+        imaginary = known[0] * learned[1] + known[1] * learned[0]
+        return known + torch.stack((real, imaginary))
 
     def filter(self, waveform: Tensor, severity: Tensor) -> Tensor:
-        """Apply the fixed response of each item's bank. Shape: (items, time), (items,) -> (items, time)."""
+        """Filter waveforms with the fixed response of each item's filter bank.
+
+        Shape: (items, time), (items,) -> (items, time).
+
+        Args:
+            severity: index of each ear's severity.
+        """
         return filter_without_delay(waveform, self.response[severity].to(waveform))
 
     def forward(self, powers: Tensor, thresholds: Tensor, severity: Tensor) -> Tensor:
-        """Complex factor on the filtered signal's spectrum, of its powers.
+        """Compute the complex factor of MSBG on spectra from their powers.
 
-        Shape: (items, frames, frequencies), (items, 8), (items,) -> complex (items, frames, frequencies).
+        Shape: (items, frames, frequencies), (items, 8), (items,) -> complex (items, frames,
+            frequencies).
+
+        Args:
+            powers: powers of the spectra of filtered waveforms in Pa^2.
+            thresholds: audiograms in dB HL.
+            severity: index of each ear's severity.
         """
-        smeared = powers @ self._smearing()[severity].mT
-        level = self.smooth(self.levels(smeared, severity), severity).log()
-        gain = self.log_gain(level, thresholds, severity).exp().mT
-        relative = self._corrected("relative")[:, severity]
-        return torch.complex(gain @ relative[0], gain @ relative[1]) * _widening(smeared, powers)
+        smeared_powers = powers @ self._smearing()[severity].mT
+        levels = self.channel_levels(smeared_powers, severity)
+        log_envelope = self.smooth(levels, severity).log()
+        gain = self.log_gain(log_envelope, thresholds, severity).exp().mT
+        real, imaginary = self._corrected("relative")[:, severity]
+        factor = torch.complex(gain @ real, gain @ imaginary)
+        return factor * _smearing_factor(smeared_powers, powers)
 
-    def spread(self, spectrum: Tensor, severity: Tensor) -> tuple[Tensor, Tensor]:
-        """The filtered signal's spectrum, smeared, and its power.
+    def smear(self, spectrum: Tensor, severity: Tensor) -> tuple[Tensor, Tensor]:
+        """Smear the spectra of filtered waveforms.
 
-        Shape: complex (items, frames, frequencies), (items,) -> the same, real (items, frames, frequencies).
+        Shape: complex (items, frames, frequencies), (items,) -> complex (items, frames,
+            frequencies), (items, frames, frequencies).
+
+        Returns: the smeared spectra and their powers.
         """
-        return smear_spectrum(spectrum, self._smearing()[severity], _LEAST)
+        return smear_spectrum(spectrum, self._smearing()[severity], SMEARING_GRADIENT_FLOOR)
 
-    def levels(self, smeared: Tensor, severity: Tensor) -> Tensor:
-        """Root of the power in each channel. Shape: (items, frames, frequencies) -> (items, channels, frames)."""
+    def channel_levels(self, smeared_powers: Tensor, severity: Tensor) -> Tensor:
+        """Compute the square root of the power in each channel.
+
+        Shape: (items, frames, frequencies), (items,) -> (items, channels, frames).
+        """
         excitation = self._corrected("excitation") * self.ear_power
-        return ((smeared.relu() @ excitation[severity].mT) + _TINY).sqrt().mT
+        channel_powers = smeared_powers.relu() @ excitation[severity].mT
+        return (channel_powers + POWER_FLOOR).sqrt().mT
 
-    def smooth(self, level: Tensor, severity: Tensor, step: int = 1) -> Tensor:
-        """Envelopes at every ``step``-th frame. Shape: (items, channels, frames) -> (items, channels, frames / step)."""
-        items, channels, _ = level.shape
+    def smooth(self, levels: Tensor, severity: Tensor, step: int = 1) -> Tensor:
+        """Smooth the levels of channels to envelopes in Pa.
+
+        Shape: (items, channels, frames), (items,) -> (items, channels, ceil(frames / step)).
+
+        Args:
+            step: number of frames from one value of an envelope to the next.
+        """
+        items, channels, _ = levels.shape
         kernels = self._corrected("smoothing")[severity].reshape(items * channels, 1, -1)
-        level = functional.pad(
-            level, (_ENVELOPE_HALF_LENGTH, _ENVELOPE_HALF_LENGTH), mode="replicate"
-        )
-        level = functional.conv1d(
-            level.reshape(1, items * channels, -1), kernels, stride=step, groups=items * channels
-        )
-        return level.reshape(items, channels, -1).clamp_min(1e-7)
+        margin = (_ENVELOPE_HALF_LENGTH, _ENVELOPE_HALF_LENGTH)
+        padded = functional.pad(levels, margin, mode="replicate")
+        rows = padded.reshape(1, items * channels, -1)
+        envelopes = functional.conv1d(rows, kernels, stride=step, groups=items * channels)
+        return envelopes.reshape(items, channels, -1).clamp_min(MIN_ENVELOPE)
 
-    def log_gain(self, log_level: Tensor, thresholds: Tensor, severity: Tensor) -> Tensor:
-        """Recruitment's, of envelopes. Shape: (items, channels, steps), (items, 8), (items,) -> as the first."""
-        # 0 where a bank has fewer channels
+    def log_gain(self, log_envelope: Tensor, thresholds: Tensor, severity: Tensor) -> Tensor:
+        """Compute the logarithm of recruitment's gain for each channel.
+
+        Shape: (items, channels, steps), (items, 8), (items,) -> (items, channels, steps).
+
+        Args:
+            log_envelope: natural logarithm of envelopes in Pa.
+            thresholds: audiograms in dB HL.
+            severity: index of each ear's severity.
+        """
         weights = constant_like(thresholds, _threshold_weights)[severity]
         exponents = (expansion_ratios(thresholds, weights) - 1.0).unsqueeze(-1)
-        return (log_level - _LOG_CATCH_UP).clamp_max(0.0) * exponents
+        return (log_envelope - _LOG_CATCH_UP).clamp_max(0.0) * exponents
 
-    def weigh(self, gain: Tensor, severity: Tensor) -> Tensor:
-        """Factor on the smeared spectrum.
+    def gains_to_factors(self, gains: Tensor, severity: Tensor) -> Tensor:
+        """Compute complex factors on smeared spectra from complex gains of the channels.
 
-        Shape: real and imaginary (items, 2 channels, steps) -> (items, steps, frequencies, 2), real and imaginary.
+        Shape: (items, 2 * channels, steps), (items,) -> (items, steps, frequencies, 2).
+
+        Args:
+            gains: real parts of all channels' gains, followed by the imaginary parts.
+            severity: index of each ear's severity.
+
+        Returns: real and imaginary parts of the factors.
         """
         real, imaginary = self._corrected("relative")[:, severity]
-        # as one product, whose columns are real and imaginary in turn
-        rows = torch.cat(
-            (torch.stack((real, imaginary), -1), torch.stack((-imaginary, real), -1)), 1
-        )
-        return (gain.mT @ rows.flatten(-2)).unflatten(-1, (-1, 2))
+        # One matrix product computes real and imaginary parts, which alternate in its columns.
+        for_real_gains = torch.stack((real, imaginary), -1)
+        for_imaginary_gains = torch.stack((-imaginary, real), -1)
+        matrix = torch.cat((for_real_gains, for_imaginary_gains), 1).flatten(-2)
+        return (gains.mT @ matrix).unflatten(-1, (-1, 2))
 
     def _smearing(self) -> Tensor:
-        """Of powers before the way into the ear, which weighs them and is taken off again.
+        """Smearing matrices for powers before the outer and the middle ear.
 
-        Shape: -> (severities, frequencies, frequencies).
+        MSBG smears after these filters, so the matrices apply their power response and undo it.
+
+        Returns: matrices of shape (severities, frequencies, frequencies), first the identity matrix
+            for ears without a loss.
         """
-        smearing = self._corrected("smearing") * (self.ear_power / self.ear_power.unsqueeze(-1))
+        ear_ratio = self.ear_power / self.ear_power.unsqueeze(-1)
+        smearing = self._corrected("smearing") * ear_ratio
         identity = torch.eye(smearing.shape[-1], dtype=smearing.dtype, device=smearing.device)
         return torch.cat((identity.unsqueeze(0), smearing))
 
 
-def _widening(smeared: Tensor, given: Tensor) -> Tensor:
-    """Square root of the quotient of two powers, imaginary where the first is negative, as in MSBG."""
-    size = smeared.abs() + _TINY
-    # of a constant or a pure tone at 200 dB SPL some powers are 0, and the gradient of such a quotient infinite
-    root = (size / torch.maximum(given + _TINY, size / _WIDEST)).sqrt()
-    imaginary = root * (smeared < 0.0)
+def _smearing_factor(smeared_powers: Tensor, powers: Tensor) -> Tensor:
+    """Compute the square root of the ratio of two powers, imaginary for negative ratios.
+
+    Shape: (...), (...) -> complex (...).
+    """
+    magnitude = smeared_powers.abs() + POWER_FLOOR
+    # The limit of the ratio keeps its gradient finite where a power is 0, as for a pure tone at
+    # 200 dB SPL.
+    divisor = torch.maximum(powers + POWER_FLOOR, magnitude / MAX_POWER_RATIO)
+    root = (magnitude / divisor).sqrt()
+    imaginary = root * (smeared_powers < 0.0)
     return torch.complex(root - imaginary, imaginary)
 
 
 @lru_cache(maxsize=8)
 def _known_values(stft: STFT) -> dict[str, NDArray[np.float64]]:
-    """MSBG's formulae on the frequencies of a transform, by the name of the buffer that holds them.
+    """Compute MSBG's formulae at the frequencies of a transform, by the name of the buffer.
 
-    They take most of the time in which a network is built, and are the same for each.
+    They take most of the time in which a network is built, and are the same for all networks.
     """
-    points = 160 * stft.fft  # a fine grid that 44.1 kHz shares
-    coarse = slice(None, points // 2 + 1, 160)
+    points = _GRID_RATIO * stft.fft
+    model_points = points * 441 // 160
+    coarse = slice(None, points // 2 + 1, _GRID_RATIO)
     banks = [BANKS[severity] for severity in SEVERITIES]
-    ear_response = np.fft.rfft(ear_filter(), points * 441 // 160)[coarse]
-    fine = 160 * 160  # points of a grid that 44.1 kHz shares, at 16 kHz
-    responses = np.stack([fixed_response(bank, NEURO_RATE, fine) for bank in banks])
+    ear_response = np.fft.rfft(ear_filter(), model_points)[coarse]
+    response_points = _GRID_RATIO * 160
+    responses = np.stack([fixed_response(bank, NEURO_RATE, response_points) for bank in banks])
 
-    excitation, relative, smoothing = [], [], []
+    excitation = []
+    relative = []
+    smoothing = []
     for severity, bank in zip(SEVERITIES, banks, strict=True):
-        channels = gammatone_response(bank, points * 441 // 160, bins=points // 2 + 1)[:, coarse]
+        fine_channels = gammatone_response(bank, model_points, bins=points // 2 + 1)
+        channels = fine_channels[:, coarse]
+        # The power of a tone in a windowed frame, times this factor, is the square of the mean of
+        # the rectified tone.
         scale = 32.0 / (3.0 * stft.window * stft.fft) * (2.0 / math.pi) ** 2
         scale *= 10.0 ** (-_FLUCTUATION_DB[severity] / 10.0)
-        excitation.append(_padded(np.abs(channels) ** 2 * scale))
-        relative.append(_padded(channels / channels.sum(0)))
-        smoothing.append(_padded(_smoothing(bank, stft.hop)))
+        excitation.append(_pad_channels(np.abs(channels) ** 2 * scale))
+        relative.append(_pad_channels(channels / channels.sum(0)))
+        smoothing.append(_pad_channels(_smoothing_kernels(bank, stft.hop)))
     factors = np.stack(relative)
     return {
         "ear_power": np.abs(ear_response) ** 2,
-        "response": impulse_responses(responses, fine, NEURO_RATE),
+        "response": impulse_responses(responses, response_points, NEURO_RATE),
         "excitation": np.stack(excitation),
         "relative": np.stack((factors.real, factors.imag)),
         "smoothing": np.stack(smoothing),
-        "smearing": np.stack([_smearing(severity, stft) for severity in SEVERITIES[1:]]),
+        "smearing": np.stack([_smearing_matrix(severity, stft) for severity in SEVERITIES[1:]]),
     }
 
 
-def _smoothing(bank: FilterBank, hop: int) -> NDArray[np.float64]:
-    """The envelope's low-pass at the frame rate. Returns (channels, 2 half lengths + 1)."""
+def _smoothing_kernels(bank: FilterBank, hop: int) -> NDArray[np.float64]:
+    """Compute the low-passes of the envelopes at the frame rate.
+
+    Args:
+        hop: samples at 16 kHz from one frame to the next.
+
+    Returns: kernels of shape (channels, 2 * half length + 1), each with a sum of 1.
+    """
     points = 4096
+    length = 2 * _ENVELOPE_HALF_LENGTH + 1
     omega = 2.0 * np.pi * np.fft.rfftfreq(points) * (NEURO_RATE / hop) / MSBG_RATE
     delay = np.exp(-1j * omega)
-    rows = []
+    kernels = []
     for numerator, denominator in envelope_filters(bank):
         response = np.polyval(numerator[::-1], delay) / np.polyval(denominator[::-1], delay)
-        impulse = np.fft.irfft(np.abs(response) ** 2, points)
-        row = np.roll(impulse, _ENVELOPE_HALF_LENGTH)[: 2 * _ENVELOPE_HALF_LENGTH + 1]
-        rows.append(row / row.sum())
-    return np.array(rows)
+        impulse_response = np.fft.irfft(np.abs(response) ** 2, points)
+        kernel = np.roll(impulse_response, _ENVELOPE_HALF_LENGTH)[:length]
+        kernels.append(kernel / kernel.sum())
+    return np.array(kernels)
 
 
-def _smearing(severity: str, stft: STFT) -> NDArray[np.float64]:
-    """MSBG's smearing matrix on the transform's frequencies."""
+def _smearing_matrix(severity: str, stft: STFT) -> NDArray[np.float64]:
+    """Compute MSBG's smearing matrix at the frequencies of a transform.
+
+    Returns: matrix of shape (frequencies, frequencies).
+    """
     spacing = NEURO_RATE / stft.fft
+    # As MSBG's, the filters cover more than the frequencies of the transform, up to about 20 kHz.
     count = round(20000.0 / spacing / 4.0) * 4
-    filters = (roex_filters(*sides, count, spacing) for sides in ((1.0, 1.0), BROADENING[severity]))
-    matrix = smearing_from_filters(*filters)
+    normal = roex_filters(1.0, 1.0, count, spacing)
+    wide = roex_filters(*BROADENING[severity], count, spacing)
+    matrix = smearing_from_filters(normal, wide)
     return matrix[: stft.frequencies, : stft.frequencies]
 
 
 def _threshold_weights() -> NDArray[np.float64]:
-    """Of every severity's bank. Returns (severities, 8, channels)."""
-    return np.stack([_padded(threshold_weights(BANKS[severity]).T).T for severity in SEVERITIES])
+    """Compute the weights of thresholds in each channel, 0 for channels that a bank lacks.
+
+    Returns: weights of shape (severities, 8, channels).
+    """
+    weights = [threshold_weights(BANKS[severity]) for severity in SEVERITIES]
+    return np.stack([_pad_channels(bank_weights.T).T for bank_weights in weights])
 
 
-def _padded(rows: NDArray[np.generic]) -> NDArray[np.generic]:
+def _pad_channels(rows: NDArray[np.generic]) -> NDArray[np.generic]:
+    """Add rows of zeros up to the number of channels of the largest bank."""
     return np.pad(rows, ((0, CHANNELS - len(rows)), (0, 0)))

@@ -1,4 +1,7 @@
-"""The selective scan of Mamba (Gu and Dao 2023) in plain torch: parallel over time."""
+"""The selective scan of Mamba in plain torch, parallel over time.
+
+Source: Gu and Dao (2023), arXiv:2312.00752.
+"""
 
 from __future__ import annotations
 
@@ -12,13 +15,17 @@ from torch import Tensor
 from torch.linalg import vecdot
 from torch.nn import functional
 
-# States held at a time: what fits a core's cache, or keeps a GPU busy. Items and channels are taken in blocks of so many.
-_BLOCK_CPU, _BLOCK_GPU = 2**18, 2**27
+_STATES_PER_BLOCK_CPU = 2**18
+"""Number of states computed at once on a CPU, few enough for the cache of a core."""
 
-# Channels of a block at least: rows of fewer cost more than the cache gives.
-_NARROWEST = 8
+_STATES_PER_BLOCK_GPU = 2**27
+"""Number of states computed at once on a GPU, enough to keep it busy."""
+
+_MIN_CHANNELS_PER_BLOCK = 8
+"""Smallest number of channels computed at once. Shorter rows cost more than the cache saves."""
 
 _Step = Callable[[], Any]
+"""One tensor operation of a scan, without arguments."""
 
 
 def selective_scan(
@@ -32,112 +39,163 @@ def selective_scan(
     delta_bias: Tensor | None = None,
     delta_softplus: bool = False,
 ) -> Tensor:
-    """y with h[t] = exp(delta[t] A) h[t-1] + delta[t] B[t] u[t] and y[t] = C[t] h[t] + D u[t], times silu(z).
+    """Run a linear recurrence whose coefficients depend on time.
 
-    The signature of ``mamba_ssm``'s function of that name, whose kernel does the work where it imports and the tensors
-    are on a GPU. Here the recurrence is a tree: about log2(time) steps, each over all times at once; the states are
-    computed again in the backward pass instead of being kept. It has a first derivative only; asked for a second, it
-    raises RuntimeError.
+    The states are h[t] = exp(delta[t] A) h[t - 1] + delta[t] B[t] u[t] with h[-1] = 0, and the
+    result is (C[t] h[t] + D u[t]) silu(z[t]).
 
-    Shape: u, delta, z (items, channels, time); A (channels, states); B, C (items, states, time); D, delta_bias
-        (channels,) -> (items, channels, time).
+    The function has the signature of that of ``mamba_ssm``, and calls it for tensors on a GPU where
+    it is installed. Otherwise, the recurrence is computed in about log2(time) steps, each of which
+    is parallel over time. The gradient computes the states again, so that they are not stored.
+    There is no second derivative.
+
+    Shape: (items, channels, time) -> (items, channels, time).
 
     Args:
-        A: negative, or the states grow.
-        delta_softplus: pass delta (+ delta_bias) through softplus.
+        u: input. Shape: (items, channels, time).
+        delta: step sizes. Shape: (items, channels, time).
+        A: rates, negative so that the states are bounded. Shape: (channels, states).
+        B: weights of the input in the states. Shape: (items, states, time).
+        C: weights of the states in the result. Shape: (items, states, time).
+        D: weight of the input in the result, 0 by default. Shape: (channels,).
+        z: gate of the result, no gate by default. Shape: (items, channels, time).
+        delta_bias: value added to the step sizes, 0 by default. Shape: (channels,).
+        delta_softplus: apply softplus to the step sizes and their bias.
 
     Raises:
-        ValueError: shapes that do not fit.
+        ValueError: the shapes do not fit together.
+        RuntimeError: a second derivative is computed.
+
+    >>> u = torch.ones(1, 1, 3)
+    >>> selective_scan(u, delta=u, A=torch.zeros(1, 1), B=u, C=u)  # a cumulative sum
+    tensor([[[1., 2., 3.]]])
     """
-    items, channels, time = u.shape
-    states = A.shape[-1]
-    if (
-        delta.shape != u.shape
-        or A.shape[0] != channels
-        or not B.shape == C.shape == (items, states, time)
-    ):
-        raise ValueError(
-            f"u {[*u.shape]}, delta {[*delta.shape]}, A {[*A.shape]}, B {[*B.shape]}, C {[*C.shape]}; "
-            "allowed: u and delta (items, channels, time), A (channels, states), B and C (items, states, time)"
-        )
-    if (kernel := _kernel_for(u)) is not None:
+    _check_shapes(u, delta, A, B, C)
+    kernel = _kernel_for(u)
+    if kernel is not None:
         output: Tensor = kernel(
             u, delta, A, B, C, D=D, z=z, delta_bias=delta_bias, delta_softplus=delta_softplus
         )
         return output
-    # powers of decays want their precision
-    given, whole = u.dtype, torch.promote_types(u.dtype, torch.float32)
-    u, delta, A, B, C = (tensor.to(whole) for tensor in (u, delta, A, B, C))
+    # Products of many decays need at least the precision of float32.
+    input_dtype = u.dtype
+    dtype = torch.promote_types(input_dtype, torch.float32)
+    u, delta, A, B, C = (tensor.to(dtype) for tensor in (u, delta, A, B, C))
     if delta_bias is not None:
         delta = delta + delta_bias.unsqueeze(-1)
     if delta_softplus:
         delta = functional.softplus(delta)
     y = _SelectiveScan.apply(delta.mT, u.mT, B.mT, C.mT, A.mT.contiguous()).mT
     if D is not None:
-        y = torch.addcmul(y, u, D.to(whole).unsqueeze(-1))
-    return (y if z is None else y * functional.silu(z)).to(given)
+        y = torch.addcmul(y, u, D.to(dtype).unsqueeze(-1))
+    if z is not None:
+        y = y * functional.silu(z)
+    return y.to(input_dtype)
 
 
-def _onward(decay: Tensor, states: Tensor, spare: Tensor) -> list[_Step]:
-    """The steps of h[t] = decay[t] h[t-1] + drive[t] with h[-1] = 0, in place of the drive.
+def _check_shapes(u: Tensor, delta: Tensor, A: Tensor, B: Tensor, C: Tensor) -> None:
+    """Raise ValueError unless the shapes of ``selective_scan``'s arguments fit together."""
+    items, channels, time = u.shape
+    weights_shape = (items, A.shape[-1], time)
+    fits = delta.shape == u.shape and A.shape[0] == channels
+    if not fits or B.shape != weights_shape or C.shape != weights_shape:
+        shapes = {"u": u, "delta": delta, "A": A, "B": B, "C": C}
+        actual = ", ".join(f"{name} {tuple(tensor.shape)}" for name, tensor in shapes.items())
+        raise ValueError(
+            "expected u and delta of shape (items, channels, time), A of (channels, states), B and "
+            f"C of (items, states, time), got {actual}"
+        )
 
-    Neighbours are joined in pairs, their scan is one of half the length, and the times between follow from it: about
-    three operations a time, log2(time) deep, and only products of decays, so that nothing overflows.
 
-    Shape: (items, time, ...) each; ``spare`` takes the products of decays.
+def _forward_steps(decay: Tensor, states: Tensor, scratch: Tensor) -> list[_Step]:
+    """Build the steps that compute h[t] = decay[t] h[t - 1] + drive[t] with h[-1] = 0 in place.
+
+    Neighbouring times are joined in pairs. The recurrence of the pairs has half the length and the
+    same form, and the times between them follow from it. This takes about three operations per time
+    in log2(time) steps. Nothing overflows, because decays are multiplied and never divided.
+
+    Shape: (items, time, ...) for all tensors.
+
+    Args:
+        decay: decays, which are at most 1.
+        states: drive, which the steps replace by the states.
+        scratch: memory for products of decays.
     """
-    time, half = states.shape[1], states.shape[1] // 2
-    if not half:
+    time = states.shape[1]
+    half = time // 2
+    if half == 0:
         return []
-    odd, later = states[:, 1::2], decay[:, 1::2]
-    steps: list[_Step] = [partial(odd.addcmul_, later, states[:, : time - 1 : 2])]
+    # The second time of each pair
+    second_states = states[:, 1::2]
+    second_decay = decay[:, 1::2]
+    first_states = states[:, : time - 1 : 2]
+    steps: list[_Step] = [partial(second_states.addcmul_, second_decay, first_states)]
     if half > 1:
-        joined = spare[:, :half]
-        steps.append(partial(torch.mul, later, decay[:, : time - 1 : 2], out=joined))
-        steps += _onward(joined, odd, spare[:, half:])
+        pair_decay = scratch[:, :half]
+        first_decay = decay[:, : time - 1 : 2]
+        steps.append(partial(torch.mul, second_decay, first_decay, out=pair_decay))
+        steps += _forward_steps(pair_decay, second_states, scratch[:, half:])
     if time > 2:
-        steps.append(partial(states[:, 2::2].addcmul_, decay[:, 2::2], odd[:, : (time - 1) // 2]))
+        later_first_states = states[:, 2::2]
+        states_before = second_states[:, : (time - 1) // 2]
+        steps.append(partial(later_first_states.addcmul_, decay[:, 2::2], states_before))
     return steps
 
 
-def _back(decay: Tensor, states: Tensor, spare: Tensor) -> list[_Step]:
-    """As ``_onward``, of h[t] = decay[t] h[t+1] + drive[t] with h[time] = 0. Shape: (items, time - 1, ...) for decay."""
-    time, half = states.shape[1], states.shape[1] // 2
-    if not half:
+def _backward_steps(decay: Tensor, states: Tensor, scratch: Tensor) -> list[_Step]:
+    """Build the steps that compute h[t] = decay[t] h[t + 1] + drive[t] with h[time] = 0 in place.
+
+    This is ``_forward_steps`` backwards in time, with pairs counted from the end.
+
+    Shape: (items, time - 1, ...) for ``decay``, (items, time, ...) for the others.
+    """
+    time = states.shape[1]
+    half = time // 2
+    if half == 0:
         return []
-    odd = time % 2  # pairs are counted from the end
-    first, earlier = states[:, odd::2], decay[:, odd::2]
-    steps: list[_Step] = [partial(first.addcmul_, earlier, states[:, odd + 1 :: 2])]
+    start = time % 2
+    first_states = states[:, start::2]
+    first_decay = decay[:, start::2]
+    second_states = states[:, start + 1 :: 2]
+    steps: list[_Step] = [partial(first_states.addcmul_, first_decay, second_states)]
     if half > 1:
-        joined = spare[:, : half - 1]
-        steps.append(partial(torch.mul, earlier[:, :-1], decay[:, odd + 1 :: 2], out=joined))
-        steps += _back(joined, first, spare[:, half:])
+        pair_decay = scratch[:, : half - 1]
+        second_decay = decay[:, start + 1 :: 2]
+        steps.append(partial(torch.mul, first_decay[:, :-1], second_decay, out=pair_decay))
+        steps += _backward_steps(pair_decay, first_states, scratch[:, half:])
     if time > 2:
-        between = states[:, 1 - odd : -1 : 2]
-        steps.append(partial(between.addcmul_, decay[:, 1 - odd :: 2], first[:, 1 - odd :]))
+        earlier_second_states = states[:, 1 - start : -1 : 2]
+        states_after = first_states[:, 1 - start :]
+        steps.append(
+            partial(earlier_second_states.addcmul_, decay[:, 1 - start :: 2], states_after)
+        )
     return steps
 
 
-def _take(steps: list[_Step]) -> None:
+def _run_steps(steps: list[_Step]) -> None:
     for step in steps:
         step()
 
 
 class _SelectiveScan(torch.autograd.Function):
-    """Shape: delta, u (items, time, channels); B, C (items, time, states); A (states, channels) -> as u.
+    """The scan, with channels last and time before states, so that each step works on whole rows.
 
-    Inside, channels lie last and times before states: every step then works on whole rows.
+    Shape: (items, time, channels) for delta and u, (items, time, states) for B and C, (states,
+        channels) for A -> (items, time, channels).
     """
 
     @staticmethod
     def forward(delta: Tensor, u: Tensor, B: Tensor, C: Tensor, A: Tensor) -> Tensor:
         y = u.new_empty(u.shape)
         with torch.autocast(u.device.type, enabled=False):
-            for rows, columns, work in _blocks(u, A, back=False):
-                d, v = (tensor[rows, :, columns].contiguous() for tensor in (delta, u))
-                b, c = (tensor[rows].contiguous() for tensor in (B, C))
-                work.run(d, v, b, A[:, columns])
-                y[rows, :, columns] = (c.unsqueeze(-2) @ work.states).squeeze(-2)
+            for items, channels, workspace in _blocks(u, A, needs_gradient=False):
+                block_delta = delta[items, :, channels].contiguous()
+                block_u = u[items, :, channels].contiguous()
+                block_B = B[items].contiguous()
+                block_C = C[items].contiguous()
+                workspace.run_forward(block_delta, block_u, block_B, A[:, channels])
+                block_y = block_C.unsqueeze(-2) @ workspace.states
+                y[items, :, channels] = block_y.squeeze(-2)
         return y
 
     @staticmethod
@@ -145,42 +203,55 @@ class _SelectiveScan(torch.autograd.Function):
         ctx.save_for_backward(*inputs)
 
     @staticmethod
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, ...]:
-        slopes: tuple[Tensor, ...] = _Slopes.apply(grad, *ctx.saved_tensors)
-        return slopes
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, ...]:
+        gradients: tuple[Tensor, ...] = _ScanGradient.apply(gradient, *ctx.saved_tensors)
+        return gradients
 
 
-class _Slopes(torch.autograd.Function):
-    """The gradients, by another function: with ``once_differentiable``, ``torch.autograd.grad`` for chosen inputs
-    finds no way through a second derivative and leaves its part out.
+class _ScanGradient(torch.autograd.Function):
+    """Gradients of the scan, which raise an error if they are differentiated.
+
+    With ``once_differentiable`` instead, ``torch.autograd.grad`` for a subset of the inputs would
+    ignore the second derivative without an error.
     """
 
     @staticmethod
     def forward(
-        grad: Tensor, delta: Tensor, u: Tensor, B: Tensor, C: Tensor, A: Tensor
+        gradient: Tensor, delta: Tensor, u: Tensor, B: Tensor, C: Tensor, A: Tensor
     ) -> tuple[Tensor, ...]:
-        grad_delta, grad_u = u.new_empty(u.shape), u.new_empty(u.shape)
-        grad_A, grad_B, grad_C = torch.zeros_like(A), torch.zeros_like(B), torch.zeros_like(C)
-        with torch.autocast(
-            u.device.type, enabled=False
-        ):  # backward may be called in an autocast region
-            for rows, columns, work in _blocks(u, A, back=True):
-                d, v, g = (tensor[rows, :, columns].contiguous() for tensor in (delta, u, grad))
-                b, c = (tensor[rows].contiguous() for tensor in (B, C))
-                a = A[:, columns]
-                work.run(d, v, b, a)
-                grad_C[rows] += vecdot(
-                    work.states, g.unsqueeze(-2)
-                )  # matmul takes three times as long
-                slope = work.run_back(g, c)
-                driven = (b.unsqueeze(-2) @ slope).squeeze(-2)
-                grad_u[rows, :, columns] = driven * d
-                grad_B[rows] += vecdot(slope, (d * v).unsqueeze(-2))
-                exponent = work.states[:, :-1].mul_(work.decay[:, 1:]).mul_(slope[:, 1:])
-                driven.mul_(v)[:, 1:] += torch.mul(exponent, a, out=work.spare[:, 1:]).sum(-2)
-                grad_delta[rows, :, columns] = driven
-                # both sums at once, of a slice, take 20 times as long
-                grad_A[:, columns] += exponent.mul_(d[:, 1:].unsqueeze(-2)).sum(1).sum(0)
+        grad_delta = u.new_empty(u.shape)
+        grad_u = u.new_empty(u.shape)
+        grad_A = torch.zeros_like(A)
+        grad_B = torch.zeros_like(B)
+        grad_C = torch.zeros_like(C)
+        # The backward pass may run in a region of autocast.
+        with torch.autocast(u.device.type, enabled=False):
+            for items, channels, workspace in _blocks(u, A, needs_gradient=True):
+                block_delta = delta[items, :, channels].contiguous()
+                block_u = u[items, :, channels].contiguous()
+                block_gradient = gradient[items, :, channels].contiguous()
+                block_B = B[items].contiguous()
+                block_C = C[items].contiguous()
+                block_A = A[:, channels]
+                workspace.run_forward(block_delta, block_u, block_B, block_A)
+                # matmul takes three times as long as vecdot.
+                grad_C[items] += vecdot(workspace.states, block_gradient.unsqueeze(-2))
+                grad_states = workspace.run_backward(block_gradient, block_C)
+                grad_drive = (block_B.unsqueeze(-2) @ grad_states).squeeze(-2)
+                grad_u[items, :, channels] = grad_drive * block_delta
+                drive = (block_delta * block_u).unsqueeze(-2)
+                grad_B[items] += vecdot(grad_states, drive)
+
+                # The gradient with respect to the exponent delta[t] A replaces the states.
+                grad_exponent = workspace.states[:, :-1].mul_(workspace.decay[:, 1:])
+                grad_exponent.mul_(grad_states[:, 1:])
+                product = torch.mul(grad_exponent, block_A, out=workspace.scratch[:, 1:])
+                block_grad_delta = grad_drive.mul_(block_u)
+                block_grad_delta[:, 1:] += product.sum(-2)
+                grad_delta[items, :, channels] = block_grad_delta
+                grad_exponent.mul_(block_delta[:, 1:].unsqueeze(-2))
+                # One sum over both dimensions of a slice takes 20 times as long as two sums.
+                grad_A[:, channels] += grad_exponent.sum(1).sum(0)
         return grad_delta, grad_u, grad_B, grad_C, grad_A
 
     @staticmethod
@@ -188,64 +259,93 @@ class _Slopes(torch.autograd.Function):
         pass
 
     @staticmethod
-    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, ...]:
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, ...]:
         raise RuntimeError(
-            "the selective scan (mamba blocks) has no second derivative; allowed: cnn or lstm blocks"
+            "the selective scan of mamba blocks has no second derivative; use cnn or lstm blocks"
         )
 
 
 class _Workspace:
-    """Decays and states of a block, in memory that the next block uses again. Shape: (items, time, states, channels)."""
+    """Decays and states of a block, in memory that all blocks share.
+
+    Args:
+        shape: (items, time, states, channels) of the block.
+        memory: three flat tensors, or four if the gradient is computed.
+
+    Attributes:
+        decay: decays of the states.
+        states: states, which overwrite the drive.
+        scratch: memory for products of decays.
+        grad_states: gradient with respect to the states, if it is computed.
+    """
 
     def __init__(self, shape: tuple[int, ...], memory: list[Tensor]) -> None:
         views = [part[: math.prod(shape)].view(shape) for part in memory]
-        self.decay, self.states, self.spare = views[:3]
-        self.slope = views[-1]  # a fourth, where there is a way back
-        self.onward = _onward(self.decay, self.states, self.spare)
+        self.decay, self.states, self.scratch = views[:3]
+        self.grad_states = views[-1]
+        self.forward_steps = _forward_steps(self.decay, self.states, self.scratch)
 
-    def run(self, delta: Tensor, u: Tensor, B: Tensor, A: Tensor) -> None:
-        """Fill ``decay`` and ``states``."""
+    def run_forward(self, delta: Tensor, u: Tensor, B: Tensor, A: Tensor) -> None:
+        """Compute the decays and the states."""
         torch.mul(delta.unsqueeze(-2), A, out=self.decay).exp_()
         torch.mul((delta * u).unsqueeze(-2), B.unsqueeze(-1), out=self.states)
-        _take(self.onward)
+        _run_steps(self.forward_steps)
 
     @cached_property
-    def back(self) -> list[_Step]:
-        return _back(self.decay[:, 1:], self.slope, self.spare)
+    def backward_steps(self) -> list[_Step]:
+        return _backward_steps(self.decay[:, 1:], self.grad_states, self.scratch)
 
-    def run_back(self, grad: Tensor, C: Tensor) -> Tensor:
-        """The gradient of the states: the same recurrence, backwards, with the next time's decay."""
-        torch.mul(C.unsqueeze(-1), grad.unsqueeze(-2), out=self.slope)
-        _take(self.back)
-        return self.slope
+    def run_backward(self, gradient: Tensor, C: Tensor) -> Tensor:
+        """Compute the gradient with respect to the states.
+
+        It follows the same recurrence backwards in time, with the decay of the following time.
+        """
+        torch.mul(C.unsqueeze(-1), gradient.unsqueeze(-2), out=self.grad_states)
+        _run_steps(self.backward_steps)
+        return self.grad_states
 
 
-def _blocks(u: Tensor, A: Tensor, back: bool) -> Iterator[tuple[slice, slice, _Workspace]]:
-    """Items, channels and the memory to work in. Blocks are of all channels, or of one item."""
+def _blocks(
+    u: Tensor, A: Tensor, needs_gradient: bool
+) -> Iterator[tuple[slice, slice, _Workspace]]:
+    """Divide items and channels into blocks, either of all channels or of one item.
+
+    Yields: items and channels of the block, and the workspace for it.
+    """
     items, time, channels = u.shape
-    room = max(_NARROWEST, (_BLOCK_GPU if u.is_cuda else _BLOCK_CPU) // max(1, time * len(A)))
-    width = math.ceil(channels / math.ceil(channels / room))  # blocks of about the same size
-    height = max(1, min(items, room // channels))
-    memory = [u.new_empty(height * time * len(A) * width) for _ in range(4 if back else 3)]
-    spaces: dict[tuple[int, ...], _Workspace] = {}
-    for top in range(0, items, height):
-        for left in range(0, channels, width):
-            shape = (min(height, items - top), time, len(A), min(width, channels - left))
-            if shape not in spaces:
-                spaces[shape] = _Workspace(shape, memory)
-            yield slice(top, top + height), slice(left, left + width), spaces[shape]
+    states = len(A)
+    states_per_block = _STATES_PER_BLOCK_GPU if u.is_cuda else _STATES_PER_BLOCK_CPU
+    rows = max(_MIN_CHANNELS_PER_BLOCK, states_per_block // max(1, time * states))
+    # Blocks of one item have about the same number of channels each.
+    channels_per_block = math.ceil(channels / math.ceil(channels / rows))
+    items_per_block = max(1, min(items, rows // channels))
+    values = items_per_block * time * states * channels_per_block
+    memory = [u.new_empty(values) for _ in range(4 if needs_gradient else 3)]
+    workspaces: dict[tuple[int, ...], _Workspace] = {}
+    for item in range(0, items, items_per_block):
+        for channel in range(0, channels, channels_per_block):
+            block_items = min(items_per_block, items - item)
+            block_channels = min(channels_per_block, channels - channel)
+            shape = (block_items, time, states, block_channels)
+            if shape not in workspaces:
+                workspaces[shape] = _Workspace(shape, memory)
+            yield (
+                slice(item, item + items_per_block),
+                slice(channel, channel + channels_per_block),
+                workspaces[shape],
+            )
 
 
 def _kernel_for(u: Tensor) -> Callable[..., Any] | None:
-    """``mamba_ssm``'s scan if ``selective_scan`` takes it for such a tensor."""
+    """Scan of ``mamba_ssm`` if it works for a tensor, otherwise None."""
     return _kernel() if u.is_cuda and u.dtype != torch.float64 else None
 
 
 @cache
 def _kernel() -> Callable[..., Any] | None:
-    """``mamba_ssm``'s scan; None where it is not installed, or was built without its kernel."""
+    """Scan of ``mamba_ssm``, or None if it is not installed or lacks its compiled kernel."""
     try:
         from mamba_ssm.ops.selective_scan_interface import selective_scan_fn
-    except Exception:  # a build for another torch or GPU fails with whatever it likes
+    except Exception:  # because a build for another torch or GPU may raise anything
         return None
     return selective_scan_fn

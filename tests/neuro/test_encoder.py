@@ -1,4 +1,4 @@
-"""The dense encoder's convolutions: what they are, whichever way they are computed."""
+"""Dilated convolutions equal torch's, whichever way they are computed."""
 
 import pytest
 import torch
@@ -10,19 +10,16 @@ from hlsim.neuro.encoder import DilatedConv
 @pytest.mark.parametrize("frozen", [False, True])
 @pytest.mark.parametrize("dilation", [1, 2, 8])
 @pytest.mark.parametrize("time", [1, 8, 21])
-def test_dilated_convolution_is_torch_s(time: int, dilation: int, frozen: bool) -> None:
+def test_dilated_convolution_equals_torchs(time: int, dilation: int, frozen: bool) -> None:
     conv = DilatedConv(3, 4, dilation).double().requires_grad_(not frozen)
     features = torch.randn(2, 3, time, 5, dtype=torch.float64, requires_grad=True)
     expected = functional.conv2d(
         features, conv.weight, conv.bias, padding=(dilation, 1), dilation=(dilation, 1)
     )
-    found = conv(features)
-    torch.testing.assert_close(found, expected, atol=1e-12, rtol=1e-12)
-    wanted = [features, *(weight for weight in conv.parameters() if weight.requires_grad)]
+    output = conv(features)
+    torch.testing.assert_close(output, expected, atol=1e-12, rtol=1e-12)
+    inputs = [features, *(weight for weight in conv.parameters() if weight.requires_grad)]
     direction = torch.randn_like(expected)
-    for mine, theirs in zip(
-        torch.autograd.grad(found, wanted, direction),
-        torch.autograd.grad(expected, wanted, direction),
-        strict=True,
-    ):
-        torch.testing.assert_close(mine, theirs, atol=1e-12, rtol=1e-12)
+    gradients = torch.autograd.grad(output, inputs, direction)
+    expected_gradients = torch.autograd.grad(expected, inputs, direction)
+    torch.testing.assert_close(gradients, expected_gradients, atol=1e-12, rtol=1e-12)

@@ -1,4 +1,4 @@
-"""The family: blocks, baselines and ablations, their sizes and laws."""
+"""All kinds of blocks, baselines and ablations have their size and obey laws."""
 
 from pathlib import Path
 
@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from hlsim import Audiogram, NeuroMSBG
+from hlsim.dsp.stft import STFT
 from hlsim.neuro import NeuroConfig
 from hlsim.training.ears import draw_thresholds
 from hlsim.training.recipes import SimulatorRecipe
@@ -54,7 +55,8 @@ KINDS = {
 def network(kind: str) -> NeuroMSBG:
     torch.manual_seed(0)
     model = NeuroMSBG(NeuroConfig.from_dict(SMALL | KINDS[kind]))
-    with torch.no_grad():  # decoders start at zero: what is before them would not be seen
+    # Decoders are zero before training, so that layers before them would have no effect.
+    with torch.no_grad():
         for parameter in model.parameters():
             parameter += 0.05 * torch.randn_like(parameter)
     return model.eval()
@@ -65,7 +67,7 @@ def recipe(name: str) -> SimulatorRecipe:
 
 
 @pytest.mark.parametrize("name", MILLIONS)
-def test_paper_sizes(name: str) -> None:
+def test_networks_have_the_sizes_of_the_papers(name: str) -> None:
     model = NeuroMSBG(NeuroConfig.from_dict(recipe(name).model))
     count = sum(parameter.numel() for parameter in model.parameters())
     assert count / 1e6 == pytest.approx(MILLIONS[name], rel=0.03)
@@ -73,13 +75,13 @@ def test_paper_sizes(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", SIMULATORS)
-def test_every_recipe_makes_a_network(name: str) -> None:
+def test_every_recipe_builds_a_network(name: str) -> None:
     model = NeuroMSBG(NeuroConfig.from_dict(recipe(name).model))
     with torch.no_grad():
         assert model(0.02 * torch.randn(2, 1600), Audiogram.standard("N3")).shape == (2, 1600)
 
 
-def test_ablations_differ_from_their_counterpart_in_one_setting() -> None:
+def test_ablations_change_one_setting() -> None:
     base = NeuroConfig.from_dict(recipe("mamba").model).to_dict()
     for name, setting in (("mamba-magnitude-only", "phase"), ("mamba-concatenated", "audiogram")):
         other = NeuroConfig.from_dict(recipe(name).model).to_dict()
@@ -87,37 +89,39 @@ def test_ablations_differ_from_their_counterpart_in_one_setting() -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_keeps_shapes_and_gives_items_what_they_would_get_alone(kind: str) -> None:
-    model, generator = network(kind), torch.Generator().manual_seed(2)
+def test_a_batch_equals_its_items_and_has_the_shape_of_the_input(kind: str) -> None:
+    model = network(kind)
+    generator = torch.Generator().manual_seed(2)
     waveforms = 0.02 * torch.randn(3, 3201, generator=generator)
     ears = draw_thresholds(3, generator)
     with torch.no_grad():
-        together = model(waveforms, ears)
-        assert together.shape == waveforms.shape and bool(torch.isfinite(together).all())
+        batch = model(waveforms, ears)
+        assert batch.shape == waveforms.shape and bool(torch.isfinite(batch).all())
         for i in range(3):
-            alone = model(waveforms[i], ears[i])
-            assert float((together[i] - alone).norm() / alone.norm()) < 1e-4
+            item = model(waveforms[i], ears[i])
+            assert float((batch[i] - item).norm() / item.norm()) < 1e-4
 
 
-def test_attention_takes_no_shortcut_that_holds_every_pair_of_times(
+def test_attention_does_not_store_all_pairs_of_times(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     model = network("transformer").eval()
-    waveform, ear = 0.02 * torch.randn(1, 1600), Audiogram.standard("N3")
+    waveform = 0.02 * torch.randn(1, 1600)
+    ear = Audiogram.standard("N3")
     expected = model(waveform, ear).detach()
 
-    def refuse(*arguments: object) -> None:
-        raise AssertionError("torch's shortcut")
+    def fail(*arguments: object) -> None:
+        raise AssertionError("torch's implementation for evaluation stores all pairs")
 
     for name in ("_transformer_encoder_layer_fwd", "_native_multi_head_attention"):
-        monkeypatch.setattr(torch, name, refuse)
+        monkeypatch.setattr(torch, name, fail)
     with torch.no_grad():
         torch.testing.assert_close(model(waveform, ear), expected)
 
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("level", [-20.0, 65.0, 120.0])
-def test_gradients_are_finite_and_reach_every_parameter(kind: str, level: float) -> None:
+def test_every_parameter_has_a_finite_gradient(kind: str, level: float) -> None:
     model = network(kind).train()
     waveform = torch.randn(2, 2000, generator=torch.Generator().manual_seed(3))
     waveform = (waveform * 10.0 ** ((level - 94.0) / 20.0)).requires_grad_()
@@ -128,64 +132,70 @@ def test_gradients_are_finite_and_reach_every_parameter(kind: str, level: float)
 
 
 @pytest.mark.parametrize("kind", ["cnn", "mamba", "monolithic lstm", "bands"])
-def test_is_deterministic_and_survives_saving(kind: str, tmp_path: Path) -> None:
+def test_networks_are_deterministic_and_restored_from_a_checkpoint(
+    kind: str, tmp_path: Path
+) -> None:
     from hlsim import load_pretrained
     from hlsim.pretrained import save_checkpoint
 
-    model, again = network(kind), network(kind)
-    waveform, ear = 0.02 * torch.randn(1600), Audiogram.standard("N2")
-    save_checkpoint(tmp_path / "kept", "neuro-msbg", model, model.config.to_dict(), {})
+    model = network(kind)
+    waveform = 0.02 * torch.randn(1600)
+    ear = Audiogram.standard("N2")
+    save_checkpoint(tmp_path / "checkpoint", "neuro-msbg", model, model.config.to_dict(), {})
+    loaded = load_pretrained(tmp_path / "checkpoint")
+    for name, value in model.state_dict().items():
+        assert torch.equal(value, loaded.state_dict()[name])
     with torch.no_grad():
-        heard = model(waveform, ear)
-        assert torch.equal(heard, again(waveform, ear))
-        loaded = load_pretrained(tmp_path / "kept")
-        # the weights to the bit; what is heard need not be, on processors that mind where in memory they lie
-        for name, value in model.state_dict().items():
-            assert torch.equal(value, loaded.state_dict()[name])
-        torch.testing.assert_close(loaded(waveform, ear), heard, rtol=1e-4, atol=1e-7)
+        output = model(waveform, ear)
+        assert torch.equal(output, network(kind)(waveform, ear))
+        # The last bits may depend on where in memory the weights lie.
+        torch.testing.assert_close(loaded(waveform, ear), output, rtol=1e-4, atol=1e-7)
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_silence_stays_silent(kind: str) -> None:
     waveform = torch.zeros(1600, requires_grad=True)
-    heard = network(kind)(waveform, Audiogram.standard("N4"))
-    heard.sum().backward()
-    assert not bool(heard.any()) and bool(torch.isfinite(waveform.grad).all())
+    output = network(kind)(waveform, Audiogram.standard("N4"))
+    output.sum().backward()
+    assert not bool(output.any()) and bool(torch.isfinite(waveform.grad).all())
 
 
-def test_magnitude_only_keeps_the_phase() -> None:
+def test_a_network_for_the_magnitude_does_not_change_the_phase() -> None:
     model = network("magnitude only")
     waveform = 0.02 * torch.randn(1, 4000, generator=torch.Generator().manual_seed(4))
-    calls = []
-    synthesise = type(model.stft).synthesise
+    spectra = []
+    synthesise = STFT.synthesise
+
+    def synthesise_and_store(stft: STFT, spectrum: torch.Tensor, length: int) -> torch.Tensor:
+        spectra.append(spectrum.detach())
+        return synthesise(stft, spectrum, length)
+
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(
-            type(model.stft),
-            "synthesise",
-            lambda s, x, n: (calls.append(x), synthesise(s, x, n))[1],
-        )
+        patch.setattr(STFT, "synthesise", synthesise_and_store)
         model(waveform, Audiogram.standard("N3"))
-    spectrum = model.stft.analyse(waveform)
-    factor = calls[0] / spectrum
-    assert float((factor.imag.abs().max() / factor.real.abs().max()).detach()) < 1e-4 and bool(
-        (factor.real > 0.0).all()
-    )
+    factor = spectra[0] / model.stft.analyse(waveform)
+    assert float(factor.imag.abs().max() / factor.real.abs().max()) < 1e-4
+    assert bool((factor.real > 0.0).all())
 
 
-def test_the_paper_s_normalisation_hides_the_level_and_ours_does_not() -> None:
-    waveform, ear = 0.02 * torch.randn(4000), Audiogram.standard("N3")
-    for kind, hidden in (("normalised", True), ("magnitude only", False)):
+def test_networks_depend_on_the_level_except_with_the_papers_normalisation() -> None:
+    waveform = 0.02 * torch.randn(4000)
+    ear = Audiogram.standard("N3")
+    for kind, is_linear in (("normalised", True), ("magnitude only", False)):
         model = network(kind)
         with torch.no_grad():
-            louder, scaled = model(10.0 * waveform, ear), 10.0 * model(waveform, ear)
-        assert (float((louder - scaled).norm() / scaled.norm()) < 1e-3) == hidden
+            output_of_louder = model(10.0 * waveform, ear)
+            louder_output = 10.0 * model(waveform, ear)
+        error = (output_of_louder - louder_output).norm() / louder_output.norm()
+        assert (float(error) < 1e-3) == is_linear
 
 
-def test_the_concatenated_audiogram_is_seen() -> None:
-    model, waveform = network("concatenated"), 0.02 * torch.randn(1600)
+def test_a_concatenated_audiogram_affects_the_output() -> None:
+    model = network("concatenated")
+    waveform = 0.02 * torch.randn(1600)
     with torch.no_grad():
-        heard = [model(waveform, Audiogram.standard(name)) for name in ("N1", "N4")]
-    assert model.audiogram_encoder is None and not torch.allclose(*heard)
+        outputs = [model(waveform, Audiogram.standard(name)) for name in ("N1", "N4")]
+    assert model.audiogram_encoder is None and not torch.allclose(*outputs)
 
 
 @pytest.mark.parametrize(
@@ -205,28 +215,27 @@ def test_a_bad_choice_raises_value_error(change: dict[str, object]) -> None:
 
 
 @pytest.mark.parametrize("block", ["cnn", "lstm", "transformer", "mamba"])
-def test_derivatives_are_right_or_refused(block: str) -> None:
-    """What the docstring of NeuroMSBG says of each kind of block."""
-    model, ear = network(block).double(), Audiogram.standard("N3")
-    wave, along = (
-        0.02 * torch.randn(2, 400, dtype=torch.float64),
-        torch.randn(400, dtype=torch.float64),
-    )
+def test_derivatives_are_exact_or_raise(block: str) -> None:
+    """The docstring of NeuroMSBG states which derivatives work for each kind of block."""
+    model = network(block).double()
+    ear = Audiogram.standard("N3")
+    wave = 0.02 * torch.randn(2, 400, dtype=torch.float64)
+    direction = torch.randn(400, dtype=torch.float64)
 
     def energy(waveform: torch.Tensor) -> torch.Tensor:
         return model(waveform, ear).square().sum()
 
     def slope(waveform: torch.Tensor, create_graph: bool = False) -> torch.Tensor:
-        given = waveform if create_graph else waveform.detach().requires_grad_()
-        return torch.autograd.grad(energy(given), given, create_graph=create_graph)[0]
+        leaf = waveform if create_graph else waveform.detach().requires_grad_()
+        return torch.autograd.grad(energy(leaf), leaf, create_graph=create_graph)[0]
 
     torch.testing.assert_close(torch.func.grad(energy)(wave), slope(wave))
-    given = wave.clone().requires_grad_()
-    first = (slope(given, create_graph=True) * along).sum()
+    leaf = wave.clone().requires_grad_()
+    directional_slope = (slope(leaf, create_graph=True) * direction).sum()
     if block in ("mamba", "transformer"):
         with pytest.raises(RuntimeError, match=r"no second derivative|is not implemented"):
-            torch.autograd.grad(first, given)
+            torch.autograd.grad(directional_slope, leaf)
         return
-    (found,) = torch.autograd.grad(first, given)
-    expected = (slope(wave + 1e-8 * along) - slope(wave - 1e-8 * along)) / 2e-8
-    assert float((found - expected).norm() / expected.norm()) < 1e-4
+    (curvature,) = torch.autograd.grad(directional_slope, leaf)
+    expected = (slope(wave + 1e-8 * direction) - slope(wave - 1e-8 * direction)) / 2e-8
+    assert float((curvature - expected).norm() / expected.norm()) < 1e-4

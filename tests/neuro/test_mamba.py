@@ -1,4 +1,4 @@
-"""Mamba's parameters, and that it is the published computation."""
+"""Mamba has the published parameters and computes the published formulae."""
 
 import pytest
 import torch
@@ -7,7 +7,7 @@ from torch.nn import functional
 
 from hlsim.neuro.mamba import Mamba
 
-# as mamba_ssm 2.2's Mamba(d_model=64) has them
+# Parameters of Mamba(d_model=64) in mamba_ssm 2.2
 SHAPES = {
     "A_log": (128, 16),
     "D": (128,),
@@ -21,18 +21,18 @@ SHAPES = {
 }
 
 
-def test_names_and_shapes_are_those_of_mamba_ssm() -> None:
+def test_parameters_have_the_names_and_shapes_of_mamba_ssms() -> None:
     assert {name: tuple(p.shape) for name, p in Mamba(64).named_parameters()} == SHAPES
 
 
-def test_steps_start_between_a_thousandth_and_a_tenth() -> None:
+def test_initial_step_sizes_lie_between_0_001_and_0_1() -> None:
     torch.manual_seed(0)
     steps = functional.softplus(Mamba(64).dt_proj.bias.detach())
     assert 0.001 <= float(steps.min()) < 0.003 and 0.03 < float(steps.max()) <= 0.1
 
 
-def published(model: Mamba, sequence: Tensor) -> Tensor:
-    """Gu and Dao 2023, step by step, from the parameters alone."""
+def published_output(model: Mamba, sequence: Tensor) -> Tensor:
+    """Output by the formulae of Gu and Dao (2023), computed step by step from the parameters."""
     p = dict(model.named_parameters())
     x, z = (sequence @ p["in_proj.weight"].T).chunk(2, -1)
     taps = p["conv1d.weight"].squeeze(1)
@@ -45,7 +45,8 @@ def published(model: Mamba, sequence: Tensor) -> Tensor:
         [p["dt_proj.weight"].shape[1], *2 * [p["A_log"].shape[1]]], -1
     )
     step = functional.softplus(step @ p["dt_proj.weight"].T + p["dt_proj.bias"])
-    state, outputs = torch.zeros(len(x), *p["A_log"].shape, dtype=x.dtype), []
+    state = torch.zeros(len(x), *p["A_log"].shape, dtype=x.dtype)
+    outputs = []
     for t in range(x.shape[1]):
         decay = torch.exp(-step[:, t, :, None] * p["A_log"].exp())
         state = decay * state + (step[:, t] * x[:, t])[..., None] * B[:, t, None]
@@ -54,16 +55,20 @@ def published(model: Mamba, sequence: Tensor) -> Tensor:
 
 
 @pytest.mark.parametrize("sizes", [{}, {"d_state": 3, "expand": 1}])
-def test_is_the_published_computation(sizes: dict[str, int]) -> None:
+def test_output_equals_the_published_formulae(sizes: dict[str, int]) -> None:
     torch.manual_seed(1)
-    model, sequence = Mamba(16, **sizes).double(), torch.randn(2, 23, 16, dtype=torch.float64)
-    torch.testing.assert_close(model(sequence), published(model, sequence), rtol=1e-10, atol=1e-10)
+    model = Mamba(16, **sizes).double()
+    sequence = torch.randn(2, 23, 16, dtype=torch.float64)
+    expected = published_output(model, sequence)
+    torch.testing.assert_close(model(sequence), expected, rtol=1e-10, atol=1e-10)
 
 
-def test_scans_in_float32_under_autocast() -> None:
+def test_the_scan_runs_in_float32_under_autocast() -> None:
     torch.manual_seed(1)
-    model, sequence = Mamba(16), torch.randn(2, 23, 16)
+    model = Mamba(16)
+    sequence = torch.randn(2, 23, 16)
+    expected = model(sequence).detach()
     with torch.autocast("cpu", torch.bfloat16):
-        lower = model(sequence)
-    assert lower.dtype == torch.bfloat16
-    assert float((lower.float() - model(sequence)).norm() / model(sequence).norm()) < 0.03
+        output = model(sequence).detach()
+    assert output.dtype == torch.bfloat16
+    assert float((output.float() - expected).norm() / expected.norm()) < 0.03

@@ -1,4 +1,4 @@
-"""The selective scan against the recurrence, step by step, in float64."""
+"""The selective scan equals the recurrence, computed step by step in float64."""
 
 from typing import Any
 
@@ -13,8 +13,9 @@ from hlsim.neuro.scan import selective_scan
 LENGTHS = (1, 2, 3, 4, 5, 31, 64, 101)
 
 
-def by_steps(u: Tensor, delta: Tensor, A: Tensor, B: Tensor, C: Tensor) -> Tensor:
-    state, outputs = torch.zeros(*u.shape[:2], A.shape[1], dtype=u.dtype), []
+def recurrence(u: Tensor, delta: Tensor, A: Tensor, B: Tensor, C: Tensor) -> Tensor:
+    state = torch.zeros(*u.shape[:2], A.shape[1], dtype=u.dtype)
+    outputs = []
     for t in range(u.shape[2]):
         step = delta[:, :, t, None]
         state = torch.exp(step * A) * state + step * B[:, None, :, t] * u[:, :, t, None]
@@ -39,50 +40,45 @@ def arguments(time: int, items: int = 3, channels: int = 5, states: int = 4) -> 
 
 @pytest.mark.parametrize("time", LENGTHS)
 @pytest.mark.parametrize("block", [1, 2**19], ids=["in parts", "at once"])
-def test_equals_the_recurrence_and_so_do_its_gradients(
+def test_scan_and_gradients_equal_those_of_the_recurrence(
     time: int, block: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(scan, "_BLOCK_CPU", block)
-    given = [tensor.requires_grad_() for tensor in arguments(time, channels=20)]
-    found, true = selective_scan(*given), by_steps(*given)
-    torch.testing.assert_close(found, true, rtol=1e-10, atol=1e-10)
-    weight = torch.randn(
-        true.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64
-    )
-    # at one step the decay multiplies nothing
-    for a, b in zip(
-        torch.autograd.grad((found * weight).sum(), given),
-        torch.autograd.grad((true * weight).sum(), given),
-        strict=True,
-    ):
-        torch.testing.assert_close(a, b, rtol=1e-10, atol=1e-10)
+    monkeypatch.setattr(scan, "_STATES_PER_BLOCK_CPU", block)
+    inputs = [tensor.requires_grad_() for tensor in arguments(time, channels=20)]
+    output = selective_scan(*inputs)
+    expected = recurrence(*inputs)
+    torch.testing.assert_close(output, expected, rtol=1e-10, atol=1e-10)
+    generator = torch.Generator().manual_seed(0)
+    direction = torch.randn(expected.shape, generator=generator, dtype=torch.float64)
+    gradients = torch.autograd.grad(output, inputs, direction)
+    expected_gradients = torch.autograd.grad(expected, inputs, direction)
+    torch.testing.assert_close(gradients, expected_gradients, rtol=1e-10, atol=1e-10)
 
 
-def test_gradcheck() -> None:
-    given = [tensor.requires_grad_() for tensor in arguments(7, 2, 2, 3)]
-    assert torch.autograd.gradcheck(selective_scan, given)
+def test_gradients_are_exact() -> None:
+    inputs = [tensor.requires_grad_() for tensor in arguments(7, 2, 2, 3)]
+    assert torch.autograd.gradcheck(selective_scan, inputs)
 
 
-@pytest.mark.parametrize("wanted", range(5))
-def test_a_second_derivative_is_refused(wanted: int) -> None:
-    """For any input, where torch would leave out what it cannot follow."""
-    given = [tensor.requires_grad_() for tensor in arguments(7, 2, 2, 3)]
-    slopes = torch.autograd.grad(selective_scan(*given).square().sum(), given, create_graph=True)
-    for slope in slopes:
+@pytest.mark.parametrize("number", range(5))
+def test_a_second_derivative_by_any_input_raises_runtime_error(number: int) -> None:
+    inputs = [tensor.requires_grad_() for tensor in arguments(7, 2, 2, 3)]
+    energy = selective_scan(*inputs).square().sum()
+    for slope in torch.autograd.grad(energy, inputs, create_graph=True):
         with pytest.raises(RuntimeError):
-            torch.autograd.grad(slope.sum(), given[wanted], retain_graph=True)
+            torch.autograd.grad(slope.sum(), inputs[number], retain_graph=True)
 
 
 def test_skip_gate_bias_and_softplus() -> None:
     u, delta, A, B, C = arguments(9)
     D, bias, z = torch.randn(5).double(), torch.randn(5).double(), torch.randn_like(u)
-    found = selective_scan(u, delta, A, B, C, D, z, bias, delta_softplus=True)
+    output = selective_scan(u, delta, A, B, C, D, z, bias, delta_softplus=True)
     step = functional.softplus(delta + bias[:, None])
-    true = (by_steps(u, step, A, B, C) + D[:, None] * u) * functional.silu(z)
-    torch.testing.assert_close(found, true, rtol=1e-10, atol=1e-10)
+    expected = (recurrence(u, step, A, B, C) + D[:, None] * u) * functional.silu(z)
+    torch.testing.assert_close(output, expected, rtol=1e-10, atol=1e-10)
 
 
-def test_is_causal_and_remembers() -> None:
+def test_scan_is_causal_and_depends_on_the_past() -> None:
     u, delta, A, B, C = arguments(40)
     changed = u.clone()
     changed[..., 20] += 1.0
@@ -90,38 +86,39 @@ def test_is_causal_and_remembers() -> None:
     assert not bool(difference[..., :20].any()) and bool(difference[..., 20:23].abs().min() > 0.0)
 
 
-def test_does_not_overflow_where_decays_vanish_and_sums_where_there_are_none() -> None:
-    ones, drive = torch.ones(2, 1, 4096), torch.full((2, 1, 4096), 1 / 69.0)
-    vanishing = selective_scan(drive, 69.0 * ones, -torch.ones(1, 1), ones, ones)  # decays of 1e-30
-    torch.testing.assert_close(vanishing, ones)
-    kept = selective_scan(ones, ones, torch.zeros(1, 1), ones, ones)
-    torch.testing.assert_close(kept, torch.arange(1.0, 4097.0).expand(2, 1, -1))
+def test_scan_does_not_overflow_for_extreme_decays() -> None:
+    ones = torch.ones(2, 1, 4096)
+    decay_of_1e_30 = selective_scan(ones / 69.0, 69.0 * ones, -torch.ones(1, 1), ones, ones)
+    torch.testing.assert_close(decay_of_1e_30, ones)
+    cumulative_sum = selective_scan(ones, ones, torch.zeros(1, 1), ones, ones)
+    torch.testing.assert_close(cumulative_sum, torch.arange(1.0, 4097.0).expand(2, 1, -1))
 
 
-def test_autocast_does_not_reach_it() -> None:
-    given = [tensor.float().requires_grad_() for tensor in arguments(33)]
-    true = selective_scan(*given)
-    gradients = torch.autograd.grad(true.square().sum(), given)
+def test_autocast_has_no_effect_inside() -> None:
+    inputs = [tensor.float().requires_grad_() for tensor in arguments(33)]
+    expected = selective_scan(*inputs)
+    expected_gradients = torch.autograd.grad(expected.square().sum(), inputs)
     with torch.autocast("cpu", torch.bfloat16):
-        found = selective_scan(*given)
-        inside = torch.autograd.grad(found.square().sum(), given)
-    assert torch.equal(found, true)
-    assert all(torch.equal(a, b) for a, b in zip(inside, gradients, strict=True))
-    # mamba_ssm's convention: A in float32, the rest as the network has it
+        output = selective_scan(*inputs)
+        gradients = torch.autograd.grad(output.square().sum(), inputs)
+    assert torch.equal(output, expected)
+    torch.testing.assert_close(gradients, expected_gradients, rtol=0, atol=0)
+
+
+def test_bfloat16_inputs_are_scanned_in_float32() -> None:
+    """A is in float32, and the other inputs have the network's precision, as in mamba_ssm."""
     u, delta, A, B, C = (tensor.float() for tensor in arguments(33))
-    lower = [tensor.bfloat16() for tensor in (u, delta, B, C)]
-    coarse = selective_scan(lower[0], lower[1], A, *lower[2:])
-    fine = selective_scan(
-        lower[0].float(), lower[1].float(), A, *(tensor.float() for tensor in lower[2:])
-    )
-    assert coarse.dtype == torch.bfloat16 and torch.equal(coarse, fine.bfloat16())
+    u, delta, B, C = (tensor.bfloat16() for tensor in (u, delta, B, C))
+    output = selective_scan(u, delta, A, B, C)
+    expected = selective_scan(u.float(), delta.float(), A, B.float(), C.float())
+    assert output.dtype == torch.bfloat16 and torch.equal(output, expected.bfloat16())
 
 
-def test_float32_is_near_float64() -> None:
-    given = arguments(101)
-    single = selective_scan(*(tensor.float() for tensor in given)).double()
-    true = selective_scan(*given)
-    assert float((single - true).norm() / true.norm()) < 1e-5
+def test_float32_is_close_to_float64() -> None:
+    inputs = arguments(101)
+    output = selective_scan(*(tensor.float() for tensor in inputs)).double()
+    expected = selective_scan(*inputs)
+    assert float((output - expected).norm() / expected.norm()) < 1e-5
 
 
 def test_shapes_that_do_not_fit_raise_value_error() -> None:
@@ -132,24 +129,26 @@ def test_shapes_that_do_not_fit_raise_value_error() -> None:
         selective_scan(u, delta[:, :2], A, B, C)
 
 
-def test_a_kernel_does_all_of_it_where_there_is_one(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_kernel_receives_all_arguments(monkeypatch: pytest.MonkeyPatch) -> None:
     calls = []
 
-    def kernel(*given: Tensor, **options: Any) -> Tensor:
-        calls.append((given, options))
-        return 0.5 * given[0]
+    def kernel(*inputs: Tensor, **options: Any) -> Tensor:
+        calls.append((inputs, options))
+        return 0.5 * inputs[0]
 
     monkeypatch.setattr(scan, "_kernel_for", lambda u: kernel)
-    given, D, bias = arguments(9), torch.randn(5).double(), torch.randn(5).double()
-    found = selective_scan(*given, D, given[0], bias, delta_softplus=True)
-    assert torch.equal(found, 0.5 * given[0])
-    ((taken, options),) = calls
-    assert all(a is b for a, b in zip(taken, given, strict=True))
-    assert options == {"D": D, "z": given[0], "delta_bias": bias, "delta_softplus": True}
+    inputs = arguments(9)
+    u, D, bias = inputs[0], torch.randn(5).double(), torch.randn(5).double()
+    output = selective_scan(*inputs, D, u, bias, delta_softplus=True)
+    assert torch.equal(output, 0.5 * u)
+    ((kernel_inputs, options),) = calls
+    assert all(a is b for a, b in zip(kernel_inputs, inputs, strict=True))
+    assert options == {"D": D, "z": u, "delta_bias": bias, "delta_softplus": True}
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
-def test_on_a_gpu_and_by_the_kernel_where_it_is() -> None:
-    given = [tensor.float().cuda() for tensor in arguments(101)]
-    true = selective_scan(*arguments(101)).float()
-    torch.testing.assert_close(selective_scan(*given).cpu(), true, rtol=1e-4, atol=1e-4)
+def test_scan_on_a_gpu_is_close_to_float64() -> None:
+    inputs = arguments(101)
+    output = selective_scan(*(tensor.float().cuda() for tensor in inputs)).cpu()
+    expected = selective_scan(*inputs).float()
+    torch.testing.assert_close(output, expected, rtol=1e-4, atol=1e-4)
