@@ -12,6 +12,7 @@ SHOWN = (
     "examples/**/*.py",
     "examples/**/*.yaml",
     "examples/*.sh",
+    "examples/*.csv",
     "CHANGELOG.md",
     "CONTRIBUTING.md",
     "SECURITY.md",
