@@ -101,6 +101,16 @@ def hasqi(clean: Array, processed: Array, audiogram: Audiogram, rate: int, seed:
     return np.array(scores[:3], dtype=np.float64)
 
 
+def haaqi(clean: Array, processed: Array, audiogram: Audiogram, rate: int, seed: int) -> Array:
+    """Combined, nonlinear and linear score."""
+    module = pytest.importorskip("clarity.evaluator.haaqi")
+    with numpy_seed(seed):
+        scores = module.haaqi_v1(
+            clean, rate, processed, rate, audiogram.to_clarity(), equalisation=1, level1=94.0
+        )
+    return np.array(scores[:3], dtype=np.float64)
+
+
 def mbstoi(clean: Array, processed: Array, rate: int) -> float:
     """Of signals (2, time), left and right."""
     module = pytest.importorskip("clarity.evaluator.mbstoi")

@@ -186,7 +186,7 @@ def haspi_report(parser: Parser) -> None:
     parser.audiogram(text="; the ear of all files, or of rows of the manifest that name none")
     text = "; and a column file (for folders) or columns listener and ear (for a manifest)"
     option("--audiograms", Path, EARS_TABLE + text)
-    text = "measures separated by commas, the most important first: haspi, hasqi, stoi, pesq"
+    text = "measures separated by commas, the most important first: haspi, hasqi, haaqi, stoi, pesq"
     option("--measures", str, text, "haspi")
     option("--baseline", str, "condition to compare all others with; by default all pairs")
     parser.flag("--better-ear", "take the better ear's scores; needs a manifest with both ears")

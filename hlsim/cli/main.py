@@ -25,7 +25,7 @@ COMMANDS = {
     ),
     "haspi-report": (
         "evaluation",
-        "compare recordings by HASPI, HASQI, STOI or PESQ, with paired tests",
+        "compare recordings by HASPI, HASQI, HAAQI, STOI or PESQ, with paired tests",
     ),
     "evaluate-compensator": ("evaluation", "compare hearing aids with no aid, NAL-R and WDRC"),
     "evaluate-simulator": ("evaluation", "compare simulators with MSBG or another teacher"),

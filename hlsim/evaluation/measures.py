@@ -20,6 +20,7 @@ from hlsim.evaluation.study import Ear, Item, Measure, Values
 from hlsim.extras import require
 from hlsim.losses.band_levels import audibility, band_level_loss, band_levels, least_audible
 from hlsim.metrics import fidelity
+from hlsim.metrics.haaqi_score import haaqi
 from hlsim.metrics.haspi_score import haspi
 from hlsim.metrics.hasqi_score import hasqi
 from hlsim.metrics.pair import check_pair
@@ -30,7 +31,7 @@ NORMAL = Audiogram.standard("NH")
 
 
 def _score_for_ear(name: str, score: Callable[..., Tensor], item: Item, output: Tensor) -> Values:
-    """Compute HASPI or HASQI with the noise and the whole kHz of pyclarity.
+    """Compute HASPI, HASQI or HAAQI with the noise and the whole kHz of pyclarity.
 
     In double precision: single precision takes half the time, but may align a channel by another sample.
     """
@@ -65,6 +66,14 @@ MEASURES = {
             "hasqi",
             partial(_score_for_ear, "hasqi", hasqi),
             title="HASQI",
+            packages=["numpy"],
+            knows_hearing=True,
+            ends=(0.0, 1.0),
+        ),
+        Measure(
+            "haaqi",
+            partial(_score_for_ear, "haaqi", haaqi),
+            title="HAAQI",
             packages=["numpy"],
             knows_hearing=True,
             ends=(0.0, 1.0),

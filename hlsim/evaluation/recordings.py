@@ -215,7 +215,7 @@ def haspi_report(
             without a comparison.
         audiogram, audiograms: the ear of all files, or a CSV file of ears.
         manifest, root: a CSV file in place of the folders, see ``read_manifest``.
-        measures: names of measures, the most important first: ``haspi``, ``hasqi``, ``stoi``, ``pesq`` or
+        measures: names of measures, the most important first: ``haspi``, ``hasqi``, ``haaqi``, ``stoi``, ``pesq`` or
             ``package.module:name``.
         baseline: the condition that comes first and that all others are compared with; by default the
             manifest's first comes first, and all conditions are compared with each other.
@@ -223,7 +223,7 @@ def haspi_report(
         store: file of scores, which is created if it does not exist; None stores nothing.
         full_scale_spl: level in dB SPL of a file with RMS 1.0.
         spl: level of every clean file in dB SPL, in place of ``full_scale_spl``.
-        seed: seed of the noise that HASPI and HASQI add.
+        seed: seed of the noise that HASPI, HASQI and HAAQI add.
         jobs, dask, progress: as in ``run_study``.
 
     Returns: the evaluation; the comparison of the first with the last condition is planned.

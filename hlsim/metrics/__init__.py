@@ -1,17 +1,21 @@
-"""Numbers of signals: scores and errors, without files."""
+"""Measures of signals: scores and errors, without files."""
 
 from typing import Any
 
+from hlsim.metrics.haaqi_score import HaaqiReference, haaqi
 from hlsim.metrics.haspi_score import HaspiReference, haspi
 from hlsim.metrics.hasqi_score import HasqiParts, HasqiReference, hasqi
 from hlsim.metrics.mbstoi_score import mbstoi
 
 __all__ = [
+    "HAAQI",
     "HASPI",
     "HASQI",
+    "HaaqiReference",
     "HaspiReference",
     "HasqiParts",
     "HasqiReference",
+    "haaqi",
     "haspi",
     "hasqi",
     "mbstoi",
@@ -19,7 +23,7 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    if name in ("HASPI", "HASQI"):  # torchmetrics is an extra
+    if name in ("HAAQI", "HASPI", "HASQI"):  # torchmetrics belongs to an extra
         from hlsim.metrics import torchmetric
 
         return getattr(torchmetric, name)

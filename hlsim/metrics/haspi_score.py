@@ -28,12 +28,12 @@ from torch import Tensor
 
 from hlsim.audiogram.thresholds import AudiogramLike
 from hlsim.calibration import PASCAL_SPL
-from hlsim.checks import Lengths, check_choice, check_waveform
+from hlsim.checks import Lengths, check_choice
 from hlsim.metrics.ear import envelope_modulation as envelopes
 from hlsim.metrics.ear import model as ear_model
 from hlsim.metrics.ear.clean_speech import CleanBatch, CleanSpeech, ItemGroup
 from hlsim.metrics.ear.model import CHANNELS, Extent
-from hlsim.metrics.pair import check_seed, cut_to_common_length
+from hlsim.metrics.pair import check_seed, match_pair
 from hlsim.torchtools import constant, not_compiled
 
 Noise = Literal["expected", "seeded", "none"]
@@ -83,12 +83,9 @@ def haspi(
         ValueError: signals of other shapes, too short, or not finite; clean speech that is silent or below 20 dB SPL; a
             rate, level, audiogram, length or seed out of range.
     """
-    check_waveform(processed, "processed")
-    processed, clean, lengths = cut_to_common_length(processed, clean, sample_rate, lengths)
+    processed, clean, lengths = match_pair(processed, clean, sample_rate, lengths)
     reference = HaspiReference(
-        clean.to(torch.promote_types(clean.dtype, processed.dtype))
-        if isinstance(clean, Tensor)
-        else clean,
+        clean,
         sample_rate=sample_rate,
         full_scale_spl=full_scale_spl,
         lengths=lengths,
@@ -137,6 +134,10 @@ class HaspiReference:
     ) -> Tensor:
         """``haspi`` of processed signals of the clean ones' shape, rate and scale. Returns (...,)."""
         check_choice("noise", noise, Noise)
+        processed, shorter = self._signals.cut(processed)
+        if shorter is not None:
+            reference = HaspiReference(**shorter, keep=False)
+            return reference.score(processed, audiogram, noise=noise, seed=seed)
         signals = self._signals
         given = signals.check(processed)
         ears = ear_model.hair_cells(signals.thresholds(audiogram))

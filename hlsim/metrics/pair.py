@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from hlsim.calibration import check_full_scale
-from hlsim.checks import Lengths, check_lengths, check_rate
+from hlsim.checks import Lengths, check_lengths, check_rate, check_waveform
 
 SHORTEST_SECONDS = 0.7
 """Shortest signal in seconds for which a score can be trusted."""
@@ -64,6 +64,32 @@ def cut_to_common_length(
     if lengths is not None:
         lengths = check_lengths(lengths, torch.Size((*clean.shape[:-1], max(both)))).clamp_max(time)
     return processed[..., :time], clean[..., :time], lengths
+
+
+def match_pair(
+    processed: Tensor, clean: Tensor, sample_rate: int, lengths: Lengths | None
+) -> tuple[Tensor, Tensor, Lengths | None]:
+    """Cut signals to their common length, and convert the clean one to the wider of both dtypes.
+
+    Args:
+        processed, clean: signals to score. Lengths may differ by 0.1 s at most.
+        sample_rate: sample rate in Hz.
+        lengths: number of samples of each item in a padded batch.
+
+    Shape: (..., time) twice.
+
+    Raises:
+        ValueError: ``processed`` is no waveform, or the lengths differ by more than 0.1 s.
+
+    >>> output, clean, _ = match_pair(torch.ones(8000).double(), torch.ones(8000), 16000, None)
+    >>> clean.dtype
+    torch.float64
+    """
+    check_waveform(processed, "processed")
+    processed, clean, lengths = cut_to_common_length(processed, clean, sample_rate, lengths)
+    if isinstance(clean, Tensor):
+        clean = clean.to(torch.promote_types(clean.dtype, processed.dtype))
+    return processed, clean, lengths
 
 
 def check_seed(seed: int) -> int:

@@ -1,4 +1,4 @@
-"""HASPI and HASQI as metrics of torchmetrics, for validation loops.
+"""HASPI, HASQI and HAAQI as metrics of torchmetrics, for validation loops.
 
 They need the extra ``train``.
 """
@@ -27,6 +27,7 @@ from hlsim.checks import (
     silence_after,
 )
 from hlsim.extras import require
+from hlsim.metrics.haaqi_score import haaqi
 from hlsim.metrics.haspi_score import Noise, haspi
 from hlsim.metrics.hasqi_score import hasqi
 from hlsim.metrics.pair import check_seed
@@ -65,6 +66,11 @@ class _MeanScore(_Metric):
         **options: Any,
     ) -> None:
         super().__init__(**options)
+        if self.dist_sync_on_step:
+            raise ValueError(
+                "dist_sync_on_step=True is not supported, because a call returns the mean of this "
+                "process's batch; call compute() for the mean over all processes"
+            )
         if limit is not None:
             check_number("limit", limit, 1, whole=True)
         check_choice("noise", noise, Noise)
@@ -190,6 +196,37 @@ class _MeanScore(_Metric):
         """Return the mean score in float32, NaN if nothing was scored."""
         return self.total / self.count
 
+    def merge_state(self, incoming_state: Any) -> None:
+        """Add the state of another metric, given as a metric or as its ``metric_state``.
+
+        Raises:
+            ValueError: the other metric has other settings, such as another sample rate.
+        """
+        state = incoming_state
+        if isinstance(incoming_state, _Metric):
+            state = incoming_state.metric_state
+        signature = state.get("signature", self.signature) if isinstance(state, dict) else None
+        if signature is not None and int(signature) != int(self.signature):
+            raise ValueError(
+                f"cannot merge two {type(self).__name__} metrics with different settings; "
+                "construct both with the same sample_rate, full_scale_spl, noise, seed, "
+                "whole_khz and limit"
+            )
+        super().merge_state(incoming_state)
+
+    def plot(self, val: Any = None, ax: Any = None) -> Any:
+        """Plot one or several values of the metric by matplotlib.
+
+        Args:
+            val: value or list of values from calls or from ``compute``; by default that of
+                ``compute`` now.
+            ax: axes of matplotlib to draw into; by default those of a new figure.
+
+        Returns:
+            Figure and axes.
+        """
+        return self._plot(val, ax)
+
     @property
     def ears(self) -> Tensor:
         """Mean score of the left and of the right ear in this process, NaN for a mono batch.
@@ -274,6 +311,16 @@ class HASQI(_MeanScore):
     """
 
     score = staticmethod(hasqi)
+
+
+class HAAQI(_MeanScore):
+    """Mean HAAQI v1 of processed music over all items since the last ``reset``.
+
+    The arguments are those of ``HASPI``. The reference is clean music amplified by NAL-R. With
+    stereo music the better ear counts, and ``ears`` has the mean of each ear.
+    """
+
+    score = staticmethod(haaqi)
 
 
 def _thresholds(audiogram: AudiogramLike, items: int, sides: int) -> Tensor:

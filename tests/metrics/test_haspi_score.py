@@ -16,7 +16,7 @@ from hlsim.audiogram import FREQUENCIES, Audiogram
 from hlsim.metrics.ear import clean_speech
 from hlsim.metrics.ear import model as ear_model
 from hlsim.metrics.haspi_score import HaspiReference, generator_after, haspi
-from hlsim.metrics.hasqi_score import HasqiReference
+from hlsim.metrics.hasqi_score import HasqiReference, hasqi
 from tests import pyclarity as reference
 from tests.pyclarity import PyclarityOutputs
 
@@ -134,6 +134,23 @@ def test_a_prepared_reference_is_the_same(clean: Tensor, noisy: Tensor) -> None:
     for noise in ("expected", "seeded", "none"):
         direct = haspi(noisy, clean, N3, lengths=[12800, 11500], noise=noise, seed=5)
         assert torch.equal(prepared.score(noisy, N3, noise=noise, seed=5), direct)
+
+
+def test_prepared_references_cut_to_the_common_length(clean: Tensor, noisy: Tensor) -> None:
+    quality = HasqiReference(clean, N3, lengths=[12800, 11500])
+    intelligibility = HaspiReference(clean, lengths=[12800, 11500])
+    longer = functional.pad(noisy, (0, 500))
+    for processed, lengths in ((longer, [12800, 11500]), (noisy[:, :12100], [12100, 11500])):
+        time = min(processed.shape[-1], clean.shape[-1])
+        pair = processed[:, :time], clean[:, :time]
+        with pytest.warns(UserWarning, match="cut to the shorter"):
+            scores = intelligibility.score(processed, N3), quality.score(processed)
+        assert torch.equal(scores[0], haspi(*pair, N3, lengths=lengths))
+        assert torch.equal(scores[1], hasqi(*pair, N3, lengths=lengths))
+    with pytest.raises(ValueError, match=r"0\.1 s"):
+        intelligibility.score(noisy[:, :11000], N3)
+    with pytest.raises(ValueError, match=r"0\.1 s"):
+        quality.score(noisy[:, :11000])
 
 
 def test_what_inference_mode_keeps_serves_training(clean: Tensor, noisy: Tensor) -> None:

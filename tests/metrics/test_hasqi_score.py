@@ -12,7 +12,8 @@ from hlsim.audio import read_audio
 from hlsim.audiogram import Audiogram
 from hlsim.metrics.ear import clean_speech, fine_structure
 from hlsim.metrics.ear import model as ear_model
-from hlsim.metrics.hasqi_score import HasqiReference, _moving, _nalr, hasqi
+from hlsim.metrics.hasqi_score import HasqiReference, hasqi
+from hlsim.metrics.quality import _nalr, scale_motion_to_level
 from tests import pyclarity as reference
 from tests.pyclarity import PyclarityOutputs
 
@@ -76,7 +77,7 @@ def test_segments_stage_by_stage(time: int) -> None:
     a, b = torch.from_numpy(x)[None], torch.from_numpy(y)[None]
     extent = ear_model.Extent((time,))
     counts = fine_structure.segments_of(extent)
-    means = fine_structure.smoothed(a, extent)[0]
+    means = fine_structure.smooth_levels(a, extent)[0]
     np.testing.assert_allclose(means.numpy(), eb.env_smooth(x, 16, 24000.0), rtol=1e-12)
     wanted = eb.bm_covary(x, y, 16, 24000.0)
     spectra = [fine_structure.segment_spectra(one, extent) for one in (a, b)]
@@ -98,7 +99,11 @@ def test_motion_where_the_envelopes_shift_leaves_nothing() -> None:
         torch.tensor([0.0, 0.5, 100.0]),
         torch.tensor([0.0, 0.0, 20.0]),
     )
-    assert _moving(motion, power, levels, 0.25).tolist() == [1.0, 0.0, pytest.approx(8.0)]
+    assert scale_motion_to_level(motion, power, levels, 0.25).tolist() == [
+        1.0,
+        0.0,
+        pytest.approx(8.0),
+    ]
 
 
 def test_a_batch_is_its_items(

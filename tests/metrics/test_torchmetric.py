@@ -13,7 +13,7 @@ from hlsim.audiogram import Audiogram
 pytest.importorskip("torchmetrics")
 
 import hlsim.metrics
-from hlsim.metrics import HASPI, HASQI
+from hlsim.metrics import HAAQI, HASPI, HASQI
 
 N3, S2 = Audiogram.standard("N3"), Audiogram.standard("S2")
 
@@ -38,7 +38,7 @@ def noisy(clean: Tensor) -> Tensor:
     return clean + 0.003 * torch.randn(clean.shape, generator=torch.Generator().manual_seed(0))
 
 
-@pytest.mark.parametrize(("kind", "name"), [(HASPI, "haspi"), (HASQI, "hasqi")])
+@pytest.mark.parametrize(("kind", "name"), [(HASPI, "haspi"), (HASQI, "hasqi"), (HAAQI, "haaqi")])
 def test_defaults_are_those_of_the_function(clean: Tensor, kind: type[Any], name: str) -> None:
     metric = kind()
     metric.update(noisy(clean), clean, N3)
@@ -150,6 +150,39 @@ def test_a_collection_keeps_apart_what_was_made_apart(clean: Tensor) -> None:
     torch.testing.assert_close(
         list(collection.compute().values()), [metric.compute() for metric in expected]
     )
+
+
+def test_plot_draws_one_value_several_and_those_of_a_collection(clean: Tensor) -> None:
+    pytest.importorskip("matplotlib").use("agg")
+    from torchmetrics import MetricCollection
+
+    collection = MetricCollection([HASPI(limit=1), HASQI(limit=1)])
+    collection.update(noisy(clean), clean, N3)
+    metric = collection["HASPI"]
+    _, axes = metric.plot()
+    assert axes.lines[0].get_ydata().item() == pytest.approx(float(metric.compute()))
+    _, axes = metric.plot([metric.compute(), torch.tensor(0.5)])
+    assert len(axes.lines[0].get_ydata()) == 2
+    assert len(collection.plot()) == 2
+
+
+def test_synchronisation_at_each_step_is_rejected() -> None:
+    with pytest.raises(ValueError, match="dist_sync_on_step"):
+        HASPI(dist_sync_on_step=True)
+
+
+def test_merged_states_are_one_mean_and_other_settings_are_rejected(clean: Tensor) -> None:
+    first, second, both = HASPI(), HASPI(), HASPI()
+    batches = (clean[:1], noisy(clean)[:1])
+    for metric, processed in zip((first, second), batches, strict=True):
+        metric.update(processed, clean[:1], N3)
+        both.update(processed, clean[:1], N3)
+    first.merge_state(second)
+    torch.testing.assert_close(first.compute(), both.compute())
+    other = HASPI(48000)
+    for state in (other, other.metric_state):
+        with pytest.raises(ValueError, match="different settings"):
+            first.merge_state(state)
 
 
 def test_what_cannot_be_scored_is_left_out_and_said(clean: Tensor) -> None:

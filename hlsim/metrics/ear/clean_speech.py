@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 import torch
 from torch import Tensor
@@ -19,7 +19,7 @@ from hlsim.metrics.ear import input as ear_input
 from hlsim.metrics.ear import model as ear_model
 from hlsim.metrics.ear.model import Extent, integers
 from hlsim.metrics.ear.recursions import RATE, middle_ear
-from hlsim.metrics.pair import LOWEST_REFERENCE_SPL, SHORTEST_SECONDS
+from hlsim.metrics.pair import LOWEST_REFERENCE_SPL, SHORTEST_SECONDS, cut_to_common_length
 
 _SHORTEST_PART = 384
 """Samples at 24 kHz of a segment of HASQI."""
@@ -79,6 +79,12 @@ class CleanSpeech:
         self._rate = self._given_rate
         if whole_khz:
             self._rate = 1000 * round(self._given_rate / 1000)
+        self._settings = {
+            "sample_rate": sample_rate,
+            "full_scale_spl": full_scale_spl,
+            "whole_khz": whole_khz,
+        }
+        self._clean, self._ends = clean.detach(), ends
         self._gain = 10.0 ** (self._full_scale / 20.0)
         with torch.no_grad():
             # in double precision, for a sample more or less at an end would move all frames
@@ -146,6 +152,27 @@ class CleanSpeech:
                 f"{label} sounds for {1000.0 * length / RATE:.2g} ms alone; {self._name} needs "
                 f"{1000.0 * _SHORTEST_PART / RATE:g} ms or more to be defined"
             )
+
+    def cut(self, processed: Tensor) -> tuple[Tensor, dict[str, Any] | None]:
+        """Cut the signals to their common length, with a warning, where it differs by 0.1 s at most.
+
+        Args:
+            processed: signals of the same rate. Shape: (..., time).
+
+        Returns:
+            The processed signals and, where they are shorter than the clean ones, the arguments
+            that prepare clean signals of their length; None otherwise.
+
+        Raises:
+            ValueError: the lengths differ by more than 0.1 s.
+        """
+        ends = torch.tensor(self._ends).reshape(self.shape)
+        processed, clean, lengths = cut_to_common_length(
+            processed, self._clean, self._given_rate, ends
+        )
+        if clean.shape == self._clean.shape:
+            return processed, None
+        return processed, {"clean": clean, "lengths": lengths, **self._settings}
 
     def check(self, processed: Tensor) -> Tensor:
         """Validate processed signals and return them as rows. Shape: (..., time) -> (items, time)."""

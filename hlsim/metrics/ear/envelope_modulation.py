@@ -204,9 +204,27 @@ def _filters() -> list[NDArray[np.float64]]:
 
 
 def _responses(points: int) -> NDArray[np.float64]:
-    """Real, for the filters are symmetric: (10, points // 2 + 1)."""
-    centred = np.zeros((len(RATES), points))
-    for row, taps in zip(centred, _filters(), strict=True):
+    """Return the frequency responses of the modulation filters: (10, points // 2 + 1)."""
+    return zero_phase_responses(_filters(), points)
+
+
+def zero_phase_responses(
+    filters: Sequence[NDArray[np.float64]], points: int
+) -> NDArray[np.float64]:
+    """Return the frequency responses of symmetric filters without their delay, which are real.
+
+    Args:
+        filters: taps of each filter, an odd number, symmetric about the middle one.
+        points: length of the Fourier transform.
+
+    Returns:
+        Responses of the filters. Shape: (filters, points // 2 + 1).
+
+    >>> zero_phase_responses([np.array([0.25, 0.5, 0.25])], 4)
+    array([[1. , 0.5, 0. ]])
+    """
+    centred = np.zeros((len(filters), points))
+    for row, taps in zip(centred, filters, strict=True):
         row[: len(taps)] = taps
         row[:] = np.roll(row, -(len(taps) // 2))
     return np.fft.rfft(centred).real

@@ -1,13 +1,17 @@
-"""How smoothed envelopes and the basilar membrane's motion agree, 16 ms at a time: HASQI's features.
+"""Features of quality: smoothed envelopes, fine structure in 16 ms segments, and long-term spectra.
 
-Kates and Arehart 2014, "The hearing-aid speech quality index (HASQI) version 2", J. Audio Eng. Soc. 62(3), 99-117.
-Segments of 384 samples at 24 kHz overlap by half; the first and the last are half as long.
+HASQI and HAAQI share them. Segments at 24 kHz overlap by half; the first and the last one are half
+as long.
+
+Source: Kates and Arehart 2014, "The hearing-aid speech quality index (HASQI) version 2", J. Audio
+Eng. Soc. 62(3), 99-117.
 """
 
 from __future__ import annotations
 
 import math
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -20,31 +24,76 @@ from hlsim.metrics.ear.recursions import RATE
 from hlsim.torchtools import constant
 
 SEGMENT = 384
-_HALF = SEGMENT // 2
-_LAGS = RATE // 1000  # 1 ms, either way
-_POINTS = 432  # of the transforms: a segment and the lags
+"""Samples of a segment of the fine structure, 16 ms at 24 kHz."""
 
-_SILENCE = 2.5  # dB over threshold that a segment, and a channel's part of it, is to exceed
-_SYNCHRONY_HZ, _SYNCHRONY_ORDER = 3500.0, 5  # of the hair cells' loss of synchrony (Johnson 1980)
+HALF_SEGMENT = SEGMENT // 2
+MAX_LAG = RATE // 1000
+"""Largest lag in samples between the fine structures of two signals, 1 ms in both directions."""
 
-_NOTHING = 1e-30
+FFT_POINTS = 432
+"""Points of the transforms of segments, enough for a segment and the lags."""
+
+SILENCE_DB = 2.5
+"""Level over threshold in dB that a segment, and a channel in it, must exceed to count."""
+
+SYNCHRONY_HZ = 3500.0
+"""Frequency above which hair cells lose synchrony (Johnson 1980)."""
+
+SYNCHRONY_ORDER = 5
+"""Order of the low-pass that describes this loss."""
+
+ENERGY_FLOOR = 1e-30
+"""Energies below this one count as zero."""
+
+NEPERS_PER_DB = math.log(10.0) / 20.0
 
 
-def segments(time: int) -> int:
-    """How many there are in a signal of so many samples."""
-    return 1 + time // SEGMENT + (time - _HALF) // SEGMENT
+def count_segments(samples: int, segment: int = SEGMENT) -> int:
+    """Return the number of segments of a signal.
+
+    Args:
+        samples: length of the signal.
+        segment: length of a segment in samples, an even number.
+
+    >>> count_segments(1000)
+    5
+    """
+    return 1 + samples // segment + (samples - segment // 2) // segment
 
 
-def segments_of(extent: Extent) -> Extent:
-    """Return the number of segments of each item."""
-    return Extent(tuple(segments(end) for end in extent.ends))
+def segments_of(extent: Extent, segment: int = SEGMENT) -> Extent:
+    """Return the number of segments of each item.
+
+    Args:
+        extent: number of samples of each item.
+        segment: length of a segment in samples, an even number.
+
+    >>> segments_of(Extent((1000, 800))).ends
+    (5, 4)
+    """
+    return Extent(tuple(count_segments(end, segment) for end in extent.ends))
 
 
-def smoothed(levels: Tensor, extent: Extent) -> Tensor:
-    """Compute Hann-weighted means. Shape: (items, channels, longest) -> (items, channels, segments)."""
-    counts = segments_of(extent)
-    window = constant(_halves, dtype=levels.dtype, device=levels.device)
-    halves = levels[..., : counts.longest * _HALF].unflatten(-1, (counts.longest, _HALF))
+# -- envelopes -------------------------------------------------------------------------------------
+
+
+def smooth_levels(levels: Tensor, extent: Extent, segment: int = SEGMENT) -> Tensor:
+    """Compute the Hann-weighted mean of each segment.
+
+    Args:
+        levels: levels of the envelopes in dB.
+        extent: number of samples of each item.
+        segment: length of a segment in samples, an even number.
+
+    Shape: (items, channels, longest) -> (items, channels, segments).
+
+    >>> smooth_levels(torch.ones(1, 2, 1000), Extent((1000,))).shape
+    torch.Size([1, 2, 5])
+    """
+    counts = segments_of(extent, segment)
+    half = segment // 2
+    window = constant(_half_windows, segment, dtype=levels.dtype, device=levels.device)
+    halves = levels[..., : counts.longest * half].unflatten(-1, (counts.longest, half))
     rising, falling = (halves @ window).unbind(-1)
     inner = 0.5 * (rising[..., 1:-1] + falling[..., 2:])
     means = torch.cat((falling[..., :1], inner, rising[..., -1:]), -1)
@@ -54,52 +103,111 @@ def smoothed(levels: Tensor, extent: Extent) -> Tensor:
     return counts.cut(torch.where(is_last, rising, means))
 
 
-def _halves() -> NDArray[np.float64]:
-    """The rising and the falling half of a Hann window, each of sum 1: (192, 2)."""
-    window = np.hanning(SEGMENT).reshape(2, _HALF).T
+def _half_windows(segment: int) -> NDArray[np.float64]:
+    """Return the rising and the falling half of a Hann window, each of sum 1: (segment / 2, 2)."""
+    window = np.hanning(segment).reshape(2, segment // 2).T
     halves: NDArray[np.float64] = window / window.sum(0)
     return halves
 
 
-def envelope_correlation(reference: Tensor, processed: Tensor, counts: Extent) -> Tensor:
-    """Mean magnitude of the correlation of five cosines over frequency.
+class Cepstra(NamedTuple):
+    """Five cosines over frequency of the audible segments of two signals, without their means.
 
-    Segments that are silent in the reference are left out; the value is 0 where no two are left. The host waits for the
-    device once.
+    Attributes:
+        reference, processed: cosines over time. Shape: (items, 5, audible segments).
+        audible: number of audible segments of each item.
+        extent: the same, but at least 1.
+    """
+
+    reference: Tensor
+    processed: Tensor
+    audible: Extent
+    extent: Extent
+
+
+def compute_cepstra(reference: Tensor, processed: Tensor, counts: Extent) -> Cepstra:
+    """Compute the cepstra of the segments that are audible in the reference.
+
+    The host waits for the device once.
 
     Args:
-        reference, processed: by ``smoothed``. Shape: (items, 32, segments).
-        counts: segments of each item.
+        reference, processed: levels by ``smooth_levels``. Shape: (items, 32, segments).
+        counts: number of segments of each item.
 
-    Returns: (items,).
+    >>> levels = 40.0 + torch.randn(1, 32, 5)
+    >>> compute_cepstra(levels, levels, Extent((5,))).reference.shape
+    torch.Size([1, 5, 5])
     """
-    places = _loud(reference, counts)
-    loud = Extent(tuple(places.sum(-1).tolist()))
-    kept = Extent(tuple(max(1, count) for count in loud.ends))
-    order = (~places).byte().argsort(dim=-1, stable=True)[:, None, : kept.longest]
+    is_audible = _audible_segments(reference, counts)
+    audible = Extent(tuple(is_audible.sum(-1).tolist()))
+    extent = Extent(tuple(max(1, count) for count in audible.ends))
+    order = (~is_audible).byte().argsort(dim=-1, stable=True)[:, None, : extent.longest]
     basis = constant(_cosines, dtype=reference.dtype, device=reference.device)
-    x, y = (
-        kept.centred(basis @ levels.take_along_dim(order, -1)) for levels in (reference, processed)
-    )
+    x = extent.centred(basis @ reference.take_along_dim(order, -1))
+    y = extent.centred(basis @ processed.take_along_dim(order, -1))
+    return Cepstra(x, y, audible, extent)
+
+
+def absolute_correlation(x: Tensor, y: Tensor) -> Tensor:
+    """Compute the magnitude of the correlation of zero-mean signals; 0 where one is constant.
+
+    Shape: (..., time) twice -> (...).
+
+    >>> absolute_correlation(torch.tensor([1.0, -1.0]), torch.tensor([-2.0, 2.0]))
+    tensor(1.0000)
+    """
     xx, yy, xy = x.square().sum(-1), y.square().sum(-1), (x * y).sum(-1)
-    there = (xx >= _NOTHING) & (yy >= _NOTHING)
-    norm = torch.where(there, xx, 1.0).sqrt() * torch.where(there, yy, 1.0).sqrt()
-    correlation = torch.where(there, xy.abs() / norm, 0.0).mean(-1)
-    return torch.where(integers(loud.ends, reference.device) < 2, 0.0, correlation)
+    is_varying = (xx >= ENERGY_FLOOR) & (yy >= ENERGY_FLOOR)
+    norm = torch.where(is_varying, xx, 1.0).sqrt() * torch.where(is_varying, yy, 1.0).sqrt()
+    return torch.where(is_varying, xy.abs() / norm, 0.0)
 
 
-def _loud(levels: Tensor, counts: Extent) -> Tensor:
-    """Whether a segment exceeds the threshold of hearing. Shape: (items, 32, segments) -> (items, segments), bool."""
-    loudness = (levels.detach() * (math.log(10.0) / 20.0)).exp().mean(1)
-    return counts.inside(levels.device) & (loudness > 10.0 ** (_SILENCE / 20.0))
+def envelope_correlation(reference: Tensor, processed: Tensor, counts: Extent) -> Tensor:
+    """Compute the mean magnitude of the correlation of five cosines over frequency.
+
+    Only segments that are audible in the reference count; the value is 0 where there are fewer than
+    two. The host waits for the device once.
+
+    Args:
+        reference, processed: levels by ``smooth_levels``. Shape: (items, 32, segments).
+        counts: number of segments of each item.
+
+    Returns:
+        Correlation of each item, 0 to 1. Shape: (items,).
+
+    >>> levels = 40.0 + torch.randn(1, 32, 5)
+    >>> envelope_correlation(levels, levels, Extent((5,)))
+    tensor([1.0000])
+    """
+    cepstra = compute_cepstra(reference, processed, counts)
+    correlation = absolute_correlation(cepstra.reference, cepstra.processed).mean(-1)
+    return zero_unless_audible(correlation, cepstra.audible)
+
+
+def zero_unless_audible(values: Tensor, audible: Extent) -> Tensor:
+    """Replace the values of items with fewer than two audible segments by 0. Shape: (items,).
+
+    >>> zero_unless_audible(torch.ones(2), Extent((9, 1)))
+    tensor([1., 0.])
+    """
+    return torch.where(integers(audible.ends, values.device) < 2, 0.0, values)
+
+
+def _audible_segments(levels: Tensor, counts: Extent) -> Tensor:
+    """Return whether a segment exceeds the threshold of hearing.
+
+    Shape: (items, 32, segments) in dB over threshold -> bool (items, segments).
+    """
+    loudness = (levels.detach() * NEPERS_PER_DB).exp().mean(1)
+    return counts.inside(levels.device) & (loudness > 10.0 ** (SILENCE_DB / 20.0))
 
 
 def _cosines() -> NDArray[np.float64]:
-    place = np.pi * np.arange(CHANNELS) / (CHANNELS - 1)
-    return np.cos(np.arange(1, 6)[:, None] * place)
+    angle = np.pi * np.arange(CHANNELS) / (CHANNELS - 1)
+    return np.cos(np.arange(1, 6)[:, None] * angle)
 
 
-# -- motion ------------------------------------------------------------------------------------------------------------
+# -- fine structure --------------------------------------------------------------------------------
 
 
 _FIRST, _INNER, _LAST = 0, 1, 2
@@ -107,72 +215,88 @@ _FIRST, _INNER, _LAST = 0, 1, 2
 
 
 def _segment_kinds(counts: Extent, device: torch.device) -> Tensor:
-    """Shape: -> (items, segments), int64."""
-    places = torch.arange(counts.longest, device=device)
-    is_last = places == integers(counts.ends, device)[:, None] - 1
-    return torch.where(is_last, _LAST, (places > 0).long())
+    """Return the kind of each segment. Shape: -> int64 (items, segments)."""
+    indices = torch.arange(counts.longest, device=device)
+    is_last = indices == integers(counts.ends, device)[:, None] - 1
+    return torch.where(is_last, _LAST, (indices > 0).long())
 
 
 def segment_spectra(motion: Tensor, extent: Extent) -> tuple[Tensor, Tensor]:
-    """Compute spectra of windowed segments without their means, and mean squares of the segments as of an envelope.
+    """Compute the spectra of windowed segments and their mean squares.
+
+    The means are subtracted first. Mean squares are those of an envelope, twice those of the motion.
 
     Args:
-        motion: zero after the end of each item. Shape: (items, channels, longest).
+        motion: motion of the basilar membrane, zero after the end of each item.
+        extent: number of samples of each item.
 
-    Returns: (items, channels, segments, bins), (items, channels, segments).
+    Shape: (items, channels, longest) -> (items, channels, segments, bins), (items, channels, segments).
+
+    >>> spectra, energy = segment_spectra(torch.randn(1, 2, 1000), Extent((1000,)))
+    >>> spectra.shape, energy.shape
+    (torch.Size([1, 2, 5, 217]), torch.Size([1, 2, 5]))
     """
     counts = segments_of(extent)
-    fixed = partial(constant, dtype=motion.dtype, device=motion.device)
+    constant_like_motion = partial(constant, dtype=motion.dtype, device=motion.device)
     kinds = _segment_kinds(counts, motion.device)
-    window, inside = (fixed(make)[kinds][:, None] for make in (_windows, _inside))
-    behind = (counts.longest + 1) * _HALF - motion.shape[-1]
-    padded = functional.pad(motion, (0, max(0, behind)))
-    parts = padded.unfold(-1, SEGMENT, _HALF)[..., : counts.longest, :] * window
-    means = parts.sum(-1, keepdim=True) / inside.sum(-1, keepdim=True)
-    parts = torch.addcmul(parts, means, inside, value=-1.0)
-    energy = parts.square().sum(-1) / window.square().sum(-1)
-    return torch.fft.rfft(parts, _POINTS), counts.cut(2.0 * energy)
+    window = constant_like_motion(_windows)[kinds][:, None]
+    inside = constant_like_motion(_inside)[kinds][:, None]
+    missing = (counts.longest + 1) * HALF_SEGMENT - motion.shape[-1]
+    padded = functional.pad(motion, (0, max(0, missing)))
+    segments = padded.unfold(-1, SEGMENT, HALF_SEGMENT)[..., : counts.longest, :] * window
+    means = segments.sum(-1, keepdim=True) / inside.sum(-1, keepdim=True)
+    segments = torch.addcmul(segments, means, inside, value=-1.0)
+    energy = segments.square().sum(-1) / window.square().sum(-1)
+    return torch.fft.rfft(segments, FFT_POINTS), counts.cut(2.0 * energy)
 
 
 def _windows() -> NDArray[np.float64]:
-    """Windows by kind: the first is the falling half, the last the rising half, padded. Returns (3, SEGMENT)."""
+    """Return the window of each kind of segment: (3, SEGMENT).
+
+    The first segment has the falling half of a window, the last one the rising half.
+    """
     window = np.hanning(SEGMENT)
-    falling = np.concatenate((window[_HALF:], np.zeros(_HALF)))
-    rising = np.concatenate((window[:_HALF], np.zeros(_HALF)))
+    falling = np.concatenate((window[HALF_SEGMENT:], np.zeros(HALF_SEGMENT)))
+    rising = np.concatenate((window[:HALF_SEGMENT], np.zeros(HALF_SEGMENT)))
     return np.stack((falling, window, rising))
 
 
 def _inside() -> NDArray[np.float64]:
-    """1 for the samples of a segment, by kind. Returns (3, SEGMENT)."""
+    """Return 1 for the samples of a segment and 0 for its padding, by kind: (3, SEGMENT)."""
     inside = np.ones((3, SEGMENT))
-    inside[[_FIRST, _LAST], _HALF:] = 0.0
+    inside[[_FIRST, _LAST], HALF_SEGMENT:] = 0.0
     return inside
 
 
 def coherence(
     reference: tuple[Tensor, Tensor], processed: tuple[Tensor, Tensor], counts: Extent
 ) -> Tensor:
-    """Compute the largest normalised cross-covariance over lags of up to 1 ms, 0 to 1.
+    """Compute the largest normalised cross-covariance over lags of up to 1 ms.
 
     Args:
-        reference, processed: by ``segment_spectra``.
-        counts: segments of each item.
+        reference, processed: spectra and mean squares by ``segment_spectra``.
+        counts: number of segments of each item.
 
-    Returns: (items, channels, segments).
+    Returns:
+        Coherence from 0 to 1. Shape: (items, channels, segments).
+
+    >>> spectra = segment_spectra(torch.randn(1, 2, 1000), Extent((1000,)))
+    >>> float(coherence(spectra, spectra, Extent((5,))).min()) > 0.99
+    True
     """
     (x, xx), (y, yy) = reference, processed
     kinds = _segment_kinds(counts, xx.device)
     weights = constant(_lag_weights, dtype=xx.dtype, device=xx.device)[kinds][:, None]
-    covariance = torch.fft.irfft(x * y.conj(), _POINTS)
-    near = torch.cat((covariance[..., : _LAGS + 1], covariance[..., -_LAGS:]), -1) * weights
-    there = (xx > 2.0 * _NOTHING) & (yy > 2.0 * _NOTHING)
-    norm = 0.5 * torch.where(there, xx, 1.0).sqrt() * torch.where(there, yy, 1.0).sqrt()
-    return torch.where(there, near.abs().amax(-1) / norm, 0.0).clamp(0.0, 1.0)
+    covariance = torch.fft.irfft(x * y.conj(), FFT_POINTS)
+    near = torch.cat((covariance[..., : MAX_LAG + 1], covariance[..., -MAX_LAG:]), -1) * weights
+    is_moving = (xx > 2.0 * ENERGY_FLOOR) & (yy > 2.0 * ENERGY_FLOOR)
+    norm = 0.5 * torch.where(is_moving, xx, 1.0).sqrt() * torch.where(is_moving, yy, 1.0).sqrt()
+    return torch.where(is_moving, near.abs().amax(-1) / norm, 0.0).clamp(0.0, 1.0)
 
 
 def _lag_weights() -> NDArray[np.float64]:
-    """Inverse autocorrelations of the windows at lags 0 to 24 and -24 to -1. Returns (3, 49)."""
-    lags = [*range(_LAGS + 1), *range(_LAGS, 0, -1)]
+    """Return the inverse autocorrelations of the windows at lags 0 to 24 and -24 to -1: (3, 49)."""
+    lags = [*range(MAX_LAG + 1), *range(MAX_LAG, 0, -1)]
     rows = []
     for window in _windows():
         autocorrelation = np.correlate(window, window, "full")[SEGMENT - 1 :]
@@ -181,45 +305,65 @@ def _lag_weights() -> NDArray[np.float64]:
 
 
 def synchrony(coherences: Tensor, mean_square: Tensor, counts: Extent) -> Tensor:
-    """Mean of what lies over threshold in the reference, less where hair cells lose synchrony.
+    """Compute the mean coherence of what is audible in the reference.
+
+    Channels count less where hair cells lose synchrony. The value is 0 where fewer than two segments
+    are audible.
 
     Args:
-        coherences: (items, 32, segments).
-        mean_square: that of the reference's segments. Shape: (items, 32, segments).
-        counts: segments of each item.
+        coherences: values by ``coherence``. Shape: (items, 32, segments).
+        mean_square: mean squares of the reference's segments. Shape: (items, 32, segments).
+        counts: number of segments of each item.
 
-    Returns: (items,); 0 where no two segments are over threshold.
+    Returns:
+        Mean of each item, 0 to 1. Shape: (items,).
+
+    >>> mean_square = torch.full((1, 32, 5), 40.0) ** 2
+    >>> synchrony(torch.full((1, 32, 5), 0.5), mean_square, Extent((5,)))
+    tensor([0.5000])
     """
     rms = mean_square.detach().sqrt()
-    loud = _loud(rms, counts)
-    weights = constant(_synchronous, dtype=rms.dtype, device=rms.device)[:, None]
-    weights = weights * ((rms > _SILENCE) & loud[:, None])
+    is_audible = _audible_segments(rms, counts)
+    weights = constant(_synchrony_weights, dtype=rms.dtype, device=rms.device)[:, None]
+    weights = weights * ((rms > SILENCE_DB) & is_audible[:, None])
     total = (weights * coherences).sum((-2, -1))
-    mean = total / weights.sum((-2, -1)).clamp_min(_NOTHING)
-    return torch.where(loud.sum(-1) < 2, 0.0, mean)
+    mean = total / weights.sum((-2, -1)).clamp_min(ENERGY_FLOOR)
+    return torch.where(is_audible.sum(-1) < 2, 0.0, mean)
 
 
-def _synchronous() -> NDArray[np.float64]:
-    ratio = (centre_frequencies() / _SYNCHRONY_HZ) ** (2 * _SYNCHRONY_ORDER)
+def _synchrony_weights() -> NDArray[np.float64]:
+    ratio = (centre_frequencies() / SYNCHRONY_HZ) ** (2 * SYNCHRONY_ORDER)
     return 1.0 / np.sqrt(1.0 + ratio)
 
 
-# -- long-term spectra -------------------------------------------------------------------------------------------------
+# -- long-term spectra -----------------------------------------------------------------------------
 
 
-def spectral_likeness(reference: Tensor, processed: Tensor) -> Tensor:
-    """By the spread of differences between two spectra and between their slopes, 0 to 1.
+def relative_loudness(levels: Tensor) -> Tensor:
+    """Return the share that each channel has in the loudness.
 
-    Shape: (..., 32) dB over threshold, twice -> (...,).
+    Shape: (..., 32) dB over threshold -> (..., 32), of sum 1.
+
+    >>> relative_loudness(torch.tensor([20.0, 20.0]))
+    tensor([0.5000, 0.5000])
     """
-    x, y = (torch.exp(levels * (math.log(10.0) / 20.0)) for levels in (reference, processed))
-    difference = x / x.sum(-1, keepdim=True) - y / y.sum(-1, keepdim=True)
-    shape = (1.0 - CHANNELS * _spread(difference) / 2.5).clamp(0.0, 1.0)
-    slope = (1.0 - CHANNELS * _spread(difference.diff(dim=-1))).clamp(0.0, 1.0)
-    return 0.579 * shape + 0.421 * slope
+    amplitude = torch.exp(levels * NEPERS_PER_DB)
+    return amplitude / amplitude.sum(-1, keepdim=True)
 
 
-def _spread(values: Tensor) -> Tensor:
-    variance = values.var(-1, correction=0)
-    there = variance > 0.0
-    return torch.where(there, torch.where(there, variance, 1.0).sqrt(), 0.0)
+def spectral_similarity(differences: Tensor, scale: float) -> Tensor:
+    """Return how equal two spectra are, by the standard deviation of their differences.
+
+    Args:
+        differences: differences of the channels.
+        scale: 32 times the standard deviation at which the similarity is 0.
+
+    Shape: (..., channels) -> (...), 0 to 1.
+
+    >>> spectral_similarity(torch.zeros(32), 2.5)
+    tensor(1.)
+    """
+    variance = differences.var(-1, correction=0)
+    is_positive = variance > 0.0  # the square root of 0 has no gradient
+    deviation = torch.where(is_positive, torch.where(is_positive, variance, 1.0).sqrt(), 0.0)
+    return (1.0 - CHANNELS * deviation / scale).clamp(0.0, 1.0)

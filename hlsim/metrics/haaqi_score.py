@@ -1,0 +1,190 @@
+"""HAAQI version 1 in PyTorch: the quality of music in an impaired ear.
+
+The score is that of ``haaqi_v1`` of pyclarity 0.9.0, which the Cadenza challenges use, with a
+gradient. It differs from ``compute_haaqi`` in these points:
+
+- ``full_scale_spl`` is 94 dB SPL by default, where ``level1`` is 65.
+- Clean music is always amplified by NAL-R (``equalisation=1``).
+- The noise at the threshold of hearing is fixed instead of drawn, and a rate of 44.1 kHz is not
+  rounded to 44. ``noise="seeded", seed=..., whole_khz=True`` gives the digits of pyclarity.
+- Both signals have one sample rate. Thresholds at other frequencies than the audiometric ones are
+  interpolated on a logarithmic scale of frequency.
+- Empty or soft signals and those shorter than 0.7 s raise ``ValueError``. ``compute_haaqi`` scores
+  empty signals 1 or 0.
+
+Source: Kates and Arehart 2016, "The hearing-aid audio quality index (HAAQI)", IEEE/ACM Transactions
+on Audio, Speech, and Language Processing 24(2), 354-365, doi 10.1109/TASLP.2015.2507858.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import scipy
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from hlsim.audiogram.thresholds import AudiogramLike
+from hlsim.calibration import PASCAL_SPL
+from hlsim.checks import Lengths
+from hlsim.dsp.fft import fft_length
+from hlsim.metrics.ear import fine_structure
+from hlsim.metrics.ear.envelope_modulation import zero_phase_responses
+from hlsim.metrics.ear.model import Extent
+from hlsim.metrics.ear.recursions import RATE
+from hlsim.metrics.haspi_score import Noise
+from hlsim.metrics.pair import match_pair
+from hlsim.metrics.quality import Comparison, QualityReference
+from hlsim.torchtools import constant, not_compiled
+
+ENVELOPE_SEGMENT = 192
+"""Samples of a segment of the smoothed envelopes, 8 ms at 24 kHz."""
+
+ENVELOPE_RATE = 2 * RATE // ENVELOPE_SEGMENT
+"""Segments per second, 250, for they overlap by half."""
+
+MODULATION_EDGES = (20.0, 32.0, 50.0, 80.0)
+"""Lower edges in Hz of the bands of modulation that count. The last band ends at 125 Hz."""
+
+MODULATION_ORDER = 128
+
+
+@not_compiled  # tracing takes minutes
+def haaqi(
+    processed: Tensor,
+    clean: Tensor,
+    audiogram: AudiogramLike,
+    *,
+    sample_rate: int = 16000,
+    full_scale_spl: float = PASCAL_SPL,
+    lengths: Lengths | None = None,
+    noise: Noise = "expected",
+    seed: int | Sequence[int] = 0,
+    whole_khz: bool = False,
+) -> Tensor:
+    """Compute HAAQI version 1 of each item: how good processed music sounds to an ear, 0 to 1.
+
+    The score compares the processed music with clean music that NAL-R has amplified for the same
+    ear. It is differentiable in ``processed``. Stereo signals have one score per ear: take the
+    better ear by ``.amax(-1)`` or the mean by ``.mean(-1)``.
+
+    Args:
+        processed: music at the impaired ear, at least 0.7 s long.
+        clean: clean music, not amplified.
+        audiogram, sample_rate, full_scale_spl, lengths, noise, seed, whole_khz: the arguments of
+            ``hasqi``.
+
+    Shape: (..., time) twice, and (..., 8) dB HL -> (...,).
+
+    Raises:
+        ValueError: as for ``haspi``.
+
+    >>> seconds = torch.arange(24000) / 24000
+    >>> chord = sum(torch.sin(2 * torch.pi * hz * seconds) for hz in (220.0, 277.2, 329.6))
+    >>> music = 0.02 * chord * torch.exp(-3 * seconds)
+    >>> f"{float(haaqi(music, music, 'NH', sample_rate=24000)):.3f}"
+    '0.999'
+    """
+    processed, clean, lengths = match_pair(processed, clean, sample_rate, lengths)
+    reference = HaaqiReference(
+        clean,
+        audiogram,
+        sample_rate=sample_rate,
+        full_scale_spl=full_scale_spl,
+        lengths=lengths,
+        whole_khz=whole_khz,
+        keep=False,
+    )
+    return reference.score(processed, noise=noise, seed=seed)
+
+
+class HaaqiReference(QualityReference):
+    """Clean music in an impaired ear, prepared for the HAAQI of many processed signals.
+
+    In float32 it takes about 18 MB per second of music.
+
+    Args:
+        clean, audiogram, sample_rate, full_scale_spl, lengths, whole_khz: the arguments of ``haaqi``.
+            The scores have the dtype and the device of ``clean``, whose gradient is not computed.
+        keep: store the clean signal's features; otherwise they are computed for each score, which
+            takes less memory.
+
+    Raises:
+        ValueError: as for ``haspi``.
+
+    >>> from hlsim import example_speech
+    >>> speech = example_speech()[:16000]
+    >>> reference = HaaqiReference(speech, "N3")
+    >>> bool(reference.score(0.1 * speech) < reference.score(speech))
+    True
+    """
+
+    score_name = "HAAQI"
+    envelope_segment = ENVELOPE_SEGMENT
+
+    @staticmethod
+    def _compute_parts(comparison: Comparison, extent: Extent) -> Tensor:
+        envelopes = modulation_correlation(
+            comparison.clean_levels,
+            comparison.processed_levels,
+            fine_structure.segments_of(extent, ENVELOPE_SEGMENT),
+        )
+        counts = fine_structure.segments_of(extent)
+        fine = fine_structure.synchrony(comparison.coherence, comparison.energy, counts)
+        x = fine_structure.relative_loudness(comparison.clean_spectrum)
+        y = fine_structure.relative_loudness(comparison.processed_spectrum)
+        shape = fine_structure.spectral_similarity(x - y, 2.5)
+        relative_shape = fine_structure.spectral_similarity((x - y) / (x + y), 25.0)
+        nonlinear = 0.754 * envelopes**3 + 0.246 * fine
+        linear = 0.329 * shape + 0.671 * relative_shape
+        return torch.stack((nonlinear, linear), -1)
+
+    @staticmethod
+    def _combine(nonlinear: Tensor, linear: Tensor) -> Tensor:
+        first_order = 0.336 * nonlinear + 0.001 * linear
+        return first_order + 0.501 * nonlinear.square() + 0.161 * linear.square()
+
+
+def modulation_correlation(reference: Tensor, processed: Tensor, counts: Extent) -> Tensor:
+    """Compute the mean correlation of the cepstra in the bands of modulation from 20 to 125 Hz.
+
+    Args:
+        reference, processed: levels by ``fine_structure.smooth_levels`` with ``ENVELOPE_SEGMENT``.
+            Shape: (items, 32, segments).
+        counts: number of segments of each item.
+
+    Returns:
+        Correlation of each item, 0 to 1. Shape: (items,).
+
+    >>> levels = 40.0 + torch.randn(1, 32, 200)
+    >>> modulation_correlation(levels, levels, Extent((200,)))
+    tensor([1.0000])
+    """
+    cepstra = fine_structure.compute_cepstra(reference, processed, counts)
+    extent = cepstra.extent
+    shortest = max(extent.longest + MODULATION_ORDER // 2, MODULATION_ORDER + 1)
+    points = fft_length(shortest, 2)
+    responses = constant(
+        _modulation_responses, points, dtype=reference.dtype, device=reference.device
+    )
+    bands = []
+    for waves in (cepstra.reference, cepstra.processed):
+        spectrum = torch.fft.rfft(waves, points)[:, None] * responses[:, None]
+        filtered = torch.fft.irfft(spectrum, points)  # (items, 4 bands, 5 cosines, points)
+        bands.append(extent.centred(filtered))
+    correlation = fine_structure.absolute_correlation(*bands).mean((-2, -1))
+    return fine_structure.zero_unless_audible(correlation, cepstra.audible)
+
+
+def _modulation_responses(points: int) -> NDArray[np.float64]:
+    """Return the frequency responses of the bands: (4, points // 2 + 1)."""
+    filters = []
+    for low, high in zip(MODULATION_EDGES, (*MODULATION_EDGES[1:], None), strict=True):
+        edges = [low] if high is None else [low, high]
+        taps = scipy.signal.firwin(
+            MODULATION_ORDER + 1, edges, window="hann", pass_zero=False, fs=ENVELOPE_RATE
+        )
+        filters.append(taps)
+    return zero_phase_responses(filters, points)
