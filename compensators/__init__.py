@@ -1,4 +1,4 @@
-"""Compensators: modules that turn a waveform and an audiogram into what the ear is to be given."""
+"""Compensators: modules that turn a waveform and an audiogram into the output of a hearing aid."""
 
 from compensators.config import HearingAidConfig, MappingConfig
 from compensators.hearing_aid import HearingAid

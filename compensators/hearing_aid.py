@@ -1,4 +1,4 @@
-"""A hearing aid that could be worn: learned gains and noise reduction on a direct path of 4 ms."""
+"""A hearing aid that could be worn: trained gains and noise reduction on a direct path of 4 ms."""
 
 from __future__ import annotations
 
@@ -18,29 +18,35 @@ from hlsim.audiogram.thresholds import AudiogramLike
 from hlsim.calibration import PASCAL_SPL
 from hlsim.torchtools import constant_like
 
-_FADE = 15.0  # dB of level over which the gain of what is quiet fades
-_RARELY = -3.0  # start of the logit of noise reduction: 1 dB of 20
+QUIET_FADE_DB = 15.0
+"""Range of levels in dB over which the gain of quiet sounds fades."""
+
+INITIAL_REDUCTION_LOGIT = -3.0
+"""Initial logit of noise reduction: 5 % of the largest attenuation."""
 
 
 class HearingAid(Wearable):
-    """Waveform and audiogram to what the impaired ear is to be given, 4 ms late, whole or in chunks as it comes.
+    """A hearing aid with a delay of 4 ms, for whole signals or chunks.
 
-    Two networks that know nothing of one another set its gains. One, without memory, sees the ear and each band's level,
-    of late and now, and corrects the gain that would restore loudness band by band
-    (``prescription.restoring_gains``); the correction is 0 before training, and where there is no loss. The other, causal
-    and recurrent, sees the levels of frames, not the ear, and takes noise off. In dB, a band's gain is
+    Two independent networks set its gains. The first has no memory. It sees the ear and the
+    smoothed and present level of each band, and corrects the gain that would restore loudness band
+    by band (``prescription.restoring_gains``); the correction is 0 before training, and where there
+    is no loss. The second is causal and recurrent. It sees the levels of frames, not the ear, and
+    reduces noise. In dB, the gain of a band is
 
         amplification * (restoring + correction) - noise_reduction * attenuation,
 
-    so that at 0 and 0 the input passes unchanged. The gain has a cap, and fades for what is quieter than
-    ``config.quiet_spl``; the output is softly limited at ``config.limit_spl``.
+    so that at 0 and 0 the input passes unchanged. The gain has a maximum, and fades for sounds
+    below ``config.quiet_spl``; the output is softly limited at ``config.limit_spl``.
 
     Args:
         config: sizes and choices.
-        sample_rate, full_scale_spl, linked: as ``Wearable``.
+        sample_rate: sample rate in Hz, as in ``Wearable``.
+        full_scale_spl: level in dB SPL of RMS 1.0.
+        linked: link the gains of two ears, as in ``Wearable``.
 
     Raises:
-        ValueError: a rate or level out of range, or a configuration of another kind.
+        ValueError: a rate or level out of range, or a configuration of another type.
     """
 
     SLIDERS = ("noise_reduction", "amplification")
@@ -55,31 +61,32 @@ class HearingAid(Wearable):
     ) -> None:
         super().__init__(sample_rate, full_scale_spl, linked)
         self.config = config = HearingAidConfig.from_optional(config)
-        self.bands, self.limit_spl = config.bands, config.limit_spl
-        width, inner, corrections = (
-            config.width,
-            config.inner,
-            nn.Linear(config.inner, config.bands),
-        )
+        self.bands = config.bands
+        self.limit_spl = config.limit_spl
+        inner = config.inner
+        corrections = nn.Linear(inner, config.bands)
         self.correct = nn.Sequential(
-            *(nn.Linear(4 * config.bands + 1, inner), nn.SiLU()),
-            *(nn.Linear(inner, inner), nn.SiLU()),
-            *(nn.Linear(inner, inner), nn.SiLU()),
+            nn.Linear(4 * config.bands + 1, inner),
+            nn.SiLU(),
+            nn.Linear(inner, inner),
+            nn.SiLU(),
+            nn.Linear(inner, inner),
+            nn.SiLU(),
             corrections,
         )
-        self.enter = nn.Linear(config.bands + config.bins, width)
-        self.recur = nn.LSTM(width, config.hidden, batch_first=True)
-        self.leave = nn.Linear(config.hidden + width, config.bands)
+        self.enter = nn.Linear(config.bands + config.bins, config.width)
+        self.recur = nn.LSTM(config.width, config.hidden, batch_first=True)
+        self.leave = nn.Linear(config.hidden + config.width, config.bands)
         with torch.no_grad():
             corrections.weight.zero_()
             corrections.bias.zero_()
-            self.leave.bias.fill_(_RARELY)
+            self.leave.bias.fill_(INITIAL_REDUCTION_LOGIT)
 
     def train(self, mode: bool = True) -> Self:
         """Set the mode of all modules but the LSTM, which stays in training mode.
 
-        cuDNN computes no gradient through an LSTM in evaluation mode. The two modes differ in nothing
-        else, because the LSTM has no dropout.
+        cuDNN computes no gradient through an LSTM in evaluation mode. The two modes differ in
+        nothing else, because the LSTM has no dropout.
         """
         super().train(mode)
         self.recur.train()
@@ -92,35 +99,41 @@ class HearingAid(Wearable):
         noise_reduction: Slider = 1.0,
         amplification: Slider = 1.0,
     ) -> Tensor:
-        """What the ear is to be given, time-aligned.
-
-        Shape: (..., time) and one audiogram or (..., 8) that broadcasts over the leading dimensions -> (..., time).
+        """Return the output for a whole signal, time-aligned.
 
         Args:
-            noise_reduction, amplification: 0 to 1, a number or one an item.
+            waveform: input of the aid.
+            audiogram: one audiogram, or (..., 8) that broadcasts over the leading dimensions.
+            noise_reduction: share of the attenuation, 0 to 1, one number or one per item.
+            amplification: share of the amplification, 0 to 1, one number or one per item.
+
+        Shape: (..., time) -> (..., time).
 
         Raises:
-            ValueError: no audiogram, levels outside -10 to 100 dB HL, sliders outside 0 to 1, or shapes that do not fit.
+            ValueError: no audiogram, levels outside -10 to 100 dB HL, sliders outside 0 to 1, or
+                shapes that do not fit.
         """
-        return self.whole(waveform, audiogram, (noise_reduction, amplification))
+        return self.process(waveform, audiogram, (noise_reduction, amplification))
 
     def stream(
         self, audiogram: AudiogramLike, noise_reduction: Slider = 1.0, amplification: Slider = 1.0
     ) -> Stream:
-        """The same for chunks of any size. Raises ValueError at other rates than 16000 Hz."""
-        return self.streamed(audiogram, (noise_reduction, amplification))
+        """Return a stream, which gives the same output for chunks of any size.
+
+        Raises:
+            ValueError: the sample rate is not 16000 Hz, or an argument is not valid.
+        """
+        return self.open_stream(audiogram, (noise_reduction, amplification))
 
     def fit(self, thresholds: Tensor) -> Tensor:
-        return torch.cat(
-            (losses(thresholds, self.bands), prescribed_gains(thresholds, self.bands)), -1
-        )
+        loss = losses(thresholds, self.bands)
+        return torch.cat((loss, prescribed_gains(thresholds, self.bands)), -1)
 
     def start(self, items: int, like: Tensor) -> dict[str, Tensor]:
-        zeros, bands = like.new_zeros, self.bands
         return {
-            "levels": zeros(items, 3, bands + 1),
-            "attenuation": zeros(items, 3, bands),
-            "hidden": zeros(items, 2, self.config.hidden),
+            "levels": like.new_zeros(items, 3, self.bands + 1),
+            "attenuation": like.new_zeros(items, 3, self.bands),
+            "hidden": like.new_zeros(items, 2, self.config.hidden),
         }
 
     def control(
@@ -128,20 +141,26 @@ class HearingAid(Wearable):
     ) -> tuple[Tensor, dict[str, Tensor]]:
         noise_reduction, amplification = sliders.split(1, -1)
         levels = self._levels(powers)
-        gain, followed = self._amplification(levels[..., : self.bands + 1], fitted, state)
-        taken, recalled = self._reduction(levels, state)
-        return amplification * gain + noise_reduction * taken, followed | recalled
+        gain, level_state = self._amplification(levels[..., : self.bands + 1], fitted, state)
+        attenuation, reduction_state = self._reduction(levels, state)
+        total = amplification * gain + noise_reduction * attenuation
+        return total, level_state | reduction_state
 
     def attenuation(self, samples: Tensor) -> Tensor:
-        """What noise reduction adds to each band's gain at the end of each frame, in dB, 0 or less; it knows no ear.
+        """Return the gain in dB, 0 or less, that noise reduction adds at the end of each frame.
 
-        Shape: (items, hops * HOP) pascals -> (items, hops, bands).
+        It does not depend on the ear.
+
+        Shape: (items, hops * HOP) in pascals -> (items, hops, bands).
         """
         levels = self._levels(frame_power(functional.pad(samples, (HISTORY, 0))))
         return self._reduction(levels, self.start(len(samples), samples))[0]
 
     def _levels(self, powers: Tensor) -> Tensor:
-        """Levels of the bands, of all, and of single frequencies. Shape: as ``control`` -> (..., bands + 1 + bins)."""
+        """Return the levels of the bands, of the whole frame, and of single frequencies in dB SPL.
+
+        Shape: (items, frames, FRAME / 2 + 1) -> (items, frames, bands + 1 + bins).
+        """
         by_band = powers @ constant_like(powers, shares, self.bands, FRAME)
         bins = powers[..., 1 : self.config.bins + 1]
         return level_db(torch.cat((by_band, powers.sum(-1, keepdim=True), bins), -1))
@@ -149,50 +168,56 @@ class HearingAid(Wearable):
     def _amplification(
         self, levels: Tensor, fitted: Tensor, state: State
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        """Shape: (items, frames, bands + 1), of bands and of all, (items, n) -> (items, frames, bands) dB."""
-        config, now = self.config, levels[..., : self.bands]
-        levels, kept = follow_peaks(
-            levels, state["levels"], decay(config.attack), decay(config.release)
-        )
+        """Return the restoring gain with its correction in dB, and the state of the levels.
+
+        Shape: (items, frames, bands + 1) for the bands and the whole frame, (items, n)
+            -> (items, frames, bands).
+        """
+        config = self.config
+        present = levels[..., : self.bands]
+        attack, release = decay(config.attack), decay(config.release)
+        levels, level_state = follow_peaks(levels, state["levels"], attack, release)
         level, total = levels.split((self.bands, 1), -1)
         loss, prescribed = fitted.chunk(2, -1)
-        ear = (
-            torch.cat((loss / 50.0, prescribed / 20.0), -1)
-            .unsqueeze(1)
-            .expand(-1, level.shape[1], -1)
-        )
+        ear = torch.cat((loss / 50.0, prescribed / 20.0), -1)
+        ear = ear.unsqueeze(1).expand(-1, level.shape[1], -1)
         reach = config.reach_db * loss.clamp_min(0.0) / (loss.clamp_min(0.0) + 10.0)
-        seen = torch.cat((ear, (levels - 40.0) / 20.0, (now - level) / 10.0), -1)
-        correction = reach.unsqueeze(1) * torch.tanh(self.correct(seen))
+        features = torch.cat((ear, (levels - 40.0) / 20.0, (present - level) / 10.0), -1)
+        correction = reach.unsqueeze(1) * torch.tanh(self.correct(features))
         gain = (restoring_gains(level, loss) + correction).clamp(0.0, config.cap_db)
-        audible = ((total - config.quiet_spl) / _FADE + 1.0).clamp(0.0, 1.0)
-        return audible * gain, {"levels": kept}
+        fade = ((total - config.quiet_spl) / QUIET_FADE_DB + 1.0).clamp(0.0, 1.0)
+        return fade * gain, {"levels": level_state}
 
     def _reduction(self, levels: Tensor, state: State) -> tuple[Tensor, dict[str, Tensor]]:
-        """Shape: (items, frames, bands + 1 + bins) -> (items, frames, bands) dB, 0 or less."""
+        """Return the gain of noise reduction in dB, 0 or less, and its state.
+
+        Shape: (items, frames, bands + 1 + bins) -> (items, frames, bands).
+        """
         config = self.config
-        seen = torch.cat((levels[..., : self.bands], levels[..., self.bands + 1 :]), -1)
-        entered = torch.tanh(self.enter((seen - 40.0) / 20.0))
+        without_total = torch.cat((levels[..., : self.bands], levels[..., self.bands + 1 :]), -1)
+        entered = torch.tanh(self.enter((without_total - 40.0) / 20.0))
         hidden, cell = state["hidden"].unbind(1)
-        if entered.shape[1] == 1:  # a stream's: the LSTM would repack its weights for one frame
+        if entered.shape[1] == 1:
             hidden, cell = _lstm_step(self.recur, entered[:, 0], hidden, cell)
-            recalled = hidden.unsqueeze(1)
+            recurrent = hidden.unsqueeze(1)
         else:
             before = (hidden.unsqueeze(0).contiguous(), cell.unsqueeze(0).contiguous())
-            recalled, (hidden, cell) = self.recur(entered, before)
+            recurrent, (hidden, cell) = self.recur(entered, before)
             hidden, cell = hidden.squeeze(0), cell.squeeze(0)
-        taken = -config.reduction_db * torch.sigmoid(self.leave(torch.cat((recalled, entered), -1)))
-        taken, kept = follow_peaks(
-            taken, state["attenuation"], decay(config.opening), decay(config.closing)
-        )
-        return taken, {"attenuation": kept, "hidden": torch.stack((hidden, cell), 1)}
+        logits = self.leave(torch.cat((recurrent, entered), -1))
+        gain = -config.reduction_db * torch.sigmoid(logits)
+        opening, closing = decay(config.opening), decay(config.closing)
+        gain, gain_state = follow_peaks(gain, state["attenuation"], opening, closing)
+        return gain, {"attenuation": gain_state, "hidden": torch.stack((hidden, cell), 1)}
 
     def extra_repr(self) -> str:
         return f"sample_rate={self.sample_rate}, full_scale_spl={self.full_scale_spl:g}"
 
 
 def _lstm_step(lstm: nn.LSTM, frame: Tensor, hidden: Tensor, cell: Tensor) -> tuple[Tensor, Tensor]:
-    """Run a one-layer LSTM for one frame, four times as fast as the module itself and with the same bits on a CPU.
+    """Run a one-layer LSTM for one frame.
+
+    It takes a quarter of the module's time, and gives the same bits on a CPU.
 
     Shape: (items, inputs), (items, units) twice -> hidden and cell state, (items, units) each.
     """

@@ -1,16 +1,23 @@
-"""The limit that keeps a compensator's output safe for the ear."""
+"""The limiter that keeps the output of a compensator safe for the ear."""
 
 from torch import Tensor
 
-_KNEE = 8.0
+EXPONENT = 8.0
+
+HIGHEST_RATIO = 1e4
+"""Ratio of a sample to the peak from which on samples count alike.
+
+Its eighth power fits into float32.
+"""
 
 
 def soft_limit(waveform: Tensor, peak: float) -> Tensor:
     """Keep every sample within a peak: x / (1 + |x / peak|^8)^(1/8).
 
-    Smooth, and nearly linear below half of the peak, where it takes off 0.004 dB at most.
+    The curve is smooth, and nearly linear below half of the peak, where it attenuates by 0.004 dB
+    at most.
 
     Shape: any -> the same, between -peak and peak.
     """
-    bounded = waveform.clamp(-1e4 * peak, 1e4 * peak)  # whose eighth power float32 still holds
-    return bounded * (1.0 + (bounded / peak).abs() ** _KNEE) ** (-1.0 / _KNEE)
+    bounded = waveform.clamp(-HIGHEST_RATIO * peak, HIGHEST_RATIO * peak)
+    return bounded * (1.0 + (bounded / peak).abs() ** EXPONENT) ** (-1.0 / EXPONENT)

@@ -1,4 +1,4 @@
-"""A name or a folder to a compensator that is ready to use."""
+"""Loading and saving of compensators."""
 
 from pathlib import Path
 
@@ -20,9 +20,10 @@ CONFIGS: dict[str, type[MappingConfig | HearingAidConfig]] = {
     "mapping-compensator": MappingConfig,
     "hearing-aid": HearingAidConfig,
 }
-"""What ``config.json`` of a checkpoint calls the kind of compensator, and what it is made of."""
+"""Configuration of each kind of compensator, by its name in ``config.json`` of a checkpoint."""
 
-_UNTRAINED: dict[str, type[NALR | WDRC]] = {"nalr": NALR, "wdrc": WDRC}
+UNTRAINED: dict[str, type[NALR | WDRC]] = {"nalr": NALR, "wdrc": WDRC}
+"""Compensators without a checkpoint."""
 
 
 def build_compensator(
@@ -31,7 +32,7 @@ def build_compensator(
     sample_rate: int = NEURO_RATE,
     full_scale_spl: float = PASCAL_SPL,
 ) -> Trained:
-    """The compensator that a configuration is of, untrained."""
+    """Build the untrained compensator of a configuration."""
     if isinstance(config, HearingAidConfig):
         return HearingAid(config, sample_rate=sample_rate, full_scale_spl=full_scale_spl)
     return MappingCompensator(config, sample_rate=sample_rate, full_scale_spl=full_scale_spl)
@@ -44,75 +45,84 @@ def load_compensator(
     full_scale_spl: float = PASCAL_SPL,
     linked: bool = False,
 ) -> Trained | NALR | WDRC:
-    """A compensator, frozen and in eval mode. Nothing is downloaded.
+    """Load a compensator, frozen and in eval mode. Nothing is downloaded.
 
     Args:
-        name: ``"nalr"``, the prescription; ``"wdrc"``, compression about it; a checkpoint that ships with hlsim; or a
-            checkpoint folder. One that was trained for one ear is meant for no other: see ``trained_for``.
-        sample_rate: of its inputs and outputs in Hz, 16000 to 48000.
+        name: ``"nalr"``, the prescription; ``"wdrc"``, the prescription with compression; a
+            checkpoint that ships with hlsim; or the folder of a checkpoint. ``trained_for`` returns
+            the ear of a compensator that was trained for one ear.
+        sample_rate: sample rate of inputs and outputs in Hz, 16000 to 48000.
         full_scale_spl: level in dB SPL of RMS 1.0.
-        linked: a hearing aid's or WDRC's gains are linked between the ears, see ``compensators.wearable``.
+        linked: link the gains of a hearing aid or WDRC between the ears, as
+            ``compensators.wearable`` describes.
 
     Raises:
-        ValueError: no such checkpoint, one of another kind, one that has changed since it was saved, or ``linked`` of one
-            that cannot.
+        ValueError: there is no such checkpoint, it is of another kind or has changed since it was
+            saved, or ``linked`` is set for a compensator that cannot link its gains.
     """
-    loaded = _load(name, sample_rate, full_scale_spl)
-    if linked and not isinstance(loaded, Wearable):
-        raise ValueError(f"{name} links no gains between ears; allowed: wdrc, or a hearing aid")
-    if isinstance(loaded, Wearable):
-        loaded.linked = linked
-    return loaded
+    compensator = _load(name, sample_rate, full_scale_spl)
+    if isinstance(compensator, Wearable):
+        compensator.linked = linked
+    elif linked:
+        raise ValueError(
+            f"{name} cannot link its gains between ears; expected wdrc or a hearing aid"
+        )
+    return compensator
 
 
 def _untrained(name: str | Path) -> type[NALR | WDRC] | None:
-    """Class of a compensator without checkpoint; its name may be written as ``NAL-R``."""
-    return _UNTRAINED.get(str(name).lower().replace("-", ""))
+    """Return the class of a compensator without a checkpoint.
+
+    NAL-R may be written with a hyphen.
+    """
+    return UNTRAINED.get(str(name).lower().replace("-", ""))
 
 
 def _load(name: str | Path, sample_rate: int, full_scale_spl: float) -> Trained | NALR | WDRC:
-    if kind := _untrained(name):
-        return kind(sample_rate=sample_rate, full_scale_spl=full_scale_spl).eval()
+    untrained = _untrained(name)
+    if untrained is not None:
+        return untrained(sample_rate=sample_rate, full_scale_spl=full_scale_spl).eval()
 
     def build(config: MappingConfig | HearingAidConfig) -> Trained:
         return build_compensator(config, sample_rate=sample_rate, full_scale_spl=full_scale_spl)
 
-    return (
-        read_checkpoint(name, CONFIGS, build, other_names=tuple(_UNTRAINED))
-        .eval()
-        .requires_grad_(False)
-    )
+    compensator = read_checkpoint(name, CONFIGS, build, other_names=tuple(UNTRAINED))
+    return compensator.eval().requires_grad_(False)
 
 
 def save_compensator(
     model: Trained, folder: str | Path, audiogram: Audiogram | None = None
 ) -> None:
-    """Write a checkpoint that ``load_compensator`` reads, whole or not at all; an older one there is replaced.
+    """Write a checkpoint that ``load_compensator`` reads, in place of one that is there.
 
-    Rate and level are no part of it: ``load_compensator`` is told them. An older one's card stays, and is of that one.
+    The checkpoint holds neither sample rate nor calibration; pass them to ``load_compensator``. An
+    existing README.md is kept.
 
     Args:
-        audiogram: the one ear that it was trained for, see ``trained_for``; None for all ears.
+        model: compensator to save.
+        folder: folder of the checkpoint.
+        audiogram: the one ear for which the compensator was trained, or None for all ears.
 
     Raises:
-        ValueError: another kind of model, or a folder that holds something else.
+        ValueError: the model is of another kind, or the folder holds something else.
     """
     if not isinstance(model, Trained):
-        allowed = "a MappingCompensator or HearingAid"
-        raise ValueError(f"{type(model).__name__} cannot be saved; allowed: {allowed}")
+        raise ValueError(
+            f"expected a MappingCompensator or a HearingAid to save, got {type(model).__name__}"
+        )
     kind = next(kind for kind, config in CONFIGS.items() if isinstance(model.config, config))
-    about = {
-        "hlsim": __version__,
-        "audiogram": audiogram.to_dict() if audiogram is not None else None,
-    }
+    ear = None if audiogram is None else audiogram.to_dict()
+    about = {"hlsim": __version__, "audiogram": ear}
     save_checkpoint(folder, kind, model, model.config.to_dict(), about)
 
 
 def trained_for(name: str | Path) -> Audiogram | None:
-    """The one ear that a compensator was trained for; None for those of all ears.
+    """Return the one ear for which a compensator was trained, or None for one that suits all ears.
 
     Raises:
-        ValueError: no such checkpoint, or what it tells is no ear.
+        ValueError: there is no such checkpoint, or its record of the ear is no audiogram.
     """
-    told = None if _untrained(name) else checkpoint_about(name).get("audiogram")
-    return None if told is None else Audiogram.from_dict(told)
+    if _untrained(name) is not None:
+        return None
+    audiogram = checkpoint_about(name).get("audiogram")
+    return None if audiogram is None else Audiogram.from_dict(audiogram)

@@ -1,4 +1,4 @@
-"""Smoothing over control frames, all frames of a call at once, with the state that the next call goes on from."""
+"""Smoothing over the control frames of a call, with a state from which the next call continues."""
 
 from __future__ import annotations
 
@@ -12,67 +12,77 @@ from torch import Tensor
 from compensators.filter_bank import HOP, RATE
 from hlsim.torchtools import constant_like
 
-_BLOCK = 128  # frames; the weights of a block are a matrix, and must not overflow
+BLOCK_FRAMES = 128
+"""Frames that are computed together by a matrix, whose powers must not overflow."""
 
 
 def decay(seconds: float) -> float:
-    """Weight of the past in a frame that falls to 1 / e in so many seconds; 0 s gives 0."""
+    """Return the weight of the past in each frame for a time constant. 0 s gives 0."""
     return math.exp(-HOP / (RATE * seconds)) if seconds > 0.0 else 0.0
 
 
 def average(values: Tensor, state: Tensor, past: float) -> Tensor:
-    """Exponential average, y[n] = past y[n - 1] + (1 - past) x[n].
+    """Compute the exponential average y[n] = past y[n - 1] + (1 - past) x[n].
 
-    Shape: (items, frames, n) and (items, n), the last y before them -> (items, frames, n).
+    Args:
+        values: x.
+        state: y of the frame before the first one.
+        past: weight of the past.
+
+    Shape: (items, frames, n), (items, n) -> (items, frames, n).
     """
     if past == 0.0:
         return values
-    done = []
-    for block in values.split(_BLOCK, 1):
+    averages = []
+    for block in values.split(BLOCK_FRAMES, 1):
         frames = block.shape[1]
-        done.append(
-            constant_like(values, _weights, frames, past) @ block
-            + constant_like(values, _fading, frames, past) * state.unsqueeze(1)
-        )
-        state = done[-1][:, -1]
-    return done[0] if len(done) == 1 else torch.cat(done, 1)
+        new = constant_like(values, _weights, frames, past) @ block
+        old = constant_like(values, _powers, frames, past) * state.unsqueeze(1)
+        averages.append(new + old)
+        state = averages[-1][:, -1]
+    return averages[0] if len(averages) == 1 else torch.cat(averages, 1)
 
 
 def follow_peaks(
     values: Tensor, state: Tensor, attack: float, release: float
 ) -> tuple[Tensor, Tensor]:
-    """A level that rises with ``attack`` and falls with ``release``, both weights of the past.
+    """Follow a level, which rises with one time constant and falls with another.
 
-    The smooth decoupled peak detector of Giannoulis, Massberg and Reiss 2012, J. Audio Eng. Soc. 60(6), Equation 17:
-    p[n] = max(x[n], release p[n - 1] + (1 - release) x[n]), y[n] = attack y[n - 1] + (1 - attack) p[n]. As p is the
-    largest of what the average would be from any of the frames on, it needs no loop over frames: p = e + d, of which e is
-    the average with ``release`` and d[n] = max(x[n] - e[n], release d[n - 1]).
+    This is the smooth decoupled peak detector of Giannoulis, Massberg and Reiss 2012, J. Audio Eng.
+    Soc. 60(6), Equation 17: p[n] = max(x[n], release p[n - 1] + (1 - release) x[n]), y[n] = attack
+    y[n - 1] + (1 - attack) p[n]. It needs no loop over frames, because p is the largest of the
+    averages that begin at any of the frames: p = e + d, where e is the average with ``release``,
+    and d[n] = max(x[n] - e[n], release d[n - 1]).
 
     Args:
-        state: e, d and y of the frame before, (items, 3, n).
+        values: x.
+        state: e, d and y of the frame before the first one, (items, 3, n).
+        attack: weight of the past in a rising level, from ``decay``.
+        release: weight of the past in a falling level.
 
-    Shape: (items, frames, n) -> (items, frames, n) and the state after them.
+    Shape: (items, frames, n) -> (items, frames, n), and the state after the last frame.
     """
-    mean, excess, smooth = state.unbind(1)
-    slow = average(values, mean, release)
-    done = []
-    for over in (values - slow).split(_BLOCK, 1):
-        fading = constant_like(values, _fading, over.shape[1], release)
-        # one frame is its own largest: ONNX has no cummax, and a stream saves the call
-        highest = over / fading if over.shape[1] == 1 else torch.cummax(over / fading, 1).values
-        done.append(fading * torch.maximum(highest, excess.unsqueeze(1)))
-        excess = done[-1][:, -1]
-    peaks = slow + (done[0] if len(done) == 1 else torch.cat(done, 1))
-    followed = average(peaks, smooth, attack)
-    return followed, torch.stack((slow[:, -1], excess, followed[:, -1]), 1)
+    slow_state, excess, smooth_state = state.unbind(1)
+    slow = average(values, slow_state, release)
+    blocks = []
+    for block in (values - slow).split(BLOCK_FRAMES, 1):
+        powers = constant_like(values, _powers, block.shape[1], release)
+        highest = block / powers
+        if block.shape[1] > 1:  # ONNX has no cummax, and a stream saves its call
+            highest = torch.cummax(highest, 1).values
+        blocks.append(powers * torch.maximum(highest, excess.unsqueeze(1)))
+        excess = blocks[-1][:, -1]
+    peaks = slow + (blocks[0] if len(blocks) == 1 else torch.cat(blocks, 1))
+    levels = average(peaks, smooth_state, attack)
+    return levels, torch.stack((slow[:, -1], excess, levels[:, -1]), 1)
 
 
-def _fading(frames: int, past: float) -> NDArray[np.float64]:
-    """Returns (frames, 1)."""
+def _powers(frames: int, past: float) -> NDArray[np.float64]:
+    """Return past ** 1 to past ** frames, (frames, 1)."""
     return past ** np.arange(1.0, frames + 1.0)[:, None]
 
 
 def _weights(frames: int, past: float) -> NDArray[np.float64]:
-    """Returns (frames, frames), lower triangular."""
-    apart = np.arange(frames)[:, None] - np.arange(frames)
-    return np.where(apart >= 0, (1.0 - past) * past ** np.maximum(apart, 0), 0.0)
+    """Return the weight of each frame in each average, lower triangular, (frames, frames)."""
+    distance = np.arange(frames)[:, None] - np.arange(frames)
+    return np.where(distance >= 0, (1.0 - past) * past ** np.maximum(distance, 0), 0.0)

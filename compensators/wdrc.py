@@ -1,4 +1,4 @@
-"""Wide dynamic range compression in bands, as most hearing aids have it; nothing of it is trained."""
+"""Wide dynamic range compression around NAL-R, without trained parameters."""
 
 from __future__ import annotations
 
@@ -23,17 +23,23 @@ from hlsim.torchtools import constant_like
 
 
 class WDRC(Wearable):
-    """NAL-R's gains for speech of 65 dB SPL, less for what is louder and more for what is softer in its band.
+    """Amplify average speech by NAL-R's gains, louder bands less and softer bands more.
 
-    A band's level, of frames of 16 ms, rises with ``attack`` and falls with ``release``. Above the knee, ``ratio`` dB
-    more make one dB more of output; ``ratio`` is 1 up to 10 dB HL, 1 more for every 40 dB, and 3 at most.
+    The level of a band, in frames of 16 ms, rises with ``attack`` and falls with ``release``. Above
+    the knee, the input level rises by ``ratio`` dB for each dB of the output level; the ratio is 1
+    up to 10 dB HL, rises by 1 per 40 dB, and is 3 at most.
 
     Args:
-        sample_rate, full_scale_spl, linked: as ``Wearable``.
-        bands: an equal number of ERBs apart, but no less than 125 Hz; 4 to 40.
-        attack, release: time constants in seconds; 0 to 1, and 0.01 to 2.
-        knee: of the compression in dB below average speech of 65 dB SPL, in its band.
-        limit_spl: peak of the output in dB SPL that no sample passes; no band is amplified beyond it.
+        sample_rate: sample rate in Hz, as in ``Wearable``.
+        full_scale_spl: level in dB SPL of RMS 1.0.
+        bands: number of bands, an equal number of ERBs but at least 125 Hz apart, 4 to 40.
+        attack: time constant in seconds, 0 to 1.
+        release: time constant in seconds, 0.01 to 2.
+        knee: knee of the compression in dB below the level of average speech at 65 dB SPL in the
+            band.
+        limit_spl: peak of the output in dB SPL that no sample exceeds, and beyond which no band is
+            amplified.
+        linked: link the gains of two ears, as in ``Wearable``.
 
     Raises:
         ValueError: a value out of range.
@@ -57,22 +63,33 @@ class WDRC(Wearable):
         check_number("release", release, 0.01, 2.0)
         check_number("knee", knee, 0.0, 60.0)
         check_number("limit_spl", limit_spl, 60.0, 140.0)
-        self.bands, self.attack, self.release = bands, attack, release
-        self.knee, self.limit_spl = knee, limit_spl
+        self.bands = bands
+        self.attack = attack
+        self.release = release
+        self.knee = knee
+        self.limit_spl = limit_spl
 
     def forward(self, waveform: Tensor, audiogram: AudiogramLike | None = None) -> Tensor:
-        """The amplified waveform, time-aligned.
+        """Return the output for a whole signal, time-aligned.
 
-        Shape: (..., time) and one audiogram or (..., 8) that broadcasts over the leading dimensions -> (..., time).
+        Args:
+            waveform: input of the aid.
+            audiogram: one audiogram, or (..., 8) that broadcasts over the leading dimensions.
+
+        Shape: (..., time) -> (..., time).
 
         Raises:
             ValueError: no audiogram, levels outside -10 to 100 dB HL, or shapes that do not fit.
         """
-        return self.whole(waveform, audiogram, ())
+        return self.process(waveform, audiogram, ())
 
     def stream(self, audiogram: AudiogramLike) -> Stream:
-        """The same for chunks of any size. Raises ValueError at other rates than 16000 Hz."""
-        return self.streamed(audiogram, ())
+        """Return a stream, which gives the same output for chunks of any size.
+
+        Raises:
+            ValueError: the sample rate is not 16000 Hz.
+        """
+        return self.open_stream(audiogram, ())
 
     def fit(self, thresholds: Tensor) -> Tensor:
         loss = losses(thresholds, self.bands)
@@ -85,12 +102,15 @@ class WDRC(Wearable):
         self, powers: Tensor, fitted: Tensor, sliders: Tensor, state: State
     ) -> tuple[Tensor, dict[str, Tensor]]:
         levels = level_db(powers @ constant_like(powers, shares, self.bands, FRAME))
-        levels, kept = follow_peaks(
-            levels, state["levels"], decay(self.attack), decay(self.release)
-        )
+        attack, release = decay(self.attack), decay(self.release)
+        levels, level_state = follow_peaks(levels, state["levels"], attack, release)
         prescribed, ratios = fitted.chunk(2, -1)
         gains = compressive_gains(above_speech(levels), prescribed, ratios, -self.knee)
-        return torch.minimum(gains, (self.limit_spl - levels).clamp_min(0.0)), {"levels": kept}
+        highest = (self.limit_spl - levels).clamp_min(0.0)
+        return torch.minimum(gains, highest), {"levels": level_state}
 
     def extra_repr(self) -> str:
-        return f"sample_rate={self.sample_rate}, full_scale_spl={self.full_scale_spl:g}, bands={self.bands}"
+        return (
+            f"sample_rate={self.sample_rate}, full_scale_spl={self.full_scale_spl:g}, "
+            f"bands={self.bands}"
+        )

@@ -1,4 +1,4 @@
-"""What every wearable aid is: gains in bands, by frames that have been, on a direct path of 4 ms; whole or streamed."""
+"""The base class of wearable aids, which apply gains in bands on a direct path of 4 ms."""
 
 from __future__ import annotations
 
@@ -26,31 +26,39 @@ from hlsim.audiogram.thresholds import (
     resolve_thresholds,
 )
 from hlsim.calibration import PASCAL_SPL, check_full_scale, gain_to_pascals
-from hlsim.checks import broadcast_shape, check_rate, check_waveform, is_finite
+from hlsim.checks import broadcast_shape, check_number, check_rate, check_waveform, describe
 from hlsim.dsp.resample import resample
 
-_GLIDE = 0.04  # of a slider's way, a hop at most: 0.1 s from end to end
-_BLOCK = 320_000  # samples of all items that run together, and the least of one's: memory, for the output is the same
-_RESAMPLED = 136  # samples at 16 kHz on which resampling there and back looks ahead
+SLIDER_STEP = 0.04
+"""Largest change of a slider per hop: 0.1 s from end to end."""
+
+BLOCK_SAMPLES = 320_000
+"""Samples of all items that are processed together, which limits memory and changes no output."""
+
+RESAMPLER_LOOKAHEAD = 136
+"""Samples at 16 kHz by which resampling to 16 kHz and back looks ahead."""
 
 
 class Wearable(nn.Module):
-    """Subclasses give ``SLIDERS``, ``fit``, ``start`` and ``control``.
+    """An aid with gains in bands. Subclasses define ``SLIDERS``, ``fit``, ``start`` and ``control``.
 
-    A direct path splits the signal into bands that sum to it, 4 ms late, multiplies each with its gain and adds them. The
-    gains come from frames of 16 ms every 4 ms that end where the direct path is, so that the output, aligned with the
-    input, looks ``DELAY`` samples ahead and no farther; they go linearly from frame to frame. The whole call and the
-    stream run the same ``step``.
+    A direct path splits the signal into bands that sum to the signal with a delay of 4 ms,
+    multiplies each band by its gain, and adds them. The gains come from frames of 16 ms every 4 ms
+    that end where the direct path is. The output, aligned with the input, therefore has a
+    look-ahead of ``DELAY`` samples. The gains go linearly from frame to frame. Whole signals and
+    streams run the same ``step``.
 
     Args:
-        sample_rate: of inputs and outputs in Hz, 16000 to 48000. The bands end at 8 kHz; what faster input has above gets
-            the gain of the highest, and only whole signals go through: resampling looks 8.5 ms farther ahead.
+        sample_rate: sample rate of inputs and outputs in Hz, 16000 to 48000. The bands end at 8
+            kHz; components above get the gain of the highest band. Other rates than 16000 are
+            supported for whole signals only, and resampling adds 8.5 ms of look-ahead.
         full_scale_spl: level in dB SPL of RMS 1.0.
-        linked: of two ears, (..., 2, time), the mean power at both sets the gains of each: ears that are fitted alike get
-            the same gains, so that differences of level between them stay. The limit of the output is each ear's own.
+        linked: for two ears, (..., 2, time), set the gains of both ears by their mean power, so
+            that differences in level between ears with the same fitting stay. The limit of the
+            output is that of each ear.
 
     Raises:
-        ValueError: a rate or level out of range; of a call, with ``linked``, another shape.
+        ValueError: a rate or level out of range; in a call with ``linked``, another shape.
     """
 
     SLIDERS: tuple[str, ...] = ()
@@ -65,133 +73,156 @@ class Wearable(nn.Module):
 
     @property
     def latency(self) -> int:
-        """Samples that the output, which is aligned with the input, looks ahead: what a stream's output is late."""
-        return (
-            DELAY
-            if self.sample_rate == RATE
-            else -(-(DELAY + _RESAMPLED) * self.sample_rate // RATE)
-        )
+        """Look-ahead of the aligned output in samples, which is the delay of a stream."""
+        if self.sample_rate == RATE:
+            return DELAY
+        return -(-(DELAY + RESAMPLER_LOOKAHEAD) * self.sample_rate // RATE)
 
     def fit(self, thresholds: Tensor) -> Tensor:
-        """What is needed of the ears. Shape: (items, 8) dB HL -> (items, n)."""
+        """Compute what ``control`` needs of the ears. Shape: (items, 8) dB HL -> (items, n)."""
         raise NotImplementedError
 
     def start(self, items: int, like: Tensor) -> dict[str, Tensor]:
-        """The state of ``control`` after silence."""
+        """Return the state of ``control`` after silence, with the type and the device of a tensor."""
         raise NotImplementedError
 
     def control(
         self, powers: Tensor, fitted: Tensor, sliders: Tensor, state: State
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        """Gain in dB of each band at the end of each frame, and the state after them.
+        """Compute each band's gain in dB at the end of each frame, and the state after the last.
 
-        Shape: (items, frames, FRAME / 2 + 1) of ``frame_power``, (items, n), (items, frames, sliders) -> (items, frames,
-        bands).
+        Args:
+            powers: result of ``frame_power``.
+            fitted: result of ``fit``.
+            sliders: values of the sliders in each frame.
+            state: state before the first frame.
+
+        Shape: (items, frames, FRAME / 2 + 1), (items, n), (items, frames, sliders)
+            -> (items, frames, bands).
         """
         raise NotImplementedError
 
     def initial(self, sliders: Tensor) -> dict[str, Tensor]:
-        """The state after silence. Shape: (items, sliders) -> (items, ...) each."""
+        """Return the state after silence. Shape: (items, sliders) -> (items, ...) each."""
         items = len(sliders)
-        past, gains = sliders.new_zeros(items, HISTORY), sliders.new_zeros(items, 2, self.bands)
+        past = sliders.new_zeros(items, HISTORY)
+        gains = sliders.new_zeros(items, 2, self.bands)
         return {"past": past, "gains": gains, "gliding": sliders, **self.start(items, sliders)}
 
     def advance(
         self, samples: Tensor, fitted: Tensor, sliders: Tensor, state: State
     ) -> dict[str, Tensor]:
-        """The state after whole hops; its ``gains`` are all that the hops had, and the next one's.
+        """Return the state after whole hops, with the gains of all the hops and of the next one.
 
-        Shape: (items, hops * HOP) pascals, (items, n), (items, sliders).
+        Shape: (items, hops * HOP) in pascals, (items, n), (items, sliders).
         """
         padded = torch.cat((state["past"], samples), -1)
         powers = frame_power(padded)
         if self.linked:
             powers = powers.unflatten(0, (-1, 2)).mean(1).repeat_interleave(2, 0)
         gliding = _glide(state["gliding"], sliders, powers.shape[1])
-        gains_db, kept = self.control(powers, fitted, gliding, state)
+        gains_db, control_state = self.control(powers, fitted, gliding, state)
         gains = torch.cat((state["gains"], 10.0 ** (gains_db / 20.0) - 1.0), 1)
-        return {"past": padded[:, -HISTORY:], "gains": gains, "gliding": gliding[:, -1], **kept}
+        common = {"past": padded[:, -HISTORY:], "gains": gains, "gliding": gliding[:, -1]}
+        return common | control_state
 
     def step(
         self, samples: Tensor, fitted: Tensor, sliders: Tensor, state: State
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        """Whole hops, ``DELAY`` samples late, and the state after them.
+        """Return the output for whole hops, ``DELAY`` samples late, and the state after them.
 
-        Shape: (items, hops * HOP) pascals, (items, n), (items, sliders) -> (items, hops * HOP).
+        Shape: (items, hops * HOP) in pascals, (items, n), (items, sliders) -> (items, hops * HOP).
         """
-        output, _, after = self._amplified(samples, fitted, sliders, state)
+        output, _, after = self._amplify(samples, fitted, sliders, state)
         return self.finish(output), after
 
-    def _amplified(
+    def _amplify(
         self, samples: Tensor, fitted: Tensor, sliders: Tensor, state: State
     ) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
-        """As ``step`` without the limit, and the highest band's gains, less 1. Shape: ... -> ..., (items, hops)."""
+        """Return the output of ``step`` before the limit, the highest band's gains - 1, and the state.
+
+        Shape: as ``step`` -> (items, hops * HOP), (items, hops).
+        """
         after = self.advance(samples, fitted, sliders, state)
         gains = after["gains"]
         padded = torch.cat((state["past"][:, -2 * DELAY :], samples), -1)
-        return (
-            apply_gains(padded, gains[:, :-1]),
-            gains[:, 2:, -1],
-            after | {"gains": gains[:, -2:]},
-        )
+        output = apply_gains(padded, gains[:, :-1])
+        return output, gains[:, 2:, -1], after | {"gains": gains[:, -2:]}
 
     def finish(self, samples: Tensor) -> Tensor:
-        """The last step, in pascals, sample by sample. Any shape."""
+        """Apply the limit of the output to samples in pascals. Any shape."""
         return soft_limit(samples, 10.0 ** ((self.limit_spl - PASCAL_SPL) / 20.0))
 
-    def whole(
+    def process(
         self, waveform: Tensor, audiogram: AudiogramLike | None, sliders: Sequence[Slider]
     ) -> Tensor:
-        """Shape: (..., time) and one audiogram or (..., 8) that broadcasts over the leading dimensions -> (..., time)."""
+        """Return the time-aligned output for whole signals.
+
+        Args:
+            waveform: input of the aid.
+            audiogram: one audiogram, or (..., 8) that broadcasts over the leading dimensions.
+            sliders: values of ``SLIDERS``.
+
+        Shape: (..., time) -> (..., time).
+        """
         check_waveform(waveform)
         with torch.autocast(waveform.device.type, enabled=False):
             batch, fitted, settings = self.prepare(waveform, audiogram, sliders)
-            time, gain = waveform.shape[-1], gain_to_pascals(self.full_scale_spl)
+            time = waveform.shape[-1]
+            gain = gain_to_pascals(self.full_scale_spl)
             signals = waveform.to(fitted.dtype).expand(*batch, -1).reshape(-1, time) * gain
             low = resample(signals, self.sample_rate, RATE)
-            ours = low.shape[-1]
-            state, outputs, highest = self.initial(settings), [], [low.new_zeros(len(low), 1)]
-            padded = nn.functional.pad(low, (0, DELAY + -(ours + DELAY) % HOP))
-            for block in padded.split(max(1, _BLOCK // (len(low) * HOP)) * HOP, -1):
-                output, gains, state = self._amplified(block, fitted, settings, state)
+            state = self.initial(settings)
+            outputs = []
+            highest_gains = [low.new_zeros(len(low), 1)]
+            low_time = low.shape[-1]
+            padded = nn.functional.pad(low, (0, DELAY + -(low_time + DELAY) % HOP))
+            block_samples = max(1, BLOCK_SAMPLES // (len(low) * HOP)) * HOP
+            for block in padded.split(block_samples, -1):
+                output, gains, state = self._amplify(block, fitted, settings, state)
                 outputs.append(output)
-                highest.append(gains)
-            result = resample(
-                torch.cat(outputs, -1)[:, DELAY : DELAY + ours], RATE, self.sample_rate
-            )
+                highest_gains.append(gains)
+            aligned = torch.cat(outputs, -1)[:, DELAY : DELAY + low_time]
+            result = resample(aligned, RATE, self.sample_rate)
             if self.sample_rate != RATE:
-                above = signals - resample(low, RATE, self.sample_rate)[:, :time]
-                gains = gain_at_rate(torch.cat(highest, -1), self.sample_rate, time)
-                result = result[:, :time] + (1.0 + gains) * above
+                above_8_khz = signals - resample(low, RATE, self.sample_rate)[:, :time]
+                gains = gain_at_rate(torch.cat(highest_gains, -1), self.sample_rate, time)
+                result = result[:, :time] + (1.0 + gains) * above_8_khz
             result = self.finish(result)
             return (result / gain).reshape(*batch, time).to(waveform.dtype)
 
-    def streamed(self, audiogram: AudiogramLike | None, sliders: Sequence[Slider]) -> Stream:
+    def open_stream(self, audiogram: AudiogramLike | None, sliders: Sequence[Slider]) -> Stream:
+        """Return a stream with the sliders set to values of ``SLIDERS``.
+
+        Raises:
+            ValueError: the sample rate is not 16000 Hz, or the audiogram or a slider is not valid.
+        """
         if self.sample_rate != RATE:
             raise ValueError(
-                f"a stream at {self.sample_rate} Hz; allowed: {RATE}, for resampling looks 8.5 ms ahead, beyond the 5 ms"
+                f"expected a sample rate of {RATE} Hz for a stream, got {self.sample_rate}; "
+                "resampling would look 8.5 ms farther ahead"
             )
-        set_to = dict(zip(self.SLIDERS, sliders, strict=True))
-        for name, slider in set_to.items():  # before the first chunk, which has the items' number
+        values = dict(zip(self.SLIDERS, sliders, strict=True))
+        for name, slider in values.items():
+            # The first chunk decides on the number of items.
             items = slider.shape if isinstance(slider, Tensor) else torch.Size()
             check_slider(name, slider, items, torch.empty(0))
-        as_thresholds(self._given(audiogram), consumer=type(self).__name__)
-        # it is asked for again when a slider moves, and a tensor may have been written into
-        return Stream(
-            self, audiogram.clone() if isinstance(audiogram, Tensor) else audiogram, set_to
-        )
+        as_thresholds(self._check_given(audiogram), consumer=type(self).__name__)
+        # The stream reads the ear again when a slider moves, and a tensor may be written into.
+        ears = audiogram.clone() if isinstance(audiogram, Tensor) else audiogram
+        return Stream(self, ears, values)
 
     def prepare(
         self, waveform: Tensor, audiogram: AudiogramLike | None, sliders: Sequence[Slider]
     ) -> tuple[torch.Size, Tensor, Tensor]:
-        """The leading dimensions of all together, what is needed of the ears, and the sliders.
+        """Return the common leading dimensions, the result of ``fit``, and the sliders.
 
         Shape: (..., time), (..., 8), (...) each -> (...), (items, n), (items, sliders).
         """
-        given = self._given(audiogram)
-        thresholds = resolve_thresholds(None, given, waveform, consumer=type(self).__name__)
-        own = next((weight.dtype for weight in self.parameters()), waveform.dtype)
-        dtype = torch.promote_types(own, torch.float32)
+        audiogram = self._check_given(audiogram)
+        thresholds = resolve_thresholds(None, audiogram, waveform, consumer=type(self).__name__)
+        own_dtype = next((weight.dtype for weight in self.parameters()), waveform.dtype)
+        dtype = torch.promote_types(own_dtype, torch.float32)
         batch = broadcast_shape(waveform.shape[:-1], thresholds.shape[:-1])
         if self.linked:
             check_two_channels(waveform)
@@ -203,44 +234,52 @@ class Wearable(nn.Module):
         stacked = torch.stack(settings, -1) if settings else ears.new_zeros(*batch, 0)
         return batch, self.fit(ears), stacked.to(dtype).reshape(len(ears), -1)
 
-    def _given(self, audiogram: AudiogramLike | None) -> AudiogramLike:
+    def _check_given(self, audiogram: AudiogramLike | None) -> AudiogramLike:
         if audiogram is None:
-            raise ValueError(
-                f"no audiogram: give one with each call, {type(self).__name__} holds none"
-            )
+            raise ValueError(f"no audiogram; pass one to each call of a {type(self).__name__}")
         return audiogram
 
 
 def check_slider(name: str, slider: Slider, batch: torch.Size, like: Tensor) -> Tensor:
     """Return a slider as a tensor of the type and on the device of another one.
 
-    The values of a tensor on a GPU are not read, because the host would wait for the GPU. Those that are out of range
-    become NaN.
+    The values of a tensor on a GPU are not read, because the host would wait for the GPU. Those
+    that are out of range become NaN.
+
+    Args:
+        name: name of the slider, for messages.
+        slider: number or tensor from 0 to 1.
+        batch: shape over which a tensor has to broadcast.
+        like: tensor with the type and the device of the result.
 
     Raises:
         ValueError: values outside 0 to 1, or a shape that does not broadcast over the items.
     """
-    if not (is_finite(slider) or (isinstance(slider, Tensor) and not slider.is_complex())):
-        raise ValueError(f"{name} is {slider!r}; allowed: a number or a tensor, 0 to 1")
-    if isinstance(slider, Tensor):
-        setting = slider.to(like.device, like.dtype, non_blocking=like.device.type != "cpu")
-    else:
-        setting = like.new_full((), torch.as_tensor(slider).item())
-    if isinstance(slider, Tensor) and slider.device.type != "cpu":
-        setting = torch.where((setting >= 0.0) & (setting <= 1.0), setting, torch.nan)
-    elif not bool(((torch.as_tensor(slider) >= 0.0) & (torch.as_tensor(slider) <= 1.0)).all()):
-        raise ValueError(f"{name} is {slider!r}; allowed: 0 to 1")
-    if setting.ndim > len(batch) or any(
-        own not in (1, size) for own, size in zip(setting.shape[::-1], batch[::-1], strict=False)
-    ):
+    if not isinstance(slider, Tensor):
+        check_number(name, slider, 0.0, 1.0)
+        return like.new_full((), torch.as_tensor(slider).item())
+    if slider.is_complex():
+        raise ValueError(f"expected {name} from 0 to 1, got {describe(slider)}")
+    values = slider.to(like.device, like.dtype, non_blocking=like.device.type != "cpu")
+    if slider.device.type != "cpu":
+        values = torch.where((values >= 0.0) & (values <= 1.0), values, torch.nan)
+    elif not bool(((slider >= 0.0) & (slider <= 1.0)).all()):
+        raise ValueError(f"expected {name} from 0 to 1, got {slider!r}")
+    pairs = zip(values.shape[::-1], batch[::-1], strict=False)
+    if values.ndim > len(batch) or any(size not in (1, items) for size, items in pairs):
         raise ValueError(
-            f"{name} has shape {tuple(setting.shape)} for items {tuple(batch)}; allowed: one, or one an item"
+            f"expected one value of {name}, or one per item in the shape {tuple(batch)}, "
+            f"got shape {tuple(values.shape)}"
         )
-    return setting
+    return values
 
 
 def _glide(now: Tensor, target: Tensor, frames: int) -> Tensor:
-    """Sliders on their way, so that no jump clicks. Shape: (items, n) twice -> (items, frames, n)."""
-    most = _GLIDE * torch.arange(1, frames + 1, dtype=now.dtype, device=now.device).unsqueeze(-1)
-    way = (target - now).unsqueeze(1)
-    return now.unsqueeze(1) + torch.minimum(torch.maximum(way, -most), most)
+    """Move sliders towards their targets, so that no jump clicks.
+
+    Shape: (items, n) twice -> (items, frames, n).
+    """
+    steps = torch.arange(1, frames + 1, dtype=now.dtype, device=now.device)
+    limit = SLIDER_STEP * steps.unsqueeze(-1)
+    distance = (target - now).unsqueeze(1)
+    return now.unsqueeze(1) + torch.minimum(torch.maximum(distance, -limit), limit)

@@ -44,7 +44,7 @@ def check_names(
     Args:
         names: names to validate.
         known: accepted names.
-        description: what the names stand for, in the plural, for the message.
+        description: noun in the plural for the message, such as ``criteria``.
         place: where the names were found, for the message.
     """
     known = list(known)
@@ -100,7 +100,7 @@ def check_weights(weights: Any, known: Iterable[str], description: str) -> dict[
     Args:
         weights: mapping of names to finite numbers of 0 or more, of which one is above 0.
         known: accepted names.
-        description: what the names stand for, in the plural, for messages.
+        description: noun in the plural for messages, such as ``criteria``.
 
     Raises:
         ValueError: the weights are not as described.

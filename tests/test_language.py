@@ -13,13 +13,19 @@ ROOT = Path(__file__).parents[1]
 
 # Folders and files that keep the rules. Add yours when it is finished.
 FINISHED = [
+    "compensators",
     "hlsim/audiogram",
     "hlsim/calibration.py",
+    "hlsim/checks.py",
     "hlsim/dsp",
     "hlsim/extras.py",
+    "hlsim/losses",
+    "hlsim/metrics/objective.py",
+    "hlsim/metrics/torchmetric.py",
     "hlsim/msbg",
     "hlsim/neuro",
     "hlsim/plugins.py",
+    "hlsim/torchtools.py",
     "tests/audiogram",
     "tests/dsp",
     "tests/msbg",
@@ -33,7 +39,9 @@ FINISHED = [
 UNFINISHED = {"hlsim/msbg/model.py", "hlsim/msbg/blocks.py"}
 
 # Rows of (file, rule, text) that may stay. A row that is no longer needed fails the test.
-EXCEPTIONS: set[tuple[str, str, str]] = set()
+EXCEPTIONS: set[tuple[str, str, str]] = {
+    ("hlsim/losses/hearing_loss.py", "name", "heard"),  # a public method
+}
 
 BANNED_NAMES = set(
     "given made told kept own found taken claimed held worn heard lasting begun one others each every "

@@ -25,14 +25,14 @@ def names_of_torch(tree: ast.AST) -> Iterator[str]:
 
 def private_part(name: str) -> str | None:
     """The name up to its first private part, or None."""
-    found = re.match(r"torch(\.[a-zA-Z]\w*)*\._(?!_)\w+", name)
-    return found and found[0]
+    match = re.match(r"torch(\.[a-zA-Z]\w*)*\._(?!_)\w+", name)
+    return match and match[0]
 
 
 def test_no_private_name_of_torch_is_used() -> None:
-    found = set()
+    names = set()
     for path in SOURCES:
         for name in names_of_torch(ast.parse(path.read_text())):
             if private := private_part(name):
-                found.add((str(path.relative_to(ROOT)), private))
-    assert found == KNOWN_EXCEPTIONS
+                names.add((str(path.relative_to(ROOT)), private))
+    assert names == KNOWN_EXCEPTIONS

@@ -59,14 +59,14 @@ def test_complex_constants_and_those_like_a_tensor() -> None:
         return 1j * np.arange(count)[::-1]
 
     for dtype, expected in ((torch.float32, torch.complex64), (torch.float64, torch.complex128)):
-        made = constant(make, 3, dtype=dtype, device=CPU)
+        tensor = constant(make, 3, dtype=dtype, device=CPU)
         assert (
-            made.dtype == expected
-            and made.is_contiguous()
-            and made.imag.tolist() == [2.0, 1.0, 0.0]
+            tensor.dtype == expected
+            and tensor.is_contiguous()
+            and tensor.imag.tolist() == [2.0, 1.0, 0.0]
         )
         for like in (torch.ones(1, dtype=dtype), torch.ones(1, dtype=expected)):
-            assert constant_like(like, make, 3) is made
+            assert constant_like(like, make, 3) is tensor
     assert constant(make, 4, dtype=torch.float32, device=CPU) is not constant(
         make, 3, dtype=torch.float32, device=CPU
     )

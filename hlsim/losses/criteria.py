@@ -70,9 +70,9 @@ def check_values(values: Any, items: int) -> Tensor:
         ValueError: it is not a tensor with one value per item.
     """
     if not isinstance(values, Tensor) or values.shape != (items,):
-        found = tuple(values.shape) if isinstance(values, Tensor) else type(values).__name__
+        result = tuple(values.shape) if isinstance(values, Tensor) else type(values).__name__
         raise ValueError(
-            f"expected the criterion to return one value per item, shape ({items},), got {found}; "
+            f"expected the criterion to return one value per item, shape ({items},), got {result}; "
             "apply a criterion that returns a mean to the result of loss.heard(...)"
         )
     return values

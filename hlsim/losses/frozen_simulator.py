@@ -34,7 +34,7 @@ class FrozenSimulator:
     ``apply``.
 
     Args:
-        simulator: as in ``HearingLossLoss``, which describes the attributes that a module may have.
+        simulator: simulator, as ``HearingLossLoss`` describes it and its attributes.
         sample_rate: sample rate in Hz.
         full_scale_spl: level in dB SPL of RMS 1.0.
         normal: normal ear, as in ``HearingLossLoss``.
@@ -271,15 +271,15 @@ def _allowed_batches(items: torch.Size, ears: torch.Size) -> list[torch.Size]:
             (batch,) ears with (batch, 1) items would.
     """
     try:
-        together = broadcast_shape(items, ears)
+        broadcast = broadcast_shape(items, ears)
     except RuntimeError:  # the simulator rejects them
         return [items]
-    if math.prod(together) > max(math.prod(items), math.prod(ears)):
+    if math.prod(broadcast) > max(math.prod(items), math.prod(ears)):
         raise ValueError(
             f"expected one audiogram, or one per item in the shape {(*items, len(FREQUENCIES))}, "
             f"got {(*ears, len(FREQUENCIES))}, which would pair each item with each ear"
         )
-    return [items, together]
+    return [items, broadcast]
 
 
 def _check_output(output: Any, source: str, waveform: Tensor, allowed: list[torch.Size]) -> Tensor:

@@ -280,11 +280,11 @@ class HearingLossLoss(nn.Module):
         check_waveform(compensated, "compensated")
         check_waveform(clean, "clean")
         for name in ("shape", "device"):
-            found, expected = getattr(compensated, name), getattr(clean, name)
-            if found != expected:
+            values = getattr(compensated, name), getattr(clean, name)
+            if values[0] != values[1]:
                 raise ValueError(
                     f"expected compensated and clean with the same {name}, "
-                    f"got {found} and {expected}"
+                    f"got {values[0]} and {values[1]}"
                 )
         listeners = self._two_ears if audiogram is None else has_listeners(audiogram)
         if listeners or self.ears == "better" or "interaural" in self.criteria:

@@ -126,7 +126,7 @@ class _MeanScore(_Metric):
         and ``ears`` has the mean of each ear.
 
         Args:
-            processed: what the ears are given.
+            processed: output of the compensator.
             clean: clean speech of the same shape.
             audiogram: one ear, or one per item. For two channels a ``Listener``, whose missing ear
                 is left out, a pair of left and right ear, or one of these per item.
@@ -292,8 +292,8 @@ class HASPI(_MeanScore):
         full_scale_spl: level in dB SPL of a signal with RMS 1.0.
         noise: treatment of the ear's internal noise, as in ``haspi``. ``"seeded"`` gives the scores
             of pyclarity.
-        seed: with ``noise="seeded"``, item i since the last reset takes ``seed`` + i, so that
-            epochs can be compared.
+        seed: seed of the first item since the last reset, for ``noise="seeded"``. It rises by 1
+            with each item, so that epochs can be compared.
         whole_khz: round the rate to whole kHz, as pyclarity does.
         limit: number of items that are scored from one reset to the next in each process; the
             others are passed over. None scores all.

@@ -94,7 +94,7 @@ def test_a_batch_is_its_items(make: Make, noise: torch.Tensor) -> None:
 def test_blocks_of_a_long_signal_are_the_whole(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
     aid, signal = make(), 0.03 * torch.randn(1, 9000)
     whole = aid(signal, EAR)
-    monkeypatch.setattr("compensators.wearable._BLOCK", 1000)
+    monkeypatch.setattr("compensators.wearable.BLOCK_SAMPLES", 1000)
     assert (aid(signal, EAR) - whole).abs().max() < 1e-5 * whole.abs().max()
 
 
