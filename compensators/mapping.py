@@ -32,13 +32,13 @@ LOWEST_CENTRE = 100.0
 class MappingCompensator(EarNetwork):
     """A network that maps a waveform and an audiogram to a time-aligned, limited output.
 
-    Log magnitude, encoded audiogram (Equation 1) and prescribed gain are its input channels. A dense
-    encoder and dual-path blocks follow. A decoder returns the log magnitude of the output, which is
-    that of the input plus the prescription ``config.start`` plus the network's correction. The
-    correction is smooth over time and frequency, and 0 before training. Without prescription, and
-    free at every frequency, training ends below NAL-R, as an inaudible band has almost no gradient.
-    With ``config.phase`` "predicted" the phase is an input channel, too, and another decoder shifts
-    it; otherwise it is kept.
+    Log magnitude, encoded audiogram (Equation 1) and prescribed gain are its input channels. A
+    dense encoder and dual-path blocks follow. A decoder returns the log magnitude of the output,
+    which is that of the input plus the prescription ``config.start`` plus the network's correction.
+    The correction is smooth over time and frequency, and 0 before training. Without prescription,
+    and free at every frequency, training ends below NAL-R, as an inaudible band has almost no
+    gradient. With ``config.phase`` "predicted" the phase is an input channel, too, and another
+    decoder shifts it; otherwise it is kept.
 
     Levels are in pascals, and nothing is normalised. The output is softly limited at
     ``config.limit_spl``.

@@ -40,7 +40,7 @@ RESAMPLER_LOOKAHEAD = 136
 
 
 class Wearable(nn.Module):
-    """An aid with gains in bands. Subclasses define ``SLIDERS``, ``fit``, ``start`` and ``control``.
+    """An aid with gains in bands. Subclasses have ``SLIDERS``, ``fit``, ``start`` and ``control``.
 
     A direct path splits the signal into bands that sum to the signal with a delay of 4 ms,
     multiplies each band by its gain, and adds them. The gains come from frames of 16 ms every 4 ms
@@ -83,7 +83,7 @@ class Wearable(nn.Module):
         raise NotImplementedError
 
     def start(self, items: int, like: Tensor) -> dict[str, Tensor]:
-        """Return the state of ``control`` after silence, with the type and the device of a tensor."""
+        """Return the state of ``control`` after silence, of the type and device of a tensor."""
         raise NotImplementedError
 
     def control(
@@ -139,7 +139,7 @@ class Wearable(nn.Module):
     def _amplify(
         self, samples: Tensor, fitted: Tensor, sliders: Tensor, state: State
     ) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
-        """Return the output of ``step`` before the limit, the highest band's gains - 1, and the state.
+        """Return the output of ``step`` before the limit, the highest gains minus 1, and the state.
 
         Shape: as ``step`` -> (items, hops * HOP), (items, hops).
         """
