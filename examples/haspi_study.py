@@ -59,7 +59,7 @@ def main() -> None:
         measures=("haspi", "stoi"),
         store=out / "report" / "scores.jsonl",
         jobs=1,
-        progress=lambda done, total: print(f"\r{done} of {total} outputs", end="", file=sys.stderr),
+        progress=lambda done, total: print(f"\r{done} of {total} values", end="", file=sys.stderr),
     )
     assert report.headline is not None
     print(report.headline.verdict())

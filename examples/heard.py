@@ -15,7 +15,8 @@ from hlsim import MSBG, Audiogram, list_pretrained, load_pretrained
 from hlsim.audio import read_audio
 from hlsim.calibration import level_spl, set_level
 from hlsim.dsp.resample import resample
-from hlsim.report.spectrograms import composite, panels
+from hlsim.report.plots import new_figure
+from hlsim.report.spectrograms import PANEL_INCHES, Panels, panels
 
 ROOT = Path(__file__).parents[1]
 RATE = 16000
@@ -38,6 +39,20 @@ def draw(signals: dict[str, Tensor], to: Path, of: str = "") -> None:
     image.quantize(96, Image.Quantize.MAXCOVERAGE).save(
         to, optimize=True
     )  # less than half of the size
+
+
+def composite(panels: Panels) -> bytes:
+    """Return all panels as one PNG, in two columns."""
+    rows = -(-len(panels) // 2)
+    figure = new_figure((2.0 * PANEL_INCHES[0], rows * PANEL_INCHES[1]))
+    places = figure.subplots(rows, 2, squeeze=False).ravel()
+    for axes, draw in zip(places, panels.values(), strict=False):
+        draw(figure, axes)
+    for axes in places[len(panels) :]:
+        axes.set_axis_off()
+    data = BytesIO()
+    figure.savefig(data, dpi=160, format="png")
+    return data.getvalue()
 
 
 @torch.no_grad()

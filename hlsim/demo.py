@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -20,7 +21,7 @@ from hlsim.evaluation.items import INPUT_LEVELS
 from hlsim.evaluation.measurements import gain_curves
 from hlsim.evaluation.measures import LEVELS, MEASURES, PERCEPTION, perceive
 from hlsim.evaluation.result import Evaluation
-from hlsim.evaluation.study import Condition, Item, run_study
+from hlsim.evaluation.study import Condition, Item
 from hlsim.metrics.pair import check_pair
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.parallel import Progress, one_thread
@@ -103,20 +104,19 @@ def demo(
         Condition(TRAINED, trained),
     ]
     report(f"scoring {len(items)} other utterances under {len(conditions)} conditions")
-    table = run_study(
-        items, conditions, [MEASURES["haspi"], LEVELS, PERCEPTION], jobs=jobs, progress=progress
+    measures = [MEASURES["haspi"], LEVELS, PERCEPTION]
+    settings = {"seed": seed, "training_steps": steps}
+    evaluation = Evaluation.run(
+        items, conditions, measures, store=None, settings=settings, jobs=jobs, progress=progress
     )
     shortest = min(len(item.clean) for item in items)
     utterances = torch.stack([item.clean[:shortest] for item in items])
-    aids = {NAL_R: nal_r, TRAINED: trained}
-    evaluation = Evaluation(
-        items=items,
-        conditions=conditions,
-        measures=[MEASURES["haspi"]],
-        table=table,
-        comparisons=compare(table, ["haspi"], planned=[("haspi", NAL_R_AT_LEVEL, TRAINED)]),
-        settings={"seed": seed, "measures": ["haspi"], "training_steps": steps},
-        details={"gain_curves": gain_curves(aids, {ear_name: audiogram}, utterances, INPUT_LEVELS)},
+    aids, ears = {NAL_R: nal_r, TRAINED: trained}, {ear_name: audiogram}
+    planned = [("haspi", NAL_R_AT_LEVEL, TRAINED)]
+    evaluation = replace(
+        evaluation,
+        comparisons=compare(evaluation.table, ["haspi"], planned=planned),
+        details={"gain_curves": gain_curves(aids, ears, utterances, INPUT_LEVELS)},
     )
     perceived = _perceived(items, conditions)
     page = demo_page(evaluation, ear_name, perceived)

@@ -12,7 +12,7 @@ import torch
 from hlsim import MSBG, Audiogram, HearingLossLoss
 from hlsim.audio import read_audio, write_audio
 from hlsim.calibration import level_spl, set_level
-from hlsim.evaluation.enhancers import load_enhancer
+from hlsim.evaluation.aids import load_enhancer
 from hlsim.msbg.ear import MSBG_RATE
 from hlsim.msbg.filterbank import BANKS, gammatone_response
 from hlsim.training.teacher import PluginTeacher

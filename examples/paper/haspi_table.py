@@ -66,7 +66,7 @@ def main(arguments: list[str] | None = None) -> None:
         manifest=out / "table.csv",
         store=out / "report" / "scores.jsonl",
         jobs=options.jobs,
-        progress=show_progress("outputs"),
+        progress=show_progress("values"),
     )
     assert report.headline is not None
     print(report.headline.verdict())

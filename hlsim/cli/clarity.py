@@ -68,7 +68,7 @@ def _clarity(options: argparse.Namespace) -> None:
         seed=options.seed,
         jobs=options.jobs,
         dask=options.dask,
-        progress=show_progress("outputs"),
+        progress=show_progress("values"),
     )
     write_scores(evaluation, options.out)
     finish(evaluation, scenes_page(evaluation, options.listen), options.out)

@@ -42,6 +42,6 @@ def _demo(options: argparse.Namespace) -> None:
         steps=options.steps,
         seed=options.seed,
         jobs=None,
-        progress=show_progress("outputs"),
+        progress=show_progress("values"),
     )
     print(summary)

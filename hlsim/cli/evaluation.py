@@ -81,7 +81,7 @@ def _evaluate_simulator(options: argparse.Namespace) -> None:
         seed=options.seed,
         jobs=options.jobs,
         dask=options.dask,
-        progress=show_progress("outputs"),
+        progress=show_progress("values"),
     )
     finish(evaluation, simulators_page(evaluation, options.listen), options.out)
 
@@ -146,7 +146,7 @@ def _evaluate_compensator(options: argparse.Namespace) -> None:
         seed=options.seed,
         jobs=options.jobs,
         dask=options.dask,
-        progress=show_progress("outputs"),
+        progress=show_progress("values"),
     )
     finish(evaluation, compensators_page(evaluation, options.listen), options.out)
 
@@ -224,7 +224,7 @@ def _haspi_report(options: argparse.Namespace) -> None:
         seed=options.seed,
         jobs=options.jobs,
         dask=options.dask,
-        progress=show_progress("outputs"),
+        progress=show_progress("values"),
     )
     finish(evaluation, report_page(evaluation, options.listen), options.out)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import uuid
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,9 +12,11 @@ import torch
 from scipy.signal import firwin2
 from torch import Tensor, nn
 
+from hlsim.audio import read_audio
 from hlsim.audiogram import Audiogram
 from hlsim.calibration import level_spl, set_level
 from hlsim.dsp.fir import filter_without_delay
+from hlsim.dsp.resample import resample
 from hlsim.evaluation.measurements import insertion_gain
 from hlsim.losses.band_levels import band_centres
 from hlsim.neuro.config import NEURO_RATE
@@ -21,6 +24,7 @@ from hlsim.plugins import WaveformPlugin
 
 _TAPS = 513  # of an equaliser: 31 Hz at 16 kHz
 _LOWEST_GAIN_DB = -100.0
+_SPEECH = Path(__file__).parents[1] / "data" / "speech" / "valid" / "flite-rms-01.flac"
 
 _GAINS: dict[tuple[str, Audiogram], list[float]] = {}
 """Gains of equalisers by their token and the ear, for this process."""
@@ -97,6 +101,29 @@ class Enhanced(nn.Module):
         """Enhance the waveform, and process what comes out."""
         aided: Tensor = self.aid(self.enhancer(waveform, NEURO_RATE), audiogram)
         return aided
+
+
+def load_enhancer(name: str) -> WaveformPlugin:
+    """Load an enhancer ``(waveform, sample_rate) -> waveform`` of (..., time) in pascals.
+
+    Raises:
+        ValueError: As ``WaveformPlugin``, or its output for speech is no waveform, or not aligned.
+    """
+    enhancer = WaveformPlugin(name, "enhancer")
+    waveform, rate = read_audio(_SPEECH)
+    speech = set_level(resample(waveform[0], rate, NEURO_RATE)[: 2 * NEURO_RATE], 65.0)
+    enhancer.check_aligned(speech, NEURO_RATE, NEURO_RATE)
+    return enhancer
+
+
+def load_enhancers(names: Sequence[str]) -> dict[str, WaveformPlugin]:
+    """Load enhancers by the part of their names after the colon; ValueError for the same part twice."""
+    enhancers = {name.rpartition(":")[2]: load_enhancer(name) for name in names}
+    if len(enhancers) < len(names):
+        raise ValueError(
+            f"enhancers {', '.join(names)}: two have the same name after the colon; rename one"
+        )
+    return enhancers
 
 
 def limit_of(aid: Any) -> float | None:

@@ -1,4 +1,4 @@
-"""Scenes of the Clarity enhancement challenges: both ears' aids, and the score of the better ear.
+"""Scenes of the Clarity enhancement challenges: aids of both ears, scored by the better ear.
 
 As in the challenges' own scripts (claritychallenge/clarity, recipes/icassp_2023 and cec3), the reference is the
 target without its room, at the level that the target has in the room; a file's RMS of 1.0 is 100 dB SPL; and the
@@ -9,10 +9,11 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -21,22 +22,19 @@ from compensators import load_compensator
 from hlsim.audio import read_audio, write_audio
 from hlsim.audiogram.listener import EARS, Listener
 from hlsim.audiogram.table import read_listeners
-from hlsim.calibration import check_full_scale, gain_to_pascals, level_spl, set_level
-from hlsim.evaluation.comparison import compare
-from hlsim.evaluation.enhancers import load_enhancers
+from hlsim.calibration import check_full_scale, gain_to_pascals, set_level
+from hlsim.evaluation.aids import load_enhancers
 from hlsim.evaluation.fingerprint import combined_fingerprint, fingerprint
 from hlsim.evaluation.measurements import samples_ahead
 from hlsim.evaluation.measures import find_measures
-from hlsim.evaluation.result import Evaluation, check_scored, score_columns
-from hlsim.evaluation.store import ScoreStore, content_hash, key_of
-from hlsim.evaluation.study import Condition, Item, Measure, Source, Values, run_study
+from hlsim.evaluation.recordings import Recording, score_recordings
+from hlsim.evaluation.result import Evaluation
+from hlsim.evaluation.store import content_hash, key_of
+from hlsim.evaluation.study import Condition
 from hlsim.files import write_atomically
-from hlsim.metrics.pair import check_seed
-from hlsim.parallel import Progress
+from hlsim.metrics.pair import check_seed, common_length
+from hlsim.parallel import one_thread, reason_of, run_parallel
 from hlsim.plugins import WaveformPlugin
-
-if TYPE_CHECKING:
-    from pandas import DataFrame
 
 FULL_SCALE_SPL = 100.0
 """Level in dB SPL of RMS 1.0 in the challenges' files."""
@@ -55,59 +53,12 @@ _PLACES = 8  # of a scene, where it becomes another sound
 _LONGEST_SECONDS = 4.0  # of that scene
 
 
-@dataclass(frozen=True)
-class Scene:
-    """Files of a scene: the front microphones, the target without its room, and the target in the room, if known."""
+class Scene(NamedTuple):
+    """Files of a scene: the front microphones, the target without its room, and in the room, if known."""
 
     mix: Path
     reference: Path
     in_room: Path | None
-
-
-@dataclass(frozen=True)
-class SceneItem:
-    """One scene for one listener, in files; ``problem`` says why its reference cannot be used."""
-
-    scene: str
-    person: str
-    mix: Path
-    reference: Path
-    listener: Listener
-    full_scale_spl: float
-    seed: int
-    problem: str = ""
-
-    @property
-    def name(self) -> str:
-        """Listener and scene."""
-        return f"{self.person} {self.scene}"
-
-    @property
-    def facts(self) -> dict[str, Any]:
-        """What the table says of the item."""
-        return {"scene": self.scene, "listener": self.person}
-
-    def digest(self, condition: str) -> str:
-        """Return the SHA-256 of both files, the listener, the level and the seed."""
-        if self.problem:
-            raise ValueError(self.problem)
-        files = [content_hash(self.mix), content_hash(self.reference)]
-        settings = [self.full_scale_spl, self.seed]
-        return key_of({"files": files, "ears": self.listener.to_dict(), "settings": settings})
-
-    def load(self) -> Item:
-        """Read mix and reference."""
-        (mix, rate), (reference, _) = read_audio(self.mix), read_audio(self.reference)
-        return Item(
-            self.name,
-            reference,
-            two_channels(self.mix, mix),
-            self.listener,
-            sample_rate=rate,
-            full_scale_spl=self.full_scale_spl,
-            seed=(self.seed + int(content_hash(self.reference)[:8], 16)) % 2**32,
-            facts=self.facts,
-        )
 
 
 @dataclass(frozen=True)
@@ -123,10 +74,8 @@ class Aids:
     def fingerprint(self) -> str | None:
         """Fingerprint of aid, enhancer, rate and level; None if one is unknown."""
         parts = [part for part in (self.aid, self.enhancer) if part is not None]
-        settings = (
-            f"{self.aid is None} {self.enhancer is None} {self.sample_rate} {self.full_scale_spl}"
-        )
-        return combined_fingerprint(settings, *map(fingerprint, parts))
+        settings = [self.aid is None, self.enhancer is None, self.sample_rate, self.full_scale_spl]
+        return combined_fingerprint(str(settings), *map(fingerprint, parts))
 
     @torch.no_grad()
     def __call__(self, waveform: Tensor, listener: Listener) -> Tensor:
@@ -142,78 +91,6 @@ class Aids:
         return aided
 
 
-@dataclass(frozen=True, kw_only=True)
-class Written(Condition):
-    """A condition whose outputs are written to a folder, under the challenges' names."""
-
-    folder: Path
-
-    def file(self, item: Source) -> Path:
-        """Return the file of an output."""
-        facts = item.facts
-        return self.folder / f"{facts['scene']}_{facts['listener']}_HA-output.wav"
-
-    def output(self, item: Item) -> Tensor:
-        """Process an item and write the output."""
-        output = self.process(item.signal, item.ear)
-        write_audio(self.file(item), output, item.sample_rate)
-        return output
-
-    def prepare_folder(self) -> None:
-        """Remove outputs of another processing of the same name."""
-        self.folder.mkdir(parents=True, exist_ok=True)
-        note = self.folder / "fingerprint.txt"
-        if not note.is_file() or note.read_text() != str(self.fingerprint):
-            for path in self.folder.glob("*_HA-output.wav"):
-                path.unlink()
-            write_atomically(note, str(self.fingerprint))
-
-
-class BetterEar:
-    """Scores of the better ear: the higher one by each measure, and the level by the first."""
-
-    def __init__(self, measures: Sequence[Measure]) -> None:
-        self.measures = list(measures)
-
-    @property
-    def fingerprint(self) -> str | None:
-        """Fingerprint of all measures; None if one is unknown."""
-        return combined_fingerprint(*(measure.fingerprint for measure in self.measures))
-
-    def __call__(self, item: Item, output: Tensor) -> Values:
-        """Return the scores, the level in dB SPL, and which ear is better."""
-        ears, reasons = {}, []
-        for place, ear in enumerate(EARS):
-            try:
-                ears[ear] = self._score_ear(item, output, place)
-            except ValueError as error:
-                reasons.append(f"{ear} ear: {error}")
-        if not ears:
-            raise ValueError("; ".join(reasons))
-        first = self.measures[0].name
-        better = max(ears, key=lambda ear: ears[ear][first])
-        scores = {name: max(scores[name] for scores in ears.values()) for name in ears[better]}
-        return {**scores, "level": ears[better]["level"], "better_ear": better}
-
-    def _score_ear(self, item: Item, output: Tensor, place: int) -> dict[str, float]:
-        one_ear = Item(
-            item.name,
-            item.clean[place].double(),
-            item.signal[place].double(),
-            getattr(item.ear, EARS[place]),
-            sample_rate=item.sample_rate,
-            full_scale_spl=item.full_scale_spl,
-            seed=item.seed,
-        )
-        samples = output[place].float().double()  # as the file has them
-        if not bool(samples.any()):
-            raise ValueError("the output is silent")
-        scores: dict[str, Any] = {}
-        for measure in self.measures:
-            scores |= measure.compute(one_ear, samples)
-        return {**scores, "level": float(level_spl(samples, item.full_scale_spl))}
-
-
 def evaluate_scenes(
     aids: Mapping[str, str],
     *,
@@ -227,9 +104,7 @@ def evaluate_scenes(
     linked: bool = False,
     full_scale_spl: float = FULL_SCALE_SPL,
     seed: int = 0,
-    jobs: int | None = None,
-    dask: str | None = None,
-    progress: Progress | None = None,
+    **running: Any,
 ) -> Evaluation:
     """Judge pairs of aids beside no aid and NAL-R on binaural scenes, by the better ear's HASPI and HASQI.
 
@@ -251,7 +126,7 @@ def evaluate_scenes(
         measures: further measures beside HASPI and HASQI; the better ear has the higher value.
         linked: whether one level sets the gains of both ears, in compensators that can.
         full_scale_spl: level in dB SPL of RMS 1.0.
-        jobs, dask, progress: as in ``run_study``.
+        running: ``jobs``, ``dask`` and ``progress``, as in ``run_study``.
 
     Returns: the evaluation of all conditions, ``unaided`` first; its detail ``look_ahead_ms`` is by condition, None
         where an aid fails on the first pair.
@@ -261,86 +136,52 @@ def evaluate_scenes(
             could be scored.
         MissingExtraError: a package is not installed.
     """
-    scores = find_measures(["haspi", "hasqi", *measures])
+    names = ["haspi", "hasqi", *measures]
+    find_measures(names)
     check_seed(seed)
     check_full_scale(full_scale_spl)
     if every < 1:
         raise ValueError(f"every is {every}; expected 1 or more")
-    if taken := {UNAIDED, NAL_R} & set(aids):
-        raise ValueError(f"{taken.pop()} is always evaluated; give the aid another label")
-    known, people = read_scenes(scenes), read_listeners(listeners)
+    known, people, folder = read_scenes(scenes), read_listeners(listeners), Path(out)
     pairs = read_pairs(scenes_listeners, known, people)[::every]
     rate = read_audio(known[pairs[0][0]].mix)[1]
-    conditions = _conditions(aids, enhancers, linked, rate, full_scale_spl, Path(out) / "signals")
+    conditions = _conditions(aids, enhancers, linked, rate, full_scale_spl)
+    folders = _folders(conditions, folder / "signals")
     ahead = _look_ahead(conditions, known[pairs[0][0]].mix, people[pairs[0][1]])
-    problems = _write_references({name: known[name] for name, _ in pairs}, rate, Path(out))
-    items = [
-        SceneItem(
-            scene=scene,
-            person=person,
-            mix=known[scene].mix,
-            reference=_reference_file(Path(out), scene),
-            listener=people[person],
-            full_scale_spl=full_scale_spl,
-            seed=seed,
-            problem=problems.get(scene, ""),
-        )
-        for scene, person in pairs
-    ]
-    for condition in conditions:
-        condition.prepare_folder()
-    better = BetterEar(scores)
-    table = run_study(
-        items,
-        conditions,
-        [Measure("better ear", better, settings=better.fingerprint)],
-        store=ScoreStore(Path(out) / "scores.jsonl"),
-        is_kept=lambda item, condition: _written(condition).file(item).is_file(),
-        jobs=jobs,
-        dask=dask,
-        progress=progress,
+    _remove_outdated(conditions, folders, known)
+    tasks = [_Pair(name, person, known[name], people[person]) for name, person in pairs]
+    write = partial(_write_signals, rate=rate, conditions=conditions, folders=folders, out=folder)
+    parallel = {name: running[name] for name in ("jobs", "dask") if name in running}
+    written = dict(run_parallel(write, tasks, **parallel))
+    recordings = []
+    for task in tasks:
+        problems = written[task]
+        if problems is None:
+            problems = dict.fromkeys(folders, "the process that computed it ended")
+        outputs = {name: task.file(own) for name, own in folders.items() if name not in problems}
+        for ear in EARS:
+            recording = Recording(
+                task.scene,
+                _reference_file(folder, task.scene),
+                outputs,
+                getattr(task.listener, ear),
+                listener=task.person,
+                ear=ear,
+                full_scale_spl=full_scale_spl,
+                seed=seed,
+                problems=problems,
+            )
+            recordings.append(recording)
+    evaluation = score_recordings(
+        recordings,
+        [replace(condition, process=None) for condition in conditions],
+        names,
+        better_ear=True,
+        planned=[("haspi", NAL_R, c.name) for c in conditions if c.kind == "aid"],
+        store=folder / "scores.jsonl",
+        **running,
     )
-    check_scored(table, ["haspi"])
-    table = _with_ears(table, items)
-    columns = score_columns(table, scores, {**items[0].facts, **_EAR_FACTS})
-    planned = [
-        ("haspi", NAL_R, condition.name) for condition in conditions if condition.kind == "aid"
-    ]
-    return Evaluation(
-        items=items,
-        conditions=conditions,
-        measures=scores,
-        table=table,
-        comparisons=compare(table, columns, planned=planned),
-        settings={
-            "seed": seed,
-            "measures": columns,
-            "full_scale_spl": full_scale_spl,
-            "better_ear": True,
-        },
-        details={"look_ahead_ms": ahead},
-    )
-
-
-_EAR_FACTS = dict.fromkeys(("better_ear", "severity", "audiogram"))
-
-
-def _written(condition: Condition) -> Written:
-    assert isinstance(condition, Written)
-    return condition
-
-
-def _with_ears(table: DataFrame, items: Sequence[SceneItem]) -> DataFrame:
-    """Add severity and audiogram of the ear that is better under the last condition."""
-    last = table[table["condition"] == table["condition"].iloc[-1]].set_index("item")
-    ears = {
-        number: getattr(items[number].listener, ear if isinstance(ear, str) else EARS[0])
-        for number, ear in last["better_ear"].items()
-    }
-    return table.assign(
-        severity=[ears[number].severity for number in table["item"]],
-        audiogram=[list(ears[number].thresholds) for number in table["item"]],
-    )
+    return replace(evaluation, details={"look_ahead_ms": ahead})
 
 
 def read_scenes(folder: str | Path) -> dict[str, Scene]:
@@ -360,7 +201,7 @@ def read_scenes(folder: str | Path) -> dict[str, Scene]:
             raise ValueError(f"{path} has no reference; put {expected} beside it")
         in_room = folder / (name + _IN_ROOM)
         # a reference of the third challenge has its level
-        levelled = found[0].name.endswith(_REFERENCE[-1]) or not in_room.is_file()
+        levelled = found[0] == references[-1] or not in_room.is_file()
         scenes[name] = Scene(path, found[0], None if levelled else in_room)
     if not scenes:
         raise ValueError(f"{folder} has no files that end with {' or '.join(_MIX)}")
@@ -375,28 +216,25 @@ def read_pairs(
     Raises:
         ValueError: the file is broken or names an unknown scene or listener, or a listener lacks an ear.
     """
-    if path is None:
-        pairs = [(scene, name) for scene in scenes for name in listeners]
-    else:
-        try:
+    named = {scene: list(listeners) for scene in scenes}
+    try:
+        if path is not None:
             named = json.loads(Path(path).read_text(encoding="utf-8"))
-            pairs = [(scene, name) for scene, names in named.items() for name in names]
-        except (OSError, ValueError, RecursionError, AttributeError, TypeError) as error:
-            raise ValueError(
-                f"{path}: cannot be read ({error}); expected an object with a list of listeners per scene"
-            ) from error
+        pairs = [(scene, name) for scene, names in named.items() for name in names]
+    except (OSError, ValueError, RecursionError, AttributeError, TypeError) as error:
+        raise ValueError(
+            f"{path}: cannot be read ({error}); expected an object with a list of listeners per scene"
+        ) from error
     if not pairs:
         raise ValueError(f"{path}: no scene has a listener")
     for scene, name in pairs:
-        if scene not in scenes:
-            raise ValueError(f"{path}: there is no scene {scene!r} in the folder of scenes")
-        if name not in listeners:
-            raise ValueError(f"{path}: there is no listener {name!r} among {len(listeners)}")
+        if scene not in scenes or name not in listeners:
+            raise ValueError(f"{path}: there is no scene {scene!r} or no listener {name!r}")
         if Path(name).name != name:
             raise ValueError(f"the listener {name!r} has a name that no file can have")
-        missing = [ear for ear in EARS if getattr(listeners[name], ear) is None]
-        if missing:
-            raise ValueError(f"the {missing[0]} ear of listener {name} is missing")
+        for ear in EARS:
+            if getattr(listeners[name], ear) is None:
+                raise ValueError(f"the {ear} ear of listener {name} is missing")
     return list(dict.fromkeys(pairs))
 
 
@@ -406,9 +244,10 @@ def _conditions(
     linked: bool,
     rate: int,
     full_scale_spl: float,
-    folder: Path,
-) -> list[Written]:
+) -> list[Condition]:
     levels: dict[str, Any] = {"sample_rate": rate, "full_scale_spl": full_scale_spl}
+    if taken := {UNAIDED, NAL_R} & set(aids):
+        raise ValueError(f"{taken.pop()} is always evaluated; give the aid another label")
     loaded: dict[str, Any] = {NAL_R: load_compensator("nalr", **levels)}
     for label, name in aids.items():
         if ":" in name and not Path(name).exists():
@@ -416,24 +255,22 @@ def _conditions(
         else:
             loaded[label] = load_compensator(name, **levels, linked=linked).eval()
     before = load_enhancers(enhancers)
-
-    def condition(name: str, aid: Any, enhancer: Any, kind: str, of: str = "") -> Written:
-        own = folder / re.sub(r"[^\w.+-]+", "-", name).strip(".-")
-        process = Aids(aid, enhancer, rate, full_scale_spl)
-        return Written(name, process, kind, of, folder=own)
-
-    conditions = [condition(UNAIDED, None, None, "unaided")]
+    conditions = [Condition(UNAIDED, Aids(None, None, rate, full_scale_spl), "unaided")]
     for label, aid in loaded.items():
         for prefix, enhancer in before.items():
-            conditions.append(condition(f"{prefix} + {label}", aid, enhancer, "enhanced", label))
+            process = Aids(aid, enhancer, rate, full_scale_spl)
+            conditions.append(Condition(f"{prefix} + {label}", process, "enhanced", label))
         kind = "prescription" if label == NAL_R else "aid"
-        conditions.append(condition(label, aid, None, kind))
-    folders = {own.folder for own in conditions}
-    if len(folders) < len(conditions) or folder in folders:
-        raise ValueError(
-            f"the labels {', '.join(aids)} make no folders of different names; choose others"
-        )
+        conditions.append(Condition(label, Aids(aid, None, rate, full_scale_spl), kind))
     return conditions
+
+
+def _folders(conditions: Sequence[Condition], root: Path) -> dict[str, Path]:
+    """Return the folder of each condition's signals; ValueError unless all differ."""
+    names = {c.name: re.sub(r"[^\w.+-]+", "-", c.name).strip(".-") for c in conditions}
+    if len({*names.values(), ""}) <= len(names):
+        raise ValueError(f"the labels {', '.join(names)} make no folders of different names")
+    return {condition: root / name for condition, name in names.items()}
 
 
 def _look_ahead(
@@ -441,7 +278,7 @@ def _look_ahead(
 ) -> dict[str, float | None]:
     """Measure the look-ahead in ms on the beginning of a scene; None where an aid fails."""
     scene, rate = read_audio(mix)
-    scene = two_channels(mix, scene)[:, : int(_LONGEST_SECONDS * rate)]
+    scene = _two_channels(mix, scene)[:, : int(_LONGEST_SECONDS * rate)]
     time = scene.shape[-1]
     generator = torch.Generator().manual_seed(0)
     other = set_level(torch.randn(scene.shape, generator=generator), 65.0)
@@ -450,11 +287,12 @@ def _look_ahead(
     else:  # its beginning is silent
         scene = set_level(torch.randn(scene.shape, generator=generator), 65.0)
     places = [*range(time // 4, time, max(1, time // (_PLACES + 3)))][:_PLACES]
-    changed = [torch.cat((scene[:, :place], other[:, place:]), -1) for place in places]
+    signals = [scene, *(torch.cat((scene[:, :p], other[:, p:]), -1) for p in places)]
     ahead: dict[str, float | None] = {}
     for condition in conditions:
+        assert condition.process is not None
         try:
-            first, *others = (condition.process(signal, listener) for signal in (scene, *changed))
+            first, *others = (condition.process(signal, listener) for signal in signals)
         except ValueError:
             ahead[condition.name] = None
             continue
@@ -462,53 +300,94 @@ def _look_ahead(
     return ahead
 
 
+class _Pair(NamedTuple):
+    """One scene for one listener."""
+
+    scene: str
+    person: str
+    files: Scene
+    listener: Listener
+
+    def file(self, folder: Path) -> Path:
+        """Return the file of the output in a condition's folder."""
+        return folder / f"{self.scene}_{self.person}_HA-output.wav"
+
+
 def _reference_file(out: Path, scene: str) -> Path:
     return out / "reference" / f"{scene}.wav"
 
 
-def _write_references(scenes: Mapping[str, Scene], rate: int, out: Path) -> dict[str, str]:
-    """Write the reference of each scene; return by scene why there is none."""
-    problems = {}
-    (out / "reference").mkdir(parents=True, exist_ok=True)
-    for name, scene in scenes.items():
+def _remove_outdated(
+    conditions: Sequence[Condition], folders: Mapping[str, Path], scenes: Mapping[str, Scene]
+) -> None:
+    """Remove the signals of a condition whose processing or scenes have changed since they were written."""
+    mixes = [content_hash(scene.mix) for scene in scenes.values()]
+    for condition in conditions:
+        folder = folders[condition.name]
+        note, state = folder / "fingerprint.txt", key_of({"of": [condition.fingerprint, mixes]})
+        unknown = condition.fingerprint is None
+        if unknown or not note.is_file() or note.read_text() != state:
+            for path in folder.glob("*_HA-output.wav"):
+                path.unlink()
+            write_atomically(note, state)
+
+
+@one_thread()
+def _write_signals(
+    pair: _Pair, rate: int, conditions: Sequence[Condition], folders: Mapping[str, Path], out: Path
+) -> dict[str, str]:
+    """Write the reference and the missing outputs of a pair; return by condition why there is none."""
+    problems: dict[str, str] = {}
+    try:
+        mix, reference = _read_scene(pair.files, rate)
+        _write(_reference_file(out, pair.scene), reference, rate)
+    except ValueError as error:
+        return dict.fromkeys(folders, str(error))
+    for condition in conditions:
+        path = pair.file(folders[condition.name])
         try:
-            write_audio(_reference_file(out, name), read_reference(scene, rate), rate)
-        except ValueError as error:
-            problems[name] = str(error)
+            if not path.is_file() and condition.process is not None:
+                _write(path, condition.process(mix, pair.listener), rate)
+        except Exception as error:  # whatever it is, the other conditions go on
+            problems[condition.name] = reason_of(error)
     return problems
 
 
-def read_reference(scene: Scene, rate: int) -> Tensor:
-    """Return the target without its room at the level that it has in the room. Shape: -> (2, time).
+def _write(path: Path, waveform: Tensor, rate: int) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_audio(path, waveform, rate)
 
-    Raises:
-        ValueError: a file is broken, or its rate or length is not that of the mix.
+
+def _read_scene(scene: Scene, rate: int) -> tuple[Tensor, Tensor]:
+    """Return the mix, and the target without its room at the level that it has in the room.
+
+    Shape: -> (2, time) twice. ValueError if a file is broken, or its rate or length is not that of the mix.
     """
-    signals = []
-    for path in filter(None, (scene.mix, scene.reference, scene.in_room)):
-        waveform, found = read_audio(path)
-        if found != rate:
-            raise ValueError(f"{path} has {found} Hz and the first scene {rate} Hz")
-        signals.append(two_channels(path, waveform, mono=path is not scene.mix))
-        if signals[-1].shape[-1] != signals[0].shape[-1]:
-            raise ValueError(
-                f"{path} has {signals[-1].shape[-1]} samples and the mix {signals[0].shape[-1]}"
-            )
-    reference, *in_room = signals[1:]
+    mix, reference, *in_room = _same_length(scene, rate)
     if not in_room:
-        return reference
+        return mix, reference
     power, wanted = (
         signal.double().square().mean(-1, keepdim=True) for signal in (reference, in_room[0])
     )
     if not bool(power.all()):
         raise ValueError(f"a channel of {scene.reference} is silent")
-    return reference * (wanted / power).sqrt()
+    return mix, reference * (wanted / power).sqrt()
 
 
-def two_channels(path: Path, waveform: Tensor, mono: bool = False) -> Tensor:
+def _same_length(scene: Scene, rate: int) -> Iterator[Tensor]:
+    """Yield the signals of a scene, cut to the mix's length if they differ from it by 0.1 s at most."""
+    samples = 0
+    for path in filter(None, scene):
+        waveform, found = read_audio(path)
+        if found != rate:
+            raise ValueError(f"{path} has {found} Hz, and the first scene {rate} Hz")
+        lengths = waveform.shape[-1], samples or waveform.shape[-1]
+        samples = common_length(lengths, rate, (str(path), str(scene.mix)))
+        yield _two_channels(path, waveform[:, :samples], mono=path != scene.mix)
+
+
+def _two_channels(path: Path, waveform: Tensor, mono: bool = False) -> Tensor:
     """Return a waveform of two channels, with ``mono`` also of one; ValueError for other numbers."""
-    channels = len(waveform)
-    if channels != 2 and not (mono and channels == 1):
-        expected = "1 or 2" if mono else "2, left and right"
-        raise ValueError(f"{path} has {channels} channels; expected {expected}")
+    if len(waveform) != 2 and not (mono and len(waveform) == 1):
+        raise ValueError(f"{path} has {len(waveform)} channels; expected left and right")
     return waveform.expand(2, -1)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from torch import Tensor, nn
 
@@ -19,24 +19,19 @@ from hlsim.evaluation.aids import (
     EqualiserLike,
     Unaided,
     limit_of,
+    load_enhancers,
 )
 from hlsim.evaluation.comparison import compare
-from hlsim.evaluation.enhancers import load_enhancers
 from hlsim.evaluation.items import INPUT_LEVELS, draw_judged_items, read_ears
 from hlsim.evaluation.measurements import draw_utterances, gain_curves, steady_tones, wearing
 from hlsim.evaluation.measures import LEVELS, PERCEPTION, find_measures, network_loss
-from hlsim.evaluation.result import Evaluation, score_columns
-from hlsim.evaluation.store import ScoreStore
-from hlsim.evaluation.study import Condition, run_study
+from hlsim.evaluation.result import Evaluation
+from hlsim.evaluation.study import Condition
 from hlsim.extras import require
 from hlsim.metrics.pair import check_seed
 from hlsim.neuro.config import NEURO_RATE
-from hlsim.parallel import Progress
 from hlsim.plugins import WaveformPlugin
 from hlsim.pretrained import load_pretrained
-
-if TYPE_CHECKING:
-    from pandas import DataFrame
 
 UNAIDED, NAL_R, COMPRESSION = "unaided", "NAL-R", "WDRC"
 """Names of the conditions that every compensator is compared with."""
@@ -62,9 +57,7 @@ def evaluate_compensators(
     gain_ears: Sequence[str] = ("N3", "S2"),
     notes: Sequence[str] = (),
     seed: int = 0,
-    jobs: int | None = None,
-    dask: str | None = None,
-    progress: Progress | None = None,
+    **running: Any,
 ) -> Evaluation:
     """Judge compensators beside no aid, NAL-R and WDRC, and beside two rivals at their own output level.
 
@@ -91,10 +84,10 @@ def evaluate_compensators(
         levels: levels of the clean speech in dB SPL, in turn.
         gain_ears: standard ears of the gain curves and the steady tones.
         notes: sentences that the report begins with.
-        jobs, dask, progress: as in ``run_study``.
+        running: ``jobs``, ``dask`` and ``progress``, as in ``run_study``.
 
     Returns: the evaluation with the groups ``clean``, ``noisy`` and ``hard`` as far as they have items, and the
-        details ``gain_curves``, ``steady_tones``, ``wearing`` and ``limits``.
+        details ``gain_curves``, ``steady_tones`` and ``wearing``.
 
     Raises:
         ValueError: data or settings that cannot be used, or no item has all its values.
@@ -105,58 +98,45 @@ def evaluate_compensators(
     _check_arguments(compensators, items, levels)
     ears, shown = _choose_ears(audiograms, audiogram, gain_ears)
     utterances = draw_utterances(speech, seed)
-    loaded = load_enhancers(enhancers)
+    enhancing = load_enhancers(enhancers)
     prescriptions = {NAL_R: NALR(sample_rate=NEURO_RATE), COMPRESSION: WDRC(sample_rate=NEURO_RATE)}
     aids = {name: aid.eval() for name, aid in {**prescriptions, **compensators}.items()}
-    conditions = _conditions(aids, compensators, loaded, utterances, levels)
+    conditions = _conditions(aids, compensators, enhancing, utterances, levels)
+    kinds = ("aid", "prescription", "enhanced")
+    worn = {c.name: c.process for c in conditions if c.process and c.kind in kinds}
+    # these come first: what cannot be used shows at once
+    details = {
+        "gain_curves": gain_curves(aids, shown, utterances, levels),
+        "steady_tones": steady_tones({UNAIDED: Unaided(), **worn}, shown, levels),
+        "wearing": wearing(worn, shown, utterances[0]),
+    }
     drawn = draw_judged_items(
         speech, noise, ears, items=items, seconds=seconds, seed=seed, levels=levels
     )
-    # these come first: what cannot be used shows at once
-    curves = gain_curves(aids, shown, utterances, levels)
-    worn = {c.name: c.process for c in conditions if c.kind in ("aid", "prescription", "enhanced")}
-    details: dict[str, Any] = {
-        "gain_curves": curves,
-        "steady_tones": steady_tones({UNAIDED: Unaided(), **worn}, shown, levels),
-        "wearing": wearing(worn, shown, utterances[0]),
-        "limits": {c.name: limit_of(c.process) for c in conditions},
-    }
     scores = find_measures(["haspi", "hasqi", *measures])
-    network = network_loss(load_pretrained(simulator))
-    table = run_study(
+    evaluation = Evaluation.run(
         drawn,
         conditions,
-        [*scores, LEVELS, PERCEPTION, network],
-        store=ScoreStore(store),
-        jobs=jobs,
-        dask=dask,
-        progress=progress,
-    )
-    evaluation = Evaluation(
-        items=drawn,
-        conditions=conditions,
-        measures=[*scores, LEVELS, PERCEPTION, network],
-        table=table,
+        [*scores, LEVELS, PERCEPTION, network_loss(load_pretrained(simulator))],
+        store=store,
         settings={
             "items": items,
             "seconds": seconds,
             "seed": seed,
             "levels": list(levels),
-            "ears": [name for name, _ in ears],
             "simulator": str(simulator),
-            "enhancers": list(map(str, loaded.values())),
-            "measures": score_columns(table, scores, drawn[0].facts),
+            "enhancers": list(map(str, enhancing.values())),
         },
-        notes=notes,
-        details=details,
+        **running,
     )
+    limits = {condition.name: limit_of(condition.process) for condition in conditions}
+    table = evaluation.table
+    # float32 rounds the limit itself by as little
+    beyond = table["peak"] > table["condition"].map(limits).astype(float) + 1e-4
+    gap = table["loss_neuro"] / table["loss_msbg"].where(table["loss_msbg"] != 0.0) - 1.0
+    table = table.assign(beyond_limit=beyond, gap=gap)
+    evaluation = replace(evaluation, table=table, notes=notes, details=details)
     return replace(evaluation, groups=_groups(evaluation))
-
-
-def complete_items(table: DataFrame) -> DataFrame:
-    """Return the rows of items that have all values under every condition."""
-    failed = table.loc[table["failure"].notna(), "item"]
-    return table[~table["item"].isin(failed)]
 
 
 def _check_arguments(
@@ -226,30 +206,26 @@ def _conditions(
 
 
 def _groups(evaluation: Evaluation) -> dict[str, Evaluation]:
-    """Return the evaluation of clean speech, of speech in noise, and of items that need help most."""
-    complete = complete_items(evaluation.table)
-    if complete.empty:
+    """Return the evaluation of clean speech, of speech in noise, and of items that need help most.
+
+    An item that lacks a value under one condition is in no group.
+    """
+    table = evaluation.table[~evaluation.table["item"].isin(evaluation.failures["item"])]
+    if table.empty:
         first = evaluation.failures.iloc[0]
-        raise ValueError(
-            f"no item has all its values; the first, {first['name']} under {first['condition']}: "
-            f"{first['failure']}"
-        )
-    unaided = complete[complete["condition"] == UNAIDED]
+        raise ValueError(f"no item has all its values; the first: {first['failure']}")
+    unaided = table[table["condition"] == UNAIDED].set_index("item")
     members = {
-        "clean": unaided.loc[unaided["speech"] == "clean", "item"],
-        "noisy": unaided.loc[unaided["speech"] == "noisy", "item"],
-        "hard": unaided.loc[unaided["haspi"] < HARD, "item"],
+        "clean": unaided["speech"] == "clean",
+        "noisy": unaided["speech"] == "noisy",
+        "hard": unaided["haspi"] < HARD,
     }
-    planned = [
-        ("haspi", condition.name, condition.of)
-        for condition in evaluation.conditions
-        if condition.kind == "same level"
-    ]
+    same_level = [c for c in evaluation.conditions if c.kind == "same level"]
+    planned = [("haspi", condition.name, condition.of) for condition in same_level]
     groups = {}
     for name, chosen in members.items():
-        part = complete[complete["item"].isin(chosen)]
+        part = table[table["item"].map(chosen)]
         if not part.empty:
-            columns = evaluation.settings["measures"]
-            comparisons = compare(part, columns, planned=planned, unit="ear")
+            comparisons = compare(part, evaluation.scores, planned=planned, unit="ear")
             groups[name] = replace(evaluation, table=part, comparisons=comparisons)
     return groups

@@ -8,9 +8,8 @@ changes its ``fingerprint``.
 from __future__ import annotations
 
 import dataclasses
-import enum
 import hashlib
-from collections.abc import Mapping
+import json
 from pathlib import Path
 from typing import Any
 
@@ -25,10 +24,6 @@ _OWN_PACKAGES = ("hlsim", "compensators")
 _MODULE_ATTRIBUTES = frozenset(vars(nn.Module()))
 
 
-class UnknownSettingError(Exception):
-    """A setting has no text that is the same in every process."""
-
-
 def fingerprint(thing: Any) -> str | None:
     """Return the SHA-256 of what decides the outputs of a module, or None if that is unknown.
 
@@ -41,21 +36,18 @@ def fingerprint(thing: Any) -> str | None:
         thing = thing.function
     stated = getattr(thing, "fingerprint", None)
     if stated is not None:
-        return text_hash(f"{_class_name(thing)} {stated}")
+        return text_hash(f"{_name(thing)} {stated}")
     if not isinstance(thing, nn.Module):
         return None
+    tensors = dict([*thing.named_parameters(), *thing.named_buffers()])
     ours = type(thing).__module__.split(".")[0] in _OWN_PACKAGES
-    tensors = [*thing.named_parameters(), *thing.named_buffers()]
     if not (ours or tensors or hasattr(thing, "config")):
         return None
+    parts = {name: [_name(part), _public(part)] for name, part in thing.named_modules()}
     try:
-        settings = [_describe_part(name, part) for name, part in thing.named_modules()]
-    except UnknownSettingError:
+        return text_hash(_describe([parts, tensors]))
+    except TypeError:
         return None
-    digest = hashlib.sha256(repr(settings).encode())
-    for name, tensor in tensors:
-        digest.update(f"{name} {_describe(tensor)}".encode())
-    return digest.hexdigest()
 
 
 def combined_fingerprint(*parts: str | None) -> str | None:
@@ -70,20 +62,19 @@ def text_hash(text: str) -> str:
 
 def samples_hash(*signals: Tensor) -> str:
     """Return the SHA-256 of the samples of signals, in hexadecimal."""
-    return text_hash(" ".join(_describe(signal) for signal in signals))
+    return text_hash(_describe(signals))
 
 
-def _describe_part(name: str, part: nn.Module) -> tuple[str, str, list[tuple[str, str]]]:
-    """Describe one submodule by its name, its class and its public attributes."""
-    public = {
-        key: value
-        for key, value in vars(part).items()
-        if key not in _MODULE_ATTRIBUTES and not key.startswith("_")
+def _public(part: nn.Module) -> dict[str, Any]:
+    """Return the public attributes of one submodule, without those of every module."""
+    return {
+        name: value
+        for name, value in vars(part).items()
+        if name not in _MODULE_ATTRIBUTES and not name.startswith("_")
     }
-    return name, _class_name(part), [(key, _describe(public[key])) for key in sorted(public)]
 
 
-def _class_name(thing: Any) -> str:
+def _name(thing: Any) -> str:
     """Return the name of a function or of an object's class; for hlsim's own with its version."""
     kind = thing if hasattr(thing, "__qualname__") else type(thing)
     ours = kind.__module__.split(".")[0] in _OWN_PACKAGES
@@ -92,28 +83,23 @@ def _class_name(thing: Any) -> str:
 
 def _describe(value: Any) -> str:
     """Return a text that differs where settings differ, the same in every process."""
-    match value:
-        case enum.Enum() | Path() | torch.dtype() | torch.device():
-            return str(value)
-        case None | bool() | int() | float() | complex() | str() | bytes():
-            return repr(value)
-        case list() | tuple():
-            return f"[{', '.join(map(_describe, value))}]"
-        case Mapping():
-            entries = sorted(f"{_describe(key)}: {_describe(value[key])}" for key in value)
-            return f"{{{', '.join(entries)}}}"
-        case Tensor():
-            return _describe(value.detach().cpu().numpy())
-        case np.ndarray():
-            samples = hashlib.sha256(np.ascontiguousarray(value).tobytes()).hexdigest()
-            return f"{value.dtype} {value.shape} {samples}"
+    return json.dumps(value, sort_keys=True, default=_describe_object)
+
+
+def _describe_object(value: Any) -> Any:
+    """Describe what JSON does not know; TypeError if that is impossible."""
+    if isinstance(value, Tensor):
+        value = value.detach().cpu().numpy()
+    if isinstance(value, np.ndarray):
+        samples = np.ascontiguousarray(value).tobytes()
+        return [str(value.dtype), value.shape, hashlib.sha256(samples).hexdigest()]
+    if isinstance(value, Path | torch.dtype | torch.device):
+        return str(value)
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        fields = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
-        return f"{type(value).__name__} {_describe(fields)}"
-    name = getattr(value, "__qualname__", "<")  # of a function or class
-    if "<" not in name:
-        return str(name)
+        return [_name(value), vars(value)]
+    if hasattr(value, "__qualname__") and "<" not in value.__qualname__:
+        return value.__qualname__
     known = fingerprint(value)
     if known is None:
-        raise UnknownSettingError
+        raise TypeError(f"{value!r} cannot be described")
     return known

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from hlsim.audiogram import Audiogram
 from hlsim.calibration import PASCAL_SPL, level_spl
 from hlsim.evaluation.fingerprint import fingerprint
-from hlsim.evaluation.study import Ear, Item, Measure, Values
+from hlsim.evaluation.study import Item, Measure, Values
 from hlsim.extras import require
 from hlsim.losses.band_levels import audibility, band_level_loss, band_levels, least_audible
 from hlsim.metrics import fidelity
@@ -173,7 +173,7 @@ LEVELS = Measure("levels", _levels)
 """RMS levels of output and clean speech in dB SPL, and the settings of the item."""
 
 
-def perceive(signal: Tensor, ear: Ear, sample_rate: int) -> Tensor:
+def perceive(signal: Tensor, ear: Audiogram, sample_rate: int) -> Tensor:
     """Return what an ear perceives, by the exact MSBG. Shape: (time,) in pascals -> (time,)."""
     with torch.no_grad():
         perceived: Tensor = MSBG(sample_rate=sample_rate)(signal, ear)
@@ -212,6 +212,7 @@ OTHER_COLUMNS = (
     *("level", "clean_level", "full_scale_spl", "seconds", "sample_rate", "seed"),
     *("peak", "perceived_level", "normal_level", "normal_clean_level", "band_error"),
     *("loss_msbg", "loss_neuro", "loudness_error", "loudness_error_clean"),
+    *("beyond_limit", "gap", "source"),
 )
 """Columns of built-in measures that are no scores."""
 

@@ -9,15 +9,15 @@ A manifest is a CSV file with one row for each output file::
 It needs the columns ``condition``, ``clean`` and ``processed``; paths are relative to the root. It may have
 ``listener``, ``ear`` (left or right), ``item`` and ``snr`` (dB). Rows that agree in listener, ear, clean
 file, item and SNR form one item. The audiogram stands in columns ``hl_250`` and so on, in a column
-``audiogram`` by its standard name, or in a second CSV file by ``listener`` and ``ear``. The level is
-that of the column ``spl`` (clean file, dB SPL) or ``full_scale_spl`` (RMS 1.0, dB SPL), or the same for all.
+``audiogram`` by its standard name, or in a second CSV file by ``listener`` and ``ear``.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path, PurePath, PurePosixPath
 from typing import TYPE_CHECKING, Any
 
@@ -28,14 +28,13 @@ from hlsim.audiogram import Audiogram
 from hlsim.audiogram.listener import EAR_NAMES, EARS
 from hlsim.audiogram.table import numbered_audiograms
 from hlsim.calibration import check_full_scale, dbfs
-from hlsim.evaluation.comparison import compare
+from hlsim.evaluation.comparison import Pair, compare
 from hlsim.evaluation.measures import LEVELS, find_measures
-from hlsim.evaluation.result import Evaluation, check_scored, score_columns
-from hlsim.evaluation.store import ScoreStore, content_hash, key_of
-from hlsim.evaluation.study import Condition, Item, run_study
+from hlsim.evaluation.result import Evaluation
+from hlsim.evaluation.store import content_hash, key_of
+from hlsim.evaluation.study import Condition, Item
 from hlsim.files import EXTENSIONS, read_table, resolve_links
 from hlsim.metrics.pair import check_seed
-from hlsim.parallel import Progress
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -59,6 +58,7 @@ class Recording:
         full_scale_spl: level in dB SPL of a file with RMS 1.0.
         spl: level of the clean file in dB SPL, in place of ``full_scale_spl``.
         seed: seed of the study; each clean file has its own, made from this one and its contents.
+        problems: for each condition without a file, the reason why.
     """
 
     utterance: str
@@ -71,6 +71,7 @@ class Recording:
     full_scale_spl: float = 94.0
     spl: float | None = None
     seed: int = 0
+    problems: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def name(self) -> str:
@@ -80,35 +81,27 @@ class Recording:
     @property
     def facts(self) -> dict[str, Any]:
         """What the table says of the item beside its name."""
-        return {
-            "listener": self.listener,
-            "ear": self.ear,
-            "utterance": self.utterance,
-            "snr": self.snr,
-            "severity": self.audiogram.severity,
-            "audiogram": list(self.audiogram.thresholds),
-        }
+        facts = ("listener", "ear", "utterance", "snr")
+        ear = {"severity": self.audiogram.severity, "audiogram": list(self.audiogram.thresholds)}
+        return {name: getattr(self, name) for name in facts} | ear
 
     def digest(self, condition: str) -> str:
         """Return the SHA-256 of both files, the ear, the level and the seed."""
-        files = [content_hash(self.clean), content_hash(self.output_file(condition))]
+        files = [content_hash(self.clean), content_hash(self._output_file(condition))]
         level = [self.full_scale_spl if self.spl is None else None, self.spl]
         ear = [self.ear, list(self.audiogram.thresholds)]
         return key_of({"files": files, "ear": ear, "level": level, "seed": self.seed})
 
-    def output_file(self, condition: str) -> Path:
-        """Return the file of one condition; ValueError if there is none."""
-        if condition not in self.outputs:
-            raise ValueError(f"no file is named for {self.name} under {condition}")
-        return self.outputs[condition]
-
-    def load(self) -> RecordedItem:
-        """Read the clean speech, of which the channel and the level are those of the ear."""
+    def load(self) -> Item:
+        """Read the clean speech; outputs are read when they are measured."""
+        if self.problems and not self.outputs:
+            raise ValueError(next(iter(self.problems.values())))
         clean, rate = read_channel(self.clean, self.ear)
         full_scale = self.full_scale_spl
         if self.spl is not None:
             full_scale = check_full_scale(self.spl - float(dbfs(clean)))
-        return RecordedItem(
+        names = [*self.outputs, *self.problems]
+        return Item(
             self.name,
             clean,
             clean,
@@ -117,25 +110,19 @@ class Recording:
             full_scale_spl=full_scale,
             seed=(self.seed + int(content_hash(self.clean)[:8], 16)) % 2**32,
             facts=self.facts,
-            recording=self,
+            recorded={name: partial(self._read_output, name, rate) for name in names},
         )
 
+    def _output_file(self, condition: str) -> Path:
+        if condition not in self.outputs:
+            raise ValueError(self.problems.get(condition, "no file is named"))
+        return self.outputs[condition]
 
-@dataclass(frozen=True, kw_only=True)
-class RecordedItem(Item):
-    """An item whose outputs were recorded."""
-
-    recording: Recording
-
-    def output(self, condition: str) -> Tensor:
-        """Read the output of a condition, which has to fit the clean speech. Shape: -> (time,)."""
-        path = self.recording.output_file(condition)
-        output, rate = read_channel(path, self.recording.ear)
-        if rate != self.sample_rate or len(output) != len(self.clean):
-            raise ValueError(
-                f"{path} has {len(output)} samples at {rate} Hz and {self.recording.clean} "
-                f"{len(self.clean)} at {self.sample_rate} Hz; both need the same rate and length"
-            )
+    def _read_output(self, condition: str, rate: int) -> Tensor:
+        path = self._output_file(condition)
+        output, output_rate = read_channel(path, self.ear)
+        if output_rate != rate:
+            raise ValueError(f"{path} has {output_rate} Hz and {self.clean} {rate} Hz")
         return output
 
 
@@ -145,27 +132,7 @@ def _name(*parts: str | float) -> str:
     return " ".join(filter(None, texts))
 
 
-class Recorded(Condition):
-    """A condition whose outputs are files."""
-
-    fingerprint = "files"
-
-    def output(self, item: Item) -> Tensor:
-        """Read the file of this condition."""
-        assert isinstance(item, RecordedItem)
-        return item.output(self.name)
-
-
-def recorded_condition(name: str) -> Recorded:
-    """Return the condition of this name; its outputs are read and not processed."""
-    return Recorded(name, process=_already_processed, kind="recorded")
-
-
-def _already_processed(waveform: Tensor, ear: Audiogram) -> Tensor:
-    return waveform
-
-
-def read_channel(path: str | Path, ear: str = "") -> tuple[Tensor, int]:
+def read_channel(path: Path, ear: str = "") -> tuple[Tensor, int]:
     """Read the channel of one ear, as it is in the file.
 
     Returns: samples (time,) in float64, and the rate in Hz. Of a file with two channels, left is the
@@ -177,8 +144,9 @@ def read_channel(path: str | Path, ear: str = "") -> tuple[Tensor, int]:
     waveform, rate = read_audio(path)
     channels = len(waveform)
     if channels > 2 or (channels == 2 and not ear):
-        expected = "1 or 2" if ear else "1, or name the ear to select a channel"
-        raise ValueError(f"{path} has {channels} channels; expected {expected}")
+        raise ValueError(
+            f"{path} has {channels} channels; one ear needs 1, or 2 and the ear's name"
+        )
     channel = waveform[EARS.index(ear) if channels == 2 else 0]
     if not bool(channel.any()):
         raise ValueError(f"{path} is silent: every sample of the {ear} channel is zero")
@@ -201,9 +169,7 @@ def haspi_report(
     full_scale_spl: float = 94.0,
     spl: float | None = None,
     seed: int = 0,
-    jobs: int | None = None,
-    dask: str | None = None,
-    progress: Progress | None = None,
+    **running: Any,
 ) -> Evaluation:
     """Score recorded speech by HASPI v2 and other measures, and compare its conditions.
 
@@ -224,7 +190,7 @@ def haspi_report(
         full_scale_spl: level in dB SPL of a file with RMS 1.0.
         spl: level of every clean file in dB SPL, in place of ``full_scale_spl``.
         seed: seed of the noise that HASPI, HASQI and HAAQI add.
-        jobs, dask, progress: as in ``run_study``.
+        running: ``jobs``, ``dask`` and ``progress``, as in ``run_study``.
 
     Returns: the evaluation; the comparison of the first with the last condition is planned.
 
@@ -244,74 +210,63 @@ def haspi_report(
         recordings = read_folders(clean, folders, **ears, **levels)
     else:
         raise ValueError("give either the folders clean and after (and before), or a manifest")
+    found = dict.fromkeys(name for recording in recordings for name in recording.outputs)
+    names = [*found] if baseline is None else [baseline, *(n for n in found if n != baseline)]
+    if baseline is not None and baseline not in found:
+        raise ValueError(f"there is no condition {baseline!r}; expected {', '.join(found)}")
     return score_recordings(
         [replace(recording, seed=seed) for recording in recordings],
+        [Condition(name, kind="recorded") for name in names],
         measures,
         baseline=baseline,
         better_ear=better_ear,
-        store=ScoreStore(store),
-        jobs=jobs,
-        dask=dask,
-        progress=progress,
+        store=store,
+        **running,
     )
 
 
 def score_recordings(
     recordings: Sequence[Recording],
+    conditions: Sequence[Condition],
     measures: Iterable[str],
     *,
-    conditions: Sequence[str] = (),
     baseline: str | None = None,
     better_ear: bool = False,
+    planned: Sequence[Pair] = (),
     **running: Any,
 ) -> Evaluation:
     """Score recordings and compare their conditions; all else as ``haspi_report``.
 
     Args:
-        conditions: their order; by default that of the recordings.
+        planned: planned comparisons; by default the first with the last condition by the first measure.
         running: ``store``, ``jobs``, ``dask`` and ``progress`` of ``run_study``.
+
+    Returns: the evaluation; with ``better_ear`` its group ``ears`` has the scores of each ear.
     """
-    chosen = find_measures(measures)
-    names = list(conditions or dict.fromkeys(name for r in recordings for name in r.outputs))
-    if baseline is not None:
-        if baseline not in names:
-            raise ValueError(f"there is no condition {baseline!r}; expected {', '.join(names)}")
-        names = [baseline, *(name for name in names if name != baseline)]
     if better_ear:
         check_both_ears(recordings)
-    studied = [recorded_condition(name) for name in names]
-    table = run_study(recordings, studied, [*chosen, LEVELS], **running)
-    columns = score_columns(table, chosen, recordings[0].facts)
-    check_scored(table, columns)
+    settings = {"seed": recordings[0].seed, "baseline": baseline, "better_ear": better_ear}
+    chosen = [*find_measures(measures), LEVELS]
+    evaluation = Evaluation.run(recordings, conditions, chosen, settings=settings, **running)
+    columns = evaluation.scores
     if better_ear:
-        table = better_ears(table, columns)
-    planned = [(columns[0], names[0], names[-1])]
-    return Evaluation(
-        items=recordings,
-        conditions=studied,
-        measures=chosen,
-        table=table,
-        comparisons=compare(table, columns, baseline=baseline, planned=planned),
-        settings={
-            "seed": recordings[0].seed,
-            "measures": columns,
-            "baseline": baseline,
-            "better_ear": better_ear,
-        },
-    )
+        ears = {"ears": evaluation}
+        evaluation = replace(evaluation, table=better_ears(evaluation.table, columns), groups=ears)
+    planned = planned or [(columns[0], evaluation.names[0], evaluation.names[-1])]
+    comparisons = compare(evaluation.table, columns, baseline=baseline, planned=planned)
+    return replace(evaluation, comparisons=comparisons)
 
 
 def check_both_ears(recordings: Iterable[Recording]) -> None:
-    """Raise ValueError unless each utterance of each listener has exactly one left and one right ear."""
-    found: dict[tuple[str, str, str], list[str]] = {}
+    """Raise ValueError unless each utterance of each listener has one left and one right ear."""
+    found: dict[str, list[str]] = {}
     for r in recordings:
-        found.setdefault((r.listener, r.utterance, str(r.snr)), []).append(r.ear)
-    for (listener, utterance, _), ears in found.items():
+        found.setdefault(_name(r.listener, r.utterance, r.snr), []).append(r.ear)
+    for name, ears in found.items():
         if sorted(ears) != sorted(EARS):
-            named = ", ".join(ear or "none" for ear in ears)
             raise ValueError(
-                f"{listener} {utterance} has the ears {named}; the better ear needs one row for the "
-                "left and one for the right ear of each utterance"
+                f"{name} has the ears {', '.join(ear or 'none' for ear in ears)}; the better ear needs "
+                "the left and the right ear of each utterance, once"
             )
 
 
@@ -319,23 +274,25 @@ def better_ears(table: DataFrame, measures: Sequence[str]) -> DataFrame:
     """Return one row per utterance and condition in place of one for each ear.
 
     A score is that of the ear which scores higher by its measure; the level is that of the ear which scores
-    higher by the first measure. Facts of an item are those of the better ear under the last condition.
+    higher by the first measure. Facts of an item are those of the better ear under the last condition, whose
+    number is in the column ``source``.
     """
-    places = {name: number for number, name in enumerate(dict.fromkeys(table["condition"]))}
+    places = {name: place for place, name in enumerate(dict.fromkeys(table["condition"]))}
     utterance = ["listener", "utterance", "snr"]
     numbers = table.groupby(utterance, sort=False, dropna=False).ngroup()
-    table = table.assign(item=numbers, place=table["condition"].map(places))
-    order = ["item", "place", measures[0], "ear"]
+    row = ["item", "place"]
+    table = table.assign(source=table["item"], item=numbers, place=table["condition"].map(places))
+    order = [*row, measures[0], "ear"]
     table = table.sort_values(order, ascending=[True, True, False, True], kind="stable")
-    best = table.drop_duplicates(["item", "place"]).set_index(["item", "place"])
+    best = table.drop_duplicates(row).set_index(row)
     for measure in measures:
-        best[measure] = table.groupby(["item", "place"])[measure].max()
+        best[measure] = table.groupby(row)[measure].max()
     last = best.xs(len(places) - 1, level="place")
-    rows = best.reset_index()
-    for fact in ("ear", "severity", "audiogram", "full_scale_spl", "clean_level"):
-        rows[fact] = rows["item"].map(last[fact])
-    rows["name"] = [_name(*parts) for parts in zip(*(rows[key] for key in utterance), strict=True)]
-    return rows.drop(columns="place")
+    best = best.reset_index()
+    for fact in ("source", "ear", "severity", "audiogram", "full_scale_spl", "clean_level"):
+        best[fact] = best["item"].map(last[fact])
+    best["name"] = [_name(*parts) for parts in zip(*(best[key] for key in utterance), strict=True)]
+    return best.drop(columns="place")
 
 
 def read_folders(
@@ -390,8 +347,7 @@ def read_manifest(
     *,
     audiogram: Audiogram | None = None,
     audiograms: str | Path | None = None,
-    full_scale_spl: float = 94.0,
-    spl: float | None = None,
+    **levels: Any,
 ) -> list[Recording]:
     """Read the recordings of a manifest, in the order of their first rows.
 
@@ -399,7 +355,7 @@ def read_manifest(
         root: folder that the paths are relative to and may not leave; by default that of the manifest.
         audiogram: the ear of rows that name none.
         audiograms: a CSV file with columns ``listener``, ``ear`` (if left and right differ) and ``hl_250``, ....
-        full_scale_spl, spl: the level of rows that name none, as in ``Recording``.
+        levels: ``full_scale_spl`` or ``spl``, as in ``Recording``.
 
     Raises:
         ValueError: a row is wrong; the message names its line.
@@ -409,59 +365,51 @@ def read_manifest(
         raise ValueError(f"{folder}: no such folder; the paths of the manifest are relative to it")
     ears = {} if audiograms is None else _read_ears(audiograms, _listener_and_ear)
     rows = read_table(path, "the manifest")
-    lacking = [column for column in _REQUIRED if not rows or column not in rows[0][1]]
-    if lacking:
-        raise ValueError(f"{path} has no rows with the columns {', '.join(lacking)}")
-    recordings: dict[tuple[Any, ...], Recording] = {}
+    columns = rows[0][1].keys() if rows else set()
+    if not columns >= {*_REQUIRED} or columns & {"spl", "full_scale_spl"}:
+        raise ValueError(
+            f"{path} needs rows with the columns {', '.join(_REQUIRED)}, and the level as an option, not a column"
+        )
+    recordings: dict[tuple[str, str], Recording] = {}
     for line, row in rows:
         try:
-            found = _read_row(row, folder, ears, audiogram, full_scale_spl, spl)
-            identity = found.listener, found.ear, found.utterance, found.clean, str(found.snr)
-            known = recordings.get(identity)
-            recordings[identity] = found if known is None else _joined(known, found)
+            found = _read_row(row, folder, ears, audiogram, levels)
+            known = recordings.setdefault(
+                (found.name, str(found.clean)), replace(found, outputs={})
+            )
+            if known.audiogram != found.audiogram:
+                raise ValueError(f"the audiogram differs from that of other rows of {known.name}")
+            if twice := known.outputs.keys() & found.outputs.keys():
+                raise ValueError(f"a second row of {known.name} under {twice.pop()}")
+            outputs = {**known.outputs, **found.outputs}
+            recordings[found.name, str(found.clean)] = replace(known, outputs=outputs)
         except ValueError as error:
             raise ValueError(f"{path}, line {line}: {error}") from error
     return list(recordings.values())
 
 
-def _joined(known: Recording, found: Recording) -> Recording:
-    """Add the output of a further row to a recording."""
-    if twice := known.outputs.keys() & found.outputs.keys():
-        raise ValueError(f"a second row of {known.name} under {twice.pop()}")
-    same = (known.audiogram, known.full_scale_spl, known.spl)
-    if same != (found.audiogram, found.full_scale_spl, found.spl):
-        raise ValueError(f"audiogram or level differ from those of the other rows of {known.name}")
-    return replace(known, outputs={**known.outputs, **found.outputs})
-
-
 def _read_row(
     row: Mapping[str, str],
     root: Path,
-    ears: Mapping[tuple[str, str], Audiogram],
-    audiogram: Audiogram | None,
-    full_scale_spl: float,
-    spl: float | None,
+    ears: Mapping[Any, Audiogram],
+    default: Audiogram | None,
+    levels: Mapping[str, Any],
 ) -> Recording:
     condition, listener, ear = row["condition"], row.get("listener", ""), _ear_name(row)
     if not condition.isprintable() or not condition:
         raise ValueError(f"the condition {condition!r} is not a printable name")
-    if _number(row, "full_scale_spl") is not None:
-        full_scale_spl, spl = float(row["full_scale_spl"]), None
-    elif _number(row, "spl") is not None:
-        spl = float(row["spl"])
-    levels = {key: value for key, value in row.items() if key.lower().startswith("hl")}
-    if any(levels.values()):
-        audiogram = Audiogram.from_row(levels)
+    thresholds = {key: value for key, value in row.items() if key.lower().startswith("hl")}
+    if any(thresholds.values()):
+        audiogram: Audiogram | None = Audiogram.from_row(thresholds)
     elif row.get("audiogram"):
         audiogram = Audiogram.standard(row["audiogram"])
     else:
-        audiogram = ears.get((listener, ear)) or ears.get((listener, "")) or audiogram
+        audiogram = ears.get((listener, ear)) or ears.get((listener, "")) or default
     if audiogram is None:
         raise ValueError(
             f"no audiogram of listener {listener!r}, ear {ear!r}: add columns hl_250, hl_500, ... or a "
             "column audiogram, or name a file of audiograms"
         )
-    snr = _number(row, "snr")
     return Recording(
         utterance=row.get("item") or PurePosixPath(row["clean"]).with_suffix("").as_posix(),
         clean=_below(root, row["clean"]),
@@ -469,9 +417,8 @@ def _read_row(
         audiogram=audiogram,
         listener=listener,
         ear=ear,
-        snr=math.nan if snr is None else snr,
-        full_scale_spl=check_full_scale(full_scale_spl),
-        spl=spl,
+        snr=_number(row.get("snr") or "nan"),
+        **levels,
     )
 
 
@@ -483,17 +430,11 @@ def _below(root: Path, name: str) -> Path:
     return path
 
 
-def _number(row: Mapping[str, str], column: str) -> float | None:
-    text = row.get(column, "")
-    if not text:
-        return None
+def _number(text: str) -> float:
     try:
-        value = float(text)
+        return float(text)
     except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
-        raise ValueError(f"{column} is {text!r}; expected a number of dB")
-    return value
+        raise ValueError(f"the SNR is {text!r}, not a number of dB") from None
 
 
 def _ear_name(row: Mapping[str, str]) -> str:

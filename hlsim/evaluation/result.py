@@ -5,11 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hlsim.evaluation.comparison import Comparison
 from hlsim.evaluation.measures import OTHER_COLUMNS
-from hlsim.evaluation.study import Condition, Measure, Source, versions_of
+from hlsim.evaluation.store import ScoreStore
+from hlsim.evaluation.study import Condition, Measure, Source, run_study, versions_of
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -39,10 +41,44 @@ class Evaluation:
     details: Mapping[str, Any] = field(default_factory=dict)
     groups: Mapping[str, Evaluation] = field(default_factory=dict)
 
+    @classmethod
+    def run(
+        cls,
+        items: Sequence[Source],
+        conditions: Sequence[Condition],
+        measures: Sequence[Measure],
+        *,
+        store: str | Path | None,
+        settings: Mapping[str, Any],
+        **running: Any,
+    ) -> Evaluation:
+        """Run a study, see ``run_study``; ValueError if nothing could be scored."""
+        table = run_study(items, conditions, measures, store=ScoreStore(store), **running)
+        evaluation = cls(items, conditions, measures, table, settings=settings)
+        if table.reindex(columns=evaluation.scores).isna().all(axis=None):
+            first = evaluation.failures.iloc[0]
+            raise ValueError(
+                f"none of {len(items)} items could be scored; the first, {first['name']} under "
+                f"{first['condition']}: {first['failure']}"
+            )
+        return evaluation
+
     @property
     def names(self) -> list[str]:
         """Names of the conditions."""
         return [condition.name for condition in self.conditions]
+
+    def of_kind(self, *kinds: str) -> list[str]:
+        """Return the names of the conditions of some kinds."""
+        return [condition.name for condition in self.conditions if condition.kind in kinds]
+
+    @property
+    def scores(self) -> list[str]:
+        """Columns of the scores: those of the measures, the first one first, and of plug-ins."""
+        named = [measure.name for measure in self.measures if measure.name in self.table]
+        facts = self.items[0].facts
+        others = {"item", "name", "condition", "failure", *facts, *OTHER_COLUMNS, *named}
+        return named + [column for column in self.table.columns if column not in others]
 
     @property
     def headline(self) -> Comparison | None:
@@ -68,16 +104,14 @@ class Evaluation:
 
     def to_dict(self) -> dict[str, Any]:
         """Return a plain dictionary for JSON, with None for a missing value."""
+        groups = {name: group.comparisons for name, group in self.groups.items()}
         values = {
-            "settings": dict(self.settings),
+            "settings": self.settings,
             "versions": self.versions,
-            "notes": list(self.notes),
+            "notes": self.notes,
             "conditions": [condition.record() for condition in self.conditions],
             "comparisons": [c.to_dict() for c in self.comparisons],
-            "groups": {
-                name: [c.to_dict() for c in group.comparisons]
-                for name, group in self.groups.items()
-            },
+            "groups": {name: [c.to_dict() for c in found] for name, found in groups.items()},
             **self.details,
             "rows": self.table.to_dict("records"),
         }
@@ -85,28 +119,8 @@ class Evaluation:
 
 
 def _without_nan(value: Any) -> Any:
-    """Return a value with None in place of each NaN, for JSON."""
     if isinstance(value, Mapping):
         return {key: _without_nan(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):
         return [_without_nan(entry) for entry in value]
     return None if isinstance(value, float) and math.isnan(value) else value
-
-
-def score_columns(
-    table: DataFrame, measures: Sequence[Measure], facts: Mapping[str, Any]
-) -> list[str]:
-    """Return the columns of scores in a study's table: those of the measures, and of plug-ins."""
-    named = [measure.name for measure in measures if measure.name in table]
-    others = {"item", "name", "condition", "failure", *facts, *OTHER_COLUMNS, *named}
-    return named + [column for column in table.columns if column not in others]
-
-
-def check_scored(table: DataFrame, columns: Sequence[str]) -> None:
-    """Raise ValueError unless the table has at least one score."""
-    if table.reindex(columns=list(columns)).isna().all(axis=None):
-        first = table[table["failure"].notna()].iloc[0]
-        raise ValueError(
-            f"none of {table['item'].nunique()} items could be scored; the first, {first['name']} "
-            f"under {first['condition']}: {first['failure']}"
-        )

@@ -80,10 +80,8 @@ def content_hash(path: str | Path) -> str:
     """Return the SHA-256 of a file's contents, in hexadecimal; ValueError if it cannot be read."""
     try:
         return sha256(Path(path))
-    except FileNotFoundError as error:
-        raise ValueError(f"{path}: no such file") from error
     except OSError as error:
-        raise ValueError(f"{path}: cannot be read ({error})") from error
+        raise ValueError(f"{path}: {str(error.strerror).lower()}") from error
 
 
 def key_of(settings: Mapping[str, Any]) -> str:

@@ -13,17 +13,18 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from importlib import metadata
+from itertools import product
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
 
 from hlsim.audiogram import Audiogram
-from hlsim.audiogram.listener import Listener
 from hlsim.calibration import PASCAL_SPL
 from hlsim.evaluation.fingerprint import combined_fingerprint, fingerprint, samples_hash
 from hlsim.evaluation.store import ScoreStore, key_of
 from hlsim.extras import require
+from hlsim.metrics.pair import common_length
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.parallel import Progress, one_thread, reason_of, run_parallel
 from hlsim.version import __version__
@@ -33,9 +34,6 @@ if TYPE_CHECKING:
 
 Values = Mapping[str, float | str]
 """Values by the name of their column."""
-
-
-Ear = Audiogram | Listener
 
 
 class Source(Protocol):
@@ -55,29 +53,31 @@ class Source(Protocol):
 
 @dataclass(frozen=True)
 class Item:
-    """One signal for one ear or one listener.
+    """One signal for one ear.
 
     Args:
         name: name in tables.
         clean: clean speech, the reference of measures.
         signal: input of the conditions.
-        ear: audiogram, or listener with two ears.
+        ear: the audiogram.
         sample_rate: rate in Hz.
         full_scale_spl: level in dB SPL of a signal with RMS 1.0.
         seed: seed of random numbers that a measure draws.
         facts: columns of the table, such as ``listener`` or ``snr``.
+        recorded: functions that read the outputs of conditions that were recorded, by their names.
 
-    Shape: (time,), or (2, time) for a listener.
+    Shape: (time,).
     """
 
     name: str
     clean: Tensor
     signal: Tensor
-    ear: Ear
+    ear: Audiogram
     sample_rate: int = NEURO_RATE
     full_scale_spl: float = PASCAL_SPL
     seed: int = 0
     facts: Mapping[str, Any] = field(default_factory=dict)
+    recorded: Mapping[str, Callable[[], Tensor]] = field(default_factory=dict)
     _computed: dict[str, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def load(self) -> Item:
@@ -103,14 +103,15 @@ class Condition:
 
     Args:
         name: name in tables.
-        process: function of an input and an ear that returns an output of the same shape.
+        process: function of an input and an ear that returns an output of the same shape; None if the outputs
+            were recorded.
         kind: role in the study, such as ``"unaided"``, ``"aid"`` or ``"equaliser"``.
         of: name of the condition that this one belongs to, such as the aid whose level it has.
         rivals: names of the conditions that this one is compared with, most important first.
     """
 
     name: str
-    process: Callable[[Tensor, Any], Tensor]
+    process: Callable[[Tensor, Any], Tensor] | None = None
     kind: str = "aid"
     of: str = ""
     rivals: Sequence[str] = ()
@@ -118,20 +119,20 @@ class Condition:
     @cached_property
     def fingerprint(self) -> str | None:
         """Fingerprint of the processing; None if it is unknown, and then no score is stored."""
-        return fingerprint(self.process)
+        return "recorded" if self.process is None else fingerprint(self.process)
 
     def output(self, item: Item) -> Tensor:
-        """Process an item."""
+        """Process an item, or read its recorded output."""
+        if self.process is None:
+            if self.name not in item.recorded:
+                raise ValueError(f"no output of {item.name} is recorded under {self.name}")
+            return item.recorded[self.name]()
         return self.process(item.signal, item.ear)
 
     def record(self) -> dict[str, Any]:
         """Return name, kind, of and rivals, for JSON."""
-        return {
-            "name": self.name,
-            "kind": self.kind,
-            "of": self.of,
-            "rivals": list(self.rivals),
-        }
+        fields = ("name", "kind", "of", "rivals")
+        return {name: getattr(self, name) for name in fields}
 
 
 @dataclass(frozen=True)
@@ -181,16 +182,16 @@ def versions_of(packages: Iterable[str]) -> dict[str, str]:
     return versions
 
 
+Place = tuple[str, str]
+"""Names of condition and measure."""
+
+
 class _Task(NamedTuple):
     """One item with the conditions and measures that are still missing."""
 
     number: int
     source: Source
-    missing: Sequence[tuple[Condition, Sequence[Measure]]]
-
-
-_Results = dict[tuple[str, str], Values | str]
-"""Values, or the reason why there are none, by the names of condition and measure."""
+    missing: list[tuple[Condition, Measure]]
 
 
 def run_study(
@@ -199,7 +200,6 @@ def run_study(
     measures: Sequence[Measure],
     *,
     store: ScoreStore | None = None,
-    is_kept: Callable[[Source, Condition], bool] | None = None,
     jobs: int | None = None,
     dask: str | None = None,
     progress: Progress | None = None,
@@ -213,10 +213,9 @@ def run_study(
     Args:
         store: values of earlier runs, to which new ones are added. A value is computed again only if samples,
             ear, condition or measure have changed.
-        is_kept: whether what a condition has written of an item still exists; if not, it is processed again.
         jobs: number of processes; None takes all cores.
         dask: address of a Dask scheduler whose workers take the place of processes.
-        progress: called with the number of finished outputs and of all.
+        progress: called with the number of finished values and of all.
 
     Returns: one row per item and condition: ``item`` (its number), ``name``, the item's facts, ``condition``,
         one column per measured value, and ``failure``, missing where every measure has its values.
@@ -226,44 +225,32 @@ def run_study(
         MissingExtraError: a package is not installed.
     """
     store = ScoreStore() if store is None else store
-    _warn_of_unknown(conditions, measures)
-    results: list[_Results] = [{} for _ in items]
-    keys: list[dict[tuple[str, str], str | None]] = [{} for _ in items]
+    _warn_of_unknown([*conditions, *measures])
+    keys = [_keys(source, conditions, measures) for source in items]
+    results: list[dict[Place, Values | str]] = [{} for _ in items]
     tasks = []
     for number, source in enumerate(items):
         missing = []
-        for condition in conditions:
-            try:
-                digest = source.digest(condition.name)
-            except ValueError as error:
-                results[number] |= {(condition.name, m.name): str(error) for m in measures}
-                continue
-            wanted = []
-            exists = is_kept is None or is_kept(source, condition)
-            for measure in measures:
-                place = condition.name, measure.name
-                keys[number][place] = key = _key(digest, condition, measure)
-                record = store.get(key) if exists and key is not None else None
-                if record is None:
-                    wanted.append(measure)
-                else:
-                    results[number][place] = record["values"]
-            if wanted:
-                missing.append((condition, wanted))
+        for condition, measure in product(conditions, measures):
+            place = condition.name, measure.name
+            record = store.get(keys[number][place])
+            if record is None:
+                missing.append((condition, measure))
+            else:
+                results[number][place] = record["values"]
         if missing:
             tasks.append(_Task(number, source, missing))
-    total = len(items) * len(conditions)
+    total = len(items) * len(conditions) * len(measures)
     done = total - sum(len(task.missing) for task in tasks)
     show = progress or (lambda done, total: None)
-    if tasks:
-        show(done, total)
+    show(done, total)
     for task, measured in run_parallel(_measure_item, tasks, jobs=jobs, dask=dask):
         for place, values in (measured or _all_failed(task, _DIED)).items():
+            results[task.number][place] = values
             key = keys[task.number][place]
-            if key is not None and not isinstance(values, str):
+            if key and not isinstance(values, str):
                 about = {"item": task.source.name, "condition": place[0], "measure": place[1]}
                 store.append(key, {**about, "values": values})
-            results[task.number][place] = values
         done += len(task.missing)
         show(done, total)
     return _table(items, conditions, measures, results)
@@ -272,17 +259,26 @@ def run_study(
 _DIED = "the process that computed it ended (a crash in compiled code, or no memory was left)"
 
 
-def _key(digest: str, condition: Condition, measure: Measure) -> str | None:
-    """Return the key of stored values; None where condition or measure has no fingerprint."""
-    if condition.fingerprint is None or measure.fingerprint is None:
-        return None
-    about = {"item": digest, "condition": condition.fingerprint}
-    return key_of({**about, "measure": measure.name, "of": measure.fingerprint})
+def _keys(
+    source: Source, conditions: Sequence[Condition], measures: Sequence[Measure]
+) -> dict[Place, str]:
+    """Return the keys of an item's values; empty where nothing is stored."""
+    keys = {}
+    for condition in conditions:
+        try:
+            digest: str | None = source.digest(condition.name)
+        except ValueError:  # loading the item or its output will fail for the same reason
+            digest = None
+        for measure in measures:
+            parts = (digest, condition.fingerprint, measure.fingerprint)
+            known = None not in parts
+            place = condition.name, measure.name
+            keys[place] = key_of({"value": [*parts, measure.name]}) if known else ""
+    return keys
 
 
-def _warn_of_unknown(conditions: Iterable[Condition], measures: Iterable[Measure]) -> None:
-    unknown = [condition.name for condition in conditions if condition.fingerprint is None]
-    unknown += [measure.name for measure in measures if measure.fingerprint is None]
+def _warn_of_unknown(parts: Sequence[Condition | Measure]) -> None:
+    unknown = [part.name for part in parts if part.fingerprint is None]
     if unknown:
         warnings.warn(
             f"scores with {', '.join(unknown)} are not stored and will be computed again by the next run; "
@@ -293,77 +289,69 @@ def _warn_of_unknown(conditions: Iterable[Condition], measures: Iterable[Measure
 
 @one_thread()
 @torch.no_grad()
-def _measure_item(task: _Task) -> _Results:
+def _measure_item(task: _Task) -> dict[Place, Values | str]:
     """Compute the missing values of one item; what fails becomes its reason."""
     try:
         item = task.source.load()
     except Exception as error:  # whatever it is, the other items go on
         return _all_failed(task, reason_of(error))
-    results: _Results = {}
-    for condition, measures in task.missing:
+    results: dict[Place, Values | str] = {}
+    pairs: dict[str, tuple[Item, Tensor]] = {}
+    for condition, measure in task.missing:
         try:
-            output = condition.output(item)
-            if not output.isfinite().all():
-                raise ValueError("the output has samples that are NaN or infinite")
+            if condition.name not in pairs:
+                pairs[condition.name] = _item_and_output(condition, item)
+            values: Values | str = measure.compute(*pairs[condition.name])
+            _check_finite(values)
         except Exception as error:
-            results |= {(condition.name, m.name): reason_of(error) for m in measures}
-            continue
-        for measure in measures:
-            try:
-                values: Values | str = _finite(measure.compute(item, output))
-            except Exception as error:
-                values = reason_of(error)
-            results[condition.name, measure.name] = values
+            values = reason_of(error)
+        results[condition.name, measure.name] = values
     return results
 
 
-def _all_failed(task: _Task, reason: str) -> _Results:
-    return {
-        (condition.name, measure.name): reason
-        for condition, measures in task.missing
-        for measure in measures
-    }
+def _all_failed(task: _Task, reason: str) -> dict[Place, Values | str]:
+    return {(condition.name, measure.name): reason for condition, measure in task.missing}
 
 
-def _finite(values: Values) -> Values:
+def _item_and_output(condition: Condition, item: Item) -> tuple[Item, Tensor]:
+    """Process an item; both are cut to the shorter one if they differ by 0.1 s at most."""
+    output = condition.output(item)
+    if not output.isfinite().all():
+        raise ValueError("the output has samples that are NaN or infinite")
+    lengths = item.clean.shape[-1], output.shape[-1]
+    samples = common_length(lengths, item.sample_rate, (item.name, f"its output {condition.name}"))
+    if samples < lengths[0]:
+        item = replace(item, clean=item.clean[:samples], signal=item.signal[:samples])
+    return item, output[:samples]
+
+
+def _check_finite(values: Any) -> None:
     for name, value in values.items():
-        if not isinstance(value, str) and not math.isfinite(value):
+        if isinstance(value, float) and not math.isfinite(value):
             raise ValueError(f"{name} is {value}, not a finite number")
-    return values
 
 
 def _table(
     items: Sequence[Source],
     conditions: Sequence[Condition],
     measures: Sequence[Measure],
-    results: Sequence[_Results],
+    results: Sequence[Mapping[Place, Values | str]],
 ) -> DataFrame:
     rows = []
-    for number, (source, found) in enumerate(zip(items, results, strict=True)):
-        for condition in conditions:
-            row = {"item": number, "name": source.name, **source.facts, "condition": condition.name}
-            reasons = {}
-            for measure in measures:
-                values = found[condition.name, measure.name]
-                if isinstance(values, str):
-                    reasons[measure.name] = values
-                    continue
-                if both := row.keys() & values.keys():
-                    raise ValueError(
-                        f"the measure {measure.name} returns {both.pop()}, a column that exists already"
-                    )
+    for (number, source), condition in product(enumerate(items), conditions):
+        row = {"item": number, "name": source.name, **source.facts, "condition": condition.name}
+        reasons = []
+        for measure in measures:
+            values = results[number][condition.name, measure.name]
+            if isinstance(values, str):
+                reasons.append(values)
+            elif both := row.keys() & values.keys():
+                raise ValueError(
+                    f"{measure.name} returns {both.pop()}, a column that exists already"
+                )
+            else:
                 row |= values
-            rows.append({**row, "failure": _failure(reasons, len(measures))})
+        rows.append({**row, "failure": "; ".join(dict.fromkeys(reasons)) or None})
     table = require("pandas", "eval").DataFrame(rows)
     table["failure"] = table.pop("failure")  # last, whichever row has which values
     return table
-
-
-def _failure(reasons: Mapping[str, str], measures: int) -> str | None:
-    """Return the reasons as one text, with the names of the measures unless all failed alike."""
-    if not reasons:
-        return None
-    alike = set(reasons.values())
-    if len(reasons) == measures and len(alike) == 1:
-        return alike.pop()
-    return "; ".join(f"{name}: {reason}" for name, reason in reasons.items())

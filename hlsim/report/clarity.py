@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from hlsim.evaluation.clarity import RULE_MS
-from hlsim.evaluation.measures import title_of
+from hlsim.evaluation.clarity import NAL_R, RULE_MS, UNAIDED
 from hlsim.evaluation.result import Evaluation
 from hlsim.files import write_atomically
 from hlsim.report.listening import listening_section
 from hlsim.report.page import Page, Section, Table, write_page
-from hlsim.report.plots import study_pictures
-from hlsim.report.recordings import detail_section
-from hlsim.report.results import number
+from hlsim.report.plots import pictures_section
+from hlsim.report.recordings import score_details
+from hlsim.report.results import LEVEL, number, of, parts, summary_table
 
 _ABOUT = (
     "Scores are those of the better ear, by each measure, and combined is the mean of HASPI and HASQI, as in "
@@ -29,31 +28,26 @@ def write_scenes(evaluation: Evaluation, out: str | Path, *, listen: int = 3) ->
 
 def write_scores(evaluation: Evaluation, out: str | Path) -> None:
     """Write ``scores.csv``: a row for each scene, listener and condition."""
+    columns = ["utterance", "listener", "condition", "combined", "haspi", "hasqi", "level"]
     table = evaluation.table.assign(
-        combined=(evaluation.table["haspi"] + evaluation.table["hasqi"]) / 2
+        combined=evaluation.table[["haspi", "hasqi"]].mean(axis=1, skipna=False)
     )
-    columns = ["scene", "listener", "condition", "combined", "haspi", "hasqi", "level"]
-    text = table[columns].to_csv(index=False, float_format="%.6f")
-    write_atomically(Path(out) / "scores.csv", text)
+    scores = table[columns].rename(columns={"utterance": "scene"})
+    write_atomically(Path(out) / "scores.csv", scores.to_csv(index=False, float_format="%.6f"))
 
 
 def scenes_page(evaluation: Evaluation, listen: int = 3) -> Page:
     """Return the page of scenes: verdict, conditions, sounds, pictures, details."""
     planned = [c.verdict() for c in evaluation.comparisons if c.planned]
-    verdict = (
-        planned[0] if planned else f"No pair of aids could be compared with {evaluation.names[1]}."
-    )
-    items = len(evaluation.items)
-    aids = [condition.name for condition in evaluation.conditions if condition.kind == "aid"]
-    heard = [*evaluation.names[:1], "NAL-R", *aids]
-    pictures = study_pictures(evaluation)
+    verdict, *others = planned or [f"No pair of aids could be compared with {NAL_R}."]
+    shown = [UNAIDED, NAL_R, *evaluation.of_kind("aid")]
     sections = [
-        Section("Conditions", [*planned[1:], _ABOUT], [conditions_table(evaluation)]),
-        listening_section(evaluation, listen, heard),
-        Section("Pictures", pictures=pictures) if pictures else None,
-        detail_section(evaluation),
+        Section("Conditions", [*others, _ABOUT], [conditions_table(evaluation)]),
+        listening_section(evaluation, listen, shown),
+        pictures_section(evaluation),
+        score_details(evaluation),
     ]
-    title = f"Clarity's scenes: {items} pairs of scene and listener"
+    title = f"Clarity's scenes: {evaluation.table['item'].nunique()} pairs of scene and listener"
     return Page(title, verdict, [section for section in sections if section is not None])
 
 
@@ -62,22 +56,18 @@ def conditions_table(evaluation: Evaluation) -> Table:
 
     A condition without any score takes none from the others.
     """
-    haspi, hasqi, level = (evaluation.wide(column) for column in ("haspi", "hasqi", "level"))
-    columns = {
-        title_of("haspi"): haspi,
-        title_of("hasqi"): hasqi,
-        "Combined": 0.5 * (haspi + hasqi),
-    }
-    scored = columns["Combined"].dropna(axis=1, how="all").notna().all(axis=1)
-    rows = []
-    for name in evaluation.names:
-        row = {"Condition": name}
-        for title, wide in columns.items():
-            row[title] = number(wide[name][scored].mean(), ".3f")
-        row["Level (dB SPL)"] = number(level[name][scored].mean(), ".1f")
-        ahead = evaluation.details["look_ahead_ms"][name]
-        row["Look-ahead (ms)"] = number(ahead, ".1f")
-        within = "" if ahead is None else "yes" if ahead <= RULE_MS else "no"
-        rows.append({**row, f"Within {RULE_MS:g} ms": within})
+    combined = 0.5 * (evaluation.wide("haspi") + evaluation.wide("hasqi"))
+    scored = combined.dropna(axis=1, how="all").notna().all(axis=1)
+    table = evaluation.table[evaluation.table["item"].isin(scored[scored].index)]
+    table = table.assign(combined=0.5 * (table["haspi"] + table["hasqi"]))
+    scores = {"HASPI": "haspi", "HASQI": "hasqi", "Combined": "combined"}
+    columns = {**{title: (of(score), ".3f") for title, score in scores.items()}, **LEVEL}
     shared = "" if scored.all() else f"the {scored.sum()} that all conditions have scores of, of "
-    return Table.of(f"Means of {shared}{len(scored)} pairs of scene and listener", rows)
+    caption = f"Means of {shared}{len(scored)} pairs of scene and listener"
+    means = summary_table(caption, parts(table), columns)
+    rows = []
+    for row in means.rows:
+        ahead = evaluation.details["look_ahead_ms"][row[0]]
+        within = "" if ahead is None else "yes" if ahead <= RULE_MS else "no"
+        rows.append((*row, number(ahead, ".1f"), within))
+    return Table(caption, (*means.header, "Look-ahead (ms)", f"Within {RULE_MS:g} ms"), rows)

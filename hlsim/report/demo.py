@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from hlsim.audiogram import Audiogram
 from hlsim.evaluation.measures import NORMAL, perceive
 from hlsim.evaluation.result import Evaluation
 from hlsim.evaluation.study import Item
@@ -24,9 +23,13 @@ from hlsim.report.plots import (
     draw_svg,
     gain_picture,
     legend,
-    study_pictures,
+    pictures_section,
 )
-from hlsim.report.recordings import detail_section
+from hlsim.report.recordings import score_details
+from hlsim.report.results import Columns, of, parts, summary_table
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
 
 UNAIDED, NAL_R, NAL_R_AT_LEVEL = "unaided", "NAL-R", "NAL-R at the trained aid's level"
 START, TRAINED = "untrained start", "trained"
@@ -69,55 +72,44 @@ def demo_page(
     assert headline is not None
     colours = condition_colours(evaluation.conditions)
     items = [source.load() for source in evaluation.items]
-    first = items[0]
-    signals = {
-        "clean speech": first.clean,
-        _NORMAL_EAR: perceive(first.clean, NORMAL, NEURO_RATE),
-        **{f"{name}, perceived": perceived[name][0] for name in _SHOWN},
-    }
+    normal = [perceive(item.clean, NORMAL, NEURO_RATE) for item in items]
+    signals = {"clean speech": items[0].clean, _NORMAL_EAR: normal[0]}
+    signals |= {f"{name}, perceived": perceived[name][0] for name in _SHOWN}
     level = float(evaluation.table["clean_level"].iloc[0])
+    about = _LISTEN.format(name=items[0].name)
+    curves = evaluation.details["gain_curves"]
+    drawn = [
+        _ear_picture(evaluation, items, colours),
+        _perceived_picture({_NORMAL_EAR: normal, **perceived}, colours),
+    ]
     sections = [
         Section("Result", [_RESULT], [result_table(evaluation)]),
-        Section("Listen", [_LISTEN.format(name=first.name)], players=players(signals, NEURO_RATE)),
-        Section(
-            "The ear and the speech",
-            [_EAR.format(level=level)],
-            pictures=[
-                _ear_picture(evaluation, items, colours),
-                _perceived_picture(items, perceived, colours),
-            ],
-        ),
-        Section(
-            "Gain",
-            [_GAIN],
-            pictures=[gain_picture(ear_name, evaluation.details["gain_curves"], colours)],
-        ),
-        Section("Pictures", pictures=study_pictures(evaluation), folded=True),
-        detail_section(evaluation),
+        Section("Listen", [about], players=players(signals, NEURO_RATE)),
+        Section("The ear and the speech", [_EAR.format(level=level)], pictures=drawn),
+        Section("Gain", [_GAIN], pictures=[gain_picture(ear_name, curves, colours)]),
+        pictures_section(evaluation),
+        score_details(evaluation),
     ]
     verdict = headline.verdict("The trained aid", "NAL-R at the same level")
-    return Page(f"A hearing aid trained for one ear: {ear_name}", verdict, sections)
+    title = f"A hearing aid trained for one ear: {ear_name}"
+    return Page(title, verdict, [section for section in sections if section is not None])
 
 
 def result_table(evaluation: Evaluation) -> Table:
     """Return means of the utterances, one row per condition."""
-    haspi = evaluation.wide("haspi")
-    unaided = haspi[UNAIDED].to_numpy().clip(0.0, 1.0)
-    rows = []
-    for name in evaluation.names:
-        part = evaluation.table[evaluation.table["condition"] == name]
-        words = words_change(unaided, haspi[name].to_numpy().clip(0.0, 1.0))
-        share = words.before if name == UNAIDED else words.after
-        rows.append(
-            {
-                "Condition": name,
-                "HASPI": f"{part['haspi'].mean():.3f}",
-                "Words understood": f"{100.0 * share:.0f} %",
-                "Output level (dB SPL)": f"{part['level'].mean():.1f}",
-                "Loudness error (dB)": f"{part['loudness_error'].mean():+.1f}",
-            }
-        )
-    return Table.of(f"Means of {len(haspi)} utterances", rows)
+    unaided = evaluation.wide("haspi")[UNAIDED].to_numpy().clip(0.0, 1.0)
+
+    def words(rows: DataFrame) -> float:
+        share = words_change(unaided, rows["haspi"].to_numpy().clip(0.0, 1.0))
+        return share.before if rows["condition"].iloc[0] == UNAIDED else share.after
+
+    columns: Columns = {
+        "HASPI": (of("haspi"), ".3f"),
+        "Words understood": (words, ".0%"),
+        "Output level (dB SPL)": (of("level"), ".1f"),
+        "Loudness error (dB)": (of("loudness_error"), "+.1f"),
+    }
+    return summary_table(f"Means of {len(unaided)} utterances", parts(evaluation.table), columns)
 
 
 def _ear_picture(
@@ -125,18 +117,14 @@ def _ear_picture(
 ) -> Picture:
     """Draw the audiogram with the speech as it is and as the trained aid amplifies it."""
     ear = items[0].ear
-    assert isinstance(ear, Audiogram)
-    chosen = [
-        condition for condition in evaluation.conditions if condition.name in (UNAIDED, TRAINED)
-    ]
     levels = {}
-    for condition in chosen:
-        with torch.no_grad():
-            bands = [band_levels(condition.output(item), NEURO_RATE) for item in items]
-        levels[condition.name] = torch.cat(bands).numpy()
+    for condition in evaluation.conditions:
+        if condition.name in (UNAIDED, TRAINED):
+            with torch.no_grad():
+                bands = [band_levels(condition.output(item), NEURO_RATE) for item in items]
+            levels[condition.name] = torch.cat(bands).numpy()
 
     def draw(axes: Any) -> None:
-        axes.figure.set_figheight(4.0)
         ear.plot(axes, label="threshold", zorder=3, color="black")
         for name, values in levels.items():
             quiet = threshold_in_quiet()
@@ -147,35 +135,19 @@ def _ear_picture(
             axes.plot(band_centres(), mean, color=colours[name], label=f"speech, {name}")
         legend(axes)
 
-    thresholds = ", ".join(f"{level:g}" for level in ear.levels)
-    return Picture(
-        draw_svg(draw),
-        f"Audiogram, {thresholds} dB HL, with speech as it is and as the trained aid amplifies it.",
-        "Audiogram and speech. The bands are MSBG's degrees of loss.",
-    )
+    text = "Audiogram, and speech as it is and as the trained aid amplifies it."
+    return Picture(draw_svg(draw, height=4.0), text, text)
 
 
 def _perceived_picture(
-    items: Sequence[Item], perceived: Mapping[str, Sequence[Tensor]], colours: Mapping[str, Any]
+    perceived: Mapping[str, Sequence[Tensor]], colours: Mapping[str, Any]
 ) -> Picture:
     """Draw the mean level that the ear perceives in each band, beside a normal ear's."""
-    signals: dict[str, Sequence[Tensor]] = {
-        _NORMAL_EAR: [perceive(item.clean, NORMAL, NEURO_RATE) for item in items],
-        **{name: perceived[name] for name in _SHOWN},
-    }
-    levels = {}
-    for name, several in signals.items():
-        powers = [10.0 ** (band_levels(signal, NEURO_RATE) / 10.0) for signal in several]
-        levels[name] = 10.0 * torch.cat(powers).mean(0).log10().numpy()
-    distance = {name: np.abs(levels[name] - levels[_NORMAL_EAR]).mean() for name in _SHOWN}
-    distances = ", ".join(f"{name} {value:.1f}" for name, value in distance.items())
-    curves = {name: (list(band_centres()), list(level)) for name, level in levels.items()}
-    return curves_picture(
-        curves,
-        colours,
-        f"Perceived level by band; mean absolute distance from a normal ear in dB: {distances}.",
-        axis="perceived level (dB SPL in a band)",
-        caption="Speech as perceived, by band; the closer to the dashed line the better.",
-        dashed=[_NORMAL_EAR],
-        lowest=0.0,
-    )
+    curves = {}
+    for name in (_NORMAL_EAR, *_SHOWN):
+        bands = torch.cat([band_levels(signal, NEURO_RATE) for signal in perceived[name]])
+        level = 10.0 * (10.0 ** (bands / 10.0)).mean(0).log10()
+        style = {"color": colours.get(name, "black"), "linestyle": "-" if name in colours else "--"}
+        curves[name] = (list(band_centres()), level.tolist(), style)
+    text = "Speech as perceived, by band; the closer to the dashed line the better."
+    return curves_picture(curves, text, "perceived level (dB SPL in a band)", lowest=0.0)

@@ -4,26 +4,27 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
-
 from hlsim.evaluation.comparison import Comparison
+from hlsim.evaluation.measures import title_of
 from hlsim.evaluation.result import Evaluation
 from hlsim.metrics.words import words_change
 from hlsim.report.listening import listening_section
-from hlsim.report.page import Page, Section, Table, write_page
-from hlsim.report.plots import study_pictures
+from hlsim.report.page import Page, Section, write_page
+from hlsim.report.plots import pictures_section
 from hlsim.report.results import (
     GAIN_NOTE,
-    STATISTICS_NOTES,
+    LEVEL,
+    STATISTICS_NOTE,
     comparison_sections,
-    conditions_table,
-    failure_section,
-    headline_table,
+    comparison_table,
+    detail_section,
     items_table,
     mean_verdict,
+    parts,
+    score_cells,
     scored_by,
     severity_counts,
-    versions_text,
+    summary_table,
 )
 
 
@@ -44,99 +45,62 @@ def write_report(evaluation: Evaluation, out: str | Path, *, listen: int = 3) ->
 
 def report_page(evaluation: Evaluation, listen: int = 3) -> Page:
     """Return the page of recorded speech: verdict, scores, sounds, pictures, details."""
-    columns = evaluation.settings["measures"]
+    columns = {**score_cells(evaluation), **LEVEL}
+    tables = [summary_table("Means of all items", parts(evaluation.table), columns)]
+    texts = [GAIN_NOTE] if "haspi" in evaluation.scores else []
     headline = evaluation.headline
-    if headline is None:
-        verdict = mean_verdict(evaluation, columns[0])
-        result = Section("Scores", [*_gain_note(columns)], [conditions_table(evaluation, columns)])
-    else:
+    verdict = mean_verdict(evaluation)
+    if headline is not None:
         verdict = headline.verdict()
-        result = Section(
-            "Scores",
-            [headline.limits(), *_gain_note(columns), *_words(evaluation, headline)],
-            _score_tables(evaluation, headline, columns),
-        )
-    pictures = study_pictures(evaluation)
+        tables.append(comparison_table([headline], "The comparison of the first sentence"))
+        texts = [headline.limits(), *texts, *_words(evaluation, headline)]
     sections = [
-        result,
+        Section("Scores", texts, tables),
         listening_section(evaluation, listen),
-        Section("Pictures", pictures=pictures) if pictures else None,
-        detail_section(evaluation),
+        pictures_section(evaluation),
+        score_details(evaluation),
     ]
-    title = f"{', '.join(evaluation.names)}: {headline_title(evaluation)}"
+    measures = ", ".join(map(title_of, evaluation.scores))
+    title = f"{', '.join(evaluation.names)}: {measures}"
     return Page(title, verdict, [section for section in sections if section is not None])
 
 
-def headline_title(evaluation: Evaluation) -> str:
-    """Return the titles of the measures."""
-    return ", ".join(measure.title or measure.name for measure in evaluation.measures)
-
-
-def detail_section(evaluation: Evaluation) -> Section:
-    """Return all comparisons, failures, notes and scores of items, folded."""
-    columns = evaluation.settings["measures"]
-    failures = failure_section(evaluation.failures)
-    sections = [
-        *comparison_sections(evaluation),
-        *([failures] if failures is not None else []),
-        Section("How the scores were made", _notes(evaluation)),
-        Section("All items", tables=[items_table(evaluation, columns)], folded=True),
+def score_details(evaluation: Evaluation) -> Section:
+    """Return all comparisons, scores of items and of ears, failures and notes, folded."""
+    tables = [items_table(evaluation, "Scores and levels of every item")]
+    if "ears" in evaluation.groups:
+        tables.append(items_table(evaluation.groups["ears"], "Scores and levels of each ear"))
+    items = Section("All items", tables=tables, folded=True)
+    better_ear = "Each score is that of the better ear, by each measure."
+    notes = [
+        scored_by(evaluation),
+        severity_counts(evaluation),
+        _about_level(evaluation),
+        better_ear if "ears" in evaluation.groups else "",
+        STATISTICS_NOTE,
     ]
-    return Section("Details", sections=sections, folded=True)
-
-
-def _score_tables(evaluation: Evaluation, headline: Comparison, columns: list[str]) -> list[Table]:
-    tables = [headline_table(headline)]
-    if len(evaluation.conditions) > 2 or len(columns) > 1:
-        tables.insert(0, conditions_table(evaluation, columns))
-    return tables
-
-
-def _gain_note(columns: list[str]) -> list[str]:
-    return [GAIN_NOTE] if "haspi" in columns else []
+    return detail_section(evaluation, *comparison_sections(evaluation), items, notes=notes)
 
 
 def _words(evaluation: Evaluation, c: Comparison) -> list[str]:
     """Say how many words a listener would understand, if the headline is HASPI's."""
     if c.measure != "haspi":
         return []
-    both = evaluation.wide("haspi")[[c.before, c.after]].dropna().to_numpy().clip(0.0, 1.0)
-    words = words_change(*np.ascontiguousarray(both.T))
-    shares = [f"{100.0 * share:.0f} %" for share in (words.before, words.after)]
-    change, low, high = [f"{100.0 * x:+.0f}" for x in (words.change, words.low, words.high)]
+    both = evaluation.wide("haspi")[[c.before, c.after]].dropna().clip(0.0, 1.0)
+    words = words_change(both[c.before].to_numpy(), both[c.after].to_numpy())
+    before, after, change, low, high = (100.0 * share for share in words)
     return [
-        f"In words: a listener would understand {shares[0]} of the words of these sentences under "
-        f"{c.before} and {shares[1]} under {c.after}, a change of {change} points. For nine of ten "
-        f"listeners the change lies between {low} and {high} points.",
+        f"In words: a listener would understand {before:.0f} % of the words of these sentences under "
+        f"{c.before} and {after:.0f} % under {c.after}, a change of {change:+.0f} points. For nine of ten "
+        f"listeners the change lies between {low:+.0f} and {high:+.0f} points.",
         "Words are predicted from HASPI by a curve that was fitted to 22 listeners with ten hearing aids "
         "(hlsim.metrics.words). HASPI ranks aids well, but says little about single listeners.",
     ]
 
 
-def _notes(evaluation: Evaluation) -> list[str]:
-    """Say how the scores were made."""
-    items = evaluation.table.drop_duplicates("item")
-    named = items["listener"] if "listener" in items else items["name"].iloc[:0]
-    listeners = named[named != ""].nunique()
-    better_ear = "Each score is that of the better ear."
-    notes = [
-        scored_by(evaluation),
-        severity_counts(evaluation),
-        f"Listeners: {listeners}." if listeners else "",
-        _about_level(evaluation),
-        better_ear if evaluation.settings.get("better_ear") else "",
-        *STATISTICS_NOTES,
-        f"The seed is {evaluation.settings['seed']}. {versions_text(evaluation.versions)}",
-    ]
-    return [note for note in notes if note]
-
-
 def _about_level(evaluation: Evaluation) -> str:
-    if "full_scale_spl" in evaluation.settings:
-        return f"RMS 1.0 stands for {evaluation.settings['full_scale_spl']:g} dB SPL."
-    scales = evaluation.table["full_scale_spl"].dropna().round(1)
-    scale = f"{scales.min():.1f} dB SPL"
-    if scales.max() > scales.min():
-        scale = f"{scales.min():.1f} to {scales.max():.1f} dB SPL, depending on the item"
-    clean = f"{evaluation.table['clean_level'].mean():.1f} dB SPL"
-    return f"The clean speech has {clean} on average; RMS 1.0 stands for {scale}."
+    clean, scale = (evaluation.table[name].dropna() for name in ("clean_level", "full_scale_spl"))
+    return (
+        f"The clean speech has {clean.mean():.1f} dB SPL on average; RMS 1.0 stands for {scale.min():.1f} to "
+        f"{scale.max():.1f} dB SPL."
+    )

@@ -2,55 +2,55 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import suppress
-from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
-from hlsim.audiogram import SEVERITIES
 from hlsim.evaluation.result import Evaluation
-from hlsim.evaluation.simulators import GROUPINGS, example_item, summaries, summary
+from hlsim.evaluation.simulators import agreement, example_item
 from hlsim.evaluation.study import Item
 from hlsim.extras import install_command, is_installed
 from hlsim.report import spectrograms
 from hlsim.report.listening import players
-from hlsim.report.page import Page, Picture, Section, Table, write_page
-from hlsim.report.plots import distribution_picture, draw_svg, legend, scatter
+from hlsim.report.page import Page, Picture, Section, write_page
+from hlsim.report.plots import distribution_picture, scatter_picture
 from hlsim.report.results import (
-    comparisons_table,
-    failure_section,
-    inner,
+    Columns,
+    comparison_table,
+    detail_section,
     loss_name,
-    number,
-    versions_text,
+    of,
+    ordered,
+    parts,
+    summary_table,
 )
 
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-COLUMNS = {
-    "n": ("n", "d"),
-    "SNR median (dB)": ("snr_median", ".1f"),
-    "SNR worst tenth (dB)": ("snr_worst_tenth", ".1f"),
-    "STOI LCC": ("stoi_lcc", ".4f"),
-    "STOI SRCC": ("stoi_srcc", ".4f"),
-    "STOI MSE": ("stoi_mse", ".5f"),
-    "PESQ LCC": ("pesq_lcc", ".4f"),
-    "PESQ SRCC": ("pesq_srcc", ".4f"),
-    "PESQ MSE": ("pesq_mse", ".4f"),
-    "RAW MSE": ("raw_mse", ".4f"),
-    "Band error median (dB)": ("band_error_median", ".2f"),
-}
-"""Columns of a table by title, with the value of ``summary`` and its format."""
 
-_GROUPINGS = dict(
-    zip(GROUPINGS, ("By degree of loss", "By level (dB SPL)", "Clean or noisy"), strict=True)
-)
+def _agreement(score: str, statistic: str) -> Callable[[DataFrame], float | None]:
+    return lambda rows: agreement(rows, score)[statistic]
+
+
+COLUMNS: Columns = {
+    "n": (of("snr", "count"), "d"),
+    "SNR median (dB)": (of("snr", "median"), ".1f"),
+    "SNR worst tenth (dB)": (of("snr", "worst tenth"), ".1f"),
+    "STOI LCC": (_agreement("stoi", "lcc"), ".4f"),
+    "STOI SRCC": (_agreement("stoi", "srcc"), ".4f"),
+    "STOI MSE": (_agreement("stoi", "mse"), ".5f"),
+    "PESQ LCC": (_agreement("pesq", "lcc"), ".4f"),
+    "PESQ SRCC": (_agreement("pesq", "srcc"), ".4f"),
+    "PESQ MSE": (_agreement("pesq", "mse"), ".4f"),
+    "RAW MSE": (of("raw_mse"), ".4f"),
+    "Band error median (dB)": (of("band_error", "median"), ".2f"),
+}
+"""Columns of the tables by title: those of the paper's Table I, and others."""
 
 _TREATMENTS = {
     "as-is": "Speech as it is",
@@ -68,31 +68,37 @@ def write_simulators(evaluation: Evaluation, out: str | Path) -> Path:
 
 def simulators_page(evaluation: Evaluation, listen: int = 1) -> Page:
     """Return the page of simulators: verdict, side by side, sounds, pictures, details."""
-    sections: list[Section] = []
+    first = next(iter(evaluation.groups.values()))
+    sections, details = [], []
     for treatment, group in evaluation.groups.items():
-        about = [] if sections else [_about(evaluation)]
-        tables = [side_by_side(group)]
+        tables = [
+            summary_table("Simulators side by side", parts(group.table), COLUMNS, first="Simulator")
+        ]
         if group.comparisons:
-            tables.append(comparisons_table(group.comparisons))
+            tables.append(
+                comparison_table(
+                    group.comparisons, "SNR compared with the first; p adjusted by Holm"
+                )
+            )
+        about = [_about(evaluation)] if group is first else []
         sections.append(Section(_TREATMENTS[treatment], about, tables))
+        grouped = [
+            summary_table(title, parts(group.table, fact), COLUMNS, first="Items")
+            for fact, title in {
+                "severity": "By degree of loss",
+                "input_level": "By level (dB SPL)",
+                "speech": "Clean or noisy",
+            }.items()
+            if group.table[fact].nunique() > 1
+        ]
+        details.append(Section(_TREATMENTS[treatment], tables=grouped))
     if listen:
         sections.append(_listening_section(evaluation))
-    first = next(iter(evaluation.groups.values()))
-    pictures = [
-        Section(name, pictures=_pictures(part)) for name, part in _parts(first) if len(part) > 1
+    drawn = [
+        Section(name, pictures=[*_pictures(rows)]) for name, rows in parts(first.table).items()
     ]
-    if pictures:
-        sections.append(Section("Pictures", sections=pictures))
-    details = [
-        Section(f"{name}: {inner(_TREATMENTS[treatment])}", tables=_summary_tables(part))
-        for treatment, group in evaluation.groups.items()
-        for name, part in _parts(group)
-    ]
-    failures = failure_section(evaluation.failures, "Simulator")
-    details += [] if failures is None else [failures]
-    details.append(Section("Versions", [versions_text(evaluation.versions)]))
-    sections.append(Section("Details", sections=details, folded=True))
-    return Page("Simulators", _verdict(evaluation), sections)
+    sections += [Section("Pictures", sections=drawn), detail_section(evaluation, *details)]
+    return Page("Simulators", _verdict(evaluation, first), sections)
 
 
 def _teacher(evaluation: Evaluation) -> str:
@@ -100,28 +106,17 @@ def _teacher(evaluation: Evaluation) -> str:
     return "the exact MSBG" if teacher == "msbg" else teacher
 
 
-def _parts(evaluation: Evaluation) -> Iterator[tuple[str, DataFrame]]:
-    """Yield name and rows of each simulator."""
-    for name in evaluation.names:
-        yield name, evaluation.table[evaluation.table["condition"] == name]
-
-
-def _verdict(evaluation: Evaluation) -> str:
+def _verdict(evaluation: Evaluation, first: Evaluation) -> str:
     """Say which simulator is closest to the teacher, by the SNR of the first treatment."""
-    treatment, group = next(iter(evaluation.groups.items()))
-    found = {name: summary(part) for name, part in _parts(group)}
-    best = max(found, key=lambda name: found[name]["snr_median"] or -math.inf)
-    snr = (
-        f"median SNR {number(found[best]['snr_median'], '.1f')} dB (worst tenth "
-        f"{number(found[best]['snr_worst_tenth'], '.1f')} dB, {found[best]['snr_n']} items)"
+    snr = {name: rows["snr"].dropna() for name, rows in parts(first.table).items()}
+    order = sorted(snr, key=lambda name: -snr[name].median() if len(snr[name]) else 0.0)
+    best = snr[order[0]]
+    others = ", ".join(f"{name} {snr[name].median():.1f} dB" for name in order[1:])
+    return (
+        f"{_TREATMENTS[evaluation.settings['inputs'][0]]}: {order[0]} has a median SNR of {best.median():.1f} dB "
+        f"(worst tenth {best.quantile(0.1):.1f} dB, {len(best)} items) against {_teacher(evaluation)}"
+        + (f"; the others: {others}." if others else ".")
     )
-    others = ", ".join(
-        f"{name} {number(values['snr_median'], '.1f')} dB"
-        for name, values in found.items()
-        if name != best
-    )
-    text = f"{_TREATMENTS[treatment]}: {best} has a {snr} against {_teacher(evaluation)}"
-    return f"{text}; the others: {others}." if others else f"{text}."
 
 
 def _about(evaluation: Evaluation) -> str:
@@ -139,37 +134,6 @@ def _about(evaluation: Evaluation) -> str:
     return text
 
 
-def side_by_side(evaluation: Evaluation) -> Table:
-    """Return one row per simulator, over all items: the columns of the paper's Table I and others."""
-    rows = {name: summary(part) for name, part in _parts(evaluation)}
-    return _table("Simulators side by side", "Simulator", rows)
-
-
-def _summary_tables(part: DataFrame) -> list[Table]:
-    """Return the tables of one simulator by the facts that differ between the items."""
-    tables = [_table("All items", "Items", {"all": summary(part)})]
-    for fact, title in _GROUPINGS.items():
-        if part[fact].nunique() > 1:
-            tables.append(_table(title, fact.replace("_", " ").capitalize(), summaries(part, fact)))
-    return tables
-
-
-def _table(caption: str, first: str, rows: Mapping[str, Mapping[str, Any]]) -> Table:
-    cells = [(name, *_cells(values)) for name, values in rows.items()]
-    return Table(caption, (first, *COLUMNS), cells)
-
-
-def _cells(values: Mapping[str, Any]) -> list[str]:
-    """Format the values of a row, each with its own n if that is smaller."""
-    cells = []
-    for key, form in COLUMNS.values():
-        cell = number(values[key], form)
-        used = values.get(f"{key.split('_')[0]}_n", values["snr_n"])
-        fewer = key != "n" and used != values["n"] and values[key] is not None
-        cells.append(f"{cell} ({used} of {values['n']})" if fewer else cell)
-    return cells
-
-
 def _listening_section(evaluation: Evaluation) -> Section:
     """Play one item: the input, the teacher's output, and each simulator's."""
     item, expected = example_item(evaluation)
@@ -177,8 +141,7 @@ def _listening_section(evaluation: Evaluation) -> Section:
     # a short clip is filled up with silence
     end = int(item.signal.nonzero().max()) + item.sample_rate // 10
     signals = {name: signal[:end] for name, signal in signals.items()}
-    names = list(signals)[2:]
-    differences = {f"{name} minus teacher": (name, "teacher") for name in names}
+    differences = {f"{name} minus teacher": (name, "teacher") for name in [*signals][2:]}
     panels = spectrograms.panels(signals, item.sample_rate, differences)
     facts = item.facts
     text = (
@@ -186,12 +149,9 @@ def _listening_section(evaluation: Evaluation) -> Section:
         f"{loss_name(facts['severity'])}. All players have the same gain. A difference is drawn where either "
         "signal is loud enough to be seen."
     )
-    return Section(
-        "Listen",
-        [text],
-        players=players(signals, item.sample_rate),
-        pictures=spectrograms.pictures({name: panels[name] for name in differences}),
-    )
+    pictures = spectrograms.pictures({name: panels[name] for name in differences})
+    played = players(signals, item.sample_rate)
+    return Section("Listen", [text], players=played, pictures=pictures)
 
 
 def _outputs(evaluation: Evaluation, item: Item) -> dict[str, Tensor]:
@@ -205,30 +165,17 @@ def _outputs(evaluation: Evaluation, item: Item) -> dict[str, Tensor]:
     return outputs
 
 
-def _pictures(part: DataFrame) -> list[Picture]:
+def _pictures(rows: DataFrame) -> Iterator[Picture]:
     """Draw the scores of simulator over teacher, and the errors by degree of loss."""
-    pictures = []
-    for name, title in (("stoi", "STOI"), ("pesq", "PESQ (wide band)")):
-        columns = [f"{name}_teacher", f"{name}_simulator"]
-        pairs = part.reindex(columns=columns).astype(float)
-        if pairs.dropna().empty:
-            continue
-        x, y = pairs.to_numpy().T
-        draw = partial(_draw_pairs, x=x, y=y, severities=list(part["severity"]), title=title)
-        text = f"{title} of the simulator's output over that of the teacher's, one point per item."
-        pictures.append(Picture(draw_svg(draw), text, text))
+    for score, title in (("stoi", "STOI"), ("pesq", "PESQ")):
+        pairs = rows.reindex(columns=[f"{score}_teacher", f"{score}_simulator"]).astype(float)
+        if not pairs.dropna().empty:
+            text = f"{title} of the simulator's output over that of the teacher's."
+            titles = (f"{title}, teacher", f"{title}, simulator")
+            x, y = pairs.to_numpy().T
+            yield scatter_picture(x, y, rows["severity"].to_numpy(), titles, text)
+    degrees = ordered(rows["severity"].unique())
     for column, title in (("snr", "SNR (dB)"), ("band_error", "Band error (dB)")):
-        groups = {
-            severity: part.loc[part["severity"] == severity, column].dropna().to_numpy()
-            for severity in SEVERITIES
-        }
-        known = {severity: values for severity, values in groups.items() if len(values)}
-        if len(known) > 1:
-            pictures.append(distribution_picture(known, title, "by degree of loss"))
-    return pictures
-
-
-def _draw_pairs(axes: Any, x: Any, y: Any, severities: list[str], title: str) -> None:
-    scatter(axes, x, y, severities, "equal")
-    axes.set(xlabel=f"{title}, teacher", ylabel=f"{title}, simulator")
-    legend(axes)
+        groups = {degree: rows.loc[rows["severity"] == degree, column] for degree in degrees}
+        if len(groups) > 1:
+            yield distribution_picture(groups, title, "degree of loss")

@@ -11,17 +11,18 @@ from torch import Tensor
 
 from hlsim.calibration import PASCAL_SPL
 from hlsim.report.page import Picture
-from hlsim.report.plots import new_figure, plain, png, svg
+from hlsim.report.plots import new_figure, plain, svg
 
 RANGE_DB = 75.0
-"""What is drawn of levels, from the loudest bin down: speech and the noise in its pauses."""
+"""Range of levels that is drawn, from the loudest bin down: speech and the noise in its pauses."""
 
-_APART_DB = 15.0  # a difference beyond is drawn as this one
-_HIGHEST = 10000.0  # Hz: MSBG and HASPI end at 8000
+PANEL_INCHES = (4.6, 2.1)
 
-_PANEL = (4.6, 2.1)  # inches
+_LARGEST_DIFFERENCE_DB = 15.0
+_HIGHEST_KHZ = 10.0  # MSBG and HASPI end at 8
 
 Panels = Mapping[str, Callable[[Any, Any], None]]
+"""Functions that draw on a matplotlib figure and axes, by title."""
 
 
 def panels(
@@ -29,51 +30,45 @@ def panels(
     sample_rate: int,
     differences: Mapping[str, tuple[str, str]] | None = None,
 ) -> Panels:
-    """What draws each signal, and after it, where it is one's, a difference: of one name less another, in dB.
+    """Return functions that draw each signal and then each difference of two of them in dB.
 
-    Differences are where either is within the range that is drawn. Shape: (time,) each, in pascals.
+    A difference, by its title, is that of the first name minus the second, where either is within the range.
+
+    Shape: (time,) each, in pascals.
     """
     levels = {name: _levels(signal, sample_rate) for name, signal in signals.items()}
     top = 5.0 * round(max(float(level.quantile(0.999)) for level in levels.values()) / 5.0 + 0.5)
     seconds = max(len(signal) for signal in signals.values()) / sample_rate
     extent = (0.0, seconds, 0.0, sample_rate / 2.0e3)
-    found: dict[str, Callable[[Any, Any], None]] = {}
-    for name, level in levels.items():
-        scale = {"vmin": top - RANGE_DB, "vmax": top, "cmap": "gist_heat_r", "extent": extent}
-        found[name] = partial(_draw, image=level, title=name, unit="dB SPL in a bin", scale=scale)
-        for title, (one, other) in (differences or {}).items():
-            if one == name:
-                apart = levels[one] - levels[other]
-                apart[torch.maximum(levels[one], levels[other]) < top - RANGE_DB] = torch.nan
-                scale = {"vmin": -_APART_DB, "vmax": _APART_DB, "cmap": "RdBu_r", "extent": extent}
-                found[title] = partial(_draw, image=apart, title=title, unit="dB", scale=scale)
-    return found
+    scale = {"vmin": top - RANGE_DB, "vmax": top, "cmap": "gist_heat_r", "extent": extent}
+    drawn: dict[str, Callable[[Any, Any], None]] = {
+        name: partial(_draw, image=level, title=name, unit="dB SPL in a bin", scale=scale)
+        for name, level in levels.items()
+    }
+    most = _LARGEST_DIFFERENCE_DB
+    scale = {"vmin": -most, "vmax": most, "cmap": "RdBu_r", "extent": extent}
+    for title, (first, second) in (differences or {}).items():
+        image = levels[first] - levels[second]
+        image[torch.maximum(levels[first], levels[second]) < top - RANGE_DB] = torch.nan
+        drawn[title] = partial(_draw, image=image, title=title, unit="dB", scale=scale)
+    return drawn
 
 
 def pictures(panels: Panels) -> list[Picture]:
-    """One a panel, for a page that lays them out by its width."""
-    found = []
+    """Return one picture per panel, for a page that lays them out by its width."""
+    drawn = []
     for title, draw in panels.items():
-        figure = new_figure(_PANEL)
+        figure = new_figure(PANEL_INCHES)
         draw(figure, figure.subplots())
-        found.append(Picture(svg(figure), f"Spectrogram: {title}"))
-    return found
-
-
-def composite(panels: Panels) -> bytes:
-    """The PNG of all, in two columns."""
-    rows = -(-len(panels) // 2)
-    figure = new_figure((2.0 * _PANEL[0], rows * _PANEL[1]))
-    places = figure.subplots(rows, 2, squeeze=False).ravel()
-    for axes, draw in zip(places, panels.values(), strict=False):
-        draw(figure, axes)
-    for axes in places[len(panels) :]:
-        axes.set_axis_off()
-    return png(figure, 160)
+        drawn.append(Picture(svg(figure), f"Spectrogram: {title}"))
+    return drawn
 
 
 def _levels(signal: Tensor, sample_rate: int) -> Tensor:
-    """Windows of 20 ms, every 10 ms; silence is at -46 dB SPL. Shape: (time,) -> (bins, frames) in dB SPL."""
+    """Return levels in windows of 20 ms, every 10 ms; silence has -46 dB SPL.
+
+    Shape: (time,) -> (bins, frames) in dB SPL.
+    """
     points = 2 * (sample_rate // 100)
     window = torch.hann_window(points)
     spectrum = torch.stft(
@@ -87,6 +82,6 @@ def _draw(
 ) -> None:
     # without interpolation a page's picture holds the bins themselves, sharp at any size
     drawn = axes.imshow(image.numpy(), origin="lower", aspect="auto", interpolation="none", **scale)
-    axes.set(xlabel="s", ylabel="kHz", ylim=(0.0, min(_HIGHEST / 1e3, scale["extent"][3])))
+    axes.set(xlabel="s", ylabel="kHz", ylim=(0.0, min(_HIGHEST_KHZ, scale["extent"][3])))
     axes.set_title(plain(title), fontsize="medium")
     figure.colorbar(drawn, ax=axes, label=unit, aspect=15, pad=0.02)

@@ -157,9 +157,9 @@ def test_the_challenges_baseline_has_its_scores(clarity: Path, tmp_path: Path) -
     pytest.importorskip("clarity")
     aids = {"baseline": f"{__name__}:Baseline"}
     study = evaluate_scenes(aids, out=tmp_path, **options(clarity))
-    assert study.failures.empty and len(study.items) == 3
+    assert study.failures.empty and study.table.item.nunique() == 3
     for row in study.table[study.table.condition == "baseline"].itertuples():
-        for measure, expected in pyclaritys(clarity, row.scene, row.listener).items():
+        for measure, expected in pyclaritys(clarity, row.utterance, row.listener).items():
             assert getattr(row, measure) == pytest.approx(expected, abs=1e-3), (row.name, measure)
     ahead = study.details["look_ahead_ms"]
     assert ahead["baseline"] == 0.0, "2.5 ms late, but never early"
@@ -271,9 +271,8 @@ def test_a_pair_that_one_aid_refuses_counts_in_no_mean_and_stops_nothing(
     peaks = [np.abs(soundfile.read(str(mix))[0]).max() for mix in mixes]
     LOUDEST[0] = sum(peaks) / 2
     aids = {"choosy": f"{__name__}:Choosy", "soft": "wdrc"}
-    with pytest.warns(UserWarning, match="choosy are not stored"):
-        study = evaluate_scenes(aids, out=tmp_path / "out", **options(clarity, every=2))
-    (failure,) = study.failures.itertuples()
+    study = evaluate_scenes(aids, out=tmp_path / "out", **options(clarity, every=2))
+    (failure,) = study.failures.itertuples()  # of the better ear; both have the reason
     assert failure.condition == "choosy" and "too loud for me" in failure.failure
     table = conditions_table(study)
     caption = "Means of the 1 that all conditions have scores of, of 2 pairs of scene and listener"
@@ -290,11 +289,10 @@ def test_a_broken_scene_is_a_failure_with_its_file(clarity: Path, tmp_path: Path
     folder = tmp_path / "scenes"
     shutil.copytree(clarity / "scenes", folder)
     signal, rate = soundfile.read(str(folder / "S06002_target_CH1.wav"))
-    soundfile.write(str(folder / "S06002_target_CH1.wav"), signal[:-5], rate)
+    soundfile.write(str(folder / "S06002_target_CH1.wav"), signal[: len(signal) // 2], rate)
     settings = options(clarity, scenes=folder, every=2)
     study = evaluate_scenes({"aid": "wdrc"}, out=tmp_path / "out", **settings)
     assert set(study.failures.name) == {"L0001 S06002"}
-    assert study.failures.failure.str.contains("S06002_target_CH1.wav has").all()
     assert "S06002_target_CH1.wav has" in scenes_page(study, listen=0).markdown()
 
 
@@ -303,7 +301,7 @@ def test_the_look_ahead_is_known_for_a_scene_that_begins_in_silence(tmp_path: Pa
     soundfile.write(tmp_path / "mix.wav", np.concatenate([np.zeros((5 * RATE, 2)), sound]), RATE)
     (tmp_path / "listeners.json").write_text(json.dumps(LISTENERS))
     listener = read_listeners(tmp_path / "listeners.json")["L0001"]
-    conditions = _conditions({}, [], False, RATE, 94.0, tmp_path)
+    conditions = _conditions({}, [], False, RATE, 94.0)
     ahead = _look_ahead(conditions, tmp_path / "mix.wav", listener)
     assert ahead["unaided"] == 0.0 and 1.0 < ahead["NAL-R"] <= 5.0
 
@@ -313,8 +311,8 @@ def test_the_look_ahead_is_known_for_a_scene_that_begins_in_silence(tmp_path: Pa
     [
         ({"scenes": "listeners.json"}, "no such folder"),
         ({"scenes": "."}, "has no files"),
-        ({"scenes_listeners": {"S06001": ["L0009"]}}, "no listener 'L0009'"),
-        ({"scenes_listeners": {"S9": ["L0001"]}}, "no scene 'S9'"),
+        ({"scenes_listeners": {"S06001": ["L0009"]}}, "listener 'L0009'"),
+        ({"scenes_listeners": {"S9": ["L0001"]}}, "scene 'S9'"),
         ({"scenes_listeners": []}, "cannot be read"),
         ({"scenes_listeners": {}}, "no scene has a listener"),
         ({"every": 0}, "every is 0"),

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from hlsim.evaluation.enhancers import load_enhancers
+from hlsim.evaluation.aids import load_enhancers
 
 CODE = """
 def softer(waveform, sample_rate):

@@ -93,7 +93,12 @@ def stereo(corpus: Path) -> None:
 
 def shorter(corpus: Path) -> None:
     signal = first_channel(corpus / "after/p2/c.wav").float()
-    write_audio(corpus / "after/p2/c.wav", signal[None, 1:], 22050)
+    write_audio(corpus / "after/p2/c.wav", signal[None, 3000:], 22050)  # by 0.14 s
+
+
+def faster(corpus: Path) -> None:
+    signal = first_channel(corpus / "after/p2/c.wav").float()
+    write_audio(corpus / "after/p2/c.wav", signal[None], 24000)
 
 
 def broken(corpus: Path) -> None:
@@ -104,7 +109,7 @@ def silent(corpus: Path) -> None:
     write_audio(corpus / "after/p2/c.wav", torch.zeros(1, 17640), 22050)
 
 
-@pytest.mark.parametrize("damage", [stereo, shorter, broken, silent])
+@pytest.mark.parametrize("damage", [stereo, shorter, faster, broken, silent])
 def test_a_file_that_cannot_be_scored_is_a_failure_with_its_name(
     corpus: Path, damage: Callable[[Path], None]
 ) -> None:
@@ -112,8 +117,17 @@ def test_a_file_that_cannot_be_scored_is_a_failure_with_its_name(
     report = haspi_report(**folders(corpus), audiogram=N4, jobs=1, measures=("stoi",))
     (failure,) = report.failures.itertuples()
     assert (failure.name, failure.condition) == ("p2/c", "after")
-    assert "after/p2/c.wav" in failure.failure and "\n" not in failure.failure
+    assert "after" in failure.failure and "\n" not in failure.failure
     assert report.table.stoi.notna().sum() == 3
+
+
+def test_lengths_that_differ_by_little_are_cut_to_the_shorter(corpus: Path) -> None:
+    path = corpus / "after/p2/c.wav"
+    write_audio(path, first_channel(path).float()[None, :-200], 22050)
+    with pytest.warns(UserWarning, match="both are cut"):
+        report = haspi_report(**folders(corpus), audiogram=N4, jobs=1, measures=("haspi", "stoi"))
+    assert report.failures.empty
+    assert report.table.seconds.tolist() == pytest.approx([0.8, 0.8, 0.8, 0.8 - 200 / 22050])
 
 
 def write_manifest(corpus: Path, text: str) -> Path:
@@ -122,31 +136,31 @@ def write_manifest(corpus: Path, text: str) -> Path:
     return path
 
 
-MANIFEST = """listener,ear,condition,clean,processed,snr,audiogram,spl
-L1,left,unaided,A,before/a.b.wav,5,N3,65
-L1,left,aided,A,after/a.b.wav,5,N3,65
-L2,right,unaided,C,before/p2/c.wav,0,S2,60
-L2,right,aided,C,after/p2/c.wav,0,S2,60
-L2,right,loud,C,gone.wav,0,S2,60
+MANIFEST = """listener,ear,condition,clean,processed,snr,audiogram
+L1,left,unaided,A,before/a.b.wav,5,N3
+L1,left,aided,A,after/a.b.wav,5,N3
+L2,right,unaided,C,before/p2/c.wav,0,S2
+L2,right,aided,C,after/p2/c.wav,0,S2
+L2,right,loud,C,gone.wav,0,S2
 """
 
 
 def test_a_manifest_names_ears_levels_and_conditions(corpus: Path) -> None:
     path = write_manifest(corpus, MANIFEST)
-    report = haspi_report(manifest=path, measures=("stoi",), baseline="aided", jobs=1)
+    report = haspi_report(manifest=path, measures=("stoi",), baseline="aided", spl=65.0, jobs=1)
     assert report.names == ["aided", "unaided", "loud"]
     assert [(c.before, c.after, c.overall.n) for c in report.comparisons] == [
         ("aided", "unaided", 2)
     ]
     items = report.table.drop_duplicates("item")
     assert list(items.name) == ["L1 left clean/a.b 5 dB", "L2 right clean/p2/c 0 dB"]
-    assert items.clean_level.tolist() == pytest.approx([65.0, 60.0])
+    assert items.clean_level.tolist() == pytest.approx([65.0, 65.0])
     assert items.audiogram.tolist() == [
         list(Audiogram.standard(name).thresholds) for name in ("N3", "S2")
     ]
     reasons = dict(zip(report.failures.name, report.failures.failure, strict=True))
-    assert "no file is named" in reasons["L1 left clean/a.b 5 dB"]
-    assert "gone.wav: no such file" in reasons["L2 right clean/p2/c 0 dB"]
+    assert "is recorded under loud" in reasons["L1 left clean/a.b 5 dB"]
+    assert "gone.wav" in reasons["L2 right clean/p2/c 0 dB"]
 
 
 def test_the_better_ear_counts(corpus: Path) -> None:
@@ -164,19 +178,21 @@ def test_the_better_ear_counts(corpus: Path) -> None:
         best = of_condition.loc[of_condition.haspi.idxmax()]
         assert (row.haspi, row.level) == (best.haspi, best.level)
     assert set(better.table.ear) == {"right"}, "the better ear under the last condition"
+    assert better.groups["ears"].table.equals(ears.table)
 
 
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"N3,65\n": "N9,65\n"}, "line 2: .*N9"),
+        ({"5,N3\n": "5,N9\n"}, "line 2: .*N9"),
         ({"A,before": "../A,before"}, "line 2: .*not a path below"),
         ({"L1,left,aided": "L1,left,unaided"}, "line 3: a second row of L1 left"),
-        ({"N3,65\nL2": "N4,65\nL2"}, "line 3: audiogram or level differ"),
-        ({",5,N3": ",x,N3"}, "line 2: snr is 'x'"),
+        ({"N3\nL2": "N4\nL2"}, "line 3: the audiogram differs"),
+        ({",5,N3": ",x,N3"}, "line 2: the SNR is 'x'"),
         ({"L1,left": "L1,top"}, "line 2: the ear is 'top'"),
-        ({"condition,": "given,"}, "columns condition"),
-        ({",audiogram,": ",ear_of,"}, "line 2: no audiogram of listener 'L1'"),
+        ({"condition,": "given,"}, "needs rows with the columns condition"),
+        ({",snr,": ",spl,"}, "the level as an option"),
+        ({",audiogram\n": ",ear_of\n"}, "line 2: no audiogram of listener 'L1'"),
     ],
 )
 def test_a_wrong_row_is_named_by_its_line(

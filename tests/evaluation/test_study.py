@@ -76,10 +76,10 @@ def test_one_row_per_item_and_condition(items: list[Item]) -> None:
     assert list(table.columns) == columns
     assert list(table.condition) == ["times 1", "times 2"] * 3
     assert table.peak.tolist() == pytest.approx([0.2, 0.4, 0.4, 0.8, 0.6, 1.2])
-    reasons = ["", "", "sign: negative", "sign: negative", "", ""]
+    reasons = ["", "", "negative", "negative", "", ""]
     assert table.failure.fillna("").tolist() == reasons
     assert calls.count("reference") == 3, "a reference is computed once per item"
-    assert seen == [(0, 6), (2, 6), (4, 6), (6, 6)]
+    assert seen == [(0, 12), (4, 12), (8, 12), (12, 12)]
 
 
 def test_an_error_is_the_reason_of_its_output_alone(items: list[Item]) -> None:

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from hlsim.report.spectrograms import RANGE_DB, composite, panels, pictures
+from hlsim.report.spectrograms import RANGE_DB, panels, pictures
 
 pytest.importorskip("matplotlib")
 
@@ -14,7 +14,7 @@ def test_a_tone_has_its_level_and_a_difference_is_in_db() -> None:
     times = torch.arange(8000) / 16000
     tone = math.sqrt(2.0) * 10 ** ((80 - 94) / 20) * torch.sin(2 * math.pi * 1000 * times)
     found = panels({"one": tone, "other": 2 * tone}, 16000, {"less": ("other", "one")})
-    assert [*found] == ["one", "other", "less"]
+    assert list(found) == ["one", "other", "less"]
     one, other, less = (draw.keywords for draw in found.values())
     assert float(one["image"][20].median()) == pytest.approx(80.0, abs=0.1)  # bins of 50 Hz
     assert one["scale"] == other["scale"]
@@ -26,11 +26,10 @@ def test_a_tone_has_its_level_and_a_difference_is_in_db() -> None:
     assert bool((difference.isfinite() == loud).all()) and not bool(loud.all())
 
 
-def test_a_picture_a_panel_and_one_of_all() -> None:
+def test_each_panel_is_a_picture() -> None:
     found = panels({"a$b": torch.randn(1600), "silent": torch.zeros(1600)}, 16000)
     assert [picture.alt for picture in pictures(found)] == [
         "Spectrogram: a$b",
         "Spectrogram: silent",
     ]
     assert all(b"<svg" in picture.data for picture in pictures(found))
-    assert composite(found).startswith(b"\x89PNG")
