@@ -25,7 +25,7 @@ import pandas as pd
 from scipy.optimize import minimize
 from scipy.special import betaln, digamma, expit, polygamma
 
-from hlsim.metrics.words import Curve, simulate
+from hlsim.metrics.words import Curve, simulate_changes
 
 START = (0.4, 3.2, 5.0, 0.5, -0.6, -1.0, -1.0)
 """Fixed coefficients, then logarithms of the dispersion and of the three deviations."""
@@ -144,7 +144,7 @@ def left_out(rows: pd.DataFrame, by: str, start: np.ndarray) -> dict[str, float]
                     pair = [
                         (aids[a].haspi.to_numpy(), aids[a]["mean"].iloc[0]) for a in (before, after)
                     ]
-                    drawn = simulate(curve, pair)
+                    drawn = simulate_changes(curve, pair)
                     low, high = np.quantile(drawn, [0.05, 0.95])
                     heard = (
                         aids[after].correctness.mean() - aids[before].correctness.mean()

@@ -1,12 +1,11 @@
-"""How close a simulator comes to the truth: errors of waveforms and bands, and scores of both that ought to agree."""
+"""Errors and scores that show how closely a simulator agrees with its teacher."""
 
 from __future__ import annotations
 
 import math
 import warnings
 from collections.abc import Callable, Iterable
-from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -17,161 +16,296 @@ from hlsim.dsp.resample import resample
 from hlsim.extras import require
 
 Signal = np.ndarray | Tensor
+"""Samples of one channel. Shape: (time,)."""
 
 _PESQ_RATE = 16000
-_BANDS = 1000.0 * 2.0 ** (
-    np.arange(-9, 9) / 3.0
-)  # centres in Hz, 125 to 6350: the last band ends at 7127
+
+_BAND_CENTRES_HZ = 1000.0 * 2.0 ** (np.arange(-9, 9) / 3.0)
+"""Centres of one-third-octave bands from 125 to 6350 Hz. The last band ends at 7127 Hz."""
+
 _BAND_RANGE_DB = 50.0
-_FLOOR = 1e-20  # of the truth's power: keeps an exact estimate at 200 dB SNR, which JSON can hold
+"""Level of a band below that of the loudest band at which the band is ignored."""
+
+_MIN_BAND_RATIO = 1e-12
+"""Smallest power of a band relative to the loudest band, -120 dB."""
+
+_MIN_ERROR_POWER = 1e-20
+"""Smallest relative power of an error, so that the SNR is finite, as JSON requires."""
 
 
 class Score(NamedTuple):
-    """A score, or None and the reason why there is none."""
+    """A score, or the reason why it does not exist.
+
+    Attributes:
+        value: score, or None.
+        reason: reason why there is no score, or None.
+
+    >>> Score(None, "output is silent").value is None
+    True
+    """
 
     value: float | None
     reason: str | None = None
 
 
-def snr_db(truth: Signal, estimate: Signal) -> float:
-    """Power of the truth over that of the error, in dB; at most 200.
+def snr_db(reference: Signal, estimate: Signal) -> float:
+    """Compute the power of the reference relative to that of the error in dB, at most 200 dB.
 
-    Shape: (time,) and (time,); ValueError for others, a sample that is not finite, or a silent truth.
+    Args:
+        reference: expected samples. Shape: (time,).
+        estimate: samples to compare. Shape: (time,).
+
+    Raises:
+        ValueError: the shapes differ, a sample is not finite, or the reference is silent.
+
+    >>> round(snr_db(np.array([1.0, -1.0]), np.array([1.1, -1.1])))
+    20
     """
-    return -10.0 * math.log10(max(raw_mse(truth, estimate), _FLOOR))
+    return -10.0 * math.log10(max(raw_mse(reference, estimate), _MIN_ERROR_POWER))
 
 
-def raw_mse(truth: Signal, estimate: Signal) -> float:
-    """Mean squared error of the waveforms, both scaled so that the truth has unit power: 10 ** (-snr_db / 10).
+def raw_mse(reference: Signal, estimate: Signal) -> float:
+    """Compute the mean squared error of a waveform relative to the power of the reference.
 
-    Without that scale the figure would grow with the level, and quiet items would not count. The paper's RAW MSE says
-    nothing about its scale.
+    Without this normalisation, the error would be proportional to the power of the signals, so that
+    soft items would not count. The Neuro-MSBG paper does not state how it scales its RAW MSE.
 
-    Shape: (time,) and (time,). Raises ValueError as ``snr_db``.
+    Args:
+        reference: expected samples. Shape: (time,).
+        estimate: samples to compare. Shape: (time,).
+
+    Raises:
+        ValueError: the shapes differ, a sample is not finite, or the reference is silent.
+
+    >>> round(raw_mse(np.array([1.0, -1.0]), np.array([1.1, -1.1])), 6)
+    0.01
     """
-    true, found = _pair(truth, estimate)
-    return float(np.mean((true - found) ** 2) / np.mean(true**2))
+    x, y = _check_signals(reference, estimate)
+    return float(np.mean((x - y) ** 2) / np.mean(x**2))
 
 
-def third_octave_error_db(truth: Signal, estimate: Signal, sample_rate: int) -> float:
-    """Median absolute difference of the levels in one-third-octave bands, 125 Hz to 7 kHz, in dB.
+def third_octave_error_db(reference: Signal, estimate: Signal, sample_rate: int) -> float:
+    """Compute the median absolute difference of band levels in dB.
 
-    Of the whole signal's spectrum. Bands more than 50 dB below the truth's loudest are left out; a band that the
-    estimate lacks counts as 120 dB below that loudest one.
+    The bands are one-third octaves from 125 Hz to 7 kHz of the spectrum of the whole signal. Bands
+    more than 50 dB below the loudest band of the reference are ignored. Levels of the estimate
+    count as at most 120 dB below this band.
 
-    Shape: (time,) and (time,). Raises ValueError as ``snr_db``, and for a rate below 16000 Hz.
+    Args:
+        reference: expected samples. Shape: (time,).
+        estimate: samples to compare. Shape: (time,).
+        sample_rate: sample rate in Hz, at least 16000.
+
+    Raises:
+        ValueError: the shapes differ, a sample is not finite, the reference is silent or has no
+            power in the bands, or the sample rate is too low.
+
+    >>> noise = np.random.default_rng(0).standard_normal(16000)
+    >>> round(third_octave_error_db(noise, 10.0 * noise, 16000))
+    20
     """
-    true, found = _pair(truth, estimate)
+    x, y = _check_signals(reference, estimate)
     if sample_rate < 2 * 8000:
-        raise ValueError(f"sample rate {sample_rate} Hz; bands up to 7 kHz need 16000 or more")
-    points = max(len(true), sample_rate // 4)  # 4 Hz apart or less: the lowest band is 29 Hz wide
-    frequencies = np.fft.rfftfreq(points, 1.0 / sample_rate)
-    edges = np.searchsorted(
-        frequencies, np.append(_BANDS * 2.0 ** (-1 / 6), _BANDS[-1] * 2.0 ** (1 / 6))
-    )
-    powers = []
-    for signal in (true, found):
-        total = np.append(0.0, np.cumsum(np.abs(np.fft.rfft(signal, points)) ** 2))
-        powers.append(np.diff(total[edges]))
-    loudest = powers[0].max()
+        raise ValueError(
+            f"expected a sample rate of 16000 Hz or more for bands up to 7 kHz, got {sample_rate}"
+        )
+    # The frequencies are at most 4 Hz apart, because the lowest band is 29 Hz wide.
+    points = max(len(x), sample_rate // 4)
+    reference_powers = _band_powers(x, points, sample_rate)
+    estimate_powers = _band_powers(y, points, sample_rate)
+    loudest = reference_powers.max()
     if loudest <= 0.0:
-        raise ValueError("truth holds nothing between 125 Hz and 7 kHz")
-    levels = [10.0 * np.log10(np.maximum(power / loudest, 1e-12)) for power in powers]
-    used = levels[0] >= -_BAND_RANGE_DB
-    return float(np.median(np.abs(levels[0] - levels[1])[used]))
+        raise ValueError("expected a reference with power between 125 Hz and 7 kHz, got none")
+    reference_levels = 10.0 * np.log10(np.maximum(reference_powers / loudest, _MIN_BAND_RATIO))
+    estimate_levels = 10.0 * np.log10(np.maximum(estimate_powers / loudest, _MIN_BAND_RATIO))
+    differences = np.abs(reference_levels - estimate_levels)
+    is_loud = reference_levels >= -_BAND_RANGE_DB
+    return float(np.median(differences[is_loud]))
 
 
-def stoi(clean: Signal, heard: Signal, sample_rate: int) -> Score:
-    """STOI (Taal 2011) by pystoi, or the reason why there is none: silence, or less than 0.4 s of speech.
+def _band_powers(signal: np.ndarray, points: int, sample_rate: int) -> np.ndarray:
+    """Compute the power in each one-third-octave band. Shape: (time,) -> (bands,)."""
+    frequencies = np.fft.rfftfreq(points, 1.0 / sample_rate)
+    lower_edges = _BAND_CENTRES_HZ * 2.0 ** (-1 / 6)
+    last_edge = _BAND_CENTRES_HZ[-1] * 2.0 ** (1 / 6)
+    edges = np.searchsorted(frequencies, np.append(lower_edges, last_edge))
+    powers = np.abs(np.fft.rfft(signal, points)) ** 2
+    cumulative_power = np.append(0.0, np.cumsum(powers))
+    return np.diff(cumulative_power[edges])
 
-    Shape: (time,) and (time,); ValueError for others. MissingExtraError without pystoi.
+
+def stoi(clean: Signal, output: Signal, sample_rate: int) -> Score:
+    """Compute the short-time objective intelligibility with pystoi.
+
+    Silence and less than 0.4 s of speech have no score.
+
+    Source: Taal, Hendriks, Heusdens and Jensen (2011).
+
+    Args:
+        clean: clean speech. Shape: (time,).
+        output: speech to score. Shape: (time,).
+        sample_rate: sample rate in Hz.
+
+    Raises:
+        ValueError: the shapes differ.
+        MissingExtraError: pystoi is not installed.
+
+    >>> noise = np.random.default_rng(0).standard_normal(16000)
+    >>> round(stoi(noise, noise, 16000).value)
+    1
     """
-    run = require("pystoi", "eval").stoi
-    return _score(lambda a, b: run(a, b, sample_rate), clean, heard)
+    pystoi = require("pystoi", "eval")
+    return _score(lambda x, y: pystoi.stoi(x, y, sample_rate), clean, output)
 
 
-def pesq_wb(clean: Signal, heard: Signal, sample_rate: int) -> Score:
-    """Wide-band PESQ (ITU-T P.862.2) by pesq, at 16 kHz, to which other rates are resampled; or why there is none.
+def pesq_wb(clean: Signal, output: Signal, sample_rate: int) -> Score:
+    """Compute wide-band PESQ with pesq at 16 kHz, to which other rates are resampled.
 
-    The library (pesq 0.0.4) crashed on 90 s of noise in 90 bursts: score minutes of speech with two processes or more,
-    which outlive it.
+    Silence and signals without detectable speech have no score. Version 0.0.4 of pesq crashed on 90
+    s of noise in 90 bursts. If you score minutes of speech, use two processes or more, which
+    survive such a crash.
 
-    Shape: (time,) and (time,). Raises as ``stoi``, for pesq.
+    Source: ITU-T P.862.2.
+
+    Args:
+        clean: clean speech. Shape: (time,).
+        output: speech to score. Shape: (time,).
+        sample_rate: sample rate in Hz.
+
+    Raises:
+        ValueError: the shapes differ.
+        MissingExtraError: pesq is not installed.
+
+    >>> pesq_wb(np.zeros(16000), np.ones(16000), 16000).reason
+    'clean is silent'
     """
-    run = require("pesq", "pesq").pesq
+    pesq = require("pesq", "pesq")
 
-    def at_16k(*signals: np.ndarray) -> float:
-        pair = [resample(torch.from_numpy(x), sample_rate, _PESQ_RATE).numpy() for x in signals]
-        return float(run(_PESQ_RATE, *pair, "wb"))
+    def score_at_16_khz(x: np.ndarray, y: np.ndarray) -> float:
+        x_at_16_khz = resample(torch.from_numpy(x), sample_rate, _PESQ_RATE).numpy()
+        y_at_16_khz = resample(torch.from_numpy(y), sample_rate, _PESQ_RATE).numpy()
+        return float(pesq.pesq(_PESQ_RATE, x_at_16_khz, y_at_16_khz, "wb"))
 
-    return _score(at_16k, clean, heard)
-
-
-def _correlation(
-    measure: Callable[..., Any], true: Iterable[float], simulated: Iterable[float]
-) -> float | None:
-    a, b = _values(true, simulated)
-    if len(a) < 2 or np.ptp(a) == 0.0 or np.ptp(b) == 0.0:
-        return None
-    return float(measure(a, b)[0])
+    return _score(score_at_16_khz, clean, output)
 
 
-linear_correlation = partial(_correlation, stats.pearsonr)
-"""Pearson's correlation (LCC); None for fewer than two pairs or where either side does not vary."""
+def linear_correlation(expected_scores: Iterable[float], scores: Iterable[float]) -> float | None:
+    """Compute Pearson's correlation of scores (LCC).
 
-rank_correlation = partial(_correlation, stats.spearmanr)
-"""Spearman's correlation (SRCC), ties at their mean rank; None as ``linear_correlation``."""
+    Returns: correlation, or None for fewer than two scores or scores that are all equal.
 
+    Raises:
+        ValueError: the numbers of scores differ, or a score is not finite.
 
-def mean_squared_error(true: Iterable[float], simulated: Iterable[float]) -> float | None:
-    """Mean squared difference of the scores; None without pairs."""
-    a, b = _values(true, simulated)
-    return float(np.mean((a - b) ** 2)) if len(a) else None
-
-
-def _values(true: Iterable[float], simulated: Iterable[float]) -> tuple[np.ndarray, np.ndarray]:
-    a, b = np.array(list(true), dtype=np.float64), np.array(list(simulated), dtype=np.float64)
-    if a.shape != b.shape or a.ndim != 1:
-        raise ValueError(f"{a.size} true scores and {b.size} simulated; allowed: equal counts")
-    if not (np.isfinite(a).all() and np.isfinite(b).all()):
-        raise ValueError("scores hold NaN or infinity; allowed: finite numbers")
-    return a, b
+    >>> round(linear_correlation([0.1, 0.2, 0.4], [0.2, 0.4, 0.8]), 6)
+    1.0
+    """
+    x, y = _check_scores(expected_scores, scores)
+    return float(stats.pearsonr(x, y)[0]) if _vary(x, y) else None
 
 
-def _score(run: Callable[[np.ndarray, np.ndarray], float], clean: Signal, heard: Signal) -> Score:
-    pair = _equal(clean, heard)
-    for name, signal in zip(("clean", "heard"), pair, strict=True):
-        if not np.isfinite(signal).all():
-            return Score(None, f"{name} holds samples that are NaN or infinite")
-        if not signal.any():
+def rank_correlation(expected_scores: Iterable[float], scores: Iterable[float]) -> float | None:
+    """Compute Spearman's rank correlation of scores (SRCC), with mean ranks for equal scores.
+
+    Returns: correlation, or None for fewer than two scores or scores that are all equal.
+
+    Raises:
+        ValueError: the numbers of scores differ, or a score is not finite.
+
+    >>> round(rank_correlation([0.1, 0.2, 0.4], [0.1, 0.3, 0.9]), 6)
+    1.0
+    """
+    x, y = _check_scores(expected_scores, scores)
+    return float(stats.spearmanr(x, y)[0]) if _vary(x, y) else None
+
+
+def mean_squared_error(expected_scores: Iterable[float], scores: Iterable[float]) -> float | None:
+    """Compute the mean squared difference of scores, or None if there are none.
+
+    Raises:
+        ValueError: the numbers of scores differ, or a score is not finite.
+
+    >>> mean_squared_error([0.5], [0.75])
+    0.0625
+    """
+    x, y = _check_scores(expected_scores, scores)
+    return float(np.mean((x - y) ** 2)) if len(x) else None
+
+
+def _vary(x: np.ndarray, y: np.ndarray) -> bool:
+    """Return whether there are two scores, and neither side is constant."""
+    return len(x) >= 2 and np.ptp(x) != 0.0 and np.ptp(y) != 0.0
+
+
+def _check_scores(
+    expected_scores: Iterable[float], scores: Iterable[float]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Convert scores to arrays of equal length.
+
+    Raises:
+        ValueError: the numbers of scores differ, or a score is not finite.
+    """
+    x = np.array(list(expected_scores), dtype=np.float64)
+    y = np.array(list(scores), dtype=np.float64)
+    if x.shape != y.shape or x.ndim != 1:
+        raise ValueError(f"expected as many scores on both sides, got {x.size} and {y.size}")
+    if not (np.isfinite(x).all() and np.isfinite(y).all()):
+        raise ValueError("expected finite scores, got NaN or infinity")
+    return x, y
+
+
+def _score(
+    compute: Callable[[np.ndarray, np.ndarray], float], clean: Signal, output: Signal
+) -> Score:
+    """Compute a score, and turn any error of the measure into the reason why there is none."""
+    arrays = _as_equal_length(clean, output)
+    for name, samples in zip(("clean", "output"), arrays, strict=True):
+        if not np.isfinite(samples).all():
+            return Score(None, f"{name} has samples that are NaN or infinite")
+        if not samples.any():
             return Score(None, f"{name} is silent")
     try:
         with warnings.catch_warnings():
-            # pystoi's word, and its score is 1e-5
+            # pystoi warns about too little speech, and returns 1e-5.
             warnings.filterwarnings("error", message="Not enough STFT frames")
-            value = float(run(*pair))
-    except (
-        Exception
-    ) as error:  # whatever a third party's measure raises is that item's reason, no more
-        text = error.args[0] if error.args else error
-        return Score(None, text.decode() if isinstance(text, bytes) else str(text))
+            value = float(compute(*arrays))
+    except Exception as error:  # because an external measure may raise anything
+        message = error.args[0] if error.args else error
+        return Score(None, message.decode() if isinstance(message, bytes) else str(message))
     return Score(value) if math.isfinite(value) else Score(None, f"the score is {value}")
 
 
-def _equal(*signals: Signal) -> tuple[np.ndarray, ...]:
-    arrays = (x.detach().cpu().numpy() if isinstance(x, Tensor) else np.asarray(x) for x in signals)
-    a, b = (x.astype(np.float64) for x in arrays)
-    if a.ndim != 1 or a.shape != b.shape or not len(a):
+def _as_equal_length(first: Signal, second: Signal) -> tuple[np.ndarray, np.ndarray]:
+    """Convert two signals to arrays of float64.
+
+    Raises:
+        ValueError: the signals are not of one shape (time,).
+    """
+    x = _as_array(first)
+    y = _as_array(second)
+    if x.ndim != 1 or x.shape != y.shape or not len(x):
         raise ValueError(
-            f"signals have shapes {a.shape} and {b.shape}; allowed: (time,) twice, equally long"
+            f"expected two signals of one shape (time,), got shapes {x.shape} and {y.shape}"
         )
-    return a, b
+    return x, y
 
 
-def _pair(truth: Signal, estimate: Signal) -> tuple[np.ndarray, ...]:
-    pair = _equal(truth, estimate)
-    if not np.isfinite(pair).all():
-        raise ValueError("truth or estimate holds samples that are NaN or infinite")
-    if not pair[0].any():
-        raise ValueError("truth is silent; an error relative to it is not defined")
-    return pair
+def _as_array(signal: Signal) -> np.ndarray:
+    array = signal.detach().cpu().numpy() if isinstance(signal, Tensor) else np.asarray(signal)
+    return array.astype(np.float64)
+
+
+def _check_signals(reference: Signal, estimate: Signal) -> tuple[np.ndarray, np.ndarray]:
+    """Convert two signals whose relative error is defined to arrays.
+
+    Raises:
+        ValueError: the shapes differ, a sample is not finite, or the reference is silent.
+    """
+    x, y = _as_equal_length(reference, estimate)
+    if not (np.isfinite(x).all() and np.isfinite(y).all()):
+        raise ValueError("expected finite samples, got NaN or infinity")
+    if not x.any():
+        raise ValueError(
+            "expected a reference that is not silent, because errors are relative to it"
+        )
+    return x, y

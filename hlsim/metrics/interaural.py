@@ -1,4 +1,4 @@
-"""What tells where a sound comes from: differences of level and of time between two ears, by octaves."""
+"""Differences of level and time between two ears, the cues by which listeners localise sounds."""
 
 from __future__ import annotations
 
@@ -17,20 +17,29 @@ from hlsim.dsp.stft import STFT
 from hlsim.torchtools import constant_like
 
 OCTAVES = (250.0, 500.0, 1000.0, 2000.0, 4000.0)
-"""Centres in Hz."""
+"""Centre frequencies of the octaves in Hz."""
 
-_LONGEST = 1000  # microseconds that a delay is looked for; a head makes some 700
-_TINY = 1e-12  # power, -26 dB SPL, that keeps the gradient near silence finite
-_DEPTH = 1e-4  # of the loudest octave's power, where an octave counts half
+MAX_DELAY_MICROSECONDS = 1000
+"""Largest delay between the ears that is considered. A head causes about 700 microseconds."""
+
+POWER_FLOOR = 1e-12
+"""Power in Pa^2, -26 dB SPL, that is added to powers, so that the gradient of silence is finite."""
+
+HALF_WEIGHT_RATIO = 1e-4
+"""Power of an octave relative to the loudest octave at which the octave has half its weight."""
 
 
 class Interaural(NamedTuple):
-    """By ``OCTAVES``, (..., 5) each; NaN where an ear is silent.
+    """Interaural differences in each octave, NaN where an ear is silent. Shape: (..., 5) each.
 
     Attributes:
-        level: dB by which the left ear's is higher.
-        time: microseconds by which the left ear is first, -1000 to 1000.
-        coherence: 0 to 1, of the ears at that delay: what is said of time holds where it is near 1.
+        level: level of the left ear minus that of the right ear in dB.
+        time: time in microseconds by which the left ear leads, from -1000 to 1000.
+        coherence: correlation of the ears at this time difference, from 0 to 1. The time difference
+            is meaningful where it is close to 1.
+
+    >>> Interaural(torch.zeros(5), torch.zeros(5), torch.ones(5)).coherence
+    tensor([1., 1., 1., 1., 1.])
     """
 
     level: Tensor
@@ -39,79 +48,134 @@ class Interaural(NamedTuple):
 
 
 def interaural(waveform: Tensor, *, sample_rate: int = 16000) -> Interaural:
-    """Differences between the ears, over all of a signal; the delay is that with the highest cross-correlation.
+    """Compute the differences of level and time between two ears.
 
-    Above 1.5 kHz nobody hears the delay of the waveform, but that of its envelope.
+    They refer to the whole signal. The time difference is the delay with the largest
+    cross-correlation of the waveforms. Above 1.5 kHz, listeners perceive delays of the envelope
+    instead.
 
-    Shape: (..., 2, time), left and right.
+    Args:
+        waveform: waveforms of the left and the right ear. Shape: (..., 2, time).
+        sample_rate: sample rate in Hz.
 
     Raises:
-        ValueError: another shape, or a rate out of range.
+        ValueError: the waveform has another shape, or the rate is out of range.
+
+    >>> noise = torch.randn(16000)
+    >>> interaural(torch.stack((10.0 * noise, noise))).level.round()
+    tensor([20., 20., 20., 20., 20.], dtype=torch.float64)
     """
     check_rate(sample_rate)
     check_two_channels(check_waveform(waveform))
     left, right, cross, octaves = _spectra(waveform.detach().double(), sample_rate)
-    delays = torch.arange(-_LONGEST, _LONGEST + 1, device=waveform.device)
+    delays = torch.arange(
+        -MAX_DELAY_MICROSECONDS, MAX_DELAY_MICROSECONDS + 1, device=waveform.device
+    )
     hz = torch.linspace(0.0, sample_rate / 2.0, len(octaves), dtype=left.dtype, device=left.device)
-    turn = 2e-6 * math.pi * hz.unsqueeze(-1) * delays
-    by_octave = octaves.mT * cross.unsqueeze(-2)
-    correlation, place = (by_octave.real @ turn.cos() + by_octave.imag @ turn.sin()).max(-1)
-    left, right = left @ octaves, right @ octaves
-    coherence = correlation / (left * right).sqrt()
-    values = (10.0 * torch.log10(left / right), delays[place].to(left), coherence)
-    return Interaural(*(torch.where(coherence.isfinite(), one, torch.nan) for one in values))
+    phase = 2e-6 * math.pi * hz.unsqueeze(-1) * delays
+    cross_of_octaves = octaves.mT * cross.unsqueeze(-2)
+    correlations = cross_of_octaves.real @ phase.cos() + cross_of_octaves.imag @ phase.sin()
+    correlation, index = correlations.max(-1)
+    left_power = left @ octaves
+    right_power = right @ octaves
+    coherence = correlation / (left_power * right_power).sqrt()
+    is_defined = coherence.isfinite()
+    return Interaural(
+        torch.where(is_defined, 10.0 * torch.log10(left_power / right_power), torch.nan),
+        torch.where(is_defined, delays[index].to(left), torch.nan),
+        torch.where(is_defined, coherence, torch.nan),
+    )
 
 
 def interaural_change(before: Tensor, after: Tensor, *, sample_rate: int = 16000) -> Interaural:
-    """What an aid makes of ``interaural``: its levels and times after it, less those before, and the coherence after.
+    """Compute the change of interaural differences by an aid.
 
-    Shape and errors: as ``interaural``, twice.
+    Args:
+        before: input of the aid for the left and the right ear. Shape: (..., 2, time).
+        after: output of the aid for the left and the right ear. Shape: (..., 2, time).
+        sample_rate: sample rate in Hz.
+
+    Returns: changes of the differences of level and time, and the coherence of the output.
+
+    Raises:
+        ValueError: a waveform has another shape, or the rate is out of range.
+
+    >>> noise = torch.randn(2, 16000)
+    >>> interaural_change(noise, noise).level
+    tensor([0., 0., 0., 0., 0.], dtype=torch.float64)
     """
-    first, last = (interaural(one, sample_rate=sample_rate) for one in (before, after))
-    return Interaural(last.level - first.level, last.time - first.time, last.coherence)
+    of_input = interaural(before, sample_rate=sample_rate)
+    of_output = interaural(after, sample_rate=sample_rate)
+    return Interaural(
+        of_output.level - of_input.level, of_output.time - of_input.time, of_output.coherence
+    )
 
 
 def interaural_loss(processed: Tensor, clean: Tensor, sample_rate: int) -> Tensor:
-    """How far the differences between the ears are from the clean signal's; a gain or delay of both ears changes nothing.
+    """Compute the error of interaural differences, which is invariant to equal gains and delays.
 
-    Mean over the octaves that the clean signal has of the error of the level difference, 1 for 10 dB, and of 1 less the
-    cosine of the error of the phase difference.
+    The loss is a weighted mean over octaves of the error of the level difference in bels, and 1
+    minus the cosine of the error of the phase difference. Octaves in which the clean signal is soft
+    have less weight.
 
-    Shape: (..., 2, time) twice, in pascals -> (...).
+    Shape: (..., 2, time), (..., 2, time) -> (...).
+
+    Args:
+        processed: output of an aid for the left and the right ear in Pa.
+        clean: clean speech at the left and the right ear in Pa.
+        sample_rate: sample rate in Hz.
+
+    >>> noise = torch.randn(2, 16000)
+    >>> bool(interaural_loss(2.0 * noise, noise, 16000) < 1e-3)
+    True
     """
     left, right, cross, octaves = _spectra(processed, sample_rate)
-    true_left, true_right, true_cross, _ = _spectra(clean, sample_rate)
-    levels = [torch.log10(one @ octaves + _TINY) for one in (left, right, true_left, true_right)]
-    error = (levels[0] - levels[1] - levels[2] + levels[3]).abs()
-    # as deep as the floor of the powers, or the phase of an ear that is mute would have a gradient of a million
-    phase = cross / (power(cross) + _TINY * (left + right + _TINY)).sqrt()
-    size = (power(true_cross) + _TINY**2).sqrt() @ octaves
-    powers = (true_left + true_right).detach() @ octaves
-    weights = powers / (powers + _DEPTH * powers.amax(-1, keepdim=True) + _TINY)
-    cosine = (phase * true_cross.conj()).real @ octaves / size
-    return (weights * (error + 1.0 - cosine)).sum(-1) / (weights.sum(-1) + _TINY)
+    clean_left, clean_right, clean_cross, _ = _spectra(clean, sample_rate)
+    left_level = torch.log10(left @ octaves + POWER_FLOOR)
+    right_level = torch.log10(right @ octaves + POWER_FLOOR)
+    clean_left_level = torch.log10(clean_left @ octaves + POWER_FLOOR)
+    clean_right_level = torch.log10(clean_right @ octaves + POWER_FLOOR)
+    level_error = (left_level - right_level - clean_left_level + clean_right_level).abs()
+    # The added power is proportional to those of the ears. With a constant instead, the phase of an
+    # ear that is nearly silent would have a gradient of a million.
+    cross_floor = POWER_FLOOR * (left + right + POWER_FLOOR)
+    phase = cross / (power(cross) + cross_floor).sqrt()
+    magnitude = (power(clean_cross) + POWER_FLOOR**2).sqrt() @ octaves
+    cosine = (phase * clean_cross.conj()).real @ octaves / magnitude
+    clean_power = (clean_left + clean_right).detach() @ octaves
+    power_of_half_weight = HALF_WEIGHT_RATIO * clean_power.amax(-1, keepdim=True)
+    weights = clean_power / (clean_power + power_of_half_weight + POWER_FLOOR)
+    error = level_error + 1.0 - cosine
+    return (weights * error).sum(-1) / (weights.sum(-1) + POWER_FLOOR)
 
 
 def _spectra(waveform: Tensor, sample_rate: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Power of the left and of the right ear, the cross-spectrum, and which frequencies each octave has.
+    """Compute the mean power and cross spectra of two ears.
 
-    Shape: (..., 2, time) -> (..., frequencies) three times, (frequencies, 5).
+    Shape: (..., 2, time) -> (..., frequencies), (..., frequencies), complex (..., frequencies),
+        (frequencies, 5).
+
+    Returns: powers of the left and of the right ear, the cross spectrum, and the frequencies of
+        each octave as 0 or 1.
     """
     hop = round(0.016 * sample_rate)
     stft = STFT(2 * hop, 2 * hop, hop)
-    spectra = (
-        stft.analyse(waveform.reshape(-1, waveform.shape[-1]))
-        * (2.0 / (stft.fft * stft.window * 0.375)) ** 0.5
-    )
+    spectra = stft.analyse(waveform.reshape(-1, waveform.shape[-1]))
+    mean_square_of_window = 0.375
+    spectra = spectra * (2.0 / (stft.fft * stft.window * mean_square_of_window)) ** 0.5
     left, right = spectra.reshape(*waveform.shape[:-1], *spectra.shape[-2:]).unbind(-3)
-    means = [one.mean(-2) for one in (power(left), power(right), left * right.conj())]
-    return means[0], means[1], means[2], constant_like(means[0], _octaves, stft.fft, sample_rate)
+    left_power = power(left).mean(-2)
+    right_power = power(right).mean(-2)
+    cross = (left * right.conj()).mean(-2)
+    return left_power, right_power, cross, constant_like(cross, _octaves, stft.fft, sample_rate)
 
 
 def _octaves(points: int, sample_rate: int) -> NDArray[np.float64]:
-    """1 where a frequency of an FFT lies in an octave. Returns (points / 2 + 1, 5)."""
-    octaves = np.log2(
-        np.maximum(np.arange(points // 2 + 1) * sample_rate / points, 1.0)[:, None]
-        / np.array(OCTAVES)
-    )
-    return ((octaves >= -0.5) & (octaves < 0.5)).astype(np.float64)
+    """Assign the frequencies of a Fourier transform to octaves.
+
+    Returns: 1 where a frequency lies in an octave, otherwise 0. Shape: (points // 2 + 1, 5).
+    """
+    hz = np.arange(points // 2 + 1) * sample_rate / points
+    octaves_from_centre = np.log2(np.maximum(hz, 1.0)[:, None] / np.array(OCTAVES))
+    is_inside = (octaves_from_centre >= -0.5) & (octaves_from_centre < 0.5)
+    return is_inside.astype(np.float64)

@@ -42,6 +42,11 @@ def score_loss(
 
     Raises:
         ValueError: an item is shorter than 0.7 s.
+
+    >>> speech = torch.randn(1, 16000)
+    >>> loss = score_loss("haspi", speech, speech, torch.zeros(1, 8), [16000], 16000)
+    >>> bool(loss < 0.2)
+    True
     """
     finite = processed.detach().isfinite().all(-1)
     processed = torch.where(finite.unsqueeze(-1), processed, 0.0)
@@ -57,6 +62,7 @@ def _score_loss(
     ends: Sequence[int],
     **options: Any,
 ) -> Tensor:
+    """``score_loss`` of finite items. Shape: (items, time) twice, (items, 8) -> (items,)."""
     try:
         return 1.0 - score(processed, clean, ears, lengths=ends, **options)
     except UnscorableError:

@@ -1,13 +1,17 @@
-"""How many words a listener would understand, from HASPI: a fitted curve with its uncertainty.
+"""Prediction of the words that a listener understands from HASPI, with its uncertainty.
 
-Fitted on 2001 responses of 22 hearing-impaired listeners to sentences through ten hearing aids (Clarity prediction
-challenges 1 and 3; Barker et al. 2022, Interspeech, doi 10.21437/Interspeech.2022-10821) by ``examples/fit_words.py``,
-which says what the model is. What to know of it:
+The model was fitted by ``examples/fit_words.py``, which describes it, to 2001 responses of 22
+hearing-impaired listeners to sentences through ten hearing aids.
 
-- HASPI was that of the better ear, of standard ears of three severities, at pyclarity's default level; the sentences had
-  7 to 10 words, in noise, in British English. Of other speech and measured ears the curve is an extrapolation.
-- HASPI ranks aids, not people: over the means of the ten aids it correlates with the words understood at 0.97, over those
-  of the listeners at 0.33. How much a listener differs from another is in the interval.
+- HASPI was that of the better ear at pyclarity's default level, computed for standard ears of three
+  severities. The sentences were in British English, in noise, and 7 to 10 words long. For other
+  speech and for measured audiograms, the predictions are an extrapolation.
+- HASPI ranks aids, not people. Its correlation with the words understood is 0.97 for the means of
+  the ten aids, and 0.33 for the means of the listeners. The intervals include the differences
+  between listeners.
+
+Source: responses of the Clarity prediction challenges 1 and 3 (Barker et al. 2022, Interspeech, doi
+10.21437/Interspeech.2022-10821).
 """
 
 from __future__ import annotations
@@ -24,17 +28,25 @@ from numpy.typing import ArrayLike, NDArray
 Array = NDArray[np.float64]
 
 DRAWS = 4000
+"""Number of listeners that are simulated."""
 
 
 class Curve(NamedTuple):
-    """The logit of the share of words understood, as HASPI tells it, and what it leaves open.
+    """Parameters of the model of the words understood.
 
     Attributes:
-        coefficients: intercept, slope within an aid, slope between the means of aids; the intercept is at HASPI 0.5.
-        covariance: of the three.
-        dispersion: of the beta-binomial law of a sentence's hits; the less, the more sentences differ.
-        listener, listener_slope, aid: standard deviations of listeners, of their slopes and of aids.
-        words: in a sentence, on average.
+        coefficients: intercept of the logit at a HASPI of 0.5, slope within an aid, and slope
+            between the means of aids.
+        covariance: covariance of the three coefficients.
+        dispersion: parameter of the beta-binomial distribution of the words understood in a
+            sentence. The smaller it is, the more sentences differ.
+        listener: standard deviation of the intercepts of listeners.
+        listener_slope: standard deviation of the slopes of listeners.
+        aid: standard deviation of the intercepts of aids.
+        words: mean number of words per sentence.
+
+    >>> 7.0 < load_curve().words < 10.0
+    True
     """
 
     coefficients: Sequence[float]
@@ -47,7 +59,18 @@ class Curve(NamedTuple):
 
 
 class WordsChange(NamedTuple):
-    """Shares of the words that a new listener would understand, and their change with its interval."""
+    """Proportion of words that a new listener understands with two aids, and its change.
+
+    Attributes:
+        before: proportion with the first aid.
+        after: proportion with the second aid.
+        change: mean change over listeners.
+        low: lower end of the interval of the change.
+        high: upper end of the interval of the change.
+
+    >>> WordsChange(0.5, 0.7, 0.2, -0.1, 0.5).change
+    0.2
+    """
 
     before: float
     after: float
@@ -57,74 +80,122 @@ class WordsChange(NamedTuple):
 
 
 @cache
-def fitted() -> Curve:
-    """The curve that ships."""
-    return Curve(**json.loads((Path(__file__).parent / "words.json").read_text(encoding="utf-8")))
+def load_curve() -> Curve:
+    """Load the model that was fitted to the listeners' responses.
+
+    >>> len(load_curve().coefficients)
+    3
+    """
+    path = Path(__file__).parent / "words.json"
+    return Curve(**json.loads(path.read_text(encoding="utf-8")))
 
 
 def words_change(
     before: ArrayLike, after: ArrayLike, *, interval: float = 0.9, seed: int = 0
 ) -> WordsChange:
-    """What HASPI under two aids says of the words that one new listener understands of these sentences.
+    """Predict the words that a new listener understands with two aids from HASPI.
+
+    In a test with listeners that were left out of the fit, 88 to 92 of 100 changes lay in the
+    interval of 0.9.
 
     Args:
-        before, after: HASPI v2 of each sentence, 0 to 1, under each aid.
-        interval: share of listeners that is to lie between ``low`` and ``high``. It holds what listeners, aids and
-            sentences differ by, and the coefficients' uncertainty; left out, 88 to 92 of 100 listeners lie in 0.9.
-
-    Shape: (items,) each, of one length or not.
+        before: HASPI v2 of each sentence with the first aid, from 0 to 1. Shape: (items,).
+        after: HASPI v2 of each sentence with the second aid, from 0 to 1. Shape: (items,), whose
+            length may differ.
+        interval: proportion of listeners whose change lies between ``low`` and ``high``. The
+            interval contains the differences between listeners, aids and sentences, and the
+            uncertainty of the coefficients.
+        seed: seed of the simulated listeners.
 
     Raises:
-        ValueError: no scores, of more dimensions, or outside 0 to 1; an interval outside 0 to 1.
+        ValueError: there are no scores, they have another shape or are outside 0 to 1, or the
+            interval is outside 0 to 1.
+
+    >>> words_change([0.3] * 20, [0.8] * 20).change > 0.3
+    True
     """
-    pair = []
-    for name, given in (("before", before), ("after", after)):
-        scores = np.asarray(given, dtype=np.float64)
-        if scores.ndim != 1 or not len(scores) or not ((scores >= 0.0) & (scores <= 1.0)).all():
-            raise ValueError(
-                f"{name} holds what is no HASPI; allowed: (items,) from 0 to 1, at least one"
-            )
-        pair.append((scores, float(scores.mean())))
     if not 0.0 < interval < 1.0:
-        raise ValueError(f"interval is {interval!r}; allowed: above 0, below 1")
-    shares = simulate_shares(fitted(), pair, seed)
-    change = shares[1] - shares[0]
+        raise ValueError(f"expected interval between 0 and 1, got {interval!r}")
+    aids = [_check_scores("before", before), _check_scores("after", after)]
+    proportion_before, proportion_after = simulate_proportions(load_curve(), aids, seed)
+    change = proportion_after - proportion_before
     low, high = np.quantile(change, [0.5 - interval / 2.0, 0.5 + interval / 2.0])
-    first, second, mean = (float(share.mean()) for share in (*shares, change))
-    return WordsChange(first, second, mean, float(low), float(high))
+    return WordsChange(
+        before=float(proportion_before.mean()),
+        after=float(proportion_after.mean()),
+        change=float(change.mean()),
+        low=float(low),
+        high=float(high),
+    )
 
 
-def simulate(curve: Curve, pair: Sequence[tuple[Array, float]], seed: int = 0) -> Array:
-    """Differences of the second from the first of two aids, one a drawn listener. Shape: (draws,)."""
-    first, second = simulate_shares(curve, pair, seed)
-    return second - first
+def _check_scores(name: str, scores: ArrayLike) -> tuple[Array, float]:
+    """Return scores as an array, and their mean.
+
+    Raises:
+        ValueError: there are no scores, or they are not HASPI scores.
+    """
+    array = np.asarray(scores, dtype=np.float64)
+    if array.ndim != 1 or not len(array) or not ((array >= 0.0) & (array <= 1.0)).all():
+        raise ValueError(
+            f"expected {name} to be one or more HASPI scores from 0 to 1 of shape (items,), "
+            f"got {scores!r}"
+        )
+    return array, float(array.mean())
 
 
-def simulate_shares(
+def simulate_changes(curve: Curve, aids: Sequence[tuple[Array, float]], seed: int = 0) -> Array:
+    """Simulate the change of the proportion of words from the first to the second of two aids.
+
+    Args:
+        curve: parameters of the model.
+        aids: HASPI of each sentence, and mean HASPI, with each aid.
+        seed: seed of the simulated listeners.
+
+    Returns: change for each listener. Shape: (draws,).
+
+    >>> scores = np.full(20, 0.6)
+    >>> simulate_changes(load_curve(), [(scores, 0.6), (scores, 0.6)]).shape
+    (4000,)
+    """
+    before, after = simulate_proportions(curve, aids, seed)
+    return after - before
+
+
+def simulate_proportions(
     curve: Curve, aids: Sequence[tuple[Array, float]], seed: int = 0
 ) -> list[Array]:
-    """Shares of words that drawn listeners understand with each aid, of which HASPI is given by sentence and on average.
+    """Simulate the proportion of words that listeners understand with each aid.
 
-    Shape: ((sentences,), ()) an aid -> (draws,) each.
+    Args:
+        curve: parameters of the model.
+        aids: HASPI of each sentence, and mean HASPI, with each aid.
+        seed: seed of the simulated listeners.
+
+    Returns: proportion for each listener, with each aid. Shape: (draws,) each.
+
+    >>> scores = np.full(20, 0.6)
+    >>> len(simulate_proportions(load_curve(), [(scores, 0.6), (scores, 0.6)]))
+    2
     """
     random = np.random.default_rng(seed)
     coefficients = random.multivariate_normal(curve.coefficients, curve.covariance, DRAWS)
-    listener, slope = (
-        s * random.standard_normal(DRAWS) for s in (curve.listener, curve.listener_slope)
-    )
-    shares = []
+    listener_intercept = curve.listener * random.standard_normal(DRAWS)
+    listener_slope = curve.listener_slope * random.standard_normal(DRAWS)
+    proportions = []
     for scores, mean in aids:
-        logit = coefficients @ np.stack(
-            [np.ones(len(scores)), scores - mean, np.full(len(scores), mean - 0.5)]
+        aid_intercept = curve.aid * random.standard_normal(DRAWS)
+        predictors = [np.ones(len(scores)), scores - mean, np.full(len(scores), mean - 0.5)]
+        logit = coefficients @ np.stack(predictors)
+        logit += (listener_intercept + aid_intercept)[:, None] + listener_slope[:, None] * (
+            scores - 0.5
         )
-        logit += (listener + curve.aid * random.standard_normal(DRAWS))[:, None] + slope[
-            :, None
-        ] * (scores - 0.5)
-        p = 1.0 / (1.0 + np.exp(-logit))
-        # of a beta-binomial share, averaged over the sentences
-        spread = (
-            p * (1.0 - p) / curve.words * (1.0 + (curve.words - 1.0) / (curve.dispersion + 1.0))
-        )
-        noise = np.sqrt(spread.sum(1)) / len(scores) * random.standard_normal(DRAWS)
-        shares.append(np.clip(p.mean(1) + noise, 0.0, 1.0))
-    return shares
+        probability = 1.0 / (1.0 + np.exp(-logit))
+        # The proportion in a sentence has the variance of a beta-binomial distribution. The mean
+        # over all sentences is approximately normal.
+        overdispersion = 1.0 + (curve.words - 1.0) / (curve.dispersion + 1.0)
+        variance = probability * (1.0 - probability) / curve.words * overdispersion
+        deviation = np.sqrt(variance.sum(1)) / len(scores)
+        noise = deviation * random.standard_normal(DRAWS)
+        proportions.append(np.clip(probability.mean(1) + noise, 0.0, 1.0))
+    return proportions
