@@ -161,7 +161,7 @@ def main(folder: str, noise_folder: str | None = None) -> None:
     rows: dict[tuple[str, str], list[tuple[float, float, bool, bool]]] = {}
     for talker in chosen:
         file = next(index for index, path in enumerate(clips.files) if path.parent == talker)
-        speech = set_level(clips.clip(file, 0.5), SPL)
+        speech = set_level(clips.cut_clip(file, 0.5), SPL)
         noise = shaped(speech, generator) if noises is None else noises.draw(1, generator)[0]
         signals = degraded(speech, set_level(noise, SPL), generator)
         for name in EARS:

@@ -192,7 +192,7 @@ def _pairs(source: Path, target: Path) -> list[tuple[Path, Path]]:
     audio, others = list_files(source)
     if others:
         endings = ", ".join(sorted({path.suffix or path.name for path in others})[:5])
-        print(f"files that are not audio, passed over: {len(others)} ({endings})", file=sys.stderr)
+        print(f"files that are not audio, not used: {len(others)} ({endings})", file=sys.stderr)
     sources: dict[Path, Path] = {}
     for path in audio:
         output = (target / path.relative_to(source)).with_suffix(".wav")

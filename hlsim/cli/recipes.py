@@ -50,7 +50,7 @@ def describe_settings(recipe: type[TrainingRecipe]) -> dict[str, str]:
             r"^    (\w+): (.+(?:\n        .+)*)", inspect.getdoc(kind) or "", re.M
         ):
             sentence = " ".join(text.split()).replace("``", "").split(". ")[0]
-            descriptions[name] = sentence.rstrip(".")
+            descriptions[name] = sentence[0].lower() + sentence[1:].rstrip(".")
     return descriptions
 
 

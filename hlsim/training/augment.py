@@ -1,6 +1,7 @@
 """Augmentation of training speech: noise, equalisation, amplification, compression and level.
 
-A simulator that is to guide a compensator must be accurate on the output of compensators, which amplify and compress.
+A simulator guides the training of aids, which amplify and compress. It must therefore be accurate
+on amplified and compressed speech.
 """
 
 import torch
@@ -11,18 +12,35 @@ from hlsim.audiogram import FREQUENCIES
 from hlsim.calibration import level_spl, set_level
 from hlsim.dsp.active_level import active_level_db
 
-HIGHEST_LEVEL = 115.0  # RMS level in dB SPL above which no training signal goes
-EQUALISER_FREQUENCIES = (100.0, 250.0, 600.0, 1500.0, 3500.0, 7000.0)  # Hz, of the random equaliser
+HIGHEST_LEVEL = 115.0
+"""Highest RMS level of a training signal in dB SPL."""
+
+EQUALISER_FREQUENCIES = (100.0, 250.0, 600.0, 1500.0, 3500.0, 7000.0)
+"""Frequencies in Hz for which the random equaliser has gains."""
+
 POWER_FLOOR = 1e-20
+"""Power in Pa^2 that keeps logarithms and divisors away from 0."""
+
+
+def draw_uniform(
+    low: float, high: float, shape: tuple[int, ...], generator: torch.Generator
+) -> Tensor:
+    """Draw numbers of a uniform distribution from ``low`` to ``high``."""
+    return low + (high - low) * torch.rand(shape, generator=generator)
 
 
 def mix(speech: Tensor, noise: Tensor, snr_db: Tensor, sample_rate: int | None = None) -> Tensor:
     """Add noise at a signal-to-noise ratio.
 
-    The ratio is that of RMS levels or, with ``sample_rate``, that of the active speech level (ITU-T P.56) and the noise's
-    RMS level.
+    Args:
+        speech: Speech with shape (items, time).
+        noise: Noise with shape (items, time).
+        snr_db: Level of the speech minus RMS level of the noise in dB, with shape (items,).
+        sample_rate: Sample rate in Hz. It makes the level of the speech the active level of ITU-T
+            P.56; without it, the RMS level is used.
 
-    Shape: (items, time) twice, (items,) dB -> (items, time).
+    Returns:
+        Noisy speech with shape (items, time).
     """
     level = 10.0 * speech.square().mean(-1).clamp_min(POWER_FLOOR).log10()
     if sample_rate is not None:
@@ -33,9 +51,18 @@ def mix(speech: Tensor, noise: Tensor, snr_db: Tensor, sample_rate: int | None =
 
 
 def equalise(waveform: Tensor, gains_db: Tensor, frequencies: Tensor, sample_rate: int) -> Tensor:
-    """Apply a zero-phase filter whose gains are linear over log frequency, and flat beyond the ends.
+    """Apply a zero-phase filter with gains at some frequencies.
 
-    Shape: (items, time), (items, points) dB, (points,) Hz -> (items, time).
+    The gains in dB are interpolated over log frequency, and constant beyond both ends.
+
+    Args:
+        waveform: Signals with shape (items, time).
+        gains_db: Gains in dB with shape (items, frequencies).
+        frequencies: Frequencies in Hz with shape (frequencies,).
+        sample_rate: Sample rate in Hz.
+
+    Returns:
+        Filtered signals with shape (items, time).
     """
     time = waveform.shape[-1]
     points = 2 * time
@@ -50,7 +77,16 @@ def equalise(waveform: Tensor, gains_db: Tensor, frequencies: Tensor, sample_rat
 
 
 def compress(waveform: Tensor, ratio: Tensor, sample_rate: int) -> Tensor:
-    """Compress the level in 10 ms around its mean. Shape: (items, time), (items,) -> (items, time)."""
+    """Compress the level of segments of 10 ms around its mean.
+
+    Args:
+        waveform: Signals with shape (items, time).
+        ratio: Compression ratios with shape (items,).
+        sample_rate: Sample rate in Hz.
+
+    Returns:
+        Compressed signals with shape (items, time).
+    """
     width = 2 * (sample_rate // 200) + 1
     squared = waveform.square().unsqueeze(1)
     power = functional.avg_pool1d(squared, width, 1, width // 2, count_include_pad=False).squeeze(1)
@@ -69,19 +105,29 @@ def augment_speech(
     levels: tuple[float, float] = (40.0, 95.0),
     treated: bool = True,
 ) -> Tensor:
-    """Random training signals in pascals.
+    """Make random training signals of speech.
 
-    Two in five items are noisy, at -5 to 20 dB. If ``treated``, one in five is compressed by 1.5 to 4, two in five are
-    equalised by up to 15 dB, and two in five amplified by 0.2 to 0.8 of the ear's loss. ``levels`` is the range of levels
-    in dB SPL before equalisation and amplification.
+    40 % of the items are noisy, with -5 to 20 dB SNR. If ``treated``, 20 % are compressed with
+    ratios of 1.5 to 4, 40 % are equalised by up to 15 dB, and 40 % are amplified by 0.2 to 0.8
+    times the hearing loss.
 
-    Shape: (items, time), (items, time) or None, (items, 8) dB HL -> (items, time).
+    Args:
+        speech: Clean speech with shape (items, time).
+        noise: Noise with shape (items, time), if there is any.
+        ears: Thresholds in dB HL with shape (items, 8).
+        sample_rate: Sample rate in Hz.
+        generator: Source of the random numbers.
+        levels: Lowest and highest level in dB SPL before equalisation and amplification.
+        treated: Whether to compress, equalise and amplify.
+
+    Returns:
+        Signals in pascals with shape (items, time).
     """
     items = len(speech)
     chance = torch.rand(items, 5, generator=generator)
 
     def uniform(low: float, high: float, *shape: int) -> Tensor:
-        return low + (high - low) * torch.rand(items, *shape, generator=generator)
+        return draw_uniform(low, high, (items, *shape), generator)
 
     def choose(column: int, share: float, changed: Tensor, unchanged: Tensor) -> Tensor:
         return torch.where((chance[:, column] < share).unsqueeze(-1), changed, unchanged)

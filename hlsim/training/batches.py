@@ -1,4 +1,4 @@
-"""Batches to train and validate on, drawn anew at every step from speech, noise and ears."""
+"""Batches for training and validation, drawn at random from speech, noise and ears."""
 
 from __future__ import annotations
 
@@ -18,7 +18,13 @@ from hlsim.audiogram import HIGHEST_SIMULATED, LOWEST_LEVEL, Audiogram
 from hlsim.audiogram.table import read_audiograms
 from hlsim.calibration import level_spl, set_level
 from hlsim.neuro.config import NEURO_RATE
-from hlsim.training.augment import EQUALISER_FREQUENCIES, augment_speech, equalise, mix
+from hlsim.training.augment import (
+    EQUALISER_FREQUENCIES,
+    augment_speech,
+    draw_uniform,
+    equalise,
+    mix,
+)
 from hlsim.training.clips import Clips, NoiseOfPairs
 from hlsim.training.corpora.manifest import SPLITS, read_manifest
 from hlsim.training.data_module import Batch, BatchData, Step
@@ -28,27 +34,33 @@ from hlsim.training.sounds import draw_sounds
 from hlsim.training.teacher import Reference, Teacher
 
 VALIDATION_SECONDS = 2.0
+"""Duration of the clips for validation."""
+
 MAX_BABBLE_VOICES = 4
+"""Largest number of voices in babble."""
 
 Files = Path | Sequence[Path]
 """A folder, or a list of files."""
 
 Pairs = Sequence[tuple[Path, Path]]
-"""Files of clean speech, each with its noisy version."""
+"""Pairs of files: clean speech and its noisy version."""
 
 
 @dataclass(frozen=True)
 class TrainingData:
-    """Speech, noise and ears to train and validate on. Only speech is required.
+    """Speech, noise and ears for training and validation. Only speech is required.
 
-    Without ``valid_speech``, validation is on the training speech and says nothing about other speakers. Without
-    ``valid_noise`` or ``valid_audiograms`` it has the noise and the ears of the training.
+    Validation uses the training data where it has no data of its own. Without ``valid_speech``, its
+    scores are those of known speakers.
 
     Attributes:
-        speech, valid_speech: clean speech.
-        noise, valid_noise: noise to mix in, or pairs of clean and noisy speech whose difference is the noise.
-        audiograms, valid_audiograms: CSV files of ears, which join the drawn ones.
-        workers: number of processes that draw batches, beside the one that trains.
+        speech: Clean speech for training.
+        noise: Noise that is mixed in, or pairs of clean and noisy speech whose difference is noise.
+        audiograms: CSV file of measured ears, which are used in addition to random ones.
+        valid_speech: Clean speech for validation.
+        valid_noise: Noise for validation, or pairs of clean and noisy speech.
+        valid_audiograms: CSV file of measured ears for validation.
+        workers: Number of processes that draw batches, in addition to the one that trains.
     """
 
     speech: Files
@@ -61,16 +73,19 @@ class TrainingData:
 
     @classmethod
     def from_manifest(
-        cls, manifest: str | Path, root: str | Path | None = None, **others: Any
+        cls, manifest: str | Path, root: str | Path | None = None, **attributes: Any
     ) -> TrainingData:
-        """The splits ``train`` and ``valid`` of a manifest; noisy minus clean speech is the noise unless one is given.
+        """Use the splits ``train`` and ``valid`` of a manifest.
+
+        Without other noise, the difference between noisy and clean speech is the noise.
 
         Args:
-            manifest, root: as for ``read_manifest``.
-            others: other attributes.
+            manifest: CSV file, see ``read_manifest``.
+            root: Folder to which its paths are relative; by default the folder of the manifest.
+            attributes: Other attributes by name.
 
         Raises:
-            ValueError: the manifest cannot be used, or has no training speech.
+            ValueError: The manifest is invalid, or has no training speech.
         """
         folder = Path(manifest).parent if root is None else Path(root)
         speech: dict[str, list[Path]] = {split: [] for split in SPLITS}
@@ -81,33 +96,39 @@ class TrainingData:
             if row.noisy:
                 pairs[row.split].append((clean, folder / row.noisy))
         if not speech["train"]:
-            raise ValueError(f"{manifest}: no row has the split 'train'")
+            raise ValueError(
+                f"{manifest}: no row has the split 'train', which holds the speech to train on; "
+                "correct the column 'split'"
+            )
         if not speech["valid"]:
             warnings.warn(
-                f"{manifest}: no row has the split 'valid', so that validation is on training speech; 'hlsim prepare "
-                "--valid-share 0.1' holds speakers out",
+                f"{manifest}: no row has the split 'valid', so training speech is used for "
+                "validation; "
+                "'hlsim prepare --valid-share 0.1' moves a tenth of the speakers to that split",
                 stacklevel=2,
             )
-        if not others.get("noise"):
-            others["noise"] = pairs["train"]
-            others["valid_noise"] = others.get("valid_noise") or pairs["valid"]
-        return cls(speech["train"], valid_speech=speech["valid"], **others)
+        if not attributes.get("noise"):
+            attributes["noise"] = pairs["train"]
+            attributes["valid_noise"] = attributes.get("valid_noise") or pairs["valid"]
+        return cls(speech["train"], valid_speech=speech["valid"], **attributes)
 
     def validation(self) -> TrainingData:
-        """The data to validate on, as data to train on.
+        """Return the validation data, as training data of another object.
 
         Raises:
-            ValueError: speech or noise to validate on is also trained on.
+            ValueError: Training and validation share files of speech or noise.
         """
         for name in ("speech", "noise"):
-            training, validation = getattr(self, name), getattr(self, f"valid_{name}")
+            training = getattr(self, name)
+            validation = getattr(self, f"valid_{name}")
             if not training or not validation:
                 continue
             shared = _resolved_files(training) & _resolved_files(validation)
             if shared:
                 raise ValueError(
-                    f"{len(shared)} files of the {name} to validate on are also trained on, such as {min(shared)}; give "
-                    f"other files, or no {name} to validate on"
+                    f"{len(shared)} files of {name} are used for both training and validation, "
+                    "such as "
+                    f"{min(shared)}; use other files for validation, or leave --valid-{name} out"
                 )
         return TrainingData(
             self.valid_speech or self.speech,
@@ -116,7 +137,7 @@ class TrainingData:
         )
 
     def identity(self) -> dict[str, str]:
-        """A description that differs for different data; lists of files are described by a hash."""
+        """Describe the data, with a hash of each list of files, to tell it from other data."""
         return {
             entry.name: _describe(getattr(self, entry.name))
             for entry in fields(self)
@@ -125,8 +146,10 @@ class TrainingData:
 
 
 def _resolved_files(source: Files | Pairs) -> set[Path]:
+    """Return the absolute paths of the files, or of the noisy file of each pair."""
     files = find_audio(source) if isinstance(source, str | Path) else source
-    return {(file[-1] if isinstance(file, tuple) else file).resolve() for file in files}
+    paths = [file[-1] if isinstance(file, tuple) else file for file in files]
+    return {path.resolve() for path in paths}
 
 
 def _describe(source: Any) -> str:
@@ -137,6 +160,7 @@ def _describe(source: Any) -> str:
 
 
 def _noise_clips(source: Files | Pairs, seconds: float) -> Clips:
+    """Return a source of noise clips: recordings, or the noise of pairs."""
     options: dict[str, Any] = {"sample_rate": NEURO_RATE, "seconds": seconds}
     if not isinstance(source, str | Path) and isinstance(source[0], tuple):
         return NoiseOfPairs(source, **options)  # type: ignore[arg-type]
@@ -144,7 +168,7 @@ def _noise_clips(source: Files | Pairs, seconds: float) -> Clips:
 
 
 class DrawnBatches(Dataset[Batch]):
-    """Random speech, noise and ears; a batch is a function of seed, step and rank alone."""
+    """Batches of random speech, noise and ears, which depend on seed, step and rank alone."""
 
     recipe: TrainingRecipe
 
@@ -161,17 +185,29 @@ class DrawnBatches(Dataset[Batch]):
 
     def __getitem__(self, step: Step) -> Batch:
         seed = (self.seed * 1_000_003 + step.number) * 64 + step.rank
-        generator = torch.Generator().manual_seed(seed % 2**63)  # the largest seed that it takes
+        generator = torch.Generator().manual_seed(seed % 2**63)  # Larger seeds are rejected.
         return self.draw(self.batch, generator)
 
     def draw(self, count: int, generator: torch.Generator) -> Batch:
-        """``clean`` and ``signal`` (count, time) in pascals, ``thresholds`` (count, 8) dB HL."""
+        """Draw a batch.
+
+        Returns:
+            ``clean`` and ``signal`` in pascals with shape (count, time), and ``thresholds`` in dB
+            HL with shape (count, 8).
+        """
         raise NotImplementedError
 
     def join_measured_ears(
         self, ears: Tensor, share: float, shift_db: float, generator: torch.Generator
     ) -> Tensor:
-        """Replace a share of drawn ears by measured ones, if there are any, each shifted by up to some dB."""
+        """Replace a share of random ears by measured ones, if there are any.
+
+        Args:
+            ears: Thresholds in dB HL with shape (items, 8).
+            share: Probability with which an ear is replaced.
+            shift_db: Largest random shift of a measured ear in dB.
+            generator: Source of the random numbers.
+        """
         if self.measured_ears is None:
             return ears
         numbers = torch.randint(len(self.measured_ears), (len(ears),), generator=generator)
@@ -181,17 +217,19 @@ class DrawnBatches(Dataset[Batch]):
             measured = (measured + shift_db * shift).clamp(LOWEST_LEVEL, HIGHEST_SIMULATED)
         return torch.where(torch.rand(len(ears), 1, generator=generator) < share, measured, ears)
 
-    def join_sounds(self, clips: Tensor, generator: torch.Generator, begun: float = 0.0) -> Tensor:
-        """Replace the recipe's share of clips by tones and clicks."""
+    def join_sounds(
+        self, clips: Tensor, generator: torch.Generator, early_share: float = 0.0
+    ) -> Tensor:
+        """Replace the recipe's share of clips by tones and clicks, see ``draw_sounds``."""
         share = self.recipe.sounds
         if not share:
             return clips
-        sounds = draw_sounds(len(clips), clips.shape[-1], NEURO_RATE, generator, begun)
+        sounds = draw_sounds(len(clips), clips.shape[-1], NEURO_RATE, generator, early_share)
         return torch.where(torch.rand(len(clips), 1, generator=generator) < share, sounds, clips)
 
 
 class SimulatorBatches(DrawnBatches):
-    """Input of a simulator: speech, noise, tones and clicks as compensators emit them, at any level."""
+    """Batches for a simulator: speech, noise, tones and clicks, like the outputs of aids."""
 
     recipe: SimulatorRecipe
 
@@ -213,7 +251,7 @@ class SimulatorBatches(DrawnBatches):
 
 
 class CompensatorBatches(DrawnBatches):
-    """Input of a compensator: clean or noisy speech, for one ear or for drawn ears."""
+    """Batches for a compensator: clean or noisy speech, for one ear or for random ears."""
 
     recipe: CompensatorRecipe
 
@@ -227,7 +265,7 @@ class CompensatorBatches(DrawnBatches):
         recipe = self.recipe
 
         def uniform(low: float, high: float, *shape: int) -> Tensor:
-            return low + (high - low) * torch.rand(count, *shape, generator=generator)
+            return draw_uniform(low, high, (count, *shape), generator)
 
         def equalise_some(clips: Tensor) -> Tensor:
             gains = uniform(-15.0, 15.0, len(EQUALISER_FREQUENCIES))
@@ -235,8 +273,9 @@ class CompensatorBatches(DrawnBatches):
             return torch.where(uniform(0.0, 1.0, 1) < recipe.equalised, equalised, clips)
 
         voices = equalise_some(self.speech.draw(count, generator))
-        # some tones begin before the clip, or a hearing aid learns that a tone always follows silence
-        clips = self.join_sounds(voices, generator, begun=1.0)
+        # Some tones begin before the clip. Otherwise a hearing aid would learn that a tone always
+        # follows silence.
+        clips = self.join_sounds(voices, generator, early_share=1.0)
         clean = set_level(clips, uniform(*recipe.levels))
         signal = clean
         if self.noise is not None:
@@ -260,22 +299,24 @@ class CompensatorBatches(DrawnBatches):
 
 
 def _babble(voices: Tensor) -> Tensor:
-    """For each item, the sum of up to four other items at equal levels."""
+    """Add up to four other items at equal levels, for each item."""
     count = min(len(voices), MAX_BABBLE_VOICES + 1)
-    others = [set_level(voices.roll(shift, 0), 65.0) for shift in range(1, count)]
-    return torch.stack(others).sum(0)
+    shifted = [set_level(voices.roll(shift, 0), 65.0) for shift in range(1, count)]
+    return torch.stack(shifted).sum(0)
 
 
 def simulator_data(
     data: TrainingData, recipe: SimulatorRecipe, reference: Reference | None = None
 ) -> BatchData:
-    """Data to train and validate a simulator on.
+    """Make the batches for training and validation of a simulator.
 
     Args:
-        reference: the teacher; by default the exact MSBG.
+        data: Speech, noise and ears.
+        recipe: Settings of the training.
+        reference: Simulator that serves as the teacher; by default the exact MSBG.
 
     Raises:
-        ValueError: the data cannot be used.
+        ValueError: Files are missing or invalid.
     """
     return BatchData(
         SimulatorBatches(recipe, data),
@@ -288,17 +329,23 @@ def simulator_data(
 def compensator_data(
     data: TrainingData, recipe: CompensatorRecipe, ear: Audiogram | None
 ) -> BatchData:
-    """Data to train and validate a compensator on, for one ear or for all.
+    """Make the batches for training and validation of a compensator.
+
+    Args:
+        data: Speech, noise and ears.
+        recipe: Settings of the training.
+        ear: Ear of a personal compensator; None for a general one.
 
     Raises:
-        ValueError: the data cannot be used, or the recipe requires noise and there is none.
+        ValueError: Files are missing or invalid, or the recipe requires noise and there is none.
     """
     needs_noise = [name for name in ("denoising", "intelligibility") if recipe.weights.get(name)]
     if recipe.babble:
         needs_noise.append("babble")
     if needs_noise and not data.noise:
         raise ValueError(
-            f"the recipe has {needs_noise[0]}, which requires noise; give a folder of noise (--noise)"
+            f"{needs_noise[0]} in the recipe requires noise, but the data has none; "
+            "add a folder of noise (--noise)"
         )
     plain = replace(recipe, equalised=0.0, seconds=VALIDATION_SECONDS)
     batches = CompensatorBatches(plain, data.validation(), ear)
@@ -308,9 +355,11 @@ def compensator_data(
 
 
 def simulator_validation(data: TrainingData, recipe: SimulatorRecipe) -> list[Batch]:
-    """Fixed items of 2 s, as for training but without equalisation, amplification and compression.
+    """Draw the validation batches of a simulator: fixed clips of 2 s.
 
-    A recipe that trains on tones and clicks has a third as many items of them, marked with ``sounds``, as of speech.
+    They are drawn as for training, but not equalised, amplified or compressed. If the recipe trains
+    on tones and clicks, one item of them, marked with ``sounds``, is added per three items of
+    speech.
     """
     data = data.validation()
     generator = torch.Generator().manual_seed(1_000 + recipe.seed)

@@ -1,4 +1,5 @@
-"""Callbacks of a training: averaged weights, the best network as a checkpoint folder, and a progress bar."""
+"""Callbacks of a training: average weights, the best network as a checkpoint, and a progress
+bar."""
 
 from __future__ import annotations
 
@@ -16,25 +17,29 @@ from torch import Tensor
 from hlsim.pretrained import save_checkpoint
 
 CHECKPOINT = "checkpoint"
-"""Folder of the best network, which ``load_pretrained`` or ``load_compensator`` reads."""
+"""Name of the folder that ``load_pretrained`` or ``load_compensator`` reads."""
 
 
 class WeightAverage(WeightAveraging):
-    """Exponential moving average of the weights, which is what is validated and saved.
+    """Exponential moving average of the weights, which replaces them in validation and checkpoints.
 
     Args:
-        decay: weight of the past, from 0 to below 1.
+        decay: Weight of the past, from 0 to below 1.
     """
 
     def __init__(self, decay: float) -> None:
-        super().__init__(use_buffers=False, multi_avg_fn=average_function(decay))
+        super().__init__(use_buffers=False, multi_avg_fn=make_average_update(decay))
 
 
-def average_function(decay: float) -> Callable[[Sequence[Tensor], Sequence[Tensor], Any], None]:
+def make_average_update(decay: float) -> Callable[[Sequence[Tensor], Sequence[Tensor], Any], None]:
     """Make the function with which ``AveragedModel`` updates its weights.
 
-    Lightning's ``EMAWeightAveraging`` has one decay throughout. Here the early decay is lower, (1 + n) / (10 + n) after
-    n steps, so that a short training forgets its random initial weights.
+    Unlike Lightning's ``EMAWeightAveraging``, it has a lower decay at first: (1 + n) / (10 + n)
+    after n steps. The random initial weights would otherwise dominate the average of a short
+    training.
+
+    Args:
+        decay: Weight of the past, from 0 to below 1.
     """
 
     def update(averages: Sequence[Tensor], weights: Sequence[Tensor], steps: Any) -> None:
@@ -46,15 +51,17 @@ def average_function(decay: float) -> Callable[[Sequence[Tensor], Sequence[Tenso
 
 
 class BestCheckpoint(ModelCheckpoint):
-    """Lightning's state with the highest validation score, and its network as a folder that hlsim loads.
+    """Callback that saves the network with the highest validation score.
+
+    It saves Lightning's state, and a checkpoint folder that hlsim loads.
 
     Args:
-        folder: folder of the training, for ``best.ckpt`` and ``checkpoint``.
-        kind: kind of the network's checkpoint.
-        record: how the network was trained, for its ``config.json``.
+        folder: Folder of the training, where ``best.ckpt`` and ``checkpoint`` are written.
+        kind: Kind of the network's checkpoint.
+        record: Training record for the checkpoint's ``config.json``.
 
     Attributes:
-        score_to_beat: score up to which no network is released.
+        score_to_beat: Score above which a checkpoint is written.
     """
 
     def __init__(self, folder: Path, kind: str, record: Mapping[str, Any]) -> None:
@@ -85,13 +92,13 @@ class BestCheckpoint(ModelCheckpoint):
     def release(
         self, module: Any, weights: Mapping[str, Tensor], step: int, seconds: float
     ) -> None:
-        """Write the network of a module, with other weights, as a checkpoint.
+        """Write the network of a module as a checkpoint.
 
         Args:
-            module: the module in training.
-            weights: its state dict at the step.
-            step: number of steps taken.
-            seconds: duration of the training until then.
+            module: Module in training.
+            weights: State dict of the module at the step.
+            step: Number of steps.
+            seconds: Duration of the training up to the step.
         """
         network = copy.deepcopy(module.network)
         network.load_state_dict(
@@ -99,20 +106,21 @@ class BestCheckpoint(ModelCheckpoint):
         )
         record = {
             **self.record,
-            "start_validation": without_score(module.start_validation),
+            "start_validation": remove_score(module.start_validation),
             "steps": step,
             "minutes": round(seconds / 60.0, 1),
-            "validation": without_score(module.validation),
+            "validation": remove_score(module.validation),
         }
         save_checkpoint(self.released, self.kind, network, network.config.to_dict(), record)
 
 
-def without_score(validation: Mapping[str, float]) -> dict[str, float]:
+def remove_score(validation: Mapping[str, float]) -> dict[str, float]:
+    """Return the measures of a validation without the score that is computed from them."""
     return {name: value for name, value in validation.items() if name != "score"}
 
 
 class ProgressBar(TQDMProgressBar):
-    """Lightning's progress bar, without numbers of epochs and versions: a training is one epoch."""
+    """Lightning's progress bar without epoch and version, because a training is one epoch."""
 
     def get_metrics(self, trainer: L.Trainer, module: L.LightningModule) -> dict[str, Any]:
         metrics: dict[str, Any] = super().get_metrics(trainer, module)

@@ -1,5 +1,6 @@
-"""Random clips of recordings, decoded once and kept in memory."""
+"""Random clips of recordings, which are decoded once and kept in memory."""
 
+import math
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,25 +11,33 @@ from torch import Tensor
 from hlsim.audio import find_audio, read_audio
 from hlsim.dsp.resample import resample
 
-MAX_FAILURES = 10_000  # draws in a row; a recording may be loud for one second in an hour
-MAX_SAMPLES_IN_MEMORY = 2**30  # 2 GB, 18 hours at 16 kHz
-SILENT_POWER = 1e-7  # mean square of a clip whose recording has its peak at 1.0
+MAX_FAILURES = 10_000
+"""Number of useless draws in a row that is an error. One second per hour of a recording may be
+loud."""
+
+MAX_SAMPLES_IN_MEMORY = 2**30
+"""Number of samples of all recordings in memory: 2 GB, 18 hours at 16 kHz."""
+
+SILENT_POWER = 1e-7
+"""Mean square up to which a clip counts as silent, if the peak of its recording is 1.0."""
 
 
 class Clips:
-    """Clips of equal length from the recordings in a folder, first channel, resampled to one rate.
+    """Clips of equal length from the first channels of recordings, at one sample rate.
 
-    Recordings are decoded when they are first drawn and kept as 16-bit samples, up to 2 GB. A file that cannot be used
-    (broken, silent, or with an unsupported rate) causes one warning, and whenever it is drawn, another is drawn instead.
+    Recordings are decoded when they are first drawn, and kept as 16-bit samples, up to 2 GB. A file
+    that is broken, silent, or has an unsupported sample rate causes one warning. Whenever it is
+    drawn, another file is drawn instead.
 
     Args:
-        source: folder that is searched for audio, with its subfolders; or a list of files.
-        sample_rate: sample rate of the clips in Hz.
-        seconds: length of a clip. Shorter recordings are repeated if ``repeat``, else followed by silence.
+        source: Folder that is searched for audio, with its subfolders; or a list of files.
+        sample_rate: Sample rate of the clips in Hz.
+        seconds: Duration of a clip.
+        repeat: Whether recordings that are shorter than a clip are repeated; otherwise silence
+            follows them.
 
     Raises:
-        ValueError: the folder does not exist or has no audio in it, or the clips would be empty. When clips are drawn:
-            too many draws in a row that give no clip.
+        ValueError: The folder does not exist or has no audio in it, or the clips have no samples.
     """
 
     def __init__(
@@ -45,16 +54,16 @@ class Clips:
         self.samples = round(seconds * sample_rate)
         if self.samples < 1:
             raise ValueError(
-                f"clips of {seconds} s have no samples; choose {1.0 / sample_rate:.2g} s or more"
+                f"expected clips of {1.0 / sample_rate:.2g} s or more, got {seconds} s"
             )
-        self._recordings: dict[int, Tensor] = {}  # 16-bit samples by number of the file
-        self._errors: dict[int, str] = {}  # by number of the file
+        self._recordings: dict[int, Tensor] = {}  # 16-bit samples by index of the file
+        self._errors: dict[int, str] = {}  # messages by index of the file
 
     def __len__(self) -> int:
         return len(self.files)
 
-    def recording(self, index: int) -> Tensor:
-        """A whole recording with its peak at 1.0. Shape: -> (time,)."""
+    def read_recording(self, index: int) -> Tensor:
+        """Return a whole recording, scaled to a peak of 1.0. Shape: -> (time,)."""
         if index not in self._recordings:
             waveform = self._decode(index)
             peak = float(waveform.abs().max())
@@ -64,54 +73,76 @@ class Clips:
             self._limit_memory()
         return self._recordings[index].float() / 32767.0
 
-    def clip(self, index: int, position: float) -> Tensor:
-        """The clip at a position from 0, the start of the recording, to 1, its end. Shape: -> (samples,)."""
-        recording = self.recording(index)
+    def cut_clip(self, index: int, position: float) -> Tensor:
+        """Cut a clip out of a recording.
+
+        Args:
+            index: Index of the file.
+            position: Position of the clip, from 0 at the start of the recording to 1 at its end.
+
+        Returns:
+            Samples with shape (time,).
+        """
+        recording = self.read_recording(index)
         if self.repeat and len(recording) < self.samples:
-            recording = recording.repeat(-(-self.samples // len(recording)))
+            recording = recording.repeat(math.ceil(self.samples / len(recording)))
         start = int(position * max(0, len(recording) - self.samples))
         clip = recording[start : start + self.samples]
         return torch.nn.functional.pad(clip, (0, self.samples - len(clip)))
 
     def draw(self, count: int, generator: torch.Generator) -> Tensor:
-        """Random clips, none of them silent. Shape: -> (count, samples)."""
+        """Draw random clips that are not silent.
+
+        Args:
+            count: Number of clips.
+            generator: Source of the random numbers.
+
+        Returns:
+            Clips with shape (count, time).
+
+        Raises:
+            ValueError: Too many draws in a row give no clip.
+        """
         clips: list[Tensor] = []
         failures = 0
         while len(clips) < count:
             index = int(torch.randint(len(self), (), generator=generator))
-            # drawn for a bad file as well, so that later draws do not depend on when it was found to be bad
+            # Also drawn for a bad file, so that all processes draw the same numbers, whether they
+            # know
+            # the file already or not.
             position = float(torch.rand((), generator=generator))
             if self._is_usable(index):
-                clip = self.clip(index, position)
+                clip = self.cut_clip(index, position)
                 if float(clip.square().mean()) > SILENT_POWER:
                     clips.append(clip)
                     failures = 0
                     continue
             failures += 1
             if failures == MAX_FAILURES:
-                reason = self._errors.get(index, f"{self.files[index]}: a clip of it is silent")
+                reason = self._errors.get(index, f"{self.files[index]}: the clip is silent")
                 raise ValueError(
-                    f"{reason}; this is the last of {failures} draws in a row without a clip to use; remove broken and "
-                    "silent recordings, or draw longer clips"
+                    f"{failures} draws in a row gave no clip, the last because of {reason}; remove "
+                    "broken and silent recordings, or draw longer clips"
                 )
         return torch.stack(clips)
 
     def _decode(self, index: int) -> Tensor:
-        """First channel of a file at the rate of the clips. Shape: -> (time,)."""
+        """Decode the first channel of a file at the clips' sample rate. Shape: -> (time,)."""
         waveform, rate = read_audio(self.files[index])
         return resample(waveform[:1], rate, self.sample_rate).squeeze(0)
 
     def _limit_memory(self) -> None:
-        """Remove the recordings that were decoded first, but not the last one."""
+        """Remove the oldest recordings from memory, except the last one."""
         total = sum(map(len, self._recordings.values()))
         while total > MAX_SAMPLES_IN_MEMORY and len(self._recordings) > 1:
             total -= len(self._recordings.pop(next(iter(self._recordings))))
 
     def _is_usable(self, index: int) -> bool:
+        """Return whether a file can be decoded, and warn the first time that it cannot."""
         if index in self._errors:
             return False
         try:
-            self.recording(index)
+            self.read_recording(index)
         except ValueError as error:
             self._errors[index] = str(error)
             warnings.warn(f"left out: {error}", stacklevel=3)
@@ -120,11 +151,12 @@ class Clips:
 
 
 class NoiseOfPairs(Clips):
-    """Clips of the noise in pairs of clean and noisy speech: noisy minus clean.
+    """Clips of the noise in pairs of clean and noisy speech, which is their difference.
 
     Args:
-        pairs: files of clean speech, each with its noisy version, aligned and equally long.
-        sample_rate, seconds: as for ``Clips``.
+        pairs: Pairs of files, clean speech and its noisy version, aligned and equally long.
+        sample_rate: Sample rate of the clips in Hz.
+        seconds: Duration of a clip. Shorter noise is repeated.
     """
 
     def __init__(
@@ -143,15 +175,23 @@ class NoiseOfPairs(Clips):
 def read_noisy(path: Path, clean: Tensor, clean_rate: int) -> Tensor:
     """Read the noisy version of clean speech.
 
-    Shape: (channels, time) -> (channels, time).
+    Args:
+        path: File of noisy speech.
+        clean: Clean speech with shape (channels, time).
+        clean_rate: Sample rate of the clean speech in Hz.
+
+    Returns:
+        Noisy speech with shape (channels, time).
 
     Raises:
-        ValueError: the file cannot be read, or is not as long as the clean speech, or has another sample rate.
+        ValueError: The file cannot be read, or differs in length, channels or sample rate from the
+            clean speech.
     """
     noisy, rate = read_audio(path)
     if (noisy.shape, rate) != (clean.shape, clean_rate):
         raise ValueError(
-            f"{path}: {noisy.shape[-1]} samples at {rate} Hz, but its clean version has {clean.shape[-1]} at "
-            f"{clean_rate} Hz; both files of a pair have equal lengths, rates and channels"
+            f"{path}: expected the shape {tuple(clean.shape)} and the sample rate {clean_rate} "
+            "Hz of the "
+            f"clean version, got {tuple(noisy.shape)} and {rate} Hz"
         )
     return noisy

@@ -1,4 +1,4 @@
-"""Training a compensator through ``HearingLossLoss``, for one ear or for all."""
+"""Training of a compensator through ``HearingLossLoss``, for one ear or for all."""
 
 from __future__ import annotations
 
@@ -23,15 +23,16 @@ from hlsim.training.trainer import TrainerOptions, train_network
 Simulator = str | Path | nn.Module
 
 NOISE_REDUCTION_CRITERIA = ("denoising", "intelligibility")
-"""Criteria of a hearing aid's noise reduction; all others are those of ``HearingLossLoss``."""
+"""Criteria that train a hearing aid's noise reduction. ``HearingLossLoss`` has the others."""
 
 
 class CompensatorTraining(TrainingModule):
-    """A compensator whose output a frozen simulator perceives.
+    """Training of a compensator in front of a frozen simulator.
 
-    Of a hearing aid only the part that a criterion asks for is trained: with the criteria of noise reduction alone,
-    amplification stays as it is, for HASPI would amplify; without them, noise reduction stays, for it would be given up
-    to reach the right level.
+    A hearing aid has two parts, and only the parts to which the recipe's criteria belong are
+    trained. Otherwise the criteria of noise reduction would change the amplification, because HASPI
+    rewards gain. The criteria of amplification would weaken the noise reduction, because it lowers
+    the level.
     """
 
     recipe: CompensatorRecipe
@@ -75,7 +76,7 @@ class CompensatorTraining(TrainingModule):
         signal, clean, ears = batch["signal"], batch["clean"], batch["thresholds"]
         if "noise_reduction" not in batch:
             return self.loss(self.network(signal, ears), clean, ears)
-        # without noise reduction the ear is to perceive the noisy speech
+        # An ear without noise reduction should perceive the noisy speech.
         slider = batch["noise_reduction"]
         reference = signal + slider.unsqueeze(-1) * (clean - signal)
         return self.loss(self.network(signal, ears, slider), reference, ears)
@@ -99,20 +100,21 @@ def train_compensator(
     simulator: Simulator = "neuro-msbg",
     **options: Unpack[TrainerOptions],
 ) -> Path:
-    """Train a compensator, or resume its training, and keep the best one by validation.
+    """Train a compensator, or resume its training, and save the one with the best validation.
 
     Args:
-        data: speech, noise and ears to draw batches from.
-        recipe: network, criteria and number of steps.
-        out: folder for the results.
-        audiogram: ear of a personal compensator; None trains a general one on drawn ears.
+        data: Speech, noise and ears.
+        recipe: Network, criteria and number of steps.
+        out: Folder for the results.
+        audiogram: Ear of a personal compensator; None trains a general one on random ears.
         simulator: ``"neuro-msbg"``, another checkpoint's name or folder, ``"msbg"``, or a module.
+        options: Device, time limit and progress, see ``TrainerOptions``.
 
     Returns:
         The folder that ``load_compensator`` reads, ``out/checkpoint``.
 
     Raises:
-        ValueError: data, recipe or simulator cannot be used.
+        ValueError: The data, the recipe or the simulator is invalid.
     """
     module = CompensatorTraining(recipe, simulator=simulator)
     batches = compensator_data(data, recipe, audiogram)
@@ -122,7 +124,7 @@ def train_compensator(
         "simulator": type(simulator).__name__ if is_module else str(simulator),
     }
     if not is_module and str(simulator) != "msbg":
-        # the same folder may hold another simulator when the training resumes
+        # The folder may contain another simulator when the training resumes.
         about["simulator_sha256"] = checkpoint_digest(simulator)  # type: ignore[arg-type]
     return train_network(
         module,

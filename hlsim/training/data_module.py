@@ -1,4 +1,4 @@
-"""Batches for Lightning, each a function of the number of its training step."""
+"""Batches for Lightning, which depend on the number of the training step alone."""
 
 from __future__ import annotations
 
@@ -13,19 +13,21 @@ from torch.utils.data import DataLoader, Dataset, Sampler
 from hlsim.training.teacher import Teacher
 
 Batch = dict[str, Tensor]
-"""``clean``, ``signal`` and ``impaired`` (items, time) in pascals, ``thresholds`` (items, 8) dB HL.
+"""Tensors by name.
 
-``impaired``, the teacher's output, is computed on the training device. ``sounds`` marks validation batches of tones and
-clicks.
+- ``clean``: clean speech in pascals with shape (items, time)
+- ``signal``: input in pascals with shape (items, time)
+- ``thresholds``: ears in dB HL with shape (items, 8)
+- ``impaired``: output of the teacher in pascals with shape (items, time), computed on the device
+- ``sounds``: a mark of validation batches of tones and clicks
 """
 
-
 MANY_STEPS = 10_000_000
-"""Length of the data for a Trainer that has no number of steps."""
+"""Number of training batches if the Trainer has no number of steps."""
 
 
 class Step(NamedTuple):
-    """Number of a training step, and rank and number of the processes that train."""
+    """Number of a training step, rank of its process, and number of processes."""
 
     number: int
     rank: int = 0
@@ -34,7 +36,7 @@ class Step(NamedTuple):
 
 @dataclass(eq=False)
 class Steps(Sampler[Step]):
-    """Steps of one process, from ``first`` to before ``end``."""
+    """Steps of one process from ``first`` to ``end``, which is not included."""
 
     first: int = 0
     rank: int = 0
@@ -42,16 +44,16 @@ class Steps(Sampler[Step]):
     end: int = MANY_STEPS
 
     def __len__(self) -> int:
-        return self.end  # Lightning counts those before a resumption, too
+        return self.end  # Lightning also counts the steps before a resumption.
 
     def __iter__(self) -> Iterator[Step]:
         return (Step(number, self.rank, self.processes) for number in range(self.first, self.end))
 
 
 class ReturnedErrors(Dataset[Any]):
-    """The batches of a data set; an error takes the place of a batch that cannot be drawn.
+    """Data set that returns an error instead of raising it, if a batch cannot be drawn.
 
-    A DataLoader would raise the error of a worker with a traceback as its message.
+    A DataLoader would add the traceback of its worker to the message.
     """
 
     def __init__(self, batches: Dataset[Batch]) -> None:
@@ -65,16 +67,16 @@ class ReturnedErrors(Dataset[Any]):
 
 
 class BatchData(L.LightningDataModule):
-    """Training batches by step, and fixed batches to validate on.
+    """Training batches by step, and fixed validation batches.
 
-    A training that continues from a Trainer's state begins with the batch after the last one. On several devices, each
-    draws its own batches: give the Trainer ``use_distributed_sampler=False``.
+    A resumed training continues with the batch after the last one. Each device draws its own
+    batches, for which the Trainer requires ``use_distributed_sampler=False``.
 
     Args:
-        training: data set whose items are the batches of a ``Step``.
-        validation: batches to validate on.
-        teacher: computes ``impaired`` for batches without it, on the training device.
-        workers: number of processes that draw batches, beside the one that trains.
+        training: Data set that returns the batch of a ``Step``.
+        validation: Batches for validation.
+        teacher: Module that computes ``impaired`` for batches without it, on the training device.
+        workers: Number of processes that draw batches, in addition to the one that trains.
     """
 
     def __init__(

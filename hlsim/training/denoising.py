@@ -1,4 +1,4 @@
-"""Criteria of a hearing aid's noise reduction: gains near Wiener's at first, then HASPI at equal level."""
+"""Criteria of a hearing aid's noise reduction: the error of its gains, and HASPI at equal level."""
 
 from __future__ import annotations
 
@@ -14,24 +14,34 @@ from hlsim.neuro.config import NEURO_RATE
 from hlsim.torchtools import constant_like
 
 POWER_FLOOR = 10.0 ** (-PASCAL_SPL / 10.0)
-"""Power at 0 dB SPL in pascals squared, so that silence is not attenuated."""
+"""Power in Pa^2 (0 dB SPL) that is added to speech and noise, so that silence is not attenuated."""
 
 WIENER_EXPONENT = 0.6
-"""Share of the dB of Wiener's gain that the wanted gain has."""
+"""Target gain in dB divided by Wiener's gain in dB."""
 
 GAIN_DELAY = 1
-"""Number of frames by which a gain is applied later than the frame from which it is estimated."""
+"""Number of frames between the frame from which a gain is estimated and that to which it
+applies."""
 
 
 def attenuation_error(aid: HearingAid, signal: Tensor, clean: Tensor) -> Tensor:
-    """Compute the mean square difference between the square roots of the gains of noise reduction and of wanted gains.
+    """Compute the error of the gains with which a hearing aid reduces noise.
 
-    The wanted gains have 0.6 of the dB of sqrt(speech / (speech + noise)), in powers, RNNoise's (Valin 2018, MMSP), and
-    are not below the largest attenuation of the aid. An estimate has errors, and those of a milder gain cost less: of
-    networks trained towards all of the dB or a part of them, those with 0.6 and at most 12 dB had the highest HASPI in
-    noise. The criterion needs neither a simulator nor an ear.
+    The target is Wiener's gain sqrt(speech / (speech + noise)), computed from powers, to the power
+    of 0.6, and at least the lowest gain of the aid. The error is the mean square difference between
+    the square roots of the gains, as in RNNoise (Valin 2018, MMSP).
 
-    Shape: (items, time) twice, in pascals -> (items,).
+    Estimates have errors, which cost less if the gains are milder. Among networks that were trained
+    with other exponents and largest attenuations, those with 0.6 and 12 dB had the highest HASPI in
+    noise. The criterion requires neither a simulator nor an ear.
+
+    Args:
+        aid: Hearing aid at 16 kHz.
+        signal: Noisy speech in pascals with shape (items, time).
+        clean: Clean speech in pascals with shape (items, time).
+
+    Returns:
+        The error of each item, with shape (items,).
     """
     samples = signal.shape[-1] // HOP * HOP
     signal, clean = signal[:, :samples], clean[:, :samples]
@@ -43,18 +53,25 @@ def attenuation_error(aid: HearingAid, signal: Tensor, clean: Tensor) -> Tensor:
         speech, noise = (frames @ band_shares).chunk(2)
         wiener = ((speech + POWER_FLOOR) / (speech + noise + POWER_FLOOR)).sqrt()
         lowest_gain = 10.0 ** (-aid.config.reduction_db / 20.0)
-        wanted = (wiener**WIENER_EXPONENT).clamp_min(lowest_gain)[:, GAIN_DELAY:]
-    return (gains[:, :-GAIN_DELAY].sqrt() - wanted.sqrt()).square().mean((-2, -1))
+        target = (wiener**WIENER_EXPONENT).clamp_min(lowest_gain)[:, GAIN_DELAY:]
+    return (gains[:, :-GAIN_DELAY].sqrt() - target.sqrt()).square().mean((-2, -1))
 
 
 def missing_intelligibility(aid: HearingAid, signal: Tensor, clean: Tensor, ears: Tensor) -> Tensor:
-    """Compute 1 minus HASPI of the aid's output, scaled to the level that the aid gives to the clean speech.
+    """Compute 1 - HASPI of an aid's output at the level of its output for clean speech.
 
-    HASPI rewards gain, and noise reduction lowers the level; at equal level it can win only by the noise it removes.
-    Wiener's gains ignore that the onset of a syllable matters more than the noise before it: a causal estimate of them is
-    late at onsets and loses much of what it has won.
+    HASPI rewards gain, and noise reduction lowers the level. At equal level, noise reduction
+    improves HASPI only by removing noise. Unlike Wiener's gains, this criterion accounts for the
+    onsets of syllables, at which a causal estimate of the gains is late.
 
-    Shape: (items, time) twice, in pascals, and (items, 8) dB HL -> (items,).
+    Args:
+        aid: Hearing aid at 16 kHz.
+        signal: Noisy speech in pascals with shape (items, time).
+        clean: Clean speech in pascals with shape (items, time).
+        ears: Thresholds in dB HL with shape (items, 8).
+
+    Returns:
+        The criterion of each item, with shape (items,).
     """
     output = aid(signal, ears)
     with torch.no_grad():

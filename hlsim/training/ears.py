@@ -1,4 +1,4 @@
-"""Random ears with the variety of measured ones."""
+"""Random ears that vary like measured ones."""
 
 from __future__ import annotations
 
@@ -10,35 +10,50 @@ from torch import Tensor
 from hlsim.audiogram import HIGHEST_SIMULATED, LOWEST_LEVEL, STANDARD
 
 MILDER = ("NH", "N1", "N2", "S1")
-"""Standard ears that join measured ones in validation, since those are mostly moderate and severe."""
+"""Standard ears that evaluations add to measured ones, most of which are moderate or severe."""
+
+SERIES = (("NH", "N1", "N2", "N3", "N4", "N5", "N6"), ("NH", "S1", "S2", "S3"))
+"""Series of standard ears by increasing loss: flat or gently sloping, and steeply sloping."""
+
+TILT = (1.0, 0.9, 0.6, 0.2, 0.0, 0.0, 0.0, 0.0)
+"""Random tilt at each frequency, relative to that at 250 Hz."""
+
+CORRELATION = 0.8
+"""Correlation of the random deviations at neighbouring frequencies, as among measured ears."""
 
 
 def draw_thresholds(count: int, generator: torch.Generator | None = None) -> Tensor:
-    """Random ears that look like measured ones, from no loss to severe.
+    """Draw random ears that resemble measured ones, from no loss to severe.
 
-    Each lies between two neighbours of one of Bisgaard's series (NH, N1 ... N6 or NH, S1 ... S3), is tilted by up to
-    20 dB at 250 Hz, and moved by Gaussian noise with a deviation of 2.4 to 8 dB that is alike at neighbouring frequencies
-    (correlation 0.8, as among measured ears). Three of four are rounded to 5 dB, as audiologists do. In MSBG's sense
-    27 % have no loss, 18 % a mild, 19 % a moderate and 36 % a severe one.
+    Each ear starts between two neighbours in one of Bisgaard's series (NH, N1 ... N6 or NH, S1 ...
+    S3). It is tilted by up to 20 dB at 250 Hz. Gaussian deviations are added, whose standard
+    deviation is 2.4 to 8 dB and which correlate at neighbouring frequencies. Three in four ears are
+    rounded to 5 dB, as in audiometry. By MSBG's definition, 27 % have no loss, 18 % a mild one, 19
+    % a moderate one and 36 % a severe one.
 
-    Returns: (count, 8) dB HL, -10 to 100.
+    Args:
+        count: Number of ears.
+        generator: Source of the random numbers.
+
+    Returns:
+        Thresholds from -10 to 100 dB HL with shape (count, 8).
     """
     uniform = torch.rand(count, 5, generator=generator)
     ears = torch.empty(count, 8)
-    for series, members in enumerate(
-        (("NH", "N1", "N2", "N3", "N4", "N5", "N6"), ("NH", "S1", "S2", "S3"))
-    ):
-        table = torch.tensor([STANDARD[name] for name in members], dtype=torch.float32)
-        # the power favours the mild end, where more ears are
-        place = uniform[:, 1] ** 1.8 * (len(members) - 1)
-        low = place.long().clamp(max=len(members) - 2)
-        between = table[low] + (table[low + 1] - table[low]) * (place - low).unsqueeze(-1)
-        ears = torch.where(((uniform[:, 0] < 0.65) == (series == 0)).unsqueeze(-1), between, ears)
-    tilt = torch.tensor([1.0, 0.9, 0.6, 0.2, 0.0, 0.0, 0.0, 0.0])
-    ears = ears + (40.0 * uniform[:, 4:] - 20.0) * tilt
-    noise = torch.randn(count, 8, generator=generator)
+    is_gentle = uniform[:, 0] < 0.65
+    for names, is_chosen in zip(SERIES, (is_gentle, ~is_gentle), strict=True):
+        table = torch.tensor([STANDARD[name] for name in names], dtype=torch.float32)
+        # The exponent makes mild losses more frequent than severe ones.
+        position = uniform[:, 1] ** 1.8 * (len(names) - 1)
+        lower = position.long().clamp(max=len(names) - 2)
+        weight = (position - lower).unsqueeze(-1)
+        interpolated = table[lower] + (table[lower + 1] - table[lower]) * weight
+        ears = torch.where(is_chosen.unsqueeze(-1), interpolated, ears)
+    ears = ears + (40.0 * uniform[:, 4:] - 20.0) * torch.tensor(TILT)
+    deviations = torch.randn(count, 8, generator=generator)
     for i in range(1, 8):
-        noise[:, i] = 0.8 * noise[:, i - 1] + math.sqrt(1 - 0.8**2) * noise[:, i]
-    ears = ears + 8.0 * noise * (0.3 + 0.7 * uniform[:, 3:4])
+        innovation = math.sqrt(1 - CORRELATION**2) * deviations[:, i]
+        deviations[:, i] = CORRELATION * deviations[:, i - 1] + innovation
+    ears = ears + 8.0 * deviations * (0.3 + 0.7 * uniform[:, 3:4])
     ears = torch.where(uniform[:, 2:3] < 0.75, 5.0 * (ears / 5.0).round(), ears)
     return ears.clamp(LOWEST_LEVEL, HIGHEST_SIMULATED)

@@ -1,4 +1,4 @@
-"""The Lightning module that both trainings share: schedule, validation scores, and initial weights."""
+"""The Lightning module of both trainings: learning rate, validation scores, and initial weights."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from torch.optim.lr_scheduler import LambdaLR
 
 from hlsim.neuro.config import ModelConfig
+from hlsim.training.callbacks import remove_score
 from hlsim.training.data_module import Batch
 from hlsim.training.recipes import TrainingRecipe
 
@@ -27,17 +28,18 @@ WARM_UP_STEPS = 50
 class TrainingModule(L.LightningModule):
     """A network in training.
 
-    The learning rate depends on the step alone, and the training ends with a validation after the recipe's last step.
-    Subclasses implement ``training_loss``, ``evaluate`` and ``summarise``.
+    The learning rate depends on the step alone, and the training ends with a validation after the
+    recipe's last step. Subclasses implement ``training_loss``, ``evaluate`` and ``summarise``.
 
     Args:
-        network: network to train.
-        recipe: learning rate, number of steps and whatever the subclass needs.
+        network: Network to train.
+        recipe: Learning rate, number of steps, and settings of the subclass.
 
     Attributes:
-        validation: values of the last validation, by name. Its ``score`` is highest for the best network.
-        start_validation: the same, before the first step.
-        description: settings and data that make this training differ from others.
+        validation: Measures of the last validation by name. The best network has the highest
+            ``score``.
+        start_validation: Measures of the validation before the first step.
+        description: Settings and data, by which a resumed training is recognised.
     """
 
     def __init__(self, network: nn.Module, recipe: TrainingRecipe) -> None:
@@ -54,27 +56,32 @@ class TrainingModule(L.LightningModule):
         raise NotImplementedError
 
     def evaluate(self, batch: Batch) -> dict[str, Tensor]:
-        """Compute measures of a validation batch by name, one value per item or per batch."""
+        """Compute the measures of a validation batch by name, with one value per item or batch."""
         raise NotImplementedError
 
     def summarise(self, values: Mapping[str, Tensor]) -> dict[str, float]:
-        """Summarise the measures of all validation batches; ``score`` is highest for the best network."""
+        """Compute means or quantiles of the measures of all validation batches, and the
+        ``score``."""
         raise NotImplementedError
 
     def trained_parameters(self) -> list[nn.Parameter]:
+        """Return the parameters that the optimiser changes."""
         return [parameter for parameter in self.parameters() if parameter.requires_grad]
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         loss = self.training_loss(batch)
         if not math.isfinite(float(loss.detach())):
             raise ValueError(
-                f"the loss is {float(loss.detach())} at step {self.global_step}; try a lower learning rate"
+                f"the loss is {float(loss.detach())} at step {self.global_step}, expected a finite "
+                "value; lower the learning rate"
             )
         self.log("loss", loss, prog_bar=True)
         return loss
 
     def on_train_batch_end(self, *arguments: Any) -> None:
-        # a stopped Trainer validates and saves its state, also where the last interval is a short one
+        # Stopping makes the Trainer validate and save its state, even if the last interval is
+        # shorter
+        # than the others.
         if self.global_step >= self.recipe.steps:
             self.trainer.should_stop = True
 
@@ -87,10 +94,9 @@ class TrainingModule(L.LightningModule):
     def on_validation_epoch_end(self) -> None:
         self.validation = self.summarise(concatenate(self._evaluations))
         self.log_dict(self.validation, batch_size=1, sync_dist=True)
-        shown = [
-            f"{name} {value:.3f}" for name, value in self.validation.items() if name != "score"
-        ]
-        self.print(f"step {self.global_step}: {', '.join(shown)}")
+        measures = remove_score(self.validation)
+        texts = [f"{name} {value:.3f}" for name, value in measures.items()]
+        self.print(f"step {self.global_step}: {', '.join(texts)}")
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         checkpoint["start_validation"] = self.start_validation
@@ -108,9 +114,13 @@ class TrainingModule(L.LightningModule):
 
 
 def relative_learning_rate(step: int, steps: int) -> float:
-    """Compute the learning rate of a step as a share of the highest one.
+    """Compute the learning rate at a step, relative to the highest one.
 
-    It rises over the first 50 steps and falls as half a cosine, to 1 % at the last step.
+    It rises over the first 50 steps, and falls along half a period of a cosine to 1 % at the end.
+
+    Args:
+        step: Number of the step.
+        steps: Number of steps of the training.
     """
     rise = min(1.0, (step + 1) / WARM_UP_STEPS)
     fall = 0.5 * (1.0 + math.cos(math.pi * min(1.0, step / steps)))
@@ -118,7 +128,7 @@ def relative_learning_rate(step: int, steps: int) -> float:
 
 
 def concatenate(evaluations: list[dict[str, Tensor]]) -> dict[str, Tensor]:
-    """Concatenate the values of several batches by name; a batch may lack some names."""
+    """Concatenate the values of several batches by name. A batch may lack names."""
     lists: dict[str, list[Tensor]] = {}
     for evaluation in evaluations:
         for name, values in evaluation.items():
@@ -132,16 +142,18 @@ def initial_network(
     build: Callable[[Config], Network],
     load: Callable[[str], nn.Module],
 ) -> Network:
-    """Build the network to train, with random weights of the recipe's seed or with those of its ``start``.
+    """Build the network to train, with random weights or with those of a checkpoint.
 
     Args:
-        recipe: ``start``, a checkpoint's name or folder; ``model``, the network's settings; ``seed``.
-        config_kind: class of the network's settings.
-        build: builds a network from its settings.
-        load: loads a checkpoint by name.
+        recipe: Recipe with the name of the checkpoint (``start``), the settings of the network
+            (``model``) and the seed of random weights.
+        config_kind: Class of the network's settings.
+        build: Function from settings to network.
+        load: Function from the name of a checkpoint to its network.
 
     Raises:
-        ValueError: there is no such checkpoint, or it is of another kind or has other settings.
+        ValueError: There is no such checkpoint, it is of another kind, or its settings differ from
+            those of the recipe.
     """
     config = config_kind.from_dict(recipe.model)
     if not recipe.start:
@@ -151,13 +163,17 @@ def initial_network(
     network: Any = load(recipe.start)
     if not isinstance(getattr(network, "config", None), config_kind):
         raise ValueError(
-            f"the recipe starts from {recipe.start!r}, a {type(network).__name__}; give a checkpoint of the recipe's kind"
+            f"the checkpoint {recipe.start!r} is a {type(network).__name__}, expected a network "
+            "with "
+            f"{config_kind.__name__}; choose another start"
         )
     if recipe.model and config != network.config:
-        given, found = config.to_dict(), network.config.to_dict()
-        differing = ", ".join(name for name in given if given[name] != found[name])
+        settings = config.to_dict()
+        start_settings = network.config.to_dict()
+        names = [name for name, value in settings.items() if value != start_settings[name]]
         raise ValueError(
-            f"the recipe's model differs from that of its start {recipe.start!r} in {differing}; leave 'model' out"
+            f"the recipe's model differs from its start {recipe.start!r} in {', '.join(names)}; "
+            "leave 'model' out"
         )
     trained: Network = network.train().requires_grad_(True)
     return trained

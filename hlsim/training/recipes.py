@@ -1,6 +1,7 @@
-"""Recipes: the settings of a training, whose names are the same in Python, in YAML files and on the command line.
+"""Recipes: the settings of a training, by the same names in Python, YAML and the command line.
 
-Nothing here imports torch, so that the command line can show the settings at once.
+The command line shows these docstrings without waiting for torch, which this module does not
+import.
 """
 
 from __future__ import annotations
@@ -16,22 +17,23 @@ ReferenceName = Literal["clean", "normal-hearing"]
 
 @dataclass(frozen=True, kw_only=True)
 class TrainingRecipe:
-    """Settings that both trainings have, with the defaults of a simulator.
+    """Settings of both trainings, with the defaults of a simulator.
 
     Attributes:
-        model: settings of the network, such as ``channels``.
-        start: name or folder of a checkpoint whose weights to start from, instead of random ones. Its settings are those
-            of the model. It remains the best network until training finds a better one.
-        steps: number of training steps, over which the learning rate falls.
-        batch: number of clips per step.
-        seconds: duration of a clip.
-        learning_rate: highest learning rate of AdamW.
-        weights: weight of each criterion.
-        levels: lowest and highest level of the speech in dB SPL.
-        sounds: share of clips that are tones or clicks instead of speech, from 0 to 1.
-        validate_every: number of steps between validations.
-        validation_items: number of items to validate on, rounded up to whole batches of 4 (compensators) or 8.
-        seed: seed of every random draw.
+        model: Settings of the network, such as ``channels``.
+        start: Name or folder of a checkpoint to start from, instead of random weights. The network
+            has its settings. It remains the best network until training finds a better one.
+        steps: Number of training steps. The learning rate falls over them.
+        batch: Number of clips per step.
+        seconds: Duration of a clip.
+        learning_rate: Highest learning rate of the optimiser, AdamW.
+        weights: Weights of the criteria by name.
+        levels: Lowest and highest level of the speech in dB SPL.
+        sounds: Share of clips that are tones or clicks instead of speech, from 0 to 1.
+        validate_every: Number of steps between validations.
+        validation_items: Number of validation items, rounded up to batches of 4 (compensators) or 8
+            (simulators).
+        seed: Seed of every random draw.
     """
 
     model: dict[str, Any] = field(default_factory=dict)
@@ -61,19 +63,18 @@ class TrainingRecipe:
             self._require(name, 0.0 <= getattr(self, name) <= 1.0, "a share from 0 to 1")
         for name in self.ranges:
             low, high = getattr(self, name)
-            self._require(name, low <= high, "a lowest and a highest value")
-            object.__setattr__(self, name, (low, high))  # a list in YAML
+            self._require(name, low <= high, "the lowest value first")
+            object.__setattr__(self, name, (low, high))  # In YAML, it is a list.
         self._require("seed", abs(self.seed) < 2**62, "less than 2**62")
         are_known = set(self.weights) <= set(self.criteria)
         self._require("weights", are_known, f"weights of {', '.join(self.criteria)}")
         are_useful = any(self.weights.values()) and min(self.weights.values()) >= 0.0
-        self._require("weights", are_useful, "0 or more for each, and more than 0 for one")
+        self._require("weights", are_useful, "no negative weight, and at least one above 0")
 
     def _require(self, name: str, is_valid: bool, expected: str) -> None:
         if not is_valid:
-            raise ValueError(
-                f"{name} of the recipe is {getattr(self, name)!r}; expected {expected}"
-            )
+            value = getattr(self, name)
+            raise ValueError(f"recipe: {name} is {value!r}, expected {expected}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,19 +82,22 @@ class SimulatorRecipe(TrainingRecipe):
     """Settings of the training of a simulator.
 
     Attributes:
-        model: settings of ``NeuroConfig``.
-        weights: weights of ``snr`` and ``log_spectrum``, both in dB / 10, and of the paper's ``magnitude``, ``phase``,
-            ``complex`` and ``time``.
-        unit_power: signal that is scaled to unit power before the criteria, and all others with it: ``truth``, the
-            target, so that soft items count as much as loud ones, or ``input``, as in MP-SENet. The paper's criteria on
-            a network without a prior need the latter: the first errors of a severe ear are 50 dB above its target, and
-            the network would learn to be silent.
-        levels: lowest and highest level of the speech in dB SPL, before amplification.
-        treated: whether clips are equalised, amplified and compressed at random, as compensators do.
-        precision: ``float32``, or ``bfloat16`` for the network's own layers. The latter is several times faster on
-            hardware with units for it and several times slower on other hardware. Transforms, physics, scans and criteria
-            stay in float32.
-        average: weight of the past in the moving average of the weights, which is validated and kept; 0 for none.
+        model: Settings of ``NeuroConfig``.
+        weights: Weights of ``snr`` and ``log_spectrum``, both in dB / 10, and of the paper's
+            ``magnitude``, ``phase``, ``complex`` and ``time``.
+        unit_power: Signal by whose power all signals are divided before the criteria, ``truth`` or
+            ``input``. ``truth`` is the target, with which soft items count as much as loud ones.
+            ``input`` is the choice of MP-SENet. The paper's criteria require it for networks
+            without a prior: at first, their errors for severe ears are 50 dB above the target, and
+            they would learn to be silent.
+        levels: Lowest and highest level of the speech in dB SPL, before amplification.
+        treated: Whether clips are equalised, amplified and compressed at random, like the outputs
+            of compensators.
+        precision: Number format of the network's layers, ``float32`` or ``bfloat16``. ``bfloat16``
+            is several times faster on hardware that supports it, and several times slower on other
+            hardware. Transforms, prior, scans and criteria remain in float32.
+        average: Weight of the past in the moving average of the weights; 0 for none. The average is
+            validated and saved.
     """
 
     weights: dict[str, float] = field(default_factory=lambda: {"snr": 1.0, "log_spectrum": 0.5})
@@ -113,24 +117,29 @@ class SimulatorRecipe(TrainingRecipe):
 class CompensatorRecipe(TrainingRecipe):
     """Settings of the training of a compensator.
 
-    The defaults are for one ear and a few minutes: many small steps. All ears require larger batches and hours.
+    The defaults are for one ear and a few minutes, with many small steps. A compensator for all
+    ears requires larger batches and hours.
 
     Attributes:
-        kind: ``mapping-compensator`` or ``hearing-aid``.
-        model: settings of ``MappingConfig`` or ``HearingAidConfig``.
-        weights: weights of the criteria of ``HearingLossLoss``: ``coherent-bands``, ``bands`` (in dB), ``paper``, and
-            ``haspi`` and ``hasqi`` (1 minus the score, for clips of 0.7 s or more); and of those of a hearing aid's noise
-            reduction: ``denoising``, the error of its gains, and ``intelligibility``, 1 minus HASPI at equal level.
-            Amplification is trained by the former alone, noise reduction by the latter alone.
-        reference: signal that the paper's criterion compares with, ``clean`` or ``normal-hearing``.
-        sounds: share of clips that are tones or clicks instead of speech, from 0 to 1. From speech in noise alone, a
-            network learns that steady sounds are noise.
-        equalised: share of clips whose speech is equalised at random by up to 15 dB, and of those whose noise is. Few
-            voices have few spectra, and the gain for other ones could be 20 dB off.
-        noisy: share of the clips of speech that are noisy, if there is noise.
-        babble: share of the noisy clips whose noise is up to four other voices.
-        snr: lowest and highest signal-to-noise ratio in dB.
-        unreduced: share of items for which a hearing aid's noise reduction is off.
+        kind: Type of the network, ``mapping-compensator`` or ``hearing-aid``.
+        model: Settings of ``MappingConfig`` or ``HearingAidConfig``.
+        weights: Weights of the criteria ``coherent-bands``, ``bands``, ``paper``, ``haspi``,
+            ``hasqi``, ``denoising`` and ``intelligibility``. The first five are those of
+            ``HearingLossLoss``; ``haspi`` and ``hasqi`` (1 - score) require clips of 0.7 s or more.
+            The last two train a hearing aid's noise reduction alone, and the others its
+            amplification alone: ``denoising`` is the error of its gains, ``intelligibility`` is 1 -
+            HASPI at equal level.
+        reference: Signal with which the paper's criterion compares, ``clean`` or
+            ``normal-hearing``.
+        sounds: Share of clips that are tones or clicks instead of speech, from 0 to 1. Without
+            them, a network learns that steady sounds are noise.
+        equalised: Share of clips of speech, and of noise, that are equalised at random by up to 15
+            dB. A few voices have few spectra, and the gains for other voices would be up to 20 dB
+            wrong.
+        noisy: Share of noisy clips among those of speech, if there is noise.
+        babble: Share of noisy clips whose noise is up to four other voices.
+        snr: Lowest and highest signal-to-noise ratio in dB.
+        unreduced: Share of items for which a hearing aid's noise reduction is off.
     """
 
     kind: Kind = "mapping-compensator"
@@ -164,19 +173,21 @@ class CompensatorRecipe(TrainingRecipe):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self._weighs("haspi", "hasqi", "intelligibility"):
+        if self._has_weight("haspi", "hasqi", "intelligibility"):
             from hlsim.metrics.pair import SHORTEST_SECONDS
 
             expected = f"{SHORTEST_SECONDS} or more for haspi, hasqi and intelligibility"
             self._require("seconds", self.seconds >= SHORTEST_SECONDS, expected)
-        reduces_noise = self._weighs("denoising", "intelligibility")
+        reduces_noise = self._has_weight("denoising", "intelligibility")
         if reduces_noise or self.unreduced > 0.0:
             expected = "hearing-aid, because only a hearing aid has noise reduction"
             self._require("kind", self.kind == "hearing-aid", expected)
         if reduces_noise or self.babble > 0.0:
             self._require("noisy", self.noisy > 0.0, "more than 0 for babble and noise reduction")
         if self.babble > 0.0:
-            self._require("batch", self.batch >= 2, "2 or more for babble, which is other voices")
+            expected = "2 or more, because babble consists of other voices of the batch"
+            self._require("batch", self.batch >= 2, expected)
 
-    def _weighs(self, *criteria: str) -> bool:
+    def _has_weight(self, *criteria: str) -> bool:
+        """Return whether one of the criteria has a weight above 0."""
         return any(self.weights.get(name, 0.0) > 0.0 for name in criteria)

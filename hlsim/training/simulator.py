@@ -1,4 +1,4 @@
-"""Training a Neuro-MSBG on the output of the exact MSBG or of another teacher."""
+"""Training of a Neuro-MSBG on the output of the exact MSBG or of another teacher."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from hlsim.training.callbacks import WeightAverage
 from hlsim.training.data_module import Batch
 from hlsim.training.module import TrainingModule, initial_network
 from hlsim.training.recipes import SimulatorRecipe
-from hlsim.training.teacher import find_teacher, name_of
+from hlsim.training.teacher import find_teacher, teacher_name
 from hlsim.training.trainer import TrainerOptions, train_network
 
 POWER_FLOOR = 1e-18
-"""Added to the power of a signal before dividing by it."""
+"""Power in Pa^2 that is added to the power of a signal before dividing by it."""
 
 
 class SimulatorTraining(TrainingModule):
-    """A network that learns the teacher's output, ``impaired`` in a batch."""
+    """Training of a network on the teacher's output, ``impaired`` in a batch."""
 
     recipe: SimulatorRecipe
 
@@ -41,7 +41,8 @@ class SimulatorTraining(TrainingModule):
         perceived = self.network(signal, batch["thresholds"])
         unit = target if self.recipe.unit_power == "truth" else signal
         scale = unit.square().mean(-1, keepdim=True).add(POWER_FLOOR).rsqrt()
-        target, perceived = target * scale, perceived * scale
+        target = target * scale
+        perceived = perceived * scale
         weights = self.recipe.weights
         parts = {"snr": noise_to_signal_db(perceived, target) / 10.0}
         self.log("snr", -10.0 * parts["snr"].mean(), prog_bar=True)
@@ -52,13 +53,17 @@ class SimulatorTraining(TrainingModule):
         return weighted_sum(parts, weights).mean()
 
     def evaluate(self, batch: Batch) -> dict[str, Tensor]:
-        """Compute the SNR of each item in dB, apart for speech and for tones and clicks."""
+        """Compute the SNR of each item in dB, by one name for speech and one for tones and
+        clicks."""
         perceived = self.network(batch["signal"], batch["thresholds"])
         name = "valid_sounds_snr" if "sounds" in batch else "valid_snr"
         return {name: -noise_to_signal_db(perceived, batch["impaired"])}
 
     def summarise(self, values: Mapping[str, Tensor]) -> dict[str, float]:
-        """Compute median and lowest tenth of each SNR; the score weights both kinds by their share in training."""
+        """Compute the median and the lowest tenth of each SNR, and the score.
+
+        The score weights speech and sounds by their shares in training.
+        """
         summary: dict[str, float] = {}
         score = 0.0
         for name, snr in values.items():
@@ -80,31 +85,32 @@ def train_simulator(
     teacher: str = "msbg",
     **options: Unpack[TrainerOptions],
 ) -> Path:
-    """Train a simulator, or resume its training, and keep the best one by validation.
+    """Train a simulator, or resume its training, and save the one with the best validation.
 
     Args:
-        data: speech, noise and ears to draw batches from.
-        recipe: network, criteria and number of steps.
-        out: folder for the results.
-        teacher: ``"msbg"``, the exact one, or the name of a plug-in, see ``PluginTeacher``.
+        data: Speech, noise and ears.
+        recipe: Network, criteria and number of steps.
+        out: Folder for the results.
+        teacher: ``"msbg"``, the exact MSBG, or the name of a plug-in, see ``PluginTeacher``.
+        options: Device, time limit and progress, see ``TrainerOptions``.
 
     Returns:
         The folder that ``load_pretrained`` reads, ``out/checkpoint``.
 
     Raises:
-        ValueError: data, recipe or teacher cannot be used.
+        ValueError: The data, the recipe or the teacher is invalid.
     """
     module = SimulatorTraining(recipe)
     reference = find_teacher(teacher)
-    described = {} if reference is None else {"teacher": name_of(reference)}
+    about = {} if reference is None else {"teacher": teacher_name(reference)}
     batches = simulator_data(data, recipe, reference)
     return train_network(
         module,
         batches,
         SIMULATOR,
         out=out,
-        identity=data.identity() | described,
-        about=described,
+        identity=data.identity() | about,
+        about=about,
         callbacks=[WeightAverage(recipe.average)] if recipe.average else [],
         **options,
     )

@@ -16,24 +16,29 @@ from hlsim.neuro.config import NEURO_RATE
 from hlsim.plugins import WaveformPlugin
 
 TEACHERS = ("msbg",)
+"""Names of the teachers that are no plug-ins."""
 
 Reference = Callable[[Tensor, Tensor, int], Tensor]
-"""A simulator in place of the exact MSBG: (items, time) in pascals, (items, 8) in dB HL and the
-sample rate in Hz -> (items, time)."""
+"""Simulator that replaces the exact MSBG as the teacher.
+
+It receives signals in pascals with shape (items, time), thresholds in dB HL with shape (items, 8)
+and the sample rate in Hz, and returns the perceived signals with shape (items, time).
+"""
 
 
 class PluginTeacher:
-    """A simulator ``(waveform, audiogram) -> waveform`` of your own, as a ``Reference``.
+    """Teacher that calls a user's simulator ``(waveform, audiogram) -> waveform``.
 
-    It receives (items, time) in pascals at its attribute ``sample_rate``, 16000 Hz if it has none,
-    and (items, 8) in dB HL, and returns the perceived signals, time-aligned with its input.
+    The simulator receives signals in pascals with shape (items, time) and thresholds in dB HL with
+    shape (items, 8). It returns the perceived signals, time-aligned with its input. The sample rate
+    is its attribute ``sample_rate`` or else 16000 Hz.
 
     Args:
-        name: As for ``load_plugin``.
+        name: ``package.module:name`` or ``path/to/file.py:name``, see ``load_plugin``.
 
     Raises:
-        ValueError: As ``WaveformPlugin``, the sample rate is out of range, or the output for half a
-            second of noise and an ear without a loss is no such waveform.
+        ValueError: There is no such simulator, its sample rate is out of range, or its output for
+            half a second of noise has another shape or is not finite.
     """
 
     def __init__(self, name: str) -> None:
@@ -50,17 +55,26 @@ class PluginTeacher:
         return str(self.plugin)
 
     def __call__(self, signals: Tensor, thresholds: Tensor, sample_rate: int) -> Tensor:
-        """Perceived signals. Shape: (items, time) in pascals, (items, 8) in dB HL -> (items, time)."""
+        """Simulate the hearing losses at another sample rate than that of the simulator.
+
+        Args:
+            signals: Signals in pascals with shape (items, time).
+            thresholds: Ears in dB HL with shape (items, 8).
+            sample_rate: Sample rate of the signals in Hz.
+
+        Returns:
+            Perceived signals in pascals with shape (items, time).
+        """
         perceived = self.plugin(resample(signals, sample_rate, self.sample_rate), thresholds)
         return resample(perceived, self.sample_rate, sample_rate)[..., : signals.shape[-1]]
 
 
 class Teacher(nn.Module):
-    """The exact MSBG, or another simulator, time-aligned with its input.
+    """Exact MSBG or another simulator, time-aligned with its input.
 
     Args:
-        sample_rate: sample rate of the signals in Hz.
-        reference: simulator to use instead of the exact MSBG.
+        sample_rate: Sample rate of the signals in Hz.
+        reference: Simulator that replaces the exact MSBG.
     """
 
     def __init__(self, sample_rate: int, reference: Reference | None = None) -> None:
@@ -71,7 +85,10 @@ class Teacher(nn.Module):
 
     @torch.no_grad()
     def forward(self, signals: Tensor, thresholds: Tensor) -> Tensor:
-        """Perceived signals. Shape: (items, time) in pascals, (items, 8) in dB HL -> (items, time)."""
+        """Simulate the hearing losses.
+
+        Shape: (items, time) in pascals, (items, 8) in dB HL -> (items, time) in pascals.
+        """
         if self.reference is not None:
             return self.reference(signals, thresholds, self.sample_rate)
         perceived: Tensor = self.msbg(signals, thresholds)
@@ -79,7 +96,13 @@ class Teacher(nn.Module):
 
 
 def find_teacher(name: str) -> PluginTeacher | None:
-    """The teacher with a name: None for ``msbg``, the exact one, or a plug-in.
+    """Load a teacher by name.
+
+    Args:
+        name: ``"msbg"``, or the name of a plug-in.
+
+    Returns:
+        The plug-in, or None for the exact MSBG.
 
     Raises:
         ValueError: There is no such teacher.
@@ -90,6 +113,6 @@ def find_teacher(name: str) -> PluginTeacher | None:
     return None
 
 
-def name_of(reference: Reference | None) -> str:
-    """Name of a teacher, with the fingerprint of a plug-in."""
+def teacher_name(reference: Reference | None) -> str:
+    """Return the name of a teacher, with the fingerprint of a plug-in."""
     return "msbg" if reference is None else str(getattr(reference, "__name__", reference))

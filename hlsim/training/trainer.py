@@ -1,4 +1,4 @@
-"""Running a training with Lightning: it resumes, keeps the best network, and stops when it is told to."""
+"""Trainings with Lightning, which resume, save the best network, and stop after a time limit."""
 
 from __future__ import annotations
 
@@ -26,23 +26,23 @@ from hlsim.training.recipes import TrainingRecipe
 from hlsim.version import __version__
 
 LAST_STATE = "last.ckpt"
-"""File of the state from which a training resumes."""
+"""Name of the file from which a training resumes."""
 
 EXPECTED_WARNINGS = (
     "many workers|directory .* exists|not used|before the epoch ended|logging interval|LeafSpec"
 )
-"""What Lightning warns of, of things that hlsim does on purpose."""
+"""Pattern of Lightning's warnings about choices that hlsim makes on purpose."""
 
 
 class TrainerOptions(TypedDict, total=False):
-    """How a training runs.
+    """Options of a training that do not change its result.
 
     Attributes:
-        max_minutes: minutes after which training stops, those before a resumption included. By default it ends after
-            the recipe's steps.
-        accelerator: as for Lightning's ``Trainer``, by default "auto".
-        devices: number of devices, by default 1. Each draws its own batches, so that the batch grows with their number.
-        progress: whether a terminal shows a progress bar, as by default.
+        max_minutes: Time limit in minutes, including the time before a resumption. By default, the
+            training ends after the recipe's steps.
+        accelerator: Type of device, "auto" (default), "cpu" or "gpu", see Lightning's ``Trainer``.
+        devices: Number of devices, 1 by default. Each draws a batch of its own at every step.
+        progress: Whether a terminal shows a progress bar, which it does by default.
     """
 
     max_minutes: float | None
@@ -62,23 +62,27 @@ def train_network(
     callbacks: Sequence[Callback] = (),
     **options: Unpack[TrainerOptions],
 ) -> Path:
-    """Train a network, or resume its training, and keep the best one by validation.
+    """Train a network, or resume its training, and save the one with the best validation.
 
     Args:
-        module, data: network and batches.
-        kind: kind of the checkpoint.
-        out: folder for checkpoint, states and TensorBoard's events. If it holds a state, training resumes from it.
-        identity: description of data and teacher. A training does not resume with another identity or recipe.
-        about: what the checkpoint's ``config.json`` says beside recipe, steps and validation.
-        callbacks: further callbacks.
+        module: Network in training.
+        data: Batches for training and validation.
+        kind: Kind of the checkpoint.
+        out: Folder for the checkpoint, the states and TensorBoard's events. If it contains a state,
+            the training resumes from it.
+        identity: Description of data and teacher. A training resumes only with the same description
+            and recipe.
+        about: Entries of the checkpoint's training record, besides recipe, steps and validation.
+        callbacks: Additional callbacks of Lightning.
+        options: Device, time limit and progress.
 
     Returns:
-        The checkpoint's folder.
+        The folder of the checkpoint.
 
     Raises:
-        ValueError: the folder holds another training or a broken state, there is no such device, or the loss is not
-            finite.
-        KeyboardInterrupt: the training was interrupted. It resumes from its last validation.
+        ValueError: The folder contains another training or a broken state, there is no such device,
+            or the loss is not finite.
+        KeyboardInterrupt: The training was interrupted. It resumes from its last validation.
     """
     recipe = module.recipe
     folder = Path(out)
@@ -100,14 +104,14 @@ def train_network(
                 trainer.validate(module, datamodule=data, verbose=False)
                 module.start_validation = module.validation
             if recipe.start:
-                # that network is the best one until training finds a better one
+                # The start is the best network until training finds a better one.
                 best.score_to_beat = module.start_validation["score"]
                 if last_state is None and trainer.is_global_zero:
                     best.release(module, module.state_dict(), step=0, seconds=0.0)
             ckpt_path = None if last_state is None else last_path
             trainer.fit(module, datamodule=data, ckpt_path=ckpt_path, weights_only=True)
         except SystemExit:
-            if trainer.interrupted:  # Lightning exits after Ctrl-C
+            if trainer.interrupted:  # Lightning raises SystemExit after Ctrl-C.
                 raise KeyboardInterrupt from None
             raise
     return folder / CHECKPOINT
@@ -116,7 +120,17 @@ def train_network(
 def make_trainer(
     folder: Path, recipe: TrainingRecipe, callbacks: Sequence[Callback], options: TrainerOptions
 ) -> L.Trainer:
-    """Make a Trainer of a recipe's steps. Raises ValueError if the options do not fit the machine."""
+    """Make a Trainer for the steps of a recipe.
+
+    Args:
+        folder: Folder for states and events.
+        recipe: Number of steps, and interval of validations.
+        callbacks: Additional callbacks.
+        options: Device, time limit and progress.
+
+    Raises:
+        ValueError: There is no such device.
+    """
     max_minutes = options.get("max_minutes")
     duration = None if max_minutes is None else timedelta(minutes=max_minutes)
     last = ModelCheckpoint(
@@ -125,21 +139,22 @@ def make_trainer(
         save_on_train_epoch_end=False,
         enable_version_counter=False,
     )
-    # the last state holds what the callbacks before it have done
+    # The state includes those of all callbacks, if it is saved after they have run.
     all_callbacks = [Timer(duration, verbose=False), *callbacks, last]
     show_progress = options.get("progress", True) and sys.stdout.isatty()
     if show_progress:
         all_callbacks.append(ProgressBar())
-    accelerator, devices = options.get("accelerator", "auto"), options.get("devices", 1)
+    accelerator = options.get("accelerator", "auto")
+    devices = options.get("devices", 1)
     try:
         return L.Trainer(
             accelerator=accelerator,
             devices=devices,
-            use_distributed_sampler=False,  # each process draws its own batches
+            use_distributed_sampler=False,  # Each process draws its own batches.
             max_epochs=-1,
             max_steps=recipe.steps,
             val_check_interval=recipe.validate_every,
-            check_val_every_n_epoch=None,  # the interval may be longer than the training
+            check_val_every_n_epoch=None,  # The interval may be longer than the training.
             num_sanity_val_steps=0,
             gradient_clip_val=1.0,
             callbacks=all_callbacks,
@@ -150,34 +165,48 @@ def make_trainer(
             default_root_dir=folder,
         )
     except MisconfigurationException as error:
-        raise ValueError(f"cannot train on {devices} of {accelerator}: {error}") from error
+        raise ValueError(
+            f"cannot train on {devices} devices of type {accelerator!r}: {error}"
+        ) from error
 
 
 def read_state(path: Path) -> dict[str, Any]:
-    """Read a training's state. Raises ValueError if the file is broken."""
+    """Read the state of a training.
+
+    Raises:
+        ValueError: The file is broken.
+    """
     try:
         state: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
         state["description"]
-    except Exception as error:  # torch, zip and pickle each have their own
+    except Exception as error:  # torch, zipfile and pickle raise various exceptions.
         raise ValueError(
-            f"{path} cannot be read as a training's state; delete it to start anew"
+            f"{path}: cannot be read as the state of a training; delete it to start from the "
+            "beginning"
         ) from error
     return state
 
 
-def check_description(path: Path, found: Mapping[str, Any], expected: Mapping[str, Any]) -> None:
-    """Raise ValueError, naming what differs, unless a state is of the training that is to resume."""
-    names = sorted({*found, *expected})
-    differing = [name for name in names if found.get(name) != expected.get(name)]
-    if differing:
+def check_description(path: Path, actual: Mapping[str, Any], expected: Mapping[str, Any]) -> None:
+    """Raise ValueError unless a state belongs to the training that should resume.
+
+    Args:
+        path: File of the state, for the error message.
+        actual: Description in the state.
+        expected: Description of the training.
+    """
+    names = sorted({*actual, *expected})
+    differences = [name for name in names if actual.get(name) != expected.get(name)]
+    if differences:
         raise ValueError(
-            f"{path} is the state of a training with other {', '.join(differing)}; choose another output folder"
+            f"{path}: the state belongs to a training that differs in {', '.join(differences)}; "
+            "choose another output folder"
         )
 
 
 @contextmanager
 def quiet_lightning() -> Iterator[None]:
-    """Silence Lightning's remarks about devices and about what hlsim does on purpose."""
+    """Silence Lightning's messages about devices, and its warnings in ``EXPECTED_WARNINGS``."""
     logger = logging.getLogger("lightning.pytorch")
     level = logger.level
     logger.setLevel(logging.WARNING)

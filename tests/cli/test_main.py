@@ -230,7 +230,7 @@ def test_folders_keep_their_tree_and_what_is_left_out_is_reported(
     assert "no checkpoint 'nobody'" in capsys.readouterr().err
     assert run(*call, "nalr") == 2
     printed = capsys.readouterr()
-    assert "files that are not audio, passed over: 1 (.txt)" in printed.err
+    assert "files that are not audio, not used: 1 (.txt)" in printed.err
     assert "broken.wav: cannot be read" in printed.err and "1 of 3 files" in printed.err
     written = {
         path.relative_to(tmp_path / "out").as_posix() for path in (tmp_path / "out").rglob("*.wav")

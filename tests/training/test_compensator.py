@@ -96,10 +96,10 @@ def test_another_ear_or_simulator_needs_another_folder(data: TrainingData, tmp_p
 
     save_simulator()
     train(data, SMALL, tmp_path / "out", audiogram=N3, simulator=simulator)
-    with pytest.raises(ValueError, match="other audiogram;"):
+    with pytest.raises(ValueError, match="differs in audiogram;"):
         train(data, SMALL, tmp_path / "out", simulator=simulator)
     save_simulator()  # with other random weights
-    with pytest.raises(ValueError, match="other simulator_sha256;"):
+    with pytest.raises(ValueError, match="differs in simulator_sha256;"):
         train(data, SMALL, tmp_path / "out", audiogram=N3, simulator=simulator)
 
 

@@ -88,7 +88,7 @@ def test_instances_that_cannot_be_read_name_the_file(voicebank: Path) -> None:
     instances = Instances(corpus.utterances, voicebank, draw_ears(4, "train"))
     noisy = voicebank / "noisy_testset_wav_16k" / "p232_001.wav"
     write_audio(noisy, torch.randn(9000), 16000)
-    with pytest.raises(ValueError, match=r"p232_001\.wav: 9000 samples at 16000 Hz"):
+    with pytest.raises(ValueError, match=r"p232_001\.wav"):
         instances[0]
     with pytest.raises(IndexError):
         instances[len(instances)]

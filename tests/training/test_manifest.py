@@ -1,4 +1,4 @@
-"""Manifests: what is written is read, and what contradicts itself is rejected."""
+"""Manifests are read as they were written, and contradictory ones are rejected."""
 
 from pathlib import Path
 
@@ -30,7 +30,7 @@ def test_a_manifest_is_read_as_it_was_written(tmp_path: Path) -> None:
     ]
     (tmp_path / "m.csv").rename(tmp_path / "a" / "m.csv")
     assert read_manifest(tmp_path / "a" / "m.csv", tmp_path) == UTTERANCES
-    with pytest.raises(ValueError, match=r"a/1.wav, is not in .*--root"):
+    with pytest.raises(ValueError, match="--root"):
         read_manifest(tmp_path / "a" / "m.csv")
 
 
@@ -75,7 +75,7 @@ def test_what_is_no_manifest_is_rejected(tmp_path: Path, text: str) -> None:
     ],
 )
 def test_contradictions_and_noise_are_rejected(rows: list[Utterance]) -> None:
-    with pytest.raises(ValueError, match=r"listed|split|would be clean speech"):
+    with pytest.raises(ValueError):
         check_utterances(rows)
 
 

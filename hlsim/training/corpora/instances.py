@@ -1,4 +1,5 @@
-"""The paper's training instances: every utterance of a corpus, clean and noisy, for several ears."""
+"""The paper's training instances: every utterance of a corpus, clean and noisy, for several
+ears."""
 
 from __future__ import annotations
 
@@ -25,22 +26,31 @@ from hlsim.training.ears import draw_thresholds
 from hlsim.training.teacher import Teacher
 
 Input = Literal["clean", "noisy"]
-SEVERITIES = ("mild", "moderate", "severe")  # "ranging from mild to severe"
+"""Version of an utterance that an instance processes."""
+
+SEVERITIES = ("mild", "moderate", "severe")
+"""Severities of the ears, which range "from mild to severe" in the paper."""
+
 EARS_PER_UTTERANCE = 2
+"""Number of ears per utterance."""
 
 
 class Instances(Dataset[dict[str, Tensor]]):
-    """Instances of utterances, at 16 kHz and 65 dB SPL active speech level, each computed when it is asked for.
+    """Instances at 16 kHz, computed on access.
 
-    Each utterance has two ears, and for each ear one instance of its clean version and one of its noisy version, if there
-    is one. An instance has ``impaired``, the output of the exact MSBG; ``clean``, the reference, and ``signal``, the
-    normal-hearing input, aligned with it; each (time,) in pascals; and ``thresholds``, (8,) dB HL.
+    Each utterance has two ears. For each ear, there is one instance of the clean and one of the
+    noisy version. An instance is a dictionary of four tensors:
+
+    - ``impaired``: output of the exact MSBG in pascals with shape (time,)
+    - ``clean``: reference, aligned with it
+    - ``signal``: normal-hearing input, aligned with it
+    - ``thresholds``: ear in dB HL with shape (8,)
 
     Args:
-        utterances: rows of a manifest, usually those of one split.
-        root: folder that their paths are relative to.
-        ears: audiograms that the utterances take in turn, two each, such as those of ``draw_ears``.
-        level: active level of the clean speech in dB SPL.
+        utterances: Rows of a manifest, usually those of one split.
+        root: Folder to which their paths are relative.
+        ears: Ears, which are assigned to the utterances in turn, such as those of ``draw_ears``.
+        level: Active level of the clean speech in dB SPL (ITU-T P.56).
     """
 
     def __init__(
@@ -69,14 +79,14 @@ class Instances(Dataset[dict[str, Tensor]]):
         thresholds = torch.tensor(ear.thresholds)
         clean, noisy = self.read(utterance)
         signal = clean if name == "clean" else noisy
-        # lengths in steps of 0.5 s: MSBG computes new filters for each length
+        # Few different lengths save time, because MSBG computes new filters for each length.
         padding = -len(signal) % (NEURO_RATE // 2)
         padded = functional.pad(signal, (0, padding))
         impaired = self.teacher(padded[None], thresholds[None])[0, : len(signal)]
         return {"clean": clean, "signal": signal, "impaired": impaired, "thresholds": thresholds}
 
     def read(self, utterance: Utterance) -> tuple[Tensor, Tensor]:
-        """Clean and noisy speech at the level of the instances. Shape: -> (time,) twice."""
+        """Read clean and noisy speech at the level of the instances. Shape: -> (time,), (time,)."""
         clean, rate = read_audio(self.root / utterance.path)
         noisy = clean
         if utterance.noisy:
@@ -88,18 +98,26 @@ class Instances(Dataset[dict[str, Tensor]]):
 
 
 def draw_ears(count: int, split: str, seed: int = 0) -> list[Audiogram]:
-    """Random ears with mild, moderate and severe losses in turn; no ear of the test split is in another split."""
+    """Draw random ears with mild, moderate and severe losses in turn.
+
+    No ear of the test split is in another split.
+
+    Args:
+        count: Number of ears.
+        split: ``train``, ``valid`` or ``test``.
+        seed: Seed of the random numbers.
+    """
     generator = torch.Generator().manual_seed(seed * 1_000_003 + zlib.crc32(split.encode()))
-    waiting: dict[str, list[Audiogram]] = {severity: [] for severity in SEVERITIES}
+    unused: dict[str, list[Audiogram]] = {severity: [] for severity in SEVERITIES}
     ears: list[Audiogram] = []
     while len(ears) < count:
         severity = SEVERITIES[len(ears) % len(SEVERITIES)]
-        if waiting[severity]:
-            ears.append(waiting[severity].pop())
+        if unused[severity]:
+            ears.append(unused[severity].pop())
             continue
-        for levels in draw_thresholds(256, generator) + 0.0:  # no negative zeros
+        for levels in draw_thresholds(256, generator) + 0.0:  # The sum turns -0.0 into 0.0.
             ear = Audiogram(tuple(levels.tolist()))
-            for_test = zlib.crc32(levels.numpy().tobytes()) % 3 == 0
-            if ear.severity in waiting and for_test == (split == "test"):
-                waiting[ear.severity].append(ear)
+            is_for_test = zlib.crc32(levels.numpy().tobytes()) % 3 == 0
+            if ear.severity in unused and is_for_test == (split == "test"):
+                unused[ear.severity].append(ear)
     return ears

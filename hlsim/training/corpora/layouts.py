@@ -1,6 +1,6 @@
-"""Corpora of known layouts, turned into manifests.
+"""Corpora of known layouts, from which manifests are made.
 
-A layout is recognised by the names of folders and files alone. What does not fit a layout exactly is rejected.
+A layout is recognised by the names of folders and files. Corpora that deviate from it are rejected.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from random import Random
 
-from hlsim.files import EXTENSIONS
+from hlsim.audio import list_files
 from hlsim.training.corpora.manifest import (
     SPLITS,
     Utterance,
@@ -28,6 +28,8 @@ SPLIT_NAMES = {
     "valid": ("valid", "validation", "val", "dev", "cv", "eval"),
     "test": ("test", "testing", "tt"),
 }
+"""Names of the folder of each split."""
+
 _SPLIT_OF = {name: split for split, names in SPLIT_NAMES.items() for name in names}
 LEVELS = {
     "split": rf"(?P<split>{'|'.join(_SPLIT_OF)})",
@@ -51,33 +53,45 @@ LAYOUTS = {
     ),
     "folders train, valid, test": rf"{LEVELS['split']}/({LEVELS['speaker']}/(.*/)?)?[^/]+",
 }
-"""Patterns of paths of audio files, in any case. Files of a pair differ in ``condition``; all have one ``version``."""
+"""Patterns of the paths of audio files by layout, ignoring case.
 
-WAYS_OUT = (
-    "correct the corpus, or give a CSV file with the columns path, noisy, speaker and split instead of it, or say what "
-    "its folders are, such as --folders split/speaker, or --folders split if the speakers are unknown"
+The two files of a pair differ in the group ``condition``. The group ``version`` is the same for
+all.
+"""
+
+ADVICE = (
+    "correct the corpus, or use a CSV file with the columns path, noisy, speaker and split "
+    "instead, or "
+    "name the levels of folders, such as --folders split/speaker, or --folders split if the "
+    "speakers "
+    "are unknown"
 )
+"""Advice on corpora that are rejected."""
 
 _UNSUPPORTED = {
     re.compile(r"(^|/)mix_(clean|both|single)/"): (
-        "this looks like LibriMix, whose s1 would be the column path and mix_single the column noisy"
+        "LibriMix is not supported; write a CSV file with the files of s1 in the column path "
+        "and those of "
+        "mix_single in the column noisy"
     ),
     re.compile(r"(^|/)clean_fileid_\d+\."): (
-        "this looks like the DNS challenge, whose clean_fileid_N would be the column path and the noisy file of the same "
-        "number the column noisy"
+        "the layout of the DNS challenge is not supported; write a CSV file with clean_fileid_N "
+        "in the "
+        "column path and the noisy file of the same number in the column noisy"
     ),
 }
+"""Advice on unsupported layouts, by a pattern that recognises their paths."""
 
 
 @dataclass(frozen=True)
 class Corpus:
-    """Utterances that were found in a folder, and the files that were not used.
+    """Utterances of a corpus, and counts of its unused files.
 
     Attributes:
-        layout: name of the layout that was recognised.
-        utterances: rows of the manifest.
-        unused_audio: number of audio files that are in no row, by folder.
-        other_files: number of files that are not audio, by extension.
+        layout: Name of the layout.
+        utterances: Rows of the manifest.
+        unused_audio: Number of unused audio files by folder.
+        other_files: Number of files that are not audio by extension.
     """
 
     layout: str
@@ -86,19 +100,19 @@ class Corpus:
     other_files: Counter[str]
 
     def to_text(self) -> str:
-        """A table of the splits, and what was passed over."""
+        """Describe the corpus: a table of its splits, and the unused files."""
         lines = [f"layout: {self.layout}", "split  speakers  utterances  pairs"]
         for split in SPLITS:
             rows = [row for row in self.utterances if row.split == split]
             speakers = {row.speaker for row in rows}
-            known = "unknown" if "" in speakers else str(len(speakers))
+            speaker_count = "unknown" if "" in speakers else str(len(speakers))
             pairs = sum(bool(row.noisy) for row in rows)
             if rows:
-                lines.append(f"{split:<5}  {known:>8}  {len(rows):>10}  {pairs:>5}")
+                lines.append(f"{split:<5}  {speaker_count:>8}  {len(rows):>10}  {pairs:>5}")
         for folder, count in sorted(self.unused_audio.items()):
-            lines.append(f"passed over: {count} audio files in {folder}")
+            lines.append(f"not used: {count} audio files in {folder}")
         for extension, count in sorted(self.other_files.items()):
-            lines.append(f"passed over: {count} other files, {extension}")
+            lines.append(f"not used: {count} other files, {extension}")
         return "\n".join(lines)
 
 
@@ -112,23 +126,27 @@ def prepare(
     """Recognise a corpus and write its manifest.
 
     Args:
-        source: folder of a known layout, or a CSV file as ``read_manifest`` takes it.
-        out: CSV file to write. Its paths are relative to the source folder, or to the folder of the CSV file.
-        folders: meaning of each level of folders, instead of a known layout: ``split``, ``speaker``, ``condition``
-            (``clean`` and ``noisy``), or ``other``.
-        valid_share: share of the training speakers to validate on, for a corpus without a validation split.
+        source: Folder of a known layout, or a CSV file, see ``read_manifest``.
+        out: CSV file to write. Its paths are relative to the folder of the corpus, or to that of
+            the CSV file.
+        folders: Meanings of the levels of folders, instead of a known layout: ``split``,
+            ``speaker``, ``condition`` (``clean`` and ``noisy``), or ``other``.
+        valid_share: Share of the training speakers that are moved to the validation split, if the
+            corpus has none.
 
     Raises:
-        ValueError: the layout is not recognised, or contradicts itself, or the manifest cannot be written.
+        ValueError: The layout is unknown or contradictory, or the manifest cannot be written.
     """
     path = Path(source)
     if Path(out).suffix != ".csv":
-        raise ValueError(f"{out}: the manifest is a CSV file; choose a name that ends in .csv")
+        raise ValueError(
+            f"{out}: expected a name that ends in .csv, because the manifest is a CSV file"
+        )
     if path.is_dir():
         corpus = find_corpus(path, folders)
     else:
         if Path(out).exists() and path.samefile(out):
-            raise ValueError(f"{out}: is the table that is read; choose another name to write")
+            raise ValueError(f"{out}: refusing to overwrite the input; choose another name")
         corpus = Corpus("CSV file", read_manifest(path), Counter(), Counter())
     utterances = corpus.utterances
     if valid_share:
@@ -138,41 +156,55 @@ def prepare(
 
 
 def find_corpus(root: Path, folders: Sequence[str] | None = None) -> Corpus:
-    """List the files of a folder, recognise their layout and check the result; errors as in ``prepare``."""
-    audio, others = _list_files(root)
+    """Recognise the layout of a folder, and check the utterances in it.
+
+    Args:
+        root: Folder of the corpus.
+        folders: Meanings of the levels of folders, see ``prepare``.
+
+    Raises:
+        ValueError: The layout is unknown or contradictory.
+    """
+    audio, other_files = _list_files(root)
     try:
         layout, utterances = recognise(audio, folders)
         check_utterances(utterances)
         check_paths(utterances, root)
     except ValueError as error:
-        raise ValueError(f"{root}: {error}; {WAYS_OUT}") from error
-    used = {name for row in utterances for name in (row.path, row.noisy)}
+        raise ValueError(f"{root}: {error}; {ADVICE}") from error
+    used = {row.path for row in utterances} | {row.noisy for row in utterances}
     unused = Counter(
         os.path.dirname(name) or "the top folder" for name in audio if name not in used
     )
-    extensions = Counter(Path(name).suffix or "without extension" for name in others)
+    extensions = Counter(Path(name).suffix or "without extension" for name in other_files)
     return Corpus(layout, utterances, unused, extensions)
 
 
 def recognise(
     files: Sequence[str], folders: Sequence[str] | None = None
 ) -> tuple[str, list[Utterance]]:
-    """Name of the layout, and its utterances.
+    """Recognise the layout of files.
 
     Args:
-        files: paths of audio files relative to the corpus, with forward slashes.
-        folders: see ``prepare``.
+        files: Paths of audio files relative to the corpus, with forward slashes.
+        folders: Meanings of the levels of folders, see ``prepare``.
+
+    Returns:
+        The name of the layout, and the utterances.
 
     Raises:
-        ValueError: the files have no known layout, or one that contradicts itself.
+        ValueError: The layout is unknown or contradictory.
     """
     if folders is not None:
         layout = f"folders {'/'.join(folders)}"
         meanings = [level for level in folders if level != "other"]
         if not set(folders) <= set(LEVELS) or len(set(meanings)) < len(meanings):
-            raise ValueError(f"{layout}; write {', '.join(LEVELS)}, with / between, each once")
+            raise ValueError(
+                f"{layout}: expected {', '.join(LEVELS)}, separated by /, and only 'other' "
+                "repeatedly"
+            )
         pattern = "/".join(LEVELS[level] for level in folders) + "/(.*/)?[^/]+"
-        return layout, _read(files, pattern, layout)
+        return layout, _read_utterances(files, pattern, layout)
     for unsupported, advice in _UNSUPPORTED.items():
         if any(unsupported.search(file) for file in files):
             raise ValueError(advice)
@@ -181,52 +213,64 @@ def recognise(
     for layout, pattern in LAYOUTS.items():
         pattern = only_folder + pattern
         if any(re.fullmatch(pattern, file, re.IGNORECASE) for file in files):
-            return layout, _read(files, pattern, layout)
-    raise ValueError(f"its layout is none of {', '.join(LAYOUTS)}")
+            return layout, _read_utterances(files, pattern, layout)
+    raise ValueError(f"unknown layout, expected one of {', '.join(LAYOUTS)}")
 
 
 def hold_out_speakers(utterances: Sequence[Utterance], share: float) -> list[Utterance]:
-    """Move a share of the training speakers, at least one, to the validation split; always the same ones.
+    """Move some training speakers to the validation split.
+
+    The speakers are random, but the same in every call.
+
+    Args:
+        utterances: Rows of a manifest.
+        share: Share of the training speakers to move. At least one is moved.
 
     Raises:
-        ValueError: there is a validation split already, or a speaker is unknown, or none would be left to train with.
+        ValueError: There is a validation split already, a speaker is unknown, or no training
+            speaker would remain.
     """
     speakers = sorted({row.speaker for row in utterances if row.split == "train"})
     if any(row.split == "valid" for row in utterances):
         raise ValueError("the corpus has a validation split already; leave --valid-share out")
     if "" in speakers:
-        raise ValueError(f"--valid-share needs speakers, and some are unknown; {WAYS_OUT}")
+        raise ValueError(f"--valid-share requires the speakers, but some are unknown; {ADVICE}")
     count = max(1, round(share * len(speakers)))
     if count >= len(speakers):
         raise ValueError(
-            f"{count} of {len(speakers)} speakers to validate on would leave none to train with"
+            f"cannot move {count} of {len(speakers)} speakers to the validation split, because "
+            "none "
+            "would remain for training; lower --valid-share"
         )
-    held_out = set(Random(0).sample(speakers, count))
-    return [
-        replace(row, split="valid") if row.speaker in held_out and row.split == "train" else row
-        for row in utterances
-    ]
+    valid_speakers = set(Random(0).sample(speakers, count))
+    rows = []
+    for row in utterances:
+        is_moved = row.split == "train" and row.speaker in valid_speakers
+        rows.append(replace(row, split="valid") if is_moved else row)
+    return rows
 
 
-def _read(files: Sequence[str], pattern: str, layout: str) -> list[Utterance]:
-    """Utterances of files whose paths all have the pattern of a layout."""
+def _read_utterances(files: Sequence[str], pattern: str, layout: str) -> list[Utterance]:
+    """Read utterances from the paths of files, which must all match the pattern of a layout."""
     clean: dict[str, Utterance] = {}
     noisy: dict[str, str] = {}
     names: dict[str, str] = {}
     for file in files:
         match = re.fullmatch(pattern, file, re.IGNORECASE)
         if match is None:
-            raise ValueError(f"{file} does not fit the layout {layout!r}")
+            raise ValueError(f"{file} does not match the layout {layout!r}")
         groups = match.groupdict(default="")
         split_name = groups.get("split", "train")
         split = _SPLIT_OF[split_name.lower()]
         for kind, name in ((split, split_name), ("version", groups.get("version", ""))):
             if names.setdefault(kind, name) != name:
                 raise ValueError(
-                    f"{file}: two names for one part of the corpus, {names[kind]!r} and {name!r}"
+                    f"{file}: expected one name for each part of the corpus, got "
+                    f"{names[kind]!r} and {name!r}"
                 )
         key = os.path.splitext(file)[0]
-        for group in ("doubled", "condition"):  # the later part of the path first
+        # The later group comes first, so that the position of the other one stays valid.
+        for group in ("doubled", "condition"):
             if groups.get(group):
                 key = key[: match.start(group)] + key[match.end(group) :]
         condition = groups.get("condition", "clean").lower()
@@ -238,30 +282,23 @@ def _read(files: Sequence[str], pattern: str, layout: str) -> list[Utterance]:
     if "(?P<condition>" in pattern and unpaired:
         first = noisy.get(unpaired[0]) or clean[unpaired[0]].path
         raise ValueError(
-            f"{len(unpaired)} files have no counterpart of the same name in clean or noisy speech, the first {first}"
+            f"{len(unpaired)} files of clean or noisy speech lack a counterpart of the same "
+            f"name, such as {first}"
         )
     return [replace(row, noisy=noisy.get(key, "")) for key, row in clean.items()]
 
 
 def _list_files(root: Path) -> tuple[list[str], list[str]]:
-    """Sorted relative paths of the audio files below a folder, and of all other files, without hidden ones.
+    """List the relative paths of the audio files and of the other files below a folder, sorted.
 
     Raises:
-        ValueError: there is no audio, or a folder is a link.
+        ValueError: There is no audio, or a folder is a link.
     """
-    audio: list[str] = []
-    others: list[str] = []
-    for path in sorted(root.rglob("*")):
-        name = path.relative_to(root).as_posix()
-        is_hidden = any(part.startswith(".") for part in name.split("/"))
-        if is_hidden:
-            continue
-        if path.is_dir():
-            if path.is_symlink():
-                raise ValueError(f"{path}: a link to a folder; put the folder itself there")
-            continue
-        is_audio = path.suffix.lower() in EXTENSIONS
-        (audio if is_audio else others).append(name)
-    if not audio:
-        raise ValueError(f"{root}: no audio in it; looked for {', '.join(EXTENSIONS)}")
-    return audio, others
+    for path in root.rglob("*"):
+        if path.is_symlink() and path.is_dir():
+            raise ValueError(
+                f"{path}: links to folders are not followed; move the folder itself there"
+            )
+    audio, other_files = list_files(root)
+    names = [path.relative_to(root).as_posix() for path in audio]
+    return names, [path.name for path in other_files]

@@ -13,19 +13,23 @@ from pathlib import Path, PurePosixPath
 from hlsim.files import read_table, resolve_links, write_atomically
 
 SPLITS = ("train", "valid", "test")
+"""Names of the splits."""
+
 COLUMNS = ("path", "noisy", "speaker", "split")
-NOT_SPEECH = {"noise", "noises", "noisy", "mix", "mixture", "mixtures", "rir", "rirs"}
-"""Words in the name of a folder that cannot hold clean speech."""
+"""Columns of a manifest."""
+
+NON_SPEECH_WORDS = {"noise", "noises", "noisy", "mix", "mixture", "mixtures", "rir", "rirs"}
+"""Words in the names of folders that contain no clean speech."""
 
 
 @dataclass(frozen=True)
 class Utterance:
-    """One row of a manifest.
+    """Row of a manifest.
 
     Attributes:
-        path: clean speech, relative to the root, with forward slashes.
-        noisy: noisy version of the same utterance, aligned and equally long; empty if there is none.
-        speaker: name of the speaker; empty if unknown.
+        path: Path of the clean speech relative to the root, with forward slashes.
+        noisy: Path of the noisy version, aligned and equally long; empty if there is none.
+        speaker: Name of the speaker; empty if unknown.
         split: ``train``, ``valid`` or ``test``.
     """
 
@@ -39,28 +43,33 @@ def read_manifest(path: str | Path, root: str | Path | None = None) -> list[Utte
     """Read and check a manifest.
 
     Args:
-        path: CSV file with a column ``path`` and optional columns ``noisy``, ``speaker`` and ``split``. Without the
-            column ``split``, every utterance is for training.
-        root: folder that the paths are relative to; by default the folder of the manifest.
+        path: CSV file with a column ``path`` and optional columns ``noisy``, ``speaker`` and
+            ``split``. Without the column ``split``, all utterances are in the split ``train``.
+        root: Folder to which the paths are relative; by default the folder of the manifest.
 
     Raises:
-        ValueError: the file is not such a table, its rows contradict each other, or a path is outside the root.
+        ValueError: The file is not such a table, its rows contradict each other, or a path is
+            outside the root.
     """
     table = read_table(path, "the manifest")
     utterances = []
     for line, row in table:
         if not row.get("path"):
             raise ValueError(
-                f"{path}, line {line}: no path; expected a CSV file with a column 'path' and optional columns 'noisy', "
-                "'speaker' and 'split'"
+                f"{path}, line {line}: the path is missing; expected a CSV file with a column "
+                "'path' "
+                "and optional columns 'noisy', 'speaker' and 'split'"
             )
-        if (split := row.get("split", "train")) not in SPLITS:
-            raise ValueError(f"{path}, line {line}: split {split!r}; write train, valid or test")
+        split = row.get("split", "train")
+        if split not in SPLITS:
+            raise ValueError(
+                f"{path}, line {line}: expected the split train, valid or test, got {split!r}"
+            )
         utterances.append(
             Utterance(row["path"], row.get("noisy", ""), row.get("speaker", ""), split)
         )
     if not utterances:
-        raise ValueError(f"{path}: has no rows; expected one row per utterance")
+        raise ValueError(f"{path}: the manifest is empty, expected one row per utterance")
     folder = Path(path).parent if root is None else Path(root)
     try:
         check_utterances(utterances)
@@ -69,23 +78,25 @@ def read_manifest(path: str | Path, root: str | Path | None = None) -> list[Utte
         raise ValueError(f"{path}: {error}") from error
     if not (folder / utterances[0].path).is_file():
         raise ValueError(
-            f"{path}: its first file, {utterances[0].path}, is not in {folder}; give the folder that the paths are "
-            "relative to as the root (--root)"
+            f"{path}: {folder} does not contain its first file, {utterances[0].path}; set the root "
+            "(--root) to the folder to which the paths are relative"
         )
     return utterances
 
 
 def write_manifest(path: str | Path, utterances: Sequence[Utterance]) -> None:
-    """Write a manifest, whole or not at all.
+    """Write a manifest atomically; an older manifest is replaced.
 
     Raises:
-        ValueError: the file cannot be written, or exists and is not a manifest.
+        ValueError: The file cannot be written, or exists and is not a manifest.
     """
     header = ",".join(COLUMNS)
     if Path(path).exists():
         with open(path, encoding="utf-8", errors="replace") as file:
             if file.readline().strip() != header:
-                raise ValueError(f"{path}: exists and is not a manifest; choose another name")
+                raise ValueError(
+                    f"{path}: refusing to overwrite a file that is no manifest; choose another name"
+                )
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(COLUMNS)
@@ -94,7 +105,7 @@ def write_manifest(path: str | Path, utterances: Sequence[Utterance]) -> None:
 
 
 def check_utterances(utterances: Sequence[Utterance]) -> None:
-    """Raise ValueError where utterances contradict each other, or noise is listed as speech."""
+    """Raise ValueError if utterances contradict each other, or noise is listed as speech."""
     clean = {utterance.path for utterance in utterances}
     splits: dict[str, dict[str, str]] = {"file": {}, "speaker": {}}
     pairs = Counter((utterance.path, utterance.noisy) for utterance in utterances)
@@ -104,9 +115,9 @@ def check_utterances(utterances: Sequence[Utterance]) -> None:
         if pairs[utterance.path, utterance.noisy] > 1:
             raise ValueError(f"{utterance.path} is listed twice")
         for folder in utterance.path.split("/")[:-1]:
-            if NOT_SPEECH & set(re.split("[^a-z]+", folder.lower())):
+            if NON_SPEECH_WORDS & set(re.split("[^a-z]+", folder.lower())):
                 raise ValueError(
-                    f"{utterance.path} would be clean speech, but is in a folder {folder}"
+                    f"{utterance.path} is listed as clean speech, but is in a folder {folder!r}"
                 )
         for kind, name in (("file", utterance.path), ("speaker", utterance.speaker)):
             other = splits[kind].setdefault(name, utterance.split)
@@ -115,13 +126,14 @@ def check_utterances(utterances: Sequence[Utterance]) -> None:
 
 
 def check_paths(utterances: Sequence[Utterance], root: Path) -> None:
-    """Raise ValueError where a path leads out of the root, through ``..`` or a link."""
+    """Raise ValueError if a path leads out of the root, through ``..`` or a link."""
     inside = resolve_links(root)
     for utterance in utterances:
         for name in (utterance.path, utterance.noisy):
             path = PurePosixPath(name)
-            outside = path.is_absolute() or ".." in path.parts
-            if outside or not resolve_links(root / path).is_relative_to(inside):
+            leads_out = path.is_absolute() or ".." in path.parts
+            if leads_out or not resolve_links(root / path).is_relative_to(inside):
                 raise ValueError(
-                    f"{name} is outside {root}; paths are relative to that folder and stay in it"
+                    f"{name} is outside {root}; expected a path relative to that folder, "
+                    "without '..'"
                 )
