@@ -1,4 +1,4 @@
-"""What the site shows from outside docs/: cards, examples and recipes keep their places, and links to them hold."""
+"""Hooks of mkdocs that add pages and files from outside docs/ to the site, and adapt the links to them."""
 
 from pathlib import Path
 
@@ -7,7 +7,7 @@ from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 
 ROOT = Path(__file__).parents[1]
-SHOWN = (
+PATTERNS = (
     "checkpoints/*/README.md",
     "examples/**/*.py",
     "examples/**/*.yaml",
@@ -20,8 +20,8 @@ SHOWN = (
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
-    """Adds them under the paths that they have in the repository."""
-    for pattern in SHOWN:
+    """Add cards, examples and recipes to the site, under their paths in the repository."""
+    for pattern in PATTERNS:
         for path in sorted(ROOT.glob(pattern)):
             name = path.relative_to(ROOT).as_posix()
             files.append(File(name, str(ROOT), config.site_dir, config.use_directory_urls))
@@ -29,7 +29,10 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Docs are the root of the site and a folder of the repository: takes one step off links that leave or enter it."""
+    """Shorten links between docs/ and the rest of the repository by one step.
+
+    The site has the pages of docs/ at its root, so a link must neither leave nor enter that folder.
+    """
     up = "../" * page.file.src_uri.count("/")
     if page.file.src_dir == str(ROOT):
         return markdown.replace(f"]({up}docs/", f"]({up}")
