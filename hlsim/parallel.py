@@ -52,8 +52,8 @@ def run_parallel(
 ) -> Iterator[tuple[Task, Result | None]]:
     """Yield each task with its result, in the order in which they finish; tasks are drawn when needed.
 
-    If a task ends its process (a crash in compiled code, no memory left), the tasks that were running are
-    repeated one by one: the one at fault yields None, and the others go on.
+    If a task ends its process (a crash in compiled code, no memory left), the tasks that were
+    running are repeated one by one: the one at fault yields None, and the others go on.
 
     Args:
         function: can be pickled; an exception that it raises ends the run.
@@ -63,7 +63,8 @@ def run_parallel(
 
     Raises:
         ValueError: ``jobs`` is less than 1, or no scheduler answers.
-        MissingExtraError: joblib (extra ``eval``) or distributed (extra ``cluster``) is not installed.
+        MissingExtraError: joblib (extra ``eval``) or distributed (extra ``cluster``) is not
+            installed.
     """
     check_jobs(jobs)
     if dask is None and jobs == 1:

@@ -150,7 +150,7 @@ def test_ears_on_a_device_that_are_out_of_range_give_nan() -> None:
         for module in (load_pretrained("neuro-msbg"), *map(load_compensator, ("nalr", "wdrc"))):
             output = module.to(DEVICE)(wave.to(DEVICE), ears.to(DEVICE)).inner
             assert output[0].isfinite().all() and output[1].isnan().all()
-        with pytest.raises(ValueError, match="outside -10 to 100 dB HL"):
+        with pytest.raises(ValueError, match="outside this range"):
             MSBG(sample_rate=16000)(wave.to(DEVICE), ears.to(DEVICE))
 
 

@@ -1,4 +1,7 @@
-"""Long signals through MSBG in overlapping blocks, computed again for gradients, so that memory does not grow."""
+"""Processing of long signals in overlapping blocks.
+
+The blocks are computed again for gradients, so that memory does not grow with the signal.
+"""
 
 import math
 from collections.abc import Callable
@@ -13,36 +16,69 @@ from hlsim.msbg.envelope import HALF_RATE_STEP, STEP
 from hlsim.msbg.smearing import HOP
 
 _BLOCK_SECONDS = 8.0
-# what a block needs around it: filters, delay, and low-passes down to 1e-6
-_LEAD_SECONDS, _LAG_SECONDS, _FADE_SECONDS = 0.75, 0.55, 0.2
+
+# The output of a block depends on samples around it by the filters, the delay, and the low-pass
+# filters down to 1e-6.
+_LEAD_SECONDS = 0.75
+"""Duration before a block on which its output depends."""
+
+_LAG_SECONDS = 0.55
+"""Duration after a block on which its output depends."""
+
+_FADE_SECONDS = 0.2
+"""Duration of the fades at the ends of a block's input."""
 
 
 def in_blocks(
     process: Callable[[Tensor, Tensor, bool], Tensor], signals: Tensor, ears: Tensor, rate: int
 ) -> Tensor:
-    """``process`` of signals, ears and whether the signals end there, by blocks.
+    """Process signals in blocks, whose outputs are those of the whole signals.
 
-    Shape: (items, time), (items, 8) -> (items, time).
+    Args:
+        process: function of signals, ears, and whether the signals end where their block does.
+        signals: signals of all items.
+        ears: thresholds of all items.
+        rate: sample rate in Hz.
+
+    Shape: (items, time), (items, levels) -> (items, time).
     """
     samples = signals.shape[-1]
     blocks = block_bounds(samples, rate)
     if len(blocks) == 1:
         return process(signals, ears, True)
-    heard = []
-    again = torch.is_grad_enabled() and _hooks_are_allowed()
+    outputs = []
+    may_checkpoint = torch.is_grad_enabled() and _hooks_are_allowed()
     for block in blocks:
-        last = block.input_stop == samples
-        given = _faded(block.cut_input(signals), rate, block.input_start > 0, not last)
-        if again and (given.requires_grad or ears.requires_grad):
-            output = checkpoint(process, given, ears, last, use_reentrant=False)
+        is_last = block.input_stop == samples
+        cut = block.cut_input(signals)
+        cut = _fade(cut, rate, fade_in=block.input_start > 0, fade_out=not is_last)
+        if may_checkpoint and (cut.requires_grad or ears.requires_grad):
+            output = checkpoint(process, cut, ears, is_last, use_reentrant=False)
         else:
-            output = process(given, ears, last)
-        heard.append(block.cut_output(output))
-    return torch.cat(heard, -1)
+            output = process(cut, ears, is_last)
+        outputs.append(block.cut_output(output))
+    return torch.cat(outputs, -1)
+
+
+def block_bounds(samples: int, rate: int) -> list[Block]:
+    """Return blocks that begin at frames of the smearing and steps of the envelopes.
+
+    The frames and steps in a block are therefore those of the whole signal.
+
+    Args:
+        samples: length of the signal.
+        rate: sample rate in Hz.
+    """
+    common = math.lcm(HOP, STEP, round(2 * HALF_RATE_STEP))
+    # the smallest number of samples that is a whole number of hops and of steps
+    unit = common * rate // math.gcd(common * rate, MSBG_RATE)
+    return split_into_blocks(
+        samples, round(_BLOCK_SECONDS * rate), _LEAD_SECONDS * rate, _LAG_SECONDS * rate, unit
+    )
 
 
 def _hooks_are_allowed() -> bool:
-    """Whether autograd takes the hooks by which checkpointing computes a block again; ``torch.func`` forbids them."""
+    """Return whether autograd accepts the hooks of checkpoints, which ``torch.func`` forbids."""
     try:
         with torch.autograd.graph.saved_tensors_hooks(_identity, _identity):
             return True
@@ -54,27 +90,17 @@ def _identity(tensor: Tensor) -> Tensor:
     return tensor
 
 
-def block_bounds(samples: int, rate: int) -> list[Block]:
-    """Blocks begin where the smearing's frames and the envelopes' steps do, so that these are those of the whole."""
-    common = math.lcm(HOP, STEP, round(2 * HALF_RATE_STEP))
-    unit = (
-        common * rate // math.gcd(common * rate, MSBG_RATE)
-    )  # samples in a whole number of hops and of steps
-    return split_into_blocks(
-        samples, round(_BLOCK_SECONDS * rate), _LEAD_SECONDS * rate, _LAG_SECONDS * rate, unit
-    )
-
-
-def _faded(block: Tensor, rate: int, begin: bool, end: bool) -> Tensor:
-    """A block's lead faded in and its lag out over 0.2 s: a sharp cut would ring wherever a band ends sharply.
+def _fade(block: Tensor, rate: int, *, fade_in: bool, fade_out: bool) -> Tensor:
+    """Fade the ends of a block over 0.2 s, as bands with sharp ends would ring at a sharp cut.
 
     Shape: (items, time) -> (items, time).
     """
     time = round(_FADE_SECONDS * rate)
-    place = torch.arange(1, time + 1, dtype=torch.float64, device=block.device) * (
-        math.pi / (time + 1)
-    )
-    ramp = (0.5 - 0.5 * place.cos()).to(block.dtype)
-    ones = block.new_ones(block.shape[-1] - 2 * time)
-    edge = ramp.new_ones(time)
-    return block * torch.cat((ramp if begin else edge, ones, ramp.flip(-1) if end else edge))
+    positions = torch.arange(1, time + 1, dtype=torch.float64, device=block.device)
+    phase = positions * (math.pi / (time + 1))
+    ramp = (0.5 - 0.5 * phase.cos()).to(block.dtype)
+    middle = block.new_ones(block.shape[-1] - 2 * time)
+    flat = ramp.new_ones(time)
+    start = ramp if fade_in else flat
+    end = ramp.flip(-1) if fade_out else flat
+    return block * torch.cat((start, middle, end))
