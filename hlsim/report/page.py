@@ -148,21 +148,6 @@ def write_page(page: Page, data: Mapping[str, Any], out: str | Path) -> Path:
     return folder / "report.html"
 
 
-def render_page(title: str, sections: Sequence[Section], lead: str = "") -> str:
-    return Page(title, lead, sections).html()
-
-
-def render_markdown(title: str, sections: Sequence[Section], lead: str = "") -> str:
-    return Page(title, lead, sections).markdown()
-
-
-def write_files(out: str | Path, contents: Mapping[str, str | bytes]) -> Path:
-    folder = check_out(out)
-    for name, data in contents.items():
-        write_atomically(folder / name, data)
-    return folder
-
-
 def check_out(out: str | Path) -> Path:
     """Return the folder of a report; ValueError if no report can be written there."""
     folder = Path(out).absolute()
