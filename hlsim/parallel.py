@@ -28,7 +28,7 @@ def reason_of(error: Exception) -> str:
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Give torch one thread: with small or parallel tasks, more threads would wait for each other."""
+    """Give torch one thread, as more threads would wait for each other in small tasks."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -50,7 +50,7 @@ def run_parallel(
     jobs: int | None = None,
     dask: str | None = None,
 ) -> Iterator[tuple[Task, Result | None]]:
-    """Yield each task with its result, in the order in which they finish; tasks are drawn when needed.
+    """Yield each task with its result as it finishes; tasks are drawn when they are needed.
 
     If a task ends its process (a crash in compiled code, no memory left), the tasks that were
     running are repeated one by one: the one at fault yields None, and the others go on.
