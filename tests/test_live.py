@@ -260,7 +260,7 @@ def test_simulated_blocks_are_what_is_heard_of_the_whole() -> None:
         ("--listener nosuch.csv", "nosuch.csv"),
         ("--audiogram N3 --input 7", "--input 7 cannot be used: No input device matching 7"),
         ("--audiogram N3 --output Phones", "--output Phones cannot be used"),
-        ("--audiogram N3 --compensator nalr", "nalr cannot run in blocks"),
+        ("--audiogram N3 --compensator nalr", "nalr cannot process blocks"),
         ("--audiogram N3 --simulate --amplification 1", "no effect with --simulate"),
         (
             "--audiogram N3 --compensator wdrc --amplification 1",

@@ -12,7 +12,7 @@ from hlsim.cli.progress import show_progress
 
 
 def clarity(parser: Parser) -> None:
-    parser.runs(
+    parser.set_command(
         _clarity,
         "dev/scenes hearing-aid --listeners listeners.json --scenes-listeners scenes_listeners.dev.json --out judged",
         "dev/scenes mine=my_package.aids:pair --listeners listeners.json --every 15 --out judged",

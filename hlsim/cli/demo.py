@@ -13,7 +13,7 @@ from hlsim.extras import require
 
 
 def demo(parser: Parser) -> None:
-    parser.runs(
+    parser.set_command(
         _demo,
         "",
         "--audiogram S2 --steps 1000 --out s2",

@@ -29,7 +29,7 @@ GAIN_EARS = ["N3", "S2"]
 
 
 def evaluate_simulator(parser: Parser) -> None:
-    parser.runs(
+    parser.set_command(
         _evaluate_simulator,
         "neuro-msbg neuro-msbg-cnn --speech speech/valid --audiograms standard --out judged",
         "mine=runs/simulator/checkpoint --speech speech/valid --audiograms standard --out judged",
@@ -87,7 +87,7 @@ def _evaluate_simulator(options: argparse.Namespace) -> None:
 
 
 def evaluate_compensator(parser: Parser) -> None:
-    parser.runs(
+    parser.set_command(
         _evaluate_compensator,
         "hearing-aid --audiograms standard --speech speech/valid --noise noise/valid --out judged",
         "mine=runs/n3/checkpoint --audiogram N3 --speech speech/valid --items 40 --out judged",
@@ -166,7 +166,7 @@ def labelled(text: str) -> tuple[str, str]:
 
 
 def haspi_report(parser: Parser) -> None:
-    parser.runs(
+    parser.set_command(
         _haspi_report,
         "--clean clean --before noisy --after enhanced --audiogram N3 --out report",
         "--manifest items.csv --measures haspi,hasqi --baseline unaided --out report",

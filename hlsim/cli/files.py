@@ -1,4 +1,4 @@
-"""The commands ``simulate`` and ``compensate``: a file in, a file out, or a folder of files."""
+"""The commands ``simulate`` and ``compensate``, for a file or a folder of files."""
 
 from __future__ import annotations
 
@@ -20,13 +20,19 @@ if TYPE_CHECKING:
 
     Model = Callable[..., Tensor]
 
-UPPER_BAND_HZ = 8500.0  # models at 16 kHz remove everything from here on
-AUDIBLE_SHARE = 1e-6  # share of the input's power above which its upper band is worth a warning
-REMOVED_SHARE = 1e-3  # share of the upper band below which it counts as removed
+UPPER_BAND_HZ = 8500.0
+"""Lowest frequency in Hz of the band that models at 16 kHz remove."""
+
+AUDIBLE_SHARE = 1e-6
+"""Share of the input's power above which the upper band is worth a warning."""
+
+REMOVED_SHARE = 1e-3
+"""Share of the upper band's power below which the band counts as removed."""
 
 
 def simulate(parser: Parser) -> None:
-    _files(
+    """Declare the options of ``simulate``."""
+    _declare_files(
         parser,
         _simulate,
         "speech.wav perceived.wav --audiogram N3",
@@ -37,15 +43,16 @@ def simulate(parser: Parser) -> None:
 
 
 def compensate(parser: Parser) -> None:
-    _files(
+    """Declare the options of ``compensate``."""
+    _declare_files(
         parser,
         _compensate,
         "speech.wav aided.wav --audiogram N3 --noise-reduction 0.5",
         "speech aided --audiogram N4 --compensator nal-r",
     )
     text = (
-        "nal-r (the prescription), wdrc (compression in bands), or a checkpoint's name or folder "
-        "(a checkpoint trained for one ear warns if used with another)"
+        "nal-r (a prescription), wdrc (compression in bands), or a checkpoint's name or folder; a "
+        "checkpoint that was trained for one ear causes a warning if it is used for another"
     )
     parser.option("--compensator", str, text, "hearing-aid")
     parser.sliders()
@@ -53,12 +60,16 @@ def compensate(parser: Parser) -> None:
     parser.flag("--linked", text)
 
 
-def _files(parser: Parser, run: Callable[[argparse.Namespace], None], *examples: str) -> None:
-    parser.runs(run, *examples)
+def _declare_files(
+    parser: Parser, run: Callable[[argparse.Namespace], None], *examples: str
+) -> None:
+    """Declare the options that both commands have."""
+    parser.set_command(run, *examples)
     text = "audio file of 16 kHz or more (wav, flac, ogg, mp3, ...), or a folder of such files"
     parser.option("input", Path, text, metavar="IN")
     text = (
-        "output file (.wav with 32-bit float, .flac, or .ogg with up to 2 channels), or a folder for wav files "
+        "output file (.wav with 32-bit float, .flac, or .ogg with up to 2 channels), or a "
+        "folder for wav files "
         "if IN is a folder"
     )
     parser.option("output", Path, text, metavar="OUT")
@@ -74,7 +85,7 @@ def _simulate(options: argparse.Namespace) -> None:
 
         return build_simulator(options.simulator, rate, options.full_scale_spl)
 
-    # MSBG keeps the band above 8 kHz, but to many ears little of it is audible
+    # MSBG keeps the band above 8 kHz. If little of it remains, the ear cannot perceive it.
     hint = "" if options.simulator == "msbg" else "use --simulator msbg to keep it"
     _process(options, build, hint)
 
@@ -93,19 +104,22 @@ def _process(
     """Process the file, or each file of the folder, and print levels and warnings.
 
     Args:
-        build: Function from sample rate, and whether it is the first call, to the model.
-        upper_band_hint: Advice for a file whose band above 8 kHz was removed; no warning if empty.
+        options: Options of the command.
+        build: Function from the sample rate, and whether it is the first call, to a model.
+        upper_band_hint: Advice for a file whose band above 8 kHz was removed. If it is empty, there
+            is no such warning.
     """
     _check_paths(options.input, options.output)
     ears = read_ears(options)
     is_folder = options.input.is_dir()
     pairs = [(options.input, options.output)]
     if is_folder:
-        pairs = _pairs(options.input, options.output)
+        pairs = _pair_files(options.input, options.output)
     from hlsim.checks import LOWEST_RATE
 
     models: dict[int, Model] = {}
-    if is_folder:  # a model that cannot be loaded is reported before the first file
+    if is_folder:
+        # A model that cannot be loaded is reported before the first file.
         models[LOWEST_RATE] = build(LOWEST_RATE, True)
     failures = 0
     for number, (source, target) in enumerate(pairs, 1):
@@ -115,15 +129,17 @@ def _process(
             if not is_folder:
                 raise
             failures += 1
-            print(f"hlsim: warning: left out: {error}", file=sys.stderr)
+            print(f"hlsim: warning: not processed: {error}", file=sys.stderr)
             continue
-        count = f"{number} of {len(pairs)}: " if is_folder else ""
-        levels = _levels(waveform, result, options.full_scale_spl)
-        print(f"{count}{target}: {levels}", flush=True)
+        prefix = f"{number} of {len(pairs)}: " if is_folder else ""
+        levels = _describe_levels(waveform, result, options.full_scale_spl)
+        print(f"{prefix}{target}: {levels}", flush=True)
         for line in _output_warnings(waveform, result, rate, upper_band_hint):
             print(f"hlsim: warning: {target}: {line}", file=sys.stderr)
     if failures:
-        raise ValueError(f"{failures} of {len(pairs)} files were left out, see the warnings above")
+        raise ValueError(
+            f"{failures} of {len(pairs)} files were not processed, see the warnings above"
+        )
 
 
 def _process_file(
@@ -134,7 +150,8 @@ def _process_file(
     models: dict[int, Model],
     build: Callable[[int, bool], Model],
 ) -> tuple[Tensor, Tensor, int]:
-    """Write the output for one file; return the input, the output and their sample rate."""
+    """Write the output for one file, and return the input, the output and their sample rate in
+    Hz."""
     import torch
 
     from hlsim.audio import check_writable, read_audio, write_audio
@@ -153,7 +170,7 @@ def _process_file(
         needs_stereo = "--linked"
     if needs_stereo and channels != 2:
         raise ValueError(
-            f"{source}: {needs_stereo} needs 2 channels, left and right, got {channels}"
+            f"{source}: {needs_stereo} requires 2 channels, left and right, got {channels}"
         )
     inner_rate = min(rate, HIGHEST_RATE)
     if inner_rate not in models:
@@ -166,7 +183,7 @@ def _process_file(
 
 
 def _check_paths(source: Path, target: Path) -> None:
-    """Raise ValueError if OUT could not be written after the work, or would replace a file of IN."""
+    """Raise ValueError if OUT could not be written, or would replace a file of IN."""
     if not source.exists():
         raise ValueError(f"{source}: there is no such file or folder")
     if source.is_dir():
@@ -174,7 +191,9 @@ def _check_paths(source: Path, target: Path) -> None:
             raise ValueError(f"{target}: expected a folder, because {source} is one")
         inner, outer = resolve_links(source), resolve_links(target)
         if inner.is_relative_to(outer) or outer.is_relative_to(inner):
-            raise ValueError(f"{target}: choose a folder outside {source} that does not contain it")
+            raise ValueError(
+                f"{target}: expected a folder that is neither inside {source} nor around it"
+            )
         return
     if target.is_dir():
         raise ValueError(f"{target}: expected a file, because {source} is one")
@@ -185,41 +204,51 @@ def _check_paths(source: Path, target: Path) -> None:
         raise ValueError(f"{target}: refusing to overwrite the input; choose another file")
 
 
-def _pairs(source: Path, target: Path) -> list[tuple[Path, Path]]:
-    """Each audio file of a folder, and its place as a wav file in the other folder."""
+def _pair_files(source: Path, target: Path) -> list[tuple[Path, Path]]:
+    """List the audio files of a folder, each with the wav file to write in the other folder."""
     from hlsim.audio import list_files
 
-    audio, others = list_files(source)
-    if others:
-        endings = ", ".join(sorted({path.suffix or path.name for path in others})[:5])
-        print(f"files that are not audio, not used: {len(others)} ({endings})", file=sys.stderr)
+    audio, other_files = list_files(source)
+    if other_files:
+        endings = sorted({path.suffix or path.name for path in other_files})
+        text = ", ".join(endings[:5])
+        print(f"files that are not audio, not used: {len(other_files)} ({text})", file=sys.stderr)
     sources: dict[Path, Path] = {}
     for path in audio:
         output = (target / path.relative_to(source)).with_suffix(".wav")
         if output in sources:
-            raise ValueError(f"{path} and {sources[output]} would both be written to {output}")
+            raise ValueError(
+                f"{path} and {sources[output]} would both be written to {output}; rename one of "
+                "them"
+            )
         sources[output] = path
     return [(path, output) for output, path in sources.items()]
 
 
-def _levels(before: Tensor, after: Tensor, full_scale_spl: float) -> str:
+def _describe_levels(before: Tensor, after: Tensor, full_scale_spl: float) -> str:
+    """Describe the levels of input and output, and the peak of the output."""
     from hlsim.calibration import level_spl
 
-    levels = [float(level_spl(signal.flatten(), full_scale_spl)) for signal in (before, after)]
+    input_level = float(level_spl(before.flatten(), full_scale_spl))
+    output_level = float(level_spl(after.flatten(), full_scale_spl))
     peak = float(level_spl(after.abs().max().reshape(1), full_scale_spl))
-    return f"input {levels[0]:.1f} dB SPL, output {levels[1]:.1f} dB SPL, peak {peak:.1f} dB SPL"
+    return (
+        f"input {input_level:.1f} dB SPL, output {output_level:.1f} dB SPL, peak {peak:.1f} dB SPL"
+    )
 
 
 def _output_warnings(
     before: Tensor, after: Tensor, rate: int, upper_band_hint: str
 ) -> Iterator[str]:
+    """Yield warnings about clipping and about a band that was removed."""
     import torch
 
     peak = float(after.abs().max())
     if peak > 1.0:
         decibels = 20.0 * math.log10(peak)
         yield (
-            f"the peak is {peak:.3g} times full scale; most players will clip it, so lower it by "
+            f"the peak is {peak:.3g} times full scale, and most players will clip it; lower the "
+            "level by "
             f"{math.ceil(decibels)} dB before playing"
         )
     first = round(UPPER_BAND_HZ / rate * before.shape[-1])
@@ -228,4 +257,7 @@ def _output_warnings(
         power = torch.fft.rfft(signal.double()).abs().square().sum(0)
         shares.append(float(power[first:].sum() / power.sum()))
     if upper_band_hint and shares[0] > AUDIBLE_SHARE and shares[1] < REMOVED_SHARE * shares[0]:
-        yield f"the band above 8 kHz was removed, because the model is limited to it; {upper_band_hint}"
+        yield (
+            "the band above 8 kHz was removed, because the model is limited to it; "
+            f"{upper_band_hint}"
+        )

@@ -1,6 +1,6 @@
-"""Values of options that are read in several commands: ears, listeners, compensators and recipes.
+"""Values of options of several commands: paths, ears, listeners and compensators.
 
-What can be rejected without torch is rejected before anything slow is imported.
+Invalid values are rejected before torch is imported, if possible.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 def require_installed(extra: str, *modules: str) -> None:
-    """Raise MissingExtraError unless the modules are installed, without the seconds of importing them."""
+    """Raise MissingExtraError unless the modules are installed, without importing them."""
     for module in modules:
         if find_spec(module) is None:
             require(module, extra)
@@ -30,7 +30,7 @@ def require_installed(extra: str, *modules: str) -> None:
 def check_paths_exist(
     *, folders: tuple[Path | None, ...] = (), files: tuple[Path | None, ...] = ()
 ) -> None:
-    """Raise ValueError unless the folders and files exist; None stands for an option that was not given."""
+    """Raise ValueError unless the folders and files exist. None stands for a missing option."""
     for path in folders:
         if path is not None and not path.is_dir():
             raise ValueError(f"{path}: there is no such folder")
@@ -41,21 +41,24 @@ def check_paths_exist(
 
 
 def read_ear(text: str) -> Audiogram:
-    """Read the value of ``--audiogram``: a standard ear, or eight levels separated by commas or blanks."""
+    """Read ``--audiogram``: a standard ear, or eight levels separated by commas or blanks."""
     parts = re.split(r"[,\s]+", text.strip())
-    if len(parts) == 1 and text.upper() not in STANDARD_EARS:
+    is_name = len(parts) == 1
+    if is_name and text.upper() not in STANDARD_EARS:
         raise ValueError(
-            f"--audiogram {text}: expected {', '.join(STANDARD_EARS)}, or eight levels in dB HL separated by commas"
+            f"--audiogram {text}: expected {', '.join(STANDARD_EARS)}, or eight levels in dB HL "
+            "separated by commas"
         )
     try:
-        levels = tuple(float(part) for part in parts[1:] and parts)
+        levels = () if is_name else tuple(float(part) for part in parts)
     except ValueError:
         raise ValueError(
-            f"--audiogram {text}: expected a standard ear such as N3, or eight numbers separated by commas"
+            f"--audiogram {text}: expected a standard ear such as N3, or eight numbers "
+            "separated by commas"
         ) from None
     from hlsim.audiogram import Audiogram
 
-    if not levels:
+    if is_name:
         return Audiogram.standard(text.upper())
     try:
         return Audiogram(levels)
@@ -71,7 +74,7 @@ def read_ears(options: argparse.Namespace) -> Audiogram | Listener:
 
 
 def read_listener(text: str) -> Listener:
-    """Read the value of ``--listener``, FILE or FILE:NAME.
+    """Read ``--listener``, which is FILE or FILE:NAME.
 
     Raises:
         ValueError: There is no such file or listener, or an ear is missing.
@@ -80,34 +83,42 @@ def read_listener(text: str) -> Listener:
     if not Path(text).exists():
         file, _, name = text.rpartition(":")
     if not Path(file).is_file():
-        raise ValueError(
-            f"--listener {text}: there is no such file; for one ear, use --audiogram instead"
-        )
+        raise ValueError(f"--listener {text}: there is no such file; use --audiogram for one ear")
     from hlsim.audiogram.table import read_listeners
 
     listeners = read_listeners(file, [name] if name else None)
     if len(listeners) != 1:
-        names = ", ".join([*listeners][:5]) + (", ..." if len(listeners) > 5 else "")
-        raise ValueError(f"--listener {text}: write {file}:NAME, where NAME is one of {names}")
+        names = ", ".join([*listeners][:5])
+        ellipsis = ", ..." if len(listeners) > 5 else ""
+        raise ValueError(
+            f"--listener {text}: write {file}:NAME, where NAME is one of {names}{ellipsis}"
+        )
     listener = next(iter(listeners.values()))
     for missing, other in (("left", "right"), ("right", "left")):
         if getattr(listener, missing) is None:
             raise ValueError(
-                f"--listener {text}: the {missing} ear is missing; for the {other} ear alone, use --audiogram "
-                "and a file of that channel"
+                f"--listener {text}: the {missing} ear is missing; use --audiogram for the "
+                f"{other} ear, and a "
+                "file with that channel"
             )
     return listener
 
 
 def other_ear_warnings(label: str, name: str, ear: Audiogram | None) -> list[str]:
-    """Warn if a compensator was trained for one ear and is used with another, or with several (None)."""
+    """Return a warning if a compensator was trained for one ear and is used for another.
+
+    Args:
+        label: Name of the compensator in the warning.
+        name: Name or folder of its checkpoint.
+        ear: Ear that uses it, or None for several ears.
+    """
     from compensators import trained_for
 
     trained_ear = trained_for(name)
     if trained_ear is None or (ear is not None and trained_ear.thresholds == ear.thresholds):
         return []
     levels = ", ".join(f"{level:g}" for level in trained_ear.thresholds)
-    return [f"{label} was trained for one ear, {levels} dB HL, and is meant for no other."]
+    return [f"{label} was trained for one ear, {levels} dB HL, and does not fit other ears."]
 
 
 def read_compensator(
@@ -116,7 +127,12 @@ def read_compensator(
     """Load the compensator of ``--compensator``, and read its sliders.
 
     Args:
-        warn: Print a warning if the compensator was trained for another ear.
+        options: Options of the command.
+        sample_rate: Sample rate in Hz.
+        warn: Whether to print a warning if the compensator was trained for another ear.
+
+    Returns:
+        The compensator, and the values of its sliders by name.
     """
     from compensators import load_compensator
 
@@ -124,8 +140,9 @@ def read_compensator(
     settings = {"sample_rate": sample_rate, "full_scale_spl": options.full_scale_spl}
     compensator = load_compensator(name, **settings, linked=getattr(options, "linked", False))
     ear = read_ear(options.audiogram) if options.audiogram else None
-    for line in other_ear_warnings(name, name, ear) if warn else ():
-        print(f"hlsim: warning: {line}", file=sys.stderr)
+    if warn:
+        for line in other_ear_warnings(name, name, ear):
+            print(f"hlsim: warning: {line}", file=sys.stderr)
     values = {
         "noise_reduction": options.noise_reduction,
         "amplification": options.amplification,
@@ -134,5 +151,7 @@ def read_compensator(
     unknown = sorted(sliders.keys() - set(getattr(compensator, "SLIDERS", ())))
     if unknown:
         option = unknown[0].replace("_", "-")
-        raise ValueError(f"--{option} has no effect with --compensator {name}; use a hearing aid")
+        raise ValueError(
+            f"--{option} has no effect with --compensator {name}; choose a hearing aid"
+        )
     return compensator, sliders

@@ -1,4 +1,4 @@
-"""The command ``live``: microphone to headphones."""
+"""The command ``live``, from microphone to headphones."""
 
 from __future__ import annotations
 
@@ -10,7 +10,9 @@ from hlsim.cli.inputs import read_compensator, read_ears
 from hlsim.cli.options import Parser, checked_type, number, positive
 from hlsim.extras import require
 
-RATE = 16000  # Hz
+RATE = 16000
+"""Sample rate of the stream in Hz."""
+
 _device = checked_type(
     lambda text: int(text) if text.isdecimal() else text,
     lambda device: device != "",
@@ -19,7 +21,8 @@ _device = checked_type(
 
 
 def live(parser: Parser) -> None:
-    parser.runs(
+    """Declare the options of ``live``."""
+    parser.set_command(
         _live,
         "--audiogram N3",
         "--listener listeners.json:L0001 --simulate --seconds 60",
@@ -27,57 +30,62 @@ def live(parser: Parser) -> None:
     option = parser.option
     ears = parser.add_mutually_exclusive_group()
     parser.audiogram(group=ears)
-    parser.listener("both ears, left first, for stereo headphones", group=ears)
+    parser.listener("both ears, for stereo headphones", group=ears)
     models = parser.add_mutually_exclusive_group()
     text = "a streaming aid: wdrc (compression in bands), or a hearing aid's name or folder"
     option("--compensator", str, text, "hearing-aid", group=models)
-    text = "simulate the hearing loss with neuro-msbg instead, in blocks of 96 ms and with a delay of 200 ms"
+    text = (
+        "simulate the hearing loss with neuro-msbg instead, in blocks of 96 ms and with a "
+        "delay of 200 ms"
+    )
     parser.flag("--simulate", text, group=models)
     parser.sliders()
-    text = "level in dB SPL of samples whose RMS is 1.0, at microphone and headphones; measure it"
+    text = (
+        "level in dB SPL of samples whose RMS is 1.0, at microphone and headphones, to be measured"
+    )
     option("--full-scale-spl", number, text, 100.0, metavar="DB")
     text = "microphone, by number or part of its name; the system's by default"
     option("--input", _device, text, metavar="DEVICE")
     text = "headphones, by number or part of their name; the system's by default"
     option("--output", _device, text, metavar="DEVICE")
     option("--block-ms", positive, "block size of an aid in ms", 4.0)
-    text = "buffer of each device in ms; raise it if there are drop-outs"
+    text = "buffer of each device in ms, to be increased if there are drop-outs"
     option("--buffer-ms", positive, text, 20.0)
     option("--seconds", positive, "stop after this many seconds")
     parser.flag("--list-devices", "list the devices and exit")
 
 
 def _live(options: argparse.Namespace) -> None:
-    sounddevice = None
     if options.list_devices:
-        sounddevice = _sounddevice()
+        sounddevice = _import_sounddevice()
         print(sounddevice.query_devices() or "no devices")
         return
     if options.audiogram is None and options.listener is None:
         raise ValueError("give an ear with --audiogram, or both ears with --listener")
-    if options.simulate and (
-        options.noise_reduction is not None or options.amplification is not None
-    ):
+    sliders = (options.noise_reduction, options.amplification)
+    if options.simulate and sliders != (None, None):
         raise ValueError("--noise-reduction and --amplification have no effect with --simulate")
     ears = read_ears(options)
-    sounddevice = _sounddevice()
+    sounddevice = _import_sounddevice()
     import torch
 
     from hlsim.live import Live, SimulatedStream, play
     from hlsim.losses.frozen_simulator import build_simulator
 
-    torch.set_num_threads(1)  # several threads spend more than 4 ms waiting for each other
+    torch.set_num_threads(1)  # Threads would wait for each other for more than 4 ms.
     block = max(1, round(options.block_ms * RATE / 1000))
     if options.simulate:
         stream = SimulatedStream(build_simulator("neuro-msbg", RATE, options.full_scale_spl), ears)
-        block, latency = 12 * stream.block, stream.latency
+        block = 12 * stream.block
+        latency = stream.latency
     else:
-        aid, sliders = read_compensator(options, RATE)
+        aid, values = read_compensator(options, RATE)
         if not hasattr(aid, "stream"):
             raise ValueError(
-                f"{options.compensator} cannot run in blocks; use wdrc, or a hearing aid"
+                f"{options.compensator} cannot process blocks; choose wdrc or a hearing aid"
             )
-        stream, latency = aid.stream(ears, **sliders), aid.latency
+        stream = aid.stream(ears, **values)
+        latency = aid.latency
     play(
         Live(stream, options.full_scale_spl, 2 if options.listener else 1, latency),
         sounddevice,
@@ -88,10 +96,11 @@ def _live(options: argparse.Namespace) -> None:
     )
 
 
-def _sounddevice() -> ModuleType:
+def _import_sounddevice() -> ModuleType:
+    """Import sounddevice, or raise an error that states how to install it."""
     try:
         return require("sounddevice", "live")
-    except OSError as error:  # raised by sounddevice itself, if the wheel brings no PortAudio
+    except OSError as error:  # PortAudio is missing: not all wheels of sounddevice include it.
         raise ValueError(
             f"PortAudio not found ({error}); install it (Debian: apt install libportaudio2)"
         ) from error

@@ -37,28 +37,35 @@ COMMANDS = {
     "train-simulator": ("training", "train a Neuro-MSBG to reproduce MSBG or another teacher"),
     "train-compensator": ("training", "train a hearing aid through a frozen simulator"),
 }
-"""For each command its module in ``hlsim.cli``, where a function of the command's name declares its options, and a
-description."""
+"""Module in ``hlsim.cli`` and description of each command.
+
+The module has a function of the command's name that declares the options.
+"""
 
 GROUPS = {
     "listen": ("simulate", "compensate", "live", "demo"),
     "evaluate": ("haspi-report", "evaluate-compensator", "evaluate-simulator", "clarity"),
     "train": ("prepare", "train-simulator", "train-compensator"),
 }
+"""Groups of commands in the help."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the program.
 
     Args:
-        arguments: Command and options; those of the process by default.
+        arguments: Command and options; by default those of the process.
 
-    Returns: exit status, 0 after success and 2 after an error.
+    Returns:
+        Exit status: 0 after success, 2 after an error, and 128 plus the number of the signal that
+        stopped the program.
     """
-    # NumPy solves only small systems here, for which OpenBLAS's threads would wait longer than they compute
+    # NumPy solves only small systems here, for which threads of OpenBLAS wait longer than they
+    # compute.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     if "matplotlib" not in sys.modules:
-        os.environ["MPLBACKEND"] = "Agg"  # a notebook's backend may be missing in this environment
+        # The backend of a notebook may be missing in this environment.
+        os.environ["MPLBACKEND"] = "Agg"
     signals: list[int] = []
 
     def stop(number: int, frame: object) -> None:
@@ -68,9 +75,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     is_main_thread = threading.current_thread() is threading.main_thread()
     previous_handler = signal.signal(signal.SIGTERM, stop) if is_main_thread else None
     try:
-        parser = _parser()
-        given = sys.argv[1:] if arguments is None else arguments
-        options = parser.parse_args(join_negative_values(given))
+        parser = _make_parser()
+        arguments = sys.argv[1:] if arguments is None else arguments
+        options = parser.parse_args(join_negative_values(arguments))
         if not hasattr(options, "run"):
             parser.print_help()
             return 0
@@ -88,10 +95,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-def _parser() -> Parser:
+def _make_parser() -> Parser:
+    """Make the parser of the program, whose commands declare their options when they are used."""
     lines = []
     for group, names in GROUPS.items():
-        lines += [f"\n{group}:", *(f"  {name:<22}{COMMANDS[name][1]}" for name in names)]
+        lines.append(f"\n{group}:")
+        lines += [f"  {name:<22}{COMMANDS[name][1]}" for name in names]
     parser = Parser(
         prog="hlsim",
         usage="hlsim COMMAND ...",
@@ -110,6 +119,7 @@ def _parser() -> Parser:
 
 
 def _declare(module: str, function: str, parser: Parser) -> None:
+    """Declare the options of a command with the function of its module."""
     getattr(import_module(f"hlsim.cli.{module}"), function)(parser)
 
 

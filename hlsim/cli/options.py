@@ -1,6 +1,6 @@
-"""Options of the command line: the parser, the options that commands share, and the types of their values.
+"""The parser of the command line, and the options that several commands have.
 
-Nothing here imports torch, so that ``--help`` takes a fraction of a second.
+This module does not import torch, so that ``--help`` takes a fraction of a second.
 """
 
 from __future__ import annotations
@@ -15,21 +15,28 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 STANDARD_EARS = ("NH", "N1", "N2", "N3", "N4", "N5", "N6", "N7", "S1", "S2", "S3")
+"""Names of the standard ears, as in ``hlsim.audiogram``."""
 
 TEACHERS = ("msbg",)
+"""Names of the teachers that are no plug-ins, as in ``hlsim.training.teacher``."""
 
 EARS_TABLE = (
     "CSV file of ears with columns hl_250, hl_500, ... in dB HL, an empty value where a frequency "
     "was not measured; or standard for Bisgaard's ears N1 to N6 and S1 to S3"
 )
+"""Description of a table of ears, for the help."""
 
 _NEGATIVE_LIST = re.compile(r"-\.?\d.*[,e]")
 
 
 def join_negative_values(arguments: Sequence[str]) -> list[str]:
-    """Join an option and a value such as ``-10,0,20``, which argparse takes for another option.
+    """Join an option and a value such as ``-10,0,20``, which argparse mistakes for an option.
 
-    Returns: the arguments, with ``--option -10,0`` written as ``--option=-10,0``.
+    Args:
+        arguments: Command and options.
+
+    Returns:
+        The arguments, with ``--option -10,0`` replaced by ``--option=-10,0``.
     """
     joined: list[str] = []
     for argument in arguments:
@@ -43,28 +50,30 @@ def join_negative_values(arguments: Sequence[str]) -> list[str]:
 
 
 class Parser(argparse.ArgumentParser):
-    """Parser of the program and of each command. Errors take one line, without the usage.
+    """Parser of the program and of each command, whose errors are one line without the usage.
 
     Args:
-        declare: Function that declares the options; called when the command is used.
+        declare: Function that declares the options. It is called when the command is used.
+        settings: Arguments of ``argparse.ArgumentParser``.
     """
 
     def __init__(self, *, declare: Callable[[Parser], None] | None = None, **settings: Any) -> None:
         super().__init__(**settings)
         self._declare = declare
         self._examples: tuple[str, ...] = ()
-        self._passed_on: tuple[str, ...] = ()
+        self._prefixes: tuple[str, ...] = ()
         self._required: Any = None
 
-    def runs(self, run: Callable[[argparse.Namespace], None], *examples: str) -> None:
-        """Set the function that runs the command, and the arguments that the help shows as examples."""
+    def set_command(self, run: Callable[[argparse.Namespace], None], *examples: str) -> None:
+        """Set the function that runs the command, and the arguments of the examples in the help."""
         self.set_defaults(run=run)
         self._examples = examples
 
-    def passes_on(self, *prefixes: str) -> None:
-        """Keep undeclared options that begin with a prefix, and their values, as ``passed_on``."""
-        self.set_defaults(passed_on=[])
-        self._passed_on = prefixes
+    def accept_prefixes(self, *prefixes: str) -> None:
+        """Collect undeclared options that begin with a prefix, and their values, as
+        ``undeclared``."""
+        self.set_defaults(undeclared=[])
+        self._prefixes = prefixes
 
     def format_help(self) -> str:
         text = super().format_help()
@@ -75,13 +84,15 @@ class Parser(argparse.ArgumentParser):
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         if self._declare is not None:
-            declare, self._declare = self._declare, None
+            declare = self._declare
+            self._declare = None
             declare(self)
         options, unknown = super().parse_known_args(args, namespace)
-        if unknown and unknown[0].startswith(self._passed_on):
-            options.passed_on = unknown
+        if unknown and unknown[0].startswith(self._prefixes):
+            options.undeclared = unknown
             unknown = []
-        if unknown:  # reported here, by the command's parser, so that the message names the command
+        if unknown:
+            # The parser of the program would report them as well, but without the command's name.
             self.error(f"unrecognized arguments: {' '.join(unknown)}")
         return options, unknown
 
@@ -103,14 +114,18 @@ class Parser(argparse.ArgumentParser):
         The help text ends with the default; required options are listed in a group of their own.
 
         Args:
-            kind: Function that reads the value.
-            group: Group of options to add this one to, such as a mutually exclusive group.
+            name: Name, with dashes unless the argument is positional.
+            kind: Function from text to value.
+            text: Description for the help.
+            default: Value if the option is missing.
+            group: Group of options that it joins, such as a mutually exclusive group.
             settings: Other arguments of ``add_argument``.
         """
         if settings.get("required"):
             group = self._required = self._required or self.add_argument_group("required options")
         elif default not in (None, []):
-            text += f" (default: {_shown(default, separator=' ' if 'nargs' in settings else ',')})"
+            separator = " " if "nargs" in settings else ","
+            text += f" (default: {_format_default(default, separator)})"
         if name.startswith("-"):
             settings["default"] = default
         if "choices" not in settings and kind in _METAVARS:
@@ -121,52 +136,63 @@ class Parser(argparse.ArgumentParser):
         """Declare an option without a value."""
         (group or self).add_argument(name, action="store_true", help=text)
 
-    # options that several commands have
-
     def teacher(self, text: str, default: str) -> None:
+        """Declare ``--teacher``."""
         help_ = (
             f"{text}: msbg (exact), or your own simulator as package.module:name or "
-            "path/to/file.py:name: a callable (waveform, audiogram) -> waveform, "
-            "or a class of such callables, time-aligned, for waveforms (items, time) in pascals and "
-            "audiograms (items, 8) in dB HL, at its attribute sample_rate or else 16000 Hz"
+            "path/to/file.py:name, which is a function (waveform, audiogram) -> waveform, or a "
+            "class of "
+            "such functions; waveforms (items, time) are in pascals, audiograms (items, 8) in "
+            "dB HL, and "
+            "the sample rate is its attribute sample_rate or else 16000 Hz"
         )
         self.option("--teacher", teacher_name, help_, default, metavar="NAME")
 
     def audiogram(self, default: str | None = None, text: str = "", **settings: Any) -> None:
+        """Declare ``--audiogram``, one ear."""
         help_ = (
-            "NH, N1 to N7, S1 to S3, or eight levels in dB HL at 250, 500, 1000, 2000, 3000, 4000, 6000 "
+            "NH, N1 to N7, S1 to S3, or eight levels in dB HL at 250, 500, 1000, 2000, 3000, "
+            "4000, 6000 "
             f"and 8000 Hz, separated by commas{text}"
         )
         self.option("--audiogram", str, help_, default, metavar="EAR", **settings)
 
     def listener(self, text: str, **settings: Any) -> None:
+        """Declare ``--listener``, two ears."""
         help_ = (
-            f"{text}: a CSV file with columns listener, ear (left or right), hl_250, ..., or Clarity's "
+            f"{text}: a CSV file with columns listener, ear (left or right), hl_250, ..., or "
+            "Clarity's "
             "listeners.json; write FILE:NAME if the file holds several listeners"
         )
         self.option("--listener", str, help_, metavar="FILE[:NAME]", **settings)
 
     def full_scale(self, **settings: Any) -> None:
+        """Declare ``--full-scale-spl``."""
         text = "level in dB SPL of a file whose RMS is 1.0"
         self.option("--full-scale-spl", number, text, 94.0, metavar="DB", **settings)
 
     def sliders(self) -> None:
+        """Declare the sliders of a hearing aid."""
         text = "strength of a hearing aid's noise reduction, 0 to 1 (default: 1)"
         self.option("--noise-reduction", slider, text)
         text = "strength of a hearing aid's amplification, 0 to 1 (default: 1)"
         self.option("--amplification", slider, text)
 
     def jobs(self) -> None:
+        """Declare ``--jobs``."""
         self.option("--jobs", count, "number of processes; all cores by default")
 
     def seed(self) -> None:
+        """Declare ``--seed``."""
         self.option("--seed", integer, "seed of every random draw", 0)
 
     def out(self) -> None:
+        """Declare ``--out``."""
         self.option("--out", folder, "folder for the results", required=True)
 
 
-def _shown(default: Any, separator: str) -> str:
+def _format_default(default: Any, separator: str) -> str:
+    """Format a default value, or the values of a list, for the help."""
     values = default if isinstance(default, list | tuple) else [default]
     texts = [f"{value:g}" if isinstance(value, float) else str(value) for value in values]
     return separator.join(texts)
@@ -175,22 +201,22 @@ def _shown(default: Any, separator: str) -> str:
 def checked_type(
     read: Callable[[str], Any], accepts: Callable[[Any], bool], expected: str
 ) -> Callable[[str], Any]:
-    """Make the type of an option: a function that reads a value and rejects those not accepted.
+    """Make a function that reads the value of an option and validates it.
 
     Args:
         read: Function from text to value; a ValueError rejects the text.
-        accepts: Condition on the value.
-        expected: Description of accepted values, for the error message.
+        accepts: Function that returns whether a value is valid.
+        expected: Description of valid values, for the error message.
     """
 
-    def value_of(text: str) -> Any:
+    def read_value(text: str) -> Any:
         with suppress(ValueError):
             value = read(text)
             if accepts(value):
                 return value
         raise argparse.ArgumentTypeError(f"got {text!r}, expected {expected}")
 
-    return value_of
+    return read_value
 
 
 _PLUGIN = re.compile(r".+:\w+")
@@ -212,7 +238,7 @@ teacher_name = checked_type(
 
 
 def folder(text: str) -> Path:
-    """Read the name of a folder for results; reject one that cannot be created before work starts."""
+    """Read the name of a folder for results, and reject one that cannot be created."""
     path = Path(text)
     existing = path.absolute()
     while not os.path.lexists(existing):

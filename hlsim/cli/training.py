@@ -14,86 +14,115 @@ from hlsim.training.recipes import CompensatorRecipe, SimulatorRecipe
 
 
 def train_simulator(parser: Parser) -> None:
-    parser.runs(
+    """Declare the options of ``train-simulator``."""
+    parser.set_command(
         _train_simulator,
         "--speech speech/train --valid-speech speech/valid --out runs/simulator",
-        "--recipe examples/neuro-msbg-light.yaml --recipe.batch 4 --manifest VoiceBank/manifest.csv --out runs/light",
+        "--recipe examples/neuro-msbg-light.yaml --recipe.batch 4 --manifest "
+        "VoiceBank/manifest.csv --out runs/light",
     )
-    parser.teacher("simulator whose output is learned", "msbg")
-    _training_options(parser)
+    parser.teacher("simulator whose output the network learns", "msbg")
+    _declare_common(parser)
     add_recipe(parser, SimulatorRecipe, "examples/neuro-msbg.yaml")
 
 
 def train_compensator(parser: Parser) -> None:
-    parser.runs(
+    """Declare the options of ``train-compensator``."""
+    parser.set_command(
         _train_compensator,
         "--speech speech/train --valid-speech speech/valid --audiogram N3 --out runs/n3",
-        "--recipe examples/hearing-aid.yaml --start hearing-aid --speech speech --noise noise --out runs/aid",
+        "--recipe examples/hearing-aid.yaml --start hearing-aid --speech speech --noise noise "
+        "--out runs/aid",
     )
-    parser.audiogram(text="; without it one compensator for all ears is trained")
+    parser.audiogram(text="; without it, one compensator for all ears is trained")
     parser.option(
         "--simulator", str, "msbg (exact), or a checkpoint's name or folder", "neuro-msbg"
     )
-    _training_options(parser)
+    _declare_common(parser)
     add_recipe(parser, CompensatorRecipe, "examples/compensator.yaml")
 
 
-def _training_options(parser: Parser) -> None:
+def _declare_common(parser: Parser) -> None:
+    """Declare the options that both commands have."""
     option = parser.option
     speech = parser.add_mutually_exclusive_group(required=True)
-    option("--speech", Path, "folder of clean speech to train on", group=speech)
-    text = "CSV file of 'hlsim prepare', instead of --speech and --valid-speech; its noisy speech gives the noise"
+    option("--speech", Path, "folder of clean speech", group=speech)
+    text = (
+        "CSV file of 'hlsim prepare', instead of --speech and --valid-speech; the noise is "
+        "that of its noisy speech"
+    )
     option("--manifest", Path, text, group=speech)
-    option("--root", Path, "folder that the manifest's paths are relative to; its own by default")
-    option("--noise", Path, "folder of noises to mix in")
+    option(
+        "--root",
+        Path,
+        "folder to which the manifest's paths are relative; by default the folder of the manifest",
+    )
+    option("--noise", Path, "folder of noise recordings that are mixed in")
     option(
         "--audiograms",
         Path,
-        "CSV file of measured ears to join the drawn ones, or standard for Bisgaard's",
+        "CSV file of measured ears, or standard for Bisgaard's; used in addition to random ears",
     )
-    option("--valid-speech", Path, "folder of other speakers to validate on")
-    option("--valid-noise", Path, "folder of noises to validate with")
-    option("--valid-audiograms", Path, "CSV file of ears to validate with, or standard")
-    text = "minutes after which to stop, those before a resumption included; the learning rate does not depend on them"
+    option("--valid-speech", Path, "folder of clean speech by other speakers, for validation")
+    option("--valid-noise", Path, "folder of noise recordings for validation")
+    option(
+        "--valid-audiograms",
+        Path,
+        "CSV file of measured ears for validation, or standard for Bisgaard's",
+    )
+    text = (
+        "time limit in minutes, including the time before a resumption; the learning rate "
+        "does not depend on it"
+    )
     option("--max-minutes", positive, text)
-    option("--device", str, "where to train", "auto", choices=("auto", "cpu", "cuda"))
-    option("--devices", count, "number of GPUs or processes; each draws batches of its own", 1)
-    option("--workers", natural, "processes that draw batches, beside the one that trains", 0)
-    parser.flag("--quiet", "no progress bar, only a line per validation")
+    option("--device", str, "device of the training", "auto", choices=("auto", "cpu", "cuda"))
+    option("--devices", count, "number of GPUs or processes; each draws its own batches", 1)
+    option(
+        "--workers",
+        natural,
+        "number of processes that draw batches, in addition to the one that trains",
+        0,
+    )
+    parser.flag("--quiet", "print one line per validation, without a progress bar")
     parser.out()
 
 
 def _train_simulator(options: argparse.Namespace) -> None:
-    _check(options)
+    _check_options(options)
     recipe = read_recipe(options, SimulatorRecipe)
-    require("lightning", "train")  # if it is broken, this says so
+    require("lightning", "train")  # A broken installation is reported here.
     from hlsim.training.simulator import train_simulator
 
-    folder = train_simulator(recipe=recipe, teacher=options.teacher, **_arguments(options))
+    folder = train_simulator(recipe=recipe, teacher=options.teacher, **_common_arguments(options))
     print(f"the best checkpoint is in {folder}")
 
 
 def _train_compensator(options: argparse.Namespace) -> None:
     if options.audiogram and (options.audiograms or options.valid_audiograms):
         raise ValueError(
-            "--audiogram trains for one ear; leave out either it or --audiograms and --valid-audiograms"
+            "--audiogram excludes --audiograms and --valid-audiograms, because it trains for "
+            "one ear; "
+            "leave one or the other out"
         )
-    _check(options)
+    _check_options(options)
     recipe = read_recipe(options, CompensatorRecipe)
     ear = read_ear(options.audiogram) if options.audiogram else None
     require("lightning", "train")
     from hlsim.training.compensator import train_compensator
 
     folder = train_compensator(
-        recipe=recipe, audiogram=ear, simulator=options.simulator, **_arguments(options)
+        recipe=recipe, audiogram=ear, simulator=options.simulator, **_common_arguments(options)
     )
     print(f"the best checkpoint is in {folder}")
 
 
-def _check(options: argparse.Namespace) -> None:
-    """Reject options that exclude each other and files that do not exist, before slow imports."""
+def _check_options(options: argparse.Namespace) -> None:
+    """Reject options that exclude each other, and missing files, before slow imports."""
     if options.manifest is not None and options.valid_speech is not None:
-        raise ValueError("--manifest has its own validation speech; leave out --valid-speech")
+        raise ValueError(
+            "--manifest excludes --valid-speech, because it includes validation "
+            "speech; leave one out"
+        )
     if options.manifest is None and options.root is not None:
         raise ValueError("--root has no effect without --manifest; leave it out")
     require_installed("train", "lightning", "tensorboard")
@@ -109,11 +138,11 @@ def _check(options: argparse.Namespace) -> None:
     )
 
 
-def _arguments(options: argparse.Namespace) -> dict[str, Any]:
-    """Return the arguments that ``train_simulator`` and ``train_compensator`` have in common."""
+def _common_arguments(options: argparse.Namespace) -> dict[str, Any]:
+    """Return the arguments that both training functions have."""
     from hlsim.training.batches import TrainingData
 
-    more: dict[str, Any] = {
+    attributes: dict[str, Any] = {
         "noise": options.noise,
         "audiograms": options.audiograms,
         "valid_noise": options.valid_noise,
@@ -121,9 +150,9 @@ def _arguments(options: argparse.Namespace) -> dict[str, Any]:
         "workers": options.workers,
     }
     if options.manifest is not None:
-        data = TrainingData.from_manifest(options.manifest, options.root, **more)
+        data = TrainingData.from_manifest(options.manifest, options.root, **attributes)
     else:
-        data = TrainingData(options.speech, valid_speech=options.valid_speech, **more)
+        data = TrainingData(options.speech, valid_speech=options.valid_speech, **attributes)
     return {
         "data": data,
         "out": options.out,

@@ -1,4 +1,4 @@
-"""What the program declares without importing it is what the library has."""
+"""Names and defaults of the command line agree with those of the library."""
 
 import inspect
 from collections.abc import Callable
@@ -27,8 +27,9 @@ def test_help_ends_with_two_examples_that_the_command_takes(command: str) -> Non
     parser = declared(command)
     text, examples = parser.format_help().split("\nexamples:\n")
     assert text.startswith(f"usage: {command}")
-    one, two = (example.split() for example in examples.splitlines())
-    for words in (one, two):
+    lines = examples.splitlines()
+    assert len(lines) == 2
+    for words in map(str.split, lines):
         assert words[0] == command and parser.parse_args(words[1:]).run
         recipes = [word for word in words if word.endswith(".yaml")]
         assert all((Path(__file__).parents[2] / recipe).is_file() for recipe in recipes)
@@ -41,7 +42,7 @@ def test_names_that_are_written_twice_agree() -> None:
 
 
 def _parameters() -> dict[str, dict[str, Any]]:
-    """Defaults by the names of the arguments that each command's functions take."""
+    """Return the defaults of each command's function by the names of its arguments."""
     pytest.importorskip("lightning")
     from hlsim.demo import demo
     from hlsim.evaluation import haspi_report
@@ -52,22 +53,22 @@ def _parameters() -> dict[str, dict[str, Any]]:
     from hlsim.training.simulator import train_simulator
     from hlsim.training.trainer import TrainerOptions
 
-    functions: dict[str, tuple[Callable[..., Any], ...]] = {
-        "prepare": (prepare,),
-        "demo": (demo,),
-        "haspi-report": (haspi_report,),
-        "evaluate-compensator": (evaluate_compensators,),
-        "evaluate-simulator": (evaluate_simulators,),
-        "train-compensator": (train_compensator,),
-        "train-simulator": (train_simulator,),
+    functions: dict[str, Callable[..., Any]] = {
+        "prepare": prepare,
+        "demo": demo,
+        "haspi-report": haspi_report,
+        "evaluate-compensator": evaluate_compensators,
+        "evaluate-simulator": evaluate_simulators,
+        "train-compensator": train_compensator,
+        "train-simulator": train_simulator,
     }
-    found: dict[str, dict[str, Any]] = {}
-    for command, several in functions.items():
-        signatures = [inspect.signature(function).parameters for function in several]
-        found[command] = {name: own[name].default for own in signatures for name in own}
+    defaults: dict[str, dict[str, Any]] = {}
+    for command, function in functions.items():
+        parameters = inspect.signature(function).parameters
+        defaults[command] = {name: parameter.default for name, parameter in parameters.items()}
         if command.startswith("train-"):
-            found[command] |= dict.fromkeys(TrainerOptions.__annotations__)
-    return found
+            defaults[command] |= dict.fromkeys(TrainerOptions.__annotations__)
+    return defaults
 
 
 def test_defaults_of_the_program_are_the_functions() -> None:
@@ -77,7 +78,7 @@ def test_defaults_of_the_program_are_the_functions() -> None:
         for name, expected in parameters.items():
             default = parser.get_default(name)
             if default is None or expected in (None, inspect.Parameter.empty):
-                continue  # required of one or the other, or read before it is passed on
+                continue  # The value is required, or is converted before the call.
             if name == "measures":
                 default = default.split(",")
             if isinstance(default, list | tuple):

@@ -1,4 +1,4 @@
-"""Progress on stderr: how much is done, and when the rest will be."""
+"""Progress and expected end of long work, on stderr."""
 
 import pytest
 
@@ -17,7 +17,7 @@ def test_the_end_follows_from_the_pace_since_the_first_call(
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 3, "a file gets a line every half minute"
     assert lines[0] == "50 of 100 scores"
-    assert lines[1].startswith("60 of 100 scores, the rest in 4.0 min")
+    assert lines[1].startswith("60 of 100 scores, 4.0 min left")
     assert lines[2] == "100 of 100 scores"
 
 

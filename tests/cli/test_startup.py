@@ -1,4 +1,4 @@
-"""Help and refusals come without torch: nobody waits seconds for them."""
+"""Help and errors of options do not import torch, which takes seconds."""
 
 import json
 import subprocess
@@ -21,7 +21,7 @@ for arguments, status in json.loads(sys.argv[1]):
 """
 
 
-def test_help_and_refusals_import_nothing_heavy(tmp_path: Path) -> None:
+def test_help_and_errors_import_nothing_heavy(tmp_path: Path) -> None:
     plain, missing, out = tmp_path / "plain.wav", tmp_path / "missing", tmp_path / "out.wav"
     plain.touch()
     lines = [

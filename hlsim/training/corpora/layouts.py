@@ -41,7 +41,8 @@ LEVELS = {
 
 LAYOUTS = {
     "VoiceBank-DEMAND": (
-        r"(?P<condition>clean|noisy)(?P<set>_(?P<split>train|test)set(_28spk|_56spk)?_wav(?P<version>_16k|_48k)?)/"
+        r"(?P<condition>clean|noisy)"
+        r"(?P<set>_(?P<split>train|test)set(_28spk|_56spk)?_wav(?P<version>_16k|_48k)?)/"
         r"(?P<doubled>(?P=condition)(?P=set)/)?(?P<speaker>p\d+)_\d+\.\w+"
     ),
     "LibriSpeech or LibriTTS": (
