@@ -95,6 +95,7 @@ def test_enhancers_take_noise_off_and_do_not_delay(
     assert apart[1] < apart[0] - 4.0
 
 
+@pytest.mark.slow
 def test_what_the_sliders_trade(
     speech_dir: Path,
     tmp_path: Path,

@@ -34,6 +34,7 @@ def test_conv_tasnet_trains(
     assert torch.load(tmp_path / "out.pt")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("network", ["gru-mask", "waveform"])
 def test_networks_are_trained_and_judged_beside_nalr(
     network: str,
@@ -87,6 +88,7 @@ def test_a_loop_of_accelerate(capsys: pytest.CaptureFixture[str]) -> None:
     assert set(aid.state_dict()) == {"weight", "bias"}
 
 
+@pytest.mark.slow
 def test_an_aid_learns_through_a_network_that_learned_another_simulator(
     tmp_path: Path,
     speech_dir: Path,

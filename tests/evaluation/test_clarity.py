@@ -153,6 +153,7 @@ def pyclaritys(folder: Path, scene: str, listener: str) -> dict[str, float]:
     return {"haspi": haspi_v2_be(**both), "hasqi": hasqi_v2_better_ear(**both)}
 
 
+@pytest.mark.slow
 def test_the_challenges_baseline_has_its_scores(clarity: Path, tmp_path: Path) -> None:
     pytest.importorskip("clarity")
     aids = {"baseline": f"{__name__}:Baseline"}
