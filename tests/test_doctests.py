@@ -21,6 +21,7 @@ MODULES = [
     "hlsim.metrics.fidelity",
     "hlsim.metrics.interaural",
     "hlsim.metrics.objective",
+    "hlsim.metrics.pair",
     "hlsim.metrics.words",
     "hlsim.msbg.cochlea",
     "hlsim.msbg.delay",

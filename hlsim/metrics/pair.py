@@ -1,4 +1,4 @@
-"""Validation of the pairs of signals that are scored, and of seeds."""
+"""Validation of pairs of signals that are scored, and of seeds."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from hlsim.calibration import check_full_scale
-from hlsim.checks import Lengths, check_lengths, check_rate, check_waveform
+from hlsim.checks import Lengths, check_lengths, check_rate, check_waveform, describe
 
 SHORTEST_SECONDS = 0.7
 """Shortest signal in seconds for which a score can be trusted."""
@@ -20,66 +20,87 @@ LOWEST_REFERENCE_SPL = 20.0
 """Lowest level of the reference in dB SPL for which a score can be trusted."""
 
 LARGEST_LENGTH_DIFFERENCE = 0.1
-"""Largest difference in seconds between the lengths of two signals, which are then cut to the shorter one."""
+"""Largest difference in seconds between the lengths of two signals, of which the longer is cut."""
 
 Signal = np.ndarray | Tensor
+"""Samples of one channel. Shape: (time,)."""
 
 
 def common_length(lengths: tuple[int, int], sample_rate: int, names: tuple[str, str]) -> int:
-    """Return the length of the shorter one of two signals, and warn if they differ.
+    """Return the length of the shorter of two signals, and warn if their lengths differ.
+
+    Args:
+        lengths: lengths of both signals in samples.
+        sample_rate: sample rate in Hz.
+        names: names of both signals in messages.
 
     Raises:
-        ValueError: they differ by more than 0.1 s.
+        ValueError: the lengths differ by more than 0.1 s.
+
+    >>> common_length((16000, 16000), 16000, ("output", "clean"))
+    16000
     """
     difference = abs(lengths[0] - lengths[1])
     if difference == 0:
         return lengths[0]
-    text = f"{names[0]} has {lengths[0]} samples and {names[1]} {lengths[1]}"
+    description = f"{names[0]} has {lengths[0]} samples and {names[1]} {lengths[1]}"
     if difference > LARGEST_LENGTH_DIFFERENCE * sample_rate:
         raise ValueError(
-            f"{text}, a difference of {difference / sample_rate:.2g} s; signals may differ by "
-            f"{LARGEST_LENGTH_DIFFERENCE:g} s at most, align and cut them first"
+            f"{description}, a difference of {difference / sample_rate:.2g} s; signals may differ "
+            f"by {LARGEST_LENGTH_DIFFERENCE:g} s at most, align and cut them first"
         )
-    warnings.warn(f"{text}; both are cut to the shorter length", stacklevel=3)
+    warnings.warn(f"{description}; both are cut to the shorter length", stacklevel=3)
     return min(lengths)
 
 
 def cut_to_common_length(
     processed: Tensor, clean: Tensor, sample_rate: int, lengths: Lengths | None
 ) -> tuple[Tensor, Tensor, Lengths | None]:
-    """Cut signals whose lengths differ by 0.1 s at most, with a warning; longer lengths of items are cut, too.
+    """Cut two signals to their common length, with a warning if their lengths differ.
 
-    Shape: (..., time) twice. Signals of other shapes are returned as they are, for they are rejected later.
+    Arguments that do not fit together for other reasons are returned unchanged, because later
+    checks reject them.
+
+    Args:
+        processed: signal to score. Shape: (..., time).
+        clean: clean speech. Shape: (..., time).
+        sample_rate: sample rate in Hz.
+        lengths: number of samples of each item in a padded batch, which are limited to the common
+            length.
 
     Raises:
-        ValueError: the lengths differ by more.
+        ValueError: the lengths differ by more than 0.1 s.
+
+    >>> output, clean, _ = cut_to_common_length(torch.ones(9000), torch.ones(9000), 16000, None)
+    >>> output.shape
+    torch.Size([9000])
     """
-    tensors = isinstance(processed, Tensor) and isinstance(clean, Tensor)
-    if not tensors or processed.ndim == 0 or processed.shape[:-1] != clean.shape[:-1]:
+    are_tensors = isinstance(processed, Tensor) and isinstance(clean, Tensor)
+    if not are_tensors or processed.ndim == 0 or processed.shape[:-1] != clean.shape[:-1]:
         return processed, clean, lengths
-    both = processed.shape[-1], clean.shape[-1]
-    if both[0] == both[1] or 0 in both:
+    times = processed.shape[-1], clean.shape[-1]
+    if times[0] == times[1] or 0 in times:
         return processed, clean, lengths
-    time = common_length(both, check_rate(sample_rate), ("processed", "clean"))
+    time = common_length(times, check_rate(sample_rate), ("processed", "clean"))
     if lengths is not None:
-        lengths = check_lengths(lengths, torch.Size((*clean.shape[:-1], max(both)))).clamp_max(time)
+        padded_shape = torch.Size((*clean.shape[:-1], max(times)))
+        lengths = check_lengths(lengths, padded_shape).clamp_max(time)
     return processed[..., :time], clean[..., :time], lengths
 
 
 def match_pair(
     processed: Tensor, clean: Tensor, sample_rate: int, lengths: Lengths | None
 ) -> tuple[Tensor, Tensor, Lengths | None]:
-    """Cut signals to their common length, and convert the clean one to the wider of both dtypes.
+    """Cut two signals to their common length, and convert clean speech to the wider precision.
 
     Args:
-        processed, clean: signals to score. Lengths may differ by 0.1 s at most.
+        processed: signal to score. Shape: (..., time).
+        clean: clean speech. Shape: (..., time).
         sample_rate: sample rate in Hz.
         lengths: number of samples of each item in a padded batch.
 
-    Shape: (..., time) twice.
-
     Raises:
-        ValueError: ``processed`` is no waveform, or the lengths differ by more than 0.1 s.
+        ValueError: ``processed`` is not a waveform, or the lengths differ by more than 0.1 s.
 
     >>> output, clean, _ = match_pair(torch.ones(8000).double(), torch.ones(8000), 16000, None)
     >>> clean.dtype
@@ -93,9 +114,18 @@ def match_pair(
 
 
 def check_seed(seed: int) -> int:
-    """Return the seed, or raise ValueError unless numpy takes it (0 to 2 ** 32 - 1)."""
+    """Return a seed that NumPy accepts.
+
+    Raises:
+        ValueError: the seed is not a whole number from 0 to 2 ** 32 - 1.
+
+    >>> check_seed(3)
+    3
+    """
     if not isinstance(seed, Integral) or not 0 <= seed < 2**32:
-        raise ValueError(f"seed is {seed!r}; allowed: whole numbers from 0 to {2**32 - 1}")
+        raise ValueError(
+            f"expected seed to be a whole number from 0 to {2**32 - 1}, got {describe(seed)}"
+        )
     return seed
 
 
@@ -106,47 +136,66 @@ def check_pair(
     full_scale_spl: float = 94.0,
     names: tuple[str, str] = ("reference", "processed"),
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Validate the signals of one ear and return them in float64, cut to their common length.
+    """Validate the signals of one ear, and return them in float64, cut to their common length.
 
     A silent processed signal is valid, because an aid that mutes gets the score of silence.
 
     Args:
+        reference: clean speech. Shape: (time,).
+        processed: signal to score. Shape: (time,).
+        sample_rate: sample rate in Hz.
+        full_scale_spl: level in dB SPL of samples whose RMS is 1.0.
         names: names of the signals in messages.
 
-    Shape: (time,) twice.
-
     Raises:
-        ValueError: signals of another shape, too short, not finite, or of lengths that differ by more than 0.1 s; a
-            reference that is silent or below 20 dB SPL; a rate or level out of range.
+        ValueError: a signal has another shape, is too short or is not finite, or the lengths differ
+            by more than 0.1 s. The reference is silent or below 20 dB SPL. The rate or the level is
+            out of range.
+
+    >>> reference, processed = check_pair(np.ones(16000) * np.arange(16000), np.ones(16000), 16000)
+    >>> reference.dtype
+    dtype('float64')
     """
     rate = check_rate(sample_rate)
     full_scale = check_full_scale(full_scale_spl)
-    clean, heard = _samples(reference, names[0]), _samples(processed, names[1])
-    common = common_length((len(clean), len(heard)), rate, names)
-    clean, heard = clean[:common], heard[:common]
+    clean = _as_float64(reference, names[0])
+    output = _as_float64(processed, names[1])
+    common = common_length((len(clean), len(output)), rate, names)
+    clean = clean[:common]
+    output = output[:common]
     if len(clean) < SHORTEST_SECONDS * rate:
         raise ValueError(
-            f"{names[0]} lasts {len(clean) / rate:.2g} s; a score needs {SHORTEST_SECONDS} s or more to mean anything"
+            f"expected {names[0]} to last {SHORTEST_SECONDS} s or more for a meaningful score, "
+            f"got {len(clean) / rate:.2g} s"
         )
     if not clean.any():
-        raise ValueError(f"{names[0]} is silent, every sample is zero")
+        raise ValueError(f"expected {names[0]} to be a sound, got silence")
     level = 10.0 * math.log10(max(float(np.var(clean)), 1e-30)) + full_scale
     if level < LOWEST_REFERENCE_SPL:
         raise ValueError(
-            f"{names[0]} is at {level:.1f} dB SPL with full_scale_spl {full_scale:g}; a score needs "
-            f"{LOWEST_REFERENCE_SPL:g} or more to mean anything"
+            f"expected {names[0]} at {LOWEST_REFERENCE_SPL:g} dB SPL or more for a meaningful "
+            f"score, got {level:.1f} dB SPL; check full_scale_spl={full_scale:g}"
         )
-    return clean, heard
+    return clean, output
 
 
-def _samples(signal: Signal, name: str) -> np.ndarray:
-    if isinstance(signal, Tensor):  # numpy has no bfloat16
-        signal = (signal.double() if signal.is_floating_point() else signal).detach().cpu().numpy()
+def _as_float64(signal: Signal, name: str) -> np.ndarray:
+    """Convert a signal to an array of float64. Shape: (time,).
+
+    Raises:
+        ValueError: the signal has another shape, no floating-point samples, or samples that are NaN
+            or infinite.
+    """
+    if isinstance(signal, Tensor):
+        # NumPy has no bfloat16.
+        samples = signal.double() if signal.is_floating_point() else signal
+        signal = samples.detach().cpu().numpy()
     values = np.asarray(signal)
     if values.ndim != 1 or not len(values) or values.dtype.kind != "f":
         raise ValueError(
-            f"{name} has shape {values.shape} of {values.dtype}; allowed: (time,), floating point, of one ear"
+            f"expected {name} to be floating-point samples of one ear, of shape (time,), "
+            f"got {values.dtype} of shape {values.shape}"
         )
     if not np.isfinite(values).all():
-        raise ValueError(f"{name} holds samples that are NaN or infinite")
+        raise ValueError(f"expected finite samples of {name}, got NaN or infinity")
     return values.astype(np.float64)

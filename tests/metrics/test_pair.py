@@ -1,4 +1,4 @@
-"""Signals whose lengths hardly differ are cut to the shorter one; others are rejected."""
+"""Signals of nearly equal lengths are cut to the shorter one, and others are rejected."""
 
 from collections.abc import Callable
 from functools import partial
@@ -31,8 +31,9 @@ def clean() -> Tensor:
 
 
 @pytest.mark.parametrize("name", SCORES)
-def test_lengths_that_hardly_differ_are_cut(clean: Tensor, name: str) -> None:
-    score, processed = SCORES[name], 0.8 * clean + 0.01 * torch.randn(13000)
+def test_signals_of_nearly_equal_lengths_are_cut(clean: Tensor, name: str) -> None:
+    score = SCORES[name]
+    processed = 0.8 * clean + 0.01 * torch.randn(13000)
     expected = score(processed[:12000], clean[:12000])
     with pytest.warns(UserWarning, match="processed has 12000 samples and clean 13000"):
         assert torch.equal(score(processed[:12000], clean), expected)
@@ -42,15 +43,15 @@ def test_lengths_that_hardly_differ_are_cut(clean: Tensor, name: str) -> None:
         score(torch.cat((processed, clean)), clean)
 
 
-def test_lengths_of_items_are_cut_too(clean: Tensor) -> None:
-    both = torch.stack((clean, clean.roll(99)))
+def test_lengths_of_items_are_limited_to_the_common_length(clean: Tensor) -> None:
+    batch = torch.stack((clean, clean.roll(99)))
     with pytest.warns(UserWarning):
-        found = haspi(0.5 * both[:, :12000], both, N3, lengths=[13000, 11500])
-    expected = haspi(0.5 * both[:, :12000], both[:, :12000], N3, lengths=[12000, 11500])
-    assert torch.equal(found, expected)
+        scores = haspi(0.5 * batch[:, :12000], batch, N3, lengths=[13000, 11500])
+    expected = haspi(0.5 * batch[:, :12000], batch[:, :12000], N3, lengths=[12000, 11500])
+    assert torch.equal(scores, expected)
 
 
-def test_arrays_are_cut_too(clean: Tensor) -> None:
+def test_arrays_of_nearly_equal_lengths_are_cut(clean: Tensor) -> None:
     with pytest.warns(UserWarning):
         pair = check_pair(clean.numpy(), clean[:12000].numpy(), 16000)
     assert [len(signal) for signal in pair] == [12000, 12000]
