@@ -137,7 +137,8 @@ def read_table(path: str | Path, contents: str) -> list[tuple[int, dict[str, str
 
 
 def _decode(data: bytes) -> str:
-    """Return the text of a file, in UTF-8 or else in one of the encodings that spreadsheets write."""
+    """Return the text of a file, in UTF-8 or else in one of the encodings that spreadsheets
+    write."""
     if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return data.decode("utf-16")
     try:
