@@ -4,8 +4,9 @@
     python examples/benchmark.py --what simulators --simulators neuro-msbg runs/mine/checkpoint
     OMP_NUM_THREADS=1 python examples/benchmark.py --what loss step --seconds 2 --batch 8
 
-The rows of a table take turns in every round, so that a ratio compares calls that ran within seconds of each other; the
-first round is not counted. Tables show the median (minimum to maximum) of all counted rounds.
+Every round times all rows of a table in turn, so that a ratio compares calls within seconds of each
+other. The first round is not counted. Tables show the median (minimum to maximum) of the other
+rounds.
 """
 
 import argparse
@@ -47,7 +48,7 @@ class Row(NamedTuple):
 
 
 def noise_like_speech(rate: int, seconds: float, batch: int, seed: int = 0) -> Tensor:
-    """Noise at 65 dB SPL, modulated at the rate of syllables. Shape: (batch, time)."""
+    """Make noise at 65 dB SPL, modulated at the rate of syllables. Shape: -> (batch, time)."""
     generator = torch.Generator().manual_seed(seed)
     samples = round(rate * seconds)
     envelope = torch.sin(2.0 * torch.pi * 4.0 * torch.arange(samples) / rate).clamp_min(0.05)
@@ -74,12 +75,13 @@ def simulator_rows(options: argparse.Namespace) -> list[Row]:
 
 
 def pyclarity_simulator_rows(signal: Tensor, reference: str, device: str) -> list[Row]:
-    """pyclarity's reference in NumPy, which takes one item at a time on the CPU, and its model in torch."""
+    """pyclarity's reference in NumPy, which processes single items on the CPU, and its torch
+    model."""
     from clarity.evaluator.msbg.msbg import Ear
     from clarity.predictor.torch_msbg import MSBGHearingModel
 
     logging.getLogger("clarity").setLevel(logging.ERROR)
-    ear = Ear(equiv_0db_spl=FULL_SCALE_SPL - 20.0)  # it adds 20 dB
+    ear = Ear(equiv_0db_spl=FULL_SCALE_SPL - 20.0)  # pyclarity adds 20 dB.
     ear.set_audiogram(EAR.to_clarity())
     items = signal.detach().cpu().double().numpy()
     model = MSBGHearingModel(
@@ -108,7 +110,8 @@ def loss_rows(options: argparse.Namespace) -> list[Row]:
 
 
 def step_rows(options: argparse.Namespace) -> list[Row]:
-    """An untrained compensator alone, and with the loss behind it: what a training step computes."""
+    """An untrained compensator alone, and with the loss behind it: what a training step
+    computes."""
     clean = noise_like_speech(16000, options.seconds, options.batch).to(options.device)
     network = MappingCompensator().to(options.device).train()
     rows = [Row("compensator alone", lambda: network(clean, EAR), "")]
@@ -159,8 +162,8 @@ TABLES = {
 }
 
 
-def milliseconds(row: Row, backward: bool, device: str) -> float:
-    """Time of one call, forward alone or with the backward pass."""
+def time_call(row: Row, backward: bool, device: str) -> float:
+    """Measure the milliseconds of a call, forward alone or with the backward pass."""
     start = time.perf_counter()
     with torch.inference_mode(not backward):
         value = row.call()
@@ -177,7 +180,7 @@ def print_table(title: str, rows: list[Row], repeats: int, device: str) -> None:
     for repeat in range(repeats + 1):
         for row in rows:
             for backward in (False, True) if row.backward else (False,):
-                elapsed = milliseconds(row, backward, device)
+                elapsed = time_call(row, backward, device)
                 if repeat > 0:
                     times.setdefault((row.name, backward), []).append(elapsed)
     print(f"\n| {title} | forward (ms) | forward + backward (ms) | pyclarity's time / forward |")
@@ -187,13 +190,17 @@ def print_table(title: str, rows: list[Row], repeats: int, device: str) -> None:
         ratios = []
         if row.reference:
             pairs = zip(times[row.reference, False], forward, strict=True)
-            ratios = [reference / own for reference, own in pairs]
-        columns = [summary(forward), summary(times.get((row.name, True), [])), summary(ratios)]
+            ratios = [reference_ms / hlsim_ms for reference_ms, hlsim_ms in pairs]
+        columns = [
+            summarise(forward),
+            summarise(times.get((row.name, True), [])),
+            summarise(ratios),
+        ]
         print(f"| {row.name} | {' | '.join(columns)} |")
 
 
-def summary(values: list[float]) -> str:
-    """Median (minimum to maximum)."""
+def summarise(values: list[float]) -> str:
+    """Format the median, minimum and maximum."""
     if not values:
         return "-"
     return f"{statistics.median(values):.1f} ({min(values):.1f} to {max(values):.1f})"
@@ -214,7 +221,8 @@ def main(arguments: list[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     size = f"{options.batch} x {options.seconds:g} s"
     print(
-        f"{size} on {options.device}, {torch.get_num_threads()} threads, torch {torch.__version__}, "
+        f"{size} on {options.device}, {torch.get_num_threads()} threads, torch "
+        f"{torch.__version__}, "
         f"{time.strftime('%Y-%m-%d')}; median (minimum to maximum) of {options.repeats} rounds"
     )
     for name in options.what:

@@ -1,7 +1,9 @@
-"""Draws docs/delay.png, the paper's impulse method against the structural delay, and prints the delay by frequency.
+"""Draw docs/delay.png, the delay by the impulse method and by MSBG's structure, and print it by
+frequency.
 
-Each figure of the table is what is left of the delay in aligned output, in samples at 44.1 kHz (negative: it comes
-early), by the cross-correlation of a tone burst of 65 dB SPL with what is heard of it.
+The table shows the remaining delay of the aligned output in samples at 44.1 kHz; negative values
+mean that it is early. The delay is measured by cross-correlation of a tone burst at 65 dB SPL with
+the output.
 """
 
 from pathlib import Path
@@ -16,27 +18,34 @@ from hlsim.msbg import estimate_delay
 from hlsim.msbg.ear import MSBG_RATE
 
 EARS = ("NH", "N1", "N2", "N3", "N4", "S1", "S2", "S3")
-TABLED = EARS[:5]
+TABLE_EARS = EARS[:5]
 LEVELS = (100.0, 110.0, 120.0)
 HERTZ = (200, 300, 400, 500, 750, 1000, 2000, 4000, 8000)
 
 
-def bursts() -> Tensor:
-    """Gaussian tone bursts, half a second each, about a third of an octave wide. Shape: -> (HERTZ, time)."""
+def make_bursts() -> Tensor:
+    """Make Gaussian tone bursts of half a second, with a bandwidth of about a third of an octave.
+
+    Shape: -> (HERTZ, time).
+    """
     cycles = torch.tensor(HERTZ).unsqueeze(-1) * torch.linspace(-0.25, 0.25, MSBG_RATE // 2 + 1)
     return set_level((2.0 * torch.pi * cycles).cos() * (-0.5 * cycles.square()).exp(), 65.0)
 
 
-def left_of_the_delay(heard: Tensor, given: Tensor) -> list[int]:
-    """Where the envelope of the cross-correlation is greatest. Shape: (HERTZ, time) twice -> samples."""
-    points = 2 * given.shape[-1]
-    product = torch.fft.fft(heard, points) * torch.fft.fft(given, points).conj()
+def measure_delays(outputs: Tensor, inputs: Tensor) -> list[int]:
+    """Return the lags in samples at which the envelopes of the cross-correlations are highest.
+
+    Shape: (HERTZ, time), (HERTZ, time).
+    """
+    points = 2 * inputs.shape[-1]
+    product = torch.fft.fft(outputs, points) * torch.fft.fft(inputs, points).conj()
     product[:, points // 2 :] = 0.0
     lags = torch.fft.ifft(product).abs().argmax(-1)
     return [lag - points if lag > points // 2 else lag for lag in lags.tolist()]
 
 
-def draw(to: Path) -> None:
+def draw(path: Path) -> None:
+    """Draw the delays of all ears."""
     figure, axes = pyplot.subplots(figsize=(8.0, 3.6), layout="constrained")
     for level in LEVELS:
         delays = [
@@ -48,17 +57,17 @@ def draw(to: Path) -> None:
     axes.plot(EARS, structural, "k_", markersize=24, label="structural delay")
     axes.set(xlabel="ear", ylabel="samples at 44.1 kHz", title="Delay of MSBG")
     axes.legend(fontsize="small")
-    figure.savefig(to, dpi=110)
+    figure.savefig(path, dpi=110)
     pyplot.close(figure)
 
 
 def main() -> None:
     print("| Ear | MSBG's severity |" + "".join(f" {hertz} Hz |" for hertz in HERTZ))
     print("|---|---|" + "---|" * len(HERTZ))
-    for name in TABLED:
+    for name in TABLE_EARS:
         ear = Audiogram.standard(name)
-        left = left_of_the_delay(MSBG(ear)(bursts()), bursts())
-        print(f"| {name} | {ear.severity} |" + "".join(f" {samples:+d} |" for samples in left))
+        delays = measure_delays(MSBG(ear)(make_bursts()), make_bursts())
+        print(f"| {name} | {ear.severity} |" + "".join(f" {samples:+d} |" for samples in delays))
     draw(Path(__file__).parents[1] / "docs" / "delay.png")
 
 

@@ -2,8 +2,8 @@
 
     python examples/draw_alignment.py speech.wav alignment.png [EAR [FULL_SCALE_SPL]]
 
-Draws the 120 ms around the loudest sample of the first channel, with outputs raised to the level of the input, and
-prints the delay by MSBG's structure and by the paper's impulse method.
+Draws the 120 ms around the loudest sample of the first channel, with outputs raised to the level of
+the input, and prints the delay by MSBG's structure and by the paper's impulse method.
 """
 
 import sys
@@ -17,16 +17,16 @@ from hlsim.audio import read_audio
 from hlsim.calibration import gain_to_pascals, level_spl
 from hlsim.msbg.ear import MSBG_RATE
 
-SHOWN_SECONDS = 0.12
+PLOT_SECONDS = 0.12
 
 
 def draw(path: str, signal: Tensor, outputs: dict[str, Tensor], sample_rate: int) -> None:
     """Draw each output over the signal, in a panel of its own."""
-    shown = min(round(SHOWN_SECONDS * sample_rate), len(signal))
-    start = int(signal.abs().argmax()) - shown // 2
-    start = min(max(0, start), len(signal) - shown)
-    window = slice(start, start + shown)
-    times = torch.arange(start, start + shown) / sample_rate
+    samples = min(round(PLOT_SECONDS * sample_rate), len(signal))
+    start = int(signal.abs().argmax()) - samples // 2
+    start = min(max(0, start), len(signal) - samples)
+    window = slice(start, start + samples)
+    times = torch.arange(start, start + samples) / sample_rate
     figure = Figure(figsize=(9.0, 5.0), layout="constrained")
     panels = figure.subplots(len(outputs), 1, sharex=True)
     for axes, (title, output) in zip(panels, outputs.items(), strict=True):
@@ -44,7 +44,7 @@ def draw(path: str, signal: Tensor, outputs: dict[str, Tensor], sample_rate: int
 def main(
     source: str, target: str, ear: str = "N3", full_scale_spl: str = "94"
 ) -> tuple[float, float]:
-    """Returns the delay in ms by MSBG's structure and by the impulse method."""
+    """Draw the figure, and return the delay in ms by MSBG's structure and by the impulse method."""
     audiogram = Audiogram.standard(ear)
     waveform, sample_rate = read_audio(source)
     signal = waveform[0] * gain_to_pascals(float(full_scale_spl))

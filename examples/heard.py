@@ -1,4 +1,5 @@
-"""Draws docs/heard.png, what an N4 ear hears with and without an aid, and docs/family.png: an N2 ear by each simulator.
+"""Draw docs/heard.png, speech as an N4 ear perceives it with and without an aid, and
+docs/family.png, an N2 ear by simulator.
 
 python examples/heard.py
 """
@@ -23,22 +24,30 @@ RATE = 16000
 EXACT = "exact MSBG"
 
 
-def speech() -> Tensor:
-    """An utterance that comes with hlsim, at 65 dB SPL. Shape: -> (time,)."""
+def read_speech() -> Tensor:
+    """Read an utterance that ships with hlsim, at 65 dB SPL. Shape: -> (time,)."""
     waveform, rate = read_audio(ROOT / "hlsim" / "data" / "speech" / "valid" / "flite-rms-01.flac")
     return set_level(resample(waveform[0], rate, RATE), 65.0)
 
 
-def draw(signals: dict[str, Tensor], to: Path, of: str = "") -> None:
-    """Each signal with its level, and how each after the one ``of`` a name differs from it."""
-    told = {name: f"{name}, {level_spl(signal):.0f} dB SPL" for name, signal in signals.items()}
-    later = [*signals][[*signals].index(of) + 1 :] if of else []
-    differences = {f"{name} less {of}": (told[name], told[of]) for name in later}
-    drawn = panels({told[name]: signal for name, signal in signals.items()}, RATE, differences)
-    image = Image.open(BytesIO(composite(drawn))).convert("RGB")
+def draw(signals: dict[str, Tensor], path: Path, reference: str = "") -> None:
+    """Draw the spectrogram of each signal.
+
+    Args:
+        signals: Signals by name.
+        path: File of the picture.
+        reference: Name of a signal. The differences from it are drawn for all signals after it.
+    """
+    titles = {name: f"{name}, {level_spl(signal):.0f} dB SPL" for name, signal in signals.items()}
+    names = [*signals]
+    later = names[names.index(reference) + 1 :] if reference else []
+    differences = {f"{name} minus {reference}": (titles[name], titles[reference]) for name in later}
+    spectrograms = {titles[name]: signal for name, signal in signals.items()}
+    pictures = panels(spectrograms, RATE, differences)
+    image = Image.open(BytesIO(composite(pictures))).convert("RGB")
     image.quantize(96, Image.Quantize.MAXCOVERAGE).save(
-        to, optimize=True
-    )  # less than half of the size
+        path, optimize=True
+    )  # 96 colours need less than half of the space.
 
 
 def composite(panels: Panels) -> bytes:
@@ -57,15 +66,17 @@ def composite(panels: Panels) -> bytes:
 
 @torch.no_grad()
 def main(folder: Path = ROOT / "docs") -> None:
-    clean, exact, ear = speech(), MSBG(sample_rate=RATE), Audiogram.standard("N4")
-    heard = {"clean speech": clean, "heard without an aid": exact(clean, ear)}
+    clean, exact, ear = read_speech(), MSBG(sample_rate=RATE), Audiogram.standard("N4")
+    perceived = {"clean speech": clean, "perceived without an aid": exact(clean, ear)}
     for name in ("nalr", "compensator-general"):
-        heard[f"heard with {name}"] = exact(load_compensator(name)(clean, ear), ear)
-    draw(heard, folder / "heard.png")
+        perceived[f"perceived with {name}"] = exact(load_compensator(name)(clean, ear), ear)
+    draw(perceived, folder / "heard.png")
     ear = Audiogram.standard("N2")
     family = [name for name, loader in list_pretrained().items() if loader == "load_pretrained"]
-    heard = {name: load_pretrained(name)(clean, ear) for name in family}
-    draw({"clean speech": clean, EXACT: exact(clean, ear)} | heard, folder / "family.png", EXACT)
+    perceived = {name: load_pretrained(name)(clean, ear) for name in family}
+    draw(
+        {"clean speech": clean, EXACT: exact(clean, ear)} | perceived, folder / "family.png", EXACT
+    )
 
 
 if __name__ == "__main__":

@@ -1,10 +1,11 @@
-"""What the hearing aid's noise reduction alone does, in noise, babble, beside a second talker and in a room.
+"""The hearing aid's noise reduction in noise, in babble, with a second talker and in a room.
 
     python examples/noise_reduction.py speech/valid noise/valid audiograms/valid.csv [ITEMS]
 
-Prints, for each scene, PESQ (wide band) and STOI for a normal ear, without amplification, and HASPI of the aid for
-measured ears with noise reduction on and off, at the level that the clean speech is given. RNNoise, DeepFilterNet3 and
-GTCRN stand beside it where they are installed (examples/enhancers.py); they look 20 ms ahead and more, the aid 4.
+For each scene, it prints wide-band PESQ and STOI for a normal ear without amplification, and HASPI
+of the aid for measured ears with noise reduction on and off, at the output level of clean speech.
+If RNNoise, DeepFilterNet3 and GTCRN are installed (examples/enhancers.py), they are compared with
+the aid. Their look-ahead is 20 ms or more, that of the aid 4 ms.
 """
 
 import math
@@ -31,8 +32,14 @@ from hlsim.training.clips import Clips
 RATE, SECONDS, LEVEL = 16000, 3.0, 65.0
 
 
-def room(generator: torch.Generator, reverberation: float = 0.5) -> Tensor:
-    """An impulse response: the direct sound, and noise that falls by 60 dB in so many seconds, as loud from 10 ms on."""
+def room_response(generator: torch.Generator, reverberation: float = 0.5) -> Tensor:
+    """Make an impulse response: the direct sound, and noise of equal energy that decays after 10
+    ms.
+
+    Args:
+        generator: Source of the random numbers.
+        reverberation: Time in seconds in which the noise decays by 60 dB.
+    """
     time = torch.arange(round(reverberation * RATE)) / RATE
     tail = torch.randn(len(time), generator=generator) * 10.0 ** (-3.0 * time / reverberation)
     tail[: RATE // 100] = 0.0
@@ -41,21 +48,21 @@ def room(generator: torch.Generator, reverberation: float = 0.5) -> Tensor:
     return tail
 
 
-def scenes(speech: str, noise: str, items: int) -> dict[str, tuple[Tensor, Tensor]]:
-    """Signal and what is to be heard of it, (items, time) each, by name."""
+def make_scenes(speech: str, noise: str, items: int) -> dict[str, tuple[Tensor, Tensor]]:
+    """Return the input and the clean speech of each scene by name, with shape (items, time)."""
     generator = torch.Generator().manual_seed(0)
     voices = Clips(speech, sample_rate=RATE, seconds=SECONDS)
     clean = set_level(voices.draw(items, generator), LEVEL)
     noises = Clips(noise, sample_rate=RATE, seconds=SECONDS, repeat=True).draw(items, generator)
-    others = [set_level(voices.draw(items, generator), LEVEL) for _ in range(6)]
+    talkers = [set_level(voices.draw(items, generator), LEVEL) for _ in range(6)]
     snr = torch.tensor([2.5, 7.5, 12.5, 17.5])[torch.arange(items) % 4]
     reverberant = torch.from_numpy(
-        fftconvolve(clean.numpy(), room(generator).numpy()[None], axes=-1)
+        fftconvolve(clean.numpy(), room_response(generator).numpy()[None], axes=-1)
     )
     return {
         "noise, 2.5 to 17.5 dB": (mix(clean, noises, snr), clean),
-        "babble of six, 0 dB": (mix(clean, torch.stack(others).sum(0), torch.zeros(items)), clean),
-        "a second talker, 0 dB": (clean + others[0], clean),
+        "babble of six, 0 dB": (mix(clean, torch.stack(talkers).sum(0), torch.zeros(items)), clean),
+        "a second talker, 0 dB": (clean + talkers[0], clean),
         "a room of 0.5 s": (set_level(reverberant[:, : clean.shape[-1]], LEVEL), clean),
         "quiet": (clean, clean),
     }
@@ -67,39 +74,42 @@ def main() -> None:
     aid, normal = load_compensator("hearing-aid"), Audiogram.standard("NH")
     measured = [ear.thresholds for _, ear in read_audiograms(audiograms, simulated=True)]
     ears = torch.tensor([measured[i % len(measured)] for i in range(items)])
-    before: dict[str, Callable[[Tensor], Tensor]] = {
+    enhancers: dict[str, Callable[[Tensor], Tensor]] = {
         "none": lambda signal: signal,
         "hearing-aid": lambda signal: aid(signal, normal, 1.0, 0.0),
     }
-    for other in (RNNoise, DeepFilterNet3, GTCRN):
-        enhance = other()
+    for enhancer in (RNNoise, DeepFilterNet3, GTCRN):
+        enhance = enhancer()
         try:
             enhance(torch.zeros(1, RATE), RATE)
         except ImportError as error:
             print(error, file=sys.stderr)
         else:
-            before[other.__name__] = partial(enhance, sample_rate=RATE)
+            enhancers[enhancer.__name__] = partial(enhance, sample_rate=RATE)
     print(
-        "| scene | noise reduction | PESQ | STOI | HASPI | interval of the change |\n|---|---|---|---|---|---|"
+        "| scene | noise reduction | PESQ | STOI | HASPI | interval of the change "
+        "|\n|---|---|---|---|---|---|"
     )
-    for scene, (signal, clean) in scenes(speech, noise, items).items():
+    for scene, (signal, clean) in make_scenes(speech, noise, items).items():
         level = level_spl(aid(clean, ears, 0.0))
-        without = None
-        for name, reduce in before.items():
+        unenhanced_scores = None
+        for name, reduce in enhancers.items():
             reduced = reduce(signal)
             pairs = list(zip(clean.numpy(), reduced.numpy(), strict=True))
-            # below 0 where PESQ finds no utterance in the clip
-            rated = [pesq(RATE, *pair, "wb", on_error=PesqError.RETURN_VALUES) for pair in pairs]
-            quality = statistics.mean(value for value in rated if value > 0.0)
+            # PESQ is negative if it finds no utterance in the clip.
+            ratings = [pesq(RATE, *pair, "wb", on_error=PesqError.RETURN_VALUES) for pair in pairs]
+            quality = statistics.mean(value for value in ratings if value > 0.0)
             intelligible = sum(stoi(*pair, RATE) for pair in pairs) / items
-            given = aid(signal, ears) if name == "hearing-aid" else aid(reduced, ears, 0.0)
-            scores = haspi(set_level(given, level), clean, ears)
-            without = scores if without is None else without
-            change = scores - without
-            half = 1.96 * float(change.std()) / math.sqrt(items)
-            interval = f"{float(change.mean()):+.3f} ± {half:.3f}" if name != "none" else ""
+            output = aid(signal, ears) if name == "hearing-aid" else aid(reduced, ears, 0.0)
+            scores = haspi(set_level(output, level), clean, ears)
+            if unenhanced_scores is None:
+                unenhanced_scores = scores
+            change = scores - unenhanced_scores
+            half_width = 1.96 * float(change.std()) / math.sqrt(items)
+            interval = f"{float(change.mean()):+.3f} ± {half_width:.3f}" if name != "none" else ""
             print(
-                f"| {scene} | {name} | {quality:.2f} | {intelligible:.3f} | {float(scores.mean()):.3f} | {interval} |"
+                f"| {scene} | {name} | {quality:.2f} | {intelligible:.3f} | "
+                f"{float(scores.mean()):.3f} | {interval} |"
             )
 
 

@@ -1,7 +1,9 @@
-"""What Neuro-MSBG makes of sounds that are not speech: python examples/other_sounds.py [NAME OR FOLDER]
+"""Errors of Neuro-MSBG for sounds that are not speech: python examples/other_sounds.py [NAME OR
+FOLDER]
 
-Steady tones, white noise and a click of 50, 65 and 80 dB SPL, compared with the exact MSBG. A tone counts where the exact
-MSBG leaves 0 dB SPL of it or more.
+The sounds are steady tones, white noise and a click at 50, 65 and 80 dB SPL. The table shows
+differences from the exact MSBG in dB. Tones that the exact MSBG attenuates below 0 dB SPL are
+ignored.
 """
 
 import sys
@@ -19,28 +21,28 @@ LOW, HIGH = (250, 500, 1000, 2000), (3000, 4000, 6000)  # Hz
 RATE = 16000
 
 
-def cells(exact: MSBG, network: torch.nn.Module, ear: Audiogram) -> list[str]:
+def make_row(exact: MSBG, network: torch.nn.Module, ear: Audiogram) -> list[str]:
+    """Return the cells of the table for an ear."""
     row = []
     for hertz in (LOW, HIGH):
-        sound, middle = tones(hertz, LEVELS), slice(RATE // 2, -RATE // 2)
-        expected, heard = (
-            level_spl(signal[:, middle]) for signal in (exact(sound), network(sound, ear))
-        )
-        off = (heard - expected)[expected >= 0.0]
-        row.append(f"{float(off.min()):+.1f} to {float(off.max()):+.1f}" if len(off) else "-")
+        sound = tones(hertz, LEVELS)
+        middle = slice(RATE // 2, -RATE // 2)
+        expected = level_spl(exact(sound)[:, middle])
+        levels = level_spl(network(sound, ear)[:, middle])
+        errors = (levels - expected)[expected >= 0.0]
+        text = f"{float(errors.min()):+.1f} to {float(errors.max()):+.1f}" if len(errors) else "-"
+        row.append(text)
     noise = torch.randn(1, 2 * RATE, generator=torch.Generator().manual_seed(0))
     click = torch.zeros(1, 2 * RATE)
     click[:, RATE] = 1.0
     for shape in (noise, click):
         sound = set_level(shape.expand(len(LEVELS), -1), torch.tensor(LEVELS))
-        expected, heard = exact(sound), network(sound, ear)
-        off = level_spl(heard) - level_spl(expected)
-        row += [
-            ", ".join(f"{value:+.1f}" for value in off.tolist()),
-            ", ".join(
-                f"{snr_db(*pair):.0f}" for pair in zip(expected.numpy(), heard.numpy(), strict=True)
-            ),
-        ]
+        expected = exact(sound)
+        perceived = network(sound, ear)
+        errors = level_spl(perceived) - level_spl(expected)
+        row.append(", ".join(f"{error:+.1f}" for error in errors.tolist()))
+        pairs = zip(expected.numpy(), perceived.numpy(), strict=True)
+        row.append(", ".join(f"{snr_db(*pair):.0f}" for pair in pairs))
     return row
 
 
@@ -51,7 +53,7 @@ def main() -> None:
     for name in EARS:
         ear = Audiogram.standard(name)
         with torch.inference_mode():
-            row = cells(MSBG(ear, sample_rate=RATE), network, ear)
+            row = make_row(MSBG(ear, sample_rate=RATE), network, ear)
         print(f"| {name} | {' | '.join(row)} |")
 
 

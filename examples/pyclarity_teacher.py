@@ -1,9 +1,10 @@
-"""pyclarity's own MSBG as a teacher: time-aligned, at any sample rate, and without its rescaling of the level.
+"""pyclarity's own MSBG as a teacher: time-aligned, at any sample rate, and without its rescaling of
+the level.
 
     hlsim evaluate-simulator neuro-msbg --teacher examples/pyclarity_teacher.py:PyclarityMSBG ...
 
-pyclarity (`pip install 'pyclarity==0.9.*'`) computes one signal at a time on a CPU, at 44.1 kHz; hlsim's exact MSBG gives
-the same output to 3e-4 of the signal, 23 to 31 times as fast.
+pyclarity (`pip install 'pyclarity==0.9.*'`) computes one signal at a time on a CPU, at 44.1 kHz;
+hlsim's exact MSBG gives the same output to 3e-4 of the signal, 23 to 31 times as fast.
 """
 
 import logging
@@ -37,7 +38,7 @@ class PyclarityMSBG:
 
 
 def pyclarity_msbg(waveform: Tensor, audiogram: Audiogram, sample_rate: int) -> Tensor:
-    """Output of pyclarity's ``Ear.process``, aligned with its input and at its level.
+    """Run pyclarity's ``Ear.process``, aligned with its input and without its change of the level.
 
     The signal is resampled to 44.1 kHz and back by scipy, followed by silence, and scaled so that
     the rescaling by active level inside ``Ear.process`` ends at the level that the signal had.
@@ -49,7 +50,7 @@ def pyclarity_msbg(waveform: Tensor, audiogram: Audiogram, sample_rate: int) -> 
     """
     ear = Ear()
     disabled = logging.root.manager.disable
-    logging.disable(max(disabled, logging.WARNING))  # it logs each audiogram
+    logging.disable(max(disabled, logging.WARNING))  # pyclarity logs each audiogram.
     try:
         ear.set_audiogram(audiogram.to_clarity())
         from_pascals = gain_to_pascals(PASCAL_SPL) / gain_to_pascals(
@@ -69,7 +70,7 @@ def pyclarity_msbg(waveform: Tensor, audiogram: Audiogram, sample_rate: int) -> 
 
 
 def gain_before_rescaling(signal: np.ndarray) -> float:
-    """Gain that the rescaling in ``Ear.process``, overall over active RMS, turns back into 1.
+    """Compute the gain that cancels the rescaling in ``Ear.process`` by overall over active RMS.
 
     The active RMS depends on the level where its threshold meets its floor, hence the iteration.
     """

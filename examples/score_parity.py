@@ -1,9 +1,10 @@
-"""HASPI and HASQI of hlsim against pyclarity's, under the same seed, and their speeds by turns on one thread:
+"""HASPI and HASQI of hlsim compared with those of pyclarity: errors with the same seed, and speed.
 
     python examples/score_parity.py SPEECH [ITEMS]
 
-Items of 3 s at 16 kHz, ears N1 to N6 and S1 to S3 in turn, 50 to 80 dB SPL; processed speech is clean, noisy (-5 to
-20 dB), NAL-R, clipped, low-passed, or noisy with NAL-R. The clean speech is prepared beforehand.
+The items are 3 s of speech at 16 kHz and 50 to 80 dB SPL, for the ears N1 to N6 and S1 to S3. The
+output is clean, noisy (-5 to 20 dB SNR), amplified by NAL-R, clipped, low-passed, or noisy and
+amplified. Times are those of one thread, without the preparation of the clean speech.
 """
 
 import sys
@@ -28,40 +29,43 @@ RATE = 16000
 EARS = ("N1", "N2", "N3", "N4", "N5", "N6", "S1", "S2", "S3")
 
 
-def processed(clean: Tensor, index: int, ear: Audiogram, generator: torch.Generator) -> Tensor:
+def process(clean: Tensor, index: int, ear: Audiogram, generator: torch.Generator) -> Tensor:
+    """Process speech in one of six ways. Shape: (time,) -> (time,)."""
     kind = ("clean", "noisy", "nal-r", "clipped", "low-passed", "noisy nal-r")[index % 6]
     noise = clean.norm() * torch.nn.functional.normalize(
         torch.randn(clean.shape, generator=generator), dim=-1
     )
     snr = 25.0 * torch.rand((), generator=generator) - 5.0
-    given = clean + noise * 10.0 ** (-snr / 20.0) if "noisy" in kind else clean
+    output = clean + noise * 10.0 ** (-snr / 20.0) if "noisy" in kind else clean
     if kind == "clipped":
         limit = 0.25 * float(clean.abs().max())
-        given = given.clamp(-limit, limit)
+        output = output.clamp(-limit, limit)
     if kind == "low-passed":
-        spectrum = torch.fft.rfft(given)
+        spectrum = torch.fft.rfft(output)
         spectrum[..., 2000 * clean.shape[-1] // RATE :] = 0.0
-        given = torch.fft.irfft(spectrum, clean.shape[-1])
-    return NALR(ear, sample_rate=RATE)(given) if "nal-r" in kind else given
+        output = torch.fft.irfft(spectrum, clean.shape[-1])
+    return NALR(ear, sample_rate=RATE)(output) if "nal-r" in kind else output
 
 
 def pyclarity_score(name: str, clean: Tensor, output: Tensor, ear: Audiogram, seed: int) -> float:
-    """pyclarity's score, with the seed of the noise that it draws from numpy's global generator."""
+    """Compute pyclarity's score with a seed of NumPy's global generator, from which it draws
+    noise."""
     score = {"haspi": haspi_v2, "hasqi": hasqi_v2}[name]
     signals = [signal.double().numpy() for signal in (clean, output)]
     np.random.seed(seed)
     return float(score(signals[0], RATE, signals[1], RATE, ear.to_clarity(), level1=94.0)[0])
 
 
-def prepared(name: str, clean: Tensor, ear: Audiogram) -> Callable[..., Tensor]:
-    """The score of processed speech, (time,) -> ()."""
+def prepare_score(name: str, clean: Tensor, ear: Audiogram) -> Callable[..., Tensor]:
+    """Prepare the clean speech, and return a function from an output (time,) to its score."""
     if name == "haspi":
         reference = HaspiReference(clean)
-        return lambda given, **noise: reference.score(given, ear, **noise)
+        return lambda output, **noise: reference.score(output, ear, **noise)
     return HasqiReference(clean, ear).score
 
 
-def timed(call: Callable[[], Any]) -> tuple[Any, float]:
+def time_call(call: Callable[[], Any]) -> tuple[Any, float]:
+    """Return the result of a call, and its processor time in seconds."""
     start = time.process_time()
     return call(), time.process_time() - start
 
@@ -80,20 +84,29 @@ def main(folder: str, items: str = "24") -> None:
             clean = set_level(
                 clips.draw(1, generator)[0], 50.0 + 30.0 * torch.rand((), generator=generator)
             )
-            given = processed(clean, index, ear, generator)
-            expected, theirs = timed(partial(pyclarity_score, name, clean, given, ear, index))
-            for dtype, found in errors.items():
-                score = prepared(name, clean.to(dtype), ear)
-                value, seeded = timed(partial(score, given.to(dtype), noise="seeded", seed=index))
-                found.append(abs(float(value) - expected))
-            ratios.append((theirs / seeded, theirs / timed(partial(score, given))[1]))  # float32
-        for dtype, found in errors.items():
+            output = process(clean, index, ear, generator)
+            expected, pyclarity_seconds = time_call(
+                partial(pyclarity_score, name, clean, output, ear, index)
+            )
+            for dtype, values in errors.items():
+                score = prepare_score(name, clean.to(dtype), ear)
+                value, seeded_seconds = time_call(
+                    partial(score, output.to(dtype), noise="seeded", seed=index)
+                )
+                values.append(abs(float(value) - expected))
+            expected_seconds = time_call(partial(score, output))[1]  # in float32
+            ratios.append(
+                (pyclarity_seconds / seeded_seconds, pyclarity_seconds / expected_seconds)
+            )
+        for dtype, values in errors.items():
             print(
-                f"{name}, {dtype}: error {np.median(found):.1e} median, {max(found):.1e} worst of {len(found)}"
+                f"{name}, {dtype}: error {np.median(values):.1e} median, {max(values):.1e} "
+                f"worst of {len(values)}"
             )
         seeded, expected_noise = np.median(ratios, 0)
         print(
-            f"{name}: {seeded:.1f} times pyclarity's speed seeded, {expected_noise:.1f} with expected noise (float32)"
+            f"{name}: {seeded:.1f} times pyclarity's speed seeded, {expected_noise:.1f} with "
+            "expected noise (float32)"
         )
 
 

@@ -1,9 +1,10 @@
-"""What the hearing aid's sliders and its release trade: HASPI, HASQI and the level heard, at five settings and three.
+"""Effect of the hearing aid's sliders and release time on HASPI, HASQI and levels.
 
     python examples/sliders.py speech/valid noise/valid audiograms/valid.csv [ITEMS] [COMPENSATOR]
 
-Items as in `hlsim evaluate-compensator`, seed 0: half of them noisy, at 50, 65 and 80 dB SPL in turn. HASQI takes NAL-R
-for perfect, HASPI rewards gain, and *heard* is the level after the exact MSBG less a normal ear's of the clean speech.
+The items are those of `hlsim evaluate-compensator` with seed 0: half of them are noisy, at 50, 65
+and 80 dB SPL. The reference of HASQI is NAL-R, and HASPI rewards gain. The *loudness error* is the
+perceived level, by the exact MSBG, minus the level that a normal ear perceives of the clean speech.
 """
 
 import statistics
@@ -18,8 +19,9 @@ from hlsim.calibration import level_spl
 from hlsim.evaluation.items import draw_judged_items, read_ears
 from hlsim.metrics import haspi, hasqi
 
-FULL, STEPS = {"noise_reduction": 1.0, "amplification": 1.0}, (0.0, 0.25, 0.5, 0.75, 1.0)
-RELEASES = (0.5, 2.0)  # seconds, beside the aid's own
+FULL = {"noise_reduction": 1.0, "amplification": 1.0}
+STEPS = (0.0, 0.25, 0.5, 0.75)
+RELEASES = (0.5, 2.0)  # seconds, in addition to that of the aid
 
 
 def main(
@@ -29,28 +31,34 @@ def main(
     items = draw_judged_items(
         speech, noise, read_ears(audiograms), items=int(count), seconds=3.0, seed=0
     )
-    own = aid.config.release
-    settings = [(FULL | {slider: value}, own) for slider in FULL for value in STEPS if value < 1.0]
+    default_release = aid.config.release
+    settings = []
+    for slider in FULL:
+        settings += [(FULL | {slider: value}, default_release) for value in STEPS]
+    settings += [(FULL, release) for release in (default_release, *RELEASES)]
     print(
-        "| noise reduction | amplification | release (s) | | HASPI | HASQI | given (dB SPL) | heard (dB) |"
+        "| noise reduction | amplification | release (s) | | HASPI | HASQI | output level (dB "
+        "SPL) | loudness error (dB) |"
     )
     print("|---|---|---|---|---|---|---|---|")
-    for sliders, release in settings + [(FULL, release) for release in (own, *RELEASES)]:
+    for sliders, release in settings:
         aid.config = replace(aid.config, release=release)
         for condition in ("clean", "noisy"):
             rows = []
             for item in items:
                 if item.facts["speech"] != condition:
                     continue
-                given = aid(item.signal, item.ear, **sliders)
+                output = aid(item.signal, item.ear, **sliders)
                 normal = msbg(item.clean, Audiogram.standard("NH"))
-                heard = level_spl(msbg(given, item.ear)) - level_spl(normal)
-                scores = [score(given, item.clean, item.ear) for score in (haspi, hasqi)]
-                rows.append([float(value) for value in (*scores, level_spl(given), heard)])
+                loudness_error = level_spl(msbg(output, item.ear)) - level_spl(normal)
+                scores = [score(output, item.clean, item.ear) for score in (haspi, hasqi)]
+                values = (*scores, level_spl(output), loudness_error)
+                rows.append([float(value) for value in values])
             means = [statistics.mean(column) for column in zip(*rows, strict=True)]
-            figures = "{:.3f} | {:.3f} | {:.1f} | {:+.1f}".format(*means)
+            texts = "{:.3f} | {:.3f} | {:.1f} | {:+.1f}".format(*means)
             print(
-                f"| {' | '.join(f'{value:g}' for value in (*sliders.values(), release))} | {condition} | {figures} |",
+                f"| {' | '.join(f'{value:g}' for value in (*sliders.values(), release))} | "
+                f"{condition} | {texts} |",
                 flush=True,
             )
 

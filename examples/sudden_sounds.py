@@ -1,10 +1,14 @@
-"""What a wearable aid makes of a slam, a click and steady noise, and how far it looks ahead.
+"""A wearable aid after a slam and a click, its look-ahead, and its gain for steady noise.
 
     python examples/sudden_sounds.py speech/valid [COMPENSATOR]
 
-Prints how far the level of eight clips of speech of 65 dB SPL is off, from 0.3 s after the sound to 0.5 s, against the
-same clips without it; the look-ahead in samples, from what changes when all from one of 200 places on is another; and,
-for white noise, the mean gain and how it wanders from one 100 ms to the next.
+It prints:
+
+- by how many dB a slam or a click changes the output level of eight clips of speech at 65 dB SPL,
+    0.3 to 0.5 s later
+- the look-ahead in samples: the signal is replaced from one of 200 positions on, and the first
+    change of the output found
+- the mean gain for white noise, and its standard deviation over segments of 100 ms
 """
 
 import sys
@@ -21,7 +25,8 @@ RATE = 16000
 
 
 def main(speech: str, name: str = "hearing-aid") -> None:
-    aid, generator = load_compensator(name), torch.Generator().manual_seed(0)
+    aid = load_compensator(name)
+    generator = torch.Generator().manual_seed(0)
     sliders = [{}, {"noise_reduction": 0.0}] if getattr(aid, "SLIDERS", ()) else [{}]
 
     def noise(samples: int, spl: float) -> Tensor:
@@ -31,27 +36,29 @@ def main(speech: str, name: str = "hearing-aid") -> None:
     slam, click = torch.zeros(2, clips.shape[-1])
     slam[8000:8800], click[8800] = noise(800, 115.0), 20.0  # 120 dB SPL
     after = slice(8800 + 3 * RATE // 10, 8800 + 5 * RATE // 10)
-    there = ", ".join(f"{level:.0f}" for level in level_spl(clips[:, after]).tolist())
-    print(f"the clips from 0.3 to 0.5 s after the sound: {there} dB SPL")
+    text = ", ".join(f"{level:.0f}" for level in level_spl(clips[:, after]).tolist())
+    print(f"levels of the clips, 0.3 to 0.5 s after the sound: {text} dB SPL")
     for ear in ("N2", "N4"):
-        given = [
-            aid(sound, Audiogram.standard(ear)) for sound in (clips, clips + slam, clips + click)
-        ]
-        plain, *struck = (level_spl(signal[:, after]) for signal in given)
-        for sound, level in zip(("slam", "click"), struck, strict=True):
-            off = ", ".join(f"{value:+.1f}" for value in (level - plain).tolist())
-            print(f"{ear}, {sound}: {off} dB after 0.3 s")
+        inputs = (clips, clips + slam, clips + click)
+        outputs = [aid(sound, Audiogram.standard(ear)) for sound in inputs]
+        speech_level, *levels = (level_spl(output[:, after]) for output in outputs)
+        for sound, level in zip(("slam", "click"), levels, strict=True):
+            changes = ", ".join(f"{value:+.1f}" for value in (level - speech_level).tolist())
+            print(f"{ear}, {sound}: {changes} dB after 0.3 s")
     ear, signal = Audiogram.standard("N3"), noise(4000, 68.0)
-    whole, ahead = aid(signal, ear), []
-    for place in torch.linspace(100, 3900, 200).int().tolist():
-        other = aid(torch.cat((signal[:place], noise(4000 - place, 80.0))), ear)
-        ahead.append(place - int((other != whole).nonzero()[0]))
-    print(f"looks {max(ahead)} samples ahead")
+    expected = aid(signal, ear)
+    look_aheads = []
+    for start in torch.linspace(100, 3900, 200).int().tolist():
+        output = aid(torch.cat((signal[:start], noise(4000 - start, 80.0))), ear)
+        first_change = int((output != expected).nonzero()[0])
+        look_aheads.append(start - first_change)
+    print(f"look-ahead: {max(look_aheads)} samples")
     for setting in sliders:
         steady = noise(4 * RATE, 65.0)
         gains = level_spl(aid(steady, ear, **setting)[RATE:].reshape(-1, RATE // 10)) - 65.0
         print(
-            f"N3, white noise of 65 dB SPL, {setting or 'as it is'}: gain {gains.mean():.1f} ± {gains.std():.1f} dB"
+            f"N3, white noise of 65 dB SPL, {setting or 'default'}: gain {gains.mean():.1f} ± "
+            f"{gains.std():.1f} dB"
         )
 
 

@@ -137,22 +137,22 @@ def test_delay_by_frequency(
 ) -> None:
     pytest.importorskip("matplotlib")
     example = load("delay.py")
-    given = example.bursts()
-    assert example.left_of_the_delay(given.roll(-7, -1), given) == [-7] * len(example.HERTZ)
+    given = example.make_bursts()
+    assert example.measure_delays(given.roll(-7, -1), given) == [-7] * len(example.HERTZ)
     # with no loss the model is linear: of 33 samples remains what the sum of the channels does not take back
     points = 4 * MSBG_RATE
     response = gammatone_response(BANKS["none"], points).sum(0)
     advance = np.gradient(np.unwrap(np.angle(response)), 2 * np.pi / points)
     spectra = np.abs(np.fft.rfft(given.numpy(), points) * response) ** 2
     expected = 33 - spectra @ advance / spectra.sum(-1)
-    left = example.left_of_the_delay(MSBG(Audiogram.standard("NH"))(given), given)
+    left = example.measure_delays(MSBG(Audiogram.standard("NH"))(given), given)
     np.testing.assert_allclose(left, expected, atol=2)
     drawn: list[Path] = []
     monkeypatch.setattr(example, "draw", drawn.append)
     example.main()
     table = capsys.readouterr().out.splitlines()
     assert table[2] == "| NH | none |" + "".join(f" {samples:+d} |" for samples in left)
-    assert len(table) == 2 + len(example.TABLED) and drawn == [
+    assert len(table) == 2 + len(example.TABLE_EARS) and drawn == [
         EXAMPLES.parent / "docs" / "delay.png"
     ]
 
@@ -195,12 +195,12 @@ def test_other_sounds(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFix
     monkeypatch.setattr(example, "EARS", ("N3",))
     monkeypatch.setattr(example.sys, "argv", ["other_sounds.py"])
     ear = Audiogram.standard("N3")
-    itself = example.cells(
+    itself = example.make_row(
         MSBG(ear, sample_rate=16000), lambda x, _: MSBG(ear, sample_rate=16000)(x), ear
     )
     assert itself[:2] == ["+0.0 to +0.0"] * 2 and itself[3] == itself[5] == "200, 200, 200"
     # one that gives 3 dB too much
-    louder = example.cells(
+    louder = example.make_row(
         MSBG(ear, sample_rate=16000), lambda x, _: 2**0.5 * MSBG(ear, sample_rate=16000)(x), ear
     )
     assert (
@@ -220,25 +220,25 @@ def test_the_default_criterion_is_valid(speech: list[tuple[torch.Tensor, int]]) 
     example = load("validity.py")
     ear, generator = Audiogram.standard("N3"), torch.Generator().manual_seed(0)
     clean = set_level(speech[0][0][0, 8000:28000], 65.0)
-    noise = set_level(example.shaped(clean, generator), 65.0)
-    signals = example.degraded(clean, noise, generator)
+    noise = set_level(example.draw_noise(clean, generator), 65.0)
+    signals = example.degrade(clean, noise, generator)
     assert len(signals) == 18 and all(signal.shape == clean.shape for signal in signals.values())
     few = {
         name: signals[name]
         for name in (*example.NOISY, "low-pass 1000 Hz", "reverberation of 1 s", "sign")
     }
-    gain_db = example.equaliser(clean, ear)
-    exact, given = MSBG(sample_rate=16000), example.filtered(clean, 10.0 ** (gain_db / 20.0))
+    gain_db = example.fit_equaliser(clean, ear)
+    exact, given = MSBG(sample_rate=16000), example.apply_gains(clean, 10.0 ** (gain_db / 20.0))
     normal = level_spl(exact(clean, Audiogram.standard("NH")))
     assert float(level_spl(exact(given, ear))) == pytest.approx(float(normal), abs=1.0)
     loss = HearingLossLoss(simulator="msbg", reduction="none")
     for share in example.GAINS.values():
-        found = example.judged(few, share * gain_db, ear, {"default": loss})
-        haspi, hasqi, ordered, nearest = example.summary(found, "default")
+        found = example.compute_scores(few, share * gain_db, ear, {"default": loss})
+        haspi, hasqi, ordered, nearest = example.compare(found, "default")
         assert ordered and nearest
         assert haspi > 0.5 and hasqi > 0.5
     worst = {name: -value for name, value in found["default"].items()}
-    assert not example.summary({**found, "upside down": worst}, "upside down")[2]
+    assert not example.compare({**found, "upside down": worst}, "upside down")[2]
 
 
 def test_pictures_of_what_is_heard_are_small(tmp_path: Path) -> None:
