@@ -29,7 +29,7 @@ from hlsim.metrics.ear import model as ear_model
 from hlsim.metrics.ear.clean_speech import CleanBatch, CleanSpeech, ItemGroup
 from hlsim.metrics.ear.model import AUDIOMETRIC_HZ, CHANNELS, Extent
 from hlsim.metrics.ear.recursions import RATE
-from hlsim.metrics.haspi_score import Noise, generator_after, item_seeds
+from hlsim.metrics.haspi_score import Noise, item_seeds, legacy_rng_after_normals
 from hlsim.torchtools import constant
 
 NALR_ORDER = 140
@@ -58,6 +58,9 @@ class QualityParts(NamedTuple):
         combined: the score, 0 to 1.
         nonlinear: similarity of envelopes and fine structure, which noise and distortion reduce.
         linear: similarity of long-term spectra, which colour reduces.
+
+    >>> QualityParts(torch.tensor(0.4), torch.tensor(0.5), torch.tensor(0.8)).nonlinear
+    tensor(0.5000)
     """
 
     combined: Tensor
@@ -69,10 +72,15 @@ class Comparison(NamedTuple):
     """Features of two signals in one ear, from which a score is computed.
 
     Attributes:
-        clean_levels, processed_levels: smoothed levels in dB over threshold. Shape: (items, 32, segments).
+        clean_levels, processed_levels: smoothed levels in dB over threshold. Shape: (items, 32,
+            segments).
         coherence: coherence of the fine structures. Shape: (items, 32, segments of 16 ms).
         energy: mean squares of the clean segments. Shape: (items, 32, segments of 16 ms).
-        clean_spectrum, processed_spectrum: long-term levels in dB over threshold. Shape: (items, 32).
+        clean_spectrum, processed_spectrum: long-term levels in dB over threshold. Shape: (items,
+            32).
+
+    >>> Comparison._fields[:2]
+    ('clean_levels', 'processed_levels')
     """
 
     clean_levels: Tensor
@@ -102,6 +110,12 @@ class QualityReference:
     Raises:
         ValueError: clean signals that are too short, not finite, silent or below 20 dB SPL; a rate,
             level, audiogram or length out of range.
+
+    >>> from hlsim import example_speech
+    >>> from hlsim.metrics import HasqiReference
+    >>> parts = HasqiReference(example_speech()[:16000], "N3").parts(example_speech()[:16000])
+    >>> bool(parts.combined == parts.nonlinear * parts.linear)
+    True
     """
 
     score_name: ClassVar[str]
@@ -147,8 +161,8 @@ class QualityReference:
         """Return the score of each processed signal.
 
         Args:
-            processed: signals of the shape, rate and scale of the clean ones. Lengths that differ by
-                0.1 s at most are cut to the shorter one, with a warning.
+            processed: signals of the shape, rate and scale of the clean ones. Lengths that differ
+                by 0.1 s at most are cut to the shorter one, with a warning.
             noise: noise at the threshold of hearing, as in ``hasqi``.
             seed: one seed, or one for each item.
 
@@ -254,7 +268,7 @@ class _Batch:
                 batch,
                 items,
                 amplified[items],
-                cells.items(items),
+                cells.select_items(items),
                 unit,
                 envelope_segment,
             )
@@ -262,7 +276,7 @@ class _Batch:
         ]
         if keep:
             for group in self._groups:
-                group.keep()
+                group.store()
 
     def compare(self, processed: Tensor, noise: Noise, seeds: list[int]) -> Comparison:
         """Compare all processed signals with the clean ones.
@@ -272,7 +286,7 @@ class _Batch:
             noise: kind of noise.
             seeds: seeds of all items.
         """
-        aligned = self._signals.matched(processed, self._batch)
+        aligned = self._signals.align(processed, self._batch)
         batch_seeds = seeds[self._batch.items]
         comparisons = [group.compare(aligned, noise, batch_seeds) for group in self._groups]
         return Comparison(*(_join_items(parts) for parts in zip(*comparisons, strict=True)))
@@ -305,18 +319,20 @@ class _Group(ItemGroup[_Channels]):
         self._cells = cells
         with torch.no_grad():
             self._clean = signals.through_middle_ear(amplified, self._extent)
-            self._latest = ear_model.longest_group_delay(self._clean, cells, self._extent)
+            self._longest_delay = ear_model.longest_group_delay(self._clean, cells, self._extent)
 
     @torch.no_grad()
-    def _hear(self, chosen: slice) -> _Channels:
-        extent, cells = self._extent, self._cells[chosen]
-        cochlea = ear_model.listen(self._clean, self._cells, chosen, extent, motion=True)
+    def _prepare(self, channels: slice) -> _Channels:
+        extent, cells = self._extent, self._cells[channels]
+        cochlea = ear_model.simulate_cochlea(
+            self._clean, self._cells, channels, extent, motion=True
+        )
         assert cochlea.motion is not None
-        delays = self._latest - ear_model.group_delays(cochlea.bandwidth, chosen)
-        levels = ear_model.adapted(ear_model.sensation(cochlea.power, cells.inner))
+        delays = self._longest_delay - ear_model.group_delays(cochlea.bandwidth, channels)
+        levels = ear_model.apply_adaptation(ear_model.sensation(cochlea.power, cells.inner))
         motion = scale_motion_to_level(cochlea.motion, cochlea.power, levels, self._unit)
         return _Channels(
-            channels=chosen,
+            channels=channels,
             envelope=ear_model.lag_spectrum(cochlea.power.sqrt(), extent),
             motion=ear_model.lag_spectrum(cochlea.motion, extent),
             delays=delays,
@@ -335,7 +351,7 @@ class _Group(ItemGroup[_Channels]):
     def _segment_spectra(
         self, motion: Tensor, delays: Tensor, noise: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
-        """Compute ``segment_spectra`` of the motion with noise, after equalising the group delays."""
+        """Add noise to the motion, equalise the group delays, and compute ``segment_spectra``."""
         extent = self._extent
         motion = motion[..., : extent.longest]
         if noise is not None:
@@ -351,13 +367,15 @@ class _Group(ItemGroup[_Channels]):
         comparisons: list[Comparison] = []
         for clean in self._channels():
             cells = self._cells[clean.channels]
-            cochlea = ear_model.listen(sound, self._cells, clean.channels, extent, motion=True)
+            cochlea = ear_model.simulate_cochlea(
+                sound, self._cells, clean.channels, extent, motion=True
+            )
             assert cochlea.motion is not None
             lags = ear_model.channel_lags(clean.envelope, cochlea.power.detach().sqrt(), extent)
             power = ear_model.shift(cochlea.power, lags, extent.ends, extent.ends, extent.padded)
             lags = ear_model.channel_lags(clean.motion, cochlea.motion.detach(), extent)
             motion = ear_model.shift(cochlea.motion, lags, extent.ends, extent.ends, extent.padded)
-            levels = ear_model.adapted(ear_model.sensation(power, cells.inner))
+            levels = ear_model.apply_adaptation(ear_model.sensation(power, cells.inner))
             motion = scale_motion_to_level(motion, power, levels, self._unit)
             smooth_levels = self._smooth(levels, clean.delays)
             noise_values = None
@@ -422,7 +440,7 @@ def _noise_sources(
 def _drawn_noise(seeds: list[int], extent: Extent, like: Tensor, skipped: int) -> NoiseSource:
     """Draw the noise of pyclarity, after skipping the deviates of a number of signals."""
     generators = [
-        generator_after(seed, skipped * CHANNELS * end)
+        legacy_rng_after_normals(seed, skipped * CHANNELS * end)
         for seed, end in zip(seeds, extent.ends, strict=True)
     ]
 

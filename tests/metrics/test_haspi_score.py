@@ -15,7 +15,7 @@ from hlsim.audio import read_audio
 from hlsim.audiogram import FREQUENCIES, Audiogram
 from hlsim.metrics.ear import clean_speech
 from hlsim.metrics.ear import model as ear_model
-from hlsim.metrics.haspi_score import HaspiReference, generator_after, haspi
+from hlsim.metrics.haspi_score import HaspiReference, haspi, legacy_rng_after_normals
 from hlsim.metrics.hasqi_score import HasqiReference, hasqi
 from tests import pyclarity as reference
 from tests.pyclarity import PyclarityOutputs
@@ -121,9 +121,9 @@ def test_a_gpus_way_through_a_batch_is_a_cpus(
     settings = {"lengths": [12800, 11345], "noise": "seeded", "seed": [3, 4]}
     one_by_one = haspi(given, clean.double(), [N2, N3], **settings)
     gradient = torch.autograd.grad(one_by_one.sum(), given)[0]
-    monkeypatch.setattr(clean_speech.CleanSpeech, "_together", lambda self, n: [slice(0, n)])
+    monkeypatch.setattr(clean_speech.CleanSpeech, "_batch_slices", lambda self, n: [slice(0, n)])
     if gather:
-        monkeypatch.setattr(ear_model, "_shifted", ear_model._gathered)
+        monkeypatch.setattr(ear_model, "_shift_rows", ear_model._gather_rows)
     together = haspi(given, clean.double(), [N2, N3], **settings)
     torch.testing.assert_close(together, one_by_one, rtol=0, atol=1e-13)
     torch.testing.assert_close(torch.autograd.grad(together.sum(), given)[0], gradient)
@@ -177,7 +177,7 @@ def test_the_generator_skips_what_is_not_needed(count: int) -> None:
     random = np.random.RandomState(11)
     random.standard_normal(count)
     np.testing.assert_array_equal(
-        generator_after(11, count).standard_normal(5), random.standard_normal(5)
+        legacy_rng_after_normals(11, count).standard_normal(5), random.standard_normal(5)
     )
 
 

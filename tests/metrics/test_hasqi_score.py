@@ -116,8 +116,8 @@ def test_a_batch_is_its_items(
         torch.testing.assert_close(together, torch.stack(alone), rtol=0, atol=1e-13)
     assert torch.equal(HasqiReference(x, ears, lengths=ends).score(y, noise="none"), together)
     # as on a GPU
-    monkeypatch.setattr(clean_speech.CleanSpeech, "_together", lambda self, n: [slice(0, n)])
-    monkeypatch.setattr(ear_model, "_shifted", ear_model._gathered)
+    monkeypatch.setattr(clean_speech.CleanSpeech, "_batch_slices", lambda self, n: [slice(0, n)])
+    monkeypatch.setattr(ear_model, "_shift_rows", ear_model._gather_rows)
     torch.testing.assert_close(
         hasqi(y, x, ears, lengths=ends, noise="none"), together, rtol=0, atol=1e-13
     )

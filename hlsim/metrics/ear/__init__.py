@@ -1,1 +1,1 @@
-"""Kates' ear, which HASPI and HASQI hear with: from clean and processed speech to what they compare."""
+"""Kates' model of the ear, on which HASPI, HASQI and HAAQI rest."""

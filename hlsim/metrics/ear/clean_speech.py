@@ -1,4 +1,4 @@
-"""Batches of clean speech, validated and brought to Kates' ear, and processed speech that is made to match them."""
+"""Batches of clean speech, prepared for Kates' ear, and the alignment of processed speech."""
 
 from __future__ import annotations
 
@@ -21,12 +21,16 @@ from hlsim.metrics.ear.model import Extent, integers
 from hlsim.metrics.ear.recursions import RATE, middle_ear
 from hlsim.metrics.pair import LOWEST_REFERENCE_SPL, SHORTEST_SECONDS, cut_to_common_length
 
-_SHORTEST_PART = 384
-"""Samples at 24 kHz of a segment of HASQI."""
+MIN_AUDIBLE_SAMPLES = 384
+"""Smallest number of samples at 24 kHz between silent ends, a segment of HASQI."""
 
 
 class UnscorableError(ValueError):
-    """A clean signal that is too soft or too short for a score to mean anything."""
+    """Error for a clean signal that is too soft or too short for a meaningful score.
+
+    >>> issubclass(UnscorableError, ValueError)
+    True
+    """
 
 
 @dataclass(frozen=True)
@@ -34,13 +38,17 @@ class CleanBatch:
     """Clean signals that are processed together.
 
     Attributes:
-        items: their place among all items.
+        items: indices of the signals among all items.
         extent: lengths at the rate of the input.
         resampled: lengths at 24 kHz.
         starts: first samples at 24 kHz that are not silence.
         audible: lengths at 24 kHz from there to the last sample that is not silence.
         spectrum: spectra for the bulk alignment.
-        signals: the audible parts in multiples of 20 uPa, in double precision. Shape: (items, padded).
+        signals: audible parts in multiples of 20 uPa, float64. Shape: (items, padded).
+
+    >>> speech = CleanSpeech(torch.randn(2, 16000), 16000, 94.0, None, False, "HASPI")
+    >>> speech.batches[0].signals.shape
+    torch.Size([1, 24000])
     """
 
     items: slice
@@ -53,9 +61,26 @@ class CleanBatch:
 
 
 class CleanSpeech:
-    """Clean signals at 24 kHz without silence at their ends, and processed signals that are made to match.
+    """Clean signals at 24 kHz without silent ends, and the alignment of processed signals.
 
-    On a CPU each item is a batch of its own, because its caches hold no more. On a GPU all items are one batch.
+    On a CPU each item is a batch, because its caches hold no more. On a GPU all items are one
+    batch.
+
+    Args:
+        clean: clean signals. Shape: (..., time).
+        sample_rate: sample rate in Hz.
+        full_scale_spl: level in dB SPL of a signal with RMS 1.0.
+        lengths: number of samples of each item in a padded batch.
+        whole_khz: round the rate to whole kHz.
+        name: name of the score, for messages.
+
+    Raises:
+        ValueError: the signals are too short or not finite, or a rate, level or length is out of
+            range.
+        UnscorableError: the signals are silent, too soft or too short to be scored.
+
+    >>> CleanSpeech(torch.randn(2, 16000), 16000, 94.0, None, False, "HASPI").shape
+    torch.Size([2])
     """
 
     def __init__(
@@ -68,7 +93,7 @@ class CleanSpeech:
         name: str,
     ) -> None:
         self._name = name
-        self._given_rate = check_rate(sample_rate)
+        self._input_rate = check_rate(sample_rate)
         self._full_scale = check_full_scale(full_scale_spl)
         check_waveform(clean, "clean")
         self.shape, self.time = clean.shape[:-1], clean.shape[-1]
@@ -76,9 +101,9 @@ class CleanSpeech:
         ends = [self.time] * self.shape.numel()
         if lengths is not None:
             ends = check_lengths(lengths, clean.shape).flatten().tolist()
-        self._rate = self._given_rate
+        self._rate = self._input_rate
         if whole_khz:
-            self._rate = 1000 * round(self._given_rate / 1000)
+            self._rate = 1000 * round(self._input_rate / 1000)
         self._settings = {
             "sample_rate": sample_rate,
             "full_scale_spl": full_scale_spl,
@@ -87,14 +112,14 @@ class CleanSpeech:
         self._clean, self._ends = clean.detach(), ends
         self._gain = 10.0 ** (self._full_scale / 20.0)
         with torch.no_grad():
-            # in double precision, for a sample more or less at an end would move all frames
+            # Double precision, because one sample more at an end would shift all frames.
             rows = clean.detach().double().reshape(-1, self.time)
             self.batches = [
                 self._batch(rows[items], items, Extent(tuple(ends[items])))
-                for items in self._together(len(rows))
+                for items in self._batch_slices(len(rows))
             ]
 
-    def _together(self, items: int) -> list[slice]:
+    def _batch_slices(self, items: int) -> list[slice]:
         if self.device.type == "cpu":
             return [slice(item, item + 1) for item in range(items)]
         return [slice(0, items)]
@@ -102,24 +127,25 @@ class CleanSpeech:
     def _batch(self, signals: Tensor, items: slice, extent: Extent) -> CleanBatch:
         """Validate and prepare signals. The host waits for the device once."""
         for index, end in enumerate(extent.ends, start=items.start):
-            if end < SHORTEST_SECONDS * self._given_rate:
+            if end < SHORTEST_SECONDS * self._input_rate:
                 raise ValueError(
-                    f"{self._label(index)} lasts {end / self._given_rate:.2g} s; {self._name} needs {SHORTEST_SECONDS} s "
-                    "or more to mean anything"
+                    f"{self._label(index)} lasts {end / self._input_rate:.2g} s; expected "
+                    f"{SHORTEST_SECONDS} s or more, because {self._name} means nothing below"
                 )
         signals = extent.cut(signals)
         variance = extent.mean(extent.centred(signals).square())
         at_ear = ear_input.to_ear_rate(signals, self._rate, extent) * self._gain
         first, last = ear_input.audible_ends(at_ear)
         finite, sounding = signals.isfinite().all(-1), signals.any(-1)
-        summary = torch.stack([one.double() for one in (finite, sounding, variance, first, last)])
-        starts, lasts = [], []
-        for index, values in enumerate(summary.mT.tolist(), start=items.start):
-            self._validate(index, *values)
-            starts.append(int(values[3]))
-            lasts.append(int(values[4]))
+        values = (finite, sounding, variance, first, last)
+        summary = torch.stack([value.double() for value in values])
+        starts, ends = [], []
+        for index, row in enumerate(summary.mT.tolist(), start=items.start):
+            self._validate(index, *row)
+            starts.append(int(row[3]))
+            ends.append(int(row[4]) + 1)
         resampled = ear_input.at_ear_rate(extent, self._rate)
-        audible = Extent(tuple(b - a + 1 for a, b in zip(starts, lasts, strict=True)))
+        audible = Extent(tuple(end - start for start, end in zip(starts, ends, strict=True)))
         spectrum = ear_input.spectrum_for_alignment(at_ear.to(self.dtype), resampled)
         delays = -integers(tuple(starts), self.device)[:, None]
         parts = ear_model.shift(
@@ -135,7 +161,7 @@ class CleanSpeech:
     def _validate(
         self, index: int, finite: float, sounding: float, variance: float, first: float, last: float
     ) -> None:
-        """Raise an error unless the score of a signal means something."""
+        """Raise an error unless the score of a signal is meaningful."""
         label = self._label(index)
         if not finite:
             raise ValueError(f"{label} holds samples that are NaN or infinite")
@@ -144,17 +170,19 @@ class CleanSpeech:
         level = 10.0 * math.log10(max(variance, 1e-30)) + self._full_scale
         if level < LOWEST_REFERENCE_SPL:
             raise UnscorableError(
-                f"{label} is at {level:.1f} dB SPL with full_scale_spl {self._full_scale:g}; {self._name} needs "
-                f"{LOWEST_REFERENCE_SPL:g} or more to mean anything"
+                f"{label} is at {level:.1f} dB SPL with full_scale_spl {self._full_scale:g}; "
+                f"expected {LOWEST_REFERENCE_SPL:g} dB SPL or more, because "
+                f"{self._name} means nothing below"
             )
-        if (length := last - first + 1) < _SHORTEST_PART:
+        length = last - first + 1
+        if length < MIN_AUDIBLE_SAMPLES:
             raise UnscorableError(
-                f"{label} sounds for {1000.0 * length / RATE:.2g} ms alone; {self._name} needs "
-                f"{1000.0 * _SHORTEST_PART / RATE:g} ms or more to be defined"
+                f"{label} has sound for only {1000.0 * length / RATE:.2g} ms; expected "
+                f"{1000.0 * MIN_AUDIBLE_SAMPLES / RATE:g} ms or more, as {self._name} requires"
             )
 
     def cut(self, processed: Tensor) -> tuple[Tensor, dict[str, Any] | None]:
-        """Cut the signals to their common length, with a warning, where it differs by 0.1 s at most.
+        """Cut signals to their common length, with a warning, if it differs by 0.1 s at most.
 
         Args:
             processed: signals of the same rate. Shape: (..., time).
@@ -168,32 +196,41 @@ class CleanSpeech:
         """
         ends = torch.tensor(self._ends).reshape(self.shape)
         processed, clean, lengths = cut_to_common_length(
-            processed, self._clean, self._given_rate, ends
+            processed, self._clean, self._input_rate, ends
         )
         if clean.shape == self._clean.shape:
             return processed, None
         return processed, {"clean": clean, "lengths": lengths, **self._settings}
 
     def check(self, processed: Tensor) -> Tensor:
-        """Validate processed signals and return them as rows. Shape: (..., time) -> (items, time)."""
+        """Validate processed signals, and return them as rows.
+
+        Shape: (..., time) -> (items, time).
+        """
         check_waveform(processed, "processed")
         if processed.shape != (*self.shape, self.time):
             raise ValueError(
-                f"processed has shape {tuple(processed.shape)}, clean {(*self.shape, self.time)}; allowed: equal shapes"
+                f"expected processed of the shape of clean, {(*self.shape, self.time)}, "
+                f"got {tuple(processed.shape)}"
             )
         if processed.device != self.device:
             raise ValueError(
-                f"processed is on {processed.device}, clean on {self.device}; allowed: one device"
+                f"processed is on {processed.device} and clean on {self.device}; "
+                "move both to one device"
             )
         if not bool(processed.detach().isfinite().all()):
             raise ValueError("processed holds samples that are NaN or infinite")
         return processed.reshape(-1, self.time)
 
     def thresholds(self, audiogram: AudiogramLike, *, host: bool = False) -> Tensor:
-        """Return the ear of each item. Shape: -> (items, 8) dB HL.
+        """Return the ear of each item.
 
         Args:
-            host: on the CPU. The host waits for the device where the ears come from there.
+            audiogram: one ear, or one for each item.
+            host: return them on the CPU. The host waits for ears that lie on a GPU.
+
+        Returns:
+            Thresholds. Shape: (items, 8) dB HL.
         """
         probe = torch.empty((*self.shape, 1), device=self.device)
         ears = resolve_thresholds(
@@ -201,16 +238,21 @@ class CleanSpeech:
         )
         if broadcast_shape(self.shape, ears.shape[:-1]) != self.shape:
             raise ValueError(
-                f"audiograms of shape {tuple(ears.shape)} for signals of {(*self.shape, self.time)}; allowed: one, or "
-                "leading dimensions that broadcast"
+                f"expected one audiogram or one for each item, got shape {tuple(ears.shape)} "
+                f"for signals of shape {(*self.shape, self.time)}"
             )
         ears = on_host(ears) if host else ears
         return ears.expand(*self.shape, 8).reshape(-1, 8)
 
-    def matched(self, processed: Tensor, batch: CleanBatch) -> Tensor:
-        """Return the parts of processed signals that are compared with the audible parts of the clean ones.
+    def align(self, processed: Tensor, batch: CleanBatch) -> Tensor:
+        """Return the parts of processed signals that match the audible parts of the clean ones.
 
-        Shape: (items, time) of the whole input -> (items of the batch, padded), in multiples of 20 uPa.
+        Args:
+            processed: all processed signals. Shape: (items, time).
+            batch: batch whose items are returned.
+
+        Returns:
+            Aligned parts in multiples of 20 uPa. Shape: (items of the batch, padded).
         """
         signals = batch.extent.cut(processed[batch.items].double())
         at_ear = ear_input.to_ear_rate(signals, self._rate, batch.extent) * self._gain
@@ -223,43 +265,48 @@ class CleanSpeech:
         return parts.squeeze(1)
 
     def groups(self, batch: CleanBatch) -> Iterator[slice]:
-        """Items of a batch whose channels are computed together."""
+        """Return slices of the items of a batch whose channels are computed together."""
         return ear_model.item_chunks(batch.audible)
 
     def through_middle_ear(self, signals: Tensor, extent: Extent) -> Tensor:
-        """Shape: (items, padded or more) -> (items, padded)."""
+        """Filter signals by the middle ear. Shape: (items, padded or more) -> (items, padded)."""
         rows = signals[:, : extent.padded].to(self.dtype)
         return middle_ear(self.device, self.dtype)(rows).flatten(-2)
 
 
 Channels = TypeVar("Channels")
-"""What an ear makes of the clean speech in some channels."""
+"""Type of the features of clean speech in some channels."""
 
 
 class ItemGroup(Generic[Channels]):
     """Items of a batch whose ears are computed together, some channels at a time.
 
     Args:
-        items: their place in the batch.
+        signals: all clean signals.
+        batch: batch of the items.
+        items: indices of the items in the batch.
+
+    >>> issubclass(ItemGroup, Generic)
+    True
     """
 
     def __init__(self, signals: CleanSpeech, batch: CleanBatch, items: slice) -> None:
         self._signals, self.items = signals, items
         self._extent = batch.audible[items]
-        self._kept: list[Channels] | None = None
+        self._stored: list[Channels] | None = None
 
-    def keep(self) -> None:
-        """Compute all channels now."""
-        self._kept = list(self._channels())
+    def store(self) -> None:
+        """Compute the features of all channels, and store them."""
+        self._stored = list(self._channels())
 
     def _channels(self) -> Iterator[Channels]:
-        if self._kept is not None:
-            yield from self._kept
+        if self._stored is not None:
+            yield from self._stored
             return
-        for chosen in ear_model.channel_chunks(
+        for channels in ear_model.channel_chunks(
             len(self._extent.ends), self._extent.padded, self._signals.device
         ):
-            yield self._hear(chosen)
+            yield self._prepare(channels)
 
-    def _hear(self, chosen: slice) -> Channels:
+    def _prepare(self, channels: slice) -> Channels:
         raise NotImplementedError

@@ -1,8 +1,11 @@
-"""How the envelopes of two signals agree, by rate of modulation: HASPI's features.
+"""Features of HASPI: correlation of the envelopes of two signals, by rate of modulation.
 
-Kates and Arehart 2021, "The hearing-aid speech perception index (HASPI) version 2", Speech Communication 131, 35-46. The
-levels of 32 channels are smoothed and taken 2667 times a second, freed of what is silent in the reference, and summed up
-in five cosines over frequency; ten band-passes of the cosines' course in time, reference and processed, are correlated.
+The levels of 32 channels are smoothed and sampled 2667 times per second. Frames that are silent in
+the reference are left out. Five cosines over frequency describe each frame. Ten band-passes filter
+the cosines over time, and the outputs of reference and processed signal are correlated.
+
+Source: Kates and Arehart 2021, "The hearing-aid speech perception index (HASPI) version 2", Speech
+Communication 131, 35-46.
 """
 
 from __future__ import annotations
@@ -24,136 +27,202 @@ from hlsim.metrics.ear.model import CHANNELS, Extent, integers, shift
 from hlsim.torchtools import constant
 
 STRIDE = 9
-"""Samples at 24 kHz from one frame to the next."""
+"""Samples at 24 kHz between frames."""
 
-_TAPS = 52  # of the smoothing window, which ends 26 samples after its frame
-_SPAN = -(-(_TAPS + 2) // STRIDE)
-_LEAD = _SPAN * STRIDE - _TAPS // 2 - 1
+WINDOW_SAMPLES = 52
+"""Length of the smoothing window, which ends 26 samples after its frame."""
 
-_SILENCE = 2.5  # dB over threshold that the reference's frames are to exceed
-_COSINES = 5
+WINDOW_STRIDES = -(-(WINDOW_SAMPLES + 2) // STRIDE)
+WINDOW_LEAD = WINDOW_STRIDES * STRIDE - WINDOW_SAMPLES // 2 - 1
+
+SILENCE_DB = 2.5
+"""Level over threshold in dB that a frame of the reference must exceed to count."""
+
+COSINES = 5
 
 RATES = (2.0, 6.0, 10.0, 16.0, 25.0, 40.0, 64.0, 100.0, 160.0, 256.0)
-"""Centres of the modulation filters in Hz."""
+"""Centre frequencies of the modulation filters in Hz."""
 
-_FRAME_RATE = 2560.0  # what the modulation filters take 24000 / 9 for
-_LONGEST = 0.24  # seconds of the filters up to 10 Hz; others have the same number of periods
+FRAME_RATE = 2560.0
+"""Frame rate for which pyclarity designs the modulation filters. The true one is 24000 / 9."""
+
+MAX_FILTER_SECONDS = 0.24
+"""Duration of the filters up to 10 Hz. The others have as many periods as that at 10 Hz."""
 
 NOISE_DB = 0.1
 """Standard deviation of the noise on the firing rate, in dB."""
 
-_NOTHING = 1e-30
+ENERGY_FLOOR = 1e-30
+"""Energies below this one count as zero."""
 
 
-def frames(levels: Tensor, delays: Tensor, extent: Extent) -> Tensor:
-    """Smoothed levels of channels at 24000 / 9 Hz, delayed to match.
+def smooth_frames(levels: Tensor, delays: Tensor, extent: Extent) -> Tensor:
+    """Delay the levels of channels, smooth them, and sample them at 24000 / 9 Hz.
 
-    Shape: (items, channels, padded), (items, channels) samples -> (items, channels, ceil(longest / 9)).
+    Args:
+        levels: levels in dB over threshold. Shape: (items, channels, padded).
+        delays: delays in samples. Shape: (items, channels), int64.
+        extent: lengths of the items.
+
+    Returns:
+        Frames. Shape: (items, channels, ceil(longest / 9)).
+
+    >>> delays = torch.zeros(1, 2, dtype=torch.int64)
+    >>> smooth_frames(torch.ones(1, 2, 128), delays, Extent((128,))).shape
+    torch.Size([1, 2, 15])
     """
     count = -(-extent.longest // STRIDE)
-    stops = [end + _LEAD for end in extent.ends]
-    late = shift(levels, delays + _LEAD, extent.ends, stops, STRIDE * (count + _SPAN - 1))
+    stops = [end + WINDOW_LEAD for end in extent.ends]
+    delayed = shift(
+        levels, delays + WINDOW_LEAD, extent.ends, stops, STRIDE * (count + WINDOW_STRIDES - 1)
+    )
     window = constant(_smoothing, dtype=levels.dtype, device=levels.device)
-    parts = late.unflatten(-1, (-1, STRIDE)) @ window
-    return sum((parts[..., i : i + count, i] for i in range(1, _SPAN)), start=parts[..., :count, 0])
+    parts = delayed.unflatten(-1, (-1, STRIDE)) @ window
+    return sum(
+        (parts[..., i : i + count, i] for i in range(1, WINDOW_STRIDES)),
+        start=parts[..., :count, 0],
+    )
 
 
 def _smoothing() -> NDArray[np.float64]:
-    """A Hann window without its zeros, by phase: (STRIDE, _SPAN)."""
-    window = np.hanning(_TAPS + 2)[1:-1]
-    padded = np.concatenate((np.zeros(_SPAN * STRIDE - _TAPS), window / window.sum()))
-    return padded.reshape(_SPAN, STRIDE).T
+    """Return a Hann window without its zeros, by phase: (STRIDE, WINDOW_STRIDES)."""
+    window = np.hanning(WINDOW_SAMPLES + 2)[1:-1]
+    padded = np.concatenate(
+        (np.zeros(WINDOW_STRIDES * STRIDE - WINDOW_SAMPLES), window / window.sum())
+    )
+    return padded.reshape(WINDOW_STRIDES, STRIDE).T
 
 
-class Course(NamedTuple):
-    """What is made of frames over the channels; that of all channels is the sum over some at a time.
+class ChannelSum(NamedTuple):
+    """Features of frames that are sums over channels, and can be added over chunks of channels.
 
     Attributes:
         loudness: mean over the channels of the amplitude over threshold. Shape: (items, frames).
         cosines: five cosines over frequency. Shape: (items, 5, frames).
+
+    >>> sum_over_channels(torch.zeros(1, 32, 4), slice(0, 32)).loudness
+    tensor([[1., 1., 1., 1.]])
     """
 
     loudness: Tensor
     cosines: Tensor
 
 
-def course(levels: Tensor, channels: slice) -> Course:
-    """Of the frames of some channels. Shape: (items, channels, frames)."""
+def sum_over_channels(levels: Tensor, channels: slice) -> ChannelSum:
+    """Sum the frames of some channels.
+
+    Args:
+        levels: frames in dB over threshold. Shape: (items, channels, frames).
+        channels: the channels.
+
+    >>> sum_over_channels(torch.zeros(1, 8, 4), slice(0, 8)).cosines.shape
+    torch.Size([1, 5, 4])
+    """
     loudness = (levels.detach() * (math.log(10.0) / 20.0)).exp().sum(-2) / CHANNELS
-    return Course(loudness, cosines(levels, channels))
+    return ChannelSum(loudness, cosines(levels, channels))
 
 
 def cosines(levels: Tensor, channels: slice = slice(None)) -> Tensor:
-    """Five cosines over frequency. Shape: (..., channels, frames) -> (..., 5, frames)."""
+    """Return five cosines over frequency. Shape: (..., channels, frames) -> (..., 5, frames).
+
+    >>> cosines(torch.ones(32, 4)).shape
+    torch.Size([5, 4])
+    """
     return constant(_cosines, dtype=levels.dtype, device=levels.device)[:, channels] @ levels
 
 
-def added(sum_so_far: Course | None, part: Course) -> Course:
-    """The sum over chunks of channels."""
-    if sum_so_far is None:
+def add_sums(total: ChannelSum | None, part: ChannelSum) -> ChannelSum:
+    """Add the sums over two chunks of channels.
+
+    >>> part = sum_over_channels(torch.zeros(1, 16, 4), slice(0, 16))
+    >>> add_sums(part, part).loudness
+    tensor([[1., 1., 1., 1.]])
+    """
+    if total is None:
         return part
-    return Course(sum_so_far.loudness + part.loudness, sum_so_far.cosines + part.cosines)
+    return ChannelSum(total.loudness + part.loudness, total.cosines + part.cosines)
 
 
-def joined(parts: Sequence[Course]) -> Course:
-    """Join the courses of several groups of items. Those that are shorter end in zeros."""
+def join_items(parts: Sequence[ChannelSum]) -> ChannelSum:
+    """Join the sums of several groups of items. Shorter ones are padded by zeros.
+
+    >>> part = sum_over_channels(torch.zeros(1, 32, 4), slice(0, 32))
+    >>> join_items([part, part]).loudness.shape
+    torch.Size([2, 4])
+    """
     if len(parts) == 1:
         return parts[0]
     longest = max(part.loudness.shape[-1] for part in parts)
-    return Course(*(_padded_and_joined(tensors, longest) for tensors in zip(*parts, strict=True)))
+    return ChannelSum(*(_pad_and_join(tensors, longest) for tensors in zip(*parts, strict=True)))
 
 
-def _padded_and_joined(tensors: Sequence[Tensor], longest: int) -> Tensor:
-    return torch.cat([functional.pad(one, (0, longest - one.shape[-1])) for one in tensors])
+def _pad_and_join(tensors: Sequence[Tensor], longest: int) -> Tensor:
+    return torch.cat([functional.pad(part, (0, longest - part.shape[-1])) for part in tensors])
 
 
-def audible_frames(loudness: Tensor, extent: Extent) -> tuple[Tensor, Extent]:
-    """Choose the frames that count: those in which the reference exceeds the threshold of hearing.
+def find_audible_frames(loudness: Tensor, extent: Extent) -> tuple[Tensor, Extent]:
+    """Find the frames in which the reference exceeds the threshold of hearing.
 
     The host waits for the device once.
 
     Args:
-        loudness: ``Course.loudness`` of the reference. Shape: (items, frames).
-        extent: samples of each item.
+        loudness: loudness of the reference. Shape: (items, frames).
+        extent: number of samples of each item.
 
-    Returns: places of the frames of each item, followed by other places, (items, kept), and how many there are of each.
+    Returns:
+        Indices of the frames of each item, followed by other indices, (items, audible), and the
+        number of audible frames of each item.
 
     Raises:
-        UnscorableError: an item has none or one.
+        UnscorableError: an item has fewer than two audible frames.
+
+    >>> indices, audible = find_audible_frames(torch.tensor([[0.0, 9.0, 9.0]]), Extent((27,)))
+    >>> indices, audible.ends
+    (tensor([[1, 2]]), (2,))
     """
     frames_of = Extent(tuple(-(-end // STRIDE) for end in extent.ends))
     loudness = frames_of.cut(loudness)
-    audible = loudness > 10.0 ** (_SILENCE / 20.0)
+    audible = loudness > 10.0 ** (SILENCE_DB / 20.0)
     counts = audible.sum(-1).tolist()
     if min(counts) < 2:
         raise UnscorableError("clean is below the threshold of hearing")
-    kept = Extent(tuple(counts))
-    places = (~audible).byte().argsort(dim=-1, stable=True)
-    return places[:, : kept.longest], kept
+    audible_extent = Extent(tuple(counts))
+    indices = (~audible).byte().argsort(dim=-1, stable=True)
+    return indices[:, : audible_extent.longest], audible_extent
 
 
-def chosen_frames(waves: Tensor, places: Tensor) -> Tensor:
-    """Return the frames at the places of each item. Shape: (items, 5, frames), (items, kept) -> (items, 5, kept)."""
-    return waves.take_along_dim(places[:, None], -1)
+def select_frames(waves: Tensor, indices: Tensor) -> Tensor:
+    """Return the frames with the indices of each item.
+
+    Shape: (items, 5, frames), (items, audible) -> (items, 5, audible).
+
+    >>> select_frames(torch.tensor([[[1.0, 2.0, 3.0]]]), torch.tensor([[1, 2]]))
+    tensor([[[2., 3.]]])
+    """
+    return waves.take_along_dim(indices[:, None], -1)
 
 
 def _cosines() -> NDArray[np.float64]:
-    place = np.pi * np.arange(CHANNELS) / (CHANNELS - 1)
-    waves = np.cos(np.arange(1, _COSINES + 1)[:, None] * place)
+    angle = np.pi * np.arange(CHANNELS) / (CHANNELS - 1)
+    waves = np.cos(np.arange(1, COSINES + 1)[:, None] * angle)
     return waves / np.linalg.norm(waves, axis=1, keepdims=True)
 
 
-# -- modulation filters ------------------------------------------------------------------------------------------------
+# -- modulation filters ----------------------------------------------------------------------------
 
 
-class Agreement(NamedTuple):
-    """How the filtered cosines of two signals correspond.
+class ModulationCovariance(NamedTuple):
+    """Covariances of the filtered cosines of two signals.
 
     Attributes:
-        xx, yy, xy: energies of both and of their product, without the means. Shape: (items, 10, 5).
-        waves: the cosines without their means, before the filters. Shape: (items, 5, kept) twice.
-        spectra: spectra of these. Shape: (items, 5, bins) twice.
-        extent: frames of each item.
+        xx, yy, xy: sums of squares and of products, without the means. Shape: (items, 10, 5).
+        waves: zero-mean cosines before the filters. Shape: (items, 5, audible) twice.
+        spectra: spectra of these cosines. Shape: (items, 5, bins) twice.
+        extent: number of audible frames of each item.
+
+    >>> waves = torch.randn(1, 5, 900)
+    >>> modulation_covariance(waves, waves, Extent((900,))).xx.shape
+    torch.Size([1, 10, 5])
     """
 
     xx: Tensor
@@ -164,41 +233,49 @@ class Agreement(NamedTuple):
     extent: Extent
 
 
-def agreement(reference: Tensor, processed: Tensor, extent: Extent) -> Agreement:
-    """Filter the course of the cosines in time by ten band-passes without delay, and compare.
+def modulation_covariance(
+    reference: Tensor, processed: Tensor, extent: Extent
+) -> ModulationCovariance:
+    """Filter the cosines over time by ten band-passes without delay, and compute covariances.
 
-    Shape: (items, 5, kept) twice.
+    Args:
+        reference, processed: cosines of the audible frames. Shape: (items, 5, audible).
+        extent: number of audible frames of each item.
+
+    >>> waves = torch.randn(1, 5, 900)
+    >>> modulation_covariance(waves, waves, Extent((900,))).xy.shape
+    torch.Size([1, 10, 5])
     """
-    kept, points = extent.longest, _points(extent.longest)
+    frames, points = extent.longest, _points(extent.longest)
     waves = extent.centred(reference), extent.centred(processed)
-    a, b = (torch.fft.rfft(one, points) for one in waves)
+    a, b = (torch.fft.rfft(wave, points) for wave in waves)
     responses = constant(_responses, points, dtype=reference.dtype, device=reference.device)
-    together = 1 if reference.device.type == "cpu" else len(responses)
+    filters_at_once = 1 if reference.device.type == "cpu" else len(responses)
     sums = []
-    for part in responses.split(together):
+    for part in responses.split(filters_at_once):
         x, y = (
-            extent.centred(torch.fft.irfft(spectrum[:, None] * part[:, None], points)[..., :kept])
+            extent.centred(torch.fft.irfft(spectrum[:, None] * part[:, None], points)[..., :frames])
             for spectrum in (a, b)
         )
         sums.append(torch.stack((x.square().sum(-1), y.square().sum(-1), (x * y).sum(-1))))
     xx, yy, xy = torch.cat(sums, 2)
-    return Agreement(xx, yy, xy, waves, (a, b), extent)
+    return ModulationCovariance(xx, yy, xy, waves, (a, b), extent)
 
 
-def _points(kept: int) -> int:
-    return fft_length(kept + len(_filters()[0]) // 2, 256)
+def _points(frames: int) -> int:
+    return fft_length(frames + len(_filters()[0]) // 2, 256)
 
 
 def _filters() -> list[NDArray[np.float64]]:
-    """A Hann window on a cosine for each rate, symmetric about the middle."""
+    """Return a Hann-windowed cosine for each rate, symmetric about the middle."""
     filters = []
     for k, rate in enumerate(RATES):
-        seconds = _LONGEST if k < 2 else _LONGEST * RATES[2] / rate
-        half = math.floor(seconds * _FRAME_RATE / 2)
+        seconds = MAX_FILTER_SECONDS if k < 2 else MAX_FILTER_SECONDS * RATES[2] / rate
+        half = math.floor(seconds * FRAME_RATE / 2)
         window = np.hanning(2 * half + 1)
         window /= window.sum()
         if k:
-            window *= 2.0 * np.cos(2.0 * np.pi * rate / _FRAME_RATE * np.arange(-half, half + 1))
+            window *= 2.0 * np.cos(2.0 * np.pi * rate / FRAME_RATE * np.arange(-half, half + 1))
         filters.append(window)
     return filters
 
@@ -230,114 +307,135 @@ def zero_phase_responses(
     return np.fft.rfft(centred).real
 
 
-# -- correlation -------------------------------------------------------------------------------------------------------
+# -- correlation -----------------------------------------------------------------------------------
 
 
-def correlation(found: Agreement) -> Tensor:
-    """Magnitude of the correlation by rate, mean over the cosines; 0 where one of them is constant.
+def correlation(covariance: ModulationCovariance) -> Tensor:
+    """Return the magnitude of the correlation by rate of modulation, averaged over the cosines.
 
-    Returns: (items, 10).
+    Constant cosines count 0.
+
+    Returns:
+        Correlations. Shape: (items, 10).
+
+    >>> waves = torch.randn(1, 5, 900)
+    >>> correlation(modulation_covariance(waves, waves, Extent((900,)))).round(decimals=4)[0, :3]
+    tensor([1., 1., 1.])
     """
-    there = (found.xx >= _NOTHING) & (found.yy >= _NOTHING)
-    norm = torch.where(there, found.xx, 1.0).sqrt() * torch.where(there, found.yy, 1.0).sqrt()
-    return torch.where(there, found.xy.abs() / norm, 0.0).mean(-1)
+    xx, yy, xy = covariance.xx, covariance.yy, covariance.xy
+    is_varying = (xx >= ENERGY_FLOOR) & (yy >= ENERGY_FLOOR)
+    norm = torch.where(is_varying, xx, 1.0).sqrt() * torch.where(is_varying, yy, 1.0).sqrt()
+    return torch.where(is_varying, xy.abs() / norm, 0.0).mean(-1)
 
 
-def expected_correlation(found: Agreement) -> Tensor:
-    """Mean of ``correlation`` over the noise that the hair cells add to both, without drawing it.
+def expected_correlation(covariance: ModulationCovariance) -> Tensor:
+    """Return the mean of ``correlation`` over the noise of the hair cells, without drawing noise.
 
-    The noise adds to the energies that the correlation is divided by, and what it adds to the product is as often
-    negative: the mean and the variance of the quotient are taken to second order, and that of a magnitude is the folded
-    normal distribution's mean.
+    The noise increases the energies by which the covariance is divided. Its contribution to the
+    covariance itself has mean zero. The mean and the variance of the quotient are computed to
+    second order. The mean of its magnitude is that of a folded normal distribution.
 
-    Returns: (items, 10).
+    Returns:
+        Correlations. Shape: (items, 10).
+
+    >>> waves = torch.randn(1, 5, 900)
+    >>> expected_correlation(modulation_covariance(waves, waves, Extent((900,)))).shape
+    torch.Size([1, 10])
     """
     variance = NOISE_DB**2
-    noise = variance * _noise_energies(found)
-    xx, yy, xy = found.xx + noise, found.yy + noise, found.xy
-    xx2, yy2, xy2, own = _energies_filtered_twice(found)
-    own = variance**2 * own
-    spread_x = (4.0 * variance * xx2 + 2.0 * own) / xx.square()
-    spread_y = (4.0 * variance * yy2 + 2.0 * own) / yy.square()
+    noise = variance * _noise_energies(covariance)
+    xx, yy, xy = covariance.xx + noise, covariance.yy + noise, covariance.xy
+    xx2, yy2, xy2, noise2 = _energies_filtered_twice(covariance)
+    noise2 = variance**2 * noise2
+    spread_x = (4.0 * variance * xx2 + 2.0 * noise2) / xx.square()
+    spread_y = (4.0 * variance * yy2 + 2.0 * noise2) / yy.square()
     norm = xx.sqrt() * yy.sqrt()
     both = 2.0 * variance * xy2 / norm
-    plain = xy / norm
-    mean = plain * (1.0 + 0.375 * (spread_x + spread_y)) - 0.5 * both * (1.0 / xx + 1.0 / yy)
-    product = (variance * (xx2 + yy2) + own) / norm.square()
+    quotient = xy / norm
+    mean = quotient * (1.0 + 0.375 * (spread_x + spread_y)) - 0.5 * both * (1.0 / xx + 1.0 / yy)
+    product = (variance * (xx2 + yy2) + noise2) / norm.square()
     spread = (
         product
-        + 0.25 * plain.square() * (spread_x + spread_y)
-        - plain * both * (1.0 / xx + 1.0 / yy)
+        + 0.25 * quotient.square() * (spread_x + spread_y)
+        - quotient * both * (1.0 / xx + 1.0 / yy)
     )
     spread = spread.clamp_min(1e-12)
     folded = (2.0 / math.pi * spread).sqrt() * torch.exp(-0.5 * mean.square() / spread)
     return (folded + mean * torch.erf(mean / (2.0 * spread).sqrt())).mean(-1)
 
 
-def _noise_energies(found: Agreement) -> Tensor:
-    """``_noise_energy`` of each item. Shape: -> (items, 10, 1)."""
-    energies = torch.from_numpy(np.stack([_noise_energy(kept) for kept in found.extent.ends]))
-    device = found.xy.device
-    energies = energies.to(device, found.xy.dtype, non_blocking=device.type != "cpu")
+def _noise_energies(covariance: ModulationCovariance) -> Tensor:
+    """Return ``_noise_energy`` of each item. Shape: -> (items, 10, 1)."""
+    rows = [_noise_energy(frames) for frames in covariance.extent.ends]
+    energies = torch.from_numpy(np.stack(rows))
+    device = covariance.xy.device
+    energies = energies.to(device, covariance.xy.dtype, non_blocking=device.type != "cpu")
     return energies.unsqueeze(-1)
 
 
-def _energies_filtered_twice(found: Agreement) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Energies of the filtered cosines filtered again, and of white noise.
+def _energies_filtered_twice(
+    covariance: ModulationCovariance,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return the energies of cosines and of white noise after filtering them twice.
 
-    They say how far noise of the filters' colour goes along with the cosines. The filters are circular, so that an item
-    is transformed with as many points as it is alone.
+    They determine the covariance of the cosines with noise that passed the same filter. The filters
+    are circular, therefore each item is transformed with as many points as it is alone.
 
-    Returns: xx, yy and xy, (items, 10, 5), and that of noise, (items, 10, 1).
+    Returns:
+        Energies xx, yy and xy of the cosines, (items, 10, 5), and of noise, (items, 10, 1).
     """
-    device = found.xy.device
+    extent, device = covariance.extent, covariance.xy.device
     members: dict[int, list[int]] = {}
-    for item, kept in enumerate(found.extent.ends):
-        members.setdefault(_points(kept), []).append(item)
+    for item, frames in enumerate(extent.ends):
+        members.setdefault(_points(frames), []).append(item)
     parts: list[tuple[Tensor, Tensor, Tensor, Tensor]] = []
     for points, items in members.items():
-        a, b = found.spectra
+        a, b = covariance.spectra
         if len(members) > 1:
-            chosen = integers(tuple(items), device)
-            kept = max(found.extent.ends[item] for item in items)
+            indices = integers(tuple(items), device)
+            longest = max(extent.ends[item] for item in items)
             a, b = (
-                torch.fft.rfft(one.index_select(0, chosen)[..., :kept], points)
-                for one in found.waves
+                torch.fft.rfft(wave.index_select(0, indices)[..., :longest], points)
+                for wave in covariance.waves
             )
-        weights = constant(_twice_filtered, points, dtype=found.xy.dtype, device=device)
+        weights = constant(_twice_filtered, points, dtype=covariance.xy.dtype, device=device)
         x, y = torch.view_as_real(a), torch.view_as_real(b)
         xx, yy, xy = (weights @ product.sum(-1).mT for product in (x.square(), y.square(), x * y))
-        counts = integers(tuple(found.extent.ends[item] for item in items), device)
-        own = counts.to(weights)[:, None, None] * weights.sum(-1, keepdim=True)
-        parts.append((xx, yy, xy, own))
+        counts = integers(tuple(extent.ends[item] for item in items), device)
+        noise = counts.to(weights)[:, None, None] * weights.sum(-1, keepdim=True)
+        parts.append((xx, yy, xy, noise))
     if len(parts) == 1:
         return parts[0]
     order = [item for items in members.values() for item in items]
     back = integers(tuple(sorted(range(len(order)), key=order.__getitem__)), device)
-    xx, yy, xy, own = (
+    xx, yy, xy, noise = (
         torch.cat(tensors).index_select(0, back) for tensors in zip(*parts, strict=True)
     )
-    return xx, yy, xy, own
+    return xx, yy, xy, noise
 
 
 @lru_cache(maxsize=1024)
-def _noise_energy(kept: int) -> NDArray[np.float64]:
-    """Energy of each filter's output for white noise of variance 1, both without their means. Returns (10,)."""
+def _noise_energy(frames: int) -> NDArray[np.float64]:
+    """Return the energy of the filters' zero-mean outputs for zero-mean white noise of variance 1.
+
+    Returns: (10,).
+    """
     energies = []
     for taps in _filters():
-        half = min(len(taps) // 2, kept - 1)
+        half = min(len(taps) // 2, frames - 1)
         lags = np.arange(-half, half + 1)
         taps = taps[len(taps) // 2 + lags]
-        sums, place = np.concatenate(([0.0], np.cumsum(taps))), np.arange(half, half + kept)
-        # a constant, filtered
-        steady = sums[np.minimum(place + 1, len(taps))] - sums[np.maximum(place + 1 - kept, 0)]
-        energy = (taps**2 * (kept - np.abs(lags))).sum()
+        sums = np.concatenate(([0.0], np.cumsum(taps)))
+        ends = np.arange(half, half + frames) + 1
+        # the response to a constant
+        steady = sums[np.minimum(ends, len(taps))] - sums[np.maximum(ends - frames, 0)]
+        energy = (taps**2 * (frames - np.abs(lags))).sum()
         energies.append(energy - (steady**2).mean() - steady.var())
     return np.array(energies)
 
 
 def _twice_filtered(points: int) -> NDArray[np.float64]:
-    """Weights of a half spectrum's squares in the energy of what was filtered twice: (10, points // 2 + 1)."""
+    """Return the weights of squared spectra in the energy after filtering twice: (10, bins)."""
     sides = np.full(points // 2 + 1, 2.0)
     sides[[0, -1]] = 1.0
     return _responses(points) ** 4 * sides / points

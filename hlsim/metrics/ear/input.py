@@ -1,4 +1,4 @@
-"""What Kates' ear does to a pair of signals before it listens: 24 kHz, bulk alignment, silent ends cut, middle ear."""
+"""Preparation of signals for Kates' ear: resampling to 24 kHz, bulk alignment and silent ends."""
 
 from __future__ import annotations
 
@@ -16,38 +16,54 @@ from hlsim.metrics.ear.model import Extent
 from hlsim.metrics.ear.recursions import RATE
 from hlsim.torchtools import constant
 
-_ZEROS, _BETA = 10, 5.0  # of the resampling filter: scipy's ``resample_poly``
-_TOGETHER = 64  # outputs, about, that share a row of inputs
-_RING = 4096  # samples in which the Chebyshev filters fade out
+ZERO_CROSSINGS, KAISER_BETA = 10, 5.0
+"""Zero crossings per side and window of the resampling filter, those of ``resample_poly``."""
 
-_HEADROOM = RATE // 500
-"""2 ms by which the processed signal is left late, for dispersion."""
+OUTPUTS_PER_ROW = 64
+"""Approximate number of resampled outputs that share a row of inputs."""
 
-_AUDIBLE_PART = 0.001  # of the reference's maximum: what is quieter at its ends is cut
+RING_SAMPLES = 4096
+"""Samples in which the response of the Chebyshev filters vanishes."""
+
+HEADROOM = RATE // 500
+"""Delay of the processed signal after alignment in samples, 2 ms, which allows for dispersion."""
+
+AUDIBLE_RATIO = 0.001
+"""Magnitude, relative to the maximum, below which the ends of the reference are silent."""
 
 
 def at_ear_rate(extent: Extent, sample_rate: int) -> Extent:
-    """Return the lengths of resampled items."""
+    """Return the lengths of the items at 24 kHz.
+
+    >>> at_ear_rate(Extent((16000,)), 16000).ends
+    (24000,)
+    """
     return Extent(tuple(-(-end * RATE // sample_rate) for end in extent.ends))
 
 
 def to_ear_rate(signals: Tensor, sample_rate: int, extent: Extent) -> Tensor:
-    """Resample signals to 24 kHz and keep their RMS; from higher rates, the RMS of what lies below 10.5 kHz.
+    """Resample signals to 24 kHz, and keep their RMS level as Kates does.
 
-    The filter is a Kaiser-windowed sinc as in scipy's ``resample_poly``. The level is matched afterwards, as Kates does.
+    From higher rates, the RMS of the band below 10.5 kHz is kept. The filter is a Kaiser-windowed
+    sinc as in scipy's ``resample_poly``.
 
     Args:
-        signals: zero after the end of each item.
-        extent: lengths of the items at ``sample_rate``.
+        signals: signals, zero after the end of each item. Shape: (items, time).
+        sample_rate: sample rate of the signals in Hz.
+        extent: lengths of the items at that rate.
 
-    Shape: (items, time) -> (items, longest of ``at_ear_rate(extent, sample_rate)``), zero after the ends.
+    Returns:
+        Resampled signals, zero after the end of each item. Shape: (items, longest).
+
+    >>> to_ear_rate(torch.randn(1, 16000), 16000, Extent((16000,))).shape
+    torch.Size([1, 24000])
     """
     if sample_rate == RATE:
         return signals
     resampled_extent = at_ear_rate(extent, sample_rate)
     common = math.gcd(RATE, sample_rate)
     up, down = RATE // common, sample_rate // common
-    periods = max(1, _TOGETHER // up)
+    periods = max(1, OUTPUTS_PER_ROW // up)
     kernel = constant(_kernel, up, down, periods, dtype=signals.dtype, device=signals.device)
     inputs, outputs = kernel.shape
     rows = -(-resampled_extent.longest // outputs)
@@ -61,34 +77,36 @@ def to_ear_rate(signals: Tensor, sample_rate: int, extent: Extent) -> Tensor:
     else:
         before = _power_below(signals, sample_rate, extent)
         after = _power_below(resampled, RATE, resampled_extent)
-    is_audible = after > 0.0  # silence has no level to match
+    is_audible = after > 0.0  # silence has no level
     ratio = torch.where(is_audible, before / torch.where(is_audible, after, 1.0), 1.0)
     return resampled * ratio.sqrt().unsqueeze(-1)
 
 
 def _reach(up: int, down: int) -> int:
-    """Inputs before an output that count for it."""
-    return -(-_ZEROS * max(up, down) // up)
+    """Return the number of inputs before an output on which it depends."""
+    return -(-ZERO_CROSSINGS * max(up, down) // up)
 
 
 def _kernel(up: int, down: int, periods: int) -> NDArray[np.float64]:
-    """Weights of a row of inputs in a row of outputs: (inputs, periods * up)."""
-    half = _ZEROS * max(up, down)
-    taps = up * scipy.signal.firwin(2 * half + 1, 1.0 / max(up, down), window=("kaiser", _BETA))
+    """Return the weights of a row of inputs in a row of outputs: (inputs, periods * up)."""
+    half = ZERO_CROSSINGS * max(up, down)
+    taps = up * scipy.signal.firwin(
+        2 * half + 1, 1.0 / max(up, down), window=("kaiser", KAISER_BETA)
+    )
     output = np.arange(periods * up)
     inputs = 2 * _reach(up, down) + down * periods
-    # input j of a row lies at (j - reach) * up on the grid that both rates share, output k at k * down
-    place = half + output[None, :] * down - (np.arange(inputs)[:, None] - _reach(up, down)) * up
-    inside = (place >= 0) & (place <= 2 * half)
-    return np.where(inside, taps[np.clip(place, 0, 2 * half)], 0.0)
+    # On the grid that both rates share, input j lies at (j - reach) * up and output k at k * down.
+    index = half + output[None, :] * down - (np.arange(inputs)[:, None] - _reach(up, down)) * up
+    inside = (index >= 0) & (index <= 2 * half)
+    return np.where(inside, taps[np.clip(index, 0, 2 * half)], 0.0)
 
 
 def _power_below(signals: Tensor, rate: int, extent: Extent) -> Tensor:
-    """Mean power of what lies below 10.5 kHz, by Kates' Chebyshev filter of seventh order.
+    """Return the mean power below 10.5 kHz, by Kates' Chebyshev filter of seventh order.
 
     Shape: (items, time) -> (items,).
     """
-    points = fft_length(extent.longest + _RING, 2)
+    points = fft_length(extent.longest + RING_SAMPLES, 2)
     response = constant(_chebyshev, rate, points, dtype=torch.complex128, device=signals.device)
     spectrum = torch.fft.rfft(signals, points) * response.to(signals.dtype.to_complex())
     return extent.mean(torch.fft.irfft(spectrum, points).square())
@@ -103,38 +121,58 @@ def _chebyshev(rate: int, points: int) -> NDArray[np.complex128]:
 
 
 def audible_ends(references: Tensor) -> tuple[Tensor, Tensor]:
-    """First and last sample of each reference that is not silence. Shape: (items, time) -> (items,) twice."""
+    """Return the first and the last sample of each reference that is not silence.
+
+    Shape: (items, time) -> int64 (items,) twice.
+
+    >>> audible_ends(torch.tensor([[0.0, 0.5, 0.0, 0.2, 0.0]]))
+    (tensor([1]), tensor([3]))
+    """
     magnitude = references.detach().abs()
     time = references.shape[-1]
-    loud = magnitude > _AUDIBLE_PART * magnitude.amax(-1, keepdim=True)
-    places = torch.arange(time, device=references.device)
-    return torch.where(loud, places, time).amin(-1), torch.where(loud, places, -1).amax(-1)
+    loud = magnitude > AUDIBLE_RATIO * magnitude.amax(-1, keepdim=True)
+    indices = torch.arange(time, device=references.device)
+    return torch.where(loud, indices, time).amin(-1), torch.where(loud, indices, -1).amax(-1)
 
 
 def spectrum_for_alignment(signals: Tensor, extent: Extent) -> Tensor:
-    """Spectra of signals without their means, fine enough for lags of their whole length.
+    """Return the spectra of zero-mean signals, zero-padded for correlations over all lags.
 
-    Shape: (items, time) -> (items, bins).
+    Args:
+        signals: signals. Shape: (items, time).
+        extent: lengths of the items.
+
+    Returns:
+        Spectra. Shape: (items, bins).
+
+    >>> spectrum_for_alignment(torch.randn(1, 100), Extent((100,))).shape
+    torch.Size([1, 101])
     """
     points = fft_length(2 * extent.longest, 2)
     return torch.fft.rfft(extent.centred(signals.detach()), points)
 
 
 def bulk_delays(reference_spectrum: Tensor, processed: Tensor, extent: Extent) -> Tensor:
-    """Samples by which processed signals are to be moved, later where positive: to 2 ms behind the reference.
+    """Return the delays that place processed signals 2 ms behind their references.
 
-    The largest magnitude of the cross-covariance decides, and the first one of several that are equal.
+    They follow from the largest magnitude of the cross-covariance.
 
     Args:
-        reference_spectrum: returned by ``spectrum_for_alignment`` for references of the same lengths.
-        processed: (items, time).
+        reference_spectrum: spectra of the references by ``spectrum_for_alignment``.
+        processed: processed signals. Shape: (items, time).
+        extent: lengths of the items, equal for references and processed signals.
 
-    Returns: (items,), int64.
+    Returns:
+        Delays in samples; negative ones advance the signal. Shape: (items,), int64.
+
+    >>> reference, extent = torch.randn(1, 100), Extent((100,))
+    >>> bulk_delays(spectrum_for_alignment(reference, extent), reference, extent)
+    tensor([48])
     """
     time, points = extent.longest, fft_length(2 * extent.longest, 2)
     with torch.no_grad():
         spectrum = reference_spectrum * spectrum_for_alignment(processed, extent).conj()
         covariance = torch.fft.irfft(spectrum, points).abs()
-        # by ascending lag, from 1 - time to time - 1
+        # in order of the lag, from 1 - time to time - 1
         by_lag = torch.cat((covariance[:, points - time + 1 :], covariance[:, :time]), -1)
-        return by_lag.argmax(-1) - (time - 1) + _HEADROOM
+        return by_lag.argmax(-1) - (time - 1) + HEADROOM

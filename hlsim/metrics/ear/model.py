@@ -1,14 +1,21 @@
-"""Kates' model of the auditory periphery, stage by stage, for HASPI and HASQI: normal and impaired ears in one.
+"""Kates' model of the auditory periphery, for normal and impaired ears.
 
-Kates 2013, "An auditory model for intelligibility and quality predictions", Proceedings of Meetings on Acoustics 19,
-050184; constants as in pyclarity 0.9.0, whose ear this equals. The stages of one channel:
+The stages of a channel are:
 
-    control gammatone (as wide as with a loss of 100 dB)  ->  bandwidth of the channel, gain of the outer hair cells
-    gammatone of that bandwidth  ->  power times gain  ->  aligned with the reference  ->  dB over the threshold
-    ->  inner hair cells' adaptation
+1. A control gammatone, as wide as with a loss of 100 dB, determines the bandwidth of the channel
+and
+   the gain of the outer hair cells.
+2. A gammatone of that bandwidth filters the signal, and the gain is applied.
+3. The output is aligned with the reference and converted to dB over the threshold of hearing.
+4. The inner hair cells adapt.
 
-Signals are in multiples of 20 uPa, so that amplitude 1 is 0 dB SPL, and as long as a whole number of blocks; what follows
-their ends is ignored. Channels lie in the second dimension from the last and are taken a few at a time.
+Signals are in multiples of 20 uPa, so that amplitude 1 is 0 dB SPL. They are padded to a multiple
+of ``BLOCK`` samples, and the padding does not matter. Channels lie in the last dimension but one,
+and are computed a few at a time.
+
+Source: Kates 2013, "An auditory model for intelligibility and quality predictions", Proceedings of
+Meetings on Acoustics 19, 050184. The constants are those of pyclarity 0.9.0, which this model
+equals.
 """
 
 from __future__ import annotations
@@ -32,52 +39,74 @@ from hlsim.metrics.ear.recursions import (
     RATE,
     Recursion,
     adaptation,
+    cached_filter,
     gain_lowpass,
     gammatone,
-    kept,
 )
 from hlsim.torchtools import constant
 
 CHANNELS = 32
-_LOWEST_HZ, _HIGHEST_HZ = 80.0, 8000.0
-_EAR_Q, _LEAST_ERB = 9.26449, 24.7  # Moore and Glasberg 1983
+"""Number of channels of the ear."""
+
+MIN_CENTRE_HZ, MAX_CENTRE_HZ = 80.0, 8000.0
+"""Centre frequencies of the first and of the last channel."""
+
+EAR_Q, MIN_ERB_HZ = 9.26449, 24.7
+"""Constants of the equivalent rectangular bandwidth (Moore and Glasberg 1983)."""
 
 AUDIOMETRIC_HZ = (250.0, 500.0, 1000.0, 2000.0, 4000.0, 6000.0)
-"""Frequencies whose thresholds count; those at 3 and 8 kHz do not."""
+"""Frequencies in Hz whose thresholds matter. Those at 3 and 8 kHz do not."""
 
-_KNEE, _CEILING = 30.0, 100.0  # dB SPL between which a normal ear compresses
-_WIDENING = 50.0  # dB SPL at which filters begin to widen; they end at twice that
-_WIDEST_LOSS = 100.0  # dB HL of the control filters
+KNEE_SPL, CEILING_SPL = 30.0, 100.0
+"""Levels in dB SPL between which a normal ear compresses."""
 
-_LONGEST_LAG = 2400  # samples by which a channel may be moved: 100 ms
+WIDENING_SPL = 50.0
+"""Level in dB SPL above which filters widen. At twice that level they are widest."""
 
-_ON_CPU, _ON_GPU = 2**19, 2**25  # samples of all channels that are processed together
+CONTROL_LOSS = 100.0
+"""Hearing loss in dB HL that gives the bandwidth of the control filters."""
+
+MAX_LAG = 2400
+"""Largest shift of a channel in samples, 100 ms."""
+
+CPU_CHUNK, GPU_CHUNK = 2**19, 2**25
+"""Samples of channels that are computed at once, so that they fit into caches or memory."""
 
 
 def centre_frequencies() -> NDArray[np.float64]:
-    """Of the channels in Hz, evenly spaced on the ERB scale from 80 to 8000 Hz. Returns (32,)."""
-    offset = _EAR_Q * _LEAST_ERB
-    steps = np.linspace(math.log(_LOWEST_HZ + offset), math.log(_HIGHEST_HZ + offset), CHANNELS)
+    """Return the centre frequencies of the channels in Hz, evenly spaced on the ERB scale: (32,).
+
+    >>> centre_frequencies()[[0, -1]].round()
+    array([  80., 8000.])
+    """
+    offset = EAR_Q * MIN_ERB_HZ
+    steps = np.linspace(
+        math.log(MIN_CENTRE_HZ + offset), math.log(MAX_CENTRE_HZ + offset), CHANNELS
+    )
     centres: NDArray[np.float64] = np.exp(steps) - offset
     return centres
 
 
-def _decay_of_normal() -> NDArray[np.float64]:
-    """Decay per sample of a gammatone of normal bandwidth. Returns (32,)."""
-    erb: NDArray[np.float64] = _LEAST_ERB + centre_frequencies() / _EAR_Q
+def _normal_decay() -> NDArray[np.float64]:
+    """Return the decay per sample of the gammatones of normal bandwidth: (32,)."""
+    erb: NDArray[np.float64] = MIN_ERB_HZ + centre_frequencies() / EAR_Q
     return 2.0 * math.pi / RATE * 1.019 * erb
 
 
 @dataclass(frozen=True)
 class HairCells:
-    """What a loss does to the channels. Shape of all: (..., 32), float64.
+    """State of the hair cells in each channel. Shape of all: (..., 32), float64.
 
     Attributes:
-        attenuation: of the outer hair cells in dB.
-        bandwidth: of the filters at low levels, in normal ones.
-        knee: dB SPL at which compression begins.
-        ratio: of the compression.
-        inner: attenuation of the inner hair cells in dB.
+        attenuation: attenuation by the outer hair cells in dB.
+        bandwidth: bandwidth of the filters at low levels, relative to normal hearing.
+        knee: level in dB SPL above which the channel compresses.
+        ratio: compression ratio.
+        inner: attenuation by the inner hair cells in dB.
+
+    >>> cells = hair_cells(torch.zeros(8))
+    >>> cells[0:2].knee
+    tensor([30., 30.], dtype=torch.float64)
     """
 
     attenuation: Tensor
@@ -89,41 +118,57 @@ class HairCells:
     def __getitem__(self, channels: slice) -> HairCells:
         return HairCells(*(field[..., channels] for field in vars(self).values()))
 
-    def items(self, chosen: slice) -> HairCells:
-        """Return those of some items. Shape of all: (items, 32)."""
-        return HairCells(*(field[chosen] for field in vars(self).values()))
+    def select_items(self, items: slice) -> HairCells:
+        """Return the hair cells of some items. Shape of all: (items, 32)."""
+        return HairCells(*(field[items] for field in vars(self).values()))
 
 
 def hair_cells(thresholds: Tensor) -> HairCells:
-    """Shares a loss out to outer and inner hair cells, after Moore et al. 1999, JASA 106. Shape: (..., 8) dB HL."""
-    places = integers(tuple(FREQUENCIES.index(hz) for hz in AUDIOMETRIC_HZ), thresholds.device)
-    between = constant(_interpolation, dtype=torch.float64, device=thresholds.device)
-    loss = (thresholds.detach().double().index_select(-1, places) @ between).clamp_min(0.0)
+    """Divide a hearing loss between outer and inner hair cells. Shape: (..., 8) dB HL.
+
+    Source: Moore et al. 1999, J. Acoust. Soc. Am. 106(5), 2761-2778.
+
+    >>> float(hair_cells(torch.full((8,), 40.0)).inner[0].round())
+    26.0
+    """
+    indices = integers(tuple(FREQUENCIES.index(hz) for hz in AUDIOMETRIC_HZ), thresholds.device)
+    weights = constant(_interpolation, dtype=torch.float64, device=thresholds.device)
+    loss = (thresholds.detach().double().index_select(-1, indices) @ weights).clamp_min(0.0)
     normal = torch.linspace(1.25, 3.5, CHANNELS, dtype=torch.float64, device=loss.device)
-    most = 70.0 * (1.0 - 1.0 / normal)  # outer hair cells' loss without any compression left
-    outer = torch.minimum(0.8 * loss, most)
-    inner = torch.where(loss < 1.25 * most, 0.2 * loss, loss - most)
+    # With this loss of the outer hair cells, no compression remains.
+    max_outer = 70.0 * (1.0 - 1.0 / normal)
+    outer = torch.minimum(0.8 * loss, max_outer)
+    inner = torch.where(loss < 1.25 * max_outer, 0.2 * loss, loss - max_outer)
     bandwidth = 1.0 + outer / 50.0 + 2.0 * (outer / 50.0) ** 6
-    knee = outer + _KNEE
-    ratio = (_CEILING - knee) / (_KNEE + 70.0 / normal + outer - knee)
+    knee = outer + KNEE_SPL
+    ratio = (CEILING_SPL - knee) / (KNEE_SPL + 70.0 / normal + outer - knee)
     return HairCells(outer, bandwidth, knee, ratio, inner)
 
 
 def _interpolation() -> NDArray[np.float64]:
-    """From the six audiometric frequencies to the channels, linear in Hz and flat beyond. Returns (6, 32)."""
+    """Return the weights of the audiometric frequencies in the channels: (6, 32).
+
+    They interpolate linearly in Hz, and extend the first and the last threshold.
+    """
     return np.stack([np.interp(centre_frequencies(), AUDIOMETRIC_HZ, row) for row in np.eye(6)])
 
 
-@kept
-def _widest(device: torch.device) -> Tensor:
-    """Bandwidth of the control filters. Shape: (32,)."""
-    return hair_cells(torch.full((8,), _WIDEST_LOSS, device=device)).bandwidth
+@cached_filter
+def _control_bandwidth(device: torch.device) -> Tensor:
+    """Return the bandwidth of the control filters, relative to normal hearing. Shape: (32,)."""
+    return hair_cells(torch.full((8,), CONTROL_LOSS, device=device)).bandwidth
 
 
 @lru_cache(maxsize=64)
 def integers(values: tuple[int, ...], device: torch.device) -> Tensor:
-    """Return whole numbers as a tensor, without making the host wait for the device. Shape: (len(values),)."""
-    with torch.inference_mode(False):  # or training could not use what it keeps
+    """Return integers as a tensor on a device, for which the host does not wait.
+
+    Shape: -> (len(values),), int64.
+
+    >>> integers((3, 5), torch.device("cpu"))
+    tensor([3, 5])
+    """
+    with torch.inference_mode(False):  # the cached tensor may serve a training later
         return torch.tensor(values).to(device, non_blocking=device.type != "cpu")
 
 
@@ -133,6 +178,10 @@ class Extent:
 
     Args:
         ends: number of samples of each item.
+
+    >>> extent = Extent((100, 30))
+    >>> extent.longest, extent.padded
+    (100, 128)
     """
 
     ends: tuple[int, ...]
@@ -146,11 +195,11 @@ class Extent:
 
     @property
     def padded(self) -> int:
-        """Length in whole blocks."""
+        """Length of the longest item, rounded up to whole blocks."""
         return -(-self.longest // BLOCK) * BLOCK
 
     def cut(self, signal: Tensor) -> Tensor:
-        """Cut the padding off, and set to zero what follows the end of each item.
+        """Remove the padding, and set the samples behind the end of each item to zero.
 
         Shape: (items, ..., padded) -> (items, ..., longest).
         """
@@ -161,16 +210,22 @@ class Extent:
         return torch.where(inside, signal, 0.0)
 
     def mean(self, signal: Tensor) -> Tensor:
-        """Mean over the time of each item. Shape: (items, ..., padded) -> (items, ...)."""
+        """Return the mean of each item over time. Shape: (items, ..., padded) -> (items, ...)."""
         ends = integers(self.ends, signal.device).to(signal.dtype)
         return self.cut(signal).sum(-1) / ends.view(-1, *[1] * (signal.ndim - 2))
 
     def centred(self, signal: Tensor) -> Tensor:
-        """Subtract the mean of each item. Shape: (items, ..., padded) -> (items, ..., longest), zero after the ends."""
+        """Subtract the mean of each item, and set the samples behind its end to zero.
+
+        Shape: (items, ..., padded) -> (items, ..., longest).
+        """
         return self.cut(signal[..., : self.longest] - self.mean(signal).unsqueeze(-1))
 
     def inside(self, device: torch.device) -> Tensor:
-        """Whether a sample belongs to its item. Shape: -> (items, longest), bool."""
+        """Return whether samples lie before the end of their item.
+
+        Shape: -> bool (items, longest).
+        """
         return torch.arange(self.longest, device=device) < integers(self.ends, device)[:, None]
 
     @property
@@ -180,46 +235,57 @@ class Extent:
 
 
 def item_chunks(extent: Extent) -> Iterator[slice]:
-    """Split the items of a batch on a GPU so that what is computed of all channels fits in memory."""
-    step = max(1, _ON_GPU // (CHANNELS * extent.padded))
+    """Split the items of a batch on a GPU so that all their channels fit into memory.
+
+    >>> list(item_chunks(Extent((24000, 24000))))
+    [slice(0, 2, None)]
+    """
+    step = max(1, GPU_CHUNK // (CHANNELS * extent.padded))
     items = len(extent.ends)
     return (slice(start, min(start + step, items)) for start in range(0, items, step))
 
 
 def channel_chunks(items: int, samples: int, device: torch.device) -> Iterator[slice]:
-    """The channels from low to high, as many at a time as caches or memory hold."""
-    room = _ON_CPU if device.type == "cpu" else _ON_GPU
-    step = min(CHANNELS, max(1, room // (items * samples)))
-    step = -(-CHANNELS // -(-CHANNELS // step))  # of one size
+    """Split the channels so that caches or memory hold those of a chunk, from low to high.
+
+    >>> len(list(channel_chunks(1, 48000, torch.device("cpu"))))
+    4
+    """
+    size = CPU_CHUNK if device.type == "cpu" else GPU_CHUNK
+    step = min(CHANNELS, max(1, size // (items * samples)))
+    step = -(-CHANNELS // -(-CHANNELS // step))  # chunks of equal size
     return (slice(start, min(start + step, CHANNELS)) for start in range(0, CHANNELS, step))
 
 
-# -- filters and compression -------------------------------------------------------------------------------------------
+# -- filters and compression -----------------------------------------------------------------------
 
 
-@kept
+@cached_filter
 def _control_filters(
     channels: tuple[int, int], device: torch.device, dtype: torch.dtype
 ) -> Recursion:
     chosen = slice(*channels)
     decay = (
-        constant(_decay_of_normal, dtype=torch.float64, device=device)[chosen]
-        * _widest(device)[chosen]
+        constant(_normal_decay, dtype=torch.float64, device=device)[chosen]
+        * _control_bandwidth(device)[chosen]
     )
-    return gammatone(decay, _angles(device)[chosen], _memory(chosen), dtype)
+    return gammatone(decay, _centre_angles(device)[chosen], _filter_memory(chosen), dtype)
 
 
-def _memory(channels: slice) -> int:
-    """Samples after which filters of normal bandwidth, and wider ones, have nothing left in double precision."""
-    return math.ceil(50.0 / float(_decay_of_normal()[channels.start]))
+def _filter_memory(channels: slice) -> int:
+    """Return the samples after which the response of normal and wider filters has vanished."""
+    return math.ceil(50.0 / float(_normal_decay()[channels.start]))
 
 
-def _angles(device: torch.device) -> Tensor:
+def _centre_angles(device: torch.device) -> Tensor:
     return constant(centre_frequencies, dtype=torch.float64, device=device) * (2.0 * math.pi / RATE)
 
 
-def _filtered(filters: Recursion, signal: Tensor) -> tuple[Tensor, Tensor]:
-    """Real and imaginary part in blocks. Shape: (items, padded) -> (items, channels, padded / BLOCK, BLOCK) twice."""
+def _apply_filters(filters: Recursion, signal: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the real and the imaginary part of the filtered signals in blocks.
+
+    Shape: (items, padded) -> (items, channels, padded / BLOCK, BLOCK) twice.
+    """
     items = len(signal)
     channels = len(filters.through) // items
     rows = signal if items == 1 else signal.repeat_interleave(channels, 0)
@@ -227,40 +293,66 @@ def _filtered(filters: Recursion, signal: Tensor) -> tuple[Tensor, Tensor]:
     return real, imaginary
 
 
-def _power(real: Tensor, imaginary: Tensor) -> Tensor:
+def _envelope_power(real: Tensor, imaginary: Tensor) -> Tensor:
     return (real * real).addcmul_(imaginary, imaginary).flatten(-2)
 
 
 def control_power(signal: Tensor, channels: slice) -> Tensor:
-    """Power of the control filters' envelopes. Shape: (items, padded) -> (items, channels, padded)."""
+    """Return the power of the control filters' envelopes.
+
+    Args:
+        signal: output of the middle ear.
+        channels: channels to compute.
+
+    Shape: (items, padded) -> (items, channels, padded).
+
+    >>> control_power(torch.zeros(1, 128), slice(0, 3)).shape
+    torch.Size([1, 3, 128])
+    """
     filters = _control_filters((channels.start, channels.stop), signal.device, signal.dtype)
-    if (items := len(signal)) > 1:
-        filters = filters.repeated(items)
-    return _power(*_filtered(filters, signal))
+    if len(signal) > 1:
+        filters = filters.repeated(len(signal))
+    return _envelope_power(*_apply_filters(filters, signal))
 
 
 def bandwidths(control: Tensor, ear: HairCells, channels: slice, extent: Extent) -> Tensor:
-    """Of the filters, in normal ones: they widen with the level. Shape: (items, channels, padded) -> (items, channels).
+    """Return the bandwidths of the filters, which widen with the level, relative to normal hearing.
 
     Args:
-        ear: of these channels.
+        control: power of the control filters' envelopes.
+        ear: hair cells of these channels.
+        channels: the channels.
+        extent: lengths of the items.
+
+    Shape: (items, channels, padded) -> (items, channels).
+
+    >>> control, ear = torch.zeros(1, 3, 128), hair_cells(torch.zeros(8))
+    >>> bandwidths(control, ear[0:3], slice(0, 3), Extent((128,)))
+    tensor([[1., 1., 1.]], dtype=torch.float64)
     """
     mean = extent.mean(control).double()
-    level = 10.0 * torch.log10(mean.clamp_min(10.0 ** (_WIDENING / 10.0)))
-    share = ((level - _WIDENING) / _WIDENING).clamp_max(1.0)
-    return ear.bandwidth + share * (_widest(control.device)[channels] - ear.bandwidth)
+    level = 10.0 * torch.log10(mean.clamp_min(10.0 ** (WIDENING_SPL / 10.0)))
+    share = ((level - WIDENING_SPL) / WIDENING_SPL).clamp_max(1.0)
+    return ear.bandwidth + share * (_control_bandwidth(control.device)[channels] - ear.bandwidth)
 
 
 @dataclass(frozen=True)
-class Heard:
-    """What the cochlea makes of a signal in some channels.
+class CochlearOutput:
+    """Output of the cochlea in some channels.
 
     Attributes:
-        power: of the compressed envelope. Shape: (items, channels, padded).
-        motion: of the basilar membrane, compressed; None where not asked for.
-        bandwidth: of the filters, in normal ones. Shape: (items, channels), float64.
-        mean_power: of the envelope before compression. Shape: (items, channels).
-        mean_control: of the control filters' envelope.
+        power: power of the compressed envelope. Shape: (items, channels, padded).
+        motion: compressed motion of the basilar membrane, or None where it was not requested.
+            Shape: (items, channels, padded).
+        bandwidth: bandwidth of the filters, relative to normal hearing. Shape: (items, channels),
+            float64.
+        mean_power: mean power of the envelope before compression. Shape: (items, channels).
+        mean_control: mean power of the control filters' envelope. Shape: (items, channels).
+
+    >>> ear = hair_cells(torch.zeros(8))
+    >>> cochlea = simulate_cochlea(torch.zeros(1, 128), ear, slice(0, 3), Extent((128,)))
+    >>> cochlea.power.shape
+    torch.Size([1, 3, 128])
     """
 
     power: Tensor
@@ -270,120 +362,181 @@ class Heard:
     mean_control: Tensor
 
 
-def listen(
+def simulate_cochlea(
     signal: Tensor, ear: HairCells, channels: slice, extent: Extent, *, motion: bool = False
-) -> Heard:
-    """Filter and compress some channels of what the middle ear lets through.
+) -> CochlearOutput:
+    """Filter the output of the middle ear in some channels, and compress it.
 
     Args:
-        signal: (items, padded).
-        ear: (items, 32) or (32,), of all channels.
-        motion: return the basilar membrane's motion, too.
+        signal: output of the middle ear. Shape: (items, padded).
+        ear: hair cells of all channels. Shape: (items, 32) or (32,).
+        channels: channels to compute.
+        extent: lengths of the items.
+        motion: return the motion of the basilar membrane, too.
+
+    >>> signal, ear = torch.zeros(1, 128), hair_cells(torch.zeros(8))
+    >>> cochlea = simulate_cochlea(signal, ear, slice(0, 3), Extent((128,)), motion=True)
+    >>> cochlea.motion.shape
+    torch.Size([1, 3, 128])
     """
     cells = ear[channels]
     control = control_power(signal, channels)
     width = bandwidths(control, cells, channels, extent)
-    decay = width * constant(_decay_of_normal, dtype=torch.float64, device=signal.device)[channels]
-    angle = _angles(signal.device)[channels].expand_as(decay)
-    filters = gammatone(decay.flatten(), angle.flatten(), _memory(channels), signal.dtype)
-    real, imaginary = _filtered(filters, signal)
-    power = _power(real, imaginary)
+    decay = width * constant(_normal_decay, dtype=torch.float64, device=signal.device)[channels]
+    angle = _centre_angles(signal.device)[channels].expand_as(decay)
+    filters = gammatone(decay.flatten(), angle.flatten(), _filter_memory(channels), signal.dtype)
+    real, imaginary = _apply_filters(filters, signal)
+    power = _envelope_power(real, imaginary)
     gain = compression_gain(control, cells)
     compressed = power * gain.square()
-    moved = real.flatten(-2) * gain if motion else None
-    means = (
-        (extent.mean(power), extent.mean(control)) if motion else (power[..., 0], control[..., 0])
+    if not motion:  # HASPI needs neither the motion nor the means
+        return CochlearOutput(compressed, None, width, power[..., 0], control[..., 0])
+    compressed_motion = real.flatten(-2) * gain
+    return CochlearOutput(
+        compressed, compressed_motion, width, extent.mean(power), extent.mean(control)
     )
-    return Heard(compressed, moved, width, *means)
 
 
 def compression_gain(control: Tensor, cells: HairCells) -> Tensor:
-    """Gain of the outer hair cells on amplitudes, by the control filters' power. Shape: (..., channels, padded)."""
+    """Return the gain of the outer hair cells on amplitudes.
+
+    Args:
+        control: power of the control filters' envelopes.
+        cells: hair cells of these channels.
+
+    Shape: (..., channels, padded) -> (..., channels, padded).
+
+    >>> compression_gain(torch.zeros(1, 2, 64), hair_cells(torch.zeros(8))[0:2])[0, 0, :2]
+    tensor([0.0951, 0.2672])
+    """
     knee, ratio, loss = (
         field.to(control).unsqueeze(-1) for field in (cells.knee, cells.ratio, cells.attenuation)
     )
-    highest = knee.new_full((), 10.0 ** (_CEILING / 10.0))
+    highest = knee.new_full((), 10.0 ** (CEILING_SPL / 10.0))
     level = control.clamp(10.0 ** (knee / 10.0), highest).log()
-    # in nepers: -loss - (level - knee) (1 - 1 / ratio)
+    # The gain in nepers is -loss - (level - knee) (1 - 1 / ratio).
     exponent = 0.5 * (1.0 / ratio - 1.0)
     neper = math.log(10.0) / 20.0
     gain = torch.addcmul(-neper * (loss + 2.0 * exponent * knee), level, exponent).exp_()
     return gain_lowpass(control.device, control.dtype)(gain).flatten(-2)
 
 
-def mean_level(heard: Heard, cells: HairCells) -> Tensor:
-    """Long-term level over threshold in dB, by the means of envelope and control. Returns (items, channels)."""
+def mean_level(cochlea: CochlearOutput, cells: HairCells) -> Tensor:
+    """Return the long-term level of each channel in dB over threshold.
+
+    Args:
+        cochlea: output of ``simulate_cochlea`` with ``motion=True``.
+        cells: hair cells of these channels.
+
+    Returns:
+        Levels of 0 dB or more. Shape: (items, channels).
+
+    >>> signal, ear = torch.zeros(1, 128), hair_cells(torch.zeros(8))
+    >>> cochlea = simulate_cochlea(signal, ear, slice(0, 3), Extent((128,)), motion=True)
+    >>> mean_level(cochlea, ear[0:3])
+    tensor([[0., 0., 0.]])
+    """
     knee = 10.0 ** (cells.knee / 10.0)
-    control = torch.maximum(heard.mean_control.double().clamp_max(10.0 ** (_CEILING / 10.0)), knee)
+    control = torch.maximum(
+        cochlea.mean_control.double().clamp_max(10.0 ** (CEILING_SPL / 10.0)), knee
+    )
     gain = -cells.attenuation - (10.0 * torch.log10(control) - cells.knee) * (
         1.0 - 1.0 / cells.ratio
     )
-    level = 10.0 * torch.log10(heard.mean_power.double().clamp_min(1.0))
-    return (level + gain - cells.inner).clamp_min(0.0).to(heard.power.dtype)
+    level = 10.0 * torch.log10(cochlea.mean_power.double().clamp_min(1.0))
+    return (level + gain - cells.inner).clamp_min(0.0).to(cochlea.power.dtype)
 
 
-# -- alignment of channels ---------------------------------------------------------------------------------------------
+# -- alignment of channels -------------------------------------------------------------------------
 
 
 def lag_spectrum(reference: Tensor, extent: Extent) -> Tensor:
-    """For ``channel_lags``: of each sample's step to the next.
+    """Return the spectrum of the differences of neighbouring samples, for ``channel_lags``.
 
-    Around its maximum the correlation hardly changes from lag to lag: single precision tells its steps, not its values.
+    Near its maximum, a correlation hardly changes from lag to lag. Single precision resolves its
+    steps, but not its values.
+
+    Args:
+        reference: envelope or motion.
+        extent: lengths of the items.
 
     Shape: (items, channels, padded) -> (items, channels, bins).
+
+    >>> lag_spectrum(torch.zeros(1, 2, 128), Extent((128,))).shape
+    torch.Size([1, 2, 1297])
     """
     points = _lag_points(extent)
-    step = constant(_step, points, dtype=reference.dtype.to_complex(), device=reference.device)
+    step = constant(
+        _step_response, points, dtype=reference.dtype.to_complex(), device=reference.device
+    )
     return torch.fft.rfft(extent.cut(reference), points) * step
 
 
-def _step(points: int) -> NDArray[np.complex128]:
+def _step_response(points: int) -> NDArray[np.complex128]:
     step: NDArray[np.complex128] = np.expm1(2j * np.pi * np.arange(points // 2 + 1) / points)
     return step
 
 
 def _lag_points(extent: Extent) -> int:
-    return fft_length(extent.longest + _LONGEST_LAG, 2)
+    return fft_length(extent.longest + MAX_LAG, 2)
 
 
 def channel_lags(reference: Tensor, processed: Tensor, extent: Extent) -> Tensor:
-    """Samples by which each channel is to be moved later to match the reference's: the largest cross-correlation's.
+    """Return the shift of each channel that gives the largest cross-correlation with the reference.
 
     Args:
         reference: ``lag_spectrum`` of the reference's envelope or motion.
         processed: envelope or motion. Shape: (items, channels, padded).
+        extent: lengths of the items.
 
-    Returns: (items, channels) from -2399 to 2400, int64.
+    Returns:
+        Samples by which to delay each channel, from -2399 to 2400, int64. Shape: (items, channels).
+
+    >>> reference = torch.zeros(1, 1, 128)
+    >>> reference[..., 50] = 1.0
+    >>> extent = Extent((128,))
+    >>> channel_lags(lag_spectrum(reference, extent), reference.roll(-7, -1), extent)
+    tensor([[7]])
     """
     with torch.no_grad():
-        points, most = _lag_points(extent), min(_LONGEST_LAG, extent.longest)
+        points, max_lag = _lag_points(extent), min(MAX_LAG, extent.longest)
         spectrum = torch.fft.rfft(extent.cut(processed), points)
         steps = torch.fft.irfft(reference * spectrum.conj(), points)
-        near = torch.cat((steps[..., points - most + 1 :], steps[..., :most]), -1)
+        near = torch.cat((steps[..., points - max_lag + 1 :], steps[..., :max_lag]), -1)
         correlation = functional.pad(near.double().cumsum(-1), (1, 0))
-        return correlation.argmax(-1) - (most - 1)
+        return correlation.argmax(-1) - (max_lag - 1)
 
 
 def shift(
     signal: Tensor, delays: Tensor, ends: Sequence[int], stops: Sequence[int], size: int
 ) -> Tensor:
-    """Move channels later by whole samples: ``output[t] = signal[t - delay]`` up to the item's stop, 0 elsewhere.
+    """Delay channels by whole samples.
+
+    The output is ``signal[t - delay]`` before the stop of each item, and 0 elsewhere.
 
     Args:
-        signal: (items, channels, time).
-        delays: (items, channels), whole numbers; negative ones move earlier.
-        ends: samples of each item that are signal; the rest counts as 0.
-        stops: samples of each item's output that may hold something.
-        size: of the output's time.
+        signal: signals. Shape: (items, channels, time).
+        delays: delays in samples; negative ones advance. Shape: (items, channels), int64.
+        ends: samples of each item that are signal; the others count as 0.
+        stops: samples of each item's output, behind which it is 0.
+        size: length of the output.
 
-    Returns: (items, channels, size).
+    Returns:
+        Delayed signals. Shape: (items, channels, size).
+
+    >>> signal = torch.tensor([[[1.0, 2.0, 3.0]]])
+    >>> shift(signal, torch.tensor([[1]]), ends=(3,), stops=(3,), size=4)
+    tensor([[[0., 1., 2., 0.]]])
     """
-    moved: Tensor = _Shift.apply(signal, delays, tuple(ends), tuple(stops), size)
-    return moved
+    delayed: Tensor = _Shift.apply(signal, delays, tuple(ends), tuple(stops), size)
+    return delayed
 
 
 class _Shift(torch.autograd.Function):
-    """Its gradient is moved back, where that of slices would be a tensor of zeros for each."""
+    """Shift each channel by an integer delay.
+
+    The backward pass applies the opposite shift. Slices would allocate a tensor of zeros each.
+    """
 
     @staticmethod
     def forward(
@@ -395,31 +548,31 @@ class _Shift(torch.autograd.Function):
         size: int,
     ) -> Tensor:
         ctx.settings = (delays, ends, stops, signal.shape[-1])
-        return _shifted(signal, delays, ends, stops, size)
+        return _shift_rows(signal, delays, ends, stops, size)
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None, None, None]:
         delays, ends, stops, size = ctx.settings
-        return _shifted(gradient, -delays, stops, ends, size), None, None, None, None
+        return _shift_rows(gradient, -delays, stops, ends, size), None, None, None, None
 
 
-def _shifted(
+def _shift_rows(
     signal: Tensor, delays: Tensor, ends: tuple[int, ...], stops: tuple[int, ...], size: int
 ) -> Tensor:
     if signal.device.type != "cpu":
-        return _gathered(signal, delays, ends, stops, size)
-    moved = signal.new_empty((*signal.shape[:-1], size))
+        return _gather_rows(signal, delays, ends, stops, size)
+    delayed = signal.new_empty((*signal.shape[:-1], size))
     for item, (end, stop) in enumerate(zip(ends, stops, strict=True)):
-        for row, out, delay in zip(signal[item], moved[item], delays[item].tolist(), strict=True):
+        for row, out, delay in zip(signal[item], delayed[item], delays[item].tolist(), strict=True):
             start = min(max(delay, 0), size)
             last = max(start, min(end + delay, stop))
             out[:start] = 0.0
             out[start:last] = row[start - delay : last - delay]
             out[last:] = 0.0
-    return moved
+    return delayed
 
 
-def _gathered(
+def _gather_rows(
     signal: Tensor, delays: Tensor, ends: tuple[int, ...], stops: tuple[int, ...], size: int
 ) -> Tensor:
     device = signal.device
@@ -431,36 +584,72 @@ def _gathered(
 
 
 def group_delays(bandwidth: Tensor, channels: slice) -> Tensor:
-    """Of the gammatones at 0 Hz, in whole samples. Shape: (items, channels) -> (items, channels), int64."""
-    decay = (
-        bandwidth.detach()
-        * constant(_decay_of_normal, dtype=torch.float64, device=bandwidth.device)[channels]
-    )
+    """Return the group delays of the gammatones at 0 Hz in whole samples.
+
+    Args:
+        bandwidth: bandwidths of the filters, relative to normal hearing.
+        channels: the channels.
+
+    Shape: (items, channels) -> int64 (items, channels).
+
+    >>> group_delays(torch.ones(1, 2), slice(0, 2))
+    tensor([[449, 404]])
+    """
+    normal_decay = constant(_normal_decay, dtype=torch.float64, device=bandwidth.device)
+    decay = bandwidth.detach() * normal_decay[channels]
     pole = torch.exp(-decay)
     return (4.0 * pole / (1.0 + 2.0 * pole) + 4.0 * pole / (1.0 - pole)).round().long()
 
 
 def longest_group_delay(signal: Tensor, ear: HairCells, extent: Extent) -> Tensor:
-    """Of all channels, which are delayed to match it. Shape: (items, padded) -> (items, 1).
+    """Return the longest group delay of all channels, to which they are delayed.
 
-    It is one of the three lowest channels': a filter widens by up to 1.28 there, and the fourth is 1.37 times as wide
-    as the first.
+    It is that of one of the first three channels: these filters widen by a factor of 1.28 at most,
+    and the fourth filter is 1.37 times as wide as the first.
+
+    Args:
+        signal: output of the middle ear.
+        ear: hair cells of all channels.
+        extent: lengths of the items.
+
+    Shape: (items, padded) -> int64 (items, 1).
+
+    >>> longest_group_delay(torch.zeros(1, 128), hair_cells(torch.zeros(8)), Extent((128,)))
+    tensor([[449]])
     """
     low = slice(0, 3)
     width = bandwidths(control_power(signal, low), ear[low], low, extent)
     return group_delays(width, low).amax(-1, keepdim=True)
 
 
-# -- inner hair cells --------------------------------------------------------------------------------------------------
+# -- inner hair cells ------------------------------------------------------------------------------
 
 
 def sensation(power: Tensor, inner: Tensor) -> Tensor:
-    """Level over the threshold in dB, 0 or more. Shape: (items, channels, padded), (items or 1, channels) -> as power."""
+    """Return the level over the threshold in dB, 0 or more.
+
+    Args:
+        power: power of the compressed envelopes. Shape: (items, channels, padded).
+        inner: attenuation by the inner hair cells in dB. Shape: (items or 1, channels).
+
+    Returns:
+        Levels. Shape: (items, channels, padded).
+
+    >>> sensation(torch.full((1, 1, 2), 1e4), torch.tensor([[10.0]]))
+    tensor([[[30., 30.]]])
+    """
     floor = 10.0 ** (inner.to(power).unsqueeze(-1) / 10.0)
     level = torch.maximum(power, floor).log().mul_(10.0 / math.log(10.0))
     return level.sub_(inner.to(power).unsqueeze(-1))
 
 
-def adapted(level: Tensor) -> Tensor:
-    """With the overshoot at onsets of the inner hair cells' adaptation. Shape: (..., padded) -> (..., padded)."""
+def apply_adaptation(level: Tensor) -> Tensor:
+    """Apply the adaptation of the inner hair cells, which emphasises onsets.
+
+    Shape: (..., padded) -> (..., padded).
+
+    >>> levels = apply_adaptation(torch.full((1, 12800), 30.0))
+    >>> levels[0, [0, -1]].round()
+    tensor([60., 30.])
+    """
     return adaptation(level.device, level.dtype)(level).flatten(-2).clamp_min(0.0)

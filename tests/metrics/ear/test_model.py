@@ -73,7 +73,7 @@ def test_padded_items_are_resampled_and_aligned_as_alone(rate: int) -> None:
         alone = ear_input.to_ear_rate(signals[item : item + 1, :end], rate, own)[0]
         torch.testing.assert_close(together[item, : len(alone)], alone, rtol=0, atol=1e-13)
         assert not together[item, len(alone) :].any()
-    assert (delays + 40 == ear_input._HEADROOM).all()
+    assert (delays + 40 == ear_input.HEADROOM).all()
 
 
 @pytest.mark.parametrize(("dtype", "error"), [(torch.float64, 1e-12), (torch.float32, 1e-6)])
@@ -87,7 +87,7 @@ def test_middle_ear_and_adaptation(
     level = 60.0 * (signal.abs() / signal.abs().max())
     level[level < 10.0] = 0.0
     expected, _ = eb.inner_hair_cell_adaptation(level[0].numpy(), level[0].numpy(), 2.0, 24000.0)
-    ours = ear_model.adapted(level.to(dtype))[0].double().numpy()
+    ours = ear_model.apply_adaptation(level.to(dtype))[0].double().numpy()
     np.testing.assert_allclose(ours, expected, rtol=0, atol=100 * error)
 
 
@@ -151,8 +151,8 @@ def test_the_ear_as_a_whole(pair: tuple[Tensor, Tensor], name: str) -> None:
     )
     latest = ear_model.longest_group_delay(x, normal, extent)
     for chosen in (slice(0, 3), slice(20, 22)):
-        a = ear_model.listen(x, normal, chosen, extent, motion=True)
-        b = ear_model.listen(y, ours, chosen, extent, motion=True)
+        a = ear_model.simulate_cochlea(x, normal, chosen, extent, motion=True)
+        b = ear_model.simulate_cochlea(y, ours, chosen, extent, motion=True)
         lags = ear_model.channel_lags(
             ear_model.lag_spectrum(a.power.sqrt(), extent), b.power.sqrt(), extent
         )
@@ -160,7 +160,7 @@ def test_the_ear_as_a_whole(pair: tuple[Tensor, Tensor], name: str) -> None:
         delays = latest - ear_model.group_delays(a.bandwidth, chosen)
         pairs = ((a.power, normal, expected[0]), (power, ours, expected[2]))
         for heard, cells, wanted in pairs:
-            level = ear_model.adapted(ear_model.sensation(heard, cells.inner[chosen]))
+            level = ear_model.apply_adaptation(ear_model.sensation(heard, cells.inner[chosen]))
             level = ear_model.shift(level, delays, extent.ends, extent.ends, extent.longest)
             np.testing.assert_allclose(level[0].numpy(), wanted[chosen], rtol=0, atol=1e-5)
         for heard, cells, wanted in ((a, normal, expected[4]), (b, ours, expected[5])):
@@ -173,7 +173,7 @@ def test_frames_and_modulation() -> None:
     random = np.random.RandomState(0)
     levels = np.cumsum(random.standard_normal((32, 9000)), -1)
     extent = ear_model.Extent((9000,))
-    ours = envelopes.frames(
+    ours = envelopes.smooth_frames(
         torch.tensor(levels)[None], torch.zeros(1, 32, dtype=torch.int64), extent
     )[0]
     expected, _ = ebm.env_filter(levels, levels, 320.0, 2560.0, 24000.0)
@@ -186,15 +186,17 @@ def test_frames_and_modulation() -> None:
     ]
     before = ebm.fir_modulation_filter(*six, 2560.0)
     wanted = ebm.modulation_cross_correlation(before[0].copy(), before[1].copy())
-    found = envelopes.agreement(x[None], y[None], ear_model.Extent((x.shape[-1],)))
+    found = envelopes.modulation_covariance(x[None], y[None], ear_model.Extent((x.shape[-1],)))
     np.testing.assert_allclose(envelopes.correlation(found)[0].numpy(), wanted, rtol=0, atol=1e-12)
 
 
 def test_channels_may_come_in_chunks() -> None:
     levels = 10.0 * torch.randn(1, 32, 500, dtype=torch.float64).abs()
-    whole = envelopes.course(levels, slice(0, 32))
-    first, second = (envelopes.course(levels[:, c], c) for c in (slice(0, 5), slice(5, 32)))
-    parts = envelopes.added(envelopes.added(None, first), second)
+    whole = envelopes.sum_over_channels(levels, slice(0, 32))
+    first, second = (
+        envelopes.sum_over_channels(levels[:, c], c) for c in (slice(0, 5), slice(5, 32))
+    )
+    parts = envelopes.add_sums(envelopes.add_sums(None, first), second)
     torch.testing.assert_close(parts.loudness, whole.loudness)
     torch.testing.assert_close(parts.cosines, whole.cosines)
 
@@ -202,7 +204,7 @@ def test_channels_may_come_in_chunks() -> None:
 def test_expected_noise_adds_what_noise_has_on_average() -> None:
     noise = torch.randn(300, 5, 900, dtype=torch.float64)
     extent = ear_model.Extent((900,) * 300)
-    energy = envelopes.agreement(noise, noise, extent).xx.mean((0, -1))
+    energy = envelopes.modulation_covariance(noise, noise, extent).xx.mean((0, -1))
     torch.testing.assert_close(
         energy, torch.from_numpy(envelopes._noise_energy(900)), rtol=0.05, atol=0.0
     )
@@ -223,7 +225,7 @@ def test_shift_of_several_items_and_its_gradient() -> None:
             inside = 0 <= source < ends[i] and t < stops[i]
             assert output[i, c, t] == (signal[i, c, source] if inside else 0.0)
     assert torch.autograd.gradcheck(shifted, (signal,))
-    together = ear_model._gathered(signal, delays, ends, stops, 45)  # as on a GPU
+    together = ear_model._gather_rows(signal, delays, ends, stops, 45)  # as on a GPU
     assert torch.equal(together, output)
 
 
