@@ -41,7 +41,8 @@ class NALR(nn.Module):
 
     Args:
         audiogram: ear or ears; may be passed to each call instead. A tensor that requires a
-            gradient has to be.
+            gradient has to be. The thresholds at 250, 500, 1000, 2000, 4000 and 6000 Hz
+            count, interpolated over log frequency where they were not measured.
         sample_rate: sample rate of inputs and outputs in Hz, 16000 to 48000.
         full_scale_spl: level in dB SPL of RMS 1.0. A linear filter does not need it; all
             compensators accept it.

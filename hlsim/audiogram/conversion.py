@@ -55,8 +55,8 @@ def find_audiogram(ear: Any) -> Audiogram | None:
         return _from_mapping(ear)
     if isinstance(ear, np.ndarray | Tensor):
         return Audiogram(tuple(ear.tolist())) if ear.ndim == 1 else None
-    if isinstance(ear, Sequence) and ear and all(isinstance(level, Real) for level in ear):
-        return Audiogram(tuple(float(level) for level in ear))
+    if isinstance(ear, Sequence) and ear and all(isinstance(level, Real | None) for level in ear):
+        return Audiogram(tuple(ear))
     return None
 
 
@@ -65,11 +65,9 @@ def _from_mapping(levels: Mapping[Any, Any]) -> Audiogram:
     if "levels" in levels:
         return Audiogram.from_dict(levels)
     try:
-        points = sorted((float(frequency), level) for frequency, level in levels.items())
+        frequencies = sorted(levels, key=float)
     except (TypeError, ValueError):
         raise ValueError(
             f"expected a dictionary of frequencies in Hz to thresholds in dB HL, got {levels!r}"
         ) from None
-    frequencies = tuple(frequency for frequency, _ in points)
-    thresholds = tuple(level for _, level in points)
-    return Audiogram(thresholds, frequencies)
+    return Audiogram(tuple(levels[frequency] for frequency in frequencies), tuple(frequencies))

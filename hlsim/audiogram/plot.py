@@ -17,9 +17,6 @@ from hlsim.audiogram.value import (
 )
 from hlsim.extras import MissingExtraError, require
 
-_SHADES = (0.0, 0.05, 0.1, 0.16)
-"""Opacity of the band of each degree of loss."""
-
 _TICKS_HZ = (250.0, 500.0, 1000.0, 2000.0, 4000.0, 6000.0, 8000.0)
 
 _STYLES: dict[EarName | None, dict[str, Any]] = {
@@ -73,10 +70,12 @@ def _prepare(axes: Any) -> None:
     """Draw the axes and the bands of the degrees of loss."""
     bounds = pairwise((LOWEST_LEVEL, *SEVERITY_LIMITS, HIGHEST_LEVEL))
     label = {"transform": axes.get_yaxis_transform(), "ha": "left", "va": "center"}
-    for severity, (low, high), shade in zip(SEVERITIES, bounds, _SHADES, strict=True):
-        axes.axhspan(low, high, color="tab:blue", alpha=shade, linewidth=0)
+    for index, (low, high) in enumerate(bounds):
+        axes.axhspan(low, high, color="tab:blue", alpha=0.05 * index, linewidth=0)
         middle = (low + high) / 2
-        axes.text(1.02, middle, severity, fontsize="small", color="0.35", rotation=90, **label)
+        axes.text(
+            1.02, middle, SEVERITIES[index], fontsize="small", color="0.35", rotation=90, **label
+        )
     frequency_axis(axes, _TICKS_HZ)
     axes.set(xlim=(180.0, 11000.0), ylim=(HIGHEST_LEVEL, LOWEST_LEVEL), ylabel="threshold (dB HL)")
     axes.set_yticks(range(0, 121, 20))

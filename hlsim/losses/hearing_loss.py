@@ -81,7 +81,8 @@ class HearingLossLoss(nn.Module):
 
     Args:
         audiogram: ear or ears; may be passed to each call instead. A tensor that requires a
-            gradient gets one, and is not registered either.
+            gradient gets one, and is not registered either. Every simulator, ``"msbg"`` included,
+            receives the levels at eight frequencies, ``Audiogram.thresholds``.
         simulator: ``"neuro-msbg"`` or the name or folder of another checkpoint; ``"msbg"``, the
             exact model; or a module that is called with a waveform and thresholds and frozen as it
             is (pass a copy of one that is still trained). A module may have the attributes

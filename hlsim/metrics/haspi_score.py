@@ -73,7 +73,9 @@ def haspi(
         processed: signal at the impaired ear, at least 0.7 s long.
         clean: clean speech, not amplified. Lengths of both that differ by 0.1 s at most are cut to
             the shorter one, with a warning.
-        audiogram: the impaired ear, -10 to 120 dB HL; one ear, or one for each item.
+        audiogram: the impaired ear, -10 to 120 dB HL; one ear, or one for each item. Its
+            thresholds at 250, 500, 1000, 2000, 4000 and 6000 Hz count, interpolated over log
+            frequency where they were not measured.
         sample_rate: sample rate in Hz, 16000 to 48000.
         full_scale_spl: level in dB SPL of a signal with RMS 1.0 (pyclarity's ``level1``).
         lengths: number of samples of each item in a padded batch.

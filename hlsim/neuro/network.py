@@ -64,7 +64,8 @@ class EarNetwork(nn.Module):
 
         Args:
             audiogram: one audiogram, or audiograms of shape (..., 8) in dB HL that broadcast to the
-                leading dimensions of the waveform.
+                leading dimensions of the waveform. Of an ``Audiogram``, the levels at eight
+                frequencies count, ``Audiogram.thresholds``, from which networks learn.
 
         Raises:
             ValueError: there is no audiogram, its levels are outside -10 to 100 dB HL, the shapes
