@@ -42,19 +42,12 @@ def read_audiograms(
     """
     highest = HIGHEST_SIMULATED if simulated else HIGHEST_LEVEL
     if str(path) == "standard":
-        ears = [(name, Audiogram.standard(name)) for name in STANDARD if name != "NH"]
-        return [({"listener": name}, ear) for name, ear in ears if max(ear.levels) <= highest]
-    return [(row, ear) for _, row, ear in numbered_audiograms(path, highest)]
-
-
-def numbered_audiograms(
-    path: str | Path, highest: float = HIGHEST_LEVEL
-) -> list[tuple[int, dict[str, str], Audiogram]]:
-    """Read the rows of ``read_audiograms``, each after the number of its line for messages."""
+        standard = [(name, Audiogram.standard(name)) for name in STANDARD if name != "NH"]
+        return [({"listener": name}, ear) for name, ear in standard if max(ear.levels) <= highest]
     ears = []
     for line, row in read_rows(path):
         ear = convert_at(f"{path}, line {line}", Audiogram.from_row, row, highest)
-        ears.append((line, row, ear))
+        ears.append((row, ear))
     return ears
 
 

@@ -26,7 +26,7 @@ from torch import Tensor
 from hlsim.audio import find_audio, read_audio
 from hlsim.audiogram import Audiogram
 from hlsim.audiogram.listener import EAR_NAMES, EARS
-from hlsim.audiogram.table import numbered_audiograms
+from hlsim.audiogram.table import convert_at, read_rows
 from hlsim.calibration import check_full_scale, dbfs
 from hlsim.evaluation.comparison import Pair, compare
 from hlsim.evaluation.measures import LEVELS, find_measures
@@ -327,8 +327,9 @@ def read_folders(
     if audiogram is not None:
         ears = dict.fromkeys(names, audiogram)
     else:
-        ears = _read_ears(str(audiograms), _file_name)
-        _check_complete(names, ears, f"{audiograms}: no audiogram for")
+        rows = _read_ears(str(audiograms), _file_name)
+        _check_complete(names, rows, f"{audiograms}: no audiogram for")
+        ears = {name: rows[name]() for name in names}
     return [
         Recording(
             utterance=name,
@@ -391,7 +392,7 @@ def read_manifest(
 def _read_row(
     row: Mapping[str, str],
     root: Path,
-    ears: Mapping[Any, Audiogram],
+    ears: Mapping[Any, Callable[[], Audiogram]],
     default: Audiogram | None,
     levels: Mapping[str, Any],
 ) -> Recording:
@@ -404,7 +405,8 @@ def _read_row(
     elif row.get("audiogram"):
         audiogram = Audiogram.standard(row["audiogram"])
     else:
-        audiogram = ears.get((listener, ear)) or ears.get((listener, "")) or default
+        read_ear = ears.get((listener, ear)) or ears.get((listener, ""))
+        audiogram = read_ear() if read_ear else default
     if audiogram is None:
         raise ValueError(
             f"no audiogram of listener {listener!r}, ear {ear!r}: add columns hl_250, hl_500, ... or a "
@@ -446,17 +448,21 @@ def _ear_name(row: Mapping[str, str]) -> str:
 
 def _read_ears(
     path: str | Path, name_of: Callable[[Mapping[str, str]], Any]
-) -> dict[Any, Audiogram]:
-    """Read the audiograms of a CSV file by what ``name_of`` makes of a row."""
-    ears: dict[Any, Audiogram] = {}
-    for line, row, audiogram in numbered_audiograms(path):
-        try:
-            name = name_of(row)
-        except ValueError as error:
-            raise ValueError(f"{path}, line {line}: {error}") from error
+) -> dict[Any, Callable[[], Audiogram]]:
+    """Read the rows of a CSV file of ears.
+
+    Args:
+        name_of: function that returns the name of the ear in a row.
+
+    Returns: for each name a function that returns the audiogram, so that only ears in use are validated.
+    """
+    ears: dict[Any, Callable[[], Audiogram]] = {}
+    for line, row in read_rows(path):
+        place = f"{path}, line {line}"
+        name = convert_at(place, name_of, row)
         if name in ears:
-            raise ValueError(f"{path}, line {line}: a second row of {name}")
-        ears[name] = audiogram
+            raise ValueError(f"{place}: a second row of {name}")
+        ears[name] = partial(convert_at, place, Audiogram.from_row, row)
     return ears
 
 

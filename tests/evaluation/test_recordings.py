@@ -207,7 +207,8 @@ def test_a_wrong_row_is_named_by_its_line(
 
 def test_audiograms_may_stand_in_a_file_of_their_own(corpus: Path) -> None:
     ears = corpus / "ears.csv"
-    ears.write_text(f"{HEADER}\na.b.wav,{LEVELS}\np2/c,{LEVELS}\nother,{LEVELS}\n")
+    unused = LEVELS.replace("80", "NR")  # only the ears of the files are validated
+    ears.write_text(f"{HEADER}\na.b.wav,{LEVELS}\np2/c,{LEVELS}\nother,{unused}\n")
     by_file = haspi_report(**folders(corpus), audiograms=ears, measures=("stoi",), jobs=1)
     assert by_file.table.audiogram.tolist() == [list(N4.thresholds)] * 4
     ears.write_text(f"{HEADER}\na.b.wav,{LEVELS}\n")
