@@ -75,7 +75,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     is_main_thread = threading.current_thread() is threading.main_thread()
     previous_handler = signal.signal(signal.SIGTERM, stop) if is_main_thread else None
     try:
-        parser = _make_parser()
+        parser = make_parser()
         arguments = sys.argv[1:] if arguments is None else arguments
         options = parser.parse_args(join_negative_values(arguments))
         if not hasattr(options, "run"):
@@ -95,7 +95,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-def _make_parser() -> Parser:
+def make_parser() -> Parser:
     """Make the parser of the program, whose commands declare their options when they are used."""
     lines = []
     for group, names in GROUPS.items():
