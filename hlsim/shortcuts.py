@@ -161,6 +161,8 @@ def listen(
 ) -> Players:
     """Show players and spectrograms of signals in a notebook, all with the same gain.
 
+    The spectrograms need the extra ``eval``; without it there are only players.
+
     The loudest signal sets the gain, so that what is soft for the ear is soft here. Start with a
     low volume.
 
@@ -174,7 +176,6 @@ def listen(
 
     Raises:
         ValueError: There is no signal, all signals are silent, or one is not mono.
-        MissingExtraError: The extra ``eval``, which draws the spectrograms, is not installed.
 
     Example:
         >>> import hlsim
@@ -263,6 +264,16 @@ def _as_tensor(audio: Tensor | NDArray[Any]) -> Tensor:
     """Return the samples as a tensor; a NumPy array must hold floating-point numbers."""
     if isinstance(audio, Tensor):
         return audio
+    if isinstance(audio, tuple):
+        raise ValueError(
+            "expected samples, got a tuple; load_audio returns samples and their rate, so write: "
+            "speech, rate = hlsim.load_audio(path), and pass sample_rate=rate"
+        )
+    if isinstance(audio, str | Path):
+        raise ValueError(
+            f"expected samples, got the path {str(audio)!r}; load them first: "
+            "speech, rate = hlsim.load_audio(path)"
+        )
     samples = np.asarray(audio)
     if not np.issubdtype(samples.dtype, np.floating):
         raise ValueError(

@@ -34,8 +34,11 @@ def _named(page: Path) -> str:
     return page.relative_to(ROOT).as_posix()
 
 
-def test_examples_of_the_readme_simulate_and_train() -> None:
+def test_examples_of_the_readme_simulate_and_train(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     pytest.importorskip("matplotlib")
+    monkeypatch.chdir(tmp_path)
     names: dict[str, Any] = {}
     for example in _examples(README):
         exec(compile(example, str(README), "exec"), names)

@@ -72,6 +72,8 @@ def test_players_share_one_gain_and_are_saved_as_a_page(tmp_path) -> None:
     [
         lambda: hlsim.simulate((SPEECH * 32768).numpy().astype(np.int16), "N3"),
         lambda: hlsim.simulate(SPEECH, "N9"),
+        lambda: hlsim.simulate("speech.wav", "N3"),
+        lambda: hlsim.simulate(hlsim.load_audio(EXAMPLE_FILE), "N3"),
         lambda: hlsim.simulate(SPEECH, {"250 Hz": 20}),
         lambda: hlsim.compensate(SPEECH, "N3", compensator="none"),
         lambda: hlsim.load_audio("missing.wav"),

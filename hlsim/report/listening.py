@@ -12,9 +12,10 @@ from hlsim.audio import encode_flac
 from hlsim.calibration import gain_to_pascals, level_spl
 from hlsim.evaluation.measures import perceive
 from hlsim.evaluation.result import Evaluation
+from hlsim.extras import MissingExtraError
 from hlsim.parallel import reason_of
 from hlsim.report import spectrograms
-from hlsim.report.page import Player, Section
+from hlsim.report.page import Picture, Player, Section
 
 LONGEST_SECONDS = 8.0
 """Length after which an item is cut on a page."""
@@ -74,14 +75,18 @@ def _item_section(evaluation: Evaluation, number: int, title: str, shown: Sequen
 
 
 def players(signals: Mapping[str, Tensor], sample_rate: int) -> list[Player]:
-    """Return players with one gain, each with its spectrogram and its level.
+    """Return players with one gain and their levels, with spectrograms if matplotlib is installed.
 
     Shape: (time,) each, in pascals. Raises ValueError if all are silent.
     """
     peak = max(float(signal.abs().max()) for signal in signals.values())
     if not peak:
         raise ValueError("all sounds are silent")
-    drawn = spectrograms.pictures(spectrograms.panels(signals, sample_rate))
+    drawn: Sequence[Picture | None]
+    try:
+        drawn = spectrograms.pictures(spectrograms.panels(signals, sample_rate))
+    except MissingExtraError:  # sounds can be played without matplotlib
+        drawn = [None] * len(signals)
     found = []
     for (name, signal), picture in zip(signals.items(), drawn, strict=True):
         label = f"{name}, {float(level_spl(signal)):.0f} dB SPL"
