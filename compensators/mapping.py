@@ -32,13 +32,15 @@ LOWEST_CENTRE = 100.0
 class MappingCompensator(EarNetwork):
     """A network that maps a waveform and an audiogram to a time-aligned, limited output.
 
-    Log magnitude, encoded audiogram (Equation 1) and prescribed gain are its input channels. A
-    dense encoder and dual-path blocks follow. A decoder returns the log magnitude of the output,
-    which is that of the input plus the prescription ``config.start`` plus the network's correction.
-    The correction is smooth over time and frequency, and 0 before training. Without prescription,
-    and free at every frequency, training ends below NAL-R, as an inaudible band has almost no
-    gradient. With ``config.phase`` "predicted" the phase is an input channel, too, and another
-    decoder shifts it; otherwise it is kept.
+    The network works on the spectrogram. Its input channels are the log magnitude, the audiogram
+    (encoded by Equation 1 of the Neuro-MSBG paper) and the prescribed gain. An encoder is followed
+    by blocks that process the spectrogram along time and along frequency in turn. A decoder returns
+    a correction of the gain, which is smooth over time and frequency and 0 before training. The
+    output has the magnitude of the input, plus the gain of the prescription ``config.start``, plus
+    this correction, all in dB. Training needs the prescription as its start: an inaudible band has
+    almost no gradient, and without a prescription the trained network is worse than NAL-R. The
+    phase of the input is kept. With ``config.phase`` "predicted" it is an input channel, and a
+    second decoder shifts it.
 
     Levels are in pascals, and nothing is normalised. The output is softly limited at
     ``config.limit_spl``.

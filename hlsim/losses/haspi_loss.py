@@ -15,11 +15,12 @@ Excess level costs twice its default, as HASPI rewards gain.
 class HASPILoss(HearingLossLoss):
     """1 minus HASPI, optionally 1 minus HASQI, and the error of the perceived level.
 
-    HASPI alone rewards any gain. Therefore the level that is perceived through ``simulator`` is
-    compared with that of a normal ear for the clean speech, and samples above 120 dB SPL cost: the
-    parts levels, louder and peaks of ``hlsim.losses.coherent_bands``. HASPI and HASQI score the
-    compensated speech (``hlsim.metrics``) with the expected effect of the ear's internal noise.
-    Items with inaudible clean speech count 0 there (``hlsim.metrics.objective``).
+    HASPI alone rewards any gain. Therefore the loss also compares the level that is perceived
+    through ``simulator`` with the level that a normal ear perceives of the clean speech, and
+    penalises samples above 120 dB SPL. These terms are called ``levels``, ``louder`` and ``peaks``
+    in ``loss.parts`` (see ``hlsim.losses.coherent_bands``). HASPI and HASQI are computed with
+    ``noise="expected"``, which makes them deterministic. An item whose clean speech is inaudible
+    has a HASPI term of 0.
 
     It is called as ``HearingLossLoss`` is, ``loss(compensated, clean, audiogram=None,
     lengths=None)``, with the same shapes, conventions and errors. Items last 0.7 s or more, and no

@@ -203,13 +203,12 @@ class HearingLossLoss(nn.Module):
                 (batch, 1, time), (batch, 8) is accepted, too. A ``Listener`` goes with
                 (..., 2, time), left first; a missing ear does not count.
             lengths: number of samples of each item of a padded batch, (...), or its share of the
-                longest, above 0 and up to 1, as SpeechBrain defines it. Samples behind the end of
-                an item do not count, and an item has the value that it has alone; with the exact
-                MSBG that of the default criterion differs by 1e-4 at most. Simulators that need no
-                exact lengths, and calls with ``listener``, simulate all items together, with
-                silence after each end.
-            listener: arguments of the simulator beyond the audiogram, by name. Tensors are moved to
-                the device of the speech.
+                longest, above 0 and up to 1, as SpeechBrain defines it. Samples after the end of an
+                item are ignored, so that its value is the one that it has alone (within 1e-4 for
+                the exact MSBG, which simulates the padded batch at once).
+            listener: further keyword arguments for a simulator of your own, by name, as a
+                dictionary. This is not a ``Listener``, which goes into ``audiogram``. Tensors are
+                moved to the device of the speech.
 
         Shape: (..., time) twice -> (), or with ``reduction="none"`` the leading dimensions, where a
             missing ear is NaN. With ``ears="better"`` the result has no dimension of ears.

@@ -306,8 +306,8 @@ class HASPI(_MeanScore):
 class HASQI(_MeanScore):
     """Mean HASQI v2 of processed speech over all items since the last ``reset``.
 
-    The arguments are those of ``HASPI``. The reference is clean speech with NAL-R. Whether enough
-    is audible does not count. On a CPU one second of audio takes about 0.2 s.
+    The arguments are those of ``HASPI``. The reference is clean speech amplified by NAL-R, and the
+    score falls with every difference from it. On a CPU one second of audio takes about 0.2 s.
     """
 
     score = staticmethod(hasqi)
