@@ -49,11 +49,14 @@ def draw(path: Path) -> None:
     figure, axes = pyplot.subplots(figsize=(8.0, 3.6), layout="constrained")
     for level in LEVELS:
         delays = [
-            estimate_delay(MSBG(Audiogram.standard(ear), aligned=False), level=level)
+            estimate_delay(
+                MSBG(Audiogram.standard(ear), sample_rate=MSBG_RATE, aligned=False), level=level
+            )
             for ear in EARS
         ]
         axes.plot(EARS, delays, "o", label=f"impulse method, {level:g} dB SPL")
-    structural = [MSBG(aligned=False).delay(Audiogram.standard(ear).severity) for ear in EARS]
+    unaligned = MSBG(sample_rate=MSBG_RATE, aligned=False)
+    structural = [unaligned.delay(Audiogram.standard(ear).severity) for ear in EARS]
     axes.plot(EARS, structural, "k_", markersize=24, label="structural delay")
     axes.set(xlabel="ear", ylabel="samples at 44.1 kHz", title="Delay of MSBG")
     axes.legend(fontsize="small")
@@ -66,7 +69,7 @@ def main() -> None:
     print("|---|---|" + "---|" * len(HERTZ))
     for name in TABLE_EARS:
         ear = Audiogram.standard(name)
-        delays = measure_delays(MSBG(ear)(make_bursts()), make_bursts())
+        delays = measure_delays(MSBG(ear, sample_rate=MSBG_RATE)(make_bursts()), make_bursts())
         print(f"| {name} | {ear.severity} |" + "".join(f" {samples:+d} |" for samples in delays))
     draw(Path(__file__).parents[1] / "docs" / "delay.png")
 

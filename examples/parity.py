@@ -26,7 +26,8 @@ def sample_for_sample(signal: torch.Tensor, ear: Audiogram) -> float:
     reference = Ear()
     reference.set_audiogram(ear.to_clarity())
     expected = reference.process(signal.double().numpy())[0]
-    heard = MSBG(ear, full_scale_spl=120.0, aligned=False, rescale_active=True)(signal).numpy()
+    model = MSBG(ear, sample_rate=44100, full_scale_spl=120.0, aligned=False, rescale_active=True)
+    heard = model(signal).numpy()
     return float(np.linalg.norm(heard - expected) / np.linalg.norm(expected))
 
 

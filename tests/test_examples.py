@@ -145,7 +145,9 @@ def test_delay_by_frequency(
     advance = np.gradient(np.unwrap(np.angle(response)), 2 * np.pi / points)
     spectra = np.abs(np.fft.rfft(given.numpy(), points) * response) ** 2
     expected = 33 - spectra @ advance / spectra.sum(-1)
-    left = example.measure_delays(MSBG(Audiogram.standard("NH"))(given), given)
+    left = example.measure_delays(
+        MSBG(Audiogram.standard("NH"), sample_rate=MSBG_RATE)(given), given
+    )
     np.testing.assert_allclose(left, expected, atol=2)
     drawn: list[Path] = []
     monkeypatch.setattr(example, "draw", drawn.append)

@@ -1,5 +1,7 @@
 """The functions for a notebook give what the modules behind them give, for tensors and arrays."""
 
+import inspect
+
 import numpy as np
 import pytest
 import soundfile
@@ -95,3 +97,15 @@ def test_load_audio_can_keep_the_samples_of_the_file() -> None:
     expected, _ = soundfile.read(EXAMPLE_FILE, dtype="float32")
     assert rate == 16000
     assert np.array_equal(samples.numpy(), expected)
+
+
+def test_all_modules_and_functions_have_the_same_default_rate() -> None:
+    defaults = {}
+    for name in hlsim.__all__:
+        value = getattr(hlsim, name)
+        if callable(value):
+            parameter = inspect.signature(value).parameters.get("sample_rate")
+            if parameter is not None and isinstance(parameter.default, int):
+                defaults[name] = parameter.default
+    assert {"MSBG", "NALR", "HearingLossLoss", "NeuroMSBG", "simulate"} <= defaults.keys()
+    assert set(defaults.values()) == {16000}

@@ -119,7 +119,7 @@ class MSBG(nn.Module):
         self,
         audiogram: AudiogramLike | None = None,
         *,
-        sample_rate: int = MSBG_RATE,
+        sample_rate: int = 16000,
         full_scale_spl: float = PASCAL_SPL,
         aligned: bool = True,
         rescale_active: bool = False,

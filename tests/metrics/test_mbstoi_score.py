@@ -39,7 +39,7 @@ def scenes(speech_dir: Path) -> tuple[Tensor, Tensor]:
     hisses = torch.randn(2, 24000, generator=torch.Generator().manual_seed(0))
     noises = [hisses[0], resample(other[0], rate, 16000)[4000:28000], hisses[1]]
     mixed = [
-        example.mixed(voice.double(), noise.double(), (front, around), snr, 16000)
+        example.mix_at_ears(voice.double(), noise.double(), (front, around), snr, 16000)
         for voice, noise, (front, around, snr) in zip(voices, noises, SCENES, strict=True)
     ]
     clean, noisy = torch.stack(mixed).unbind(1)
