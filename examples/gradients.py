@@ -25,7 +25,10 @@ HALF_A_HOP = 12  # samples
 def gradients(
     loss: HearingLossLoss, signals: Tensor, clean: Tensor, ears: list[Audiogram], later: int = 0
 ) -> Tensor:
-    """Of each item for its ear, begun some samples later. Shape: (items, time) twice -> (items, time)."""
+    """Compute the gradient of each item for its ear, with speech shifted by some samples.
+
+    Shape: (items, time) twice -> (items, time).
+    """
     signals = signals.clone().requires_grad_()
     begun, reference = (functional.pad(one, (later, 0)) for one in (signals, clean))
     loss(begun, reference, ears).sum().backward()

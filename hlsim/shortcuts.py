@@ -129,7 +129,7 @@ def compensate(
 
     Args:
         audio: Tensor or NumPy array of floating-point samples, ``(..., time)``.
-        ear: As in ``simulate``.
+        ear: One of the values that ``simulate`` takes.
         sample_rate: Sample rate in Hz, 16000 to 48000.
         compensator: ``"hearing-aid"``, ``"nalr"``, ``"wdrc"``, or the name or folder of another
             checkpoint.

@@ -1,4 +1,4 @@
-"""What every test starts from: seeded random numbers, few threads, and the embedded speech."""
+"""Common set-up of all tests: seeded random numbers, one thread, and the bundled speech."""
 
 import random
 from collections.abc import Iterator

@@ -68,7 +68,7 @@ class Case:
 
 @dataclass(frozen=True)
 class Summary:
-    """What is stored of an array."""
+    """Hash, sampled values and sums that are stored for an array."""
 
     digest: str
     shape: tuple[int, ...]
@@ -234,7 +234,7 @@ def parameter_gradient(model: nn.Module, output: Tensor) -> Tensor:
 
 
 def in_chunks(stream: Any, signal: Tensor, sizes: tuple[int, ...] = (1, 100, 16, 777)) -> Tensor:
-    """What a stream returns for chunks of several sizes, and at its end."""
+    """Output of a stream for chunks of several sizes and at its end."""
     outputs = []
     position = turn = 0
     while position < signal.shape[-1]:

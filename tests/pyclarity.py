@@ -23,7 +23,7 @@ from hlsim.audiogram import Audiogram
 OUTPUTS_FILE = Path(__file__).with_name("pyclarity.npz")
 
 STRIDE = 17
-"""Of long signals every 17th value is stored; 17 shares no factor with MSBG's frames and hops."""
+"""Distance of the stored values of a long signal; 17 shares no factor with MSBG's frames and hops."""
 
 Array = NDArray[Any]
 
@@ -112,6 +112,6 @@ def haaqi(clean: Array, processed: Array, audiogram: Audiogram, rate: int, seed:
 
 
 def mbstoi(clean: Array, processed: Array, rate: int) -> float:
-    """Of signals (2, time), left and right."""
+    """Compute pyclarity's MBSTOI of signals (2, time), left ear first."""
     module = pytest.importorskip("clarity.evaluator.mbstoi")
     return float(module.mbstoi(*clean, *processed, rate))

@@ -1,4 +1,4 @@
-"""What runs on a GPU keeps to it and does not make the host wait, as far as that shows without one."""
+"""Modules stay on the device of their input and do not make the host wait, on a pretended GPU."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What works without an extra."""
+"""The core works without the extras, and a missing extra is named in the error."""
 
 import subprocess
 import sys

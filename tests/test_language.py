@@ -32,6 +32,7 @@ FINISHED = [
     "hlsim/extras.py",
     "hlsim/files.py",
     "hlsim/live.py",
+    "hlsim/losses",
     "hlsim/metrics/ear",
     "hlsim/metrics/fidelity.py",
     "hlsim/metrics/haaqi_score.py",

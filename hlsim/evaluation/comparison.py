@@ -36,7 +36,7 @@ class Comparison:
         level_before_mean, level_after_mean: mean output levels of the same items in dB SPL; NaN if
             they are not known.
         by_severity: comparison for each degree of loss that occurs.
-        unit: what items are nested in, such as ``"listener"``.
+        unit: column within which the items are nested, such as ``"listener"``.
         unit_means: comparison of the means of each unit; None unless there are two units or more.
         planned: whether the comparison was planned before the scores were known. Its p values are
             not adjusted; those of all others are adjusted by Holm over the family of the measure.
@@ -222,7 +222,7 @@ def compare(
     """Compare the conditions of a study, each with every earlier one.
 
     Args:
-        table: what ``run_study`` returns.
+        table: table that ``run_study`` returns.
         measures: columns of scores.
         baseline: the condition that all others are compared with, in place of every earlier one.
         planned: comparisons that were planned before the scores were known. They stay outside the

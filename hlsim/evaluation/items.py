@@ -35,8 +35,8 @@ STANDARD_EARS = ("N2", "N3", "N4", "N5", "N6", "S1", "S2", "S3")
 """Bisgaard's audiograms that are in every comparison of compensators."""
 
 Treatment = Literal["as-is", "louder", "nal-r", "compressed", "compensated"]
-"""What is done to a signal before a simulator gets it: nothing, 20 dB of gain, NAL-R for the ear,
-compression of 3:1, or a compensator."""
+"""Processing of the input of a simulator: none, 20 dB of gain, NAL-R for the ear, compression of
+3:1, or a compensator."""
 
 
 def draw_items(

@@ -1,4 +1,7 @@
-"""What scores of speech do not show of an aid: gain curves, steady tones, quiet noise, look-ahead, cost."""
+"""Properties of an aid that scores of speech do not show.
+
+These are gain curves, steady tones, quiet noise, look-ahead and cost.
+"""
 
 from __future__ import annotations
 

@@ -200,7 +200,7 @@ def _perception(item: Item, output: Tensor) -> Values:
 
 
 PERCEPTION = Measure("perception", _perception, packages=["hlsim"])
-"""What the exact MSBG says of an output, in dB SPL or dB.
+"""Levels and band levels of an output as perceived through the exact MSBG, in dB SPL or dB.
 
 ``peak`` is the largest sample of the output; ``perceived_level`` the level after MSBG, ``normal_level`` that of
 the input for a normal ear, noise included, ``normal_clean_level`` that of the clean speech for a normal ear;

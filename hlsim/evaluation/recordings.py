@@ -80,7 +80,7 @@ class Recording:
 
     @property
     def facts(self) -> dict[str, Any]:
-        """What the table says of the item beside its name."""
+        """Columns of the table that describe the item, without its name."""
         facts = ("listener", "ear", "utterance", "snr")
         ear = {"severity": self.audiogram.severity, "audiogram": list(self.audiogram.thresholds)}
         return {name: getattr(self, name) for name in facts} | ear

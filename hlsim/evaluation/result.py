@@ -1,4 +1,4 @@
-"""What an evaluation returns: the table of its study, the comparisons, and how they were made."""
+"""Result of an evaluation: the table of its study, the comparisons, and the settings."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ class Evaluation:
     """A finished study.
 
     Attributes:
-        items, conditions, measures: what was studied.
+        items, conditions, measures: the three inputs of ``run_study``.
         table: one row per item and condition, see ``run_study``.
         comparisons: comparisons of the conditions, see ``compare``.
-        settings: what the values depend on, such as the seed.
+        settings: settings on which the values depend, such as the seed.
         notes: sentences that the report begins with.
         details: further results for JSON, such as gain curves.
         groups: the same evaluation of a part of the items, by the name of the part.

@@ -10,15 +10,15 @@ import numpy as np
 from scipy import stats
 
 RESAMPLES = 9999
-"""Of the bootstrap."""
+"""Number of bootstrap resamples."""
 
 _DRAWS = 1_000_000  # indices drawn at a time: keeps the bootstrap's memory at some 16 MB
 
 FEWEST = 6
-"""Values from which on an interval is given, and Wilcoxon's p can fall below 0.05."""
+"""Smallest number of items with an interval; with fewer, Wilcoxon's p cannot fall below 0.05."""
 
 ROUNDING = 1e-7
-"""What is less than this part of the largest score is rounding: scores of files depend on float32."""
+"""Differences below this share of the largest score count as zero, because scores are float32."""
 
 
 @dataclass(frozen=True)
@@ -146,5 +146,5 @@ def _scores(values: Iterable[float], name: str) -> np.ndarray:
         raise ValueError(f"no scores {name}; a paired comparison needs at least one pair")
     for index, score in enumerate(scores):
         if not math.isfinite(score):
-            raise ValueError(f"score {index} {name} is {score}; allowed: finite numbers")
+            raise ValueError(f"score {index} {name} is {score}; expected a finite number")
     return scores

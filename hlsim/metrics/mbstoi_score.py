@@ -128,15 +128,18 @@ def _check_shapes(processed: Tensor, clean: Tensor) -> None:
         check_waveform(signal, name)
         if signal.ndim < 2 or signal.shape[-2] != 2:
             raise ValueError(
-                f"{name} has shape {tuple(signal.shape)}; allowed: (..., 2, time), the left and the right ear"
+                f"expected {name} of shape (..., 2, time), left ear first, "
+                f"got {tuple(signal.shape)}"
             )
     if processed.shape != clean.shape:
         raise ValueError(
-            f"processed has shape {tuple(processed.shape)}, clean {tuple(clean.shape)}; allowed: equal shapes"
+            f"expected signals of the same shape, got processed {tuple(processed.shape)} "
+            f"and clean {tuple(clean.shape)}"
         )
     if processed.device != clean.device:
         raise ValueError(
-            f"processed is on {processed.device}, clean on {clean.device}; allowed: one device"
+            f"expected signals on the same device, got processed on {processed.device} "
+            f"and clean on {clean.device}; move one of them with .to(device)"
         )
 
 
@@ -209,10 +212,10 @@ def _without_silence(signals: Tensor, extent: Extent) -> tuple[Tensor, list[int]
     counts = active.sum(-1).tolist()
     fewest = min(counts)
     if fewest <= _SEGMENT:
-        item = f", item {counts.index(fewest)}," if len(counts) > 1 else ""
+        item = f" in item {counts.index(fewest)}" if len(counts) > 1 else ""
         raise ValueError(
-            f"clean{item} has {_seconds(fewest):.2g} s of speech within {_RANGE_DB:g} dB of its loudest; allowed: "
-            f"{_seconds(_SEGMENT + 1):.2g} s or more"
+            f"expected at least {_seconds(_SEGMENT + 1):.2g} s of clean speech within {_RANGE_DB:g} dB "
+            f"of its loudest frame{item}, got {_seconds(fewest):.2g} s"
         )
     order = (~active).byte().argsort(dim=-1, stable=True)[:, : max(counts)]
     used = Extent(tuple(counts)).inside(rows.device)
@@ -228,7 +231,8 @@ def _seconds(frames: int) -> float:
 
 
 def _band_envelopes(frames: Tensor) -> Tensor:
-    """Of each band, the power of left and right and the real and the imaginary part of their cross-spectrum.
+    """Compute the power of each band at both ears, and the real and imaginary parts of its
+    cross-spectrum.
 
     Shape: (items, clean and processed, left and right, frames, samples) -> (items, frames, bands, 8).
     """
@@ -241,11 +245,14 @@ def _band_envelopes(frames: Tensor) -> Tensor:
 
 
 def _correlations(windows: Tensor, single: Tensor) -> Tensor:
-    """Mean over bands of the correlation of the clean and the processed envelope, of the best delay and level or one ear.
+    """Compute the mean over bands of the correlation between clean and processed envelopes.
+
+    The envelopes are those after equalisation and cancellation with the best delay and level, or of
+    one ear if that is better.
 
     Args:
-        windows: what ``_band_envelopes`` returns, of each segment.
-        single: whether one ear may be taken.
+        windows: segments of the output of ``_band_envelopes``.
+        single: whether one ear alone may be used.
 
     Shape: (segments, bands, 8, frames), (segments,) -> (segments,).
     """
@@ -308,16 +315,18 @@ def _band_matrix() -> NDArray[np.float64]:
 
 
 def _jittered() -> NDArray[np.float64]:
-    """What the products of two envelopes count in the product of what cancellation leaves of them, jitter averaged.
+    """Compute the weights of products of band features after equalisation and cancellation.
 
-    With levels g and -g and a delay t, the band at the angular frequency w keeps of L, R and their cross-spectrum r + i m
+    Let L and R be the powers of a band at both ears, r + i m its cross-spectrum, and w its angular
+    frequency. With the levels g and -g and the delay t, equalisation and cancellation give
 
-        10^g L + 10^-g R - 2 cos(w t) r - 2 sin(w t) m,
+        10^g L + 10^-g R - 2 cos(w t) r - 2 sin(w t) m.
 
-    so that the product of two such is a sum over the pairs of (L, R, r, m), each in both orders. Its mean over normal
-    errors of level and delay (equations 5 and 6, times sqrt(2) for two ears) has a closed form (equations 7 and 8).
+    The product of two such terms is a weighted sum of products of the features (L, R, r, m). Its
+    mean over normally distributed errors of level and delay (equations 5 and 6, times sqrt(2) for
+    two ears) has a closed form (equations 7 and 8).
 
-    Returns (bands, pairs, delays * levels).
+    Returns: weights, (bands, pairs of features, delays * levels).
     """
     w = 2.0 * np.pi * _LOWEST_CENTRE * 2.0 ** (np.arange(_BANDS) / 3.0)[:, None, None]
     t, g = _DELAYS[:, None], _LEVELS / 20.0

@@ -66,7 +66,7 @@ def demo_page(
     Args:
         evaluation: study of the demo's conditions, with the detail ``gain_curves``.
         ear_name: name of the ear, for the title.
-        perceived: what the ear perceives of each item, by condition.
+        perceived: perceived signals of each item, by condition.
     """
     headline = evaluation.headline
     assert headline is not None

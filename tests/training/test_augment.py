@@ -1,4 +1,4 @@
-"""What training speech goes through: levels, ratios and gains as asked for."""
+"""Augmented training speech has the requested levels, ratios and gains."""
 
 import pytest
 import torch

@@ -1,4 +1,4 @@
-"""What noise reduction is trained to be."""
+"""Training criteria of noise reduction have their defining properties."""
 
 import torch
 
