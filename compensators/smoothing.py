@@ -68,13 +68,23 @@ def follow_peaks(
     for block in (values - slow).split(BLOCK_FRAMES, 1):
         powers = constant_like(values, _powers, block.shape[1], release)
         highest = block / powers
-        if block.shape[1] > 1:  # ONNX has no cummax, and a stream saves its call
-            highest = torch.cummax(highest, 1).values
+        if block.shape[1] > 1:  # a stream saves the call
+            highest = _running_maximum(highest)
         blocks.append(powers * torch.maximum(highest, excess.unsqueeze(1)))
         excess = blocks[-1][:, -1]
     peaks = slow + (blocks[0] if len(blocks) == 1 else torch.cat(blocks, 1))
     levels = average(peaks, smooth_state, attack)
     return levels, torch.stack((slow[:, -1], excess, levels[:, -1]), 1)
+
+
+def _running_maximum(values: Tensor) -> Tensor:
+    """Return the largest value up to each frame. Shape: (items, frames, n) -> the same."""
+    if not torch.compiler.is_exporting():
+        return torch.cummax(values, 1).values
+    highest = [values[:, 0]]  # ONNX has no cummax.
+    for value in values.unbind(1)[1:]:
+        highest.append(torch.maximum(highest[-1], value))
+    return torch.stack(highest, 1)
 
 
 def _powers(frames: int, past: float) -> NDArray[np.float64]:

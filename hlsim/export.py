@@ -2,13 +2,13 @@
 
 The program of a simulator processes a fixed number of items with a fixed length.
 
-The program of a wearable aid processes one hop, ``HOP`` = 64 samples (4 ms at 16 kHz), of each
-item, such as the left and the right ear. Its state is an input and an output. All tensors are
-float32.
+The program of a wearable aid processes one hop, ``HOP`` = 64 samples (4 ms at 16 kHz), or a fixed
+number of hops of each item, such as the left and the right ear. Its state is an input and an
+output. All tensors are float32.
 
 Inputs by name:
 
-- ``samples`` (items, 64): the input, where RMS 1.0 is ``aid.full_scale_spl`` dB SPL
+- ``samples`` (items, hops * 64): the input, where RMS 1.0 is ``aid.full_scale_spl`` dB SPL
 - ``fitted`` (items, n): the aid's parameters for the ear
 - ``sliders`` (items, sliders): values from 0 to 1 in the order of ``aid.SLIDERS``, if the aid has
     any
@@ -16,7 +16,7 @@ Inputs by name:
 
 Outputs by name:
 
-- ``output`` (items, 64): the aid's output, delayed by ``aid.latency`` = 64 samples
+- ``output`` (items, hops * 64): the aid's output, delayed by ``aid.latency`` = 64 samples
 - each state with the prefix ``next_``: for example ``next_past``, the input ``past`` of the next
     call
 
@@ -32,6 +32,9 @@ onnxruntime run the file (``np.savez`` stores the inputs):
         outputs = dict(zip(names, session.run(None, inputs)))
         play(outputs.pop("output"))
         inputs |= outputs
+
+Without torch, the file of ``export_fit`` computes ``fitted`` for an ear. The state after silence is
+zeros, except ``gliding``, which equals ``sliders``.
 """
 
 from __future__ import annotations
@@ -80,8 +83,19 @@ class _SimulatorCall(nn.Module):
         return self.simulator._process(waveform * self.gain, thresholds) / self.gain
 
 
+class _FitCall(nn.Module):
+    """``Wearable.fit`` as a call."""
+
+    def __init__(self, aid: Wearable) -> None:
+        super().__init__()
+        self.aid = aid
+
+    def forward(self, thresholds: Tensor) -> Tensor:
+        return self.aid.fit(thresholds)
+
+
 class _HopCall(nn.Module):
-    """``Wearable.step`` of one hop, with named inputs and outputs."""
+    """``Wearable.step`` of whole hops, with named inputs and outputs."""
 
     def __init__(self, aid: Wearable) -> None:
         super().__init__()
@@ -164,7 +178,7 @@ def export_onnx(
 
 
 def first_inputs(
-    aid: Wearable, audiogram: AudiogramLike, *, items: int = 1, **sliders: Slider
+    aid: Wearable, audiogram: AudiogramLike, *, items: int = 1, hops: int = 1, **sliders: Slider
 ) -> dict[str, Tensor]:
     """Return the inputs of an aid's program for the first hop: fitted to the ear, with silence.
 
@@ -172,6 +186,7 @@ def first_inputs(
         aid: Aid at 16 kHz.
         audiogram: One ear for all items, or one per item.
         items: Number of signals that the program processes.
+        hops: Number of hops that one call of the program processes.
         sliders: Values from 0 to 1 by name, one for all items or one per item; 1 by default.
 
     Raises:
@@ -189,7 +204,7 @@ def first_inputs(
     weight = next(aid.parameters(), torch.empty(0))
     values = [sliders.get(name, 1.0) for name in aid.SLIDERS]
     with torch.no_grad():
-        samples = weight.new_zeros(items, HOP)
+        samples = weight.new_zeros(items, hops * HOP)
         _, fitted, settings = aid.prepare(samples, audiogram, values)
         inputs = {
             "samples": samples,
@@ -201,24 +216,25 @@ def first_inputs(
     return {name: tensor.clone() for name, tensor in inputs.items() if tensor.numel()}
 
 
-def hop_program(aid: Wearable, *, items: int = 1) -> torch.export.ExportedProgram:
-    """Export one hop of an aid as a program; ``program.module()(**inputs)`` returns the outputs.
+def hop_program(aid: Wearable, *, items: int = 1, hops: int = 1) -> torch.export.ExportedProgram:
+    """Export hops of an aid as a program; ``program.module()(**inputs)`` returns the outputs.
 
     Args:
         aid: Aid at 16 kHz.
         items: Number of signals that the program processes.
+        hops: Number of hops that one call processes.
 
     Raises:
         ValueError: The aid's sample rate is not 16000 Hz.
     """
-    inputs = first_inputs(aid, torch.zeros(len(FREQUENCIES)), items=items)
+    inputs = first_inputs(aid, torch.zeros(len(FREQUENCIES)), items=items, hops=hops)
     with torch.no_grad(), warnings.catch_warnings():
         # torch.export warns of the list of weights in nn.LSTM, which does no harm.
         warnings.filterwarnings("ignore", r"The tensor attributes .*_flat_weights")
         return torch.export.export(_HopCall(aid), (), inputs)
 
 
-def export_aid(aid: Wearable, path: str | Path, *, items: int = 1) -> None:
+def export_aid(aid: Wearable, path: str | Path, *, items: int = 1, hops: int = 1) -> None:
     """Write the program of ``hop_program`` as an ONNX file.
 
     Args:
@@ -232,15 +248,16 @@ def export_aid(aid: Wearable, path: str | Path, *, items: int = 1) -> None:
         MissingExtraError: onnx, onnxscript or onnxruntime is not installed.
     """
     _require_onnx()
-    program = hop_program(aid, items=items)
+    program = hop_program(aid, items=items, hops=hops)
     call = _HopCall(aid)
-    inputs = first_inputs(aid, torch.linspace(20.0, 90.0, len(FREQUENCIES)), items=items)
+    ear = torch.linspace(20.0, 90.0, len(FREQUENCIES))
+    inputs = first_inputs(aid, ear, items=items, hops=hops)
     if "sliders" in inputs:
         # Sliders that move, so that their state is checked as well.
         inputs["sliders"] = 0.2 * inputs["sliders"]
     rms = NOISE_RMS / gain_to_pascals(aid.full_scale_spl)
     generator = torch.Generator().manual_seed(0)
-    noise = rms * torch.randn(CHECKED_HOPS, items, HOP, generator=generator)
+    noise = rms * torch.randn(CHECKED_HOPS, items, hops * HOP, generator=generator)
     state_names = [name for name in inputs if name not in STATELESS_INPUTS]
     with torch.no_grad():
         for samples in noise.to(inputs["samples"]):
@@ -249,6 +266,29 @@ def export_aid(aid: Wearable, path: str | Path, *, items: int = 1) -> None:
             last_inputs = inputs
             inputs = inputs | {name: expected[f"next_{name}"] for name in state_names}
     _write_onnx(program, path, last_inputs, expected)
+
+
+def export_fit(aid: Wearable, path: str | Path, *, items: int = 1) -> None:
+    """Write the computation of an aid's parameters for an ear as an ONNX file.
+
+    Its input is ``thresholds`` (items, 8) in dB HL, its output ``fitted`` (items, n).
+
+    Args:
+        aid: Aid at any sample rate.
+        path: File to write.
+        items: Number of ears.
+
+    Raises:
+        ValueError: The output of onnxruntime differs by more than ``TOLERANCE``.
+        MissingExtraError: onnx, onnxscript or onnxruntime is not installed.
+    """
+    _require_onnx()
+    ears = torch.linspace(20.0, 90.0, len(FREQUENCIES)).repeat(items, 1)
+    call = _FitCall(aid)
+    with torch.no_grad():
+        program = torch.export.export(call, (ears,))
+        fitted = call(ears)
+    _write_onnx(program, path, {"thresholds": ears}, {"fitted": fitted})
 
 
 def _require_onnx() -> None:

@@ -10,7 +10,14 @@ from torch import Tensor
 
 from compensators import WDRC, HearingAid
 from hlsim import MSBG, Audiogram, NeuroMSBG, load_pretrained
-from hlsim.export import export_aid, export_onnx, export_program, first_inputs, hop_program
+from hlsim.export import (
+    export_aid,
+    export_fit,
+    export_onnx,
+    export_program,
+    first_inputs,
+    hop_program,
+)
 from hlsim.neuro import NeuroConfig
 from tests.compensators.test_wearable import AIDS, EAR, Make, trained
 
@@ -74,6 +81,20 @@ def test_a_program_of_hops_gives_the_outputs_of_the_stream(make: Make) -> None:
     assert_near(torch.cat(outputs, -1), torch.cat(expected, -1), 1e-5)
 
 
+@AIDS
+def test_a_program_of_several_hops_gives_the_outputs_of_the_stream(make: Make) -> None:
+    aid: Any = make()
+    inputs = first_inputs(aid, EAR, hops=5)
+    program = hop_program(aid, hops=5).module()
+    signal = 0.02 * torch.randn(1, 20 * 320)
+    outputs = []
+    for samples in signal.split(320, -1):
+        results = program(**inputs | {"samples": samples})
+        outputs.append(results.pop("output"))
+        inputs |= {name.removeprefix("next_"): state for name, state in results.items()}
+    assert_near(torch.cat(outputs, -1), aid.stream(EAR)(signal), 1e-5)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(("items", "seconds"), [(2, 0.5), (1, 1.0)])
 def test_onnx_gives_the_simulators_outputs(tmp_path: Path, items: int, seconds: float) -> None:
@@ -109,6 +130,33 @@ def test_onnx_gives_the_outputs_of_the_stream(make: Make, tmp_path: Path) -> Non
         inputs |= results
         expected.append(stream(samples))
     assert_near(torch.cat(outputs, -1), torch.cat(expected, -1), 1e-4)
+
+
+@pytest.mark.slow
+@AIDS
+def test_onnx_without_torch_gives_the_outputs_of_the_stream(make: Make, tmp_path: Path) -> None:
+    """For two hops per call, fitted and started as on a machine without torch."""
+    pytest.importorskip("onnxscript")
+    aid: Any = make()
+    export_fit(aid, tmp_path / "fit.onnx")
+    export_aid(aid, tmp_path / "aid.onnx", hops=2)
+    thresholds = torch.tensor([EAR.thresholds]).numpy()
+    fitted = onnx_session(tmp_path / "fit.onnx").run(None, {"thresholds": thresholds})[0]
+    session = onnx_session(tmp_path / "aid.onnx")
+    shapes = {entry.name: entry.shape for entry in session.get_inputs()}
+    inputs = {name: torch.zeros(shape).numpy() for name, shape in shapes.items()}
+    inputs["fitted"] = fitted
+    for name in {"sliders", "gliding"} & set(inputs):
+        inputs[name] = torch.ones(shapes[name]).numpy()
+    names = [entry.name.removeprefix("next_") for entry in session.get_outputs()]
+    signal = 0.02 * torch.randn(1, 6400)
+    outputs = []
+    for samples in signal.split(128, -1):
+        inputs["samples"] = samples.numpy()
+        results = dict(zip(names, session.run(None, inputs), strict=True))
+        outputs.append(torch.from_numpy(results.pop("output")))
+        inputs |= results
+    assert_near(torch.cat(outputs, -1), aid.stream(EAR)(signal), 1e-4)
 
 
 @pytest.mark.slow
