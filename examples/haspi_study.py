@@ -1,54 +1,87 @@
-"""A study of real files: python examples/haspi_study.py CLEAN_DIR NOISY_DIR AUDIOGRAMS.csv OUT [ITEMS]
+"""Score real recordings with HASPI: unaided, with NAL-R, and at the level of NAL-R.
 
-Clean and noisy recordings of equal names, such as those of VoiceBank-DEMAND, and a CSV file of measured ears with columns
-listener, ear, hl_250, ... hl_8000. Each of ITEMS utterances (12) goes to a left ear, four listeners in turn, with clean
-speech at 65 dB SPL, under three conditions: unaided, NAL-R, and the unaided signal raised to NAL-R's level (gain), which
-tells what amplification alone would do. Writes the files and a manifest into OUT, and the report into OUT/report.
+    python examples/haspi_study.py CLEAN_DIR NOISY_DIR AUDIOGRAMS.csv OUT [ITEMS]
+
+CLEAN_DIR and NOISY_DIR contain recordings with equal names, such as those of VoiceBank-DEMAND.
+AUDIOGRAMS.csv contains measured ears, with the columns listener, ear, hl_250, ... hl_8000. Each of
+ITEMS utterances (12 by default) goes to the left ear of one of four listeners, with clean speech at
+65 dB SPL, under three conditions: unaided, NAL-R, and the unaided signal at the output level of
+NAL-R (gain), which shows the effect of amplification alone. The audio files and a manifest are
+written into OUT, and the report into OUT/report.
 """
 
 import csv
 import sys
 from pathlib import Path
 
+from torch import Tensor
+
 from compensators import NALR
+from hlsim import Audiogram
 from hlsim.audio import find_audio, read_audio, write_audio
 from hlsim.audiogram.table import read_audiograms
 from hlsim.calibration import level_spl, set_level
 from hlsim.evaluation import haspi_report
 from hlsim.report.recordings import write_report
 
-SPL, SECONDS, LISTENERS = 65.0, 3.0, 4
+SPL = 65.0
+SECONDS = 3.0
+LISTENERS = 4
+
+
+def read_pair(clean_path: Path, noisy_path: Path) -> tuple[Tensor, Tensor, int]:
+    """Read clean and noisy speech, with the clean speech at 65 dB SPL.
+
+    Both get the same gain, so that the signal-to-noise ratio does not change.
+
+    Returns:
+        Clean speech and noisy speech with shape (time,), and their sample rate in Hz.
+    """
+    clean, rate = read_audio(clean_path)
+    noisy, _ = read_audio(noisy_path)
+    samples = int(SECONDS * rate)
+    clean = clean[0, :samples]
+    gain = 10.0 ** ((SPL - level_spl(clean)) / 20.0)
+    return clean * gain, noisy[0, :samples] * gain, rate
+
+
+def make_conditions(noisy: Tensor, ear: Audiogram, sample_rate: int) -> dict[str, Tensor]:
+    """Make the signals of the three conditions by name. Shape: (time,) each."""
+    prescribed = NALR(sample_rate=sample_rate)(noisy, ear)
+    amplified = set_level(noisy, level_spl(prescribed))
+    return {"unaided": noisy, "gain": amplified, "NAL-R": prescribed}
 
 
 def main() -> None:
     clean_dir, noisy_dir, audiograms, out = map(Path, sys.argv[1:5])
     count = int(sys.argv[5]) if len(sys.argv) > 5 else 12
-    noisy = {path.stem: path for path in find_audio(noisy_dir)}
-    pairs = [(path, noisy[path.stem]) for path in find_audio(clean_dir)]
-    ears = [(row, ear) for row, ear in read_audiograms(audiograms) if row["ear"] in ("l", "left")][
-        :LISTENERS
+    noisy_paths = {path.stem: path for path in find_audio(noisy_dir)}
+    clean_paths = find_audio(clean_dir)
+    left_ears = [
+        (row, ear) for row, ear in read_audiograms(audiograms) if row["ear"] in ("l", "left")
     ]
+    left_ears = left_ears[:LISTENERS]
     rows = []
     for number in range(count):
-        row, ear = ears[number % len(ears)]
-        clean_path, noisy_path = pairs[number % len(pairs)]
-        (clean, rate), (mixed, _) = read_audio(clean_path), read_audio(noisy_path)
-        end = int(SECONDS * rate)
-        clean, mixed = clean[0, :end], mixed[0, :end]
-        # one gain for both: the noise stays where it was
-        gain_db = SPL - level_spl(clean)
-        unaided = mixed * 10 ** (gain_db / 20)
-        aided = NALR(sample_rate=rate)(unaided, ear)
-        signals = {"unaided": unaided, "gain": set_level(unaided, level_spl(aided)), "NAL-R": aided}
+        row, ear = left_ears[number % len(left_ears)]
+        clean_path = clean_paths[number % len(clean_paths)]
+        clean, noisy, rate = read_pair(clean_path, noisy_paths[clean_path.stem])
+        snr = float(level_spl(clean) - level_spl(noisy - clean))
         name = f"{row['listener']}-{clean_path.stem}.wav"
-        snr = level_spl(clean) - level_spl(mixed - clean)
-        for condition, signal in {"clean": clean * 10 ** (gain_db / 20), **signals}.items():
+        for condition, signal in {"clean": clean, **make_conditions(noisy, ear, rate)}.items():
             (out / condition).mkdir(parents=True, exist_ok=True)
             write_audio(out / condition / name, signal, rate)
             if condition != "clean":
-                row_of = {"listener": row["listener"], "ear": "left", "condition": condition}
-                files = {"clean": f"clean/{name}", "processed": f"{condition}/{name}"}
-                rows.append({**row_of, **files, "snr": f"{5 * round(float(snr) / 5)}"})
+                rows.append(
+                    {
+                        "listener": row["listener"],
+                        "ear": "left",
+                        "condition": condition,
+                        "clean": f"clean/{name}",
+                        "processed": f"{condition}/{name}",
+                        "snr": f"{5 * round(snr / 5)}",
+                    }
+                )
     with open(out / "study.csv", "w", newline="", encoding="utf-8") as file:
         table = csv.DictWriter(file, list(rows[0]))
         table.writeheader()

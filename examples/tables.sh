@@ -1,13 +1,17 @@
 #!/usr/bin/env bash
-# The paper's Tables I, III and IV, and the comparison of normalisations: trains every row on one thread, and compares
-# them. Killed, it goes on with the same command. Results are in docs/paper-tables.md, but for the paper's rows at full
-# width, which want a GPU.
+# The paper's Tables I, III and IV, and a comparison of normalisations.
 #
-#   [STEPS=10000] [JOBS=2] [ROWS="paper/cnn neuro-msbg-lstm:model.phase=input:seed=1"] examples/tables.sh CORPORA OUT [ITEMS]
+#   [STEPS=10000] [JOBS=2] [ROWS="paper/cnn neuro-msbg-lstm:model.phase=input:seed=1"] \
+#       examples/tables.sh CORPORA OUT [ITEMS]
 #
-# CORPORA holds speech/{train,valid}, noise/{train,valid} and audiograms/{train,valid}.csv.
-# STEPS: steps of each row, instead of those of its recipe. JOBS: rows trained at a time. ROWS: these alone, compared as
-# Table I; what follows a colon changes a setting of the recipe.
+# Trains each row on one thread, and compares the rows. If it is stopped, the same command continues. Results are in
+# docs/paper-tables.md, except for the paper's rows at full width, which require a GPU.
+#
+# CORPORA contains speech/{train,valid}, noise/{train,valid} and audiograms/{train,valid}.csv.
+# STEPS: number of steps per row, instead of that of its recipe
+# JOBS: number of rows that are trained at the same time
+# ROWS: rows to train instead of all, which are compared as in Table I; each is a recipe, with changed settings after
+#     colons
 set -euo pipefail
 corpora=$1 out=$2 items=${3:-80}
 here=$(dirname "${BASH_SOURCE[0]}")

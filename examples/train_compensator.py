@@ -1,7 +1,10 @@
-"""Your own network, trained for one ear: python examples/train_compensator.py SPEECH_DIR OUT.pt [EAR] [STEPS]
+"""Train a network of your own for one ear.
 
-Any module that takes a waveform will do. This one corrects NAL-R by eight gains a frame, smooth over frequency. Start
-from a prescription, as it does: a band that the ear does not hear has almost no gradient.
+    python examples/train_compensator.py SPEECH_DIR OUT.pt [EAR] [STEPS]
+
+Any module that maps a waveform to a waveform can be trained. This one multiplies the output of
+NAL-R by eight gains per frame, which are interpolated over frequency. Start from a prescription, as
+it does: the loss has almost no gradient in a band that the ear does not perceive.
 """
 
 import sys
@@ -15,50 +18,55 @@ from hlsim.calibration import set_level
 from hlsim.dsp.stft import STFT
 from hlsim.training.clips import Clips
 
-RATE = 16000
+SAMPLE_RATE = 16000
+POWER_FLOOR = 1e-11
+"""Power that is added before the logarithm, so that silence has finite features."""
 
 
 class MyNetwork(nn.Module):
+    """NAL-R, followed by eight gains per frame. Before training, the gains are 1."""
+
     def __init__(self) -> None:
         super().__init__()
-        self.prescription, self.stft = NALR(sample_rate=RATE), STFT(400, 400, 100)
-        frequencies, gains = self.stft.frequencies, nn.Conv1d(32, 8, 1)
-        self.layers = nn.Sequential(nn.Conv1d(frequencies, 32, 5, padding=2), nn.PReLU(), gains)
-        nn.init.zeros_(gains.weight)  # the prescription is where it starts
-        nn.init.zeros_(gains.bias)
+        self.prescription = NALR(sample_rate=SAMPLE_RATE)
+        self.stft = STFT(400, 400, 100)
+        last_layer = nn.Conv1d(32, 8, 1)
+        self.layers = nn.Sequential(
+            nn.Conv1d(self.stft.frequencies, 32, 5, padding=2), nn.PReLU(), last_layer
+        )
+        nn.init.zeros_(last_layer.weight)
+        nn.init.zeros_(last_layer.bias)
 
     def forward(self, waveform: Tensor, ear: Audiogram) -> Tensor:
-        batch = waveform.reshape(-1, waveform.shape[-1])  # (items, time)
-        spectrum = self.stft.analyse(self.prescription(batch, ear))  # (items, frames, frequencies)
-        gains = self.layers(
-            (spectrum.abs().square() + 1e-11).log().mT / 4.0
-        ).mT  # (items, frames, 8)
-        gains = nn.functional.interpolate(
-            gains, self.stft.frequencies, mode="linear", align_corners=True
+        """Compensate the loss of an ear. Shape: (..., time) in pascals -> the same."""
+        samples = waveform.shape[-1]
+        prescribed = self.prescription(waveform.reshape(-1, samples), ear)
+        spectrum = self.stft.analyse(prescribed)  # (items, frames, frequencies)
+        features = (spectrum.abs().square() + POWER_FLOOR).log() / 4.0
+        log_gains = self.layers(features.mT).mT  # (items, frames, 8)
+        log_gains = nn.functional.interpolate(
+            log_gains, self.stft.frequencies, mode="linear", align_corners=True
         )
-        return self.stft.synthesise(spectrum * gains.exp(), waveform.shape[-1]).reshape(
-            waveform.shape
-        )
+        output = self.stft.synthesise(spectrum * log_gains.exp(), samples)
+        return output.reshape(waveform.shape)
 
 
 def main(folder: str, out: str, ear_name: str = "N3", steps: str = "200") -> None:
     torch.manual_seed(0)
-    ear, network = Audiogram.standard(ear_name), MyNetwork()
-    loss = HearingLossLoss(ear, sample_rate=RATE)  # frozen; simulator="msbg" is the exact one
+    ear = Audiogram.standard(ear_name)
+    network = MyNetwork()
+    loss = HearingLossLoss(ear, sample_rate=SAMPLE_RATE)
     optimiser = torch.optim.AdamW(network.parameters(), lr=1e-3)
-    clips, generator = (
-        Clips(folder, sample_rate=RATE, seconds=1.0),
-        torch.Generator().manual_seed(0),
-    )
+    clips = Clips(folder, sample_rate=SAMPLE_RATE, seconds=1.0)
+    generator = torch.Generator().manual_seed(0)
     for step in range(int(steps)):
-        # in pascals: RMS 1.0 is 94 dB SPL, and levels matter
-        speech = set_level(
-            clips.draw(4, generator), 50.0 + 30.0 * torch.rand(4, generator=generator)
-        )
+        speech = clips.draw(4, generator)
+        levels = 50.0 + 30.0 * torch.rand(4, generator=generator)  # dB SPL
+        speech = set_level(speech, levels)
         value = loss(network(speech, ear), speech)
         optimiser.zero_grad()
         value.backward()
-        nn.utils.clip_grad_norm_(network.parameters(), 1.0)  # few steps have larger ones
+        nn.utils.clip_grad_norm_(network.parameters(), 1.0)
         optimiser.step()
         if step % 20 == 0 or step + 1 == int(steps):
             print(f"step {step}: loss {float(value.detach()):.3f}", flush=True)

@@ -28,19 +28,19 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Take one thread, for transforms of several need not round alike from process to process."""
+    """Use one thread, because the rounding of transforms depends on the number of threads."""
     torch.set_num_threads(1)
     config.stash[NEW_OUTPUTS] = {}
 
 
 def pytest_sessionfinish(session: pytest.Session) -> None:
-    """Store pyclarity's outputs where that was asked for."""
+    """Store pyclarity's outputs if ``--write-pyclarity`` was set."""
     if session.config.stash[NEW_OUTPUTS]:
         write_outputs(session.config.stash[NEW_OUTPUTS])
 
 
 def pytest_report_header(config: pytest.Config) -> str | None:
-    """Say what a plain run leaves out."""
+    """Name the tests that run only with a marker."""
     if config.option.markexpr == "not slow and not install and not browser and not audio":
         return (
             "left out: slow tests, and tests of an installation, of a browser and of sound; "
@@ -51,7 +51,7 @@ def pytest_report_header(config: pytest.Config) -> str | None:
 
 @pytest.fixture(params=["stored", pytest.param("computed", marks=pytest.mark.slow)])
 def pyclarity(request: pytest.FixtureRequest) -> PyclarityOutputs:
-    """Outputs of pyclarity by key: those stored, and in a second, slow test those computed anew."""
+    """Outputs of pyclarity by key: the stored ones, and in a second, slow test, computed ones."""
     writes = request.config.option.write_pyclarity
     new_outputs = request.config.stash[NEW_OUTPUTS] if writes else None
     return PyclarityOutputs(request.param == "computed", new_outputs)
@@ -59,7 +59,7 @@ def pyclarity(request: pytest.FixtureRequest) -> PyclarityOutputs:
 
 @pytest.fixture(autouse=True)
 def seeded() -> None:
-    """Seed every generator before each test; numpy's global one too, for pyclarity's HASPI draws from it."""
+    """Seed every generator before each test; pyclarity's HASPI uses numpy's global one."""
     random.seed(0)
     np.random.seed(0)
     torch.manual_seed(0)
@@ -67,7 +67,7 @@ def seeded() -> None:
 
 @pytest.fixture
 def two_threads() -> Iterator[None]:
-    """For what takes another way with more than one."""
+    """Use two threads, for code that computes differently with more than one."""
     torch.set_num_threads(2)
     yield
     torch.set_num_threads(1)
@@ -75,13 +75,13 @@ def two_threads() -> Iterator[None]:
 
 @pytest.fixture(scope="session")
 def speech_dir() -> Path:
-    """The folder of embedded speech, with ``train`` and ``valid`` in it."""
+    """The folder of the bundled speech, with the subfolders ``train`` and ``valid``."""
     return SPEECH_DIR
 
 
 @pytest.fixture
 def speech(speech_dir: Path) -> list[tuple[Tensor, int]]:
-    """Four utterances of as many voices, two at 16 kHz and two at 22.05 kHz: waveform and rate in Hz.
+    """Four utterances by four voices, two at 16 kHz and two at 22.05 kHz, with their rates in Hz.
 
     The level is 68 dB SPL where RMS 1.0 is 94 dB SPL.
 

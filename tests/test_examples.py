@@ -1,4 +1,4 @@
-"""The examples run as they stand, on little."""
+"""The examples run, on small data."""
 
 import csv
 import importlib.util
@@ -40,7 +40,7 @@ def test_own_network_trains(
     fresh, trained = example.MyNetwork(), example.MyNetwork()
     trained.load_state_dict(torch.load(out))
     ear, noise = Audiogram.standard("N4"), 0.03 * torch.randn(2, 8000)
-    # it starts from the prescription, and two steps have moved it
+    # Before training it equals the prescription, and after two steps it differs.
     torch.testing.assert_close(
         fresh(noise, ear), fresh.prescription(noise, ear), atol=1e-4, rtol=1e-3
     )
@@ -89,14 +89,14 @@ def test_enhancers_take_noise_off_and_do_not_delay(
     enhancer = load_enhancer(f"{EXAMPLES}/enhancers.py:{name}")  # which rejects delays
     clean = set_level(speech[0][0][:, :48000], 65.0)
     noise = set_level(torch.randn_like(clean), 60.0)
-    apart = [
-        float(level_spl(made - clean)) for made in (clean + noise, enhancer(clean + noise, 16000))
-    ]
-    assert apart[1] < apart[0] - 4.0
+    noisy = clean + noise
+    error_before = float(level_spl(noisy - clean))
+    error_after = float(level_spl(enhancer(noisy, 16000) - clean))
+    assert error_after < error_before - 4.0
 
 
 @pytest.mark.slow
-def test_what_the_sliders_trade(
+def test_sliders_trade_noise_for_level(
     speech_dir: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -125,10 +125,11 @@ def test_similarity_of_neurograms() -> None:
     pytest.importorskip("brucezilany")
     example, generator = load("auditory_nerve.py"), np.random.default_rng(0)
     normal = generator.uniform(0.0, 200.0, (16, 30))
-    near, far = (normal + size * generator.standard_normal(normal.shape) for size in (5.0, 50.0))
+    similar = normal + 5.0 * generator.standard_normal(normal.shape)
+    dissimilar = normal + 50.0 * generator.standard_normal(normal.shape)
     assert example.nsim(normal, normal) == pytest.approx(1.0)
-    assert example.nsim(far, normal) < example.nsim(near, normal) < 1.0
-    # audiologists give outer hair cells up to some 60 dB, less where the cochlea amplifies less
+    assert example.nsim(dissimilar, normal) < example.nsim(similar, normal) < 1.0
+    # Outer hair cells amplify by up to about 60 dB, and less at low frequencies.
     assert example.outer_hair_cells_db(500.0)[-1] < example.outer_hair_cells_db(4000.0)[-1] < 65.0
 
 
@@ -137,16 +138,17 @@ def test_delay_by_frequency(
 ) -> None:
     pytest.importorskip("matplotlib")
     example = load("delay.py")
-    given = example.make_bursts()
-    assert example.measure_delays(given.roll(-7, -1), given) == [-7] * len(example.HERTZ)
-    # with no loss the model is linear: of 33 samples remains what the sum of the channels does not take back
+    bursts = example.make_bursts()
+    assert example.measure_delays(bursts.roll(-7, -1), bursts) == [-7] * len(example.HERTZ)
+    # Without a loss, MSBG is linear. Its alignment removes 33 samples, and the sum of the channels
+    # advances the bursts.
     points = 4 * MSBG_RATE
     response = gammatone_response(BANKS["none"], points).sum(0)
     advance = np.gradient(np.unwrap(np.angle(response)), 2 * np.pi / points)
-    spectra = np.abs(np.fft.rfft(given.numpy(), points) * response) ** 2
+    spectra = np.abs(np.fft.rfft(bursts.numpy(), points) * response) ** 2
     expected = 33 - spectra @ advance / spectra.sum(-1)
     left = example.measure_delays(
-        MSBG(Audiogram.standard("NH"), sample_rate=MSBG_RATE)(given), given
+        MSBG(Audiogram.standard("NH"), sample_rate=MSBG_RATE)(bursts), bursts
     )
     np.testing.assert_allclose(left, expected, atol=2)
     drawn: list[Path] = []
@@ -176,7 +178,7 @@ def test_parity(
     assert float((perceived - exact).norm() / exact.norm()) < 0.03
     generator = torch.Generator().manual_seed(1)
     for number, name in enumerate(("N4", "N5", "N6", "S3")):
-        ear, level = example.amplified(number, [], generator)
+        ear, level = example.draw_amplified_case(number, [], generator)
         off = torch.tensor(ear.thresholds) - torch.tensor(Audiogram.standard(name).thresholds)
         assert 0.0 < float(off.abs().max()) < 25.0 and 80.0 <= level <= 115.0
     ears = tmp_path / "ears.csv"
@@ -201,7 +203,7 @@ def test_other_sounds(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFix
         MSBG(ear, sample_rate=16000), lambda x, _: MSBG(ear, sample_rate=16000)(x), ear
     )
     assert itself[:2] == ["+0.0 to +0.0"] * 2 and itself[3] == itself[5] == "200, 200, 200"
-    # one that gives 3 dB too much
+    # This simulator is 3 dB too loud.
     louder = example.make_row(
         MSBG(ear, sample_rate=16000), lambda x, _: 2**0.5 * MSBG(ear, sample_rate=16000)(x), ear
     )
@@ -218,7 +220,7 @@ def test_other_sounds(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFix
 
 
 def test_the_default_criterion_is_valid(speech: list[tuple[torch.Tensor, int]]) -> None:
-    """Some of the degradations, of one synthetic voice, as the example judges them."""
+    """The example ranks some degradations of one synthetic voice as HASPI and HASQI do."""
     example = load("validity.py")
     ear, generator = Audiogram.standard("N3"), torch.Generator().manual_seed(0)
     clean = set_level(speech[0][0][0, 8000:28000], 65.0)
@@ -230,20 +232,21 @@ def test_the_default_criterion_is_valid(speech: list[tuple[torch.Tensor, int]]) 
         for name in (*example.NOISY, "low-pass 1000 Hz", "reverberation of 1 s", "sign")
     }
     gain_db = example.fit_equaliser(clean, ear)
-    exact, given = MSBG(sample_rate=16000), example.apply_gains(clean, 10.0 ** (gain_db / 20.0))
+    exact = MSBG(sample_rate=16000)
+    amplified = example.apply_gains(clean, 10.0 ** (gain_db / 20.0))
     normal = level_spl(exact(clean, Audiogram.standard("NH")))
-    assert float(level_spl(exact(given, ear))) == pytest.approx(float(normal), abs=1.0)
+    assert float(level_spl(exact(amplified, ear))) == pytest.approx(float(normal), abs=1.0)
     loss = HearingLossLoss(simulator="msbg", reduction="none")
     for share in example.GAINS.values():
-        found = example.compute_scores(few, share * gain_db, ear, {"default": loss})
-        haspi, hasqi, ordered, nearest = example.compare(found, "default")
+        scores = example.compute_scores(few, share * gain_db, ear, {"default": loss})
+        haspi, hasqi, ordered, nearest = example.compare(scores, "default")
         assert ordered and nearest
         assert haspi > 0.5 and hasqi > 0.5
-    worst = {name: -value for name, value in found["default"].items()}
-    assert not example.compare({**found, "upside down": worst}, "upside down")[2]
+    worst = {name: -value for name, value in scores["default"].items()}
+    assert not example.compare({**scores, "upside down": worst}, "upside down")[2]
 
 
-def test_pictures_of_what_is_heard_are_small(tmp_path: Path) -> None:
+def test_pictures_of_perceived_speech_are_small(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     load("heard.py").main(tmp_path)
     sizes = {path.name: path.stat().st_size for path in tmp_path.iterdir()}
@@ -260,7 +263,9 @@ def test_benchmark_prints_a_table_of_each_kind(
     lines = capsys.readouterr().out.splitlines()
     assert [line.split()[1] for line in lines if "forward (ms)" in line] == [*example.TABLES]
     rows = [line for line in lines if line.startswith("| pyclarity")]
-    assert len(rows) == 5 and sum("1.0 (1.0 to 1.0)" in row for row in rows) == 4
+    # Each of the four tables divides by its first row of pyclarity. The fifth row may happen to be
+    # as fast.
+    assert len(rows) == 5 and sum("1.0 (1.0 to 1.0)" in row for row in rows) >= 4
 
 
 def test_alignment_by_structure_and_by_an_impulse_agree(speech_dir: Path, tmp_path: Path) -> None:

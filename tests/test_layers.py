@@ -50,7 +50,7 @@ def room_of(module: str) -> str:
 
 
 def imported_modules(path: Path) -> Iterator[str]:
-    """Modules of the project that a file imports anywhere, in functions and for type checkers, too."""
+    """Return the modules of the project that a file imports, in functions and for types, too."""
     for node in ast.walk(ast.parse(path.read_text())):
         names = []
         if isinstance(node, ast.Import):

@@ -70,14 +70,12 @@ def test_criteria_of_other_packages_on_what_is_heard(
     values = losses(capsys.readouterr().out)
     assert values[-1] < values[0]
     # it has a gradient of its own, and the reference itself costs least
-    measure, reference = (
-        example.from_elsewhere(package),
-        example.set_level(torch.randn(2, 16000), 65.0),
-    )
-    heard = (reference + 0.02 * torch.randn(2, 16000)).requires_grad_()
-    worse = measure(heard, reference)
-    worse.backward()
-    assert float(measure(reference, reference)) < worse.item() and bool(heard.grad.any())
+    criterion = example.import_criterion(package)
+    reference = example.set_level(torch.randn(2, 16000), 65.0)
+    noisy = (reference + 0.02 * torch.randn(2, 16000)).requires_grad_()
+    value = criterion(noisy, reference)
+    value.backward()
+    assert float(criterion(reference, reference)) < value.item() and bool(noisy.grad.any())
 
 
 def test_a_loop_of_accelerate(capsys: pytest.CaptureFixture[str]) -> None:
@@ -123,7 +121,7 @@ def test_an_aid_learns_through_a_network_that_learned_another_simulator(
     )
     ears = tmp_path / "ears.csv"
     ears.write_text("hl_250,hl_1000,hl_4000\n20,30,75\n")
-    given = (
+    options = (
         *teacher,
         "--speech",
         str(valid),
@@ -135,7 +133,9 @@ def test_an_aid_learns_through_a_network_that_learned_another_simulator(
         "0.5",
     )
     assert (
-        main(["evaluate-simulator", str(out / "checkpoint"), *given, "--out", str(tmp_path / "of")])
+        main(
+            ["evaluate-simulator", str(out / "checkpoint"), *options, "--out", str(tmp_path / "of")]
+        )
         == 0
     )
     assert "examples.training.dead_region:DeadRegion" in capsys.readouterr().out
@@ -143,7 +143,7 @@ def test_an_aid_learns_through_a_network_that_learned_another_simulator(
     for simulator in (str(out / "checkpoint"), ""):
         example.main(str(train), str(valid), simulator, "S2", "2")
         text = capsys.readouterr().out
-        assert text.count(" dB ") == 9 and text.startswith("heard without the aid: -")
+        assert text.count(" dB ") == 9 and text.startswith("perceived without the aid: -")
 
 
 def test_a_dead_region_is_silent_and_the_rest_is_attenuated() -> None:
@@ -152,14 +152,13 @@ def test_a_dead_region_is_silent_and_the_rest_is_attenuated() -> None:
     tones = torch.stack(
         [torch.sin(2 * torch.pi * hz * time) for hz in (500.0, 1000.0, 2000.0, 3500.0)]
     )
-    heard = load("dead_region.py").DeadRegion()(tones, ear)[:, 1000:-1000]
-    levels = 20.0 * (heard.std(-1) / tones[:, 1000:-1000].std(-1)).log10()
+    perceived = load("dead_region.py").DeadRegion()(tones, ear)[:, 1000:-1000]
+    levels = 20.0 * (perceived.std(-1) / tones[:, 1000:-1000].std(-1)).log10()
     torch.testing.assert_close(levels[:3], torch.tensor([-20.0, -25.0, -55.0]), atol=0.5, rtol=0.0)
     assert float(levels[3]) < -75.0
-    # in phase: nothing is delayed
-    assert (
-        float(torch.nn.functional.cosine_similarity(heard[0], tones[0, 1000:-1000], dim=0)) > 0.9999
-    )
+    # The output is in phase with the input, so it is not delayed.
+    similarity = torch.nn.functional.cosine_similarity(perceived[0], tones[0, 1000:-1000], dim=0)
+    assert float(similarity) > 0.9999
 
 
 def test_lightning_in_bf16(capsys: pytest.CaptureFixture[str]) -> None:
@@ -172,7 +171,7 @@ def test_lightning_in_bf16(capsys: pytest.CaptureFixture[str]) -> None:
 def test_a_filter_bank_trains(speech_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
     example = load("filter_bank.py")
     ear = example.Audiogram.standard("N3")
-    aid = example.trained(str(speech_dir / "train"), example.HearingLossLoss(ear), 8)
+    aid = example.train_filter_bank(str(speech_dir / "train"), example.HearingLossLoss(ear), 8)
     start, *_, end = losses(capsys.readouterr().err)
     assert end < start
     assert float(aid.gain.mean()) > 0.1  # of 10 dB
@@ -182,11 +181,11 @@ def test_a_filter_bank_trains(speech_dir: Path, capsys: pytest.CaptureFixture[st
     speech = example.Clips(str(speech_dir / "valid"), sample_rate=16000, seconds=1.0).draw(
         1, torch.Generator().manual_seed(0)
     )
-    nothing, louder = (
-        example.judged(lambda wave, g=gain: g * wave, ear, speech) for gain in (1.0, 10.0)
+    unaided, louder = (
+        example.describe_aid(lambda wave, g=gain: g * wave, ear, speech) for gain in (1.0, 10.0)
     )
-    assert "gives 65.0 dB SPL" in nothing and "gives 85.0 dB SPL" in louder
-    assert nothing < louder  # HASPI comes first
+    assert "output level 65.0 dB SPL" in unaided and "output level 85.0 dB SPL" in louder
+    assert unaided < louder  # Both texts begin with HASPI.
 
 
 def test_haspi_trains_with_the_level_and_without(
@@ -196,9 +195,13 @@ def test_haspi_trains_with_the_level_and_without(
     example = load("haspi_objective.py")
     ear = example.Audiogram.standard("N3")
     for name in ("HASPILoss", "HASPI alone"):
-        aid = example.trained(str(speech_dir / "train"), example.LOSSES[name](ear), 3, clips=2)
+        aid = example.train_filter_bank(
+            str(speech_dir / "train"), example.LOSSES[name](ear), 3, clips=2
+        )
         assert len(capsys.readouterr().err.splitlines()) == 2  # the first step and the last
         assert float(aid.gain.detach().mean()) > 0.05  # of 10 dB: speech is heard too softly
     speech = example.Clips(speech_dir / "valid", sample_rate=16000, seconds=1.0)
-    told = example.told(aid, ear, speech.draw(1, torch.Generator().manual_seed(0)), math.inf)
-    assert told.startswith("HASPI 0.") and 80.0 < float(told.split()[-3]) < 110.0
+    text = example.describe_aid_in_noise(
+        aid, ear, speech.draw(1, torch.Generator().manual_seed(0)), math.inf
+    )
+    assert text.startswith("HASPI 0.") and 80.0 < float(text.split()[-3]) < 110.0

@@ -1,4 +1,4 @@
-"""The built wheel: what it holds, and that it works where there is no checkout. Run with ``pytest -m install``."""
+"""The wheel contains what it should, and works without a checkout (``pytest -m install``)."""
 
 import os
 import shutil
@@ -19,7 +19,7 @@ CHECKPOINT_FILES = ("model.safetensors", "config.json", "README.md")
 
 
 def run(*command: str | Path, cwd: Path) -> None:
-    """Run a command that sees nothing of this interpreter's environment; fail with what it printed."""
+    """Run a command without this environment's variables, and show its output if it fails."""
     hidden = ("PYTHONPATH", "PYTHONHOME", "VIRTUAL_ENV")
     environment = {name: value for name, value in os.environ.items() if name not in hidden}
     done = subprocess.run(
@@ -39,7 +39,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def environment(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """A fresh environment with the wheel and its dependencies and no extra; several GB, so it is not kept."""
+    """A new environment with the wheel and no extra, which is deleted, because it is large."""
     folder = tmp_path_factory.mktemp("environment")
     try:
         run(sys.executable, "-m", "venv", folder, cwd=folder)
@@ -62,11 +62,11 @@ def test_wheel_holds_checkpoints_speech_and_type_markers(wheel: Path) -> None:
             expected[f"hlsim/checkpoints/{folder.name}/{name}"] = folder / name
 
     with ZipFile(wheel) as archive:
-        held = set(archive.namelist())
-        assert expected.keys() <= held, f"missing: {sorted(expected.keys() - held)}"
+        names = set(archive.namelist())
+        assert expected.keys() <= names, f"missing: {sorted(expected.keys() - names)}"
         for name, file in expected.items():
             assert archive.read(name) == file.read_bytes(), name
-    assert {name.split("/")[0].split("-")[0] for name in held} == {"hlsim", "compensators"}
+    assert {name.split("/")[0].split("-")[0] for name in names} == {"hlsim", "compensators"}
 
 
 @pytest.mark.parametrize("simulator", ["neuro-msbg", "msbg"])
@@ -79,10 +79,10 @@ def test_installed_wheel_simulates_outside_the_repository(
     run(*command, "--simulator", simulator, cwd=tmp_path)
 
     clean, clean_rate = soundfile.read(source)
-    heard, heard_rate = soundfile.read(tmp_path / "out.wav")
-    assert heard_rate == clean_rate
-    assert heard.shape == clean.shape
-    assert np.isfinite(heard).all()
-    # N3 is a moderate loss: speech at 68 dB SPL is heard softer, yet heard
-    level = 10 * np.log10(np.mean(heard**2) / np.mean(clean**2))
+    perceived, perceived_rate = soundfile.read(tmp_path / "out.wav")
+    assert perceived_rate == clean_rate
+    assert perceived.shape == clean.shape
+    assert np.isfinite(perceived).all()
+    # With the moderate loss N3, speech at 68 dB SPL is perceived, but softer
+    level = 10 * np.log10(np.mean(perceived**2) / np.mean(clean**2))
     assert -60 < level < -3

@@ -1,8 +1,11 @@
-"""The paper's last table: python examples/paper/haspi_table.py VOICEBANK OUT --audiograms EARS.csv
+"""The paper's last table: HASPI before and after compensation.
 
-HASPI before and after compensation of VoiceBank's 824 test utterances, two ears each, n = 1648, with paired tests.
-VOICEBANK holds clean_testset_wav and noisy_testset_wav. Writes the files and a manifest into OUT, and the report into
-OUT/report; if it is stopped, the same command continues. The paper has 0.428 before and 0.616 after, d = 0.594.
+    python examples/paper/haspi_table.py VOICEBANK OUT --audiograms EARS.csv
+
+The 824 test utterances of VoiceBank are scored for two ears each (n = 1648), with paired tests.
+VOICEBANK contains clean_testset_wav and noisy_testset_wav. The audio files and a manifest are
+written into OUT, and the report into OUT/report. If the command is stopped, the same command
+continues. The paper has 0.428 before and 0.616 after compensation, with d = 0.594.
 """
 
 import argparse
@@ -28,11 +31,13 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("corpus", type=Path)
     parser.add_argument("out", type=Path)
     parser.add_argument(
-        "--audiograms", type=Path, help="CSV of unseen ears; drawn ears, mild to severe, without"
+        "--audiograms",
+        type=Path,
+        help="CSV file of ears that were not trained on; random ears by default",
     )
     parser.add_argument("--input", choices=("clean", "noisy"), default="clean")
     parser.add_argument("--compensators", nargs="+", default=["nalr", "compensator-general"])
-    parser.add_argument("--jobs", type=int, help="processes; all cores by default")
+    parser.add_argument("--jobs", type=int, help="number of processes; one per core by default")
     options = parser.parse_args(arguments)
     out = options.out
     test = [row for row in find_corpus(options.corpus).utterances if row.split == "test"]
@@ -40,27 +45,27 @@ def main(arguments: list[str] | None = None) -> None:
         ears = draw_ears(2 * len(test), "test")
     else:
         ears = [ear for _, ear in read_audiograms(options.audiograms, simulated=True)]
-    instances = Instances(test, options.corpus, ears)  # at 65 dB SPL, active speech level
+    instances = Instances(test, options.corpus, ears)  # at an active level of 65 dB SPL
     models = {Path(name).name: load_compensator(name) for name in options.compensators}
     if len(models) < len(options.compensators):
-        sys.exit(f"{', '.join(options.compensators)}: two have one name; give folders of others")
+        sys.exit(f"{', '.join(options.compensators)}: two have the same name; rename a folder")
     for condition in ("clean", "unaided", *models):
         (out / condition).mkdir(parents=True, exist_ok=True)
-    chosen = [(utterance, ear) for utterance, ear, name in instances.items if name == options.input]
+    items = [(utterance, ear) for utterance, ear, name in instances.items if name == options.input]
     rows = []
     show = show_progress("ears")
-    for number, (utterance, ear) in enumerate(chosen):
+    for number, (utterance, ear) in enumerate(items):
         name = f"{Path(utterance.path).stem}-{number}.wav"
         clean, noisy = instances.read(utterance)
         signal = clean if options.input == "clean" else noisy
         with torch.no_grad():
-            aided = {condition: model(signal, ear) for condition, model in models.items()}
-        for condition, output in {"clean": clean, "unaided": signal, **aided}.items():
+            outputs = {condition: model(signal, ear) for condition, model in models.items()}
+        for condition, output in {"clean": clean, "unaided": signal, **outputs}.items():
             write_audio(out / condition / name, output, NEURO_RATE)
             if condition != "clean":
                 files = {"clean": f"clean/{name}", "processed": f"{condition}/{name}"}
                 rows.append({"condition": condition, **files, **ear.to_row()})
-        show(number + 1, len(chosen))
+        show(number + 1, len(items))
     write_table(out / "table.csv", rows)
     report = haspi_report(
         manifest=out / "table.csv",
@@ -74,8 +79,9 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def write_table(path: Path, rows: list[dict[str, str]]) -> None:
+    """Write rows as a CSV file, or exit if there are none."""
     if not rows:
-        sys.exit(f"{path}: no rows; the corpus needs clean_testset_wav and noisy_testset_wav")
+        sys.exit(f"{path}: no rows; the corpus requires clean_testset_wav and noisy_testset_wav")
     path.parent.mkdir(parents=True, exist_ok=True)
     with open(path, "w", newline="", encoding="utf-8") as file:
         table = csv.DictWriter(file, list(rows[0]))

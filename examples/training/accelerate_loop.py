@@ -1,4 +1,7 @@
-"""A loop of Hugging Face's accelerate: model, optimiser and loader are prepared; the loss just goes to the device."""
+"""Train an aid in a loop of Hugging Face's accelerate.
+
+The network, the optimiser and the loader are prepared. The loss is only moved to the device.
+"""
 
 import torch
 from accelerate import Accelerator
@@ -17,7 +20,7 @@ def main(steps: int = 20) -> nn.Module:
     aid, optimiser, loader = accelerator.prepare(
         aid, torch.optim.Adam(aid.parameters(), lr=1e-3), loader
     )
-    # frozen, without parameters of its own, and in no checkpoint: there is nothing to prepare
+    # The loss has no parameters and no checkpoint, so there is nothing to prepare.
     loss = HearingLossLoss(Audiogram.standard("N3")).to(accelerator.device)
     for step in range(steps):
         for (clean,) in loader:

@@ -1,8 +1,10 @@
-"""torchaudio's ConvTasNet as an aid for one ear: python examples/training/conv_tasnet.py SPEECH_DIR OUT.pt [EAR] [STEPS]
+"""Train torchaudio's ConvTasNet as an aid for one ear.
 
-ConvTasNet normalises its input's level away (a global norm in each block), so that it cannot learn compression: it gives
-soft and loud speech the same gain. Train it at one level, or mend it: docs/guide/your-own-network.md, which also says
-how many steps it needs.
+    python examples/training/conv_tasnet.py SPEECH_DIR OUT.pt [EAR] [STEPS]
+
+ConvTasNet removes the level of its input, because each block has a global norm. It therefore cannot
+learn compression: soft and loud speech get the same gain. Train it at one level, or change its
+norms; docs/guide/your-own-network.md says how, and how many steps it requires.
 """
 
 import sys
@@ -16,7 +18,7 @@ from hlsim.training.clips import Clips
 
 
 def conv_tasnet() -> ConvTasNet:
-    """Shape of what it takes and gives: (batch, 1, time)."""
+    """Build a small ConvTasNet, whose input and output have the shape (items, 1, time)."""
     return ConvTasNet(
         num_sources=1,
         enc_num_feats=128,
@@ -31,14 +33,10 @@ def main(folder: str, out: str, ear: str = "N3", steps: str = "500", seconds: fl
     network = conv_tasnet()
     loss = HearingLossLoss(Audiogram.standard(ear))
     optimiser = torch.optim.Adam(network.parameters(), lr=3e-3)
-    clips, generator = (
-        Clips(folder, sample_rate=16000, seconds=seconds),
-        torch.Generator().manual_seed(0),
-    )
+    clips = Clips(folder, sample_rate=16000, seconds=seconds)
+    generator = torch.Generator().manual_seed(0)
     for step in range(int(steps)):
-        speech = set_level(clips.draw(4, generator), 65.0).unsqueeze(
-            1
-        )  # (batch, 1, time), in pascals
+        speech = set_level(clips.draw(4, generator), 65.0).unsqueeze(1)  # (items, 1, time)
         value = loss(network(speech), speech)
         optimiser.zero_grad()
         value.backward()

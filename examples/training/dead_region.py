@@ -1,7 +1,9 @@
-"""Another simulator than MSBG, in thirty lines, for `--teacher` and for ``HearingLossLoss(simulator=DeadRegion())``.
+"""A simulator of dead regions, which can be a teacher (``--teacher``) or part of a loss.
 
-Each frequency is attenuated by its loss, whatever the level; from the first frequency on, from 2 kHz up, where the loss
-exceeds 70 dB HL, the cochlea is dead and nothing is heard.
+``HearingLossLoss(simulator=DeadRegion())`` trains an aid through it. It shows that any simulator
+can take the place of MSBG. Each frequency is attenuated by its loss, whatever the level. Above the
+first frequency from 2 kHz up whose loss exceeds 70 dB HL, the cochlea is dead, and the ear
+perceives nothing.
 """
 
 import torch
@@ -9,21 +11,30 @@ from torch import Tensor, nn
 
 from hlsim.audiogram.thresholds import interpolate
 
+TAPS = 512
+"""Length of the filter in samples, 32 ms."""
+
 
 class DeadRegion(nn.Module):
-    sample_rate = 16000  # of what it takes and gives; `hlsim --teacher` resamples to it and back
+    """Attenuation by the threshold loss, with a dead region above 2 kHz.
+
+    Attributes:
+        sample_rate: Sample rate of input and output in Hz. ``--teacher`` resamples to it and back.
+    """
+
+    sample_rate = 16000
 
     def forward(self, waveform: Tensor, audiogram: Tensor) -> Tensor:
-        """Shape: (..., time), (..., 8) dB HL -> (..., time), time-aligned."""
-        hz = tuple(k * self.sample_rate / 512 for k in range(257))
-        loss = interpolate(audiogram, hz)
-        dead = (loss > 70.0) & (torch.tensor(hz, device=loss.device) >= 2000.0)
-        gains = 10.0 ** (-loss.clamp_min(0.0) / 20.0) * (dead.cumsum(-1) == 0)
-        # a filter of 32 ms around its middle, so that nothing is delayed
-        taps = torch.fft.irfft(gains.to(waveform)).roll(256, -1) * torch.hann_window(512).to(
-            waveform
-        )
+        """Simulate the loss. Shape: (..., time), (..., 8) in dB HL -> (..., time), time-aligned."""
+        hz = tuple(number * self.sample_rate / TAPS for number in range(TAPS // 2 + 1))
+        loss_db = interpolate(audiogram, hz)
+        is_dead = (loss_db > 70.0) & (torch.tensor(hz, device=loss_db.device) >= 2000.0)
+        is_alive = is_dead.cumsum(-1) == 0
+        gains = 10.0 ** (-loss_db.clamp_min(0.0) / 20.0) * is_alive
+        # The filter is symmetric around its middle, so that it causes no delay.
+        impulse_response = torch.fft.irfft(gains.to(waveform)).roll(TAPS // 2, -1)
+        impulse_response = impulse_response * torch.hann_window(TAPS).to(waveform)
         time = waveform.shape[-1]
-        size = time + 512
-        product = torch.fft.rfft(waveform, size) * torch.fft.rfft(taps, size)
-        return torch.fft.irfft(product, size)[..., 256 : 256 + time]
+        points = time + TAPS
+        spectrum = torch.fft.rfft(waveform, points) * torch.fft.rfft(impulse_response, points)
+        return torch.fft.irfft(spectrum, points)[..., TAPS // 2 : TAPS // 2 + time]

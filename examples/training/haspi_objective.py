@@ -1,9 +1,11 @@
-"""The 16-parameter aid of filter_bank.py from zero through HASPI: with a term for the level that is heard, and without.
+"""Train the aid of ``filter_bank.py`` through HASPI, with and without a term for the loudness.
 
-    python examples/training/haspi_objective.py TRAIN_SPEECH VALID_SPEECH [EAR] [STEPS] [SNR] [AIDS...]
+    python examples/training/haspi_objective.py TRAIN_SPEECH VALID_SPEECH \
+        [EAR] [STEPS] [SNR] [LOSSES...]
 
-It is given the speech in white noise at SNR dB, by default in none: of clean speech HASPI soon has no more to give.
-Of each aid it prints what filter_bank.py does, and the highest peak that the ear is given at 80 dB SPL.
+The input is speech in white noise at SNR dB, or clean speech by default, whose HASPI soon reaches
+its maximum. Of each aid it prints what ``filter_bank.py`` prints, and the highest peak of the
+output at 80 dB SPL.
 """
 
 import math
@@ -12,7 +14,7 @@ from collections.abc import Callable
 from functools import partial
 
 import torch
-from filter_bank import RATE, judged, trained
+from filter_bank import SAMPLE_RATE, Aid, describe_aid, train_filter_bank
 from torch import Tensor, nn
 
 from compensators import NALR
@@ -27,36 +29,37 @@ LOSSES: dict[str, Callable[[Audiogram], HearingLossLoss]] = {
 }
 
 
-def in_noise(speech: Tensor, snr: float, generator: torch.Generator) -> Tensor:
-    return speech + set_level(
-        torch.randn(speech.shape, generator=generator), level_spl(speech) - snr
-    )
+def add_noise(speech: Tensor, snr: float, generator: torch.Generator) -> Tensor:
+    """Add white noise at a signal-to-noise ratio in dB. Shape: (items, time) -> (items, time)."""
+    noise = torch.randn(speech.shape, generator=generator)
+    return speech + set_level(noise, level_spl(speech) - snr)
 
 
 @torch.no_grad()
-def told(aid: nn.Module, ear: Audiogram, speech: Tensor, snr: float) -> str:
-    """What filter_bank.py tells, and the highest peak at 80 dB SPL. Shape: (items, time)."""
+def describe_aid_in_noise(aid: Aid, ear: Audiogram, speech: Tensor, snr: float) -> str:
+    """Measure an aid as ``describe_aid`` does, and the highest peak of its output at 80 dB SPL."""
 
-    def given(clean: Tensor) -> Tensor:
-        aided: Tensor = aid(in_noise(clean, snr, torch.Generator().manual_seed(0)))
-        return aided
+    def process_noisy(clean: Tensor) -> Tensor:
+        return aid(add_noise(clean, snr, torch.Generator().manual_seed(0)))
 
-    peak = PASCAL_SPL + 20.0 * math.log10(float(given(set_level(speech, 80.0)).abs().max()))
-    return f"{judged(given, ear, speech)}, peak {peak:.0f} dB SPL"
+    peak = float(process_noisy(set_level(speech, 80.0)).abs().max())
+    peak_spl = PASCAL_SPL + 20.0 * math.log10(peak)
+    return f"{describe_aid(process_noisy, ear, speech)}, peak {peak_spl:.0f} dB SPL"
 
 
 def main(
     train: str, valid: str, name: str = "N3", steps: str = "200", snr: str = "inf", *names: str
 ) -> None:
     ear = Audiogram.standard(name)
-    speech = Clips(valid, sample_rate=RATE, seconds=2.0).draw(8, torch.Generator().manual_seed(0))
+    clips = Clips(valid, sample_rate=SAMPLE_RATE, seconds=2.0)
+    speech = clips.draw(8, torch.Generator().manual_seed(0))
     for title, aid in (("unaided", nn.Identity()), ("NAL-R", NALR(ear))):
-        print(f"{name}, {title}: {told(aid, ear, speech, float(snr))}", flush=True)
+        print(f"{name}, {title}: {describe_aid_in_noise(aid, ear, speech, float(snr))}", flush=True)
     for title in names or LOSSES:
         generator = torch.Generator().manual_seed(0)
-        noisy = partial(in_noise, snr=float(snr), generator=generator)
-        aid = trained(train, LOSSES[title](ear), int(steps), clips=2, given=noisy)
-        print(f"{name}, {title}: {told(aid, ear, speech, float(snr))}", flush=True)
+        degrade = partial(add_noise, snr=float(snr), generator=generator)
+        aid = train_filter_bank(train, LOSSES[title](ear), int(steps), clips=2, degrade=degrade)
+        print(f"{name}, {title}: {describe_aid_in_noise(aid, ear, speech, float(snr))}", flush=True)
 
 
 if __name__ == "__main__":

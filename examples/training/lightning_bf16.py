@@ -1,4 +1,7 @@
-"""A Lightning module in bf16: the loss is not in the checkpoint, and works in float32 by itself."""
+"""Train an aid with Lightning in bfloat16.
+
+The loss computes in float32 by itself, and is not part of the checkpoint.
+"""
 
 import lightning
 import torch
@@ -16,7 +19,7 @@ class Aid(lightning.LightningModule):
         self.loss = HearingLossLoss(Audiogram.standard(ear))
 
     def training_step(self, batch: list[Tensor], index: int) -> Tensor:
-        speech = batch[0]  # (batch, 1, time)
+        speech = batch[0]  # (items, 1, time)
         value: Tensor = self.loss(self.network(speech), speech)
         self.log("loss", value)
         return value
@@ -28,9 +31,15 @@ class Aid(lightning.LightningModule):
 def main(steps: int = 20) -> Aid:
     speech = set_level(torch.randn(8, 1, 8000), 65.0)
     trainer = lightning.Trainer(
-        max_steps=steps, precision="bf16-mixed", accelerator="auto", devices=1, logger=False, enable_checkpointing=False,
-        enable_progress_bar=False, enable_model_summary=False,
-    )  # fmt: skip
+        max_steps=steps,
+        precision="bf16-mixed",
+        accelerator="auto",
+        devices=1,
+        logger=False,
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+    )
     aid = Aid()
     trainer.fit(aid, DataLoader(TensorDataset(speech), batch_size=4))
     return aid

@@ -1,9 +1,11 @@
-"""A criterion of your own on what is heard: here STOI's correlation of short-time envelopes, in plain torch.
-
-``HearingLossLoss(ear, criterion=envelope_correlation)`` takes it as it is. One that gives a mean instead of a value for
-each item, as those of auraloss and torch-stoi, goes on ``heard, reference = loss.heard(aided, clean)``:
+"""Train with a criterion of your own on perceived speech.
 
     python examples/training/your_criterion.py [auraloss | torch-stoi]
+
+The criterion here is the correlation of short-time envelopes, as in STOI. ``HearingLossLoss``
+accepts it as its ``criterion``, because it returns a value for each item. A criterion that returns
+a mean instead, such as those of auraloss and torch-stoi, is applied to the two signals that
+``loss.heard`` returns.
 """
 
 import sys
@@ -16,45 +18,55 @@ from hlsim import Audiogram, HearingLossLoss
 from hlsim.calibration import set_level
 from hlsim.losses.band_levels import band_levels
 
-
-def envelope_correlation(heard: Tensor, reference: Tensor) -> Tensor:
-    """One minus the correlation of envelopes over 384 ms in each of 24 bands. Shape: (items, time) twice -> (items,)."""
-    envelopes = (10.0 ** (band_levels(waveform, 16000) / 20.0) for waveform in (heard, reference))
-    first, second = (envelope.unfold(-2, min(24, envelope.shape[-2]), 12) for envelope in envelopes)
-    first, second = (part - part.mean(-1, keepdim=True) for part in (first, second))
-    return 1.0 - nn.functional.cosine_similarity(first, second, dim=-1).mean((-2, -1))
+SAMPLE_RATE = 16000
 
 
-def from_elsewhere(package: str) -> Callable[[Tensor, Tensor], Tensor]:
-    """Someone else's mean over the items of what is heard and the reference, (items, time) in pascals."""
+def envelope_correlation(perceived: Tensor, reference: Tensor) -> Tensor:
+    """Compute 1 - the mean correlation of the envelopes in 24 bands, over segments of 384 ms.
+
+    Shape: (items, time), (items, time) -> (items,).
+    """
+    centred = []
+    for waveform in (perceived, reference):
+        envelopes = 10.0 ** (band_levels(waveform, SAMPLE_RATE) / 20.0)
+        segments = envelopes.unfold(-2, min(24, envelopes.shape[-2]), 12)
+        centred.append(segments - segments.mean(-1, keepdim=True))
+    return 1.0 - nn.functional.cosine_similarity(*centred, dim=-1).mean((-2, -1))
+
+
+def import_criterion(package: str) -> Callable[[Tensor, Tensor], Tensor]:
+    """Return a criterion of another package, which computes a mean over items of shape (time,)."""
     if package == "auraloss":
         from auraloss.freq import MultiResolutionSTFTLoss
 
-        spectra = MultiResolutionSTFTLoss()
-        return lambda heard, reference: spectra(heard.unsqueeze(1), reference.unsqueeze(1))
+        spectral_loss = MultiResolutionSTFTLoss()
+        return lambda perceived, reference: spectral_loss(
+            perceived.unsqueeze(1), reference.unsqueeze(1)
+        )
     from torch_stoi import NegSTOILoss
 
-    intelligibility = NegSTOILoss(sample_rate=16000)
-    return lambda heard, reference: intelligibility(heard, reference).mean()
+    stoi_loss = NegSTOILoss(sample_rate=SAMPLE_RATE)
+    return lambda perceived, reference: stoi_loss(perceived, reference).mean()
 
 
 def main(package: str = "", steps: int = 20) -> None:
     torch.manual_seed(0)
-    gains = nn.Parameter(torch.zeros(5))
+    ear = Audiogram.standard("N3")
+    log_gains = nn.Parameter(torch.zeros(5))
     clean = set_level(torch.randn(2, 16000) * torch.linspace(0.0, 20.0, 16000).sin(), 65.0)
-    loss = HearingLossLoss(Audiogram.standard("N3"), criterion=envelope_correlation)
-    # or beside the default, whose levels it does not know, of one hearing each
-    default = HearingLossLoss(Audiogram.standard("N3"), simulator=loss.simulator)
-    measure = from_elsewhere(package) if package else None
-    optimiser = torch.optim.Adam([gains], lr=0.1)
+    loss = HearingLossLoss(ear, criterion=envelope_correlation)
+    # Correlations ignore the level, so the default criterion is added. Both share one simulator.
+    default_loss = HearingLossLoss(ear, simulator=loss.simulator)
+    imported_criterion = import_criterion(package) if package else None
+    optimiser = torch.optim.Adam([log_gains], lr=0.1)
     for step in range(steps):
-        aided = torch.fft.irfft(
-            torch.fft.rfft(clean)
-            * 10.0 ** nn.functional.interpolate(gains[None, None], 8001, mode="linear")[0],
-            16000,
-        )
-        value = default(aided, clean)
-        value = value + (measure(*loss.heard(aided, clean)) if measure else loss(aided, clean))
+        gains = 10.0 ** nn.functional.interpolate(log_gains[None, None], 8001, mode="linear")[0]
+        output = torch.fft.irfft(torch.fft.rfft(clean) * gains, 16000)
+        value = default_loss(output, clean)
+        if imported_criterion is None:
+            value = value + loss(output, clean)
+        else:
+            value = value + imported_criterion(*loss.heard(output, clean))
         optimiser.zero_grad()
         value.backward()
         optimiser.step()

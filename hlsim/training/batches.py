@@ -103,8 +103,8 @@ class TrainingData:
         if not speech["valid"]:
             warnings.warn(
                 f"{manifest}: no row has the split 'valid', so training speech is used for "
-                "validation; "
-                "'hlsim prepare --valid-share 0.1' moves a tenth of the speakers to that split",
+                "validation; 'hlsim prepare --valid-share 0.1' moves a tenth of the speakers to "
+                "that split",
                 stacklevel=2,
             )
         if not attributes.get("noise"):
@@ -127,8 +127,8 @@ class TrainingData:
             if shared:
                 raise ValueError(
                     f"{len(shared)} files of {name} are used for both training and validation, "
-                    "such as "
-                    f"{min(shared)}; use other files for validation, or leave --valid-{name} out"
+                    f"such as {min(shared)}; use other files for validation, or leave "
+                    f"--valid-{name} out"
                 )
         return TrainingData(
             self.valid_speech or self.speech,

@@ -108,8 +108,7 @@ class Clips:
         while len(clips) < count:
             index = int(torch.randint(len(self), (), generator=generator))
             # Also drawn for a bad file, so that all processes draw the same numbers, whether they
-            # know
-            # the file already or not.
+            # know the file already or not.
             position = float(torch.rand((), generator=generator))
             if self._is_usable(index):
                 clip = self.cut_clip(index, position)
@@ -190,8 +189,7 @@ def read_noisy(path: Path, clean: Tensor, clean_rate: int) -> Tensor:
     noisy, rate = read_audio(path)
     if (noisy.shape, rate) != (clean.shape, clean_rate):
         raise ValueError(
-            f"{path}: expected the shape {tuple(clean.shape)} and the sample rate {clean_rate} "
-            "Hz of the "
-            f"clean version, got {tuple(noisy.shape)} and {rate} Hz"
+            f"{path}: expected the shape {tuple(clean.shape)} and the sample rate {clean_rate} Hz "
+            f"of the clean version, got {tuple(noisy.shape)} and {rate} Hz"
         )
     return noisy

@@ -80,8 +80,7 @@ class TrainingModule(L.LightningModule):
 
     def on_train_batch_end(self, *arguments: Any) -> None:
         # Stopping makes the Trainer validate and save its state, even if the last interval is
-        # shorter
-        # than the others.
+        # shorter than the others.
         if self.global_step >= self.recipe.steps:
             self.trainer.should_stop = True
 
@@ -164,8 +163,7 @@ def initial_network(
     if not isinstance(getattr(network, "config", None), config_kind):
         raise ValueError(
             f"the checkpoint {recipe.start!r} is a {type(network).__name__}, expected a network "
-            "with "
-            f"{config_kind.__name__}; choose another start"
+            f"with {config_kind.__name__}; choose another start"
         )
     if recipe.model and config != network.config:
         settings = config.to_dict()

@@ -14,7 +14,7 @@ EXAMPLE = Path(__file__).parents[2] / "examples" / "fit_words.py"
 @pytest.mark.slow
 def test_bundled_parameters_are_those_of_a_new_fit() -> None:
     example = runpy.run_path(str(EXAMPLE))
-    rows = example["data"]()
+    rows = example["read_responses"]()
     assert (len(rows), rows.listener.nunique(), rows.system.nunique()) == (2001, 22, 10)
     fit = example["fit"](rows)
     for name, value in load_curve()._asdict().items():
@@ -31,7 +31,7 @@ def test_bundled_parameters_are_those_of_a_new_fit() -> None:
 @pytest.mark.slow
 def test_the_interval_contains_a_listener_left_out_of_the_fit() -> None:
     example = runpy.run_path(str(EXAMPLE))
-    rows = example["data"]()
+    rows = example["read_responses"]()
     average_listener = "L0209"
     responses = rows[rows.listener == average_listener]
     curve = example["fit"](rows[rows.listener != average_listener].reset_index(drop=True)).curve

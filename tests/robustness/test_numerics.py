@@ -1,4 +1,4 @@
-"""Odd signals, from silence to 1e38 Pa and from one sample up: finite sound and finite gradients, or a refusal."""
+"""Unusual signals give finite outputs and gradients, or are rejected."""
 
 from contextlib import suppress
 from functools import cache
@@ -28,7 +28,7 @@ KINDS = {
 
 
 def signal(draw: Random, samples: int) -> Tensor:
-    """An impulse, a constant, noise, a tone, a step or bursts, of a random level. Shape: -> (samples,)."""
+    """Draw an impulse, a constant, noise, a tone, a step or bursts, at a random level."""
     time, at = torch.arange(samples, dtype=torch.float64), draw.randrange(samples)
     noise = torch.randn(
         samples, generator=torch.Generator().manual_seed(draw.randrange(2**32))

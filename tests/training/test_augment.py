@@ -76,9 +76,9 @@ def test_compress_divides_level_differences_by_the_ratio() -> None:
     half = loud_and_soft.shape[-1] // 2
     for ratio in (1.0, 2.0, 4.0):
         out = compress(loud_and_soft, torch.tensor([ratio]), 16000)
-        apart = level_spl(out[:, 1000 : half - 1000]) - level_spl(out[:, half + 1000 : -1000])
+        difference = level_spl(out[:, 1000 : half - 1000]) - level_spl(out[:, half + 1000 : -1000])
         # 20 dB; the floor 30 dB under the mean takes a little
-        assert float(apart) == pytest.approx(20.0 / ratio, abs=0.5)
+        assert float(difference) == pytest.approx(20.0 / ratio, abs=0.5)
     torch.testing.assert_close(compress(loud_and_soft, torch.ones(1), 16000), loud_and_soft)
 
 

@@ -35,7 +35,7 @@ def hum(samples: int) -> Tensor:
 
 @pytest.fixture
 def manifest(tmp_path: Path) -> Path:
-    """Manifest of four speakers with pairs of noise and the same noise with a hum; one validates."""
+    """Manifest of four speakers, one for validation. Noisy speech is clean speech plus a hum."""
     rows = []
     for number, split in enumerate(("train", "train", "train", "valid")):
         clean = torch.randn(9600) * torch.linspace(0, 0.1, 9600)

@@ -1,4 +1,4 @@
-"""Training a compensator: it learns, it resumes, and it trains what its recipe asks for."""
+"""A compensator learns, its training resumes, and the parts that the recipe names are trained."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -44,7 +44,7 @@ def draw(recipe: CompensatorRecipe, data: TrainingData, count: int, seed: int = 
 
 @pytest.fixture
 def noisy(data: TrainingData) -> TrainingData:
-    """The speech, which serves as its own noise, too."""
+    """Data in which the speech is also the noise."""
     return TrainingData(data.speech, noise=data.speech, valid_speech=data.valid_speech)
 
 
@@ -103,7 +103,9 @@ def test_another_ear_or_simulator_needs_another_folder(data: TrainingData, tmp_p
         train(data, SMALL, tmp_path / "out", audiogram=N3, simulator=simulator)
 
 
-def test_one_for_an_ear_starts_from_one_for_all(data: TrainingData, tmp_path: Path) -> None:
+def test_a_personal_compensator_starts_from_a_general_one(
+    data: TrainingData, tmp_path: Path
+) -> None:
     started = replace(SMALL, model={}, start="compensator-general", learning_rate=1e-6)
     ear = Audiogram.standard("N4")
     folders = [
@@ -111,21 +113,23 @@ def test_one_for_an_ear_starts_from_one_for_all(data: TrainingData, tmp_path: Pa
         for name, recipe in (("started", started), ("random", SMALL))
     ]
     about, random = (checkpoint_about(folder) for folder in folders)
-    start_loss, random_loss = (one["start_validation"]["valid_loss"] for one in (about, random))
+    start_loss, random_loss = (
+        record["start_validation"]["valid_loss"] for record in (about, random)
+    )
     assert start_loss < 0.7 * random_loss
     assert about["start_sha256"] == checkpoint_digest("compensator-general")
     start, trained = load_compensator("compensator-general"), load_compensator(folders[0])
-    for one, other in zip(start.parameters(), trained.parameters(), strict=True):
-        assert float((one - other).abs().max()) < 1e-5
+    for initial, final in zip(start.parameters(), trained.parameters(), strict=True):
+        assert float((initial - final).abs().max()) < 1e-5
 
 
-def test_a_start_that_training_makes_worse_is_kept(data: TrainingData, tmp_path: Path) -> None:
+def test_the_start_is_saved_if_training_makes_it_worse(data: TrainingData, tmp_path: Path) -> None:
     recipe = replace(SMALL, model={}, start="compensator-general", learning_rate=10.0)
     folder = train(data, recipe, tmp_path)
     assert checkpoint_about(folder)["steps"] == 0
-    start, kept = load_compensator("compensator-general"), load_compensator(folder)
-    for one, other in zip(start.parameters(), kept.parameters(), strict=True):
-        assert torch.equal(one, other)
+    start, saved = load_compensator("compensator-general"), load_compensator(folder)
+    for initial, final in zip(start.parameters(), saved.parameters(), strict=True):
+        assert torch.equal(initial, final)
 
 
 @pytest.mark.parametrize(
@@ -150,7 +154,7 @@ def test_the_model_of_a_start_may_be_repeated() -> None:
     assert CompensatorTraining(recipe, simulator="msbg").network.config == config
 
 
-def test_a_general_one_draws_ears_and_noise(noisy: TrainingData, tmp_path: Path) -> None:
+def test_a_general_compensator_draws_ears_and_noise(noisy: TrainingData, tmp_path: Path) -> None:
     columns = [f"hl_{hz}" for hz in (250, 500, 1000, 2000, 3000, 4000, 6000, 8000)]
     rows = [",".join(columns), *(",".join([str(level)] * 8) for level in (60, 61, 62))]
     (tmp_path / "ears.csv").write_text("\n".join(rows) + "\n")
@@ -239,13 +243,14 @@ def test_a_share_of_the_clips_are_tones_and_clicks(data: TrainingData) -> None:
     assert clicks(0.0) == 0 and 5 < clicks(0.4) < 21 and clicks(1.0) == 32
 
 
-def test_sounds_have_no_noise_and_babble_is_the_others_voices(noisy: TrainingData) -> None:
+def test_sounds_have_no_noise_and_babble_is_made_of_other_voices(noisy: TrainingData) -> None:
     recipe = replace(SMALL, equalised=0.0, noisy=1.0)
     sounds = draw(replace(recipe, sounds=1.0), noisy, 2)
     assert torch.equal(sounds["signal"], sounds["clean"])
     speech = draw(replace(recipe, babble=1.0), noisy, 2)
-    noise, others = speech["signal"] - speech["clean"], speech["clean"].flip(0)
-    assert (torch.cosine_similarity(noise, others, -1) > 0.999).all()
+    noise = speech["signal"] - speech["clean"]
+    other_voices = speech["clean"].flip(0)
+    assert (torch.cosine_similarity(noise, other_voices, -1) > 0.999).all()
 
 
 @pytest.mark.parametrize(

@@ -100,9 +100,9 @@ def test_voicebank_demands_names_give_the_papers_number_of_utterances() -> None:
         [*voicebank(), "noise/bus/1.wav"],
         [*voicebank(), "clean_testset_wav/speech.wav", "noisy_testset_wav/speech.wav"],
     ],
-    ids=["no noisy folder", "a file lacks", "another set", "both rates", "noise", "another name"],
+    ids=["no noisy folder", "a missing file", "another set", "both rates", "noise", "another name"],
 )
-def test_what_is_not_exactly_voicebank_demand_is_rejected(files: list[str]) -> None:
+def test_other_folders_than_those_of_voicebank_demand_are_rejected(files: list[str]) -> None:
     with pytest.raises(ValueError):
         recognise(files)
 
@@ -155,7 +155,7 @@ def test_split_folders_are_recognised_by_any_of_their_names(names: tuple[str, ..
     ["extra/c/1.wav", "training/c/1.wav", "1.wav"],
     ids=["no split", "second name of a split", "beside the folders"],
 )
-def test_what_is_beside_split_folders_is_rejected(other: str) -> None:
+def test_other_files_beside_split_folders_are_rejected(other: str) -> None:
     with pytest.raises(ValueError):
         recognise(["train/a/1.wav", "test/b/1.wav", other])
 
@@ -222,7 +222,7 @@ def test_any_other_layout_is_rejected_with_advice(tree: Tree, files: list[str]) 
         find_corpus(tree(*files))
 
 
-def test_an_option_says_what_folders_are() -> None:
+def test_an_option_gives_the_meaning_of_folders() -> None:
     files = ["id1/session1/1.wav", "id1/session2/1.wav", "id2/session1/1.wav"]
     _, utterances = recognise(files, ["speaker"])
     assert [row.speaker for row in utterances] == ["id1", "id1", "id2"]
@@ -257,7 +257,7 @@ def test_prepare_writes_what_training_reads(tree: Tree, tmp_path: Path) -> None:
     corpus = tree(*voicebank("_16k"))
     prepared = prepare(corpus, tmp_path / "m.csv", valid_share=0.5)
     assert read_manifest(tmp_path / "m.csv", corpus) == prepared.utterances
-    # a table of one's own is read in the same way, and is not overwritten
+    # A CSV file of the user is read in the same way, and is not overwritten.
     (corpus / "own.csv").write_text((tmp_path / "m.csv").read_text())
     assert prepare(corpus / "own.csv", corpus / "manifest.csv").utterances == prepared.utterances
     (corpus / "notes.csv").write_text("a,b\n")

@@ -9,7 +9,7 @@ from hlsim.metrics import haspi
 from hlsim.training.denoising import attenuation_error, missing_intelligibility
 
 
-def test_nothing_taken_off_is_right_where_there_is_no_noise_and_wrong_elsewhere() -> None:
+def test_no_attenuation_is_right_without_noise_and_wrong_in_noise() -> None:
     aid = HearingAid(HearingAidConfig(width=8, hidden=8))
     with torch.no_grad():
         aid.leave.bias.fill_(-60.0)
@@ -18,7 +18,7 @@ def test_nothing_taken_off_is_right_where_there_is_no_noise_and_wrong_elsewhere(
     silent = torch.zeros(2, 9000)
     assert (attenuation_error(aid, clean, clean) < 1e-9).all()
     assert (attenuation_error(aid, silent, silent) < 1e-9).all()
-    # noise alone is to be 12 dB down
+    # The target for noise alone is 12 dB of attenuation.
     alone = attenuation_error(aid, clean, silent)
     assert ((alone - (1.0 - 10.0 ** (-12.0 / 40.0)) ** 2).abs() < 0.005).all()
     with torch.no_grad():
@@ -27,7 +27,7 @@ def test_nothing_taken_off_is_right_where_there_is_no_noise_and_wrong_elsewhere(
     assert (attenuation_error(aid, clean, clean) > 0.2).all()
 
 
-def test_it_learns_to_tell_a_tone_from_noise() -> None:
+def test_an_aid_learns_to_distinguish_a_tone_from_noise() -> None:
     aid = HearingAid(HearingAidConfig(width=16, hidden=16))
     optimiser = torch.optim.Adam(aid.parameters(), lr=0.02)
     turns = 1000.0 * torch.arange(8000) / 16000.0
@@ -43,7 +43,7 @@ def test_it_learns_to_tell_a_tone_from_noise() -> None:
     assert errors[-1] < 0.3 * errors[0]
 
 
-def test_intelligibility_is_haspi_at_the_level_of_the_clean_speech_amplified(
+def test_intelligibility_is_haspi_at_the_level_of_amplified_clean_speech(
     speech: list[tuple[torch.Tensor, int]],
 ) -> None:
     aid, ears = HearingAid(HearingAidConfig(width=8, hidden=8)).eval(), torch.full((2, 8), 50.0)
@@ -54,7 +54,9 @@ def test_intelligibility_is_haspi_at_the_level_of_the_clean_speech_amplified(
     missing = missing_intelligibility(aid, signal, clean, ears)
     missing.mean().backward()  # type: ignore[no-untyped-call]
     reached = {
-        name for name, one in aid.named_parameters() if one.grad is not None and one.grad.any()
+        name
+        for name, parameter in aid.named_parameters()
+        if parameter.grad is not None and parameter.grad.any()
     }
     assert {name.split(".")[0] for name in reached} == {"enter", "recur", "leave", "correct"}
     level = level_spl(aid(clean, ears, 0.0))

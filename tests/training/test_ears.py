@@ -26,7 +26,7 @@ def test_drawn_ears_are_alike_at_neighbouring_frequencies() -> None:
     neighbours = correlation.diagonal(1)
     assert float(neighbours.min()) > 0.85
     assert float(correlation[0, -1]) < float(neighbours.min()) - 0.1
-    # even about a series' own shape: the jump from 3 to 4 kHz is small and its sign varies
+    # The difference between 3 and 4 kHz is small, and its sign varies.
     jump = ears[:, 5] - ears[:, 4]
     assert float(jump.abs().median()) < 10.0
 
@@ -36,4 +36,4 @@ def test_drawing_depends_on_the_generator_alone() -> None:
     torch.rand(7)
     assert torch.equal(first, draw_thresholds(64, torch.Generator().manual_seed(5)))
     assert not torch.equal(first, draw_thresholds(64, torch.Generator().manual_seed(6)))
-    as_thresholds(first)  # every one is fit for a simulator
+    as_thresholds(first)  # Every ear is valid for a simulator.

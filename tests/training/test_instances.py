@@ -1,4 +1,4 @@
-"""The paper's instances: their number, and what each of them holds."""
+"""The number and the content of the instances are those of the paper."""
 
 from pathlib import Path
 
@@ -74,7 +74,7 @@ def test_an_instance_is_what_an_ear_perceives_aligned_with_its_input(voicebank: 
         perceived = MSBG(sample_rate=16000)(signal, ear)
         assert impaired.shape == signal.shape == clean.shape
         assert float((impaired - perceived).norm() / perceived.norm()) < 1e-4
-    # what MSBG delays by its structure is taken off, to a fraction of a sample
+    # The structural delay of MSBG is removed to a fraction of a sample.
     unaligned = MSBG(sample_rate=16000, aligned=False)
     delay = round(unaligned.delay(ear.severity) * 16000 / MSBG_RATE)
     late = unaligned(functional.pad(signal, (0, 2000)), ear)

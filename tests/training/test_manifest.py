@@ -34,7 +34,7 @@ def test_a_manifest_is_read_as_it_was_written(tmp_path: Path) -> None:
         read_manifest(tmp_path / "a" / "m.csv")
 
 
-def test_columns_but_the_path_may_lack(tmp_path: Path) -> None:
+def test_all_columns_but_the_path_are_optional(tmp_path: Path) -> None:
     (tmp_path / "1.wav").touch()
     (tmp_path / "m.csv").write_text("seconds,path\n2.5,1.wav\n")
     assert read_manifest(tmp_path / "m.csv") == [Utterance("1.wav")]
@@ -53,7 +53,7 @@ def test_columns_but_the_path_may_lack(tmp_path: Path) -> None:
         "path,noisy\n1.wav,../1.wav\n",
     ],
 )
-def test_what_is_no_manifest_is_rejected(tmp_path: Path, text: str) -> None:
+def test_invalid_manifests_are_rejected(tmp_path: Path, text: str) -> None:
     (tmp_path / "m.csv").write_text(text)
     (tmp_path / "1.wav").touch()
     with pytest.raises(ValueError, match=r"m\.csv"):
@@ -79,7 +79,7 @@ def test_contradictions_and_noise_are_rejected(rows: list[Utterance]) -> None:
         check_utterances(rows)
 
 
-def test_what_is_allowed_beside_them() -> None:
+def test_similar_utterances_are_accepted() -> None:
     check_utterances(
         [
             Utterance("1.wav", "noisy/1.wav"),

@@ -1,4 +1,4 @@
-"""Recipes: the same in Python, in YAML and on the command line; and what they refuse."""
+"""Recipes are equal in Python, in YAML and on the command line, and reject invalid settings."""
 
 from dataclasses import fields
 from pathlib import Path
@@ -24,8 +24,9 @@ snr: [-5, 20]
 babble: 0.3
 """
 AID_OPTIONS = (
-    "--recipe.kind=hearing-aid --recipe.model.width 8 --recipe.model.hidden=16 --recipe.learning_rate 1e-3 "
-    "--recipe.weights={'denoising':2} --recipe.snr [-5,20] --recipe.babble 0.3"
+    "--recipe.kind=hearing-aid --recipe.model.width 8 --recipe.model.hidden=16 "
+    "--recipe.learning_rate 1e-3 --recipe.weights={'denoising':2} --recipe.snr [-5,20] "
+    "--recipe.babble 0.3"
 )
 AID_RECIPE = CompensatorRecipe(
     kind="hearing-aid",
@@ -54,7 +55,8 @@ def test_the_command_line_comes_before_the_file(tmp_path: Path) -> None:
     pytest.importorskip("jsonargparse")
     (tmp_path / "aid.yaml").write_text(AID_YAML)
     recipe = from_options(
-        f"--recipe.model.width 4 --recipe {tmp_path / 'aid.yaml'} --start hearing-aid --recipe.seed -3"
+        f"--recipe.model.width 4 --recipe {tmp_path / 'aid.yaml'} --start hearing-aid "
+        "--recipe.seed -3"
     )
     assert recipe.model == {"width": 4, "hidden": 16}
     assert (recipe.start, recipe.seed, recipe.babble) == ("hearing-aid", -3, 0.3)
@@ -80,8 +82,8 @@ def test_the_help_describes_every_setting(recipe: Any) -> None:
     assert describe_settings(recipe).keys() >= {setting.name for setting in fields(recipe)}
 
 
-def test_a_name_that_is_written_twice_agrees() -> None:
-    """Recipes do not import torch, which the loss does."""
+def test_names_of_references_are_those_of_the_loss() -> None:
+    """Recipes repeat the names, because they do not import torch."""
     assert get_args(ReferenceName) == get_args(frozen_simulator.ReferenceName)
 
 
@@ -102,14 +104,14 @@ def test_a_name_that_is_written_twice_agrees() -> None:
         (CompensatorRecipe, {"sounds": -0.5}),
         (CompensatorRecipe, {"noisy": 1.5}),
         (CompensatorRecipe, {"weights": {"bands": 0.0}}),
-        (CompensatorRecipe, {"weights": {"haspi": 1.0}}),  # of clips too short for a score
-        (CompensatorRecipe, {"weights": {"denoising": 1.0}}),  # without noise reduction
+        (CompensatorRecipe, {"weights": {"haspi": 1.0}}),  # The clips are too short.
+        (CompensatorRecipe, {"weights": {"denoising": 1.0}}),  # There is no noise reduction.
         (CompensatorRecipe, {"unreduced": 0.5}),
         (CompensatorRecipe, AID | {"weights": {"denoising": 1.0}, "noisy": 0.0}),
         (CompensatorRecipe, AID | {"babble": 0.5, "batch": 1}),
     ],
 )
-def test_settings_that_do_not_fit(recipe: Any, settings: dict[str, Any]) -> None:
+def test_invalid_settings_are_rejected(recipe: Any, settings: dict[str, Any]) -> None:
     with pytest.raises(ValueError):
         recipe(**settings)
 
@@ -139,7 +141,7 @@ def test_settings_that_do_not_fit(recipe: Any, settings: dict[str, Any]) -> None
         "\0",
     ],
 )
-def test_files_that_are_no_recipe(tmp_path: Path, text: str) -> None:
+def test_invalid_files_are_rejected(tmp_path: Path, text: str) -> None:
     pytest.importorskip("jsonargparse")
     (tmp_path / "recipe.yaml").write_text(text)
     with pytest.raises(ValueError):
@@ -149,7 +151,7 @@ def test_files_that_are_no_recipe(tmp_path: Path, text: str) -> None:
 @pytest.mark.parametrize(
     "argument", ["--recipe.batch=1.5", "--recipe.kind=vocoder", "--recipe.colour=red", "--foo=1"]
 )
-def test_arguments_that_are_no_setting(argument: str) -> None:
+def test_unknown_arguments_are_rejected(argument: str) -> None:
     pytest.importorskip("jsonargparse")
     with pytest.raises(ValueError):
         make_recipe(CompensatorRecipe, None, [argument])

@@ -1,4 +1,4 @@
-"""Training a simulator: it learns, it resumes, and its batches and validation items are as described."""
+"""A simulator learns, its training resumes, and its batches match their description."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -21,11 +21,12 @@ from hlsim.training.batches import (
     simulator_validation,
 )
 from hlsim.training.data_module import Batch, Step
+from hlsim.training.module import concatenate
 from hlsim.training.recipes import SimulatorRecipe
 from hlsim.training.simulator import SimulatorTraining, train_simulator
 from hlsim.training.teacher import PluginTeacher
 
-TINY = SimulatorRecipe(
+SMALL = SimulatorRecipe(
     model={"channels": 4, "blocks": 1, "stride": [4, 3], "kernel": [3, 3]},
     steps=8,
     batch=2,
@@ -61,16 +62,14 @@ def validation(module: SimulatorTraining, data: TrainingData) -> dict[str, float
     with torch.no_grad():
         batches = list(simulator_data(data, module.recipe).val_dataloader())
         values = [module.evaluate(batch) for batch in batches]
-    names = {name for one in values for name in one}
-    joined = {name: torch.cat([one[name] for one in values if name in one]) for name in names}
-    return module.summarise(joined)
+    return module.summarise(concatenate(values))
 
 
 def test_a_training_leaves_a_checkpoint_with_its_record(data: TrainingData, tmp_path: Path) -> None:
-    folder = train_simulator(data, TINY, out=tmp_path / "out", accelerator="cpu")
+    folder = train_simulator(data, SMALL, out=tmp_path / "out", accelerator="cpu")
     about = checkpoint_about(folder)
     assert about["recipe"]["batch"] == 2 and about["steps"] in (4, 8)
-    module = SimulatorTraining(TINY)
+    module = SimulatorTraining(SMALL)
     names = {"valid_snr_median", "valid_snr_worst_tenth"}
     assert about["start_validation"].keys() == about["validation"].keys() == names
     assert validation(module, data)["valid_snr_median"] == pytest.approx(
@@ -82,8 +81,8 @@ def test_a_training_leaves_a_checkpoint_with_its_record(data: TrainingData, tmp_
     )
 
 
-def test_the_average_is_what_is_validated_and_released(data: TrainingData, tmp_path: Path) -> None:
-    folder = train_simulator(data, replace(TINY, steps=4), out=tmp_path, accelerator="cpu")
+def test_the_average_is_validated_and_saved(data: TrainingData, tmp_path: Path) -> None:
+    folder = train_simulator(data, replace(SMALL, steps=4), out=tmp_path, accelerator="cpu")
     assert checkpoint_about(folder)["steps"] == 4
     released = load_pretrained(folder).state_dict()
     state = torch.load(tmp_path / "last.ckpt", weights_only=True)
@@ -110,17 +109,17 @@ def test_a_short_training_beats_the_untrained_network(data: TrainingData, tmp_pa
 
 
 def test_training_starts_from_a_checkpoint(data: TrainingData, tmp_path: Path) -> None:
-    recipe = replace(TINY, model={}, start="neuro-msbg-cnn", steps=1, learning_rate=1e-6)
+    recipe = replace(SMALL, model={}, start="neuro-msbg-cnn", steps=1, learning_rate=1e-6)
     folder = train_simulator(data, recipe, out=tmp_path, accelerator="cpu")
     start, trained = load_pretrained("neuro-msbg-cnn"), load_pretrained(folder)
     assert trained.config == start.config
-    for one, other in zip(start.parameters(), trained.parameters(), strict=True):
-        assert float((one - other).abs().max()) < 1e-5
+    for initial, final in zip(start.parameters(), trained.parameters(), strict=True):
+        assert float((initial - final).abs().max()) < 1e-5
     assert checkpoint_about(folder)["start_sha256"] == checkpoint_digest("neuro-msbg-cnn")
 
 
-def test_all_is_trained_that_is_trained_from_random_weights() -> None:
-    started = SimulatorTraining(replace(TINY, model={}, start="neuro-msbg-cnn")).network
+def test_a_start_has_the_same_trained_parameters_as_random_weights() -> None:
+    started = SimulatorTraining(replace(SMALL, model={}, start="neuro-msbg-cnn")).network
     random = NeuroMSBG(started.config)
     trained, expected = (
         {name for name, parameter in network.named_parameters() if parameter.requires_grad}
@@ -129,20 +128,20 @@ def test_all_is_trained_that_is_trained_from_random_weights() -> None:
     assert trained == expected and started.training
 
 
-def test_initial_weights_depend_on_the_seed_alone_and_leave_others_draws() -> None:
+def test_initial_weights_depend_on_the_seed_alone_and_change_no_other_draws() -> None:
     torch.manual_seed(5)
-    first = SimulatorTraining(TINY).network.state_dict()
+    first = SimulatorTraining(SMALL).network.state_dict()
     draw = torch.rand(())
     torch.manual_seed(5)
     assert torch.equal(draw, torch.rand(()))
-    again = SimulatorTraining(TINY).network.state_dict()
+    again = SimulatorTraining(SMALL).network.state_dict()
     assert all(torch.equal(first[name], again[name]) for name in first)
 
 
 def test_bfloat16_is_near_and_keeps_gradients_precise(data: TrainingData) -> None:
     losses = []
     for precision in ("float32", "bfloat16"):
-        recipe = replace(TINY, precision=precision)  # type: ignore[arg-type]
+        recipe = replace(SMALL, precision=precision)  # type: ignore[arg-type]
         module = SimulatorTraining(recipe)
         loss = module.training_loss(training_batch(data, recipe))
         loss.backward()
@@ -153,7 +152,7 @@ def test_bfloat16_is_near_and_keeps_gradients_precise(data: TrainingData) -> Non
 
 
 def test_noise_ears_and_all_criteria_train(rich: TrainingData) -> None:
-    recipe = replace(TINY, weights=ALL_CRITERIA)
+    recipe = replace(SMALL, weights=ALL_CRITERIA)
     module = SimulatorTraining(recipe)
     loss = module.training_loss(training_batch(rich, recipe))
     loss.backward()
@@ -168,14 +167,14 @@ def test_another_teacher_is_recorded_and_needs_another_folder(
 ) -> None:
     monkeypatch.syspath_prepend(Path(__file__).parents[2] / "examples" / "training")
     settings: dict[str, Any] = {"out": tmp_path, "accelerator": "cpu"}
-    recipe = replace(TINY, steps=1)
+    recipe = replace(SMALL, steps=1)
     folder = train_simulator(data, recipe, teacher="dead_region:DeadRegion", **settings)
     assert checkpoint_about(folder)["teacher"] == "dead_region:DeadRegion"
     with pytest.raises(ValueError, match="differs in teacher;"):
         train_simulator(data, recipe, **settings)
     targets = []
     for teacher in (None, PluginTeacher("dead_region:DeadRegion")):
-        batches = simulator_data(data, TINY, teacher)
+        batches = simulator_data(data, SMALL, teacher)
         targets.append(batches.on_after_batch_transfer(batches.training[Step(0)], 0))
     assert torch.equal(targets[0]["signal"], targets[1]["signal"])
     assert not torch.allclose(targets[0]["impaired"], targets[1]["impaired"])
@@ -188,11 +187,13 @@ def test_missing_data_is_named_before_anything_is_written(
     nowhere = tmp_path / "nowhere"
     sources: dict[str, Any] = {"speech": speech_dir / "train"} | {missing: nowhere}
     with pytest.raises(ValueError, match=f"^{nowhere}"):
-        train_simulator(TrainingData(**sources), TINY, out=tmp_path / "out", accelerator="cpu")
+        train_simulator(TrainingData(**sources), SMALL, out=tmp_path / "out", accelerator="cpu")
     assert not (tmp_path / "out").exists()
 
 
-def test_files_trained_on_are_none_to_validate_on(speech_dir: Path, tmp_path: Path) -> None:
+def test_files_are_not_used_for_both_training_and_validation(
+    speech_dir: Path, tmp_path: Path
+) -> None:
     train_dir, valid = speech_dir / "train", speech_dir / "valid"
     link = tmp_path / "link"
     link.symlink_to(train_dir)
@@ -205,14 +206,14 @@ def test_files_trained_on_are_none_to_validate_on(speech_dir: Path, tmp_path: Pa
     )
     for source in sources:
         with pytest.raises(ValueError, match="both training and validation"):
-            simulator_data(TrainingData(**source), TINY)
+            simulator_data(TrainingData(**source), SMALL)
 
 
 def test_the_validation_set_is_fixed_and_as_described(rich: TrainingData) -> None:
-    recipe = replace(TINY, validation_items=24)
+    recipe = replace(SMALL, validation_items=24)
     batches = simulator_validation(rich, recipe)
-    for one, same in zip(batches, simulator_validation(rich, recipe), strict=True):
-        assert all(torch.equal(one[name], same[name]) for name in ("signal", "thresholds"))
+    for first, second in zip(batches, simulator_validation(rich, recipe), strict=True):
+        assert all(torch.equal(first[name], second[name]) for name in ("signal", "thresholds"))
     signals = torch.cat([batch["signal"] for batch in batches])
     ears = torch.cat([batch["thresholds"] for batch in batches])
     assert signals.shape == (24, 32000) and ears.shape == (24, 8)
@@ -223,9 +224,9 @@ def test_the_validation_set_is_fixed_and_as_described(rich: TrainingData) -> Non
     assert not torch.equal(other, signals)
 
 
-def test_sounds_take_the_place_of_a_share_of_the_clips(data: TrainingData) -> None:
+def test_sounds_replace_a_share_of_the_clips(data: TrainingData) -> None:
     def clips(sounds: float) -> Tensor:
-        recipe = replace(TINY, batch=40, sounds=sounds, treated=False)
+        recipe = replace(SMALL, batch=40, sounds=sounds, treated=False)
         return simulator_data(data, recipe).training[Step(0)]["signal"]
 
     def clicks(signals: Tensor) -> int:
@@ -236,7 +237,8 @@ def test_sounds_take_the_place_of_a_share_of_the_clips(data: TrainingData) -> No
 
 def test_sounds_are_validated_by_their_share(data: TrainingData) -> None:
     speech, both = (
-        validation(SimulatorTraining(recipe), data) for recipe in (TINY, replace(TINY, sounds=0.25))
+        validation(SimulatorTraining(recipe), data)
+        for recipe in (SMALL, replace(SMALL, sounds=0.25))
     )
     median, low = both["valid_sounds_snr_median"], both["valid_sounds_snr_worst_tenth"]
     assert both["valid_snr_median"] == speech["valid_snr_median"]

@@ -1,4 +1,4 @@
-"""Tones and clicks: what they are, and that a seed is all they depend on."""
+"""Tones are steady, clicks are short, and both depend on the seed alone."""
 
 import torch
 
@@ -13,7 +13,7 @@ def test_tones_are_steady_and_few() -> None:
     tones = draw(40)[::2]
     spectra = (tones[:, 8000:] * torch.hann_window(8000)).T.contiguous()
     powers = torch.fft.rfft(spectra, dim=0).abs().square()
-    # four tones, five bins of the window each: no more than that fluctuates
+    # The power is in four tones, each of five bins because of the window.
     loudest = powers.topk(5 * 4, dim=0).values.sum(0)
     assert float((loudest / powers.sum(0)).min()) > 0.999
     hertz = powers.argmax(0) * 2.0
@@ -32,6 +32,6 @@ def test_clicks_are_single_samples() -> None:
     assert int(counts.min()) >= 1 and int(counts.max()) <= 8 and len(counts.unique()) > 2
 
 
-def test_a_seed_is_all_they_hang_on() -> None:
+def test_sounds_depend_on_the_seed_alone() -> None:
     assert torch.equal(draw(6), draw(6)) and not torch.equal(draw(6), draw(6, seed=1))
     assert draw(3, 1).shape == (3, 1) and bool(torch.isfinite(draw(3, 1)).all())

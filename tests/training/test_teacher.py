@@ -1,4 +1,4 @@
-"""The teacher: the exact MSBG, or another simulator."""
+"""The teacher is the exact MSBG or another simulator."""
 
 from pathlib import Path
 
@@ -31,7 +31,7 @@ def test_the_teacher_is_the_exact_msbg() -> None:
     assert find_teacher("msbg") is None and teacher_name(None) == "msbg"
 
 
-def test_a_plug_in_is_asked_at_its_own_rate(tmp_path: Path) -> None:
+def test_a_plug_in_is_called_at_its_own_rate(tmp_path: Path) -> None:
     (tmp_path / "plugin.py").write_text(PLUGIN)
     teacher = find_teacher(f"{tmp_path}/plugin.py:Quieter")
     speech = set_level(torch.randn(2, 16000), 65.0)

@@ -1,4 +1,4 @@
-"""Running a training, on a network of four numbers: steps, resuming, what is kept and what is refused."""
+"""A training takes its steps, resumes, saves the best network, and rejects other settings."""
 
 import json
 import math
@@ -40,12 +40,12 @@ class NoisyTargets(Dataset[Batch]):
 
 
 class VectorTraining(TrainingModule):
-    """Fits the vector to its targets.
+    """Training of the vector on its targets.
 
     Args:
-        scores: score of the validation after a step; by default minus the sum of the vector.
-        interrupt: "interrupted" in the step after the fifth, "stopped" after the fifth step, or "cut off" in the
-            validation after the fourth.
+        scores: Score of the validation after each step; by default minus the sum of the vector.
+        interrupt: "interrupted" in the step after the fifth, "stopped" after the fifth step, or
+            "cut off" in the validation after the fourth.
     """
 
     def __init__(
@@ -102,8 +102,8 @@ def assert_same(first: Any, second: Any) -> None:
             assert_same(first[name], second[name])
     elif isinstance(first, list):
         assert len(first) == len(second)
-        for one, other in zip(first, second, strict=True):
-            assert_same(one, other)
+        for first_entry, second_entry in zip(first, second, strict=True):
+            assert_same(first_entry, second_entry)
     else:
         assert first == second
 
@@ -123,7 +123,7 @@ def test_takes_the_recipes_steps_and_validates_after_the_last(
 
 @pytest.mark.parametrize("interrupt", ["interrupted", "stopped", "cut off"])
 def test_a_resumed_training_ends_as_an_uninterrupted_one(tmp_path: Path, interrupt: str) -> None:
-    """In a step between two validations, and in a validation, of weights and of their average."""
+    """Interruptions are in a step and in a validation; weights and averages are compared."""
     run(VectorTraining(), tmp_path / "whole")
     try:
         run(VectorTraining(interrupt=interrupt), tmp_path / "parts")
@@ -151,7 +151,7 @@ def test_a_finished_training_takes_no_further_step(tmp_path: Path) -> None:
 
 
 def test_time_only_stops(tmp_path: Path) -> None:
-    """Minutes count over all parts; a larger number goes on."""
+    """The time limit includes the time before a resumption."""
     short, later, longer = (VectorTraining(steps=10_000) for _ in range(3))
     run(short, tmp_path, max_minutes=0.01)
     reached = last_state(tmp_path)["global_step"]
@@ -222,9 +222,7 @@ def test_a_broken_state_is_named(tmp_path: Path, content: bytes) -> None:
         ),
     ],
 )
-def test_a_machine_that_cannot_train_leaves_no_folder(
-    tmp_path: Path, options: dict[str, Any]
-) -> None:
+def test_an_unusable_device_leaves_no_folder(tmp_path: Path, options: dict[str, Any]) -> None:
     with pytest.raises(ValueError):
         run(VectorTraining(), tmp_path / "out", **options)
     assert not (tmp_path / "out").exists()
@@ -243,7 +241,7 @@ def test_a_loss_that_is_not_finite_ends_the_training(tmp_path: Path, value: floa
 
 
 def test_the_average_forgets_the_initial_weights() -> None:
-    """A moving average whose early decay is (1 + n) / (10 + n), up to its own."""
+    """The decay is (1 + n) / (10 + n) after n steps, up to its final value."""
     values, expected = [1.0, 4.0, 2.0, 8.0], 0.0
     for step, value in enumerate(values):
         decay = 0.0 if step == 0 else min(0.2, (1.0 + step) / (10.0 + step))

@@ -62,23 +62,19 @@ all.
 
 ADVICE = (
     "correct the corpus, or use a CSV file with the columns path, noisy, speaker and split "
-    "instead, or "
-    "name the levels of folders, such as --folders split/speaker, or --folders split if the "
-    "speakers "
-    "are unknown"
+    "instead, or name the levels of folders, such as --folders split/speaker, or --folders split "
+    "if the speakers are unknown"
 )
 """Advice on corpora that are rejected."""
 
 _UNSUPPORTED = {
     re.compile(r"(^|/)mix_(clean|both|single)/"): (
-        "LibriMix is not supported; write a CSV file with the files of s1 in the column path "
-        "and those of "
-        "mix_single in the column noisy"
+        "LibriMix is not supported; write a CSV file with the files of s1 in the column path and "
+        "those of mix_single in the column noisy"
     ),
     re.compile(r"(^|/)clean_fileid_\d+\."): (
         "the layout of the DNS challenge is not supported; write a CSV file with clean_fileid_N "
-        "in the "
-        "column path and the noisy file of the same number in the column noisy"
+        "in the column path and the noisy file of the same number in the column noisy"
     ),
 }
 """Advice on unsupported layouts, by a pattern that recognises their paths."""
@@ -240,8 +236,7 @@ def hold_out_speakers(utterances: Sequence[Utterance], share: float) -> list[Utt
     if count >= len(speakers):
         raise ValueError(
             f"cannot move {count} of {len(speakers)} speakers to the validation split, because "
-            "none "
-            "would remain for training; lower --valid-share"
+            "none would remain for training; lower --valid-share"
         )
     valid_speakers = set(Random(0).sample(speakers, count))
     rows = []

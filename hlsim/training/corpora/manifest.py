@@ -57,8 +57,7 @@ def read_manifest(path: str | Path, root: str | Path | None = None) -> list[Utte
         if not row.get("path"):
             raise ValueError(
                 f"{path}, line {line}: the path is missing; expected a CSV file with a column "
-                "'path' "
-                "and optional columns 'noisy', 'speaker' and 'split'"
+                "'path' and optional columns 'noisy', 'speaker' and 'split'"
             )
         split = row.get("split", "train")
         if split not in SPLITS:
