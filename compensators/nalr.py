@@ -90,7 +90,7 @@ class NALR(nn.Module):
         Raises:
             ValueError: no audiogram, levels outside -10 to 120 dB HL, or shapes that do not fit.
         """
-        check_waveform(waveform)
+        check_waveform(waveform, full_scale_spl=self.full_scale_spl)
         thresholds = resolve_thresholds(
             self.thresholds, audiogram, waveform, two_ears=self._two_ears, **THRESHOLD_OPTIONS
         )

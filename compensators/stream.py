@@ -59,7 +59,7 @@ class Stream:
         super().__setattr__(name, value)
 
     def __call__(self, chunk: Tensor) -> Tensor:
-        check_waveform(chunk, "chunk")
+        check_waveform(chunk, "chunk", full_scale_spl=self._aid.full_scale_spl)
         if not bool(chunk.isfinite().all()):
             raise ValueError("expected finite samples in a chunk, got NaN or infinity")
         with torch.no_grad(), torch.autocast(chunk.device.type, enabled=False):

@@ -165,7 +165,7 @@ class Wearable(nn.Module):
 
         Shape: (..., time) -> (..., time).
         """
-        check_waveform(waveform)
+        check_waveform(waveform, full_scale_spl=self.full_scale_spl)
         with torch.autocast(waveform.device.type, enabled=False):
             batch, fitted, settings = self.prepare(waveform, audiogram, sliders)
             time = waveform.shape[-1]

@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from hlsim.checks import HIGHEST_RATE, LOWEST_RATE, check_waveform
+from hlsim.checks import HIGHEST_RATE, LOWEST_RATE, check_rate, check_waveform
 from hlsim.files import EXTENSIONS, atomic_path, check_extension
 
 HIGHEST_FILE_RATE = 384_000
@@ -45,9 +45,11 @@ def read_audio(path: str | Path, *, any_rate: bool = False) -> tuple[Tensor, int
         sample rate in Hz.
 
     Raises:
-        ValueError: libsndfile cannot read the file; it is empty, silent, or holds NaN or infinity;
-            or its sample rate is below 16 kHz or too high.
+        ValueError: ``path`` is not a path; libsndfile cannot read the file; it is empty, silent, or
+            holds NaN or infinity; or its sample rate is below 16 kHz or too high.
     """
+    if not isinstance(path, str | os.PathLike):
+        raise ValueError(f"expected the path of an audio file, got {type(path).__name__}")
     if not os.path.isfile(path):
         raise ValueError(f"{path}: there is no such file")
     try:
@@ -148,11 +150,10 @@ def check_writable(path: str | Path, channels: int, sample_rate: int) -> None:
             "write .wav or .flac instead"
         )
     highest = HIGHEST_OGG_RATE if is_ogg else HIGHEST_FILE_RATE
-    if not LOWEST_RATE <= sample_rate <= highest or int(sample_rate) != sample_rate:
-        raise ValueError(
-            f"{path}: expected a whole sample rate of {LOWEST_RATE} to {highest} Hz, "
-            f"got {sample_rate} Hz"
-        )
+    try:
+        check_rate(sample_rate, highest=highest)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
 
 
 def encode_flac(waveform: Tensor, sample_rate: int) -> bytes:

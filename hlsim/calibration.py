@@ -72,6 +72,9 @@ def level_spl(waveform: Tensor, full_scale_spl: float = PASCAL_SPL) -> Tensor:
 def set_level(waveform: Tensor, spl: float | Tensor, full_scale_spl: float = PASCAL_SPL) -> Tensor:
     """Scale waveforms to an RMS level in dB SPL. Silence stays silent.
 
+    Each item, and so each channel, gets a gain of its own. For one gain, which keeps the level
+    differences between channels, write ``set_level(x.flatten(), spl).view_as(x)``.
+
     Shape: (..., time) -> (..., time).
 
     Args:

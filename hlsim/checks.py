@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from numbers import Real
 from typing import Any, get_args
@@ -15,6 +16,9 @@ LOWEST_RATE, HIGHEST_RATE = 16000, 48000
 
 HIGHEST_SAMPLE = 1e9
 """Largest accepted sample. From 1e14 on, products of powers exceed the range of float32."""
+
+LOUDEST_SPL = 120.0
+"""RMS level in dB SPL above which the first waveform causes a warning."""
 
 MOST_CHANNELS = 8
 """A last dimension of at most this many values behind a longer one holds channels, not time."""
@@ -133,23 +137,32 @@ def describe(value: Any) -> str:
     return repr(value) if is_finite(value) else f"{value!r} ({type(value).__name__})"
 
 
-def check_rate(sample_rate: int) -> int:
+def check_rate(sample_rate: int, lowest: int = LOWEST_RATE, highest: int = HIGHEST_RATE) -> int:
     """Return a sample rate as an int.
 
+    Args:
+        sample_rate: sample rate in Hz.
+        lowest: lowest accepted rate.
+        highest: highest accepted rate.
+
     Raises:
-        ValueError: the rate is not a whole number of Hz from 16000 to 48000.
+        ValueError: the rate is not a whole number of Hz from ``lowest`` to ``highest``.
     """
-    accepted = is_finite(sample_rate) and LOWEST_RATE <= sample_rate <= HIGHEST_RATE
+    accepted = is_finite(sample_rate) and lowest <= sample_rate <= highest
     if not accepted or int(sample_rate) != sample_rate:
         raise ValueError(
-            f"expected a sample rate from {LOWEST_RATE} to {HIGHEST_RATE} Hz as a whole number, "
+            f"expected a sample rate from {lowest} to {highest} Hz as a whole number, "
             f"got {describe(sample_rate)}"
         )
     return int(sample_rate)
 
 
 def check_waveform(
-    waveform: Tensor, name: str = "waveform", *, highest: float = HIGHEST_SAMPLE
+    waveform: Tensor,
+    name: str = "waveform",
+    *,
+    highest: float = HIGHEST_SAMPLE,
+    full_scale_spl: float | None = None,
 ) -> Tensor:
     """Return a waveform that can be processed.
 
@@ -162,6 +175,8 @@ def check_waveform(
         waveform: tensor to validate.
         name: name of the argument, for messages.
         highest: largest accepted magnitude of a finite sample.
+        full_scale_spl: level in dB SPL of RMS 1.0. If it is passed, the first waveform of a process
+            whose level is above ``LOUDEST_SPL`` causes a warning.
 
     Raises:
         ValueError: it is not a floating-point tensor with time last, has no samples, or has a
@@ -180,7 +195,31 @@ def check_waveform(
             raise ValueError(
                 f"expected samples of {name} up to {highest:g}, got {peak:.3g}; scale it to pascals"
             )
+        if full_scale_spl is not None:
+            _warn_if_loud(waveform, name, peak, full_scale_spl)
     return waveform
+
+
+_has_warned_of_level = False
+
+
+def _warn_if_loud(waveform: Tensor, name: str, peak: float, full_scale_spl: float) -> None:
+    """Warn once per process of an item whose level is above ``LOUDEST_SPL``."""
+    global _has_warned_of_level
+    highest_rms = 10.0 ** ((LOUDEST_SPL - full_scale_spl) / 20.0)
+    # No RMS is above the peak, so that the level of other waveforms need not be computed.
+    if _has_warned_of_level or not highest_rms < peak < math.inf:
+        return
+    rms = float(waveform.detach().double().square().mean(-1).max().sqrt())
+    if rms > highest_rms:
+        _has_warned_of_level = True
+        warnings.warn(
+            f"{name} has a level of {20.0 * math.log10(rms) + full_scale_spl:.0f} dB SPL; did you "
+            "forget calibration? Load files with hlsim.load_audio, scale samples with "
+            "hlsim.calibration.set_level, or pass full_scale_spl. There are no further warnings "
+            "of this kind",
+            stacklevel=3,
+        )
 
 
 def check_time_last(waveform: Tensor, name: str = "waveform") -> None:

@@ -17,6 +17,7 @@ from compensators import load_compensator
 from hlsim.audio import read_audio
 from hlsim.audiogram.thresholds import AudiogramLike
 from hlsim.calibration import PASCAL_SPL, gain_to_pascals, level_spl, set_level
+from hlsim.checks import check_rate
 from hlsim.dsp.resample import resample
 from hlsim.losses.frozen_simulator import build_simulator
 from hlsim.neuro.config import NEURO_RATE
@@ -40,14 +41,16 @@ def load_audio(
         path: A file that libsndfile reads, such as WAV, FLAC, Ogg or MP3.
         spl: RMS level in dB SPL to which the recording is scaled, with one gain for all channels.
             ``None`` keeps the samples as they are in the file.
-        sample_rate: Rate in Hz to which the recording is resampled; by default its own.
+        sample_rate: Rate in Hz to which the recording is resampled, 16000 to 48000; by default its
+            own.
 
     Returns:
         Samples in pascals, ``(time,)`` for a mono file and ``(channels, time)`` otherwise, and
         their sample rate in Hz.
 
     Raises:
-        ValueError: The file cannot be read, is empty or silent, or holds NaN or infinity.
+        ValueError: The file cannot be read, is empty or silent, or holds NaN or infinity; or the
+            level or the sample rate is not valid.
 
     Example:
         >>> import hlsim
@@ -57,6 +60,7 @@ def load_audio(
     """
     channels, rate = read_audio(path, any_rate=sample_rate is not None)
     if sample_rate is not None:
+        sample_rate = check_rate(sample_rate)
         channels = resample(channels, rate, sample_rate)
         rate = sample_rate
     if spl is not None:
@@ -89,7 +93,7 @@ def simulate(
     simulator: str | Path | torch.nn.Module = "msbg",
     full_scale_spl: float = PASCAL_SPL,
 ) -> Audio:
-    """Simulate what an impaired ear perceives of a signal.
+    """Simulate what an impaired ear perceives of a signal, without gradients.
 
     Args:
         audio: Tensor or NumPy array of floating-point samples, ``(..., time)``.
@@ -125,7 +129,7 @@ def compensate(
     compensator: str | Path = "hearing-aid",
     full_scale_spl: float = PASCAL_SPL,
 ) -> Audio:
-    """Compute the output of a hearing aid for a signal.
+    """Compute the output of a hearing aid for a signal, without gradients.
 
     Args:
         audio: Tensor or NumPy array of floating-point samples, ``(..., time)``.
@@ -276,11 +280,15 @@ def _as_tensor(audio: Tensor | NDArray[Any]) -> Tensor:
         )
     samples = np.asarray(audio)
     if not np.issubdtype(samples.dtype, np.floating):
+        is_integer = np.issubdtype(samples.dtype, np.integer)
+        fix = "; divide 16-bit samples by 32768, then set their level with set_level"
         raise ValueError(
-            f"expected floating-point samples, got an array of {samples.dtype}; divide 16-bit "
-            "samples by 32768 and set their level with hlsim.calibration.set_level"
+            "expected a tensor or an array of floating-point samples, got "
+            f"{type(audio).__name__} of {samples.dtype}{fix if is_integer else ''}"
         )
-    return torch.from_numpy(np.ascontiguousarray(samples))
+    # A copy, because torch takes no array that is reversed, read-only or in another byte order.
+    size = min(samples.dtype.itemsize, 8)
+    return torch.from_numpy(np.array(samples, dtype=f"f{size}", order="C"))
 
 
 def _as_input(result: Tensor, audio: Audio) -> Audio:

@@ -61,8 +61,8 @@ def as_thresholds(
         ValueError: The value does not describe ears, an ear is missing, a tensor does not hold
             eight real numbers per ear, or a level is NaN or outside -10 to ``highest`` dB HL.
     """
-    if isinstance(audiogram, np.ndarray):
-        audiogram = torch.from_numpy(audiogram).float()
+    if isinstance(audiogram, np.ndarray) and audiogram.ndim > 1:
+        audiogram = torch.tensor(audiogram.astype(np.float32))
     listed = list_ears(audiogram)
     if listed is None:
         return _check_tensor(_stack(audiogram), highest, consumer)

@@ -27,6 +27,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from hlsim.checks import check_rate
 from hlsim.torchtools import compute_once
 
 ROLLOFF = 0.9475937167399596
@@ -37,6 +38,9 @@ ZERO_CROSSINGS = 64
 
 KAISER_BETA = 14.769656459379492
 """Shape parameter of the Kaiser window."""
+
+HIGHEST_RATE = 1_000_000
+"""Highest accepted sample rate in Hz."""
 
 MAX_KERNEL_VALUES = 100_000_000
 """Largest number of values of a kernel, 0.4 GB in float32.
@@ -63,12 +67,14 @@ def resample(waveform: Tensor, source_rate: int, target_rate: int) -> Tensor:
 
     Raises:
         TypeError: the samples are integers or complex.
-        ValueError: the common factor of the rates is so small that the kernel would take gigabytes,
-            as for 44101 and 16000 Hz.
+        ValueError: a rate is not a whole number from 1 to 1000000 Hz, or the common factor of the
+            rates is so small that the kernel would take gigabytes, as for 44101 and 16000 Hz.
 
     >>> resample(torch.randn(2, 44100), 44100, 16000).shape
     torch.Size([2, 16000])
     """
+    source_rate = check_rate(source_rate, 1, HIGHEST_RATE)
+    target_rate = check_rate(target_rate, 1, HIGHEST_RATE)
     if source_rate == target_rate:
         return waveform
     if not waveform.is_floating_point():

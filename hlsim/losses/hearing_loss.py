@@ -277,8 +277,8 @@ class HearingLossLoss(nn.Module):
         listener: Mapping[str, Any] | None = None,
     ) -> "_Inputs":
         """Validate the arguments of a call, and silence what does not count."""
-        check_waveform(compensated, "compensated")
-        check_waveform(clean, "clean")
+        check_waveform(compensated, "compensated", full_scale_spl=self.full_scale_spl)
+        check_waveform(clean, "clean", full_scale_spl=self.full_scale_spl)
         for name in ("shape", "device"):
             values = getattr(compensated, name), getattr(clean, name)
             if values[0] != values[1]:

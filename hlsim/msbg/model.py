@@ -155,7 +155,7 @@ class MSBG(nn.Module):
         Raises:
             ValueError: no audiogram, levels outside -10 to 100 dB HL, or shapes that do not fit.
         """
-        check_waveform(waveform)
+        check_waveform(waveform, full_scale_spl=self.full_scale_spl)
         grids = self._other_grids
         if audiogram is not None:
             grids = ears_on_other_grids(audiogram)

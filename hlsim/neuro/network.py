@@ -71,7 +71,7 @@ class EarNetwork(nn.Module):
             ValueError: there is no audiogram, its levels are outside -10 to 100 dB HL, the shapes
                 do not broadcast, or the waveform is on another device than the weights.
         """
-        check_waveform(waveform)
+        check_waveform(waveform, full_scale_spl=self.full_scale_spl)
         # Replicas of nn.DataParallel list no parameters.
         weight = next(self.parameters(), None)
         if weight is not None and weight.device != waveform.device:

@@ -95,7 +95,7 @@ class CleanSpeech:
         self._name = name
         self._input_rate = check_rate(sample_rate)
         self._full_scale = check_full_scale(full_scale_spl)
-        check_waveform(clean, "clean")
+        check_waveform(clean, "clean", full_scale_spl=self._full_scale)
         self.shape, self.time = clean.shape[:-1], clean.shape[-1]
         self.dtype, self.device = torch.promote_types(clean.dtype, torch.float32), clean.device
         ends = [self.time] * self.shape.numel()
@@ -207,7 +207,7 @@ class CleanSpeech:
 
         Shape: (..., time) -> (items, time).
         """
-        check_waveform(processed, "processed")
+        check_waveform(processed, "processed", full_scale_spl=self._full_scale)
         if processed.shape != (*self.shape, self.time):
             raise ValueError(
                 f"expected processed of the shape of clean, {(*self.shape, self.time)}, "
