@@ -1,11 +1,13 @@
-"""Golden cases: outputs and gradients whose bits a change of code must not alter.
+"""Golden cases: outputs and gradients that a change of the code must not alter by a single bit.
 
-``golden.npz`` holds two excerpts of the bundled speech, what every case returned when the file was written, and the
-environment of that time. ``test_golden.py`` compares. A case that is meant to change is written again by name::
+``golden.npz`` contains two excerpts of the bundled speech, the output of every case when the file
+was written, and a description of the environment. ``test_golden.py`` compares new outputs with it.
+If the output of a case should change, write that case again::
 
     python -m tests.golden "resample 44100 to 16000 Hz"
 
-Without a name the command adds the cases that the file lacks, and ``--all`` writes every case.
+Without a name, the command adds cases that are missing in the file, and ``--all`` writes every
+case.
 """
 
 from __future__ import annotations
@@ -28,8 +30,9 @@ from torch import Tensor, nn
 
 GOLDEN_FILE = Path(__file__).with_name("golden.npz")
 
-# Largest differences on another machine or with another version of torch, relative to the peak of the array.
-# Measured between AVX-512, AVX2 and no vector instructions of one machine; each allows a few times as much.
+# Largest differences on another machine or with another version of torch, relative to the peak of
+# the array. Each is a few times the largest difference that was measured between AVX-512, AVX2 and
+# no vector instructions on one machine.
 EXACT = 1e-6
 RESAMPLED = 1e-5  # hlsim's own resampling takes part
 SINGLE_PRECISION = (
@@ -93,7 +96,7 @@ class Summary:
         )
 
     def difference(self, other: Summary) -> float:
-        """Largest difference relative to the peak; of a sum it is divided by the root of its length."""
+        """Compute the largest difference relative to the peak; sums are scaled by their length."""
         if self.shape != other.shape:
             return float("inf")
         if (np.isnan(self.samples) != np.isnan(other.samples)).any():
@@ -121,7 +124,7 @@ def environment() -> dict[str, str]:
     }
 
 
-# -- the file ----------------------------------------------------------------------------------------------------------
+# The file
 
 
 @lru_cache(maxsize=1)
@@ -181,11 +184,11 @@ def compute(case: Case) -> dict[str, Summary]:
     return {name: Summary.of(value) for name, value in case.compute().items()}
 
 
-# -- signals and helpers -----------------------------------------------------------------------------------------------
+# Signals and helpers
 
 
 def speech(seconds: float = 0.4, rate: int = 16000, name: str = "female") -> Tensor:
-    """An excerpt of a bundled utterance in pascals; its samples are read at another rate as they are."""
+    """Return an excerpt of a bundled utterance in pascals, whose samples are used at any rate."""
     count = round(seconds * rate)
     excerpt = read_file()[1][name]
     repeated = np.resize(excerpt, count)
@@ -246,7 +249,7 @@ def in_chunks(stream: Any, signal: Tensor, sizes: tuple[int, ...] = (1, 100, 16,
     return torch.cat(outputs, -1)
 
 
-# -- MSBG --------------------------------------------------------------------------------------------------------------
+# MSBG
 
 
 def exact_msbg(name: str, rate: int, aligned: bool) -> Arrays:
@@ -291,7 +294,7 @@ def msbg_delay() -> Arrays:
     return {"samples": np.array(estimate_delay(model))}
 
 
-# -- checkpoints and compensators --------------------------------------------------------------------------------------
+# Checkpoints and compensators
 
 
 def simulator(name: str, rate: int = 16000) -> Arrays:
@@ -394,11 +397,11 @@ def random_compensator(kind: str) -> Arrays:
     return {**results, "gradient of the parameters": gradient}
 
 
-# -- losses ------------------------------------------------------------------------------------------------------------
+# Losses
 
 
 def loss_value(loss: nn.Module, *arguments: Any, listener: bool = False) -> dict[str, Tensor]:
-    """The value for a compensated batch and clean speech, and the gradient of the compensated batch."""
+    """Compute the loss of an aid's output, and the gradient with respect to the output."""
     clean = torch.stack([speech(0.8), speech(0.8, name="male")])
     compensated = 1.5 * clean + noise(clean.numel()).reshape(clean.shape)
     if listener:
@@ -470,7 +473,7 @@ def haspi_loss(simulator: str) -> Arrays:
     return loss_value(HASPILoss(ear("N3"), simulator=simulator, quality=0.5))
 
 
-# -- metrics -----------------------------------------------------------------------------------------------------------
+# Metrics
 
 
 def metric(name: str, dtype: torch.dtype, rate: int = 16000, **options: Any) -> Arrays:
@@ -509,7 +512,7 @@ def binaural(rate: int) -> Arrays:
     return with_gradient(lambda x: mbstoi(x, clean, sample_rate=rate), processed)
 
 
-# -- resampling and statistics -----------------------------------------------------------------------------------------
+# Resampling and statistics
 
 
 def resampled(source_rate: int, target_rate: int, dtype: torch.dtype = torch.float32) -> Arrays:
@@ -551,7 +554,7 @@ def interval() -> Arrays:
     return {"ends": np.array(bootstrap_interval(after - before))}
 
 
-# -- the table of cases ------------------------------------------------------------------------------------------------
+# The table of cases
 
 SIMULATORS = (
     "neuro-msbg",

@@ -1,8 +1,9 @@
-"""pyclarity's outputs, stored because pyclarity takes most of the time of the tests that compare with it.
+"""Stored outputs of pyclarity, which save most of the time of the tests that compare with it.
 
-A test asks the fixture ``pyclarity`` for an output by a key, with the function that computes it. By default it gets the
-output stored in ``pyclarity.npz``. Marked slow, each of these tests runs a second time, calls pyclarity, and compares its
-output with the stored one as well. ``pytest -n 0 -m slow --write-pyclarity`` stores what was computed.
+A test requests an output from the fixture ``pyclarity`` by a key, with the function that computes
+it. By default, the output is read from ``pyclarity.npz``. Each of these tests also runs as a slow
+test, which calls pyclarity and compares its output with the stored one. ``pytest -n 0 -m slow
+--write-pyclarity`` stores new outputs.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from hlsim.audiogram import Audiogram
 OUTPUTS_FILE = Path(__file__).with_name("pyclarity.npz")
 
 STRIDE = 17
-"""Distance of the stored values of a long signal; 17 shares no factor with MSBG's frames and hops."""
+"""Distance of stored samples of a long signal; 17 has no factor in common with MSBG's hops."""
 
 Array = NDArray[Any]
 
@@ -60,7 +61,7 @@ def write_outputs(new_outputs: dict[str, Array]) -> None:
     np.savez_compressed(OUTPUTS_FILE, **{**known, **new_outputs})
 
 
-# -- calls of pyclarity ------------------------------------------------------------------------------------------------
+# Calls of pyclarity
 
 
 @contextmanager

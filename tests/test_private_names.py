@@ -10,7 +10,7 @@ SOURCES = sorted([*(ROOT / "hlsim").rglob("*.py"), *(ROOT / "compensators").rglo
 
 
 def names_of_torch(tree: ast.AST) -> Iterator[str]:
-    """Find dotted names that begin with torch, such as ``torch.fft.rfft``, in imports and in code."""
+    """Find dotted names that begin with torch, such as ``torch.fft.rfft``."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Attribute):
             yield ast.unparse(node)
