@@ -9,6 +9,8 @@ from typing import Any, NamedTuple
 import pytest
 import torch
 from torch import Tensor, nn
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
 
 from compensators import WDRC, MappingCompensator, load_compensator
 from hlsim import MSBG, Audiogram, HearingLossLoss, load_pretrained, torchtools
@@ -110,6 +112,10 @@ for criterion in ("coherent-bands", "bands", "paper"):
             partial(HearingLossLoss, N3, simulator=simulator, criterion=criterion), judge_own_ear
         )
     CALLS[f"loss {criterion}"] = Call(partial(HearingLossLoss, criterion=criterion), judge)
+for simulator in ("msbg", "neuro-msbg"):
+    CALLS[f"loss through {simulator} with checkpoint, own ear"] = Call(
+        partial(HearingLossLoss, N3, simulator=simulator, checkpoint=True), judge_own_ear
+    )
 
 
 def value_and_gradient(call: Call, module: nn.Module, *tensors: Tensor) -> tuple[Tensor, Tensor]:
@@ -141,6 +147,48 @@ def test_module_keeps_to_its_device_and_does_not_wait(name: str) -> None:
     for found, expected, tolerance in zip(on_device, on_cpu, (1e-4, 1e-2), strict=True):
         assert isinstance(found, PretendTensor)
         assert (found.inner - expected).norm() <= tolerance * expected.norm()
+
+
+class Operations(TorchDispatchMode):
+    """The operations in a context, with the shapes of their results."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.log: list[tuple[str, list[torch.Size]]] = []
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        result = func(*args, **(kwargs or {}))
+        tensors = [leaf for leaf in tree_leaves(result) if isinstance(leaf, Tensor)]
+        self.log.append((str(func), [tensor.shape for tensor in tensors]))
+        return result
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "loss coherent-bands through msbg, own ear",
+        "loss coherent-bands through neuro-msbg, own ear",
+        "neuro-msbg-mamba",
+        "hearing-aid",
+        "compensator-general",
+    ],
+)
+def test_operations_and_shapes_do_not_depend_on_the_signal(name: str) -> None:
+    """A CUDA graph replays the operations that it captured, in the memory that it captured."""
+    call = CALLS[name]
+    module = call.build()
+    logs = []
+    with PretendDevice() as device:
+        module.to(DEVICE)
+        ears = EARS.to(DEVICE)
+        for scale in (0.02, 0.02, 1.0, 0.0):
+            signals = (scale * torch.randn(2, 4, 12000)).to(DEVICE)
+            device.waits.clear()
+            with Operations() as operations:
+                value_and_gradient(call, module, *signals, ears)
+            logs.append(operations.log)
+            waits = device.waits.total()
+    assert waits == 0 and logs[1] == logs[2] == logs[3]  # the first call computes the constants
 
 
 def test_ears_on_a_device_that_are_out_of_range_give_nan() -> None:

@@ -196,7 +196,27 @@ class _GradientLimiter(torch.autograd.Function):
         edges = torch.minimum(before, after)
         ramp = (torch.arange(ctx.block, device=gradient.device) / ctx.block).to(edges)
         factors = torch.lerp(edges[..., :-1, None], edges[..., 1:, None], ramp).flatten(-2)
-        return gradient * factors[..., :time], None
+        limited: Tensor = _FirstDerivative.apply(gradient * factors[..., :time])
+        return limited, None
+
+
+class _FirstDerivative(torch.autograd.Function):
+    """Identity that raises RuntimeError if it is differentiated."""
+
+    @staticmethod
+    def forward(gradient: Tensor) -> Tensor:
+        return gradient.view_as(gradient)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor], output: Tensor) -> None:
+        pass
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> Tensor:
+        raise RuntimeError(
+            "the criteria 'coherent-bands', 'haspi' and 'hasqi' limit the gradient and have no "
+            "second derivative; use 'bands', 'paper' or a function"
+        )
 
 
 def _split(samples: Tensor, block: int) -> Tensor:

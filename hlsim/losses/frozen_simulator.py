@@ -3,13 +3,14 @@
 import math
 import os
 from collections.abc import Callable, Mapping
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
+from torch.utils.checkpoint import checkpoint
 
 from hlsim.audiogram import FREQUENCIES
 from hlsim.audiogram.devices import on_device
@@ -18,6 +19,7 @@ from hlsim.dsp.resample import resample
 from hlsim.losses.band_levels import HIGHEST
 from hlsim.msbg import MSBG
 from hlsim.msbg.response import apply_bank_phase, simulate_normal_ear
+from hlsim.neuro.network import EarNetwork
 from hlsim.pretrained import SIMULATOR, find_checkpoint, load_pretrained
 from hlsim.torchtools import without_modes
 
@@ -39,6 +41,7 @@ class FrozenSimulator:
         full_scale_spl: level in dB SPL of RMS 1.0.
         normal: normal ear, as in ``HearingLossLoss``.
         reference: reference of the criteria that have a choice, as in ``HearingLossLoss``.
+        checkpoint: compute the activations of the simulator again in the backward pass.
 
     Raises:
         ValueError: an argument is not as ``HearingLossLoss`` describes it.
@@ -51,6 +54,7 @@ class FrozenSimulator:
         full_scale_spl: float,
         normal: Hearing | None,
         reference: ReferenceName | None,
+        checkpoint: bool = False,
     ) -> None:
         if normal is not None and not callable(normal):
             raise ValueError(
@@ -62,6 +66,11 @@ class FrozenSimulator:
         self.choice = reference
         simulator = build_simulator(simulator, sample_rate, full_scale_spl)
         self.simulator = simulator.eval().requires_grad_(False)
+        self._checkpoints_whole = checkpoint
+        if checkpoint and isinstance(simulator, MSBG | EarNetwork):
+            # They compute a few items at a time again, so that the peak is lower, too.
+            simulator.checkpoint = True
+            self._checkpoints_whole = False
         if isinstance(normal, nn.Module):
             normal.eval().requires_grad_(False)
 
@@ -96,7 +105,10 @@ class FrozenSimulator:
             name: value.to(waveform.device) if isinstance(value, Tensor) else value
             for name, value in (options or {}).items()
         }
-        output = self.simulator(waveform, thresholds, **options)
+        simulator = partial(self.simulator, **options)
+        if self._checkpoints_whole:
+            simulator = partial(checkpoint, simulator, use_reentrant=False)
+        output = simulator(waveform, thresholds)
         return _check_output(output, "simulator", waveform, allowed)
 
     def _simulate_by_length(self, waveform: Tensor, thresholds: Tensor, ends: Tensor) -> Tensor:

@@ -140,6 +140,7 @@ class HearingLossLoss(nn.Module):
         reduction: Reduction = "mean",
         normal: Hearing | None = None,
         ears: EarsName = "mean",
+        checkpoint: bool = False,
     ) -> None:
         super().__init__()
         self.sample_rate = check_rate(sample_rate)
@@ -154,7 +155,7 @@ class HearingLossLoss(nn.Module):
         self.weights = combine_weights(weights, self.criteria)
         self._two_ears = has_listeners(audiogram)
         self._frozen = FrozenSimulator(
-            simulator, self.sample_rate, self.full_scale_spl, normal, reference
+            simulator, self.sample_rate, self.full_scale_spl, normal, reference, checkpoint
         )
         # nn.Module does not register what is in a tuple.
         self._unregistered = (store_thresholds(audiogram, allow_missing=True), criterion)

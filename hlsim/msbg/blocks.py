@@ -5,6 +5,7 @@ The blocks are computed again for gradients, so that memory does not grow with t
 
 import math
 from collections.abc import Callable
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -30,33 +31,39 @@ _FADE_SECONDS = 0.2
 
 
 def in_blocks(
-    process: Callable[[Tensor, Tensor, bool], Tensor], signals: Tensor, ears: Tensor, rate: int
+    process: Callable[[Tensor, Tensor, bool], Tensor],
+    signals: Tensor,
+    ears: Tensor,
+    rate: int,
+    *,
+    checkpoints_short: bool = False,
 ) -> Tensor:
     """Process signals in blocks, whose outputs are those of the whole signals.
+
+    Blocks of long signals are computed again in the backward pass.
 
     Args:
         process: function of signals, ears, and whether the signals end where their block does.
         signals: signals of all items.
         ears: thresholds of all items.
         rate: sample rate in Hz.
+        checkpoints_short: compute signals of one block again in the backward pass, too.
 
     Shape: (items, time), (items, levels) -> (items, time).
     """
     samples = signals.shape[-1]
     blocks = block_bounds(samples, rate)
+    is_differentiated = torch.is_grad_enabled() and (signals.requires_grad or ears.requires_grad)
+    if is_differentiated and (checkpoints_short or len(blocks) > 1) and _hooks_are_allowed():
+        process = partial(checkpoint, process, use_reentrant=False)
     if len(blocks) == 1:
         return process(signals, ears, True)
     outputs = []
-    may_checkpoint = torch.is_grad_enabled() and _hooks_are_allowed()
     for block in blocks:
         is_last = block.input_stop == samples
         cut = block.cut_input(signals)
         cut = _fade(cut, rate, fade_in=block.input_start > 0, fade_out=not is_last)
-        if may_checkpoint and (cut.requires_grad or ears.requires_grad):
-            output = checkpoint(process, cut, ears, is_last, use_reentrant=False)
-        else:
-            output = process(cut, ears, is_last)
-        outputs.append(block.cut_output(output))
+        outputs.append(block.cut_output(process(cut, ears, is_last)))
     return torch.cat(outputs, -1)
 
 

@@ -57,10 +57,10 @@ _END_LEAD_SAMPLES = 7296
 """Samples before the end on which these depend."""
 
 _CPU_SAMPLES = 384_000
-"""Samples of all items that run together on a CPU."""
+"""Samples of all items that run together on a CPU, or with ``checkpoint``."""
 
 _DEVICE_SAMPLES = 12_000_000
-"""Samples of all items that run together on another device."""
+"""Samples of all items that run together elsewhere."""
 
 
 class _Group(NamedTuple):
@@ -106,6 +106,10 @@ class MSBG(nn.Module):
             gain of 1 to 3 dB down that depends on the utterance, as the reference does with one
             channel. It scales two channels by one gain.
 
+    Attributes:
+        checkpoint: compute activations again in the backward pass, a few items or one block at a
+            time, instead of storing them. False by default.
+
     Raises:
         ValueError: a rate, level or audiogram out of range.
     """
@@ -129,6 +133,7 @@ class MSBG(nn.Module):
         self.full_scale_spl = check_full_scale(full_scale_spl)
         self.aligned = aligned
         self.rescale_active = rescale_active
+        self.checkpoint = False
         levels = store_thresholds(audiogram)
         is_trained = levels is not None and levels.requires_grad
         self.register_buffer("_levels", None if is_trained else levels, persistent=False)
@@ -205,6 +210,9 @@ class MSBG(nn.Module):
         if self.rescale_active:
             signals = signals * active_rescaling(resample_to_model_rate(signals, self.sample_rate))
 
+        needs_small_portions = self.checkpoint or signals.device.type == "cpu"
+        samples_at_once = _CPU_SAMPLES if needs_small_portions else _DEVICE_SAMPLES
+        items_at_once = max(1, samples_at_once // signals.shape[-1])
         outputs: list[Tensor] = []
         order: list[int] = []
         known = on_host(thresholds).to(dtype).expand(*batch, -1).reshape(ears.shape)
@@ -213,12 +221,19 @@ class MSBG(nn.Module):
             grids = [grids[ear] for ear in ear_of_item.flatten().tolist()]
         for group, members in _group_items(known, ears.requires_grad, grids).items():
             process = partial(self._simulate_group, group=group)
-            for items in _split_items(members, signals.shape[-1], signals.device.type):
+            for items in _split_items(members, items_at_once):
                 rows = _select(items, signals.device)
                 levels = ears[rows]
                 if group.frequencies != FREQUENCIES:
                     levels = _levels(grids, items).to(ears, non_blocking=True)
-                outputs.append(in_blocks(process, signals[rows], levels, self.sample_rate))
+                output = in_blocks(
+                    process,
+                    signals[rows],
+                    levels,
+                    self.sample_rate,
+                    checkpoints_short=self.checkpoint,
+                )
+                outputs.append(output)
                 order += items
         longest = max(output.shape[-1] for output in outputs)
         if len(outputs) == 1:
@@ -385,7 +400,6 @@ def _indices(items: list[int], device: torch.device) -> Tensor:
     return torch.tensor(items).to(device, non_blocking=device.type != "cpu")
 
 
-def _split_items(members: list[int], samples: int, device: str) -> list[list[int]]:
-    """Split items into portions that together do not take too much memory."""
-    size = max(1, (_CPU_SAMPLES if device == "cpu" else _DEVICE_SAMPLES) // samples)
+def _split_items(members: list[int], size: int) -> list[list[int]]:
+    """Split items into portions of a size."""
     return [members[start : start + size] for start in range(0, len(members), size)]

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import torch
 from torch import Tensor, nn
+from torch.utils.checkpoint import checkpoint
 
 from hlsim.audiogram import FREQUENCIES
 from hlsim.audiogram.thresholds import AudiogramLike, resolve_thresholds
@@ -42,6 +45,10 @@ class EarNetwork(nn.Module):
             the frequencies below 8 kHz only.
         full_scale_spl: level in dB SPL of samples whose RMS is 1.0.
 
+    Attributes:
+        checkpoint: compute activations again in the backward pass, a few items or one block at a
+            time, instead of storing them. False by default.
+
     Raises:
         ValueError: the rate or the level is out of range.
 
@@ -56,6 +63,7 @@ class EarNetwork(nn.Module):
         super().__init__()
         self.sample_rate = check_rate(sample_rate)
         self.full_scale_spl = check_full_scale(full_scale_spl)
+        self.checkpoint = False
 
     def forward(self, waveform: Tensor, audiogram: AudiogramLike) -> Tensor:
         """Process waveforms for ears.
@@ -96,10 +104,12 @@ class EarNetwork(nn.Module):
 
     def _items_at_once(self, signals: Tensor) -> int:
         """Number of items that run at once."""
-        if signals.device.type != "cpu" or torch.compiler.is_compiling():
+        on_cpu = signals.device.type == "cpu"
+        if torch.compiler.is_compiling() or not (on_cpu or self.checkpoint):
             return len(signals)
         samples_per_item = NEURO_RATE * signals.shape[-1]
-        return max(1, self._samples_at_once * self.sample_rate // samples_per_item)
+        samples = self._samples_at_once if on_cpu else _DEVICE_SAMPLES
+        return max(1, samples * self.sample_rate // samples_per_item)
 
     def _run(self, signals: Tensor, ears: Tensor) -> Tensor:
         """Convert to pascals at 16 kHz, process, and convert back.
@@ -116,14 +126,15 @@ class EarNetwork(nn.Module):
 
         Shape: (items, time), (items, 8) -> (items, time).
         """
+        process = self._process
+        if self.checkpoint:
+            process = partial(checkpoint, process, use_reentrant=False)
         if self._receptive_field is None or torch.compiler.is_compiling():
-            return self._process(signals, ears)
+            return process(signals, ears)
         unit, field = self._receptive_field
         hop = self._samples_at_once if signals.device.type == "cpu" else _DEVICE_SAMPLES
         blocks = split_into_blocks(signals.shape[-1], hop, field, field, unit)
-        outputs = [
-            block.cut_output(self._process(block.cut_input(signals), ears)) for block in blocks
-        ]
+        outputs = [block.cut_output(process(block.cut_input(signals), ears)) for block in blocks]
         return outputs[0] if len(outputs) == 1 else torch.cat(outputs, -1)
 
     @property

@@ -213,6 +213,50 @@ def test_caller_can_be_compiled(simulator: str, clean: Tensor) -> None:
     same(slopes[0], slopes[1])
 
 
+class Halved(nn.Module):
+    def forward(self, waveform: Tensor, audiogram: Tensor) -> Tensor:
+        return 0.5 * waveform.sin()
+
+
+@pytest.mark.parametrize("simulator", [*SIMULATORS, "neuro-msbg-light", Halved()])
+@pytest.mark.parametrize("seconds", [0.3, 9.0])
+def test_checkpoint_stores_less_and_changes_no_bit(
+    simulator: str | nn.Module, seconds: float, clean: Tensor
+) -> None:
+    signal = clean.repeat(2, 32)[:, : round(16000 * seconds)]
+    results, stored = [], []
+    for checkpoint in (False, True):
+        loss = HearingLossLoss([N3, S2] * 2, simulator=simulator, checkpoint=checkpoint)
+        output = (3.0 * signal).requires_grad_()
+        sizes: dict[int, int] = {}
+
+        def pack(tensor: Tensor, sizes: dict[int, int] = sizes) -> Tensor:
+            sizes[tensor.untyped_storage().data_ptr()] = tensor.untyped_storage().nbytes()
+            return tensor
+
+        with torch.autograd.graph.saved_tensors_hooks(pack, lambda tensor: tensor):
+            value = loss(output, signal)
+        stored.append(sum(sizes.values()))
+        results.append((value.detach(), torch.autograd.grad(value, output)[0]))
+    assert torch.equal(results[0][0], results[1][0])
+    assert torch.equal(results[0][1], results[1][1])
+    if isinstance(simulator, str) and seconds < 1.0:
+        assert stored[1] < 0.4 * stored[0]
+
+
+def test_limited_gradient_has_no_derivative(clean: Tensor) -> None:
+    for criterion in CRITERIA:
+        loss = HearingLossLoss(N3, simulator=Halved(), criterion=criterion)
+        output = (3.0 * clean).requires_grad_()
+        (slope,) = torch.autograd.grad(loss(output, clean), output, create_graph=True)
+        if criterion == "coherent-bands":
+            with pytest.raises(RuntimeError, match="no second derivative"):
+                torch.autograd.grad(slope.sum(), output)
+        else:
+            (curvature,) = torch.autograd.grad(slope.sum(), output)
+            assert bool(curvature.isfinite().all())
+
+
 # Audiograms
 
 
