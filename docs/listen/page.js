@@ -1,0 +1,335 @@
+// The page: an ear, a sound, and three ways to hear it.
+
+import { AudiogramChart, FREQUENCIES, HIGHEST, LOWEST, STANDARD, parseThresholds } from "./audiogram.js";
+import { compensate, request, simulate } from "./engine.js";
+import { LIVE_DELAY, Live, record } from "./microphone.js";
+import { Player } from "./player.js";
+import { LONGEST_SECONDS, decode, levelOf, present } from "./sound.js";
+import { drawSpectrogram } from "./spectrogram.js";
+import { SAMPLE_RATE } from "./windows.js";
+
+const SPEECH = [
+  { file: "flite-rms-01", sentence: "The ferry leaves at six, so pack your scarf and boots tonight." },
+  { file: "flite-slt-03", sentence: "Would you measure the width of this narrow path for me?" },
+  { file: "espeak-us-annie-01", sentence: "Jane whispered a joke and the whole choir began to laugh." },
+  { file: "flite-awb-01", sentence: "A boat with yellow oars drifted beneath the stone bridge." },
+];
+const VERSIONS = {
+  normal: { title: "Normal hearing", short: "Normal", about: "a healthy ear" },
+  ear: { title: "This ear", short: "This ear", about: "the ear that you chose, without help" },
+  aided: { title: "This ear with a hearing aid", short: "With aid", about: "the aid’s output, heard by the same ear" },
+};
+const FIRST_EAR = "N3";
+const RECORDED_SECONDS = 5;
+const DRAG_PAUSE = 120; // milliseconds without a movement after which the sounds follow
+const PLAY = '<svg viewBox="0 0 24 24" aria-hidden="true"><path d="M7 4v16l13-8z"/></svg>';
+const PAUSE = '<svg viewBox="0 0 24 24" aria-hidden="true"><path d="M6 5h4v14H6zM14 5h4v14h-4z"/></svg>';
+
+const $ = (id) => document.getElementById(id);
+const volumeOf = () => ($("volume").value / 100) ** 2;
+
+const chart = new AudiogramChart($("audiogram"), thresholdsOfLink() ?? STANDARD[FIRST_EAR].thresholds);
+const player = new Player(volumeOf());
+const cards = {};
+
+// Pascals by version, and the sound from which they are computed.
+export const state = { sound: null, results: {} };
+
+let wanted = null; // version that shall play as soon as it is computed
+let computation = new AbortController();
+let timer = 0;
+let live = null;
+
+// The ear
+
+function thresholdsOfLink() {
+  const text = new URLSearchParams(location.hash.slice(1)).get("ear");
+  return text === null ? null : parseThresholds(text);
+}
+
+function link() {
+  return `#ear=${chart.thresholds.join(",")}`;
+}
+
+function showEar() {
+  const [key] = Object.entries(STANDARD).find(([, { thresholds }]) => `${thresholds}` === `${chart.thresholds}`) ?? [];
+  for (const button of $("presets").children) button.setAttribute("aria-pressed", button.textContent === key);
+  const name = key ? STANDARD[key].name : "An ear of your own";
+  if ($("ear-name").textContent !== name) $("ear-name").textContent = name;
+  chart.thresholds.forEach((level, i) => {
+    const input = $("numbers").querySelectorAll("input")[i];
+    if (document.activeElement !== input) input.value = level;
+  });
+}
+
+function changeEar() {
+  showEar();
+  history.replaceState(null, "", link());
+  $("shared").textContent = "";
+  live?.fit(chart.thresholds);
+  for (const name of ["ear", "aided"]) cards[name].setAttribute("aria-busy", "true");
+  clearTimeout(timer);
+  timer = setTimeout(compute, DRAG_PAUSE);
+}
+
+function setEar(thresholds) {
+  chart.set(thresholds);
+  changeEar();
+}
+
+// The three versions
+
+async function compute() {
+  computation.abort();
+  computation = new AbortController();
+  const { signal: abort } = computation;
+  const { sound } = state;
+  const thresholds = [...chart.thresholds];
+  if (sound === null) return;
+  const steps = {
+    normal: () => simulate(sound, STANDARD.Normal.thresholds, abort),
+    ear: () => simulate(sound, thresholds, abort),
+    aided: async () => simulate(await compensate(sound, thresholds, abort), thresholds, abort),
+  };
+  if (state.results.normal) delete steps.normal;
+  try {
+    // The version that is heard comes first.
+    const names = Object.keys(steps);
+    names.sort((a, b) => (b === player.playing) - (a === player.playing));
+    for (const name of names) {
+      const pascals = await steps[name]();
+      abort.throwIfAborted();
+      show(name, pascals);
+    }
+    say("");
+    document.body.dataset.ready = "true";
+  } catch (error) {
+    if (!abort.aborted) fail(error);
+  }
+}
+
+function show(name, pascals) {
+  state.results[name] = pascals;
+  player.set(name, pascals);
+  drawSpectrogram(cards[name].querySelector("canvas"), pascals);
+  cards[name].setAttribute("aria-busy", "false");
+  const difference = Math.round(levelOf(state.results.normal ?? pascals) - levelOf(pascals));
+  const { about } = VERSIONS[name];
+  let loudness = about;
+  if (name !== "normal") {
+    if (Math.abs(difference) <= 1) loudness = "as loud as for a healthy ear";
+    else loudness = `${Math.abs(difference)} dB ${difference > 0 ? "softer" : "louder"} than for a healthy ear`;
+  }
+  cards[name].querySelector(".loudness").textContent = loudness;
+  cards[name].querySelector("canvas").setAttribute("aria-label", `Spectrogram of ${VERSIONS[name].title}: ${loudness}`);
+  if (wanted === name) {
+    wanted = null;
+    player.play(name);
+  }
+}
+
+function addCard(name) {
+  const card = document.createElement("section");
+  card.className = "version";
+  card.id = `version-${name}`;
+  card.setAttribute("aria-busy", "true");
+  card.innerHTML = `
+    <div class="head">
+      <button type="button" class="play">${PLAY}</button>
+      <div class="text"><h3></h3><div class="loudness"></div></div>
+    </div>
+    <div class="picture">
+      <canvas role="img" width="480" height="128"></canvas>
+      <span class="high" aria-hidden="true">high pitch</span><span class="low" aria-hidden="true">low</span>
+      <div class="head-line"></div>
+    </div>`;
+  card.querySelector("h3").textContent = VERSIONS[name].title;
+  card.querySelector(".loudness").textContent = VERSIONS[name].about;
+  card.querySelector(".play").addEventListener("click", () => press(name));
+  cards[name] = card;
+  $("versions").append(card);
+  // On a narrow screen, the same buttons are always in reach.
+  const button = document.createElement("button");
+  button.type = "button";
+  button.dataset.version = name;
+  button.addEventListener("click", () => press(name));
+  $("dock").append(button);
+}
+
+function press(name) {
+  if (player.playing === name) player.stop();
+  else if (player.has(name)) player.play(name);
+  else {
+    wanted = name;
+    player.context.resume(); // A browser allows it only now, while the button is pressed.
+    say("The sound comes as soon as it is computed …");
+  }
+}
+
+player.onchange = () => {
+  for (const [name, card] of Object.entries(cards)) {
+    const playing = player.playing === name;
+    card.classList.toggle("playing", playing);
+    const button = card.querySelector(".play");
+    button.innerHTML = playing ? PAUSE : PLAY;
+    button.setAttribute("aria-label", `${playing ? "Stop" : "Play"}: ${VERSIONS[name].title}`);
+    const docked = $("dock").querySelector(`[data-version=${name}]`);
+    docked.innerHTML = `${playing ? PAUSE : PLAY} ${VERSIONS[name].short}`;
+    docked.setAttribute("aria-pressed", playing);
+  }
+  if (player.playing !== null) requestAnimationFrame(moveHead);
+};
+
+function moveHead() {
+  if (player.playing === null) return;
+  const share = player.position / player.duration;
+  cards[player.playing].querySelector(".head-line").style.left = `${100 * share}%`;
+  requestAnimationFrame(moveHead);
+}
+
+// The sound
+
+async function setSound(promise, name) {
+  try {
+    const samples = present(await promise);
+    player.clear();
+    state.sound = samples;
+    state.results = {};
+    const seconds = samples.length / SAMPLE_RATE;
+    const cut = seconds === LONGEST_SECONDS ? `, the first ${LONGEST_SECONDS} seconds` : "";
+    $("source-name").textContent = `${name}${cut}`;
+    for (const card of Object.values(cards)) card.setAttribute("aria-busy", "true");
+    await compute();
+  } catch (error) {
+    fail(error);
+  }
+}
+
+async function bundledSpeech(file) {
+  const response = await fetch(`assets/speech/${file}.flac`);
+  if (!response.ok) throw new Error("The speech could not be loaded. Reload the page.");
+  return decode(await response.arrayBuffer());
+}
+
+function chooseSpeech() {
+  const { file, sentence } = SPEECH[$("speech").selectedIndex];
+  return setSound(bundledSpeech(file), `“${sentence}” (a computer’s voice)`);
+}
+
+async function recordSound() {
+  const button = $("record");
+  const label = button.textContent;
+  button.disabled = true;
+  player.stop();
+  await stopLive();
+  const showTime = (seconds) => (button.textContent = `Speak … ${Math.ceil(RECORDED_SECONDS - seconds)} s`);
+  await setSound(record(RECORDED_SECONDS, showTime), "Your recording");
+  button.textContent = label;
+  button.disabled = false;
+}
+
+// Live
+
+async function startLive() {
+  player.stop();
+  live = new Live();
+  $("live").textContent = "Stop";
+  $("live-status").textContent = "Starting …";
+  try {
+    await live.start(chart.thresholds, volumeOf(), showLive);
+  } catch (error) {
+    live = null;
+    $("live").textContent = "Start";
+    $("live-status").textContent = `${error.message} You can record instead, and listen afterwards.`;
+  }
+}
+
+async function stopLive() {
+  if (live === null) return;
+  const stopped = live;
+  live = null;
+  $("live").textContent = "Start";
+  $("live-status").textContent = "";
+  await stopped.stop();
+}
+
+function showLive({ blocks, late }) {
+  if (live === null) return;
+  let text = `On. ${Math.round(LIVE_DELAY)} ms later than the sound card alone.`;
+  if (late > 0.01 * blocks) text += " This device is too slow: parts are missing. Record instead.";
+  $("live-status").textContent = text;
+}
+
+// Messages
+
+function say(text) {
+  $("status").textContent = text;
+}
+
+function fail(error) {
+  say(error.message);
+  document.body.dataset.failed = error.message;
+}
+
+// Start
+
+for (const key of Object.keys(STANDARD)) {
+  const button = document.createElement("button");
+  button.type = "button";
+  button.textContent = key;
+  button.title = STANDARD[key].name;
+  button.addEventListener("click", () => setEar(STANDARD[key].thresholds));
+  $("presets").append(button);
+}
+FREQUENCIES.forEach((hertz, i) => {
+  const label = document.createElement("label");
+  label.textContent = `${hertz} Hz`;
+  const input = document.createElement("input");
+  Object.assign(input, { type: "number", min: LOWEST, max: HIGHEST, step: 5 });
+  input.setAttribute("aria-label", `Level at ${hertz} hertz in decibels`);
+  input.addEventListener("change", () => {
+    const thresholds = [...chart.thresholds];
+    const level = input.value === "" ? thresholds[i] : Number(input.value);
+    thresholds[i] = Math.round(Math.min(HIGHEST, Math.max(LOWEST, level)));
+    input.value = thresholds[i];
+    setEar(thresholds);
+  });
+  label.append(input);
+  $("numbers").append(label);
+});
+for (const { sentence } of SPEECH) $("speech").add(new Option(sentence));
+for (const name of Object.keys(VERSIONS)) addCard(name);
+player.onchange();
+player.setRepeat($("repeat").checked);
+showEar();
+
+chart.addEventListener("change", changeEar);
+addEventListener("hashchange", () => {
+  const thresholds = thresholdsOfLink();
+  if (thresholds !== null && `${thresholds}` !== `${chart.thresholds}`) setEar(thresholds);
+});
+$("speech").addEventListener("change", chooseSpeech);
+$("file").addEventListener("change", () => {
+  const [file] = $("file").files;
+  if (file) setSound(file.arrayBuffer().then(decode), file.name);
+});
+$("record").addEventListener("click", recordSound);
+$("repeat").addEventListener("change", () => player.setRepeat($("repeat").checked));
+$("volume").addEventListener("input", () => {
+  player.setVolume(volumeOf());
+  live?.setVolume(volumeOf());
+});
+$("headphones").addEventListener("change", () => {
+  $("live").disabled = !$("headphones").checked;
+  if (!$("headphones").checked) stopLive();
+});
+$("live").addEventListener("click", () => (live === null ? startLive() : stopLive()));
+$("share").addEventListener("click", async () => {
+  history.replaceState(null, "", link());
+  const copied = await navigator.clipboard?.writeText(location.href).then(() => true, () => false);
+  $("shared").textContent = copied ? "Copied." : "Copy the address of this page.";
+});
+
+say("Loading the ear and the hearing aid …");
+request("load").catch(fail);
+chooseSpeech();

@@ -1,0 +1,27 @@
+// The windows in which the simulator processes a signal, as in the guide "ONNX, and windows of a long signal".
+
+export const SAMPLE_RATE = 16000;
+export const WINDOW = 20000; // samples that the exported simulator takes
+const STEP = 48; // windows start on multiples of it
+const CONTEXT = 1984; // samples on either side that the network needs
+const HOP = Math.floor((WINDOW - 2 * CONTEXT) / STEP) * STEP;
+
+// Length of a signal with silence after it, so that its last window ends where the signal ends.
+export function paddedLength(length) {
+  if (length <= WINDOW) return WINDOW;
+  return WINDOW + Math.ceil((length - WINDOW) / STEP) * STEP;
+}
+
+// Windows that cover a padded signal. Of the output of each, samples from `from` to `to` of the signal are used.
+export function windowsOf(length) {
+  const last = length - WINDOW;
+  const windows = [];
+  let from = 0;
+  for (let start = 0; start < last; start += HOP) {
+    const to = start + WINDOW - CONTEXT;
+    windows.push({ start, from, to });
+    from = to;
+  }
+  windows.push({ start: last, from, to: length });
+  return windows;
+}
