@@ -40,7 +40,9 @@ RESAMPLER_LOOKAHEAD = 136
 
 
 class Wearable(nn.Module):
-    """An aid with gains in bands. Subclasses have ``SLIDERS``, ``fit``, ``start`` and ``control``.
+    """An aid with gains in bands.
+
+    Subclasses have ``SLIDERS`` with ``DEFAULT_SLIDERS``, ``fit``, ``start`` and ``control``.
 
     A direct path splits the signal into bands that sum to the signal with a delay of 4 ms,
     multiplies each band by its gain, and adds them. The gains come from frames of 16 ms every 4 ms
@@ -62,6 +64,7 @@ class Wearable(nn.Module):
     """
 
     SLIDERS: tuple[str, ...] = ()
+    DEFAULT_SLIDERS: tuple[float, ...] = ()
     bands: int
     limit_spl: float
 

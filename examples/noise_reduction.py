@@ -100,7 +100,7 @@ def main() -> None:
             ratings = [pesq(RATE, *pair, "wb", on_error=PesqError.RETURN_VALUES) for pair in pairs]
             quality = statistics.mean(value for value in ratings if value > 0.0)
             intelligible = sum(stoi(*pair, RATE) for pair in pairs) / items
-            output = aid(signal, ears) if name == "hearing-aid" else aid(reduced, ears, 0.0)
+            output = aid(signal, ears, 1.0) if name == "hearing-aid" else aid(reduced, ears, 0.0)
             scores = haspi(set_level(output, level), clean, ears)
             if unenhanced_scores is None:
                 unenhanced_scores = scores

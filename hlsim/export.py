@@ -187,7 +187,8 @@ def first_inputs(
         audiogram: One ear for all items, or one per item.
         items: Number of signals that the program processes.
         hops: Number of hops that one call of the program processes.
-        sliders: Values from 0 to 1 by name, one for all items or one per item; 1 by default.
+        sliders: Values from 0 to 1 by name, one for all items or one per item; by default
+            those of the aid.
 
     Raises:
         ValueError: The aid's sample rate is not 16000 Hz, it has no such slider, or it rejects the
@@ -202,7 +203,8 @@ def first_inputs(
             f"{', '.join(aid.SLIDERS) or 'none'}"
         )
     weight = next(aid.parameters(), torch.empty(0))
-    values = [sliders.get(name, 1.0) for name in aid.SLIDERS]
+    defaults = zip(aid.SLIDERS, aid.DEFAULT_SLIDERS, strict=True)
+    values = [sliders.get(name, default) for name, default in defaults]
     with torch.no_grad():
         samples = weight.new_zeros(items, hops * HOP)
         _, fitted, settings = aid.prepare(samples, audiogram, values)

@@ -43,7 +43,9 @@ def test_examples_of_the_readme_simulate_and_train(
     for example in _examples(README):
         exec(compile(example, str(README), "exec"), names)
     levels = [float(level_spl(names[name])) for name in ("unaided", "aided", "speech")]
-    assert levels == sorted(levels)
+    unaided, aided, original = levels
+    assert unaided < original - 30.0
+    assert aided == pytest.approx(original, abs=1.0)
     assert float(names["value"]) > 0
     gradients = [parameter.grad for parameter in names["network"].parameters()]
     assert all(bool(gradient.abs().sum() > 0) for gradient in gradients)

@@ -173,7 +173,7 @@ class Parser(argparse.ArgumentParser):
 
     def sliders(self) -> None:
         """Declare the sliders of a hearing aid."""
-        text = "strength of a hearing aid's noise reduction, 0 to 1 (default: 1)"
+        text = "strength of a hearing aid's noise reduction, 0 to 1 (default: 0.5)"
         self.option("--noise-reduction", slider, text)
         text = "strength of a hearing aid's amplification, 0 to 1 (default: 1)"
         self.option("--amplification", slider, text)

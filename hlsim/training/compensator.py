@@ -75,7 +75,8 @@ class CompensatorTraining(TrainingModule):
     def _amplification_loss(self, batch: Batch) -> Tensor:
         signal, clean, ears = batch["signal"], batch["clean"], batch["thresholds"]
         if "noise_reduction" not in batch:
-            return self.loss(self.network(signal, ears), clean, ears)
+            sliders = {"noise_reduction": 1.0} if isinstance(self.network, HearingAid) else {}
+            return self.loss(self.network(signal, ears, **sliders), clean, ears)
         # An ear without noise reduction should perceive the noisy speech.
         slider = batch["noise_reduction"]
         reference = signal + slider.unsqueeze(-1) * (clean - signal)

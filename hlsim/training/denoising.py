@@ -73,7 +73,7 @@ def missing_intelligibility(aid: HearingAid, signal: Tensor, clean: Tensor, ears
     Returns:
         The criterion of each item, with shape (items,).
     """
-    output = aid(signal, ears)
+    output = aid(signal, ears, noise_reduction=1.0)
     with torch.no_grad():
         level = level_spl(aid(clean, ears, noise_reduction=0.0))
     lengths = [signal.shape[-1]] * len(signal)

@@ -125,7 +125,7 @@ def test_what_lies_above_8_khz_gets_the_gain_of_the_highest_band(make: Make, rat
     middle = slice(rate // 4, -rate // 4)
     assert level_spl((alone - expected)[middle]) < level_spl(expected[middle]) - 60.0
     added = (both - alone)[middle]
-    _, fitted, sliders = slow.prepare(low, EAR, [1.0] * len(slow.SLIDERS))
+    _, fitted, sliders = slow.prepare(low, EAR, slow.DEFAULT_SLIDERS)
     hops = resample(low, rate, 16000)[: 240 * 64].reshape(1, -1)
     gain = slow.advance(hops, fitted, sliders, slow.initial(sliders))["gains"][0, -1, -1]
     assert float(gain) > 1.0

@@ -60,5 +60,5 @@ def test_intelligibility_is_haspi_at_the_level_of_amplified_clean_speech(
     }
     assert {name.split(".")[0] for name in reached} == {"enter", "recur", "leave", "correct"}
     level = level_spl(aid(clean, ears, 0.0))
-    expected = 1.0 - haspi(set_level(aid(signal, ears), level), clean, ears)
+    expected = 1.0 - haspi(set_level(aid(signal, ears, 1.0), level), clean, ears)
     torch.testing.assert_close(missing, expected)
