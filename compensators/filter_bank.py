@@ -44,6 +44,9 @@ POWER_FLOOR = 10.0 ** (-PASCAL_SPL / 10.0)
 GRID_POINTS = 4096
 """Length of the transform on which filters are designed and speech is divided into bands."""
 
+SPEECH_SPL = 65.0
+"""Level in dB SPL of average speech."""
+
 # Long-term average of speech at 70 dB SPL in thirds of an octave, men's and women's:
 # Byrne et al. 1994, Journal of the Acoustical Society of America 96(4)
 SPEECH_SPECTRUM = {
@@ -151,13 +154,20 @@ def level_db(powers: Tensor) -> Tensor:
 
 def speech_levels(count: int) -> tuple[float, ...]:
     """Return the level of average speech at 65 dB SPL in each band in dB SPL."""
-    frequencies = np.arange(1, GRID_POINTS // 2 + 1) * RATE / GRID_POINTS
+    bands = speech_density(GRID_POINTS) @ shares(count, GRID_POINTS)[1:]
+    return tuple((10.0 * np.log10(bands / bands.sum()) + SPEECH_SPL).tolist())
+
+
+def speech_density(points: int) -> NDArray[np.float64]:
+    """Return the relative power density of speech at a transform's frequencies above 0 Hz.
+
+    Returns: (points / 2,).
+    """
+    frequencies = np.arange(1, points // 2 + 1) * RATE / points
     third_octave = 10.0 * np.log10(2.0 ** (1.0 / 6.0) - 2.0 ** (-1.0 / 6.0))
     thirds = np.array(list(SPEECH_SPECTRUM), dtype=float)
     density = np.array(list(SPEECH_SPECTRUM.values())) - 10.0 * np.log10(thirds) - third_octave
-    powers = 10.0 ** (np.interp(np.log(frequencies), np.log(thirds), density) / 10.0)
-    bands = powers @ shares(count, GRID_POINTS)[1:]
-    return tuple((10.0 * np.log10(bands / bands.sum()) + 65.0).tolist())
+    return 10.0 ** (np.interp(np.log(frequencies), np.log(thirds), density) / 10.0)
 
 
 def _hop_matrix(count: int) -> NDArray[np.float64]:

@@ -12,8 +12,8 @@ from compensators.config import HearingAidConfig
 from compensators.filter_bank import FRAME, HISTORY, frame_power, level_db, shares
 from compensators.prescription import losses, prescribed_gains, restoring_gains
 from compensators.smoothing import decay, follow_peaks
-from compensators.stream import Slider, State, Stream
-from compensators.wearable import Wearable
+from compensators.stream import Stream
+from compensators.wearable import Slider, State, Wearable
 from hlsim.audiogram.thresholds import AudiogramLike
 from hlsim.calibration import PASCAL_SPL
 from hlsim.torchtools import constant_like
@@ -134,7 +134,7 @@ class HearingAid(Wearable):
         Raises:
             ValueError: the sample rate is not 16000 Hz, or an argument is not valid.
         """
-        return self.open_stream(audiogram, (noise_reduction, amplification))
+        return Stream(self, audiogram, noise_reduction=noise_reduction, amplification=amplification)
 
     def fit(self, thresholds: Tensor) -> Tensor:
         loss = losses(thresholds, self.bands)
@@ -220,9 +220,6 @@ class HearingAid(Wearable):
         opening, closing = decay(config.opening), decay(config.closing)
         gain, gain_state = follow_peaks(gain, state["attenuation"], opening, closing)
         return gain, {"attenuation": gain_state, "hidden": torch.stack((hidden, cell), 1)}
-
-    def extra_repr(self) -> str:
-        return f"sample_rate={self.sample_rate}, full_scale_spl={self.full_scale_spl:g}"
 
 
 def _lstm_step(lstm: nn.LSTM, frame: Tensor, hidden: Tensor, cell: Tensor) -> tuple[Tensor, Tensor]:

@@ -1,5 +1,7 @@
 """The paper's compensator: Neuro-MSBG with a magnitude path that maps instead of masking."""
 
+from __future__ import annotations
+
 import math
 
 import numpy as np
@@ -9,9 +11,11 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from compensators.config import MappingConfig
+from compensators.gains import measure_gains
 from compensators.limiter import soft_limit
 from compensators.nalr import nalr_gains_db
-from hlsim.audiogram.thresholds import interpolate
+from hlsim.audiogram import FREQUENCIES
+from hlsim.audiogram.thresholds import AudiogramLike, as_thresholds, interpolate
 from hlsim.calibration import PASCAL_SPL
 from hlsim.dsp.erb import erb_number
 from hlsim.dsp.fft import power
@@ -87,6 +91,28 @@ class MappingCompensator(EarNetwork):
         else:
             gains = float(start) * thresholds.clamp_min(0.0)
         return interpolate(gains, self.config.hz)
+
+    @torch.no_grad()
+    def gains(self, audiogram: AudiogramLike, level: float = 65.0) -> Tensor:
+        """Measure the insertion gains for noise with the spectrum of average speech.
+
+        Args:
+            audiogram: one or more ears.
+            level: presentation level in dB SPL, 0 to 120.
+
+        Returns:
+            Gains in dB at the eight ``FREQUENCIES``, (8,) for one ear, else (..., 8).
+
+        Raises:
+            ValueError: an ear or the level is not valid.
+
+        >>> MappingCompensator().gains("N3").shape
+        torch.Size([8])
+        """
+        thresholds = as_thresholds(audiogram, consumer=type(self).__name__)
+        ears = thresholds.to(self.magnitude_decoder.leave.weight).reshape(-1, len(FREQUENCIES))
+        gains = measure_gains(lambda noise: self._process(noise, ears), len(ears), level, ears)
+        return gains.reshape(thresholds.shape)
 
     def extra_repr(self) -> str:
         return (

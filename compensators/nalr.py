@@ -1,5 +1,7 @@
 """NAL-R, the closed-form prescription that a trained compensator has to beat."""
 
+from __future__ import annotations
+
 from functools import lru_cache
 from typing import Any
 
@@ -12,6 +14,7 @@ from torch import Tensor, nn
 from hlsim.audiogram import FREQUENCIES, HIGHEST_LEVEL
 from hlsim.audiogram.thresholds import (
     AudiogramLike,
+    as_thresholds,
     has_listeners,
     interpolate,
     resolve_thresholds,
@@ -103,6 +106,29 @@ class NALR(nn.Module):
             delay = self.order // 2
             output = torch.fft.irfft(spectrum, points)[..., delay : delay + time]
             return output.to(waveform.dtype)
+
+    def gains(self, audiogram: AudiogramLike | None = None, level: float = 65.0) -> Tensor:
+        """Compute the insertion gains of the prescription, which are the same at every level.
+
+        Args:
+            audiogram: one or more ears, by default those that were passed to the constructor.
+            level: presentation level in dB SPL, which all aids accept.
+
+        Returns:
+            Gains in dB at the eight ``FREQUENCIES``, (8,) for one ear, else (..., 8).
+
+        Raises:
+            ValueError: no audiogram, or levels outside -10 to 120 dB HL.
+
+        >>> NALR().gains("N3").round()
+        tensor([ 0.,  9., 20., 21., 22., 23., 24., 24.])
+        """
+        thresholds = self.thresholds
+        if audiogram is not None:
+            thresholds = as_thresholds(audiogram, **THRESHOLD_OPTIONS)
+        if thresholds is None:
+            raise ValueError("no audiogram; pass one to gains, or to NALR when building it")
+        return nalr_gains_db(thresholds)
 
     def taps(self, thresholds: Tensor) -> Tensor:
         """Return the taps of the filter, symmetric around the middle one.

@@ -1,5 +1,6 @@
 """Loading and saving of compensators."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 from compensators.config import HearingAidConfig, MappingConfig
@@ -11,7 +12,7 @@ from compensators.wearable import Wearable
 from hlsim.audiogram import Audiogram
 from hlsim.calibration import PASCAL_SPL
 from hlsim.neuro.config import NEURO_RATE
-from hlsim.pretrained import checkpoint_about, read_checkpoint, save_checkpoint
+from hlsim.pretrained import Settings, checkpoint_about, read_checkpoint, save_checkpoint
 from hlsim.version import __version__
 
 Trained = MappingCompensator | HearingAid
@@ -86,7 +87,9 @@ def _load(name: str | Path, sample_rate: int, full_scale_spl: float) -> Trained 
     def build(config: MappingConfig | HearingAidConfig) -> Trained:
         return build_compensator(config, sample_rate=sample_rate, full_scale_spl=full_scale_spl)
 
-    compensator = read_checkpoint(name, CONFIGS, build, other_names=tuple(UNTRAINED))
+    kinds: dict[str, Callable[[Settings], MappingConfig | HearingAidConfig]]
+    kinds = {kind: config.from_dict for kind, config in CONFIGS.items()}
+    compensator = read_checkpoint(name, kinds, build, other_names=tuple(UNTRAINED))
     return compensator.eval().requires_grad_(False)
 
 

@@ -2,24 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING
-
 import torch
 from torch import Tensor
 
-from compensators.filter_bank import DELAY, HOP, apply_gains
-from hlsim.audiogram.thresholds import AudiogramLike
+from compensators.filter_bank import DELAY, HOP, RATE, apply_gains
+from compensators.wearable import Slider, Wearable, check_slider
+from hlsim.audiogram.thresholds import AudiogramLike, as_thresholds
 from hlsim.calibration import gain_to_pascals
 from hlsim.checks import check_waveform
-
-if TYPE_CHECKING:
-    from compensators.wearable import Wearable
-
-Slider = float | Tensor
-
-State = Mapping[str, Tensor]
-"""Tensors that are carried from hop to hop, by name, (items, ...) each."""
 
 
 class Stream:
@@ -38,24 +28,30 @@ class Stream:
         AttributeError: an attribute is set that is not a slider of the aid.
     """
 
-    def __init__(
-        self, aid: Wearable, audiogram: AudiogramLike | None, sliders: Mapping[str, Slider]
-    ) -> None:
+    def __init__(self, aid: Wearable, audiogram: AudiogramLike, **sliders: Slider) -> None:
+        if aid.sample_rate != RATE:
+            raise ValueError(
+                f"expected a sample rate of {RATE} Hz for a stream, got {aid.sample_rate}; "
+                "resampling would look 8.5 ms farther ahead"
+            )
+        as_thresholds(audiogram, consumer=type(aid).__name__)
         self._aid = aid
-        self._audiogram = audiogram
-        for name, slider in sliders.items():
-            setattr(self, name, slider)
+        # A copy, because the caller may write into a tensor, and the ear is read with each slider.
+        self._audiogram = audiogram.clone() if isinstance(audiogram, Tensor) else audiogram
         self._state: dict[str, Tensor] = {}  # empty before the first chunk
         self._previous_sliders: list[Slider] = []
         self._shape = self._batch = torch.Size()
         self._partial_hop = self._fitted = self._sliders = torch.empty(0)
+        for name, slider in sliders.items():
+            items = slider.shape if isinstance(slider, Tensor) else torch.Size()
+            check_slider(name, slider, items, torch.empty(0))
+            setattr(self, name, slider)
 
-    def __setattr__(self, name: str, value: object) -> None:
+    def __setattr__(self, name: str, value: Slider) -> None:
         if not name.startswith("_") and name not in self._aid.SLIDERS:
             sliders = ", ".join(self._aid.SLIDERS) or "no sliders"
-            raise AttributeError(
-                f"the stream of a {type(self._aid).__name__} has no slider {name}; it has {sliders}"
-            )
+            aid = type(self._aid).__name__
+            raise AttributeError(f"the stream of a {aid} has no slider {name}; it has {sliders}")
         super().__setattr__(name, value)
 
     def __call__(self, chunk: Tensor) -> Tensor:
@@ -95,13 +91,13 @@ class Stream:
 
     def _prepare(self, chunk: Tensor) -> None:
         """Fit the aid to the ear with the first chunk, and follow the sliders."""
-        sliders = [getattr(self, name) for name in self._aid.SLIDERS]
         is_first = not self._state
         if not is_first and chunk.shape[:-1] not in (self._shape, self._batch):
             raise ValueError(
                 f"expected a chunk of shape {(*self._shape, 'time')} as before, "
                 f"got {tuple(chunk.shape)}"
             )
+        sliders = [getattr(self, name) for name in self._aid.SLIDERS]
         if is_first or not all(map(_is_same, sliders, self._previous_sliders)):
             self._batch, self._fitted, self._sliders = self._aid.prepare(
                 chunk, self._audiogram, sliders

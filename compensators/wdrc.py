@@ -14,8 +14,8 @@ from compensators.prescription import (
     prescribed_gains,
 )
 from compensators.smoothing import decay, follow_peaks
-from compensators.stream import State, Stream
-from compensators.wearable import Wearable
+from compensators.stream import Stream
+from compensators.wearable import State, Wearable
 from hlsim.audiogram.thresholds import AudiogramLike
 from hlsim.calibration import PASCAL_SPL
 from hlsim.checks import check_number
@@ -89,7 +89,7 @@ class WDRC(Wearable):
         Raises:
             ValueError: the sample rate is not 16000 Hz.
         """
-        return self.open_stream(audiogram, ())
+        return Stream(self, audiogram)
 
     def fit(self, thresholds: Tensor) -> Tensor:
         loss = losses(thresholds, self.bands)
@@ -108,9 +108,3 @@ class WDRC(Wearable):
         gains = compressive_gains(above_speech(levels), prescribed, ratios, -self.knee)
         highest = (self.limit_spl - levels).clamp_min(0.0)
         return torch.minimum(gains, highest), {"levels": level_state}
-
-    def extra_repr(self) -> str:
-        return (
-            f"sample_rate={self.sample_rate}, full_scale_spl={self.full_scale_spl:g}, "
-            f"bands={self.bands}"
-        )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor, nn
@@ -16,8 +16,8 @@ from compensators.filter_bank import (
     frame_power,
     gain_at_rate,
 )
+from compensators.gains import measure_gains
 from compensators.limiter import soft_limit
-from compensators.stream import Slider, State, Stream
 from hlsim.audiogram import FREQUENCIES
 from hlsim.audiogram.thresholds import (
     AudiogramLike,
@@ -28,6 +28,11 @@ from hlsim.audiogram.thresholds import (
 from hlsim.calibration import PASCAL_SPL, check_full_scale, gain_to_pascals
 from hlsim.checks import broadcast_shape, check_number, check_rate, check_waveform, describe
 from hlsim.dsp.resample import resample
+
+Slider = float | Tensor
+
+State = Mapping[str, Tensor]
+"""Tensors that are carried from hop to hop, by name, (items, ...) each."""
 
 SLIDER_STEP = 0.04
 """Largest change of a slider per hop: 0.1 s from end to end."""
@@ -194,27 +199,6 @@ class Wearable(nn.Module):
             result = self.finish(result)
             return (result / gain).reshape(*batch, time).to(waveform.dtype)
 
-    def open_stream(self, audiogram: AudiogramLike | None, sliders: Sequence[Slider]) -> Stream:
-        """Return a stream with the sliders set to values of ``SLIDERS``.
-
-        Raises:
-            ValueError: the sample rate is not 16000 Hz, or the audiogram or a slider is not valid.
-        """
-        if self.sample_rate != RATE:
-            raise ValueError(
-                f"expected a sample rate of {RATE} Hz for a stream, got {self.sample_rate}; "
-                "resampling would look 8.5 ms farther ahead"
-            )
-        values = dict(zip(self.SLIDERS, sliders, strict=True))
-        for name, slider in values.items():
-            # The first chunk decides on the number of items.
-            items = slider.shape if isinstance(slider, Tensor) else torch.Size()
-            check_slider(name, slider, items, torch.empty(0))
-        as_thresholds(self._check_given(audiogram), consumer=type(self).__name__)
-        # The stream reads the ear again when a slider moves, and a tensor may be written into.
-        ears = audiogram.clone() if isinstance(audiogram, Tensor) else audiogram
-        return Stream(self, ears, values)
-
     def prepare(
         self, waveform: Tensor, audiogram: AudiogramLike | None, sliders: Sequence[Slider]
     ) -> tuple[torch.Size, Tensor, Tensor]:
@@ -222,7 +206,6 @@ class Wearable(nn.Module):
 
         Shape: (..., time), (..., 8), (...) each -> (...), (items, n), (items, sliders).
         """
-        audiogram = self._check_given(audiogram)
         thresholds = resolve_thresholds(None, audiogram, waveform, consumer=type(self).__name__)
         own_dtype = next((weight.dtype for weight in self.parameters()), waveform.dtype)
         dtype = torch.promote_types(own_dtype, torch.float32)
@@ -230,21 +213,53 @@ class Wearable(nn.Module):
         if self.linked:
             check_two_channels(waveform)
         settings = [
-            check_slider(name, slider, batch, thresholds).expand(batch)
+            check_slider(name, slider, batch, thresholds)
             for name, slider in zip(self.SLIDERS, sliders, strict=True)
         ]
         ears = thresholds.to(dtype).expand(*batch, -1).reshape(-1, len(FREQUENCIES))
         stacked = torch.stack(settings, -1) if settings else ears.new_zeros(*batch, 0)
         return batch, self.fit(ears), stacked.to(dtype).reshape(len(ears), -1)
 
-    def _check_given(self, audiogram: AudiogramLike | None) -> AudiogramLike:
-        if audiogram is None:
-            raise ValueError(f"no audiogram; pass one to each call of a {type(self).__name__}")
-        return audiogram
+    @torch.no_grad()
+    def gains(self, audiogram: AudiogramLike, level: float = 65.0) -> Tensor:
+        """Measure the insertion gains for noise with the spectrum of average speech.
+
+        Noise reduction is off, and the limit of the output does not count.
+
+        Args:
+            audiogram: one or more ears.
+            level: presentation level in dB SPL, 0 to 120.
+
+        Returns:
+            Gains in dB at the eight ``FREQUENCIES``, (8,) for one ear, else (..., 8).
+
+        Raises:
+            ValueError: an ear or the level is not valid.
+
+        >>> from compensators import WDRC
+        >>> WDRC().gains("N3", level=65.0).round()
+        tensor([ 1.,  8., 18., 20., 21., 22., 23., 24.])
+        """
+        thresholds = as_thresholds(audiogram, consumer=type(self).__name__)
+        weight = next(self.parameters(), thresholds)
+        ears = thresholds.to(weight).reshape(-1, len(FREQUENCIES))
+        sliders = ears.new_tensor([float(name != "noise_reduction") for name in self.SLIDERS])
+        sliders = sliders.expand(len(ears), -1)
+
+        def amplify(noise: Tensor) -> Tensor:
+            return self._amplify(noise, self.fit(ears), sliders, self.initial(sliders))[0]
+
+        return measure_gains(amplify, len(ears), level, ears).reshape(thresholds.shape)
+
+    def extra_repr(self) -> str:
+        return (
+            f"sample_rate={self.sample_rate}, full_scale_spl={self.full_scale_spl:g}, "
+            f"bands={self.bands}"
+        )
 
 
 def check_slider(name: str, slider: Slider, batch: torch.Size, like: Tensor) -> Tensor:
-    """Return a slider as a tensor of the type and on the device of another one.
+    """Return a slider as a tensor with one value per item, of the type of another tensor.
 
     The values of a tensor on a GPU are not read, because the host would wait for the GPU. Those
     that are out of range become NaN.
@@ -252,29 +267,33 @@ def check_slider(name: str, slider: Slider, batch: torch.Size, like: Tensor) -> 
     Args:
         name: name of the slider, for messages.
         slider: number or tensor from 0 to 1.
-        batch: shape over which a tensor has to broadcast.
+        batch: shape of the result, to which a tensor has to broadcast.
         like: tensor with the type and the device of the result.
 
     Raises:
         ValueError: values outside 0 to 1, or a shape that does not broadcast over the items.
+
+    >>> check_slider("amplification", 0.5, torch.Size([2]), torch.empty(0))
+    tensor([0.5000, 0.5000])
     """
     if not isinstance(slider, Tensor):
         check_number(name, slider, 0.0, 1.0)
-        return like.new_full((), torch.as_tensor(slider).item())
+        return like.new_full(batch, float(slider))
     if slider.is_complex():
         raise ValueError(f"expected {name} from 0 to 1, got {describe(slider)}")
     values = slider.to(like.device, like.dtype, non_blocking=like.device.type != "cpu")
+    in_range = (slider >= 0.0) & (slider <= 1.0)
     if slider.device.type != "cpu":
-        values = torch.where((values >= 0.0) & (values <= 1.0), values, torch.nan)
-    elif not bool(((slider >= 0.0) & (slider <= 1.0)).all()):
+        values = torch.where(in_range, values, torch.nan)
+    elif not bool(in_range.all()):
         raise ValueError(f"expected {name} from 0 to 1, got {slider!r}")
-    pairs = zip(values.shape[::-1], batch[::-1], strict=False)
-    if values.ndim > len(batch) or any(size not in (1, items) for size, items in pairs):
+    try:
+        return values.expand(batch)
+    except RuntimeError:
         raise ValueError(
             f"expected one value of {name}, or one per item in the shape {tuple(batch)}, "
             f"got shape {tuple(values.shape)}"
-        )
-    return values
+        ) from None
 
 
 def _glide(now: Tensor, target: Tensor, frames: int) -> Tensor:

@@ -23,7 +23,8 @@ if TYPE_CHECKING:
     from hlsim.losses.hearing_loss import HearingLossLoss
     from hlsim.msbg import MSBG, estimate_delay
     from hlsim.neuro import NeuroMSBG
-    from hlsim.pretrained import list_pretrained, load_pretrained
+    from hlsim.neuro.pretrained import load_pretrained
+    from hlsim.pretrained import list_pretrained
     from hlsim.shortcuts import compensate, example_speech, info, listen, load_audio, simulate
 
 
@@ -72,7 +73,7 @@ _MODULES = {
     "listen": "hlsim.shortcuts",
     "load_audio": "hlsim.shortcuts",
     "load_compensator": "compensators",
-    "load_pretrained": "hlsim.pretrained",
+    "load_pretrained": "hlsim.neuro.pretrained",
     "read_audiograms": "hlsim.audiogram.table",
     "save_compensator": "compensators",
     "simulate": "hlsim.shortcuts",

@@ -48,8 +48,7 @@ import torch
 from torch import Tensor, nn
 
 from compensators.filter_bank import HOP, RATE
-from compensators.stream import Slider
-from compensators.wearable import Wearable
+from compensators.wearable import Slider, Wearable
 from hlsim.audiogram import FREQUENCIES
 from hlsim.audiogram.thresholds import AudiogramLike
 from hlsim.calibration import gain_to_pascals

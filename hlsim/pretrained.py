@@ -16,13 +16,10 @@ import safetensors.torch
 import torch
 from torch import nn
 
-from hlsim.calibration import PASCAL_SPL
 from hlsim.files import atomic_path
-from hlsim.neuro.config import NEURO_RATE, ModelConfig, NeuroConfig
-from hlsim.neuro.model import NeuroMSBG
 
 Model = TypeVar("Model", bound=nn.Module)
-Config = TypeVar("Config", bound=ModelConfig)
+Config = TypeVar("Config")
 Settings = Mapping[str, Any]
 
 WEIGHTS = "model.safetensors"
@@ -31,30 +28,6 @@ CARD = "README.md"
 
 SIMULATOR = "neuro-msbg"
 """Kind of a simulator's checkpoint in ``config.json``. All other kinds are compensators."""
-
-
-def load_pretrained(
-    name: str | Path, *, sample_rate: int = NEURO_RATE, full_scale_spl: float = PASCAL_SPL
-) -> NeuroMSBG:
-    """Load a trained Neuro-MSBG, frozen and in eval mode, without downloads.
-
-    Args:
-        name: Name of a checkpoint that ships with hlsim, such as ``"neuro-msbg"``, or a checkpoint
-            folder.
-        sample_rate: Sample rate of inputs and outputs in Hz, 16000 to 48000.
-        full_scale_spl: Level in dB SPL of RMS 1.0.
-
-    Raises:
-        ValueError: There is no such checkpoint, it is damaged, or it is no simulator.
-    """
-
-    def build(config: NeuroConfig) -> NeuroMSBG:
-        return NeuroMSBG(
-            config, sample_rate=sample_rate, full_scale_spl=full_scale_spl, compute_prior=False
-        )
-
-    model = read_checkpoint(name, {SIMULATOR: NeuroConfig}, build)
-    return model.eval().requires_grad_(False)
 
 
 def list_pretrained() -> dict[str, str]:
@@ -69,7 +42,7 @@ def _loader_name(kind: str) -> str:
 
 def read_checkpoint(
     name: str | Path,
-    kinds: Mapping[str, type[Config]],
+    kinds: Mapping[str, Callable[[Settings], Config]],
     build: Callable[[Config], Model],
     other_names: Sequence[str] = (),
 ) -> Model:
@@ -79,7 +52,7 @@ def read_checkpoint(
 
     Args:
         name: Name of a checkpoint that ships with hlsim, or a checkpoint folder.
-        kinds: Class of the configuration by accepted kind of checkpoint.
+        kinds: Function from settings to a configuration, by accepted kind of checkpoint.
         build: Function from configuration to model.
         other_names: Names that the caller accepts in addition, for the error message.
 
@@ -111,7 +84,7 @@ def read_checkpoint(
             "'config_sha256'; download or save the checkpoint again"
         )
     try:
-        config = kinds[kind].from_dict(settings)
+        config = kinds[kind](settings)
     except (TypeError, ValueError) as error:
         raise ValueError(f"{folder / CONFIG}: {error}") from error
     device = torch.get_default_device()

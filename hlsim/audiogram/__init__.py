@@ -1,6 +1,6 @@
 """Hearing thresholds of ears: as values, as tensors, in tables and as plots."""
 
-from hlsim.audiogram.value import (
+from hlsim.audiogram.scale import (
     FREQUENCIES,
     HIGHEST_LEVEL,
     HIGHEST_SIMULATED,
@@ -8,9 +8,8 @@ from hlsim.audiogram.value import (
     SEVERITIES,
     SEVERITY_LIMITS,
     STANDARD,
-    Audiogram,
-    severity_index,
 )
+from hlsim.audiogram.value import Audiogram, severity_index
 
 __all__ = [
     "FREQUENCIES",

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 from hlsim.audiogram.conversion import EarLike, as_audiogram
 from hlsim.audiogram.plot import draw_png
-from hlsim.audiogram.value import Audiogram, EarName
+from hlsim.audiogram.scale import EarName
+from hlsim.audiogram.value import Audiogram
 
 EARS: tuple[EarName, EarName] = ("left", "right")
 

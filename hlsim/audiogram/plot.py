@@ -7,12 +7,11 @@ from collections.abc import Callable, Iterable
 from itertools import pairwise
 from typing import Any
 
-from hlsim.audiogram.value import (
+from hlsim.audiogram.scale import (
     HIGHEST_LEVEL,
     LOWEST_LEVEL,
     SEVERITIES,
     SEVERITY_LIMITS,
-    Audiogram,
     EarName,
 )
 from hlsim.extras import MissingExtraError, require
@@ -27,18 +26,19 @@ _STYLES: dict[EarName | None, dict[str, Any]] = {
 """Matplotlib's properties of the line of an ear."""
 
 
-def plot_audiogram(
-    audiogram: Audiogram, axes: Any = None, ear: EarName | None = None, **style: Any
+def plot_thresholds(
+    frequencies: Iterable[float],
+    levels: Iterable[float],
+    axes: Any = None,
+    ear: EarName | None = None,
+    **style: Any,
 ) -> Any:
-    """Draw an audiogram, as ``Audiogram.plot``."""
+    """Draw thresholds, as ``Audiogram.plot``."""
     if axes is None:
         _, axes = require("matplotlib.pyplot", "eval").subplots(layout="constrained")
     if not axes.yaxis_inverted():  # axes on which no audiogram has been drawn
         _prepare(axes)
-    style = _STYLES[ear] | style
-    if ear is not None:
-        style = {"label": f"{ear}, PTA {audiogram.pta:.0f} dB HL"} | style
-    axes.plot(audiogram.frequencies, audiogram.levels, **style)
+    axes.plot(frequencies, levels, **_STYLES[ear] | style)
     if ear is not None:
         axes.legend()
     return axes

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from hlsim.audiogram.listener import EAR_NAMES, Listener
-from hlsim.audiogram.value import HIGHEST_LEVEL, HIGHEST_SIMULATED, STANDARD, Audiogram
+from hlsim.audiogram.scale import HIGHEST_LEVEL, HIGHEST_SIMULATED, STANDARD
+from hlsim.audiogram.value import Audiogram, convert_at
 from hlsim.files import read_table
-
-Result = TypeVar("Result")
 
 
 def read_audiograms(
@@ -51,18 +50,6 @@ def read_audiograms(
     return ears
 
 
-def read_audiogram(path: str | Path, name: str | None = None) -> Audiogram:
-    """Read one ear from a table, as ``Audiogram.from_csv``."""
-    rows = read_audiograms(path)
-    ears = [ear for row, ear in rows if name is None or name in row.values()]
-    if len(ears) != 1:
-        raise ValueError(
-            f"{path}: expected one row with the name {name!r} in a column, found {len(ears)} rows; "
-            "pass the name of one row"
-        )
-    return ears[0]
-
-
 def read_rows(path: str | Path) -> list[tuple[int, dict[str, str]]]:
     """Read the rows of a table of audiograms, each after the number of its line."""
     rows = read_table(path, "audiograms")
@@ -71,14 +58,6 @@ def read_rows(path: str | Path) -> list[tuple[int, dict[str, str]]]:
             f"{path}: no audiograms; expected a header such as hl_250,hl_500 and one row per ear"
         )
     return rows
-
-
-def convert_at(place: str, convert: Callable[..., Result], *arguments: Any) -> Result:
-    """Return ``convert(*arguments)``, or raise its ValueError with the place in front."""
-    try:
-        return convert(*arguments)
-    except ValueError as error:
-        raise ValueError(f"{place}: {error}") from error
 
 
 def read_listeners(path: str | Path, names: Collection[str] | None = None) -> dict[str, Listener]:

@@ -14,14 +14,8 @@ from torch import Tensor
 from hlsim.audiogram.conversion import EarLike, find_audiogram
 from hlsim.audiogram.devices import known_on_host, on_device, on_host
 from hlsim.audiogram.listener import EARS, Listener
-from hlsim.audiogram.value import (
-    FREQUENCIES,
-    HIGHEST_SIMULATED,
-    LOWEST_LEVEL,
-    Audiogram,
-    check_range,
-    join_numbers,
-)
+from hlsim.audiogram.scale import FREQUENCIES, HIGHEST_SIMULATED, LOWEST_LEVEL
+from hlsim.audiogram.value import Audiogram, check_range, join_numbers
 from hlsim.checks import broadcast_shape
 from hlsim.torchtools import constant_like
 

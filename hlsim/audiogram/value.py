@@ -4,53 +4,31 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from hlsim.audiogram.plot import draw_png, plot_thresholds
+from hlsim.audiogram.scale import (
+    FREQUENCIES,
+    HIGHEST_LEVEL,
+    LOWEST_LEVEL,
+    SEVERITIES,
+    SEVERITY_LIMITS,
+    STANDARD,
+    STEPS_PER_DB,
+    EarName,
+)
 from hlsim.extras import require
+from hlsim.files import read_table
 
-EarName = Literal["left", "right"]
-
-FREQUENCIES = (250.0, 500.0, 1000.0, 2000.0, 3000.0, 4000.0, 6000.0, 8000.0)
-"""The eight audiometric frequencies in Hz at which networks, losses and aids take thresholds."""
-
-LOWEST_LEVEL, HIGHEST_LEVEL = -10.0, 120.0
-"""Range of the thresholds of an audiogram in dB HL."""
-
-HIGHEST_SIMULATED = 100.0
-"""Highest threshold that a simulator takes, in dB HL. MSBG is singular at 105 dB HL."""
-
-SEVERITIES = ("none", "mild", "moderate", "severe")
-"""MSBG's degrees of loss, by the mean threshold from 2 to 8 kHz."""
-
-SEVERITY_LIMITS = (15.0, 35.0, 56.0)
-"""Mean thresholds in dB HL above which a loss is mild, moderate and severe (pyclarity 0.9.0)."""
-
-STEPS_PER_DB = 1e4
-"""Resolution of levels for the severity: 19.7 dB HL in single precision counts as 19.7."""
-
-# Bisgaard, Vlaming, Dahlquist 2010, Trends in Amplification 14(2), doi 10.1177/1084713810379609,
-# Tables 1 and 2, at the frequencies above. The tables end at 6 kHz; 8 kHz repeats that threshold.
-STANDARD = {
-    "NH": (0, 0, 0, 0, 0, 0, 0, 0),
-    "N1": (10, 10, 10, 15, 20, 30, 40, 40),
-    "N2": (20, 20, 25, 35, 40, 45, 50, 50),
-    "N3": (35, 35, 40, 50, 55, 60, 65, 65),
-    "N4": (55, 55, 55, 65, 70, 75, 80, 80),
-    "N5": (65, 70, 75, 80, 80, 80, 80, 80),
-    "N6": (75, 80, 85, 90, 95, 100, 100, 100),
-    "N7": (90, 95, 105, 105, 105, 105, 105, 105),
-    "S1": (10, 10, 10, 15, 30, 55, 70, 70),
-    "S2": (20, 20, 25, 55, 75, 95, 95, 95),
-    "S3": (30, 35, 60, 75, 80, 80, 85, 85),
-}
+Result = TypeVar("Result")
 
 # a frequency, "k" for kHz, and the name of a remark on the frequency
 _COLUMN = re.compile(r"(?:hl[_ ]?)?(\d+\.?\d*|\.\d+) ?(k?)(?:hz)?(_.+)?", re.IGNORECASE)
@@ -138,14 +116,21 @@ class Audiogram:
         Args:
             path: A table as for ``read_audiograms``.
             name: Text in any column of the row to read, such as ``"N3"``. It may be left out if
-                the table has one row.
+                the table has one row. Other rows are not validated.
 
         Raises:
-            ValueError: The table is not valid, or not exactly one row has the name.
+            ValueError: The table cannot be read, not exactly one row has the name, or the row is
+                not an audiogram.
         """
-        from hlsim.audiogram.table import read_audiogram
-
-        return read_audiogram(path, name)
+        rows = read_table(path, "audiograms")
+        matches = [(line, row) for line, row in rows if name is None or name in row.values()]
+        if len(matches) != 1:
+            raise ValueError(
+                f"{path}: expected one row with the name {name!r} in a column, found "
+                f"{len(matches)} rows; pass the name of one row"
+            )
+        line, row = matches[0]
+        return convert_at(f"{path}, line {line}", cls.from_row, row)
 
     def __repr__(self) -> str:
         return f"Audiogram({self.short_text()})"
@@ -160,8 +145,6 @@ class Audiogram:
 
     def _repr_png_(self) -> bytes | None:
         """Return the drawn audiogram for a notebook, or ``None`` without matplotlib."""
-        from hlsim.audiogram.plot import draw_png
-
         return draw_png(self.plot)
 
     @property
@@ -207,9 +190,9 @@ class Audiogram:
         Raises:
             MissingExtraError: Matplotlib is not installed.
         """
-        from hlsim.audiogram.plot import plot_audiogram
-
-        return plot_audiogram(self, axes, ear, **style)
+        if ear is not None:
+            style = {"label": f"{ear}, PTA {self.pta:.0f} dB HL"} | style
+        return plot_thresholds(self.frequencies, self.levels, axes, ear, **style)
 
     def to_dict(self) -> dict[str, list[float]]:
         """Return a JSON-serialisable dictionary, the inverse of ``from_dict``."""
@@ -229,7 +212,7 @@ class Audiogram:
     def to_row(self) -> dict[str, str]:
         """Return a row of a CSV file with the columns ``hl_250``, ``hl_500`` and so on."""
         points = zip(self.frequencies, self.levels, strict=True)
-        return {f"hl_{_shortest(frequency)}": _shortest(level) for frequency, level in points}
+        return {f"hl_{_shortest(hz)}": _shortest(level) for hz, level in points}
 
     @classmethod
     def from_row(cls, row: Mapping[str, str], highest: float = HIGHEST_LEVEL) -> Audiogram:
@@ -325,6 +308,14 @@ def severity_index(levels: Tensor, frequencies: Sequence[float] = FREQUENCIES) -
     return torch.stack([mean > limit for limit in SEVERITY_LIMITS]).sum(0)
 
 
+def convert_at(place: str, convert: Callable[..., Result], *arguments: Any) -> Result:
+    """Return ``convert(*arguments)``, or raise its ValueError with the place in front."""
+    try:
+        return convert(*arguments)
+    except ValueError as error:
+        raise ValueError(f"{place}: {error}") from error
+
+
 def check_range(levels: Iterable[float], highest: float, user: str) -> None:
     """Validate levels in dB HL.
 
@@ -380,6 +371,5 @@ def _as_array(values: Any) -> NDArray[np.float64]:
 
 
 def _shortest(value: float) -> str:
-    """Return the shortest text that reads as the same number."""
-    short = f"{value:g}"
-    return short if float(short) == value else repr(value)
+    """Return the shortest text that reads as the same number, without a decimal point if whole."""
+    return str(value).removesuffix(".0")

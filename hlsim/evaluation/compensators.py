@@ -30,8 +30,8 @@ from hlsim.evaluation.study import Condition
 from hlsim.extras import require
 from hlsim.metrics.pair import check_seed
 from hlsim.neuro.config import NEURO_RATE
+from hlsim.neuro.pretrained import load_pretrained
 from hlsim.plugins import WaveformPlugin
-from hlsim.pretrained import load_pretrained
 
 UNAIDED, NAL_R, COMPRESSION = "unaided", "NAL-R", "WDRC"
 """Names of the conditions that every compensator is compared with."""

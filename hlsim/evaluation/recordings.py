@@ -26,7 +26,8 @@ from torch import Tensor
 from hlsim.audio import find_audio, read_audio
 from hlsim.audiogram import Audiogram
 from hlsim.audiogram.listener import EAR_NAMES, EARS
-from hlsim.audiogram.table import convert_at, read_rows
+from hlsim.audiogram.table import read_rows
+from hlsim.audiogram.value import convert_at
 from hlsim.calibration import check_full_scale, dbfs
 from hlsim.evaluation.comparison import Pair, compare
 from hlsim.evaluation.measures import LEVELS, find_measures

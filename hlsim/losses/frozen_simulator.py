@@ -20,7 +20,8 @@ from hlsim.losses.band_levels import HIGHEST
 from hlsim.msbg import MSBG
 from hlsim.msbg.response import apply_bank_phase, simulate_normal_ear
 from hlsim.neuro.network import EarNetwork
-from hlsim.pretrained import SIMULATOR, find_checkpoint, load_pretrained
+from hlsim.neuro.pretrained import load_pretrained
+from hlsim.pretrained import SIMULATOR, find_checkpoint
 from hlsim.torchtools import without_modes
 
 ReferenceName = Literal["clean", "normal-hearing"]

@@ -1,5 +1,7 @@
 """A training loss that simulates an impaired ear."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -276,7 +278,7 @@ class HearingLossLoss(nn.Module):
         lengths: Lengths | None = None,
         *,
         listener: Mapping[str, Any] | None = None,
-    ) -> "_Inputs":
+    ) -> _Inputs:
         """Validate the arguments of a call, and silence what does not count."""
         check_waveform(compensated, "compensated", full_scale_spl=self.full_scale_spl)
         check_waveform(clean, "clean", full_scale_spl=self.full_scale_spl)
@@ -313,14 +315,14 @@ class HearingLossLoss(nn.Module):
         clean = torch.where(known.unsqueeze(-1), clean, 0.0)
         return _Inputs(compensated, clean, ears.nan_to_num(), ends, known, listener)
 
-    def _simulate(self, inputs: "_Inputs", waveform: Tensor) -> Tensor:
+    def _simulate(self, inputs: _Inputs, waveform: Tensor) -> Tensor:
         return self._frozen.simulate(waveform, inputs.ears, inputs.options, inputs.ends)
 
-    def _reference(self, criterion: str, inputs: "_Inputs", batch: torch.Size) -> Tensor:
+    def _reference(self, criterion: str, inputs: _Inputs, batch: torch.Size) -> Tensor:
         _, clean, ears, ends, _, options = inputs
         return self._frozen.reference(criterion, clean, ears, batch, options, ends)
 
-    def _compare(self, inputs: "_Inputs") -> dict[str, Tensor]:
+    def _compare(self, inputs: _Inputs) -> dict[str, Tensor]:
         """Return the parts of the loss of each item. Shape: the leading dimensions each."""
         compensated, clean, ears, ends, known, _ = inputs
         limited = compensated

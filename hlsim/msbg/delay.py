@@ -1,5 +1,7 @@
 """Measurement of a simulator's delay with an impulse, as in the Neuro-MSBG paper."""
 
+from __future__ import annotations
+
 import torch
 from torch import nn
 

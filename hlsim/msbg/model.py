@@ -1,5 +1,7 @@
 """The exact MSBG: batched, differentiable, on a CPU or a GPU."""
 
+from __future__ import annotations
+
 import math
 from functools import partial
 from typing import NamedTuple

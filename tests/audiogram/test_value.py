@@ -13,8 +13,8 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from hlsim.audiogram import FREQUENCIES, SEVERITIES, Audiogram, severity_index
+from hlsim.audiogram.scale import EarName
 from hlsim.audiogram.thresholds import as_thresholds
-from hlsim.audiogram.value import EarName
 
 # Bisgaard, Vlaming and Dahlquist 2010, Tables 1 and 2, all ten frequencies
 BISGAARD_HZ = (250, 375, 500, 750, 1000, 1500, 2000, 3000, 4000, 6000)

@@ -12,7 +12,8 @@ from torch import nn
 from compensators import NALR, WDRC, load_compensator
 from hlsim import MSBG, Audiogram
 from hlsim.evaluation.fingerprint import combined_fingerprint, fingerprint
-from hlsim.pretrained import SIMULATOR, load_pretrained, shipped_checkpoints
+from hlsim.neuro.pretrained import load_pretrained
+from hlsim.pretrained import SIMULATOR, shipped_checkpoints
 
 
 def test_settings_and_ears_tell_modules_apart() -> None:

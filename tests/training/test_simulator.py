@@ -14,7 +14,8 @@ from hlsim.audio import find_audio, write_audio
 from hlsim.audiogram import Audiogram
 from hlsim.calibration import level_spl
 from hlsim.neuro import NeuroMSBG
-from hlsim.pretrained import checkpoint_about, checkpoint_digest, load_pretrained
+from hlsim.neuro.pretrained import load_pretrained
+from hlsim.pretrained import checkpoint_about, checkpoint_digest
 from hlsim.training.batches import (
     TrainingData,
     simulator_data,

@@ -1,0 +1,69 @@
+"""Insertion gains of an aid, measured with noise that has the spectrum of average speech."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from compensators.filter_bank import RATE, SPEECH_SPL, speech_density
+from hlsim.audiogram import FREQUENCIES
+from hlsim.calibration import PASCAL_SPL
+from hlsim.checks import check_number
+from hlsim.dsp.fft import power
+from hlsim.torchtools import constant_like
+
+
+def measure_gains(
+    process: Callable[[Tensor], Tensor], items: int, level: float, like: Tensor
+) -> Tensor:
+    """Measure gains in thirds of an octave around the eight ``FREQUENCIES`` in dB.
+
+    Args:
+        process: function from the input to the output of an aid, both (items, time) in pascals.
+        items: number of signals.
+        level: level of the noise in dB SPL, 0 to 120.
+        like: tensor with the type and the device of the noise.
+
+    Returns: (items, 8).
+
+    Raises:
+        ValueError: the level is out of range.
+
+    >>> measure_gains(lambda noise: 10.0 * noise, 1, 65.0, torch.empty(0)).round()
+    tensor([[20., 20., 20., 20., 20., 20., 20., 20.]])
+    """
+    check_number("level", level, 0.0, 120.0)
+    noise = constant_like(like, speech_noise) * 10.0 ** ((level - SPEECH_SPL) / 20.0)
+    # The first second, in which gains settle, does not count.
+    output = process(noise.repeat(items, 2))[:, RATE:]
+    thirds = constant_like(like, _thirds_of_octave)
+    output_power, noise_power = (
+        power(torch.fft.rfft(signal)) @ thirds for signal in (output, noise)
+    )
+    return 10.0 * (output_power / noise_power).log10()
+
+
+def speech_noise() -> NDArray[np.float64]:
+    """Return a second of noise with the spectrum of average speech at 65 dB SPL, (16000,).
+
+    The end of the noise continues with its beginning.
+
+    >>> speech_noise().shape
+    (16000,)
+    """
+    spectrum = np.zeros(RATE // 2 + 1, dtype=complex)
+    phases = np.random.default_rng(0).uniform(0.0, 2.0 * np.pi, RATE // 2)
+    spectrum[1:] = np.sqrt(speech_density(RATE)) * np.exp(1j * phases)
+    noise = np.fft.irfft(spectrum)
+    rms = 10.0 ** ((SPEECH_SPL - PASCAL_SPL) / 20.0)
+    return noise * rms / np.sqrt(np.square(noise).mean())
+
+
+def _thirds_of_octave() -> NDArray[np.float64]:
+    """Return 1 for each whole frequency in Hz in each third of an octave, else 0, (8001, 8)."""
+    ratio = np.arange(RATE // 2 + 1)[:, None] / np.array(FREQUENCIES)
+    return ((ratio > 2.0 ** (-1.0 / 6.0)) & (ratio < 2.0 ** (1.0 / 6.0))).astype(float)

@@ -1,0 +1,96 @@
+"""The insertion gains that an aid reports are those of its prescription and of its output."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from compensators import NALR, WDRC, load_compensator
+from compensators.filter_bank import speech_density
+from hlsim import Audiogram, Listener
+from hlsim.audiogram import FREQUENCIES
+from hlsim.calibration import level_spl, set_level
+
+EARS = ["N2", "N4", "S2"]
+
+
+def byrne_and_dillon(ear: Audiogram) -> list[float]:
+    """Compute NAL-R at 250, 500, 1000, 2000, 4000 and 6000 Hz from the printed formula."""
+    bias = {250: -17, 500: -8, 1000: 1, 2000: -1, 4000: -2, 6000: -2}
+    loss = dict(zip(FREQUENCIES, ear.thresholds, strict=True))
+    three_frequencies = loss[500] + loss[1000] + loss[2000]
+    common = 0.05 * three_frequencies
+    if three_frequencies > 180:
+        common = 9.0 + 0.116 * (three_frequencies - 180)
+    return [max(0.0, common + 0.31 * loss[hz] + bias[hz]) for hz in bias]
+
+
+@pytest.mark.parametrize("ear", EARS)
+def test_nalr_has_the_gains_of_the_published_formula(ear: str) -> None:
+    gains = NALR().gains(ear)
+    at_formula = [FREQUENCIES.index(hz) for hz in (250, 500, 1000, 2000, 4000, 6000)]
+    expected = byrne_and_dillon(Audiogram.standard(ear))
+    assert gains[at_formula].tolist() == pytest.approx(expected, abs=1e-5)
+    assert torch.equal(NALR(ear).gains(level=80.0), gains)
+
+
+@pytest.mark.parametrize("ear", EARS)
+def test_compression_has_about_nalrs_gains_for_average_speech(ear: str) -> None:
+    # The level of noise varies, and compression follows its peaks, which lowers the gain.
+    below = NALR().gains(ear) - WDRC().gains(ear)
+    assert float(below.min()) > -0.5
+    assert float(below.max()) < 2.5
+
+
+def speech_shaped_noise(level: float) -> Tensor:
+    """Draw 4 s of noise with the spectrum of speech."""
+    phases = 2.0 * np.pi * np.random.default_rng(1).random(32000)
+    spectrum = np.concatenate([[0.0], np.sqrt(speech_density(64000)) * np.exp(1j * phases)])
+    return set_level(torch.tensor(np.fft.irfft(spectrum)).float(), level)
+
+
+def gain_in_bands(output: Tensor, sound: Tensor) -> Tensor:
+    """Measure the gain in thirds of an octave."""
+    powers = [torch.fft.rfft(signal[16000:]).abs().square() for signal in (output, sound)]
+    frequencies = torch.fft.rfftfreq(48000, 1.0 / 16000.0)
+    gains = []
+    for hz in FREQUENCIES:
+        in_band = (frequencies / hz).log2().abs() < 1.0 / 6.0
+        output_power, sound_power = (power[in_band].sum() for power in powers)
+        gains.append(10.0 * float((output_power / sound_power).log10()))
+    return torch.tensor(gains)
+
+
+@pytest.mark.parametrize("name", ["wdrc", "hearing-aid", "compensator-general"])
+@pytest.mark.parametrize("level", [50.0, 65.0])
+def test_gains_are_those_of_the_output_for_other_noise(name: str, level: float) -> None:
+    aid: Any = load_compensator(name)
+    options = {"noise_reduction": 0.0} if name == "hearing-aid" else {}
+    noise = speech_shaped_noise(level)
+    with torch.no_grad():
+        output = aid(noise, "N3", **options)
+    difference = aid.gains("N3", level) - gain_in_bands(output, noise)
+    assert float(difference.abs().max()) < 1.0
+
+
+def test_the_gain_of_a_tone_is_that_of_the_prescription() -> None:
+    time = torch.arange(32000) / 16000.0
+    tone = set_level((2.0 * np.pi * 1000.0 * time).sin(), 60.0)
+    gain = float(level_spl(NALR()(tone, "N3")[8000:-8000]) - 60.0)
+    assert gain == pytest.approx(float(NALR().gains("N3")[2]), abs=0.5)
+
+
+def test_gains_have_the_shape_of_the_ears_and_need_valid_ones() -> None:
+    listener = Listener("N2", "N4")
+    for aid in (NALR(), WDRC(), load_compensator("hearing-aid")):
+        both = aid.gains([listener, listener])
+        assert both.shape == (2, 2, 8)
+        torch.testing.assert_close(both[0, 1], aid.gains("N4"))
+        for arguments in ((None,), ("N9",)):
+            with pytest.raises(ValueError):
+                aid.gains(*arguments)
+    for level in (-1.0, 121.0, "65"):
+        with pytest.raises(ValueError):
+            WDRC().gains("N3", level)
