@@ -14,8 +14,9 @@ config.json, tokenizer.json, vocabulary.txt), and runs offline.
 
 `transcribe` cuts recordings at pauses and keeps the pieces in which two models recognise the same
 words. `compare` processes these sentences by every aid for every ear, scales all outputs to the level
-of the first aid's output, and prints words correct with 95 % intervals (bootstrap over sentences),
-paired differences, and the speech reception threshold. A stopped comparison continues where it was.
+of the first aid's output (unless `--own-levels` is given), and prints words correct with 95 %
+intervals (bootstrap over sentences), paired differences, and the speech reception threshold. A
+stopped comparison continues where it was.
 
 An aid is a name that `load_compensator` takes, a plug-in `file.py:NAME` called with a waveform and an
 ear, or `unaided`; `hearing-aid@0.5` is an aid with half of its noise reduction.
@@ -423,8 +424,13 @@ class AtEqualLevel(Condition):
         return set_level(aid(item.signal, item.ear), level)
 
 
-def make_conditions(aids: Sequence[str]) -> list[Condition]:
-    """Return one condition per aid; all outputs have the level of the first aid's output."""
+def make_conditions(aids: Sequence[str], *, own_levels: bool) -> list[Condition]:
+    """Return one condition per aid.
+
+    All outputs have the level of the first aid's output, unless ``own_levels`` is set.
+    """
+    if own_levels:
+        return [Condition(name, load_aid(name)) for name in aids]
     first = load_aid(aids[0])
     return [AtEqualLevel(name, AtLevelOf(load_aid(name), first).eval()) for name in aids]
 
@@ -585,7 +591,8 @@ def run_compare(options: argparse.Namespace) -> None:
     }
     unaided = Condition("unaided", Unaided().eval())
     normal = run_study(normal_items, [unaided], [measure], **running)
-    table = run_study(items, make_conditions(options.aids), [measure], **running)
+    conditions = make_conditions(options.aids, own_levels=options.own_levels)
+    table = run_study(items, conditions, [measure], **running)
     print(file=sys.stderr)
     table.to_csv(out / "table.csv", index=False)
     failures = table["failure"].dropna()
@@ -610,6 +617,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     command.add_argument("--sentences", default=SENTENCES, help="CSV file of sentences")
     command.add_argument("--aids", nargs="+", default=["hearing-aid", "nalr"], help="aids")
     command.add_argument("--baseline", help="aid that is subtracted; by default the last one")
+    command.add_argument("--own-levels", action="store_true", help="do not equalise levels")
     command.add_argument("--snrs", nargs="+", default=["0", "5", "quiet"], help="SNRs in dB")
     command.add_argument("--seed", type=int, default=0, help="seed of noise and internal noise")
     command.add_argument("--step", type=int, default=1, help="every STEP-th ear, in turn")
