@@ -20,11 +20,11 @@ from hlsim.evaluation.comparison import compare
 from hlsim.evaluation.items import INPUT_LEVELS
 from hlsim.evaluation.measurements import gain_curves
 from hlsim.evaluation.measures import LEVELS, MEASURES, PERCEPTION, perceive
+from hlsim.evaluation.parallel import Progress, one_thread
 from hlsim.evaluation.result import Evaluation
 from hlsim.evaluation.study import Condition, Item
 from hlsim.metrics.pair import check_pair
 from hlsim.neuro.config import NEURO_RATE
-from hlsim.parallel import Progress, one_thread
 from hlsim.report.demo import (
     NAL_R,
     NAL_R_AT_LEVEL,

@@ -107,7 +107,8 @@ class WaveformPlugin:
     def __call__(self, waveform: Tensor, *arguments: Any) -> Tensor:
         """Call the plug-in.
 
-        Shape: (..., time) -> (..., time), in the precision of the waveform.
+        Shape: (..., time) -> (..., time), in the precision of the waveform. The output of an aid
+        may have another duration.
 
         Args:
             waveform: first argument of the plug-in.
@@ -123,7 +124,12 @@ class WaveformPlugin:
             output = self.function(waveform, *arguments)
         except Exception as error:  # because code of a plug-in may raise anything
             raise ValueError(f"{self.kind} {self.name} failed: {_describe(error)}") from error
-        if not isinstance(output, Tensor) or output.is_complex() or output.shape != waveform.shape:
+        is_real = isinstance(output, Tensor) and not output.is_complex()
+        if is_real and self.kind == "aid" and output.ndim == waveform.ndim:
+            has_shape = output.shape[:-1] == waveform.shape[:-1]
+        else:
+            has_shape = is_real and output.shape == waveform.shape
+        if not has_shape:
             raise ValueError(
                 f"{self.kind} {self.name} returned {_describe_output(output)}, expected a real "
                 f"tensor of shape {tuple(waveform.shape)}"

@@ -12,7 +12,7 @@ import torch
 from hlsim import MSBG, Audiogram, HearingLossLoss
 from hlsim.audio import read_audio, write_audio
 from hlsim.calibration import level_spl, set_level
-from hlsim.evaluation.aids import load_enhancer
+from hlsim.evaluation.aids import load_enhancers
 from hlsim.msbg.ear import MSBG_RATE
 from hlsim.msbg.filterbank import BANKS, gammatone_response
 from hlsim.training.teacher import PluginTeacher
@@ -86,7 +86,7 @@ def test_enhancers_take_noise_off_and_do_not_delay(
 ) -> None:
     if importlib.util.find_spec(package) is None:
         pytest.skip(f"{package} is not installed")
-    enhancer = load_enhancer(f"{EXAMPLES}/enhancers.py:{name}")  # which rejects delays
+    enhancer = load_enhancers([f"{EXAMPLES}/enhancers.py:{name}"])[name]  # which rejects delays
     clean = set_level(speech[0][0][:, :48000], 65.0)
     noise = set_level(torch.randn_like(clean), 60.0)
     noisy = clean + noise

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import os
 from pathlib import Path
 
 from hlsim.cli.inputs import check_paths_exist, read_ear, require_installed
@@ -13,26 +12,22 @@ from hlsim.extras import require
 
 
 def demo(parser: Parser) -> None:
-    parser.set_command(
-        _demo,
-        "",
-        "--audiogram S2 --steps 1000 --out s2",
-    )
+    """Declare the options of ``demo``."""
+    parser.set_command(_demo, "", "--audiogram S2 --steps 1000 --out s2")
     parser.option("--out", folder, "folder for report, audio and pictures", Path("hlsim-demo"))
     parser.audiogram("N4")
-    text = "folder of 22 files or more instead of the embedded speech; a third is scored"
+    text = "folder of 22 files or more instead of the bundled speech; a third is scored"
     parser.option("--speech", Path, text)
     parser.option("--steps", count, "training steps; 3000 take about three minutes", 3000)
     parser.seed()
 
 
 def _demo(options: argparse.Namespace) -> None:
-    os.environ["MPLBACKEND"] = "Agg"  # a notebook's backend may not exist in this environment
     require_installed("train", "lightning", "tensorboard")
     require_installed("eval", "joblib", "matplotlib")
     check_paths_exist(folders=(options.speech,))
     ear = read_ear(options.audiogram)
-    require("lightning", "train")  # one that is there may be broken
+    require("lightning", "train")  # A broken installation is reported here.
     from hlsim.demo import demo
 
     summary = demo(

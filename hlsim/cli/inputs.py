@@ -121,15 +121,20 @@ def other_ear_warnings(label: str, name: str, ear: Audiogram | None) -> list[str
     return [f"{label} was trained for one ear, {levels} dB HL, and does not fit other ears."]
 
 
-def read_compensator(
-    options: argparse.Namespace, sample_rate: int, *, warn: bool = True
-) -> tuple[Any, dict[str, float]]:
+def warn_of_other_ear(options: argparse.Namespace) -> None:
+    """Print a warning if ``--compensator`` was trained for another ear than ``--audiogram``."""
+    name = options.compensator
+    ear = read_ear(options.audiogram) if options.audiogram else None
+    for line in other_ear_warnings(name, name, ear):
+        print(f"hlsim: warning: {line}", file=sys.stderr)
+
+
+def read_compensator(options: argparse.Namespace, sample_rate: int) -> tuple[Any, dict[str, float]]:
     """Load the compensator of ``--compensator``, and read its sliders.
 
     Args:
         options: Options of the command.
         sample_rate: Sample rate in Hz.
-        warn: Whether to print a warning if the compensator was trained for another ear.
 
     Returns:
         The compensator, and the values of its sliders by name.
@@ -139,18 +144,13 @@ def read_compensator(
     name = options.compensator
     settings = {"sample_rate": sample_rate, "full_scale_spl": options.full_scale_spl}
     compensator = load_compensator(name, **settings, linked=getattr(options, "linked", False))
-    ear = read_ear(options.audiogram) if options.audiogram else None
-    if warn:
-        for line in other_ear_warnings(name, name, ear):
-            print(f"hlsim: warning: {line}", file=sys.stderr)
     values = {
         "noise_reduction": options.noise_reduction,
         "amplification": options.amplification,
     }
     sliders = {slider: value for slider, value in values.items() if value is not None}
-    unknown = sorted(sliders.keys() - set(getattr(compensator, "SLIDERS", ())))
-    if unknown:
-        option = unknown[0].replace("_", "-")
+    for slider in sliders.keys() - set(getattr(compensator, "SLIDERS", ())):
+        option = slider.replace("_", "-")
         raise ValueError(
             f"--{option} has no effect with --compensator {name}; choose a hearing aid"
         )

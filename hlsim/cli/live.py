@@ -6,7 +6,7 @@ import argparse
 import math
 from types import ModuleType
 
-from hlsim.cli.inputs import read_compensator, read_ears
+from hlsim.cli.inputs import read_compensator, read_ears, warn_of_other_ear
 from hlsim.cli.options import Parser, checked_type, number, positive
 from hlsim.extras import require
 
@@ -79,6 +79,7 @@ def _live(options: argparse.Namespace) -> None:
         block = 12 * stream.block
         latency = stream.latency
     else:
+        warn_of_other_ear(options)
         aid, values = read_compensator(options, RATE)
         if not hasattr(aid, "stream"):
             raise ValueError(

@@ -7,6 +7,7 @@ import os
 import signal
 import sys
 import threading
+import warnings
 from collections.abc import Sequence
 from functools import partial
 from importlib import import_module
@@ -16,8 +17,8 @@ from hlsim.extras import MissingExtraError
 from hlsim.version import __version__
 
 COMMANDS = {
-    "simulate": ("files", "simulate a hearing loss on a file or a folder of files"),
-    "compensate": ("files", "apply a hearing aid to a file or a folder of files"),
+    "simulate": ("processing", "simulate a hearing loss on a file or a folder of files"),
+    "compensate": ("processing", "apply a hearing aid to a file or a folder of files"),
     "live": ("live", "run a hearing aid or a simulated hearing loss from microphone to headphones"),
     "demo": (
         "demo",
@@ -29,7 +30,7 @@ COMMANDS = {
     ),
     "evaluate-compensator": ("evaluation", "compare hearing aids with no aid, NAL-R and WDRC"),
     "evaluate-simulator": ("evaluation", "compare simulators with MSBG or another teacher"),
-    "clarity": ("clarity", "evaluate pairs of aids on scenes of the Clarity challenges"),
+    "clarity": ("evaluation", "evaluate pairs of aids on scenes of the Clarity challenges"),
     "prepare": (
         "prepare",
         "recognise the layout of a corpus and write its manifest, a CSV file to train on",
@@ -66,6 +67,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if "matplotlib" not in sys.modules:
         # The backend of a notebook may be missing in this environment.
         os.environ["MPLBACKEND"] = "Agg"
+    warnings.formatwarning = lambda message, *_, **__: f"hlsim: warning: {message}\n"
     signals: list[int] = []
 
     def stop(number: int, frame: object) -> None:

@@ -166,10 +166,36 @@ class Parser(argparse.ArgumentParser):
         )
         self.option("--listener", str, help_, metavar="FILE[:NAME]", **settings)
 
-    def full_scale(self, **settings: Any) -> None:
-        """Declare ``--full-scale-spl``."""
+    def levels(self, levelled: str) -> None:
+        """Declare ``--full-scale-spl`` and, instead, ``--spl``, the level of each file.
+
+        Args:
+            levelled: Noun for the signal with the level.
+        """
+        group = self.add_mutually_exclusive_group()
         text = "level in dB SPL of a file whose RMS is 1.0"
-        self.option("--full-scale-spl", number, text, 94.0, metavar="DB", **settings)
+        self.option("--full-scale-spl", number, text, 94.0, group=group, metavar="DB")
+        text = f"level in dB SPL of {levelled}"
+        self.option("--spl", positive, text, group=group, metavar="DB")
+
+    def linked(self, condition: str) -> None:
+        """Declare ``--linked``."""
+        text = f"link the gains of both ears ({condition}hearing aids and wdrc only)"
+        self.flag("--linked", text)
+
+    def enhancers(self, waveforms: str) -> None:
+        """Declare ``--enhancer``.
+
+        Args:
+            waveforms: Description of its input and output.
+        """
+        text = (
+            "noise reduction of your own before each aid, package.module:name or "
+            "path/to/file.py:name: a callable (waveform, sample_rate) -> waveform or its class, "
+            f"for {waveforms}"
+        )
+        settings = {"nargs": "+", "metavar": "NAME", "dest": "enhancers"}
+        self.option("--enhancer", plugin_name, text, [], **settings)
 
     def sliders(self) -> None:
         """Declare the sliders of a hearing aid."""

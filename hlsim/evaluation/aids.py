@@ -1,4 +1,4 @@
-"""Aids that others are compared with: none, an equaliser, another one at the same level, an enhancer first."""
+"""Aids with which others are compared: no aid, an equaliser, and an aid at the level of another."""
 
 from __future__ import annotations
 
@@ -22,16 +22,25 @@ from hlsim.losses.band_levels import band_centres
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.plugins import WaveformPlugin
 
-_TAPS = 513  # of an equaliser: 31 Hz at 16 kHz
-_LOWEST_GAIN_DB = -100.0
-_SPEECH = Path(__file__).parents[1] / "data" / "speech" / "valid" / "flite-rms-01.flac"
+EQUALISER_TAPS = 513
+"""Number of taps of an equaliser, which gives it a resolution of 31 Hz at 16 kHz."""
+
+LOWEST_GAIN_DB = -100.0
+"""Lowest gain of an equaliser in dB."""
+
+SPEECH_FILE = Path(__file__).parents[1] / "data" / "speech" / "valid" / "flite-rms-01.flac"
+"""Speech on which an enhancer is tried when it is loaded."""
 
 _GAINS: dict[tuple[str, Audiogram], list[float]] = {}
-"""Gains of equalisers by their token and the ear, for this process."""
+"""Gains of the equalisers of this process, by their identifier and the ear."""
 
 
 class Unaided(nn.Module):
-    """No hearing aid: the output is the input."""
+    """No hearing aid: the output is the input.
+
+    >>> Unaided()(torch.ones(2), Audiogram.standard("N3"))
+    tensor([1., 1.])
+    """
 
     def forward(self, waveform: Tensor, audiogram: Audiogram) -> Tensor:
         """Return the waveform."""
@@ -39,24 +48,34 @@ class Unaided(nn.Module):
 
 
 class AtLevelOf(nn.Module):
-    """An aid whose output has the RMS level of another aid's output for the same input."""
+    """Aid whose output has the RMS level of another aid's output for the same input.
+
+    >>> AtLevelOf(Unaided(), Unaided())(torch.ones(2), Audiogram.standard("N3"))
+    tensor([1., 1.])
+    """
 
     def __init__(self, aid: nn.Module, other: nn.Module) -> None:
         super().__init__()
         self.aid, self.other = aid, other
 
     def forward(self, waveform: Tensor, audiogram: Audiogram) -> Tensor:
-        """Process the waveform with both aids, and return the first output at the second's level."""
+        """Return the output of the first aid at the level of the second."""
         return set_level(self.aid(waveform, audiogram), level_spl(self.other(waveform, audiogram)))
 
 
 class EqualiserLike(nn.Module):
-    """A fixed filter for each ear with an aid's mean insertion gain: what is left of the aid without the rest.
+    """Fixed filter for each ear with an aid's mean insertion gain.
+
+    Everything that an aid achieves beyond it is not due to gain.
 
     Args:
         aid: the aid.
-        utterances: speech that its gain is measured on, (utterances, time) at 16 kHz.
-        levels: levels of the speech in dB SPL; the gain in dB is their mean.
+        utterances: speech on which the gain is measured. Shape: (utterances, time) at 16 kHz.
+        levels: levels of the speech in dB SPL, over which the gain in dB is averaged.
+
+    >>> equaliser = EqualiserLike(Unaided(), torch.randn(1, 16000), (65.0,))
+    >>> max(equaliser.gains_db(Audiogram.standard("N3")))
+    0.0
     """
 
     utterances: Tensor
@@ -65,68 +84,91 @@ class EqualiserLike(nn.Module):
         super().__init__()
         self.aid, self.levels = aid, tuple(levels)
         self.register_buffer("utterances", utterances, persistent=False)
-        self._token = uuid.uuid4().hex  # the same in every process that this object is sent to
+        self._identifier = uuid.uuid4().hex  # the same in every process that receives a copy
 
     def forward(self, waveform: Tensor, audiogram: Audiogram) -> Tensor:
-        """Filter the waveform. The gains of an ear are measured once in a process."""
-        place = self._token, audiogram
-        if place not in _GAINS:
-            _GAINS[place] = self.gains_db(audiogram)
-        return equalise_bands(waveform, _GAINS[place])
+        """Filter the waveform. The gains of an ear are measured once per process."""
+        key = self._identifier, audiogram
+        if key not in _GAINS:
+            _GAINS[key] = self.gains_db(audiogram)
+        return equalise_bands(waveform, _GAINS[key])
 
     def gains_db(self, audiogram: Audiogram) -> list[float]:
-        """Return the gain in dB of each band, rounded to 0.1 dB."""
+        """Measure the gain of each band in dB, rounded to 0.1 dB."""
         gains = insertion_gain(self.aid, audiogram, self.utterances, self.levels)
-        mean = np.mean(gains, 0).clip(_LOWEST_GAIN_DB, None)
+        mean = np.mean(gains, 0).clip(LOWEST_GAIN_DB, None)
         return [round(gain, 1) for gain in mean.tolist()]
 
 
 def equalise_bands(waveform: Tensor, gains_db: Sequence[float]) -> Tensor:
-    """Filter with gains in dB at ``band_centres``, with linear phase and without delay."""
-    hertz = np.linspace(0.0, NEURO_RATE / 2.0, _TAPS)
+    """Filter a waveform at 16 kHz with one gain per band, with linear phase and without delay.
+
+    Args:
+        waveform: signal with shape (..., time).
+        gains_db: gains in dB at the frequencies of ``band_centres``.
+
+    >>> equalise_bands(torch.ones(1000), [6.0] * 24).shape
+    torch.Size([1000])
+    """
+    hertz = np.linspace(0.0, NEURO_RATE / 2.0, EQUALISER_TAPS)
     gains = np.interp(np.log(hertz.clip(1.0)), np.log(band_centres()), gains_db)
-    taps = firwin2(_TAPS, hertz, 10.0 ** (gains / 20.0), fs=NEURO_RATE)
+    taps = firwin2(EQUALISER_TAPS, hertz, 10.0 ** (gains / 20.0), fs=NEURO_RATE)
     return filter_without_delay(waveform, torch.from_numpy(taps).to(waveform))
 
 
 class Enhanced(nn.Module):
-    """An aid behind an enhancer that reduces noise."""
+    """Aid after an enhancer that reduces noise.
+
+    >>> enhancer = WaveformPlugin("torch:mul", "enhancer")
+    >>> Enhanced(enhancer, Unaided())(torch.ones(2), Audiogram.standard("N3"))
+    tensor([16000., 16000.])
+    """
 
     def __init__(self, enhancer: WaveformPlugin, aid: nn.Module) -> None:
         super().__init__()
         self.enhancer, self.aid = enhancer, aid
-        self.limit_spl = limit_of(aid)
+        self.limit_spl = output_limit_spl(aid)
 
     def forward(self, waveform: Tensor, audiogram: Audiogram) -> Tensor:
-        """Enhance the waveform, and process what comes out."""
+        """Process the output of the enhancer."""
         aided: Tensor = self.aid(self.enhancer(waveform, NEURO_RATE), audiogram)
         return aided
 
 
-def load_enhancer(name: str) -> WaveformPlugin:
-    """Load an enhancer ``(waveform, sample_rate) -> waveform`` of (..., time) in pascals.
+def load_enhancers(names: Sequence[str]) -> dict[str, WaveformPlugin]:
+    """Load enhancers ``(waveform, sample_rate) -> waveform`` of (..., time) in pascals.
+
+    Args:
+        names: ``package.module:name`` or ``path/to/file.py:name``.
+
+    Returns:
+        The enhancers by the part of their names after the colon.
 
     Raises:
-        ValueError: As ``WaveformPlugin``, or its output for speech is no waveform, or not aligned.
+        ValueError: an enhancer cannot be loaded, its output for speech is not a waveform or not
+            time-aligned, or two have the same name after the colon.
+
+    >>> load_enhancers([])
+    {}
     """
-    enhancer = WaveformPlugin(name, "enhancer")
-    waveform, rate = read_audio(_SPEECH)
-    speech = set_level(resample(waveform[0], rate, NEURO_RATE)[: 2 * NEURO_RATE], 65.0)
-    enhancer.check_aligned(speech, NEURO_RATE, NEURO_RATE)
-    return enhancer
-
-
-def load_enhancers(names: Sequence[str]) -> dict[str, WaveformPlugin]:
-    """Load enhancers by the part of their names after the colon; ValueError for the same part twice."""
-    enhancers = {name.rpartition(":")[2]: load_enhancer(name) for name in names}
-    if len(enhancers) < len(names):
-        raise ValueError(
-            f"enhancers {', '.join(names)}: two have the same name after the colon; rename one"
-        )
+    recording, rate = read_audio(SPEECH_FILE)
+    speech = set_level(resample(recording[0], rate, NEURO_RATE)[: 2 * NEURO_RATE], 65.0)
+    enhancers: dict[str, WaveformPlugin] = {}
+    for name in names:
+        enhancer = WaveformPlugin(name, "enhancer")
+        enhancer.check_aligned(speech, NEURO_RATE, NEURO_RATE)
+        label = name.rpartition(":")[2]
+        if label in enhancers:
+            raise ValueError(f"two enhancers have the name {label} after the colon; rename one")
+        enhancers[label] = enhancer
     return enhancers
 
 
-def limit_of(aid: Any) -> float | None:
-    """Return the peak in dB SPL that an aid promises not to pass; None if it promises none."""
+def output_limit_spl(aid: Any) -> float | None:
+    """Return the peak in dB SPL that an aid guarantees not to exceed, or None.
+
+    >>> output_limit_spl(Unaided()) is None
+    True
+    """
     limit: float | None = getattr(getattr(aid, "config", aid), "limit_spl", None)
     return limit

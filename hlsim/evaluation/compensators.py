@@ -1,4 +1,4 @@
-"""Compensators judged beside what a user would choose, on the same speech, ears, levels and noise."""
+"""Compensators compared with other choices of a user, for the same speech, ears and noise."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from torch import Tensor, nn
+from torch import nn
 
 from compensators.nalr import NALR
 from compensators.wdrc import WDRC
@@ -18,12 +18,18 @@ from hlsim.evaluation.aids import (
     Enhanced,
     EqualiserLike,
     Unaided,
-    limit_of,
     load_enhancers,
+    output_limit_spl,
 )
 from hlsim.evaluation.comparison import compare
 from hlsim.evaluation.items import INPUT_LEVELS, draw_judged_items, read_ears
-from hlsim.evaluation.measurements import draw_utterances, gain_curves, steady_tones, wearing
+from hlsim.evaluation.measurements import (
+    draw_utterances,
+    gain_curves,
+    measure_aids,
+    steady_tones,
+    wearing,
+)
 from hlsim.evaluation.measures import LEVELS, PERCEPTION, find_measures, network_loss
 from hlsim.evaluation.result import Evaluation
 from hlsim.evaluation.study import Condition
@@ -34,10 +40,13 @@ from hlsim.neuro.pretrained import load_pretrained
 from hlsim.plugins import WaveformPlugin
 
 UNAIDED, NAL_R, COMPRESSION = "unaided", "NAL-R", "WDRC"
-"""Names of the conditions that every compensator is compared with."""
+"""Names of the conditions with which every compensator is compared."""
 
 HARD = 0.6
 """Unaided HASPI below which an item belongs to the group ``hard``."""
+
+PEAK_TOLERANCE_DB = 1e-4
+"""Excess of a peak over an output limit that is due to rounding in float32."""
 
 
 def evaluate_compensators(
@@ -55,60 +64,65 @@ def evaluate_compensators(
     seconds: float = 3.0,
     levels: Sequence[float] = INPUT_LEVELS,
     gain_ears: Sequence[str] = ("N3", "S2"),
-    notes: Sequence[str] = (),
     seed: int = 0,
     **running: Any,
 ) -> Evaluation:
-    """Judge compensators beside no aid, NAL-R and WDRC, and beside two rivals at their own output level.
+    """Compare compensators with no aid, NAL-R and WDRC, and with two rivals at their output level.
 
-    The rivals are NAL-R and an equaliser: for each ear a fixed filter with the compensator's mean gain for
-    speech at ``levels``. The comparison with NAL-R at the compensator's level by HASPI is planned.
+    The rivals are NAL-R and an equaliser, a fixed filter for each ear with the compensator's mean
+    gain for speech at ``levels``. The comparison with NAL-R at the compensator's level by HASPI is
+    planned.
 
-    Values are stored as they become known. A run that was stopped continues where it was, one with a further
-    compensator computes that one alone, and one with another simulator computes the surrogate gap alone. An
-    item counts only if every condition has all its values.
+    Values are stored as they become known. An interrupted run can be continued, and a run with one
+    more compensator, or with another simulator, computes only the values that are missing. An item
+    counts only if every condition has all its values.
 
     Args:
-        compensators: modules by name, at 16 kHz and 94 dB SPL full scale, called with a waveform and an
-            ear. The peaks of one with an attribute ``limit_spl``, or ``config.limit_spl``, are compared with it.
-        speech, noise: folders of recordings; with ``noise`` every second item is noisy, at 2.5 to 17.5 dB.
+        compensators: modules by name, at 16 kHz and 94 dB SPL full scale, which are called with a
+            waveform and an ear. If a module has the attribute ``limit_spl`` or
+            ``config.limit_spl``, its peaks are compared with that limit.
+        speech, noise: folders of recordings. With ``noise``, every second item is noisy, at 2.5 to
+            17.5 dB.
         store: file of values, which is created if it does not exist; None stores nothing.
-        audiograms: CSV file of ears that join Bisgaard's N2 to N6 and S1 to S3.
-        audiogram: one ear in place of all, also for the gain curves; for a compensator that was trained for it.
-        enhancers: names ``package.module:name`` of callables ``(waveform, sample_rate) -> waveform`` that
-            reduce noise before each aid, under conditions such as ``gtcrn + NAL-R``.
-        simulator: the Neuro-MSBG of the surrogate gap, by name or folder.
-        measures: further measures beside HASPI and HASQI.
-        items: number of items. 400 give each main row 200 pairs.
-        seconds: length of an item; HASPI is not reliable much below 3.
+        audiograms: CSV file of ears, in addition to Bisgaard's N2 to N6 and S1 to S3.
+        audiogram: single ear for everything, for a compensator that was trained for it.
+        enhancers: names ``package.module:name`` of functions ``(waveform, sample_rate) ->
+            waveform`` that reduce noise before each aid, in conditions such as ``gtcrn + NAL-R``.
+        simulator: Neuro-MSBG of the surrogate gap, by name or folder.
+        measures: measures in addition to HASPI and HASQI.
+        items: number of items. 400 items give each main row 200 pairs.
+        seconds: length of an item. HASPI is not reliable much below 3.
         levels: levels of the clean speech in dB SPL, in turn.
         gain_ears: standard ears of the gain curves and the steady tones.
-        notes: sentences that the report begins with.
+        seed: seed of all random draws.
         running: ``jobs``, ``dask`` and ``progress``, as in ``run_study``.
 
-    Returns: the evaluation with the groups ``clean``, ``noisy`` and ``hard`` as far as they have items, and the
+    Returns:
+        The evaluation with the groups ``clean``, ``noisy`` and ``hard`` if they have items, and the
         details ``gain_curves``, ``steady_tones`` and ``wearing``.
 
     Raises:
-        ValueError: data or settings that cannot be used, or no item has all its values.
+        ValueError: data or settings are not valid, or no item has all its values.
         MissingExtraError: a package is not installed.
     """
     require("pandas", "eval")
     check_seed(seed)
     _check_arguments(compensators, items, levels)
-    ears, shown = _choose_ears(audiograms, audiogram, gain_ears)
+    ears, gain_curve_ears = _choose_ears(audiograms, audiogram, gain_ears)
     utterances = draw_utterances(speech, seed)
-    enhancing = load_enhancers(enhancers)
+    enhancer_plugins = load_enhancers(enhancers)
     prescriptions = {NAL_R: NALR(sample_rate=NEURO_RATE), COMPRESSION: WDRC(sample_rate=NEURO_RATE)}
     aids = {name: aid.eval() for name, aid in {**prescriptions, **compensators}.items()}
-    conditions = _conditions(aids, compensators, enhancing, utterances, levels)
+    equalisers = {name: EqualiserLike(aids[name], utterances, levels) for name in compensators}
+    conditions = _make_conditions(aids, equalisers, enhancer_plugins)
     kinds = ("aid", "prescription", "enhanced")
-    worn = {c.name: c.process for c in conditions if c.process and c.kind in kinds}
-    # these come first: what cannot be used shows at once
+    wearable = {c.name: c.process for c in conditions if c.process and c.kind in kinds}
+    with_unaided: dict[str, Any] = {UNAIDED: Unaided(), **wearable}
+    # These measurements come first, because they reject an aid that fails.
     details = {
-        "gain_curves": gain_curves(aids, shown, utterances, levels),
-        "steady_tones": steady_tones({UNAIDED: Unaided(), **worn}, shown, levels),
-        "wearing": wearing(worn, shown, utterances[0]),
+        "gain_curves": gain_curves(aids, gain_curve_ears, utterances, levels),
+        "steady_tones": measure_aids(with_unaided, gain_curve_ears, steady_tones, levels),
+        "wearing": measure_aids(wearable, gain_curve_ears, wearing, utterances[0]),
     }
     drawn = draw_judged_items(
         speech, noise, ears, items=items, seconds=seconds, seed=seed, levels=levels
@@ -125,18 +139,19 @@ def evaluate_compensators(
             "seed": seed,
             "levels": list(levels),
             "simulator": str(simulator),
-            "enhancers": list(map(str, enhancing.values())),
+            "enhancers": list(map(str, enhancer_plugins.values())),
         },
         **running,
     )
-    limits = {condition.name: limit_of(condition.process) for condition in conditions}
+    limits = {condition.name: output_limit_spl(condition.process) for condition in conditions}
     table = evaluation.table
-    # float32 rounds the limit itself by as little
-    beyond = table["peak"] > table["condition"].map(limits).astype(float) + 1e-4
-    gap = table["loss_neuro"] / table["loss_msbg"].where(table["loss_msbg"] != 0.0) - 1.0
-    table = table.assign(beyond_limit=beyond, gap=gap)
-    evaluation = replace(evaluation, table=table, notes=notes, details=details)
-    return replace(evaluation, groups=_groups(evaluation))
+    limit = table["condition"].map(limits).astype(float)
+    relative_loss = table["loss_neuro"] / table["loss_msbg"].where(table["loss_msbg"] != 0.0)
+    table = table.assign(
+        beyond_limit=table["peak"] > limit + PEAK_TOLERANCE_DB, gap=relative_loss - 1.0
+    )
+    evaluation = replace(evaluation, table=table, details=details)
+    return replace(evaluation, groups=_make_groups(evaluation))
 
 
 def _check_arguments(
@@ -163,52 +178,53 @@ def _choose_ears(
             "give either audiograms, a CSV file of ears, or audiogram, one ear for all"
         )
     if audiogram is None:
-        ears, shown = read_ears(audiograms), {name: Audiogram.standard(name) for name in gain_ears}
+        gain_curve_ears = {name: Audiogram.standard(name) for name in gain_ears}
+        ears = read_ears(audiograms)
     else:
         thresholds = " ".join(f"{level:g}" for level in audiogram.levels)
-        shown = {f"{thresholds} dB HL": audiogram}
-        ears = list(shown.items())
-    for ear in shown.values():
-        as_thresholds(ear)  # rejects what a simulator does not take
-    return ears, shown
+        gain_curve_ears = {f"{thresholds} dB HL": audiogram}
+        ears = list(gain_curve_ears.items())
+    for ear in gain_curve_ears.values():
+        as_thresholds(ear)  # rejects thresholds that a simulator does not accept
+    return ears, gain_curve_ears
 
 
-def _conditions(
+def _make_conditions(
     aids: Mapping[str, nn.Module],
-    compensators: Mapping[str, nn.Module],
+    equalisers: Mapping[str, nn.Module],
     enhancers: Mapping[str, WaveformPlugin],
-    utterances: Tensor,
-    levels: Sequence[float],
 ) -> list[Condition]:
-    """Return all conditions, each after those that it is compared with."""
-    conditions = [Condition(UNAIDED, Unaided().eval(), kind="unaided")]
+    """Return all conditions, each after those with which it is compared.
+
+    Aids without an equaliser are prescriptions.
+    """
+    conditions = [Condition(UNAIDED, Unaided(), kind="unaided")]
     for name, aid in aids.items():
         enhanced = [
-            Condition(f"{prefix} + {name}", Enhanced(e, aid).eval(), "enhanced", name, [name])
-            for prefix, e in enhancers.items()
+            Condition(f"{prefix} + {name}", Enhanced(enhancer, aid), "enhanced", name, [name])
+            for prefix, enhancer in enhancers.items()
         ]
-        if name not in compensators:
+        if name not in equalisers:
             rivals = [UNAIDED] if name == NAL_R else [UNAIDED, NAL_R]
             conditions += [Condition(name, aid, "prescription", rivals=rivals), *enhanced]
             continue
-        equaliser = EqualiserLike(aid, utterances, levels)
+        nal_r = AtLevelOf(aids[NAL_R], aid)
+        equaliser = AtLevelOf(equalisers[name], aid)
         same_level = [
-            Condition(
-                f"{NAL_R} at {name}'s level", AtLevelOf(aids[NAL_R], aid), "same level", name
-            ),
-            Condition(f"equaliser at {name}'s level", AtLevelOf(equaliser, aid), "equaliser", name),
+            Condition(f"{NAL_R} at {name}'s level", nal_r, "same level", name),
+            Condition(f"equaliser at {name}'s level", equaliser, "equaliser", name),
         ]
-        own = [condition.name for condition in (*same_level, *enhanced)]
-        prescribed = [c.name for c in conditions if c.of == NAL_R]
-        rivals = [own[0], own[1], UNAIDED, NAL_R, COMPRESSION, *prescribed, *own[2:]]
+        rivals = [condition.name for condition in same_level] + [UNAIDED, NAL_R, COMPRESSION]
+        rivals += [condition.name for condition in conditions if condition.of == NAL_R]
+        rivals += [condition.name for condition in enhanced]
         conditions += [*same_level, *enhanced, Condition(name, aid, "aid", rivals=rivals)]
     return conditions
 
 
-def _groups(evaluation: Evaluation) -> dict[str, Evaluation]:
-    """Return the evaluation of clean speech, of speech in noise, and of items that need help most.
+def _make_groups(evaluation: Evaluation) -> dict[str, Evaluation]:
+    """Return the evaluation of clean speech, of noisy speech, and of hard items.
 
-    An item that lacks a value under one condition is in no group.
+    An item that lacks a value in one condition is in no group.
     """
     table = evaluation.table[~evaluation.table["item"].isin(evaluation.failures["item"])]
     if table.empty:
@@ -223,8 +239,8 @@ def _groups(evaluation: Evaluation) -> dict[str, Evaluation]:
     same_level = [c for c in evaluation.conditions if c.kind == "same level"]
     planned = [("haspi", condition.name, condition.of) for condition in same_level]
     groups = {}
-    for name, chosen in members.items():
-        part = table[table["item"].map(chosen)]
+    for name, is_member in members.items():
+        part = table[table["item"].map(is_member)]
         if not part.empty:
             comparisons = compare(part, evaluation.scores, planned=planned, unit="ear")
             groups[name] = replace(evaluation, table=part, comparisons=comparisons)

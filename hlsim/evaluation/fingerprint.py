@@ -1,8 +1,8 @@
-"""Fingerprints of modules: what decides whether a stored score still holds.
+"""Fingerprints of modules: everything that decides whether a stored score is still valid.
 
-A fingerprint is made of the class name, the configuration and the tensors. Source code is not read, so
-that moving a class or editing a comment discards nothing; who changes what foreign code computes also
-changes its ``fingerprint``.
+A fingerprint covers class names, configurations and tensors. Source code is not read, so that
+moving a class or editing a comment invalidates nothing. Authors of other modules change the
+attribute ``fingerprint`` when the outputs of a module change.
 """
 
 from __future__ import annotations
@@ -20,17 +20,27 @@ from torch import Tensor, nn
 from hlsim.plugins import WaveformPlugin
 from hlsim.version import __version__
 
-_OWN_PACKAGES = ("hlsim", "compensators")
+HLSIM_PACKAGES = ("hlsim", "compensators")
+"""Packages whose classes include the version of hlsim in their fingerprints."""
+
 _MODULE_ATTRIBUTES = frozenset(vars(nn.Module()))
 
 
 def fingerprint(thing: Any) -> str | None:
-    """Return the SHA-256 of what decides the outputs of a module, or None if that is unknown.
+    """Compute the SHA-256 of everything that decides the outputs of a module or function.
 
-    Anything may state its own in an attribute ``fingerprint``. A function states nothing else; an
-    ``nn.Module`` is described by its classes, the public attributes and the tensors of all its parts.
-    Classes of hlsim include the version of hlsim. The fingerprint of a foreign module without tensors,
-    ``config`` and ``fingerprint`` is unknown, as is one with a public attribute that cannot be described.
+    An attribute ``fingerprint`` replaces everything else. A module is described by the classes, the
+    public attributes and the tensors of all its submodules.
+
+    Returns:
+        The hash in hexadecimal, or None if the outputs may change without notice: for a function
+        without the attribute, for a module of another package without tensors and ``config``, and
+        for a module with a public attribute that cannot be described.
+
+    >>> fingerprint(nn.Linear(2, 2)) == fingerprint(nn.Linear(2, 2))  # random weights
+    False
+    >>> fingerprint(abs) is None
+    True
     """
     if isinstance(thing, WaveformPlugin):
         thing = thing.function
@@ -40,10 +50,9 @@ def fingerprint(thing: Any) -> str | None:
     if not isinstance(thing, nn.Module):
         return None
     tensors = dict([*thing.named_parameters(), *thing.named_buffers()])
-    ours = type(thing).__module__.split(".")[0] in _OWN_PACKAGES
-    if not (ours or tensors or hasattr(thing, "config")):
+    if not (_is_from_hlsim(type(thing)) or tensors or hasattr(thing, "config")):
         return None
-    parts = {name: [_name(part), _public(part)] for name, part in thing.named_modules()}
+    parts = {name: [_name(part), _public_attributes(part)] for name, part in thing.named_modules()}
     try:
         return text_hash(_describe([parts, tensors]))
     except TypeError:
@@ -51,21 +60,33 @@ def fingerprint(thing: Any) -> str | None:
 
 
 def combined_fingerprint(*parts: str | None) -> str | None:
-    """Return one fingerprint for several parts; None if that of a part is unknown."""
+    """Compute one fingerprint of several parts, or return None if that of a part is unknown.
+
+    >>> combined_fingerprint("a", None) is None
+    True
+    """
     return None if None in parts else text_hash(" ".join(map(str, parts)))
 
 
 def text_hash(text: str) -> str:
-    """Return the SHA-256 of a text, in hexadecimal."""
+    """Compute the SHA-256 of a text, in hexadecimal.
+
+    >>> text_hash("abc")[:8]
+    'ba7816bf'
+    """
     return hashlib.sha256(text.encode()).hexdigest()
 
 
 def samples_hash(*signals: Tensor) -> str:
-    """Return the SHA-256 of the samples of signals, in hexadecimal."""
+    """Compute the SHA-256 of the samples of signals, in hexadecimal.
+
+    >>> samples_hash(torch.ones(3)) == samples_hash(torch.ones(4))
+    False
+    """
     return text_hash(_describe(signals))
 
 
-def _public(part: nn.Module) -> dict[str, Any]:
+def _public_attributes(part: nn.Module) -> dict[str, Any]:
     """Return the public attributes of one submodule, without those of every module."""
     return {
         name: value
@@ -74,20 +95,28 @@ def _public(part: nn.Module) -> dict[str, Any]:
     }
 
 
+def _is_from_hlsim(kind: Any) -> bool:
+    return kind.__module__.split(".")[0] in HLSIM_PACKAGES
+
+
 def _name(thing: Any) -> str:
-    """Return the name of a function or of an object's class; for hlsim's own with its version."""
+    """Return the name of a function or of an object's class, with the version if it is hlsim's."""
     kind = thing if hasattr(thing, "__qualname__") else type(thing)
-    ours = kind.__module__.split(".")[0] in _OWN_PACKAGES
-    return f"{kind.__qualname__} of hlsim {__version__}" if ours else str(kind.__qualname__)
+    version = f" of hlsim {__version__}" if _is_from_hlsim(kind) else ""
+    return f"{kind.__qualname__}{version}"
 
 
 def _describe(value: Any) -> str:
-    """Return a text that differs where settings differ, the same in every process."""
+    """Return a text that differs between different settings and is the same in every process."""
     return json.dumps(value, sort_keys=True, default=_describe_object)
 
 
 def _describe_object(value: Any) -> Any:
-    """Describe what JSON does not know; TypeError if that is impossible."""
+    """Convert an object that JSON cannot represent.
+
+    Raises:
+        TypeError: the object cannot be described.
+    """
     if isinstance(value, Tensor):
         value = value.detach().cpu().numpy()
     if isinstance(value, np.ndarray):

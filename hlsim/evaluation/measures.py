@@ -1,7 +1,6 @@
-"""The measures: scores of speech for an ear, levels, what an ear perceives, and closeness to a teacher.
+"""Measures: scores of speech for an ear, levels, perceived sound, and measures of your own.
 
-A measure is a function of an item and an output that returns numbers. ``--measure package.module:name`` adds
-anyone's.
+A measure is a function of an item and an output that returns numbers by column.
 """
 
 from __future__ import annotations
@@ -28,12 +27,26 @@ from hlsim.msbg import MSBG
 from hlsim.plugins import load_plugin
 
 NORMAL = Audiogram.standard("NH")
+"""The normal ear."""
+
+
+def _ear_measure(name: str, score: Callable[..., Tensor], rewards_gain: bool = False) -> Measure:
+    """Return the measure of HASPI, HASQI or HAAQI."""
+    return Measure(
+        name,
+        partial(_score_for_ear, name, score),
+        title=name.upper(),
+        packages=["numpy"],  # which draws the noise
+        knows_hearing=True,
+        rewards_gain=rewards_gain,
+        ends=(0.0, 1.0),
+    )
 
 
 def _score_for_ear(name: str, score: Callable[..., Tensor], item: Item, output: Tensor) -> Values:
-    """Compute HASPI, HASQI or HAAQI with the noise and the whole kHz of pyclarity.
+    """Compute a score with the noise and the whole kHz of pyclarity.
 
-    In double precision: single precision takes half the time, but may align a channel by another sample.
+    Single precision takes half the time, but may align a channel differently by one sample.
     """
     samples = check_pair(item.clean, output, item.sample_rate, item.full_scale_spl)
     clean, processed = map(torch.from_numpy, samples)
@@ -42,90 +55,84 @@ def _score_for_ear(name: str, score: Callable[..., Tensor], item: Item, output: 
     return {name: float(score(processed, clean, item.ear, **options))}
 
 
-def _score_of_signal(name: str, function: str, item: Item, output: Tensor) -> Values:
-    """Compute STOI or PESQ of the output, whatever the ear."""
-    value, reason = getattr(fidelity, function)(item.clean, output, item.sample_rate)
+def _score_signal(
+    name: str, score: Callable[..., fidelity.Score], item: Item, output: Tensor
+) -> Values:
+    """Compute STOI or PESQ, which do not depend on the ear."""
+    value, reason = score(item.clean, output, item.sample_rate)
     if value is None:
         raise ValueError(reason)
     return {name: value}
 
 
-MEASURES = {
-    measure.name: measure
-    for measure in (
-        Measure(
-            "haspi",
-            partial(_score_for_ear, "haspi", haspi),
-            title="HASPI",
-            packages=["numpy"],  # draws the noise
-            knows_hearing=True,
-            rewards_gain=True,
-            ends=(0.0, 1.0),
-        ),
-        Measure(
-            "hasqi",
-            partial(_score_for_ear, "hasqi", hasqi),
-            title="HASQI",
-            packages=["numpy"],
-            knows_hearing=True,
-            ends=(0.0, 1.0),
-        ),
-        Measure(
-            "haaqi",
-            partial(_score_for_ear, "haaqi", haaqi),
-            title="HAAQI",
-            packages=["numpy"],
-            knows_hearing=True,
-            ends=(0.0, 1.0),
-        ),
-        Measure(
-            "stoi",
-            partial(_score_of_signal, "stoi", "stoi"),
-            title="STOI",
-            packages=["pystoi", "numpy", "scipy"],
-            ends=(0.0, 1.0),
-        ),
-        Measure(
-            "pesq",
-            partial(_score_of_signal, "pesq", "pesq_wb"),
-            title="PESQ",
-            packages=["pesq", "numpy"],
-            ends=(1.0, 4.64),
-        ),
-    )
-}
-"""The scores of ``--measures`` by name. More is better in all of them."""
+STOI = Measure(
+    "stoi",
+    partial(_score_signal, "stoi", fidelity.stoi),
+    title="STOI",
+    packages=["pystoi", "numpy", "scipy"],
+    ends=(0.0, 1.0),
+)
 
-_NEEDS = {"stoi": ("pystoi", "eval"), "pesq": ("pesq", "pesq")}
+PESQ = Measure(
+    "pesq",
+    partial(_score_signal, "pesq", fidelity.pesq_wb),
+    title="PESQ",
+    packages=["pesq", "numpy"],
+    ends=(1.0, 4.64),
+)
+
+MEASURES = {
+    "haspi": _ear_measure("haspi", haspi, rewards_gain=True),
+    "hasqi": _ear_measure("hasqi", hasqi),
+    "haaqi": _ear_measure("haaqi", haaqi),
+    "stoi": STOI,
+    "pesq": PESQ,
+}
+"""The scores of ``--measures`` by name. Higher is better for all of them."""
+
+PACKAGES = {"stoi": ("pystoi", "eval"), "pesq": ("pesq", "pesq")}
+"""Optional package of a measure, and the extra that installs it."""
 
 
 def find_measures(names: Iterable[str]) -> list[Measure]:
-    """Return measures by name: those of ``MEASURES`` and ``package.module:name``, each once.
+    """Return measures by name, without duplicates.
+
+    Args:
+        names: names in ``MEASURES``, or ``package.module:name``.
 
     Raises:
         ValueError: there is no such measure, or no name at all.
         MissingExtraError: the package of a measure is not installed.
+
+    >>> [measure.title for measure in find_measures(["haspi", "hasqi", "haspi"])]
+    ['HASPI', 'HASQI']
     """
-    chosen = list(dict.fromkeys(names))
-    if not chosen:
+    unique = list(dict.fromkeys(names))
+    if not unique:
         raise ValueError(f"no measure is named; name one or more of {', '.join(MEASURES)}")
-    for name in chosen:
-        if name in _NEEDS:
-            require(*_NEEDS[name])
-    return [load_measure(name) if ":" in name else _built_in(name) for name in chosen]
+    for name in unique:
+        if name in PACKAGES:
+            require(*PACKAGES[name])
+        elif name not in MEASURES and ":" not in name:
+            raise ValueError(
+                f"there is no measure {name!r}; expected one of {', '.join(MEASURES)} or "
+                "package.module:name"
+            )
+    return [MEASURES[name] if name in MEASURES else load_measure(name) for name in unique]
 
 
 class PluginMeasure:
-    """A measure of anyone's, ``package.module:name``: a function ``(item, output) -> numbers``.
+    """Function ``(item, output) -> numbers`` of a user, ``package.module:name``.
 
-    It is pickled by its name, so that other processes import it as this one did.
+    It is pickled by its name, so that other processes import it in the same way.
+
+    >>> PluginMeasure("builtins:max").name
+    'builtins:max'
     """
 
     def __init__(self, name: str) -> None:
         self.name = name
         self.function = load_plugin(name, "measure")
-        if not callable(self.function):
-            raise ValueError(f"measure {name} is not callable; expected (item, output) -> dict")
 
     def __reduce__(self) -> Any:
         return PluginMeasure, (self.name,)
@@ -138,27 +145,30 @@ class PluginMeasure:
 
 
 def load_measure(name: str) -> Measure:
-    """Return the measure ``package.module:name``; ValueError if it cannot be loaded."""
+    """Load the measure ``package.module:name``.
+
+    Raises:
+        ValueError: it cannot be loaded.
+
+    >>> load_measure("builtins:max").name
+    'builtins:max'
+    """
     plugin = PluginMeasure(name)
     return Measure(name, plugin, settings=fingerprint(plugin.function))
 
 
 def title_of(column: str) -> str:
-    """Return the title of a score's column."""
+    """Return the title of a score's column.
+
+    >>> title_of("haspi"), title_of("crest factor")
+    ('HASPI', 'crest factor')
+    """
     if column in MEASURES:
         return MEASURES[column].title
     return "SNR (dB)" if column == "snr" else column
 
 
-def _built_in(name: str) -> Measure:
-    if name not in MEASURES:
-        raise ValueError(
-            f"there is no measure {name!r}; expected one of {', '.join(MEASURES)} or package.module:name"
-        )
-    return MEASURES[name]
-
-
-def _levels(item: Item, output: Tensor) -> Values:
+def _measure_levels(item: Item, output: Tensor) -> Values:
     return {
         "level": float(level_spl(output, item.full_scale_spl)),
         "clean_level": float(level_spl(item.clean, item.full_scale_spl)),
@@ -169,43 +179,51 @@ def _levels(item: Item, output: Tensor) -> Values:
     }
 
 
-LEVELS = Measure("levels", _levels)
+LEVELS = Measure("levels", _measure_levels)
 """RMS levels of output and clean speech in dB SPL, and the settings of the item."""
 
 
 def perceive(signal: Tensor, ear: Audiogram, sample_rate: int) -> Tensor:
-    """Return what an ear perceives, by the exact MSBG. Shape: (time,) in pascals -> (time,)."""
+    """Simulate what an ear perceives, by the exact MSBG.
+
+    Shape: (time,) -> (time,), in pascals.
+
+    >>> perceive(torch.ones(1600), Audiogram.standard("N3"), 16000).shape
+    torch.Size([1600])
+    """
     with torch.no_grad():
         perceived: Tensor = MSBG(sample_rate=sample_rate)(signal, ear)
     return perceived
 
 
-def _perception(item: Item, output: Tensor) -> Values:
+def _measure_perception(item: Item, output: Tensor) -> Values:
     rate = item.sample_rate
     reference = item.once("normal clean", lambda: perceive(item.clean, NORMAL, rate))
     normal_input = item.once("normal input", lambda: perceive(item.signal, NORMAL, rate))
     perceived = perceive(output, item.ear, rate)
     level = float(level_spl(perceived))
-    normal, normal_clean = float(level_spl(normal_input)), float(level_spl(reference))
+    normal_level = float(level_spl(normal_input))
+    normal_clean_level = float(level_spl(reference))
     return {
         "peak": peak_spl(output),
         "perceived_level": level,
-        "normal_level": normal,
-        "normal_clean_level": normal_clean,
-        "loudness_error": level - normal,
-        "loudness_error_clean": level - normal_clean,
+        "normal_level": normal_level,
+        "normal_clean_level": normal_clean_level,
+        "loudness_error": level - normal_level,
+        "loudness_error_clean": level - normal_clean_level,
         "band_error": band_error_db(perceived, reference, rate),
         "loss_msbg": float(band_level_loss(perceived, reference, rate)),
     }
 
 
-PERCEPTION = Measure("perception", _perception, packages=["hlsim"])
+PERCEPTION = Measure("perception", _measure_perception, packages=["hlsim"])
 """Levels and band levels of an output as perceived through the exact MSBG, in dB SPL or dB.
 
-``peak`` is the largest sample of the output; ``perceived_level`` the level after MSBG, ``normal_level`` that of
-the input for a normal ear, noise included, ``normal_clean_level`` that of the clean speech for a normal ear;
-``loudness_error`` and ``loudness_error_clean`` are the differences from them. ``band_error`` compares with the
-clean speech for a normal ear by ``band_error_db``, ``loss_msbg`` by ``HearingLossLoss(criterion="bands")``.
+``peak`` is the largest sample of the output, and ``perceived_level`` the level after MSBG.
+``normal_level`` and ``normal_clean_level`` are the levels of the input (with its noise) and of the
+clean speech for a normal ear; ``loudness_error`` and ``loudness_error_clean`` are the differences
+from them. ``band_error`` and ``loss_msbg`` compare with the clean speech for a normal ear, by
+``band_error_db`` and by ``HearingLossLoss(criterion="bands")``.
 """
 
 OTHER_COLUMNS = (
@@ -214,11 +232,15 @@ OTHER_COLUMNS = (
     *("loss_msbg", "loss_neuro", "loudness_error", "loudness_error_clean"),
     *("beyond_limit", "gap", "source"),
 )
-"""Columns of built-in measures that are no scores."""
+"""Columns of measures that are no scores."""
 
 
 def network_loss(simulator: nn.Module) -> Measure:
-    """Return the measure ``loss_neuro``: the loss of ``loss_msbg`` with a network in MSBG's place."""
+    """Return the measure ``loss_neuro``: the loss of ``loss_msbg`` with a network as simulator.
+
+    >>> network_loss(nn.Identity()).name
+    'network loss'
+    """
 
     def compute(item: Item, output: Tensor) -> Values:
         reference = item.once("normal by network", lambda: simulator(item.clean, NORMAL))
@@ -229,16 +251,27 @@ def network_loss(simulator: nn.Module) -> Measure:
 
 
 def peak_spl(waveform: Tensor) -> float:
-    """Return the largest sample in dB SPL, where a sample of 1.0 is 94. Shape: (time,)."""
+    """Compute the level of the largest sample in dB SPL, where a sample of 1.0 is 94.
+
+    >>> peak_spl(torch.tensor([0.0, -10.0]))
+    114.0
+    """
     return float(20.0 * waveform.abs().max().clamp_min(1e-10).log10()) + PASCAL_SPL
 
 
 def band_error_db(perceived: Tensor, reference: Tensor, sample_rate: int) -> float:
-    """Return the median absolute difference of band levels in dB.
+    """Compute the median absolute difference of band levels in dB.
 
-    The bands and frames that a normal ear finds audible count.
+    Only bands and frames of the reference that are audible for a normal ear count.
 
-    Shape: (time,) and (time,), in pascals. Raises ValueError if nothing is audible.
+    Shape: (time,) and (time,), in pascals.
+
+    Raises:
+        ValueError: nothing is audible.
+
+    >>> noise = torch.randn(16000, generator=torch.Generator().manual_seed(0))
+    >>> round(band_error_db(0.1 * noise, noise, 16000))
+    20
     """
     levels = band_levels(perceived, sample_rate)
     reference_levels = band_levels(reference, sample_rate)

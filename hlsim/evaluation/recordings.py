@@ -1,21 +1,22 @@
-"""Recorded outputs as the items of a study: ``haspi-report`` scores files, from folders or a manifest.
+"""Recorded outputs as the items of a study: ``haspi-report`` scores files.
 
-A manifest is a CSV file with one row for each output file::
+The files are in folders, or in a manifest, a CSV file with one row for each output file::
 
     listener,ear,condition,clean,processed,snr,hl_250,hl_500,...,hl_8000
     L1,left,unaided,clean/s01.flac,noisy/s01.flac,5,35,35,...,65
     L1,left,NAL-R,clean/s01.flac,nalr/L1-left/s01.flac,5,35,35,...,65
 
-It needs the columns ``condition``, ``clean`` and ``processed``; paths are relative to the root. It may have
-``listener``, ``ear`` (left or right), ``item`` and ``snr`` (dB). Rows that agree in listener, ear, clean
-file, item and SNR form one item. The audiogram stands in columns ``hl_250`` and so on, in a column
-``audiogram`` by its standard name, or in a second CSV file by ``listener`` and ``ear``.
+A manifest needs the columns ``condition``, ``clean`` and ``processed``; paths are relative to the
+root. It may have ``listener``, ``ear`` (left or right), ``item`` and ``snr`` (dB). Rows with the
+same listener, ear, clean file, item and SNR form one item. Its audiogram is in columns ``hl_250``
+and so on, in a column ``audiogram`` by its standard name, or in a second CSV file by ``listener``
+and ``ear``.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path, PurePath, PurePosixPath
@@ -32,7 +33,7 @@ from hlsim.calibration import check_full_scale, dbfs
 from hlsim.evaluation.comparison import Pair, compare
 from hlsim.evaluation.measures import LEVELS, find_measures
 from hlsim.evaluation.result import Evaluation
-from hlsim.evaluation.store import content_hash, key_of
+from hlsim.evaluation.store import content_hash, settings_hash
 from hlsim.evaluation.study import Condition, Item
 from hlsim.files import EXTENSIONS, read_table, resolve_links
 from hlsim.metrics.pair import check_seed
@@ -40,8 +41,23 @@ from hlsim.metrics.pair import check_seed
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-_EAR_NAMES = {"": "", **EAR_NAMES}
-_REQUIRED = ("condition", "clean", "processed")
+REQUIRED_COLUMNS = {"condition", "clean", "processed"}
+"""Columns that a manifest must have."""
+
+LEVEL_COLUMNS = {"spl", "full_scale_spl"}
+"""Columns that a manifest must not have, because levels are options."""
+
+UTTERANCE_COLUMNS = ["listener", "utterance", "snr"]
+"""Columns of the table that both ears of an utterance share."""
+
+EAR_FACTS = ("source", "ear", "severity", "audiogram", "full_scale_spl", "clean_level")
+"""Columns of the table that describe the item of one ear."""
+
+Row = Mapping[str, str]
+"""Values of a row of a CSV file, by column."""
+
+Rows = Mapping[Any, tuple[str, Row]]
+"""Rows of a CSV file with their places, by a key."""
 
 
 @dataclass(frozen=True)
@@ -54,12 +70,17 @@ class Recording:
         outputs: file of the output for each condition.
         audiogram: the ear.
         listener: name of the listener; empty if unknown.
-        ear: ``"left"``, ``"right"`` or empty. Of a file with two channels it selects the channel.
+        ear: ``"left"``, ``"right"`` or empty. It selects the channel of a file with two channels.
         snr: signal-to-noise ratio in dB; NaN if unknown.
         full_scale_spl: level in dB SPL of a file with RMS 1.0.
-        spl: level of the clean file in dB SPL, in place of ``full_scale_spl``.
-        seed: seed of the study; each clean file has its own, made from this one and its contents.
-        problems: for each condition without a file, the reason why.
+        spl: level of the clean file in dB SPL, instead of ``full_scale_spl``.
+        seed: seed of the study. Each clean file has its own seed, which depends on this one and on
+            its contents.
+        problems: reason why there is no file, for conditions without one.
+
+    >>> ear = Audiogram.standard("N3")
+    >>> Recording("s01", Path("s01.wav"), {}, ear, listener="L1", ear="left", snr=5.0).name
+    'L1 left s01 5 dB'
     """
 
     utterance: str
@@ -76,25 +97,30 @@ class Recording:
 
     @property
     def name(self) -> str:
-        """Listener, ear, utterance and SNR, as far as they are known."""
-        return _name(self.listener, self.ear, self.utterance, self.snr)
+        """Listener, ear, utterance and SNR, if they are known."""
+        return _join_name(self.listener, self.ear, self.utterance, self.snr)
 
     @property
     def facts(self) -> dict[str, Any]:
         """Columns of the table that describe the item, without its name."""
-        facts = ("listener", "ear", "utterance", "snr")
-        ear = {"severity": self.audiogram.severity, "audiogram": list(self.audiogram.thresholds)}
-        return {name: getattr(self, name) for name in facts} | ear
+        return {
+            "listener": self.listener,
+            "ear": self.ear,
+            "utterance": self.utterance,
+            "snr": self.snr,
+            "severity": self.audiogram.severity,
+            "audiogram": list(self.audiogram.thresholds),
+        }
 
     def digest(self, condition: str) -> str:
         """Return the SHA-256 of both files, the ear, the level and the seed."""
         files = [content_hash(self.clean), content_hash(self._output_file(condition))]
         level = [self.full_scale_spl if self.spl is None else None, self.spl]
         ear = [self.ear, list(self.audiogram.thresholds)]
-        return key_of({"files": files, "ear": ear, "level": level, "seed": self.seed})
+        return settings_hash({"files": files, "ear": ear, "level": level, "seed": self.seed})
 
     def load(self) -> Item:
-        """Read the clean speech; outputs are read when they are measured."""
+        """Read the clean speech. Outputs are read when they are measured."""
         if self.problems and not self.outputs:
             raise ValueError(next(iter(self.problems.values())))
         clean, rate = read_channel(self.clean, self.ear)
@@ -127,20 +153,28 @@ class Recording:
         return output
 
 
-def _name(*parts: str | float) -> str:
-    """Join the known parts of an item's name; a number is an SNR in dB."""
+def _join_name(*parts: str | float) -> str:
+    """Join the known parts of an item's name. A number is an SNR in dB."""
     texts = [part if isinstance(part, str) else f"{part:g} dB" for part in parts if part == part]
     return " ".join(filter(None, texts))
 
 
 def read_channel(path: Path, ear: str = "") -> tuple[Tensor, int]:
-    """Read the channel of one ear, as it is in the file.
+    """Read the channel of one ear at the scale of the file.
 
-    Returns: samples (time,) in float64, and the rate in Hz. Of a file with two channels, left is the
-        first and right the second.
+    Args:
+        path: audio file.
+        ear: ``"left"`` for the first and ``"right"`` for the second of two channels.
+
+    Returns:
+        Samples with shape (time,) in float64, and the rate in Hz.
 
     Raises:
-        ValueError: the file cannot be read or is silent, or its channels do not fit the ear.
+        ValueError: the file cannot be read, or its channels do not fit the ear.
+
+    >>> from hlsim.shortcuts import EXAMPLE_FILE
+    >>> read_channel(EXAMPLE_FILE)[1]
+    16000
     """
     waveform, rate = read_audio(path)
     channels = len(waveform)
@@ -149,8 +183,6 @@ def read_channel(path: Path, ear: str = "") -> tuple[Tensor, int]:
             f"{path} has {channels} channels; one ear needs 1, or 2 and the ear's name"
         )
     channel = waveform[EARS.index(ear) if channels == 2 else 0]
-    if not bool(channel.any()):
-        raise ValueError(f"{path} is silent: every sample of the {ear} channel is zero")
     return channel.double(), rate
 
 
@@ -174,49 +206,50 @@ def haspi_report(
 ) -> Evaluation:
     """Score recorded speech by HASPI v2 and other measures, and compare its conditions.
 
-    Files are scored as they are, one channel for one ear. A stopped run continues where it was. A file
-    that cannot be scored is listed with the reason, and the others are scored.
+    An interrupted run can be continued. A file that cannot be scored is listed with the reason.
 
     Args:
-        clean, before, after: folders, see ``read_folders``. Without ``before`` there is one condition, and scores
-            without a comparison.
+        clean, before, after: folders, see ``read_folders``. Without ``before``, there is one
+            condition, and scores without a comparison.
         audiogram, audiograms: the ear of all files, or a CSV file of ears.
-        manifest, root: a CSV file in place of the folders, see ``read_manifest``.
-        measures: names of measures, the most important first: ``haspi``, ``hasqi``, ``haaqi``, ``stoi``, ``pesq`` or
-            ``package.module:name``.
-        baseline: the condition that comes first and that all others are compared with; by default the
-            manifest's first comes first, and all conditions are compared with each other.
-        better_ear: take the better ear's score of each utterance; needs a manifest with both ears.
+        manifest, root: a CSV file instead of the folders, see ``read_manifest``.
+        measures: names of measures, the most important first: ``haspi``, ``hasqi``, ``haaqi``,
+            ``stoi``, ``pesq`` or ``package.module:name``.
+        baseline: condition with which all other conditions are compared. By default, all
+            conditions are compared with each other.
+        better_ear: whether to use the better ear's score of each utterance, for which a manifest
+            with both ears is needed.
         store: file of scores, which is created if it does not exist; None stores nothing.
         full_scale_spl: level in dB SPL of a file with RMS 1.0.
-        spl: level of every clean file in dB SPL, in place of ``full_scale_spl``.
+        spl: level of every clean file in dB SPL, instead of ``full_scale_spl``.
         seed: seed of the noise that HASPI, HASQI and HAAQI add.
         running: ``jobs``, ``dask`` and ``progress``, as in ``run_study``.
 
-    Returns: the evaluation; the comparison of the first with the last condition is planned.
+    Returns:
+        The evaluation. The comparison of the first with the last condition is planned.
 
     Raises:
-        ValueError: files do not match, a row of the manifest is wrong, or nothing could be scored.
+        ValueError: files do not match, a row of the manifest is not valid, or nothing could be
+            scored.
         MissingExtraError: the package of a measure is not installed.
     """
     check_seed(seed)
     check_full_scale(full_scale_spl if spl is None else spl)
-    ears: dict[str, Any] = {"audiogram": audiogram, "audiograms": audiograms}
-    levels: dict[str, Any] = {"full_scale_spl": full_scale_spl, "spl": spl}
-    no_folders = clean is None and before is None and after is None
-    if manifest is not None and no_folders:
-        recordings = read_manifest(manifest, root, **ears, **levels)
-    elif manifest is None and clean is not None and after is not None:
+    settings: dict[str, Any] = {"full_scale_spl": full_scale_spl, "spl": spl, "seed": seed}
+    if manifest and not any((clean, before, after)):
+        recordings = read_manifest(manifest, root, audiogram, audiograms, **settings)
+    elif clean and after and not manifest:
         folders = {"before": before, "after": after}
-        recordings = read_folders(clean, folders, **ears, **levels)
+        recordings = read_folders(clean, folders, audiogram, audiograms, **settings)
     else:
         raise ValueError("give either the folders clean and after (and before), or a manifest")
-    found = dict.fromkeys(name for recording in recordings for name in recording.outputs)
-    names = [*found] if baseline is None else [baseline, *(n for n in found if n != baseline)]
-    if baseline is not None and baseline not in found:
-        raise ValueError(f"there is no condition {baseline!r}; expected {', '.join(found)}")
+    names = list(dict.fromkeys(name for r in recordings for name in r.outputs))
+    if baseline is not None:
+        if baseline not in names:
+            raise ValueError(f"there is no condition {baseline!r}; expected {', '.join(names)}")
+        names.sort(key=lambda name: name != baseline)
     return score_recordings(
-        [replace(recording, seed=seed) for recording in recordings],
+        recordings,
         [Condition(name, kind="recorded") for name in names],
         measures,
         baseline=baseline,
@@ -236,131 +269,159 @@ def score_recordings(
     planned: Sequence[Pair] = (),
     **running: Any,
 ) -> Evaluation:
-    """Score recordings and compare their conditions; all else as ``haspi_report``.
+    """Score recordings and compare their conditions.
 
     Args:
-        planned: planned comparisons; by default the first with the last condition by the first measure.
-        running: ``store``, ``jobs``, ``dask`` and ``progress`` of ``run_study``.
+        recordings: recordings.
+        conditions: conditions of the recordings' outputs.
+        measures, baseline, better_ear: see ``haspi_report``.
+        planned: planned comparisons; by default that of the first with the last condition by the
+            first measure.
+        running: ``store`` as in ``haspi_report``; ``jobs``, ``dask`` and ``progress`` as in
+            ``run_study``.
 
-    Returns: the evaluation; with ``better_ear`` its group ``ears`` has the scores of each ear.
+    Returns:
+        The evaluation; with ``better_ear``, its group ``ears`` has the scores of each ear.
+
+    Raises:
+        ValueError: nothing could be scored, or an utterance lacks one of both ears.
     """
     if better_ear:
-        check_both_ears(recordings)
+        _check_both_ears(recordings)
     settings = {"seed": recordings[0].seed, "baseline": baseline, "better_ear": better_ear}
-    chosen = [*find_measures(measures), LEVELS]
-    evaluation = Evaluation.run(recordings, conditions, chosen, settings=settings, **running)
-    columns = evaluation.scores
+    columns = [*find_measures(measures), LEVELS]
+    evaluation = Evaluation.run(recordings, conditions, columns, settings=settings, **running)
+    scores = evaluation.scores
     if better_ear:
         ears = {"ears": evaluation}
-        evaluation = replace(evaluation, table=better_ears(evaluation.table, columns), groups=ears)
-    planned = planned or [(columns[0], evaluation.names[0], evaluation.names[-1])]
-    comparisons = compare(evaluation.table, columns, baseline=baseline, planned=planned)
+        evaluation = replace(evaluation, table=better_ears(evaluation.table, scores), groups=ears)
+    planned = planned or [(scores[0], evaluation.names[0], evaluation.names[-1])]
+    comparisons = compare(evaluation.table, scores, baseline=baseline, planned=planned)
     return replace(evaluation, comparisons=comparisons)
 
 
-def check_both_ears(recordings: Iterable[Recording]) -> None:
+def _check_both_ears(recordings: Iterable[Recording]) -> None:
     """Raise ValueError unless each utterance of each listener has one left and one right ear."""
-    found: dict[str, list[str]] = {}
+    ears: dict[str, list[str]] = {}
     for r in recordings:
-        found.setdefault(_name(r.listener, r.utterance, r.snr), []).append(r.ear)
-    for name, ears in found.items():
-        if sorted(ears) != sorted(EARS):
+        ears.setdefault(_join_name(r.listener, r.utterance, r.snr), []).append(r.ear)
+    for name, names in ears.items():
+        if sorted(names) != sorted(EARS):
             raise ValueError(
-                f"{name} has the ears {', '.join(ear or 'none' for ear in ears)}; the better ear needs "
-                "the left and the right ear of each utterance, once"
+                f"expected one left and one right ear of {name} for the better ear, got "
+                f"{', '.join(ear or 'no name' for ear in names)}"
             )
 
 
 def better_ears(table: DataFrame, measures: Sequence[str]) -> DataFrame:
-    """Return one row per utterance and condition in place of one for each ear.
+    """Return one row per utterance and condition instead of one row per ear.
 
-    A score is that of the ear which scores higher by its measure; the level is that of the ear which scores
-    higher by the first measure. Facts of an item are those of the better ear under the last condition, whose
+    A score is the higher one of both ears. Other values are those of the ear with the higher score
+    by the first measure. Facts of an item are those of the better ear in the last condition, whose
     number is in the column ``source``.
+
+    Args:
+        table: table of a study with two ears for each utterance.
+        measures: columns of scores.
+
+    >>> import pandas
+    >>> facts = {"listener": "L1", "utterance": "s01", "snr": 5.0, "condition": "unaided"}
+    >>> ears = {"item": [0, 1], "ear": ["left", "right"], "haspi": [0.2, 0.7]}
+    >>> better = better_ears(pandas.DataFrame(ears).assign(**facts), ["haspi"])
+    >>> better["name"].tolist(), better["ear"].tolist(), better["haspi"].tolist()
+    (['L1 s01 5 dB'], ['right'], [0.7])
     """
-    places = {name: place for place, name in enumerate(dict.fromkeys(table["condition"]))}
-    utterance = ["listener", "utterance", "snr"]
-    numbers = table.groupby(utterance, sort=False, dropna=False).ngroup()
-    row = ["item", "place"]
-    table = table.assign(source=table["item"], item=numbers, place=table["condition"].map(places))
-    order = [*row, measures[0], "ear"]
-    table = table.sort_values(order, ascending=[True, True, False, True], kind="stable")
-    best = table.drop_duplicates(row).set_index(row)
+    conditions = list(dict.fromkeys(table["condition"]))
+    numbers = table.groupby(UTTERANCE_COLUMNS, sort=False, dropna=False).ngroup()
+    table = table.assign(source=table["item"], item=numbers)
+    # The left ear counts if both ears have the same score.
+    order = table.sort_values([measures[0], "ear"], ascending=[False, True], kind="stable")
+    row = ["item", "condition"]
+    rows = [(item, condition) for item in range(numbers.max() + 1) for condition in conditions]
+    best = order.drop_duplicates(row).set_index(row).loc[rows]
     for measure in measures:
         best[measure] = table.groupby(row)[measure].max()
-    last = best.xs(len(places) - 1, level="place")
+    last = best.xs(conditions[-1], level="condition")
     best = best.reset_index()
-    for fact in ("source", "ear", "severity", "audiogram", "full_scale_spl", "clean_level"):
+    for fact in set(EAR_FACTS) & set(best):
         best[fact] = best["item"].map(last[fact])
-    best["name"] = [_name(*parts) for parts in zip(*(best[key] for key in utterance), strict=True)]
-    return best.drop(columns="place")
+    utterances = best[UTTERANCE_COLUMNS].itertuples(index=False)
+    return best.assign(name=[_join_name(*utterance) for utterance in utterances])
 
 
 def read_folders(
     clean: str | Path,
     folders: Mapping[str, str | Path | None],
-    *,
     audiogram: Audiogram | None = None,
     audiograms: str | Path | None = None,
-    **levels: Any,
+    **settings: Any,
 ) -> list[Recording]:
-    """Read the recordings of folders, one per file name, sorted by name.
+    """Read the recordings of folders, one for each name of a file.
 
     Args:
         clean: folder of clean speech.
-        folders: folder of the outputs of each condition; one that is None is left out. The files of all folders have
-            the same names, whatever their extension.
+        folders: folder of the outputs of each condition, or None to leave it out. The files of all
+            folders have the same names, whatever their extension.
         audiogram: the ear of all files.
-        audiograms: in its place a CSV file with the columns ``file`` (name below the folder, with or without
-            extension) and ``hl_250``, ``hl_500``, .... Rows of other files are ignored.
-        levels: ``full_scale_spl`` or ``spl``, as in ``Recording``.
+        audiograms: CSV file of ears instead, with the columns ``file`` (name below the folder, with
+            or without extension) and ``hl_250``, ``hl_500``, .... Rows of other files are ignored.
+        settings: ``full_scale_spl``, ``spl`` and ``seed`` of the recordings.
 
     Raises:
         ValueError: the names differ, or a file has no audiogram.
+
+    >>> from hlsim.shortcuts import EXAMPLE_FILE
+    >>> folder, ear = EXAMPLE_FILE.parent, Audiogram.standard("N3")
+    >>> len(read_folders(folder, {"unaided": folder}, ear))
+    10
     """
     if (audiogram is None) == (audiograms is None):
         raise ValueError("give either audiogram, the ear of all files, or audiograms, a CSV file")
-    speech = _by_name(clean)
-    outputs = {name: _by_name(folder) for name, folder in folders.items() if folder is not None}
-    names = sorted({*speech, *(name for files in outputs.values() for name in files)})
-    for folder, files in ((clean, speech), *((folders[name], outputs[name]) for name in outputs)):
-        _check_complete(names, files, f"{folder}: no file for")
-    if audiogram is not None:
-        ears = dict.fromkeys(names, audiogram)
-    else:
-        rows = _read_ears(str(audiograms), _file_name)
-        _check_complete(names, rows, f"{audiograms}: no audiogram for")
-        ears = {name: rows[name]() for name in names}
+    speech = _files_by_name(clean)
+    outputs = {}
+    for condition, folder in folders.items():
+        if folder is not None:
+            outputs[condition] = _files_by_name(folder)
+            _check_names(speech, outputs[condition], f"{clean}: no file for")
+            _check_names(outputs[condition], speech, f"{folder}: no file for")
+    ears = dict.fromkeys(speech, audiogram)
+    if audiograms is not None:
+        rows = _read_ears(audiograms, _file_name)
+        _check_names(rows, speech, f"{audiograms}: no audiogram for")
+        ears = {name: convert_at(rows[name][0], Audiogram.from_row, rows[name][1]) for name in ears}
     return [
         Recording(
             utterance=name,
             clean=speech[name].absolute(),
             outputs={condition: files[name].absolute() for condition, files in outputs.items()},
-            audiogram=ears[name],
-            **levels,
+            audiogram=ear,
+            **settings,
         )
-        for name in names
+        for name, ear in ears.items()
+        if ear is not None
     ]
 
 
 def read_manifest(
     path: str | Path,
     root: str | Path | None = None,
-    *,
     audiogram: Audiogram | None = None,
     audiograms: str | Path | None = None,
-    **levels: Any,
+    **settings: Any,
 ) -> list[Recording]:
     """Read the recordings of a manifest, in the order of their first rows.
 
     Args:
-        root: folder that the paths are relative to and may not leave; by default that of the manifest.
-        audiogram: the ear of rows that name none.
-        audiograms: a CSV file with columns ``listener``, ``ear`` (if left and right differ) and ``hl_250``, ....
-        levels: ``full_scale_spl`` or ``spl``, as in ``Recording``.
+        path: CSV file.
+        root: folder to which the paths are relative and which contains them; by default that of
+            the manifest.
+        audiogram: the ear of rows without an audiogram.
+        audiograms: CSV file with the columns ``listener``, ``ear`` (if left and right differ) and
+            ``hl_250``, ....
+        settings: ``full_scale_spl``, ``spl`` and ``seed`` of the recordings.
 
     Raises:
-        ValueError: a row is wrong; the message names its line.
+        ValueError: a row is not valid; the message names its line.
     """
     folder = resolve_links(Path(path).parent if root is None else root)
     if not folder.is_dir():
@@ -368,137 +429,133 @@ def read_manifest(
     ears = {} if audiograms is None else _read_ears(audiograms, _listener_and_ear)
     rows = read_table(path, "the manifest")
     columns = rows[0][1].keys() if rows else set()
-    if not columns >= {*_REQUIRED} or columns & {"spl", "full_scale_spl"}:
+    if not columns >= REQUIRED_COLUMNS or columns & LEVEL_COLUMNS:
         raise ValueError(
-            f"{path} needs rows with the columns {', '.join(_REQUIRED)}, and the level as an option, not a column"
+            f"{path}: expected rows with the columns {', '.join(sorted(REQUIRED_COLUMNS))}, and "
+            "the level as an option, not as a column"
         )
-    recordings: dict[tuple[str, str], Recording] = {}
+    recordings: dict[tuple[str, Path], Recording] = {}
     for line, row in rows:
         try:
-            found = _read_row(row, folder, ears, audiogram, levels)
-            known = recordings.setdefault(
-                (found.name, str(found.clean)), replace(found, outputs={})
-            )
-            if known.audiogram != found.audiogram:
-                raise ValueError(f"the audiogram differs from that of other rows of {known.name}")
-            if twice := known.outputs.keys() & found.outputs.keys():
-                raise ValueError(f"a second row of {known.name} under {twice.pop()}")
-            outputs = {**known.outputs, **found.outputs}
-            recordings[found.name, str(found.clean)] = replace(known, outputs=outputs)
+            recording = _read_row(row, folder, ears, audiogram, settings)
+            key = recording.name, recording.clean
+            recordings[key] = _merge(recordings[key], recording) if key in recordings else recording
         except ValueError as error:
             raise ValueError(f"{path}, line {line}: {error}") from error
     return list(recordings.values())
 
 
 def _read_row(
-    row: Mapping[str, str],
+    row: Row,
     root: Path,
-    ears: Mapping[Any, Callable[[], Audiogram]],
+    ears: Rows,
     default: Audiogram | None,
-    levels: Mapping[str, Any],
+    settings: Mapping[str, Any],
 ) -> Recording:
+    """Return the recording of a row of a manifest, with one output."""
     condition, listener, ear = row["condition"], row.get("listener", ""), _ear_name(row)
-    if not condition.isprintable() or not condition:
-        raise ValueError(f"the condition {condition!r} is not a printable name")
-    thresholds = {key: value for key, value in row.items() if key.lower().startswith("hl")}
+    thresholds = {name: text for name, text in row.items() if name.lower().startswith("hl")}
+    audiogram = default
     if any(thresholds.values()):
-        audiogram: Audiogram | None = Audiogram.from_row(thresholds)
+        audiogram = Audiogram.from_row(thresholds)
     elif row.get("audiogram"):
         audiogram = Audiogram.standard(row["audiogram"])
-    else:
-        read_ear = ears.get((listener, ear)) or ears.get((listener, ""))
-        audiogram = read_ear() if read_ear else default
+    elif place_and_row := ears.get((listener, ear)) or ears.get((listener, "")):
+        audiogram = convert_at(place_and_row[0], Audiogram.from_row, place_and_row[1])
     if audiogram is None:
         raise ValueError(
-            f"no audiogram of listener {listener!r}, ear {ear!r}: add columns hl_250, hl_500, ... or a "
-            "column audiogram, or name a file of audiograms"
+            f"no audiogram of listener {listener!r}, ear {ear!r}: add columns hl_250, hl_500, ... "
+            "or a column audiogram, or name a file of audiograms"
         )
+    if not condition:
+        raise ValueError("the condition has no name")
     return Recording(
         utterance=row.get("item") or PurePosixPath(row["clean"]).with_suffix("").as_posix(),
-        clean=_below(root, row["clean"]),
-        outputs={condition: _below(root, row["processed"])},
+        clean=_path_below(root, row["clean"]),
+        outputs={condition: _path_below(root, row["processed"])},
         audiogram=audiogram,
         listener=listener,
         ear=ear,
-        snr=_number(row.get("snr") or "nan"),
-        **levels,
+        snr=float(row.get("snr") or "nan"),
+        **settings,
     )
 
 
-def _below(root: Path, name: str) -> Path:
-    """Return a path below the root, with links followed; ValueError if it leaves it."""
+def _merge(recording: Recording, other: Recording) -> Recording:
+    """Return a recording with the output of another row of the same item."""
+    if recording.audiogram != other.audiogram:
+        raise ValueError(f"the audiogram differs from that of other rows of {recording.name}")
+    for condition in recording.outputs.keys() & other.outputs.keys():
+        raise ValueError(f"a second row of {recording.name} under {condition}")
+    return replace(recording, outputs={**recording.outputs, **other.outputs})
+
+
+def _path_below(root: Path, name: str) -> Path:
+    """Return a path below the root, with links followed.
+
+    Raises:
+        ValueError: the path leads out of the root.
+    """
     path = resolve_links(root / name)
     if not name or not path.is_relative_to(root):
         raise ValueError(f"{name!r} is not a path below {root}")
     return path
 
 
-def _number(text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        raise ValueError(f"the SNR is {text!r}, not a number of dB") from None
-
-
-def _ear_name(row: Mapping[str, str]) -> str:
+def _ear_name(row: Row) -> str:
     text = row.get("ear", "").lower()
-    if text not in _EAR_NAMES:
+    if text and text not in EAR_NAMES:
         raise ValueError(f"the ear is {text!r}; expected left or right")
-    return _EAR_NAMES[text]
+    return EAR_NAMES.get(text, "")
 
 
-def _read_ears(
-    path: str | Path, name_of: Callable[[Mapping[str, str]], Any]
-) -> dict[Any, Callable[[], Audiogram]]:
-    """Read the rows of a CSV file of ears.
+def _read_ears(path: str | Path, key_of: Callable[[Row], Any]) -> Rows:
+    """Read the rows of a CSV file of ears, whose audiograms are validated when they are used.
 
     Args:
-        name_of: function that returns the name of the ear in a row.
-
-    Returns: for each name a function that returns the audiogram, so that only ears in use are validated.
+        path: the file.
+        key_of: function that returns the key of a row.
     """
-    ears: dict[Any, Callable[[], Audiogram]] = {}
+    ears: dict[Any, tuple[str, Row]] = {}
     for line, row in read_rows(path):
         place = f"{path}, line {line}"
-        name = convert_at(place, name_of, row)
-        if name in ears:
-            raise ValueError(f"{place}: a second row of {name}")
-        ears[name] = partial(convert_at, place, Audiogram.from_row, row)
+        key = convert_at(place, key_of, row)
+        if key in ears:
+            raise ValueError(f"{place}: a second row of {key}")
+        ears[key] = place, row
     return ears
 
 
-def _listener_and_ear(row: Mapping[str, str]) -> tuple[str, str]:
+def _listener_and_ear(row: Row) -> tuple[str, str]:
     if not row.get("listener"):
         raise ValueError("no listener is named; the file needs a column listener")
     return row["listener"], _ear_name(row)
 
 
-def _file_name(row: Mapping[str, str]) -> str:
+def _file_name(row: Row) -> str:
     if not row.get("file"):
         raise ValueError("no file is named; the file needs a column file")
-    return _stem(PurePath(row["file"]))
+    return _without_extension(PurePath(row["file"]))
 
 
-def _stem(path: PurePath) -> str:
-    """Return the path in POSIX form without the extension of an audio file."""
+def _without_extension(path: PurePath) -> str:
+    """Return a path in POSIX form without the extension of an audio file."""
     return (path.with_suffix("") if path.suffix.lower() in EXTENSIONS else path).as_posix()
 
 
-def _by_name(folder: str | Path) -> dict[str, Path]:
+def _files_by_name(folder: str | Path) -> dict[str, Path]:
     files: dict[str, Path] = {}
     for path in find_audio(folder):
-        name = _stem(path.relative_to(folder))
+        name = _without_extension(path.relative_to(folder))
         if name in files:
             raise ValueError(f"{files[name]} and {path} have the same name; keep one of them")
         files[name] = path
     return files
 
 
-def _check_complete(names: Sequence[str], found: Iterable[str], lack: str) -> None:
-    """Raise ValueError with the first few names that are missing."""
-    missing = sorted(set(names) - set(found))
+def _check_names(names: Collection[str], expected: Collection[str], problem: str) -> None:
+    """Raise ValueError with the first names that are missing."""
+    missing = sorted(set(expected) - set(names))
     if missing:
         few = ", ".join(missing[:3]) + (", ..." if len(missing) > 3 else "")
-        raise ValueError(
-            f"{lack} {few} ({len(missing)} of {len(names)}); all folders need the same names"
-        )
+        raise ValueError(f"{problem} {few} ({len(missing)} of {len(expected)})")

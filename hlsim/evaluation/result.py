@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from hlsim.evaluation.comparison import Comparison
 from hlsim.evaluation.measures import OTHER_COLUMNS
 from hlsim.evaluation.store import ScoreStore
-from hlsim.evaluation.study import Condition, Measure, Source, run_study, versions_of
+from hlsim.evaluation.study import Condition, Measure, Source, installed_versions, run_study
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -26,9 +26,9 @@ class Evaluation:
         table: one row per item and condition, see ``run_study``.
         comparisons: comparisons of the conditions, see ``compare``.
         settings: settings on which the values depend, such as the seed.
-        notes: sentences that the report begins with.
+        notes: sentences with which the report begins.
         details: further results for JSON, such as gain curves.
-        groups: the same evaluation of a part of the items, by the name of the part.
+        groups: the same evaluation for a part of the items, by the name of the part.
     """
 
     items: Sequence[Source]
@@ -52,7 +52,11 @@ class Evaluation:
         settings: Mapping[str, Any],
         **running: Any,
     ) -> Evaluation:
-        """Run a study, see ``run_study``; ValueError if nothing could be scored."""
+        """Run a study, see ``run_study``.
+
+        Raises:
+            ValueError: no output could be scored.
+        """
         table = run_study(items, conditions, measures, store=ScoreStore(store), **running)
         evaluation = cls(items, conditions, measures, table, settings=settings)
         if table.reindex(columns=evaluation.scores).isna().all(axis=None):
@@ -74,16 +78,16 @@ class Evaluation:
 
     @property
     def scores(self) -> list[str]:
-        """Columns of the scores: those of the measures, the first one first, and of plug-ins."""
+        """Columns of the scores: those of the measures in their order, then those of plug-ins."""
         named = [measure.name for measure in self.measures if measure.name in self.table]
         facts = self.items[0].facts
-        others = {"item", "name", "condition", "failure", *facts, *OTHER_COLUMNS, *named}
-        return named + [column for column in self.table.columns if column not in others]
+        no_scores = {"item", "name", "condition", "failure", *facts, *OTHER_COLUMNS, *named}
+        return named + [column for column in self.table.columns if column not in no_scores]
 
     @property
     def headline(self) -> Comparison | None:
-        """The first planned comparison, or the first of all; None if there is none."""
-        planned = [c for c in self.comparisons if c.planned]
+        """The first planned comparison, or else the first one; None if there is none."""
+        planned = [comparison for comparison in self.comparisons if comparison.planned]
         return next(iter([*planned, *self.comparisons]), None)
 
     @property
@@ -93,25 +97,30 @@ class Evaluation:
 
     @property
     def versions(self) -> dict[str, str]:
-        """Versions of the packages that the values depend on."""
+        """Versions of the packages on which the values depend."""
         packages = [package for measure in self.measures for package in measure.packages]
-        return versions_of(["hlsim", *packages, "scipy"])
+        return installed_versions(["hlsim", *packages, "scipy"])
 
     def wide(self, column: str) -> DataFrame:
-        """Return one column with a row per item and a column per condition."""
+        """Return one column with a row for each item and a column for each condition."""
         table = self.table.pivot(index="item", columns="condition", values=column)
         return table.reindex(columns=self.names)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return a plain dictionary for JSON, with None for a missing value."""
-        groups = {name: group.comparisons for name, group in self.groups.items()}
+        """Return a dictionary for JSON, with None for missing values."""
+        fields = ("name", "kind", "of", "rivals")
+        conditions = [{name: getattr(c, name) for name in fields} for c in self.conditions]
+        groups = {
+            name: [comparison.to_dict() for comparison in group.comparisons]
+            for name, group in self.groups.items()
+        }
         values = {
             "settings": self.settings,
             "versions": self.versions,
             "notes": self.notes,
-            "conditions": [condition.record() for condition in self.conditions],
-            "comparisons": [c.to_dict() for c in self.comparisons],
-            "groups": {name: [c.to_dict() for c in found] for name, found in groups.items()},
+            "conditions": conditions,
+            "comparisons": [comparison.to_dict() for comparison in self.comparisons],
+            "groups": groups,
             **self.details,
             "rows": self.table.to_dict("records"),
         }

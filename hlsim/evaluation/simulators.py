@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from hlsim.evaluation.comparison import compare
 from hlsim.evaluation.fingerprint import fingerprint
-from hlsim.evaluation.items import SIMULATOR_LEVELS, Treatment, draw_items, treat
+from hlsim.evaluation.items import SIMULATOR_LEVELS, draw_items, treat
 from hlsim.evaluation.measures import load_measure, perceive
 from hlsim.evaluation.result import Evaluation
 from hlsim.evaluation.study import Condition, Item, Measure, Values
@@ -25,7 +25,8 @@ from hlsim.training.teacher import PluginTeacher, find_teacher
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-_SHORTEST = 0.02  # s: a window of the spectrograms
+SHORTEST_SECONDS = 0.02
+"""Shortest item in seconds, which is one window of the spectrograms."""
 
 
 def evaluate_simulators(
@@ -40,36 +41,40 @@ def evaluate_simulators(
     items: int = 240,
     seconds: float = 3.0,
     levels: Sequence[float] = SIMULATOR_LEVELS,
-    inputs: Sequence[Treatment] = ("as-is",),
+    inputs: Sequence[str] = ("as-is",),
     compensator: nn.Module | None = None,
     seed: int = 0,
     **running: Any,
 ) -> Evaluation:
-    """Compare simulators with the exact MSBG, or another teacher, side by side.
+    """Compare simulators with the exact MSBG, or another teacher.
 
-    Values are stored as they become known: a run that was stopped continues where it was, and one with a
-    further simulator computes that one alone.
+    Values are stored as they become known. An interrupted run can be continued, and a run with one
+    more simulator computes only its values.
 
     Args:
         simulators: modules by name, at 16 kHz and 94 dB SPL full scale.
-        speech, noise: folders of recordings; with ``noise`` every second item is noisy.
+        speech, noise: folders of recordings. With ``noise``, every second item is noisy.
         audiograms: CSV file of ears, see ``draw_items``.
         store: file of values, which is created if it does not exist; None stores nothing.
-        teacher: the simulator to compare with: ``"msbg"``, the exact one, or ``package.module:name``.
+        teacher: the simulator to compare with: ``"msbg"``, the exact one, or
+            ``package.module:name``.
         measures: further measures, ``package.module:name``.
         items: number of items; each is measured for each of ``inputs``.
         seconds: length of an item; PESQ and STOI need 2 or more.
-        levels: levels in dB SPL that the items take in turn.
-        inputs: treatments of the signal before the simulator gets it.
-        compensator: the module of the treatment ``compensated``.
+        levels: levels in dB SPL that the items have in turn.
+        inputs: treatments of the signal before the simulator, see ``TREATMENTS``.
+        compensator: module of the treatment ``compensated``.
+        seed: seed of all random draws.
         running: ``jobs``, ``dask`` and ``progress``, as in ``run_study``.
 
-    Returns: the evaluation with one group per treatment, in which each simulator is compared with the
+    Returns:
+        The evaluation with one group per treatment, in which each simulator is compared with the
         first by its SNR.
 
     Raises:
-        ValueError: data or settings that cannot be used, or no item has a value.
-        MissingExtraError: pandas or pystoi is not installed. Without pesq that measure is left out.
+        ValueError: data or settings are not valid, or no item has a value.
+        MissingExtraError: pandas or pystoi is not installed. Without pesq, that measure is left
+            out.
     """
     require("pandas", "eval")
     require("pystoi", "eval")
@@ -77,7 +82,7 @@ def evaluate_simulators(
         raise ValueError("an evaluation needs at least one simulator, item, level and input")
     if len(set(inputs)) < len(inputs):
         raise ValueError(f"one of the inputs {', '.join(inputs)} is named twice")
-    if seconds < _SHORTEST:
+    if seconds < SHORTEST_SECONDS:
         raise ValueError(f"items of {seconds:g} s are too short; PESQ and STOI need 2 s")
     drawn = draw_items(
         speech, noise, audiograms, items=items, seconds=seconds, seed=seed, levels=levels
@@ -106,7 +111,17 @@ def evaluate_simulators(
 
 
 def teacher_output(teacher: PluginTeacher | None, item: Item) -> Tensor:
-    """Return what the teacher makes of an item, computed once per item; None is the exact MSBG."""
+    """Return the teacher's output for an item, which is computed once per item.
+
+    Args:
+        teacher: the teacher; None is the exact MSBG.
+        item: the item.
+
+    >>> from hlsim import Audiogram
+    >>> clean = torch.ones(1600)
+    >>> teacher_output(None, Item("item 1", clean, clean, Audiogram.standard("N3"))).shape
+    torch.Size([1600])
+    """
 
     def compute() -> Tensor:
         if teacher is None:
@@ -118,10 +133,14 @@ def teacher_output(teacher: PluginTeacher | None, item: Item) -> Tensor:
 
 
 def fidelity_to(name: str) -> Measure:
-    """Return the measure of closeness to a teacher.
+    """Return the measure of a simulator's fidelity to a teacher.
 
-    Its values are the SNR, the scaled mean squared error and the error of third-octave bands, and STOI and PESQ of
-    teacher and simulator against the clean speech, as far as they are defined. PESQ is left out without pesq.
+    Its values are the SNR, the scaled mean squared error, the error of third-octave bands, and STOI
+    and PESQ of teacher and simulator against the clean speech, if they are defined. PESQ is left
+    out if pesq is not installed.
+
+    >>> fidelity_to("msbg").name
+    'fidelity'
     """
     teacher = find_teacher(name)
     scores = {"stoi": fidelity.stoi}
@@ -136,11 +155,11 @@ def fidelity_to(name: str) -> Measure:
             "band_error": fidelity.third_octave_error_db(expected, output, item.sample_rate),
         }
         for score, function in scores.items():
-            of_teacher = partial(function, item.clean, expected, NEURO_RATE)
-            known = item.once(score, of_teacher).value
-            found = function(item.clean, output, NEURO_RATE).value
-            if known is not None and found is not None:
-                values |= {f"{score}_teacher": known, f"{score}_simulator": found}
+            score_teacher = partial(function, item.clean, expected, NEURO_RATE)
+            of_teacher = item.once(score, score_teacher).value
+            of_simulator = function(item.clean, output, NEURO_RATE).value
+            if of_teacher is not None and of_simulator is not None:
+                values |= {f"{score}_teacher": of_teacher, f"{score}_simulator": of_simulator}
         return values
 
     settings = "msbg" if teacher is None else fingerprint(teacher.plugin)
@@ -149,9 +168,20 @@ def fidelity_to(name: str) -> Measure:
 
 
 def agreement(rows: DataFrame, score: str) -> dict[str, float | None]:
-    """Return how well a score of simulator and teacher agree: correlations and mean squared difference.
+    """Compute the agreement of simulator and teacher in a score.
 
-    They are None where they are not defined.
+    Args:
+        rows: rows of the table.
+        score: ``"stoi"`` or ``"pesq"``.
+
+    Returns:
+        Linear and rank correlation (``lcc``, ``srcc``) and the mean squared difference (``mse``);
+        None where they are not defined.
+
+    >>> import pandas
+    >>> rows = pandas.DataFrame({"stoi_teacher": [0.1, 0.5], "stoi_simulator": [0.2, 0.6]})
+    >>> agreement(rows, "stoi")["srcc"]
+    1.0
     """
     columns = [f"{score}_teacher", f"{score}_simulator"]
     pairs = rows.reindex(columns=columns).astype(float).dropna().to_numpy().T
@@ -163,14 +193,15 @@ def agreement(rows: DataFrame, score: str) -> dict[str, float | None]:
 
 
 def example_item(evaluation: Evaluation) -> tuple[Item, Tensor]:
-    """Return an item to show, and what the teacher makes of it.
+    """Return an item to show, and the teacher's output for it.
 
-    It has the first treatment and, as far as there are such items, a moderate loss, loud and clean speech: much
-    of it is lost, and much still perceived.
+    It has the first treatment and, if there are such items, a moderate loss and loud, clean speech:
+    much of it is lost, and much is still perceived.
     """
     rows = evaluation.table.dropna(subset="snr")
     rows = rows[rows["treatment"] == rows["treatment"].iloc[0]]
-    rows = rows.assign(other=rows["severity"] != "moderate")
-    order = rows.sort_values(["other", "input_level", "speech"], ascending=[True, False, True])
+    rows = rows.assign(is_other_loss=rows["severity"] != "moderate")
+    columns = ["is_other_loss", "input_level", "speech"]
+    order = rows.sort_values(columns, ascending=[True, False, True])
     item = evaluation.items[order["item"].iloc[0]].load()
     return item, teacher_output(find_teacher(evaluation.settings["teacher"]), item)

@@ -1,6 +1,6 @@
-"""Scores on disk: each is appended when it is known, so that a stopped run continues where it was.
+"""Scores on disk: each is appended when it is known, so that an interrupted run can be continued.
 
-The file holds one JSON object per line, so that two runs may share it and people can read it.
+The file holds one JSON object per line, so that two runs can share it and people can read it.
 """
 
 from __future__ import annotations
@@ -17,16 +17,22 @@ from hlsim.files import sha256
 
 
 class ScoreStore:
-    """A file of JSON lines, ``{"key": ..., ...}``, that only grows; the last line with a key counts.
+    """Records by key in a file of JSON lines, ``{"key": ..., ...}``, which only grows.
 
-    Nothing is written before the first record. A line that a kill cut short is ignored, and the next
+    The last line with a key counts. A line that an interruption cut short is ignored, and the next
     record starts a new line.
 
     Args:
-        path: file of records; it need not exist. None keeps the records in memory.
+        path: file of records, which is created with the first record. None keeps the records in
+            memory.
 
     Raises:
         ValueError: the file cannot be read.
+
+    >>> store = ScoreStore()
+    >>> store.append("abc", {"values": {"haspi": 0.5}})
+    >>> store.get("abc")
+    {'values': {'haspi': 0.5}}
     """
 
     def __init__(self, path: str | Path | None = None) -> None:
@@ -44,7 +50,11 @@ class ScoreStore:
         return self.records.get(key)
 
     def append(self, key: str, record: Mapping[str, Any]) -> None:
-        """Keep a record, on disk before this returns. ValueError if that fails."""
+        """Store a record, which is on disk when this returns.
+
+        Raises:
+            ValueError: the file cannot be written, or JSON cannot represent the record.
+        """
         line = json.dumps({"key": key, **record}, ensure_ascii=False, allow_nan=False) + "\n"
         if self.path is not None:
             try:
@@ -57,7 +67,7 @@ class ScoreStore:
     def _write(self, path: Path, line: str) -> None:
         data = (f"\n{line}" if self._last_line_is_cut else line).encode()
         with open(path, "ab", buffering=0) as file:
-            # one write of whole lines at the end of the file: two runs may share it
+            # Two runs can share the file because each line is a single write at its end.
             self._last_line_is_cut = file.write(data) < len(data)
             os.fsync(file.fileno())
         if self._last_line_is_cut:
@@ -68,7 +78,7 @@ class ScoreStore:
             with open(path, encoding="utf-8", errors="replace") as file:
                 for line in file:
                     self._last_line_is_cut = not line.endswith("\n")
-                    # a line that is cut short or not ours is ignored
+                    # A line that is cut short, or is not a record, is ignored.
                     with suppress(ValueError, KeyError, TypeError, AttributeError):
                         record = json.loads(line)
                         self.records[record.pop("key")] = record
@@ -77,13 +87,24 @@ class ScoreStore:
 
 
 def content_hash(path: str | Path) -> str:
-    """Return the SHA-256 of a file's contents, in hexadecimal; ValueError if it cannot be read."""
+    """Compute the SHA-256 of a file's contents, in hexadecimal.
+
+    Raises:
+        ValueError: the file cannot be read.
+
+    >>> content_hash(__file__) == content_hash(__file__)
+    True
+    """
     try:
         return sha256(Path(path))
     except OSError as error:
         raise ValueError(f"{path}: {str(error.strerror).lower()}") from error
 
 
-def key_of(settings: Mapping[str, Any]) -> str:
-    """Return the SHA-256 of settings that JSON can hold, in hexadecimal, whatever their order."""
+def settings_hash(settings: Mapping[str, Any]) -> str:
+    """Compute the SHA-256 of settings that JSON can represent, whatever their order.
+
+    >>> settings_hash({"a": 1, "b": 2}) == settings_hash({"b": 2, "a": 1})
+    True
+    """
     return text_hash(json.dumps(settings, sort_keys=True, allow_nan=False))

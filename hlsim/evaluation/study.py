@@ -1,8 +1,8 @@
 """A study: items, conditions and measures in, one table out.
 
-Every evaluation in hlsim is a study. ``haspi-report``, ``evaluate-compensator``, ``evaluate-simulator``,
-``clarity`` and the demo differ in their items (files, drawn clips, scenes), their conditions (recorded files,
-hearing aids, simulators) and their measures, and in nothing else.
+Every evaluation in hlsim is a study. ``haspi-report``, ``evaluate-compensator``,
+``evaluate-simulator``, ``clarity`` and the demo differ in their items (files, drawn clips, scenes),
+their conditions (recorded files, hearing aids, simulators) and their measures, and in nothing else.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from torch import Tensor
 from hlsim.audiogram import Audiogram
 from hlsim.calibration import PASCAL_SPL
 from hlsim.evaluation.fingerprint import combined_fingerprint, fingerprint, samples_hash
-from hlsim.evaluation.store import ScoreStore, key_of
+from hlsim.evaluation.parallel import Progress, describe_error, one_thread, run_parallel
+from hlsim.evaluation.store import ScoreStore, settings_hash
 from hlsim.extras import require
 from hlsim.metrics.pair import common_length
 from hlsim.neuro.config import NEURO_RATE
-from hlsim.parallel import Progress, one_thread, reason_of, run_parallel
 from hlsim.version import __version__
 
 if TYPE_CHECKING:
@@ -35,9 +35,11 @@ if TYPE_CHECKING:
 Values = Mapping[str, float | str]
 """Values by the name of their column."""
 
+DEAD_PROCESS = "its process ended (after a crash in compiled code, or because memory ran out)"
+
 
 class Source(Protocol):
-    """Where an item comes from: memory, as with ``Item`` itself, or files."""
+    """Source of an item: memory, as ``Item`` itself, or files."""
 
     @property
     def name(self) -> str: ...
@@ -46,7 +48,7 @@ class Source(Protocol):
     def facts(self) -> Mapping[str, Any]: ...
 
     def digest(self, condition: str) -> str:
-        """Return a SHA-256 of all that decides the item's values, but for condition and measure."""
+        """Return a SHA-256 of the item and of a condition's output, if that is recorded."""
 
     def load(self) -> Item: ...
 
@@ -64,9 +66,13 @@ class Item:
         full_scale_spl: level in dB SPL of a signal with RMS 1.0.
         seed: seed of random numbers that a measure draws.
         facts: columns of the table, such as ``listener`` or ``snr``.
-        recorded: functions that read the outputs of conditions that were recorded, by their names.
+        recorded: functions that read recorded outputs, by the name of their condition.
 
     Shape: (time,).
+
+    >>> clean = torch.ones(8)
+    >>> Item("item 1", clean, clean, Audiogram.standard("N3")).sample_rate
+    16000
     """
 
     name: str
@@ -81,17 +87,20 @@ class Item:
     _computed: dict[str, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def load(self) -> Item:
-        """Return the item, without what ``once`` has computed."""
+        """Return the item, without the results of ``once``."""
         return replace(self)
 
     def digest(self, condition: str) -> str:
-        """Return the SHA-256 of samples, ear, rate, level and seed; it is the same for all conditions."""
+        """Return the SHA-256 of samples, ear, rate, level and seed."""
         samples = samples_hash(self.clean, self.signal)
         settings = [self.sample_rate, self.full_scale_spl, self.seed]
-        return key_of({"samples": samples, "ear": self.ear.to_dict(), "settings": settings})
+        return settings_hash({"samples": samples, "ear": self.ear.to_dict(), "settings": settings})
 
     def once(self, name: str, compute: Callable[[], Any]) -> Any:
-        """Return what ``compute`` returns, computed once per item: a reference that all conditions share."""
+        """Return the result of ``compute``, which runs once per item.
+
+        All conditions share such a result, for example a reference.
+        """
         if name not in self._computed:
             self._computed[name] = compute()
         return self._computed[name]
@@ -99,15 +108,18 @@ class Item:
 
 @dataclass(frozen=True)
 class Condition:
-    """One way of processing an item, as a record: nothing has to be read from its name.
+    """One way of processing an item.
 
     Args:
         name: name in tables.
-        process: function of an input and an ear that returns an output of the same shape; None if the outputs
-            were recorded.
+        process: function of an input and an ear that returns an output of the same shape; None if
+            the outputs were recorded.
         kind: role in the study, such as ``"unaided"``, ``"aid"`` or ``"equaliser"``.
-        of: name of the condition that this one belongs to, such as the aid whose level it has.
-        rivals: names of the conditions that this one is compared with, most important first.
+        of: name of the condition to which this one belongs, such as the aid whose level it has.
+        rivals: names of the conditions with which this one is compared, most important first.
+
+    >>> Condition("unaided", lambda signal, ear: signal, "unaided").of
+    ''
     """
 
     name: str
@@ -118,37 +130,36 @@ class Condition:
 
     @cached_property
     def fingerprint(self) -> str | None:
-        """Fingerprint of the processing; None if it is unknown, and then no score is stored."""
+        """Fingerprint of the processing. If it is None, unknown, scores are not stored."""
         return "recorded" if self.process is None else fingerprint(self.process)
 
     def output(self, item: Item) -> Tensor:
         """Process an item, or read its recorded output."""
-        if self.process is None:
-            if self.name not in item.recorded:
-                raise ValueError(f"no output of {item.name} is recorded under {self.name}")
-            return item.recorded[self.name]()
-        return self.process(item.signal, item.ear)
-
-    def record(self) -> dict[str, Any]:
-        """Return name, kind, of and rivals, for JSON."""
-        fields = ("name", "kind", "of", "rivals")
-        return {name: getattr(self, name) for name in fields}
+        if self.process is not None:
+            return self.process(item.signal, item.ear)
+        if self.name not in item.recorded:
+            raise ValueError(f"no output of {item.name} is recorded under {self.name}")
+        return item.recorded[self.name]()
 
 
 @dataclass(frozen=True)
 class Measure:
-    """A function of an item and an output, and what readers of its values have to know.
+    """A function of an item and an output, and its properties.
 
     Args:
-        name: name in options and files; a score's column has the same name.
+        name: name in options and files. The column of a score has the same name.
         compute: function that returns values by column, or raises ValueError if there are none.
         title: name in tables and plots.
         packages: packages whose versions decide the values.
-        revision: raise it when a change of hlsim changes a value.
-        settings: fingerprint of what else decides the values, such as a teacher; None if it is unknown.
+        revision: number to be increased when a change of hlsim changes a value.
+        settings: fingerprint of other settings that decide the values, such as a teacher; None if
+            it is unknown.
         knows_hearing: whether the values depend on audiogram and level.
-        rewards_gain: whether more level alone brings a higher score.
+        rewards_gain: whether a higher level alone increases the score.
         ends: lowest and highest score, for the axes of plots.
+
+    >>> Measure("peak", lambda item, output: {"peak": float(output.abs().max())}).revision
+    1
     """
 
     name: str
@@ -164,26 +175,25 @@ class Measure:
     @cached_property
     def fingerprint(self) -> str | None:
         """Fingerprint of revision, versions and settings; None if the settings are unknown."""
-        return combined_fingerprint(
-            str(self.revision), str(versions_of(self.packages)), self.settings
-        )
+        versions = str(installed_versions(self.packages))
+        return combined_fingerprint(str(self.revision), versions, self.settings)
 
 
-def versions_of(packages: Iterable[str]) -> dict[str, str]:
-    """Return the installed version of each package, that of hlsim also if it runs from its sources."""
+def installed_versions(packages: Iterable[str]) -> dict[str, str]:
+    """Return the installed version of each package.
+
+    >>> sorted(installed_versions(["hlsim", "no-such-package"]))
+    ['hlsim', 'no-such-package']
+    """
     versions = {}
     for package in dict.fromkeys(packages):
         try:
             versions[package] = metadata.version(package)
         except metadata.PackageNotFoundError:
             versions[package] = "not installed"
-        if package == "hlsim":
+        if package == "hlsim":  # which may run from its sources
             versions[package] = __version__
     return versions
-
-
-Place = tuple[str, str]
-"""Names of condition and measure."""
 
 
 class _Task(NamedTuple):
@@ -206,115 +216,121 @@ def run_study(
 ) -> DataFrame:
     """Measure the output of every condition for every item.
 
-    Items are measured in parallel, and the values do not depend on how many at a time. An error ends only the
-    measure, output or item that it occurs in: it becomes the reason in the column ``failure``, and a later
-    run tries again.
+    Items are measured in parallel, and the values do not depend on the number of processes. An
+    error ends only the measure, output or item in which it occurs. It becomes the reason in the
+    column ``failure``, and a later run tries again.
 
     Args:
-        store: values of earlier runs, to which new ones are added. A value is computed again only if samples,
-            ear, condition or measure have changed.
-        jobs: number of processes; None takes all cores.
-        dask: address of a Dask scheduler whose workers take the place of processes.
-        progress: called with the number of finished values and of all.
+        items: items, or sources that load them.
+        conditions: conditions.
+        measures: measures.
+        store: values of earlier runs, to which new ones are added. A value is computed again only
+            if samples, ear, condition or measure have changed.
+        jobs: number of processes; all cores by default.
+        dask: address of a Dask scheduler, whose workers replace the processes.
+        progress: function that is called with the number of finished values and of all values.
 
-    Returns: one row per item and condition: ``item`` (its number), ``name``, the item's facts, ``condition``,
-        one column per measured value, and ``failure``, missing where every measure has its values.
+    Returns:
+        One row per item and condition: ``item`` (its number), ``name``, the item's facts,
+        ``condition``, one column per measured value, and ``failure``, which is missing if every
+        measure has its values.
 
     Raises:
         ValueError: no scheduler answers, or the store cannot be written.
         MissingExtraError: a package is not installed.
+
+    >>> signal = torch.ones(1600)
+    >>> items = [Item("item 1", signal, signal, Audiogram.standard("N3"))]
+    >>> conditions = [Condition("unaided", torch.nn.Identity())]
+    >>> measures = [Measure("peak", lambda item, output: {"peak": float(output.abs().max())})]
+    >>> with warnings.catch_warnings(action="ignore"):  # a lambda has no fingerprint
+    ...     table = run_study(items, conditions, measures, jobs=1)
+    >>> table["peak"].tolist()
+    [1.0]
     """
     store = ScoreStore() if store is None else store
-    _warn_of_unknown([*conditions, *measures])
-    keys = [_keys(source, conditions, measures) for source in items]
-    results: list[dict[Place, Values | str]] = [{} for _ in items]
+    show = progress or (lambda done, total: None)
+    _warn_of_unknown_fingerprints([*conditions, *measures])
+    results: dict[tuple[int, str, str], Values | str] = {}
+    keys: dict[tuple[int, str, str], str] = {}
     tasks = []
     for number, source in enumerate(items):
         missing = []
-        for condition, measure in product(conditions, measures):
-            place = condition.name, measure.name
-            record = store.get(keys[number][place])
-            if record is None:
-                missing.append((condition, measure))
-            else:
-                results[number][place] = record["values"]
+        for condition in conditions:
+            digest = _digest(source, condition)
+            for measure in measures:
+                key = _key(digest, condition, measure)
+                record = store.get(key)
+                if record is None:
+                    missing.append((condition, measure))
+                    keys[number, condition.name, measure.name] = key
+                else:
+                    results[number, condition.name, measure.name] = record["values"]
         if missing:
             tasks.append(_Task(number, source, missing))
     total = len(items) * len(conditions) * len(measures)
-    done = total - sum(len(task.missing) for task in tasks)
-    show = progress or (lambda done, total: None)
-    show(done, total)
+    show(len(results), total)
     for task, measured in run_parallel(_measure_item, tasks, jobs=jobs, dask=dask):
-        for place, values in (measured or _all_failed(task, _DIED)).items():
-            results[task.number][place] = values
-            key = keys[task.number][place]
-            if key and not isinstance(values, str):
-                about = {"item": task.source.name, "condition": place[0], "measure": place[1]}
-                store.append(key, {**about, "values": values})
-        done += len(task.missing)
-        show(done, total)
-    return _table(items, conditions, measures, results)
+        if measured is None:
+            measured = [DEAD_PROCESS] * len(task.missing)
+        for (condition, measure), values in zip(task.missing, measured, strict=True):
+            place = task.number, condition.name, measure.name
+            results[place] = values
+            if keys[place] and not isinstance(values, str):
+                names = {"item": task.source.name, "condition": place[1], "measure": place[2]}
+                store.append(keys[place], {**names, "values": values})
+        show(len(results), total)
+    return _make_table(items, conditions, measures, results)
 
 
-_DIED = "the process that computed it ended (a crash in compiled code, or no memory was left)"
+def _digest(source: Source, condition: Condition) -> str | None:
+    try:
+        return source.digest(condition.name)
+    except ValueError:  # Loading the item or its output fails later for the same reason.
+        return None
 
 
-def _keys(
-    source: Source, conditions: Sequence[Condition], measures: Sequence[Measure]
-) -> dict[Place, str]:
-    """Return the keys of an item's values; empty where nothing is stored."""
-    keys = {}
-    for condition in conditions:
-        try:
-            digest: str | None = source.digest(condition.name)
-        except ValueError:  # loading the item or its output will fail for the same reason
-            digest = None
-        for measure in measures:
-            parts = (digest, condition.fingerprint, measure.fingerprint)
-            known = None not in parts
-            place = condition.name, measure.name
-            keys[place] = key_of({"value": [*parts, measure.name]}) if known else ""
-    return keys
+def _key(digest: str | None, condition: Condition, measure: Measure) -> str:
+    """Return the key of stored values, which is empty if they cannot be stored."""
+    parts = (digest, condition.fingerprint, measure.fingerprint)
+    return "" if None in parts else settings_hash({"value": [*parts, measure.name]})
 
 
-def _warn_of_unknown(parts: Sequence[Condition | Measure]) -> None:
+def _warn_of_unknown_fingerprints(parts: Sequence[Condition | Measure]) -> None:
     unknown = [part.name for part in parts if part.fingerprint is None]
     if unknown:
         warnings.warn(
-            f"scores with {', '.join(unknown)} are not stored and will be computed again by the next run; "
-            "to store them, give what computes them an attribute fingerprint, such as a version",
+            f"scores with {', '.join(unknown)} are not stored and will be computed again by the "
+            "next run; to store them, add an attribute fingerprint, such as a version, to the "
+            "object that computes them",
             stacklevel=3,
         )
 
 
 @one_thread()
 @torch.no_grad()
-def _measure_item(task: _Task) -> dict[Place, Values | str]:
-    """Compute the missing values of one item; what fails becomes its reason."""
+def _measure_item(task: _Task) -> list[Values | str]:
+    """Compute the missing values of one item; a failure gives its reason instead."""
     try:
         item = task.source.load()
-    except Exception as error:  # whatever it is, the other items go on
-        return _all_failed(task, reason_of(error))
-    results: dict[Place, Values | str] = {}
+    except Exception as error:  # A failure must not end the study.
+        return [describe_error(error)] * len(task.missing)
+    results: list[Values | str] = []
     pairs: dict[str, tuple[Item, Tensor]] = {}
     for condition, measure in task.missing:
         try:
             if condition.name not in pairs:
                 pairs[condition.name] = _item_and_output(condition, item)
-            values: Values | str = measure.compute(*pairs[condition.name])
+            values = measure.compute(*pairs[condition.name])
             _check_finite(values)
+            results.append(values)
         except Exception as error:
-            values = reason_of(error)
-        results[condition.name, measure.name] = values
+            results.append(describe_error(error))
     return results
 
 
-def _all_failed(task: _Task, reason: str) -> dict[Place, Values | str]:
-    return {(condition.name, measure.name): reason for condition, measure in task.missing}
-
-
 def _item_and_output(condition: Condition, item: Item) -> tuple[Item, Tensor]:
-    """Process an item; both are cut to the shorter one if they differ by 0.1 s at most."""
+    """Process an item, and cut the item and its output to the shorter length."""
     output = condition.output(item)
     if not output.isfinite().all():
         raise ValueError("the output has samples that are NaN or infinite")
@@ -325,33 +341,31 @@ def _item_and_output(condition: Condition, item: Item) -> tuple[Item, Tensor]:
     return item, output[:samples]
 
 
-def _check_finite(values: Any) -> None:
+def _check_finite(values: Values) -> None:
     for name, value in values.items():
         if isinstance(value, float) and not math.isfinite(value):
             raise ValueError(f"{name} is {value}, not a finite number")
 
 
-def _table(
+def _make_table(
     items: Sequence[Source],
     conditions: Sequence[Condition],
     measures: Sequence[Measure],
-    results: Sequence[Mapping[Place, Values | str]],
+    results: Mapping[tuple[int, str, str], Values | str],
 ) -> DataFrame:
     rows = []
     for (number, source), condition in product(enumerate(items), conditions):
         row = {"item": number, "name": source.name, **source.facts, "condition": condition.name}
         reasons = []
         for measure in measures:
-            values = results[number][condition.name, measure.name]
+            values = results[number, condition.name, measure.name]
             if isinstance(values, str):
                 reasons.append(values)
-            elif both := row.keys() & values.keys():
-                raise ValueError(
-                    f"{measure.name} returns {both.pop()}, a column that exists already"
-                )
-            else:
-                row |= values
+                continue
+            for column in row.keys() & values.keys():
+                raise ValueError(f"{measure.name} returns {column}, a column that exists already")
+            row |= values
         rows.append({**row, "failure": "; ".join(dict.fromkeys(reasons)) or None})
     table = require("pandas", "eval").DataFrame(rows)
-    table["failure"] = table.pop("failure")  # last, whichever row has which values
+    table["failure"] = table.pop("failure")  # The order of columns does not depend on the values.
     return table

@@ -11,9 +11,9 @@ from torch import Tensor
 from hlsim.audio import encode_flac
 from hlsim.calibration import gain_to_pascals, level_spl
 from hlsim.evaluation.measures import perceive
+from hlsim.evaluation.parallel import describe_error
 from hlsim.evaluation.result import Evaluation
 from hlsim.extras import MissingExtraError
-from hlsim.parallel import reason_of
 from hlsim.report import spectrograms
 from hlsim.report.page import Picture, Player, Section
 
@@ -54,7 +54,7 @@ def listening_section(
             number = int(row.get("source", row.name))
             sections.append(_item_section(evaluation, number, title, shown or evaluation.names))
         except Exception as error:  # a page is not lost to a sound
-            sections.append(Section(title, [f"It cannot be played: {reason_of(error)}"]))
+            sections.append(Section(title, [f"It cannot be played: {describe_error(error)}"]))
     return Section("Listen", [_EXPLANATION], sections=sections) if sections else None
 
 

@@ -1,4 +1,4 @@
-"""The command ``prepare`` prints each layout and writes its manifest, or prints one line of error."""
+"""The command ``prepare`` prints each layout and writes its manifest, or prints one error."""
 
 from pathlib import Path
 

@@ -16,7 +16,8 @@ for arguments, status in json.loads(sys.argv[1]):
         ended = main(arguments)
     except SystemExit as end:
         ended = end.code
-    heavy = {"torch", "numpy", "scipy", "soundfile", "lightning", "clarity", "matplotlib"} & set(sys.modules)
+    names = "torch numpy scipy soundfile lightning clarity matplotlib".split()
+    heavy = set(names) & set(sys.modules)
     assert ended == status and not heavy, (arguments, ended, heavy)
 """
 

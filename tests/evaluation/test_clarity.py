@@ -1,12 +1,12 @@
-"""Clarity's scenes, made in the challenges' layout: names, levels, parity with pyclarity, resuming, errors."""
+"""Clarity's scenes: files, levels, parity with pyclarity, continued runs, and errors."""
 
 from __future__ import annotations
 
 import csv
 import hashlib
 import json
-import math
 import shutil
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -24,64 +24,51 @@ from hlsim.audiogram.table import read_listeners
 from hlsim.cli.main import main
 from hlsim.dsp.resample import resample
 from hlsim.evaluation.clarity import (
-    _conditions,
-    _look_ahead,
+    _make_conditions,
+    _measure_look_ahead,
     evaluate_scenes,
-    read_pairs,
     read_scenes,
 )
 from hlsim.report.clarity import conditions_table, scenes_page
 
 RATE = 44100
+LOW_RATE = 16000
 SPEECH = Path(hlsim.__file__).parent / "data" / "speech" / "valid"
 CFS = [250, 500, 1000, 2000, 3000, 4000, 6000, 8000]
-LISTENERS = {
-    "L0001": {
-        "name": "L0001",
-        "audiogram_cfs": CFS,
-        "audiogram_levels_l": [35, 35, 35, 40, 50, 55, 60, 65],
-        "audiogram_levels_r": [20, 20, 25, 35, 45, 50, 55, 55],
-    },
-    "L0002": {
-        "name": "L0002",
-        "audiogram_cfs": CFS,
-        "audiogram_levels_l": [10, 15, 20, 30, 35, 45, 50, 50],
-        "audiogram_levels_r": [55, 55, 60, 65, 70, 75, 80, 80],
-    },
+EARS = {
+    "L0001": ([35, 35, 35, 40, 50, 55, 60, 65], [20, 20, 25, 35, 45, 50, 55, 55]),
+    "L0002": ([10, 15, 20, 30, 35, 45, 50, 50], [55, 55, 60, 65, 70, 75, 80, 80]),
 }
-COMPRESSOR = {"fs": RATE, "attack": 50, "release": 1000, "threshold": 0.35, "attenuation": 0.1}
-COMPRESSOR |= {
-    "makeup_gain": 1,
-    "rms_buffer_size": 0.064,
-}  # recipes/icassp_2023/baseline/config.yaml
+LISTENERS = {
+    name: {"audiogram_cfs": CFS, "audiogram_levels_l": left, "audiogram_levels_r": right}
+    for name, (left, right) in EARS.items()
+}
 PAIRS = {"S06001": ["L0001", "L0002"], "S06002": ["L0001"]}
 
 
-def ears(signal: np.ndarray, late: int, softer_db: float) -> np.ndarray:
-    """What comes from one side: later and softer at the other ear."""
-    other = np.concatenate([np.zeros(late), signal[: len(signal) - late]]) * 10 ** (-softer_db / 20)
+def spread(signal: np.ndarray, delay: int, softer_db: float) -> np.ndarray:
+    """Return a signal from one side: delayed and softer at the other ear."""
+    other = np.concatenate([np.zeros(delay), signal[:-delay]]) * 10 ** (-softer_db / 20)
     return np.stack([signal, other], 1)
 
 
-def make_scenes(folder: Path, seconds: float = 1.0) -> Path:
-    """Two scenes, noise from the other side than speech, in a room of one reflection, 16-bit."""
+def write(path: Path, signal: np.ndarray, rate: int = LOW_RATE) -> None:
+    soundfile.write(path, signal, rate, subtype="PCM_16")
+
+
+def make_scenes(folder: Path, rate: int) -> Path:
+    """Write two scenes of 1 s with noise from the other side, in a room with one reflection."""
     (folder / "scenes").mkdir(parents=True)
     generator = np.random.default_rng(0)
     for name, path in zip(PAIRS, sorted(SPEECH.iterdir()), strict=False):
-        waveform, rate = read_audio(path)
-        speech = resample(waveform[0], rate, RATE).double().numpy()[: int(seconds * RATE)]
-        speech = 0.02 * speech / speech.std()
-        anechoic = ears(speech, 20, 5.0)
+        waveform, speech_rate = read_audio(path)
+        speech = resample(waveform[0], speech_rate, rate).double().numpy()[:rate]
+        anechoic = spread(0.02 * speech / speech.std(), 20, 5.0)
         target = 0.7 * (anechoic + 0.4 * np.roll(anechoic[:, ::-1], 900, 0))
-        noise = ears(0.008 * generator.standard_normal(len(speech)), 25, 6.0)[:, ::-1]
-        for end, signal in (
-            ("mix_CH1", target + noise),
-            ("target_CH1", target),
-            ("target_anechoic_CH1", anechoic),
-        ):
-            soundfile.write(
-                str(folder / "scenes" / f"{name}_{end}.wav"), signal, RATE, subtype="PCM_16"
-            )
+        noise = spread(0.008 * generator.standard_normal(len(speech)), 25, 6.0)[:, ::-1]
+        signals = {"mix": target + noise, "target": target, "target_anechoic": anechoic}
+        for kind, signal in signals.items():
+            write(folder / "scenes" / f"{name}_{kind}_CH1.wav", signal, rate)
     (folder / "listeners.json").write_text(json.dumps(LISTENERS))
     (folder / "pairs.json").write_text(json.dumps(PAIRS))
     return folder
@@ -89,86 +76,97 @@ def make_scenes(folder: Path, seconds: float = 1.0) -> Path:
 
 @pytest.fixture(scope="module")
 def clarity(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return make_scenes(tmp_path_factory.mktemp("clarity"))
+    return make_scenes(tmp_path_factory.mktemp("clarity"), LOW_RATE)
 
 
-def options(folder: Path, **more: Any) -> dict[str, Any]:
-    own = {"scenes": folder / "scenes", "listeners": folder / "listeners.json", "jobs": 1}
-    return own | {"scenes_listeners": folder / "pairs.json"} | more
+@pytest.fixture
+def scenes(clarity: Path, tmp_path: Path) -> Path:
+    """Return a copy of the scenes, to be changed."""
+    return Path(shutil.copytree(clarity / "scenes", tmp_path / "scenes"))
+
+
+def options(folder: Path, **changes: Any) -> dict[str, Any]:
+    files = {"listeners": folder / "listeners.json", "scenes_listeners": folder / "pairs.json"}
+    return {"scenes": folder / "scenes", "jobs": 1, **files, **changes}
+
+
+def settings_of_compressor() -> dict[str, float]:
+    """Return the settings of recipes/icassp_2023/baseline/config.yaml."""
+    settings = {"fs": RATE, "attack": 50, "release": 1000, "threshold": 0.35, "attenuation": 0.1}
+    return settings | {"makeup_gain": 1, "rms_buffer_size": 0.064}
 
 
 class Baseline:
-    """Clarity's own: pyclarity's NAL-R and compressor with the challenge's settings, its delay kept, its tail cut."""
+    """Baseline of Clarity: pyclarity's NAL-R, which returns 220 samples more, and compressor."""
 
-    def __call__(
-        self, waveform: torch.Tensor, listener: Listener, sample_rate: int
-    ) -> torch.Tensor:
+    def __call__(self, waveform: Tensor, listener: Listener, sample_rate: int) -> Tensor:
         from clarity.enhancer.compressor import Compressor
         from clarity.enhancer.nalr import NALR
         from clarity.utils.audiogram import Audiogram
 
         nalr = NALR(nfir=220, sample_rate=sample_rate)
-        compressor = Compressor(**COMPRESSOR)
-        made = []
+        compressor = Compressor(**settings_of_compressor())
+        outputs = []
         for channel, ear in zip(
             waveform.double().numpy(), (listener.left, listener.right), strict=True
         ):
             assert ear is not None
             filtered = nalr.apply(nalr.build(Audiogram(ear.thresholds, CFS))[0], channel)
-            made.append(np.tanh(compressor.process(filtered)[0]))
-        return torch.from_numpy(np.stack(made)[:, : waveform.shape[-1]])
+            outputs.append(np.tanh(compressor.process(filtered)[0]))
+        return torch.from_numpy(np.stack(outputs))
 
 
-def pyclaritys(folder: Path, scene: str, listener: str) -> dict[str, float]:
-    """The challenge's scores of its own baseline, all by pyclarity, in the steps of its script of ICASSP 2023."""
+def score_by_pyclarity(folder: Path, scene: str, listener: str) -> dict[str, float]:
+    """Score the baseline by pyclarity, in the steps of its script of ICASSP 2023."""
     from clarity.enhancer.compressor import Compressor
     from clarity.enhancer.nalr import NALR
     from clarity.evaluator.haspi import haspi_v2_be
     from clarity.evaluator.hasqi import hasqi_v2_better_ear
-    from clarity.utils.audiogram import Listener as Clarity
+    from clarity.utils.audiogram import Audiogram
+    from clarity.utils.audiogram import Listener as ClarityListener
 
-    signals = {
-        end: soundfile.read(str(folder / "scenes" / f"{scene}_{end}.wav"))[0]
-        for end in ("mix_CH1", "target_CH1", "target_anechoic_CH1")
-    }
-    person = Clarity.from_dict(LISTENERS[listener])
+    mix, target, anechoic = (
+        soundfile.read(folder / "scenes" / f"{scene}_{kind}_CH1.wav")[0]
+        for kind in ("mix", "target", "target_anechoic")
+    )
+    ears = [Audiogram(levels, CFS) for levels in EARS[listener]]
     np.random.seed(int(hashlib.md5(scene.encode()).hexdigest(), 16) % 10**8)
-    nalr, compressor = NALR(nfir=220, sample_rate=RATE), Compressor(**COMPRESSOR)
-    amplified = []
-    for channel, ear in zip(
-        signals["mix_CH1"].T, (person.audiogram_left, person.audiogram_right), strict=True
-    ):
-        amplified.append(compressor.process(nalr.apply(nalr.build(ear)[0], channel))[0])
-    given = np.tanh(np.stack(amplified, 1)).astype(np.float32)
-    level = (signals["target_CH1"] ** 2).mean(0) ** 0.5 / (
-        signals["target_anechoic_CH1"] ** 2
-    ).mean(0) ** 0.5
-    reference = signals["target_anechoic_CH1"] * level
-    both = {
+    nalr, compressor = NALR(nfir=220, sample_rate=RATE), Compressor(**settings_of_compressor())
+    amplified = [
+        compressor.process(nalr.apply(nalr.build(ear)[0], channel))[0]
+        for channel, ear in zip(mix.T, ears, strict=True)
+    ]
+    output = np.tanh(np.stack(amplified, 1)).astype(np.float32)[: len(mix)]
+    reference = anechoic * ((target**2).mean(0) ** 0.5 / (anechoic**2).mean(0) ** 0.5)
+    arguments = {
         "reference_left": reference[:, 0],
         "reference_right": reference[:, 1],
+        "processed_left": output[:, 0],
+        "processed_right": output[:, 1],
         "sample_rate": RATE,
+        "listener": ClarityListener(*ears),
     }
-    both |= {"processed_left": given[:, 0], "processed_right": given[:, 1], "listener": person}
-    return {"haspi": haspi_v2_be(**both), "hasqi": hasqi_v2_better_ear(**both)}
+    return {"haspi": haspi_v2_be(**arguments), "hasqi": hasqi_v2_better_ear(**arguments)}
 
 
 @pytest.mark.slow
-def test_the_challenges_baseline_has_its_scores(clarity: Path, tmp_path: Path) -> None:
+@pytest.mark.filterwarnings("ignore:the input has")
+def test_the_baseline_has_the_scores_of_the_challenge(tmp_path: Path) -> None:
     pytest.importorskip("clarity")
+    folder = make_scenes(tmp_path / "clarity", RATE)
     aids = {"baseline": f"{__name__}:Baseline"}
-    study = evaluate_scenes(aids, out=tmp_path, **options(clarity))
+    study = evaluate_scenes(aids, out=tmp_path / "out", **options(folder))
     assert study.failures.empty and study.table.item.nunique() == 3
     for row in study.table[study.table.condition == "baseline"].itertuples():
-        for measure, expected in pyclaritys(clarity, row.utterance, row.listener).items():
+        for measure, expected in score_by_pyclarity(folder, row.utterance, row.listener).items():
             assert getattr(row, measure) == pytest.approx(expected, abs=1e-3), (row.name, measure)
-    ahead = study.details["look_ahead_ms"]
-    assert ahead["baseline"] == 0.0, "2.5 ms late, but never early"
-    assert 2.0 < ahead["NAL-R"] <= 5.0
+    look_ahead = study.details["look_ahead_ms"]
+    assert look_ahead["baseline"] == 0.0, "2.5 ms late, but never early"
+    assert 2.0 < look_ahead["NAL-R"] <= 5.0
 
 
-class FromTheFuture:
-    """An aid that knows what comes in 8 ms."""
+class Anticipating:
+    """Aid with a look-ahead of 8 ms."""
 
     fingerprint = "1"
 
@@ -176,28 +174,29 @@ class FromTheFuture:
         return 4.0 * waveform.roll(-(sample_rate * 8 // 1000), -1)
 
 
-class HalfTheNoise:
-    """An enhancer, which gets pascals."""
+class Halving:
+    """Enhancer, which receives pascals."""
 
     fingerprint = "1"
 
     def __call__(self, waveform: Tensor, sample_rate: int) -> Tensor:
-        if sample_rate == RATE:  # 0.014 in the file: 100 to 94 dB SPL
+        if waveform.ndim == 2:  # RMS 0.014 at 100 dB SPL full scale is 0.028 pascals.
             assert 0.02 < float(waveform.square().mean().sqrt()) < 0.06
         return 0.5 * waveform
 
 
+@pytest.mark.usefixtures("quick_scores")
 def test_the_command_writes_page_scores_and_signals_and_continues(
     clarity: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "out"
-    arguments = ["clarity", clarity / "scenes", "soft=wdrc", f"early={__name__}:FromTheFuture"]
+    arguments = ["clarity", clarity / "scenes", "soft=wdrc", f"early={__name__}:Anticipating"]
     arguments += ["--listeners", clarity / "listeners.json", "--jobs", "1", "--every", "2"]
     arguments += ["--scenes-listeners", clarity / "pairs.json", "--listen", "1", "--out", out]
-    command = [*map(str, arguments), "--enhancer", f"{__name__}:HalfTheNoise"]
+    command = [*map(str, arguments), "--enhancer", f"{__name__}:Halving"]
     assert main(command) == 0
-    printed = capsys.readouterr().out
-    assert "HalfTheNoise + soft" in printed and "8.0 no" in " ".join(printed.split())
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "Halving + soft" in printed and "8.0 no" in printed
     with open(out / "scores.csv", newline="") as file:
         rows = [*csv.DictReader(file)]
     pairs = [(row["scene"], row["listener"]) for row in rows[::7]]
@@ -208,103 +207,177 @@ def test_the_command_writes_page_scores_and_signals_and_continues(
     levels = {row["condition"]: float(row["level"]) for row in rows[:7]}
     assert levels["early"] - levels["unaided"] == pytest.approx(20 * np.log10(4), abs=0.1)
     signal = out / "signals" / "early" / "S06001_L0001_HA-output.wav"
-    mix, _ = soundfile.read(str(clarity / "scenes" / "S06001_mix_CH1.wav"))
-    output, rate = soundfile.read(str(signal))
-    assert rate == RATE and np.allclose(output, 4 * np.roll(mix, -352, 0), atol=1e-6)
+    mix, _ = soundfile.read(clarity / "scenes" / "S06001_mix_CH1.wav")
+    output, rate = soundfile.read(signal)
+    assert rate == LOW_RATE and np.allclose(output, 4 * np.roll(mix, -128, 0), atol=1e-6)
     assert (out / "report.html").read_text().count("<audio") == 5
     stored, report = (out / "scores.jsonl").read_text(), (out / "report.json").read_text()
     signal.unlink()
     other = out / "signals" / "soft" / "S06001_L0001_HA-output.wav"
     written = other.stat().st_mtime_ns
     assert main(command) == 0
-    assert np.allclose(soundfile.read(str(signal))[0], output), "a lost signal is written again"
+    assert np.allclose(soundfile.read(signal)[0], output), "a missing signal is written again"
     assert other.stat().st_mtime_ns == written and (out / "report.json").read_text() == report
     assert (out / "scores.jsonl").read_text().startswith(stored)
 
 
-def test_signals_of_another_aid_of_the_same_label_are_replaced(
+@pytest.mark.usefixtures("quick_scores")
+def test_signals_of_another_aid_with_the_same_label_are_replaced(
     clarity: Path, tmp_path: Path
 ) -> None:
     signal = tmp_path / "signals" / "aid" / "S06001_L0001_HA-output.wav"
     outputs = []
-    for name in ("wdrc", f"{__name__}:FromTheFuture", "wdrc"):
-        evaluate_scenes({"aid": name}, out=tmp_path, **options(clarity, every=4))
+    for name in ("wdrc", f"{__name__}:Anticipating", "wdrc"):
+        evaluate_scenes({"aid": name}, out=tmp_path, **options(clarity, stride=4))
         outputs.append(signal.read_bytes())
     assert outputs[0] == outputs[2] != outputs[1]
 
 
-def test_linked_gains_and_a_reference_of_one_channel(clarity: Path, tmp_path: Path) -> None:
-    folder = tmp_path / "third"  # names of the third challenge: the reference has its level
+@pytest.mark.usefixtures("quick_scores")
+def test_linked_gains_and_a_reference_with_one_channel(clarity: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "third"  # names of the third challenge, whose reference has its level
     folder.mkdir()
     for scene in PAIRS:
-        signal, _ = soundfile.read(str(clarity / "scenes" / f"{scene}_target_anechoic_CH1.wav"))
-        soundfile.write(str(folder / f"{scene}_reference.wav"), signal[:, 0], RATE)
+        signal, _ = soundfile.read(clarity / "scenes" / f"{scene}_target_anechoic_CH1.wav")
+        write(folder / f"{scene}_reference.wav", signal[:, 0])
         for ending in ("_mix_CH1.wav", "_target_CH1.wav"):
             (folder / f"{scene}{ending}").symlink_to(clarity / "scenes" / f"{scene}{ending}")
-    settings = options(clarity, scenes=folder, scenes_listeners=None, every=4)
-    apart, linked = (
-        evaluate_scenes({"aid": "wdrc"}, out=tmp_path / str(own), linked=own, **settings).table
-        for own in (False, True)
+    settings = options(clarity, scenes=folder, scenes_listeners=None, stride=4)
+    separate, linked = (
+        evaluate_scenes({"aid": "wdrc"}, out=tmp_path / str(flag), linked=flag, **settings).table
+        for flag in (False, True)
     )
-    assert set(apart.name) == {"L0001 S06001"}
-    assert (apart.haspi == linked.haspi).tolist() == [True, True, False]
-    written, _ = soundfile.read(str(tmp_path / "True" / "reference" / "S06001.wav"))
-    original, _ = soundfile.read(str(folder / "S06001_reference.wav"))
+    assert set(separate.name) == {"L0001 S06001"}
+    assert (separate.haspi == linked.haspi).tolist() == [True, True, False]
+    written, _ = soundfile.read(tmp_path / "True" / "reference" / "S06001.wav")
+    original, _ = soundfile.read(folder / "S06001_reference.wav")
     assert np.allclose(written, original[:, None])
 
 
-class Choosy:
-    """Refuses loud scenes."""
-
-    def __call__(self, waveform: Tensor, listener: Listener, sample_rate: int) -> Tensor:
-        if waveform.abs().max() > LOUDEST[0]:
-            raise ValueError("too loud for me")
-        return 2.0 * waveform
+def loud_scenes_fail(waveform: Tensor, listener: Listener, sample_rate: int) -> Tensor:
+    if waveform.abs().max() > HIGHEST_PEAK[0]:
+        raise ValueError("too loud")
+    return 2.0 * waveform
 
 
-LOUDEST = [math.inf]
+HIGHEST_PEAK = [np.inf]
 
 
-def test_a_pair_that_one_aid_refuses_counts_in_no_mean_and_stops_nothing(
-    clarity: Path, tmp_path: Path
-) -> None:
+@pytest.mark.usefixtures("quick_scores")
+def test_a_pair_for_which_one_aid_fails_counts_in_no_mean(clarity: Path, tmp_path: Path) -> None:
     mixes = [clarity / "scenes" / f"{name}_mix_CH1.wav" for name in PAIRS]
-    peaks = [np.abs(soundfile.read(str(mix))[0]).max() for mix in mixes]
-    LOUDEST[0] = sum(peaks) / 2
-    aids = {"choosy": f"{__name__}:Choosy", "soft": "wdrc"}
-    study = evaluate_scenes(aids, out=tmp_path / "out", **options(clarity, every=2))
-    (failure,) = study.failures.itertuples()  # of the better ear; both have the reason
-    assert failure.condition == "choosy" and "too loud for me" in failure.failure
+    peaks = [np.abs(soundfile.read(mix)[0]).max() for mix in mixes]
+    HIGHEST_PEAK[0] = sum(peaks) / 2
+    aids = {"choosy": f"{__name__}:loud_scenes_fail", "soft": "wdrc"}
+    study = evaluate_scenes(aids, out=tmp_path / "out", **options(clarity, stride=2))
+    (failure,) = study.failures.itertuples()
+    assert failure.condition == "choosy" and "too loud" in failure.failure
     table = conditions_table(study)
     caption = "Means of the 1 that all conditions have scores of, of 2 pairs of scene and listener"
     assert table.caption == caption
-    kept = study.table[study.table.item != failure.item]
-    assert [row[1] for row in table.rows] == [f"{score:.3f}" for score in kept.haspi]
+    scored = study.table[study.table.item != failure.item]
+    assert [row[1] for row in table.rows] == [f"{score:.3f}" for score in scored.haspi]
     assert (study.details["look_ahead_ms"]["choosy"] is None) == (peaks[0] > peaks[1])
-    nothing = study.table.assign(haspi=study.table.haspi.where(study.table.condition != "choosy"))
-    cells = [row[1] for row in conditions_table(replace(study, table=nothing)).rows]
+    without = study.table.assign(haspi=study.table.haspi.where(study.table.condition != "choosy"))
+    cells = [row[1] for row in conditions_table(replace(study, table=without)).rows]
     assert cells[2] == "n/a" and "n/a" not in (cells[0], cells[1], cells[3])
 
 
-def test_a_broken_scene_is_a_failure_with_its_file(clarity: Path, tmp_path: Path) -> None:
-    folder = tmp_path / "scenes"
-    shutil.copytree(clarity / "scenes", folder)
-    signal, rate = soundfile.read(str(folder / "S06002_target_CH1.wav"))
-    soundfile.write(str(folder / "S06002_target_CH1.wav"), signal[: len(signal) // 2], rate)
-    settings = options(clarity, scenes=folder, every=2)
+@pytest.mark.usefixtures("quick_scores")
+@pytest.mark.filterwarnings("ignore:.*both are cut")
+@pytest.mark.parametrize(
+    ("kind", "change", "message"),
+    [
+        ("target_anechoic", 100, ""),
+        ("target_anechoic", -100, ""),
+        ("target", -100, ""),
+        ("mix", -100, ""),
+        ("target", -8000, "S06002_target_CH1.wav 8000"),
+        ("target_anechoic", -8000, "S06002_target_anechoic_CH1.wav has 8000 samples"),
+        ("mix", -8000, "16000 samples"),
+    ],
+)
+def test_lengths_may_differ_by_a_tenth_of_a_second(
+    clarity: Path, tmp_path: Path, scenes: Path, kind: str, change: int, message: str
+) -> None:
+    path = scenes / f"S06002_{kind}_CH1.wav"
+    signal, _ = soundfile.read(path)
+    write(path, np.concatenate((signal, signal))[: len(signal) + change])
+    settings = options(clarity, scenes=scenes, stride=2)
     study = evaluate_scenes({"aid": "wdrc"}, out=tmp_path / "out", **settings)
-    assert set(study.failures.name) == {"L0001 S06002"}
-    assert "S06002_target_CH1.wav has" in scenes_page(study, listen=0).markdown()
+    if message:
+        assert set(study.failures.name) == {"L0001 S06002"}
+        assert message in scenes_page(study, listen=0).markdown()
+    else:
+        assert study.failures.empty
 
 
-def test_the_look_ahead_is_known_for_a_scene_that_begins_in_silence(tmp_path: Path) -> None:
-    sound = 0.02 * np.sin(np.arange(2.0 * RATE)).reshape(-1, 2)
-    soundfile.write(tmp_path / "mix.wav", np.concatenate([np.zeros((5 * RATE, 2)), sound]), RATE)
-    (tmp_path / "listeners.json").write_text(json.dumps(LISTENERS))
-    listener = read_listeners(tmp_path / "listeners.json")["L0001"]
-    conditions = _conditions({}, [], False, RATE, 94.0)
-    ahead = _look_ahead(conditions, tmp_path / "mix.wav", listener)
-    assert ahead["unaided"] == 0.0 and 1.0 < ahead["NAL-R"] <= 5.0
+def longer_by_220(waveform: Tensor, listener: Listener, sample_rate: int) -> Tensor:
+    return torch.cat((waveform, waveform[:, :220]), -1)
+
+
+def longer_by_one_second(waveform: Tensor, listener: Listener, sample_rate: int) -> Tensor:
+    return torch.cat((waveform, waveform), -1)
+
+
+def mono(waveform: Tensor, listener: Listener, sample_rate: int) -> Tensor:
+    return waveform[0]
+
+
+@pytest.mark.usefixtures("quick_scores")
+@pytest.mark.filterwarnings("ignore:.*both are cut", "ignore:scores with")
+@pytest.mark.parametrize(
+    ("aid", "message"),
+    [
+        (longer_by_220, ""),
+        (longer_by_one_second, "a difference of 1 s"),
+        (mono, "expected a real tensor of shape"),
+    ],
+)
+def test_an_aid_may_return_a_tenth_of_a_second_more(
+    clarity: Path, tmp_path: Path, aid: Callable[..., Tensor], message: str
+) -> None:
+    aids = {"mine": f"{__name__}:{aid.__name__}"}
+    study = evaluate_scenes(aids, out=tmp_path, **options(clarity, stride=4))
+    assert study.failures.empty == (not message)
+    assert study.failures.failure.str.contains(message).all()
+
+
+def test_the_look_ahead_is_known_for_a_scene_that_begins_in_silence(
+    clarity: Path, tmp_path: Path
+) -> None:
+    sound = 0.02 * np.sin(np.arange(2.0 * LOW_RATE)).reshape(-1, 2)
+    write(tmp_path / "mix.wav", np.concatenate([np.zeros((5 * LOW_RATE, 2)), sound]))
+    listener = read_listeners(clarity / "listeners.json")["L0001"]
+    conditions = _make_conditions({}, [], False, LOW_RATE, 94.0)
+    look_ahead = _measure_look_ahead(conditions, tmp_path / "mix.wav", listener)
+    assert look_ahead["unaided"] == 0.0 and 1.0 < look_ahead["NAL-R"] <= 7.0
+
+
+@pytest.mark.usefixtures("quick_scores")
+@pytest.mark.parametrize("is_csv", [False, True])
+def test_only_listeners_that_are_used_are_validated(
+    clarity: Path, tmp_path: Path, is_csv: bool
+) -> None:
+    listeners = tmp_path / f"listeners.{'csv' if is_csv else 'json'}"
+    if is_csv:
+        rows = ["listener,ear,hl_500,hl_4000", "L0001,left,20,NR", "L0002,left,20,40"]
+        listeners.write_text("\n".join([*rows, "L0002,right,20,40"]))
+    else:
+        broken = {"audiogram_cfs": CFS, "audiogram_levels_l": [10]}
+        listeners.write_text(json.dumps(LISTENERS | {"L0001": broken}))
+    settings = options(clarity, listeners=listeners)
+    for name, status in (("L0002", True), ("L0001", False)):
+        settings["scenes_listeners"] = tmp_path / "pairs.json"
+        settings["scenes_listeners"].write_text(json.dumps({"S06001": [name]}))
+        if status:
+            assert len(evaluate_scenes({}, out=tmp_path / "out", **settings).table) == 2
+        else:
+            with pytest.raises(ValueError, match=r"L0001|line 2"):
+                evaluate_scenes({}, out=tmp_path / "out", **settings)
+
+
+LEFT_EAR_ONLY = "listener,ear,hl_500,hl_4000\nL0001,left,20,40\n"
 
 
 @pytest.mark.parametrize(
@@ -316,34 +389,35 @@ def test_the_look_ahead_is_known_for_a_scene_that_begins_in_silence(tmp_path: Pa
         ({"scenes_listeners": {"S9": ["L0001"]}}, "scene 'S9'"),
         ({"scenes_listeners": []}, "cannot be read"),
         ({"scenes_listeners": {}}, "no scene has a listener"),
-        ({"every": 0}, "every is 0"),
+        ({"listeners": LEFT_EAR_ONLY}, "the right ear of listener L0001 is missing"),
+        ({"listeners": {"../x": LISTENERS["L0001"]}}, "a name that no file can have"),
+        ({"stride": 0}, "stride is 0"),
         ({"aids": {"NAL-R": "wdrc"}}, "another label"),
         ({"aids": {"a b": "wdrc", "a-b": "wdrc"}}, "different names"),
         ({"aids": {"a": "no.such:thing"}}, "aid no.such:thing"),
         ({"full_scale_spl": float("nan")}, "full_scale_spl"),
     ],
 )
-def test_what_cannot_be_judged_is_rejected_before_anything_is_written(
+def test_invalid_settings_are_rejected_before_anything_is_written(
     clarity: Path, tmp_path: Path, change: dict[str, Any], message: str
 ) -> None:
-    settings = options(clarity, aids={"aid": "wdrc"}) | change
-    if isinstance(pairs := settings["scenes_listeners"], dict | list):
-        (tmp_path / "own.json").write_text(json.dumps(pairs))
-        settings["scenes_listeners"] = tmp_path / "own.json"
+    settings = {**options(clarity), "aids": {"aid": "wdrc"}, **change}
+    if "listeners" in change:
+        settings["scenes_listeners"] = None
+    for name in ("listeners", "scenes_listeners"):
+        if isinstance(settings[name], dict | list):
+            (tmp_path / f"{name}.json").write_text(json.dumps(settings[name]))
+            settings[name] = tmp_path / f"{name}.json"
+        elif settings[name] == LEFT_EAR_ONLY:
+            (tmp_path / "ears.csv").write_text(LEFT_EAR_ONLY)
+            settings[name] = tmp_path / "ears.csv"
     settings["scenes"] = clarity / settings["scenes"]
     with pytest.raises(ValueError, match=message):
         evaluate_scenes(settings.pop("aids"), out=tmp_path / "out", **settings)
     assert not (tmp_path / "out").exists()
 
 
-def test_listeners_without_an_ear_or_with_odd_names_are_rejected(
-    clarity: Path, tmp_path: Path
-) -> None:
-    scenes, people = read_scenes(clarity / "scenes"), read_listeners(clarity / "listeners.json")
-    with pytest.raises(ValueError, match="the right ear of listener one is missing"):
-        read_pairs(None, scenes, {"one": Listener(people["L0001"].left, None)})
-    with pytest.raises(ValueError, match="a name that no file can have"):
-        read_pairs(None, scenes, {"../x": people["L0001"]})
+def test_a_scene_without_a_reference_is_rejected(tmp_path: Path) -> None:
     (tmp_path / "S1_mix_CH1.wav").write_bytes(b"")
     with pytest.raises(ValueError, match=r"no reference; put S1_target_anechoic_CH1\.wav or"):
         read_scenes(tmp_path)

@@ -1,135 +1,155 @@
-"""What a compensator makes of steady tones, and how it would be worn: filters pass, and what is at fault is caught."""
+"""Gains, steady tones, quiet noise and look-ahead of aids with known properties."""
 
 import math
+from collections.abc import Callable
+from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor, nn
 
-from compensators import NALR
+from compensators import NALR, MappingCompensator
+from compensators.config import MappingConfig
 from hlsim import MSBG, Audiogram
 from hlsim.calibration import level_spl
-from hlsim.evaluation.aids import Unaided
-from hlsim.evaluation.measurements import TONES, steady_tones, tones, wearing
+from hlsim.evaluation.aids import EqualiserLike, Unaided, equalise_bands
+from hlsim.evaluation.measurements import (
+    TONES,
+    gain_curves,
+    insertion_gain,
+    steady_tones,
+    tones,
+    wearing,
+)
 from hlsim.evaluation.measures import NORMAL
+from hlsim.losses.band_levels import band_edges
 
 N3 = Audiogram.standard("N3")
+COUNT = len(TONES)
 
 
-class Modulating(nn.Module):
-    """The waveform times 1 + depth cos(2 pi 80 t)."""
-
-    def __init__(self, depth: float) -> None:
-        super().__init__()
-        self.depth = depth
-
-    def forward(self, waveform: Tensor, audiogram: Audiogram) -> Tensor:
-        turns = 80 * torch.arange(waveform.shape[-1]) % 16000 / 16000
-        return waveform * (1.0 + self.depth * (2.0 * torch.pi * turns).cos())
+def modulate(waveform: Tensor, ear: Audiogram, depth: float) -> Tensor:
+    """Multiply the waveform by 1 + depth cos(2 pi 80 t)."""
+    turns = 80 * torch.arange(waveform.shape[-1]) % 16000 / 16000
+    return waveform * (1.0 + depth * (2.0 * torch.pi * turns).cos())
 
 
-class Muting(nn.Module):
-    """40 dB less of a sound whose level stays the same from one 32 ms to the next."""
-
-    def forward(self, waveform: Tensor, audiogram: Audiogram) -> Tensor:
-        levels = level_spl(waveform[: len(waveform) // 512 * 512].unflatten(-1, (-1, 512)))
-        return 0.01 * waveform if float(levels.std()) < 1.0 else waveform
+def mute_steady_sounds(waveform: Tensor, ear: Audiogram) -> Tensor:
+    """Reduce a sound by 40 dB if its level is the same in all frames of 32 ms."""
+    levels = level_spl(waveform[: len(waveform) // 512 * 512].unflatten(-1, (-1, 512)))
+    return 0.01 * waveform if float(levels.std()) < 1.0 else waveform
 
 
-class Unable(nn.Module):
-    def forward(self, waveform: Tensor, audiogram: Audiogram) -> Tensor:
-        return waveform * math.nan
+def anticipate(waveform: Tensor, ear: Audiogram) -> Tensor:
+    """Advance the sound by 80 samples; amplify soft sounds by 20 dB and others by 6 dB."""
+    gain = 2.0 if float(level_spl(waveform)) > 50.0 else 10.0
+    return gain * waveform.roll(-80)
 
 
-def test_tones() -> None:
-    # the levels of each tone, in the order of the tones
+def silence(waveform: Tensor, ear: Audiogram) -> Tensor:
+    return 0.0 * waveform
+
+
+def test_tones_have_their_levels_and_frequencies() -> None:
     sound = tones((250, 1000), (50.0, 65.0, 80.0))
     torch.testing.assert_close(level_spl(sound), torch.tensor([50.0, 65.0, 80.0, 50.0, 65.0, 80.0]))
     assert (torch.fft.rfft(sound).abs().argmax(-1) / 2).tolist() == [250.0] * 3 + [1000.0] * 3
 
 
-def test_unaided_is_what_the_exact_model_gives() -> None:
-    (found,) = steady_tones({"unaided": Unaided()}, {"N3": N3}, (50.0, 65.0))
-    assert (found["aid"], found["ear"], found["levels"]) == ("unaided", "N3", [50.0, 65.0])
+def test_the_loudness_error_without_an_aid_is_that_of_the_exact_model() -> None:
+    result = steady_tones(Unaided(), N3, (50.0, 65.0))
     time = torch.arange(32000, dtype=torch.float64) / 16000
     for row, level in enumerate((50.0, 65.0)):
         tone = 2**0.5 * 10.0 ** ((level - 94.0) / 20.0) * (2.0 * torch.pi * 1000.0 * time).sin()
-        heard, normal = (
-            level_spl(MSBG(ear, sample_rate=16000)(tone)[8000:24000]) for ear in (N3, NORMAL)
-        )
-        off = found["loudness_error_db"][row][TONES.index(1000)]
-        assert off == pytest.approx(float(heard - normal), abs=0.01) and off < -20.0
-
-
-def test_a_filter_adds_nothing() -> None:
-    (found,) = steady_tones({"NAL-R": NALR()}, {"N3": N3}, (50.0, 80.0))
-    assert max(map(max, found["sidebands_db"])) < -60.0
+        impaired, normal = (level_spl(MSBG(ear)(tone)[8000:24000]) for ear in (N3, NORMAL))
+        error = result["loudness_error_db"][row][TONES.index(1000)]
+        assert error == pytest.approx(float(impaired - normal), abs=0.01) and error < -20.0
 
 
 @pytest.mark.parametrize("depth", [0.1, 1.0])
-def test_modulation_is_caught(depth: float) -> None:
-    (found,) = steady_tones({"own": Modulating(depth)}, {"NH": NORMAL}, (65.0,))
-    # two sidebands of depth / 2
-    (sidebands,) = found["sidebands_db"]
-    assert sidebands == pytest.approx([10.0 * math.log10(depth**2 / 2.0)] * len(TONES), abs=0.01)
-    # a linear ear hears them too
-    assert found["loudness_error_db"][0][2] == pytest.approx(
-        10.0 * math.log10(1.0 + depth**2 / 2.0), abs=0.1
-    )
+def test_modulation_adds_two_sidebands_of_half_its_depth(depth: float) -> None:
+    result = steady_tones(lambda waveform, ear: modulate(waveform, ear, depth), NORMAL, (65.0,))
+    expected = 10.0 * math.log10(depth**2 / 2.0)
+    assert result["sidebands_db"][0] == pytest.approx([expected] * COUNT, abs=0.01)
+    loudness = 10.0 * math.log10(1.0 + depth**2 / 2.0)  # A normal ear is linear.
+    assert result["loudness_error_db"][0][2] == pytest.approx(loudness, abs=0.1)
 
 
-def test_muting_of_steady_sounds_is_caught() -> None:
-    # with no loss all is linear: 0 dB off unaided, and what was taken away
-    unaided, muted = steady_tones(
-        {"unaided": Unaided(), "own": Muting()}, {"NH": NORMAL}, (50.0, 80.0)
-    )
+@pytest.mark.parametrize(
+    ("aid", "error"), [(Unaided(), 0.0), (mute_steady_sounds, -40.0), (silence, None)]
+)
+def test_muting_of_steady_sounds_is_measured(aid: Callable[..., Tensor], error: Any) -> None:
+    result = steady_tones(aid, NORMAL, (50.0, 80.0))
     for level in range(2):
-        assert unaided["loudness_error_db"][level] == pytest.approx([0.0] * len(TONES), abs=1e-3)
-        assert muted["loudness_error_db"][level] == pytest.approx([-40.0] * len(TONES), abs=1e-3)
+        errors = result["loudness_error_db"][level]
+        if error is None:
+            assert max(errors) < -40.0 and result["sidebands_db"][level] == [-200.0] * COUNT
+        else:
+            assert errors == pytest.approx([error] * COUNT, abs=1e-3)
 
 
-class LookingAhead(nn.Module):
-    """The sound of so many samples later, twice as loud; soft sounds ten times as loud."""
-
-    def __init__(self, samples: int) -> None:
-        super().__init__()
-        self.samples = samples
-
-    def forward(self, waveform: Tensor, audiogram: Audiogram) -> Tensor:
-        gain = 2.0 if float(level_spl(waveform)) > 50.0 else 10.0
-        return gain * torch.cat((waveform[self.samples :], waveform[: self.samples]))
-
-
-def test_what_wearing_it_would_be_like() -> None:
-    speech = torch.randn(48000, generator=torch.Generator().manual_seed(1))
-    aids = {"own": LookingAhead(80), "none": Unaided(), "NAL-R": NALR()}
-    own, none, prescribed = wearing(aids, {"N3": N3}, speech)
-    assert own["look_ahead_ms"] == pytest.approx(5.0) and none["look_ahead_ms"] == 0.0
-    assert own["quiet_gain_db"] == pytest.approx([20.0, 20.0], abs=0.1)
-    assert none["quiet_gain_db"] == [0.0, 0.0]
-    # its filter has 110 samples before the middle, the first of them small
-    assert 3.0 < prescribed["look_ahead_ms"] <= 1000.0 * 110 / 16000
-    assert all(found["cpu_ms"] > 0.0 for found in (own, prescribed))
-    with pytest.raises(
-        ValueError, match="own, ear N3, changed speech: the output has samples that are NaN"
-    ):
-        wearing({"own": Unable()}, {"N3": N3}, speech)
+@pytest.mark.parametrize(
+    ("aid", "lowest", "highest", "gain"),
+    [
+        (anticipate, 5.0, 5.0, 20.0),
+        (Unaided(), 0.0, 0.0, 0.0),
+        # Its filter has 110 samples before the middle, the first of which are small.
+        (NALR(), 3.0, 1000.0 * 110 / 16000, None),
+        (silence, 0.0, 0.0, None),
+    ],
+)
+def test_look_ahead_gain_for_quiet_noise_and_cost(
+    aid: Callable[..., Tensor], lowest: float, highest: float, gain: float | None
+) -> None:
+    result = wearing(aid, N3, torch.randn(48000, generator=torch.Generator().manual_seed(1)))
+    assert lowest <= result["look_ahead_ms"] <= highest and result["cpu_ms"] > 0.0
+    if gain is not None:
+        assert result["quiet_gain_db"] == pytest.approx([gain, gain], abs=0.1)
 
 
-def test_silence_has_figures() -> None:
-    silent = {"own": lambda waveform, ear: 0.0 * waveform}
-    (found,) = steady_tones(silent, {"NH": NORMAL}, (65.0,))  # type: ignore[arg-type]
-    assert (
-        found["sidebands_db"] == [[-200.0] * len(TONES)]
-        and found["loudness_error_db"][0][2] < -140.0
-    )
-    noise = torch.randn(48000, generator=torch.Generator().manual_seed(0))
-    (worn,) = wearing(silent, {"NH": NORMAL}, noise)  # type: ignore[arg-type]
-    assert worn["look_ahead_ms"] == 0.0 and max(worn["quiet_gain_db"]) < -100.0
+def test_an_equaliser_has_the_mean_gain_of_its_aid() -> None:
+    edges = band_edges()
+    gains = np.interp(np.linspace(0.0, 1.0, len(edges) - 1), [0.0, 0.4, 1.0], [0.0, 10.0, 40.0])
+
+    class Filter(nn.Module):
+        def forward(self, waveform: Tensor, audiogram: Audiogram) -> Tensor:
+            return equalise_bands(waveform, gains.tolist())
+
+    noise = torch.randn(1, 48000)
+    measured = insertion_gain(Filter(), N3, noise, (65.0,))
+    # A band is as loud as its loudest part where the gain rises steeply.
+    np.testing.assert_allclose(measured[0], gains, atol=1.0)
+    equaliser = EqualiserLike(Filter(), noise, (50.0, 80.0))
+    assert equaliser.gains_db(N3) == pytest.approx(measured[0], abs=0.06)
+    limited = MappingCompensator(MappingConfig(limit_spl=80.0)).eval()
+    soft, loud = insertion_gain(limited, N3, noise, (50.0, 80.0))
+    assert np.mean(loud) < np.mean(soft) - 6.0
 
 
-def test_samples_that_are_not_numbers() -> None:
-    with pytest.raises(
-        ValueError, match="own, ear N3, steady tones: the output has samples that are NaN"
-    ):
-        steady_tones({"own": Unable()}, {"N3": N3}, (65.0,))
+def raise_error(waveform: Tensor, ear: Audiogram) -> Tensor:
+    raise RuntimeError("no\nbattery")
+
+
+@pytest.mark.parametrize(
+    ("aid", "message"),
+    [
+        (lambda waveform, ear: waveform * math.nan, "samples that are NaN"),
+        (lambda waveform, ear: waveform[None], "expected an output of shape"),
+        (lambda waveform, ear: None, "got NoneType"),
+        (lambda waveform, ear: torch.cat((waveform, waveform)), "a difference of 1 s"),
+        (raise_error, "RuntimeError: no battery"),
+    ],
+)
+def test_an_aid_that_fails_is_named(aid: Callable[..., Tensor], message: str) -> None:
+    with pytest.raises(ValueError, match=f"^mine, ear N3: .*{message}"):
+        gain_curves({"mine": aid}, {"N3": N3}, torch.randn(1, 16000), (65.0,))
+
+
+def test_an_aid_may_return_a_tenth_of_a_second_more() -> None:
+    def longer(waveform: Tensor, ear: Audiogram) -> Tensor:
+        return torch.cat((10.0 * waveform, waveform[:1600]))
+
+    with pytest.warns(UserWarning, match="both are cut"):
+        gains = insertion_gain(longer, N3, torch.randn(1, 16000), (65.0,))
+    assert gains[0] == pytest.approx([20.0] * 24, abs=1e-4)

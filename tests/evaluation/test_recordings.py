@@ -25,109 +25,111 @@ LEVELS = ",".join(N4.to_row().values())
 
 @pytest.fixture
 def corpus(tmp_path: Path, speech_dir: Path) -> Path:
-    """Folders clean, before and after with two files of 0.8 s, one in a subfolder, at two rates."""
+    """Write two files of 0.8 s, one in a subfolder, at two rates, to clean, before and after."""
     for name, source in (("a.b", "train/flite-slt-01"), ("p2/c", "valid/espeak-us-annie-01")):
         waveform, rate = read_audio(speech_dir / f"{source}.flac")
         clean = waveform[:, rate : rate + 8 * rate // 10]
         noisy = clean + 0.002 * torch.randn(clean.shape)
-        signals = {
-            "clean": (".flac", clean),
-            "before": (".wav", noisy),
-            "after": (".wav", 8 * noisy),
-        }
-        for folder, (suffix, signal) in signals.items():
-            path = tmp_path / folder / f"{name}{suffix}"
+        for folder, signal in (("clean", clean), ("before", noisy), ("after", 8 * noisy)):
+            path = tmp_path / folder / f"{name}{'.flac' if folder == 'clean' else '.wav'}"
             path.parent.mkdir(parents=True, exist_ok=True)
             write_audio(path, signal, rate)
     return tmp_path
 
 
-def folders(corpus: Path) -> dict[str, Path]:
-    return {name: corpus / name for name in ("clean", "before", "after")}
+def folders(corpus: Path) -> dict[str, Any]:
+    return {name: corpus / name for name in ("clean", "before", "after")} | {"jobs": 1}
 
 
 def first_channel(path: Path) -> Tensor:
     return read_audio(path)[0][0].double()
 
 
-def test_a_score_is_that_of_the_metric(corpus: Path) -> None:
-    report = haspi_report(
-        **folders(corpus), audiogram=N4, seed=4, full_scale_spl=90.0, jobs=1, measures=("haspi",)
-    )
+def test_a_score_is_that_of_the_metric_and_is_read_again(corpus: Path) -> None:
+    store = corpus / "scores.jsonl"
+    settings = {**folders(corpus), "seed": 4, "full_scale_spl": 90.0, "store": store}
+    report = haspi_report(**settings, audiogram=N4)
     assert list(report.table.name) == ["a.b", "a.b", "p2/c", "p2/c"]
     for row in report.table.itertuples():
         clean = corpus / "clean" / f"{row.name}.flac"
         seed = (4 + int(content_hash(clean)[:8], 16)) % 2**32
         output = first_channel(corpus / row.condition / f"{row.name}.wav")
-        settings: dict[str, Any] = {"sample_rate": row.sample_rate, "full_scale_spl": 90.0}
-        settings |= {"noise": "seeded", "seed": seed, "whole_khz": True}
-        score = haspi(output, first_channel(clean), N4, **settings)
+        options: dict[str, Any] = {"sample_rate": row.sample_rate, "full_scale_spl": 90.0}
+        options |= {"noise": "seeded", "seed": seed, "whole_khz": True}
+        score = haspi(output, first_channel(clean), N4, **options)
         assert (row.haspi, row.seed) == (float(score), seed)
         level = 90.0 + 10.0 * math.log10(float(output.square().mean()))
         assert row.level == pytest.approx(level, abs=1e-9)
     comparison = report.headline
     assert comparison is not None and comparison.overall.delta > 0.2
     assert comparison.level_change == pytest.approx(20.0 * math.log10(8.0), abs=1e-4)
-
-
-def test_one_condition_alone_is_scored_without_a_comparison(corpus: Path) -> None:
-    report = haspi_report(corpus / "clean", after=corpus / "after", audiogram=N4, spl=65.0, jobs=1)
-    assert report.names == ["after"] and report.comparisons == [] and report.headline is None
-    assert report.table.clean_level.tolist() == pytest.approx([65.0, 65.0])
-    assert report.table.haspi.notna().all()
-
-
-def test_a_run_with_the_same_store_reads_its_scores(corpus: Path) -> None:
-    store = corpus / "scores.jsonl"
-    first = haspi_report(**folders(corpus), audiogram=N4, jobs=1, store=store)
     lines = store.read_bytes()
-    again = haspi_report(**folders(corpus), audiogram=N4, jobs=1, store=store)
-    assert again.table.equals(first.table) and store.read_bytes() == lines
-    haspi_report(**folders(corpus), audiogram=Audiogram.standard("N2"), jobs=1, store=store)
+    assert haspi_report(**settings, audiogram=N4).table.equals(report.table)
+    assert store.read_bytes() == lines
+    haspi_report(**settings, audiogram=Audiogram.standard("N2"))
     assert store.read_bytes().count(b"\n") == 2 * lines.count(b"\n")
 
 
-def stereo(corpus: Path) -> None:
-    write_audio(corpus / "after/p2/c.wav", torch.ones(2, 17640) * 0.1, 22050)
+def test_a_single_condition_is_scored_without_a_comparison(corpus: Path) -> None:
+    """Folders, a single pair of files, and a manifest with one condition."""
+    settings: dict[str, Any] = {"audiogram": N4, "spl": 65.0, "jobs": 1, "measures": ["stoi"]}
+    single = corpus / "single"
+    for folder in ("clean", "after"):
+        (single / folder).mkdir(parents=True)
+        (path,) = (corpus / folder).glob("a.b.*")
+        path.rename(single / folder / path.name)
+    manifest = write_manifest(single, "condition,clean,processed\nmine,A,after/a.b.wav\n")
+    for report, items in (
+        (haspi_report(corpus / "clean", after=corpus / "after", **settings), 1),
+        (haspi_report(single / "clean", after=single / "after", **settings), 1),
+        (haspi_report(manifest=manifest, **settings), 1),
+    ):
+        assert report.comparisons == [] and report.headline is None and len(report.names) == 1
+        assert report.table.clean_level.tolist() == pytest.approx([65.0] * items)
+        assert report.table.stoi.notna().all()
 
 
-def shorter(corpus: Path) -> None:
-    signal = first_channel(corpus / "after/p2/c.wav").float()
-    write_audio(corpus / "after/p2/c.wav", signal[None, 3000:], 22050)  # by 0.14 s
+def two_channels(signal: Tensor) -> tuple[Tensor, int]:
+    return signal.expand(2, -1), 22050
 
 
-def faster(corpus: Path) -> None:
-    signal = first_channel(corpus / "after/p2/c.wav").float()
-    write_audio(corpus / "after/p2/c.wav", signal[None], 24000)
+def much_shorter(signal: Tensor) -> tuple[Tensor, int]:
+    return signal[3000:], 22050  # by 0.14 s
 
 
-def broken(corpus: Path) -> None:
-    (corpus / "after/p2/c.wav").write_bytes(b"RIFF and nothing more")
+def another_rate(signal: Tensor) -> tuple[Tensor, int]:
+    return signal, 24000
 
 
-def silent(corpus: Path) -> None:
-    write_audio(corpus / "after/p2/c.wav", torch.zeros(1, 17640), 22050)
-
-
-@pytest.mark.parametrize("damage", [stereo, shorter, faster, broken, silent])
-def test_a_file_that_cannot_be_scored_is_a_failure_with_its_name(
-    corpus: Path, damage: Callable[[Path], None]
+@pytest.mark.parametrize("damage", [two_channels, much_shorter, another_rate, None, torch.zeros])
+def test_a_file_that_cannot_be_scored_is_a_failure(
+    corpus: Path, damage: Callable[[Tensor], tuple[Tensor, int]] | None
 ) -> None:
-    damage(corpus)
-    report = haspi_report(**folders(corpus), audiogram=N4, jobs=1, measures=("stoi",))
+    path = corpus / "after/p2/c.wav"
+    if damage is None:
+        path.write_bytes(b"RIFF and nothing more")
+    elif damage is torch.zeros:
+        write_audio(path, torch.zeros(1, 17640), 22050)
+    else:
+        write_audio(path, *damage(first_channel(path).float()))
+    report = haspi_report(**folders(corpus), audiogram=N4, measures=("stoi",))
     (failure,) = report.failures.itertuples()
     assert (failure.name, failure.condition) == ("p2/c", "after")
     assert "after" in failure.failure and "\n" not in failure.failure
     assert report.table.stoi.notna().sum() == 3
 
 
-def test_lengths_that_differ_by_little_are_cut_to_the_shorter(corpus: Path) -> None:
+@pytest.mark.parametrize("samples", [-200, -2205, 256])
+def test_lengths_that_differ_by_little_are_cut_to_the_shorter(corpus: Path, samples: int) -> None:
     path = corpus / "after/p2/c.wav"
-    write_audio(path, first_channel(path).float()[None, :-200], 22050)
+    signal = first_channel(path).float()
+    longer = torch.cat((signal, signal[:256]))
+    write_audio(path, longer[: len(signal) + samples], 22050)
     with pytest.warns(UserWarning, match="both are cut"):
-        report = haspi_report(**folders(corpus), audiogram=N4, jobs=1, measures=("haspi", "stoi"))
-    assert report.failures.empty
-    assert report.table.seconds.tolist() == pytest.approx([0.8, 0.8, 0.8, 0.8 - 200 / 22050])
+        report = haspi_report(**folders(corpus), audiogram=N4, measures=("haspi", "stoi"))
+    assert report.failures.haspi.isna().all() and report.table.stoi.notna().all()
+    last = 0.8 + min(0, samples) / 22050
+    assert report.table.seconds.tolist() == pytest.approx([0.8, 0.8, 0.8, last])
 
 
 def write_manifest(corpus: Path, text: str) -> Path:
@@ -149,15 +151,13 @@ def test_a_manifest_names_ears_levels_and_conditions(corpus: Path) -> None:
     path = write_manifest(corpus, MANIFEST)
     report = haspi_report(manifest=path, measures=("stoi",), baseline="aided", spl=65.0, jobs=1)
     assert report.names == ["aided", "unaided", "loud"]
-    assert [(c.before, c.after, c.overall.n) for c in report.comparisons] == [
-        ("aided", "unaided", 2)
-    ]
+    pairs = [(c.before, c.after, c.overall.n) for c in report.comparisons]
+    assert pairs == [("aided", "unaided", 2)]
     items = report.table.drop_duplicates("item")
     assert list(items.name) == ["L1 left clean/a.b 5 dB", "L2 right clean/p2/c 0 dB"]
     assert items.clean_level.tolist() == pytest.approx([65.0, 65.0])
-    assert items.audiogram.tolist() == [
-        list(Audiogram.standard(name).thresholds) for name in ("N3", "S2")
-    ]
+    ears = [list(Audiogram.standard(name).thresholds) for name in ("N3", "S2")]
+    assert items.audiogram.tolist() == ears
     reasons = dict(zip(report.failures.name, report.failures.failure, strict=True))
     assert "is recorded under loud" in reasons["L1 left clean/a.b 5 dB"]
     assert "gone.wav" in reasons["L2 right clean/p2/c 0 dB"]
@@ -165,86 +165,88 @@ def test_a_manifest_names_ears_levels_and_conditions(corpus: Path) -> None:
 
 def test_the_better_ear_counts(corpus: Path) -> None:
     rows = ["listener,ear,condition,clean,processed,audiogram"]
-    files = {"unaided": ("after", "before"), "aided": ("before", "after")}
-    for condition, (left, right) in files.items():
+    for condition, left, right in (("unaided", "after", "before"), ("aided", "before", "after")):
         rows.append(f"L1,left,{condition},A,{left}/a.b.wav,N5")
         rows.append(f"L1,right,{condition},A,{right}/a.b.wav,N5")
     path = write_manifest(corpus, "\n".join(rows))
     ears = haspi_report(manifest=path, jobs=1)
     better = haspi_report(manifest=path, jobs=1, better_ear=True)
-    assert len(better.table) == 2 and list(better.table.name) == ["L1 clean/a.b"] * 2
+    assert list(better.table.name) == ["L1 clean/a.b"] * 2
     for row in better.table.itertuples():
-        of_condition = ears.table[ears.table.condition == row.condition]
-        best = of_condition.loc[of_condition.haspi.idxmax()]
+        both = ears.table[ears.table.condition == row.condition]
+        best = both.loc[both.haspi.idxmax()]
         assert (row.haspi, row.level) == (best.haspi, best.level)
-    assert set(better.table.ear) == {"right"}, "the better ear under the last condition"
+    assert set(better.table.ear) == {"right"}, "the better ear in the last condition"
     assert better.groups["ears"].table.equals(ears.table)
 
 
 @pytest.mark.parametrize(
-    ("changes", "message"),
+    ("old", "new", "message"),
     [
-        ({"5,N3\n": "5,N9\n"}, "line 2: .*N9"),
-        ({"A,before": "../A,before"}, "line 2: .*not a path below"),
-        ({"L1,left,aided": "L1,left,unaided"}, "line 3: a second row of L1 left"),
-        ({"N3\nL2": "N4\nL2"}, "line 3: the audiogram differs"),
-        ({",5,N3": ",x,N3"}, "line 2: the SNR is 'x'"),
-        ({"L1,left": "L1,top"}, "line 2: the ear is 'top'"),
-        ({"condition,": "given,"}, "needs rows with the columns condition"),
-        ({",snr,": ",spl,"}, "the level as an option"),
-        ({",audiogram\n": ",ear_of\n"}, "line 2: no audiogram of listener 'L1'"),
+        ("5,N3\n", "5,N9\n", "line 2: .*N9"),
+        ("A,before", "../A,before", "line 2: .*not a path below"),
+        ("L1,left,aided", "L1,left,unaided", "line 3: a second row of L1 left"),
+        ("L1,left,aided", "L1,left,", "line 3: the condition has no name"),
+        ("N3\nL2", "N4\nL2", "line 3: the audiogram differs"),
+        (",5,N3", ",x,N3", "line 2: .*'x'"),
+        ("L1,left", "L1,top", "line 2: the ear is 'top'"),
+        ("condition,", "treatment,", "expected rows with the columns clean, condition"),
+        (",snr,", ",spl,", "the level as an option"),
+        (",audiogram\n", ",ear_of\n", "line 2: no audiogram of listener 'L1'"),
     ],
 )
-def test_a_wrong_row_is_named_by_its_line(
-    corpus: Path, changes: dict[str, str], message: str
+def test_the_line_of_an_invalid_row_is_named(
+    corpus: Path, old: str, new: str, message: str
 ) -> None:
-    text = MANIFEST
-    for old, new in changes.items():
-        text = text.replace(old, new)
     with pytest.raises(ValueError, match=message):
-        read_manifest(write_manifest(corpus, text))
+        read_manifest(write_manifest(corpus, MANIFEST.replace(old, new)))
 
 
-def test_audiograms_may_stand_in_a_file_of_their_own(corpus: Path) -> None:
+def test_audiograms_may_be_in_a_file_of_their_own(corpus: Path) -> None:
     ears = corpus / "ears.csv"
-    unused = LEVELS.replace("80", "NR")  # only the ears of the files are validated
+    unused = LEVELS.replace("80", "NR")  # Only ears that are used are validated.
+    settings = {**folders(corpus), "audiograms": ears, "measures": ("stoi",)}
     ears.write_text(f"{HEADER}\na.b.wav,{LEVELS}\np2/c,{LEVELS}\nother,{unused}\n")
-    by_file = haspi_report(**folders(corpus), audiograms=ears, measures=("stoi",), jobs=1)
-    assert by_file.table.audiogram.tolist() == [list(N4.thresholds)] * 4
+    assert haspi_report(**settings).table.audiogram.tolist() == [list(N4.thresholds)] * 4
     ears.write_text(f"{HEADER}\na.b.wav,{LEVELS}\n")
     with pytest.raises(ValueError, match=r"ears\.csv: no audiogram for p2/c"):
-        haspi_report(**folders(corpus), audiograms=ears)
+        haspi_report(**settings)
+    ears.write_text(f"{HEADER}\na.b.wav,{LEVELS}\np2/c,{unused}\n")
+    with pytest.raises(ValueError, match=r"ears\.csv, line 3: .*NR"):
+        haspi_report(**settings)
+    manifest = write_manifest(corpus, MANIFEST.replace(",audiogram\n", ",remark\n"))
+    names = HEADER.replace("file", "listener,ear")
+    ears.write_text(f"{names}\nL1,left,{LEVELS}\nL2,,{LEVELS}\nL3,left,{unused}\n")
+    assert {r.audiogram for r in read_manifest(manifest, audiograms=ears)} == {N4}
 
 
 @pytest.mark.parametrize(
-    "settings",
+    ("settings", "message"),
     [
-        {},
-        {"audiogram": N4, "seed": -1},
-        {"audiogram": N4, "full_scale_spl": 300.0},
-        {"audiogram": N4, "measures": ("loudness",)},
-        {"audiogram": N4, "measures": ()},
-        {"audiogram": N4, "baseline": "unaided"},
-        {"audiogram": N4, "better_ear": True},
-        {"audiogram": N4, "after": None},
-        {"audiogram": N4, "manifest": "study.csv"},
+        ({}, "give either audiogram"),
+        ({"audiogram": N4, "seed": -1}, "seed"),
+        ({"audiogram": N4, "full_scale_spl": 300.0}, "full_scale_spl"),
+        ({"audiogram": N4, "measures": ("loudness",)}, "no measure 'loudness'"),
+        ({"audiogram": N4, "measures": ()}, "no measure is named"),
+        ({"audiogram": N4, "baseline": "unaided"}, "no condition 'unaided'"),
+        ({"audiogram": N4, "better_ear": True}, "one left and one right ear"),
+        ({"audiogram": N4, "after": None}, "give either the folders"),
+        ({"audiogram": N4, "manifest": "study.csv"}, "give either the folders"),
     ],
 )
-def test_settings_that_cannot_be_are_rejected_before_scoring(
-    corpus: Path, settings: dict[str, Any]
+def test_invalid_settings_are_rejected_before_scoring(
+    corpus: Path, settings: dict[str, Any], message: str
 ) -> None:
-    with pytest.raises(ValueError):
-        haspi_report(**{**folders(corpus), **settings}, jobs=1)
+    with pytest.raises(ValueError, match=message):
+        haspi_report(**{**folders(corpus), **settings})
 
 
-def test_folders_need_the_same_names(corpus: Path) -> None:
-    (corpus / "after" / "a.b.wav").unlink()
-    with pytest.raises(ValueError, match=r"after: no file for a\.b \(1 of 2\)"):
+def test_folders_that_do_not_match_or_have_no_audio(corpus: Path) -> None:
+    (corpus / "after" / "a.b.wav").rename(corpus / "after" / "d.wav")
+    with pytest.raises(ValueError, match=r"after: no file for a\.b|clean: no file for d"):
         haspi_report(**folders(corpus), audiogram=N4)
-
-
-def test_nothing_scored_is_an_error(corpus: Path) -> None:
+    (corpus / "after" / "d.wav").rename(corpus / "after" / "a.b.wav")
     for path in (corpus / "clean").rglob("*.flac"):
         path.write_bytes(b"no audio")
     with pytest.raises(ValueError, match="none of 2 items could be scored"):
-        haspi_report(**folders(corpus), audiogram=N4, jobs=1)
+        haspi_report(**folders(corpus), audiogram=N4)

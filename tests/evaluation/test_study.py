@@ -1,12 +1,14 @@
-"""A study's table: its rows, its failures, what is computed again, and what a kill costs."""
+"""A study's table: its rows, its failures, stored values, and a run that is killed."""
 
 import os
 import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -14,15 +16,16 @@ from torch import Tensor
 
 from hlsim import Audiogram
 from hlsim.evaluation import Condition, Item, Measure, ScoreStore, run_study
-from hlsim.evaluation.measures import load_measure
+from hlsim.evaluation.measures import find_measures, load_measure
 
 pytest.importorskip("pandas")
 
 N3 = Audiogram.standard("N3")
+CALLS: list[str] = []
 
 
 class Gain:
-    """A condition that multiplies; its fingerprint is its factor."""
+    """Condition that multiplies. Its fingerprint is its factor."""
 
     def __init__(self, factor: float) -> None:
         self.fingerprint = self.factor = factor
@@ -33,9 +36,14 @@ class Gain:
         return self.factor * signal
 
 
+def count_call(name: str, value: Tensor) -> Tensor:
+    CALLS.append(name)
+    return value
+
+
 def peak(item: Item, output: Tensor) -> dict[str, float]:
-    reference = item.once("reference", lambda: counted("reference", item.clean.abs().max()))
-    return {"peak": float(counted("peak", output.abs().max())), "clean_peak": float(reference)}
+    reference = item.once("reference", lambda: count_call("reference", item.clean.abs().max()))
+    return {"peak": float(count_call("peak", output.abs().max())), "clean_peak": float(reference)}
 
 
 def sign(item: Item, output: Tensor) -> dict[str, float]:
@@ -44,20 +52,12 @@ def sign(item: Item, output: Tensor) -> dict[str, float]:
     return {"sign": 1.0}
 
 
-calls: list[str] = []
-
-
-def counted(what: str, value: Tensor) -> Tensor:
-    calls.append(what)
-    return value
-
-
 MEASURES = [Measure("peak", peak), Measure("sign", sign)]
 
 
 @pytest.fixture
 def items() -> list[Item]:
-    calls.clear()
+    CALLS.clear()
     signals = [torch.full((8,), level) for level in (0.1, -0.2, 0.3)]
     return [
         Item(f"item {i}", signal, 2 * signal, N3, facts={"listener": f"L{i % 2}"})
@@ -65,55 +65,78 @@ def items() -> list[Item]:
     ]
 
 
-def conditions(*factors: float) -> list[Condition]:
+def gains(*factors: float) -> list[Condition]:
     return [Condition(f"times {factor:g}", Gain(factor)) for factor in factors]
 
 
-def test_one_row_per_item_and_condition(items: list[Item]) -> None:
-    seen: list[tuple[int, int]] = []
-    table = run_study(items, conditions(1, 2), MEASURES, jobs=1, progress=lambda *n: seen.append(n))
+def test_there_is_one_row_per_item_and_condition(items: list[Item]) -> None:
+    progress: list[tuple[int, int]] = []
+    table = run_study(items, gains(1, 2), MEASURES, jobs=1, progress=lambda *n: progress.append(n))
     columns = ["item", "name", "listener", "condition", "peak", "clean_peak", "sign", "failure"]
     assert list(table.columns) == columns
     assert list(table.condition) == ["times 1", "times 2"] * 3
     assert table.peak.tolist() == pytest.approx([0.2, 0.4, 0.4, 0.8, 0.6, 1.2])
-    reasons = ["", "", "negative", "negative", "", ""]
-    assert table.failure.fillna("").tolist() == reasons
-    assert calls.count("reference") == 3, "a reference is computed once per item"
-    assert seen == [(0, 12), (4, 12), (8, 12), (12, 12)]
+    assert table.failure.fillna("").tolist() == ["", "", "negative", "negative", "", ""]
+    assert CALLS.count("reference") == 3, "a reference is computed once per item"
+    assert (progress[0], progress[-1]) == ((0, 12), (12, 12))
 
 
-def test_an_error_is_the_reason_of_its_output_alone(items: list[Item]) -> None:
-    table = run_study(items, conditions(0, 1), MEASURES, jobs=1)
-    assert table.failure[table.condition == "times 0"].eq("RuntimeError: no battery").all()
-    assert table.peak[table.condition == "times 1"].notna().all()
+def longer(samples: int) -> Callable[[Tensor, Audiogram], Tensor]:
+    return lambda signal, ear: torch.cat((signal, signal.new_ones(samples)))
 
 
-def test_only_what_is_missing_is_computed(items: list[Item], tmp_path: Path) -> None:
+@pytest.mark.filterwarnings("ignore:scores with")
+@pytest.mark.parametrize(
+    ("process", "failure"),
+    [
+        (Gain(0), "RuntimeError: no battery"),
+        (lambda signal, ear: signal / 0.0, "NaN or infinite"),
+        (longer(1601), "a difference of 0.1 s"),
+        (None, "no output of item 0 is recorded under c"),
+    ],
+)
+def test_an_error_ends_only_its_output(items: list[Item], process: Any, failure: str) -> None:
+    table = run_study(items[:1], [Condition("c", process), *gains(1)], MEASURES, jobs=1)
+    assert failure in table.failure[0] and table.peak[1] == pytest.approx(0.2)
+
+
+@pytest.mark.filterwarnings("ignore:scores with")
+@pytest.mark.parametrize("samples", [1, 1600])
+def test_a_longer_output_is_cut_with_a_warning(items: list[Item], samples: int) -> None:
+    with pytest.warns(UserWarning, match="both are cut to the shorter length"):
+        table = run_study(items, [Condition("c", longer(samples))], MEASURES[:1], jobs=1)
+    assert table.peak.tolist() == pytest.approx([0.2, 0.4, 0.6])
+
+
+def test_a_column_that_exists_is_rejected(items: list[Item]) -> None:
+    measure = Measure("copy", lambda item, output: {"listener": 1.0}, settings="1")
+    with pytest.raises(ValueError, match="listener, a column that exists already"):
+        run_study(items, gains(1), [measure], jobs=1)
+
+
+def test_only_missing_values_are_computed(items: list[Item], tmp_path: Path) -> None:
     path = tmp_path / "scores.jsonl"
-
-    def computed(*arguments: object) -> int:
-        calls.clear()
-        run_study(*arguments, store=ScoreStore(path), jobs=1)
-        return calls.count("peak")
-
-    first = run_study(items, conditions(1), MEASURES, store=ScoreStore(path), jobs=1)
-    assert computed(items, conditions(1), MEASURES[:1]) == 0
-    again = run_study(items, conditions(1), MEASURES, store=ScoreStore(path), jobs=1)
-    assert again.equals(first)
-    assert computed(items, conditions(1, 3), MEASURES[:1]) == 3, "one condition is new"
-    renamed = [Condition("another name", Gain(1))]
-    assert computed(items, renamed, MEASURES[:1]) == 0, "names do not count"
-    changed = [
+    first = run_study(items, gains(1), MEASURES, store=ScoreStore(path), jobs=1)
+    assert run_study(items, gains(1), MEASURES, store=ScoreStore(path), jobs=1).equals(first)
+    changed_items = [
         replace(items[0], signal=items[0].signal + 1),
         replace(items[0], clean=items[0].clean + 1),
         replace(items[0], ear=Audiogram.standard("N4")),
         replace(items[0], seed=1),
     ]
-    assert computed(changed, conditions(1), MEASURES[:1]) == 4
-    assert computed(items, conditions(1), [replace(MEASURES[0], revision=2)]) == 3
+    for computed, arguments in (
+        (0, (items, gains(1), MEASURES[:1])),
+        (3, (items, gains(1, 3), MEASURES[:1])),
+        (0, (items, [Condition("another name", Gain(1))], MEASURES[:1])),
+        (4, (changed_items, gains(1), MEASURES[:1])),
+        (3, (items, gains(1), [replace(MEASURES[0], revision=2)])),
+    ):
+        CALLS.clear()
+        run_study(*arguments, store=ScoreStore(path), jobs=1)
+        assert CALLS.count("peak") == computed
 
 
-def test_without_a_fingerprint_nothing_is_stored(items: list[Item]) -> None:
+def test_values_without_a_fingerprint_are_not_stored(items: list[Item]) -> None:
     store = ScoreStore()
     unknown = [Condition("mine", lambda signal, ear: signal)]
     with pytest.warns(UserWarning, match="scores with mine are not stored"):
@@ -121,28 +144,33 @@ def test_without_a_fingerprint_nothing_is_stored(items: list[Item]) -> None:
     assert len(store) == 0
 
 
-def test_processes_change_nothing(items: list[Item]) -> None:
-    pytest.importorskip("joblib")
-    one, two = (run_study(items, conditions(1, 2), MEASURES, jobs=jobs) for jobs in (1, 2))
-    assert two.equals(one)
+CREST = """
+def crest(item, output):
+    return {'crest': output.abs().max() / output.square().mean().sqrt()}
+crest.fingerprint = '1'
+def wrong(item, output):
+    return 1.0
+"""
 
 
-def test_anyones_function_is_a_measure(
-    items: list[Item], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("jobs", [1, pytest.param(2, marks=pytest.mark.slow)])
+def test_a_function_of_a_user_is_a_measure(
+    items: list[Item], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, jobs: int
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    Path("crest.py").write_text(
-        "def crest(item, output):\n"
-        "    return {'crest': output.abs().max() / output.square().mean().sqrt()}\n"
-        "crest.fingerprint = '1'\n"
-        "def wrong(item, output):\n"
-        "    return 1.0\n"
-    )
-    measures = [load_measure("crest:crest"), load_measure("crest:wrong")]
+    Path("crest.py").write_text(CREST)
+    measures = [*MEASURES, load_measure("crest:crest"), load_measure("crest:wrong")]
     with pytest.warns(UserWarning, match="crest:wrong are not stored"):
-        table = run_study(items, conditions(1), measures, jobs=2)
+        table = run_study(items, gains(1), measures, jobs=jobs)
     assert table.crest.tolist() == pytest.approx([1.0] * 3)
+    assert table.peak.tolist() == pytest.approx([0.2, 0.4, 0.6])
     assert table.failure.str.contains("expected a dict of numbers").all()
+
+
+@pytest.mark.parametrize("names", [[], ["loudness"], ["no_such:measure"]])
+def test_unknown_measures_are_rejected(names: list[str]) -> None:
+    with pytest.raises(ValueError, match="measure"):
+        find_measures(names)
 
 
 SCRIPT = """
@@ -167,7 +195,7 @@ print(table["sum"].tolist())
 
 
 @pytest.mark.slow
-def test_a_killed_run_continues_where_it_was(tmp_path: Path) -> None:
+def test_a_killed_run_continues(tmp_path: Path) -> None:
     path = tmp_path / "scores.jsonl"
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
     command = [sys.executable, "-c", SCRIPT, str(path)]

@@ -1,4 +1,4 @@
-"""The commands ``simulate`` and ``compensate``, for a file or a folder of files."""
+"""The commands ``simulate`` and ``compensate``, which process a file or a folder of files."""
 
 from __future__ import annotations
 
@@ -6,13 +6,12 @@ import argparse
 import math
 import os
 import sys
-import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Mapping, Sized
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from hlsim.cli.inputs import read_compensator, read_ears
+from hlsim.cli.inputs import read_compensator, read_ears, warn_of_other_ear
 from hlsim.cli.options import Parser
 from hlsim.files import check_extension, resolve_links
 
@@ -36,11 +35,11 @@ def simulate(parser: Parser) -> None:
     _declare_files(
         parser,
         _simulate,
-        "speech.wav perceived.wav --audiogram N3",
-        "scenes perceived --listener listeners.json:L0001 --simulator msbg",
+        "speech.wav perceived.wav --audiogram N3 --spl 65",
+        "scenes perceived --listener listeners.json:L0001 --simulator neuro-msbg",
     )
     text = "msbg (exact), or a checkpoint's name or folder"
-    parser.option("--simulator", str, text, "neuro-msbg")
+    parser.option("--simulator", str, text, "msbg")
 
 
 def compensate(parser: Parser) -> None:
@@ -57,8 +56,7 @@ def compensate(parser: Parser) -> None:
     )
     parser.option("--compensator", str, text, "hearing-aid")
     parser.sliders()
-    text = "link the gains of both ears (stereo files; hearing aids and wdrc only)"
-    parser.flag("--linked", text)
+    parser.linked("stereo files; ")
 
 
 def _declare_files(
@@ -69,19 +67,18 @@ def _declare_files(
     text = "audio file of 16 kHz or more (wav, flac, ogg, mp3, ...), or a folder of such files"
     parser.option("input", Path, text, metavar="IN")
     text = (
-        "output file (.wav with 32-bit float, .flac, or .ogg with up to 2 channels), or a "
-        "folder for wav files "
-        "if IN is a folder"
+        "output file (.wav with 32-bit float; from simulate also .flac, or .ogg with up to 2 "
+        "channels), or a folder for wav files if IN is a folder"
     )
     parser.option("output", Path, text, metavar="OUT")
     ears = parser.add_mutually_exclusive_group(required=True)
     parser.audiogram(group=ears)
     parser.listener("both ears, for stereo files, left first", group=ears)
-    parser.full_scale()
+    parser.levels("the input; the output keeps the scale of the file")
 
 
 def _simulate(options: argparse.Namespace) -> None:
-    def build(rate: int, is_first: bool) -> Model:
+    def build(rate: int) -> Model:
         from hlsim.losses.frozen_simulator import build_simulator
 
         return build_simulator(options.simulator, rate, options.full_scale_spl)
@@ -92,22 +89,28 @@ def _simulate(options: argparse.Namespace) -> None:
 
 
 def _compensate(options: argparse.Namespace) -> None:
-    def build(rate: int, is_first: bool) -> Model:
-        compensator, sliders = read_compensator(options, rate, warn=is_first)
+    if options.output.suffix.lower() in (".flac", ".ogg"):
+        raise ValueError(
+            f"{options.output}: expected the extension .wav, because an aid amplifies beyond the "
+            "full scale of other formats"
+        )
+
+    def build(rate: int) -> Model:
+        compensator, sliders = read_compensator(options, rate)
         return partial(compensator, **sliders)
 
     _process(options, build, "use --compensator hearing-aid, wdrc or nal-r to keep it")
 
 
 def _process(
-    options: argparse.Namespace, build: Callable[[int, bool], Model], upper_band_hint: str
+    options: argparse.Namespace, build: Callable[[int], Model], upper_band_hint: str
 ) -> None:
     """Process the file, or each file of the folder, and print levels and warnings.
 
     Args:
         options: Options of the command.
-        build: Function from the sample rate, and whether it is the first call, to a model.
-        upper_band_hint: Advice for a file whose band above 8 kHz was removed. If it is empty, there
+        build: Function from a sample rate in Hz to a model.
+        upper_band_hint: Advice for files whose band above 8 kHz was removed. If it is empty, there
             is no such warning.
     """
     # Threads of OpenMP spin while they wait. On a busy machine that triples the time of the many
@@ -124,25 +127,32 @@ def _process(
     models: dict[int, Model] = {}
     if is_folder:
         # A model that cannot be loaded is reported before the first file.
-        models[LOWEST_RATE] = build(LOWEST_RATE, True)
-    failures = 0
+        models[LOWEST_RATE] = build(LOWEST_RATE)
+    if getattr(options, "compensator", None):
+        warn_of_other_ear(options)
+    peaks: dict[Path, float] = {}
+    dull: list[Path] = []
     for number, (source, target) in enumerate(pairs, 1):
         try:
-            waveform, result, rate = _process_file(options, source, target, ears, models, build)
+            waveform, result, rate, gain = _process_file(
+                options, source, target, ears, models, build
+            )
         except ValueError as error:
             if not is_folder:
                 raise
-            failures += 1
             print(f"hlsim: warning: not processed: {error}", file=sys.stderr)
             continue
         prefix = f"{number} of {len(pairs)}: " if is_folder else ""
-        levels = _describe_levels(waveform, result, options.full_scale_spl)
+        levels = _describe_levels(waveform * gain, result * gain, options.full_scale_spl)
         print(f"{prefix}{target}: {levels}", flush=True)
-        for line in _output_warnings(waveform, result, rate, upper_band_hint):
-            print(f"hlsim: warning: {target}: {line}", file=sys.stderr)
-    if failures:
+        peaks[target] = float(result.abs().max())
+        if upper_band_hint and _lacks_upper_band(waveform, result, rate):
+            dull.append(target)
+    _print_warnings(peaks, dull, upper_band_hint)
+    if len(peaks) < len(pairs):
         raise ValueError(
-            f"{failures} of {len(pairs)} files were not processed, see the warnings above"
+            f"{len(pairs) - len(peaks)} of {len(pairs)} files were not processed, see the warnings "
+            "above"
         )
 
 
@@ -152,21 +162,22 @@ def _process_file(
     target: Path,
     ears: object,
     models: dict[int, Model],
-    build: Callable[[int, bool], Model],
-) -> tuple[Tensor, Tensor, int]:
-    """Write the output for one file, and return the input, the output and their sample rate in
-    Hz."""
+    build: Callable[[int], Model],
+) -> tuple[Tensor, Tensor, int, float]:
+    """Write the output for one file.
+
+    Returns:
+        The input and the output at the scale of the file, their sample rate in Hz, and the gain
+        from that scale to the level at which the input was processed.
+    """
     import torch
 
     from hlsim.audio import check_writable, read_audio, write_audio
+    from hlsim.calibration import level_spl
     from hlsim.checks import HIGHEST_RATE
     from hlsim.dsp.resample import resample
 
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        waveform, rate = read_audio(source, any_rate=True)
-    for warning in caught:
-        print(f"hlsim: warning: {warning.message}", file=sys.stderr)
+    waveform, rate = read_audio(source, any_rate=True)
     channels, samples = waveform.shape
     check_writable(target, channels, rate)
     needs_stereo = "--listener" if options.listener else ""
@@ -176,14 +187,18 @@ def _process_file(
         raise ValueError(
             f"{source}: {needs_stereo} requires 2 channels, left and right, got {channels}"
         )
+    gain = 1.0
+    if options.spl is not None:
+        level = float(level_spl(waveform.flatten(), options.full_scale_spl))
+        gain = 10.0 ** ((options.spl - level) / 20.0)
     inner_rate = min(rate, HIGHEST_RATE)
     if inner_rate not in models:
-        models[inner_rate] = build(inner_rate, not models)
+        models[inner_rate] = build(inner_rate)
     with torch.no_grad():
-        result = models[inner_rate](resample(waveform, rate, inner_rate), ears)
-        result = resample(result, inner_rate, rate)[..., :samples]
+        result = models[inner_rate](resample(waveform * gain, rate, inner_rate), ears)
+        result = resample(result, inner_rate, rate)[..., :samples] / gain
     write_audio(target, result, rate)
-    return waveform, result, rate
+    return waveform, result, rate, gain
 
 
 def _check_paths(source: Path, target: Path) -> None:
@@ -233,35 +248,47 @@ def _describe_levels(before: Tensor, after: Tensor, full_scale_spl: float) -> st
     """Describe the levels of input and output, and the peak of the output."""
     from hlsim.calibration import level_spl
 
-    input_level = float(level_spl(before.flatten(), full_scale_spl))
-    output_level = float(level_spl(after.flatten(), full_scale_spl))
-    peak = float(level_spl(after.abs().max().reshape(1), full_scale_spl))
-    return (
-        f"input {input_level:.1f} dB SPL, output {output_level:.1f} dB SPL, peak {peak:.1f} dB SPL"
-    )
+    signals = {
+        "input": before.flatten(),
+        "output": after.flatten(),
+        "peak": after.abs().max()[None],
+    }
+    levels = {name: float(level_spl(signal, full_scale_spl)) for name, signal in signals.items()}
+    return ", ".join(f"{name} {level:.1f} dB SPL" for name, level in levels.items())
 
 
-def _output_warnings(
-    before: Tensor, after: Tensor, rate: int, upper_band_hint: str
-) -> Iterator[str]:
-    """Yield warnings about clipping and about a band that was removed."""
+def _lacks_upper_band(before: Tensor, after: Tensor, rate: int) -> bool:
+    """Return whether the input has an audible upper band that the output lacks."""
     import torch
 
-    peak = float(after.abs().max())
-    if peak > 1.0:
-        decibels = 20.0 * math.log10(peak)
-        yield (
-            f"the peak is {peak:.3g} times full scale, and most players will clip it; lower the "
-            "level by "
-            f"{math.ceil(decibels)} dB before playing"
-        )
     first = round(UPPER_BAND_HZ / rate * before.shape[-1])
     shares = []
     for signal in (before, after):
         power = torch.fft.rfft(signal.double()).abs().square().sum(0)
         shares.append(float(power[first:].sum() / power.sum()))
-    if upper_band_hint and shares[0] > AUDIBLE_SHARE and shares[1] < REMOVED_SHARE * shares[0]:
-        yield (
-            "the band above 8 kHz was removed, because the model is limited to it; "
-            f"{upper_band_hint}"
+    return shares[0] > AUDIBLE_SHARE and shares[1] < REMOVED_SHARE * shares[0]
+
+
+def _print_warnings(peaks: Mapping[Path, float], dull: list[Path], upper_band_hint: str) -> None:
+    """Print one warning about clipping, and one about a band that was removed, for all files."""
+    warnings = []
+    loud = {path: peak for path, peak in peaks.items() if peak > 1.0}
+    if loud:
+        path = max(loud, key=lambda path: loud[path])
+        decibels = math.ceil(20.0 * math.log10(loud[path]))
+        warnings.append(
+            f"{_count(loud, path)}: the peak is {loud[path]:.3g} times full scale, and most "
+            f"players will clip it; lower the level by {decibels} dB before playing"
         )
+    if dull:
+        warnings.append(
+            f"{_count(dull, dull[0])}: the band above 8 kHz was removed, because the model is "
+            f"limited to it; {upper_band_hint}"
+        )
+    for text in warnings:
+        print(f"hlsim: warning: {text}", file=sys.stderr)
+
+
+def _count(files: Sized, path: Path) -> str:
+    """Name one of several files, and the number of the others."""
+    return f"{path} (and {len(files) - 1} more)" if len(files) > 1 else str(path)
