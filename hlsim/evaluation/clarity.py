@@ -1,8 +1,9 @@
 """Scenes of the Clarity enhancement challenges: aids of both ears, scored by the better ear.
 
 As in the challenges' scripts (claritychallenge/clarity, recipes/icassp_2023 and cec3), the
-reference is the target without its room, at the level of the target in the room. An RMS of 1.0 in a file is
-100 dB SPL. The score of a listener is that of the ear with the higher score, by each measure.
+reference is the target without its room, at the level of the target in the room. An RMS of 1.0 in a
+file is 100 dB SPL. The score of a listener is that of the ear with the higher score, by each
+measure.
 """
 
 from __future__ import annotations

@@ -14,6 +14,7 @@ from compensators import NALR, MappingCompensator, MappingConfig, load_compensat
 from hlsim import MSBG, Audiogram, Listener
 from hlsim.audio import read_audio, write_audio
 from hlsim.audiogram import FREQUENCIES
+from hlsim.calibration import set_level
 from hlsim.cli.main import main
 from hlsim.pretrained import save_checkpoint
 
@@ -231,6 +232,51 @@ def test_folders_keep_their_tree_and_unused_files_are_reported(
     assert written == {"one.wav", "a/two.wav"} and printed.out.count("dB SPL, output") == 2
     (tmp_path / "in" / "one.mp3").touch()
     assert run(*call, "nalr") == 2 and "would both be written" in capsys.readouterr().err
+
+
+def test_a_presentation_level_is_that_of_the_input(
+    tmp_path: Path, utterance: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    waveform, rate = read_audio(utterance)
+    calibrated = set_level(waveform, 50.0)
+    aid = load_compensator("wdrc", sample_rate=rate)
+    gain = float(calibrated.abs().max() / waveform.abs().max())
+    options = ("--audiogram", "N3", "--spl", "50")
+    for command, model in (("simulate", MSBG(N3, sample_rate=rate)), ("compensate", aid)):
+        option = ("--compensator", "wdrc") if command == "compensate" else ()
+        assert run(command, utterance, tmp_path / "out.wav", *options, *option) == 0
+        assert "input 50.0 dB SPL" in capsys.readouterr().out
+        inputs = (calibrated,) if command == "simulate" else (calibrated, N3)
+        expected = model(*inputs) / gain  # at the scale of the file
+        output = read_audio(tmp_path / "out.wav")[0]
+        torch.testing.assert_close(output, expected, atol=1e-5, rtol=1e-4)
+    both = ("--full-scale-spl", "94")
+    error_of(capsys, "simulate", utterance, tmp_path / "out.wav", *options, *both)
+
+
+def test_a_folder_causes_one_warning_about_clipping(
+    tmp_path: Path, utterance: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "in").mkdir()
+    for number in range(3):
+        (tmp_path / "in" / f"{number}.flac").write_bytes(utterance.read_bytes())
+    call = ("compensate", tmp_path / "in", tmp_path / "out", "--audiogram", "N4")
+    assert run(*call, "--compensator", "Nal-R") == 0
+    (warning,) = capsys.readouterr().err.splitlines()
+    assert "0.wav (and 2 more): the peak is" in warning and "lower the level by" in warning
+
+
+@pytest.mark.parametrize("name", ["out.flac", "out.OGG", "out.mp3"])
+def test_compensate_rejects_other_formats_than_wav_at_once(
+    tmp_path: Path,
+    utterance: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    name: str,
+) -> None:
+    monkeypatch.setattr("hlsim.audio.read_audio", None)
+    call = ("compensate", utterance, tmp_path / name, "--audiogram", "N4")
+    assert "expected the extension .wav" in error_of(capsys, *call)
 
 
 @pytest.mark.parametrize(
