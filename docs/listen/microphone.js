@@ -10,7 +10,7 @@ const PASCAL_SPL = 94;
 const PASCALS = 10 ** ((MICROPHONE_SPL - PASCAL_SPL) / 20);
 const AID_DELAY = 64; // samples
 const BLOCK = 128; // samples that an AudioWorklet processes at a time
-export const QUEUED_BLOCKS = 4; // time that the aid has for each block
+export const QUEUED_BLOCKS = 5; // time that the aid has for each block
 
 // Milliseconds from a sample at the input of the worklet to the same sample at its output.
 export const LIVE_DELAY = (1000 * (QUEUED_BLOCKS * BLOCK + AID_DELAY)) / SAMPLE_RATE;

@@ -1,7 +1,7 @@
 // The page: an ear, a sound, and three ways to hear it.
 
 import { AudiogramChart, FREQUENCIES, HIGHEST, LOWEST, STANDARD, parseThresholds } from "./audiogram.js";
-import { compensate, request, simulate } from "./engine.js";
+import { compensate, simulate } from "./engine.js";
 import { LIVE_DELAY, Live, record } from "./microphone.js";
 import { Player } from "./player.js";
 import { LONGEST_SECONDS, decode, levelOf, present } from "./sound.js";
@@ -331,5 +331,4 @@ $("share").addEventListener("click", async () => {
 });
 
 say("Loading the ear and the hearing aid …");
-request("load").catch(fail);
 chooseSpeech();

@@ -6,10 +6,11 @@ const STEP = 48; // windows start on multiples of it
 const CONTEXT = 1984; // samples on either side that the network needs
 const HOP = Math.floor((WINDOW - 2 * CONTEXT) / STEP) * STEP;
 
-// Length of a signal with silence after it, so that its last window ends where the signal ends.
+// Length of a signal and the silence after it: the context that its end needs, and as much more as lets the last window
+// end there.
 export function paddedLength(length) {
-  if (length <= WINDOW) return WINDOW;
-  return WINDOW + Math.ceil((length - WINDOW) / STEP) * STEP;
+  const shortest = Math.max(WINDOW, length + CONTEXT);
+  return WINDOW + Math.ceil((shortest - WINDOW) / STEP) * STEP;
 }
 
 // Windows that cover a padded signal. Of the output of each, samples from `from` to `to` of the signal are used.

@@ -71,11 +71,6 @@ let liveStream = null;
 let livePort = null;
 
 const requests = {
-  // Resolves when everything is loaded.
-  async load() {
-    await aid;
-  },
-
   async simulate({ samples, thresholds }) {
     const { session, shapes } = await simulator;
     const inputs = { waveform: tensor(samples, shapes.waveform), thresholds: thresholdsTensor(thresholds) };

@@ -1,0 +1,368 @@
+"""The listening page in a real Chromium: values, clicks, the keyboard, the microphone, two widths, and no other host.
+
+Run with ``pytest -m browser``. Needs npm, playwright and a Chromium: its own (``playwright install chromium``), or one
+of the system, found by name or in the environment variable ``CHROMIUM``. This command prints the figures of the guide:
+
+    pytest -n 0 -s -m browser tests/test_listening_page.py -k figures
+"""
+
+import http.server
+import os
+import shutil
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import soundfile
+import torch
+from torch import Tensor
+
+import hlsim
+from hlsim.calibration import set_level
+
+pytestmark = pytest.mark.browser
+
+ROOT = Path(__file__).parents[1]
+FLAGS = (
+    "--no-sandbox --disable-gpu --disable-background-networking --disable-component-update --disable-sync "
+    "--use-fake-device-for-media-stream --use-fake-ui-for-media-stream"
+)
+COMPUTED = "!document.querySelector('[aria-busy=true]') || document.body.dataset.failed"
+PAGE = "const { state } = await import('./page.js');"
+
+
+@pytest.fixture(scope="module")
+def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """Address of the page with its models, from a server of static files."""
+    if shutil.which("npm") is None:
+        pytest.skip("needs npm")
+    pytest.importorskip("onnxscript")
+    folder = tmp_path_factory.mktemp("listen")
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, str(ROOT / "docs" / "listening_page.py"), str(folder)]
+    subprocess.run(command, check=True, env=environment, stderr=subprocess.DEVNULL)
+
+    class Handler(http.server.SimpleHTTPRequestHandler):
+        extensions_map = http.server.SimpleHTTPRequestHandler.extensions_map | {
+            ".mjs": "text/javascript",
+            ".wasm": "application/wasm",
+        }
+
+        def __init__(self, *arguments: Any) -> None:
+            super().__init__(*arguments, directory=str(folder))
+
+        def log_message(self, *arguments: Any) -> None:
+            pass
+
+    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    yield f"http://127.0.0.1:{server.server_port}/"
+    server.shutdown()
+
+
+@pytest.fixture(scope="module")
+def chromium() -> Iterator[Any]:
+    sync_api = pytest.importorskip("playwright.sync_api")
+    names = ("chromium", "chromium-browser", "google-chrome")
+    path = os.environ.get("CHROMIUM") or next(filter(None, map(shutil.which, names)), None)
+    with sync_api.sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=path, args=FLAGS.split())
+        yield browser
+        browser.close()
+
+
+@pytest.fixture
+def page(request: pytest.FixtureRequest, chromium: Any, address: str) -> Iterator[Any]:
+    """A new page, 1400 px wide by default, which must print nothing and ask no other host."""
+    width = getattr(request, "param", 1400)
+    page = chromium.new_page(viewport={"width": width, "height": 900})
+    messages: list[str] = []
+    requests: list[str] = []
+    page.on("console", lambda message: messages.append(message.text))
+    page.on("pageerror", lambda error: messages.append(str(error)))
+    page.on("request", lambda one: requests.append(one.url))
+    page.set_default_timeout(60_000)
+    yield page
+    page.close()
+    assert messages == []
+    assert [url for url in requests if not url.startswith((address, "data:", "blob:"))] == []
+
+
+@pytest.fixture
+def opened(page: Any, address: str) -> Any:
+    """The page with its first sound computed."""
+    page.goto(address)
+    wait(page)
+    return page
+
+
+WIDTHS = pytest.mark.parametrize("page", [390, 1400], indirect=True)
+
+
+def wait(page: Any) -> None:
+    """Wait until all versions are computed."""
+    page.wait_for_function(COMPUTED)
+    assert page.evaluate("document.body.dataset.failed") is None
+
+
+def set_file(page: Any, path: Path) -> None:
+    page.set_input_files("#file", path)
+    page.wait_for_function(
+        "name => document.getElementById('source-name').textContent == name", arg=path.name
+    )
+    wait(page)
+
+
+def result(page: Any, name: str) -> Tensor:
+    samples = page.evaluate(f"async () => {{ {PAGE} return [...state.results['{name}']]; }}")
+    return torch.tensor(samples)
+
+
+def error_db(output: Tensor, expected: Tensor) -> float:
+    return float(20.0 * torch.log10((output - expected).norm() / expected.norm()))
+
+
+def expected_results(signal: Tensor, ear: str) -> dict[str, Tensor]:
+    """Compute the three versions of the page in Python. In the page, silence follows a sound."""
+    simulator = hlsim.load_pretrained("neuro-msbg-light")
+    silence = torch.zeros(16000)
+    clean = torch.cat((set_level(signal, 65.0), silence))
+    with torch.no_grad():
+        versions = {
+            "normal": simulator(clean, "NH"),
+            "ear": simulator(clean, ear),
+            "aided": simulator(
+                torch.cat((hlsim.compensate(clean, ear)[: len(signal)], silence)), ear
+            ),
+        }
+    return {name: perceived[: len(signal)] for name, perceived in versions.items()}
+
+
+def speech_file(folder: Path, samples: int) -> tuple[Path, Tensor]:
+    signal = hlsim.example_speech()[:samples]
+    path = folder / "speech.wav"
+    soundfile.write(path, signal.numpy(), 16000, subtype="FLOAT")
+    return path, signal
+
+
+@pytest.mark.parametrize(("ear", "samples"), [("N2", 48_000), ("S3", 61_234), ("N6", 9_000)])
+def test_outputs_equal_those_of_python(
+    page: Any, address: str, tmp_path: Path, ear: str, samples: int
+) -> None:
+    path, signal = speech_file(tmp_path, samples)
+    thresholds = hlsim.Audiogram.standard(ear).thresholds
+    page.goto(f"{address}#ear={','.join(f'{level:g}' for level in thresholds)}")
+    set_file(page, path)
+    for name, expected in expected_results(signal, ear).items():
+        assert error_db(result(page, name), expected) < -60.0, name
+
+
+@WIDTHS
+def test_nothing_is_wider_than_the_screen(opened: Any) -> None:
+    assert opened.evaluate("document.documentElement.scrollWidth") <= opened.viewport_size["width"]
+    sizes = opened.evaluate(
+        "[...document.querySelectorAll('svg text')].map(t => t.getBoundingClientRect().height)"
+    )
+    assert min(sizes) >= 11
+    assert opened.locator("#dock").is_visible() == (opened.viewport_size["width"] < 960)
+
+
+@WIDTHS
+def test_a_dragged_point_moves_the_sounds_and_the_link(opened: Any) -> None:
+    assert opened.locator("[aria-pressed=true]").first.inner_text() == "N3"
+    before = result(opened, "ear")
+    box = opened.locator(".point .dot").nth(0).bounding_box()
+    opened.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+    opened.mouse.down()
+    opened.mouse.move(box["x"] + 5, box["y"] + 60, steps=4)
+    opened.mouse.up()
+    level = int(opened.locator(".point").nth(0).get_attribute("aria-valuenow"))
+    assert level > 45
+    assert opened.url.endswith(f"#ear={level},35,40,50,55,60,65,65")
+    assert opened.locator("#ear-name").inner_text() == "An ear of your own"
+    opened.wait_for_timeout(200)
+    wait(opened)
+    assert float(result(opened, "ear").norm()) < 0.9 * float(before.norm())
+
+
+def test_presets_numbers_and_the_link_set_the_ear(opened: Any) -> None:
+    opened.get_by_role("button", name="S1", exact=True).click()
+    assert opened.url.endswith("#ear=10,10,10,15,30,55,70,70")
+    opened.get_by_text("Type the numbers").click()
+    opened.get_by_label("Level at 1000 hertz in decibels").fill("400")
+    opened.keyboard.press("Tab")
+    assert opened.url.endswith("#ear=10,10,100,15,30,55,70,70")
+    opened.evaluate("location.hash = '#ear=20,20,25,35,40,45,50,50'")
+    opened.wait_for_function("document.getElementById('ear-name').textContent.startsWith('N2')")
+    opened.evaluate("location.hash = '#ear=20,20,nonsense'")
+    opened.wait_for_timeout(100)
+    assert (
+        opened.locator(".point").nth(3).get_attribute("aria-valuetext") == "35 decibels, mild loss"
+    )
+
+
+def test_the_keyboard_alone_sets_an_ear_and_plays(opened: Any) -> None:
+    def press_tab_until(label: str) -> None:
+        for _ in range(60):
+            opened.keyboard.press("Tab")
+            focused = "document.activeElement.getAttribute('aria-label') || document.activeElement.innerText"
+            if label in opened.evaluate(focused):
+                return
+        pytest.fail(f"the tabulator does not reach {label}")
+
+    opened.keyboard.press("Tab")
+    assert opened.evaluate("document.activeElement.className") == "skip"
+    press_tab_until("at 4000 hertz")
+    for key in ("ArrowDown", "ArrowDown", "ArrowLeft", "PageDown"):
+        opened.keyboard.press(key)
+    assert opened.url.endswith("#ear=35,35,40,50,55,85,65,65")
+    opened.wait_for_timeout(200)
+    wait(opened)
+    press_tab_until("Play: This ear")
+    opened.keyboard.press("Enter")
+    opened.wait_for_selector("#version-ear.playing")
+    press_tab_until("Play: This ear with a hearing aid")
+    opened.keyboard.press("Space")
+    opened.wait_for_selector("#version-aided.playing")
+    assert opened.locator(".playing").count() == 1
+    opened.keyboard.press("Space")
+    opened.wait_for_function("!document.querySelector('.playing')")
+
+
+def test_playback_starts_softly_and_is_limited(opened: Any) -> None:
+    """For a tone 20 dB above full scale, and for one that the limiter should leave as it is."""
+    assert float(opened.locator("#volume").input_value()) <= 50
+    peaks = opened.evaluate(
+        """async () => {
+            const { safeOutput } = await import('./player.js');
+            const peakOf = async (amplitude) => {
+                const context = new OfflineAudioContext(1, 16000, 16000);
+                const tone = new OscillatorNode(context, { frequency: 500 });
+                const gain = new GainNode(context, { gain: amplitude });
+                tone.connect(gain).connect(safeOutput(context, 1));
+                tone.start();
+                const samples = (await context.startRendering()).getChannelData(0);
+                return samples.reduce((peak, sample) => Math.max(peak, Math.abs(sample)), 0);
+            };
+            return [await peakOf(10), await peakOf(0.1)];
+        }"""
+    )
+    assert peaks[0] <= 0.5
+    assert abs(peaks[1] - 0.1) < 1e-3
+
+
+def test_a_file_that_is_no_sound_is_named(opened: Any, tmp_path: Path) -> None:
+    path = tmp_path / "notes.wav"
+    path.write_text("no sound")
+    opened.set_input_files("#file", path)
+    opened.wait_for_function(
+        "document.getElementById('status').textContent.includes('cannot read')"
+    )
+
+
+def test_a_recording_can_be_heard(opened: Any) -> None:
+    opened.get_by_role("button", name="Record 5 seconds").click()
+    opened.wait_for_function(
+        "document.getElementById('source-name').textContent == 'Your recording'"
+    )
+    wait(opened)
+    recording = result(opened, "normal")
+    assert recording.shape == (5 * 16000,)
+    assert float(recording.norm()) > 0.1
+
+
+def test_the_live_aid_starts_and_stops(opened: Any) -> None:
+    start = opened.locator("#live")
+    assert start.is_disabled()
+    opened.get_by_label("I wear headphones").check()
+    start.click()
+    opened.wait_for_function("document.getElementById('live-status').textContent.startsWith('On.')")
+    opened.get_by_role("button", name="N5").click()
+    start.click()
+    opened.wait_for_function("document.getElementById('live').textContent == 'Start'")
+
+
+LIVE = """async (thresholds) => {
+    const { connectAid, LIVE_DELAY } = await import('./microphone.js');
+    const context = new AudioContext({ sampleRate: 16000 });
+    const seconds = 6;
+    const noise = new AudioBuffer({ length: seconds * 16000, sampleRate: 16000 });
+    const samples = noise.getChannelData(0);
+    for (let i = 0; i < samples.length; i++) samples[i] = 0.02 * (Math.random() - 0.5);
+    const source = new AudioBufferSourceNode(context, { buffer: noise });
+    const aid = await connectAid(context, source, thresholds);
+    const statistics = [];
+    aid.port.onmessage = ({ data }) => statistics.push(data);
+    const both = new ChannelMergerNode(context, { numberOfInputs: 2 });
+    source.connect(both, 0, 0);
+    aid.connect(both, 0, 1);
+    const code = `registerProcessor('both', class extends AudioWorkletProcessor {
+        process([input]) { if (input.length == 2) this.port.postMessage(input); return true; }
+    })`;
+    const module = URL.createObjectURL(new Blob([code], { type: 'text/javascript' }));
+    await context.audioWorklet.addModule(module);
+    const recorder = new AudioWorkletNode(context, 'both');
+    const recording = [[], []];
+    recorder.port.onmessage = ({ data }) => data.forEach((part, i) => recording[i].push(...part));
+    both.connect(recorder).connect(context.destination);
+    source.start();
+    await new Promise((resolve) => (source.onended = resolve));
+    await context.close();
+    return { recording, delay: LIVE_DELAY, ...statistics.at(-1) };
+}"""
+
+
+def test_figures_of_the_guide(page: Any, address: str, tmp_path: Path) -> None:
+    """Print the figures of the guide, and fail where one misses its target."""
+    path, signal = speech_file(tmp_path, 48_000)
+    begin = time.perf_counter()
+    page.goto(address)
+    page.locator("#version-ear .play").click()
+    page.wait_for_selector("#version-ear.playing")
+    first_sound = time.perf_counter() - begin
+    page.locator("#version-ear .play").click()
+    wait(page)
+    set_file(page, path)
+    print(f"\nfirst sound of the impaired ear after opening the page: {first_sound:.1f} s")
+
+    expected = expected_results(signal, "N3")
+    for name, output in expected.items():
+        print(f"{name}, N3, 3 s: {error_db(result(page, name), output):.0f} dB relative to Python")
+
+    times = page.evaluate(
+        f"""async (thresholds) => {{
+            {PAGE}
+            const {{ simulate, compensate }} = await import('./engine.js');
+            const best = async (call) => {{
+                const times = [];
+                for (let run = 0; run < 7; run++) {{
+                    const begin = performance.now();
+                    await call(state.sound, thresholds);
+                    times.push((performance.now() - begin) / 3000);
+                }}
+                return times.sort((a, b) => a - b)[3];
+            }};
+            return {{ simulator: await best(simulate), aid: await best(compensate) }};
+        }}""",
+        list(hlsim.Audiogram.standard("N3").thresholds),
+    )
+    for name, share in times.items():
+        print(f"{name}, 3 s, median of 7 runs: {share:.3f} of real time")
+
+    live = page.evaluate(LIVE, list(hlsim.Audiogram.standard("N3").thresholds))
+    given, output = (torch.tensor(channel) for channel in live["recording"])
+    points = 2 * len(given)
+    product = torch.fft.rfft(output, points) * torch.fft.rfft(given, points).conj()
+    delay = float(torch.fft.irfft(product)[:4000].abs().argmax()) / 16.0
+    print(
+        f"live: {delay:.1f} ms from input to output of the audio graph; {live['late']} of "
+        f"{live['blocks']} blocks of 8 ms were late; {live['milliseconds']:.2f} ms for the last one"
+    )
+    assert first_sound < 5.0
+    assert max(times.values()) < 1.0 / 3.0
+    assert delay < 50.0 and abs(delay - live["delay"]) < 1.0
