@@ -11,6 +11,7 @@ It needs npm, and hlsim with the extra ``dev``.
 
 import hashlib
 import logging
+import re
 import shutil
 import subprocess
 import sys
@@ -23,6 +24,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from mkdocs.config.defaults import MkDocsConfig
     from mkdocs.structure.files import Files
+    from mkdocs.structure.pages import Page
 
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "listen"
@@ -70,6 +72,13 @@ def on_files(files: "Files", config: "MkDocsConfig") -> "Files":
     return files
 
 
+def on_page_markdown(markdown: str, page: "Page", config: "MkDocsConfig", files: "Files") -> str:
+    """Replace links to the page by their text if there is no page."""
+    if missing_requirement() is None:
+        return markdown
+    return re.sub(r"\[([^]]*)\]\([./]*listen/index\.html\)", r"\1", markdown)
+
+
 def missing_requirement() -> str | None:
     """Return the name of a program or package that is not installed, or None."""
     if shutil.which("npm") is None:
@@ -101,7 +110,8 @@ def build_assets() -> Path:
 
 def _fingerprint() -> str:
     configs = [ROOT / "checkpoints" / name / "config.json" for name in (SIMULATOR, AID)]
-    sources = (Path(__file__), ROOT / "hlsim" / "export.py", *configs)
+    code = [*ROOT.glob("compensators/*.py"), *ROOT.glob("hlsim/neuro/*.py")]
+    sources = [Path(__file__), ROOT / "hlsim" / "export.py", *configs, *sorted(code)]
     return hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()
 
 

@@ -5,7 +5,8 @@ import * as ort from "./assets/ort.wasm.bundle.min.mjs";
 ort.env.wasm.numThreads = 1; // Several threads need HTTP headers that a static host does not send.
 ort.env.logLevel = "error";
 
-const NOISE_REDUCTION = 1;
+// The defaults of hlsim.compensate.
+const NOISE_REDUCTION = 0.5;
 const AMPLIFICATION = 1;
 
 const load = async (name) => {
