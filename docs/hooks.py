@@ -1,5 +1,6 @@
 """Hooks of mkdocs that add pages and files from outside docs/ to the site, and adapt the links to them."""
 
+import re
 from pathlib import Path
 
 from mkdocs.config.defaults import MkDocsConfig
@@ -33,6 +34,7 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
 
     The site has the pages of docs/ at its root, so a link must neither leave nor enter that folder.
     """
+    markdown = re.sub(r"(\]\([^)#:]+)\.ipynb\b", r"\1.md", markdown)  # notebooks are shown as pages
     up = "../" * page.file.src_uri.count("/")
     if page.file.src_dir == str(ROOT):
         return markdown.replace(f"]({up}docs/", f"]({up}")
