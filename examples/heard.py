@@ -8,6 +8,7 @@ from io import BytesIO
 from pathlib import Path
 
 import torch
+from matplotlib.figure import Figure
 from PIL import Image
 from torch import Tensor
 
@@ -16,12 +17,12 @@ from hlsim import MSBG, Audiogram, list_pretrained, load_pretrained
 from hlsim.audio import read_audio
 from hlsim.calibration import level_spl, set_level
 from hlsim.dsp.resample import resample
-from hlsim.report.plots import new_figure
-from hlsim.report.spectrograms import PANEL_INCHES, Panels, panels
+from hlsim.report.sounds import spectrogram_levels
 
 ROOT = Path(__file__).parents[1]
 RATE = 16000
 EXACT = "exact MSBG"
+RANGE_DB = 75.0
 
 
 def read_speech() -> Tensor:
@@ -31,37 +32,45 @@ def read_speech() -> Tensor:
 
 
 def draw(signals: dict[str, Tensor], path: Path, reference: str = "") -> None:
-    """Draw the spectrogram of each signal.
+    """Draw the spectrogram of each signal, two in a row.
 
     Args:
         signals: Signals by name.
         path: File of the picture.
         reference: Name of a signal. The differences from it are drawn for all signals after it.
     """
-    titles = {name: f"{name}, {level_spl(signal):.0f} dB SPL" for name, signal in signals.items()}
+    levels = {name: spectrogram_levels(signal, RATE) for name, signal in signals.items()}
+    highest = 5.0 * round(
+        max(float(image.quantile(0.999)) for image in levels.values()) / 5.0 + 0.5
+    )
+    lowest = highest - RANGE_DB
+    panels = []
+    for name, image in levels.items():
+        title = f"{name}, {level_spl(signals[name]):.0f} dB SPL"
+        panels.append((title, image, "dB SPL in a bin", "gist_heat_r", (lowest, highest)))
     names = [*signals]
-    later = names[names.index(reference) + 1 :] if reference else []
-    differences = {f"{name} minus {reference}": (titles[name], titles[reference]) for name in later}
-    spectrograms = {titles[name]: signal for name, signal in signals.items()}
-    pictures = panels(spectrograms, RATE, differences)
-    image = Image.open(BytesIO(composite(pictures))).convert("RGB")
-    image.quantize(96, Image.Quantize.MAXCOVERAGE).save(
-        path, optimize=True
-    )  # 96 colours need less than half of the space.
+    for name in names[names.index(reference) + 1 :] if reference else []:
+        image = levels[name] - levels[reference]
+        image[torch.maximum(levels[name], levels[reference]) < lowest] = torch.nan
+        panels.append((f"{name} minus {reference}", image, "dB", "RdBu_r", (-15.0, 15.0)))
 
-
-def composite(panels: Panels) -> bytes:
-    """Return all panels as one PNG, in two columns."""
     rows = -(-len(panels) // 2)
-    figure = new_figure((2.0 * PANEL_INCHES[0], rows * PANEL_INCHES[1]))
+    figure = Figure(figsize=(9.2, 2.1 * rows), layout="constrained")
     places = figure.subplots(rows, 2, squeeze=False).ravel()
-    for axes, draw in zip(places, panels.values(), strict=False):
-        draw(figure, axes)
+    for axes, (title, image, unit, colours, (low, high)) in zip(places, panels, strict=False):
+        extent = (0.0, len(signals[names[0]]) / RATE, 0.0, 8.0)
+        style = {"vmin": low, "vmax": high, "cmap": colours, "extent": extent}
+        drawn = axes.imshow(image.numpy(), origin="lower", aspect="auto", **style)
+        axes.set(xlabel="time (s)", ylabel="frequency (kHz)")
+        axes.set_title(title, fontsize="medium")
+        figure.colorbar(drawn, ax=axes, label=unit, aspect=15, pad=0.02)
     for axes in places[len(panels) :]:
         axes.set_axis_off()
     data = BytesIO()
     figure.savefig(data, dpi=160, format="png")
-    return data.getvalue()
+    # 96 colours need less than half of the space
+    picture = Image.open(data).convert("RGB").quantize(96, Image.Quantize.MAXCOVERAGE)
+    picture.save(path, optimize=True)
 
 
 @torch.no_grad()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import platform
-from html import escape
 from importlib import metadata
 from pathlib import Path
 from typing import Any, TypeVar
@@ -16,7 +15,7 @@ from torch import Tensor
 from compensators import load_compensator
 from hlsim.audio import read_audio
 from hlsim.audiogram.thresholds import AudiogramLike
-from hlsim.calibration import PASCAL_SPL, gain_to_pascals, level_spl, set_level
+from hlsim.calibration import PASCAL_SPL, gain_to_pascals, set_level
 from hlsim.checks import check_rate
 from hlsim.dsp.resample import resample
 from hlsim.losses.frozen_simulator import build_simulator
@@ -163,12 +162,10 @@ def listen(
     full_scale_spl: float = PASCAL_SPL,
     **signals: Tensor | NDArray[Any],
 ) -> Players:
-    """Show players and spectrograms of signals in a notebook, all with the same gain.
+    """Show a player in a notebook that switches between signals at the same position.
 
-    The spectrograms need the extra ``eval``; without it there are only players.
-
-    The loudest signal sets the gain, so that what is soft for the ear is soft here. Start with a
-    low volume.
+    All signals have the same gain, so that what is soft for the ear is soft here, and the volume
+    starts low. The spectrograms need the extra ``eval``; without it there are only sounds.
 
     Args:
         sample_rate: Sample rate in Hz of all signals.
@@ -176,7 +173,7 @@ def listen(
         signals: Mono signals by the label to show, ``(time,)`` each.
 
     Returns:
-        An object that a notebook displays; its ``save`` method writes a page for a browser.
+        A player that a notebook displays; its ``save`` method writes a page for a browser.
 
     Raises:
         ValueError: There is no signal, all signals are silent, or one is not mono.
@@ -204,7 +201,7 @@ def listen(
 
 
 class Players:
-    """Audio players with spectrograms, displayed by a notebook or saved as a page.
+    """A player of several signals, displayed by a notebook or saved as a page.
 
     Args:
         signals: Signals in pascals by their labels, ``(time,)`` each.
@@ -212,36 +209,29 @@ class Players:
     """
 
     def __init__(self, signals: dict[str, Tensor], sample_rate: int) -> None:
-        from hlsim.report.listening import players
+        from hlsim.report.sounds import make_player
 
-        self.labels = list(signals)
-        self._players = players(signals, sample_rate)
-        self._levels = {label: float(level_spl(signal)) for label, signal in signals.items()}
+        self._player = make_player({"": signals}, sample_rate)
+
+    @property
+    def labels(self) -> list[str]:
+        """Labels of the signals, in order."""
+        return [sound.label for sound in self._player.sounds]
 
     def _repr_html_(self) -> str:
-        from hlsim.report.page import data_uri
-
-        figures = []
-        for player in self._players:
-            picture = ""
-            if player.picture is not None:
-                source = data_uri(player.picture.data)
-                alt = escape(player.picture.alt)
-                picture = f'<br><img src="{source}" alt="{alt}" style="max-width: 30em">'
-            figures.append(
-                f"<figure><figcaption>{escape(player.label)}</figcaption>"
-                f'<audio controls src="{data_uri(player.data)}"></audio>{picture}</figure>'
-            )
-        return "\n".join(figures)
+        return self._player.html()
 
     def __repr__(self) -> str:
-        levels = ", ".join(f"{label} {level:.0f} dB SPL" for label, level in self._levels.items())
+        sounds = self._player.sounds
+        levels = ", ".join(f"{sound.label} {sound.level:.0f} dB SPL" for sound in sounds)
         return f"Players({levels})"
 
     def save(self, path: str | Path) -> None:
-        """Write the players as one HTML file that a browser opens without a network."""
-        page = f'<!doctype html><html lang="en"><meta charset="utf-8">{self._repr_html_()}</html>\n'
-        Path(path).write_text(page, encoding="utf-8")
+        """Write the player as one HTML file that a browser opens without a network."""
+        from hlsim.report.page import Page, Section
+
+        page = Page("Listen", "", [Section("Sounds", player=self._player)])
+        Path(path).write_text(page.html(), encoding="utf-8")
 
 
 def info() -> str:

@@ -1,4 +1,4 @@
-"""The demo, cut short: everything it promises lies there, and agrees with itself."""
+"""The demo with few steps: page, sounds and printed table are written, and agree."""
 
 import json
 from pathlib import Path
@@ -12,7 +12,7 @@ from hlsim import Audiogram
 pytest.importorskip("lightning")
 pytest.importorskip("joblib")
 
-from hlsim.demo import _names, demo
+from hlsim.demo import _name_files, _sentence, demo
 
 
 @pytest.fixture
@@ -32,27 +32,33 @@ def test_demo_writes_page_and_sounds_that_agree(tmp_path: Path, short_speech: Pa
     text = demo(out, ear, speech=short_speech, steps=60, seed=seed, report=lambda line: None)
     report = json.loads((out / "report.json").read_text())
     rows = report["rows"]
-    names = ["unaided", "NAL-R", "NAL-R at the trained aid's level", "untrained start", "trained"]
+    names = ["unaided", "NAL-R", "NAL-R, same level", "trained aid"]
     assert [row["condition"] for row in rows] == names * 8
     # after numpy's last seed comes its first
-    assert [row["seed"] for row in rows[::5]] == [seed, seed + 1, 0, 1, 2, 3, 4, 5]
-    assert rows[2]["level"] == pytest.approx(rows[4]["level"], abs=1e-3)
+    assert [row["seed"] for row in rows[::4]] == [seed, seed + 1, 0, 1, 2, 3, 4, 5]
+    assert rows[2]["level"] == pytest.approx(rows[3]["level"], abs=1e-3)
     means = {
         name: fmean(row["haspi"] for row in rows if row["condition"] == name) for name in names
     }
-    printed = {line[:32].strip(): line[32:].split() for line in text.splitlines()}
+    printed = {line[:18].strip(): line[18:].split() for line in text.splitlines()}
     for name, mean in means.items():
         assert printed[name][0] == f"{mean:.3f}"
     # NAL-R, and an aid that starts from it, make speech easier to understand for this ear
-    assert means["NAL-R"] > means["unaided"] and means["trained"] > means["unaided"]
-    (planned,) = (c for c in report["comparisons"] if c["planned"])
-    assert (planned["before"], planned["after"]) == (names[2], "trained")
+    assert means["NAL-R"] > means["unaided"] and means["trained aid"] > means["unaided"]
+    # one comparison is planned and tested, so that no adjusted p can contradict it
+    [comparison] = report["comparisons"]
+    assert comparison["planned"]
+    assert (comparison["before"], comparison["after"]) == (names[2], "trained aid")
     page = (out / "report.html").read_text()
-    assert text.startswith("\nThe trained aid ") and f"seed {seed}, 60 training steps" in text
-    assert text.endswith(f"\nThe page: {out / 'report.html'}")
-    assert text.splitlines()[1] in page and page.count("<audio") == 5 and "N4 (severe loss)" in page
+    assert text.startswith("\nThe trained aid ")
+    assert text.endswith(f"\n{(out / 'report.html').as_uri()}") and len(text.splitlines()) == 9
+    evidence = text.splitlines()[1].rpartition(" (")[2]
+    assert f"({evidence}</small>" in page and page.count("t-test p = ") == 1
+    assert page.count("<audio") == 7 and "N4 (severe loss)" in page
+    for name in names:
+        assert f">{means[name]:.3f}</td>" in page
     assert (out / "training" / "checkpoint" / "model.safetensors").stat().st_size > 0
-    assert len(list((out / "audio").glob("*.wav"))) == 6 * 8
+    assert len(list((out / "audio").glob("*.wav"))) == 2 * 4 * 8
 
 
 def test_speech_that_cannot_be_scored_is_named_before_the_training(
@@ -68,11 +74,17 @@ def test_speech_that_cannot_be_scored_is_named_before_the_training(
 
 def test_names_tell_speakers_apart(tmp_path: Path) -> None:
     files = [tmp_path / "p225" / "001.wav", tmp_path / "p226" / "001.wav"]
-    assert _names(files, tmp_path) == ["p225-001", "p226-001"]
-    assert len(set(_names([*files, tmp_path / "p225-001.wav"], tmp_path))) == 3
+    assert _name_files(files, tmp_path) == ["p225-001", "p226-001"]
+    assert len(set(_name_files([*files, tmp_path / "p225-001.wav"], tmp_path))) == 3
+
+
+def test_words_of_bundled_utterances_are_known(tmp_path: Path, speech_dir: Path) -> None:
+    sentences = {_sentence(path) for path in (speech_dir / "valid").glob("*.flac")}
+    assert len(sentences) == 10 and "" not in sentences
+    assert _sentence(tmp_path / "flite-rms-01.flac") == ""
 
 
 def test_too_little_speech(tmp_path: Path, speech_dir: Path) -> None:
-    with pytest.raises(ValueError, match="needs 22 or more"):
+    with pytest.raises(ValueError, match="expected 22 or more"):
         demo(tmp_path / "out", Audiogram.standard("N4"), speech=speech_dir / "valid")
     assert not (tmp_path / "out").exists()

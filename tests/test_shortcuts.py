@@ -67,6 +67,7 @@ def test_players_share_one_gain_and_are_saved_as_a_page(tmp_path) -> None:
     players.save(tmp_path / "page.html")
     page = (tmp_path / "page.html").read_text()
     assert page.count("<audio controls") == page.count("<img") == 2
+    assert "hlsim-player" in players._repr_html_()
 
 
 @pytest.mark.parametrize(

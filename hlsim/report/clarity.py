@@ -7,16 +7,17 @@ from pathlib import Path
 from hlsim.evaluation.clarity import NAL_R, RULE_MS, UNAIDED
 from hlsim.evaluation.result import Evaluation
 from hlsim.files import write_atomically
-from hlsim.report.listening import listening_section
 from hlsim.report.page import Page, Section, Table, write_page
-from hlsim.report.plots import pictures_section
+from hlsim.report.plots import pictures_sections
 from hlsim.report.recordings import score_details
 from hlsim.report.results import LEVEL, number, of, parts, summary_table
+from hlsim.report.sounds import listening_sections
 
 _ABOUT = (
-    "Scores are those of the better ear, by each measure, and combined is the mean of HASPI and HASQI, as in "
-    "Clarity's challenge at ICASSP 2023. HASPI rewards any gain, so that the level of the better ear stands beside "
-    f"it. The look-ahead is measured; the challenges allow {RULE_MS:g} ms."
+    "Scores are those of the better ear, by each measure, and combined is the mean of HASPI and "
+    "HASQI, as in Clarity's challenge at ICASSP 2023. HASPI rewards any gain, so that the level "
+    "of the better ear stands beside it. The look-ahead is measured; the challenges allow "
+    f"{RULE_MS:g} ms."
 )
 
 
@@ -29,10 +30,9 @@ def write_scenes(evaluation: Evaluation, out: str | Path, *, listen: int = 3) ->
 def write_scores(evaluation: Evaluation, out: str | Path) -> None:
     """Write ``scores.csv``: a row for each scene, listener and condition."""
     columns = ["utterance", "listener", "condition", "combined", "haspi", "hasqi", "level"]
-    table = evaluation.table.assign(
-        combined=evaluation.table[["haspi", "hasqi"]].mean(axis=1, skipna=False)
-    )
-    scores = table[columns].rename(columns={"utterance": "scene"})
+    combined = evaluation.table[["haspi", "hasqi"]].mean(axis=1, skipna=False)
+    scores = evaluation.table.assign(combined=combined)[columns]
+    scores = scores.rename(columns={"utterance": "scene"})
     write_atomically(Path(out) / "scores.csv", scores.to_csv(index=False, float_format="%.6f"))
 
 
@@ -43,12 +43,12 @@ def scenes_page(evaluation: Evaluation, listen: int = 3) -> Page:
     shown = [UNAIDED, NAL_R, *evaluation.of_kind("aid")]
     sections = [
         Section("Conditions", [*others, _ABOUT], [conditions_table(evaluation)]),
-        listening_section(evaluation, listen, shown),
-        pictures_section(evaluation),
+        *listening_sections(evaluation, listen, shown),
+        *pictures_sections(evaluation),
         score_details(evaluation),
     ]
     title = f"Clarity's scenes: {evaluation.table['item'].nunique()} pairs of scene and listener"
-    return Page(title, verdict, [section for section in sections if section is not None])
+    return Page(title, verdict, sections)
 
 
 def conditions_table(evaluation: Evaluation) -> Table:
@@ -67,7 +67,9 @@ def conditions_table(evaluation: Evaluation) -> Table:
     means = summary_table(caption, parts(table), columns)
     rows = []
     for row in means.rows:
-        ahead = evaluation.details["look_ahead_ms"][row[0]]
-        within = "" if ahead is None else "yes" if ahead <= RULE_MS else "no"
-        rows.append((*row, number(ahead, ".1f"), within))
+        look_ahead = evaluation.details["look_ahead_ms"][row[0]]
+        within_rule = ""
+        if look_ahead is not None:
+            within_rule = "yes" if look_ahead <= RULE_MS else "no"
+        rows.append((*row, number(look_ahead, ".1f"), within_rule))
     return Table(caption, (*means.header, "Look-ahead (ms)", f"Within {RULE_MS:g} ms"), rows)

@@ -1,12 +1,14 @@
-"""Pages: sections of text, tables, pictures and players, as one HTML file or as Markdown.
+"""Pages: sections of text, tables, players and pictures, as one HTML file or as Markdown.
 
-The HTML fetches nothing and runs no script: pictures and sounds are data in the page. It can be read on a
-phone, where wide tables scroll by themselves, and with a keyboard.
+The HTML fetches nothing: pictures and sounds are data in the page, and its only script is that of
+the players. It can be read on a phone, where wide tables scroll by themselves, and with a keyboard.
+The templates are in the folder ``templates``.
 """
 
 from __future__ import annotations
 
 import base64
+import hashlib
 import json
 import os
 import re
@@ -18,6 +20,8 @@ from typing import Any
 
 from hlsim.extras import require
 from hlsim.files import write_atomically
+
+_TEMPLATES = Path(__file__).with_name("templates")
 
 
 @dataclass(frozen=True)
@@ -42,68 +46,148 @@ class Table:
         return "\n".join(f"| {' | '.join(line)} |" for line in escaped)
 
     def text(self) -> str:
-        """Return the table for a terminal, without the caption."""
-        lines = [self.header, *self.rows]
-        widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-        return "\n".join(_aligned(line, widths) for line in lines)
+        """Return the table for a terminal, without the caption.
 
-
-def _aligned(line: Sequence[str], widths: Sequence[int]) -> str:
-    """Align the first cell to the left and the others to the right."""
-    first, *others = [(cell, width) for cell, width in zip(line, widths, strict=True)]
-    cells = [first[0].ljust(first[1]), *(cell.rjust(width) for cell, width in others)]
-    return "  ".join(cells)
+        >>> print(Table("Scores", ("Aid", "HASPI"), [("none", "0.27"), ("NAL-R", "0.9")]).text())
+        Aid    HASPI
+        none    0.27
+        NAL-R    0.9
+        """
+        columns = list(zip(self.header, *self.rows, strict=True))
+        widths = [max(map(len, column)) for column in columns]
+        aligned = [
+            [cell.rjust(width) for cell in column]
+            for column, width in zip(columns, widths, strict=True)
+        ]
+        aligned[0] = [cell.ljust(widths[0]) for cell in columns[0]]
+        return "\n".join("  ".join(line) for line in zip(*aligned, strict=True))
 
 
 @dataclass(frozen=True)
 class Picture:
-    """Contents of an SVG or PNG file, a text for readers who do not see it, and a caption."""
+    """Contents of an SVG or PNG file, with a text for readers who do not see it.
+
+    Attributes:
+        data: contents of the file.
+        alt: text in place of the picture.
+        title: heading above the picture.
+        note: sentence below the picture.
+    """
 
     data: bytes
     alt: str
-    caption: str = ""
+    title: str = ""
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class Sound:
+    """One sound of a player.
+
+    Attributes:
+        number: place in the player, from 1.
+        label: name on the button.
+        level: level in dB SPL.
+        audio: contents of a FLAC or WAV file.
+        loudness: level in dB relative to full scale with which it is played.
+        spectrogram: contents of a PNG file whose edges are the edges of the spectrogram; empty if
+            there is none.
+        note: words over the spectrogram.
+    """
+
+    number: int
+    label: str
+    level: float
+    audio: bytes
+    loudness: float = 0.0
+    spectrogram: bytes = b""
+    note: str = ""
 
 
 @dataclass(frozen=True)
 class Player:
-    """Contents of a FLAC or WAV file to be played, and a picture of the sound."""
+    """Sounds of one item, between which a listener switches at the same position.
 
-    data: bytes
-    label: str
-    picture: Picture | None = None
+    Attributes:
+        groups: sounds with one gain by the heading of their group, which may be empty.
+        seconds: length of the sounds.
+        hint: sentence below the controls.
+        sentence: words that are spoken.
+        volume: volume to start with, from 0 to 1.
+        levels: lowest and highest level in dB SPL of the spectrograms.
+        colours: colours of the spectrograms in CSS, from the lowest to the highest level.
+        highest_khz: highest frequency of the spectrograms.
+    """
+
+    groups: Mapping[str, Sequence[Sound]]
+    seconds: float
+    hint: str
+    sentence: str = ""
+    volume: float = 0.5
+    levels: tuple[float, float] = (0.0, 0.0)
+    colours: Sequence[str] = ()
+    highest_khz: float = 0.0
+
+    @property
+    def sounds(self) -> list[Sound]:
+        """All sounds of the player, in order."""
+        return [sound for group in self.groups.values() for sound in group]
+
+    def html(self) -> str:
+        """Return the player with its style and script, to be shown by a notebook."""
+        return _render("fragment.html", player=self)
+
+
+@dataclass(frozen=True)
+class Card:
+    """A number that a reader should remember, over the same number of all conditions.
+
+    Attributes:
+        title: name of the number.
+        value: the number, as text.
+        meaning: sentence that explains the number.
+        bars: label, text and length from 0 to 1 for each condition; the last one is highlighted.
+    """
+
+    title: str
+    value: str
+    meaning: str
+    bars: Sequence[tuple[str, str, float]]
 
 
 @dataclass(frozen=True)
 class Section:
-    """A part of a page: paragraphs, tables, players, pictures and inner parts, in this order.
+    """A part of a page: paragraphs, tables, a player, pictures and inner parts, in this order.
 
-    Args:
-        folded: whether it is shown only when it is opened.
+    A folded section is shown only when it is opened.
     """
 
     title: str
     paragraphs: Sequence[str] = ()
     tables: Sequence[Table] = ()
     pictures: Sequence[Picture] = ()
-    players: Sequence[Player] = ()
+    player: Player | None = None
     sections: Sequence[Section] = ()
     folded: bool = False
 
 
 @dataclass(frozen=True)
 class Page:
-    """A title, a verdict in one sentence, and the sections that support it."""
+    """A title, a verdict in one sentence, and what supports it: cards and sections."""
 
     title: str
     verdict: str
     sections: Sequence[Section]
+    cards: Sequence[Card] = ()
 
     def html(self) -> str:
         """Return the page as one HTML file; all text is escaped."""
-        return (
-            str(_template().render(title=self.title, sections=self.sections, lead=self.verdict))
-            + "\n"
-        )
+        claim, evidence = self.verdict, ""
+        if self.verdict.endswith(")."):  # numbers in parentheses are printed smaller
+            claim, _, evidence = self.verdict.rpartition(" (")
+            evidence = evidence and f"({evidence}"
+        parts = {"title": self.title, "sections": self.sections, "cards": self.cards}
+        return _render("page.html", verdict=claim or evidence, evidence=evidence, **parts)
 
     def markdown(self) -> str:
         """Return text and tables without what is played or drawn; HTML tags stay text."""
@@ -123,7 +207,7 @@ def _markdown_blocks(sections: Sequence[Section], depth: int) -> list[str]:
 
 
 def write_page(page: Page, data: Mapping[str, Any], out: str | Path) -> Path:
-    """Write ``report.html``, ``report.md`` and ``report.json``, which holds the data, into a folder.
+    """Write ``report.html``, ``report.md``, and ``report.json`` with the data, into a folder.
 
     Files of these names are replaced; others stay.
 
@@ -153,22 +237,37 @@ def check_out(out: str | Path) -> Path:
     folder = Path(out).absolute()
     existing = next(path for path in (folder, *folder.parents) if path.exists())
     if not existing.is_dir():
-        raise ValueError(f"{existing} is not a folder, so that no report can be written there")
+        raise ValueError(f"{existing} is a file; choose a folder for the report")
     if not os.access(existing, os.W_OK | os.X_OK):
-        raise ValueError(f"there is no permission to write a report into {existing}")
+        raise ValueError(f"there is no permission to write into {existing}; choose another folder")
     return folder
 
 
 @cache
-def _template() -> Any:
+def _environment() -> Any:
     jinja2 = require("jinja2", "eval")
-    source = Path(__file__).with_name("page.html").read_text(encoding="utf-8")
-    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
-    return environment.from_string(source, {"uri": data_uri})
+    loader = jinja2.FileSystemLoader(_TEMPLATES)
+    environment = jinja2.Environment(
+        loader=loader, autoescape=True, undefined=jinja2.StrictUndefined
+    )
+    script = (_TEMPLATES / "player.js").read_text(encoding="utf-8")
+    digest = hashlib.sha256(script.encode()).digest()
+    environment.globals |= {"script": script, "script_hash": base64.b64encode(digest).decode()}
+    environment.filters["uri"] = data_uri
+    return environment
+
+
+def _render(template: str, **values: Any) -> str:
+    text: str = _environment().get_template(template).render(**values)
+    return f"{text}\n"
 
 
 def data_uri(data: bytes) -> str:
-    """Return the contents of a file as a URI; its first bytes tell its kind."""
-    kinds = {b"\x89PNG": "image/png", b"fLaC": "audio/flac", b"RIFF": "audio/wav"}
-    kind = kinds.get(data[:4], "image/svg+xml")
-    return f"data:{kind};base64,{base64.b64encode(data).decode('ascii')}"
+    """Return the contents of a file as a URI, whose type is known from its first bytes.
+
+    >>> data_uri(b"<svg/>")
+    'data:image/svg+xml;base64,PHN2Zy8+'
+    """
+    types = {b"\x89PNG": "image/png", b"fLaC": "audio/flac", b"RIFF": "audio/wav"}
+    media_type = types.get(data[:4], "image/svg+xml")
+    return f"data:{media_type};base64,{base64.b64encode(data).decode('ascii')}"

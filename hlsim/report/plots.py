@@ -1,161 +1,227 @@
-"""Plots of a study, narrow enough for a phone. All raise MissingExtraError without matplotlib."""
+"""Plots of a study, narrow enough for a phone, for light and dark pages.
+
+They raise MissingExtraError without matplotlib. They do not use pyplot, so that no window, no
+global state and no notebook's backend is involved.
+"""
 
 from __future__ import annotations
 
 import io
 from collections.abc import Callable, Mapping, Sequence
+from itertools import pairwise
 from textwrap import fill
 from typing import Any
 
 import numpy as np
 
 from hlsim.audiogram.plot import frequency_axis
-from hlsim.evaluation.comparison import Comparison
 from hlsim.evaluation.measures import MEASURES
 from hlsim.evaluation.result import Evaluation
 from hlsim.evaluation.study import Condition
 from hlsim.extras import require
 from hlsim.report.page import Picture, Section
-from hlsim.report.results import loss_name, ordered
+from hlsim.report.results import ordered
 
 MANY_POINTS = 2000
 """Number of points above which they are drawn as pixels, so that a page stays small."""
 
+INK = "#010203"
+"""Stand-in for the colour of text, which is dark on a light page and light on a dark page."""
+
+COLOURS = ("#2f7ed8", "#c96a00", "#128a66", "#b04a92", "#d0433e", "#8a6d3b")
+"""Colours of lines and their labels, which can be read on white and on black."""
+
+UNAIDED_COLOUR = "#7d828a"
+
 LINE_STYLES = ("-", "--", ":", "-.")
+
+LINEAR_DB = 0.5
+"""Difference between the gains at two levels below which they are drawn as one curve."""
+
+_NO_BREAK = "\N{NO-BREAK SPACE}"
+_WIDTH_INCHES = 4.2
+_LINE_INCHES = 0.17  # of a label
+
+_STYLE: dict[str, Any] = {
+    **dict.fromkeys(
+        ("axes.edgecolor", "axes.labelcolor", "text.color", "xtick.color", "ytick.color"), INK
+    ),
+    "grid.color": "#9a9fa8",
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "svg.fonttype": "none",
+    "svg.hashsalt": "hlsim",  # the same plot gives the same bytes
+}
+
+_CSS = b"svg { color: #1a1c20 } @media (prefers-color-scheme: dark) { svg { color: #e6e8eb } }"
 
 Curves = Mapping[str, tuple[Sequence[float], Sequence[float], Mapping[str, Any]]]
 """Curves by name: x, y, and the style of the line."""
 
 
-def draw_svg(draw: Callable[[Any], None], height: float = 3.5) -> bytes:
-    """Return the SVG of what a function draws on matplotlib axes."""
-    figure = new_figure((4.2, height))
-    draw(figure.subplots())
-    return svg(figure)
+def draw_picture(
+    draw: Callable[[Any], None], title: str, *, alt: str = "", note: str = "", height: float = 3.2
+) -> Picture:
+    """Return what a function draws on matplotlib axes, as SVG.
 
+    Args:
+        draw: function that is called with the axes.
+        title: heading above the picture.
+        alt: text in place of the picture; by default the title.
+        note: sentence below the picture.
+        height: height in inches.
 
-def svg(figure: Any) -> bytes:
-    """Return a figure as SVG; the same figure gives the same bytes."""
+    >>> draw_picture(lambda axes: axes.plot([1, 2]), "A line").alt
+    'A line'
+    """
+    figures = require("matplotlib.figure", "eval")
     data = io.BytesIO()
-    with require("matplotlib", "eval").rc_context({"svg.hashsalt": "hlsim"}):
-        figure.savefig(data, format="svg", dpi=150, metadata={"Date": None})
-    return data.getvalue()
-
-
-def new_figure(inches: tuple[float, float]) -> Any:
-    """Return a figure of its own: without pyplot there is no window and no global state."""
-    figure = require("matplotlib.figure", "eval").Figure(figsize=inches, layout="constrained")
-    require("matplotlib.backends.backend_agg", "eval").FigureCanvasAgg(figure)
-    return figure
+    with require("matplotlib", "eval").rc_context(_STYLE):
+        figure = figures.Figure(figsize=(_WIDTH_INCHES, height), layout="constrained")
+        draw(figure.subplots())
+        style = {"transparent": True, "dpi": 150, "metadata": {"Date": None}}
+        figure.savefig(data, format="svg", **style)
+    svg = data.getvalue().replace(INK.encode(), b"currentColor")
+    svg = svg.replace(b"</style>", _CSS + b"</style>", 1)
+    return Picture(svg, alt or title, title, note)
 
 
 def plain(text: str) -> str:
-    """Return a label that matplotlib shows as it is: no mathematics, nothing hidden from a legend."""
-    text = text.replace("$", r"\$")
-    return f"\u200b{text}" if text.startswith("_") else text
+    """Return a label that matplotlib shows as it is, without mathematics.
+
+    >>> plain("5 $")
+    '5 \\\\$'
+    """
+    return text.replace("$", r"\$")
 
 
 def condition_colours(conditions: Sequence[Condition]) -> dict[str, Any]:
     """Return a colour for each condition; one that belongs to another has its colour, paler."""
     names = [condition.name for condition in conditions]
-    heads = [condition.name for condition in conditions if condition.of not in names]
-    colours: dict[str, Any] = {name: f"C{place % 10}" for place, name in enumerate(heads)}
-    for head in heads:
-        belonging = [condition.name for condition in conditions if condition.of == head]
-        paler = {name: (colours[head], 0.6 / (k + 1)) for k, name in enumerate(belonging)}
-        colours |= paler
+    aided = [c.name for c in conditions if c.of not in names and c.kind != "unaided"]
+    colours: dict[str, Any] = dict.fromkeys(names, UNAIDED_COLOUR)
+    colours |= {name: COLOURS[place % len(COLOURS)] for place, name in enumerate(aided)}
+    for condition in conditions:
+        if condition.of in names:
+            colours[condition.name] = (colours[condition.of], 0.6)
     return colours
 
 
-def legend(axes: Any) -> None:
-    """Draw the legend below the axes, where it covers nothing; the figure grows by it."""
-    handles, labels = axes.get_legend_handles_labels()
-    columns = 2 if max(map(len, labels)) < 24 else 1
-    rows = -(-len(labels) // columns)
-    axes.figure.set_figheight(axes.figure.get_figheight() + 0.21 * rows)
-    style = {"ncols": columns, "fontsize": "small", "frameon": False}
-    axes.figure.legend(handles, labels, loc="outside lower left", **style)
+def label_curves(axes: Any) -> None:
+    """Write the name of each curve beside its right end, in its colour, without overlaps."""
+    curves = [line for line in axes.lines if not line.get_label().startswith("_")]
+    names = [fill(line.get_label(), 16) for line in curves]
+    low, high = axes.get_ylim()
+    ends = np.array([(line.get_ydata()[-1] - low) / (high - low) for line in curves])
+    heights = [1 + name.count("\n") for name in names]
+    line_height = _LINE_INCHES / axes.figure.get_figheight() / 0.8
+    places = spread_labels(ends.clip(0.0, 1.0), line_height * np.array(heights))
+    for line, name, place in zip(curves, names, places, strict=True):
+        style = {"color": line.get_color(), "alpha": line.get_alpha(), "va": "center"}
+        axes.text(1.02, place, name, transform=axes.transAxes, fontsize="small", **style)
+
+
+def spread_labels(ends: np.ndarray, heights: np.ndarray) -> np.ndarray:
+    """Move labels up and down until none covers another; they keep their order.
+
+    Args:
+        ends: wanted middle of each label, from 0 to 1. Shape: (labels,).
+        heights: height of each label. Shape: (labels,).
+
+    Returns: the middle of each label. Shape: (labels,).
+
+    >>> spread_labels(np.array([0.5, 0.5]), np.array([0.1, 0.1])).round(2).tolist()
+    [0.5, 0.6]
+    """
+    places = ends.astype(float)
+    order = np.argsort(ends, kind="stable")
+    pairs = list(pairwise(order))
+    for below, above in pairs:
+        distance = (heights[below] + heights[above]) / 2.0
+        places[above] = max(places[above], places[below] + distance)
+    if len(order):
+        places[order[-1]] = min(places[order[-1]], 1.0)
+    for below, above in reversed(pairs):
+        distance = (heights[below] + heights[above]) / 2.0
+        places[below] = min(places[below], places[above] - distance)
+    return places
 
 
 def scatter_picture(
-    x: Any, y: Any, severities: Any, titles: tuple[str, str], alt: str, ends: Any = None
+    x: Any, y: Any, axis_titles: tuple[str, str], title: str, ends: Any = None
 ) -> Picture:
-    """Draw one point per item, coloured by degree of loss, and a line where both values are equal."""
-    known = np.isfinite(x + y)
+    """Draw one point per item, and a line where both values are equal."""
 
     def draw(axes: Any) -> None:
-        line = {"color": "0.5", "linewidth": 1.0, "linestyle": "--", "label": "equal"}
-        axes.axline((1.0, 1.0), slope=1.0, **line)
-        for place, severity in enumerate(ordered(np.unique(severities).tolist())):
-            chosen = known & (severities == severity)
-            pixels = chosen.sum() > MANY_POINTS
-            style = {"color": f"C{place}", "label": loss_name(severity), "rasterized": pixels}
-            axes.scatter(x[chosen], y[chosen], s=14, alpha=0.7, **style)
-        axes.set(xlabel=plain(titles[0]), ylabel=plain(titles[1]), xlim=ends, ylim=ends)
-        legend(axes)
+        axes.axline((1.0, 1.0), slope=1.0, color=INK, alpha=0.5, linewidth=1.0, linestyle="--")
+        style = {"s": 16, "alpha": 0.7, "color": COLOURS[0], "rasterized": len(x) > MANY_POINTS}
+        axes.scatter(x, y, **style)
+        axes.set(xlabel=plain(axis_titles[0]), ylabel=plain(axis_titles[1]), xlim=ends, ylim=ends)
 
-    return Picture(draw_svg(draw), alt, alt)
+    note = "Each point is an item; both values are equal on the dashed line."
+    return draw_picture(draw, title, note=note)
 
 
-def distribution_picture(groups: Mapping[str, Any], title: str, by: str) -> Picture:
+def distribution_picture(groups: Mapping[str, Any], measure: str, by: str) -> Picture:
     """Draw quartiles, median and every value of each group."""
-    groups = {name: values.dropna().to_numpy() for name, values in groups.items()}
-    groups = {name: values for name, values in groups.items() if len(values)}
+    values = {name: group.dropna().to_numpy() for name, group in groups.items()}
+    values = {name: group for name, group in values.items() if len(group)}
 
     def draw(axes: Any) -> None:
         generator = np.random.default_rng(0)
-        for place, values in enumerate(groups.values()):
-            low, middle, high = np.percentile(values, (25, 50, 75))
-            axes.barh(place, high - low, 0.56, low, color="0.85")
-            axes.plot((middle, middle), (place - 0.28, place + 0.28), color="black")
-            heights = place + generator.uniform(-0.18, 0.18, len(values))
-            pixels = len(values) > MANY_POINTS
-            style = {"s": 7, "alpha": 0.4, "linewidths": 0, "color": "C0", "rasterized": pixels}
-            axes.scatter(values, heights, **style)
-        names = [plain(fill(name, 18)) for name in groups]
-        axes.set_yticks(range(len(groups)), names, fontsize="small")
+        for place, group in enumerate(values.values()):
+            low, middle, high = np.percentile(group, (25, 50, 75))
+            axes.barh(place, high - low, 0.56, low, color=INK, alpha=0.15)
+            axes.plot((middle, middle), (place - 0.28, place + 0.28), color=INK)
+            heights = place + generator.uniform(-0.18, 0.18, len(group))
+            style = {"s": 9, "alpha": 0.5, "linewidths": 0, "color": COLOURS[0]}
+            axes.scatter(group, heights, rasterized=len(group) > MANY_POINTS, **style)
+        names = [plain(fill(name, 18)) for name in values]
+        axes.set_yticks(range(len(values)), names, fontsize="small")
         axes.invert_yaxis()
-        axes.set(xlabel=title)
+        axes.set(xlabel=measure)
 
-    medians = [f"{name} {np.median(values):.3f}" for name, values in groups.items()]
-    text = f"{title} by {by}: quartiles, median and every item"
-    data = draw_svg(draw, height=1.0 + 0.45 * len(groups))
-    return Picture(data, f"{text}; medians: {', '.join(medians)}.", f"{text}.")
+    medians = [f"{name} {np.median(group):.3f}" for name, group in values.items()]
+    title = f"{measure} by {by}"
+    alt = f"{title}; medians: {', '.join(medians)}."
+    height = 0.9 + 0.45 * len(values)
+    note = "Grey: the middle half of the items. Line: the median. Points: all items."
+    return draw_picture(draw, title, alt=alt, note=note, height=height)
 
 
 def curves_picture(
-    curves: Curves, alt: str, axis: str, over: str = "", lowest: float | None = None
+    curves: Curves, title: str, axis: str, *, over: str = "", lowest: float | None = None
 ) -> Picture:
-    """Draw curves over frequency, or over what ``over`` names."""
+    """Draw curves over frequency, or over what ``over`` names, with their names beside them."""
 
     def draw(axes: Any) -> None:
         for name, (x, y, style) in curves.items():
-            axes.plot(x, y, label=plain(name), marker="." if over else "", **style)
+            # a label that begins with an underscore would be hidden
+            axes.plot(x, y, label=plain(f" {name}"), marker="." if over else "", **style)
         axes.set(ylabel=axis, ylim=(lowest, None))
         if over:
             axes.set(xlabel=over)
-            axes.grid(alpha=0.3)
+            axes.grid(alpha=0.2)
         else:
             frequency_axis(axes, (250, 500, 1000, 2000, 4000))
-        legend(axes)
+        label_curves(axes)
 
-    return Picture(draw_svg(draw), alt, alt)
+    return draw_picture(draw, title)
 
 
 def gain_picture(
     title: str, results: Sequence[Mapping[str, Any]], colours: Mapping[str, Any]
 ) -> Picture:
-    """Draw the insertion gains of ``gain_curves``: one colour per aid, one line style per level."""
-    curves = {
-        f"{row['aid']}, {level:g} dB SPL": (
-            row["frequencies"],
-            gains,
-            {"color": colours[row["aid"]], "linestyle": LINE_STYLES[place % 4]},
-        )
-        for row in results
-        for place, (level, gains) in enumerate(zip(row["levels"], row["gain_db"], strict=True))
-    }
-    return curves_picture(curves, f"Insertion gain, {title}.", "insertion gain (dB)")
+    """Draw insertion gains, rows of ``gain_curves``: one colour per aid, one line per level."""
+    curves = {}
+    for row in results:
+        gains, aid = np.array(row["gain_db"]), row["aid"]
+        names = [f"{aid}, {level:g}{_NO_BREAK}dB{_NO_BREAK}SPL" for level in row["levels"]]
+        if float(np.ptp(gains, axis=0).max()) < LINEAR_DB:
+            gains, names = gains[:1], [aid]
+        for name, line, style in zip(names, gains.tolist(), LINE_STYLES, strict=False):
+            curves[name] = (row["frequencies"], line, {"color": colours[aid], "linestyle": style})
+    return curves_picture(curves, title, "insertion gain (dB)")
 
 
 def means_picture(evaluation: Evaluation, column: str, fact: str, title: str, over: str) -> Picture:
@@ -163,47 +229,31 @@ def means_picture(evaluation: Evaluation, column: str, fact: str, title: str, ov
     colours = condition_colours(evaluation.conditions)
     means = evaluation.table.groupby(["condition", fact])[column].mean()
     curves = {}
-    for name in evaluation.names:
-        x = ordered(means[name].index) if name in means else []
+    for name in means.index.unique(0).intersection(evaluation.names):
+        x = ordered(means[name].index)
         curves[name] = (x, [means[name][value] for value in x], {"color": colours[name]})
-    return curves_picture(curves, f"Mean {title} over {over}.", f"mean {title}", over)
+    return curves_picture(curves, f"Mean {title} by {over}", f"mean {title}", over=over)
 
 
-def pictures_section(evaluation: Evaluation) -> Section | None:
-    """Draw a study of scores; a picture that would show a single group or item is left out."""
-    headline = evaluation.headline
-    if headline is None or headline.overall.n < 2:
-        return None
-    column, title = headline.measure, headline.title
-    pictures = [*_headline_pictures(evaluation, headline)]
-    by_condition = dict(evaluation.wide(column).items())
-    pictures.append(distribution_picture(by_condition, title, "condition"))
+def pictures_sections(evaluation: Evaluation) -> list[Section]:
+    """Draw the scores of a study; a picture that would show a single group or item is left out.
+
+    Returns: one section, or none if there is nothing to compare.
+    """
+    c = evaluation.headline
+    if c is None or c.overall.n < 2:
+        return []
+    scores = evaluation.wide(c.measure)
+    before, after = scores[[c.before, c.after]].dropna().to_numpy().T
+    ends = MEASURES[c.measure].ends if c.measure in MEASURES else None
+    margins = None if ends is None else (ends[0] - 0.03, ends[1] + 0.03)
+    axis_titles = (f"{c.title}, {c.before}", f"{c.title}, {c.after}")
+    title = f"{c.title} of the {len(before)} items"
+    pictures = [
+        distribution_picture(dict(scores.items()), c.title, "condition"),
+        scatter_picture(before, after, axis_titles, title, margins),
+    ]
     for fact, name in {"severity": "degree of loss", "snr": "SNR (dB)"}.items():
         if fact in evaluation.table and evaluation.table[fact].nunique() > 1:
-            pictures.append(means_picture(evaluation, column, fact, title, name))
-    return Section("Pictures", pictures=pictures)
-
-
-def _headline_pictures(evaluation: Evaluation, c: Comparison) -> list[Picture]:
-    """Draw the scores of the headline's items, and their change over that of the level."""
-    scores = evaluation.wide(c.measure)[[c.before, c.after]].dropna()
-    levels = evaluation.wide("level").loc[scores.index]
-    facts = evaluation.table.drop_duplicates("item").set_index("item").loc[scores.index]
-    before, after = scores[c.before].to_numpy(), scores[c.after].to_numpy()
-    ends = MEASURES[c.measure].ends if c.measure in MEASURES else None
-    margin = None if ends is None else (ends[0] - 0.03, ends[1] + 0.03)
-    titles = (f"{c.title}, {c.before}", f"{c.title}, {c.after}")
-    text = f"{c.title} of {len(scores)} items under {c.before} and {c.after}."
-    change = (levels[c.after] - levels[c.before]).to_numpy()
-
-    def draw(axes: Any) -> None:
-        axes.axhline(0.0, color="0.5", linewidth=1.0, linestyle="--")
-        axes.scatter(change, after - before, s=14, alpha=0.7, rasterized=len(change) > MANY_POINTS)
-        axes.set(xlabel="change of level (dB)", ylabel=f"change of {c.title}")
-
-    gain = f"What gain may explain: change of {c.title} over the change of level."
-    severities = facts["severity"].to_numpy()
-    return [
-        scatter_picture(before, after, severities, titles, text, margin),
-        Picture(draw_svg(draw), gain, gain),
-    ]
+            pictures.append(means_picture(evaluation, c.measure, fact, c.title, name))
+    return [Section("Pictures", pictures=pictures)]

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from hlsim.evaluation.comparison import Comparison
 from hlsim.evaluation.measures import title_of
 from hlsim.evaluation.result import Evaluation
 from hlsim.metrics.words import words_change
-from hlsim.report.listening import listening_section
-from hlsim.report.page import Page, Section, write_page
-from hlsim.report.plots import pictures_section
+from hlsim.report.page import Page, Section, Table, write_page
+from hlsim.report.plots import pictures_sections
 from hlsim.report.results import (
     GAIN_NOTE,
     LEVEL,
@@ -26,12 +26,15 @@ from hlsim.report.results import (
     severity_counts,
     summary_table,
 )
+from hlsim.report.sounds import listening_sections
 
 
 def write_report(evaluation: Evaluation, out: str | Path, *, listen: int = 3) -> Path:
     """Write the evaluation as ``report.html``, ``report.md`` and ``report.json`` into a folder.
 
     Args:
+        evaluation: result of ``haspi_report``.
+        out: folder of the files.
         listen: number of items with players and spectrograms.
 
     Returns: the path of ``report.html``.
@@ -56,51 +59,58 @@ def report_page(evaluation: Evaluation, listen: int = 3) -> Page:
         texts = [headline.limits(), *texts, *_words(evaluation, headline)]
     sections = [
         Section("Scores", texts, tables),
-        listening_section(evaluation, listen),
-        pictures_section(evaluation),
+        *listening_sections(evaluation, listen),
+        *pictures_sections(evaluation),
         score_details(evaluation),
     ]
     measures = ", ".join(map(title_of, evaluation.scores))
-    title = f"{', '.join(evaluation.names)}: {measures}"
-    return Page(title, verdict, [section for section in sections if section is not None])
+    return Page(f"{', '.join(evaluation.names)}: {measures}", verdict, sections)
 
 
-def score_details(evaluation: Evaluation) -> Section:
-    """Return all comparisons, scores of items and of ears, failures and notes, folded."""
-    tables = [items_table(evaluation, "Scores and levels of every item")]
+def score_details(
+    evaluation: Evaluation, texts: Sequence[str] = (), tables: Sequence[Table] = ()
+) -> Section:
+    """Return all comparisons, scores of items and of ears, failures and notes, folded.
+
+    Args:
+        evaluation: the study.
+        texts: paragraphs to begin with.
+        tables: tables to begin with.
+    """
+    item_tables = [items_table(evaluation, "Scores and levels of every item")]
+    better_ear = ""
     if "ears" in evaluation.groups:
-        tables.append(items_table(evaluation.groups["ears"], "Scores and levels of each ear"))
-    items = Section("All items", tables=tables, folded=True)
-    better_ear = "Each score is that of the better ear, by each measure."
+        caption = "Scores and levels of each ear"
+        item_tables.append(items_table(evaluation.groups["ears"], caption))
+        better_ear = "Each score is that of the better ear, by each measure."
+    sections = [*comparison_sections(evaluation), Section("All items", tables=item_tables)]
+    clean, scale = (evaluation.table[name].dropna() for name in ("clean_level", "full_scale_spl"))
+    levels = (
+        f"The clean speech has {clean.mean():.1f} dB SPL on average; RMS 1.0 stands for "
+        f"{scale.min():.1f} to {scale.max():.1f} dB SPL."
+    )
     notes = [
         scored_by(evaluation),
         severity_counts(evaluation),
-        _about_level(evaluation),
-        better_ear if "ears" in evaluation.groups else "",
+        levels,
+        better_ear,
         STATISTICS_NOTE,
     ]
-    return detail_section(evaluation, *comparison_sections(evaluation), items, notes=notes)
+    return detail_section(evaluation, sections, notes, texts=texts, tables=tables)
 
 
 def _words(evaluation: Evaluation, c: Comparison) -> list[str]:
-    """Say how many words a listener would understand, if the headline is HASPI's."""
+    """Return sentences about the words understood, if the headline is that of HASPI."""
     if c.measure != "haspi":
         return []
     both = evaluation.wide("haspi")[[c.before, c.after]].dropna().clip(0.0, 1.0)
     words = words_change(both[c.before].to_numpy(), both[c.after].to_numpy())
     before, after, change, low, high = (100.0 * share for share in words)
     return [
-        f"In words: a listener would understand {before:.0f} % of the words of these sentences under "
-        f"{c.before} and {after:.0f} % under {c.after}, a change of {change:+.0f} points. For nine of ten "
-        f"listeners the change lies between {low:+.0f} and {high:+.0f} points.",
-        "Words are predicted from HASPI by a curve that was fitted to 22 listeners with ten hearing aids "
-        "(hlsim.metrics.words). HASPI ranks aids well, but says little about single listeners.",
+        f"In words: a listener would understand {before:.0f} % of the words of these sentences "
+        f"under {c.before} and {after:.0f} % under {c.after}, a change of {change:+.0f} points. "
+        f"For nine of ten listeners the change lies between {low:+.0f} and {high:+.0f} points.",
+        "Words are predicted from HASPI by a curve that was fitted to 22 listeners with ten "
+        "hearing aids (hlsim.metrics.words). HASPI ranks aids well, but says little about single "
+        "listeners.",
     ]
-
-
-def _about_level(evaluation: Evaluation) -> str:
-    clean, scale = (evaluation.table[name].dropna() for name in ("clean_level", "full_scale_spl"))
-    return (
-        f"The clean speech has {clean.mean():.1f} dB SPL on average; RMS 1.0 stands for {scale.min():.1f} to "
-        f"{scale.max():.1f} dB SPL."
-    )

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from hlsim.audiogram import SEVERITIES
 from hlsim.evaluation.comparison import Comparison, p_text
-from hlsim.evaluation.measures import MEASURES, title_of
+from hlsim.evaluation.measures import title_of
 from hlsim.evaluation.result import Evaluation
 from hlsim.evaluation.statistics import RESAMPLES, PairedComparison
 from hlsim.report.page import Section, Table
@@ -17,16 +17,16 @@ if TYPE_CHECKING:
     from pandas import DataFrame, Series
 
 GAIN_NOTE = (
-    "HASPI rewards any gain, however loud: compare conditions at equal level, and read the level beside "
-    "every score."
+    "HASPI rewards any gain, however loud: compare conditions at equal level, and read the level "
+    "beside every score."
 )
 
 STATISTICS_NOTE = (
-    "A change is the later condition minus the earlier one. Standard deviations divide by n - 1; the "
-    "tests are two-sided; d is the mean change over the standard deviation of the changes. Intervals "
-    f"are percentiles of {RESAMPLES} bootstrap resamples, expanded for few items (Hesterberg 2015); "
-    "there is none for fewer than six. Wilcoxon's test leaves out items that did not change; W is the "
-    "smaller rank sum."
+    "A change is the later condition minus the earlier one. Standard deviations divide by n - 1; "
+    "the tests are two-sided; d is the mean change over the standard deviation of the changes. "
+    f"Intervals are percentiles of {RESAMPLES} bootstrap resamples, expanded for few items "
+    "(Hesterberg 2015); there is none for fewer than six. Wilcoxon's test leaves out items that "
+    "did not change; W is the smaller rank sum."
 )
 
 Columns = Mapping[str, tuple[Callable[["DataFrame"], Any], str]]
@@ -55,14 +55,15 @@ def score_cells(evaluation: Evaluation) -> Columns:
 
 
 def parts(table: DataFrame, fact: str = "") -> dict[str, DataFrame]:
-    """Return the rows of each condition, or of each value of a fact under each condition, by name."""
+    """Return the rows of each condition, or of each value of a fact and condition, by name."""
     if not fact:
         return {name: table[table["condition"] == name] for name in table["condition"].unique()}
-    return {
-        f"{value if isinstance(value, str) else f'{value:g}'}, {name}": rows
-        for value in ordered(table[fact].dropna().unique())
-        for name, rows in parts(table[table[fact] == value]).items()
-    }
+    rows = {}
+    for value in ordered(table[fact].dropna().unique()):
+        heading = value if isinstance(value, str) else f"{value:g}"
+        for name, part in parts(table[table[fact] == value]).items():
+            rows[f"{heading}, {name}"] = part
+    return rows
 
 
 def ordered(values: Sequence[Any]) -> list[Any]:
@@ -79,18 +80,30 @@ def summary_table(
     first: str = "Condition",
     folded: bool = False,
 ) -> Table:
-    """Return one row of statistics for each part of a study's table."""
-    cells = [
-        {first: name, **{title: number(get(part), form) for title, (get, form) in columns.items()}}
-        for name, part in rows.items()
-    ]
+    """Return one row of statistics for each part of a study's table.
+
+    Args:
+        caption: caption of the table.
+        rows: parts of the study's table by name.
+        columns: statistics by title.
+        first: title of the names.
+        folded: whether the table is shown only when it is opened.
+    """
+    cells = []
+    for name, part in rows.items():
+        values = {title: number(compute(part), form) for title, (compute, form) in columns.items()}
+        cells.append({first: name, **values})
     return Table.of(caption, cells, folded=folded)
 
 
-def number(value: Any, form: str, none: str = "n/a") -> str:
-    """Format a number; return a text as it is, and ``none`` for None and NaN."""
+def number(value: Any, form: str) -> str:
+    """Format a number; return a text as it is, and "n/a" for None and NaN.
+
+    >>> number(0.25, ".0%"), number(None, ".1f")
+    ('25%', 'n/a')
+    """
     if value is None or (not isinstance(value, str) and math.isnan(value)):
-        return none
+        return "n/a"
     return f"{value:{form}}"
 
 
@@ -111,12 +124,13 @@ def loss_name(severity: str) -> str:
 
 
 def mean_verdict(evaluation: Evaluation) -> str:
-    """Say in one sentence what a single condition scores."""
+    """Return the mean score of a single condition as a sentence."""
     measure = evaluation.scores[0]
     scored = evaluation.table.dropna(subset=[measure])
     return (
-        f"{title_of(measure)} of the condition {evaluation.names[0]} is {scored[measure].mean():.3f} on "
-        f"average ({len(scored)} items, at {scored['level'].mean():.1f} dB SPL)."
+        f"{title_of(measure)} of the condition {evaluation.names[0]} is "
+        f"{scored[measure].mean():.3f} on average ({len(scored)} items, at "
+        f"{scored['level'].mean():.1f} dB SPL)."
     )
 
 
@@ -173,46 +187,59 @@ def comparison_sections(evaluation: Evaluation) -> list[Section]:
 
 
 def detail_section(
-    evaluation: Evaluation, *sections: Section, notes: Sequence[str] = ()
+    evaluation: Evaluation,
+    sections: Sequence[Section],
+    notes: Sequence[str],
+    *,
+    texts: Sequence[str] = (),
+    tables: Sequence[Table] = (),
 ) -> Section:
-    """Return further sections, failures, notes and, if they are known, single scores, folded."""
+    """Return texts, tables, sections, failures and notes, folded.
+
+    Args:
+        evaluation: the study.
+        sections: inner sections.
+        notes: sentences about the origin of the values; empty ones are left out.
+        texts: paragraphs to begin with.
+        tables: tables to begin with.
+    """
     further = list(sections)
     failures = evaluation.failures[["name", "condition", "failure"]].to_numpy().tolist()
     if failures:
         table = Table("Outputs without all values", ("Item", "Condition", "Reason"), failures)
         further.append(Section("Failures", ["The other items were measured."], [table]))
     versions = ", ".join(f"{name} {v}" for name, v in evaluation.versions.items())
-    seed = evaluation.settings["seed"]
-    texts = [*filter(None, notes), f"Seed {seed}. Versions: {versions}."]
-    further.append(Section("How the values were made", texts))
-    return Section("Details", sections=further, folded=True)
+    origin = f"Seed {evaluation.settings['seed']}. Versions: {versions}."
+    further.append(Section("How the values were computed", [*filter(None, notes), origin]))
+    return Section("Details", texts, tables, sections=further, folded=True)
 
 
 def items_table(evaluation: Evaluation, caption: str) -> Table:
     """Return scores and level of every item under every condition."""
-    columns = {title_of(score): score for score in evaluation.scores} | {"dB SPL": "level"}
+    columns = {title_of(score): (score, ".3f") for score in evaluation.scores}
+    columns["dB SPL"] = ("level", ".1f")
     rows = []
     for _, part in evaluation.table.groupby("item", sort=False):
         row = {"Item": part["name"].iloc[0], "Loss": part["severity"].iloc[0]}
-        for name, only in parts(part).items():
-            for title, column in columns.items():
-                row[f"{title}, {name}"] = number(only[column].iloc[0], ".3f")
+        for name, of_condition in parts(part).items():
+            for title, (column, form) in columns.items():
+                row[f"{title}, {name}"] = number(of_condition[column].iloc[0], form)
         rows.append(row)
     return Table.of(caption, rows)
 
 
 def scored_by(evaluation: Evaluation) -> str:
-    """Say what computed HASPI and HASQI."""
-    named = [MEASURES[name].title for name in ("haspi", "hasqi") if name in evaluation.scores]
+    """Return a sentence about the origin of HASPI and HASQI."""
+    names = [title_of(name) for name in ("haspi", "hasqi") if name in evaluation.scores]
     version = evaluation.versions["hlsim"]
     text = (
-        f"{' and '.join(named)} (version 2) are computed by hlsim {version}, as by pyclarity 0.9."
+        f"{' and '.join(names)} (version 2) are computed by hlsim {version}, as by pyclarity 0.9."
     )
-    return text if named else ""
+    return text if names else ""
 
 
 def severity_counts(evaluation: Evaluation) -> str:
-    """Say how many items have which degree of loss."""
+    """Return a sentence with the number of items for each degree of loss."""
     counts = evaluation.table.drop_duplicates("item")["severity"].value_counts()
     texts = [f"{name} {counts[name]}" for name in SEVERITIES if name in counts]
     return f"Degrees of hearing loss by item: {', '.join(texts)}."

@@ -111,7 +111,7 @@ def test_conditions_groups_and_page(
     assert page.verdict.startswith("On clean speech, mine ")
     assert [section.title for section in page.sections][:2] == ["Scores", "Listen"]
     (example,) = page.sections[1].sections
-    assert len(example.players) == 4, "clean speech, unaided, NAL-R at the same level, mine"
+    assert len(example.player.sounds) == 4, "normal ear, unaided, NAL-R at the same level, mine"
     assert "my_enhancer:half" in page.markdown() and page.html().count("<audio") == 4
 
 

@@ -71,7 +71,7 @@ def check_page(study: Evaluation) -> None:
     assert titles == ["Speech as it is", "20 dB louder", "Listen"]
     item, teacher = example_item(study)
     assert item.facts["treatment"] == "as-is" and teacher.shape == item.signal.shape
-    labels = [player.label.split(",")[0] for player in page.sections[2].players[:3]]
+    labels = [sound.label for sound in page.sections[2].player.sounds[:3]]
     assert labels == ["input", "teacher", "light"]
     assert "Failures" in page.markdown() and "NaN" in page.markdown()
 

@@ -1,30 +1,57 @@
-"""The report's page in a real Chromium: no error, no request, players that play, a phone's width, the keyboard.
+"""Pages in a real Chromium: no error, no request, players, a phone's width, dark mode, the keyboard.
 
-Run with ``pytest -m browser``. Needs playwright and a Chromium: its own (``playwright install chromium``), or one of the
-system, found by name or in the environment variable ``CHROMIUM``.
+Run with ``pytest -m browser``. The tests need playwright and a Chromium: its own
+(``playwright install chromium``), or the system's, found by name or in the environment variable
+``CHROMIUM``.
 """
 
 import os
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from hlsim import example_speech, listen
 from hlsim.report.page import write_page
 from hlsim.report.recordings import report_page
 from tests.report.test_recordings import evaluation
 
 pytestmark = pytest.mark.browser
 
+STATE = """
+    () => [...document.querySelectorAll('.hlsim-player')].map(player => {
+        const audios = [...player.querySelectorAll('audio')];
+        return {
+            playing: audios.map((audio, number) => audio.paused ? -1 : number).filter(n => n >= 0),
+            times: audios.map(audio => audio.currentTime),
+            volumes: audios.map(audio => audio.volume),
+            pressed: [...player.querySelectorAll('.select')]
+                .findIndex(button => button.getAttribute('aria-pressed') === 'true'),
+            position: Number(player.querySelector('.position').value),
+            lowered: player.querySelector('.lowered').textContent,
+        };
+    })
+"""
+"""JavaScript that returns the state of each player of a page."""
+
 
 @pytest.fixture(scope="module")
-def page_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A report of three conditions; the scores are made up."""
+def report_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A report of three conditions with made-up scores."""
     root = tmp_path_factory.mktemp("report")
     study = evaluation(root)
     return write_page(report_page(study, listen=2), study.to_dict(), root / "out")
+
+
+@pytest.fixture(scope="module")
+def players_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A saved player of speech and of louder copies."""
+    path = tmp_path_factory.mktemp("players") / "players.html"
+    speech = example_speech()
+    listen(original=speech, louder=2.0 * speech, much_louder=20.0 * speech).save(path)
+    return path
 
 
 @pytest.fixture(scope="module")
@@ -38,85 +65,161 @@ def chromium() -> Iterator[Any]:
         browser.close()
 
 
-@pytest.fixture(params=[(400, 740), (1400, 900)], ids=["phone", "desk"])
-def opened(request: pytest.FixtureRequest, chromium: Any) -> Iterator[Callable[[Path], Any]]:
-    """Opens a page; fails afterwards where it said anything or asked for anything but itself."""
-    width, height = request.param
-    page = chromium.new_page(viewport={"width": width, "height": height})
-    said: list[str] = []
-    asked: list[str] = []
-    page.on("console", lambda message: said.append(message.text))
-    page.on("pageerror", lambda error: said.append(str(error)))
-    page.on("request", lambda one: asked.append(one.url))
-
-    def open_page(path: Path) -> Any:
-        page.goto(path.as_uri())
-        return page
-
-    yield open_page
+@pytest.fixture(params=["390 light", "390 dark", "1400 light", "1400 dark"])
+def window(request: pytest.FixtureRequest, chromium: Any) -> Iterator[Any]:
+    """A window that fails the test if its page logs anything or requests more than itself."""
+    width, scheme = request.param.split()
+    size = {"width": int(width), "height": 844}
+    page = chromium.new_page(viewport=size, color_scheme=scheme)
+    logged: list[str] = []
+    requests: list[str] = []
+    page.on("console", lambda message: logged.append(message.text))
+    page.on("pageerror", lambda error: logged.append(str(error)))
+    page.on("request", lambda request: requests.append(request.url))
+    yield page
     url = page.url.partition("#")[0]
     page.close()
-    assert said == []
-    assert [one for one in asked if not one.startswith("data:")] == [url]
+    assert logged == []
+    assert [request for request in requests if not request.startswith("data:")] == [url]
 
 
 @pytest.fixture
-def page(opened: Callable[[Path], Any], page_file: Path) -> Any:
-    return opened(page_file)
+def report(window: Any, report_file: Path) -> Any:
+    window.goto(report_file.as_uri())
+    return window
 
 
-def test_pictures_are_drawn_and_nothing_is_wider_than_the_screen(page: Any) -> None:
-    widths = page.evaluate(
+@pytest.fixture
+def players(window: Any, players_file: Path) -> Any:
+    window.goto(players_file.as_uri())
+    return window
+
+
+def wait_until(page: Any, expression: str, argument: Any = None) -> None:
+    """Wait for an expression; playwright's own function needs ``eval``, which the page forbids."""
+    for _ in range(200):
+        if page.evaluate(expression, argument):
+            return
+        page.wait_for_timeout(25)
+    raise AssertionError(f"not true after 5 s: {expression}")
+
+
+def test_pictures_are_drawn_and_nothing_is_wider_than_the_screen(report: Any) -> None:
+    widths = report.evaluate(
         "[...document.images].map(i => [i.naturalWidth, i.getBoundingClientRect().width])"
     )
-    # five of the study, and for each of two items clean speech and three conditions
-    assert len(widths) == 5 + 2 * 4
-    inner = page.viewport_size["width"]
-    assert all(natural > 0 and 150 < shown <= inner for natural, shown in widths)
-    assert page.evaluate("document.documentElement.scrollWidth") <= inner
+    # four of the study, and for each of two items a normal ear and three conditions
+    assert len(widths) == 4 + 2 * 4
+    inner = report.viewport_size["width"]
+    assert all(natural > 0 and 150 < width <= inner for natural, width in widths)
+    assert report.evaluate("document.documentElement.scrollWidth") <= inner
     # the first table is whole even on a phone
-    region = page.locator(".scroll").first
-    assert region.evaluate("e => e.scrollWidth <= e.clientWidth")
-    assert (
-        page.evaluate("parseFloat(getComputedStyle(document.querySelector('td')).fontSize)") >= 13
+    assert report.locator(".scroll").first.evaluate("e => e.scrollWidth <= e.clientWidth")
+    size = "parseFloat(getComputedStyle(document.querySelector('td')).fontSize)"
+    assert report.evaluate(size) >= 13
+
+
+def test_text_and_plots_follow_the_colour_scheme(report: Any) -> None:
+    colours = report.evaluate(
+        "[getComputedStyle(document.body).color, getComputedStyle(document.body).backgroundColor]"
     )
-
-
-def test_players_play(page: Any) -> None:
-    played = page.evaluate(
+    ink, ground = (sum(map(int, colour[4:-1].split(","))) for colour in colours)
+    dark = report.evaluate("matchMedia('(prefers-color-scheme: dark)').matches")
+    assert (ink > ground) == dark and abs(ink - ground) > 400
+    # a pixel of the axes of the first plot, which is an image that the page's style cannot reach
+    lightest, darkest = report.evaluate(
         """async () => {
-            const out = [];
-            for (const audio of document.querySelectorAll('audio')) {
-                audio.muted = true;
-                await audio.play();
-                await new Promise(done => audio.ontimeupdate = () => audio.currentTime > 0 && done());
-                out.push([audio.duration, audio.error === null, audio.currentTime > 0]);
-                audio.pause();
-            }
-            return out;
+            const image = document.querySelector('.pictures img');
+            await image.decode();
+            const canvas = document.createElement('canvas');
+            Object.assign(canvas, {width: image.width, height: image.height});
+            const context = canvas.getContext('2d');
+            context.drawImage(image, 0, 0, image.width, image.height);
+            const data = context.getImageData(0, 0, image.width, image.height).data;
+            const grey = [];
+            for (let i = 0; i < data.length; i += 4)
+                if (data[i + 3] > 250) grey.push((data[i] + data[i + 1] + data[i + 2]) / 3);
+            return [Math.max(...grey), Math.min(...grey)];
         }"""
     )
-    assert len(played) == 2 * 4
-    assert all(abs(seconds - 1.0) < 0.02 and fine and moved for seconds, fine, moved in played)
+    assert lightest > 200 if dark else darkest < 50
 
 
-def test_the_keyboard_reaches_everything(page: Any) -> None:
-    page.keyboard.press("Tab")
-    focus = "[document.activeElement.className || document.activeElement.tagName, document.activeElement.innerText]"
-    assert page.evaluate(focus) == ["skip", "Skip to the report"]
-    assert page.evaluate("document.activeElement.getBoundingClientRect().left") >= 0
-    page.keyboard.press("Enter")
-    assert page.evaluate("document.activeElement.id") == "main"
-    reached = []
-    for _ in range(80):
-        page.keyboard.press("Tab")
-        kind = page.evaluate(
-            "document.activeElement.tagName + '.' + document.activeElement.className"
+def test_switching_keeps_the_position(players: Any) -> None:
+    players.locator(".play").click()
+    wait_until(players, "document.querySelector('audio').currentTime > 0.4")
+    players.locator(".select").nth(1).click()
+    wait_until(players, "document.querySelectorAll('audio')[1].currentTime > 0.4")
+    (state,) = players.evaluate(STATE)
+    assert state["playing"] == [1] and state["pressed"] == 1
+    assert state["times"][1] - state["times"][0] < 1.0
+    players.keyboard.press("1")
+    wait_until(players, "!document.querySelector('audio').paused")
+    (state,) = players.evaluate(STATE)
+    assert state["playing"] == [0] and state["times"][0] >= 0.4
+    players.locator(".play").click()
+    (state,) = players.evaluate(STATE)
+    assert state["playing"] == []
+    assert state["position"] == pytest.approx(state["times"][0], abs=0.05)
+
+
+def test_a_spectrogram_and_the_slider_choose_the_position(players: Any) -> None:
+    spectrogram = players.locator(".spectrogram").nth(1)
+    box = spectrogram.bounding_box()
+    spectrogram.click(position={"x": box["width"] / 2, "y": 40})
+    wait_until(players, "!document.querySelectorAll('audio')[1].paused")
+    (state,) = players.evaluate(STATE)
+    assert state["times"][1] == pytest.approx(2.0, abs=0.5)
+    players.locator(".play").click()
+    players.locator(".position").fill("1")
+    (state,) = players.evaluate(STATE)
+    assert state["times"][1] == pytest.approx(1.0, abs=0.01)
+
+
+def test_a_much_louder_sound_lowers_the_volume(players: Any) -> None:
+    (state,) = players.evaluate(STATE)
+    start = state["volumes"][0]
+    assert start == 0.5
+    players.locator(".select").nth(1).click()  # 6 dB louder
+    (state,) = players.evaluate(STATE)
+    assert state["volumes"][1] == start and state["lowered"] == ""
+    players.locator(".select").nth(2).click()  # 26 dB louder than the first
+    (state,) = players.evaluate(STATE)
+    assert state["volumes"][2] == pytest.approx(start * 10 ** ((12 - 26.02) / 20), rel=0.01)
+    assert state["lowered"].startswith("Volume lowered by 14 dB")
+    # the volume is now set by this sound, so that a softer one does not raise it
+    players.locator(".select").nth(0).click()
+    (state,) = players.evaluate(STATE)
+    assert state["volumes"][0] < start and state["lowered"] == ""
+
+
+def test_only_one_player_of_a_page_plays(report: Any) -> None:
+    for number in range(2):
+        report.locator(".play").nth(number).click()
+        wait_until(
+            report, "n => document.querySelectorAll('.play')[n].textContent === 'Pause'", number
         )
-        reached.append(kind)
+    first, second = report.evaluate(STATE)
+    assert first["playing"] == [] and second["playing"] == [0]
+    assert report.locator(".hlsim-player audio[controls]").count() == 0
+
+
+def test_the_keyboard_reaches_everything(report: Any) -> None:
+    report.keyboard.press("Tab")
+    element = "document.activeElement"
+    focus = f"[{element}.className || {element}.tagName, {element}.innerText]"
+    assert report.evaluate(focus) == ["skip", "Skip to the report"]
+    assert report.evaluate(f"{element}.getBoundingClientRect().left") >= 0
+    report.keyboard.press("Enter")
+    assert report.evaluate(f"{element}.id") == "main"
+    focused = []
+    for _ in range(80):
+        report.keyboard.press("Tab")
+        kind = report.evaluate(f"{element}.tagName + '.' + {element}.className")
+        focused.append(kind)
         if kind.startswith("SUMMARY"):
             break
-    tables = page.evaluate(
+    tables = report.evaluate(
         """() => {
             const folded = document.querySelector('details');
             const follows = Node.DOCUMENT_POSITION_FOLLOWING;
@@ -124,33 +227,34 @@ def test_the_keyboard_reaches_everything(page: Any) -> None:
                 e => e.compareDocumentPosition(folded) & follows && !folded.contains(e)).length;
         }"""
     )
-    assert reached.count("DIV.scroll") == tables >= 2
-    assert sum(kind.startswith("AUDIO") for kind in reached) >= 8
-    hidden = page.locator("details table").first
+    assert focused.count("DIV.scroll") == tables >= 2
+    assert focused.count("BUTTON.play") == 2 and focused.count("BUTTON.select") == 8
+    assert focused.count("INPUT.volume") == focused.count("INPUT.position") == 2
+    hidden = report.locator("details table").first
     assert not hidden.is_visible()
-    page.keyboard.press("Enter")
+    report.keyboard.press("Enter")
     assert hidden.is_visible()
 
 
-def test_a_link_to_a_folded_section_opens_it_and_shows_its_heading(page: Any) -> None:
-    names = page.evaluate("[...document.querySelectorAll('details.folded > div')].map(e => e.id)")
-    name = next(name for name in names if page.locator(f'nav a[href="#{name}"]').count())
-    details = page.locator(f'details.folded:has(> [id="{name}"])')
+def test_a_link_to_a_folded_section_opens_it_and_shows_its_heading(report: Any) -> None:
+    names = report.evaluate("[...document.querySelectorAll('details.folded > div')].map(e => e.id)")
+    name = next(name for name in names if report.locator(f'nav a[href="#{name}"]').count())
+    details = report.locator(f'details.folded:has(> [id="{name}"])')
     assert not details.evaluate("e => e.open")
-    page.locator(f'nav a[href="#{name}"]').click()
-    page.wait_for_function("e => e.open", arg=details.element_handle())
+    report.locator(f'nav a[href="#{name}"]').click()
+    wait_until(report, "e => e.open", details.element_handle())
     place = details.locator("h2").first.bounding_box()
-    assert 0 <= place["y"] < page.viewport_size["height"]
+    assert 0 <= place["y"] < report.viewport_size["height"]
 
 
-def test_the_focus_is_seen_and_scrolls_a_wide_table(page: Any) -> None:
-    wide = page.locator(".scroll").last
-    page.locator("summary").first.click()
+def test_the_focus_is_visible_and_scrolls_a_wide_table(report: Any) -> None:
+    wide = report.locator(".scroll").last
+    report.locator("summary").first.click()
     wide.focus()
-    page.keyboard.press("Tab")
-    page.keyboard.press("Shift+Tab")
+    report.keyboard.press("Tab")
+    report.keyboard.press("Shift+Tab")
     assert wide.evaluate("e => getComputedStyle(e).outlineStyle") == "solid"
     if wide.evaluate("e => e.scrollWidth > e.clientWidth"):
         for _ in range(3):
-            page.keyboard.press("ArrowRight")
-        page.wait_for_function("e => e.scrollLeft > 0", arg=wide.element_handle())
+            report.keyboard.press("ArrowRight")
+        wait_until(report, "e => e.scrollLeft > 0", wide.element_handle())

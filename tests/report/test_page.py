@@ -1,11 +1,13 @@
 """One HTML file with everything in it: escaped, closed, and without an address."""
 
+import base64
+import hashlib
 import re
 from html.parser import HTMLParser
 
-from hlsim.report.page import Page, Picture, Player, Section, Table
+from hlsim.report.page import Card, Page, Picture, Player, Section, Sound, Table
 
-VOID = {"meta", "link", "img", "input", "br"}
+VOID_TAGS = {"meta", "link", "img", "input", "br"}
 
 
 class Balance(HTMLParser):
@@ -18,7 +20,7 @@ class Balance(HTMLParser):
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         self.attributes += [(tag, name, value or "") for name, value in attrs]
-        if tag not in VOID:
+        if tag not in VOID_TAGS:
             self.open.append(tag)
 
     def handle_endtag(self, tag: str) -> None:
@@ -29,7 +31,11 @@ NASTY = '<script>alert("x")</script> & \'quotes\' "too"'
 
 
 def page() -> str:
-    inner = Section("Inner", players=[Player(b"fLaC123", NASTY), Player(b"RIFF123", "wav")])
+    sounds = [
+        Sound(1, NASTY, 60.0, b"fLaC123", spectrogram=b"\x89PNG", note=NASTY),
+        Sound(2, "wav", 60.0, b"RIFF123"),
+    ]
+    inner = Section("Inner", player=Player({NASTY: sounds}, 1.0, NASTY, sentence=NASTY))
     sections = [
         Section(
             NASTY,
@@ -43,7 +49,7 @@ def page() -> str:
         ),
         Section("Folded", paragraphs=["text"], folded=True),
     ]
-    return Page(NASTY, NASTY, sections).html()
+    return Page(NASTY, f"{NASTY} (5 items).", sections, [Card(NASTY, "1", NASTY, [])]).html()
 
 
 def test_everything_is_escaped_and_closed() -> None:
@@ -51,12 +57,13 @@ def test_everything_is_escaped_and_closed() -> None:
     parser = Balance()
     parser.feed(text)
     assert parser.open == []
-    assert "<script" not in text and text.count("&lt;script&gt;") >= 8
-    assert ("img", "alt", NASTY) in parser.attributes and (
-        "audio",
-        "aria-label",
-        NASTY,
-    ) in parser.attributes
+    # the player's script is the only one, and the page's policy runs no other
+    assert text.count("<script") == 1 and text.count("&lt;script&gt;") >= 14
+    [script] = re.findall(r"<script>(.*)</script>", text, re.DOTALL)
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    assert f"script-src 'sha256-{digest}'\"" in text
+    assert ("img", "alt", NASTY) in parser.attributes
+    assert ("audio", "aria-label", NASTY) in parser.attributes
 
 
 def test_nothing_is_fetched() -> None:
@@ -65,7 +72,7 @@ def test_nothing_is_fetched() -> None:
     addresses = [
         value for _, name, value in parser.attributes if name in ("src", "href", "data", "srcset")
     ]
-    assert len(addresses) == 2 + 2 + 1 + 1 + 3  # pictures, players, icon, skip link, sections
+    assert len(addresses) == 2 + 3 + 1 + 1 + 3  # pictures, sounds, icon, skip link, sections
     assert all(value.startswith(("data:", "#")) for value in addresses)
     assert {
         value.split(";")[0] for value in addresses if value.startswith("data:") and ";" in value
@@ -84,6 +91,13 @@ def test_links_lead_to_sections_and_tables_take_the_focus() -> None:
     names = set(re.findall(r' id="([^"]+)"', text))
     assert set(re.findall(r'href="#([^"]+)"', text)) <= names
     assert re.findall(r"<h(\d)", text) == ["1", "2", "2", "3", "2"]
-    assert text.count('role="region" tabindex="0"') == text.count("<table") == 1
+    assert text.count('role="region" tabindex="0"') == text.count('class="scroll"') == 1
     assert '<html lang="en">' in text and "width=device-width" in text
     assert text.count('<details class="folded">') == text.count("<summary>") == 1
+
+
+def test_numbers_at_the_end_of_the_verdict_are_printed_smaller() -> None:
+    text = Page("Aids", "Mine (new) is better: 0.9 (10 items; p = 0.01).", []).html()
+    verdict = "Mine (new) is better: 0.9 <small>(10 items; p = 0.01).</small>"
+    assert f'<p class="verdict">{verdict}</p>' in text
+    assert '<p class="verdict">' not in Page("Aids", "", []).html()

@@ -1,0 +1,214 @@
+"""Players of what an ear perceives, with spectrograms on one scale of dB SPL."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from hlsim.audio import encode_flac
+from hlsim.calibration import PASCAL_SPL, gain_to_pascals, level_spl
+from hlsim.evaluation.measures import NORMAL, perceive
+from hlsim.evaluation.parallel import describe_error
+from hlsim.evaluation.result import Evaluation
+from hlsim.extras import MissingExtraError, require
+from hlsim.report.page import Player, Section, Sound
+
+LONGEST_SECONDS = 8.0
+"""Length after which an item is cut on a page."""
+
+RANGE_DB = 90.0
+"""Range of levels in a spectrogram, from the loudest bin down."""
+
+NORMAL_EAR = "normal ear (the goal)"
+"""Label of clean speech as a normal ear perceives it."""
+
+_PEAK = 0.9
+_COLOUR_MAP = "magma"
+_HIGHEST_HZ = 8000.0  # MSBG and HASPI end there
+_EMPTY_SHARE = 0.01  # of the bins that are within the range of an almost empty spectrogram
+
+_EXPLANATION = (
+    "What the impaired ear perceives, by MSBG. The goal is what a normal ear perceives of the "
+    "clean speech. Switch between the sounds while one plays: the position stays the same."
+)
+
+
+_HINT = (
+    "All sounds of a row have one gain (full scale is a peak of {full_scale:.0f} dB SPL), so "
+    "that what is soft for the ear is soft here. The volume starts low. If a sound is more than "
+    "12 dB louder than the one by which you set the volume, the volume is lowered. Keys 1 to 9 "
+    "switch."
+)
+
+
+def listening_sections(
+    evaluation: Evaluation, count: int, shown: Sequence[str] = ()
+) -> list[Section]:
+    """Return players of some items, from the largest rise of the score to the largest fall.
+
+    Args:
+        evaluation: the study.
+        count: number of items.
+        shown: names of the conditions to be played, by default all.
+
+    Returns: one section, or none if there is nothing to play.
+    """
+    headline = evaluation.headline
+    if headline is None or not count:
+        return []
+    scores = evaluation.wide(headline.measure)
+    changes = (scores[headline.after] - scores[headline.before]).dropna()
+    changes = changes.sort_values(ascending=False, kind="stable")
+    places = np.linspace(0, len(changes) - 1, min(count, len(changes))).round().astype(int)
+    rows = evaluation.table.drop_duplicates("item").set_index("item")
+    sections = []
+    for place in places.tolist():
+        row, change = rows.loc[changes.index[place]], changes.iloc[place]
+        rank = f"change {change:+.3f}, rank {place + 1} of {len(changes)}"
+        title = f"{row['name']} ({headline.title}: {rank})"
+        number = int(row.get("source", row.name))
+        try:
+            sections.append(_item_section(evaluation, number, title, shown or evaluation.names))
+        except Exception as error:  # a page is not lost to a sound
+            sections.append(Section(title, [f"It cannot be played: {describe_error(error)}"]))
+    return [Section("Listen", [_EXPLANATION], sections=sections)]
+
+
+def _item_section(evaluation: Evaluation, number: int, title: str, shown: Sequence[str]) -> Section:
+    """Return a player of the signals that a normal ear and, by condition, the ear perceives."""
+    item = evaluation.items[number].load()
+    gain, end = gain_to_pascals(item.full_scale_spl), int(LONGEST_SECONDS * item.sample_rate)
+    signals = {NORMAL_EAR: perceive(item.clean[:end].float() * gain, NORMAL, item.sample_rate)}
+    for condition in evaluation.conditions:
+        if condition.name in shown:
+            with torch.no_grad():
+                output = condition.output(item)[:end].float() * gain
+            signals[condition.name] = perceive(output, item.ear, item.sample_rate)
+    thresholds = ", ".join(f"{level:g}" for level in item.ear.thresholds)
+    about = f"{item.ear.severity.capitalize()} loss, thresholds {thresholds} dB HL."
+    return Section(title, [about], player=make_player({"": signals}, item.sample_rate))
+
+
+def make_player(
+    groups: Mapping[str, Mapping[str, Tensor]], sample_rate: int, sentence: str = ""
+) -> Player:
+    """Return a player, with spectrograms if matplotlib is installed.
+
+    All signals of a group have one gain, so that their loudness can be compared. Groups may have
+    different gains: the output of an aid is much louder than what the ear perceives of it.
+
+    Args:
+        groups: signals in pascals by label, for each heading of a group.
+        sample_rate: sample rate in Hz.
+        sentence: words that are spoken.
+
+    Shape: (time,) for each signal.
+
+    Raises:
+        ValueError: all signals of a group are silent.
+
+    >>> tone = torch.sin(torch.arange(16000) * 0.2)
+    >>> player = make_player({"": {"tone": tone, "soft tone": 0.1 * tone}}, 16000)
+    >>> [f"{sound.label} {sound.level:.0f} dB SPL" for sound in player.sounds]
+    ['tone 91 dB SPL', 'soft tone 71 dB SPL']
+    """
+    bins = [
+        [spectrogram_levels(signal, sample_rate) for signal in group.values()]
+        for group in groups.values()
+    ]
+    loudest = max(float(levels.quantile(0.999)) for group in bins for levels in group)
+    highest = 5.0 * round(loudest / 5.0 + 0.5)
+    gains = [_PEAK / _peak(group) for group in groups.values()]
+    sounds: dict[str, list[Sound]] = {}
+    number = 0
+    for (heading, group), group_bins, gain in zip(groups.items(), bins, gains, strict=True):
+        softer = 20.0 * np.log10(gains[0] / gain)
+        title = heading + (f", played {softer:.0f} dB softer" if softer > 0.5 else "")
+        sounds[title] = []
+        for (label, signal), levels in zip(group.items(), group_bins, strict=True):
+            number += 1
+            level = float(level_spl(signal))
+            sound = Sound(
+                number=number,
+                label=label,
+                level=level,
+                audio=encode_flac(signal * gain, sample_rate),
+                loudness=level - PASCAL_SPL + 20.0 * np.log10(gain),
+                spectrogram=_spectrogram_png(levels, highest),
+                note=_note(levels, highest - RANGE_DB),
+            )
+            sounds[title].append(sound)
+    return Player(
+        groups=sounds,
+        seconds=max(len(signal) for group in groups.values() for signal in group.values())
+        / sample_rate,
+        hint=_HINT.format(full_scale=PASCAL_SPL - 20.0 * np.log10(gains[0])),
+        sentence=sentence,
+        levels=(highest - RANGE_DB, highest),
+        colours=_colours(),
+        highest_khz=min(_HIGHEST_HZ, sample_rate / 2.0) / 1000.0,
+    )
+
+
+def _peak(group: Mapping[str, Tensor]) -> float:
+    """Return the largest sample of all signals of a group."""
+    peak = max(float(signal.abs().max()) for signal in group.values())
+    if not peak:
+        raise ValueError("all sounds are silent; pass a signal with samples other than zero")
+    return peak
+
+
+def spectrogram_levels(signal: Tensor, sample_rate: int) -> Tensor:
+    """Return levels up to 8 kHz in windows of 20 ms, every 10 ms; silence has -46 dB SPL.
+
+    Args:
+        signal: signal in pascals.
+        sample_rate: sample rate in Hz.
+
+    Shape: (time,) -> (bins of 50 Hz, frames) in dB SPL.
+
+    >>> spectrogram_levels(torch.zeros(16000), 16000).shape
+    torch.Size([161, 101])
+    """
+    points = 2 * (sample_rate // 100)
+    window = torch.hann_window(points)
+    spectrum = torch.stft(
+        signal.float().cpu(), points, points // 2, window=window, return_complex=True
+    )
+    levels = 20.0 * torch.log10(spectrum.abs() * 2.0**0.5 / window.sum() + 1e-7) + PASCAL_SPL
+    return levels[: round(_HIGHEST_HZ * points / sample_rate) + 1]
+
+
+def _spectrogram_png(levels: Tensor, highest: float) -> bytes:
+    """Return a picture with one pixel for each bin and frame; none without matplotlib."""
+    try:
+        maps, image = require("matplotlib", "eval").colormaps, require("PIL.Image", "eval")
+    except MissingExtraError:  # sounds can be played without it
+        return b""
+    shares = ((levels - highest) / RANGE_DB + 1.0).clamp(0.0, 1.0)
+    pixels = (255.0 * shares).round().to(torch.uint8).flip(0).numpy()
+    picture = image.fromarray(pixels)
+    picture.putpalette(maps[_COLOUR_MAP](range(256), bytes=True)[:, :3].tobytes())
+    data = io.BytesIO()
+    picture.save(data, format="PNG", optimize=True)
+    return data.getvalue()
+
+
+def _colours() -> list[str]:
+    """Return the colours of a spectrogram in CSS, from the lowest level to the highest."""
+    try:
+        maps = require("matplotlib", "eval").colormaps
+    except MissingExtraError:
+        return []
+    colours = maps[_COLOUR_MAP](range(0, 256, 51), bytes=True)
+    return [f"rgb({red} {green} {blue})" for red, green, blue, _ in colours.tolist()]
+
+
+def _note(levels: Tensor, lowest: float) -> str:
+    """Return what to write over a spectrogram in which there is almost nothing to see."""
+    share = float((levels > lowest).float().mean())
+    return f"almost nothing above {lowest:.0f} dB SPL" if share < _EMPTY_SHARE else ""

@@ -1,0 +1,75 @@
+"""Plots: legible in light and dark, labels beside the curves, and no picture of a single group."""
+
+import numpy as np
+import pytest
+
+from hlsim.evaluation import Condition
+from hlsim.report.plots import (
+    INK,
+    UNAIDED_COLOUR,
+    condition_colours,
+    curves_picture,
+    distribution_picture,
+    gain_picture,
+    spread_labels,
+)
+
+pandas = pytest.importorskip("pandas")
+pytest.importorskip("matplotlib")
+
+
+def test_ink_follows_the_colour_scheme_of_the_page_and_plots_are_reproducible() -> None:
+    curves = {"_a $b$": ([250, 4000], [1.0, 2.0], {"color": "#2f7ed8"})}
+    picture = curves_picture(curves, "A title", "level (dB)")
+    assert picture.data == curves_picture(curves, "A title", "level (dB)").data
+    text = picture.data.decode()
+    assert INK not in text and "currentColor" in text
+    assert "prefers-color-scheme: dark" in text
+    assert "_a $b$" in text, "the label is shown as it is"
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_labels_keep_their_order_and_their_distance(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    ends, heights = random.uniform(0.0, 1.0, 6), random.choice([0.05, 0.1], 6)
+    places = spread_labels(ends, heights)
+    order = np.argsort(ends)
+    distances = np.diff(places[order])
+    needed = (heights[order][1:] + heights[order][:-1]) / 2
+    assert (distances >= needed - 1e-9).all() and places.max() <= 1.0
+
+
+def test_a_linear_aid_has_one_gain_curve() -> None:
+    frequencies, levels = [250, 1000, 4000], [50.0, 80.0]
+    rows = [
+        {"aid": "linear", "frequencies": frequencies, "levels": levels, "gain_db": [[5, 6, 7]] * 2},
+        {
+            "aid": "compressor",
+            "frequencies": frequencies,
+            "levels": levels,
+            "gain_db": [[5, 6, 7], [1, 2, 3]],
+        },
+    ]
+    colours = {"linear": "#2f7ed8", "compressor": "#c96a00"}
+    text = gain_picture("Gain", rows, colours).data.decode()
+    assert text.count("linear") == 1
+    assert text.count("compressor") == 2 and "80\N{NO-BREAK SPACE}dB" in text
+
+
+def test_colours_of_conditions() -> None:
+    conditions = [
+        Condition("none", kind="unaided"),
+        Condition("NAL-R, same level", kind="same level", of="mine"),
+        Condition("mine"),
+        Condition("other"),
+    ]
+    colours = condition_colours(conditions)
+    assert colours["none"] == UNAIDED_COLOUR
+    assert colours["NAL-R, same level"] == (colours["mine"], 0.6)
+    assert len({str(colour) for colour in colours.values()}) == 4
+
+
+def test_a_distribution_names_the_medians_for_readers_who_do_not_see_it() -> None:
+    groups = {"N2": pandas.Series([0.1, 0.2, 0.6]), "empty": pandas.Series([np.nan])}
+    picture = distribution_picture(groups, "HASPI", "ear")
+    assert picture.alt == "HASPI by ear; medians: N2 0.200."

@@ -1,0 +1,67 @@
+"""Players: levels in dB SPL, one gain per group, spectrograms on one scale."""
+
+import io
+import math
+
+import pytest
+import soundfile
+import torch
+from PIL import Image
+from torch import Tensor
+
+from hlsim.report.sounds import RANGE_DB, make_player, spectrogram_levels
+
+pytest.importorskip("matplotlib")
+
+
+def tone(level: float, seconds: float = 0.5) -> Tensor:
+    """A tone of 1 kHz at a level in dB SPL."""
+    times = torch.arange(round(seconds * 16000)) / 16000
+    return math.sqrt(2.0) * 10 ** ((level - 94) / 20) * torch.sin(2 * math.pi * 1000 * times)
+
+
+def samples(audio: bytes) -> Tensor:
+    return torch.from_numpy(soundfile.read(io.BytesIO(audio), dtype="float32")[0])
+
+
+def test_a_tone_has_its_level_in_one_bin() -> None:
+    levels = spectrogram_levels(tone(80.0), 16000)
+    assert float(levels[20].median()) == pytest.approx(80.0, abs=0.1)  # bins of 50 Hz
+    assert float(levels[40].median()) < 20.0
+    assert len(spectrogram_levels(torch.zeros(44100), 44100)) == len(levels), "both end at 8 kHz"
+
+
+def test_sounds_of_a_group_have_one_gain_and_groups_are_not_louder_than_others() -> None:
+    groups = {"perceived": {"a": tone(60.0), "b": tone(50.0)}, "output": {"c": tone(90.0)}}
+    player = make_player(groups, 16000, "Some words.")
+    assert list(player.groups) == ["perceived", "output, played 30 dB softer"]
+    first, second, third = player.sounds
+    assert [sound.number for sound in player.sounds] == [1, 2, 3]
+    ratio = samples(first.audio).std() / samples(second.audio).std()
+    assert float(ratio) == pytest.approx(10 ** (10 / 20), rel=1e-3)
+    for sound in (first, third):
+        assert float(samples(sound.audio).abs().max()) == pytest.approx(0.9, abs=1e-3)
+    for sound in player.sounds:
+        played = 20 * float(samples(sound.audio).square().mean().log10()) / 2
+        assert sound.loudness == pytest.approx(played, abs=0.01)
+    assert "full scale is a peak of 64 dB SPL" in player.hint
+
+
+def test_spectrograms_have_one_scale_and_say_where_nothing_is_seen() -> None:
+    player = make_player({"": {"loud": tone(80.0), "soft": tone(-20.0)}}, 16000)
+    lowest, highest = player.levels
+    assert 80.0 < highest < 100.0 and lowest == highest - RANGE_DB
+    loud, soft = (Image.open(io.BytesIO(s.spectrogram)) for s in player.sounds)
+    frames = spectrogram_levels(tone(80.0), 16000).shape
+    assert loud.size == soft.size == frames[::-1]
+    row = frames[0] - 1 - 20  # the picture begins at 8 kHz
+    expected = 255 * (80.0 - lowest) / RANGE_DB
+    assert loud.getpixel((frames[1] // 2, row)) == pytest.approx(expected, abs=1)
+    assert soft.getextrema() == (0, 0)
+    notes = [sound.note for sound in player.sounds]
+    assert notes == ["", f"almost nothing above {lowest:.0f} dB SPL"]
+
+
+def test_silence_is_rejected() -> None:
+    with pytest.raises(ValueError, match="silent"):
+        make_player({"": {"silence": torch.zeros(1600)}}, 16000)
