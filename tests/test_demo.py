@@ -51,7 +51,7 @@ def test_demo_writes_page_and_sounds_that_agree(tmp_path: Path, short_speech: Pa
     assert (comparison["before"], comparison["after"]) == (names[2], "trained aid")
     page = (out / "report.html").read_text()
     assert text.startswith("\nThe trained aid ")
-    assert text.endswith(f"\n{(out / 'report.html').as_uri()}") and len(text.splitlines()) == 9
+    assert text.endswith(f"\n{(out / 'report.html').as_uri()}") and len(text.splitlines()) == 10
     evidence = text.splitlines()[1].rpartition(" (")[2]
     assert f"({evidence}</small>" in page and page.count("t-test p = ") == 1
     assert page.count("<audio") == 7 and "N4 (severe loss)" in page
