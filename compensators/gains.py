@@ -11,40 +11,53 @@ from torch import Tensor
 
 from compensators.filter_bank import RATE, SPEECH_SPL, speech_density
 from hlsim.audiogram import FREQUENCIES
+from hlsim.audiogram.thresholds import AudiogramLike, as_thresholds
 from hlsim.calibration import PASCAL_SPL
 from hlsim.checks import check_number
 from hlsim.dsp.fft import power
 from hlsim.torchtools import constant_like
 
 
+@torch.no_grad()
 def measure_gains(
-    process: Callable[[Tensor], Tensor], items: int, level: float, like: Tensor
+    process: Callable[[Tensor, Tensor], Tensor],
+    audiogram: AudiogramLike,
+    level: float,
+    dtype: torch.dtype,
+    device: torch.device,
 ) -> Tensor:
-    """Measure gains in thirds of an octave around the eight ``FREQUENCIES`` in dB.
+    """Measure gains in thirds of an octave around the eight ``FREQUENCIES``.
 
     Args:
-        process: function from the input to the output of an aid, both (items, time) in pascals.
-        items: number of signals.
+        process: function from the input of an aid, (items, time) in pascals, and the thresholds of
+            ears, (items, 8), to its output, (items, time).
+        audiogram: one or more ears.
         level: level of the noise in dB SPL, 0 to 120.
-        like: tensor with the type and the device of the noise.
+        dtype: type of the noise.
+        device: device of the noise.
 
-    Returns: (items, 8).
+    Returns: Gains in dB, (8,) for one ear, else (..., 8).
 
     Raises:
-        ValueError: the level is out of range.
+        ValueError: an ear or the level is not valid.
 
-    >>> measure_gains(lambda noise: 10.0 * noise, 1, 65.0, torch.empty(0)).round()
-    tensor([[20., 20., 20., 20., 20., 20., 20., 20.]])
+    >>> gains = measure_gains(
+    ...     lambda noise, ears: 10.0 * noise, "N3", 65.0, torch.float32, torch.device("cpu")
+    ... )
+    >>> gains.round()
+    tensor([20., 20., 20., 20., 20., 20., 20., 20.])
     """
     check_number("level", level, 0.0, 120.0)
-    noise = constant_like(like, speech_noise) * 10.0 ** ((level - SPEECH_SPL) / 20.0)
+    thresholds = as_thresholds(audiogram, consumer="an aid").to(device, dtype)
+    ears = thresholds.reshape(-1, len(FREQUENCIES))
+    noise = constant_like(ears, speech_noise) * 10.0 ** ((level - SPEECH_SPL) / 20.0)
     # The first second, in which gains settle, does not count.
-    output = process(noise.repeat(items, 2))[:, RATE:]
-    thirds = constant_like(like, _thirds_of_octave)
+    output = process(noise.repeat(len(ears), 2), ears)[:, RATE:]
+    thirds = constant_like(ears, _thirds_of_octave)
     output_power, noise_power = (
         power(torch.fft.rfft(signal)) @ thirds for signal in (output, noise)
     )
-    return 10.0 * (output_power / noise_power).log10()
+    return (10.0 * (output_power / noise_power).log10()).reshape(thresholds.shape)
 
 
 def speech_noise() -> NDArray[np.float64]:

@@ -14,8 +14,7 @@ from compensators.config import MappingConfig
 from compensators.gains import measure_gains
 from compensators.limiter import soft_limit
 from compensators.nalr import nalr_gains_db
-from hlsim.audiogram import FREQUENCIES
-from hlsim.audiogram.thresholds import AudiogramLike, as_thresholds, interpolate
+from hlsim.audiogram.thresholds import AudiogramLike, interpolate
 from hlsim.calibration import PASCAL_SPL
 from hlsim.dsp.erb import erb_number
 from hlsim.dsp.fft import power
@@ -92,7 +91,6 @@ class MappingCompensator(EarNetwork):
             gains = float(start) * thresholds.clamp_min(0.0)
         return interpolate(gains, self.config.hz)
 
-    @torch.no_grad()
     def gains(self, audiogram: AudiogramLike, level: float = 65.0) -> Tensor:
         """Measure the insertion gains for noise with the spectrum of average speech.
 
@@ -109,10 +107,8 @@ class MappingCompensator(EarNetwork):
         >>> MappingCompensator().gains("N3").shape
         torch.Size([8])
         """
-        thresholds = as_thresholds(audiogram, consumer=type(self).__name__)
-        ears = thresholds.to(self.magnitude_decoder.leave.weight).reshape(-1, len(FREQUENCIES))
-        gains = measure_gains(lambda noise: self._process(noise, ears), len(ears), level, ears)
-        return gains.reshape(thresholds.shape)
+        weight = self.magnitude_decoder.leave.weight
+        return measure_gains(self._process, audiogram, level, weight.dtype, weight.device)
 
     def extra_repr(self) -> str:
         return (

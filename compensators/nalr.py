@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from hlsim.audiogram import FREQUENCIES, HIGHEST_LEVEL
+from hlsim.audiogram import HIGHEST_LEVEL
 from hlsim.audiogram.thresholds import (
     AudiogramLike,
     as_thresholds,
@@ -24,13 +24,10 @@ from hlsim.calibration import PASCAL_SPL, check_full_scale
 from hlsim.checks import check_number, check_rate, check_waveform
 from hlsim.dsp.fir import frequency_sampling_fir
 from hlsim.dsp.windows import hamming
-from hlsim.torchtools import constant, constant_like
+from hlsim.torchtools import constant_like
 
 BIAS_DB = {250.0: -17.0, 500.0: -8.0, 1000.0: 1.0, 2000.0: -1.0, 4000.0: -2.0, 6000.0: -2.0}
 """Constant of NAL-R's formula at each of its frequencies."""
-
-FORMULA_INDICES = tuple(FREQUENCIES.index(frequency) for frequency in BIAS_DB)
-"""Positions of the formula's frequencies among ``FREQUENCIES``."""
 
 THRESHOLD_OPTIONS: dict[str, Any] = {"highest": HIGHEST_LEVEL, "consumer": "NAL-R"}
 
@@ -179,9 +176,11 @@ def _has_loss(thresholds: Tensor) -> Tensor:
 
 
 def _formula_levels(thresholds: Tensor) -> Tensor:
-    """Select the thresholds at the frequencies of the formula. Shape: (..., 8) -> (..., 6)."""
-    indices = constant(tuple, FORMULA_INDICES, dtype=torch.int64, device=thresholds.device)
-    return thresholds.index_select(-1, indices)
+    """Select the thresholds at the frequencies of the formula. Shape: (..., 8) -> (..., 6).
+
+    These are all but 3000 and 8000 Hz.
+    """
+    return torch.cat((thresholds[..., :4], thresholds[..., 5:7]), -1)
 
 
 @lru_cache(maxsize=8)

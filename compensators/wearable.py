@@ -21,7 +21,6 @@ from compensators.limiter import soft_limit
 from hlsim.audiogram import FREQUENCIES
 from hlsim.audiogram.thresholds import (
     AudiogramLike,
-    as_thresholds,
     check_two_channels,
     resolve_thresholds,
 )
@@ -220,7 +219,6 @@ class Wearable(nn.Module):
         stacked = torch.stack(settings, -1) if settings else ears.new_zeros(*batch, 0)
         return batch, self.fit(ears), stacked.to(dtype).reshape(len(ears), -1)
 
-    @torch.no_grad()
     def gains(self, audiogram: AudiogramLike, level: float = 65.0) -> Tensor:
         """Measure the insertion gains for noise with the spectrum of average speech.
 
@@ -240,16 +238,14 @@ class Wearable(nn.Module):
         >>> WDRC().gains("N3", level=65.0).round()
         tensor([ 1.,  8., 18., 20., 21., 22., 23., 24.])
         """
-        thresholds = as_thresholds(audiogram, consumer=type(self).__name__)
-        weight = next(self.parameters(), thresholds)
-        ears = thresholds.to(weight).reshape(-1, len(FREQUENCIES))
-        sliders = ears.new_tensor([float(name != "noise_reduction") for name in self.SLIDERS])
-        sliders = sliders.expand(len(ears), -1)
 
-        def amplify(noise: Tensor) -> Tensor:
+        def amplify(noise: Tensor, ears: Tensor) -> Tensor:
+            sliders = noise.new_tensor([float(name != "noise_reduction") for name in self.SLIDERS])
+            sliders = sliders.expand(len(noise), -1)
             return self._amplify(noise, self.fit(ears), sliders, self.initial(sliders))[0]
 
-        return measure_gains(amplify, len(ears), level, ears).reshape(thresholds.shape)
+        weight = next(self.parameters(), torch.empty(0))
+        return measure_gains(amplify, audiogram, level, weight.dtype, weight.device)
 
     def extra_repr(self) -> str:
         return (

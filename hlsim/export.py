@@ -52,6 +52,7 @@ from compensators.wearable import Slider, Wearable
 from hlsim.audiogram import FREQUENCIES
 from hlsim.audiogram.thresholds import AudiogramLike
 from hlsim.calibration import gain_to_pascals
+from hlsim.checks import check_names
 from hlsim.extras import require
 from hlsim.files import atomic_path
 from hlsim.neuro import NeuroMSBG
@@ -62,6 +63,9 @@ TOLERANCE = 1e-4
 
 NOISE_RMS = 0.03
 """RMS in pascals (64 dB SPL) of the noise with which ONNX files are checked."""
+
+EAR = torch.linspace(20.0, 90.0, len(FREQUENCIES))
+"""Thresholds in dB HL with which ONNX files are checked."""
 
 CHECKED_HOPS = 16
 """Number of hops of noise with which the program of an aid is checked."""
@@ -129,10 +133,8 @@ def export_program(
     """
     if not isinstance(simulator, NeuroMSBG) or simulator.sample_rate != NEURO_RATE:
         raise ValueError(
-            f"expected a NeuroMSBG with sample_rate {NEURO_RATE}, got a "
-            f"{type(simulator).__name__}; "
-            "the exact MSBG cannot be exported, because its filters depend on the audiogram's "
-            "values"
+            f"expected a NeuroMSBG with sample_rate {NEURO_RATE}, got a {type(simulator).__name__}; "
+            "the exact MSBG cannot be exported, because its filters depend on the audiogram's values"
         )
     if not (seconds * NEURO_RATE >= 1 and items >= 1):
         raise ValueError(
@@ -166,11 +168,8 @@ def export_onnx(
     program = export_program(simulator, seconds=seconds, items=items)
     assert isinstance(simulator, NeuroMSBG)
     weight = next(simulator.parameters())
-    rms = NOISE_RMS / gain_to_pascals(simulator.full_scale_spl)
-    generator = torch.Generator().manual_seed(0)
-    noise = torch.randn(items, round(seconds * NEURO_RATE), generator=generator)
-    ears = torch.linspace(20.0, 90.0, len(FREQUENCIES)).expand(items, -1)
-    inputs = {"waveform": (rms * noise).to(weight), "thresholds": ears.to(weight)}
+    noise = _draw_noise(items, round(seconds * NEURO_RATE), full_scale_spl=simulator.full_scale_spl)
+    inputs = {"waveform": noise.to(weight), "thresholds": EAR.expand(items, -1).to(weight)}
     with torch.no_grad():
         perceived = _SimulatorCall(simulator)(*inputs.values())
     _write_onnx(program, path, inputs, {"perceived": perceived})
@@ -195,12 +194,7 @@ def first_inputs(
     """
     if aid.sample_rate != RATE:
         raise ValueError(f"expected an aid at {RATE} Hz, got one at {aid.sample_rate} Hz")
-    unknown = sorted(set(sliders) - set(aid.SLIDERS))
-    if unknown:
-        raise ValueError(
-            f"a {type(aid).__name__} has no slider {', '.join(unknown)}; its sliders are: "
-            f"{', '.join(aid.SLIDERS) or 'none'}"
-        )
+    check_names(sliders, aid.SLIDERS, "sliders", f"of a {type(aid).__name__}")
     weight = next(aid.parameters(), torch.empty(0))
     defaults = zip(aid.SLIDERS, aid.DEFAULT_SLIDERS, strict=True)
     values = [sliders.get(name, default) for name, default in defaults]
@@ -251,14 +245,11 @@ def export_aid(aid: Wearable, path: str | Path, *, items: int = 1, hops: int = 1
     _require_onnx()
     program = hop_program(aid, items=items, hops=hops)
     call = _HopCall(aid)
-    ear = torch.linspace(20.0, 90.0, len(FREQUENCIES))
-    inputs = first_inputs(aid, ear, items=items, hops=hops)
+    inputs = first_inputs(aid, EAR, items=items, hops=hops)
     if "sliders" in inputs:
         # Sliders that move, so that their state is checked as well.
         inputs["sliders"] = 0.2 * inputs["sliders"]
-    rms = NOISE_RMS / gain_to_pascals(aid.full_scale_spl)
-    generator = torch.Generator().manual_seed(0)
-    noise = rms * torch.randn(CHECKED_HOPS, items, hops * HOP, generator=generator)
+    noise = _draw_noise(CHECKED_HOPS, items, hops * HOP, full_scale_spl=aid.full_scale_spl)
     state_names = [name for name in inputs if name not in STATELESS_INPUTS]
     with torch.no_grad():
         for samples in noise.to(inputs["samples"]):
@@ -284,12 +275,18 @@ def export_fit(aid: Wearable, path: str | Path, *, items: int = 1) -> None:
         MissingExtraError: onnx, onnxscript or onnxruntime is not installed.
     """
     _require_onnx()
-    ears = torch.linspace(20.0, 90.0, len(FREQUENCIES)).repeat(items, 1)
+    ears = EAR.repeat(items, 1)
     call = _FitCall(aid)
     with torch.no_grad():
         program = torch.export.export(call, (ears,))
         fitted = call(ears)
     _write_onnx(program, path, {"thresholds": ears}, {"fitted": fitted})
+
+
+def _draw_noise(*shape: int, full_scale_spl: float) -> Tensor:
+    """Draw noise at 64 dB SPL with which ONNX files are checked."""
+    generator = torch.Generator().manual_seed(0)
+    return NOISE_RMS / gain_to_pascals(full_scale_spl) * torch.randn(*shape, generator=generator)
 
 
 def _require_onnx() -> None:
@@ -329,7 +326,6 @@ def _check_onnx(path: Path, inputs: dict[str, Tensor], expected: Sequence[Tensor
         peak = reference.abs().max().clamp_min(torch.finfo(reference.dtype).tiny)
         if not error <= TOLERANCE * peak:
             raise ValueError(
-                f"{path.name}: the output of onnxruntime differs by {float(error / peak):.0e} "
-                "of its "
-                f"peak, expected {TOLERANCE:g} or less; the file was not written"
+                f"{path.name}: the output of onnxruntime differs by {float(error / peak):.0e} of "
+                f"its peak, expected {TOLERANCE:g} or less; the file was not written"
             )
