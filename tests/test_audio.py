@@ -46,8 +46,9 @@ def test_wav_holds_more_than_full_scale_and_one_signal_is_one_file(tmp_path: Pat
 
 
 FORMATS: dict[str, dict[str, str]] = {
-    "a.mp3": {}, "a.opus": {"format": "OGG", "subtype": "OPUS"}, "a.aiff": {}, "a.caf": {"subtype": "PCM_16"},
-    "a.w64": {}, "a.rf64": {}, "a.au": {}, "a.sph": {"format": "NIST"}, "gsm.wav": {"subtype": "GSM610"},
+    "a.mp3": {}, "a.opus": {"format": "OGG", "subtype": "OPUS"}, "a.aiff": {},
+    "a.caf": {"subtype": "PCM_16"}, "a.w64": {}, "a.rf64": {}, "a.au": {},
+    "a.sph": {"format": "NIST"}, "gsm.wav": {"subtype": "GSM610"},
     "g721.au": {"subtype": "G721_32"}, "adpcm.wav": {"subtype": "IMA_ADPCM"},
 }  # fmt: skip
 
@@ -167,8 +168,10 @@ def test_files_of_folders_are_sorted_and_hidden_ones_left_out(tmp_path: Path) ->
     for name in ("b/2.FLAC", "b/1.mp3", "a.wav", ".hidden.wav", "b/notes.txt", ".cache/c.wav"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).touch()
-    audio, others = list_files(tmp_path)
-    names = [[path.relative_to(tmp_path).as_posix() for path in files] for files in (audio, others)]
+    audio, other_files = list_files(tmp_path)
+    names = [
+        [path.relative_to(tmp_path).as_posix() for path in files] for files in (audio, other_files)
+    ]
     assert names == [["a.wav", "b/1.mp3", "b/2.FLAC"], ["b/notes.txt"]]
     for folder in (tmp_path / "folder.wav", tmp_path / "none"):
         with pytest.raises(ValueError, match=f"^{folder}: "):

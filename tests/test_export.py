@@ -19,7 +19,7 @@ from hlsim.export import (
     hop_program,
 )
 from hlsim.neuro import NeuroConfig
-from tests.compensators.test_wearable import AIDS, EAR, Make, trained
+from tests.compensators.aids import EAR, WEARABLES, build_wearable, varied_hearing_aid
 
 SMALL = NeuroConfig(channels=4, blocks=1)
 
@@ -44,7 +44,7 @@ def onnx_session(path: Path) -> Any:
 )
 def test_a_program_gives_the_simulators_outputs(name: str, items: int, seconds: float) -> None:
     simulator = load_pretrained(name, full_scale_spl=100.0)
-    # exported before the first call of this length, so that no cached constant comes from the export
+    # exported before the first call of this length, so that the export computes all constants
     program = export_program(simulator, seconds=seconds, items=items).module()
     wave, ears = example(items, seconds)
     assert_near(program(wave, ears), simulator(wave, ears), 1e-4)
@@ -63,10 +63,10 @@ def test_an_export_leaves_mode_and_precision_as_they_are() -> None:
     assert all(module.training for module in aid.modules())
 
 
-@AIDS
-def test_a_program_of_hops_gives_the_outputs_of_the_stream(make: Make) -> None:
+@pytest.mark.parametrize("name", WEARABLES)
+def test_a_program_of_hops_gives_the_outputs_of_the_stream(name: str) -> None:
     """For two ears, at another full scale, with a slider that moves on the way."""
-    aid: Any = make(full_scale_spl=110.0)
+    aid: Any = build_wearable(name, full_scale_spl=110.0)
     ears = torch.tensor([EAR.thresholds, Audiogram.standard("S2").thresholds])
     inputs, stream, outputs, expected = first_inputs(aid, ears, items=2), aid.stream(ears), [], []
     assert not aid.SLIDERS or set(inputs) >= set(aid.initial(torch.ones(2, 2)))
@@ -81,9 +81,9 @@ def test_a_program_of_hops_gives_the_outputs_of_the_stream(make: Make) -> None:
     assert_near(torch.cat(outputs, -1), torch.cat(expected, -1), 1e-5)
 
 
-@AIDS
-def test_a_program_of_several_hops_gives_the_outputs_of_the_stream(make: Make) -> None:
-    aid: Any = make()
+@pytest.mark.parametrize("name", WEARABLES)
+def test_a_program_of_several_hops_gives_the_outputs_of_the_stream(name: str) -> None:
+    aid: Any = build_wearable(name)
     inputs = first_inputs(aid, EAR, hops=5)
     program = hop_program(aid, hops=5).module()
     signal = 0.02 * torch.randn(1, 20 * 320)
@@ -108,11 +108,11 @@ def test_onnx_gives_the_simulators_outputs(tmp_path: Path, items: int, seconds: 
 
 
 @pytest.mark.slow
-@AIDS
-def test_onnx_gives_the_outputs_of_the_stream(make: Make, tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", WEARABLES)
+def test_onnx_gives_the_outputs_of_the_stream(name: str, tmp_path: Path) -> None:
     """For steps in level, with sliders that move on the way."""
     pytest.importorskip("onnxscript")
-    aid: Any = make()
+    aid: Any = build_wearable(name)
     export_aid(aid, tmp_path / "aid.onnx")
     session = onnx_session(tmp_path / "aid.onnx")
     names = [entry.name.removeprefix("next_") for entry in session.get_outputs()]
@@ -133,11 +133,11 @@ def test_onnx_gives_the_outputs_of_the_stream(make: Make, tmp_path: Path) -> Non
 
 
 @pytest.mark.slow
-@AIDS
-def test_onnx_without_torch_gives_the_outputs_of_the_stream(make: Make, tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", WEARABLES)
+def test_onnx_without_torch_gives_the_outputs_of_the_stream(name: str, tmp_path: Path) -> None:
     """For two hops per call, fitted and started as on a machine without torch."""
     pytest.importorskip("onnxscript")
-    aid: Any = make()
+    aid: Any = build_wearable(name)
     export_fit(aid, tmp_path / "fit.onnx")
     export_aid(aid, tmp_path / "aid.onnx", hops=2)
     thresholds = torch.tensor([EAR.thresholds]).numpy()
@@ -191,8 +191,8 @@ def test_a_file_with_other_outputs_is_not_written(
         lambda: export_program(NeuroMSBG(SMALL), seconds=0.0),
         lambda: export_program(NeuroMSBG(SMALL), seconds=float("nan")),
         lambda: export_program(NeuroMSBG(SMALL), items=0),
-        lambda: hop_program(trained(sample_rate=44100)),
-        lambda: first_inputs(trained(), EAR, volume=1.0),
+        lambda: hop_program(varied_hearing_aid(sample_rate=44100)),
+        lambda: first_inputs(varied_hearing_aid(), EAR, volume=1.0),
     ],
 )
 def test_what_cannot_be_exported_is_a_value_error(call: Callable[[], object]) -> None:

@@ -23,7 +23,7 @@ from hlsim.calibration import set_level
 from hlsim.cli.main import main
 from hlsim.extras import MissingExtraError
 from hlsim.live import Live, SimulatedStream, _key_reader, play
-from tests.compensators.test_wearable import trained
+from tests.compensators.aids import varied_hearing_aid
 
 EAR = Audiogram.standard("N3")
 FINE = SimpleNamespace(
@@ -154,7 +154,7 @@ def test_two_ears_each_have_their_own(
 
 
 def test_keys_move_the_sliders_that_are_there() -> None:
-    aid: Any = trained()
+    aid: Any = varied_hearing_aid()
     live = Live(aid.stream(EAR, 1.0, 0.5), 94.0)
     for key in "nnnNaAAx":
         live.press(key)

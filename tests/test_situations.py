@@ -1,7 +1,7 @@
 """Situations that users of other audio libraries reported give the right result, or say what to do.
 
-Tests of files are in ``test_audio.py``, of tables in ``audiogram/test_table.py``, and of arrays with
-time first in ``test_checks.py``.
+Tests of files are in ``test_audio.py``, of tables in ``audiogram/test_table.py``, and of arrays
+with time first in ``test_checks.py``.
 """
 
 import io

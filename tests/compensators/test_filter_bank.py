@@ -1,4 +1,4 @@
-"""The division of frequency: filters that sum to a delay, levels, and gains that go from hop to hop."""
+"""Filters that sum to a delay, levels of bands, gains between hops, and smoothing without loops."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,9 @@ from compensators.filter_bank import (
     shares,
     speech_levels,
 )
+from compensators.smoothing import average, decay, follow_peaks
 from hlsim.calibration import set_level
+from tests.compensators.aids import tone
 
 
 @pytest.mark.parametrize("count", [4, 20, 40])
@@ -27,47 +29,74 @@ def test_filters_sum_to_a_delay(count: int) -> None:
     assert np.abs(filters(count).sum(0) - impulse).max() < 1e-12
     assert np.allclose(filters(count), filters(count)[:, ::-1])  # linear phase
     assert np.allclose(shares(count, 512).sum(1), 1.0)
-    spaces = np.diff(centres(count))
-    assert centres(count)[0] == 0.0 and centres(count)[-1] == pytest.approx(8000.0, abs=1.0)
-    assert (spaces[:-1] > 124.9).all()
+    assert centres(count)[0] == 0.0
+    assert centres(count)[-1] == pytest.approx(8000.0, abs=1.0)
+    assert (np.diff(centres(count))[:-1] > 124.9).all()
 
 
 def test_levels_are_in_db_spl() -> None:
-    time = torch.arange(16000) / 16000.0
     for hertz in (250.0, 1000.0, 3001.0):
-        tone = set_level(torch.sin(2.0 * torch.pi * hertz * time), 65.0)
-        powers = frame_power(tone[None, : HISTORY + 200 * HOP])
+        powers = frame_power(tone(hertz, 65.0)[None, : HISTORY + 200 * HOP])
         assert (level_db(powers.sum(-1)) - 65.0).abs().max() < 0.3
         bands = level_db(powers @ torch.tensor(shares(20, FRAME), dtype=torch.float32)).mean((0, 1))
         assert abs(centres(20)[int(bands.argmax())] - hertz) < 260.0
     noise = set_level(torch.randn(1, HISTORY + 400 * HOP), 50.0)
-    assert abs(float(level_db(frame_power(noise).sum(-1).mean())) - 50.0) < 0.3
+    assert float(level_db(frame_power(noise).sum(-1).mean())) == pytest.approx(50.0, abs=0.3)
     assert float(level_db(torch.zeros(1))) == pytest.approx(0.0, abs=1e-4)
 
 
 def test_average_speech_has_its_level_and_falls_with_frequency() -> None:
     levels = torch.tensor(speech_levels(20))
-    assert float(10.0 * torch.log10((10.0 ** (levels / 10.0)).sum())) == pytest.approx(
-        65.0, abs=1e-4
-    )
-    assert float(levels.argmax()) in (1, 2, 3, 4) and float(levels.max() - levels[-2]) > 15.0
+    total = 10.0 * torch.log10((10.0 ** (levels / 10.0)).sum())
+    assert float(total) == pytest.approx(65.0, abs=1e-4)
+    assert int(levels.argmax()) in (1, 2, 3, 4)
+    assert float(levels.max() - levels[-2]) > 15.0
 
 
-def test_gains_against_a_sum_in_float64() -> None:
+def test_gains_equal_a_sum_in_float64() -> None:
     signal, gains = torch.randn(2, 2 * DELAY + 3 * HOP), torch.randn(2, 4, 20)
-    bands = np.stack(
-        [[np.convolve(item, taps, "valid") for taps in filters(20)] for item in signal.numpy()]
-    )
-    place = (np.arange(3 * HOP) + 1) / HOP
-    knots = gains.double().numpy()
-    paths = np.stack([[np.interp(place, np.arange(4), band) for band in item.T] for item in knots])
-    truth = signal[:, DELAY : DELAY + 3 * HOP].numpy() + (bands * paths).sum(1)
-    assert np.abs(apply_gains(signal, gains).numpy() - truth).max() < 1e-5
-    # from the tenth sample of a hop on
-    part = apply_gains(signal[:, 10 : 2 * DELAY + 40], gains[:, :2], 10)
-    assert np.abs(part.numpy() - truth[:, 10:40]).max() < 1e-5
+    time = (np.arange(3 * HOP) + 1) / HOP
+    expected = signal[:, DELAY : DELAY + 3 * HOP].double().numpy()
+    for band, taps in enumerate(filters(20)):
+        for item in range(2):
+            path = np.interp(time, np.arange(4), gains[item, :, band].double().numpy())
+            expected[item] += np.convolve(signal[item].double().numpy(), taps, "valid") * path
+    assert np.abs(apply_gains(signal, gains).numpy() - expected).max() < 1e-5
+    part = apply_gains(signal[:, 10 : 2 * DELAY + 40], gains[:, :2], 10)  # from sample 10 of a hop
+    assert np.abs(part.numpy() - expected[:, 10:40]).max() < 1e-5
 
 
 def test_gains_of_1_change_nothing() -> None:
     signal = torch.randn(1, 2 * DELAY + 5 * HOP)
     assert torch.equal(apply_gains(signal, torch.zeros(1, 6, 20)), signal[:, DELAY:-DELAY])
+
+
+@pytest.mark.parametrize("past", [0.0, 0.3, 0.96])
+def test_the_average_equals_its_recursion(past: float) -> None:
+    values, expected = torch.randn(2, 300, 3), torch.randn(2, 3)
+    averages = average(values, expected, past)
+    for frame in range(300):
+        expected = past * expected + (1.0 - past) * values[:, frame]
+        assert (averages[:, frame] - expected).abs().max() < 1e-5
+
+
+@pytest.mark.parametrize(("attack", "release"), [(0.005, 0.1), (0.0, 0.01), (0.02, 0.5)])
+def test_the_peak_follower_equals_the_recursion_of_giannoulis(
+    attack: float, release: float
+) -> None:
+    values = 60.0 * torch.rand(2, 700, 3)
+    values[:, 200:400] = 0.0
+    values.requires_grad_()
+    up, down = decay(attack), decay(release)
+    levels, state = follow_peaks(values, torch.zeros(2, 3, 3), up, down)
+    peak = smooth = torch.zeros(2, 3)
+    for frame in range(700):
+        peak = torch.maximum(values[:, frame], down * peak + (1.0 - down) * values[:, frame])
+        smooth = up * smooth + (1.0 - up) * peak
+        assert (levels[:, frame] - smooth).abs().max() < 1e-3
+    first, between = follow_peaks(values[:, :333], torch.zeros(2, 3, 3), up, down)
+    second, last = follow_peaks(values[:, 333:], between, up, down)
+    assert (torch.cat((first, second), 1) - levels).abs().max() < 1e-3
+    assert (last - state).abs().max() < 1e-3
+    (gradient,) = torch.autograd.grad(levels.sum(), values)
+    assert gradient.isfinite().all()

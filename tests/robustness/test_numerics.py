@@ -27,7 +27,7 @@ KINDS = {
 }
 
 
-def signal(draw: Random, samples: int) -> Tensor:
+def draw_signal(draw: Random, samples: int) -> Tensor:
     """Draw an impulse, a constant, noise, a tone, a step or bursts, at a random level."""
     time, at = torch.arange(samples, dtype=torch.float64), draw.randrange(samples)
     noise = torch.randn(
@@ -46,7 +46,7 @@ def signal(draw: Random, samples: int) -> Tensor:
 
 
 class Case:
-    """A batch, its reference, an ear and who is given them."""
+    """A batch, its reference, an ear and the module that processes them."""
 
     def __init__(self, draw: Random, names: tuple[str, ...]) -> None:
         self.name, self.ear, items = draw.choice(names), draw.choice(EARS), draw.choice((1, 1, 3))
@@ -56,8 +56,9 @@ class Case:
             (shortest, *(draw.randint(shortest, max(4000, shortest + 800)) for _ in range(2)))
         )
         kind = draw.choice((torch.float32, torch.float32, torch.float64))
-        self.given, self.clean = (
-            torch.stack([signal(draw, samples) for _ in range(items)]).to(kind) for _ in range(2)
+        self.signal, self.clean = (
+            torch.stack([draw_signal(draw, samples) for _ in range(items)]).to(kind)
+            for _ in range(2)
         )
         if (
             shortest > 1 and draw.random() < 0.7
@@ -80,12 +81,14 @@ def module(name: str) -> Any:
 
 def check(case: Case) -> None:
     paired = " of " in case.name or case.name in ("haspi", "hasqi")
-    given, ear = case.given.clone().requires_grad_(), Audiogram.standard(case.ear)
-    out = module(case.name)(given, *([case.clean] if paired else []), ear)
+    signal, ear = case.signal.clone().requires_grad_(), Audiogram.standard(case.ear)
+    out = module(case.name)(signal, *([case.clean] if paired else []), ear)
     assert bool(torch.isfinite(out).all()), "not finite"
-    assert paired or out.shape == given.shape, "another shape"
+    assert paired or out.shape == signal.shape, "another shape"
     out.sum().backward()
-    assert given.grad is not None and bool(torch.isfinite(given.grad).all()), "gradient not finite"
+    assert signal.grad is not None and bool(torch.isfinite(signal.grad).all()), (
+        "gradient not finite"
+    )
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -103,5 +106,5 @@ def test_a_constant_beside_which_all_other_frequencies_are_silent(
     name: str, pascals: float, ear: str
 ) -> None:
     case = Case(Random(0), (name,))
-    case.given, case.ear = torch.full((1, 2000), pascals), ear
+    case.signal, case.ear = torch.full((1, 2000), pascals), ear
     check(case)

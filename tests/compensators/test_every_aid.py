@@ -1,0 +1,163 @@
+"""Laws that hold for every aid."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from compensators import (
+    NALR,
+    WDRC,
+    HearingAid,
+    HearingAidConfig,
+    MappingCompensator,
+    MappingConfig,
+    load_compensator,
+    save_compensator,
+)
+from compensators.limiter import soft_limit
+from hlsim import Audiogram
+from hlsim.calibration import set_level
+from hlsim.neuro import NeuroConfig
+from tests.compensators.aids import EAR, SMALL, varied_hearing_aid, varied_mapping
+
+AIDS: dict[str, Callable[..., Any]] = {
+    "nalr": NALR,
+    "wdrc": WDRC,
+    "aid": varied_hearing_aid,
+    "mapping": varied_mapping,
+}
+every_aid = pytest.mark.parametrize("build", AIDS.values(), ids=AIDS)
+EARS = torch.tensor([Audiogram.standard(name).thresholds for name in ("NH", "N2", "S3")])
+
+
+def assert_close(output: Tensor, expected: Tensor, tolerance: float = 1e-5) -> None:
+    """Compare relative to the peak."""
+    assert output.shape == expected.shape
+    assert float((output - expected).abs().max()) < tolerance * float(expected.abs().max())
+
+
+@every_aid
+def test_a_batch_equals_its_items_and_broadcasts(
+    build: Callable[..., Any], utterance: Tensor
+) -> None:
+    aid = build()
+    batch = torch.stack([utterance[:8000], 3.0 * utterance[4000:12000], 0.1 * utterance[-8000:]])
+    outputs = aid(batch, EARS)
+    for signal, ear, output in zip(batch, EARS, outputs, strict=True):
+        assert_close(aid(signal, ear), output)
+    assert_close(aid(batch.unsqueeze(1), EARS.unsqueeze(1)), outputs.unsqueeze(1))
+    assert aid(batch[0], EARS).shape == (3, 8000)
+    assert aid(batch.unsqueeze(1), EARS[:2]).shape == (3, 2, 8000)
+
+
+@every_aid
+def test_scale_and_precision_are_those_of_the_caller(
+    build: Callable[..., Any], utterance: Tensor
+) -> None:
+    signal = utterance[None, :5000]
+    output = build()(signal, EAR)
+    # RMS 1.0 at 114 dB SPL is RMS 10 at 94 dB SPL.
+    assert_close(10.0 * build(full_scale_spl=114.0)(signal / 10.0, EAR), output)
+    assert_close(build().double()(signal.double(), EAR).float(), output, 1e-4)
+    assert build()(signal.half(), EAR).dtype == torch.float16
+
+
+@every_aid
+@pytest.mark.parametrize("samples", [1, 37, 4001])
+def test_silence_stays_silent_with_finite_gradients(
+    build: Callable[..., Any], samples: int
+) -> None:
+    silence = torch.zeros(2, samples, requires_grad=True)
+    output = build()(silence, EAR)
+    assert output.shape == silence.shape
+    assert not output.any()
+    (gradient,) = torch.autograd.grad(output.square().sum() + output.sum(), silence)
+    assert gradient.isfinite().all()
+
+
+@pytest.mark.parametrize("build", [WDRC, varied_hearing_aid, varied_mapping])
+@pytest.mark.parametrize("rate", [16000, 44100])
+def test_no_sample_exceeds_the_limit(build: Callable[..., Any], rate: int) -> None:
+    noise = torch.randn(rate // 4)
+    peak = 1.000001 * 10.0 ** (16.0 / 20.0)  # 110 dB SPL
+    for level in (65.0, 115.0):
+        for ear in ("N2", "N6"):
+            output = build(sample_rate=rate)(set_level(noise, level), ear)
+            assert float(output.abs().max()) <= peak
+
+
+def test_the_soft_limit_is_smooth_monotonic_and_linear_for_soft_samples() -> None:
+    samples = torch.linspace(-6.0, 6.0, 2001, dtype=torch.float64)
+    limited = soft_limit(samples, 2.0)
+    assert limited.diff().min() >= 0.0
+    assert limited.abs().max() <= 2.0
+    soft = samples.abs() < 1.0
+    assert (limited[soft] / samples[soft] - 1.0).abs().nan_to_num().max() < 6e-4
+    points = torch.tensor([-3.0, -2.0, 0.0, 1.0, 2.5], dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda x: soft_limit(x, 2.0), (points,))
+    assert soft_limit(torch.tensor([1e30, float("inf")]), 2.0).tolist() == pytest.approx([2.0] * 2)
+
+
+SAVED: dict[str, Any] = {
+    "aid": lambda: varied_hearing_aid(config=HearingAidConfig(hidden=32, cap_db=40.0)),
+    "mapping": lambda: varied_mapping(MappingConfig(channels=8, blocks=1, start=0.3)),
+}
+
+
+@pytest.mark.parametrize("name", SAVED)
+def test_a_saved_aid_is_the_same_when_loaded(name: str, tmp_path: Path, utterance: Tensor) -> None:
+    aid = SAVED[name]()
+    save_compensator(MappingCompensator(SMALL), tmp_path / "mine")
+    save_compensator(aid, tmp_path / "mine")  # replaces the other one
+    loaded: Any = load_compensator(tmp_path / "mine")
+    assert type(loaded) is type(aid)
+    assert loaded.config == aid.config
+    assert not loaded.training
+    assert not any(weight.requires_grad for weight in loaded.parameters())
+    assert torch.equal(loaded(utterance, EAR), aid(utterance, EAR))
+
+
+BAD_SETTINGS: list[tuple[Callable[..., Any], dict[str, Any]]] = [
+    *((NALR, {"order": order}) for order in (221, 2.0, "220", True, 0, 1024)),
+    (NALR, {"audiogram": torch.zeros(8, requires_grad=True)}),
+    (NALR, {"audiogram": torch.full((8,), 121.0)}),
+    (NALR, {"sample_rate": 8000}),
+    *((WDRC, {name: 200.0}) for name in ("bands", "attack", "release", "knee", "limit_spl")),
+    *((HearingAidConfig, {"bands": bands}) for bands in (3, 20.0)),
+    *((HearingAidConfig, {name: -1.0}) for name in ("cap_db", "release", "hidden")),
+    (HearingAidConfig, {"limit_spl": "loud"}),
+    *((MappingConfig, {"start": start}) for start in ("none", 2.0, True)),
+    *((MappingConfig, {"bands": bands}) for bands in (2, "a", 20.0)),
+    (MappingConfig, {"reach_db": None}),
+    (MappingConfig, {"limit_spl": 200.0}),
+    (MappingConfig, {"channels": 0}),
+    (MappingConfig, {"fft": 400, "window": 400, "hop": 200}),
+    (MappingConfig, {"phase": "minimum"}),
+    (MappingConfig.from_dict, {"data": {"layers": 3}}),
+    *((MappingCompensator, {"config": config}) for config in (5, {}, MappingConfig, NeuroConfig())),
+    (HearingAid, {"config": MappingConfig()}),
+]
+
+
+@pytest.mark.parametrize(("build", "settings"), BAD_SETTINGS)
+def test_a_bad_setting_raises_value_error(
+    build: Callable[..., Any], settings: dict[str, Any]
+) -> None:
+    with pytest.raises(ValueError):
+        build(**settings)
+
+
+@every_aid
+@pytest.mark.parametrize(
+    ("samples", "ear"),
+    [((100,), None), ((100,), torch.full((8,), 121.0)), ((3, 100), torch.zeros(2, 8))],
+)
+def test_a_bad_call_raises_value_error(
+    build: Callable[..., Any], samples: tuple[int, ...], ear: Any
+) -> None:
+    with pytest.raises(ValueError):
+        build()(torch.randn(samples), ear)
