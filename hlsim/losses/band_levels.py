@@ -47,6 +47,11 @@ def band_levels(waveform: Tensor, sample_rate: int) -> Tensor:
     that of the signal.
 
     Shape: (..., time) in pascals -> (..., frames, 24) in dB SPL; silence gives -86.
+
+    >>> from hlsim.calibration import set_level
+    >>> levels = band_levels(set_level(torch.randn(16000), 65.0), sample_rate=16000)
+    >>> levels.shape
+    torch.Size([63, 24])
     """
     stft, shares = band_analysis(waveform, sample_rate)
     spectrum = stft.analyse(waveform.reshape(-1, waveform.shape[-1]))
@@ -73,6 +78,10 @@ def band_level_loss(perceived: Tensor, normal: Tensor, sample_rate: int) -> Tens
 
     Shape: (..., time) twice, in pascals -> (...) in dB; 0 if neither is audible. The weights carry
         no gradient.
+
+    >>> speech = torch.randn(1, 16000)
+    >>> band_level_loss(0.1 * speech, speech, sample_rate=16000).round(decimals=2)  # 20 dB too low
+    tensor([20.])
     """
     levels = band_levels(perceived, sample_rate)
     reference_levels = band_levels(normal, sample_rate)
@@ -89,6 +98,9 @@ def least_audible(levels: Tensor) -> Tensor:
     It is the threshold in quiet, or 40 dB below the strongest band of the item if that is higher.
 
     Shape: (..., frames, 24) in dB SPL -> (..., 1, 24).
+
+    >>> least_audible(torch.full((1, 10, 24), 60.0))[0, 0, :3]
+    tensor([23.0014, 20.0000, 20.0000])
     """
     quiet = constant(threshold_in_quiet, dtype=levels.dtype, device=levels.device)
     return torch.maximum(quiet, levels.amax((-2, -1), keepdim=True) - DEPTH).detach()
@@ -98,6 +110,9 @@ def audibility(levels: Tensor, threshold: Tensor) -> Tensor:
     """Return weights, 0 up to the threshold of audibility and 1 from 20 dB above, without gradient.
 
     Shape: (..., frames, 24), (..., 1, 24) in dB SPL -> (..., frames, 24).
+
+    >>> audibility(torch.tensor([10.0, 30.0, 50.0]), threshold=torch.tensor(20.0))
+    tensor([0.0000, 0.5000, 1.0000])
     """
     return ((levels.detach() - threshold) / RISE).clamp(0.0, 1.0)
 
@@ -108,6 +123,10 @@ def band_analysis(like: Tensor, sample_rate: int) -> tuple[STFT, Tensor]:
     Args:
         like: tensor with the type and the device of the shares.
         sample_rate: sample rate in Hz.
+
+    >>> stft, shares = band_analysis(torch.zeros(1), sample_rate=16000)
+    >>> stft.hop, shares.shape
+    (256, torch.Size([257, 24]))
     """
     hop = round(FRAME_SECONDS / 2.0 * sample_rate)
     stft = STFT(2 * hop, 2 * hop, hop)
@@ -119,25 +138,40 @@ def spectrum_scale(stft: STFT) -> float:
     """Return the factor from the power of a frequency to its part of the signal's mean square.
 
     It counts both halves of the spectrum. The squares of a Hann window of n samples sum to 3 n / 8.
+
+    >>> spectrum_scale(STFT(512, 512, 256)) * 512**2 * 3 / 16
+    1.0
     """
     return 2.0 / (stft.fft * 0.375 * stft.window)
 
 
 def band_edges() -> NDArray[np.float64]:
-    """Return the edges of the bands in Hz, (25,)."""
+    """Return the edges of the bands in Hz, (25,).
+
+    >>> print(band_edges()[[0, 24]].round())
+    [  80. 7500.]
+    """
     lowest, highest = erb_number(np.array([LOWEST, HIGHEST]))
     return erb_frequency(np.linspace(lowest, highest, BANDS + 1))
 
 
 def band_centres() -> NDArray[np.float64]:
-    """Return the geometric centres of the bands in Hz, (24,)."""
+    """Return the geometric centres of the bands in Hz, (24,).
+
+    >>> print(band_centres()[12].round())
+    1423.0
+    """
     edges = band_edges()
     centres: NDArray[np.float64] = np.sqrt(edges[1:] * edges[:-1])
     return centres
 
 
 def band_shares(fft: int, sample_rate: int) -> NDArray[np.float64]:
-    """Return the share of each frequency of a transform in each band, (fft // 2 + 1, 24)."""
+    """Return the share of each frequency of a transform in each band, (fft // 2 + 1, 24).
+
+    >>> band_shares(512, sample_rate=16000).shape
+    (257, 24)
+    """
     spacing = sample_rate / fft
     frequencies = np.arange(fft // 2 + 1)[:, None] * spacing
     edges = band_edges()
@@ -148,7 +182,11 @@ def band_shares(fft: int, sample_rate: int) -> NDArray[np.float64]:
 
 @lru_cache(maxsize=1)
 def threshold_in_quiet() -> NDArray[np.float64]:
-    """Return a normal ear's threshold in each band in dB SPL, (24,) (Terhardt 1979, Equation 1)."""
+    """Return a normal ear's threshold in each band in dB SPL, (24,) (Terhardt 1979, Equation 1).
+
+    >>> print(threshold_in_quiet()[12].round(1))  # at 1423 Hz
+    2.0
+    """
     khz = band_centres() / 1000.0
     levels: NDArray[np.float64] = (
         3.64 * khz**-0.8 - 6.5 * np.exp(-0.6 * (khz - 3.3) ** 2) + 1e-3 * khz**4

@@ -106,6 +106,11 @@ def coherent_band_parts(perceived: Tensor, normal: Tensor, sample_rate: int) -> 
 
     Shape: (items, time) twice, in pascals -> (items,) each. The weights carry no gradient; audible
         sound where the reference is silent has a gradient all the same.
+
+    >>> speech = torch.randn(1, 16000)
+    >>> parts = coherent_band_parts(0.1 * speech, speech, sample_rate=16000)  # 20 dB too low
+    >>> {name: round(part.item(), 2) + 0.0 for name, part in parts.items()}
+    {'incoherence': 0.0, 'misalignment': 0.0, 'levels': 10.99, 'louder': 0.0}
     """
     stft, shares = band_analysis(perceived, sample_rate)
     shares = shares * spectrum_scale(stft)
@@ -146,6 +151,9 @@ def peak_excess(compensated: Tensor) -> Tensor:
     """Return the mean excess of the samples over 120 dB SPL, relative to that pressure.
 
     Shape: (items, time) in pascals -> (items,).
+
+    >>> peak_excess(torch.full((1, 100), 2.0 * HIGHEST_PEAK))
+    tensor([1.])
     """
     return (compensated.abs() / HIGHEST_PEAK - 1.0).clamp_min(0.0).mean(-1)
 
@@ -160,6 +168,13 @@ def limit_gradient_spikes(compensated: Tensor, sample_rate: int) -> Tensor:
     more below the loudest one of the item, the limit is six times as low. NaN stays.
 
     Shape: (..., time) -> (..., time).
+
+    >>> samples = torch.randn(1, 1600, requires_grad=True)
+    >>> gradient = torch.ones(1, 1600)
+    >>> gradient[0, 800] = 1e6
+    >>> limit_gradient_spikes(samples, sample_rate=16000).backward(gradient)
+    >>> print(samples.grad.max().item() <= MAX_GRADIENT_RATIO)
+    True
     """
     limited: Tensor = _GradientLimiter.apply(compensated, round(LIMITER_SECONDS * sample_rate))
     return limited

@@ -33,6 +33,9 @@ def check_criterion(criterion: Any) -> dict[str, Any]:
 
     Raises:
         ValueError: an unknown name, or a weight that is negative or not finite.
+
+    >>> check_criterion({"bands": 1.0, "paper": 0.0})
+    {'bands': 1.0}
     """
     if callable(criterion) and not isinstance(criterion, type):
         return {"criterion": criterion}
@@ -52,6 +55,9 @@ def combine_weights(
 
     Raises:
         ValueError: an unknown part, or a weight that is negative or not finite.
+
+    >>> combine_weights(None, {"bands": 0.5, "haspi": 2.0})
+    {'band_levels': 0.5, 'haspi': 2.0}
     """
     defaults: dict[str, float] = {}
     scales: dict[str, float] = {}
@@ -68,6 +74,9 @@ def check_values(values: Any, items: int) -> Tensor:
 
     Raises:
         ValueError: it is not a tensor with one value per item.
+
+    >>> check_values(torch.tensor([0.5, 1.0]), items=2)
+    tensor([0.5000, 1.0000])
     """
     if not isinstance(values, Tensor) or values.shape != (items,):
         result = tuple(values.shape) if isinstance(values, Tensor) else type(values).__name__
@@ -82,6 +91,9 @@ def weighted_sum(parts: Mapping[str, Tensor], weights: Mapping[str, float]) -> T
     """Return the sum of the parts of a loss times their weights.
 
     Parts without a weight do not count.
+
+    >>> weighted_sum({"time": torch.tensor(2.0), "phase": torch.tensor(1.0)}, {"time": 0.5})
+    tensor(1.)
     """
     total = torch.zeros_like(next(iter(parts.values())))
     for name, weight in weights.items():

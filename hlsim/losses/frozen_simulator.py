@@ -5,7 +5,7 @@ import os
 from collections.abc import Callable, Mapping
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -30,6 +30,30 @@ Hearing = Callable[[Tensor], Tensor]
 """A normal ear: (..., time) -> (..., time)."""
 
 
+class Inputs(NamedTuple):
+    """Validated arguments of a call of the loss.
+
+    Attributes:
+        compensated: output of the compensator, silent after each end and at missing ears.
+        clean: clean speech, silent there, too.
+        ears: thresholds in dB HL, 0 dB HL for missing ears.
+        ends: number of samples of each item, or None if all are as long as the batch.
+        known: mask of the ears that are not missing, or None if all are known.
+        options: arguments of the simulator beyond the audiogram, by name.
+
+    >>> speech = torch.randn(2, 1600)
+    >>> Inputs(speech, speech, torch.zeros(8), ends=None, known=None, options={}).ears.shape
+    torch.Size([8])
+    """
+
+    compensated: Tensor
+    clean: Tensor
+    ears: Tensor
+    ends: Tensor | None
+    known: Tensor | None
+    options: Mapping[str, Any]
+
+
 class FrozenSimulator:
     """A simulator in eval mode without trainable parameters, and the normal ear that belongs to it.
 
@@ -46,6 +70,10 @@ class FrozenSimulator:
 
     Raises:
         ValueError: an argument is not as ``HearingLossLoss`` describes it.
+
+    >>> frozen = FrozenSimulator("msbg", 16000, 94.0, normal=None, reference=None)
+    >>> frozen.simulator.training
+    False
     """
 
     def __init__(
@@ -62,119 +90,105 @@ class FrozenSimulator:
                 "expected normal to be a module or a function of a waveform, "
                 f"got {type(normal).__name__}"
             )
-        self.sample_rate = sample_rate
-        self.normal = normal
-        self.choice = reference
         simulator = build_simulator(simulator, sample_rate, full_scale_spl)
         self.simulator = simulator.eval().requires_grad_(False)
+        self.sample_rate = sample_rate
+        self.normal = normal
+        if isinstance(normal, nn.Module):
+            normal.eval().requires_grad_(False)
+        self.choice = reference
+        self._highest_frequency = float(getattr(simulator, "highest_frequency", math.inf))
+        self._limits_band = 2.0 * self._highest_frequency < sample_rate
+        self._needs_exact_lengths = bool(getattr(simulator, "needs_exact_lengths", False))
+        self._has_bank_phase = normal is None and bool(getattr(simulator, "emulates_msbg", False))
         self._checkpoints_whole = checkpoint
         if checkpoint and isinstance(simulator, MSBG | EarNetwork):
             # They compute a few items at a time again, so that the peak is lower, too.
             simulator.checkpoint = True
             self._checkpoints_whole = False
-        if isinstance(normal, nn.Module):
-            normal.eval().requires_grad_(False)
 
-    def simulate(
-        self,
-        waveform: Tensor,
-        thresholds: Tensor,
-        options: Mapping[str, Any] | None,
-        ends: Tensor | None = None,
-    ) -> Tensor:
+    def simulate(self, waveform: Tensor, thresholds: Tensor, inputs: Inputs) -> Tensor:
         """Return the output of the simulator.
 
         Args:
             waveform: speech.
             thresholds: ears in dB HL.
-            options: more arguments of the simulator by name.
-            ends: number of samples of each item, for simulators that need exact lengths.
+            inputs: lengths, and further arguments of the simulator.
 
         Shape: (..., time), (..., 8) -> (..., time); the leading dimensions broadcast.
         """
+        batch = _broadcast_batch(waveform.shape[:-1], thresholds.shape[:-1])
+        if not self._needs_exact_lengths or inputs.ends is None or inputs.options or batch is None:
+            return self._run(waveform, thresholds, inputs.options)
+        time = waveform.shape[-1]
+        ends = inputs.ends.expand(batch).flatten()
+        if all(end == time for end in ends.tolist()):
+            return self._run(waveform, thresholds)
+        # Items of each length are simulated separately, without the silence after their ends.
+        items = waveform.expand(*batch, -1).reshape(-1, time)
+        ears = thresholds.expand(*batch, -1).reshape(-1, len(FREQUENCIES))
+        outputs: dict[int, Tensor] = {}
+        for end in ends.unique().tolist():
+            members = (ends == end).nonzero().flatten()
+            chosen = members.to(items.device)
+            padded = functional.pad(self._run(items[chosen, :end], ears[chosen]), (0, time - end))
+            outputs |= zip(members.tolist(), padded, strict=True)
+        return torch.stack([outputs[item] for item in range(len(items))]).reshape(*batch, time)
+
+    def _run(
+        self, waveform: Tensor, thresholds: Tensor, options: Mapping[str, Any] | None = None
+    ) -> Tensor:
+        """Run the simulator, and validate its output."""
         weight = next(self.simulator.parameters(), None)
         if weight is not None and weight.device != waveform.device:
             raise ValueError(
                 f"the speech is on {waveform.device} and the simulator on {weight.device}; "
                 "move the loss with .to()"
             )
-        allowed = _allowed_batches(waveform.shape[:-1], thresholds.shape[:-1])
-        by_length = len(allowed) == 2 and not options and self._needs_exact_lengths
-        if by_length and ends is not None and bool((ends != waveform.shape[-1]).any()):
-            return self._simulate_by_length(waveform, thresholds, ends.expand(allowed[1]))
-        options = {
+        arguments = {
             name: value.to(waveform.device) if isinstance(value, Tensor) else value
             for name, value in (options or {}).items()
         }
-        simulator = partial(self.simulator, **options)
+        simulator = partial(self.simulator, **arguments)
         if self._checkpoints_whole:
             simulator = partial(checkpoint, simulator, use_reentrant=False)
         output = simulator(waveform, thresholds)
-        return _check_output(output, "simulator", waveform, allowed)
+        batch = _broadcast_batch(waveform.shape[:-1], thresholds.shape[:-1])
+        return _check_output(output, "simulator", waveform, batch)
 
-    def _simulate_by_length(self, waveform: Tensor, thresholds: Tensor, ends: Tensor) -> Tensor:
-        """Simulate the items of each length separately, without the silence after their ends.
-
-        Shape: (..., time), (..., 8), (*batch) -> (*batch, time), with zeros after each end.
-        """
-        batch, time = ends.shape, waveform.shape[-1]
-        items = waveform.expand(*batch, -1).reshape(-1, time)
-        ears = thresholds.expand(*batch, -1).reshape(-1, len(FREQUENCIES))
-        outputs: dict[int, Tensor] = {}
-        for end in ends.flatten().unique().tolist():
-            members = (ends.flatten() == end).nonzero().flatten()
-            chosen = members.to(items.device)
-            group = self.simulate(items[chosen, :end], ears[chosen], None)
-            padded = functional.pad(group, (0, time - end))
-            outputs |= zip(members.tolist(), padded, strict=True)
-        return torch.stack([outputs[item] for item in range(len(items))]).reshape(*batch, time)
-
-    def reference(
-        self,
-        criterion: str,
-        clean: Tensor,
-        ears: Tensor,
-        batch: torch.Size,
-        options: Mapping[str, Any] | None,
-        ends: Tensor | None,
-    ) -> Tensor:
+    def reference(self, criterion: str, inputs: Inputs, batch: torch.Size) -> Tensor:
         """Return the reference with which a criterion compares the output of the simulator.
 
         Args:
             criterion: ``coherent-bands``, ``bands``, ``paper``, or the name of another criterion.
-            clean: clean speech.
-            ears: thresholds in dB HL.
+            inputs: arguments of the call.
             batch: leading dimensions of the result.
-            options: more arguments of the simulator by name.
-            ends: number of samples of each item.
 
-        Shape: (..., time), (..., 8) -> (*batch, time).
+        Shape: (*batch, time).
         """
+        clean, ears = inputs.clean, inputs.ears
         time = clean.shape[-1]
-        with_phase = self.normal is None and self._emulates_msbg
+        if self._has_bank_phase:
+            ears = ears.expand(*batch, -1) if ears.ndim > 1 else ears
+            ears = ears.reshape(-1, len(FREQUENCIES))
         choice = self._choice(criterion)
-        if with_phase and ears.ndim > 1:
-            ears = ears.expand(*batch, -1).reshape(-1, len(FREQUENCIES))
-        elif with_phase:
-            ears = ears.unsqueeze(0)
         with torch.set_grad_enabled(torch.is_grad_enabled() and clean.requires_grad):
             if choice == "clean":
                 reference = self._limit_band(clean)
             elif self.normal is not None:
-                normal = self.normal(clean)
-                normal = _check_output(normal, "normal ear", clean, [clean.shape[:-1]])
-                return normal.expand(*batch, time)
-            elif with_phase and criterion not in ("bands", "paper"):
+                reference = _check_output(self.normal(clean), "normal ear", clean)
+            elif self._has_bank_phase and criterion not in ("bands", "paper"):
                 items = self._limit_band(clean).expand(*batch, time).reshape(-1, time)
                 return simulate_normal_ear(items, ears, self.sample_rate).reshape(*batch, time)
             else:
                 no_loss = on_device(_no_loss(clean.dtype), clean.device)
-                reference = self.simulate(clean, no_loss, options, ends)
-            if criterion == "bands" or not with_phase:
-                return reference.expand(*batch, time)
-            items = reference.expand(*batch, time).reshape(-1, time)
-            normal_hearing = choice == "normal-hearing"
-            items = apply_bank_phase(items, ears, self.sample_rate, normal=normal_hearing)
+                reference = self.simulate(clean, no_loss, inputs)
+            reference = reference.expand(*batch, time)
+            if criterion == "bands" or not self._has_bank_phase:
+                return reference
+            normal = choice == "normal-hearing"
+            items = reference.reshape(-1, time)
+            items = apply_bank_phase(items, ears, self.sample_rate, normal=normal)
             return items.reshape(*batch, time)
 
     def frequencies(self, fft: int) -> int | None:
@@ -189,9 +203,7 @@ class FrozenSimulator:
     def _choice(self, criterion: str) -> ReferenceName:
         if criterion in ("coherent-bands", "bands"):
             return "normal-hearing"
-        if self.choice is not None:
-            return self.choice
-        return "clean" if criterion == "paper" else "normal-hearing"
+        return self.choice or ("clean" if criterion == "paper" else "normal-hearing")
 
     def _limit_band(self, clean: Tensor) -> Tensor:
         """Remove the band that the simulator does not return."""
@@ -201,27 +213,16 @@ class FrozenSimulator:
         low = resample(clean, self.sample_rate, rate)
         return resample(low, rate, self.sample_rate)[..., : clean.shape[-1]]
 
-    @property
-    def _limits_band(self) -> bool:
-        return 2.0 * self._highest_frequency < self.sample_rate
-
-    @property
-    def _highest_frequency(self) -> float:
-        return float(getattr(self.simulator, "highest_frequency", math.inf))
-
-    @property
-    def _emulates_msbg(self) -> bool:
-        return bool(getattr(self.simulator, "emulates_msbg", False))
-
-    @property
-    def _needs_exact_lengths(self) -> bool:
-        return bool(getattr(self.simulator, "needs_exact_lengths", False))
-
 
 def apply_to_module(value: object, function: Callable[[Tensor], Tensor]) -> None:
     """Apply a function to the tensors of a module, but keep float32 or float64.
 
     Values that are not modules are ignored.
+
+    >>> layer = nn.Linear(2, 1)
+    >>> apply_to_module(layer, lambda tensor: tensor.bfloat16())
+    >>> layer.weight.dtype
+    torch.float32
     """
 
     def move(tensor: Tensor) -> Tensor:
@@ -247,6 +248,9 @@ def build_simulator(
     Raises:
         ValueError: there is no such checkpoint, or the module was built for another rate or level,
             or delays its output.
+
+    >>> build_simulator("msbg", sample_rate=16000, full_scale_spl=94.0)
+    MSBG(sample_rate=16000, full_scale_spl=94, aligned=True)
     """
     if isinstance(simulator, nn.Module):
         settings = {"sample_rate": sample_rate, "full_scale_spl": full_scale_spl}
@@ -276,29 +280,39 @@ def _no_loss(dtype: torch.dtype) -> Tensor:
     return without_modes(lambda: torch.zeros(len(FREQUENCIES), dtype=dtype))
 
 
-def _allowed_batches(items: torch.Size, ears: torch.Size) -> list[torch.Size]:
-    """Return the leading dimensions that the output of a simulator may have.
+def _broadcast_batch(items: torch.Size, ears: torch.Size) -> torch.Size | None:
+    """Return the shape to which the leading dimensions of signals and ears broadcast, or None.
 
     Raises:
         ValueError: the ears would broadcast so that each item is simulated for each ear, as
             (batch,) ears with (batch, 1) items would.
     """
     try:
-        broadcast = broadcast_shape(items, ears)
+        batch = broadcast_shape(items, ears)
     except RuntimeError:  # the simulator rejects them
-        return [items]
-    if math.prod(broadcast) > max(math.prod(items), math.prod(ears)):
+        return None
+    if math.prod(batch) > max(math.prod(items), math.prod(ears)):
         raise ValueError(
             f"expected one audiogram, or one per item in the shape {(*items, len(FREQUENCIES))}, "
             f"got {(*ears, len(FREQUENCIES))}, which would pair each item with each ear"
         )
-    return [items, broadcast]
+    return batch
 
 
-def _check_output(output: Any, source: str, waveform: Tensor, allowed: list[torch.Size]) -> Tensor:
-    """Return an output, or raise ValueError unless it is a waveform with the shape of its input."""
+def _check_output(
+    output: Any, source: str, waveform: Tensor, batch: torch.Size | None = None
+) -> Tensor:
+    """Return an output, or raise ValueError unless it is a waveform with the shape of its input.
+
+    Args:
+        output: value to validate.
+        source: name of the module that returned it, for messages.
+        waveform: input of the module.
+        batch: further leading dimensions that the output may have.
+    """
     check_waveform(output, f"the output of the {source}", highest=math.inf)
-    if output.shape[:-1] not in allowed or output.shape[-1] != waveform.shape[-1]:
+    time = waveform.shape[-1:]
+    if output.shape != waveform.shape and (batch is None or output.shape != batch + time):
         raise ValueError(
             f"expected the {source} to return the shape {tuple(waveform.shape)}, or to broadcast "
             f"it with the audiograms, got {tuple(output.shape)}"

@@ -38,6 +38,12 @@ class HASPILoss(HearingLossLoss):
 
     Raises:
         ValueError: as ``HearingLossLoss``, or a weight is negative or not finite.
+
+    >>> import hlsim
+    >>> speech = hlsim.example_speech()[:16000]
+    >>> loss = HASPILoss("N3", simulator="msbg")
+    >>> print(loss(speech, speech).item() > loss(5.0 * speech, speech).item())  # amplified
+    True
     """
 
     def __init__(

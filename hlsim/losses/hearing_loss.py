@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, Self
+from typing import Any, Literal, Self
 
 import torch
 from torch import Tensor, nn
@@ -41,6 +41,7 @@ from hlsim.losses.criteria import (
 from hlsim.losses.frozen_simulator import (
     FrozenSimulator,
     Hearing,
+    Inputs,
     ReferenceName,
     apply_to_module,
 )
@@ -64,69 +65,84 @@ An ear with a loss that is 0.1 lower than that of the other ear counts 2.7 times
 
 
 class HearingLossLoss(nn.Module):
-    """Difference between compensated speech in an impaired ear and clean speech in a normal ear.
+    """Difference between what an impaired ear and what a normal ear perceives.
 
-    The simulator is frozen: it stays in eval mode and has no trainable parameter. It is not
-    registered, so that the parameters and the checkpoint of a module that holds this loss do not
-    include it. It moves with ``.to()`` all the same, and gradients pass through it to the
-    compensated speech. As one simulator serves the whole process, use ``DistributedDataParallel``
-    instead of ``nn.DataParallel``.
+    The impaired ear perceives compensated speech, the output of an aid, and the normal ear clean
+    speech. A simulator computes both. It is frozen: it stays in eval mode and has no trainable
+    parameter, but gradients pass through it to the compensated speech. It is not registered, so
+    that the parameters and the state dict of a module that holds this loss do not include it. It
+    moves with ``.to()`` all the same. Use ``DistributedDataParallel`` instead of
+    ``nn.DataParallel``, because all threads of a process share one simulator.
 
-    Nothing normalises the level: 65 dB SPL is RMS 0.035 at the default ``full_scale_spl``. NaN and
-    infinity are not rejected, so that a gradient scaler can see them; they make the value of their
-    own item NaN.
+    The level is not normalised: 65 dB SPL is an RMS of 0.035 at the default ``full_scale_spl``. NaN
+    and infinity are not rejected, so that a gradient scaler can detect them. They make the value of
+    their item NaN.
 
-    The loss may be called in an autocast region and works in float32 there. Call ``backward()``
-    outside of it, as torch recommends: in one of float16, gradients may be NaN. A compiled caller
-    runs the loss as it is, with a graph break. ``torch.func.grad`` works, except for the criteria
-    ``"haspi"`` and ``"hasqi"``.
+    In an autocast region, the loss computes in float32. Call ``backward()`` outside of the region,
+    as torch recommends, because gradients in float16 may be NaN. A compiled caller runs the loss
+    uncompiled, with a graph break. ``torch.func.grad`` works, except for the criteria ``"haspi"``
+    and ``"hasqi"``, and without ``checkpoint``.
+
+    The criterion is one of
+
+    - ``"coherent-bands"``: coherence and level in bands (``hlsim.losses.coherent_bands``)
+    - ``"bands"``: levels in bands (``hlsim.losses.band_levels``)
+    - ``"paper"``: Equations 2 to 9 of the Neuro-MSBG paper, which are not balanced between ears and
+      levels (``hlsim.losses.paper``)
+    - ``"haspi"`` and ``"hasqi"``: 1 minus the score of the compensated speech
+      (``hlsim.metrics.objective``). They ignore the level, so combine them with another criterion.
+    - ``"interaural"``: change of the differences between the ears of a listener
+      (``hlsim.metrics.interaural``), to be combined with another criterion
+    - several of these by name with their weights, ``{"coherent-bands": 1.0, "haspi": 0.3}``
+    - a function of the perceived speech and the reference, (items, time) each in pascals, that
+      returns one value per item, (items,)
 
     Args:
         audiogram: ear or ears; may be passed to each call instead. A tensor that requires a
             gradient gets one, and is not registered either. Every simulator, ``"msbg"`` included,
             receives the levels at eight frequencies, ``Audiogram.thresholds``.
         simulator: ``"neuro-msbg"`` or the name or folder of another checkpoint; ``"msbg"``, the
-            exact model; or a module that is called with a waveform and thresholds and frozen as it
-            is (pass a copy of one that is still trained). A module may have the attributes
-            ``sample_rate``, ``full_scale_spl`` and ``aligned``, which are validated;
-            ``emulates_msbg``, if its normal ear and its phases are those of MSBG;
-            ``highest_frequency`` in Hz, if it returns nothing above; and ``needs_exact_lengths``,
-            if silence after the end of an item changes the output before.
+            exact model; or a module, which is called with a waveform and thresholds. The module
+            itself is frozen, so pass a copy of one that is still trained. It may have the
+            attributes ``sample_rate``, ``full_scale_spl`` and ``aligned``, which are validated;
+            ``emulates_msbg``, true if its normal ear and its phases are those of MSBG;
+            ``highest_frequency`` of its output in Hz; and ``needs_exact_lengths``, true if silence
+            after the end of an item changes the output before.
         sample_rate: sample rate of the speech in Hz, 16000 to 48000. Neuro-MSBG compares the band
-            below 8 kHz, and below 7.5 kHz at higher rates than 16000.
+            below 8 kHz, and below 7.5 kHz at rates above 16000.
         full_scale_spl: level in dB SPL of RMS 1.0.
-        reference: reference of ``"paper"``, of a function and of ``heard``: ``"clean"``, the clean
-            speech itself (the default for ``"paper"``), or ``"normal-hearing"``, what a normal ear
-            perceives of it (the default otherwise). Both have the phase of MSBG's filter bank for
-            the severity of the ear (``hlsim.msbg.response``); otherwise speech with inverted
-            polarity could be closer than the speech. With ``normal``, or a simulator that does not
-            emulate MSBG, the reference is compared as it is. The other criteria always compare with
-            a normal ear.
-        criterion: ``"coherent-bands"``, coherence and level in bands
-            (``hlsim.losses.coherent_bands``); ``"bands"``, levels in bands; ``"paper"``, Equations
-            2 to 9 of Neuro-MSBG, which are not balanced between ears and levels
-            (``hlsim.losses.paper``); ``"haspi"`` and ``"hasqi"``, 1 minus the score of the
-            compensated speech (``hlsim.metrics.objective``), which ignore the level and are to be
-            combined with another, ``{"coherent-bands": 1.0, "haspi": 0.3}``, as is
-            ``"interaural"``, the change of the differences between a listener's ears
-            (``hlsim.metrics.interaural``); weights of several by name; or a function of the
-            perceived speech and the reference, (items, time) in pascals, that returns one value per
-            item, (items,).
+        reference: signal with which ``"paper"``, a function and ``heard`` compare: ``"clean"``, the
+            clean speech (the default for ``"paper"``), or ``"normal-hearing"``, the output of a
+            normal ear for it (the default otherwise). The other criteria always compare with a
+            normal ear. The reference gets the phase of MSBG's filter bank for the severity of the
+            ear (``hlsim.msbg.response``), unless ``normal`` is passed or the simulator does not
+            emulate MSBG. Without this phase, inverted speech could be closer than the speech.
+        criterion: criterion, as listed above.
         weights: weights of the parts by name; other parts do not count.
         reduction: ``"mean"`` over the items, whatever their lengths, or ``"none"`` for one value
             per item.
-        normal: the normal ear that belongs to the simulator, a module, which is frozen too, or a
-            function, (..., time) -> (..., time). By default a simulator that emulates MSBG has
-            MSBG's at 0 dB HL, and another is called with 0 dB HL itself: what it does to every ear,
-            such as a low-pass filter, it then does to the reference. A network that learned another
-            teacher needs the normal ear of that teacher.
-        ears: for two ears, (..., 2, time): ``"mean"``, or ``"better"`` for a smooth choice of the
-            better ear: each counts by its share, ``softmax(-loss / 0.1)`` over both. The gradient
-            does not follow the shares, so that no ear is made worse.
+        normal: normal ear that belongs to the simulator: a module, which is frozen too, or a
+            function, (..., time) -> (..., time). By default, it is MSBG at 0 dB HL for a simulator
+            that emulates MSBG, and the simulator itself at 0 dB HL otherwise. Changes that the
+            simulator makes for every ear, such as a low-pass, then apply to the reference, too. A
+            network that emulates another teacher needs the normal ear of that teacher.
+        ears: reduction of two ears, (..., 2, time): ``"mean"``, or ``"better"`` for a smooth choice
+            of the better ear. Each ear then counts by its share, ``softmax(-loss / 0.1)`` over
+            both. The shares carry no gradient, so that no ear is made worse.
+        checkpoint: compute the activations of the simulator again in the backward pass instead of
+            storing them, which takes less memory. Value and gradient are the same.
 
     Raises:
         ValueError: an unknown name, a value of another type or out of range, or a simulator that
             was built for another rate or level, or delays its output.
+
+    >>> import hlsim
+    >>> speech = hlsim.example_speech()[:16000]
+    >>> loss = HearingLossLoss("N3", simulator="msbg")
+    >>> print(loss(speech, speech).item() > loss(5.0 * speech, speech).item())  # amplified
+    True
+    >>> sorted(loss.parts(speech, speech))
+    ['incoherence', 'levels', 'louder', 'misalignment', 'peaks']
     """
 
     def __init__(
@@ -255,8 +271,8 @@ class HearingLossLoss(nn.Module):
         """
         inputs = self._prepare(*arguments, **options)
         with torch.autocast(inputs.clean.device.type, enabled=False):
-            perceived = self._simulate(inputs, inputs.compensated)
-            reference = self._reference("criterion", inputs, perceived.shape[:-1])
+            perceived = self._frozen.simulate(inputs.compensated, inputs.ears, inputs)
+            reference = self._frozen.reference("criterion", inputs, perceived.shape[:-1])
             if inputs.ends is not None:
                 perceived = silence_after(perceived, inputs.ends)
                 reference = silence_after(reference, inputs.ends)
@@ -278,7 +294,7 @@ class HearingLossLoss(nn.Module):
         lengths: Lengths | None = None,
         *,
         listener: Mapping[str, Any] | None = None,
-    ) -> _Inputs:
+    ) -> Inputs:
         """Validate the arguments of a call, and silence what does not count."""
         check_waveform(compensated, "compensated", full_scale_spl=self.full_scale_spl)
         check_waveform(clean, "clean", full_scale_spl=self.full_scale_spl)
@@ -304,31 +320,25 @@ class HearingLossLoss(nn.Module):
         compensated, clean = compensated.to(dtype), clean.to(dtype)
         if ends is not None:
             compensated, clean = silence_after(compensated, ends), silence_after(clean, ends)
+        options = listener or {}
         # Only a listener, whose ears are on the CPU, may lack an ear.
         known = ears.isfinite().all(-1) if listeners else None
         ears = on_device(ears, compensated.device)
         if known is None or bool(known.all()):
-            return _Inputs(compensated, clean, ears, ends, None, listener)
+            return Inputs(compensated, clean, ears, ends, None, options)
         # A missing ear is simulated as a normal one that is given silence.
         known = known.to(compensated.device, non_blocking=True)
         compensated = torch.where(known.unsqueeze(-1), compensated, 0.0)
         clean = torch.where(known.unsqueeze(-1), clean, 0.0)
-        return _Inputs(compensated, clean, ears.nan_to_num(), ends, known, listener)
+        return Inputs(compensated, clean, ears.nan_to_num(), ends, known, options)
 
-    def _simulate(self, inputs: _Inputs, waveform: Tensor) -> Tensor:
-        return self._frozen.simulate(waveform, inputs.ears, inputs.options, inputs.ends)
-
-    def _reference(self, criterion: str, inputs: _Inputs, batch: torch.Size) -> Tensor:
-        _, clean, ears, ends, _, options = inputs
-        return self._frozen.reference(criterion, clean, ears, batch, options, ends)
-
-    def _compare(self, inputs: _Inputs) -> dict[str, Tensor]:
+    def _compare(self, inputs: Inputs) -> dict[str, Tensor]:
         """Return the parts of the loss of each item. Shape: the leading dimensions each."""
         compensated, clean, ears, ends, known, _ = inputs
         limited = compensated
         if {"coherent-bands", *SCORES} & self.criteria.keys():
             limited = coherent_bands.limit_gradient_spikes(compensated, self.sample_rate)
-        perceived = self._simulate(inputs, limited)
+        perceived = self._frozen.simulate(limited, ears, inputs)
         batch, time = perceived.shape[:-1], perceived.shape[-1]
         gain = gain_to_pascals(self.full_scale_spl)
 
@@ -339,7 +349,7 @@ class HearingLossLoss(nn.Module):
         signals = {"perceived": as_items(perceived), "output": as_items(compensated)}
         for name in self.criteria:
             if name not in CRITERIA_OF_OUTPUT:
-                signals[name] = as_items(self._reference(name, inputs, batch))
+                signals[name] = as_items(self._frozen.reference(name, inputs, batch))
         item_ends = [time] * math.prod(batch)
         if ends is not None:
             item_ends = ends.expand(batch).flatten().tolist()
@@ -413,22 +423,3 @@ class HearingLossLoss(nn.Module):
         self._frozen.apply(function)
         apply_to_module(self.criterion, function)
         return self
-
-
-class _Inputs(NamedTuple):
-    """Validated arguments of a call.
-
-    Attributes:
-        compensated, clean: speech in one precision, silent after each end and at missing ears.
-        ears: thresholds, 0 dB HL for missing ears.
-        ends: number of samples of each item, or None.
-        known: which ears are known, or None if all are.
-        options: arguments of the simulator beyond the audiogram.
-    """
-
-    compensated: Tensor
-    clean: Tensor
-    ears: Tensor
-    ends: Tensor | None
-    known: Tensor | None
-    options: Mapping[str, Any] | None

@@ -50,6 +50,11 @@ def in_blocks(
         checkpoints_short: compute signals of one block again in the backward pass, too.
 
     Shape: (items, time), (items, levels) -> (items, time).
+
+    >>> speech, ear = torch.randn(1, 320000), torch.zeros(1, 8)  # 20 s
+    >>> output = in_blocks(lambda signals, ears, is_last: 0.5 * signals, speech, ear, rate=16000)
+    >>> torch.equal(output, 0.5 * speech)
+    True
     """
     samples = signals.shape[-1]
     blocks = block_bounds(samples, rate)
@@ -75,6 +80,9 @@ def block_bounds(samples: int, rate: int) -> list[Block]:
     Args:
         samples: length of the signal.
         rate: sample rate in Hz.
+
+    >>> [(block.input_start, block.input_stop) for block in block_bounds(320000, rate=16000)]
+    [(0, 133120), (102400, 256000), (225280, 320000)]
     """
     common = math.lcm(HOP, STEP, round(2 * HALF_RATE_STEP))
     # the smallest number of samples that is a whole number of hops and of steps

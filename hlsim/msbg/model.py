@@ -114,6 +114,14 @@ class MSBG(nn.Module):
 
     Raises:
         ValueError: a rate, level or audiogram out of range.
+
+    >>> import hlsim
+    >>> speech = hlsim.example_speech()[:16000]
+    >>> MSBG("N4")(speech).shape
+    torch.Size([16000])
+    >>> ears = torch.tensor([[20.0] * 8, [60.0] * 8])
+    >>> MSBG()(speech, ears).shape  # one signal, two ears
+    torch.Size([2, 16000])
     """
 
     emulates_msbg = True
@@ -332,6 +340,10 @@ def active_rescaling(signals: Tensor) -> Tensor:
     It is pyclarity's ``measure_rms`` at -12 dB, and 1 if no frame is active.
 
     Shape: (..., time) at 44.1 kHz in pascals -> (..., 1).
+
+    >>> pause, sound = torch.zeros(44100), torch.ones(44100)
+    >>> print(active_rescaling(torch.cat((sound, pause))).square().round(decimals=2))
+    tensor([0.5000])
     """
     frame = round(0.01 * MSBG_RATE)
     to_reference = 10.0 ** ((PASCAL_SPL - 120.0) / 10.0)  # to powers in pyclarity's full scale

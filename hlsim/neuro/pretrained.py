@@ -21,6 +21,10 @@ def load_pretrained(
 
     Raises:
         ValueError: There is no such checkpoint, it is damaged, or it is no simulator.
+
+    >>> import torch
+    >>> load_pretrained("neuro-msbg-light")(torch.randn(2, 16000), "N3").shape
+    torch.Size([2, 16000])
     """
 
     def build(config: NeuroConfig) -> NeuroMSBG:
