@@ -13,7 +13,7 @@ from torch import Tensor
 from compensators import NALR, load_compensator
 from hlsim.audio import find_audio, read_audio, write_audio
 from hlsim.audiogram import STANDARD, Audiogram
-from hlsim.calibration import set_level
+from hlsim.calibration import PASCAL_SPL, set_level
 from hlsim.dsp.resample import resample
 from hlsim.evaluation.aids import AtLevelOf, Unaided
 from hlsim.evaluation.comparison import compare
@@ -23,7 +23,7 @@ from hlsim.evaluation.measures import LEVELS, MEASURES, PERCEPTION, perceive
 from hlsim.evaluation.parallel import Progress, one_thread
 from hlsim.evaluation.result import Evaluation
 from hlsim.evaluation.study import Condition, Item
-from hlsim.metrics.pair import check_pair
+from hlsim.metrics.ear.clean_speech import CleanSpeech
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.report.demo import (
     NAL_R,
@@ -154,7 +154,10 @@ def _read_items(
         waveform, rate = read_audio(path)
         clip = resample(waveform[0], rate, NEURO_RATE)[: round(_MAX_SECONDS * NEURO_RATE)]
         clean = set_level(clip, SPEECH_LEVEL)
-        check_pair(clean, clean, NEURO_RATE, names=(str(path), str(path)))
+        try:
+            CleanSpeech(clean, None, NEURO_RATE, PASCAL_SPL, False, "HASPI")
+        except ValueError as error:
+            raise ValueError(f"{path} cannot be scored: {error}") from error
         item_seed = (seed + number) % 2**32
         items.append(Item(name, clean, clean, audiogram, seed=item_seed, facts=facts))
     return items

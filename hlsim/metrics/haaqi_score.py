@@ -34,8 +34,7 @@ from hlsim.metrics.ear import fine_structure
 from hlsim.metrics.ear.envelope_modulation import zero_phase_responses
 from hlsim.metrics.ear.model import Extent
 from hlsim.metrics.ear.recursions import RATE
-from hlsim.metrics.haspi_score import Noise
-from hlsim.metrics.pair import match_pair
+from hlsim.metrics.pair import Noise, match_pair
 from hlsim.metrics.quality import Comparison, QualityReference
 from hlsim.torchtools import constant, not_compiled
 
@@ -129,7 +128,7 @@ class HaaqiReference(QualityReference):
     envelope_segment = ENVELOPE_SEGMENT
 
     @staticmethod
-    def _compute_parts(comparison: Comparison, extent: Extent) -> Tensor:
+    def compute_parts(comparison: Comparison, extent: Extent) -> Tensor:
         envelopes = modulation_correlation(
             comparison.clean_levels,
             comparison.processed_levels,

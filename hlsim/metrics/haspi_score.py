@@ -24,7 +24,7 @@ import json
 from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple, Unpack
 
 import numpy as np
 import torch
@@ -33,16 +33,14 @@ from torch import Tensor
 
 from hlsim.audiogram.thresholds import AudiogramLike
 from hlsim.calibration import PASCAL_SPL
-from hlsim.checks import Lengths, check_choice
+from hlsim.checks import Lengths
 from hlsim.metrics.ear import envelope_modulation as envelopes
 from hlsim.metrics.ear import model as ear_model
-from hlsim.metrics.ear.clean_speech import CleanBatch, CleanSpeech, ItemGroup
+from hlsim.metrics.ear.clean_speech import CleanBatch, CleanSpeech
 from hlsim.metrics.ear.model import CHANNELS, Extent
-from hlsim.metrics.pair import check_seed, match_pair
+from hlsim.metrics.pair import Noise, match_pair
+from hlsim.metrics.reference import PreparedBatch, Reference, Settings, map_on_cores
 from hlsim.torchtools import constant, not_compiled
-
-Noise = Literal["expected", "seeded", "none"]
-"""Internal noise of the ear: its mean effect, the noise that pyclarity draws, or none."""
 
 
 @not_compiled  # tracing takes minutes
@@ -109,16 +107,17 @@ def haspi(
     return reference.score(processed, audiogram, noise=noise, seed=seed)
 
 
-class HaspiReference:
+class HaspiReference(Reference["_Batch"]):
     """Clean speech in a normal ear, prepared for the HASPI of many processed signals.
 
     It does not depend on an audiogram. In float32 it takes about 4 MB per second of speech.
 
     Args:
-        clean, sample_rate, full_scale_spl, lengths, whole_khz: the arguments of ``haspi``. The
-            scores have the dtype and the device of ``clean``, whose gradient is not computed.
-        keep: store the clean signal's features; otherwise they are computed for each score, which
-            takes less memory.
+        clean: clean speech, not amplified. The scores have its dtype and its device. Its gradient
+            is not computed.
+        settings: ``sample_rate``, ``full_scale_spl``, ``lengths`` and ``whole_khz`` as for
+            ``haspi``. ``keep=False`` computes the clean signal's features for each score instead
+            of storing them, which takes less memory.
 
     Raises:
         ValueError: as for ``haspi``.
@@ -130,20 +129,13 @@ class HaspiReference:
     True
     """
 
-    @torch.inference_mode(False)  # the features may serve a training later
-    def __init__(
-        self,
-        clean: Tensor,
-        *,
-        sample_rate: int = 16000,
-        full_scale_spl: float = PASCAL_SPL,
-        lengths: Lengths | None = None,
-        whole_khz: bool = False,
-        keep: bool = True,
-    ) -> None:
-        self._signals = CleanSpeech(clean, sample_rate, full_scale_spl, lengths, whole_khz, "HASPI")
-        with torch.autocast(clean.device.type, enabled=False):
-            self._batches = [_Batch(self._signals, batch, keep) for batch in self._signals.batches]
+    score_name = "HASPI"
+
+    def __init__(self, clean: Tensor, **settings: Unpack[Settings]) -> None:
+        super().__init__(clean, **settings)
+
+    def _prepare_batches(self, signals: CleanSpeech) -> list[_Batch]:
+        return map_on_cores(lambda batch: _Batch(signals, batch), signals.batches)
 
     def score(
         self,
@@ -165,21 +157,9 @@ class HaspiReference:
         Raises:
             ValueError: as for ``haspi``.
         """
-        check_choice("noise", noise, Noise)
-        processed, shorter = self._signals.cut(processed)
-        if shorter is not None:
-            reference = HaspiReference(**shorter, keep=False)
-            return reference.score(processed, audiogram, noise=noise, seed=seed)
-        signals = self._signals
-        rows = signals.check(processed)
-        ears = ear_model.hair_cells(signals.thresholds(audiogram))
-        seeds = item_seeds(seed, signals.shape)
-        with torch.autocast(processed.device.type, enabled=False):
-            features = [batch.compare(rows, ears, noise, seeds) for batch in self._batches]
-            return intelligibility(torch.cat(features)).reshape(signals.shape)
-
-
-# -- items that are processed together -------------------------------------------------------------
+        ears = ear_model.hair_cells(self._signals.thresholds(audiogram))
+        features = self._compare(processed, noise, seed, ears)
+        return intelligibility(features).reshape(features.shape[:-1])
 
 
 class _Channels(NamedTuple):
@@ -198,102 +178,56 @@ class _Channels(NamedTuple):
     channel_sum: envelopes.ChannelSum
 
 
-class _Batch:
-    """Clean signals of a batch in a normal ear.
+class _Batch(PreparedBatch[_Channels]):
+    """Clean speech of a batch in a normal ear."""
 
-    Args:
-        signals: all clean signals.
-        batch: those of the batch.
-        keep: compute the features now, and store them.
-    """
+    def __init__(self, signals: CleanSpeech, batch: CleanBatch) -> None:
+        normal = ear_model.hair_cells(torch.zeros(8, device=signals.device))
+        super().__init__(signals, batch, batch.signals, normal)
 
-    def __init__(self, signals: CleanSpeech, batch: CleanBatch, keep: bool) -> None:
-        self._signals, self._batch = signals, batch
-        self._groups = [_Group(signals, batch, items) for items in signals.groups(batch)]
-        if keep:
-            for group in self._groups:
-                group.store()
+    def _prepare(self, channels: slice) -> _Channels:
+        extent = self._extent
+        cochlea = ear_model.simulate_cochlea(self._clean, self._cells, channels, extent)
+        spectrum = ear_model.lag_spectrum(cochlea.power.sqrt(), extent)
+        delays = self._longest_delay - ear_model.group_delays(cochlea.bandwidth, channels)
+        frames = self._frames(cochlea.power, self._cells.inner[channels], delays)
+        return _Channels(channels, spectrum, delays, envelopes.sum_over_channels(frames, channels))
+
+    def _frames(self, power: Tensor, inner: Tensor, delays: Tensor) -> Tensor:
+        """Return the smoothed levels of compressed envelopes."""
+        levels = ear_model.apply_adaptation(ear_model.sensation(power, inner))
+        return envelopes.smooth_frames(levels, delays, self._extent)
 
     def compare(
-        self, processed: Tensor, ears: ear_model.HairCells, noise: Noise, seeds: list[int]
+        self, processed: Tensor, noise: Noise, seeds: Sequence[int], *ears: ear_model.HairCells
     ) -> Tensor:
-        """Compute the features of each item.
-
-        Args:
-            processed: all processed signals. Shape: (items, time).
-            ears: hair cells of all items. Shape: (items, 32).
-            noise: kind of noise.
-            seeds: seeds of all items.
-
-        Returns:
-            Features. Shape: (items of the batch, 10).
-        """
-        batch = self._batch
-        aligned = self._signals.align(processed, batch)
-        ear = ears.select_items(batch.items)
-        pairs = [group.sum_channels(aligned, ear) for group in self._groups]
-        clean_sum, processed_sum = (envelopes.join_items(sums) for sums in zip(*pairs, strict=True))
-        indices, extent = envelopes.find_audible_frames(clean_sum.loudness, batch.audible)
+        """Compute the ten features of each item."""
+        items, extent = self._batch.items, self._extent
+        sound, ear = self._align(processed), ears[0].select_items(items)
+        clean_sum: envelopes.ChannelSum | None = None
+        processed_sum: envelopes.ChannelSum | None = None
+        for clean in self._channels():
+            channels = clean.channels
+            cochlea = ear_model.simulate_cochlea(sound, ear, channels, extent)
+            lags = ear_model.channel_lags(clean.spectrum, cochlea.power.detach().sqrt(), extent)
+            power = ear_model.shift(cochlea.power, lags, extent.ends, extent.ends, extent.padded)
+            frames = self._frames(power, ear.inner[:, channels], clean.delays)
+            clean_sum = envelopes.add_sums(clean_sum, clean.channel_sum)
+            processed_sum = envelopes.add_sums(
+                processed_sum, envelopes.sum_over_channels(frames, channels)
+            )
+        assert clean_sum is not None and processed_sum is not None
+        indices, audible = envelopes.find_audible_frames(clean_sum.loudness, extent)
         x = envelopes.select_frames(clean_sum.cosines, indices)
         y = envelopes.select_frames(processed_sum.cosines, indices)
         if noise == "seeded":
-            counts = [2 * CHANNELS * end for end in batch.audible.ends]
-            pair = _draw_pairs(seeds[batch.items], counts, extent, x)
+            counts = [2 * CHANNELS * end for end in extent.ends]
+            pair = _draw_pairs(seeds[items], counts, audible, x)
             x, y = x + pair[0], y + pair[1]
-        covariance = envelopes.modulation_covariance(x, y, extent)
+        covariance = envelopes.modulation_covariance(x, y, audible)
         if noise == "expected":
             return envelopes.expected_correlation(covariance)
         return envelopes.correlation(covariance)
-
-
-class _Group(ItemGroup[_Channels]):
-    """Items whose ears are computed together, each with the features of its clean speech."""
-
-    def __init__(self, signals: CleanSpeech, batch: CleanBatch, items: slice) -> None:
-        super().__init__(signals, batch, items)
-        with torch.no_grad():
-            self._ear = ear_model.hair_cells(torch.zeros(8, device=signals.device))
-            self._clean = signals.through_middle_ear(batch.signals[items], self._extent)
-            self._longest_delay = ear_model.longest_group_delay(
-                self._clean, self._ear, self._extent
-            )
-
-    @torch.no_grad()
-    def _prepare(self, channels: slice) -> _Channels:
-        cochlea = ear_model.simulate_cochlea(self._clean, self._ear, channels, self._extent)
-        spectrum = ear_model.lag_spectrum(cochlea.power.sqrt(), self._extent)
-        delays = self._longest_delay - ear_model.group_delays(cochlea.bandwidth, channels)
-        levels = ear_model.apply_adaptation(
-            ear_model.sensation(cochlea.power, self._ear.inner[channels])
-        )
-        frames = envelopes.smooth_frames(levels, delays, self._extent)
-        channel_sum = envelopes.sum_over_channels(frames, channels)
-        return _Channels(channels, spectrum, delays, channel_sum)
-
-    def sum_channels(
-        self, processed: Tensor, ears: ear_model.HairCells
-    ) -> tuple[envelopes.ChannelSum, envelopes.ChannelSum]:
-        """Sum the frames of the clean and of the processed signals over all channels.
-
-        Shape: (items, padded) and (items, 32) of the batch.
-        """
-        extent = self._extent
-        ear = ears.select_items(self.items)
-        sound = self._signals.through_middle_ear(processed[self.items], extent)
-        x: envelopes.ChannelSum | None = None
-        y: envelopes.ChannelSum | None = None
-        for clean in self._channels():
-            cells = ear_model.simulate_cochlea(sound, ear, clean.channels, extent)
-            lags = ear_model.channel_lags(clean.spectrum, cells.power.detach().sqrt(), extent)
-            power = ear_model.shift(cells.power, lags, extent.ends, extent.ends, extent.padded)
-            levels = ear_model.apply_adaptation(
-                ear_model.sensation(power, ear.inner[:, clean.channels])
-            )
-            x = envelopes.add_sums(x, clean.channel_sum)
-            frames = envelopes.smooth_frames(levels, clean.delays, extent)
-            y = envelopes.add_sums(y, envelopes.sum_over_channels(frames, clean.channels))
-        assert x is not None and y is not None
-        return x, y
 
 
 # -- noise -----------------------------------------------------------------------------------------
@@ -302,7 +236,9 @@ DEVIATES_PER_DRAW = 2**16
 """Approximate number of deviates that are drawn at once."""
 
 
-def _draw_pairs(seeds: list[int], skipped: list[int], extent: Extent, like: Tensor) -> Tensor:
+def _draw_pairs(
+    seeds: Sequence[int], skipped: Sequence[int], extent: Extent, like: Tensor
+) -> Tensor:
     """Draw the noise of the clean and of the processed signals.
 
     Args:
@@ -365,29 +301,6 @@ def legacy_rng_after_normals(seed: int, count: int) -> np.random.RandomState:
     random = np.random.RandomState()
     random.set_state(_state_after(seed, count))
     return random
-
-
-def item_seeds(seed: int | Sequence[int], shape: torch.Size) -> list[int]:
-    """Return one seed for each item.
-
-    Args:
-        seed: one seed, or one for each item.
-        shape: shape of the batch of items.
-
-    Raises:
-        ValueError: the number of seeds is another one, or a seed is out of range.
-
-    >>> item_seeds(3, torch.Size([2]))
-    [3, 3]
-    """
-    items = shape.numel()
-    try:
-        seeds: list[Any] = list(seed)  # type: ignore[arg-type]
-    except TypeError:  # neither a sequence nor a tensor with elements
-        seeds = [seed] * items
-    if len(seeds) != items:
-        raise ValueError(f"expected one seed or {items}, one for each item, got {len(seeds)}")
-    return [check_seed(value) for value in seeds]
 
 
 # -- networks --------------------------------------------------------------------------------------

@@ -19,8 +19,7 @@ from hlsim.calibration import PASCAL_SPL
 from hlsim.checks import Lengths
 from hlsim.metrics.ear import fine_structure
 from hlsim.metrics.ear.model import Extent
-from hlsim.metrics.haspi_score import Noise
-from hlsim.metrics.pair import match_pair
+from hlsim.metrics.pair import Noise, match_pair
 from hlsim.metrics.quality import Comparison, QualityParts, QualityReference
 from hlsim.torchtools import not_compiled
 
@@ -101,7 +100,7 @@ class HasqiReference(QualityReference):
     envelope_segment = fine_structure.SEGMENT
 
     @staticmethod
-    def _compute_parts(comparison: Comparison, extent: Extent) -> Tensor:
+    def compute_parts(comparison: Comparison, extent: Extent) -> Tensor:
         counts = fine_structure.segments_of(extent)
         envelopes = fine_structure.envelope_correlation(
             comparison.clean_levels, comparison.processed_levels, counts

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import math
 import warnings
+from collections.abc import Sequence
 from numbers import Integral
+from typing import Any, Literal
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from hlsim.calibration import check_full_scale
 from hlsim.checks import Lengths, check_lengths, check_rate, check_waveform, describe
 
 SHORTEST_SECONDS = 0.7
@@ -22,8 +21,8 @@ LOWEST_REFERENCE_SPL = 20.0
 LARGEST_LENGTH_DIFFERENCE = 0.1
 """Largest difference in seconds between the lengths of two signals, of which the longer is cut."""
 
-Signal = np.ndarray | Tensor
-"""Samples of one channel. Shape: (time,)."""
+Noise = Literal["expected", "seeded", "none"]
+"""Internal noise of the ear: its mean effect, the noise that pyclarity draws, or none."""
 
 
 def common_length(lengths: tuple[int, int], sample_rate: int, names: tuple[str, str]) -> int:
@@ -129,73 +128,24 @@ def check_seed(seed: int) -> int:
     return seed
 
 
-def check_pair(
-    reference: Signal,
-    processed: Signal,
-    sample_rate: int,
-    full_scale_spl: float = 94.0,
-    names: tuple[str, str] = ("reference", "processed"),
-) -> tuple[np.ndarray, np.ndarray]:
-    """Validate the signals of one ear, and return them in float64, cut to their common length.
-
-    A silent processed signal is valid, because an aid that mutes gets the score of silence.
+def item_seeds(seed: int | Sequence[int], shape: torch.Size) -> list[int]:
+    """Return one seed for each item.
 
     Args:
-        reference: clean speech. Shape: (time,).
-        processed: signal to score. Shape: (time,).
-        sample_rate: sample rate in Hz.
-        full_scale_spl: level in dB SPL of samples whose RMS is 1.0.
-        names: names of the signals in messages.
+        seed: one seed, or one for each item.
+        shape: shape of the batch of items.
 
     Raises:
-        ValueError: a signal has another shape, is too short or is not finite, or the lengths differ
-            by more than 0.1 s. The reference is silent or below 20 dB SPL. The rate or the level is
-            out of range.
+        ValueError: the number of seeds is another one, or a seed is out of range.
 
-    >>> reference, processed = check_pair(np.ones(16000) * np.arange(16000), np.ones(16000), 16000)
-    >>> reference.dtype
-    dtype('float64')
+    >>> item_seeds(3, torch.Size([2]))
+    [3, 3]
     """
-    rate = check_rate(sample_rate)
-    full_scale = check_full_scale(full_scale_spl)
-    clean = _as_float64(reference, names[0])
-    output = _as_float64(processed, names[1])
-    common = common_length((len(clean), len(output)), rate, names)
-    clean = clean[:common]
-    output = output[:common]
-    if len(clean) < SHORTEST_SECONDS * rate:
-        raise ValueError(
-            f"expected {names[0]} to last {SHORTEST_SECONDS} s or more for a meaningful score, "
-            f"got {len(clean) / rate:.2g} s"
-        )
-    if not clean.any():
-        raise ValueError(f"expected {names[0]} to be a sound, got silence")
-    level = 10.0 * math.log10(max(float(np.var(clean)), 1e-30)) + full_scale
-    if level < LOWEST_REFERENCE_SPL:
-        raise ValueError(
-            f"expected {names[0]} at {LOWEST_REFERENCE_SPL:g} dB SPL or more for a meaningful "
-            f"score, got {level:.1f} dB SPL; check full_scale_spl={full_scale:g}"
-        )
-    return clean, output
-
-
-def _as_float64(signal: Signal, name: str) -> np.ndarray:
-    """Convert a signal to an array of float64. Shape: (time,).
-
-    Raises:
-        ValueError: the signal has another shape, no floating-point samples, or samples that are NaN
-            or infinite.
-    """
-    if isinstance(signal, Tensor):
-        # NumPy has no bfloat16.
-        samples = signal.double() if signal.is_floating_point() else signal
-        signal = samples.detach().cpu().numpy()
-    values = np.asarray(signal)
-    if values.ndim != 1 or not len(values) or values.dtype.kind != "f":
-        raise ValueError(
-            f"expected {name} to be floating-point samples of one ear, of shape (time,), "
-            f"got {values.dtype} of shape {values.shape}"
-        )
-    if not np.isfinite(values).all():
-        raise ValueError(f"expected finite samples of {name}, got NaN or infinity")
-    return values.astype(np.float64)
+    items = shape.numel()
+    try:
+        seeds: list[Any] = list(seed)  # type: ignore[arg-type]
+    except TypeError:  # neither a sequence nor a tensor with elements
+        seeds = [seed] * items
+    if len(seeds) != items:
+        raise ValueError(f"expected one seed or {items}, one for each item, got {len(seeds)}")
+    return [check_seed(value) for value in seeds]

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple, Unpack
 
 import numpy as np
 import torch
@@ -17,23 +17,23 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
-from hlsim.audiogram import FREQUENCIES
+from compensators.nalr import FORMULA_INDICES, nalr_gains_db
 from hlsim.audiogram.thresholds import AudiogramLike
-from hlsim.calibration import PASCAL_SPL, check_full_scale
-from hlsim.checks import Lengths, check_choice
 from hlsim.dsp.fft import fft_length
 from hlsim.dsp.fir import frequency_sampling_fir
 from hlsim.dsp.windows import hamming
 from hlsim.metrics.ear import fine_structure
 from hlsim.metrics.ear import model as ear_model
-from hlsim.metrics.ear.clean_speech import CleanBatch, CleanSpeech, ItemGroup
+from hlsim.metrics.ear.clean_speech import CleanBatch, CleanSpeech
 from hlsim.metrics.ear.model import AUDIOMETRIC_HZ, CHANNELS, Extent
 from hlsim.metrics.ear.recursions import RATE
-from hlsim.metrics.haspi_score import Noise, item_seeds, legacy_rng_after_normals
+from hlsim.metrics.haspi_score import legacy_rng_after_normals
+from hlsim.metrics.pair import Noise
+from hlsim.metrics.reference import PreparedBatch, Reference, Settings, map_on_cores
 from hlsim.torchtools import constant
 
 NALR_ORDER = 140
-NALR_BIAS = np.array([-17.0, -8.0, 1.0, -1.0, -2.0, -2.0])
+"""Order of the filter that amplifies the clean signal."""
 
 THRESHOLD_NOISE_DB = -10.0
 """Level of the noise on the motion of the basilar membrane, in dB over threshold."""
@@ -44,8 +44,8 @@ FROZEN_SAMPLES = 2**17
 FROZEN_STRIDE = 4001
 """Samples between the parts of two neighbouring channels."""
 
-NoiseSource = Callable[[slice, Extent], Tensor]
-"""Function that returns noise of some channels, (items or 1, channels, longest).
+NoiseSource = Callable[[slice], Tensor | None]
+"""Function that returns noise of some channels, (items or 1, channels, longest), or None.
 
 Channels are requested in ascending order.
 """
@@ -91,25 +91,21 @@ class Comparison(NamedTuple):
     processed_spectrum: Tensor
 
 
-class QualityReference:
+class QualityReference(Reference["_Batch"]):
     """Clean signals in an impaired ear, prepared for the scores of many processed signals.
 
-    Subclasses compute the score from a ``Comparison``.
+    Subclasses compute the score from a ``Comparison``. In float32 it takes about 18 MB per second.
 
     Args:
-        clean: clean signals, whose dtype and device are those of the scores. Their gradient is not
-            computed.
+        clean: clean signals, not amplified. The scores have their dtype and their device. Their
+            gradient is not computed.
         audiogram: the impaired ear, -10 to 120 dB HL; one ear, or one for each item.
-        sample_rate: sample rate in Hz, 16000 to 48000.
-        full_scale_spl: level in dB SPL of a signal with RMS 1.0.
-        lengths: number of samples of each item in a padded batch.
-        whole_khz: round the rate to whole kHz, as pyclarity does.
-        keep: store the clean signal's features; otherwise they are computed for each score, which
-            takes less memory.
+        settings: ``sample_rate``, ``full_scale_spl``, ``lengths`` and ``whole_khz`` as for
+            ``haspi``. ``keep=False`` computes the clean signals' features for each score instead
+            of storing them, which takes less memory.
 
     Raises:
-        ValueError: clean signals that are too short, not finite, silent or below 20 dB SPL; a rate,
-            level, audiogram or length out of range.
+        ValueError: as for ``haspi``.
 
     >>> from hlsim import example_speech
     >>> from hlsim.metrics import HasqiReference
@@ -118,42 +114,23 @@ class QualityReference:
     True
     """
 
-    score_name: ClassVar[str]
     envelope_segment: ClassVar[int]
 
-    @torch.inference_mode(False)  # the features may serve a training later
     def __init__(
-        self,
-        clean: Tensor,
-        audiogram: AudiogramLike,
-        *,
-        sample_rate: int = 16000,
-        full_scale_spl: float = PASCAL_SPL,
-        lengths: Lengths | None = None,
-        whole_khz: bool = False,
-        keep: bool = True,
+        self, clean: Tensor, audiogram: AudiogramLike, **settings: Unpack[Settings]
     ) -> None:
-        self._audiogram = audiogram
-        self._signals = CleanSpeech(
-            clean, sample_rate, full_scale_spl, lengths, whole_khz, self.score_name
+        super().__init__(clean, audiogram, **settings)
+
+    def _prepare_batches(self, signals: CleanSpeech) -> list[_Batch]:
+        assert self._audiogram is not None
+        ears = signals.thresholds(self._audiogram)
+        host_ears = signals.thresholds(self._audiogram, host=True).detach().double()
+        return map_on_cores(
+            lambda batch: _Batch(
+                signals, batch, ears[batch.items], host_ears[batch.items], type(self)
+            ),
+            signals.batches,
         )
-        signals = self._signals
-        ears = signals.thresholds(audiogram)
-        host_ears = signals.thresholds(audiogram, host=True).detach().double().numpy()
-        unit = 10.0 ** (-check_full_scale(full_scale_spl) / 20.0)
-        with torch.autocast(clean.device.type, enabled=False):
-            self._batches = [
-                _Batch(
-                    signals,
-                    batch,
-                    ears[batch.items],
-                    host_ears[batch.items],
-                    unit,
-                    self.envelope_segment,
-                    keep,
-                )
-                for batch in signals.batches
-            ]
 
     def score(
         self, processed: Tensor, *, noise: Noise = "expected", seed: int | Sequence[int] = 0
@@ -180,24 +157,11 @@ class QualityReference:
 
         The arguments are those of ``score``.
         """
-        check_choice("noise", noise, Noise)
-        processed, shorter = self._signals.cut(processed)
-        if shorter is not None:
-            reference = type(self)(**shorter, audiogram=self._audiogram, keep=False)
-            return reference.parts(processed, noise=noise, seed=seed)
-        rows = self._signals.check(processed)
-        seeds = item_seeds(seed, self._signals.shape)
-        with torch.autocast(processed.device.type, enabled=False):
-            parts = []
-            for batch in self._batches:
-                comparison = batch.compare(rows, noise, seeds)
-                parts.append(self._compute_parts(comparison, batch.extent))
-            scores = torch.cat(parts).reshape(*self._signals.shape, 2)
-            nonlinear, linear = scores.unbind(-1)
-            return QualityParts(self._combine(nonlinear, linear), nonlinear, linear)
+        nonlinear, linear = self._compare(processed, noise, seed).unbind(-1)
+        return QualityParts(self._combine(nonlinear, linear), nonlinear, linear)
 
     @staticmethod
-    def _compute_parts(comparison: Comparison, extent: Extent) -> Tensor:
+    def compute_parts(comparison: Comparison, extent: Extent) -> Tensor:
         """Return the nonlinear and the linear part of each item. Shape: -> (items, 2)."""
         raise NotImplementedError
 
@@ -234,7 +198,7 @@ class _Channels:
     spectrum: Tensor
 
 
-class _Batch:
+class _Batch(PreparedBatch[_Channels]):
     """Clean signals of a batch in their impaired ears.
 
     Args:
@@ -242,9 +206,7 @@ class _Batch:
         batch: those of the batch.
         ears, host_ears: ears of the items, on the device of the signals and on the CPU.
             Shape: (items, 8) dB HL.
-        unit: amplitude of 20 uPa in the signals.
-        envelope_segment: samples of a segment of the smoothed envelopes.
-        keep: compute the features now, and store them.
+        score: the score that is computed.
     """
 
     def __init__(
@@ -252,152 +214,97 @@ class _Batch:
         signals: CleanSpeech,
         batch: CleanBatch,
         ears: Tensor,
-        host_ears: NDArray[np.float64],
-        unit: float,
-        envelope_segment: int,
-        keep: bool,
+        host_ears: Tensor,
+        score: type[QualityReference],
     ) -> None:
-        self._signals, self._batch = signals, batch
-        self.extent = batch.audible
-        with torch.no_grad():
-            amplified = _amplify(batch.signals, host_ears, batch.audible)
-            cells = ear_model.hair_cells(ears)
-        self._groups = [
-            _Group(
-                signals,
-                batch,
-                items,
-                amplified[items],
-                cells.select_items(items),
-                unit,
-                envelope_segment,
-            )
-            for items in signals.groups(batch)
-        ]
-        if keep:
-            for group in self._groups:
-                group.store()
+        amplified = _amplify(batch.signals, host_ears, batch.audible)
+        super().__init__(signals, batch, amplified, ear_model.hair_cells(ears))
+        self._score = score
+        self._unit = 10.0 ** (-signals.full_scale / 20.0)
 
-    def compare(self, processed: Tensor, noise: Noise, seeds: list[int]) -> Comparison:
-        """Compare all processed signals with the clean ones.
-
-        Args:
-            processed: all signals. Shape: (items, time).
-            noise: kind of noise.
-            seeds: seeds of all items.
-        """
-        aligned = self._signals.align(processed, self._batch)
-        batch_seeds = seeds[self._batch.items]
-        comparisons = [group.compare(aligned, noise, batch_seeds) for group in self._groups]
-        return Comparison(*(_join_items(parts) for parts in zip(*comparisons, strict=True)))
-
-
-def _join_items(parts: Sequence[Tensor]) -> Tensor:
-    """Join tensors of several groups of items. Segments that a group lacks are zero."""
-    longest = max(part.shape[-1] for part in parts)
-    return torch.cat([functional.pad(part, (0, longest - part.shape[-1])) for part in parts])
-
-
-class _Group(ItemGroup[_Channels]):
-    """Items whose ears are computed together, each with the features of its clean signal."""
-
-    def __init__(
-        self,
-        signals: CleanSpeech,
-        batch: CleanBatch,
-        items: slice,
-        amplified: Tensor,
-        cells: ear_model.HairCells,
-        unit: float,
-        envelope_segment: int,
-    ) -> None:
-        super().__init__(signals, batch, items)
-        self._unit = unit
-        self._noise_amplitude = unit * 10.0 ** (THRESHOLD_NOISE_DB / 20.0)
-        self._envelope_segment = envelope_segment
-        self._counts = fine_structure.segments_of(self._extent)
-        self._cells = cells
-        with torch.no_grad():
-            self._clean = signals.through_middle_ear(amplified, self._extent)
-            self._longest_delay = ear_model.longest_group_delay(self._clean, cells, self._extent)
-
-    @torch.no_grad()
     def _prepare(self, channels: slice) -> _Channels:
-        extent, cells = self._extent, self._cells[channels]
-        cochlea = ear_model.simulate_cochlea(
-            self._clean, self._cells, channels, extent, motion=True
-        )
-        assert cochlea.motion is not None
+        extent = self._extent
+        cochlea, motion = self._simulate(self._clean, channels)
         delays = self._longest_delay - ear_model.group_delays(cochlea.bandwidth, channels)
-        levels = ear_model.apply_adaptation(ear_model.sensation(cochlea.power, cells.inner))
-        motion = scale_motion_to_level(cochlea.motion, cochlea.power, levels, self._unit)
+        cells = self._cells[channels]
+        smooth_levels, adapted_motion = self._adapt(cochlea.power, motion, cells, delays)
         return _Channels(
             channels=channels,
             envelope=ear_model.lag_spectrum(cochlea.power.sqrt(), extent),
-            motion=ear_model.lag_spectrum(cochlea.motion, extent),
+            motion=ear_model.lag_spectrum(motion, extent),
             delays=delays,
-            smooth_levels=self._smooth(levels, delays),
-            adapted_motion=motion,
-            segments=self._segment_spectra(motion, delays),
+            smooth_levels=smooth_levels,
+            adapted_motion=adapted_motion,
+            segments=self._segment_spectra(adapted_motion, delays, None),
             spectrum=ear_model.mean_level(cochlea, cells),
         )
 
-    def _smooth(self, levels: Tensor, delays: Tensor) -> Tensor:
-        """Smooth levels after equalising the group delays."""
-        extent = self._extent
-        delayed = ear_model.shift(levels, delays, extent.ends, extent.ends, extent.longest)
-        return fine_structure.smooth_levels(delayed, extent, self._envelope_segment)
+    def _simulate(self, sound: Tensor, channels: slice) -> tuple[ear_model.CochlearOutput, Tensor]:
+        """Return the output of the cochlea, and the motion of its basilar membrane."""
+        cells, extent = self._cells, self._extent
+        cochlea = ear_model.simulate_cochlea(sound, cells, channels, extent, motion=True)
+        assert cochlea.motion is not None
+        return cochlea, cochlea.motion
+
+    def _adapt(
+        self, power: Tensor, motion: Tensor, cells: ear_model.HairCells, delays: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Return the smoothed levels, with equal group delays, and the adapted motion."""
+        levels = ear_model.apply_adaptation(ear_model.sensation(power, cells.inner))
+        motion = scale_motion_to_level(motion, power, levels, self._unit)
+        delayed = self._equalise_delays(levels, delays)
+        segment = self._score.envelope_segment
+        return fine_structure.smooth_levels(delayed, self._extent, segment), motion
+
+    def _equalise_delays(self, channels: Tensor, delays: Tensor) -> Tensor:
+        ends, longest = self._extent.ends, self._extent.longest
+        return ear_model.shift(channels, delays, ends, ends, longest)
 
     def _segment_spectra(
-        self, motion: Tensor, delays: Tensor, noise: Tensor | None = None
+        self, motion: Tensor, delays: Tensor, noise: Tensor | None
     ) -> tuple[Tensor, Tensor]:
         """Add noise to the motion, equalise the group delays, and compute ``segment_spectra``."""
         extent = self._extent
         motion = motion[..., : extent.longest]
         if noise is not None:
-            motion = motion + self._noise_amplitude * noise
-        delayed = ear_model.shift(motion, delays, extent.ends, extent.ends, extent.longest)
-        return fine_structure.segment_spectra(delayed, extent)
+            motion = motion + self._unit * 10.0 ** (THRESHOLD_NOISE_DB / 20.0) * noise
+        return fine_structure.segment_spectra(self._equalise_delays(motion, delays), extent)
 
-    def compare(self, processed: Tensor, noise: Noise, seeds: list[int]) -> Comparison:
-        """Compare the signals in all channels. Shape: (items, padded) of the batch."""
-        extent = self._extent
-        sound = self._signals.through_middle_ear(processed[self.items], extent)
-        clean_noise, processed_noise = _noise_sources(noise, seeds[self.items], extent, sound)
+    def compare(
+        self, processed: Tensor, noise: Noise, seeds: Sequence[int], *ears: ear_model.HairCells
+    ) -> Tensor:
+        """Compute the nonlinear and the linear part of each item."""
+        extent, counts = self._extent, fine_structure.segments_of(self._extent)
+        sound = self._align(processed)
+        draw_clean, draw_processed = _noise_sources(noise, seeds[self._batch.items], extent, sound)
         comparisons: list[Comparison] = []
         for clean in self._channels():
-            cells = self._cells[clean.channels]
-            cochlea = ear_model.simulate_cochlea(
-                sound, self._cells, clean.channels, extent, motion=True
-            )
-            assert cochlea.motion is not None
+            channels = clean.channels
+            cochlea, motion = self._simulate(sound, channels)
             lags = ear_model.channel_lags(clean.envelope, cochlea.power.detach().sqrt(), extent)
             power = ear_model.shift(cochlea.power, lags, extent.ends, extent.ends, extent.padded)
-            lags = ear_model.channel_lags(clean.motion, cochlea.motion.detach(), extent)
-            motion = ear_model.shift(cochlea.motion, lags, extent.ends, extent.ends, extent.padded)
-            levels = ear_model.apply_adaptation(ear_model.sensation(power, cells.inner))
-            motion = scale_motion_to_level(motion, power, levels, self._unit)
-            smooth_levels = self._smooth(levels, clean.delays)
-            noise_values = None
-            if processed_noise is not None:
-                noise_values = processed_noise(clean.channels, extent)
-            segments = self._segment_spectra(motion, clean.delays, noise_values)
+            lags = ear_model.channel_lags(clean.motion, motion.detach(), extent)
+            motion = ear_model.shift(motion, lags, extent.ends, extent.ends, extent.padded)
+            cells = self._cells[channels]
+            smooth_levels, motion = self._adapt(power, motion, cells, clean.delays)
+            segments = self._segment_spectra(motion, clean.delays, draw_processed(channels))
             clean_segments = clean.segments
+            clean_noise = draw_clean(channels)
             if clean_noise is not None:
-                noise_values = clean_noise(clean.channels, extent)
                 clean_segments = self._segment_spectra(
-                    clean.adapted_motion, clean.delays, noise_values
+                    clean.adapted_motion, clean.delays, clean_noise
                 )
             comparison = Comparison(
                 clean_levels=clean.smooth_levels,
                 processed_levels=smooth_levels,
-                coherence=fine_structure.coherence(clean_segments, segments, self._counts),
+                coherence=fine_structure.coherence(clean_segments, segments, counts),
                 energy=clean_segments[1],
                 clean_spectrum=clean.spectrum,
                 processed_spectrum=ear_model.mean_level(cochlea, cells),
             )
             comparisons.append(comparison)
-        return Comparison(*(torch.cat(parts, 1) for parts in zip(*comparisons, strict=True)))
+        joined = Comparison(*(torch.cat(parts, 1) for parts in zip(*comparisons, strict=True)))
+        return self._score.compute_parts(joined, extent)
 
 
 def scale_motion_to_level(motion: Tensor, power: Tensor, levels: Tensor, unit: float) -> Tensor:
@@ -426,25 +333,29 @@ def scale_motion_to_level(motion: Tensor, power: Tensor, levels: Tensor, unit: f
 
 
 def _noise_sources(
-    noise: Noise, seeds: list[int], extent: Extent, like: Tensor
-) -> tuple[NoiseSource | None, NoiseSource | None]:
+    noise: Noise, seeds: Sequence[int], extent: Extent, like: Tensor
+) -> tuple[NoiseSource, NoiseSource]:
     """Return the sources of noise for the clean and for the processed signals."""
-    if noise == "none":
-        return None, None
+    if noise == "seeded":
+        return _drawn_noise(seeds, extent, like, 0), _drawn_noise(seeds, extent, like, 1)
     if noise == "expected":
         # Only audible parts of the clean signal count, and the noise is far below them.
-        return None, partial(_frozen_noise, like=like)
-    return _drawn_noise(seeds, extent, like, 0), _drawn_noise(seeds, extent, like, 1)
+        return _no_noise, partial(_frozen_noise, extent=extent, like=like)
+    return _no_noise, _no_noise
 
 
-def _drawn_noise(seeds: list[int], extent: Extent, like: Tensor, skipped: int) -> NoiseSource:
+def _no_noise(channels: slice) -> None:
+    return None
+
+
+def _drawn_noise(seeds: Sequence[int], extent: Extent, like: Tensor, skipped: int) -> NoiseSource:
     """Draw the noise of pyclarity, after skipping the deviates of a number of signals."""
     generators = [
         legacy_rng_after_normals(seed, skipped * CHANNELS * end)
         for seed, end in zip(seeds, extent.ends, strict=True)
     ]
 
-    def draw(channels: slice, extent: Extent) -> Tensor:
+    def draw(channels: slice) -> Tensor:
         count = channels.stop - channels.start
         noise = torch.zeros(len(extent.ends), count, extent.longest, dtype=like.dtype)
         for row, generator, end in zip(noise, generators, extent.ends, strict=True):
@@ -454,7 +365,7 @@ def _drawn_noise(seeds: list[int], extent: Extent, like: Tensor, skipped: int) -
     return draw
 
 
-def _frozen_noise(channels: slice, extent: Extent, *, like: Tensor) -> Tensor:
+def _frozen_noise(channels: slice, *, extent: Extent, like: Tensor) -> Tensor:
     """Return the same noise every time: each channel takes its part of one signal."""
     table = constant(_frozen_table, dtype=torch.float32, device=like.device)
     first = channels.start * FROZEN_STRIDE
@@ -471,34 +382,27 @@ def _frozen_table() -> NDArray[np.float64]:
 # -- NAL-R -----------------------------------------------------------------------------------------
 
 
-def _nalr(thresholds: NDArray[np.float64]) -> NDArray[np.float64]:
+def _nalr_taps(thresholds: Tensor) -> NDArray[np.float64]:
     """Return the taps of NAL-R at 24 kHz, linear in dB between the audiometric frequencies.
 
     Shape: (8,) dB HL -> (141,).
-
-    Source: Byrne and Dillon 1986, Ear and Hearing 7(4), 257-265.
     """
-    loss = thresholds[[FREQUENCIES.index(hz) for hz in AUDIOMETRIC_HZ]]
-    if loss.max() <= 0.0:
+    indices = list(FORMULA_INDICES)
+    if thresholds[indices].max() <= 0.0:
         return np.eye(NALR_ORDER + 1)[NALR_ORDER // 2]
-    sum_of_three = float(loss[1:4].sum())  # at 500, 1000 and 2000 Hz
-    if sum_of_three <= 180.0:
-        common_gain = 0.05 * sum_of_three
-    else:
-        common_gain = 9.0 + 0.116 * (sum_of_three - 180.0)
-    gains = np.maximum(common_gain + 0.31 * loss + NALR_BIAS, 0.0)
+    gains = nalr_gains_db(thresholds)[indices].numpy()
     grid = np.arange(NALR_ORDER + 1) / NALR_ORDER
     decibels = np.interp(grid * RATE / 2, AUDIOMETRIC_HZ, gains)
     return frequency_sampling_fir(len(grid), grid, 10.0 ** (decibels / 20.0), hamming(len(grid)))
 
 
-def _amplify(signals: Tensor, ears: NDArray[np.float64], extent: Extent) -> Tensor:
+def _amplify(signals: Tensor, ears: Tensor, extent: Extent) -> Tensor:
     """Amplify signals by NAL-R. As in pyclarity, the output begins at the filter's last tap.
 
     Shape: (items, padded), (items, 8) dB HL -> (items, padded).
     """
     points = fft_length(extent.longest + NALR_ORDER, 2)
-    taps = torch.from_numpy(np.stack([_nalr(ear) for ear in ears]))
+    taps = torch.from_numpy(np.stack([_nalr_taps(ear) for ear in ears]))
     fir = taps.to(signals.device, signals.dtype, non_blocking=signals.device.type != "cpu")
     spectrum = torch.fft.rfft(signals[:, : extent.longest], points) * torch.fft.rfft(fir, points)
     filtered = torch.fft.irfft(spectrum, points)[:, NALR_ORDER : NALR_ORDER + extent.longest]

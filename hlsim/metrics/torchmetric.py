@@ -28,9 +28,9 @@ from hlsim.checks import (
 )
 from hlsim.extras import require
 from hlsim.metrics.haaqi_score import haaqi
-from hlsim.metrics.haspi_score import Noise, haspi
+from hlsim.metrics.haspi_score import haspi
 from hlsim.metrics.hasqi_score import hasqi
-from hlsim.metrics.pair import check_seed
+from hlsim.metrics.pair import Noise, check_seed
 
 _Metric: Any = require("torchmetrics", "train").Metric
 

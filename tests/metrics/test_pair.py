@@ -9,7 +9,6 @@ from torch import Tensor
 
 from hlsim import Audiogram
 from hlsim.metrics import haspi, hasqi, mbstoi
-from hlsim.metrics.pair import check_pair
 
 N3 = Audiogram.standard("N3")
 
@@ -49,9 +48,3 @@ def test_lengths_of_items_are_limited_to_the_common_length(clean: Tensor) -> Non
         scores = haspi(0.5 * batch[:, :12000], batch, N3, lengths=[13000, 11500])
     expected = haspi(0.5 * batch[:, :12000], batch[:, :12000], N3, lengths=[12000, 11500])
     assert torch.equal(scores, expected)
-
-
-def test_arrays_of_nearly_equal_lengths_are_cut(clean: Tensor) -> None:
-    with pytest.warns(UserWarning):
-        pair = check_pair(clean.numpy(), clean[:12000].numpy(), 16000)
-    assert [len(signal) for signal in pair] == [12000, 12000]

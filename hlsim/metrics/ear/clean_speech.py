@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, Generic, TypeVar
 
 import torch
 from torch import Tensor
@@ -46,7 +44,7 @@ class CleanBatch:
         spectrum: spectra for the bulk alignment.
         signals: audible parts in multiples of 20 uPa, float64. Shape: (items, padded).
 
-    >>> speech = CleanSpeech(torch.randn(2, 16000), 16000, 94.0, None, False, "HASPI")
+    >>> speech = CleanSpeech(torch.randn(2, 16000), None, 16000, 94.0, False, "HASPI")
     >>> speech.batches[0].signals.shape
     torch.Size([1, 24000])
     """
@@ -63,14 +61,14 @@ class CleanBatch:
 class CleanSpeech:
     """Clean signals at 24 kHz without silent ends, and the alignment of processed signals.
 
-    On a CPU each item is a batch, because its caches hold no more. On a GPU all items are one
-    batch.
+    On a CPU each item is a batch, because its caches hold no more. On a GPU a batch has as many
+    items as fit into memory with all their channels.
 
     Args:
         clean: clean signals. Shape: (..., time).
+        lengths: number of samples of each item in a padded batch.
         sample_rate: sample rate in Hz.
         full_scale_spl: level in dB SPL of a signal with RMS 1.0.
-        lengths: number of samples of each item in a padded batch.
         whole_khz: round the rate to whole kHz.
         name: name of the score, for messages.
 
@@ -79,23 +77,23 @@ class CleanSpeech:
             range.
         UnscorableError: the signals are silent, too soft or too short to be scored.
 
-    >>> CleanSpeech(torch.randn(2, 16000), 16000, 94.0, None, False, "HASPI").shape
+    >>> CleanSpeech(torch.randn(2, 16000), None, 16000, 94.0, False, "HASPI").shape
     torch.Size([2])
     """
 
     def __init__(
         self,
         clean: Tensor,
+        lengths: Lengths | None,
         sample_rate: int,
         full_scale_spl: float,
-        lengths: Lengths | None,
         whole_khz: bool,
         name: str,
     ) -> None:
         self._name = name
         self._input_rate = check_rate(sample_rate)
-        self._full_scale = check_full_scale(full_scale_spl)
-        check_waveform(clean, "clean", full_scale_spl=self._full_scale)
+        self.full_scale = check_full_scale(full_scale_spl)
+        check_waveform(clean, "clean", full_scale_spl=self.full_scale)
         self.shape, self.time = clean.shape[:-1], clean.shape[-1]
         self.dtype, self.device = torch.promote_types(clean.dtype, torch.float32), clean.device
         ends = [self.time] * self.shape.numel()
@@ -104,13 +102,9 @@ class CleanSpeech:
         self._rate = self._input_rate
         if whole_khz:
             self._rate = 1000 * round(self._input_rate / 1000)
-        self._settings = {
-            "sample_rate": sample_rate,
-            "full_scale_spl": full_scale_spl,
-            "whole_khz": whole_khz,
-        }
+        self._settings = sample_rate, full_scale_spl, whole_khz, name
         self._clean, self._ends = clean.detach(), ends
-        self._gain = 10.0 ** (self._full_scale / 20.0)
+        self._gain = 10.0 ** (self.full_scale / 20.0)
         with torch.no_grad():
             # Double precision, because one sample more at an end would shift all frames.
             rows = clean.detach().double().reshape(-1, self.time)
@@ -120,9 +114,11 @@ class CleanSpeech:
             ]
 
     def _batch_slices(self, items: int) -> list[slice]:
-        if self.device.type == "cpu":
-            return [slice(item, item + 1) for item in range(items)]
-        return [slice(0, items)]
+        size = 1
+        if self.device.type != "cpu":
+            samples = self.time * RATE // self._rate
+            size = max(1, ear_model.GPU_CHUNK // (ear_model.CHANNELS * samples))
+        return [slice(start, min(start + size, items)) for start in range(0, items, size)]
 
     def _batch(self, signals: Tensor, items: slice, extent: Extent) -> CleanBatch:
         """Validate and prepare signals. The host waits for the device once."""
@@ -167,10 +163,10 @@ class CleanSpeech:
             raise ValueError(f"{label} holds samples that are NaN or infinite")
         if not sounding:
             raise UnscorableError(f"{label} is silent, every sample is zero")
-        level = 10.0 * math.log10(max(variance, 1e-30)) + self._full_scale
+        level = 10.0 * math.log10(max(variance, 1e-30)) + self.full_scale
         if level < LOWEST_REFERENCE_SPL:
             raise UnscorableError(
-                f"{label} is at {level:.1f} dB SPL with full_scale_spl {self._full_scale:g}; "
+                f"{label} is at {level:.1f} dB SPL with full_scale_spl {self.full_scale:g}; "
                 f"expected {LOWEST_REFERENCE_SPL:g} dB SPL or more, because "
                 f"{self._name} means nothing below"
             )
@@ -181,15 +177,14 @@ class CleanSpeech:
                 f"{1000.0 * MIN_AUDIBLE_SAMPLES / RATE:g} ms or more, as {self._name} requires"
             )
 
-    def cut(self, processed: Tensor) -> tuple[Tensor, dict[str, Any] | None]:
+    def cut(self, processed: Tensor) -> tuple[Tensor, CleanSpeech]:
         """Cut signals to their common length, with a warning, if it differs by 0.1 s at most.
 
         Args:
             processed: signals of the same rate. Shape: (..., time).
 
         Returns:
-            The processed signals and, where they are shorter than the clean ones, the arguments
-            that prepare clean signals of their length; None otherwise.
+            Both signals. The clean ones are prepared again if they are longer.
 
         Raises:
             ValueError: the lengths differ by more than 0.1 s.
@@ -199,15 +194,15 @@ class CleanSpeech:
             processed, self._clean, self._input_rate, ends
         )
         if clean.shape == self._clean.shape:
-            return processed, None
-        return processed, {"clean": clean, "lengths": lengths, **self._settings}
+            return processed, self
+        return processed, CleanSpeech(clean, lengths, *self._settings)
 
     def check(self, processed: Tensor) -> Tensor:
         """Validate processed signals, and return them as rows.
 
         Shape: (..., time) -> (items, time).
         """
-        check_waveform(processed, "processed", full_scale_spl=self._full_scale)
+        check_waveform(processed, "processed", full_scale_spl=self.full_scale)
         if processed.shape != (*self.shape, self.time):
             raise ValueError(
                 f"expected processed of the shape of clean, {(*self.shape, self.time)}, "
@@ -264,49 +259,7 @@ class CleanSpeech:
         parts = ear_model.shift(at_ear[:, None], delays, ends, stops, batch.audible.padded)
         return parts.squeeze(1)
 
-    def groups(self, batch: CleanBatch) -> Iterator[slice]:
-        """Return slices of the items of a batch whose channels are computed together."""
-        return ear_model.item_chunks(batch.audible)
-
     def through_middle_ear(self, signals: Tensor, extent: Extent) -> Tensor:
         """Filter signals by the middle ear. Shape: (items, padded or more) -> (items, padded)."""
         rows = signals[:, : extent.padded].to(self.dtype)
         return middle_ear(self.device, self.dtype)(rows).flatten(-2)
-
-
-Channels = TypeVar("Channels")
-"""Type of the features of clean speech in some channels."""
-
-
-class ItemGroup(Generic[Channels]):
-    """Items of a batch whose ears are computed together, some channels at a time.
-
-    Args:
-        signals: all clean signals.
-        batch: batch of the items.
-        items: indices of the items in the batch.
-
-    >>> issubclass(ItemGroup, Generic)
-    True
-    """
-
-    def __init__(self, signals: CleanSpeech, batch: CleanBatch, items: slice) -> None:
-        self._signals, self.items = signals, items
-        self._extent = batch.audible[items]
-        self._stored: list[Channels] | None = None
-
-    def store(self) -> None:
-        """Compute the features of all channels, and store them."""
-        self._stored = list(self._channels())
-
-    def _channels(self) -> Iterator[Channels]:
-        if self._stored is not None:
-            yield from self._stored
-            return
-        for channels in ear_model.channel_chunks(
-            len(self._extent.ends), self._extent.padded, self._signals.device
-        ):
-            yield self._prepare(channels)
-
-    def _prepare(self, channels: slice) -> Channels:
-        raise NotImplementedError

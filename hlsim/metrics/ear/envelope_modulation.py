@@ -19,12 +19,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
-from torch.nn import functional
 
 from hlsim.dsp.fft import fft_length
 from hlsim.metrics.ear.clean_speech import UnscorableError
 from hlsim.metrics.ear.model import CHANNELS, Extent, integers, shift
-from hlsim.torchtools import constant
+from hlsim.torchtools import constant, constant_like
 
 STRIDE = 9
 """Samples at 24 kHz between frames."""
@@ -141,23 +140,6 @@ def add_sums(total: ChannelSum | None, part: ChannelSum) -> ChannelSum:
     if total is None:
         return part
     return ChannelSum(total.loudness + part.loudness, total.cosines + part.cosines)
-
-
-def join_items(parts: Sequence[ChannelSum]) -> ChannelSum:
-    """Join the sums of several groups of items. Shorter ones are padded by zeros.
-
-    >>> part = sum_over_channels(torch.zeros(1, 32, 4), slice(0, 32))
-    >>> join_items([part, part]).loudness.shape
-    torch.Size([2, 4])
-    """
-    if len(parts) == 1:
-        return parts[0]
-    longest = max(part.loudness.shape[-1] for part in parts)
-    return ChannelSum(*(_pad_and_join(tensors, longest) for tensors in zip(*parts, strict=True)))
-
-
-def _pad_and_join(tensors: Sequence[Tensor], longest: int) -> Tensor:
-    return torch.cat([functional.pad(part, (0, longest - part.shape[-1])) for part in tensors])
 
 
 def find_audible_frames(loudness: Tensor, extent: Extent) -> tuple[Tensor, Extent]:
@@ -384,33 +366,27 @@ def _energies_filtered_twice(
     Returns:
         Energies xx, yy and xy of the cosines, (items, 10, 5), and of noise, (items, 10, 1).
     """
-    extent, device = covariance.extent, covariance.xy.device
-    members: dict[int, list[int]] = {}
-    for item, frames in enumerate(extent.ends):
-        members.setdefault(_points(frames), []).append(item)
-    parts: list[tuple[Tensor, Tensor, Tensor, Tensor]] = []
-    for points, items in members.items():
-        a, b = covariance.spectra
-        if len(members) > 1:
-            indices = integers(tuple(items), device)
-            longest = max(extent.ends[item] for item in items)
-            a, b = (
-                torch.fft.rfft(wave.index_select(0, indices)[..., :longest], points)
-                for wave in covariance.waves
-            )
-        weights = constant(_twice_filtered, points, dtype=covariance.xy.dtype, device=device)
-        x, y = torch.view_as_real(a), torch.view_as_real(b)
-        xx, yy, xy = (weights @ product.sum(-1).mT for product in (x.square(), y.square(), x * y))
-        counts = integers(tuple(extent.ends[item] for item in items), device)
-        noise = counts.to(weights)[:, None, None] * weights.sum(-1, keepdim=True)
-        parts.append((xx, yy, xy, noise))
-    if len(parts) == 1:
-        return parts[0]
-    order = [item for items in members.values() for item in items]
-    back = integers(tuple(sorted(range(len(order)), key=order.__getitem__)), device)
-    xx, yy, xy, noise = (
-        torch.cat(tensors).index_select(0, back) for tensors in zip(*parts, strict=True)
-    )
+    ends = covariance.extent.ends
+    if len({_points(frames) for frames in ends}) == 1:
+        return _filter_twice(*covariance.spectra, ends)
+    parts = []
+    for item, frames in enumerate(ends):
+        waves = (wave[item, None, :, :frames] for wave in covariance.waves)
+        x, y = (torch.fft.rfft(wave, _points(frames)) for wave in waves)
+        parts.append(_filter_twice(x, y, (frames,)))
+    xx, yy, xy, noise = (torch.cat(tensors) for tensors in zip(*parts, strict=True))
+    return xx, yy, xy, noise
+
+
+def _filter_twice(
+    reference: Tensor, processed: Tensor, ends: tuple[int, ...]
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return ``_energies_filtered_twice`` from spectra of the length of every item."""
+    x, y = torch.view_as_real(reference), torch.view_as_real(processed)
+    weights = constant_like(x, _twice_filtered, _points(max(ends)))
+    xx, yy, xy = (weights @ product.sum(-1).mT for product in (x.square(), y.square(), x * y))
+    counts = integers(ends, weights.device).to(weights)
+    noise = counts[:, None, None] * weights.sum(-1, keepdim=True)
     return xx, yy, xy, noise
 
 

@@ -234,17 +234,6 @@ class Extent:
         return min(self.ends) == self.longest
 
 
-def item_chunks(extent: Extent) -> Iterator[slice]:
-    """Split the items of a batch on a GPU so that all their channels fit into memory.
-
-    >>> list(item_chunks(Extent((24000, 24000))))
-    [slice(0, 2, None)]
-    """
-    step = max(1, GPU_CHUNK // (CHANNELS * extent.padded))
-    items = len(extent.ends)
-    return (slice(start, min(start + step, items)) for start in range(0, items, step))
-
-
 def channel_chunks(items: int, samples: int, device: torch.device) -> Iterator[slice]:
     """Split the channels so that caches or memory hold those of a chunk, from low to high.
 
