@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
-from compensators.nalr import FORMULA_INDICES, nalr_gains_db
+from compensators.nalr import nalr_gains_db
 from hlsim.audiogram.thresholds import AudiogramLike
 from hlsim.dsp.fft import fft_length
 from hlsim.dsp.fir import frequency_sampling_fir
@@ -25,7 +25,7 @@ from hlsim.dsp.windows import hamming
 from hlsim.metrics.ear import fine_structure
 from hlsim.metrics.ear import model as ear_model
 from hlsim.metrics.ear.clean_speech import CleanBatch, CleanSpeech
-from hlsim.metrics.ear.model import AUDIOMETRIC_HZ, CHANNELS, Extent
+from hlsim.metrics.ear.model import AUDIOMETRIC_HZ, AUDIOMETRIC_INDICES, CHANNELS, Extent
 from hlsim.metrics.ear.recursions import RATE
 from hlsim.metrics.haspi_score import legacy_rng_after_normals
 from hlsim.metrics.pair import Noise
@@ -387,7 +387,7 @@ def _nalr_taps(thresholds: Tensor) -> NDArray[np.float64]:
 
     Shape: (8,) dB HL -> (141,).
     """
-    indices = list(FORMULA_INDICES)
+    indices = list(AUDIOMETRIC_INDICES)
     if thresholds[indices].max() <= 0.0:
         return np.eye(NALR_ORDER + 1)[NALR_ORDER // 2]
     gains = nalr_gains_db(thresholds)[indices].numpy()

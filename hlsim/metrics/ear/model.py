@@ -57,6 +57,9 @@ EAR_Q, MIN_ERB_HZ = 9.26449, 24.7
 AUDIOMETRIC_HZ = (250.0, 500.0, 1000.0, 2000.0, 4000.0, 6000.0)
 """Frequencies in Hz whose thresholds matter. Those at 3 and 8 kHz do not."""
 
+AUDIOMETRIC_INDICES = tuple(FREQUENCIES.index(hz) for hz in AUDIOMETRIC_HZ)
+"""Positions of these frequencies in an audiogram."""
+
 KNEE_SPL, CEILING_SPL = 30.0, 100.0
 """Levels in dB SPL between which a normal ear compresses."""
 
@@ -131,7 +134,7 @@ def hair_cells(thresholds: Tensor) -> HairCells:
     >>> float(hair_cells(torch.full((8,), 40.0)).inner[0].round())
     26.0
     """
-    indices = integers(tuple(FREQUENCIES.index(hz) for hz in AUDIOMETRIC_HZ), thresholds.device)
+    indices = integers(AUDIOMETRIC_INDICES, thresholds.device)
     weights = constant(_interpolation, dtype=torch.float64, device=thresholds.device)
     loss = (thresholds.detach().double().index_select(-1, indices) @ weights).clamp_min(0.0)
     normal = torch.linspace(1.25, 3.5, CHANNELS, dtype=torch.float64, device=loss.device)
