@@ -1,6 +1,5 @@
-"""Microphone to headphones without either: devices that hand a recording on in blocks, and refuse as PortAudio does."""
+"""From microphone to headphones, with devices that replay a recording in blocks."""
 
-import csv
 import os
 import re
 import subprocess
@@ -15,70 +14,75 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from torch import Tensor
 
 import hlsim
 from compensators import WDRC
-from hlsim import Audiogram, Listener, load_pretrained
+from hlsim import Listener, load_pretrained
 from hlsim.calibration import set_level
 from hlsim.cli.main import main
 from hlsim.extras import MissingExtraError
 from hlsim.live import Live, SimulatedStream, _key_reader, play
-from tests.compensators.aids import varied_hearing_aid
+from tests.compensators.aids import EAR, tone, varied_hearing_aid
 
-EAR = Audiogram.standard("N3")
-FINE = SimpleNamespace(
-    input_overflow=False, input_underflow=False, output_overflow=False, output_underflow=False
-)
+FLAGS = ("input_overflow", "input_underflow", "output_overflow", "output_underflow")
+NO_LOSS = SimpleNamespace(**dict.fromkeys(FLAGS, False))
 
 
 class Devices:
-    """Stands for the module sounddevice: one microphone, or as many as the recording has channels, and headphones."""
+    """A replacement of the module sounddevice.
+
+    Args:
+        recording: signal of each microphone, (microphones, time).
+        lost: numbers of the blocks that are reported as lost.
+        sample_rate: the only supported sample rate.
+        headphones: number of output channels.
+    """
 
     class PortAudioError(Exception):
         pass
 
     def __init__(
         self,
-        recording: torch.Tensor,
+        recording: Tensor,
         lost: tuple[int, ...] = (),
-        takes: int = 16000,
-        plays: int = 2,
+        sample_rate: int = 16000,
+        headphones: int = 2,
     ) -> None:
-        self.recording, self.lost, self.takes = torch.atleast_2d(recording).mT.numpy(), lost, takes
-        self.plays = plays
+        self.recording = torch.atleast_2d(recording).mT.numpy()
+        self.lost, self.sample_rate, self.headphones = lost, sample_rate, headphones
         self.played = np.zeros((0, 2), dtype=np.float32)
-        self.opened: dict[str, Any] = {}
+        self.options: dict[str, Any] = {}
 
     def query_devices(self, device: int | str | None = None, kind: str | None = None) -> Any:
         if kind is None:
             return "  0 Loopback, ALSA (1 in, 2 out)"
         if device not in (None, 0, "Loopback"):
             raise ValueError(f"No {kind} device matching {device!r}")
-        return {"max_input_channels": self.recording.shape[1], "max_output_channels": self.plays}
+        channels = self.recording.shape[1]
+        return {"max_input_channels": channels, "max_output_channels": self.headphones}
 
-    def _settings(self, samplerate: int, **rest: Any) -> None:
-        if samplerate != self.takes:
+    def _check_settings(self, samplerate: int, **_: object) -> None:
+        if samplerate != self.sample_rate:
             raise self.PortAudioError("Invalid sample rate [PaErrorCode -9997]")
 
-    check_input_settings = check_output_settings = _settings
+    check_input_settings = check_output_settings = _check_settings
 
-    def Stream(self, callback: Callable[..., None], **opened: Any) -> Any:
-        self.opened = opened
-        block, number = opened["blocksize"], -1
-        for number, given in enumerate(
-            np.split(self.recording, range(block, len(self.recording), block))
-        ):
-            played = np.full((len(given), opened["channels"][1]), np.nan, dtype=np.float32)
-            status = SimpleNamespace(**vars(FINE) | {"output_underflow": number in self.lost})
-            callback(given, played, len(given), None, status)
+    def Stream(self, callback: Callable[..., None], **options: Any) -> Any:
+        self.options = options
+        starts = range(options["blocksize"], len(self.recording), options["blocksize"])
+        for number, block in enumerate(np.split(self.recording, starts)):
+            played = np.full((len(block), options["channels"][1]), np.nan, dtype=np.float32)
+            flags = SimpleNamespace(**vars(NO_LOSS) | {"output_underflow": number in self.lost})
+            callback(block, played, len(block), None, flags)
             self.played = np.concatenate((self.played, played))
-        return _Open()
+        return OpenStream()
 
 
-class _Open:
+class OpenStream:
     active, latency = True, (0.01, 0.02)
 
-    def __enter__(self) -> "_Open":
+    def __enter__(self) -> "OpenStream":
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -88,72 +92,73 @@ class _Open:
 
 
 @pytest.fixture
-def recording() -> torch.Tensor:
+def recording() -> Tensor:
     """Noise of 65 dB SPL where RMS 1.0 is 100 dB SPL. Shape: (6400,)."""
     return set_level(torch.randn(6400), 65.0, 100.0)
 
 
-def test_what_is_played_is_what_the_aid_gives(
-    recording: torch.Tensor, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+def assert_played(devices: Devices, expected: Tensor, tolerance: float) -> None:
+    """Compare the output of each ear with what the headphones played."""
+    limited = expected.clamp(-1.0, 1.0).expand(2, -1).mT.numpy()
+    assert np.abs(devices.played - limited).max() < tolerance * np.abs(limited).max()
+
+
+def test_the_output_of_the_aid_is_played(
+    recording: Tensor, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     devices = Devices(recording, lost=(3, 9))
     monkeypatch.setitem(sys.modules, "sounddevice", devices)
-    call = ["live", "--audiogram", "n3", "--seconds", "0.05", "--block-ms", "5"]
-    assert main([*call, "--compensator", "wdrc"]) == 0
+    command = "live --audiogram n3 --seconds 0.05 --block-ms 5 --compensator wdrc"
+    assert main(command.split()) == 0
     stream = WDRC(full_scale_spl=100.0).stream(EAR)
     stream(torch.zeros(20 * 80))  # before the devices open
-    expected = stream(recording).clamp(-1.0, 1.0).numpy()
-    assert np.abs(devices.played - expected[:, None]).max() < 1e-5 * np.abs(expected).max()
-    assert devices.opened == {
-        "samplerate": 16000, "blocksize": 80, "device": (None, None), "channels": (1, 2), "dtype": "float32",
-        "latency": 0.02,
+    expected = stream(recording)
+    assert_played(devices, expected, 1e-5)
+    assert devices.options == {
+        "samplerate": 16000, "blocksize": 80, "device": (None, None), "channels": (1, 2),
+        "dtype": "float32", "latency": 0.02,
     }  # fmt: skip
-    out = capsys.readouterr().out
-    level = 10.0 * np.log10(np.square(expected).mean()) + 100.0
-    assert "blocks of 5 ms, delay 34 ms" in out  # 30 of the devices, 4 of the aid
-    assert f"in  65.0, out {level:5.1f} dB SPL, drop-outs 2" in out and out.endswith(
-        "stopped, drop-outs 2\n"
-    )
+    text = capsys.readouterr().out
+    level = 10.0 * np.log10(np.square(expected.clamp(-1.0, 1.0)).mean()) + 100.0
+    assert "blocks of 5 ms, delay 34 ms" in text  # 30 of the devices, 4 of the aid
+    assert f"in  65.0, out {level:5.1f} dB SPL, drop-outs 2" in text
+    assert text.endswith("stopped, drop-outs 2\n")
 
 
 @pytest.mark.parametrize("microphones", [1, 2])
-def test_two_ears_each_have_their_own(
+def test_each_ear_gets_the_signal_of_its_microphone_or_of_the_only_one(
     microphones: int,
-    recording: torch.Tensor,
+    recording: Tensor,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """Through the aid, and through the impaired ears; each hears its own microphone, or the only one."""
-    given = torch.stack((recording, 0.1 * recording.roll(99)))[:microphones]
-    devices = Devices(given)
+    channels = torch.stack((recording, 0.1 * recording.roll(99)))[:microphones]
+    devices, both = Devices(channels), channels.expand(2, -1)
     monkeypatch.setitem(sys.modules, "sounddevice", devices)
-    listener = Listener(Audiogram.standard("N2"), Audiogram.standard("N4"))
-    with (tmp_path / "ears.csv").open("w", newline="") as file:
-        rows = csv.DictWriter(file, fieldnames=[*listener.to_rows("A")[0]])
-        rows.writeheader()
-        rows.writerows(listener.to_rows("A"))
-    call = ["live", "--listener", str(tmp_path / "ears.csv"), "--seconds", "0.05"]
-    assert main([*call, "--compensator", "wdrc"]) == 0
-    stream, both = WDRC(full_scale_spl=100.0).stream(listener), given.expand(2, -1)
+    listener, table = Listener("N2", "N4"), tmp_path / "ears.csv"
+    rows = [f"A,{side},{','.join(ear.to_row().values())}" for side, ear in listener.ears().items()]
+    table.write_text("\n".join([f"listener,ear,{','.join(EAR.to_row())}", *rows]))
+    command = ["live", "--listener", str(table), "--seconds", "0.05"]
+    assert main([*command, "--compensator", "wdrc"]) == 0
+    stream = WDRC(full_scale_spl=100.0).stream(listener)
     stream(torch.zeros(2, 20 * 64))  # before the devices open
-    expected = stream(both).clamp(-1.0, 1.0).numpy()
-    assert devices.opened["channels"] == (microphones, 2)
-    assert np.abs(devices.played.T - expected).max() < 1e-5 * np.abs(expected).max()
-    assert not np.allclose(expected[0], expected[1])
-    second = 65.0 if microphones == 1 else 45.0
-    assert f"in  65.0 /  {second:.1f}, out " in capsys.readouterr().out
+    expected = stream(both)
+    assert devices.options["channels"] == (microphones, 2)
+    assert_played(devices, expected, 1e-5)
+    assert not torch.allclose(expected[0], expected[1])
+    right_level = 65.0 if microphones == 1 else 45.0
+    assert f"in  65.0 /  {right_level:.1f}, out " in capsys.readouterr().out
 
     devices.played = devices.played[:0]
-    assert main([*call, "--simulate"]) == 0
-    stream = SimulatedStream(load_pretrained("neuro-msbg", full_scale_spl=100.0), listener)
-    heard = (
-        torch.cat([stream(chunk) for chunk in both.split(1536, -1)], -1).clamp(-1.0, 1.0).numpy()
-    )
-    assert np.abs(devices.played.T - heard).max() < 1e-4 * np.abs(heard).max() > 0.0
+    assert main([*command, "--simulate"]) == 0
+    simulated = SimulatedStream(load_pretrained("neuro-msbg", full_scale_spl=100.0), listener)
+    perceived = torch.cat([simulated(chunk) for chunk in both.split(1536, -1)], -1)
+    assert perceived.any()
+    assert_played(devices, perceived, 1e-4)
 
 
-def test_keys_move_the_sliders_that_are_there() -> None:
+def test_keys_move_the_sliders_that_a_stream_has() -> None:
     aid: Any = varied_hearing_aid()
     live = Live(aid.stream(EAR, 1.0, 0.5), 94.0)
     for key in "nnnNaAAx":
@@ -162,99 +167,99 @@ def test_keys_move_the_sliders_that_are_there() -> None:
     for key in "A" * 9 + "n" * 12:
         live.press(key)
     assert "noise reduction 0.0 (n/N), amplification 1.0" in live.status()
-    plain = Live(WDRC().stream(EAR), 94.0)
-    plain.press("n")
-    assert plain.status() == "drop-outs 0"
+    without_sliders = Live(WDRC().stream(EAR), 94.0)
+    without_sliders.press("n")
+    assert without_sliders.status() == "drop-outs 0"
 
 
-def test_output_stays_within_full_scale_and_levels_begin_anew() -> None:
-    live, played = Live(lambda heard: 4.0 * heard, 94.0), np.zeros((64, 2), dtype=np.float32)
-    live(np.full((64, 1), 0.5, dtype=np.float32), played, 64, None, FINE)
-    assert (played == 1.0).all() and live.status() == "in  88.0, out  94.0 dB SPL, drop-outs 0"
-    live(np.zeros((64, 1), dtype=np.float32), played, 64, None, FINE)
-    assert live.status() == "in   0.0, out   0.0 dB SPL, drop-outs 0"
+def test_the_output_is_limited_to_full_scale_and_levels_are_those_since_the_last_call() -> None:
+    live, played = Live(lambda samples: 4.0 * samples, 94.0), np.zeros((64, 2), dtype=np.float32)
+    for sample, status in ((0.5, "in  88.0, out  94.0"), (0.0, "in   0.0, out   0.0")):
+        live(np.full((64, 1), sample, dtype=np.float32), played, 64, None, NO_LOSS)
+        assert (played == min(1.0, 4.0 * sample)).all()
+        assert live.status() == f"{status} dB SPL, drop-outs 0"
 
 
-def test_what_a_stream_raises_ends_it(
-    recording: torch.Tensor, capsys: pytest.CaptureFixture[str]
+def test_an_error_of_the_stream_stops_it(
+    recording: Tensor, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    calls = 0
+    samples_left = [64] * 21  # the warm-up and one block
 
-    def broken(heard: torch.Tensor) -> torch.Tensor:
-        nonlocal calls
-        calls += 1
-        if calls > 21:
-            raise ValueError("enough")
-        return heard
+    def fail_later(samples: Tensor) -> Tensor:
+        if not samples_left:
+            raise ValueError("the stream failed")
+        samples_left.pop()
+        return samples
 
     devices: Any = Devices(recording)
-    with pytest.raises(ValueError, match="enough"):
-        play(Live(broken, 94.0), devices)
-    assert not devices.played[64:].any() and "stopped" in capsys.readouterr().out
+    with pytest.raises(ValueError, match="the stream failed"):
+        play(Live(fail_later, 94.0), devices)
+    assert not devices.played[64:].any()
+    assert "stopped" in capsys.readouterr().out
 
 
-def test_ctrl_c_ends_it_and_devices_that_stop_are_started_again_or_told(
-    recording: torch.Tensor, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+def test_ctrl_c_stops_and_devices_that_stop_are_started_again(
+    recording: Tensor, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     devices: Any = Devices(recording)
 
-    def interrupted(seconds: float) -> None:
+    def interrupt(seconds: float) -> None:
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr("hlsim.live.time.sleep", interrupted)
+        patch.setattr("hlsim.live.time.sleep", interrupt)
         play(Live(WDRC().stream(EAR), 94.0), devices)
     assert capsys.readouterr().out.endswith("stopped, drop-outs 0\n")
-    starts: list[Any] = [None, Devices.PortAudioError("Device unavailable [PaErrorCode -9985]")]
+    errors: list[Any] = [None, Devices.PortAudioError("Device unavailable [PaErrorCode -9985]")]
 
-    def start(self: _Open) -> None:
-        if error := starts.pop(0):
+    def start(self: OpenStream) -> None:
+        if error := errors.pop(0):
             raise error
 
-    monkeypatch.setattr(_Open, "active", False)
-    monkeypatch.setattr(_Open, "start", start)
+    monkeypatch.setattr(OpenStream, "active", False)
+    monkeypatch.setattr(OpenStream, "start", start)
     monkeypatch.setattr("hlsim.live.time.sleep", lambda seconds: None)
     live = Live(WDRC().stream(EAR), 94.0)
     with pytest.raises(ValueError, match="stopped: Device unavailable"):
         play(live, devices)
-    assert live.drop_outs == 2 and not starts
+    assert live.drop_outs == 2
+    assert not errors
 
 
-def test_without_terminals_there_are_no_keys(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "termios", None)
-    with _key_reader() as key:
-        assert key(0.0) == ""
-
-
-def test_a_terminal_gives_its_keys_and_is_left_as_it_was(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_keys_are_read_from_a_terminal_whose_settings_are_restored(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     termios, pty = pytest.importorskip("termios"), pytest.importorskip("pty")
-    ours, theirs = pty.openpty()
-    before = termios.tcgetattr(theirs)
-    with open(theirs, closefd=False) as terminal, monkeypatch.context() as patch:
+    keyboard, stdin = pty.openpty()
+    settings = termios.tcgetattr(stdin)
+    with open(stdin, closefd=False) as terminal, monkeypatch.context() as patch:
         patch.setattr(sys, "stdin", terminal)
-        with _key_reader() as key:
-            os.write(ours, b"Nq")
-            assert [key(1.0), key(1.0), key(0.01)] == ["N", "q", ""]
-    assert termios.tcgetattr(theirs) == before
-    os.close(ours)
-    os.close(theirs)
+        with _key_reader() as read_key:
+            os.write(keyboard, b"Nq")
+            assert [read_key(1.0), read_key(1.0), read_key(0.01)] == ["N", "q", ""]
+    assert termios.tcgetattr(stdin) == settings
+    os.close(keyboard)
+    os.close(stdin)
+    monkeypatch.setitem(sys.modules, "termios", None)  # as on Windows
+    with _key_reader() as read_key:
+        assert read_key(0.0) == ""
 
 
-def test_simulated_blocks_are_what_is_heard_of_the_whole() -> None:
+def test_simulated_blocks_equal_the_whole_signal() -> None:
     simulator = load_pretrained("neuro-msbg")
     stream, signal = SimulatedStream(simulator, EAR), 0.03 * torch.randn(24 * 1024)
     assert (stream.latency, stream.block) == (3200, 128)
-    found = torch.cat([stream(chunk) for chunk in signal.split(1536)])
+    perceived = torch.cat([stream(chunk) for chunk in signal.split(1536)])
     whole = simulator(signal, EAR)
-    middle = slice(stream.latency, -2 * stream.latency)  # begun from silence, as the whole does not
-    found = found[stream.latency :][middle]
-    assert (found - whole[: -stream.latency][middle]).abs().max() < 1e-4 * whole.abs().max()
+    middle = slice(stream.latency, -2 * stream.latency)  # the stream begins with silence
+    difference = perceived[stream.latency :][middle] - whole[: -stream.latency][middle]
+    assert difference.abs().max() < 1e-4 * whole.abs().max()
     with pytest.raises(ValueError, match="finite receptive field"):
         SimulatedStream(load_pretrained("neuro-msbg-lstm"), EAR)
 
 
 @pytest.mark.parametrize(
-    ("arguments", "part"),
+    ("arguments", "message"),
     [
         ("", "--audiogram"),
         ("--listener nosuch.csv", "nosuch.csv"),
@@ -262,69 +267,73 @@ def test_simulated_blocks_are_what_is_heard_of_the_whole() -> None:
         ("--audiogram N3 --output Phones", "--output Phones cannot be used"),
         ("--audiogram N3 --compensator nalr", "nalr cannot process blocks"),
         ("--audiogram N3 --simulate --amplification 1", "no effect with --simulate"),
-        (
-            "--audiogram N3 --compensator wdrc --amplification 1",
-            "no effect with --compensator wdrc",
-        ),
+        ("--audiogram N3 --compensator wdrc --amplification 1", "--compensator wdrc"),
         ("--audiogram N7", "100"),
     ],
 )
-def test_bad_options_are_one_line(
-    arguments: str, part: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+def test_bad_options_cause_one_line(
+    arguments: str,
+    message: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.setitem(sys.modules, "sounddevice", Devices(torch.zeros(64)))
     assert main(["live", *arguments.split()]) == 2
     error = capsys.readouterr().err
-    assert error.startswith("hlsim: error: ") and error.count("\n") == 1 and part in error
+    assert error.startswith("hlsim: error: ")
+    assert error.count("\n") == 1
+    assert message in error
 
 
-def test_devices_that_do_not_fit_are_rejected(
+def test_unsuitable_devices_are_rejected(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    mono: Any = Devices(torch.zeros(64), plays=1)
+    mono: Any = Devices(torch.zeros(64), headphones=1)
     with pytest.raises(ValueError, match="one channel, expected two"):
         play(Live(lambda samples: samples, 94.0, ears=2), mono)
-    monkeypatch.setitem(sys.modules, "sounddevice", Devices(torch.zeros(64), takes=48000))
+    monkeypatch.setitem(sys.modules, "sounddevice", Devices(torch.zeros(64), sample_rate=48000))
     assert main(["live", "--audiogram", "N3"]) == 2
     assert "the system's input cannot be used: Invalid sample rate" in capsys.readouterr().err
-    assert main(["live", "--list-devices"]) == 0 and "Loopback" in capsys.readouterr().out
+    assert main(["live", "--list-devices"]) == 0
+    assert "Loopback" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
-    ("error", "part"),
+    ("error", "fix"),
     [
         (OSError("PortAudio library not found"), "apt install libportaudio2"),
         (MissingExtraError("pip install 'hlsim[live]'"), "hlsim[live]"),
     ],
 )
 def test_missing_libraries_are_named(
-    error: Exception, part: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    error: Exception, fix: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def fail(*_: object) -> None:
         raise error
 
     monkeypatch.setattr("hlsim.cli.live.require", fail)
     assert main(["live", "--audiogram", "N3"]) == 2
-    assert part in capsys.readouterr().err
+    assert fix in capsys.readouterr().err
 
 
 @pytest.fixture
 def server(tmp_path: Path) -> Iterator[dict[str, str]]:
-    """A PulseAudio server with two sinks that play to nobody, ``room`` and ``ears``: its environment."""
+    """Environment of a PulseAudio server with the sinks ``room`` and ``ears``."""
     pytest.importorskip("sounddevice")
     if not all(map(which, ("pulseaudio", "pactl", "paplay", "parec"))):
         pytest.skip("PulseAudio and its utilities are not installed")
-    path = f"{tmp_path}/native"
-    own = {"XDG_RUNTIME_DIR": str(tmp_path), "HOME": str(tmp_path), "PULSE_SERVER": f"unix:{path}"}
-    modules = [f"module-native-protocol-unix socket={path} auth-anonymous=1"]
-    modules += [f"module-null-sink sink_name={name} rate=16000" for name in ("room", "ears")]
-    command = ["pulseaudio", "-n", "--daemonize=no", "--exit-idle-time=-1", "--use-pid-file=no"]
-    for module in modules:
-        command += ["-L", module]
-    environment = os.environ | own | {"PULSE_SINK": "ears", "PULSE_SOURCE": "room.monitor"}
+    socket = tmp_path / "native"
+    command = "pulseaudio -n --daemonize=no --exit-idle-time=-1 --use-pid-file=no".split()
+    command += ["-L", f"module-native-protocol-unix socket={socket} auth-anonymous=1"]
+    for name in ("room", "ears"):
+        command += ["-L", f"module-null-sink sink_name={name} rate=16000"]
+    environment = os.environ | {
+        "XDG_RUNTIME_DIR": str(tmp_path), "HOME": str(tmp_path), "PULSE_SERVER": f"unix:{socket}",
+        "PULSE_SINK": "ears", "PULSE_SOURCE": "room.monitor",
+    }  # fmt: skip
     with subprocess.Popen(command, env=environment, stderr=subprocess.DEVNULL) as running:
         for _ in range(100):
-            if Path(path).exists():
+            if socket.exists():
                 break
             time.sleep(0.1)
         yield environment
@@ -332,36 +341,37 @@ def server(tmp_path: Path) -> Iterator[dict[str, str]]:
 
 
 @pytest.mark.audio
-def test_through_an_audio_server(server: dict[str, str], tmp_path: Path) -> None:
-    """A tone of 65 dB SPL in the room is at the ears as the aid gives it."""
+def test_a_tone_in_the_room_reaches_the_ears(server: dict[str, str], tmp_path: Path) -> None:
     soundfile = pytest.importorskip("soundfile")
-    tone = set_level(
-        torch.sin(2.0 * torch.pi * 1000.0 * torch.arange(16000 * 60) / 16000.0), 65.0, 100.0
-    )
-    soundfile.write(tmp_path / "tone.wav", tone.numpy(), 16000)
-    command = [sys.executable, "-m", "hlsim", "live", "--audiogram", "N3", "--seconds", "6"]
-    command += ["--compensator", "wdrc"]
-    command += ["--input", "pulse", "--output", "pulse", "--buffer-ms", "100"]
-    # both ask for little at a time: a sink without anybody takes up to two seconds at once
-    spoken = ["paplay", "--latency-msec=10", "--device=room", str(tmp_path / "tone.wav")]
-    heard = ["parec", "--latency-msec=10", "--device=ears.monitor", "--rate=16000", "--channels=1"]
+    sound = tone(1000.0, 65.0 - 6.0, 60.0)  # 65 dB SPL where RMS 1.0 is 100 dB SPL
+    soundfile.write(tmp_path / "tone.wav", sound.numpy(), 16000)
+    command = "-m hlsim live --audiogram N3 --seconds 6 --compensator wdrc --input pulse"
+    command += " --output pulse --buffer-ms 100"
+    # A sink asks for two seconds at once unless the latency is low.
+    speaker = ["paplay", "--latency-msec=10", "--device=room", str(tmp_path / "tone.wav")]
+    recorder = "parec --latency-msec=10 --device=ears.monitor --rate=16000 --channels=1"
     with (
-        (tmp_path / "heard").open("wb") as file,
-        subprocess.Popen(spoken, env=server) as speaker,
-        subprocess.Popen([*heard, "--format=float32le"], env=server, stdout=file) as listener,
+        (tmp_path / "recording").open("wb") as file,
+        subprocess.Popen(speaker, env=server) as playing,
+        subprocess.Popen(
+            [*recorder.split(), "--format=float32le"], env=server, stdout=file
+        ) as recording,
     ):
-        ended = subprocess.run(
-            command, env=server, capture_output=True, text=True, cwd=Path(hlsim.__file__).parents[1]
+        result = subprocess.run(
+            [sys.executable, *command.split()],
+            env=server,
+            capture_output=True,
+            text=True,
+            cwd=Path(hlsim.__file__).parents[1],
         )
-        speaker.terminate()
-        listener.terminate()
-    assert ended.returncode == 0, ended.stderr
-    assert re.search(r"in  6[45]\.\d, out  \d\d\.\d dB SPL, drop-outs \d", ended.stdout), (
-        ended.stdout
-    )
-    aid = WDRC(full_scale_spl=100.0)(tone[:16000], EAR)[8000:]
-    expected = float(aid.square().mean().log10() * 10.0 + 100.0)
-    blocks = np.fromfile(tmp_path / "heard", dtype=np.float32)
-    blocks = blocks[: len(blocks) // 1600 * 1600].reshape(-1, 1600)
+        playing.terminate()
+        recording.terminate()
+    assert result.returncode == 0, result.stderr
+    status = r"in  6[45]\.\d, out  \d\d\.\d dB SPL, drop-outs \d"
+    assert re.search(status, result.stdout), result.stdout
+    output = WDRC(full_scale_spl=100.0)(sound[:16000], EAR)[8000:]
+    expected = float(output.square().mean().log10() * 10.0 + 100.0)
+    samples = np.fromfile(tmp_path / "recording", dtype=np.float32)
+    blocks = samples[: len(samples) // 1600 * 1600].reshape(-1, 1600)
     levels = 10.0 * np.log10(np.square(blocks).mean(-1) + 1e-12) + 100.0
-    assert (np.abs(levels - expected) < 0.5).sum() >= 20  # tenths of a second
+    assert (np.abs(levels - expected) < 0.5).sum() >= 20  # blocks of 0.1 s
