@@ -20,6 +20,9 @@ class MappingConfig(NetworkConfig):
         bands: number of bands of the correction, evenly spaced on the ERB-number scale, 4 to 40.
         reach_db: largest correction up or down in dB.
         limit_spl: peak of the output in dB SPL that no sample exceeds.
+
+    >>> MappingConfig(blocks=1, phase="predicted").phase
+    'predicted'
     """
 
     start: str | float = "nalr"
@@ -62,6 +65,9 @@ class HearingAidConfig(ModelConfig):
         cap_db: largest gain of a band in dB.
         quiet_spl: level in dB SPL below which the gain fades, to none 15 dB lower.
         limit_spl: peak of the output in dB SPL that no sample exceeds.
+
+    >>> HearingAidConfig(bands=12).cap_db
+    45.0
     """
 
     bands: int = 20

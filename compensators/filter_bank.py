@@ -58,7 +58,11 @@ SPEECH_SPECTRUM = {
 
 @lru_cache(maxsize=8)
 def centres(count: int) -> tuple[float, ...]:
-    """Return centres from 0 to 8000 Hz, an equal number of ERBs but at least 125 Hz apart."""
+    """Return centres from 0 to 8000 Hz, an equal number of ERBs but at least 125 Hz apart.
+
+    >>> [round(hertz) for hertz in centres(4)]
+    [0, 526, 2264, 8000]
+    """
     low, high = 0.0, 100.0
     for _ in range(60):
         middle = 0.5 * (low + high)
@@ -82,6 +86,9 @@ def shares(count: int, points: int) -> NDArray[np.float64]:
     """Return the share of each band in each frequency of a transform, (points / 2 + 1, count).
 
     The shares are straight lines between the centres, and sum to 1.
+
+    >>> shares(20, 512).shape
+    (257, 20)
     """
     frequencies = np.arange(points // 2 + 1) * RATE / points
     return np.stack([np.interp(frequencies, centres(count), row) for row in np.eye(count)], 1)
@@ -91,6 +98,9 @@ def filters(count: int) -> NDArray[np.float64]:
     """Return the symmetric taps of the filters, (count, 129).
 
     Their sum is 1 at the middle tap, else 0.
+
+    >>> filters(20).shape
+    (20, 129)
     """
     impulses = np.fft.irfft(shares(count, GRID_POINTS).T, GRID_POINTS)
     taps = np.roll(impulses, DELAY, -1)[:, : 2 * DELAY + 1]
@@ -109,6 +119,10 @@ def apply_gains(padded: Tensor, gains: Tensor, first: int = 0) -> Tensor:
         first: position of the first sample in its hop.
 
     Shape: (items, 2 * DELAY + time), (items, hops + 1, bands) -> (items, time).
+
+    >>> twice_as_loud = torch.ones(1, 3, 20)
+    >>> apply_gains(torch.ones(1, 2 * DELAY + 2 * HOP), twice_as_loud).round()[0, :3]
+    tensor([2., 2., 2.])
     """
     time, count = padded.shape[-1] - 2 * DELAY, gains.shape[-1]
     length = min(time, HOP)
@@ -131,6 +145,9 @@ def gain_at_rate(gains: Tensor, rate: int, time: int) -> Tensor:
         time: number of samples.
 
     Shape: (items, hops + 1) -> (items, time).
+
+    >>> gain_at_rate(torch.tensor([[0.0, 1.0]]), 16000, 63)[0, [15, 31]]
+    tensor([0.2500, 0.5000])
     """
     samples = torch.arange(time, device=gains.device)
     position = (samples * RATE + rate).double() / (HOP * rate)
@@ -142,18 +159,29 @@ def frame_power(padded: Tensor) -> Tensor:
     """Return the power of each frequency in frames of 16 ms every 4 ms. The sum is the mean square.
 
     Shape: (items, HISTORY + frames * HOP) in pascals -> (items, frames, FRAME / 2 + 1).
+
+    >>> frame_power(torch.randn(2, HISTORY + 10 * HOP)).shape
+    torch.Size([2, 10, 129])
     """
     frames = padded.unfold(-1, FRAME, HOP) * constant_like(padded, _window)
     return power(torch.fft.rfft(frames)) * constant_like(padded, _scale)
 
 
 def level_db(powers: Tensor) -> Tensor:
-    """Return the level of powers in dB SPL, 0 or more. Any shape."""
+    """Return the level of powers in dB SPL, 0 or more. Any shape.
+
+    >>> level_db(torch.tensor([0.0, 1.0])).round()
+    tensor([ 0., 94.])
+    """
     return 10.0 * torch.log10(powers + POWER_FLOOR) + PASCAL_SPL
 
 
 def speech_levels(count: int) -> tuple[float, ...]:
-    """Return the level of average speech at 65 dB SPL in each band in dB SPL."""
+    """Return the level of average speech at 65 dB SPL in each band in dB SPL.
+
+    >>> [round(level) for level in speech_levels(4)]
+    [60, 63, 53, 43]
+    """
     bands = speech_density(GRID_POINTS) @ shares(count, GRID_POINTS)[1:]
     return tuple((10.0 * np.log10(bands / bands.sum()) + SPEECH_SPL).tolist())
 
@@ -162,6 +190,9 @@ def speech_density(points: int) -> NDArray[np.float64]:
     """Return the relative power density of speech at a transform's frequencies above 0 Hz.
 
     Returns: (points / 2,).
+
+    >>> speech_density(512).shape
+    (256,)
     """
     frequencies = np.arange(1, points // 2 + 1) * RATE / points
     third_octave = 10.0 * np.log10(2.0 ** (1.0 / 6.0) - 2.0 ** (-1.0 / 6.0))

@@ -54,6 +54,12 @@ class HearingAid(Wearable):
 
     Raises:
         ValueError: a rate or level out of range, or a configuration of another type.
+
+    >>> import hlsim
+    >>> aid = HearingAid().eval()
+    >>> output = aid(hlsim.example_speech(), "N3", noise_reduction=0.0)
+    >>> output.shape
+    torch.Size([64320])
     """
 
     SLIDERS = ("noise_reduction", "amplification")

@@ -18,6 +18,10 @@ def soft_limit(waveform: Tensor, peak: float) -> Tensor:
     at most.
 
     Shape: any -> the same, between -peak and peak.
+
+    >>> import torch
+    >>> soft_limit(torch.tensor([0.1, 2.0, 100.0]), peak=2.0)
+    tensor([0.1000, 1.8340, 2.0000])
     """
     bounded = waveform.clamp(-HIGHEST_RATIO * peak, HIGHEST_RATIO * peak)
     return bounded * (1.0 + (bounded / peak).abs() ** EXPONENT) ** (-1.0 / EXPONENT)

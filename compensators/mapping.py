@@ -55,6 +55,11 @@ class MappingCompensator(EarNetwork):
 
     Raises:
         ValueError: a rate or level out of range, or a configuration of another type.
+
+    >>> import hlsim
+    >>> model = MappingCompensator(MappingConfig(channels=8, blocks=1))
+    >>> model(hlsim.example_speech(), "N3").shape
+    torch.Size([64320])
     """
 
     config: MappingConfig

@@ -50,6 +50,12 @@ class NALR(nn.Module):
 
     Raises:
         ValueError: a value out of range.
+
+    >>> import hlsim
+    >>> from hlsim.calibration import level_spl
+    >>> output = NALR("N3")(hlsim.example_speech())
+    >>> level_spl(output).round()
+    tensor(78.)
     """
 
     thresholds: Tensor | None
@@ -154,6 +160,9 @@ def nalr_gains_db(thresholds: Tensor) -> Tensor:
     not count. An ear without any loss has no gain.
 
     Shape: (..., 8) dB HL -> (..., 8), 0 dB or more.
+
+    >>> nalr_gains_db(torch.tensor([20.0, 20.0, 25.0, 35.0, 40.0, 45.0, 50.0, 50.0])).round()
+    tensor([ 0.,  2., 13., 14., 15., 16., 18., 18.])
     """
     losses = _formula_levels(thresholds)
     three_frequency_sum = losses[..., 1:4].sum(-1, keepdim=True)  # 500, 1000 and 2000 Hz

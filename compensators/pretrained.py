@@ -33,7 +33,11 @@ def build_compensator(
     sample_rate: int = NEURO_RATE,
     full_scale_spl: float = PASCAL_SPL,
 ) -> Trained:
-    """Build the untrained compensator of a configuration."""
+    """Build the untrained compensator of a configuration.
+
+    >>> build_compensator(HearingAidConfig(bands=12)).bands
+    12
+    """
     if isinstance(config, HearingAidConfig):
         return HearingAid(config, sample_rate=sample_rate, full_scale_spl=full_scale_spl)
     return MappingCompensator(config, sample_rate=sample_rate, full_scale_spl=full_scale_spl)
@@ -60,6 +64,10 @@ def load_compensator(
     Raises:
         ValueError: there is no such checkpoint, it is of another kind or has changed since it was
             saved, or ``linked`` is set for a compensator that cannot link its gains.
+
+    >>> import hlsim
+    >>> aid = load_compensator("hearing-aid")
+    >>> output = aid(hlsim.example_speech(), "N3")
     """
     compensator = _load(name, sample_rate, full_scale_spl)
     if isinstance(compensator, Wearable):
@@ -108,6 +116,11 @@ def save_compensator(
 
     Raises:
         ValueError: the model is of another kind, or the folder holds something else.
+
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     save_compensator(HearingAid(), f"{folder}/mine")
+    ...     aid = load_compensator(f"{folder}/mine")
     """
     if not isinstance(model, Trained):
         raise ValueError(
@@ -124,6 +137,9 @@ def trained_for(name: str | Path) -> Audiogram | None:
 
     Raises:
         ValueError: there is no such checkpoint, or its record of the ear is no audiogram.
+
+    >>> trained_for("hearing-aid") is None
+    True
     """
     if _untrained(name) is not None:
         return None

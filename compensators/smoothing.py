@@ -17,7 +17,11 @@ BLOCK_FRAMES = 128
 
 
 def decay(seconds: float) -> float:
-    """Return the weight of the past in each frame for a time constant. 0 s gives 0."""
+    """Return the weight of the past in each frame for a time constant. 0 s gives 0.
+
+    >>> round(decay(0.1), 3)
+    0.961
+    """
     return math.exp(-HOP / (RATE * seconds)) if seconds > 0.0 else 0.0
 
 
@@ -30,6 +34,9 @@ def average(values: Tensor, state: Tensor, past: float) -> Tensor:
         past: weight of the past.
 
     Shape: (items, frames, n), (items, n) -> (items, frames, n).
+
+    >>> average(torch.ones(1, 3, 1), torch.zeros(1, 1), 0.5).flatten()
+    tensor([0.5000, 0.7500, 0.8750])
     """
     if past == 0.0:
         return values
@@ -61,6 +68,11 @@ def follow_peaks(
         release: weight of the past in a falling level.
 
     Shape: (items, frames, n) -> (items, frames, n), and the state after the last frame.
+
+    >>> values = torch.tensor([0.0, 60.0, 0.0, 0.0]).reshape(1, 4, 1)
+    >>> levels, state = follow_peaks(values, torch.zeros(1, 3, 1), attack=0.0, release=0.9)
+    >>> levels.flatten()
+    tensor([ 0.0000, 60.0000, 54.0000, 48.6000])
     """
     slow_state, excess, smooth_state = state.unbind(1)
     slow = average(values, slow_state, release)

@@ -26,6 +26,12 @@ class Stream:
         ValueError: as the call of the aid, or the leading dimensions change, or samples are NaN or
             infinite, which would stay in the state. A rejected chunk changes nothing.
         AttributeError: an attribute is set that is not a slider of the aid.
+
+    >>> import hlsim
+    >>> stream = hlsim.load_compensator("hearing-aid").stream("N3")
+    >>> stream.noise_reduction = 0.3
+    >>> stream(torch.zeros(100)).shape
+    torch.Size([100])
     """
 
     def __init__(self, aid: Wearable, audiogram: AudiogramLike, **sliders: Slider) -> None:

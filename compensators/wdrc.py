@@ -43,6 +43,10 @@ class WDRC(Wearable):
 
     Raises:
         ValueError: a value out of range.
+
+    >>> import hlsim
+    >>> WDRC()(hlsim.example_speech(), "N3").shape
+    torch.Size([64320])
     """
 
     def __init__(

@@ -65,6 +65,11 @@ class Wearable(nn.Module):
 
     Raises:
         ValueError: a rate or level out of range; in a call with ``linked``, another shape.
+
+    >>> from compensators import WDRC
+    >>> aid = WDRC()
+    >>> aid.SLIDERS, aid.latency
+    ((), 64)
     """
 
     SLIDERS: tuple[str, ...] = ()

@@ -47,6 +47,11 @@ def read_audio(path: str | Path, *, any_rate: bool = False) -> tuple[Tensor, int
     Raises:
         ValueError: ``path`` is not a path; libsndfile cannot read the file; it is empty, silent, or
             holds NaN or infinity; or its sample rate is below 16 kHz or too high.
+
+    >>> import hlsim
+    >>> samples, rate = read_audio(hlsim.shortcuts.EXAMPLE_FILE)
+    >>> samples.shape, rate
+    (torch.Size([1, 64320]), 16000)
     """
     if not isinstance(path, str | os.PathLike):
         raise ValueError(f"expected the path of an audio file, got {type(path).__name__}")
@@ -105,6 +110,12 @@ def write_audio(path: str | Path, waveform: Tensor, sample_rate: int) -> None:
     Raises:
         ValueError: The extension, the shape or the sample rate is not supported, samples are NaN or
             infinite, or samples exceed full scale in flac or ogg, which would clip them.
+
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     write_audio(f"{folder}/noise.wav", 0.1 * torch.randn(2, 16000), 16000)
+    ...     read_audio(f"{folder}/noise.wav")[0].shape
+    torch.Size([2, 16000])
     """
     suffix = check_extension(path)
     if check_waveform(waveform).ndim > 2:
@@ -142,6 +153,8 @@ def check_writable(path: str | Path, channels: int, sample_rate: int) -> None:
         path: File to write.
         channels: Number of channels.
         sample_rate: Sample rate in Hz.
+
+    >>> check_writable("noise.wav", channels=2, sample_rate=48000)
     """
     is_ogg = Path(path).suffix.lower() == ".ogg"
     if is_ogg and channels > MAX_OGG_CHANNELS:
@@ -169,6 +182,9 @@ def encode_flac(waveform: Tensor, sample_rate: int) -> bytes:
     Raises:
         ValueError: The signal has channels, samples beyond full scale, or a sample rate that flac
             does not support.
+
+    >>> encode_flac(torch.zeros(160), 16000)[:4]
+    b'fLaC'
     """
     samples = check_waveform(waveform).detach().to("cpu", torch.float32)
     if samples.ndim != 1 or not bool((samples.abs() <= 1.0).all()):
@@ -190,6 +206,10 @@ def find_audio(folder: str | Path) -> list[Path]:
 
     Raises:
         ValueError: There is no such folder, or no audio in it.
+
+    >>> import hlsim
+    >>> [path.name for path in find_audio(hlsim.shortcuts.EXAMPLE_FILE.parent)][:1]
+    ['espeak-scotland-m7-01.flac']
     """
     return list_files(folder)[0]
 
@@ -199,6 +219,9 @@ def list_files(folder: str | Path) -> tuple[list[Path], list[Path]]:
 
     Raises:
         ValueError: There is no such folder, or no audio in it.
+
+    >>> import hlsim
+    >>> audio, other_files = list_files(hlsim.shortcuts.EXAMPLE_FILE.parent)
     """
     root = Path(folder)
     if not root.is_dir():

@@ -35,6 +35,9 @@ def broadcast_shape(*shapes: Sequence[int]) -> torch.Size:
 
     Raises:
         RuntimeError: the shapes do not fit.
+
+    >>> broadcast_shape((3, 1), (2,))
+    torch.Size([3, 2])
     """
     number = torch.empty(())
     return torch.broadcast_tensors(*(number.expand(shape) for shape in shapes))[0].shape
@@ -50,6 +53,8 @@ def check_names(
         known: accepted names.
         description: noun in the plural for the message, such as ``criteria``.
         place: where the names were found, for the message.
+
+    >>> check_names(["bands"], ["bands", "paper"], "criteria")
     """
     known = list(known)
     unknown = sorted({str(name) for name in names} - set(known))
@@ -68,6 +73,9 @@ def check_choice(name: str, value: Any, choice: Any, place: str = "") -> None:
         value: value to validate.
         choice: the ``Literal``.
         place: where the value was found, for the message.
+
+    >>> from typing import Literal
+    >>> check_choice("ears", "better", Literal["mean", "better"])
     """
     choices = get_args(choice)
     if not isinstance(value, str) or value not in choices:
@@ -87,6 +95,8 @@ def check_number(
         lowest: smallest accepted number.
         highest: largest accepted number.
         whole: accept integers only.
+
+    >>> check_number("bands", 20, 4, 40, whole=True)
     """
     accepted = is_finite(value) and lowest <= value <= highest
     if accepted and not (whole and type(value) is not int):
@@ -108,6 +118,9 @@ def check_weights(weights: Any, known: Iterable[str], description: str) -> dict[
 
     Raises:
         ValueError: the weights are not as described.
+
+    >>> check_weights({"bands": 1}, ["bands", "paper"], "criteria")
+    {'bands': 1.0}
     """
     if not isinstance(weights, Mapping):
         raise ValueError(
@@ -123,7 +136,11 @@ def check_weights(weights: Any, known: Iterable[str], description: str) -> dict[
 
 
 def is_finite(value: Any) -> bool:
-    """Return whether a value is a finite real number of Python or NumPy. A bool is not one."""
+    """Return whether a value is a finite real number of Python or NumPy. A bool is not one.
+
+    >>> is_finite(1.5), is_finite(True), is_finite(math.nan)
+    (True, False, False)
+    """
     if not isinstance(value, Real) or isinstance(value, bool):
         return False
     try:
@@ -133,7 +150,11 @@ def is_finite(value: Any) -> bool:
 
 
 def describe(value: Any) -> str:
-    """Return a value as messages show it, with its type unless it is a number."""
+    """Return a value as messages show it, with its type unless it is a number.
+
+    >>> describe(3), describe("3")
+    ('3', "'3' (str)")
+    """
     return repr(value) if is_finite(value) else f"{value!r} ({type(value).__name__})"
 
 
@@ -147,6 +168,9 @@ def check_rate(sample_rate: int, lowest: int = LOWEST_RATE, highest: int = HIGHE
 
     Raises:
         ValueError: the rate is not a whole number of Hz from ``lowest`` to ``highest``.
+
+    >>> check_rate(44100.0)
+    44100
     """
     accepted = is_finite(sample_rate) and lowest <= sample_rate <= highest
     if not accepted or int(sample_rate) != sample_rate:
@@ -181,6 +205,9 @@ def check_waveform(
     Raises:
         ValueError: it is not a floating-point tensor with time last, has no samples, or has a
             sample above ``highest``.
+
+    >>> check_waveform(torch.zeros(2, 16000)).shape
+    torch.Size([2, 16000])
     """
     check_time_last(waveform, name)
     if waveform.ndim == 0 or waveform.numel() == 0:
@@ -223,7 +250,14 @@ def _warn_if_loud(waveform: Tensor, name: str, peak: float, full_scale_spl: floa
 
 
 def check_time_last(waveform: Tensor, name: str = "waveform") -> None:
-    """Raise ValueError unless a value is a floating-point tensor that can have time last."""
+    """Raise ValueError unless a value is a floating-point tensor that can have time last.
+
+    >>> try:
+    ...     check_time_last(torch.zeros(16000, 2))
+    ... except ValueError as error:
+    ...     print(error)
+    expected waveform with time last, got shape (16000, 2); transpose it: x.T
+    """
     if not isinstance(waveform, Tensor):
         raise ValueError(
             f"expected {name} to be a floating-point tensor with time last, "
@@ -253,6 +287,9 @@ def check_lengths(lengths: Lengths, shape: torch.Size) -> Tensor:
 
     Raises:
         ValueError: the numbers, their type or their shape are not as described.
+
+    >>> check_lengths([0.5, 1.0], torch.Size([2, 100]))
+    tensor([ 50, 100])
     """
     *items, time = shape
     expected = f"expected lengths to be whole numbers from 1 to {time} of shape {tuple(items)}"
@@ -277,6 +314,10 @@ def silence_after(waveform: Tensor, ends: Tensor) -> Tensor:
     """Replace the samples behind the end of each item by zeros.
 
     Shape: (..., time), (...) -> (..., time).
+
+    >>> silence_after(torch.ones(2, 3), torch.tensor([1, 2]))
+    tensor([[1., 0., 0.],
+            [1., 1., 0.]])
     """
     samples = torch.arange(waveform.shape[-1], device=waveform.device)
     ends = ends.to(waveform.device, non_blocking=True)

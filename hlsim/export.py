@@ -130,6 +130,10 @@ def export_program(
 
     Raises:
         ValueError: The simulator is no Neuro-MSBG at 16 kHz, or there is no sample or no item.
+
+    >>> import hlsim
+    >>> program = export_program(hlsim.load_pretrained("neuro-msbg-light"), seconds=0.1)
+    >>> perceived = program.module()(torch.zeros(1, 1600), torch.full((1, 8), 40.0))
     """
     if not isinstance(simulator, NeuroMSBG) or simulator.sample_rate != NEURO_RATE:
         raise ValueError(
@@ -165,6 +169,10 @@ def export_onnx(
             operation; or the output of onnxruntime for noise at 64 dB SPL differs by more than
             ``TOLERANCE``.
         MissingExtraError: onnx, onnxscript or onnxruntime is not installed.
+
+    >>> import hlsim
+    >>> simulator = hlsim.load_pretrained("neuro-msbg-light")
+    >>> export_onnx(simulator, "simulator.onnx")  # doctest: +SKIP
     """
     _require_onnx()
     program = export_program(simulator, seconds=seconds, items=items)
@@ -193,6 +201,10 @@ def first_inputs(
     Raises:
         ValueError: The aid's sample rate is not 16000 Hz, it has no such slider, or it rejects the
             ear or a value.
+
+    >>> from compensators import WDRC
+    >>> [*first_inputs(WDRC(), "N3")]
+    ['samples', 'fitted', 'past', 'gains', 'levels']
     """
     if aid.sample_rate != RATE:
         raise ValueError(f"expected an aid at {RATE} Hz, got one at {aid.sample_rate} Hz")
@@ -223,6 +235,12 @@ def hop_program(aid: Wearable, *, items: int = 1, hops: int = 1) -> torch.export
 
     Raises:
         ValueError: The aid's sample rate is not 16000 Hz.
+
+    >>> from compensators import WDRC
+    >>> program = hop_program(WDRC())
+    >>> outputs = program.module()(**first_inputs(WDRC(), "N3"))
+    >>> outputs["output"].shape
+    torch.Size([1, 64])
     """
     inputs = first_inputs(aid, torch.zeros(len(FREQUENCIES)), items=items, hops=hops)
     with torch.no_grad(), warnings.catch_warnings():
@@ -243,6 +261,9 @@ def export_aid(aid: Wearable, path: str | Path, *, items: int = 1, hops: int = 1
         ValueError: The aid's sample rate is not 16000 Hz, or an output or state of onnxruntime
             differs by more than ``TOLERANCE`` in the last of 16 hops of noise at 64 dB SPL.
         MissingExtraError: onnx, onnxscript or onnxruntime is not installed.
+
+    >>> from compensators import WDRC
+    >>> export_aid(WDRC(), "aid.onnx")  # doctest: +SKIP
     """
     _require_onnx()
     program = hop_program(aid, items=items, hops=hops)
@@ -275,6 +296,9 @@ def export_fit(aid: Wearable, path: str | Path, *, items: int = 1) -> None:
     Raises:
         ValueError: The output of onnxruntime differs by more than ``TOLERANCE``.
         MissingExtraError: onnx, onnxscript or onnxruntime is not installed.
+
+    >>> from compensators import WDRC
+    >>> export_fit(WDRC(), "fit.onnx")  # doctest: +SKIP
     """
     _require_onnx()
     ears = EAR.repeat(items, 1)

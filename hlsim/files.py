@@ -32,6 +32,12 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
 
     Raises:
         ValueError: The path cannot be written, for example because the disk is full.
+
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     with atomic_path(f"{folder}/scores.csv") as temporary:
+    ...         _ = temporary.write_text("haspi")
+    ...     Path(f"{folder}/scores.csv").read_text()
+    'haspi'
     """
     path = Path(path)
     try:
@@ -61,6 +67,11 @@ def write_atomically(path: str | Path, data: str | bytes) -> None:
 
     Raises:
         ValueError: The file cannot be written.
+
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     write_atomically(f"{folder}/scores.csv", "haspi")
+    ...     Path(f"{folder}/scores.csv").read_text()
+    'haspi'
     """
     contents = data.encode() if isinstance(data, str) else data
     with atomic_path(path) as temporary:
@@ -71,6 +82,9 @@ def resolve_links(path: str | Path) -> Path:
     """Return the absolute path without links.
 
     Unlike ``Path.resolve`` before Python 3.13, this raises nothing for a link to itself.
+
+    >>> resolve_links("/tmp/../missing").name
+    'missing'
     """
     return Path(os.path.realpath(path))
 
@@ -80,6 +94,9 @@ def check_extension(path: str | Path) -> str:
 
     Raises:
         ValueError: The extension is not in ``WRITTEN_EXTENSIONS``.
+
+    >>> check_extension("speech.WAV")
+    '.wav'
     """
     suffix = Path(path).suffix.lower()
     if suffix not in WRITTEN_EXTENSIONS:
@@ -88,7 +105,13 @@ def check_extension(path: str | Path) -> str:
 
 
 def sha256(path: Path) -> str:
-    """Compute the SHA-256 of a file, in hexadecimal."""
+    """Compute the SHA-256 of a file, in hexadecimal.
+
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     write_atomically(f"{folder}/empty", "")
+    ...     sha256(Path(f"{folder}/empty"))[:8]
+    'e3b0c442'
+    """
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
@@ -106,6 +129,11 @@ def read_table(path: str | Path, contents: str) -> list[tuple[int, dict[str, str
 
     Raises:
         ValueError: The file cannot be read, a column appears twice, or a row has too many values.
+
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     write_atomically(f"{folder}/ears.csv", "name;500 Hz\\nA;20\\n")
+    ...     read_table(f"{folder}/ears.csv", "the table")
+    [(2, {'name': 'A', '500 Hz': '20'})]
     """
     rows = []
     try:

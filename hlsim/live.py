@@ -47,6 +47,11 @@ class Live:
     Attributes:
         drop_outs: Number of lost blocks.
         error: Message of an exception in the stream; empty if there was none.
+
+    >>> from compensators import WDRC
+    >>> live = Live(WDRC().stream("N3"), full_scale_spl=100.0)
+    >>> live.status()
+    'drop-outs 0'
     """
 
     def __init__(
@@ -131,6 +136,11 @@ class SimulatedStream:
 
     Raises:
         ValueError: The simulator is no such network.
+
+    >>> import hlsim
+    >>> stream = SimulatedStream(hlsim.load_pretrained("neuro-msbg"), Audiogram.standard("N3"))
+    >>> stream(torch.zeros(1536)).shape
+    torch.Size([1536])
     """
 
     def __init__(self, simulator: torch.nn.Module, audiogram: Audiogram | Listener) -> None:
@@ -179,6 +189,9 @@ def play(
     Raises:
         ValueError: A device does not exist, does not support 16 kHz, or has too few channels; or
             the stream failed.
+
+    >>> import sounddevice  # doctest: +SKIP
+    >>> play(live, sounddevice, seconds=10.0)  # doctest: +SKIP
     """
     microphones = _count_channels(sounddevice, "input", devices[0])
     headphones = _count_channels(sounddevice, "output", devices[1])

@@ -31,7 +31,11 @@ SIMULATOR = "neuro-msbg"
 
 
 def list_pretrained() -> dict[str, str]:
-    """List the checkpoints that ship with hlsim, and the name of the function that loads each."""
+    """List the checkpoints that ship with hlsim, and the name of the function that loads each.
+
+    >>> list_pretrained()["neuro-msbg"]
+    'load_pretrained'
+    """
     folders = shipped_checkpoints()
     return {name: _loader_name(_read_record(folder)["kind"]) for name, folder in folders.items()}
 
@@ -58,6 +62,11 @@ def read_checkpoint(
 
     Raises:
         ValueError: There is no such checkpoint, it is damaged, or its kind is not accepted.
+
+    >>> from hlsim.neuro import NeuroConfig, NeuroMSBG
+    >>> kinds = {SIMULATOR: NeuroConfig.from_dict}
+    >>> read_checkpoint("neuro-msbg-light", kinds, NeuroMSBG).config.blocks
+    2
     """
     folder = find_checkpoint(name, kinds, other_names)
     record = _read_record(folder)
@@ -114,6 +123,9 @@ def find_checkpoint(
 
     Raises:
         ValueError: There is no such checkpoint.
+
+    >>> find_checkpoint("neuro-msbg").name
+    'neuro-msbg'
     """
     if not isinstance(name, str | os.PathLike):
         raise ValueError(f"expected a checkpoint's name or folder, got {type(name).__name__}")
@@ -137,6 +149,9 @@ def checkpoint_digest(name: str | Path) -> str:
 
     Raises:
         ValueError: There is no such checkpoint.
+
+    >>> len(checkpoint_digest("neuro-msbg"))
+    64
     """
     return str(_read_record(find_checkpoint(name)).get("sha256"))
 
@@ -146,6 +161,9 @@ def checkpoint_about(name: str | Path) -> dict[str, Any]:
 
     Raises:
         ValueError: There is no such checkpoint.
+
+    >>> "minutes" in checkpoint_about("neuro-msbg")
+    True
     """
     about = _read_record(find_checkpoint(name)).get("about")
     return dict(about) if isinstance(about, dict) else {}
@@ -156,6 +174,9 @@ def shipped_checkpoints(kinds: Collection[str] | None = None) -> dict[str, Path]
 
     Args:
         kinds: Kinds of checkpoints to include; all by default.
+
+    >>> [*shipped_checkpoints(["hearing-aid"])]
+    ['hearing-aid']
     """
     folders = [path.parent for path in sorted(checkpoints_folder().glob(f"*/{CONFIG}"))]
     if kinds is not None:
@@ -165,7 +186,11 @@ def shipped_checkpoints(kinds: Collection[str] | None = None) -> dict[str, Path]
 
 def checkpoints_folder() -> Path:
     """Return the folder of the checkpoints: in an installed package, or next to it in a source
-    tree."""
+    tree.
+
+    >>> checkpoints_folder().name
+    'checkpoints'
+    """
     package = Path(__file__).parent
     installed = package / "checkpoints"
     return installed if installed.is_dir() else package.parent / "checkpoints"
@@ -191,6 +216,12 @@ def save_checkpoint(
 
     Raises:
         ValueError: The folder contains other files, or cannot be written.
+
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     save_checkpoint(f"{folder}/mine", "linear", nn.Linear(1, 1), {}, {"seed": 0})
+    ...     checkpoint_about(f"{folder}/mine")
+    {'seed': 0}
     """
     target = check_replaceable(folder)
     state = {
@@ -215,6 +246,9 @@ def check_replaceable(folder: str | Path) -> Path:
 
     Raises:
         ValueError: The folder contains files that no checkpoint has, and saving would delete them.
+
+    >>> check_replaceable("new/checkpoint").name
+    'checkpoint'
     """
     target = Path(folder)
     if target.exists() and not target.is_dir():

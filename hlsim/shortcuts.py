@@ -206,6 +206,9 @@ class Players:
     Args:
         signals: Signals in pascals by their labels, ``(time,)`` each.
         sample_rate: Sample rate in Hz of all signals.
+
+    >>> Players({"original": example_speech()}, 16000)
+    Players(original 65 dB SPL)
     """
 
     def __init__(self, signals: dict[str, Tensor], sample_rate: int) -> None:

@@ -23,6 +23,12 @@ def not_compiled(function: Callable[P, Result]) -> Callable[P, Result]:
 
     This is ``torch.compiler.disable`` without its price: as a decorator, it would import the
     compiler, which takes longer than importing hlsim.
+
+    >>> @not_compiled
+    ... def square(x):
+    ...     return x * x
+    >>> square(3)
+    9
     """
 
     @wraps(function)
@@ -41,6 +47,10 @@ def without_modes(
 
     These modes belong to a thread, so the function runs in a thread of its own. Tensors that it
     creates are plain ones, which can be kept and used under any mode.
+
+    >>> with torch.inference_mode():
+    ...     without_modes(torch.ones, 2).is_inference()
+    False
     """
     with ThreadPoolExecutor(1) as pool:
         return pool.submit(function, *arguments, **options).result()
@@ -55,13 +65,20 @@ def constant(
         function: a module's function that returns an array or numbers.
         dtype: type of real values, and of the parts of complex ones.
         device: device of the tensor.
+
+    >>> constant(np.hanning, 3, dtype=torch.float32, device=torch.device("cpu"))
+    tensor([0., 1., 0.])
     """
     tensor: Tensor = compute_once(_constant, function, arguments, dtype, device)
     return tensor
 
 
 def constant_like(tensor: Tensor, function: Callable[..., Any], *arguments: Any) -> Tensor:
-    """Return ``constant`` in the precision and on the device of a real or complex tensor."""
+    """Return ``constant`` in the precision and on the device of a real or complex tensor.
+
+    >>> constant_like(torch.zeros(1).double(), np.hanning, 3)
+    tensor([0., 1., 0.], dtype=torch.float64)
+    """
     dtype = tensor.dtype.to_real() if tensor.is_complex() else tensor.dtype
     return constant(function, *arguments, dtype=dtype, device=tensor.device)
 
@@ -72,6 +89,9 @@ def compute_once(function: Callable[..., Any], *arguments: Any) -> Any:
     Args:
         function: a module's function that returns a tensor or another object with ``nbytes``.
         arguments: hashable arguments.
+
+    >>> compute_once(np.hanning, 5) is compute_once(np.hanning, 5)
+    True
     """
     if torch.compiler.is_compiling():  # a program that is traced cannot use tensors from outside
         return function(*arguments)
@@ -79,7 +99,11 @@ def compute_once(function: Callable[..., Any], *arguments: Any) -> Any:
 
 
 def as_tensor(values: Any, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """Convert real or complex values to a tensor of ``dtype`` or of its complex counterpart."""
+    """Convert real or complex values to a tensor of ``dtype`` or of its complex counterpart.
+
+    >>> as_tensor(np.array([1j]), torch.float32, torch.device("cpu")).dtype
+    torch.complex64
+    """
     if isinstance(values, np.ndarray):
         values = np.ascontiguousarray(values)
     tensor = torch.as_tensor(values)

@@ -44,7 +44,11 @@ def as_audiogram(ear: EarLike) -> Audiogram:
 
 
 def find_audiogram(ear: Any) -> Audiogram | None:
-    """Return the audiogram of one ear, or ``None`` if the value does not describe one ear."""
+    """Return the audiogram of one ear, or ``None`` if the value does not describe one ear.
+
+    >>> find_audiogram("n3"), find_audiogram(3)
+    (Audiogram('N3'), None)
+    """
     if isinstance(ear, Audiogram):
         return ear
     if isinstance(ear, str):

@@ -49,6 +49,9 @@ def on_device(levels: Tensor, device: torch.device) -> Tensor:
     """Return ears on a device. The host does not wait, and remembers the values of its own ears.
 
     Shape: any -> the same.
+
+    >>> on_device(torch.zeros(8), torch.device("cpu")).device
+    device(type='cpu')
     """
     if levels.device == device:
         return levels
@@ -66,6 +69,9 @@ def on_host(levels: Tensor) -> Tensor:
     """Return the values of ears on the CPU. The host waits for the device unless it knows them.
 
     Shape: any -> the same.
+
+    >>> on_host(torch.zeros(8)).device
+    device(type='cpu')
     """
     if levels.device == _HOST:
         return levels.detach()
@@ -77,5 +83,9 @@ def on_host(levels: Tensor) -> Tensor:
 
 
 def known_on_host(levels: Tensor) -> Tensor | None:
-    """Return the values of ears if the host knows them without waiting for the device."""
+    """Return the values of ears if the host knows them without waiting for the device.
+
+    >>> known_on_host(torch.zeros(2))
+    tensor([0., 0.])
+    """
     return levels.detach() if levels.device == _HOST else _COPIES.find(levels, _HOST)

@@ -33,7 +33,12 @@ def plot_thresholds(
     ear: EarName | None = None,
     **style: Any,
 ) -> Any:
-    """Draw thresholds, as ``Audiogram.plot``."""
+    """Draw thresholds, as ``Audiogram.plot``.
+
+    >>> axes = plot_thresholds([500, 1000], [20, 30], ear="left", label="left")
+    >>> axes.get_xscale()
+    'log'
+    """
     if axes is None:
         _, axes = require("matplotlib.pyplot", "eval").subplots(layout="constrained")
     if not axes.yaxis_inverted():  # axes on which no audiogram has been drawn
@@ -45,7 +50,11 @@ def plot_thresholds(
 
 
 def draw_png(plot: Callable[[Any], Any]) -> bytes | None:
-    """Return a PNG of what a function draws on axes, or ``None`` if matplotlib is not installed."""
+    """Return a PNG of what a function draws on axes, or ``None`` if matplotlib is not installed.
+
+    >>> draw_png(lambda axes: axes.plot([0, 1]))[1:4]
+    b'PNG'
+    """
     try:
         figure_module = require("matplotlib.figure", "eval")
     except MissingExtraError:
@@ -58,7 +67,11 @@ def draw_png(plot: Callable[[Any], Any]) -> bytes | None:
 
 
 def frequency_axis(axes: Any, ticks: Iterable[float]) -> None:
-    """Give axes a logarithmic frequency axis in kHz with ticks at frequencies in Hz."""
+    """Give axes a logarithmic frequency axis in kHz with ticks at frequencies in Hz.
+
+    >>> from matplotlib.figure import Figure
+    >>> frequency_axis(Figure().subplots(), [250, 1000, 4000])
+    """
     hertz = list(ticks)
     axes.set(xscale="log", xlabel="frequency (kHz)")
     axes.set_xticks(hertz, [f"{tick / 1000:g}" for tick in hertz])

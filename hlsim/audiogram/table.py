@@ -51,7 +51,14 @@ def read_audiograms(
 
 
 def read_rows(path: str | Path) -> list[tuple[int, dict[str, str]]]:
-    """Read the rows of a table of audiograms, each after the number of its line."""
+    """Read the rows of a table of audiograms, each after the number of its line.
+
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     _ = Path(f"{folder}/ears.csv").write_text("hl_500\\n20\\n")
+    ...     read_rows(f"{folder}/ears.csv")
+    [(2, {'hl_500': '20'})]
+    """
     rows = read_table(path, "audiograms")
     if not rows:
         raise ValueError(
@@ -77,6 +84,12 @@ def read_listeners(path: str | Path, names: Collection[str] | None = None) -> di
         ValueError: The file cannot be read, has no listener of a name, or an ear is not valid, is
             neither left nor right, or occurs twice. The message names the file and the line or the
             listener.
+
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     _ = Path(f"{folder}/ears.csv").write_text("listener,ear,500 Hz\\nA,L,20\\nA,R,30\\n")
+    ...     read_listeners(f"{folder}/ears.csv")
+    {'A': Listener(left={500: 20}, right={500: 30})}
     """
     is_json = str(path).lower().endswith(".json")
     sources = _read_entries(path) if is_json else _group_rows(path)

@@ -54,6 +54,9 @@ def as_thresholds(
     Raises:
         ValueError: The value does not describe ears, an ear is missing, a tensor does not hold
             eight real numbers per ear, or a level is NaN or outside -10 to ``highest`` dB HL.
+
+    >>> as_thresholds(["N1", "N3"]).shape
+    torch.Size([2, 8])
     """
     if isinstance(audiogram, np.ndarray) and audiogram.ndim > 1:
         audiogram = torch.tensor(audiogram.astype(np.float32))
@@ -80,6 +83,9 @@ def list_ears(audiogram: Any) -> tuple[list[Audiogram | None], tuple[int, ...]] 
 
     The missing ear of a listener is ``None``. The result is ``None`` for a tensor, a sequence of
     tensors, and a value that does not describe ears.
+
+    >>> list_ears(["N1", "N3"])
+    ([Audiogram('N1'), Audiogram('N3')], (2,))
     """
     if isinstance(audiogram, Tensor):
         return None
@@ -110,6 +116,9 @@ def ears_on_other_grids(audiogram: AudiogramLike | None) -> list[Audiogram | Non
 
     Raises:
         ValueError: A level is above 100 dB HL, at any frequency.
+
+    >>> ears_on_other_grids(["N3", {500: 20}])
+    [None, Audiogram({500: 20})]
     """
     ears, _ = list_ears(audiogram) or ([], ())
     grids = [None if ear is None or ear.frequencies == FREQUENCIES else ear for ear in ears]
@@ -124,6 +133,9 @@ def store_thresholds(audiogram: AudiogramLike | None, **options: Any) -> Tensor 
 
     The result is a copy, because the caller may write into a tensor later. A tensor that requires a
     gradient stays itself.
+
+    >>> store_thresholds("N3").shape
+    torch.Size([8])
     """
     if audiogram is None:
         return None
@@ -158,6 +170,9 @@ def resolve_thresholds(
     Raises:
         ValueError: There are no ears, the shapes do not broadcast, or the waveform of a listener is
             not (..., 2, time).
+
+    >>> resolve_thresholds(None, "N3", torch.zeros(2, 16000)).shape
+    torch.Size([8])
     """
     if audiogram is None and stored is None:
         raise ValueError(
@@ -179,20 +194,31 @@ def resolve_thresholds(
 
 
 def unsqueeze_mono(thresholds: Tensor, shape: torch.Size) -> Tensor:
-    """Give each mono item of (batch, 1, time) its ear. Shape: (batch, 8) -> (batch, 1, 8)."""
+    """Give each mono item of (batch, 1, time) its ear. Shape: (batch, 8) -> (batch, 1, 8).
+
+    >>> unsqueeze_mono(torch.zeros(2, 8), torch.Size([2, 1, 16000])).shape
+    torch.Size([2, 1, 8])
+    """
     mono = len(shape) == 3 and shape[1] == 1
     return thresholds.unsqueeze(1) if mono and thresholds.shape[:-1] == shape[:1] else thresholds
 
 
 def has_listeners(audiogram: AudiogramLike | None) -> bool:
-    """Whether ears are those of a ``Listener`` or of a sequence of listeners."""
+    """Whether ears are those of a ``Listener`` or of a sequence of listeners.
+
+    >>> has_listeners(Listener("N1", "N3")), has_listeners("N1")
+    (True, False)
+    """
     if isinstance(audiogram, list | tuple) and audiogram:
         return isinstance(audiogram[0], Listener)
     return isinstance(audiogram, Listener)
 
 
 def check_two_channels(waveform: Tensor) -> None:
-    """Raise ValueError unless a waveform has the shape (..., 2, time)."""
+    """Raise ValueError unless a waveform has the shape (..., 2, time).
+
+    >>> check_two_channels(torch.zeros(2, 16000))
+    """
     if waveform.shape[-2:-1] != (2,):
         raise ValueError(
             "expected a waveform of shape (..., 2, time) for two ears, left first, "
@@ -204,6 +230,9 @@ def interpolate(levels: Tensor, frequencies: tuple[float, ...]) -> Tensor:
     """Interpolate levels at the eight frequencies, linearly in Hz and flat beyond them.
 
     Shape: (..., 8) -> (..., frequencies).
+
+    >>> interpolate(torch.arange(8.0), (375.0, 9000.0))
+    tensor([0.5000, 7.0000])
     """
     # A GPU may round matrix products to ten bits, so this is a sum of products.
     weights = constant_like(levels, interpolation_weights, frequencies)
@@ -213,7 +242,11 @@ def interpolate(levels: Tensor, frequencies: tuple[float, ...]) -> Tensor:
 def interpolation_weights(
     frequencies: tuple[float, ...], grid: tuple[float, ...] = FREQUENCIES
 ) -> NDArray[np.float64]:
-    """Return the weights of levels on a grid in those at some frequencies, (grid, frequencies)."""
+    """Return the weights of levels on a grid in those at some frequencies, (grid, frequencies).
+
+    >>> interpolation_weights((375.0,)).T
+    array([[0.5, 0.5, 0. , 0. , 0. , 0. , 0. , 0. ]])
+    """
     return np.stack([np.interp(frequencies, grid, row) for row in np.eye(len(grid))])
 
 

@@ -297,6 +297,9 @@ def severity_index(levels: Tensor, frequencies: Sequence[float] = FREQUENCIES) -
         frequencies: Frequencies of the last dimension in Hz.
 
     Shape: (..., frequencies) -> (...), int64.
+
+    >>> SEVERITIES[severity_index(torch.full((8,), 40.0))]
+    'moderate'
     """
     # Tensors, because CUDA multiplies by the reciprocal of a number, which changes the last bit.
     steps_per_db = levels.new_full((), STEPS_PER_DB, dtype=torch.float64)
@@ -309,7 +312,11 @@ def severity_index(levels: Tensor, frequencies: Sequence[float] = FREQUENCIES) -
 
 
 def convert_at(place: str, convert: Callable[..., Result], *arguments: Any) -> Result:
-    """Return ``convert(*arguments)``, or raise its ValueError with the place in front."""
+    """Return ``convert(*arguments)``, or raise its ValueError with the place in front.
+
+    >>> convert_at("ears.csv, line 2", Audiogram.from_row, {"hl_500": "20"})
+    Audiogram({500: 20})
+    """
     try:
         return convert(*arguments)
     except ValueError as error:
@@ -321,6 +328,8 @@ def check_range(levels: Iterable[float], highest: float, user: str) -> None:
 
     Raises:
         ValueError: A level is below -10 or above ``highest``, or NaN.
+
+    >>> check_range([20.0, 30.0], 100.0, "MSBG")
     """
     if not all(LOWEST_LEVEL <= level <= highest for level in levels):
         raise ValueError(
@@ -330,7 +339,11 @@ def check_range(levels: Iterable[float], highest: float, user: str) -> None:
 
 
 def join_numbers(values: Iterable[float]) -> str:
-    """Return numbers as text for a message."""
+    """Return numbers as text for a message.
+
+    >>> join_numbers([250.0, 707.1])
+    '250, 707.1'
+    """
     return ", ".join(f"{value:g}" for value in values)
 
 
