@@ -1,4 +1,4 @@
-"""Functions for a notebook: load speech, simulate a hearing loss, apply a hearing aid, and listen."""
+"""Functions for a notebook: load speech, simulate a loss, apply an aid, and listen."""
 
 from __future__ import annotations
 
