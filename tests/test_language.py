@@ -76,6 +76,7 @@ FINISHED = [
     "tests/cli",
     "tests/compensators",
     "tests/dsp",
+    "tests/losses",
     "tests/evaluation",
     "tests/golden.py",
     "tests/metrics/test_fidelity.py",

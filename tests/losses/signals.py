@@ -17,8 +17,8 @@ def add_noise(clean: Tensor, snr: float) -> Tensor:
     """Add white noise at an SNR in dB to each item."""
     generator = torch.Generator().manual_seed(0)
     noise = torch.randn(clean.shape, dtype=clean.dtype, generator=generator)
-    rms = clean.square().mean(-1, keepdim=True).sqrt()
-    return clean + noise * rms * 10.0 ** (-snr / 20.0)
+    power_ratio = clean.square().sum(-1, keepdim=True) / noise.square().sum(-1, keepdim=True)
+    return clean + noise * power_ratio.sqrt() * 10.0 ** (-snr / 20.0)
 
 
 def filter_by_gain(waveform: Tensor, gain_db: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""HearingLossLoss: its frozen simulator, shapes, lengths, criteria, levels, gradients and errors."""
+"""HearingLossLoss: its simulator, shapes, lengths, criteria, levels, gradients and errors."""
 
 import copy
 import pickle

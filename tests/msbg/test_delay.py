@@ -9,12 +9,6 @@ from hlsim.msbg import estimate_delay
 from tests.pyclarity import PyclarityOutputs, msbg
 
 
-def test_impulse_method_with_no_loss_is_the_measured_1078() -> None:
-    simulator = MSBG(Audiogram.standard("NH"), aligned=False, sample_rate=44100)
-    assert estimate_delay(simulator) == 1078
-    assert simulator.delay("none") == 1047
-
-
 @pytest.mark.parametrize("name", ["N1", "N2", "N3", "S1", "S2"])
 def test_impulse_method_depends_on_the_ear_and_the_structural_delay_does_not(name: str) -> None:
     ear = Audiogram.standard(name)

@@ -5,7 +5,7 @@ import pytest
 import scipy.signal
 
 from hlsim.dsp.fir import frequency_sampling_fir
-from hlsim.msbg.ear import EAR_DELAY, MSBG_RATE, ear_filter, lowpass_filter
+from hlsim.msbg.ear import MSBG_RATE, ear_filter, lowpass_filter
 
 msbg = pytest.importorskip("clarity.evaluator.msbg.msbg")
 msbg_utils = pytest.importorskip("clarity.evaluator.msbg.msbg_utils")
@@ -20,13 +20,6 @@ def test_outer_and_middle_ear_filter_as_pyclarity(backward: bool) -> None:
     np.testing.assert_allclose(ours, theirs, atol=1e-12 * np.abs(theirs).max())
 
 
-@pytest.mark.parametrize("backward", [False, True])
-def test_delay_is_half_the_length(backward: bool) -> None:
-    taps = ear_filter(backward)
-    assert len(taps) == 2 * EAR_DELAY + 1
-    np.testing.assert_allclose(taps, taps[::-1], atol=1e-12 * np.abs(taps).max())
-
-
 def test_ear_and_inverse_ear_together_only_delay() -> None:
     hz = np.geomspace(150, 5000, 400)
     _, ear = scipy.signal.freqz(ear_filter(), 1.0, hz, fs=MSBG_RATE)
@@ -34,24 +27,11 @@ def test_ear_and_inverse_ear_together_only_delay() -> None:
     assert np.abs(20 * np.log10(np.abs(ear * inverse_ear))).max() < 0.5
 
 
-def test_ear_has_a_gain_of_0_db_at_1_khz() -> None:
-    _, response = scipy.signal.freqz(ear_filter(), 1.0, [1000.0], fs=MSBG_RATE)
-    assert abs(20 * np.log10(np.abs(response[0]))) < 0.1
-
-
 def test_lowpass_equals_pyclaritys() -> None:
     # These are the lines of pyclarity's Ear.process.
     length = 2 * int(np.floor(0.0015 * 44100)) + 1
     theirs = scipy.signal.firwin(length, 18000 / int(44100 / 2), window=("kaiser", 8))
     np.testing.assert_allclose(lowpass_filter(), theirs, atol=1e-15)
-
-
-def test_lowpass_passes_speech_and_stops_20_khz() -> None:
-    response = np.abs(
-        scipy.signal.freqz(lowpass_filter(), 1.0, [100, 8000, 15000, 20000], fs=MSBG_RATE)[1]
-    )
-    np.testing.assert_allclose(response[:3], 1.0, atol=1e-3)
-    assert response[3] < 1e-4
 
 
 @pytest.mark.parametrize("taps", [141, 1015])

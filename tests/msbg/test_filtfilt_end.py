@@ -48,14 +48,6 @@ def test_envelopes_of_an_abrupt_end_equal_pyclaritys(name: str, length: int) -> 
     assert error_without_oscillation.max() > 0.2
 
 
-def test_single_precision_is_enough() -> None:
-    bank = BANKS["mild"]
-    channels = torch.from_numpy(tones(bank, 8000, 2 * STEP * 342))
-    expected = oscillation(channels, bank, 8000)
-    rounded = oscillation(channels.float(), bank, 8000)
-    assert float((rounded - expected).abs().max()) < 1e-5
-
-
 @pytest.mark.parametrize("length", [1, 5, STEP, STEP + 1, 100, LOOK_BACK - 1, LOOK_BACK + 1])
 def test_oscillation_has_the_shape_of_the_envelopes_and_stops_behind_the_end(length: int) -> None:
     bank = BANKS["severe"]

@@ -13,10 +13,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from hlsim import Listener, torchtools
+from hlsim import Listener
 from hlsim.audio import find_audio, read_audio
 from hlsim.audiogram import STANDARD, Audiogram
-from hlsim.calibration import gain_to_pascals, level_spl, set_level
+from hlsim.calibration import level_spl, set_level
 from hlsim.msbg import MSBG
 from hlsim.msbg.blocks import block_bounds
 from hlsim.msbg.model import STRUCTURAL_DELAY, active_rescaling
@@ -143,11 +143,6 @@ def test_ears_at_other_frequencies_may_share_a_batch(speech: list[tuple[Tensor, 
     assert relative_error(fast_model(six.thresholds)(waves[0]).numpy(), expected[0].numpy()) > 0.1
 
 
-def test_levels_that_msbg_does_not_take_are_rejected_at_any_frequency() -> None:
-    with pytest.raises(ValueError, match="-10 to 100 dB HL"):
-        MSBG(Audiogram((20, 40, 110), (500, 4000, 14000)))
-
-
 def spectrum_of_reference(
     ear: Audiogram, wave: Wave, rate: int, highest: float
 ) -> NDArray[np.complex128]:
@@ -235,19 +230,6 @@ def test_outputs_have_their_length_and_are_finite(severity: str, time: int) -> N
     assert bool(torch.isfinite(output_at_16_khz).all())
 
 
-@pytest.mark.parametrize("spl", [38.0, 50.0, 65.0, 100.0])
-def test_rescaling_equals_pyclaritys(recordings: list[tuple[Wave, int]], spl: float) -> None:
-    measure_rms = pytest.importorskip("clarity.evaluator.msbg.msbg_utils").measure_rms
-    rng = np.random.default_rng(5)
-    for _ in range(6):
-        wave = clip(recordings, rng, rng.uniform(0.3, 1.0))
-        wave *= 10 ** ((spl - 120) / 20) / np.sqrt(np.mean(wave**2))
-        expected = np.sqrt(np.mean(wave**2)) / measure_rms(wave, RATE, -12)[0]
-        ours = active_rescaling(torch.from_numpy(wave * gain_to_pascals(120.0)))
-        assert ours.shape == (1,)
-        assert float(ours) == pytest.approx(expected, rel=1e-9)
-
-
 def test_rescaling_does_not_change_silence_and_very_short_clips() -> None:
     assert active_rescaling(torch.zeros(2, 3, 1000)).eq(1.0).all()
     # Below 40 dB SPL, no frame counts as active, and pyclarity returns NaN.
@@ -298,14 +280,8 @@ def test_ears_and_waveforms_broadcast(speech: list[tuple[Tensor, int]]) -> None:
     single_ear = model(wave.expand(3, 2, -1), sequence[2])
     torch.testing.assert_close(single_ear, output_per_ear[2].expand(3, 2, -1))
     torch.testing.assert_close(model(wave.expand(2, 4, -1), ears.expand(2, 4, 8)), grid)
-
-
-def test_the_audiogram_of_the_call_replaces_the_stored_one(
-    speech: list[tuple[Tensor, int]],
-) -> None:
-    wave = speech_at(speech, seconds=0.1)
-    n3, s1 = Audiogram.standard("N3"), Audiogram.standard("S1")
-    torch.testing.assert_close(fast_model(n3)(wave, s1), fast_model(s1)(wave), atol=0, rtol=0)
+    # The audiogram of the call replaces the stored one.
+    torch.testing.assert_close(fast_model("S1")(wave, ears), output_per_ear)
 
 
 @pytest.mark.parametrize("severity", EARS)
@@ -351,15 +327,6 @@ def test_without_a_loss_the_model_is_linear_and_keeps_the_level(
     assert abs(float(level_spl(model(wave)) - level_spl(wave))) < 2.0
 
 
-def test_full_scale_changes_only_the_unit(speech: list[tuple[Tensor, int]]) -> None:
-    wave = speech_at(speech, seconds=0.2)
-    ear = Audiogram.standard("N3")
-    gain = gain_to_pascals(110.0)
-    torch.testing.assert_close(
-        fast_model(ear, full_scale_spl=110.0)(wave / gain) * gain, fast_model(ear)(wave)
-    )
-
-
 @pytest.mark.parametrize("severity", EARS)
 @pytest.mark.parametrize("hops", [1, 7])
 def test_a_shift_of_the_input_by_whole_hops_shifts_the_output(
@@ -385,32 +352,6 @@ def test_silence_gives_silence_with_finite_gradients(rate: int, dtype: torch.dty
         assert waves.grad is not None and bool(torch.isfinite(waves.grad).all())
 
 
-def test_gradients_are_finite_for_soft_and_clipped_inputs(speech: list[tuple[Tensor, int]]) -> None:
-    wave = speech_at(speech, seconds=0.2)
-    levels = torch.tensor([-20.0, 20.0, 60.0, 100.0, 120.0])
-    waves = torch.stack([set_level(wave, level) for level in levels])
-    waves = torch.cat((waves, (1e3 * waves[-1:]).clamp(-1, 1)))
-    waves = waves.unsqueeze(1).expand(-1, 4, -1).clone()
-    waves[:, :, 2000:4000] = 0.0
-    waves.requires_grad_()
-    output = fast_model()(waves, ears_of_all_severities(4))
-    assert bool(torch.isfinite(output).all())
-    output.square().sum().backward()
-    assert waves.grad is not None and bool(torch.isfinite(waves.grad).all())
-    assert bool((waves.grad.abs().amax(-1) > 0).all())
-
-
-@pytest.mark.parametrize("severity", EARS)
-def test_float32_equals_float64_up_to_rounding(
-    speech: list[tuple[Tensor, int]], severity: str
-) -> None:
-    model = fast_model(Audiogram.standard(EARS[severity]))
-    wave = speech_at(speech)
-    expected = model(wave.double())
-    assert expected.dtype == torch.float64
-    assert relative_error(model(wave).double().numpy(), expected.numpy()) < 2e-5
-
-
 def test_autocast_has_no_effect_inside(speech: list[tuple[Tensor, int]]) -> None:
     wave = speech_at(speech, seconds=0.2)
     model = fast_model(Audiogram.standard("N3"))
@@ -422,15 +363,6 @@ def test_autocast_has_no_effect_inside(speech: list[tuple[Tensor, int]]) -> None
     assert bfloat16_output.dtype == torch.bfloat16
     expected = model(wave.bfloat16().float()).bfloat16()
     torch.testing.assert_close(bfloat16_output, expected)
-
-
-@pytest.mark.slow
-def test_a_compiled_model_runs_uncompiled(monkeypatch: pytest.MonkeyPatch) -> None:
-    # With an empty cache, the functions that compute filters are called, too.
-    monkeypatch.setattr(torchtools, "_CACHE", torchtools._Cache(2**28))
-    model, wave = MSBG(Audiogram.standard("N3"), sample_rate=16000), 0.03 * torch.randn(1, 1200)
-    output = torch.compile(model, backend="eager")(wave)
-    assert torch.equal(output, model(wave))
 
 
 def test_the_model_has_no_parameters_and_copies_are_equal(
@@ -461,48 +393,35 @@ def test_the_model_follows_a_trained_audiogram() -> None:
         model(wave)
 
 
-N3 = Audiogram.standard("N3")
+BAD_CALLS: list[tuple[Any, Any]] = [
+    (torch.zeros(100), None),
+    (torch.zeros(100), torch.full((8,), 100.5)),
+    (torch.zeros(100), torch.full((8,), -11.0)),
+    (torch.zeros(100), "N7"),
+    (torch.zeros(100), torch.full((8,), math.nan)),
+    (torch.zeros(100), torch.zeros(7)),
+    (torch.zeros(100), 3),
+    (torch.zeros(100, dtype=torch.int16), "N3"),
+    (torch.zeros(2, 0), "N3"),
+    (torch.tensor(1.0), "N3"),
+    (torch.zeros(3, 100), torch.zeros(2, 8)),
+    (torch.zeros(3, 100), ["N3", "N3"]),
+]
+BAD_SETTINGS: dict[str, list[Any]] = {
+    "sample_rate": [8000, 96000],
+    "full_scale_spl": [-1.0, math.nan],
+    "audiogram": ["N7", torch.zeros(7), Audiogram((20, 40, 110), (500, 4000, 14000))],
+}
 
 
-@pytest.mark.parametrize(
-    ("wave", "audiogram"),
-    [
-        (torch.zeros(100), None),
-        (torch.zeros(100), torch.full((8,), 100.5)),
-        (torch.zeros(100), torch.full((8,), -11.0)),
-        (torch.zeros(100), Audiogram.standard("N7")),
-        (torch.zeros(100), torch.full((8,), math.nan)),
-        (torch.zeros(100), torch.zeros(7)),
-        (torch.zeros(100), 3),
-        (torch.zeros(100, dtype=torch.int16), N3),
-        (torch.zeros(2, 0), N3),
-        (torch.tensor(1.0), N3),
-        (torch.zeros(3, 100), torch.zeros(2, 8)),
-        (torch.zeros(3, 100), [N3, N3]),
-    ],
-)
-def test_bad_call_raises_value_error(wave: Any, audiogram: Any) -> None:
-    with pytest.raises(ValueError):
-        fast_model()(wave, audiogram)
-
-
-@pytest.mark.parametrize(
-    "options",
-    [
-        {"sample_rate": 8000},
-        {"sample_rate": 96000},
-        {"full_scale_spl": -1.0},
-        {"full_scale_spl": math.nan},
-        {"audiogram": Audiogram.standard("N7")},
-        {"audiogram": torch.zeros(7)},
-    ],
-)
-def test_bad_setting_raises_value_error(options: dict[str, Any]) -> None:
-    with pytest.raises(ValueError):
-        fast_model(**options)
-
-
-def test_an_unknown_severity_raises_value_error() -> None:
+def test_bad_calls_and_settings_raise_value_error() -> None:
+    for wave, audiogram in BAD_CALLS:
+        with pytest.raises(ValueError):
+            fast_model()(wave, audiogram)
+    for name, values in BAD_SETTINGS.items():
+        for value in values:
+            with pytest.raises(ValueError):
+                MSBG(**{name: value})
     with pytest.raises(ValueError):
         fast_model().delay("Severe")
 
@@ -552,13 +471,6 @@ def test_processing_in_blocks_equals_processing_at_once(
     assert relative_error(output.numpy(), expected.numpy()) < 1e-5
 
 
-@pytest.mark.slow
-def test_blocks_have_the_length_of_the_input_at_an_unusual_rate() -> None:
-    wave = 0.03 * torch.randn(10 * 16026)
-    with torch.no_grad():
-        assert MSBG(Audiogram.standard("N6"), sample_rate=16026)(wave).shape == wave.shape
-
-
 @pytest.mark.parametrize("aligned", [True, False])
 def test_gradients_through_blocks_equal_those_at_once(
     monkeypatch: pytest.MonkeyPatch, aligned: bool
@@ -566,26 +478,18 @@ def test_gradients_through_blocks_equal_those_at_once(
     monkeypatch.setattr("hlsim.msbg.blocks._BLOCK_SECONDS", 1.0)
     wave = 0.03 * torch.randn(2 * 44100, dtype=torch.float64)
     model = fast_model(Audiogram.standard("N3"), aligned=aligned)
+    assert len(block_bounds(wave.shape[-1], RATE)) > 1
     gradients = []
     for _ in range(2):
         leaf = wave.clone().requires_grad_()
         model(leaf).square().sum().backward()
         assert leaf.grad is not None
         gradients.append(leaf.grad.numpy())
+        if aligned:
+            slope = torch.func.grad(lambda signal: model(signal).square().sum())(wave)
+            torch.testing.assert_close(slope, leaf.grad)
         monkeypatch.setattr("hlsim.msbg.blocks.block_bounds", lambda n, _: [(0, 0, n, n)])
     assert relative_error(gradients[0], gradients[1]) < 1e-4
-
-
-def test_gradients_through_blocks_equal_those_of_a_transform(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr("hlsim.msbg.blocks._BLOCK_SECONDS", 1.0)
-    model, wave = MSBG(Audiogram.standard("N3"), sample_rate=16000), 0.03 * torch.randn(20000)
-    assert len(block_bounds(20000, 16000)) > 1
-    leaf = wave.clone().requires_grad_()
-    model(leaf).square().sum().backward()
-    slope = torch.func.grad(lambda signal: model(signal).square().sum())(wave)
-    torch.testing.assert_close(slope, leaf.grad)
 
 
 @pytest.mark.parametrize("rate", [16000, 17000, 18000, 20000])

@@ -45,11 +45,6 @@ def test_steps_of_two_frames_change_the_output_little() -> None:
     assert float((output - expected).norm() / expected.norm()) < 0.05
 
 
-@pytest.mark.parametrize("length", [1, 23, 24, 49, 1000])
-def test_signals_may_have_any_length(length: int) -> None:
-    assert light()(0.05 * torch.randn(4, length), EARS).shape == (4, length)
-
-
 def test_processing_in_blocks_equals_processing_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     model = light()
     waveform = 0.05 * torch.randn(1, 40000)
@@ -82,11 +77,3 @@ def test_gradients_are_exact() -> None:
 
     assert torch.autograd.gradcheck(simulate, waveform, fast_mode=True, atol=1e-6)
     assert torch.autograd.gradgradcheck(simulate, waveform, fast_mode=True, atol=1e-6)
-
-
-@pytest.mark.parametrize(
-    "settings", [{"prior": False}, {"level_aware": False}, {"block": "lstm"}], ids=str
-)
-def test_settings_that_do_not_fit_bands_raise_value_error(settings: dict[str, object]) -> None:
-    with pytest.raises(ValueError):
-        light(**settings)

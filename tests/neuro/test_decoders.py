@@ -27,14 +27,6 @@ def test_factor_has_the_gain_and_the_angle_of_two_maps() -> None:
     torch.testing.assert_close(factor, expected, atol=1e-12, rtol=1e-12)
 
 
-def test_before_training_the_phase_shift_is_zero() -> None:
-    features, log_gain = random_inputs()
-    model = PhaseDecoder(4, 0, (4, 3), False).double()
-    factor = model.factor(features, SIZE, log_gain)
-    torch.testing.assert_close(factor.real, log_gain.exp(), atol=1e-12, rtol=1e-12)
-    assert not factor.imag.any()
-
-
 def test_gradients_are_exact() -> None:
     model = random_decoder()
     inputs = tuple(tensor.requires_grad_() for tensor in random_inputs())

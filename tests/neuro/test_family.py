@@ -198,22 +198,6 @@ def test_a_concatenated_audiogram_affects_the_output() -> None:
     assert model.audiogram_encoder is None and not torch.allclose(*outputs)
 
 
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"block": "gru"},
-        {"structure": "cascade"},
-        {"audiogram": "none"},
-        {"phase": "random"},
-        {"block": "transformer", "channels": 10, "heads": 4},
-        {"states": 0},
-    ],
-)
-def test_a_bad_choice_raises_value_error(change: dict[str, object]) -> None:
-    with pytest.raises(ValueError):
-        NeuroConfig.from_dict(change)
-
-
 @pytest.mark.parametrize("block", ["cnn", "lstm", "transformer", "mamba"])
 def test_derivatives_are_exact_or_raise(block: str) -> None:
     """The docstring of NeuroMSBG states which derivatives work for each kind of block."""

@@ -45,13 +45,6 @@ def test_channels_that_a_bank_lacks_are_zero() -> None:
         np.testing.assert_allclose(prior.relative_known[0, number].sum(0), 1.0, atol=1e-4)
 
 
-def test_smoothing_preserves_the_mean() -> None:
-    prior = Prior(NeuroConfig().stft)
-    for number, severity in enumerate(SEVERITIES):
-        rows = prior.smoothing_known[number, : BANKS[severity].channels]
-        np.testing.assert_allclose(rows.sum(-1), 1.0, atol=1e-5)
-
-
 def test_smearing_factor_is_the_complex_root_of_the_ratio() -> None:
     smeared = torch.randn(3, 40, dtype=torch.float64).requires_grad_()
     powers = (torch.rand(3, 40, dtype=torch.float64) + 0.1).requires_grad_()
