@@ -15,15 +15,18 @@ pytest.importorskip("joblib")
 from hlsim.demo import _name_files, _sentence, demo
 
 
-@pytest.fixture
-def short_speech(tmp_path: Path, speech_dir: Path) -> Path:
-    """24 utterances of a second, so that eight are scored."""
-    folder = tmp_path / "speech"
+def write_short_speech(folder: Path, speech_dir: Path) -> Path:
+    """Write 24 utterances of a second, of which the demo scores eight."""
     folder.mkdir()
     for path in sorted(speech_dir.rglob("*.flac")):
         samples, rate = soundfile.read(path)
         soundfile.write(folder / path.name, samples[rate // 2 : rate // 2 + rate], rate)
     return folder
+
+
+@pytest.fixture
+def short_speech(tmp_path: Path, speech_dir: Path) -> Path:
+    return write_short_speech(tmp_path / "speech", speech_dir)
 
 
 def test_demo_writes_page_and_sounds_that_agree(tmp_path: Path, short_speech: Path) -> None:

@@ -7,10 +7,10 @@ from pathlib import Path
 from hlsim.evaluation.clarity import NAL_R, RULE_MS, UNAIDED
 from hlsim.evaluation.result import Evaluation
 from hlsim.files import write_atomically
-from hlsim.report.page import Page, Section, Table, write_page
+from hlsim.report.page import Page, Section, Table
 from hlsim.report.plots import pictures_sections
 from hlsim.report.recordings import score_details
-from hlsim.report.results import LEVEL, number, of, parts, summary_table
+from hlsim.report.results import LEVEL, number, split_rows, statistic, summary_table
 from hlsim.report.sounds import listening_sections
 
 _ABOUT = (
@@ -19,12 +19,6 @@ _ABOUT = (
     "of the better ear stands beside it. The look-ahead is measured; the challenges allow "
     f"{RULE_MS:g} ms."
 )
-
-
-def write_scenes(evaluation: Evaluation, out: str | Path, *, listen: int = 3) -> Path:
-    """Write ``scores.csv`` and the files of ``write_report`` into a folder."""
-    write_scores(evaluation, out)
-    return write_page(scenes_page(evaluation, listen), evaluation.to_dict(), out)
 
 
 def write_scores(evaluation: Evaluation, out: str | Path) -> None:
@@ -39,11 +33,11 @@ def write_scores(evaluation: Evaluation, out: str | Path) -> None:
 def scenes_page(evaluation: Evaluation, listen: int = 3) -> Page:
     """Return the page of scenes: verdict, conditions, sounds, pictures, details."""
     planned = [c.verdict() for c in evaluation.comparisons if c.planned]
-    verdict, *others = planned or [f"No pair of aids could be compared with {NAL_R}."]
-    shown = [UNAIDED, NAL_R, *evaluation.of_kind("aid")]
+    verdict, *further_verdicts = planned or [f"No pair of aids could be compared with {NAL_R}."]
+    played = [UNAIDED, NAL_R, *evaluation.of_kind("aid")]
     sections = [
-        Section("Conditions", [*others, _ABOUT], [conditions_table(evaluation)]),
-        *listening_sections(evaluation, listen, shown),
+        Section("Conditions", [*further_verdicts, _ABOUT], [conditions_table(evaluation)]),
+        *listening_sections(evaluation, listen, played),
         *pictures_sections(evaluation),
         score_details(evaluation),
     ]
@@ -61,10 +55,10 @@ def conditions_table(evaluation: Evaluation) -> Table:
     table = evaluation.table[evaluation.table["item"].isin(scored[scored].index)]
     table = table.assign(combined=0.5 * (table["haspi"] + table["hasqi"]))
     scores = {"HASPI": "haspi", "HASQI": "hasqi", "Combined": "combined"}
-    columns = {**{title: (of(score), ".3f") for title, score in scores.items()}, **LEVEL}
+    columns = {**{title: (statistic(score), ".3f") for title, score in scores.items()}, **LEVEL}
     shared = "" if scored.all() else f"the {scored.sum()} that all conditions have scores of, of "
     caption = f"Means of {shared}{len(scored)} pairs of scene and listener"
-    means = summary_table(caption, parts(table), columns)
+    means = summary_table(caption, split_rows(table), columns)
     rows = []
     for row in means.rows:
         look_ahead = evaluation.details["look_ahead_ms"][row[0]]

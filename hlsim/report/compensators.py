@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from hlsim.evaluation.compensators import HARD, UNAIDED
+from hlsim.evaluation.compensators import COMPRESSION, HARD, NAL_R, UNAIDED
 from hlsim.evaluation.measurements import QUIET_LEVELS, UTTERANCES
 from hlsim.evaluation.result import Evaluation
-from hlsim.report.page import Page, Picture, Section, Table, write_page
+from hlsim.report.page import Page, Picture, Section, Table
 from hlsim.report.plots import (
     condition_colours,
     curves_picture,
@@ -25,12 +24,12 @@ from hlsim.report.results import (
     Columns,
     comparison_table,
     detail_section,
-    inner,
-    of,
+    lower_first,
     paired_table,
-    parts,
     score_cells,
     scored_by,
+    split_rows,
+    statistic,
     summary_table,
 )
 from hlsim.report.sounds import listening_sections
@@ -42,22 +41,22 @@ GROUPS = {
 }
 
 COLUMNS: Columns = {
-    "Output level (dB SPL)": (of("level"), ".1f"),
-    "Highest peak (dB SPL)": (of("peak", "max"), ".1f"),
-    "Peaks beyond the limit": (of("beyond_limit", "sum"), "g"),
-    "Loudness error (dB)": (of("loudness_error"), "+.1f"),
-    "the same, mean absolute": (of("loudness_error", "mean absolute"), ".1f"),
-    "against speech alone": (of("loudness_error_clean"), "+.1f"),
-    "Band error (dB)": (of("band_error"), ".1f"),
+    "Output level (dB SPL)": (statistic("level"), ".1f"),
+    "Highest peak (dB SPL)": (statistic("peak", "max"), ".1f"),
+    "Peaks beyond the limit": (statistic("beyond_limit", "sum"), "g"),
+    "Loudness error (dB)": (statistic("loudness_error"), "+.1f"),
+    "the same, mean absolute": (statistic("loudness_error", "mean absolute"), ".1f"),
+    "against speech alone": (statistic("loudness_error_clean"), "+.1f"),
+    "Band error (dB)": (statistic("band_error"), ".1f"),
 }
 """Columns of the tables by title."""
 
 _LOWEST_ERROR_DB = -60.0  # of a tone in a picture; below, it is inaudible anyway
 
 _GAP_COLUMNS: Columns = {
-    "Neuro-MSBG (dB)": (of("loss_neuro"), ".2f"),
-    "Exact MSBG (dB)": (of("loss_msbg"), ".2f"),
-    "Relative difference, median item": (of("gap", "median absolute"), ".1%"),
+    "Neuro-MSBG (dB)": (statistic("loss_neuro"), ".2f"),
+    "Exact MSBG (dB)": (statistic("loss_msbg"), ".2f"),
+    "Relative difference, median item": (statistic("gap", "median absolute"), ".1%"),
 }
 
 _COLUMN_NOTES = (
@@ -102,23 +101,20 @@ _WEARING = (
 )
 
 
-def write_compensators(evaluation: Evaluation, out: str | Path, *, listen: int = 3) -> Path:
-    """Write the result of ``evaluate_compensators`` into a folder, as ``write_report`` does."""
-    return write_page(compensators_page(evaluation, listen), evaluation.to_dict(), out)
-
-
 def compensators_page(evaluation: Evaluation, listen: int = 3) -> Page:
     """Return the page of compensators: verdicts, scores, sounds, gains, details."""
     main = {name: group for name, group in evaluation.groups.items() if name != "hard"}
-    verdict, *others = [text for name, group in main.items() for text in _verdicts(name, group)]
+    verdict, *further_verdicts = [
+        text for name, group in main.items() for text in _verdicts(name, group)
+    ]
     aids = [condition for condition in evaluation.conditions if condition.kind == "aid"]
     names = [aid.name for aid in aids]
     tables = [summary_table(GROUPS[name], *_rows(group)) for name, group in main.items()]
-    about = [*evaluation.notes, *others, _about(evaluation), GAIN_NOTE]
-    shown = [UNAIDED, *aids[0].rivals[:1], *names]
+    about = [*evaluation.notes, *further_verdicts, _about(evaluation), GAIN_NOTE]
+    played = [UNAIDED, *aids[0].rivals[:1], *names]
     sections = [
         Section("Scores", about, tables),
-        *listening_sections(next(iter(main.values())), listen, shown),
+        *listening_sections(next(iter(main.values())), listen, played),
         Section("Gain", [_GAINS], pictures=_gain_pictures(evaluation)),
         Section("Could it be worn?", [_WEARING], [_wearing_table(evaluation)]),
         _details(evaluation),
@@ -131,7 +127,7 @@ def _verdicts(name: str, group: Evaluation) -> Iterator[str]:
     for c in group.comparisons:
         if c.planned:
             verdict = c.verdict(c.after, "NAL-R at the same level")
-            yield f"On {inner(GROUPS[name])}, {verdict}"
+            yield f"On {lower_first(GROUPS[name])}, {verdict}"
 
 
 def _about(evaluation: Evaluation) -> str:
@@ -148,7 +144,7 @@ def _about(evaluation: Evaluation) -> str:
 
 def _rows(group: Evaluation, fact: str = "") -> tuple[Any, Columns]:
     """Return the rows of a table and its columns."""
-    return parts(group.table, fact), {**score_cells(group), **COLUMNS}
+    return split_rows(group.table, fact), {**score_cells(group), **COLUMNS}
 
 
 def _details(evaluation: Evaluation) -> Section:
@@ -167,7 +163,7 @@ def _details(evaluation: Evaluation) -> Section:
         ]
         if name == "hard":
             tables.insert(0, summary_table("All items", *_rows(group)))
-        gaps = summary_table("Mean loss", parts(group.table), _GAP_COLUMNS)
+        gaps = summary_table("Mean loss", split_rows(group.table), _GAP_COLUMNS)
         inner_sections = [
             *pictures_sections(group),
             Section("Paired tests", tables=_test_tables(group)),
@@ -185,14 +181,13 @@ def _gain_pictures(evaluation: Evaluation) -> list[Picture]:
     curves = evaluation.details["gain_curves"]
     pictures = []
     for ear in dict.fromkeys(row["ear"] for row in curves):
-        for aid in evaluation.of_kind("aid"):
-            names = [*evaluation.of_kind("prescription"), aid]
-            rows = [row for row in curves if row["ear"] == ear and row["aid"] in names]
+        for aid in [COMPRESSION, *evaluation.of_kind("aid")]:
+            rows = [row for row in curves if row["ear"] == ear and row["aid"] in (NAL_R, aid)]
             pictures.append(gain_picture(f"{aid}, ear {ear}", rows, colours))
     clean = evaluation.groups.get("clean")
     if clean is not None and clean.table["input_level"].nunique() > 1:
-        title = "output level in clean speech (dB SPL)"
-        pictures.append(means_picture(clean, "level", "input_level", title, "speech (dB SPL)"))
+        titles = ("output level (dB SPL)", "level of clean speech (dB SPL)")
+        pictures.append(means_picture(clean, "level", "input_level", *titles))
     return pictures
 
 
@@ -226,7 +221,7 @@ def _wearing_table(evaluation: Evaluation) -> Table:
         cells["Worst sidebands (dB)"] = f"{sidebands[ear, aid]:.0f}"
         cells["Time for a second (ms)"] = f"{row['cpu_ms']:.1f}"
         rows.append(cells)
-    return Table.of("Look-ahead, gain for quiet noise, sidebands and cost", rows)
+    return Table.from_rows("Look-ahead, gain for quiet noise, sidebands and cost", rows)
 
 
 def _test_tables(group: Evaluation) -> list[Table]:

@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from hlsim.audiogram import Audiogram
-from hlsim.audiogram.plot import frequency_axis
 from hlsim.evaluation.measures import NORMAL, perceive
 from hlsim.evaluation.result import Evaluation
 from hlsim.losses.band_levels import band_centres, band_levels, threshold_in_quiet
@@ -19,14 +18,13 @@ from hlsim.neuro.config import NEURO_RATE
 from hlsim.report.page import Card, Page, Picture, Section, Table
 from hlsim.report.plots import (
     INK,
+    Curve,
     condition_colours,
     curves_picture,
-    draw_picture,
     gain_picture,
-    label_curves,
 )
 from hlsim.report.recordings import score_details
-from hlsim.report.results import Columns, of, parts, summary_table
+from hlsim.report.results import Columns, split_rows, statistic, summary_table
 from hlsim.report.sounds import NORMAL_EAR, make_player
 
 if TYPE_CHECKING:
@@ -35,8 +33,7 @@ if TYPE_CHECKING:
 UNAIDED, NAL_R, NAL_R_AT_LEVEL, TRAINED = "unaided", "NAL-R", "NAL-R, same level", "trained aid"
 """Names of the demo's conditions."""
 
-_SHOWN = (UNAIDED, NAL_R, TRAINED)
-_LOWEST_SHOWN_DB = 0.0
+_PLAYED = (UNAIDED, NAL_R, TRAINED)
 
 _COMPARISON = (
     "HASPI rewards any gain. The trained aid is therefore compared with NAL-R, the prescription "
@@ -48,8 +45,9 @@ _LISTEN = (
     "in the folder audio beside this page."
 )
 _PICTURES = (
-    "The training adjusts the gain so that this ear perceives speech as loud as a normal ear does, in "
-    "each frequency band. NAL-R has one gain for all levels. Less gain for louder speech is compression."
+    "The training adjusts the gain so that this ear perceives speech as loud as a normal ear "
+    "does, in each frequency band. NAL-R has one gain for all levels. Less gain for louder "
+    "speech is compression."
 )
 
 
@@ -84,7 +82,7 @@ def demo_page(
     groups = {
         "As this ear perceives it": {
             NORMAL_EAR: normal[-1],
-            **{name: perceived[name][-1] for name in _SHOWN},
+            **{name: perceived[name][-1] for name in _PLAYED},
         },
         "What comes out of the aid": {
             "original speech": items[-1].clean,
@@ -107,13 +105,13 @@ def demo_page(
 def result_table(evaluation: Evaluation) -> Table:
     """Return means of the utterances, one row per condition."""
     columns: Columns = {
-        "HASPI": (of("haspi"), ".3f"),
+        "HASPI": (statistic("haspi"), ".3f"),
         "Words understood": (_predict_words, ".0%"),
-        "Output level (dB SPL)": (of("level"), ".1f"),
-        "Loudness error (dB)": (of("loudness_error"), "+.1f"),
+        "Output level (dB SPL)": (statistic("level"), ".1f"),
+        "Loudness error (dB)": (statistic("loudness_error"), "+.1f"),
     }
     count = len(evaluation.items)
-    return summary_table(f"Means of {count} utterances", parts(evaluation.table), columns)
+    return summary_table(f"Means of {count} utterances", split_rows(evaluation.table), columns)
 
 
 def _predict_words(rows: DataFrame) -> float:
@@ -124,7 +122,7 @@ def _predict_words(rows: DataFrame) -> float:
 
 def _cards(evaluation: Evaluation) -> list[Card]:
     """Return HASPI, words and loudness error of all conditions."""
-    rows = parts(evaluation.table)
+    rows = split_rows(evaluation.table)
     errors = {name: float(part["loudness_error"].mean()) for name, part in rows.items()}
     largest_error = max(map(abs, errors.values()))
     haspi = {name: float(part["haspi"].mean()) for name, part in rows.items()}
@@ -162,41 +160,37 @@ def _ear_picture(
     colours: Mapping[str, Any],
 ) -> Picture:
     """Draw the audiogram with the speech as it is and as the trained aid amplifies it."""
-    quiet = threshold_in_quiet()
-    levels = {
-        name: torch.cat([band_levels(signal, NEURO_RATE) for signal in outputs[name]]).numpy()
-        - quiet
-        for name in (UNAIDED, TRAINED)
-    }
-
-    def draw(axes: Any) -> None:
-        for name, values in levels.items():
-            low, high = np.percentile(values, (30, 99), axis=0)
-            mean = 10.0 * np.log10((10.0 ** (values / 10.0)).mean(0))
-            style = {"color": colours[name], "alpha": 0.25, "linewidth": 0}
-            axes.fill_between(band_centres(), low, high, **style)
-            axes.plot(band_centres(), mean, color=colours[name], label=f"speech, {name}")
-        axes.plot(ear.frequencies, ear.levels, color=INK, marker="o", label="threshold of this ear")
-        frequency_axis(axes, (250, 500, 1000, 2000, 4000, 8000))
-        axes.set(ylim=(120.0, -10.0), ylabel="level (dB HL)")
-        label_curves(axes)
-
+    curves: dict[str, Curve] = {}
+    for name in (UNAIDED, TRAINED):
+        levels = _mean_levels(outputs[name]) - threshold_in_quiet()
+        curves[f"speech, {name}"] = (band_centres(), levels, {"color": colours[name]})
+    style = {"color": INK, "marker": "o"}
+    curves["threshold of this ear"] = (ear.frequencies, ear.levels, style)
     note = (
-        f"Speech at {level:g} dB SPL: mean level in each band and, shaded, the 30th to 99th "
-        "percentile. What lies above the line of the threshold is inaudible."
+        f"Speech at {level:g} dB SPL, mean level in each band. Where it lies above the line of the "
+        "threshold, it is inaudible on average."
     )
-    return draw_picture(draw, "The ear, and the speech that reaches it", note=note)
+    title = "The ear, and the speech that reaches it"
+    return curves_picture(curves, title, "level (dB HL)", ends=(120.0, -10.0), note=note)
 
 
 def _perceived_picture(
     perceived: Mapping[str, Sequence[Tensor]], colours: Mapping[str, Any]
 ) -> Picture:
     """Draw the mean level that the ear perceives in each band, beside a normal ear's."""
-    curves = {}
-    for name in (NORMAL_EAR, *_SHOWN):
-        bands = torch.cat([band_levels(signal, NEURO_RATE) for signal in perceived[name]])
-        level = 10.0 * (10.0 ** (bands / 10.0)).mean(0).log10()
-        style = {"color": colours.get(name, INK), "linestyle": "-" if name in colours else "--"}
-        curves[name] = (list(band_centres()), level.tolist(), style)
-    title = "Speech as perceived: the closer to the dashed line the better"
-    return curves_picture(curves, title, "level (dB SPL per band)", lowest=_LOWEST_SHOWN_DB)
+    styles = {name: {"color": colours[name]} for name in _PLAYED}
+    styles[NORMAL_EAR] = {"color": INK, "linestyle": "--"}
+    curves = {
+        name: (band_centres(), _mean_levels(perceived[name]), style)
+        for name, style in styles.items()
+    }
+    note = "The closer to the dashed line, the better."
+    title = "Speech as this ear perceives it"
+    return curves_picture(curves, title, "level (dB SPL per band)", ends=(0.0, None), note=note)
+
+
+def _mean_levels(signals: Sequence[Tensor]) -> np.ndarray:
+    """Return the mean level of all frames in dB SPL. Shape: (bands,)."""
+    frames = torch.cat([band_levels(signal, NEURO_RATE) for signal in signals])
+    powers: np.ndarray = (10.0 ** (frames / 10.0)).mean(0).numpy()
+    return 10.0 * np.log10(powers)

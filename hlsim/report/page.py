@@ -34,7 +34,9 @@ class Table:
     folded: bool = False
 
     @classmethod
-    def of(cls, caption: str, rows: Sequence[Mapping[str, str]], *, folded: bool = False) -> Table:
+    def from_rows(
+        cls, caption: str, rows: Sequence[Mapping[str, str]], *, folded: bool = False
+    ) -> Table:
         """Make a table of rows by column title; all rows have the same titles."""
         header = list(rows[0]) if rows else []
         return cls(caption, header, [list(row.values()) for row in rows], folded)
@@ -85,7 +87,6 @@ class Sound:
     """One sound of a player.
 
     Attributes:
-        number: place in the player, from 1.
         label: name on the button.
         level: level in dB SPL.
         audio: contents of a FLAC or WAV file.
@@ -95,7 +96,6 @@ class Sound:
         note: words over the spectrogram.
     """
 
-    number: int
     label: str
     level: float
     audio: bytes
@@ -111,7 +111,7 @@ class Player:
     Attributes:
         groups: sounds with one gain by the heading of their group, which may be empty.
         seconds: length of the sounds.
-        hint: sentence below the controls.
+        full_scale: peak level in dB SPL of full scale in the first group.
         sentence: words that are spoken.
         volume: volume to start with, from 0 to 1.
         levels: lowest and highest level in dB SPL of the spectrograms.
@@ -121,7 +121,7 @@ class Player:
 
     groups: Mapping[str, Sequence[Sound]]
     seconds: float
-    hint: str
+    full_scale: float
     sentence: str = ""
     volume: float = 0.5
     levels: tuple[float, float] = (0.0, 0.0)
@@ -157,7 +157,7 @@ class Card:
 
 @dataclass(frozen=True)
 class Section:
-    """A part of a page: paragraphs, tables, a player, pictures and inner parts, in this order.
+    """A part of a page: tables, paragraphs, a player, pictures and inner parts, in this order.
 
     A folded section is shown only when it is opened.
     """
@@ -198,8 +198,8 @@ class Page:
 def _markdown_blocks(sections: Sequence[Section], depth: int) -> list[str]:
     blocks: list[str] = []
     for section in sections:
-        inner = [*section.paragraphs]
-        inner += [f"**{table.caption}**\n\n{table.markdown()}" for table in section.tables]
+        inner = [f"**{table.caption}**\n\n{table.markdown()}" for table in section.tables]
+        inner += section.paragraphs
         inner += _markdown_blocks(section.sections, depth + 1)
         if inner:
             blocks += [f"{'#' * depth} {section.title}", *inner]

@@ -31,6 +31,9 @@ INK = "#010203"
 COLOURS = ("#2f7ed8", "#c96a00", "#128a66", "#b04a92", "#d0433e", "#8a6d3b")
 """Colours of lines and their labels, which can be read on white and on black."""
 
+POINTS = {"alpha": 0.6, "linewidths": 0, "color": COLOURS[0]}
+"""Style of the points of items."""
+
 UNAIDED_COLOUR = "#7d828a"
 
 LINE_STYLES = ("-", "--", ":", "-.")
@@ -42,10 +45,13 @@ _NO_BREAK = "\N{NO-BREAK SPACE}"
 _WIDTH_INCHES = 4.2
 _LINE_INCHES = 0.17  # of a label
 
+_INKED = (
+    "text.color axes.edgecolor axes.labelcolor xtick.color ytick.color boxplot.boxprops.color "
+    "boxplot.medianprops.color boxplot.whiskerprops.color"
+)
+
 _STYLE: dict[str, Any] = {
-    **dict.fromkeys(
-        ("axes.edgecolor", "axes.labelcolor", "text.color", "xtick.color", "ytick.color"), INK
-    ),
+    **dict.fromkeys(_INKED.split(), INK),
     "grid.color": "#9a9fa8",
     "axes.spines.top": False,
     "axes.spines.right": False,
@@ -55,8 +61,8 @@ _STYLE: dict[str, Any] = {
 
 _CSS = b"svg { color: #1a1c20 } @media (prefers-color-scheme: dark) { svg { color: #e6e8eb } }"
 
-Curves = Mapping[str, tuple[Sequence[float], Sequence[float], Mapping[str, Any]]]
-"""Curves by name: x, y, and the style of the line."""
+Curve = tuple[Sequence[float] | np.ndarray, Sequence[float] | np.ndarray, Mapping[str, Any]]
+"""Horizontal and vertical places of a curve, and the style of the line."""
 
 
 def draw_picture(
@@ -118,7 +124,7 @@ def label_curves(axes: Any) -> None:
     places = spread_labels(ends.clip(0.0, 1.0), line_height * np.array(heights))
     for line, name, place in zip(curves, names, places, strict=True):
         style = {"color": line.get_color(), "alpha": line.get_alpha(), "va": "center"}
-        axes.text(1.02, place, name, transform=axes.transAxes, fontsize="small", **style)
+        axes.text(1.02, place, name, transform=axes.transAxes, fontsize=9, **style)
 
 
 def spread_labels(ends: np.ndarray, heights: np.ndarray) -> np.ndarray:
@@ -154,8 +160,7 @@ def scatter_picture(
 
     def draw(axes: Any) -> None:
         axes.axline((1.0, 1.0), slope=1.0, color=INK, alpha=0.5, linewidth=1.0, linestyle="--")
-        style = {"s": 16, "alpha": 0.7, "color": COLOURS[0], "rasterized": len(x) > MANY_POINTS}
-        axes.scatter(x, y, **style)
+        axes.scatter(x, y, s=16, rasterized=len(x) > MANY_POINTS, **POINTS)
         axes.set(xlabel=plain(axis_titles[0]), ylabel=plain(axis_titles[1]), xlim=ends, ylim=ends)
 
     note = "Each point is an item; both values are equal on the dashed line."
@@ -168,45 +173,56 @@ def distribution_picture(groups: Mapping[str, Any], measure: str, by: str) -> Pi
     values = {name: group for name, group in values.items() if len(group)}
 
     def draw(axes: Any) -> None:
-        generator = np.random.default_rng(0)
-        for place, group in enumerate(values.values()):
-            low, middle, high = np.percentile(group, (25, 50, 75))
-            axes.barh(place, high - low, 0.56, low, color=INK, alpha=0.15)
-            axes.plot((middle, middle), (place - 0.28, place + 0.28), color=INK)
-            heights = place + generator.uniform(-0.18, 0.18, len(group))
-            style = {"s": 9, "alpha": 0.5, "linewidths": 0, "color": COLOURS[0]}
-            axes.scatter(group, heights, rasterized=len(group) > MANY_POINTS, **style)
         names = [plain(fill(name, 18)) for name in values]
-        axes.set_yticks(range(len(values)), names, fontsize="small")
+        style = {"orientation": "horizontal", "tick_labels": names, "widths": 0.5}
+        axes.boxplot(list(values.values()), whis=0.0, showfliers=False, showcaps=False, **style)
+        generator = np.random.default_rng(0)
+        for place, group in enumerate(values.values(), 1):
+            heights = place + generator.uniform(-0.18, 0.18, len(group))
+            axes.scatter(group, heights, s=9, rasterized=len(group) > MANY_POINTS, **POINTS)
         axes.invert_yaxis()
         axes.set(xlabel=measure)
 
     medians = [f"{name} {np.median(group):.3f}" for name, group in values.items()]
     title = f"{measure} by {by}"
     alt = f"{title}; medians: {', '.join(medians)}."
-    height = 0.9 + 0.45 * len(values)
-    note = "Grey: the middle half of the items. Line: the median. Points: all items."
-    return draw_picture(draw, title, alt=alt, note=note, height=height)
+    note = "Box: the middle half of the items and their median. Points: all items."
+    return draw_picture(draw, title, alt=alt, note=note, height=0.9 + 0.45 * len(values))
 
 
 def curves_picture(
-    curves: Curves, title: str, axis: str, *, over: str = "", lowest: float | None = None
+    curves: Mapping[str, Curve],
+    title: str,
+    axis: str,
+    *,
+    over: str = "",
+    ends: tuple[float | None, float | None] = (None, None),
+    note: str = "",
 ) -> Picture:
-    """Draw curves over frequency, or over what ``over`` names, with their names beside them."""
+    """Draw curves over frequency, or over what ``over`` names, with their names beside them.
+
+    Args:
+        curves: curves by name.
+        title: heading above the picture.
+        axis: title of the vertical axis.
+        over: title of the horizontal axis; by default, it is frequency in Hz.
+        ends: lower and upper end of the vertical axis.
+        note: sentence below the picture.
+    """
 
     def draw(axes: Any) -> None:
         for name, (x, y, style) in curves.items():
             # a label that begins with an underscore would be hidden
-            axes.plot(x, y, label=plain(f" {name}"), marker="." if over else "", **style)
-        axes.set(ylabel=axis, ylim=(lowest, None))
+            axes.plot(x, y, label=plain(f" {name}"), **style)
+        axes.set(ylabel=axis, ylim=ends)
         if over:
             axes.set(xlabel=over)
-            axes.grid(alpha=0.2)
+            axes.grid(alpha=0.3)
         else:
-            frequency_axis(axes, (250, 500, 1000, 2000, 4000))
+            frequency_axis(axes, (250, 500, 1000, 2000, 4000, 8000))
         label_curves(axes)
 
-    return draw_picture(draw, title)
+    return draw_picture(draw, title, note=note)
 
 
 def gain_picture(
@@ -231,8 +247,9 @@ def means_picture(evaluation: Evaluation, column: str, fact: str, title: str, ov
     curves = {}
     for name in means.index.unique(0).intersection(evaluation.names):
         x = ordered(means[name].index)
-        curves[name] = (x, [means[name][value] for value in x], {"color": colours[name]})
-    return curves_picture(curves, f"Mean {title} by {over}", f"mean {title}", over=over)
+        style = {"color": colours[name], "marker": "."}
+        curves[name] = (x, [means[name][value] for value in x], style)
+    return curves_picture(curves, f"Mean {title} by {over}", title, over=over)
 
 
 def pictures_sections(evaluation: Evaluation) -> list[Section]:

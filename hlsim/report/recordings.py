@@ -20,10 +20,10 @@ from hlsim.report.results import (
     detail_section,
     items_table,
     mean_verdict,
-    parts,
     score_cells,
     scored_by,
     severity_counts,
+    split_rows,
     summary_table,
 )
 from hlsim.report.sounds import listening_sections
@@ -49,7 +49,7 @@ def write_report(evaluation: Evaluation, out: str | Path, *, listen: int = 3) ->
 def report_page(evaluation: Evaluation, listen: int = 3) -> Page:
     """Return the page of recorded speech: verdict, scores, sounds, pictures, details."""
     columns = {**score_cells(evaluation), **LEVEL}
-    tables = [summary_table("Means of all items", parts(evaluation.table), columns)]
+    tables = [summary_table("Means of all items", split_rows(evaluation.table), columns)]
     texts = [GAIN_NOTE] if "haspi" in evaluation.scores else []
     headline = evaluation.headline
     verdict = mean_verdict(evaluation)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from operator import methodcaller
 from typing import TYPE_CHECKING, Any
 
 from hlsim.audiogram import SEVERITIES
@@ -29,7 +30,7 @@ STATISTICS_NOTE = (
     "did not change; W is the smaller rank sum."
 )
 
-Columns = Mapping[str, tuple[Callable[["DataFrame"], Any], str]]
+Columns = dict[str, tuple[Callable[["DataFrame"], Any], str]]
 """Columns of a table by title: a function of some rows of the study's table, and a format."""
 
 _STATISTICS: dict[str, Callable[[Series], Any]] = {
@@ -40,28 +41,31 @@ _STATISTICS: dict[str, Callable[[Series], Any]] = {
 }
 
 
-def of(column: str, statistic: str = "mean") -> Callable[[DataFrame], Any]:
+def statistic(column: str, name: str = "mean") -> Callable[[DataFrame], Any]:
     """Return a statistic of a column: a method of a pandas Series, or one of ``_STATISTICS``."""
-    return lambda rows: _STATISTICS.get(statistic, lambda v: getattr(v, statistic)())(rows[column])
+    compute = _STATISTICS.get(name) or methodcaller(name)
+    return lambda rows: compute(rows[column])
 
 
-LEVEL: Columns = {"Level (dB SPL)": (of("level"), ".1f")}
+LEVEL: Columns = {"Level (dB SPL)": (statistic("level"), ".1f")}
 
 
 def score_cells(evaluation: Evaluation) -> Columns:
     """Return n and the mean of each score with its standard deviation."""
-    scores = {f"{title_of(s)} (mean ± std)": (of(s, "mean ± std"), "") for s in evaluation.scores}
-    return {"n": (of(evaluation.scores[0], "count"), "d"), **scores}
+    columns: Columns = {"n": (statistic(evaluation.scores[0], "count"), "d")}
+    for score in evaluation.scores:
+        columns[f"{title_of(score)} (mean ± std)"] = (statistic(score, "mean ± std"), "")
+    return columns
 
 
-def parts(table: DataFrame, fact: str = "") -> dict[str, DataFrame]:
+def split_rows(table: DataFrame, fact: str = "") -> dict[str, DataFrame]:
     """Return the rows of each condition, or of each value of a fact and condition, by name."""
     if not fact:
         return {name: table[table["condition"] == name] for name in table["condition"].unique()}
     rows = {}
     for value in ordered(table[fact].dropna().unique()):
         heading = value if isinstance(value, str) else f"{value:g}"
-        for name, part in parts(table[table[fact] == value]).items():
+        for name, part in split_rows(table[table[fact] == value]).items():
             rows[f"{heading}, {name}"] = part
     return rows
 
@@ -93,7 +97,7 @@ def summary_table(
     for name, part in rows.items():
         values = {title: number(compute(part), form) for title, (compute, form) in columns.items()}
         cells.append({first: name, **values})
-    return Table.of(caption, cells, folded=folded)
+    return Table.from_rows(caption, cells, folded=folded)
 
 
 def number(value: Any, form: str) -> str:
@@ -113,7 +117,7 @@ def spread(mean: float, deviation: float | None) -> str:
     return text if deviation is None or math.isnan(deviation) else f"{text} ± {deviation:.3f}"
 
 
-def inner(title: str) -> str:
+def lower_first(title: str) -> str:
     """Return a title for use within a sentence."""
     return title[:1].lower() + title[1:]
 
@@ -142,13 +146,13 @@ def comparison_table(comparisons: Sequence[Comparison], caption: str = "Comparis
         row = {"Comparison": f"{c.title}: {c.before} to {c.after}{planned}"}
         row |= paired_cells(c.overall, c.p_t, c.p_w)
         rows.append({**row, "Level change (dB)": number(c.level_change, "+.1f")})
-    return Table.of(caption, rows)
+    return Table.from_rows(caption, rows)
 
 
 def paired_table(caption: str, rows: Mapping[str, PairedComparison]) -> Table:
     """Return one row per paired comparison, with p values that are not adjusted."""
     cells = [{"Items": name, **paired_cells(c, c.p_t, c.p_w)} for name, c in rows.items()]
-    return Table.of(f"{caption}; p not adjusted", cells)
+    return Table.from_rows(f"{caption}; p not adjusted", cells)
 
 
 def paired_cells(c: PairedComparison, p_t: float | None, p_w: float | None) -> dict[str, str]:
@@ -221,11 +225,11 @@ def items_table(evaluation: Evaluation, caption: str) -> Table:
     rows = []
     for _, part in evaluation.table.groupby("item", sort=False):
         row = {"Item": part["name"].iloc[0], "Loss": part["severity"].iloc[0]}
-        for name, of_condition in parts(part).items():
+        for name, of_condition in split_rows(part).items():
             for title, (column, form) in columns.items():
                 row[f"{title}, {name}"] = number(of_condition[column].iloc[0], form)
         rows.append(row)
-    return Table.of(caption, rows)
+    return Table.from_rows(caption, rows)
 
 
 def scored_by(evaluation: Evaluation) -> str:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import torch
@@ -12,16 +11,16 @@ import torch
 from hlsim.evaluation.result import Evaluation
 from hlsim.evaluation.simulators import agreement, example_item
 from hlsim.extras import install_command, is_installed
-from hlsim.report.page import Page, Picture, Section, write_page
+from hlsim.report.page import Page, Picture, Section
 from hlsim.report.plots import distribution_picture, scatter_picture
 from hlsim.report.results import (
     Columns,
     comparison_table,
     detail_section,
     loss_name,
-    of,
     ordered,
-    parts,
+    split_rows,
+    statistic,
     summary_table,
 )
 from hlsim.report.sounds import make_player
@@ -35,17 +34,17 @@ def _agreement(score: str, statistic: str) -> Callable[[DataFrame], float | None
 
 
 COLUMNS: Columns = {
-    "n": (of("snr", "count"), "d"),
-    "SNR median (dB)": (of("snr", "median"), ".1f"),
-    "SNR worst tenth (dB)": (of("snr", "worst tenth"), ".1f"),
+    "n": (statistic("snr", "count"), "d"),
+    "SNR median (dB)": (statistic("snr", "median"), ".1f"),
+    "SNR worst tenth (dB)": (statistic("snr", "worst tenth"), ".1f"),
     "STOI LCC": (_agreement("stoi", "lcc"), ".4f"),
     "STOI SRCC": (_agreement("stoi", "srcc"), ".4f"),
     "STOI MSE": (_agreement("stoi", "mse"), ".5f"),
     "PESQ LCC": (_agreement("pesq", "lcc"), ".4f"),
     "PESQ SRCC": (_agreement("pesq", "srcc"), ".4f"),
     "PESQ MSE": (_agreement("pesq", "mse"), ".4f"),
-    "RAW MSE": (of("raw_mse"), ".4f"),
-    "Band error median (dB)": (of("band_error", "median"), ".2f"),
+    "RAW MSE": (statistic("raw_mse"), ".4f"),
+    "Band error median (dB)": (statistic("band_error", "median"), ".2f"),
 }
 """Columns of the tables by title: those of the paper's Table I, and others."""
 
@@ -58,18 +57,13 @@ _TREATMENTS = {
 }
 
 
-def write_simulators(evaluation: Evaluation, out: str | Path) -> Path:
-    """Write the result of ``evaluate_simulators`` into a folder, as ``write_report`` does."""
-    return write_page(simulators_page(evaluation), evaluation.to_dict(), out)
-
-
 def simulators_page(evaluation: Evaluation, listen: int = 1) -> Page:
     """Return the page of simulators: verdict, side by side, sounds, pictures, details."""
     first = next(iter(evaluation.groups.values()))
     scores = [_scores(treatment, group) for treatment, group in evaluation.groups.items()]
     details = [_details(treatment, group) for treatment, group in evaluation.groups.items()]
     pictures = [
-        Section(name, pictures=[*_pictures(rows)]) for name, rows in parts(first.table).items()
+        Section(name, pictures=[*_pictures(rows)]) for name, rows in split_rows(first.table).items()
     ]
     sections = [
         *scores,
@@ -83,7 +77,9 @@ def simulators_page(evaluation: Evaluation, listen: int = 1) -> Page:
 def _scores(treatment: str, group: Evaluation) -> Section:
     """Return all simulators side by side, and their comparisons, for a treatment of the input."""
     tables = [
-        summary_table("Simulators side by side", parts(group.table), COLUMNS, first="Simulator")
+        summary_table(
+            "Simulators side by side", split_rows(group.table), COLUMNS, first="Simulator"
+        )
     ]
     if group.comparisons:
         caption = "SNR compared with the first; p adjusted by Holm"
@@ -99,7 +95,7 @@ def _details(treatment: str, group: Evaluation) -> Section:
         "speech": "Clean or noisy",
     }
     tables = [
-        summary_table(title, parts(group.table, fact), COLUMNS, first="Items")
+        summary_table(title, split_rows(group.table, fact), COLUMNS, first="Items")
         for fact, title in facts.items()
         if group.table[fact].nunique() > 1
     ]
@@ -116,12 +112,14 @@ def _verdict(evaluation: Evaluation, first: Evaluation) -> str:
     snr = first.wide("snr").dropna(axis=1, how="all")
     medians = snr.median().sort_values(ascending=False)
     best = snr[medians.index[0]].dropna()
-    others = ", ".join(f"{name} {median:.1f} dB" for name, median in medians.iloc[1:].items())
+    other_medians = ", ".join(
+        f"{name} {median:.1f} dB" for name, median in medians.iloc[1:].items()
+    )
     return (
         f"{_TREATMENTS[evaluation.settings['inputs'][0]]}: {best.name} has a median SNR of "
         f"{best.median():.1f} dB (worst tenth {best.quantile(0.1):.1f} dB, {len(best)} items) "
         "against "
-        f"{_teacher(evaluation)}" + (f"; the others: {others}." if others else ".")
+        f"{_teacher(evaluation)}" + (f"; the others: {other_medians}." if other_medians else ".")
     )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -26,10 +27,12 @@ RANGE_DB = 90.0
 NORMAL_EAR = "normal ear (the goal)"
 """Label of clean speech as a normal ear perceives it."""
 
+SPECTROGRAM_COLOURS = ("#000004", "#3b0f70", "#8c2981", "#de4968", "#fe9f6d", "#fcfdbf")
+"""Colours from the lowest level of a spectrogram to the highest, those of matplotlib's magma."""
+
 _PEAK = 0.9
-_COLOUR_MAP = "magma"
 _HIGHEST_HZ = 8000.0  # MSBG and HASPI end there
-_EMPTY_SHARE = 0.01  # of the bins that are within the range of an almost empty spectrogram
+_EMPTY_SHARE = 0.03  # of the bins that are within the range of an almost empty spectrogram
 
 _EXPLANATION = (
     "What the impaired ear perceives, by MSBG. The goal is what a normal ear perceives of the "
@@ -37,23 +40,15 @@ _EXPLANATION = (
 )
 
 
-_HINT = (
-    "All sounds of a row have one gain (full scale is a peak of {full_scale:.0f} dB SPL), so "
-    "that what is soft for the ear is soft here. The volume starts low. If a sound is more than "
-    "12 dB louder than the one by which you set the volume, the volume is lowered. Keys 1 to 9 "
-    "switch."
-)
-
-
 def listening_sections(
-    evaluation: Evaluation, count: int, shown: Sequence[str] = ()
+    evaluation: Evaluation, count: int, conditions: Sequence[str] = ()
 ) -> list[Section]:
     """Return players of some items, from the largest rise of the score to the largest fall.
 
     Args:
         evaluation: the study.
         count: number of items.
-        shown: names of the conditions to be played, by default all.
+        conditions: names of the conditions to be played, by default all.
 
     Returns: one section, or none if there is nothing to play.
     """
@@ -72,19 +67,23 @@ def listening_sections(
         title = f"{row['name']} ({headline.title}: {rank})"
         number = int(row.get("source", row.name))
         try:
-            sections.append(_item_section(evaluation, number, title, shown or evaluation.names))
+            sections.append(
+                _item_section(evaluation, number, title, conditions or evaluation.names)
+            )
         except Exception as error:  # a page is not lost to a sound
             sections.append(Section(title, [f"It cannot be played: {describe_error(error)}"]))
     return [Section("Listen", [_EXPLANATION], sections=sections)]
 
 
-def _item_section(evaluation: Evaluation, number: int, title: str, shown: Sequence[str]) -> Section:
+def _item_section(
+    evaluation: Evaluation, number: int, title: str, conditions: Sequence[str]
+) -> Section:
     """Return a player of the signals that a normal ear and, by condition, the ear perceives."""
     item = evaluation.items[number].load()
     gain, end = gain_to_pascals(item.full_scale_spl), int(LONGEST_SECONDS * item.sample_rate)
     signals = {NORMAL_EAR: perceive(item.clean[:end].float() * gain, NORMAL, item.sample_rate)}
     for condition in evaluation.conditions:
-        if condition.name in shown:
+        if condition.name in conditions:
             with torch.no_grad():
                 output = condition.output(item)[:end].float() * gain
             signals[condition.name] = perceive(output, item.ear, item.sample_rate)
@@ -96,7 +95,7 @@ def _item_section(evaluation: Evaluation, number: int, title: str, shown: Sequen
 def make_player(
     groups: Mapping[str, Mapping[str, Tensor]], sample_rate: int, sentence: str = ""
 ) -> Player:
-    """Return a player, with spectrograms if matplotlib is installed.
+    """Return a player, with spectrograms if Pillow is installed.
 
     All signals of a group have one gain, so that their loudness can be compared. Groups may have
     different gains: the output of an aid is much louder than what the ear perceives of it.
@@ -116,40 +115,37 @@ def make_player(
     >>> [f"{sound.label} {sound.level:.0f} dB SPL" for sound in player.sounds]
     ['tone 91 dB SPL', 'soft tone 71 dB SPL']
     """
-    bins = [
-        [spectrogram_levels(signal, sample_rate) for signal in group.values()]
-        for group in groups.values()
-    ]
-    loudest = max(float(levels.quantile(0.999)) for group in bins for levels in group)
+    levels = {
+        heading: {name: spectrogram_levels(signal, sample_rate) for name, signal in group.items()}
+        for heading, group in groups.items()
+    }
+    loudest = max(float(v.quantile(0.999)) for group in levels.values() for v in group.values())
     highest = 5.0 * round(loudest / 5.0 + 0.5)
-    gains = [_PEAK / _peak(group) for group in groups.values()]
-    sounds: dict[str, list[Sound]] = {}
-    number = 0
-    for (heading, group), group_bins, gain in zip(groups.items(), bins, gains, strict=True):
-        softer = 20.0 * np.log10(gains[0] / gain)
+    first_peak = _peak(next(iter(groups.values())))
+    sounds = {}
+    for heading, group in groups.items():
+        peak = _peak(group)
+        softer = 20.0 * math.log10(peak / first_peak)
         title = heading + (f", played {softer:.0f} dB softer" if softer > 0.5 else "")
-        sounds[title] = []
-        for (label, signal), levels in zip(group.items(), group_bins, strict=True):
-            number += 1
-            level = float(level_spl(signal))
-            sound = Sound(
-                number=number,
-                label=label,
-                level=level,
-                audio=encode_flac(signal * gain, sample_rate),
-                loudness=level - PASCAL_SPL + 20.0 * np.log10(gain),
-                spectrogram=_spectrogram_png(levels, highest),
-                note=_note(levels, highest - RANGE_DB),
+        sounds[title] = [
+            Sound(
+                label,
+                level_spl(signal).item(),
+                encode_flac(signal * (_PEAK / peak), sample_rate),
+                loudness=level_spl(signal).item() - _full_scale(peak),
+                spectrogram=_spectrogram_png(levels[heading][label], highest),
+                note=_note(levels[heading][label], highest - RANGE_DB),
             )
-            sounds[title].append(sound)
+            for label, signal in group.items()
+        ]
+    samples = max(len(signal) for group in groups.values() for signal in group.values())
     return Player(
         groups=sounds,
-        seconds=max(len(signal) for group in groups.values() for signal in group.values())
-        / sample_rate,
-        hint=_HINT.format(full_scale=PASCAL_SPL - 20.0 * np.log10(gains[0])),
+        seconds=samples / sample_rate,
+        full_scale=_full_scale(first_peak),
         sentence=sentence,
         levels=(highest - RANGE_DB, highest),
-        colours=_colours(),
+        colours=SPECTROGRAM_COLOURS,
         highest_khz=min(_HIGHEST_HZ, sample_rate / 2.0) / 1000.0,
     )
 
@@ -160,6 +156,11 @@ def _peak(group: Mapping[str, Tensor]) -> float:
     if not peak:
         raise ValueError("all sounds are silent; pass a signal with samples other than zero")
     return peak
+
+
+def _full_scale(peak: float) -> float:
+    """Return the level in dB SPL of full scale if a peak in pascals is played at ``_PEAK``."""
+    return PASCAL_SPL + 20.0 * math.log10(peak / _PEAK)
 
 
 def spectrogram_levels(signal: Tensor, sample_rate: int) -> Tensor:
@@ -184,28 +185,26 @@ def spectrogram_levels(signal: Tensor, sample_rate: int) -> Tensor:
 
 
 def _spectrogram_png(levels: Tensor, highest: float) -> bytes:
-    """Return a picture with one pixel for each bin and frame; none without matplotlib."""
+    """Return a picture with one pixel for each bin and frame; nothing without Pillow."""
     try:
-        maps, image = require("matplotlib", "eval").colormaps, require("PIL.Image", "eval")
+        image = require("PIL.Image", "eval")
     except MissingExtraError:  # sounds can be played without it
         return b""
     shares = ((levels - highest) / RANGE_DB + 1.0).clamp(0.0, 1.0)
     pixels = (255.0 * shares).round().to(torch.uint8).flip(0).numpy()
     picture = image.fromarray(pixels)
-    picture.putpalette(maps[_COLOUR_MAP](range(256), bytes=True)[:, :3].tobytes())
+    picture.putpalette(_palette())
     data = io.BytesIO()
     picture.save(data, format="PNG", optimize=True)
     return data.getvalue()
 
 
-def _colours() -> list[str]:
-    """Return the colours of a spectrogram in CSS, from the lowest level to the highest."""
-    try:
-        maps = require("matplotlib", "eval").colormaps
-    except MissingExtraError:
-        return []
-    colours = maps[_COLOUR_MAP](range(0, 256, 51), bytes=True)
-    return [f"rgb({red} {green} {blue})" for red, green, blue, _ in colours.tolist()]
+def _palette() -> bytes:
+    """Return 256 colours between those of ``SPECTROGRAM_COLOURS``, three bytes each."""
+    anchors = np.array([list(bytes.fromhex(colour[1:])) for colour in SPECTROGRAM_COLOURS])
+    shares, places = np.linspace(0.0, 1.0, 256), np.linspace(0.0, 1.0, len(anchors))
+    channels = [np.interp(shares, places, channel) for channel in anchors.T]
+    return np.stack(channels, 1).round().astype(np.uint8).tobytes()
 
 
 def _note(levels: Tensor, lowest: float) -> str:

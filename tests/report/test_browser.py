@@ -1,4 +1,4 @@
-"""Pages in a real Chromium: no error, no request, players, a phone's width, dark mode, the keyboard.
+"""Pages in a real Chromium: errors, requests, players, a phone's width, dark mode, the keyboard.
 
 Run with ``pytest -m browser``. The tests need playwright and a Chromium: its own
 (``playwright install chromium``), or the system's, found by name or in the environment variable
@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from hlsim import example_speech, listen
+from hlsim import Audiogram, example_speech, listen
 from hlsim.report.page import write_page
 from hlsim.report.recordings import report_page
 from tests.report.test_recordings import evaluation
@@ -52,6 +52,21 @@ def players_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     speech = example_speech()
     listen(original=speech, louder=2.0 * speech, much_louder=20.0 * speech).save(path)
     return path
+
+
+@pytest.fixture(scope="module")
+def demo_file(tmp_path_factory: pytest.TempPathFactory, speech_dir: Path) -> Path:
+    """The demo's page after few steps of training."""
+    for package in ("lightning", "joblib"):
+        pytest.importorskip(package)
+    from hlsim.demo import demo
+    from tests.test_demo import write_short_speech
+
+    root = tmp_path_factory.mktemp("demo")
+    speech = write_short_speech(root / "speech", speech_dir)
+    ear = Audiogram.standard("N4")
+    demo(root / "out", ear, speech=speech, steps=10, report=lambda line: None)
+    return root / "out" / "report.html"
 
 
 @pytest.fixture(scope="module")
@@ -143,6 +158,38 @@ def test_text_and_plots_follow_the_colour_scheme(report: Any) -> None:
         }"""
     )
     assert lightest > 200 if dark else darkest < 50
+
+
+def test_the_page_of_the_demo_shows_its_numbers_verdict_and_sounds(
+    window: Any, demo_file: Path
+) -> None:
+    window.goto(demo_file.as_uri())
+    inner = window.viewport_size["width"]
+    assert window.evaluate("document.documentElement.scrollWidth") <= inner
+    widths = window.evaluate(
+        "[...document.images].map(i => [i.naturalWidth, i.getBoundingClientRect().width])"
+    )
+    assert len(widths) == 3 + 7, "pictures, and spectrograms of all sounds"
+    assert all(natural > 0 and 150 < width <= inner for natural, width in widths)
+    titles = window.locator(".card .name").all_inner_texts()
+    assert titles == ["HASPI", "Words understood", "Loudness error"]
+    bars = window.locator(".card .bar").evaluate_all(
+        "cells => cells.map(cell => cell.getBoundingClientRect().width)"
+    )
+    assert len(bars) == 3 * 4 and min(bars) > 40
+    order = window.evaluate(
+        """['.cards', '.verdict', '.hlsim-player', '.pictures', 'details'].map(
+            name => document.querySelector(name).getBoundingClientRect().top)"""
+    )
+    assert order == sorted(order)
+    labels = window.locator(".select span").all_inner_texts()
+    assert labels[:4] == ["normal ear (the goal)", "unaided", "NAL-R", "trained aid"]
+    assert labels[4:] == ["original speech", "NAL-R", "trained aid"]
+    window.locator(".play").click()
+    window.locator(".select").nth(3).click()
+    wait_until(window, "document.querySelectorAll('audio')[3].currentTime > 0.1")
+    (state,) = window.evaluate(STATE)
+    assert state["playing"] == [3]
 
 
 def test_switching_keeps_the_position(players: Any) -> None:

@@ -1,4 +1,4 @@
-"""The page of ``haspi-report``: one verdict, the same p everywhere, pictures only of what differs."""
+"""The page of ``haspi-report``: one verdict, the same p everywhere, no needless picture."""
 
 import json
 import math
@@ -56,9 +56,9 @@ def evaluation(folder: Path, *, ears: tuple[str, ...] = ("N1", "N3", "N4", "S2")
 def test_a_comparison_has_one_p_wherever_it_appears(tmp_path: Path) -> None:
     study = evaluation(tmp_path)
     page = report_page(study, listen=0)
-    planned, others = study.headline, [c for c in study.comparisons if not c.planned]
+    planned, unplanned = study.headline, [c for c in study.comparisons if not c.planned]
     assert planned is not None and planned.p_t == planned.overall.p_t
-    assert [c.p_t for c in others] == holm(c.overall.p_t for c in others)
+    assert [c.p_t for c in unplanned] == holm(c.overall.p_t for c in unplanned)
     text = page.markdown()
     assert page.verdict == planned.verdict() and text.count(f"p = {planned.p_t:.5f}") >= 3
     assert "Planned before the scores were known" in text
@@ -88,6 +88,9 @@ def test_no_picture_shows_a_single_group(tmp_path: Path) -> None:
     def titles(study: Evaluation) -> str:
         return " ".join(p.alt for p in report_page(study, 0).sections[1].pictures)
 
-    several, one = titles(evaluation(tmp_path)), titles(evaluation(tmp_path, ears=("N4",)))
-    assert "degree of loss" in several and "degree of loss" not in one
-    assert "by SNR" in one and "by condition" in one
+    several_ears, single_ear = (
+        titles(evaluation(tmp_path)),
+        titles(evaluation(tmp_path, ears=("N4",))),
+    )
+    assert "degree of loss" in several_ears and "degree of loss" not in single_ear
+    assert "by SNR" in single_ear and "by condition" in single_ear
