@@ -53,6 +53,9 @@ class MappingCompensator(EarNetwork):
         sample_rate: sample rate in Hz, as in ``EarNetwork``.
         full_scale_spl: level in dB SPL of RMS 1.0.
 
+    Attributes:
+        highest_frequency: highest frequency of outputs in Hz.
+
     Raises:
         ValueError: a rate or level out of range, or a configuration of another type.
 
@@ -61,6 +64,8 @@ class MappingCompensator(EarNetwork):
     >>> model(hlsim.example_speech(), "N3").shape
     torch.Size([64320])
     """
+
+    highest_frequency = NEURO_RATE / 2.0
 
     config: MappingConfig
 

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from hlsim.cli.inputs import check_paths_exist, read_ear, require_installed
-from hlsim.cli.options import Parser, count, folder
+from hlsim.cli.options import Parser, count, folder, integer
 from hlsim.cli.progress import show_progress
 from hlsim.extras import require
 
@@ -19,7 +19,7 @@ def demo(parser: Parser) -> None:
     text = "folder of 22 files or more instead of the bundled speech; a third is scored"
     parser.option("--speech", Path, text)
     parser.option("--steps", count, "training steps; 3000 take about three minutes", 3000)
-    parser.seed()
+    parser.option("--seed", integer, "seed of every random draw", 0)
 
 
 def _demo(options: argparse.Namespace) -> None:

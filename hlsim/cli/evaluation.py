@@ -10,7 +10,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hlsim.cli.inputs import check_paths_exist, other_ear_warnings, read_ear, require_installed
-from hlsim.cli.options import EARS_TABLE, Parser, count, natural, number, plugin_name, positive
+from hlsim.cli.options import (
+    EARS_TABLE,
+    Parser,
+    count,
+    folder,
+    integer,
+    natural,
+    number,
+    plugin_name,
+    positive,
+)
 from hlsim.cli.progress import show_progress
 
 if TYPE_CHECKING:
@@ -144,7 +154,6 @@ def haspi_report(parser: Parser) -> None:
     option("--baseline", str, "condition to compare all others with; by default all pairs")
     parser.flag("--better-ear", "use the better ear's scores; needs a manifest with both ears")
     parser.levels("every clean file")
-    option("--scores", Path, "file in which scores are stored (default: OUT/scores.jsonl)")
     _declare_study(parser)
 
 
@@ -170,7 +179,7 @@ def _haspi_report(options: argparse.Namespace) -> None:
         measures=named_measures + arguments.pop("measures"),
         baseline=options.baseline,
         better_ear=options.better_ear,
-        store=options.scores or options.out / "scores.jsonl",
+        store=options.out / "scores.jsonl",
         full_scale_spl=options.full_scale_spl,
         spl=options.spl,
         **arguments,
@@ -282,11 +291,11 @@ def _declare_study(parser: Parser, listen: int = 3) -> None:
     parser.option("--measure", plugin_name, text, [], nargs="+", metavar="NAME")
     parser.option("--listen", natural, "number of items with players on the page", listen)
     parser.flag("--print", "print all tables of the page instead of the first")
-    parser.jobs()
+    parser.option("--jobs", count, "number of processes; all cores by default")
     text = "address of a Dask scheduler, such as tcp://host:8786, whose workers are used"
     parser.option("--dask", str, text, metavar="ADDRESS")
-    parser.seed()
-    parser.out()
+    parser.option("--seed", integer, "seed of every random draw", 0)
+    parser.option("--out", folder, "folder for the results", required=True)
 
 
 def _study_arguments(options: argparse.Namespace) -> dict[str, Any]:

@@ -129,29 +129,28 @@ def warn_of_other_ear(options: argparse.Namespace) -> None:
         print(f"hlsim: warning: {line}", file=sys.stderr)
 
 
-def read_compensator(options: argparse.Namespace, sample_rate: int) -> tuple[Any, dict[str, float]]:
-    """Load the compensator of ``--compensator``, and read its sliders.
+def load_compensator(options: argparse.Namespace, sample_rate: int) -> Any:
+    """Load the compensator of ``--compensator``, and check that it has the sliders in use.
 
     Args:
         options: Options of the command.
         sample_rate: Sample rate in Hz.
-
-    Returns:
-        The compensator, and the values of its sliders by name.
     """
-    from compensators import load_compensator
+    import compensators
 
     name = options.compensator
+    linked = getattr(options, "linked", False)
     settings = {"sample_rate": sample_rate, "full_scale_spl": options.full_scale_spl}
-    compensator = load_compensator(name, **settings, linked=getattr(options, "linked", False))
-    values = {
-        "noise_reduction": options.noise_reduction,
-        "amplification": options.amplification,
-    }
-    sliders = {slider: value for slider, value in values.items() if value is not None}
-    for slider in sliders.keys() - set(getattr(compensator, "SLIDERS", ())):
+    compensator = compensators.load_compensator(name, **settings, linked=linked)
+    for slider in read_sliders(options).keys() - set(getattr(compensator, "SLIDERS", ())):
         option = slider.replace("_", "-")
         raise ValueError(
             f"--{option} has no effect with --compensator {name}; choose a hearing aid"
         )
-    return compensator, sliders
+    return compensator
+
+
+def read_sliders(options: argparse.Namespace) -> dict[str, float]:
+    """Return the values of the sliders that are options."""
+    values = {name: getattr(options, name) for name in ("noise_reduction", "amplification")}
+    return {name: value for name, value in values.items() if value is not None}

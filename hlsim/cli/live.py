@@ -6,7 +6,7 @@ import argparse
 import math
 from types import ModuleType
 
-from hlsim.cli.inputs import read_compensator, read_ears, warn_of_other_ear
+from hlsim.cli.inputs import load_compensator, read_ears, read_sliders, warn_of_other_ear
 from hlsim.cli.options import Parser, checked_type, number, positive
 from hlsim.extras import require
 
@@ -62,8 +62,7 @@ def _live(options: argparse.Namespace) -> None:
         return
     if options.audiogram is None and options.listener is None:
         raise ValueError("give an ear with --audiogram, or both ears with --listener")
-    sliders = (options.noise_reduction, options.amplification)
-    if options.simulate and sliders != (None, None):
+    if options.simulate and read_sliders(options):
         raise ValueError("--noise-reduction and --amplification have no effect with --simulate")
     ears = read_ears(options)
     sounddevice = _import_sounddevice()
@@ -80,12 +79,12 @@ def _live(options: argparse.Namespace) -> None:
         latency = stream.latency
     else:
         warn_of_other_ear(options)
-        aid, values = read_compensator(options, RATE)
+        aid = load_compensator(options, RATE)
         if not hasattr(aid, "stream"):
             raise ValueError(
                 f"{options.compensator} cannot process blocks; choose wdrc or a hearing aid"
             )
-        stream = aid.stream(ears, **values)
+        stream = aid.stream(ears, **read_sliders(options))
         latency = aid.latency
     play(
         Live(stream, options.full_scale_spl, 2 if options.listener else 1, latency),

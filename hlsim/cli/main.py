@@ -16,39 +16,32 @@ from hlsim.cli.options import Parser, join_negative_values
 from hlsim.extras import MissingExtraError
 from hlsim.version import __version__
 
-COMMANDS = {
-    "simulate": ("processing", "simulate a hearing loss on a file or a folder of files"),
-    "compensate": ("processing", "apply a hearing aid to a file or a folder of files"),
-    "live": ("live", "run a hearing aid or a simulated hearing loss from microphone to headphones"),
-    "demo": (
-        "demo",
-        "train a compensator for one ear on bundled speech, and compare it with NAL-R",
-    ),
-    "haspi-report": (
-        "evaluation",
-        "compare recordings by HASPI, HASQI, HAAQI, STOI or PESQ, with paired tests",
-    ),
-    "evaluate-compensator": ("evaluation", "compare hearing aids with no aid, NAL-R and WDRC"),
-    "evaluate-simulator": ("evaluation", "compare simulators with MSBG or another teacher"),
-    "clarity": ("evaluation", "evaluate pairs of aids on scenes of the Clarity challenges"),
-    "prepare": (
-        "prepare",
-        "recognise the layout of a corpus and write its manifest, a CSV file to train on",
-    ),
-    "train-simulator": ("training", "train a Neuro-MSBG to reproduce MSBG or another teacher"),
-    "train-compensator": ("training", "train a hearing aid through a frozen simulator"),
+GROUPS = {
+    "listen": {
+        "simulate": ("processing", "simulate a hearing loss on a file or a folder of files"),
+        "compensate": ("processing", "apply a hearing aid to a file or a folder of files"),
+        "live": ("live", "run a hearing aid or a simulated hearing loss with a microphone"),
+        "demo": ("demo", "train a compensator for one ear on bundled speech"),
+    },
+    "evaluate": {
+        "haspi-report": ("evaluation", "compare recordings by HASPI, HASQI, HAAQI, STOI or PESQ"),
+        "evaluate-compensator": ("evaluation", "compare hearing aids with no aid, NAL-R and WDRC"),
+        "evaluate-simulator": ("evaluation", "compare simulators with MSBG or another teacher"),
+        "clarity": ("evaluation", "evaluate pairs of aids on scenes of the Clarity challenges"),
+    },
+    "train": {
+        "prepare": ("prepare", "write the manifest of a corpus, a CSV file to train on"),
+        "train-simulator": ("training", "train a Neuro-MSBG to reproduce MSBG or another teacher"),
+        "train-compensator": ("training", "train a hearing aid through a frozen simulator"),
+    },
 }
-"""Module in ``hlsim.cli`` and description of each command.
+"""Module in ``hlsim.cli`` and description of each command, by group.
 
 The module has a function of the command's name that declares the options.
 """
 
-GROUPS = {
-    "listen": ("simulate", "compensate", "live", "demo"),
-    "evaluate": ("haspi-report", "evaluate-compensator", "evaluate-simulator", "clarity"),
-    "train": ("prepare", "train-simulator", "train-compensator"),
-}
-"""Groups of commands in the help."""
+COMMANDS = {name: entry for group in GROUPS.values() for name, entry in group.items()}
+"""Module and description of each command."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -100,9 +93,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def make_parser() -> Parser:
     """Make the parser of the program, whose commands declare their options when they are used."""
     lines = []
-    for group, names in GROUPS.items():
+    for group, commands in GROUPS.items():
         lines.append(f"\n{group}:")
-        lines += [f"  {name:<22}{COMMANDS[name][1]}" for name in names]
+        lines += [f"  {name:<22}{text}" for name, (_, text) in commands.items()]
     parser = Parser(
         prog="hlsim",
         usage="hlsim COMMAND ...",
@@ -111,12 +104,11 @@ def make_parser() -> Parser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action="version", version=f"hlsim {__version__}")
-    commands = parser.add_subparsers(
-        prog="hlsim", metavar="COMMAND", help="one of the commands below"
-    )
+    text = "one of the commands below"
+    subparsers = parser.add_subparsers(prog="hlsim", metavar="COMMAND", help=text)
     for command, (module, text) in COMMANDS.items():
         declare = partial(_declare, module, command.replace("-", "_"))
-        commands.add_parser(command, description=text, declare=declare)
+        subparsers.add_parser(command, description=text, declare=declare)
     return parser
 
 

@@ -204,18 +204,6 @@ class Parser(argparse.ArgumentParser):
         text = "strength of a hearing aid's amplification, 0 to 1 (default: 1)"
         self.option("--amplification", slider, text)
 
-    def jobs(self) -> None:
-        """Declare ``--jobs``."""
-        self.option("--jobs", count, "number of processes; all cores by default")
-
-    def seed(self) -> None:
-        """Declare ``--seed``."""
-        self.option("--seed", integer, "seed of every random draw", 0)
-
-    def out(self) -> None:
-        """Declare ``--out``."""
-        self.option("--out", folder, "folder for the results", required=True)
-
 
 def _format_default(default: Any, separator: str) -> str:
     """Format a default value, or the values of a list, for the help."""

@@ -6,28 +6,19 @@ import argparse
 import math
 import os
 import sys
-from collections.abc import Callable, Mapping, Sized
-from functools import partial
+from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-from hlsim.cli.inputs import read_compensator, read_ears, warn_of_other_ear
+from hlsim.cli.inputs import load_compensator, read_ears, read_sliders, warn_of_other_ear
 from hlsim.cli.options import Parser
 from hlsim.files import check_extension, resolve_links
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-    Model = Callable[..., Tensor]
-
-UPPER_BAND_HZ = 8500.0
-"""Lowest frequency in Hz of the band that models at 16 kHz remove."""
-
-AUDIBLE_SHARE = 1e-6
-"""Share of the input's power above which the upper band is worth a warning."""
-
-REMOVED_SHARE = 1e-3
-"""Share of the upper band's power below which the band counts as removed."""
+Build = Callable[[int], Any]
+"""Function from a sample rate in Hz to a model."""
 
 
 def simulate(parser: Parser) -> None:
@@ -78,14 +69,12 @@ def _declare_files(
 
 
 def _simulate(options: argparse.Namespace) -> None:
-    def build(rate: int) -> Model:
+    def build(rate: int) -> Any:
         from hlsim.losses.frozen_simulator import build_simulator
 
         return build_simulator(options.simulator, rate, options.full_scale_spl)
 
-    # MSBG keeps the band above 8 kHz. If little of it remains, the ear cannot perceive it.
-    hint = "" if options.simulator == "msbg" else "use --simulator msbg to keep it"
-    _process(options, build, hint)
+    _process(options, build, {}, "--simulator msbg")
 
 
 def _compensate(options: argparse.Namespace) -> None:
@@ -94,24 +83,29 @@ def _compensate(options: argparse.Namespace) -> None:
             f"{options.output}: expected the extension .wav, because an aid amplifies beyond the "
             "full scale of other formats"
         )
+    sliders = read_sliders(options)
+    alternatives = "--compensator hearing-aid, wdrc or nal-r"
+    _process(options, lambda rate: load_compensator(options, rate), sliders, alternatives)
 
-    def build(rate: int) -> Model:
-        compensator, sliders = read_compensator(options, rate)
-        return partial(compensator, **sliders)
 
-    _process(options, build, "use --compensator hearing-aid, wdrc or nal-r to keep it")
+class Result(NamedTuple):
+    """Properties of the output for one file, which decide about warnings."""
+
+    path: Path
+    peak: float
+    lacks_band: bool
 
 
 def _process(
-    options: argparse.Namespace, build: Callable[[int], Model], upper_band_hint: str
+    options: argparse.Namespace, build: Build, sliders: dict[str, float], alternatives: str
 ) -> None:
     """Process the file, or each file of the folder, and print levels and warnings.
 
     Args:
         options: Options of the command.
         build: Function from a sample rate in Hz to a model.
-        upper_band_hint: Advice for files whose band above 8 kHz was removed. If it is empty, there
-            is no such warning.
+        sliders: Further arguments of the model.
+        alternatives: Options for models that keep the band above 8 kHz.
     """
     # Threads of OpenMP spin while they wait. On a busy machine that triples the time of the many
     # short computations here.
@@ -124,52 +118,40 @@ def _process(
         pairs = _pair_files(options.input, options.output)
     from hlsim.checks import LOWEST_RATE
 
-    models: dict[int, Model] = {}
+    models: dict[int, Any] = {}
     if is_folder:
         # A model that cannot be loaded is reported before the first file.
         models[LOWEST_RATE] = build(LOWEST_RATE)
-    if getattr(options, "compensator", None):
+    if "compensator" in options:
         warn_of_other_ear(options)
-    peaks: dict[Path, float] = {}
-    dull: list[Path] = []
+    results = []
     for number, (source, target) in enumerate(pairs, 1):
+        prefix = f"{number} of {len(pairs)}: " if is_folder else ""
         try:
-            waveform, result, rate, gain = _process_file(
-                options, source, target, ears, models, build
-            )
+            result, levels = _process_file(options, source, target, ears, models, build, sliders)
         except ValueError as error:
             if not is_folder:
                 raise
             print(f"hlsim: warning: not processed: {error}", file=sys.stderr)
-            continue
-        prefix = f"{number} of {len(pairs)}: " if is_folder else ""
-        levels = _describe_levels(waveform * gain, result * gain, options.full_scale_spl)
-        print(f"{prefix}{target}: {levels}", flush=True)
-        peaks[target] = float(result.abs().max())
-        if upper_band_hint and _lacks_upper_band(waveform, result, rate):
-            dull.append(target)
-    _print_warnings(peaks, dull, upper_band_hint)
-    if len(peaks) < len(pairs):
-        raise ValueError(
-            f"{len(pairs) - len(peaks)} of {len(pairs)} files were not processed, see the warnings "
-            "above"
-        )
+        else:
+            print(f"{prefix}{target}: {levels}", flush=True)
+            results.append(result)
+    _print_warnings(results, alternatives)
+    if len(results) < len(pairs):
+        failures = len(pairs) - len(results)
+        raise ValueError(f"{failures} of {len(pairs)} files failed, see the warnings above")
 
 
 def _process_file(
     options: argparse.Namespace,
     source: Path,
     target: Path,
-    ears: object,
-    models: dict[int, Model],
-    build: Callable[[int], Model],
-) -> tuple[Tensor, Tensor, int, float]:
-    """Write the output for one file.
-
-    Returns:
-        The input and the output at the scale of the file, their sample rate in Hz, and the gain
-        from that scale to the level at which the input was processed.
-    """
+    ears: Any,
+    models: dict[int, Any],
+    build: Build,
+    sliders: dict[str, float],
+) -> tuple[Result, str]:
+    """Write the output for one file, and return its properties and a description of levels."""
     import torch
 
     from hlsim.audio import check_writable, read_audio, write_audio
@@ -187,18 +169,24 @@ def _process_file(
         raise ValueError(
             f"{source}: {needs_stereo} requires 2 channels, left and right, got {channels}"
         )
-    gain = 1.0
-    if options.spl is not None:
-        level = float(level_spl(waveform.flatten(), options.full_scale_spl))
-        gain = 10.0 ** ((options.spl - level) / 20.0)
+
+    def level(signal: Tensor) -> float:
+        return float(level_spl(signal.flatten(), options.full_scale_spl))
+
+    gain = 1.0 if options.spl is None else 10.0 ** ((options.spl - level(waveform)) / 20.0)
     inner_rate = min(rate, HIGHEST_RATE)
     if inner_rate not in models:
         models[inner_rate] = build(inner_rate)
+    model = models[inner_rate]
     with torch.no_grad():
-        result = models[inner_rate](resample(waveform * gain, rate, inner_rate), ears)
-        result = resample(result, inner_rate, rate)[..., :samples] / gain
-    write_audio(target, result, rate)
-    return waveform, result, rate, gain
+        output = model(resample(waveform * gain, rate, inner_rate), ears, **sliders)
+        output = resample(output, inner_rate, rate)[..., :samples]
+    peak = output.abs().max()
+    write_audio(target, output / gain, rate)
+    levels = {"input": level(waveform * gain), "output": level(output), "peak": level(peak[None])}
+    lacks_band = getattr(model, "highest_frequency", math.inf) < rate / 2
+    description = ", ".join(f"{name} {value:.1f} dB SPL" for name, value in levels.items())
+    return Result(target, float(peak) / gain, lacks_band), description
 
 
 def _check_paths(source: Path, target: Path) -> None:
@@ -244,51 +232,25 @@ def _pair_files(source: Path, target: Path) -> list[tuple[Path, Path]]:
     return [(path, output) for output, path in sources.items()]
 
 
-def _describe_levels(before: Tensor, after: Tensor, full_scale_spl: float) -> str:
-    """Describe the levels of input and output, and the peak of the output."""
-    from hlsim.calibration import level_spl
-
-    signals = {
-        "input": before.flatten(),
-        "output": after.flatten(),
-        "peak": after.abs().max()[None],
-    }
-    levels = {name: float(level_spl(signal, full_scale_spl)) for name, signal in signals.items()}
-    return ", ".join(f"{name} {level:.1f} dB SPL" for name, level in levels.items())
-
-
-def _lacks_upper_band(before: Tensor, after: Tensor, rate: int) -> bool:
-    """Return whether the input has an audible upper band that the output lacks."""
-    import torch
-
-    first = round(UPPER_BAND_HZ / rate * before.shape[-1])
-    shares = []
-    for signal in (before, after):
-        power = torch.fft.rfft(signal.double()).abs().square().sum(0)
-        shares.append(float(power[first:].sum() / power.sum()))
-    return shares[0] > AUDIBLE_SHARE and shares[1] < REMOVED_SHARE * shares[0]
-
-
-def _print_warnings(peaks: Mapping[Path, float], dull: list[Path], upper_band_hint: str) -> None:
-    """Print one warning about clipping, and one about a band that was removed, for all files."""
-    warnings = []
-    loud = {path: peak for path, peak in peaks.items() if peak > 1.0}
+def _print_warnings(results: Iterable[Result], alternatives: str) -> None:
+    """Print one warning about clipping, and one about the band above 8 kHz, for all files."""
+    loud = [result for result in results if result.peak > 1.0]
     if loud:
-        path = max(loud, key=lambda path: loud[path])
-        decibels = math.ceil(20.0 * math.log10(loud[path]))
-        warnings.append(
-            f"{_count(loud, path)}: the peak is {loud[path]:.3g} times full scale, and most "
-            f"players will clip it; lower the level by {decibels} dB before playing"
+        peak = max(result.peak for result in loud)
+        decibels = math.ceil(20.0 * math.log10(peak))
+        _warn(
+            loud,
+            f"the peak is up to {peak:.3g} times full scale, and most players will clip it; lower "
+            f"the level by {decibels} dB before playing",
         )
+    dull = [result for result in results if result.lacks_band]
     if dull:
-        warnings.append(
-            f"{_count(dull, dull[0])}: the band above 8 kHz was removed, because the model is "
-            f"limited to it; {upper_band_hint}"
-        )
-    for text in warnings:
-        print(f"hlsim: warning: {text}", file=sys.stderr)
+        _warn(dull, f"the output has no band above 8 kHz, which {alternatives} would keep")
 
 
-def _count(files: Sized, path: Path) -> str:
-    """Name one of several files, and the number of the others."""
-    return f"{path} (and {len(files) - 1} more)" if len(files) > 1 else str(path)
+def _warn(results: list[Result], text: str) -> None:
+    """Print a warning about one or several files."""
+    files = f"{results[0].path}"
+    if len(results) > 1:
+        files += f" and {len(results) - 1} more"
+    print(f"hlsim: warning: {files}: {text}", file=sys.stderr)

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from hlsim.cli.inputs import check_paths_exist, read_ear, require_installed
-from hlsim.cli.options import Parser, count, natural, positive
+from hlsim.cli.options import Parser, count, folder, natural, positive
 from hlsim.cli.recipes import add_recipe, read_recipe
 from hlsim.extras import require
 from hlsim.training.recipes import CompensatorRecipe, SimulatorRecipe
@@ -84,7 +84,7 @@ def _declare_common(parser: Parser) -> None:
         0,
     )
     parser.flag("--quiet", "print one line per validation, without a progress bar")
-    parser.out()
+    parser.option("--out", folder, "folder for the results", required=True)
 
 
 def _train_simulator(options: argparse.Namespace) -> None:

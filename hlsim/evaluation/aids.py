@@ -14,11 +14,12 @@ from torch import Tensor, nn
 
 from hlsim.audio import read_audio
 from hlsim.audiogram import Audiogram
-from hlsim.calibration import level_spl, set_level
+from hlsim.calibration import PASCAL_SPL, gain_to_pascals, level_spl, set_level
 from hlsim.dsp.fir import filter_without_delay
 from hlsim.dsp.resample import resample
 from hlsim.evaluation.measurements import insertion_gain
 from hlsim.losses.band_levels import band_centres
+from hlsim.metrics.pair import common_length
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.plugins import WaveformPlugin
 
@@ -42,7 +43,7 @@ class Unaided(nn.Module):
     tensor([1., 1.])
     """
 
-    def forward(self, waveform: Tensor, audiogram: Audiogram) -> Tensor:
+    def forward(self, waveform: Tensor, ear: Any) -> Tensor:
         """Return the waveform."""
         return waveform
 
@@ -116,22 +117,58 @@ def equalise_bands(waveform: Tensor, gains_db: Sequence[float]) -> Tensor:
     return filter_without_delay(waveform, torch.from_numpy(taps).to(waveform))
 
 
+class PluginAid(nn.Module):
+    """Aid of a user, ``(waveform, listener, sample_rate) -> waveform``.
+
+    An output that is longer than the input by up to 0.1 s is cut.
+
+    >>> PluginAid("builtins:max", 16000)
+    PluginAid()
+    """
+
+    def __init__(self, name: str, sample_rate: int) -> None:
+        super().__init__()
+        self.plugin = WaveformPlugin(name, "aid")
+        self.sample_rate = sample_rate
+
+    def forward(self, waveform: Tensor, listener: Any) -> Tensor:
+        """Call the plug-in. Shape: (2, time) -> (2, time)."""
+        output = self.plugin(waveform, listener, self.sample_rate)
+        lengths = waveform.shape[-1], output.shape[-1]
+        names = ("the input", f"the output of {self.plugin.name}")
+        return output[..., : common_length(lengths, self.sample_rate, names)]
+
+
 class Enhanced(nn.Module):
     """Aid after an enhancer that reduces noise.
+
+    Args:
+        enhancer: the enhancer, for signals in pascals.
+        aid: the aid.
+        sample_rate: rate in Hz.
+        full_scale_spl: level in dB SPL of RMS 1.0 at the input of the aid.
 
     >>> enhancer = WaveformPlugin("torch:mul", "enhancer")
     >>> Enhanced(enhancer, Unaided())(torch.ones(2), Audiogram.standard("N3"))
     tensor([16000., 16000.])
     """
 
-    def __init__(self, enhancer: WaveformPlugin, aid: nn.Module) -> None:
+    def __init__(
+        self,
+        enhancer: WaveformPlugin,
+        aid: nn.Module,
+        sample_rate: int = NEURO_RATE,
+        full_scale_spl: float = PASCAL_SPL,
+    ) -> None:
         super().__init__()
-        self.enhancer, self.aid = enhancer, aid
+        self.enhancer, self.aid, self.sample_rate = enhancer, aid, sample_rate
+        self.gain = gain_to_pascals(full_scale_spl)
         self.limit_spl = output_limit_spl(aid)
 
-    def forward(self, waveform: Tensor, audiogram: Audiogram) -> Tensor:
+    def forward(self, waveform: Tensor, ear: Any) -> Tensor:
         """Process the output of the enhancer."""
-        aided: Tensor = self.aid(self.enhancer(waveform, NEURO_RATE), audiogram)
+        enhanced = self.enhancer(waveform * self.gain, self.sample_rate) / self.gain
+        aided: Tensor = self.aid(enhanced, ear)
         return aided
 
 

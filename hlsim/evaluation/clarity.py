@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -24,9 +24,8 @@ from compensators import load_compensator
 from hlsim.audio import read_audio, write_audio
 from hlsim.audiogram.listener import EARS, Listener
 from hlsim.audiogram.table import read_listeners
-from hlsim.calibration import check_full_scale, gain_to_pascals, set_level
-from hlsim.evaluation.aids import load_enhancers
-from hlsim.evaluation.fingerprint import combined_fingerprint, fingerprint
+from hlsim.calibration import set_level
+from hlsim.evaluation.aids import Enhanced, PluginAid, Unaided, load_enhancers
 from hlsim.evaluation.measurements import changed_signals, look_ahead
 from hlsim.evaluation.measures import find_measures
 from hlsim.evaluation.parallel import describe_error, one_thread, run_parallel
@@ -35,8 +34,7 @@ from hlsim.evaluation.result import Evaluation
 from hlsim.evaluation.store import content_hash, settings_hash
 from hlsim.evaluation.study import DEAD_PROCESS, Condition
 from hlsim.files import write_atomically
-from hlsim.metrics.pair import check_seed, common_length
-from hlsim.plugins import WaveformPlugin
+from hlsim.metrics.pair import common_length
 
 FULL_SCALE_SPL = 100.0
 """Level in dB SPL of RMS 1.0 in the challenges' files."""
@@ -78,52 +76,6 @@ class Scene(NamedTuple):
     mix: Path
     reference: Path
     in_room: Path | None
-
-
-@dataclass(frozen=True)
-class BilateralAid:
-    """Aid for both ears, with an optional enhancer before it.
-
-    Args:
-        aid: the aid; without one, the output is the input.
-        enhancer: function that reduces noise.
-        sample_rate: rate in Hz.
-        full_scale_spl: level in dB SPL of RMS 1.0.
-
-    >>> from hlsim import Audiogram
-    >>> ear = Audiogram.standard("N3")
-    >>> BilateralAid(None, None, 16000, 100.0)(torch.ones(2, 100), Listener(ear, ear)).shape
-    torch.Size([2, 100])
-    """
-
-    aid: nn.Module | WaveformPlugin | None
-    enhancer: WaveformPlugin | None
-    sample_rate: int
-    full_scale_spl: float
-
-    @property
-    def fingerprint(self) -> str | None:
-        """Fingerprint of aid, enhancer, rate and level; None if one is unknown."""
-        parts = [part for part in (self.aid, self.enhancer) if part is not None]
-        settings = [self.aid is None, self.enhancer is None, self.sample_rate, self.full_scale_spl]
-        return combined_fingerprint(str(settings), *map(fingerprint, parts))
-
-    @torch.no_grad()
-    def __call__(self, waveform: Tensor, listener: Listener) -> Tensor:
-        """Process both channels. An output that is longer by up to 0.1 s is cut.
-
-        Shape: (2, time) -> (2, time).
-        """
-        output = waveform
-        if self.enhancer is not None:
-            gain = gain_to_pascals(self.full_scale_spl)
-            output = self.enhancer(output * gain, self.sample_rate) / gain
-        if isinstance(self.aid, WaveformPlugin):
-            output = self.aid(output, listener, self.sample_rate)
-        elif self.aid is not None:
-            output = self.aid(output, listener)
-        lengths = waveform.shape[-1], output.shape[-1]
-        return output[:, : common_length(lengths, self.sample_rate, ("the input", "the output"))]
 
 
 def evaluate_scenes(
@@ -179,8 +131,6 @@ def evaluate_scenes(
     """
     names = ["haspi", "hasqi", *measures]
     find_measures(names)
-    check_seed(seed)
-    check_full_scale(full_scale_spl)
     if stride < 1:
         raise ValueError(f"stride is {stride}; expected 1 or more")
     known, folder = read_scenes(scenes), Path(out)
@@ -328,22 +278,22 @@ def _make_conditions(
     full_scale_spl: float,
 ) -> list[Condition]:
     levels: dict[str, Any] = {"sample_rate": rate, "full_scale_spl": full_scale_spl}
-    for label in {UNAIDED, NAL_R} & set(aids):
-        raise ValueError(f"{label} is always evaluated; give the aid another label")
-    loaded: dict[str, Any] = {NAL_R: load_compensator("nalr", **levels)}
+    loaded: dict[str, nn.Module] = {NAL_R: load_compensator("nalr", **levels)}
     for label, name in aids.items():
+        if label in (UNAIDED, NAL_R):
+            raise ValueError(f"{label} is always evaluated; give the aid another label")
         if ":" in name and not Path(name).exists():
-            loaded[label] = WaveformPlugin(name, "aid")
+            loaded[label] = PluginAid(name, rate)
         else:
             loaded[label] = load_compensator(name, **levels, linked=linked)
     plugins = load_enhancers(enhancers)
-    conditions = [Condition(UNAIDED, BilateralAid(None, None, **levels), "unaided")]
+    conditions = [Condition(UNAIDED, Unaided(), "unaided")]
     for label, aid in loaded.items():
         for prefix, enhancer in plugins.items():
-            process = BilateralAid(aid, enhancer, **levels)
+            process = Enhanced(enhancer, aid, **levels)
             conditions.append(Condition(f"{prefix} + {label}", process, "enhanced", label))
         kind = "prescription" if label == NAL_R else "aid"
-        conditions.append(Condition(label, BilateralAid(aid, None, **levels), kind))
+        conditions.append(Condition(label, aid, kind))
     return conditions
 
 
@@ -359,6 +309,7 @@ def _signal_folders(conditions: Sequence[Condition], root: Path) -> dict[str, Pa
     return {condition: root / name for condition, name in names.items()}
 
 
+@torch.no_grad()
 def _measure_look_ahead(
     conditions: Sequence[Condition], mix: Path, listener: Listener
 ) -> dict[str, float | None]:
@@ -409,6 +360,7 @@ def _remove_outdated(
 
 
 @one_thread()
+@torch.no_grad()
 def _write_signals(
     pair: ListenerInScene,
     rate: int,

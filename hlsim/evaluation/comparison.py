@@ -41,11 +41,17 @@ class Comparison:
         unit: column within which the items are nested, such as ``"listener"``.
         unit_means: comparison of the means of each unit; None unless there are two units or more.
         left_out: number of items that lack one of the two scores.
+        p_t, p_w: p values of the t-test and of Wilcoxon's test to be stated.
         planned: whether the comparison was planned before the scores were known. Its p values are
             not adjusted; those of all other comparisons are adjusted by Holm over the family of the
             measure.
-        p_t, p_w: p values of the t-test and of Wilcoxon's test to be stated.
         family: number of comparisons for which the p values are adjusted.
+
+    >>> import pandas
+    >>> rows = [(0, "a", 0.2), (1, "a", 0.4), (0, "b", 0.3), (1, "b", 0.5)]
+    >>> table = pandas.DataFrame(rows, columns=["item", "condition", "haspi"])
+    >>> compare(table, ["haspi"])[0].verdict()[:52]
+    'b cannot be distinguished from a: HASPI 0.400 agains'
     """
 
     measure: str
@@ -58,9 +64,9 @@ class Comparison:
     unit: str
     unit_means: PairedComparison | None
     left_out: int
+    p_t: float | None
+    p_w: float | None
     planned: bool = False
-    p_t: float | None = None
-    p_w: float | None = None
     family: int = 1
 
     @property
@@ -218,29 +224,24 @@ def compare(
         wide = table.pivot(index="item", columns="condition", values=columns)
         candidates = [_compare_pair(wide, facts, measure, *pair, unit) for pair in pairs]
         defined = [comparison for comparison in candidates if comparison is not None]
-        comparisons += _state_p_values(defined, planned)
+        comparisons += _adjust(defined, planned)
     return comparisons
 
 
-def _state_p_values(
-    comparisons: Sequence[Comparison], planned: Collection[Pair]
-) -> list[Comparison]:
-    """Add the p values to be stated: unchanged for planned comparisons, adjusted for all others."""
-    is_planned = [(c.measure, c.before, c.after) in planned for c in comparisons]
-    family = [c.overall for c, plan in zip(comparisons, is_planned, strict=True) if not plan]
-    adjusted_t = iter(holm(overall.p_t for overall in family))
-    adjusted_w = iter(holm(overall.p_w for overall in family))
-    stated = []
-    for c, plan in zip(comparisons, is_planned, strict=True):
-        if plan:
-            # A single comparison needs no plan.
-            is_one_of_several = len(comparisons) > 1
-            overall = c.overall
-            c = replace(c, p_t=overall.p_t, p_w=overall.p_w, planned=is_one_of_several)
-        else:
-            c = replace(c, p_t=next(adjusted_t), p_w=next(adjusted_w), family=len(family))
-        stated.append(c)
-    return stated
+def _adjust(comparisons: Sequence[Comparison], planned: Collection[Pair]) -> list[Comparison]:
+    """Mark planned comparisons, and adjust the p values of all others."""
+    if len(comparisons) > 1:
+        is_planned = [(c.measure, c.before, c.after) in planned for c in comparisons]
+        comparisons = [replace(c, planned=p) for c, p in zip(comparisons, is_planned, strict=True)]
+    family = [comparison for comparison in comparisons if not comparison.planned]
+    adjusted_t = iter(holm(comparison.p_t for comparison in family))
+    adjusted_w = iter(holm(comparison.p_w for comparison in family))
+    return [
+        c
+        if c.planned
+        else replace(c, p_t=next(adjusted_t), p_w=next(adjusted_w), family=len(family))
+        for c in comparisons
+    ]
 
 
 def _compare_pair(
@@ -263,17 +264,20 @@ def _compare_pair(
         chosen = severities == name
         if chosen.any():
             by_severity[name] = paired_comparison(first[chosen], second[chosen])
+    overall = paired_comparison(first, second)
     return Comparison(
         measure=measure,
         before=before,
         after=after,
-        overall=paired_comparison(first, second),
+        overall=overall,
         level_before_mean=levels[0],
         level_after_mean=levels[1],
         by_severity=by_severity,
         unit=unit,
         unit_means=_compare_units(facts[unit].to_numpy(), first, second) if unit in facts else None,
         left_out=len(scores) - len(both),
+        p_t=overall.p_t,
+        p_w=overall.p_w,
     )
 
 

@@ -16,7 +16,7 @@ and ``ear``.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path, PurePath, PurePosixPath
@@ -36,7 +36,6 @@ from hlsim.evaluation.result import Evaluation
 from hlsim.evaluation.store import content_hash, settings_hash
 from hlsim.evaluation.study import Condition, Item
 from hlsim.files import EXTENSIONS, read_table, resolve_links
-from hlsim.metrics.pair import check_seed
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -55,9 +54,6 @@ EAR_FACTS = ("source", "ear", "severity", "audiogram", "full_scale_spl", "clean_
 
 Row = Mapping[str, str]
 """Values of a row of a CSV file, by column."""
-
-Rows = Mapping[Any, tuple[str, Row]]
-"""Rows of a CSV file with their places, by a key."""
 
 
 @dataclass(frozen=True)
@@ -232,9 +228,13 @@ def haspi_report(
         ValueError: files do not match, a row of the manifest is not valid, or nothing could be
             scored.
         MissingExtraError: the package of a measure is not installed.
+
+    >>> from hlsim.shortcuts import EXAMPLE_FILE
+    >>> folder, ear = EXAMPLE_FILE.parent, Audiogram.standard("N3")
+    >>> report = haspi_report(folder, after=folder, audiogram=ear, measures=["stoi"], jobs=1)
+    >>> round(float(report.table["stoi"].mean()), 3)
+    1.0
     """
-    check_seed(seed)
-    check_full_scale(full_scale_spl if spl is None else spl)
     settings: dict[str, Any] = {"full_scale_spl": full_scale_spl, "spl": spl, "seed": seed}
     if manifest and not any((clean, before, after)):
         recordings = read_manifest(manifest, root, audiogram, audiograms, **settings)
@@ -285,6 +285,15 @@ def score_recordings(
 
     Raises:
         ValueError: nothing could be scored, or an utterance lacks one of both ears.
+
+    >>> from hlsim.shortcuts import EXAMPLE_FILE
+    >>> outputs = {"unaided": EXAMPLE_FILE}
+    >>> recording = Recording("s01", EXAMPLE_FILE, outputs, Audiogram.standard("N3"))
+    >>> evaluation = score_recordings(
+    ...     [recording], [Condition("unaided")], ["stoi"], store=None, jobs=1
+    ... )
+    >>> evaluation.names
+    ['unaided']
     """
     if better_ear:
         _check_both_ears(recordings)
@@ -378,28 +387,22 @@ def read_folders(
     if (audiogram is None) == (audiograms is None):
         raise ValueError("give either audiogram, the ear of all files, or audiograms, a CSV file")
     speech = _files_by_name(clean)
-    outputs = {}
+    rows = []
     for condition, folder in folders.items():
-        if folder is not None:
-            outputs[condition] = _files_by_name(folder)
-            _check_names(speech, outputs[condition], f"{clean}: no file for")
-            _check_names(outputs[condition], speech, f"{folder}: no file for")
-    ears = dict.fromkeys(speech, audiogram)
-    if audiograms is not None:
-        rows = _read_ears(audiograms, _file_name)
-        _check_names(rows, speech, f"{audiograms}: no audiogram for")
-        ears = {name: convert_at(rows[name][0], Audiogram.from_row, rows[name][1]) for name in ears}
-    return [
-        Recording(
-            utterance=name,
-            clean=speech[name].absolute(),
-            outputs={condition: files[name].absolute() for condition, files in outputs.items()},
-            audiogram=ear,
-            **settings,
-        )
-        for name, ear in ears.items()
-        if ear is not None
-    ]
+        outputs = {} if folder is None else _files_by_name(folder)
+        different_names = sorted(outputs.keys() ^ speech.keys())
+        if outputs and different_names:
+            raise ValueError(
+                f"{clean} and {folder}: expected files with the same names, but only one of them "
+                f"has {different_names[0]} ({len(different_names)} differences)"
+            )
+        for name, output in outputs.items():
+            files = {"clean": str(speech[name].absolute()), "processed": str(output.absolute())}
+            rows.append(
+                (str(output), {"condition": condition, "item": name, "file": name, **files})
+            )
+    root = Path(Path.cwd().anchor)
+    return _read_recordings(rows, "file", root, audiogram, audiograms, settings)
 
 
 def read_manifest(
@@ -422,11 +425,18 @@ def read_manifest(
 
     Raises:
         ValueError: a row is not valid; the message names its line.
+
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     manifest = Path(folder) / "study.csv"
+    ...     _ = manifest.write_text("condition,clean,processed\\nunaided,a.wav,b.wav\\n")
+    ...     recordings = read_manifest(manifest, audiogram=Audiogram.standard("N3"))
+    >>> recordings[0].utterance, list(recordings[0].outputs)
+    ('a', ['unaided'])
     """
     folder = resolve_links(Path(path).parent if root is None else root)
     if not folder.is_dir():
         raise ValueError(f"{folder}: no such folder; the paths of the manifest are relative to it")
-    ears = {} if audiograms is None else _read_ears(audiograms, _listener_and_ear)
     rows = read_table(path, "the manifest")
     columns = rows[0][1].keys() if rows else set()
     if not columns >= REQUIRED_COLUMNS or columns & LEVEL_COLUMNS:
@@ -434,34 +444,52 @@ def read_manifest(
             f"{path}: expected rows with the columns {', '.join(sorted(REQUIRED_COLUMNS))}, and "
             "the level as an option, not as a column"
         )
+    places = [(f"{path}, line {line}", row) for line, row in rows]
+    return _read_recordings(places, "listener", folder, audiogram, audiograms, settings)
+
+
+def _read_recordings(
+    rows: Iterable[tuple[str, Row]],
+    column: str,
+    root: Path,
+    audiogram: Audiogram | None,
+    audiograms: str | Path | None,
+    settings: Mapping[str, Any],
+) -> list[Recording]:
+    """Return the recordings of rows with their places.
+
+    Args:
+        rows: rows of a manifest, one for each output.
+        column: column that names the ear in ``audiograms``.
+        root: folder that contains all files.
+        audiogram: the ear of rows without an audiogram.
+        audiograms: CSV file of ears.
+        settings: further arguments of the recordings.
+    """
+    ears = {} if audiograms is None else _read_ears(audiograms, column)
     recordings: dict[tuple[str, Path], Recording] = {}
-    for line, row in rows:
-        try:
-            recording = _read_row(row, folder, ears, audiogram, settings)
-            key = recording.name, recording.clean
-            recordings[key] = _merge(recordings[key], recording) if key in recordings else recording
-        except ValueError as error:
-            raise ValueError(f"{path}, line {line}: {error}") from error
+    for place, row in rows:
+        name, ear = row.get(column, ""), convert_at(place, _ear_name, row)
+        entry = ears.get((name, ear)) or ears.get((name, ""))
+        default = convert_at(entry[0], Audiogram.from_row, entry[1]) if entry else audiogram
+        recording = convert_at(place, _read_row, row, root, default, settings)
+        key = recording.name, recording.clean
+        if key in recordings:
+            recording = convert_at(place, _merge, recordings[key], recording)
+        recordings[key] = recording
     return list(recordings.values())
 
 
 def _read_row(
-    row: Row,
-    root: Path,
-    ears: Rows,
-    default: Audiogram | None,
-    settings: Mapping[str, Any],
+    row: Row, root: Path, audiogram: Audiogram | None, settings: Mapping[str, Any]
 ) -> Recording:
-    """Return the recording of a row of a manifest, with one output."""
+    """Return the recording of a row, with one output."""
     condition, listener, ear = row["condition"], row.get("listener", ""), _ear_name(row)
     thresholds = {name: text for name, text in row.items() if name.lower().startswith("hl")}
-    audiogram = default
     if any(thresholds.values()):
         audiogram = Audiogram.from_row(thresholds)
     elif row.get("audiogram"):
         audiogram = Audiogram.standard(row["audiogram"])
-    elif place_and_row := ears.get((listener, ear)) or ears.get((listener, "")):
-        audiogram = convert_at(place_and_row[0], Audiogram.from_row, place_and_row[1])
     if audiogram is None:
         raise ValueError(
             f"no audiogram of listener {listener!r}, ear {ear!r}: add columns hl_250, hl_500, ... "
@@ -509,33 +537,29 @@ def _ear_name(row: Row) -> str:
     return EAR_NAMES.get(text, "")
 
 
-def _read_ears(path: str | Path, key_of: Callable[[Row], Any]) -> Rows:
+def _read_ears(path: str | Path, column: str) -> dict[tuple[str, str], tuple[str, Row]]:
     """Read the rows of a CSV file of ears, whose audiograms are validated when they are used.
 
     Args:
         path: the file.
-        key_of: function that returns the key of a row.
+        column: column with the name of the ear, ``"listener"`` or ``"file"``.
+
+    Returns:
+        The place and the values of the row for each name and ear.
     """
-    ears: dict[Any, tuple[str, Row]] = {}
+    ears: dict[tuple[str, str], tuple[str, Row]] = {}
     for line, row in read_rows(path):
         place = f"{path}, line {line}"
-        key = convert_at(place, key_of, row)
+        if not row.get(column):
+            raise ValueError(f"{place}: expected a name in the column {column}")
+        name = row[column]
+        if column == "file":
+            name = _without_extension(PurePath(name))
+        key = name, convert_at(place, _ear_name, row)
         if key in ears:
-            raise ValueError(f"{place}: a second row of {key}")
+            raise ValueError(f"{place}: a second row of {' '.join(key)}")
         ears[key] = place, row
     return ears
-
-
-def _listener_and_ear(row: Row) -> tuple[str, str]:
-    if not row.get("listener"):
-        raise ValueError("no listener is named; the file needs a column listener")
-    return row["listener"], _ear_name(row)
-
-
-def _file_name(row: Row) -> str:
-    if not row.get("file"):
-        raise ValueError("no file is named; the file needs a column file")
-    return _without_extension(PurePath(row["file"]))
 
 
 def _without_extension(path: PurePath) -> str:
@@ -551,11 +575,3 @@ def _files_by_name(folder: str | Path) -> dict[str, Path]:
             raise ValueError(f"{files[name]} and {path} have the same name; keep one of them")
         files[name] = path
     return files
-
-
-def _check_names(names: Collection[str], expected: Collection[str], problem: str) -> None:
-    """Raise ValueError with the first names that are missing."""
-    missing = sorted(set(expected) - set(names))
-    if missing:
-        few = ", ".join(missing[:3]) + (", ..." if len(missing) > 3 else "")
-        raise ValueError(f"{problem} {few} ({len(missing)} of {len(expected)})")

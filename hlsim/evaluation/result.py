@@ -29,6 +29,11 @@ class Evaluation:
         notes: sentences with which the report begins.
         details: further results for JSON, such as gain curves.
         groups: the same evaluation for a part of the items, by the name of the part.
+
+    >>> import pandas
+    >>> table = pandas.DataFrame({"item": [0], "condition": ["aid"], "haspi": [0.5]})
+    >>> Evaluation([], [Condition("aid")], [], table).wide("haspi")["aid"].tolist()
+    [0.5]
     """
 
     items: Sequence[Source]

@@ -6,7 +6,6 @@ The file holds one JSON object per line, so that two runs can share it and peopl
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -19,8 +18,7 @@ from hlsim.files import sha256
 class ScoreStore:
     """Records by key in a file of JSON lines, ``{"key": ..., ...}``, which only grows.
 
-    The last line with a key counts. A line that an interruption cut short is ignored, and the next
-    record starts a new line.
+    The last line with a key counts. A line that an interruption cut short is ignored.
 
     Args:
         path: file of records, which is created with the first record. None keeps the records in
@@ -38,52 +36,38 @@ class ScoreStore:
     def __init__(self, path: str | Path | None = None) -> None:
         self.path = None if path is None else Path(path)
         self.records: dict[str, dict[str, Any]] = {}
-        self._last_line_is_cut = False
-        if self.path is not None and self.path.exists():
-            self._read(self.path)
-
-    def __len__(self) -> int:
-        return len(self.records)
+        if self.path is None or not self.path.exists():
+            return
+        try:
+            lines = self.path.read_text(encoding="utf-8", errors="replace").split("\n")
+        except OSError as error:
+            raise ValueError(f"{path}: cannot read stored scores ({error})") from error
+        for line in lines:
+            # A line that is cut short, or is not a record, is ignored.
+            with suppress(ValueError, KeyError, TypeError, AttributeError):
+                record = json.loads(line)
+                self.records[record.pop("key")] = record
 
     def get(self, key: str) -> dict[str, Any] | None:
         """Return the record with a key, or None."""
         return self.records.get(key)
 
     def append(self, key: str, record: Mapping[str, Any]) -> None:
-        """Store a record, which is on disk when this returns.
+        """Store a record, which is in the file when this returns.
 
         Raises:
             ValueError: the file cannot be written, or JSON cannot represent the record.
         """
-        line = json.dumps({"key": key, **record}, ensure_ascii=False, allow_nan=False) + "\n"
+        line = json.dumps({"key": key, **record}, ensure_ascii=False, allow_nan=False)
         if self.path is not None:
             try:
                 self.path.parent.mkdir(parents=True, exist_ok=True)
-                self._write(self.path, line)
+                with open(self.path, "a", encoding="utf-8") as file:
+                    # The line before this one may be cut short.
+                    file.write(f"\n{line}")
             except OSError as error:
                 raise ValueError(f"{self.path}: cannot store scores ({error})") from error
         self.records[key] = dict(record)
-
-    def _write(self, path: Path, line: str) -> None:
-        data = (f"\n{line}" if self._last_line_is_cut else line).encode()
-        with open(path, "ab", buffering=0) as file:
-            # Two runs can share the file because each line is a single write at its end.
-            self._last_line_is_cut = file.write(data) < len(data)
-            os.fsync(file.fileno())
-        if self._last_line_is_cut:
-            raise OSError("the disk is full")
-
-    def _read(self, path: Path) -> None:
-        try:
-            with open(path, encoding="utf-8", errors="replace") as file:
-                for line in file:
-                    self._last_line_is_cut = not line.endswith("\n")
-                    # A line that is cut short, or is not a record, is ignored.
-                    with suppress(ValueError, KeyError, TypeError, AttributeError):
-                        record = json.loads(line)
-                        self.records[record.pop("key")] = record
-        except OSError as error:
-            raise ValueError(f"{path}: cannot read stored scores ({error})") from error
 
 
 def content_hash(path: str | Path) -> str:

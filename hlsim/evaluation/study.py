@@ -39,7 +39,12 @@ DEAD_PROCESS = "its process ended (after a crash in compiled code, or because me
 
 
 class Source(Protocol):
-    """Source of an item: memory, as ``Item`` itself, or files."""
+    """Source of an item: memory, as ``Item`` itself, or files.
+
+    >>> source: Source = Item("item 1", torch.ones(8), torch.ones(8), Audiogram.standard("N3"))
+    >>> source.load().name
+    'item 1'
+    """
 
     @property
     def name(self) -> str: ...
@@ -241,7 +246,7 @@ def run_study(
 
     >>> signal = torch.ones(1600)
     >>> items = [Item("item 1", signal, signal, Audiogram.standard("N3"))]
-    >>> conditions = [Condition("unaided", torch.nn.Identity())]
+    >>> conditions = [Condition("unaided", lambda signal, ear: signal)]
     >>> measures = [Measure("peak", lambda item, output: {"peak": float(output.abs().max())})]
     >>> with warnings.catch_warnings(action="ignore"):  # a lambda has no fingerprint
     ...     table = run_study(items, conditions, measures, jobs=1)

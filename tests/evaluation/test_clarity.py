@@ -90,12 +90,6 @@ def options(folder: Path, **changes: Any) -> dict[str, Any]:
     return {"scenes": folder / "scenes", "jobs": 1, **files, **changes}
 
 
-def settings_of_compressor() -> dict[str, float]:
-    """Return the settings of recipes/icassp_2023/baseline/config.yaml."""
-    settings = {"fs": RATE, "attack": 50, "release": 1000, "threshold": 0.35, "attenuation": 0.1}
-    return settings | {"makeup_gain": 1, "rms_buffer_size": 0.064}
-
-
 class Baseline:
     """Baseline of Clarity: pyclarity's NAL-R, which returns 220 samples more, and compressor."""
 
@@ -104,48 +98,43 @@ class Baseline:
         from clarity.enhancer.nalr import NALR
         from clarity.utils.audiogram import Audiogram
 
+        # from recipes/icassp_2023/baseline/config.yaml
+        settings = {"attack": 50, "release": 1000, "threshold": 0.35, "attenuation": 0.1}
+        settings |= {"makeup_gain": 1, "rms_buffer_size": 0.064}
         nalr = NALR(nfir=220, sample_rate=sample_rate)
-        compressor = Compressor(**settings_of_compressor())
+        compressor = Compressor(fs=sample_rate, **settings)
         outputs = []
         for channel, ear in zip(
             waveform.double().numpy(), (listener.left, listener.right), strict=True
         ):
-            assert ear is not None
             filtered = nalr.apply(nalr.build(Audiogram(ear.thresholds, CFS))[0], channel)
             outputs.append(np.tanh(compressor.process(filtered)[0]))
         return torch.from_numpy(np.stack(outputs))
 
 
-def score_by_pyclarity(folder: Path, scene: str, listener: str) -> dict[str, float]:
+def score_by_pyclarity(folder: Path, scene: str, name: str) -> dict[str, float]:
     """Score the baseline by pyclarity, in the steps of its script of ICASSP 2023."""
-    from clarity.enhancer.compressor import Compressor
-    from clarity.enhancer.nalr import NALR
     from clarity.evaluator.haspi import haspi_v2_be
     from clarity.evaluator.hasqi import hasqi_v2_better_ear
     from clarity.utils.audiogram import Audiogram
     from clarity.utils.audiogram import Listener as ClarityListener
 
     mix, target, anechoic = (
-        soundfile.read(folder / "scenes" / f"{scene}_{kind}_CH1.wav")[0]
+        soundfile.read(folder / "scenes" / f"{scene}_{kind}_CH1.wav")[0].T
         for kind in ("mix", "target", "target_anechoic")
     )
-    ears = [Audiogram(levels, CFS) for levels in EARS[listener]]
+    listener = read_listeners(folder / "listeners.json")[name]
     np.random.seed(int(hashlib.md5(scene.encode()).hexdigest(), 16) % 10**8)
-    nalr, compressor = NALR(nfir=220, sample_rate=RATE), Compressor(**settings_of_compressor())
-    amplified = [
-        compressor.process(nalr.apply(nalr.build(ear)[0], channel))[0]
-        for channel, ear in zip(mix.T, ears, strict=True)
-    ]
-    output = np.tanh(np.stack(amplified, 1)).astype(np.float32)[: len(mix)]
-    reference = anechoic * ((target**2).mean(0) ** 0.5 / (anechoic**2).mean(0) ** 0.5)
-    arguments = {
-        "reference_left": reference[:, 0],
-        "reference_right": reference[:, 1],
-        "processed_left": output[:, 0],
-        "processed_right": output[:, 1],
-        "sample_rate": RATE,
-        "listener": ClarityListener(*ears),
+    output = Baseline()(torch.from_numpy(mix), listener, RATE).float().numpy()[:, : mix.shape[1]]
+    level = (target**2).mean(1, keepdims=True) / (anechoic**2).mean(1, keepdims=True)
+    signals = {"reference": anechoic * level**0.5, "processed": output}
+    sides = {
+        f"{kind}_{side}": signal[channel]
+        for kind, signal in signals.items()
+        for channel, side in enumerate(("left", "right"))
     }
+    person = ClarityListener(*(Audiogram(levels, CFS) for levels in EARS[name]))
+    arguments = {**sides, "sample_rate": RATE, "listener": person}
     return {"haspi": haspi_v2_be(**arguments), "hasqi": hasqi_v2_better_ear(**arguments)}
 
 
@@ -289,11 +278,9 @@ def test_a_pair_for_which_one_aid_fails_counts_in_no_mean(clarity: Path, tmp_pat
     ("kind", "change", "message"),
     [
         ("target_anechoic", 100, ""),
-        ("target_anechoic", -100, ""),
         ("target", -100, ""),
         ("mix", -100, ""),
         ("target", -8000, "S06002_target_CH1.wav 8000"),
-        ("target_anechoic", -8000, "S06002_target_anechoic_CH1.wav has 8000 samples"),
         ("mix", -8000, "16000 samples"),
     ],
 )

@@ -209,7 +209,7 @@ def test_audiograms_may_be_in_a_file_of_their_own(corpus: Path) -> None:
     ears.write_text(f"{HEADER}\na.b.wav,{LEVELS}\np2/c,{LEVELS}\nother,{unused}\n")
     assert haspi_report(**settings).table.audiogram.tolist() == [list(N4.thresholds)] * 4
     ears.write_text(f"{HEADER}\na.b.wav,{LEVELS}\n")
-    with pytest.raises(ValueError, match=r"ears\.csv: no audiogram for p2/c"):
+    with pytest.raises(ValueError, match=r"c\.wav: no audiogram of"):
         haspi_report(**settings)
     ears.write_text(f"{HEADER}\na.b.wav,{LEVELS}\np2/c,{unused}\n")
     with pytest.raises(ValueError, match=r"ears\.csv, line 3: .*NR"):
@@ -224,7 +224,6 @@ def test_audiograms_may_be_in_a_file_of_their_own(corpus: Path) -> None:
     ("settings", "message"),
     [
         ({}, "give either audiogram"),
-        ({"audiogram": N4, "seed": -1}, "seed"),
         ({"audiogram": N4, "full_scale_spl": 300.0}, "full_scale_spl"),
         ({"audiogram": N4, "measures": ("loudness",)}, "no measure 'loudness'"),
         ({"audiogram": N4, "measures": ()}, "no measure is named"),
@@ -243,7 +242,10 @@ def test_invalid_settings_are_rejected_before_scoring(
 
 def test_folders_that_do_not_match_or_have_no_audio(corpus: Path) -> None:
     (corpus / "after" / "a.b.wav").rename(corpus / "after" / "d.wav")
-    with pytest.raises(ValueError, match=r"after: no file for a\.b|clean: no file for d"):
+    with pytest.raises(
+        ValueError,
+        match=r"after: expected files with the same names, but only one of them has a\.b",
+    ):
         haspi_report(**folders(corpus), audiogram=N4)
     (corpus / "after" / "d.wav").rename(corpus / "after" / "a.b.wav")
     for path in (corpus / "clean").rglob("*.flac"):

@@ -141,7 +141,7 @@ def test_values_without_a_fingerprint_are_not_stored(items: list[Item]) -> None:
     unknown = [Condition("mine", lambda signal, ear: signal)]
     with pytest.warns(UserWarning, match="scores with mine are not stored"):
         run_study(items, unknown, MEASURES[:1], store=store, jobs=1)
-    assert len(store) == 0
+    assert len(store.records) == 0
 
 
 CREST = """
