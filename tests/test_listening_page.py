@@ -190,6 +190,15 @@ def test_a_dragged_point_moves_the_sounds_and_the_link(opened: Any) -> None:
     assert float(result(opened, "ear").norm()) < 0.9 * float(before.norm())
 
 
+def test_loudness_is_that_relative_to_a_healthy_ear(opened: Any) -> None:
+    loudness = opened.locator(".loudness")
+    assert loudness.nth(1).inner_text() == "26 dB softer than for a healthy ear"
+    opened.get_by_role("button", name="N6", exact=True).click()
+    opened.wait_for_function(
+        "document.querySelectorAll('.loudness')[1].textContent == 'not heard at all'"
+    )
+
+
 def test_presets_numbers_and_the_link_set_the_ear(opened: Any) -> None:
     opened.get_by_role("button", name="S1", exact=True).click()
     assert opened.url.endswith("#ear=10,10,10,15,30,55,70,70")
@@ -283,8 +292,10 @@ def test_the_live_aid_starts_and_stops(opened: Any) -> None:
     start.click()
     opened.wait_for_function("document.getElementById('live-status').textContent.startsWith('On.')")
     opened.get_by_role("button", name="N5").click()
-    start.click()
+    opened.locator("#version-ear .play").click()
     opened.wait_for_function("document.getElementById('live').textContent == 'Start'")
+    opened.wait_for_selector("#version-ear.playing")
+    wait(opened)
 
 
 LIVE = """async (thresholds) => {

@@ -16,8 +16,8 @@ worker.onmessage = ({ data: { id, result, error } }) => {
   else reject(new Error(error));
 };
 
-worker.onerror = (event) => {
-  for (const { reject } of pending.values()) reject(new Error(event.message || "the models could not be started"));
+worker.onerror = () => {
+  for (const { reject } of pending.values()) reject(new Error("This browser cannot start the ear and the hearing aid. Try a newer one."));
   pending.clear();
 };
 

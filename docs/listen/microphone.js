@@ -74,20 +74,26 @@ export async function connectAid(context, source, thresholds) {
 }
 
 export class Live {
-  // `onstatistics` gets the number of blocks so far, of those that came too late, and the milliseconds per block.
-  async start(thresholds, volume, onstatistics) {
+  // `onlate` gets the share of blocks that came too late in the last half second.
+  async start(thresholds, volume, onlate) {
     this.stream = await openMicrophone();
     this.context = new AudioContext({ sampleRate: SAMPLE_RATE, latencyHint: "interactive" });
     try {
       const source = new MediaStreamAudioSourceNode(this.context, { mediaStream: this.stream });
       const node = await connectAid(this.context, source, thresholds);
-      node.port.onmessage = ({ data }) => onstatistics(data);
+      let before = { blocks: 0, late: 0 };
+      node.port.onmessage = ({ data }) => {
+        onlate((data.late - before.late) / (data.blocks - before.blocks));
+        before = data;
+      };
       this.output = safeOutput(this.context, 0);
       node.connect(this.output);
       await this.context.resume();
       this.setVolume(volume, 1); // slowly, so that nothing is suddenly loud
     } catch (error) {
       await this.stop();
+      // Not every browser brings a microphone to 16 kHz.
+      if (error.name === "NotSupportedError") throw new Error("This browser cannot run the aid live.");
       throw error;
     }
   }

@@ -21,6 +21,8 @@ const VERSIONS = {
 };
 const FIRST_EAR = "N3";
 const RECORDED_SECONDS = 5;
+const SOFTEST_SPL = 5; // level in dB SPL below which speech is not heard
+const HIGHEST_LATE_SHARE = 0.1; // of the blocks of the live aid
 const DRAG_PAUSE = 120; // milliseconds without a movement after which the sounds follow
 const PLAY = '<svg viewBox="0 0 24 24" aria-hidden="true"><path d="M7 4v16l13-8z"/></svg>';
 const PAUSE = '<svg viewBox="0 0 24 24" aria-hidden="true"><path d="M6 5h4v14H6zM14 5h4v14h-4z"/></svg>';
@@ -54,8 +56,7 @@ function link() {
 function showEar() {
   const [key] = Object.entries(STANDARD).find(([, { thresholds }]) => `${thresholds}` === `${chart.thresholds}`) ?? [];
   for (const button of $("presets").children) button.setAttribute("aria-pressed", button.textContent === key);
-  const name = key ? STANDARD[key].name : "An ear of your own";
-  if ($("ear-name").textContent !== name) $("ear-name").textContent = name;
+  write("ear-name", key ? STANDARD[key].name : "An ear of your own");
   chart.thresholds.forEach((level, i) => {
     const input = $("numbers").querySelectorAll("input")[i];
     if (document.activeElement !== input) input.value = level;
@@ -66,10 +67,11 @@ function changeEar() {
   showEar();
   history.replaceState(null, "", link());
   $("shared").textContent = "";
-  live?.fit(chart.thresholds);
   for (const name of ["ear", "aided"]) cards[name].setAttribute("aria-busy", "true");
   clearTimeout(timer);
-  timer = setTimeout(compute, DRAG_PAUSE);
+  // The live aid needs the models in time, so the other sounds wait until it stops.
+  if (live !== null) live.fit(chart.thresholds);
+  else timer = setTimeout(compute, DRAG_PAUSE);
 }
 
 function setEar(thresholds) {
@@ -93,9 +95,9 @@ async function compute() {
   };
   if (state.results.normal) delete steps.normal;
   try {
-    // The version that is heard comes first.
+    const first = player.playing ?? wanted;
     const names = Object.keys(steps);
-    names.sort((a, b) => (b === player.playing) - (a === player.playing));
+    names.sort((a, b) => (b === first) - (a === first));
     for (const name of names) {
       const pascals = await steps[name]();
       abort.throwIfAborted();
@@ -113,19 +115,24 @@ function show(name, pascals) {
   player.set(name, pascals);
   drawSpectrogram(cards[name].querySelector("canvas"), pascals);
   cards[name].setAttribute("aria-busy", "false");
-  const difference = Math.round(levelOf(state.results.normal ?? pascals) - levelOf(pascals));
-  const { about } = VERSIONS[name];
-  let loudness = about;
-  if (name !== "normal") {
-    if (Math.abs(difference) <= 1) loudness = "as loud as for a healthy ear";
-    else loudness = `${Math.abs(difference)} dB ${difference > 0 ? "softer" : "louder"} than for a healthy ear`;
+  for (const [version, card] of Object.entries(cards)) {
+    const loudness = describeLoudness(version);
+    card.querySelector(".loudness").textContent = loudness;
+    card.querySelector("canvas").setAttribute("aria-label", `Spectrogram of ${VERSIONS[version].title}: ${loudness}`);
   }
-  cards[name].querySelector(".loudness").textContent = loudness;
-  cards[name].querySelector("canvas").setAttribute("aria-label", `Spectrogram of ${VERSIONS[name].title}: ${loudness}`);
   if (wanted === name) {
     wanted = null;
     player.play(name);
   }
+}
+
+function describeLoudness(name) {
+  const { normal, [name]: perceived } = state.results;
+  if (name === "normal" || !normal || !perceived) return VERSIONS[name].about;
+  if (levelOf(perceived) < SOFTEST_SPL) return "not heard at all";
+  const difference = Math.round(levelOf(perceived) - levelOf(normal));
+  if (Math.abs(difference) <= 1) return "as loud as for a healthy ear";
+  return `${Math.abs(difference)} dB ${difference > 0 ? "louder" : "softer"} than for a healthy ear`;
 }
 
 function addCard(name) {
@@ -156,12 +163,13 @@ function addCard(name) {
   $("dock").append(button);
 }
 
-function press(name) {
+async function press(name) {
+  player.context.resume(); // A browser allows sound only now, while the button is pressed.
+  await stopLive();
   if (player.playing === name) player.stop();
   else if (player.has(name)) player.play(name);
   else {
     wanted = name;
-    player.context.resume(); // A browser allows it only now, while the button is pressed.
     say("The sound comes as soon as it is computed …");
   }
 }
@@ -251,16 +259,22 @@ async function stopLive() {
   $("live").textContent = "Start";
   $("live-status").textContent = "";
   await stopped.stop();
+  await compute();
 }
 
-function showLive({ blocks, late }) {
+function showLive(late) {
   if (live === null) return;
   let text = `On. ${Math.round(LIVE_DELAY)} ms later than the sound card alone.`;
-  if (late > 0.01 * blocks) text += " This device is too slow: parts are missing. Record instead.";
-  $("live-status").textContent = text;
+  if (late > HIGHEST_LATE_SHARE) text += " This device is too slow: parts are missing. Record instead.";
+  write("live-status", text);
 }
 
 // Messages
+
+// Screen readers read a text again when it is written, so it is written only when it changes.
+function write(id, text) {
+  if ($(id).textContent !== text) $(id).textContent = text;
+}
 
 function say(text) {
   $("status").textContent = text;

@@ -9,15 +9,26 @@ ort.env.logLevel = "error";
 const NOISE_REDUCTION = 0.5;
 const AMPLIFICATION = 1;
 
-const load = async (name) => {
-  const session = await ort.InferenceSession.create(`./assets/${name}.onnx`);
+const LOADING_FAILED = "The ear and the hearing aid could not be loaded. Reload the page.";
+
+async function download(name) {
+  const response = await fetch(`./assets/${name}.onnx`);
+  if (!response.ok) throw new Error(LOADING_FAILED);
+  return response.arrayBuffer();
+}
+
+async function start(bytes) {
+  const session = await ort.InferenceSession.create(await bytes);
   const shapes = Object.fromEntries(session.inputMetadata.map(({ name, shape }) => [name, shape]));
   return { session, shapes };
-};
+}
 
-const simulator = load("simulator");
-const fit = simulator.then(() => load("fit"));
-const aid = fit.then(() => load("aid"));
+// All files are on their way at once, but the simulator starts first, because the first sound needs it alone.
+const [simulatorBytes, fitBytes, aidBytes] = ["simulator", "fit", "aid"].map(download);
+const simulator = start(simulatorBytes);
+const fit = simulator.then(() => start(fitBytes));
+const aid = fit.then(() => start(aidBytes));
+for (const promise of [fitBytes, aidBytes, simulator, fit, aid]) promise.catch(() => {}); // Requests report the error.
 
 function tensor(values, shape) {
   return new ort.Tensor("float32", values, shape);
@@ -126,7 +137,7 @@ onmessage = ({ data: { id, name, ...parameters } }) => {
     try {
       postMessage({ id, result: await requests[name](parameters) });
     } catch (error) {
-      postMessage({ id, error: String(error) });
+      postMessage({ id, error: error.message ?? String(error) });
     }
   });
 };
