@@ -78,10 +78,6 @@ class Listener:
             axes = ear.plot(axes, ear=name, **style)
         return axes
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return a JSON-serialisable dictionary; ``Listener(**dictionary)`` is its inverse."""
-        return {name: ear and ear.to_dict() for name, ear in vars(self).items()}
-
     def to_rows(self, name: str) -> list[dict[str, str]]:
         """Return one row of a CSV file per ear, as ``read_listeners`` reads them.
 

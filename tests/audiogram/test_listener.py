@@ -1,6 +1,5 @@
 """A listener's two ears are treated as two separate calls treat them."""
 
-import io
 import json
 import math
 from functools import partial
@@ -145,17 +144,10 @@ def test_the_better_ears_metric_leaves_a_missing_ear_out(scene: Tensor) -> None:
         metric.update(outputs[:1], scene[None], [BOTH, BOTH])
 
 
-def _saved(listener: Listener) -> bytes:
-    file = io.BytesIO()
-    torch.save(listener, file)
-    return file.getvalue()
-
-
 def test_written_and_read(tmp_path: Path) -> None:
-    for listener in (BOTH, Listener(LEFT, None)):
-        assert Listener(**json.loads(json.dumps(listener.to_dict()))) == listener
+    torch.save(BOTH, tmp_path / "listener.pt")
     with torch.serialization.safe_globals([Audiogram, Listener]):
-        assert torch.load(io.BytesIO(_saved(BOTH)), weights_only=True) == BOTH
+        assert torch.load(tmp_path / "listener.pt", weights_only=True) == BOTH
     assert Listener.from_clarity(ENTRY) == BOTH
     (tmp_path / "listeners.json").write_text(json.dumps({"L0001": ENTRY}))
     assert read_listeners(tmp_path / "listeners.json") == {"L0001": BOTH}

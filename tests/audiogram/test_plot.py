@@ -17,20 +17,12 @@ def test_axes_are_those_of_audiology_and_are_prepared_once() -> None:
     assert left.plot(axes, marker="x") is axes
     low, high = axes.get_ylim()
     assert low == 120.0 and high == -10.0 and axes.get_xscale() == "log"
-    assert [label.get_text() for label in axes.get_xticklabels()] == [
-        "0.25",
-        "0.5",
-        "1",
-        "2",
-        "4",
-        "6",
-        "8",
-    ]
+    ticks = [label.get_text() for label in axes.get_xticklabels()]
+    assert ticks == "0.25 0.5 1 2 4 6 8".split()
     first, second = axes.get_lines()
     assert tuple(first.get_ydata()) == right.levels and first.get_label() == "right"
-    assert (
-        first.get_color() == "tab:red" and first.get_marker() == "o" and second.get_marker() == "x"
-    )
+    assert (first.get_color(), first.get_marker()) == ("tab:red", "o")
+    assert second.get_marker() == "x"
     assert tuple(second.get_xdata()) == (500, 3000)
     assert [text.get_text() for text in axes.texts] == [*SEVERITIES]
     bounds = [sorted({patch.get_y(), patch.get_y() + patch.get_height()}) for patch in axes.patches]

@@ -19,18 +19,6 @@ def read_text(folder: Path, text: str, encoding: str = "utf-8") -> list[Audiogra
     return [ear for _, ear in read_audiograms(path)]
 
 
-def test_round_trip(tmp_path: Path) -> None:
-    ears = [Audiogram.standard(name) for name in ("N1", "S3")]
-    lines = [",".join(("file", *ears[0].to_row()))]
-    lines += [
-        ",".join((name, *ear.to_row().values())) for name, ear in zip("ab", ears, strict=True)
-    ]
-    (tmp_path / "ears.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
-    read = read_audiograms(tmp_path / "ears.csv")
-    assert [ear for _, ear in read] == ears
-    assert [row["file"] for row, _ in read] == ["a", "b"]
-
-
 @pytest.mark.parametrize(
     "text",
     [
