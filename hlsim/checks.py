@@ -43,16 +43,13 @@ def broadcast_shape(*shapes: Sequence[int]) -> torch.Size:
     return torch.broadcast_tensors(*(number.expand(shape) for shape in shapes))[0].shape
 
 
-def check_names(
-    names: Iterable[Any], known: Iterable[str], description: str, place: str = ""
-) -> None:
+def check_names(names: Iterable[Any], known: Iterable[str], description: str) -> None:
     """Raise ValueError unless all names are known.
 
     Args:
         names: names to validate.
         known: accepted names.
         description: noun in the plural for the message, such as ``criteria``.
-        place: where the names were found, for the message.
 
     >>> check_names(["bands"], ["bands", "paper"], "criteria")
     """
@@ -60,28 +57,24 @@ def check_names(
     unknown = sorted({str(name) for name in names} - set(known))
     if unknown:
         raise ValueError(
-            f"unknown {description}{_after_space(place)}: {', '.join(unknown)}; "
-            f"expected some of {', '.join(known)}"
+            f"unknown {description}: {', '.join(unknown)}; expected some of {', '.join(known)}"
         )
 
 
-def check_choice(name: str, value: Any, choice: Any, place: str = "") -> None:
+def check_choice(name: str, value: Any, choice: Any) -> None:
     """Raise ValueError unless a value is one of the strings of a ``Literal``.
 
     Args:
         name: name of the setting, for the message.
         value: value to validate.
         choice: the ``Literal``.
-        place: where the value was found, for the message.
 
     >>> from typing import Literal
     >>> check_choice("ears", "better", Literal["mean", "better"])
     """
     choices = get_args(choice)
     if not isinstance(value, str) or value not in choices:
-        raise ValueError(
-            f"expected {name}{_after_space(place)} to be one of {', '.join(choices)}, got {value!r}"
-        )
+        raise ValueError(f"expected {name} to be one of {', '.join(choices)}, got {value!r}")
 
 
 def check_number(
@@ -322,7 +315,3 @@ def silence_after(waveform: Tensor, ends: Tensor) -> Tensor:
     samples = torch.arange(waveform.shape[-1], device=waveform.device)
     ends = ends.to(waveform.device, non_blocking=True)
     return torch.where(samples < ends.unsqueeze(-1), waveform, 0.0)
-
-
-def _after_space(place: str) -> str:
-    return f" {place}" if place else ""

@@ -208,7 +208,7 @@ def first_inputs(
     """
     if aid.sample_rate != RATE:
         raise ValueError(f"expected an aid at {RATE} Hz, got one at {aid.sample_rate} Hz")
-    check_names(sliders, aid.SLIDERS, "sliders", f"of a {type(aid).__name__}")
+    check_names(sliders, aid.SLIDERS, "sliders")
     weight = next(aid.parameters(), torch.empty(0))
     defaults = zip(aid.SLIDERS, aid.DEFAULT_SLIDERS, strict=True)
     values = [sliders.get(name, default) for name, default in defaults]

@@ -267,21 +267,14 @@ def _key_reader() -> Iterator[Callable[[float], str]]:
     The function returns the key. If none was pressed, or stdin is no terminal, it returns "".
     """
 
-    def wait(seconds: float) -> str:
-        time.sleep(seconds)
-        return ""
-
     try:
         import termios
         import tty
-    except ImportError:  # Windows has no such modules.
-        yield wait
-        return
-    try:
+
         terminal = sys.stdin.fileno()
-        before = termios.tcgetattr(terminal)
-    except (AttributeError, OSError, ValueError, termios.error):
-        yield wait
+        settings = termios.tcgetattr(terminal)
+    except Exception:  # Windows has no termios, and stdin may be closed or no terminal.
+        yield _wait
         return
 
     def read(seconds: float) -> str:
@@ -292,4 +285,10 @@ def _key_reader() -> Iterator[Callable[[float], str]]:
         tty.setcbreak(terminal)
         yield read
     finally:
-        termios.tcsetattr(terminal, termios.TCSADRAIN, before)
+        termios.tcsetattr(terminal, termios.TCSADRAIN, settings)
+
+
+def _wait(seconds: float) -> str:
+    """Wait in place of a function that reads keys."""
+    time.sleep(seconds)
+    return ""

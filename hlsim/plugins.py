@@ -8,6 +8,7 @@ import itertools
 import os
 import re
 import sys
+import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import lru_cache
@@ -130,9 +131,11 @@ class WaveformPlugin:
         else:
             has_shape = is_real and output.shape == waveform.shape
         if not has_shape:
+            kind = output.dtype if isinstance(output, Tensor) else type(output).__name__
             raise ValueError(
-                f"{self.kind} {self.name} returned {_describe_output(output)}, expected a real "
-                f"tensor of shape {tuple(waveform.shape)}"
+                f"{self.kind} {self.name} returned {kind} of shape "
+                f"{tuple(getattr(output, 'shape', ()))}, expected a real tensor of shape "
+                f"{tuple(waveform.shape)}"
             )
         if not bool(output.isfinite().all()):
             raise ValueError(f"{self.kind} {self.name} returned samples that are NaN or infinite")
@@ -208,18 +211,5 @@ def _prepend_to_path(folder: str) -> Iterator[None]:
 def _describe(error: Exception) -> str:
     """Describe an exception in one line: its type, its text, and where it was raised."""
     text = f"{type(error).__name__}: {' '.join(str(error).split())}"
-    traceback = error.__traceback__
-    while traceback is not None and traceback.tb_next is not None:
-        traceback = traceback.tb_next
-    if traceback is None:
-        return text
-    file = Path(traceback.tb_frame.f_code.co_filename).name
-    return f"{text} ({file}, line {traceback.tb_lineno})"
-
-
-def _describe_output(output: Any) -> str:
-    """Describe the output of a plug-in in words for an error message."""
-    if not isinstance(output, Tensor):
-        return f"an object of type {type(output).__name__}"
-    number = "complex" if output.is_complex() else "real"
-    return f"a {number} tensor of shape {tuple(output.shape)}"
+    frames = traceback.extract_tb(error.__traceback__)
+    return f"{text} ({Path(frames[-1].filename).name}, line {frames[-1].lineno})"
