@@ -135,12 +135,12 @@ class Sizes:
     """Sizes of what is measured.
 
     Attributes:
-        seconds: duration of an item in the sections that measure speed.
-        short: duration of an item in the section "equality".
-        items: in the section "equality".
-        batches: of the section "throughput".
-        budget: seconds that a measurement repeats its call.
-        training: batches and durations of training steps.
+        seconds: duration of an item in seconds in the sections that measure speed.
+        short: duration of an item in seconds in the section "equality".
+        items: number of items in the section "equality".
+        batches: numbers of items in the section "throughput".
+        budget: duration in seconds for which a measurement repeats its call.
+        training: number and duration in seconds of the items of training steps.
     """
 
     seconds: float = 4.0
@@ -159,8 +159,10 @@ class Subject:
     """A call that is compared and timed.
 
     Attributes:
-        build: makes the module, on the CPU and in float32.
-        call: takes module, processed and clean speech (items, time), and ears (items, 8).
+        name: name of the call in tables.
+        build: function that returns the module, on the CPU and in float32.
+        call: function of the module, processed and clean speech (items, time), and ears (items, 8).
+        rate: sample rate in Hz.
     """
 
     name: str
@@ -169,19 +171,19 @@ class Subject:
     rate: int = 16000
 
 
-def simulate(module: nn.Module, wave: Tensor, clean: Tensor, ears: Tensor) -> Tensor:
+def process(module: nn.Module, wave: Tensor, clean: Tensor, ears: Tensor) -> Tensor:
     return module(wave, ears)
 
 
-def judge(module: nn.Module, wave: Tensor, clean: Tensor, ears: Tensor) -> Tensor:
+def compare(module: nn.Module, wave: Tensor, clean: Tensor, ears: Tensor) -> Tensor:
     return module(wave, clean, ears)
 
 
-def judge_own_ear(module: nn.Module, wave: Tensor, clean: Tensor, ears: Tensor) -> Tensor:
+def compare_for_own_ear(module: nn.Module, wave: Tensor, clean: Tensor, ears: Tensor) -> Tensor:
     return module(wave, clean)
 
 
-def judge_two_ears(module: nn.Module, wave: Tensor, clean: Tensor, ears: Tensor) -> Tensor:
+def compare_two_ears(module: nn.Module, wave: Tensor, clean: Tensor, ears: Tensor) -> Tensor:
     return module(two_ears(wave), two_ears(clean), ears.unsqueeze(-2))
 
 
@@ -192,28 +194,28 @@ def two_ears(wave: Tensor) -> Tensor:
 
 def compensators() -> list[Subject]:
     names = ("nalr", "wdrc", "hearing-aid", "compensator-general")
-    return [Subject(name, lambda name=name: load_compensator(name), simulate) for name in names]
+    return [Subject(name, lambda name=name: load_compensator(name), process) for name in names]
 
 
 def simulators() -> list[Subject]:
-    found = [
-        Subject("MSBG 16 kHz", lambda: MSBG(sample_rate=16000), simulate),
-        Subject("MSBG 44.1 kHz", lambda: MSBG(sample_rate=44100), simulate, 44100),
+    subjects = [
+        Subject("MSBG 16 kHz", lambda: MSBG(sample_rate=16000), process),
+        Subject("MSBG 44.1 kHz", lambda: MSBG(sample_rate=44100), process, 44100),
     ]
     for name in shipped_checkpoints([SIMULATOR]):
-        found.append(Subject(name, lambda name=name: load_pretrained(name), simulate))
-    return found
+        subjects.append(Subject(name, lambda name=name: load_pretrained(name), process))
+    return subjects
 
 
 def losses() -> list[Subject]:
     """The loss with each criterion through each simulator; the ears are given with the call."""
-    found = []
+    subjects = []
     for criterion in CRITERIA:
-        call = judge_two_ears if criterion == "interaural" else judge
+        call = compare_two_ears if criterion == "interaural" else compare
         for simulator in ("neuro-msbg", "msbg"):
             build = loss_builder(simulator=simulator, criterion=criterion)
-            found.append(Subject(f"loss {criterion}, {simulator}", build, call))
-    return found
+            subjects.append(Subject(f"loss {criterion}, {simulator}", build, call))
+    return subjects
 
 
 def loss_builder(**options: Any) -> Callable[[], nn.Module]:
@@ -229,17 +231,17 @@ def scores() -> list[Subject]:
             nn.Identity,
             lambda _, wave, clean, ears: mbstoi(two_ears(wave), two_ears(clean)),
         ),
-        Subject("HASPILoss", HASPILoss, judge),
+        Subject("HASPILoss", HASPILoss, compare),
     ]
 
 
 def speed_subjects() -> list[Subject]:
     """Calls to be timed. The ear of a loss is given to its constructor."""
-    found = simulators()
+    subjects = simulators()
     for simulator in ("neuro-msbg", "msbg"):
         build = loss_builder(audiogram=Audiogram.standard("N3"), simulator=simulator)
-        found.append(Subject(f"loss through {simulator}", build, judge_own_ear))
-    return [*found, *scores(), *compensators()]
+        subjects.append(Subject(f"loss through {simulator}", build, compare_for_own_ear))
+    return [*subjects, *scores(), *compensators()]
 
 
 def speech_like(rate: int, seconds: float, items: int, seed: int) -> Tensor:
@@ -263,8 +265,9 @@ def signals(rate: int, seconds: float, items: int) -> tuple[Tensor, Tensor, Tens
     return clean + noise, clean, torch.tensor(levels)
 
 
-def relative_error(found: Tensor, expected: Tensor) -> float:
-    difference = found.detach().double().cpu() - expected.detach().double().cpu()
+def relative_error(values: Tensor, expected: Tensor) -> float:
+    """Norm of the difference relative to the norm of the expected values."""
+    difference = values.detach().double().cpu() - expected.detach().double().cpu()
     return float(difference.norm() / expected.detach().double().norm().cpu())
 
 
@@ -294,8 +297,8 @@ class Call:
     ) -> None:
         self.subject = subject
         self.module = subject.build().to(device, dtype)
-        given = (one.to(device, dtype) for one in signals(subject.rate, seconds, items))
-        self.wave, self.clean, self.ears = given
+        tensors = (tensor.to(device, dtype) for tensor in signals(subject.rate, seconds, items))
+        self.wave, self.clean, self.ears = tensors
         self.wave.requires_grad_()
 
     def value(self) -> Tensor:
@@ -332,8 +335,8 @@ class Run:
     def on_gpu(self) -> bool:
         return self.device.type == "cuda"
 
-    def take(self, section: str, name: str, measure: Callable[[], Row]) -> None:
-        """Measure a row unless it is there or the time is over, and write down what happened."""
+    def add_row(self, section: str, name: str, measure: Callable[[], Row]) -> None:
+        """Measure a row and append it to the file, unless it is there or the time is over."""
         if any(row["section"] == section and row["name"] == name for row in self.rows):
             return
         if time.time() > self.deadline:
@@ -343,7 +346,7 @@ class Run:
         start = time.perf_counter()
         try:
             row |= measure()
-            self.finish()
+            self.synchronise()
         except Exception as error:  # one failing row must not stop the rest
             lines = traceback.format_exception(error)
             row["error"] = "".join(lines).strip().splitlines()[-6:]
@@ -373,12 +376,12 @@ class Run:
             os.environ[DEADLINE] = str(self.deadline)
             os.execv(sys.executable, [sys.executable, *sys.argv])
 
-    def finish(self) -> None:
+    def synchronise(self) -> None:
         if self.on_gpu:
             torch.cuda.synchronize(self.device)
 
     def time(self, call: Step, budget: float | None = None) -> Row:
-        """Milliseconds of the first call, median and least of the others, and peak memory.
+        """Milliseconds of the first call, median and minimum of the others, and peak memory.
 
         CUDA events measure calls that follow each other. ``latency_ms`` is the median wall time of
         single calls, each waited for. Memory that was allocated before does not count.
@@ -406,10 +409,10 @@ class Run:
         return row | {"latency_ms": statistics.median(latencies), "calls": count}
 
     def latency(self, call: Step) -> float:
-        self.finish()
+        self.synchronise()
         start = time.perf_counter()
         call()
-        self.finish()
+        self.synchronise()
         return 1000.0 * (time.perf_counter() - start)
 
     def event_times(self, call: Step, count: int) -> list[float]:
@@ -419,7 +422,7 @@ class Run:
         for event in events[1:]:
             call()
             event.record()
-        self.finish()
+        self.synchronise()
         return [first.elapsed_time(second) for first, second in pairwise(events)]
 
 
@@ -427,9 +430,9 @@ class Run:
 
 
 def machine(run: Run) -> None:
-    run.take("machine", "about", lambda: about(run))
+    run.add_row("machine", "about", lambda: about(run))
     if run.on_gpu:
-        run.take("machine", "ceilings", lambda: ceilings(run))
+        run.add_row("machine", "ceilings", lambda: ceilings(run))
 
 
 def about(run: Run) -> Row:
@@ -482,7 +485,7 @@ def ceilings(run: Run) -> Row:
 
 def equality(run: Run) -> None:
     for subject in [*simulators(), *losses(), *scores(), *compensators()]:
-        run.take("equality", subject.name, lambda subject=subject: equality_row(run, subject))
+        run.add_row("equality", subject.name, lambda subject=subject: equality_row(run, subject))
 
 
 def equality_row(run: Run, subject: Subject) -> Row:
@@ -500,27 +503,27 @@ def equality_row(run: Run, subject: Subject) -> Row:
         with precision(name):
             call = Call(subject, run.device, *size)
             try:
-                found = call.both()
+                values = call.both()
             except Exception as error:  # the value may be right where the gradient fails
                 value_error = relative_error(call.forward(), single[0])
                 message = f"{type(error).__name__}: {error}"[:300]
                 row[name] = {"float32": [value_error, None], "gradient_fails": message}
                 continue
-        row[name] = {"float32": errors(found, single)}
+        row[name] = {"float32": errors(values, single)}
         if double is not None:
-            row[name]["float64"] = errors(found, double)
+            row[name]["float64"] = errors(values, double)
     return row
 
 
-def errors(found: Iterable[Tensor], expected: Iterable[Tensor]) -> list[float]:
-    pairs = zip(found, expected, strict=True)
+def errors(values: Iterable[Tensor], expected: Iterable[Tensor]) -> list[float]:
+    pairs = zip(values, expected, strict=True)
     return [relative_error(first, second) for first, second in pairs]
 
 
 def table_two(run: Run) -> None:
     """The paper's Table II: 1 s at 44.1 kHz, batch 1. Networks of its size have random weights."""
     seconds = min(1.0, run.sizes.seconds)
-    wave, _, ears = (one.to(run.device) for one in signals(44100, seconds, 2))
+    wave, _, ears = (tensor.to(run.device) for tensor in signals(44100, seconds, 2))
     wave, ear = wave[1:], ears[1:]
 
     def measure(module: nn.Module, paper_ms: float | None = None) -> Row:
@@ -530,9 +533,9 @@ def table_two(run: Run) -> None:
             row = run.time(lambda: module(wave, ear))
         return row | {"parameters": count, "paper_ms": paper_ms}
 
-    run.take("table-2", "MSBG", lambda: measure(MSBG(sample_rate=44100)))
+    run.add_row("table-2", "MSBG", lambda: measure(MSBG(sample_rate=44100)))
     for name, settings in PAPER_NETWORKS.items():
-        run.take(
+        run.add_row(
             "table-2",
             f"{name}, paper's size",
             lambda name=name, settings=settings: measure(
@@ -540,7 +543,7 @@ def table_two(run: Run) -> None:
             ),
         )
     for name in shipped_checkpoints([SIMULATOR]):
-        run.take(
+        run.add_row(
             "table-2", name, lambda name=name: measure(load_pretrained(name, sample_rate=44100))
         )
 
@@ -548,7 +551,7 @@ def table_two(run: Run) -> None:
 def throughput(run: Run) -> None:
     for subject in speed_subjects():
         for items in run.sizes.batches:
-            run.take(
+            run.add_row(
                 "throughput",
                 f"{subject.name}, {items}",
                 lambda subject=subject, items=items: throughput_row(run, subject, items),
@@ -574,18 +577,18 @@ def throughput_row(run: Run, subject: Subject, items: int) -> Row:
 def waits(run: Run) -> None:
     items = min(4, max(run.sizes.batches))
     for subject in [*speed_subjects(), *losses()]:
-        run.take("waits", subject.name, lambda subject=subject: waits_row(run, subject, items))
+        run.add_row("waits", subject.name, lambda subject=subject: waits_row(run, subject, items))
 
 
 def waits_row(run: Run, subject: Subject, items: int) -> Row:
-    """How often a call makes the host wait for the device, by the line of hlsim that does."""
+    """Number of times that a call makes the host wait for the device, by the line of hlsim."""
     if not run.on_gpu:
         return {"skipped": "needs a GPU"}
     row: Row = {"items": items}
     call = Call(subject, run.device, min(1.0, run.sizes.seconds), items)
     for direction, step in (("forward", call.forward), ("both", call.both)):
         step()
-        run.finish()
+        run.synchronise()
         with counted_waits() as lines:
             step()
         row[direction] = dict(lines.most_common(12))
@@ -633,7 +636,7 @@ def capture(run: Run) -> None:
             ("loss", "hearing-aid", "compensator")
         ):
             for batch in (1, items):
-                run.take(
+                run.add_row(
                     "capture",
                     f"{subject.name}, {batch}",
                     lambda subject=subject, batch=batch: capture_row(run, subject, batch),
@@ -669,8 +672,8 @@ def capture_row(run: Run, subject: Subject, items: int) -> Row:
         call.wave.copy_(0.7 * call.wave.flip(-1))
         call.clean.copy_(call.clean.flip(-1))
     graph.replay()
-    run.finish()
-    row["replay_error"] = errors([one.clone() for one in captured], step())
+    run.synchronise()
+    row["replay_error"] = errors([tensor.clone() for tensor in captured], step())
     return row
 
 
@@ -678,13 +681,13 @@ def autocast(run: Run) -> None:
     """Compensators and networks in bfloat16: outputs and times beside those in float32."""
     items = 2 if run.sizes is SMALL else 16
     for name in ("compensator-general", "hearing-aid"):
-        run.take(
+        run.add_row(
             "autocast",
             f"{name}, autocast region",
             lambda name=name: autocast_row(run, load_compensator(name), items, inside=False),
         )
     for name in ("neuro-msbg", "neuro-msbg-mamba"):
-        run.take(
+        run.add_row(
             "autocast",
             f"{name}, layers",
             lambda name=name: autocast_row(run, load_pretrained(name), items, inside=True),
@@ -698,7 +701,7 @@ def autocast_row(run: Run, model: nn.Module, items: int, inside: bool) -> Row:
         inside: set the network's ``autocast_dtype`` instead of calling it in an autocast region.
     """
     model = model.to(run.device)
-    wave, _, ears = (one.to(run.device) for one in signals(16000, run.sizes.seconds, items))
+    wave, _, ears = (tensor.to(run.device) for tensor in signals(16000, run.sizes.seconds, items))
     with torch.no_grad():
         whole = model(wave, ears)
         row: Row = {"float32_ms": run.time(lambda: model(wave, ears))["median_ms"]}
@@ -717,7 +720,7 @@ def training(run: Run) -> None:
         for block in PAPER_NETWORKS:
             for lower in (None, torch.bfloat16):
                 kind = "float32" if lower is None else "bfloat16"
-                run.take(
+                run.add_row(
                     "training",
                     f"{block} {kind}, {size}",
                     lambda block=block, lower=lower, items=items, seconds=seconds: simulator_row(
@@ -725,7 +728,7 @@ def training(run: Run) -> None:
                     ),
                 )
         if mamba_kernel() is not None:
-            run.take(
+            run.add_row(
                 "training",
                 f"mamba-ssm float32, {size}",
                 lambda items=items, seconds=seconds: simulator_row(
@@ -734,7 +737,7 @@ def training(run: Run) -> None:
             )
     items, seconds = run.sizes.batches[-2], run.sizes.seconds
     for simulator in ("neuro-msbg", "msbg"):
-        run.take(
+        run.add_row(
             "training",
             f"compensator through {simulator}, {items} x {seconds:g} s",
             lambda simulator=simulator: compensator_row(run, simulator, items, seconds),
@@ -753,7 +756,7 @@ def simulator_row(
     torch.manual_seed(0)
     network = NeuroMSBG(NeuroConfig(**PAPER_NETWORKS[block])).to(run.device).train()
     network.autocast_dtype = lower
-    wave, clean, ears = (one.to(run.device) for one in signals(16000, seconds, items))
+    wave, clean, ears = (tensor.to(run.device) for tensor in signals(16000, seconds, items))
     scale = clean.square().mean(-1, keepdim=True).rsqrt()
 
     def loss() -> Tensor:
@@ -772,7 +775,7 @@ def compensator_row(run: Run, simulator: str, items: int, seconds: float) -> Row
     ear = Audiogram.standard("N3")
     network = load_compensator("compensator-general").to(run.device).train().requires_grad_(True)
     criterion = HearingLossLoss(ear, simulator=simulator).to(run.device)
-    wave, clean, _ = (one.to(run.device) for one in signals(16000, seconds, items))
+    wave, clean, _ = (tensor.to(run.device) for tensor in signals(16000, seconds, items))
     return step_row(run, network, lambda: criterion(network(wave, ear), clean), items * seconds)
 
 
@@ -795,7 +798,9 @@ def step_row(run: Run, network: nn.Module, loss: Callable[[], Tensor], audio: fl
 
 def operations(run: Run) -> None:
     for subject in speed_subjects():
-        run.take("operations", subject.name, lambda subject=subject: operations_row(run, subject))
+        run.add_row(
+            "operations", subject.name, lambda subject=subject: operations_row(run, subject)
+        )
 
 
 def operations_row(run: Run, subject: Subject) -> Row:
@@ -804,80 +809,31 @@ def operations_row(run: Run, subject: Subject) -> Row:
     row: Row = {}
     for direction, step in (("forward", call.forward), ("both", call.both)):
         step()
-        run.finish()
+        run.synchronise()
         kinds = [torch.profiler.ProfilerActivity.CPU]
         if run.on_gpu:
             kinds.append(torch.profiler.ProfilerActivity.CUDA)
         with torch.profiler.profile(activities=kinds, record_shapes=True) as profile:
             step()
-            run.finish()
-        row[direction] = counts(profile.events())
+            run.synchronise()
+        row[direction] = count_operations(profile.events())
     return row
 
 
-VIEWS = {
-    "view",
-    "reshape",
-    "transpose",
-    "permute",
-    "expand",
-    "select",
-    "slice",
-    "unsqueeze",
-    "squeeze",
-}
-VIEWS |= {
-    "as_strided",
-    "empty",
-    "empty_like",
-    "empty_strided",
-    "split",
-    "chunk",
-    "detach",
-    "unfold",
-}
-VIEWS |= {
-    "narrow",
-    "alias",
-    "item",
-    "_local_scalar_dense",
-    "real",
-    "imag",
-    "view_as_real",
-    "t",
-    "mT",
-}
-VIEWS |= {
-    "view_as_complex",
-    "resolve_conj",
-    "resolve_neg",
-    "diagonal",
-    "lift_fresh",
-    "unbind",
-    "conj",
-}
-VIEWS |= {
-    "movedim",
-    "_conj",
-    "numpy_T",
-    "is_nonzero",
-    "result_type",
-    "expand_as",
-    "new_empty",
-    "set",
-}
-VIEWS |= {"unflatten", "flatten", "swapaxes", "_unsafe_view", "split_with_sizes", "_reshape_alias"}
-VIEWS |= {
-    "broadcast_tensors",
-    "broadcast_to",
-    "expand_copy",
-    "resize",
-    "_has_compatible_shallow_copy_type",
-}
+VIEWS = set(
+    (
+        "view reshape transpose permute expand select slice unsqueeze squeeze as_strided empty "
+        "empty_like empty_strided split chunk detach unfold narrow alias item _local_scalar_dense "
+        "real imag view_as_real t mT view_as_complex resolve_conj resolve_neg diagonal lift_fresh "
+        "unbind conj movedim _conj numpy_T is_nonzero result_type expand_as new_empty set "
+        "unflatten flatten swapaxes _unsafe_view split_with_sizes _reshape_alias broadcast_tensors "
+        "broadcast_to expand_copy resize _has_compatible_shallow_copy_type"
+    ).split()
+)
 """Operations that launch no kernel."""
 
 
-def counts(events: Iterable[Any]) -> Row:
+def count_operations(events: Iterable[Any]) -> Row:
     """Operations that launch a kernel, the megabytes that they move, and kernels on a GPU."""
     number = moved = kernels = 0
     busy_us = 0.0
@@ -885,7 +841,9 @@ def counts(events: Iterable[Any]) -> Row:
         if event.device_type != torch.autograd.DeviceType.CPU:
             kernels += 1
             busy_us += event.time_range.elapsed_us()
-        elif works(event) and not any(works(child) for child in event.cpu_children):
+        elif launches_kernel(event) and not any(
+            launches_kernel(child) for child in event.cpu_children
+        ):
             sizes = [element_count(shape) for shape in event.input_shapes]
             number += 1
             moved += 4 * (sum(sizes) + max(sizes, default=0))
@@ -893,7 +851,7 @@ def counts(events: Iterable[Any]) -> Row:
     return row | {"kernels": kernels, "busy_ms": round(busy_us / 1e3, 3)}
 
 
-def works(event: Any) -> bool:
+def launches_kernel(event: Any) -> bool:
     name = event.name
     return name.startswith("aten::") and name.removeprefix("aten::").rstrip("_") not in VIEWS
 
@@ -915,7 +873,7 @@ SECTIONS: dict[str, Callable[[Run], None]] = {
     "training": training,
     "operations": operations,
 }
-"""In the order of their importance."""
+"""Functions that measure the sections, the most important one first."""
 
 
 # -- Summary ---------------------------------------------------------------------------------------

@@ -1,9 +1,9 @@
 """A pretended device, which finds on a CPU what would fail or wait on a GPU.
 
-Its tensors report the device ``pretend:0`` and keep their values on the CPU. An operation that mixes
-them with tensors of the CPU raises an error, as it would on a GPU. Whatever makes the host wait for
-the device (``.item()``, ``bool(tensor)``, ``.tolist()``, ``nonzero``, ``.cpu()``, boolean indices, a
-blocking copy to the device) is counted by the line of hlsim that does it::
+Its tensors report the device ``pretend:0`` and keep their values on the CPU. An operation that
+mixes them with tensors of the CPU raises an error, as it would on a GPU. Operations that make the
+host wait for the device (``.item()``, ``bool(tensor)``, ``.tolist()``, ``nonzero``, ``.cpu()``,
+boolean indices, a blocking copy to the device) are counted by the line of hlsim that runs them::
 
     with PretendDevice() as device:
         output = module.to(DEVICE)(torch.randn(3, device=DEVICE))
@@ -110,7 +110,7 @@ class PretendDevice(TorchDispatchMode):
 
     @property
     def waits(self) -> Counter[str]:
-        """How often each line of hlsim made the host wait since the context was entered."""
+        """Number of waits of the host by line of hlsim, since the context was entered."""
         return waits
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:

@@ -21,7 +21,7 @@ from tests.pretend_device import DEVICE, PretendDevice, PretendTensor
 
 @pytest.fixture(autouse=True)
 def constants_on_the_pretended_device(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Compute constants in this thread, the only one that knows the device, and keep them from other tests."""
+    """Compute constants in this thread, which has the device, and not in the shared cache."""
     for module in (torchtools, recursions):
         monkeypatch.setattr(module, "without_modes", lambda function, *args: function(*args))
     monkeypatch.setattr(torchtools, "_CACHE", torchtools._Cache(torchtools.CACHE_BYTES))
@@ -36,8 +36,9 @@ class Call(NamedTuple):
     """A call of a module that is compared between devices.
 
     Attributes:
-        call: takes the module, processed and clean speech (4, time), and ears (4, 8) on its device.
-        waits: how often the host may wait for the device.
+        build: function that returns the module on the CPU.
+        call: function of the module, processed and clean speech (4, time), and ears (4, 8).
+        waits: number of times that the host may wait for the device.
     """
 
     build: Callable[[], nn.Module]
@@ -61,15 +62,15 @@ def simulate_own_ear(module: Any, wave: Tensor, clean: Tensor, ears: Tensor) -> 
     return module(wave)
 
 
-def judge(module: Any, wave: Tensor, clean: Tensor, ears: Tensor) -> Tensor:
+def compare(module: Any, wave: Tensor, clean: Tensor, ears: Tensor) -> Tensor:
     return module(wave, clean, ears)
 
 
-def judge_own_ear(module: Any, wave: Tensor, clean: Tensor, ears: Tensor) -> Tensor:
+def compare_for_own_ear(module: Any, wave: Tensor, clean: Tensor, ears: Tensor) -> Tensor:
     return module(wave, clean)
 
 
-def judge_two_ears(module: Any, wave: Tensor, clean: Tensor, ears: Tensor) -> Tensor:
+def compare_two_ears(module: Any, wave: Tensor, clean: Tensor, ears: Tensor) -> Tensor:
     return module(wave.unflatten(0, (2, 2)), clean.unflatten(0, (2, 2)), ears.unflatten(0, (2, 2)))
 
 
@@ -90,8 +91,8 @@ CALLS: dict[str, Call] = {
     "msbg, late, own ear": Call(
         partial(MSBG, N3, aligned=False, rescale_active=True), simulate_own_ear
     ),
-    "loss through msbg": Call(partial(HearingLossLoss, simulator="msbg"), judge, waits=1),
-    "interaural loss": Call(partial(HearingLossLoss, criterion="interaural"), judge_two_ears),
+    "loss through msbg": Call(partial(HearingLossLoss, simulator="msbg"), compare, waits=1),
+    "interaural loss": Call(partial(HearingLossLoss, criterion="interaural"), compare_two_ears),
     "mapping": Call(MappingCompensator, simulate),
     "linked wdrc": Call(partial(WDRC, linked=True), simulate_two_ears),
 }
@@ -109,12 +110,13 @@ for name in ("nalr", "wdrc", "hearing-aid", "compensator-general"):
 for criterion in ("coherent-bands", "bands", "paper"):
     for simulator in ("msbg", "neuro-msbg"):
         CALLS[f"loss {criterion} through {simulator}, own ear"] = Call(
-            partial(HearingLossLoss, N3, simulator=simulator, criterion=criterion), judge_own_ear
+            partial(HearingLossLoss, N3, simulator=simulator, criterion=criterion),
+            compare_for_own_ear,
         )
-    CALLS[f"loss {criterion}"] = Call(partial(HearingLossLoss, criterion=criterion), judge)
+    CALLS[f"loss {criterion}"] = Call(partial(HearingLossLoss, criterion=criterion), compare)
 for simulator in ("msbg", "neuro-msbg"):
     CALLS[f"loss through {simulator} with checkpoint, own ear"] = Call(
-        partial(HearingLossLoss, N3, simulator=simulator, checkpoint=True), judge_own_ear
+        partial(HearingLossLoss, N3, simulator=simulator, checkpoint=True), compare_for_own_ear
     )
 
 
@@ -144,9 +146,9 @@ def test_module_keeps_to_its_device_and_does_not_wait(name: str) -> None:
         device.waits.clear()
         on_device = value_and_gradient(call, module, *tensors)
         assert device.waits.total() == call.waits, device.waits
-    for found, expected, tolerance in zip(on_device, on_cpu, (1e-4, 1e-2), strict=True):
-        assert isinstance(found, PretendTensor)
-        assert (found.inner - expected).norm() <= tolerance * expected.norm()
+    for result, expected, tolerance in zip(on_device, on_cpu, (1e-4, 1e-2), strict=True):
+        assert isinstance(result, PretendTensor)
+        assert (result.inner - expected).norm() <= tolerance * expected.norm()
 
 
 class Operations(TorchDispatchMode):
