@@ -33,8 +33,8 @@ class HASPILoss(HearingLossLoss):
         audiogram: ear or ears, as in ``HearingLossLoss``.
         quality: weight of 1 minus HASQI, beside 1 for 1 minus HASPI.
         level: weight of level and peaks. With 0 a model learns to be as loud as it can.
-        options: ``simulator``, ``sample_rate``, ``full_scale_spl``, ``reduction``, ``normal`` and
-            ``ears`` of ``HearingLossLoss``.
+        options: ``simulator``, ``sample_rate``, ``full_scale_spl``, ``reduction``, ``normal``,
+            ``ears`` and ``checkpoint`` of ``HearingLossLoss``.
 
     Raises:
         ValueError: as ``HearingLossLoss``, or a weight is negative or not finite.

@@ -60,7 +60,7 @@ def in_blocks(
     blocks = block_bounds(samples, rate)
     is_differentiated = torch.is_grad_enabled() and (signals.requires_grad or ears.requires_grad)
     if is_differentiated and (checkpoints_short or len(blocks) > 1) and _hooks_are_allowed():
-        process = partial(checkpoint, process, use_reentrant=False)
+        process = partial(checkpoint, process, use_reentrant=False, preserve_rng_state=False)
     if len(blocks) == 1:
         return process(signals, ears, True)
     outputs = []

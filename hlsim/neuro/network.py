@@ -28,7 +28,7 @@ _MAX_CPU_SAMPLES = 128_000
 """Largest number of samples at 16 kHz that run at once on a CPU."""
 
 _DEVICE_SAMPLES = 960_000
-"""Number of samples of a long item that run at once on other devices."""
+"""Samples of a long item, or with ``checkpoint`` of all items, that run at once elsewhere."""
 
 
 class EarNetwork(nn.Module):
@@ -128,7 +128,8 @@ class EarNetwork(nn.Module):
         """
         process = self._process
         if self.checkpoint:
-            process = partial(checkpoint, process, use_reentrant=False)
+            # The networks draw no random numbers, whose state need not be stored.
+            process = partial(checkpoint, process, use_reentrant=False, preserve_rng_state=False)
         if self._receptive_field is None or torch.compiler.is_compiling():
             return process(signals, ears)
         unit, field = self._receptive_field
