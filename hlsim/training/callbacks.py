@@ -114,7 +114,7 @@ class BestCheckpoint(ModelCheckpoint):
         save_checkpoint(self.released, self.kind, network, network.config.to_dict(), record)
 
 
-def remove_score(validation: Mapping[str, float]) -> dict[str, float]:
+def remove_score(validation: Mapping[str, Any]) -> dict[str, Any]:
     """Return the measures of a validation without the score that is computed from them."""
     return {name: value for name, value in validation.items() if name != "score"}
 
@@ -125,7 +125,7 @@ class ProgressBar(TQDMProgressBar):
     def get_metrics(self, trainer: L.Trainer, module: L.LightningModule) -> dict[str, Any]:
         metrics: dict[str, Any] = super().get_metrics(trainer, module)
         metrics.pop("v_num", None)
-        return metrics
+        return remove_score(metrics)
 
     def on_train_epoch_start(self, trainer: L.Trainer, *arguments: Any) -> None:
         super().on_train_epoch_start(trainer, *arguments)

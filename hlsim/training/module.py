@@ -92,10 +92,11 @@ class TrainingModule(L.LightningModule):
 
     def on_validation_epoch_end(self) -> None:
         self.validation = self.summarise(concatenate(self._evaluations))
-        self.log_dict(self.validation, batch_size=1, sync_dist=True)
-        measures = remove_score(self.validation)
-        texts = [f"{name} {value:.3f}" for name, value in measures.items()]
-        self.print(f"step {self.global_step}: {', '.join(texts)}")
+        self.log_dict(self.validation, prog_bar=True, batch_size=1, sync_dist=True)
+        if self.trainer.progress_bar_callback is None:  # a progress bar shows the measures
+            measures = remove_score(self.validation)
+            texts = [f"{name} {value:.3f}" for name, value in measures.items()]
+            self.print(f"step {self.global_step}: {', '.join(texts)}")
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         checkpoint["start_validation"] = self.start_validation
