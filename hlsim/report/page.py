@@ -10,7 +10,6 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
-import os
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -48,21 +47,16 @@ class Table:
         return "\n".join(f"| {' | '.join(line)} |" for line in escaped)
 
     def text(self) -> str:
-        """Return the table for a terminal, without the caption.
+        """Return the table for a terminal, without the caption and the title of the names.
 
         >>> print(Table("Scores", ("Aid", "HASPI"), [("none", "0.27"), ("NAL-R", "0.9")]).text())
-        Aid    HASPI
-        none    0.27
-        NAL-R    0.9
+              HASPI
+        none   0.27
+        NAL-R   0.9
         """
-        columns = list(zip(self.header, *self.rows, strict=True))
-        widths = [max(map(len, column)) for column in columns]
-        aligned = [
-            [cell.rjust(width) for cell in column]
-            for column, width in zip(columns, widths, strict=True)
-        ]
-        aligned[0] = [cell.ljust(widths[0]) for cell in columns[0]]
-        return "\n".join("  ".join(line) for line in zip(*aligned, strict=True))
+        frame = require("pandas", "eval").DataFrame(self.rows, columns=self.header)
+        text: str = frame.set_index(self.header[0]).rename_axis(None).to_string()
+        return text
 
 
 @dataclass(frozen=True)
@@ -116,7 +110,6 @@ class Player:
         volume: volume to start with, from 0 to 1.
         levels: lowest and highest level in dB SPL of the spectrograms.
         colours: colours of the spectrograms in CSS, from the lowest to the highest level.
-        highest_khz: highest frequency of the spectrograms.
     """
 
     groups: Mapping[str, Sequence[Sound]]
@@ -126,7 +119,6 @@ class Player:
     volume: float = 0.5
     levels: tuple[float, float] = (0.0, 0.0)
     colours: Sequence[str] = ()
-    highest_khz: float = 0.0
 
     @property
     def sounds(self) -> list[Sound]:
@@ -217,7 +209,6 @@ def write_page(page: Page, data: Mapping[str, Any], out: str | Path) -> Path:
         ValueError: the files cannot be written, or JSON cannot hold the data.
         MissingExtraError: jinja2 is not installed.
     """
-    folder = check_out(out)
     try:
         text = json.dumps(data, indent=1, ensure_ascii=False, allow_nan=False)
     except (TypeError, ValueError) as error:
@@ -227,20 +218,10 @@ def write_page(page: Page, data: Mapping[str, Any], out: str | Path) -> Path:
         "report.md": page.markdown(),
         "report.html": page.html(),
     }
+    folder = Path(out).absolute()
     for name, content in contents.items():
         write_atomically(folder / name, content)
     return folder / "report.html"
-
-
-def check_out(out: str | Path) -> Path:
-    """Return the folder of a report; ValueError if no report can be written there."""
-    folder = Path(out).absolute()
-    existing = next(path for path in (folder, *folder.parents) if path.exists())
-    if not existing.is_dir():
-        raise ValueError(f"{existing} is a file; choose a folder for the report")
-    if not os.access(existing, os.W_OK | os.X_OK):
-        raise ValueError(f"there is no permission to write into {existing}; choose another folder")
-    return folder
 
 
 @cache

@@ -220,16 +220,15 @@ def detail_section(
 
 def items_table(evaluation: Evaluation, caption: str) -> Table:
     """Return scores and level of every item under every condition."""
-    columns = {title_of(score): (score, ".3f") for score in evaluation.scores}
-    columns["dB SPL"] = ("level", ".1f")
-    rows = []
-    for _, part in evaluation.table.groupby("item", sort=False):
-        row = {"Item": part["name"].iloc[0], "Loss": part["severity"].iloc[0]}
-        for name, of_condition in split_rows(part).items():
-            for title, (column, form) in columns.items():
-                row[f"{title}, {name}"] = number(of_condition[column].iloc[0], form)
-        rows.append(row)
-    return Table.from_rows(caption, rows)
+    facts = evaluation.table.drop_duplicates("item").set_index("item")
+    columns = {"Item": facts["name"], "Loss": facts["severity"]}
+    for name in evaluation.names:
+        for score in evaluation.scores:
+            scores = evaluation.wide(score)[name]
+            columns[f"{title_of(score)}, {name}"] = scores.map(lambda value: number(value, ".3f"))
+        levels = evaluation.wide("level")[name]
+        columns[f"dB SPL, {name}"] = levels.map(lambda value: number(value, ".1f"))
+    return Table(caption, list(columns), list(zip(*columns.values(), strict=True)))
 
 
 def scored_by(evaluation: Evaluation) -> str:

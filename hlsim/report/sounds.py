@@ -21,8 +21,8 @@ from hlsim.report.page import Player, Section, Sound
 LONGEST_SECONDS = 8.0
 """Length after which an item is cut on a page."""
 
-RANGE_DB = 90.0
-"""Range of levels in a spectrogram, from the loudest bin down."""
+SPECTROGRAM_LEVELS = (0.0, 90.0)
+"""Lowest and highest level of all spectrograms in dB SPL, for a bin of 50 Hz."""
 
 NORMAL_EAR = "normal ear (the goal)"
 """Label of clean speech as a normal ear perceives it."""
@@ -115,12 +115,6 @@ def make_player(
     >>> [f"{sound.label} {sound.level:.0f} dB SPL" for sound in player.sounds]
     ['tone 91 dB SPL', 'soft tone 71 dB SPL']
     """
-    levels = {
-        heading: {name: spectrogram_levels(signal, sample_rate) for name, signal in group.items()}
-        for heading, group in groups.items()
-    }
-    loudest = max(float(v.quantile(0.999)) for group in levels.values() for v in group.values())
-    highest = 5.0 * round(loudest / 5.0 + 0.5)
     first_peak = _peak(next(iter(groups.values())))
     sounds = {}
     for heading, group in groups.items():
@@ -128,15 +122,7 @@ def make_player(
         softer = 20.0 * math.log10(peak / first_peak)
         title = heading + (f", played {softer:.0f} dB softer" if softer > 0.5 else "")
         sounds[title] = [
-            Sound(
-                label,
-                level_spl(signal).item(),
-                encode_flac(signal * (_PEAK / peak), sample_rate),
-                loudness=level_spl(signal).item() - _full_scale(peak),
-                spectrogram=_spectrogram_png(levels[heading][label], highest),
-                note=_note(levels[heading][label], highest - RANGE_DB),
-            )
-            for label, signal in group.items()
+            _make_sound(label, signal, sample_rate, peak) for label, signal in group.items()
         ]
     samples = max(len(signal) for group in groups.values() for signal in group.values())
     return Player(
@@ -144,9 +130,24 @@ def make_player(
         seconds=samples / sample_rate,
         full_scale=_full_scale(first_peak),
         sentence=sentence,
-        levels=(highest - RANGE_DB, highest),
+        levels=SPECTROGRAM_LEVELS,
         colours=SPECTROGRAM_COLOURS,
-        highest_khz=min(_HIGHEST_HZ, sample_rate / 2.0) / 1000.0,
+    )
+
+
+def _make_sound(label: str, signal: Tensor, sample_rate: int, peak: float) -> Sound:
+    """Encode a signal of a group with a peak in pascals, and draw it."""
+    level = float(level_spl(signal))
+    levels = spectrogram_levels(signal, sample_rate)
+    lowest = SPECTROGRAM_LEVELS[0]
+    is_empty = float((levels > lowest).float().mean()) < _EMPTY_SHARE
+    return Sound(
+        label,
+        level,
+        encode_flac(signal * (_PEAK / peak), sample_rate),
+        loudness=level - _full_scale(peak),
+        spectrogram=_spectrogram_png(levels),
+        note=f"almost nothing above {lowest:.0f} dB SPL" if is_empty else "",
     )
 
 
@@ -184,13 +185,14 @@ def spectrogram_levels(signal: Tensor, sample_rate: int) -> Tensor:
     return levels[: round(_HIGHEST_HZ * points / sample_rate) + 1]
 
 
-def _spectrogram_png(levels: Tensor, highest: float) -> bytes:
+def _spectrogram_png(levels: Tensor) -> bytes:
     """Return a picture with one pixel for each bin and frame; nothing without Pillow."""
     try:
         image = require("PIL.Image", "eval")
     except MissingExtraError:  # sounds can be played without it
         return b""
-    shares = ((levels - highest) / RANGE_DB + 1.0).clamp(0.0, 1.0)
+    lowest, highest = SPECTROGRAM_LEVELS
+    shares = ((levels - lowest) / (highest - lowest)).clamp(0.0, 1.0)
     pixels = (255.0 * shares).round().to(torch.uint8).flip(0).numpy()
     picture = image.fromarray(pixels)
     picture.putpalette(_palette())
@@ -205,9 +207,3 @@ def _palette() -> bytes:
     shares, places = np.linspace(0.0, 1.0, 256), np.linspace(0.0, 1.0, len(anchors))
     channels = [np.interp(shares, places, channel) for channel in anchors.T]
     return np.stack(channels, 1).round().astype(np.uint8).tobytes()
-
-
-def _note(levels: Tensor, lowest: float) -> str:
-    """Return what to write over a spectrogram in which there is almost nothing to see."""
-    share = float((levels > lowest).float().mean())
-    return f"almost nothing above {lowest:.0f} dB SPL" if share < _EMPTY_SHARE else ""
