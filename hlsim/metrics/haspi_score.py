@@ -135,7 +135,7 @@ class HaspiReference(Reference["_Batch"]):
         super().__init__(clean, **settings)
 
     def _prepare_batches(self, signals: CleanSpeech) -> list[_Batch]:
-        return map_on_cores(lambda batch: _Batch(signals, batch), signals.batches)
+        return map_on_cores(lambda batch: _Batch(signals, batch), signals.batches, signals.clean)
 
     def score(
         self,

@@ -130,6 +130,7 @@ class QualityReference(Reference["_Batch"]):
                 signals, batch, ears[batch.items], host_ears[batch.items], type(self)
             ),
             signals.batches,
+            signals.clean,
         )
 
     def score(

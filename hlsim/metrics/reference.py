@@ -144,7 +144,7 @@ class Reference(Generic[Batch]):
         self._batches = self._prepare(self._signals)
         if keep:
             with torch.autocast(clean.device.type, enabled=False):
-                map_on_cores(lambda batch: batch.store(), self._batches)
+                map_on_cores(lambda batch: batch.store(), self._batches, self._signals.clean)
 
     @torch.no_grad()
     def _prepare(self, signals: CleanSpeech) -> list[Batch]:
@@ -169,18 +169,13 @@ class Reference(Generic[Batch]):
         seeds = item_seeds(seed, signals.shape)
         with torch.autocast(rows.device.type, enabled=False):
             features = map_on_cores(
-                lambda batch: batch.compare(rows, noise, seeds, *ears),
-                batches,
-                differentiable=rows.requires_grad and torch.is_grad_enabled(),
+                lambda batch: batch.compare(rows, noise, seeds, *ears), batches, rows
             )
         return torch.cat(features).reshape(*signals.shape, -1)
 
 
 def map_on_cores(
-    function: Callable[[Argument], Result],
-    arguments: Sequence[Argument],
-    *,
-    differentiable: bool = False,
+    function: Callable[[Argument], Result], arguments: Sequence[Argument], signal: Tensor
 ) -> list[Result]:
     """Call a function for each of several arguments, in as many threads as torch uses.
 
@@ -190,14 +185,16 @@ def map_on_cores(
     Args:
         function: function to call.
         arguments: arguments of the calls.
-        differentiable: call it in this thread, so that autograd's hooks, which belong to a thread,
-            see every operation.
+        signal: tensor on which the function depends. If it is not on a CPU or has a gradient, the
+            calls are made in this thread, to which the hooks of autograd belong.
 
-    >>> map_on_cores(abs, [-1, -2])
+    >>> map_on_cores(abs, [-1, -2], torch.zeros(1))
     [1, 2]
     """
     threads = torch.get_num_threads()
-    if differentiable or min(threads, len(arguments)) == 1:
+    workers = min(threads, len(arguments))
+    is_differentiable = signal.requires_grad and torch.is_grad_enabled()
+    if workers == 1 or signal.device.type != "cpu" or is_differentiable:
         return [function(argument) for argument in arguments]
     inference = torch.is_inference_mode_enabled()
 
@@ -205,7 +202,6 @@ def map_on_cores(
         with torch.inference_mode(inference), torch.no_grad():
             return function(argument)
 
-    workers = min(threads, len(arguments))
     try:
         with ThreadPoolExecutor(workers, initializer=torch.set_num_threads, initargs=(1,)) as pool:
             return list(pool.map(call, arguments))

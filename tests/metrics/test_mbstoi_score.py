@@ -145,7 +145,7 @@ def test_blocks_do_not_change_the_score(
 ) -> None:
     clean, noisy = scenes
     whole = mbstoi(noisy, clean)
-    monkeypatch.setattr(sys.modules["hlsim.metrics.mbstoi_score"], "_TOGETHER_CPU", 7 * 4000)
+    monkeypatch.setattr(sys.modules["hlsim.metrics.mbstoi_score"], "CPU_SEGMENTS", 7)
     torch.testing.assert_close(mbstoi(noisy, clean), whole, atol=1e-12, rtol=0.0)
 
 

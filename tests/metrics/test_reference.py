@@ -11,6 +11,8 @@ import hlsim
 from hlsim.metrics import haspi, hasqi
 from hlsim.metrics.reference import map_on_cores
 
+SIGNAL = torch.zeros(1)
+
 
 @pytest.fixture(autouse=True)
 def two_threads() -> Iterator[None]:
@@ -21,26 +23,27 @@ def two_threads() -> Iterator[None]:
 
 
 def test_calls_run_in_other_threads_that_compute_alone() -> None:
-    settings = map_on_cores(lambda _: (get_ident(), torch.get_num_threads()), range(4))
+    settings = map_on_cores(lambda _: (get_ident(), torch.get_num_threads()), range(4), SIGNAL)
     assert all(thread != get_ident() and threads == 1 for thread, threads in settings)
     assert torch.get_num_threads() == 2
 
 
 def test_differentiable_calls_run_in_this_thread() -> None:
-    assert set(map_on_cores(lambda _: get_ident(), range(4), differentiable=True)) == {get_ident()}
+    signal = torch.zeros(1, requires_grad=True)
+    assert set(map_on_cores(lambda _: get_ident(), range(4), signal)) == {get_ident()}
 
 
 @pytest.mark.parametrize("mode", [torch.no_grad, torch.inference_mode, torch.enable_grad])
 def test_calls_have_the_mode_of_this_thread(mode: type) -> None:
     with mode():
         expected = torch.is_inference_mode_enabled()
-        modes = map_on_cores(lambda _: torch.is_inference_mode_enabled(), range(2))
+        modes = map_on_cores(lambda _: torch.is_inference_mode_enabled(), range(2), SIGNAL)
     assert modes == [expected, expected]
 
 
 def test_the_first_error_is_raised() -> None:
     with pytest.raises(ZeroDivisionError):
-        map_on_cores(lambda divisor: 1 / divisor, [1, 0])
+        map_on_cores(lambda divisor: 1 / divisor, [1, 0], SIGNAL)
     assert torch.get_num_threads() == 2
 
 

@@ -103,7 +103,7 @@ class CleanSpeech:
         if whole_khz:
             self._rate = 1000 * round(self._input_rate / 1000)
         self._settings = sample_rate, full_scale_spl, whole_khz, name
-        self._clean, self._ends = clean.detach(), ends
+        self.clean, self._ends = clean.detach(), ends
         self._gain = 10.0 ** (self.full_scale / 20.0)
         with torch.no_grad():
             # Double precision, because one sample more at an end would shift all frames.
@@ -191,9 +191,9 @@ class CleanSpeech:
         """
         ends = torch.tensor(self._ends).reshape(self.shape)
         processed, clean, lengths = cut_to_common_length(
-            processed, self._clean, self._input_rate, ends
+            processed, self.clean, self._input_rate, ends
         )
-        if clean.shape == self._clean.shape:
+        if clean.shape == self.clean.shape:
             return processed, self
         return processed, CleanSpeech(clean, lengths, *self._settings)
 
