@@ -1,4 +1,4 @@
-"""HASPI and HASQI of hlsim compared with those of pyclarity: errors with the same seed, and speed.
+"""HASPI, HASQI and HAAQI of hlsim compared with those of pyclarity: errors with the same seed, and speed.
 
     python examples/score_parity.py SPEECH [ITEMS]
 
@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from clarity.evaluator.haaqi import haaqi_v1
 from clarity.evaluator.haspi import haspi_v2
 from clarity.evaluator.hasqi import hasqi_v2
 from torch import Tensor
@@ -22,9 +23,10 @@ from torch import Tensor
 from compensators import NALR
 from hlsim import Audiogram
 from hlsim.calibration import set_level
-from hlsim.metrics import HaspiReference, HasqiReference
+from hlsim.metrics import HaaqiReference, HaspiReference, HasqiReference
 from hlsim.training.clips import Clips
 
+PYCLARITY = {"haspi": haspi_v2, "hasqi": hasqi_v2, "haaqi": partial(haaqi_v1, equalisation=1)}
 RATE = 16000
 EARS = ("N1", "N2", "N3", "N4", "N5", "N6", "S1", "S2", "S3")
 
@@ -50,7 +52,7 @@ def process(clean: Tensor, index: int, ear: Audiogram, generator: torch.Generato
 def pyclarity_score(name: str, clean: Tensor, output: Tensor, ear: Audiogram, seed: int) -> float:
     """Compute pyclarity's score with a seed of NumPy's global generator, from which it draws
     noise."""
-    score = {"haspi": haspi_v2, "hasqi": hasqi_v2}[name]
+    score = PYCLARITY[name]
     signals = [signal.double().numpy() for signal in (clean, output)]
     np.random.seed(seed)
     return float(score(signals[0], RATE, signals[1], RATE, ear.to_clarity(), level1=94.0)[0])
@@ -61,7 +63,8 @@ def prepare_score(name: str, clean: Tensor, ear: Audiogram) -> Callable[..., Ten
     if name == "haspi":
         reference = HaspiReference(clean)
         return lambda output, **noise: reference.score(output, ear, **noise)
-    return HasqiReference(clean, ear).score
+    reference_class = {"hasqi": HasqiReference, "haaqi": HaaqiReference}[name]
+    return reference_class(clean, ear).score
 
 
 def time_call(call: Callable[[], Any]) -> tuple[Any, float]:
@@ -77,7 +80,7 @@ def main(folder: str, items: str = "24") -> None:
         Clips(folder, sample_rate=RATE, seconds=3.0),
         torch.Generator().manual_seed(0),
     )
-    for name in ("haspi", "hasqi"):
+    for name in PYCLARITY:
         errors, ratios = {torch.float64: [], torch.float32: []}, []
         for index in range(int(items)):
             ear = Audiogram.standard(EARS[index % len(EARS)])

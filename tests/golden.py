@@ -661,6 +661,12 @@ def metric_cases() -> dict[str, Case]:
         for kind in ("seeded", "none"):
             function = partial(in_double, noise=kind, seed=[1, 2])
             cases[f"{name} with noise {kind}"] = Case(function)
+    haaqi = partial(metric, "haaqi", torch.float64)
+    cases["haaqi, float32"] = single(partial(metric, "haaqi", torch.float32))
+    cases["haaqi, float64"] = Case(haaqi)
+    cases["haaqi at 44100 Hz"] = Case(partial(haaqi, 44100))
+    cases["haaqi with noise seeded"] = Case(partial(haaqi, noise="seeded", seed=[1, 2]))
+    cases["haaqi with lengths"] = single(partial(metric_lengths, "haaqi"))
     for rate in (16000, 44100):
         cases[f"mbstoi at {rate} Hz"] = Case(partial(binaural, rate))
     return cases

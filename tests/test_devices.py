@@ -14,7 +14,7 @@ from torch.utils._pytree import tree_leaves
 
 from compensators import WDRC, MappingCompensator, load_compensator
 from hlsim import MSBG, Audiogram, HearingLossLoss, load_pretrained, torchtools
-from hlsim.metrics import haspi, hasqi, mbstoi
+from hlsim.metrics import haaqi, haspi, hasqi, mbstoi
 from hlsim.metrics.ear import recursions
 from tests.pretend_device import DEVICE, PretendDevice, PretendTensor
 
@@ -99,6 +99,7 @@ CALLS: dict[str, Call] = {
 # the number of waits of scores does not depend on the number of items
 CALLS["haspi"] = Call(nn.Identity, score(haspi), waits=3)
 CALLS["hasqi"] = Call(nn.Identity, score(hasqi), waits=4)
+CALLS["haaqi"] = Call(nn.Identity, score(haaqi), waits=4)
 CALLS["mbstoi"] = Call(nn.Identity, score_two_ears, waits=2)
 for name in ("neuro-msbg", "neuro-msbg-mamba", "neuro-msbg-lstm", "neuro-msbg-transformer"):
     CALLS[name] = Call(partial(load_pretrained, name), simulate)

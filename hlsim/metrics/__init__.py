@@ -1,5 +1,6 @@
 """Measures of signals: scores and errors, without files."""
 
+from importlib.util import find_spec
 from typing import Any
 
 from hlsim.metrics.haaqi_score import HaaqiReference, haaqi
@@ -7,10 +8,9 @@ from hlsim.metrics.haspi_score import HaspiReference, haspi
 from hlsim.metrics.hasqi_score import HasqiParts, HasqiReference, hasqi
 from hlsim.metrics.mbstoi_score import mbstoi
 
+_TORCHMETRICS = ["HAAQI", "HASPI", "HASQI"]
+
 __all__ = [
-    "HAAQI",
-    "HASPI",
-    "HASQI",
     "HaaqiReference",
     "HaspiReference",
     "HasqiParts",
@@ -20,10 +20,12 @@ __all__ = [
     "hasqi",
     "mbstoi",
 ]
+if find_spec("torchmetrics"):  # torchmetrics belongs to an extra
+    __all__ += _TORCHMETRICS
 
 
 def __getattr__(name: str) -> Any:
-    if name in ("HAAQI", "HASPI", "HASQI"):  # torchmetrics belongs to an extra
+    if name in _TORCHMETRICS:
         from hlsim.metrics import torchmetric
 
         return getattr(torchmetric, name)

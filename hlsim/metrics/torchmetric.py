@@ -284,8 +284,9 @@ class HASPI(_MeanScore):
     item is that of ``haspi`` with the same settings, in double precision. On a CPU one second of
     audio takes about 0.12 s on one core; ``limit`` bounds the cost of a validation epoch.
 
-    In a LightningModule ``self.haspi = HASPI(sample_rate=16000)``, in ``validation_step``
-    ``self.haspi.update(aided, clean, audiogram); self.log("haspi", self.haspi)``.
+    In a LightningModule, write ``self.haspi = HASPI(sample_rate=16000)`` in the constructor, and
+    ``self.haspi.update(output, clean, audiogram); self.log("haspi", self.haspi)`` in
+    ``validation_step``.
 
     Args:
         sample_rate: sample rate in Hz, 16000 to 48000.
@@ -298,6 +299,15 @@ class HASPI(_MeanScore):
         limit: number of items that are scored from one reset to the next in each process; the
             others are passed over. None scores all.
         options: keyword arguments of ``torchmetrics.Metric``.
+
+    Raises:
+        ValueError: a value out of range, or ``dist_sync_on_step=True``.
+
+    >>> from hlsim import example_speech
+    >>> speech, metric = example_speech()[:16000], HASPI()
+    >>> metric.update(speech, speech, "NH")
+    >>> bool(metric.compute() > 0.9), int(metric.count)
+    (True, 1)
     """
 
     score = staticmethod(haspi)
@@ -308,6 +318,11 @@ class HASQI(_MeanScore):
 
     The arguments are those of ``HASPI``. The reference is clean speech amplified by NAL-R, and the
     score falls with every difference from it. On a CPU one second of audio takes about 0.2 s.
+
+    >>> from hlsim import example_speech
+    >>> speech, metric = example_speech()[:16000], HASQI()
+    >>> round(float(metric(speech, speech, "NH")), 2)
+    0.99
     """
 
     score = staticmethod(hasqi)
@@ -318,6 +333,13 @@ class HAAQI(_MeanScore):
 
     The arguments are those of ``HASPI``. The reference is clean music amplified by NAL-R. With
     stereo music the better ear counts, and ``ears`` has the mean of each ear.
+
+    >>> seconds = torch.arange(24000) / 24000
+    >>> music = 0.02 * torch.sin(2 * torch.pi * 220.0 * seconds) * torch.exp(-3 * seconds)
+    >>> metric = HAAQI(sample_rate=24000)
+    >>> metric.update(torch.stack([music, 0.1 * music])[None], music.expand(1, 2, -1), ["NH", "NH"])
+    >>> bool(metric.ears[0] > metric.ears[1])
+    True
     """
 
     score = staticmethod(haaqi)

@@ -7,7 +7,7 @@ from scipy.signal import resample_poly
 from torch import Tensor
 
 import hlsim
-from hlsim import Audiogram, Listener
+from hlsim import NALR, Audiogram, Listener
 from hlsim.metrics import HaaqiReference, haaqi
 from hlsim.metrics.ear.model import Extent
 from hlsim.metrics.haaqi_score import modulation_correlation
@@ -61,6 +61,25 @@ def test_equals_pyclarity_under_its_seed(pyclarity: PyclarityOutputs, kind: str,
         assert [float(part) for part in parts] == pytest.approx(expected, abs=error)
     score = float(haaqi(processed, clean, N4, sample_rate=rate, whole_khz=True))
     assert score == pytest.approx(expected[0], abs=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("name", "unaided", "amplified"), [("NH", 0.91, 0.91), ("N2", 0.73, 0.90), ("N4", 0.28, 0.94)]
+)
+def test_identical_music_has_pyclaritys_score_below_1(
+    pyclarity: PyclarityOutputs, name: str, unaided: float, amplified: float
+) -> None:
+    """The module's docstring and the guide for Cadenza state these scores."""
+    clean, ear = example_music(24000), Audiogram.standard(name)
+    by_nalr = NALR(ear, sample_rate=24000, order=140)(clean)
+    for kind, processed, score in (("clean", clean, unaided), ("NAL-R", by_nalr, amplified)):
+        arguments = clean.numpy(), processed.numpy(), ear, 24000, 7
+        expected = float(pyclarity(f"haaqi, {kind}, {name}", reference.haaqi, *arguments)[0])
+        prepared = HaaqiReference(clean, ear, sample_rate=24000)
+        assert float(prepared.score(processed, noise="seeded", seed=7)) == pytest.approx(
+            expected, abs=1e-6
+        )
+        assert expected == pytest.approx(score, abs=0.005)
 
 
 @pytest.mark.parametrize("segments", [7, 300])
