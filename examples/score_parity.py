@@ -1,4 +1,4 @@
-"""HASPI, HASQI and HAAQI of hlsim compared with those of pyclarity: errors with the same seed, and speed.
+"""HASPI, HASQI and HAAQI compared with those of pyclarity: errors with the same seed, and speed.
 
     python examples/score_parity.py SPEECH [ITEMS]
 

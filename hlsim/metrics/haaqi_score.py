@@ -15,7 +15,7 @@ gradient. It differs from ``compute_haaqi`` in these points:
 Identical signals do not score 1, here as in pyclarity. The ear expects the amplification of NAL-R:
 1.2 s of chords at 70 dB SPL score 0.91 against themselves for the ear NH, 0.73 for N2 and 0.28 for
 N4. Amplified by NAL-R, they score 0.91, 0.90 and 0.94. Compare scores with those of NAL-R instead
-of 1. ``tests/metrics/test_haaqi_score.py`` computes these scores.
+of 1. ``tests/metrics/test_scores.py`` computes these scores.
 
 Source: Kates and Arehart 2016, "The hearing-aid audio quality index (HAAQI)", IEEE/ACM Transactions
 on Audio, Speech, and Language Processing 24(2), 354-365, doi 10.1109/TASLP.2015.2507858.

@@ -1,0 +1,422 @@
+"""HASPI, HASQI and HAAQI against pyclarity, their batches, noise, gradients and errors."""
+
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from scipy.signal import resample_poly
+from torch import Tensor
+from torch.nn import functional
+
+import hlsim
+from hlsim import NALR, Audiogram, Listener
+from hlsim.audio import read_audio
+from hlsim.metrics import HaaqiReference, HaspiReference, HasqiReference, haaqi, haspi, hasqi
+from hlsim.metrics.ear import clean_speech, fine_structure
+from hlsim.metrics.ear import model as ear_model
+from hlsim.metrics.ear.model import Extent
+from hlsim.metrics.haaqi_score import modulation_correlation
+from hlsim.metrics.haspi_score import legacy_rng_after_normals
+from hlsim.metrics.quality import _nalr_taps, scale_motion_to_level
+from tests import pyclarity as reference
+from tests.pyclarity import PyclarityOutputs
+
+SPEECH = Path(hlsim.__file__).parent / "data" / "speech" / "valid"
+NH, N1, N2, N3, N4, N5, N6, S2 = (
+    Audiogram.standard(name) for name in ("NH", "N1", "N2", "N3", "N4", "N5", "N6", "S2")
+)
+SCORES: dict[str, Callable[..., Tensor]] = {"haspi": haspi, "hasqi": hasqi, "haaqi": haaqi}
+NOISES = ("expected", "seeded", "none")
+
+
+@cache
+def pair(first: int = 1, noise_gain: float = 0.5) -> tuple[Tensor, Tensor]:
+    """Return two clips of 0.8 s at 16 kHz, 68 dB SPL, clean and noisy. Shape: (2, time) each."""
+    paths = [SPEECH / f"flite-rms-0{number}.flac" for number in (first, first + 1)]
+    clean = torch.stack([read_audio(path)[0][0, 8000:20800] for path in paths])
+    noise = torch.randn(clean.shape, generator=torch.Generator().manual_seed(1))
+    return clean, clean + noise_gain * noise * clean.square().mean(-1, keepdim=True).sqrt()
+
+
+def at_rate(signal: Tensor, rate: int) -> Tensor:
+    """Return the first item at another rate. Shape: (items, time) -> (time,), float64."""
+    return torch.from_numpy(resample_poly(signal[0].double().numpy(), rate // 100, 160))
+
+
+@cache
+def example_music(rate: int) -> Tensor:
+    """Return 1.2 s of four chords of decaying harmonic tones, 70 dB SPL, float64."""
+    random = np.random.RandomState(0)
+    time = np.arange(round(1.2 * rate)) / rate
+    music = np.zeros_like(time)
+    for onset in (0.0, 0.3, 0.6, 0.9):
+        since_onset = time - onset
+        envelope = np.where(since_onset >= 0.0, np.exp(-6.0 * np.maximum(since_onset, 0.0)), 0.0)
+        for semitone in (0, 4, 7):
+            pitch = 220.0 * 2.0 ** ((semitone + random.randint(12)) / 12)
+            for harmonic in range(1, 9):
+                phase = 2.0 * np.pi * random.uniform()
+                tone = np.sin(2.0 * np.pi * harmonic * pitch * since_onset + phase)
+                music += envelope * tone / harmonic
+    return torch.from_numpy(music * 10.0 ** ((70.0 - 94.0) / 20.0) / np.sqrt(np.mean(music**2)))
+
+
+def degrade(clean: Tensor) -> Tensor:
+    """Return the signal with noise and clipped peaks."""
+    noise = np.random.RandomState(1).standard_normal(clean.shape)
+    rms = float(clean.square().mean().sqrt())
+    return (2.0 * clean + 0.2 * rms * torch.from_numpy(noise)).clamp(-5.0 * rms, 5.0 * rms)
+
+
+# -- pyclarity -------------------------------------------------------------------------------------
+
+Case = tuple[Audiogram, int, Callable[[int], tuple[Tensor, Tensor]]]
+
+
+def speech_case(ear: Audiogram, rate: int, change: Callable[[Tensor], Tensor], *clips: Any) -> Case:
+    return (
+        ear,
+        rate,
+        lambda rate: (
+            at_rate(pair(*clips)[0], rate),
+            change(at_rate(pair(*clips)[1], rate)),
+        ),
+    )
+
+
+def music_case(kind: str, rate: int) -> Case:
+    def signals(rate: int) -> tuple[Tensor, Tensor]:
+        speech = hlsim.example_speech()[None, 8000 : 8000 + round(1.2 * 16000)]
+        clean = example_music(rate) if kind == "music" else at_rate(speech, rate)
+        return clean, degrade(clean)
+
+    return N4, rate, signals
+
+
+PARITY = {
+    "haspi, noisy": speech_case(N2, 16000, lambda signal: signal),
+    "haspi, amplified, 48 kHz": speech_case(N3, 48000, lambda signal: 10.0 * signal),
+    "haspi, clipped, 44.1 kHz": speech_case(S2, 44100, lambda signal: signal.clamp(-0.02, 0.02)),
+    "haspi, nearly inaudible": speech_case(N5, 24000, lambda signal: 0.3 * signal),
+    "hasqi, 16000 Hz": speech_case(N1, 16000, lambda signal: signal, 3, 0.3),
+    "hasqi, 48000 Hz": speech_case(N3, 48000, lambda signal: 5.0 * signal, 3, 0.3),
+    "hasqi, 44100 Hz": speech_case(N3, 44100, lambda signal: 0.5 * signal, 3, 0.3),
+}
+for kind in ("music", "speech"):
+    for rate in (16000, 24000, 32000, 44100):
+        PARITY[f"haaqi, {kind}, {rate} Hz"] = music_case(kind, rate)
+
+
+@pytest.mark.parametrize("key", PARITY)
+def test_equals_pyclarity_under_its_seed(pyclarity: PyclarityOutputs, key: str) -> None:
+    name = key.partition(",")[0]
+    ear, rate, signals = PARITY[key]
+    clean, processed = signals(rate)
+    arguments = clean.numpy(), processed.numpy(), ear, rate, 7
+    expected = np.atleast_1d(pyclarity(key, getattr(reference, name), *arguments)).tolist()
+    settings = {"sample_rate": rate, "whole_khz": True}
+    in_double = 1e-6 if name == "haaqi" else 1e-7
+    for dtype, error in ((torch.float64, in_double), (torch.float32, 1e-4)):
+        x, y = clean.to(dtype), processed.to(dtype)
+        if name == "haspi":
+            found = [float(haspi(y, x, ear, noise="seeded", seed=7, **settings))]
+        else:
+            kind = HasqiReference if name == "hasqi" else HaaqiReference
+            found = [float(v) for v in kind(x, ear, **settings).parts(y, noise="seeded", seed=7)]
+        assert found == pytest.approx(expected, abs=error)
+    score = float(SCORES[name](processed, clean, ear, **settings))
+    assert score == pytest.approx(expected[0], abs=7e-3 if name == "haspi" else 2e-3)
+
+
+@pytest.mark.parametrize(
+    ("name", "unaided", "amplified"), [("NH", 0.91, 0.91), ("N2", 0.73, 0.90), ("N4", 0.28, 0.94)]
+)
+def test_identical_music_has_pyclaritys_score_below_1(
+    pyclarity: PyclarityOutputs, name: str, unaided: float, amplified: float
+) -> None:
+    """The module's docstring and the guide for Cadenza state these scores."""
+    clean, ear = example_music(24000), Audiogram.standard(name)
+    by_nalr = NALR(ear, sample_rate=24000, order=140)(clean)
+    for kind, processed, score in (("clean", clean, unaided), ("NAL-R", by_nalr, amplified)):
+        arguments = clean.numpy(), processed.numpy(), ear, 24000, 7
+        expected = float(pyclarity(f"haaqi, {kind}, {name}", reference.haaqi, *arguments)[0])
+        found = haaqi(processed, clean, ear, sample_rate=24000, noise="seeded", seed=7)
+        assert float(found) == pytest.approx(expected, abs=1e-6)
+        assert expected == pytest.approx(score, abs=0.005)
+
+
+@pytest.mark.parametrize("segments", [7, 300])
+def test_modulation_correlation_equals_pyclaritys(segments: int) -> None:
+    eb = pytest.importorskip("clarity.evaluator.haspi.eb")
+    random = np.random.RandomState(0)
+    x = 20.0 * np.abs(random.standard_normal((32, segments)))
+    y = x + 5.0 * random.standard_normal((32, segments))
+    x[:, 2] = 0.0  # a silent segment
+    expected = eb.melcor9(x.copy(), y.copy(), 2.5, 0.0, 8)[2]
+    levels = (torch.from_numpy(signal)[None] for signal in (x, y))
+    result = modulation_correlation(*levels, Extent((segments,)))
+    assert float(result) == pytest.approx(expected, abs=1e-12)
+
+
+@pytest.mark.parametrize("ear", [NH, N3, N6])
+def test_nalr_equals_pyclaritys(ear: Audiogram) -> None:
+    clarity = pytest.importorskip("clarity.enhancer.nalr")
+    expected, _ = clarity.NALR(140, 24000).build(ear.to_clarity())
+    taps = _nalr_taps(torch.tensor(ear.thresholds, dtype=torch.float64))
+    np.testing.assert_allclose(taps, expected, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("time", [9000, 9100, 9216])
+def test_features_of_segments_equal_pyclaritys(time: int) -> None:
+    eb = pytest.importorskip("clarity.evaluator.haspi.eb")
+    random = np.random.RandomState(0)
+    x, y = (20.0 * np.abs(random.standard_normal((32, time))) for _ in range(2))
+    y[:, :3000] = x[:, 5:3005]
+    y[3] = 0.0
+    waves, extent = [torch.from_numpy(signal)[None] for signal in (x, y)], Extent((time,))
+    counts = fine_structure.segments_of(extent)
+    means = fine_structure.smooth_levels(waves[0], extent)[0]
+    np.testing.assert_allclose(means.numpy(), eb.env_smooth(x, 16, 24000.0), rtol=1e-12)
+    covariance, energy = eb.bm_covary(x, y, 16, 24000.0)[:2]
+    spectra = [fine_structure.segment_spectra(wave, extent) for wave in waves]
+    coherence = fine_structure.coherence(*spectra, counts)
+    np.testing.assert_allclose(coherence[0].numpy(), covariance, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(spectra[0][1][0].numpy(), energy, rtol=1e-10)
+    synchrony = float(fine_structure.synchrony(coherence, spectra[0][1], counts))
+    assert synchrony == pytest.approx(eb.ave_covary2(covariance, energy, 2.5)[1][4], abs=1e-12)
+    smooth = [eb.env_smooth(signal, 16, 24000.0) for signal in (x, y)]
+    expected, _ = eb.mel_cepstrum_correlation(*smooth, 2.5, 0.0)
+    levels = (torch.from_numpy(signal)[None] for signal in smooth)
+    correlation = float(fine_structure.envelope_correlation(*levels, counts))
+    assert correlation == pytest.approx(expected, abs=1e-12)
+
+
+def test_motion_keeps_its_unit_where_the_shifted_envelope_is_zero() -> None:
+    motion, power = torch.tensor([4.0, 4.0, 4.0]), torch.tensor([0.0, 0.5, 100.0])
+    scaled = scale_motion_to_level(motion, power, torch.tensor([0.0, 0.0, 20.0]), 0.25)
+    torch.testing.assert_close(scaled, torch.tensor([1.0, 0.0, 8.0]))
+
+
+# -- levels, rates and batches ---------------------------------------------------------------------
+
+
+def test_full_scale_is_pyclaritys_level1() -> None:
+    clean, noisy = (signal[0].double() for signal in pair())
+    loud = haspi(10.0 * noisy, 10.0 * clean, N3, full_scale_spl=74.0)
+    torch.testing.assert_close(loud, haspi(noisy, clean, N3), rtol=0, atol=1e-10)
+
+
+def test_rates_are_exact_unless_whole_khz_are_requested() -> None:
+    x, y = (at_rate(signal, 44100) for signal in pair())
+    exact, rounded = (
+        float(haspi(y, x, N2, sample_rate=44100, whole_khz=whole)) for whole in (False, True)
+    )
+    at_16_khz = float(haspi(pair()[1][0].double(), pair()[0][0].double(), N2))
+    assert abs(exact - at_16_khz) < abs(rounded - at_16_khz)
+
+
+@pytest.mark.parametrize("noise", NOISES)
+@pytest.mark.parametrize("name", SCORES)
+def test_a_batch_equals_its_items(name: str, noise: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    clean, noisy = (signal.double() for signal in pair())
+    score, ends, ears = SCORES[name], [12800, 11345], [N2, N3]
+    items = [
+        score(noisy[i, :end], clean[i, :end], ears[i], noise=noise, seed=i)
+        for i, end in enumerate(ends)
+    ]
+    padded = torch.where(torch.arange(12800) < torch.tensor(ends)[:, None], noisy, 0.7)
+    padded.requires_grad_()
+    settings = {"lengths": ends, "noise": noise, "seed": [0, 1]}
+    batch = score(padded, clean, torch.tensor([N2.levels, N3.levels]), **settings)
+    torch.testing.assert_close(batch, torch.stack(items), rtol=0, atol=1e-13)
+    (gradient,) = torch.autograd.grad(batch.sum(), padded)
+    # On a GPU all items are one batch, and channels are shifted by indices.
+    monkeypatch.setattr(clean_speech.CleanSpeech, "_batch_slices", lambda self, n: [slice(0, n)])
+    monkeypatch.setattr(ear_model, "_shift_rows", ear_model._gather_rows)
+    as_on_gpu = score(padded, clean, ears, **settings)
+    torch.testing.assert_close(as_on_gpu, batch, rtol=0, atol=1e-13)
+    torch.testing.assert_close(torch.autograd.grad(as_on_gpu.sum(), padded)[0], gradient)
+
+
+def test_scores_have_the_leading_dimensions_of_the_signals() -> None:
+    clean, noisy = pair()
+    scores = haspi(noisy[:, None], clean[:, None], N2, lengths=[[12800], [11345]])
+    assert scores.shape == (2, 1)
+    assert float(scores[0, 0]) == float(haspi(noisy[0], clean[0], N2))
+
+
+def test_stereo_music_has_a_score_for_each_ear() -> None:
+    clean = torch.stack([example_music(16000), 0.5 * example_music(16000)])
+    processed = degrade(clean)
+    expected = [haaqi(processed[side], clean[side], ear) for side, ear in enumerate((N2, N4))]
+    scores = haaqi(processed, clean, Listener(N2, N4))
+    torch.testing.assert_close(scores, torch.stack(expected), rtol=0, atol=1e-12)
+
+
+def prepare(name: str, clean: Tensor, **settings: Any) -> Callable[..., Tensor]:
+    """Return a function from processed signals to their scores for the ear N3."""
+    if name == "haspi":
+        prepared = HaspiReference(clean, **settings)
+        return lambda processed, **noise: prepared.score(processed, N3, **noise)
+    return (HasqiReference if name == "hasqi" else HaaqiReference)(clean, N3, **settings).score
+
+
+@pytest.mark.parametrize("name", SCORES)
+def test_a_prepared_reference_gives_the_same_scores(name: str) -> None:
+    clean, noisy = pair()
+    score, prepared = SCORES[name], prepare(name, clean, lengths=[12800, 11500])
+    for noise in NOISES:
+        direct = score(noisy, clean, N3, lengths=[12800, 11500], noise=noise, seed=5)
+        assert torch.equal(prepared(noisy, noise=noise, seed=5), direct)
+    longer = functional.pad(noisy, (0, 500))
+    for processed, lengths in ((longer, [12800, 11500]), (noisy[:, :12100], [12100, 11500])):
+        time = min(processed.shape[-1], clean.shape[-1])
+        with pytest.warns(UserWarning, match="cut to the shorter"):
+            cut = prepared(processed)
+        assert torch.equal(cut, score(processed[:, :time], clean[:, :time], N3, lengths=lengths))
+    with pytest.raises(ValueError, match=r"0\.1 s"):
+        prepared(noisy[:, :11000])
+
+
+@pytest.mark.parametrize("name", SCORES)
+def test_references_of_inference_mode_serve_training_and_autocast_has_no_effect(name: str) -> None:
+    clean, noisy = (signal[0] for signal in pair())
+    with torch.inference_mode():
+        prepared = prepare(name, clean)
+    processed = noisy.clone().requires_grad_()
+    (gradient,) = torch.autograd.grad(prepared(processed), processed)
+    assert bool(gradient.any())
+    expected = SCORES[name](noisy, clean, N3)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        assert torch.equal(SCORES[name](noisy, clean, N3), expected)
+
+
+# -- noise -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("count", [0, 2, 64, 2 * 10**6])
+def test_the_generator_skips_deviates(count: int) -> None:
+    random = np.random.RandomState(11)
+    random.standard_normal(count)
+    skipped = legacy_rng_after_normals(11, count)
+    np.testing.assert_array_equal(skipped.standard_normal(5), random.standard_normal(5))
+
+
+@pytest.mark.parametrize(("ear", "gain"), [(N2, 1.0), (N3, 3.0)])
+def test_expected_noise_is_the_mean_over_seeds(ear: Audiogram, gain: float) -> None:
+    clean, noisy = (signal[0].double() for signal in pair())
+    prepared, processed = HaspiReference(clean), gain * noisy
+    scores = [float(prepared.score(processed, ear, noise="seeded", seed=s)) for s in range(12)]
+    error = max(3.0 * np.std(scores) / 12**0.5, 2e-4)
+    assert float(prepared.score(processed, ear)) == pytest.approx(np.mean(scores), abs=error)
+    assert len(set(scores)) == 12
+
+
+# -- gradient --------------------------------------------------------------------------------------
+
+
+def amplify(signal: Tensor, gains_db: Tensor) -> Tensor:
+    """Apply a gain at each audiometric frequency, interpolated linearly."""
+    spectrum = torch.fft.rfft(signal)
+    hz = torch.linspace(0.0, 8000.0, spectrum.shape[-1])
+    weights = np.stack([np.interp(hz, hlsim.audiogram.FREQUENCIES, row) for row in np.eye(8)])
+    gains = gains_db.to(signal) @ torch.from_numpy(weights).to(signal)
+    return torch.fft.irfft(spectrum * 10.0 ** (gains / 20.0), signal.shape[-1])
+
+
+@pytest.mark.parametrize("name", SCORES)
+def test_gradient_equals_finite_differences(name: str) -> None:
+    step = 1e-3
+    clean, noisy = (signal[0].double() for signal in pair())
+    prepared = prepare(name, clean)
+    gains = torch.full((8,), 10.0, dtype=torch.float64, requires_grad=True)
+    (gradient,) = torch.autograd.grad(prepared(amplify(noisy, gains)), gains)
+    for band in (1, 3, 5):
+        change = step * torch.eye(8, dtype=torch.float64)[band]
+        with torch.no_grad():
+            ends = [float(prepared(amplify(noisy, gains + sign * change))) for sign in (1, -1)]
+        assert float(gradient[band]) == pytest.approx((ends[0] - ends[1]) / (2 * step), rel=0.01)
+
+
+@pytest.mark.parametrize("noise", ["expected", "none"])
+@pytest.mark.parametrize("signal", ["silence", "equal", "inaudible", "denormal", "loud", "click"])
+@pytest.mark.parametrize("name", SCORES)
+def test_gradient_is_finite(name: str, signal: str, noise: str) -> None:
+    clean = pair()[0][0, :12000]
+    gains = {"silence": 0.0, "equal": 1.0, "inaudible": 1e-4, "denormal": 1e-37, "loud": 1e3}
+    click = functional.pad(torch.ones(1), (6000, 5999))
+    processed = click if signal == "click" else gains[signal] * clean
+    processed = processed.clone().requires_grad_()
+    for ear in (N6,) if name == "haspi" else (NH, N6):
+        score = SCORES[name](processed, clean, ear, noise=noise)
+        (gradient,) = torch.autograd.grad(score, processed)
+        assert 0.0 <= float(score.detach()) <= 1.0 and bool(gradient.isfinite().all())
+
+
+def test_ascent_on_gains_raises_the_score() -> None:
+    clean, noisy = (signal[0] for signal in pair())
+    prepared = HaspiReference(clean)
+    gains = torch.zeros(8, requires_grad=True)
+    optimiser = torch.optim.Adam([gains], lr=4.0)
+    for _ in range(5):
+        optimiser.zero_grad()
+        (-prepared.score(amplify(noisy, gains), N3)).backward()
+        optimiser.step()
+    amplified = amplify(noisy, gains.detach())
+    before, after = (float(prepared.score(y, N3, noise="seeded")) for y in (noisy, amplified))
+    assert after > before + 0.05
+
+
+# -- properties and errors -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", SCORES)
+def test_less_noise_is_better(name: str) -> None:
+    clean = example_music(16000) if name == "haaqi" else pair()[0][0].double()
+    noise = torch.randn(clean.shape, dtype=torch.float64) * clean.std()
+    gains = (1.0, 0.3, 0.1, 0.0)
+    scores = [float(SCORES[name](clean + gain * noise, clean, "NH")) for gain in gains]
+    assert scores == sorted(scores) and scores[-1] > 0.9
+
+
+def test_a_delay_does_not_count() -> None:
+    clean, noisy = (functional.pad(signal[0].double(), (0, 2000)) for signal in pair())
+    scores = [float(haspi(noisy.roll(delay), clean, N2)) for delay in (0, 100, 800)]
+    assert scores[1] == pytest.approx(scores[2], abs=1e-9)
+    assert scores[0] == pytest.approx(scores[2], abs=1e-3)  # the first samples are missing
+
+
+BAD_ARGUMENTS: list[dict[str, Any]] = [
+    {"clean": torch.ones(8000) * 0.01},  # too short
+    {"clean": torch.zeros(16000)},
+    {"clean": torch.full((16000,), torch.nan)},
+    {"clean": 1e-5 * torch.randn(16000)},  # too soft
+    {"clean": functional.pad(torch.ones(100), (8000, 8000))},  # a click
+    {"processed": torch.full((12800,), torch.inf)},
+    {"processed": torch.zeros(2, 12800)},
+    {"processed": torch.zeros(12800, dtype=torch.int64)},
+    {"processed": torch.zeros(12800, device="meta")},
+    {"audiogram": 3},
+    {"audiogram": torch.full((8,), 130.0)},
+    {"audiogram": [N3, N3]},
+    {"sample_rate": 8000},
+    {"full_scale_spl": -1.0},
+    {"lengths": 17000},
+    {"lengths": 9000},
+    {"noise": "loud"},
+    {"seed": [1, 2]},
+    {"seed": None},
+    {"seed": -1},
+]
+
+
+@pytest.mark.parametrize("change", BAD_ARGUMENTS)
+@pytest.mark.parametrize("name", SCORES)
+def test_bad_arguments_raise_value_error(name: str, change: dict[str, Any]) -> None:
+    clean = change.get("clean", pair()[0][0])
+    with pytest.raises(ValueError):
+        SCORES[name](**{"processed": clean, "clean": clean, "audiogram": N3, **change})
