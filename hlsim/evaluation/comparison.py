@@ -215,16 +215,12 @@ def compare(
     pairs = list(combinations(conditions, 2))
     if baseline is not None:
         pairs = [(baseline, other) for other in conditions if other != baseline]
-    facts = table.drop_duplicates("item").set_index("item")
     comparisons = []
     for measure in measures:
-        columns = [column for column in (measure, "level") if column in table]
-        if measure not in columns:
-            continue
-        wide = table.pivot(index="item", columns="condition", values=columns)
-        candidates = [_compare_pair(wide, facts, measure, *pair, unit) for pair in pairs]
-        defined = [comparison for comparison in candidates if comparison is not None]
-        comparisons += _adjust(defined, planned)
+        if measure in table:
+            candidates = [_compare_pair(table, measure, *pair, unit) for pair in pairs]
+            defined = [comparison for comparison in candidates if comparison is not None]
+            comparisons += _adjust(defined, planned)
     return comparisons
 
 
@@ -245,26 +241,27 @@ def _adjust(comparisons: Sequence[Comparison], planned: Collection[Pair]) -> lis
 
 
 def _compare_pair(
-    wide: DataFrame, facts: DataFrame, measure: str, before: str, after: str, unit: str
+    table: DataFrame, measure: str, before: str, after: str, unit: str
 ) -> Comparison | None:
     """Compare two conditions, or return None if no item has both scores."""
-    scores = wide[measure].reindex(columns=[before, after])
-    both = scores.dropna()
-    if both.empty:
+    first_rows, second_rows = (
+        table[table["condition"] == name].set_index("item") for name in (before, after)
+    )
+    has_both = first_rows[measure].notna() & second_rows[measure].notna()
+    if not has_both.any():
         return None
-    first, second = both[before].to_numpy(float), both[after].to_numpy(float)
-    facts = facts.loc[both.index]
+    first_rows, second_rows = first_rows[has_both], second_rows[has_both]
+    first, second = (rows[measure].to_numpy(float) for rows in (first_rows, second_rows))
     levels = [math.nan, math.nan]
-    if "level" in wide:
-        levels_of_both = wide["level"].loc[both.index]
-        levels = [math.fsum(levels_of_both[name]) / len(both) for name in (before, after)]
-    severities = facts["severity"].to_numpy() if "severity" in facts else np.full(len(both), "")
+    if "level" in table:
+        levels = [math.fsum(rows["level"]) / len(rows) for rows in (first_rows, second_rows)]
     by_severity = {}
     for name in SEVERITIES:
-        chosen = severities == name
+        chosen = first_rows.get("severity", np.array([])) == name
         if chosen.any():
             by_severity[name] = paired_comparison(first[chosen], second[chosen])
     overall = paired_comparison(first, second)
+    units = first_rows[unit].to_numpy() if unit in table else np.array([])
     return Comparison(
         measure=measure,
         before=before,
@@ -274,8 +271,8 @@ def _compare_pair(
         level_after_mean=levels[1],
         by_severity=by_severity,
         unit=unit,
-        unit_means=_compare_units(facts[unit].to_numpy(), first, second) if unit in facts else None,
-        left_out=len(scores) - len(both),
+        unit_means=_compare_units(units, first, second),
+        left_out=len(has_both) - len(first),
         p_t=overall.p_t,
         p_w=overall.p_w,
     )
