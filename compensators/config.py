@@ -1,4 +1,4 @@
-"""Configurations of the trained compensators, which JSON can hold."""
+"""Settings of the two trainable compensators, which are stored as JSON."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from hlsim.neuro.config import ModelConfig, NetworkConfig, Phase
 
 @dataclass(frozen=True)
 class MappingConfig(NetworkConfig):
-    """Sizes and choices of a ``MappingCompensator``, in addition to those of ``NetworkConfig``.
+    """Settings of a ``MappingCompensator``, in addition to those of ``NetworkConfig``.
 
     Attributes:
         start: gain before training: ``"nalr"``, or a share of the hearing loss from 0 to 1.
@@ -46,7 +46,7 @@ class MappingConfig(NetworkConfig):
 
 @dataclass(frozen=True)
 class HearingAidConfig(ModelConfig):
-    """Sizes and choices of a ``HearingAid``.
+    """Settings of a ``HearingAid``.
 
     Attributes:
         bands: number of bands with a gain, an equal number of ERBs but at least 125 Hz apart, 4 to

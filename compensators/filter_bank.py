@@ -1,4 +1,4 @@
-"""The filter bank of a wearable aid, and levels on the same division of frequency.
+"""The filter bank of a wearable aid, and sound levels in its bands.
 
 The filters have linear phase and sum to a delay.
 """
@@ -58,7 +58,9 @@ SPEECH_SPECTRUM = {
 
 @lru_cache(maxsize=8)
 def centres(count: int) -> tuple[float, ...]:
-    """Return centres from 0 to 8000 Hz, an equal number of ERBs but at least 125 Hz apart.
+    """Return centre frequencies of bands from 0 to 8000 Hz.
+
+    Neighbours are an equal number of ERBs, but at least 125 Hz, apart.
 
     >>> [round(hertz) for hertz in centres(4)]
     [0, 526, 2264, 8000]
@@ -74,7 +76,7 @@ def centres(count: int) -> tuple[float, ...]:
 
 
 def _spaced(count: int, erbs: float) -> list[float]:
-    """Return frequencies from 0 Hz up that are so many ERBs apart."""
+    """Return frequencies from 0 Hz upwards with a spacing in ERBs, but at least 125 Hz."""
     frequencies = [0.0]
     for _ in range(count - 1):
         width = erbs * float(erb(np.array(frequencies[-1])))
@@ -83,9 +85,11 @@ def _spaced(count: int, erbs: float) -> list[float]:
 
 
 def shares(count: int, points: int) -> NDArray[np.float64]:
-    """Return the share of each band in each frequency of a transform, (points / 2 + 1, count).
+    """Return the weight of each band at each frequency of a Fourier transform.
 
-    The shares are straight lines between the centres, and sum to 1.
+    Returns: (points / 2 + 1, count).
+
+    The weights are linear between the centres of bands, and sum to 1.
 
     >>> shares(20, 512).shape
     (257, 20)
@@ -108,7 +112,9 @@ def filters(count: int) -> NDArray[np.float64]:
 
 
 def apply_gains(padded: Tensor, gains: Tensor, first: int = 0) -> Tensor:
-    """Sum the bands times gains that are linear between hops, with a delay of ``DELAY`` samples.
+    """Amplify each band and sum the bands, with a delay of ``DELAY`` samples.
+
+    The gains change linearly from hop to hop.
 
     It uses no transform, so that later samples do not change earlier ones even by rounding. Gains
     of 1 change nothing either.
@@ -156,7 +162,9 @@ def gain_at_rate(gains: Tensor, rate: int, time: int) -> Tensor:
 
 
 def frame_power(padded: Tensor) -> Tensor:
-    """Return the power of each frequency in frames of 16 ms every 4 ms. The sum is the mean square.
+    """Compute the power at each frequency in frames of 16 ms every 4 ms.
+
+    The sum over frequencies is the mean square of a frame.
 
     Shape: (items, HISTORY + frames * HOP) in pascals -> (items, frames, FRAME / 2 + 1).
 
@@ -168,7 +176,7 @@ def frame_power(padded: Tensor) -> Tensor:
 
 
 def level_db(powers: Tensor) -> Tensor:
-    """Return the level of powers in dB SPL, 0 or more. Any shape.
+    """Convert powers in Pa^2 to levels in dB SPL, 0 or more. Any shape.
 
     >>> level_db(torch.tensor([0.0, 1.0])).round()
     tensor([ 0., 94.])

@@ -1,4 +1,4 @@
-"""A hearing aid that could be worn: trained gains and noise reduction on a direct path of 4 ms."""
+"""A hearing aid with trained gains and trained noise reduction, and a delay of 4 ms."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ class HearingAid(Wearable):
             self.leave.bias.fill_(INITIAL_REDUCTION_LOGIT)
 
     def train(self, mode: bool = True) -> Self:
-        """Set the mode of all modules but the LSTM, which stays in training mode.
+        """Set the mode of all modules except the LSTM, which stays in training mode.
 
         cuDNN computes no gradient through an LSTM in evaluation mode. The two modes differ in
         nothing else, because the LSTM has no dropout.

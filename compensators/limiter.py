@@ -1,4 +1,4 @@
-"""The limiter that keeps the output of a compensator safe for the ear."""
+"""Limiter of the output of a compensator."""
 
 from torch import Tensor
 
@@ -12,7 +12,7 @@ Its eighth power fits into float32.
 
 
 def soft_limit(waveform: Tensor, peak: float) -> Tensor:
-    """Keep every sample within a peak: x / (1 + |x / peak|^8)^(1/8).
+    """Limit the magnitude of samples smoothly: x / (1 + |x / peak|^8)^(1/8).
 
     The curve is smooth, and nearly linear below half of the peak, where it attenuates by 0.004 dB
     at most.

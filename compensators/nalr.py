@@ -1,4 +1,4 @@
-"""NAL-R, the closed-form prescription that a trained compensator has to beat."""
+"""NAL-R, a linear prescription of gains for an audiogram."""
 
 from __future__ import annotations
 

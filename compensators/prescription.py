@@ -1,7 +1,4 @@
-"""Gains that follow from ear and level alone:
-
-NAL-R with compression, and gains that restore loudness.
-"""
+"""Prescriptions of gains: NAL-R with compression, and gains that restore loudness."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Smoothing over the control frames of a call, with a state from which the next call continues."""
+"""Smoothing of levels and gains over control frames, with a state for the next call."""
 
 from __future__ import annotations
 
@@ -17,7 +17,9 @@ BLOCK_FRAMES = 128
 
 
 def decay(seconds: float) -> float:
-    """Return the weight of the past in each frame for a time constant. 0 s gives 0.
+    """Convert a time constant to the weight of the previous frame in an exponential average.
+
+    The weight is 0 for 0 s.
 
     >>> round(decay(0.1), 3)
     0.961
@@ -53,7 +55,7 @@ def average(values: Tensor, state: Tensor, past: float) -> Tensor:
 def follow_peaks(
     values: Tensor, state: Tensor, attack: float, release: float
 ) -> tuple[Tensor, Tensor]:
-    """Follow a level, which rises with one time constant and falls with another.
+    """Smooth levels with one time constant where they rise and another where they fall.
 
     This is the smooth decoupled peak detector of Giannoulis, Massberg and Reiss 2012, J. Audio Eng.
     Soc. 60(6), Equation 17: p[n] = max(x[n], release p[n - 1] + (1 - release) x[n]), y[n] = attack

@@ -1,4 +1,4 @@
-"""A wearable aid in use: chunks of any size, one after the other."""
+"""Streams, in which a wearable aid processes chunks of any size."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ class Stream:
         return rest
 
     def _prepare(self, chunk: Tensor) -> None:
-        """Fit the aid to the ear with the first chunk, and follow the sliders."""
+        """Compute the parameters for the ear from the first chunk, and update the sliders."""
         is_first = not self._state
         if not is_first and chunk.shape[:-1] not in (self._shape, self._batch):
             raise ValueError(

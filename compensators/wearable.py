@@ -1,4 +1,4 @@
-"""The base class of wearable aids, which apply gains in bands on a direct path of 4 ms."""
+"""Base class of wearable aids, which amplify bands with a delay of 4 ms."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ class Wearable(nn.Module):
         return -(-(DELAY + RESAMPLER_LOOKAHEAD) * self.sample_rate // RATE)
 
     def fit(self, thresholds: Tensor) -> Tensor:
-        """Compute what ``control`` needs of the ears. Shape: (items, 8) dB HL -> (items, n)."""
+        """Compute the parameters of ``control`` for ears. Shape: (items, 8) dB HL -> (items, n)."""
         raise NotImplementedError
 
     def start(self, items: int, like: Tensor) -> dict[str, Tensor]:
@@ -124,7 +124,7 @@ class Wearable(nn.Module):
     def advance(
         self, samples: Tensor, fitted: Tensor, sliders: Tensor, state: State
     ) -> dict[str, Tensor]:
-        """Return the state after whole hops, with the gains of all the hops and of the next one.
+        """Return the state after whole hops, in which ``gains`` covers all of these hops.
 
         Shape: (items, hops * HOP) in pascals, (items, n), (items, sliders).
         """
@@ -298,7 +298,7 @@ def check_slider(name: str, slider: Slider, batch: torch.Size, like: Tensor) -> 
 
 
 def _glide(now: Tensor, target: Tensor, frames: int) -> Tensor:
-    """Move sliders towards their targets, so that no jump clicks.
+    """Move sliders gradually to new values, because a jump would click.
 
     Shape: (items, n) twice -> (items, frames, n).
     """

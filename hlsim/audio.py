@@ -1,4 +1,4 @@
-"""Audio files: read, written and found. No other module imports soundfile."""
+"""Reading, writing and listing of audio files. No other module imports soundfile."""
 
 import io
 import os
@@ -100,7 +100,7 @@ def _read_blocks(file: soundfile.SoundFile) -> NDArray[np.float32]:
 
 
 def write_audio(path: str | Path, waveform: Tensor, sample_rate: int) -> None:
-    """Write a wav (32-bit float), flac (24-bit) or ogg (Vorbis) file atomically.
+    """Write a WAV (32-bit float), FLAC (24-bit) or Ogg (Vorbis) file, completely or not at all.
 
     Args:
         path: File to write, whose extension decides the format.

@@ -304,7 +304,7 @@ def check_lengths(lengths: Lengths, shape: torch.Size) -> Tensor:
 
 
 def silence_after(waveform: Tensor, ends: Tensor) -> Tensor:
-    """Replace the samples behind the end of each item by zeros.
+    """Replace the samples after the end of each item by zeros.
 
     Shape: (..., time), (...) -> (..., time).
 

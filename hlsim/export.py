@@ -87,7 +87,7 @@ class _SimulatorCall(nn.Module):
 
 
 class _FitCall(nn.Module):
-    """``Wearable.fit`` as a call."""
+    """``Wearable.fit`` as a module."""
 
     def __init__(self, aid: Wearable) -> None:
         super().__init__()
@@ -98,7 +98,7 @@ class _FitCall(nn.Module):
 
 
 class _HopCall(nn.Module):
-    """``Wearable.step`` of whole hops, with named inputs and outputs."""
+    """``Wearable.step`` as a module with named inputs and outputs."""
 
     def __init__(self, aid: Wearable) -> None:
         super().__init__()

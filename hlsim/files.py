@@ -1,4 +1,4 @@
-"""Files: written atomically, hashed, and read as tables."""
+"""Atomic writing and hashing of files, and reading of tables."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
 
 
 def write_atomically(path: str | Path, data: str | bytes) -> None:
-    """Write a file that is complete or, if writing fails, as it was before.
+    """Write a file completely, or leave it unchanged if writing fails.
 
     Args:
         path: File to write.

@@ -35,7 +35,7 @@ DEVICE_HINT = f"choose one of hlsim live --list-devices that supports {NEURO_RAT
 
 
 class Live:
-    """Callback of sounddevice that processes each block.
+    """Callback for sounddevice that processes each block.
 
     Args:
         stream: Function from a block to its output, both with shape (time,) for one ear or
@@ -175,7 +175,9 @@ def play(
     buffer: float = 0.02,
     seconds: float = math.inf,
 ) -> None:
-    """Run until the time is up, or until ``q`` or Ctrl-C is pressed, with a status line.
+    """Play the stream with a status line until the time is over or a key stops it.
+
+    The keys are ``q`` and Ctrl-C.
 
     Args:
         live: Callback that processes the blocks.

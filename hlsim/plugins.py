@@ -170,7 +170,7 @@ class WaveformPlugin:
 
 
 def _first_channel(waveform: Tensor) -> Tensor:
-    """First channel in float32. Shape: (..., time) -> (time,)."""
+    """Return the first channel in float32. Shape: (..., time) -> (time,)."""
     return waveform.reshape(-1, waveform.shape[-1])[0].float()
 
 

@@ -242,7 +242,7 @@ def save_checkpoint(
 
 
 def check_replaceable(folder: str | Path) -> Path:
-    """Return the folder.
+    """Return a folder as a path if saving a checkpoint there deletes no other file.
 
     Raises:
         ValueError: The folder contains files that no checkpoint has, and saving would delete them.

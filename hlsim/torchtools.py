@@ -19,7 +19,7 @@ CACHE_BYTES = 2**28
 
 
 def not_compiled(function: Callable[P, Result]) -> Callable[P, Result]:
-    """Decorate a function that a compiled program calls as it is, with a break in its graph.
+    """Decorate a function that ``torch.compile`` leaves uncompiled, with a break in the graph.
 
     This is ``torch.compiler.disable`` without its price: as a decorator, it would import the
     compiler, which takes longer than importing hlsim.
@@ -43,7 +43,7 @@ def not_compiled(function: Callable[P, Result]) -> Callable[P, Result]:
 def without_modes(
     function: Callable[P, Result], /, *arguments: P.args, **options: P.kwargs
 ) -> Result:
-    """Call a function outside of inference mode, ``torch.func`` and other modes of the caller.
+    """Call a function without the caller's modes, such as inference mode or ``torch.func``.
 
     These modes belong to a thread, so the function runs in a thread of its own. Tensors that it
     creates are plain ones, which can be kept and used under any mode.
@@ -59,7 +59,7 @@ def without_modes(
 def constant(
     function: Callable[..., Any], *arguments: Any, dtype: torch.dtype, device: torch.device
 ) -> Tensor:
-    """Return the values of ``function(*arguments)`` as a tensor that nobody may write into.
+    """Return the values of ``function(*arguments)`` as a cached tensor, which must not be changed.
 
     Args:
         function: a module's function that returns an array or numbers.

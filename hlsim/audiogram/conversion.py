@@ -1,4 +1,4 @@
-"""Conversion of the ways to write an ear into an ``Audiogram``."""
+"""Conversion of names, lists, arrays and dictionaries into an ``Audiogram``."""
 
 from __future__ import annotations
 

@@ -20,7 +20,7 @@ class _Copies:
         self._entries: dict[tuple[int, torch.device], tuple[weakref.ref[Tensor], int, Tensor]] = {}
 
     def find(self, tensor: Tensor, device: torch.device) -> Tensor | None:
-        """Return the copy on a device, or None if there is none of the tensor's present values."""
+        """Return the copy on a device, or None if there is none or the tensor has changed since."""
         if not _is_remembered(tensor):
             return None
         owner, version, copy = self._entries.get((id(tensor), device), (None, 0, None))
@@ -46,7 +46,9 @@ _HOST = torch.device("cpu")
 
 
 def on_device(levels: Tensor, device: torch.device) -> Tensor:
-    """Return ears on a device. The host does not wait, and remembers the values of its own ears.
+    """Return thresholds on a device, without making the host wait.
+
+    The copy of thresholds from the CPU is stored, so that ``on_host`` finds their values.
 
     Shape: any -> the same.
 
@@ -66,7 +68,7 @@ def on_device(levels: Tensor, device: torch.device) -> Tensor:
 
 
 def on_host(levels: Tensor) -> Tensor:
-    """Return the values of ears on the CPU. The host waits for the device unless it knows them.
+    """Return thresholds on the CPU. The host waits for the device unless a copy is stored.
 
     Shape: any -> the same.
 
@@ -83,7 +85,7 @@ def on_host(levels: Tensor) -> Tensor:
 
 
 def known_on_host(levels: Tensor) -> Tensor | None:
-    """Return the values of ears if the host knows them without waiting for the device.
+    """Return thresholds on the CPU if a copy is stored, else None.
 
     >>> known_on_host(torch.zeros(2))
     tensor([0., 0.])

@@ -33,7 +33,7 @@ def plot_thresholds(
     ear: EarName | None = None,
     **style: Any,
 ) -> Any:
-    """Draw thresholds, as ``Audiogram.plot``.
+    """Draw thresholds as ``Audiogram.plot`` does.
 
     >>> axes = plot_thresholds([500, 1000], [20, 30], ear="left", label="left")
     >>> axes.get_xscale()

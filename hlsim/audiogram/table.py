@@ -51,7 +51,7 @@ def read_audiograms(
 
 
 def read_rows(path: str | Path) -> list[tuple[int, dict[str, str]]]:
-    """Read the rows of a table of audiograms, each after the number of its line.
+    """Read the rows of a table of audiograms, with the number of the line of each.
 
     >>> from tempfile import TemporaryDirectory
     >>> with TemporaryDirectory() as folder:

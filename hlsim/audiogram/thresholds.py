@@ -79,7 +79,7 @@ def as_thresholds(
 
 
 def list_ears(audiogram: Any) -> tuple[list[Audiogram | None], tuple[int, ...]] | None:
-    """Return the audiograms that a value holds, and the leading shape of their thresholds.
+    """Return the audiograms of a value, and the leading shape of their thresholds.
 
     The missing ear of a listener is ``None``. The result is ``None`` for a tensor, a sequence of
     tensors, and a value that does not describe ears.
@@ -194,7 +194,7 @@ def resolve_thresholds(
 
 
 def unsqueeze_mono(thresholds: Tensor, shape: torch.Size) -> Tensor:
-    """Give each mono item of (batch, 1, time) its ear. Shape: (batch, 8) -> (batch, 1, 8).
+    """Add a channel dimension if the items are mono. Shape: (batch, 8) -> (batch, 1, 8).
 
     >>> unsqueeze_mono(torch.zeros(2, 8), torch.Size([2, 1, 16000])).shape
     torch.Size([2, 1, 8])
@@ -204,7 +204,7 @@ def unsqueeze_mono(thresholds: Tensor, shape: torch.Size) -> Tensor:
 
 
 def has_listeners(audiogram: AudiogramLike | None) -> bool:
-    """Whether ears are those of a ``Listener`` or of a sequence of listeners.
+    """Return whether a value is a ``Listener`` or a sequence of listeners.
 
     >>> has_listeners(Listener("N1", "N3")), has_listeners("N1")
     (True, False)
@@ -242,7 +242,7 @@ def interpolate(levels: Tensor, frequencies: tuple[float, ...]) -> Tensor:
 def interpolation_weights(
     frequencies: tuple[float, ...], grid: tuple[float, ...] = FREQUENCIES
 ) -> NDArray[np.float64]:
-    """Return the weights of levels on a grid in those at some frequencies, (grid, frequencies).
+    """Return the matrix that interpolates levels on a grid linearly, (grid, frequencies).
 
     >>> interpolation_weights((375.0,)).T
     array([[0.5, 0.5, 0. , 0. , 0. , 0. , 0. , 0. ]])

@@ -176,7 +176,7 @@ class Audiogram:
         return (levels[500.0] + levels[1000.0] + levels[2000.0] + levels[4000.0]) / 4.0
 
     def plot(self, axes: Any = None, *, ear: EarName | None = None, **style: Any) -> Any:
-        """Draw the thresholds downwards over octaves, with MSBG's degrees of loss as bands.
+        """Draw the audiogram with MSBG's degrees of loss as bands.
 
         Args:
             axes: Matplotlib axes to draw on, which may show other ears; by default new ones.
@@ -263,7 +263,7 @@ class Audiogram:
 
     @classmethod
     def from_clarity(cls, source: Any, ear: EarName | None = None) -> Audiogram:
-        """Return the audiogram of an ear of pyclarity.
+        """Convert pyclarity's ``Audiogram``, or one ear of its ``Listener``.
 
         Args:
             source: pyclarity's ``Audiogram``; or, with ``ear``, its ``Listener`` or an entry of
@@ -312,7 +312,7 @@ def severity_index(levels: Tensor, frequencies: Sequence[float] = FREQUENCIES) -
 
 
 def convert_at(place: str, convert: Callable[..., Result], *arguments: Any) -> Result:
-    """Return ``convert(*arguments)``, or raise its ValueError with the place in front.
+    """Return ``convert(*arguments)``. The message of its ValueError begins with a place in a file.
 
     >>> convert_at("ears.csv, line 2", Audiogram.from_row, {"hl_500": "20"})
     Audiogram({500: 20})
