@@ -202,10 +202,9 @@ def first_inputs(
         ValueError: The aid's sample rate is not 16000 Hz, it has no such slider, or it rejects the
             ear or a value.
 
-    Example:
-        >>> from compensators import WDRC
-        >>> [*first_inputs(WDRC(), "N3")]
-        ['samples', 'fitted', 'past', 'gains', 'levels']
+    >>> from compensators import WDRC
+    >>> print(*first_inputs(WDRC(), "N3"))
+    samples fitted past gains levels
     """
     if aid.sample_rate != RATE:
         raise ValueError(f"expected an aid at {RATE} Hz, got one at {aid.sample_rate} Hz")
