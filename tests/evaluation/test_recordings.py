@@ -1,7 +1,6 @@
 """Recorded speech scored from folders and from a manifest."""
 
 import math
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -89,29 +88,20 @@ def test_a_single_condition_is_scored_without_a_comparison(corpus: Path) -> None
         assert report.table.stoi.notna().all()
 
 
-def two_channels(signal: Tensor) -> tuple[Tensor, int]:
-    return signal.expand(2, -1), 22050
-
-
-def much_shorter(signal: Tensor) -> tuple[Tensor, int]:
-    return signal[3000:], 22050  # by 0.14 s
-
-
-def another_rate(signal: Tensor) -> tuple[Tensor, int]:
-    return signal, 24000
-
-
-@pytest.mark.parametrize("damage", [two_channels, much_shorter, another_rate, None, torch.zeros])
-def test_a_file_that_cannot_be_scored_is_a_failure(
-    corpus: Path, damage: Callable[[Tensor], tuple[Tensor, int]] | None
-) -> None:
+@pytest.mark.parametrize("damage", ["two channels", "shorter", "another rate", "broken", "silent"])
+def test_a_file_that_cannot_be_scored_is_a_failure(corpus: Path, damage: str) -> None:
     path = corpus / "after/p2/c.wav"
-    if damage is None:
+    signal = first_channel(path).float()
+    signals = {
+        "two channels": (signal.expand(2, -1), 22050),
+        "shorter": (signal[3000:], 22050),  # by 0.14 s
+        "another rate": (signal, 24000),
+        "silent": (0.0 * signal, 22050),
+    }
+    if damage == "broken":
         path.write_bytes(b"RIFF and nothing more")
-    elif damage is torch.zeros:
-        write_audio(path, torch.zeros(1, 17640), 22050)
     else:
-        write_audio(path, *damage(first_channel(path).float()))
+        write_audio(path, *signals[damage])
     report = haspi_report(**folders(corpus), audiogram=N4, measures=("stoi",))
     (failure,) = report.failures.itertuples()
     assert (failure.name, failure.condition) == ("p2/c", "after")
