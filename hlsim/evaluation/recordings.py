@@ -491,8 +491,11 @@ def _read_row(
     elif row.get("audiogram"):
         audiogram = Audiogram.standard(row["audiogram"])
     if audiogram is None:
+        owner = f"listener {listener!r}, ear {ear!r}"
+        if "file" in row:
+            owner = f"file {row['file']!r}"
         raise ValueError(
-            f"no audiogram of listener {listener!r}, ear {ear!r}: add columns hl_250, hl_500, ... "
+            f"no audiogram of {owner}: add columns hl_250, hl_500, ... "
             "or a column audiogram, or name a file of audiograms"
         )
     if not condition:
