@@ -23,12 +23,12 @@ async function start(bytes) {
   return { session, shapes };
 }
 
-// All files are on their way at once, but the simulator starts first, because the first sound needs it alone.
-const [simulatorBytes, fitBytes, aidBytes] = ["simulator", "fit", "aid"].map(download);
-const simulator = start(simulatorBytes);
-const fit = simulator.then(() => start(fitBytes));
-const aid = fit.then(() => start(aidBytes));
-for (const promise of [fitBytes, aidBytes, simulator, fit, aid]) promise.catch(() => {}); // Requests report the error.
+// The first sound needs the runtime, which starts with the smallest model, and the simulator. The aid comes after them.
+const simulatorBytes = download("simulator");
+const fit = start(download("fit"));
+const simulator = fit.then(() => start(simulatorBytes));
+const aid = simulator.then(() => start(download("aid")));
+for (const promise of [simulatorBytes, fit, simulator, aid]) promise.catch(() => {}); // Requests report the error.
 
 function tensor(values, shape) {
   return new ort.Tensor("float32", values, shape);
