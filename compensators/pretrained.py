@@ -1,6 +1,6 @@
 """Loading and saving of compensators."""
 
-from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 from compensators.config import HearingAidConfig, MappingConfig
@@ -12,7 +12,7 @@ from compensators.wearable import Wearable
 from hlsim.audiogram import Audiogram
 from hlsim.calibration import PASCAL_SPL
 from hlsim.neuro.config import NEURO_RATE
-from hlsim.pretrained import Settings, checkpoint_about, read_checkpoint, save_checkpoint
+from hlsim.pretrained import checkpoint_about, read_checkpoint, save_checkpoint
 from hlsim.version import __version__
 
 Trained = MappingCompensator | HearingAid
@@ -69,7 +69,15 @@ def load_compensator(
     >>> aid = load_compensator("hearing-aid")
     >>> output = aid(hlsim.example_speech(), "N3")
     """
-    compensator = _load(name, sample_rate, full_scale_spl)
+    untrained = _untrained(name)
+    compensator: Trained | NALR | WDRC
+    if untrained is not None:
+        compensator = untrained(sample_rate=sample_rate, full_scale_spl=full_scale_spl)
+    else:
+        build = partial(build_compensator, sample_rate=sample_rate, full_scale_spl=full_scale_spl)
+        kinds = {kind: config.from_dict for kind, config in CONFIGS.items()}
+        compensator = read_checkpoint(name, kinds, build, other_names=tuple(UNTRAINED))
+    compensator.eval().requires_grad_(False)
     if isinstance(compensator, Wearable):
         compensator.linked = linked
     elif linked:
@@ -85,20 +93,6 @@ def _untrained(name: str | Path) -> type[NALR | WDRC] | None:
     NAL-R may be written with a hyphen.
     """
     return UNTRAINED.get(str(name).lower().replace("-", ""))
-
-
-def _load(name: str | Path, sample_rate: int, full_scale_spl: float) -> Trained | NALR | WDRC:
-    untrained = _untrained(name)
-    if untrained is not None:
-        return untrained(sample_rate=sample_rate, full_scale_spl=full_scale_spl).eval()
-
-    def build(config: MappingConfig | HearingAidConfig) -> Trained:
-        return build_compensator(config, sample_rate=sample_rate, full_scale_spl=full_scale_spl)
-
-    kinds: dict[str, Callable[[Settings], MappingConfig | HearingAidConfig]]
-    kinds = {kind: config.from_dict for kind, config in CONFIGS.items()}
-    compensator = read_checkpoint(name, kinds, build, other_names=tuple(UNTRAINED))
-    return compensator.eval().requires_grad_(False)
 
 
 def save_compensator(

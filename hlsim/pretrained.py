@@ -80,18 +80,16 @@ def read_checkpoint(
     except OSError as error:
         raise ValueError(f"{folder}: cannot read the checkpoint: {error}") from error
     settings: Any = record.get("config")
-    if hashlib.sha256(weights).hexdigest() != record.get("sha256"):
-        raise ValueError(
-            f"{folder / WEIGHTS}: the file is damaged or was replaced, because its SHA-256 is "
-            "not that "
-            f"in {CONFIG}; download or save the checkpoint again"
-        )
-    if record.get("config_sha256") != _digest(settings):
-        raise ValueError(
-            f"{folder / CONFIG}: the configuration was changed after saving, because its "
-            "SHA-256 is not "
-            "'config_sha256'; download or save the checkpoint again"
-        )
+    digests = {
+        WEIGHTS: (hashlib.sha256(weights).hexdigest(), record.get("sha256")),
+        CONFIG: (_digest(settings), record.get("config_sha256")),
+    }
+    for file, (digest, recorded) in digests.items():
+        if digest != recorded:
+            raise ValueError(
+                f"{folder / file}: the file is damaged or was changed after saving, because its "
+                f"SHA-256 is not that in {CONFIG}; download or save the checkpoint again"
+            )
     try:
         config = kinds[kind](settings)
     except (TypeError, ValueError) as error:
