@@ -270,8 +270,9 @@ def test_a_file_that_is_no_sound_is_named(opened: Any, tmp_path: Path) -> None:
     path.write_text("no sound")
     opened.set_input_files("#file", path)
     opened.wait_for_function(
-        "document.getElementById('status').textContent.includes('cannot read')"
+        "document.getElementById('source-name').textContent.includes('cannot read')"
     )
+    assert opened.locator("#version-normal .play").is_enabled()
 
 
 def test_a_recording_can_be_heard(opened: Any) -> None:

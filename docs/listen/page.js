@@ -38,6 +38,7 @@ const cards = {};
 export const state = { sound: null, results: {} };
 
 let wanted = null; // version that shall play as soon as it is computed
+let choices = 0; // number of sounds that were chosen
 let computation = new AbortController();
 let timer = 0;
 let live = null;
@@ -198,8 +199,10 @@ function moveHead() {
 // The sound
 
 async function setSound(promise, name) {
+  const choice = ++choices;
   try {
     const samples = present(await promise);
+    if (choice !== choices) return; // Another sound was chosen meanwhile.
     player.clear();
     state.sound = samples;
     state.results = {};
@@ -209,7 +212,8 @@ async function setSound(promise, name) {
     for (const card of Object.values(cards)) card.setAttribute("aria-busy", "true");
     await compute();
   } catch (error) {
-    fail(error);
+    write("source-name", error.message);
+    say("");
   }
 }
 
