@@ -233,10 +233,10 @@ class HearingLossLoss(nn.Module):
             missing ear is NaN. With ``ears="better"`` the result has no dimension of ears.
 
         Raises:
-            ValueError: shapes or devices that do not fit, no audiogram, levels outside -10 to 100
-                dB HL, lengths outside 1 to time, a simulator, normal ear or criterion that returns
-                another shape than it should, or, with ``"haspi"`` or ``"hasqi"``, items shorter
-                than 0.7 s.
+            ValueError: there is no audiogram, shapes or devices do not fit, levels are outside -10
+                to 100 dB HL, lengths are outside 1 to time, a simulator, normal ear or criterion
+                returns another shape than it should, or, with ``"haspi"`` or ``"hasqi"``, an item
+                is shorter than 0.7 s.
         """
         parts = self.parts(compensated, clean, audiogram, lengths, listener=listener)
         return weighted_sum(parts, self.weights)
@@ -245,10 +245,11 @@ class HearingLossLoss(nn.Module):
     def parts(self, *arguments: Any, **options: Any) -> dict[str, Tensor]:
         """Return the parts of the loss by name, before their weights.
 
-        ``"coherent-bands"`` has the parts incoherence, misalignment, levels, louder and peaks,
-        ``"bands"`` has band_levels (dB), ``"paper"`` has magnitude, phase, complex and time; the
-        other criteria and a function are parts themselves. ``forward`` returns ``sum(weight *
-        parts[name] for name, weight in loss.weights.items())``.
+        The parts of ``"coherent-bands"`` are incoherence, misalignment, levels, louder and peaks,
+        that of ``"bands"`` is band_levels (in dB), and those of ``"paper"`` are magnitude, phase,
+        complex and time. The other criteria have one part of their own name, and a function has the
+        part ``"criterion"``. ``forward`` returns ``sum(weight * parts[name] for name, weight in
+        loss.weights.items())``.
 
         Arguments, shapes and errors are those of ``forward``.
         """
@@ -261,13 +262,13 @@ class HearingLossLoss(nn.Module):
     def heard(self, *arguments: Any, **options: Any) -> tuple[Tensor, Tensor]:
         """Return the perceived speech and its reference, for a criterion of your own.
 
-        Both are in pascals and aligned, silent after the end of each item and at a listener's
-        missing ear. The gradient passes through the frozen simulator.
+        Both signals are in pascals and time-aligned. They are silent after the end of each item,
+        and at the missing ear of a listener. Gradients pass through the frozen simulator.
 
         Arguments and errors are those of ``forward``.
 
-        Shape: (..., time) twice -> (..., time) twice; the leading dimensions broadcast with the
-            ears'.
+        Shape: (..., time) twice -> (..., time) twice; the leading dimensions broadcast with those
+            of the ears.
         """
         inputs = self._prepare(*arguments, **options)
         with torch.autocast(inputs.clean.device.type, enabled=False):

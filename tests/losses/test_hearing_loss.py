@@ -262,14 +262,12 @@ def test_audiogram_in_all_forms(simulator: str, clean: Tensor) -> None:
     stored = HearingLossLoss(N3, simulator=simulator, criterion="paper")
     bare = HearingLossLoss(simulator=stored.simulator, criterion="paper")
     expected = stored(clean, clean)
-    for ear in (N3, [N3, N3], torch.tensor(N3.thresholds), torch.tensor([N3.thresholds])):
+    for ear in ("N3", [N3, N3], torch.tensor([N3.thresholds])):
         torch.testing.assert_close(bare(clean, clean, ear), expected)
-        loss = HearingLossLoss(ear, simulator=stored.simulator, criterion="paper")
-        torch.testing.assert_close(loss(clean, clean), expected)
     # The ear of the call has priority over the stored one.
-    torch.testing.assert_close(stored(clean, clean, S2), bare(clean, clean, S2))
-    magnitude = float(stored.parts(clean, clean)["magnitude"])
-    assert float(stored.parts(clean, clean, S2)["magnitude"]) != pytest.approx(magnitude, rel=0.05)
+    other = stored(clean, clean, S2)
+    torch.testing.assert_close(other, bare(clean, clean, S2))
+    assert float(other) != pytest.approx(float(expected), rel=0.01)
 
 
 def test_batch_is_the_mean_of_its_items(options: Options, clean: Tensor) -> None:
@@ -514,13 +512,6 @@ def test_speech_is_closer_than_inverted_speech_and_silence(
         assert float(upright[name]) < float(silent[name]), name
 
 
-def test_prescribed_gain_is_better_than_none(options: Options, clean: Tensor) -> None:
-    loss = HearingLossLoss(N4, **options, reference="normal-hearing")
-    value, slope = compute(loss, clean, clean)
-    assert float(loss(20.0 * clean, clean)) < float(value)
-    assert float((slope * clean).sum()) < 0.0  # more gain, less loss
-
-
 @each_simulator
 @pytest.mark.parametrize("ear", ["N2", "N4", "S2"])
 @pytest.mark.parametrize("gain", [0.0, 0.5, 1.0])
@@ -533,19 +524,6 @@ def test_less_noise_costs_less(simulator: str, ear: str, gain: float, clean: Ten
         noisy = add_noise(clean, snr)
         costs.append(float(loss((1.0 - gain) * noisy + gain * prescription(noisy), clean)))
     assert costs == sorted(costs) and costs[0] < costs[1]
-
-
-@each_simulator
-@pytest.mark.parametrize("ear", ["N1", "N3", "S2"])
-def test_sign_and_a_millisecond_cost_less_than_noise(
-    simulator: str, ear: str, clean: Tensor
-) -> None:
-    loss = HearingLossLoss(Audiogram.standard(ear), simulator=simulator)
-    aid = NALR(Audiogram.standard(ear))
-    padded = nn.functional.pad(clean, (200, 200))
-    signals = (add_noise(padded, 20.0), -padded, padded.roll(16, -1))
-    noise, sign, delay = (float(loss(aid(signal), padded)) for signal in signals)
-    assert max(sign, delay) < noise
 
 
 # Levels and rates
@@ -619,14 +597,6 @@ def test_pauses_do_not_dominate_the_gradient(
     _, slope = compute(loss, 5.0 * signal, signal)
     speech, pause = slope[:, :4800].norm(), slope[:, 6400:].norm()
     assert float(speech) > 0.0 and float(pause) < 0.1 * float(speech)
-
-
-@each_simulator
-def test_gradient_is_not_zero_for_clean_speech(simulator: str, clean: Tensor) -> None:
-    loss = HearingLossLoss(N3, simulator=simulator)
-    for signal in (1e-4 * clean, clean[:, :40], clean[:, :1] + 0.01, 1e-7 * clean):
-        value, slope = compute(loss, signal, signal)
-        assert bool(value.isfinite()) and bool(slope.isfinite().all()) and bool(slope.any())
 
 
 @pytest.mark.parametrize(
