@@ -251,6 +251,32 @@ def test_only_one_player_of_a_page_plays(report: Any) -> None:
     assert report.locator(".hlsim-player audio[controls]").count() == 0
 
 
+def test_players_of_several_notebook_cells_work_on_one_page(window: Any, tmp_path: Path) -> None:
+    speech = example_speech()[:16000]
+    cells = [listen(original=speech, soft=0.5 * speech)._repr_html_() for _ in range(2)]
+    path = tmp_path / "notebook.html"
+    path.write_text("<!doctype html><link rel=icon href=data:,>" + "".join(cells), encoding="utf-8")
+    window.goto(path.as_uri())
+    window.locator(".select").nth(3).click()
+    wait_until(window, "document.querySelectorAll('audio')[3].currentTime > 0.1")
+    first, second = window.evaluate(STATE)
+    assert (first["playing"], second["playing"]) == ([], [1])
+    window.locator(".volume").first.fill("0.25")
+    first, second = window.evaluate(STATE)
+    assert first["volumes"] == second["volumes"] == [0.25, 0.25]
+
+
+def test_without_scripts_every_sound_has_the_controls_of_the_browser(
+    chromium: Any, players_file: Path
+) -> None:
+    page = chromium.new_context(java_script_enabled=False).new_page()
+    page.goto(players_file.as_uri())
+    assert page.locator("audio[controls]").count() == 3
+    assert page.locator("audio").first.is_visible()
+    assert not page.locator(".controls").first.is_visible()
+    page.context.close()
+
+
 def test_the_keyboard_reaches_everything(report: Any) -> None:
     report.keyboard.press("Tab")
     element = "document.activeElement"
