@@ -107,6 +107,7 @@ MODULES = [
     "hlsim.neuro.scan",
     "hlsim.plugins",
     "hlsim.pretrained",
+    "hlsim.report.page",
     "hlsim.shortcuts",
     "hlsim.torchtools",
 ]

@@ -25,7 +25,11 @@ _TEMPLATES = Path(__file__).with_name("templates")
 
 @dataclass(frozen=True)
 class Table:
-    """Cells of text; the first column names the rows. A folded table is shown when it is opened."""
+    """Cells of text; the first column names the rows. A folded table is shown when it is opened.
+
+    >>> Table("Scores", ("Aid", "HASPI"), [("NAL-R", "0.93")]).markdown()
+    '| Aid | HASPI |\\n| --- | --- |\\n| NAL-R | 0.93 |'
+    """
 
     caption: str
     header: Sequence[str]
@@ -68,6 +72,9 @@ class Picture:
         alt: text in place of the picture.
         title: heading above the picture.
         note: sentence below the picture.
+
+    >>> Picture(b"<svg/>", "An empty picture").title
+    ''
     """
 
     data: bytes
@@ -88,6 +95,9 @@ class Sound:
         spectrogram: contents of a PNG file whose edges are the edges of the spectrogram; empty if
             there is none.
         note: words over the spectrogram.
+
+    >>> Sound("unaided", 10.2, b"fLaC").note
+    ''
     """
 
     label: str
@@ -110,6 +120,10 @@ class Player:
         volume: volume to start with, from 0 to 1.
         levels: lowest and highest level in dB SPL of the spectrograms.
         colours: colours of the spectrograms in CSS, from the lowest to the highest level.
+
+    >>> player = Player({"": [Sound("unaided", 10.2, b"fLaC")]}, seconds=4.0, full_scale=94.0)
+    >>> [sound.label for sound in player.sounds]
+    ['unaided']
     """
 
     groups: Mapping[str, Sequence[Sound]]
@@ -139,6 +153,10 @@ class Card:
         value: the number, as text.
         meaning: sentence that explains the number.
         bars: label, text and length from 0 to 1 for each condition; the last one is highlighted.
+
+    >>> card = Card("HASPI", "0.93", "Predicted intelligibility.", [("NAL-R", "0.93", 0.93)])
+    >>> "width: 93.0%" in Page("Aids", "", [], [card]).html()
+    True
     """
 
     title: str
@@ -152,6 +170,9 @@ class Section:
     """A part of a page: tables, paragraphs, a player, pictures and inner parts, in this order.
 
     A folded section is shown only when it is opened.
+
+    >>> Section("Scores", ["The mean of ten items."]).folded
+    False
     """
 
     title: str
@@ -165,7 +186,18 @@ class Section:
 
 @dataclass(frozen=True)
 class Page:
-    """A title, a verdict in one sentence, and what supports it: cards and sections."""
+    """A title, a verdict in one sentence, and what supports it: cards and sections.
+
+    >>> print(Page("Aids", "NAL-R is better.", [Section("Scores", ["See below."])]).markdown())
+    # Aids
+    <BLANKLINE>
+    NAL-R is better.
+    <BLANKLINE>
+    ## Scores
+    <BLANKLINE>
+    See below.
+    <BLANKLINE>
+    """
 
     title: str
     verdict: str
@@ -208,6 +240,11 @@ def write_page(page: Page, data: Mapping[str, Any], out: str | Path) -> Path:
     Raises:
         ValueError: the files cannot be written, or JSON cannot hold the data.
         MissingExtraError: jinja2 is not installed.
+
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     write_page(Page("Aids", "", []), {"rows": []}, folder).name
+    'report.html'
     """
     try:
         text = json.dumps(data, indent=1, ensure_ascii=False, allow_nan=False)
