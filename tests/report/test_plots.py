@@ -1,5 +1,10 @@
 """Plots: legible in light and dark, labels beside the curves, and no picture of a single group."""
 
+import os
+import subprocess
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -73,3 +78,18 @@ def test_a_distribution_names_the_medians_for_readers_who_do_not_see_it() -> Non
     groups = {"N2": pandas.Series([0.1, 0.2, 0.6]), "empty": pandas.Series([np.nan])}
     picture = distribution_picture(groups, "HASPI", "ear")
     assert picture.alt == "HASPI by ear; medians: N2 0.200."
+
+
+def test_a_backend_of_a_notebook_that_is_not_installed_is_not_needed() -> None:
+    program = (
+        "from hlsim.report.plots import draw_picture as d; d(lambda axes: axes.plot([1, 2]), 't')"
+    )
+    environment = {**os.environ, "MPLBACKEND": "module://missing_inline.backend"}
+    ended = subprocess.run(
+        [sys.executable, "-c", program],
+        env=environment,
+        cwd=Path(__file__).parents[2],
+        capture_output=True,
+        text=True,
+    )
+    assert ended.returncode == 0, ended.stderr[-2000:]
