@@ -198,6 +198,17 @@ class _Batch(PreparedBatch[_Channels]):
         levels = ear_model.apply_adaptation(ear_model.sensation(power, inner))
         return envelopes.smooth_frames(levels, delays, self._extent)
 
+    def _sum_channels(
+        self, clean: _Channels, sound: Tensor, ear: ear_model.HairCells
+    ) -> tuple[envelopes.ChannelSum, envelopes.ChannelSum]:
+        """Sum the frames of the clean and of the processed speech over some channels."""
+        channels, extent = clean.channels, self._extent
+        cochlea = ear_model.simulate_cochlea(sound, ear, channels, extent)
+        lags = ear_model.channel_lags(clean.spectrum, cochlea.power.detach().sqrt(), extent)
+        power = ear_model.shift(cochlea.power, lags, extent.ends, extent.ends, extent.padded)
+        frames = self._frames(power, ear.inner[:, channels], clean.delays)
+        return clean.channel_sum, envelopes.sum_over_channels(frames, channels)
+
     def compare(
         self, processed: Tensor, noise: Noise, seeds: Sequence[int], *ears: ear_model.HairCells
     ) -> Tensor:
@@ -206,16 +217,10 @@ class _Batch(PreparedBatch[_Channels]):
         sound, ear = self._align(processed), ears[0].select_items(items)
         clean_sum: envelopes.ChannelSum | None = None
         processed_sum: envelopes.ChannelSum | None = None
-        for clean in self._channels():
-            channels = clean.channels
-            cochlea = ear_model.simulate_cochlea(sound, ear, channels, extent)
-            lags = ear_model.channel_lags(clean.spectrum, cochlea.power.detach().sqrt(), extent)
-            power = ear_model.shift(cochlea.power, lags, extent.ends, extent.ends, extent.padded)
-            frames = self._frames(power, ear.inner[:, channels], clean.delays)
-            clean_sum = envelopes.add_sums(clean_sum, clean.channel_sum)
-            processed_sum = envelopes.add_sums(
-                processed_sum, envelopes.sum_over_channels(frames, channels)
-            )
+        sums = self._map_channels(lambda clean: self._sum_channels(clean, sound, ear), sound)
+        for clean_part, processed_part in sums:
+            clean_sum = envelopes.add_sums(clean_sum, clean_part)
+            processed_sum = envelopes.add_sums(processed_sum, processed_part)
         assert clean_sum is not None and processed_sum is not None
         indices, audible = envelopes.find_audible_frames(clean_sum.loudness, extent)
         x = envelopes.select_frames(clean_sum.cosines, indices)

@@ -275,37 +275,43 @@ class _Batch(PreparedBatch[_Channels]):
         self, processed: Tensor, noise: Noise, seeds: Sequence[int], *ears: ear_model.HairCells
     ) -> Tensor:
         """Compute the nonlinear and the linear part of each item."""
-        extent, counts = self._extent, fine_structure.segments_of(self._extent)
-        sound = self._align(processed)
-        draw_clean, draw_processed = _noise_sources(noise, seeds[self._batch.items], extent, sound)
-        comparisons: list[Comparison] = []
-        for clean in self._channels():
-            channels = clean.channels
-            cochlea, motion = self._simulate(sound, channels)
-            lags = ear_model.channel_lags(clean.envelope, cochlea.power.detach().sqrt(), extent)
-            power = ear_model.shift(cochlea.power, lags, extent.ends, extent.ends, extent.padded)
-            lags = ear_model.channel_lags(clean.motion, motion.detach(), extent)
-            motion = ear_model.shift(motion, lags, extent.ends, extent.ends, extent.padded)
-            cells = self._cells[channels]
-            smooth_levels, motion = self._adapt(power, motion, cells, clean.delays)
-            segments = self._segment_spectra(motion, clean.delays, draw_processed(channels))
-            clean_segments = clean.segments
-            clean_noise = draw_clean(channels)
-            if clean_noise is not None:
-                clean_segments = self._segment_spectra(
-                    clean.adapted_motion, clean.delays, clean_noise
-                )
-            comparison = Comparison(
-                clean_levels=clean.smooth_levels,
-                processed_levels=smooth_levels,
-                coherence=fine_structure.coherence(clean_segments, segments, counts),
-                energy=clean_segments[1],
-                clean_spectrum=clean.spectrum,
-                processed_spectrum=ear_model.mean_level(cochlea, cells),
-            )
-            comparisons.append(comparison)
+        sound, chunks = self._align(processed), self._channel_chunks()
+        sources = _noise_sources(noise, seeds[self._batch.items], self._extent, sound)
+        noises = {channels.start: [source(channels) for source in sources] for channels in chunks}
+        comparisons = self._map_channels(
+            lambda clean: self._compare_channels(clean, sound, *noises[clean.channels.start]), sound
+        )
         joined = Comparison(*(torch.cat(parts, 1) for parts in zip(*comparisons, strict=True)))
-        return self._score.compute_parts(joined, extent)
+        return self._score.compute_parts(joined, self._extent)
+
+    def _compare_channels(
+        self,
+        clean: _Channels,
+        sound: Tensor,
+        clean_noise: Tensor | None,
+        processed_noise: Tensor | None,
+    ) -> Comparison:
+        channels, extent = clean.channels, self._extent
+        cells = self._cells[channels]
+        cochlea, motion = self._simulate(sound, channels)
+        lags = ear_model.channel_lags(clean.envelope, cochlea.power.detach().sqrt(), extent)
+        power = ear_model.shift(cochlea.power, lags, extent.ends, extent.ends, extent.padded)
+        lags = ear_model.channel_lags(clean.motion, motion.detach(), extent)
+        motion = ear_model.shift(motion, lags, extent.ends, extent.ends, extent.padded)
+        smooth_levels, motion = self._adapt(power, motion, cells, clean.delays)
+        segments = self._segment_spectra(motion, clean.delays, processed_noise)
+        clean_segments = clean.segments
+        if clean_noise is not None:
+            clean_segments = self._segment_spectra(clean.adapted_motion, clean.delays, clean_noise)
+        counts = fine_structure.segments_of(extent)
+        return Comparison(
+            clean_levels=clean.smooth_levels,
+            processed_levels=smooth_levels,
+            coherence=fine_structure.coherence(clean_segments, segments, counts),
+            energy=clean_segments[1],
+            clean_spectrum=clean.spectrum,
+            processed_spectrum=ear_model.mean_level(cochlea, cells),
+        )
 
 
 def scale_motion_to_level(motion: Tensor, power: Tensor, levels: Tensor, unit: float) -> Tensor:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, ClassVar, Generic, TypedDict, TypeVar
 
@@ -60,16 +60,28 @@ class PreparedBatch(Generic[Channels]):
 
     def store(self) -> None:
         """Compute the features of all channels, and store them."""
-        self._stored = list(self._channels())
+        self._stored = self._map_channels(lambda features: features, self._clean)
 
-    @torch.no_grad()
-    def _channels(self) -> Iterator[Channels]:
+    def _map_channels(self, function: Callable[[Channels], Result], signal: Tensor) -> list[Result]:
+        """Call a function with the features of some channels at a time, from low to high.
+
+        Args:
+            function: function to call.
+            signal: tensor on which the function depends.
+        """
         if self._stored is not None:
-            yield from self._stored
-            return
+            return map_on_cores(function, self._stored, signal)
+
+        def prepare_and_call(channels: slice) -> Result:
+            with torch.no_grad():
+                features = self._prepare(channels)
+            return function(features)
+
+        return map_on_cores(prepare_and_call, self._channel_chunks(), signal)
+
+    def _channel_chunks(self) -> list[slice]:
         items, padded = self._clean.shape
-        for channels in ear_model.channel_chunks(items, padded, self._signals.device):
-            yield self._prepare(channels)
+        return list(ear_model.channel_chunks(items, padded, self._signals.device))
 
     def _prepare(self, channels: slice) -> Channels:
         raise NotImplementedError
@@ -105,8 +117,8 @@ Batch = TypeVar("Batch", bound=PreparedBatch[Any])
 class Reference(Generic[Batch]):
     """Clean signals that are prepared for the scores of many processed signals.
 
-    On a CPU the items are distributed over as many threads as torch uses, if no gradient is needed.
-    The scores do not depend on it.
+    On a CPU the items, or the channels of one item, are distributed over as many threads as torch
+    uses, if no gradient is needed. The scores do not depend on it.
 
     Args:
         clean: clean signals, whose dtype and device are those of the scores. Their gradient is not

@@ -159,38 +159,37 @@ class _MeanScore(_Metric):
         self.seen += items
         if self.limit is not None:
             items = max(0, min(items, self.limit - first))
-        signals = []
-        for signal in (processed, clean):
-            rows = signal.detach().to(processed.device, torch.float64).reshape(-1, sides, time)
-            signals.append(silence_after(rows, ends.unsqueeze(-1).expand(-1, sides)))
-
-        known = thresholds.isfinite().all(-1)
+        processed, clean = (
+            silence_after(
+                signal.detach().to(processed.device, torch.float64).reshape(-1, sides, time),
+                ends[:, None].expand(-1, sides),
+            )
+            for signal in (processed, clean)
+        )
         scores = torch.full((items, sides), math.nan, dtype=torch.float64)
         reasons: dict[int, str] = {}
-        pairs = [(item, side) for item, side in known[:items].nonzero().tolist()]
-        results = self._score(pairs, first, signals[0], signals[1], thresholds, ends)
+        pairs = thresholds[:items].isfinite().all(-1).nonzero().tolist()
+        results = self._score(pairs, first, processed, clean, thresholds, ends)
         for (item, side), result in zip(pairs, results, strict=True):
             if isinstance(result, str):
                 reasons.setdefault(item, result)
             else:
                 scores[item, side] = result
-        scored = ~scores.isnan()
+        is_scored = ~scores.isnan()
         for item in range(items):
-            if not scored[item].any():
+            if not is_scored[item].any():
                 self.failed += 1
-                warnings.warn(
-                    f"{type(self).__name__} leaves out item {first + item}: {reasons[item]}",
-                    stacklevel=2,
-                )
+                message = f"{type(self).__name__} leaves out item {first + item}: {reasons[item]}"
+                warnings.warn(message, stacklevel=2)
                 continue
             score, side = scores[item].nan_to_num(-math.inf).max(-1)
-            samples = signals[0][item, int(side), : int(ends[item])]
+            samples = processed[item, int(side), : int(ends[item])]
             self.total += float(score)
             self.total_level += float(level_spl(samples, self.full_scale_spl))
             self.count += 1
         if two_ears:
             self.total_ears += scores.nan_to_num(0.0).sum(0).to(self.total_ears)
-            self.count_ears += scored.sum(0).to(self.count_ears)
+            self.count_ears += is_scored.sum(0).to(self.count_ears)
 
     def compute(self) -> Tensor:
         """Return the mean score in float32, NaN if nothing was scored."""
@@ -243,7 +242,7 @@ class _MeanScore(_Metric):
     @torch.no_grad()
     def _score(
         self,
-        pairs: list[tuple[int, int]],
+        pairs: list[list[int]],
         first: int,
         processed: Tensor,
         clean: Tensor,
@@ -253,26 +252,23 @@ class _MeanScore(_Metric):
         """Return for each item and side its score, or the reason why there is none."""
         if not pairs:
             return []
-        rows, sides = zip(*pairs, strict=True)
-        items = list(rows)
+        items, sides = torch.tensor(pairs).unbind(-1)
         try:
             scores = type(self).score(
-                processed[items, list(sides)],
-                clean[items, list(sides)],
-                thresholds[items, list(sides)],
+                *(values[items, sides] for values in (processed, clean, thresholds)),
                 sample_rate=self.sample_rate,
                 full_scale_spl=self.full_scale_spl,
                 lengths=ends[items],
                 noise=self.noise,
-                seed=[(self.seed + first + item) % 2**32 for item in items],
+                seed=((self.seed + first + items) % 2**32).tolist(),
                 whole_khz=self.whole_khz,
             )
         except ValueError as error:
             if len(pairs) == 1:
                 return [str(error)]
             # One pair without a score stops them all, so they are scored one by one.
-            alone = (processed, clean, thresholds, ends)
-            return [self._score([pair], first, *alone)[0] for pair in pairs]
+            batch = processed, clean, thresholds, ends
+            return [self._score([pair], first, *batch)[0] for pair in pairs]
         results: list[float | str] = scores.tolist()
         return results
 

@@ -1,4 +1,4 @@
-"""The HASPI and HASQI metrics against the functions, alone and in a Lightning validation loop."""
+"""The torchmetrics against the functions, alone and in a validation loop of Lightning."""
 
 from pathlib import Path
 from typing import Any
@@ -69,31 +69,31 @@ def test_mean_over_batches(clean: Tensor, kind: type[Any], name: str) -> None:
     assert float(metric.compute()) == pytest.approx(expected[0], abs=1e-6)
 
 
-def test_of_two_channels_the_better_ear_counts(clean: Tensor) -> None:
+def test_the_better_ear_of_two_channels_counts(clean: Tensor) -> None:
     clean = clean[:1]
     both = torch.stack([clean, clean], 1)
-    given = torch.stack([noisy(clean), 3.0 * noisy(clean)], 1)  # (batch, left and right, time)
-    metric, each = HASPI(16000), []
+    processed = torch.stack([noisy(clean), 3.0 * noisy(clean)], 1)  # (batch, left and right, time)
+    metric, scores = HASPI(16000), []
     for side, ear in enumerate((N3, S2)):
-        each.append([expected_score(clean[i], given[i, side], ear, seed=i) for i in range(1)])
-    expected = torch.tensor(each, dtype=torch.float64)
+        scores.append([expected_score(clean[i], processed[i, side], ear, seed=i) for i in range(1)])
+    expected = torch.tensor(scores, dtype=torch.float64)
     for ears in (
         [N3, S2],
         torch.tensor([N3.levels, S2.levels]),
         torch.tensor([[N3.levels, S2.levels]]),
     ):
         metric.reset()
-        metric.update(given, both, ears)
+        metric.update(processed, both, ears)
         assert float(metric.compute()) == pytest.approx(float(expected.amax(0).mean()), abs=1e-6)
         torch.testing.assert_close(metric.ears.double(), expected.mean(1), atol=1e-6, rtol=0)
     metric.reset()
-    given[:, 0] = torch.nan  # an ear without a score loses
-    metric.update(given, both, [N3, S2])
+    processed[:, 0] = torch.nan  # an ear without a score does not count
+    metric.update(processed, both, [N3, S2])
     assert float(metric.compute()) == pytest.approx(float(expected[1].mean()), abs=1e-6)
     assert int(metric.failed) == 0 and bool(metric.ears.isnan()[0])
     for wrong in (N3, [N3], torch.zeros(2, 8, 1)):
         with pytest.raises(ValueError, match=r"thresholds|audiogram"):
-            metric.update(given, both, wrong)
+            metric.update(processed, both, wrong)
 
 
 def test_limit_and_lengths(clean: Tensor) -> None:
@@ -111,7 +111,7 @@ def test_limit_and_lengths(clean: Tensor) -> None:
     )
 
 
-def test_a_call_counts_as_an_update_and_gives_the_batchs_own_mean(clean: Tensor) -> None:
+def test_a_call_is_an_update_and_returns_the_mean_of_its_batch(clean: Tensor) -> None:
     updated, called = HASPI(16000, limit=2), HASPI(16000, limit=2)
     batches = [noisy(clean)[:1], clean[:1], noisy(clean)[:1]]
     values = []
@@ -126,7 +126,7 @@ def test_a_call_counts_as_an_update_and_gives_the_batchs_own_mean(clean: Tensor)
     )
 
 
-def test_torchmetrics_keeps_the_value_of_a_call_where_lightning_reads_it(clean: Tensor) -> None:
+def test_lightning_finds_the_value_of_a_call(clean: Tensor) -> None:
     from torchmetrics import MeanMetric
 
     mean, metric = MeanMetric(), HASPI()
@@ -134,7 +134,7 @@ def test_torchmetrics_keeps_the_value_of_a_call_where_lightning_reads_it(clean: 
     assert metric(clean, clean, N3) == metric._forward_cache
 
 
-def test_a_collection_keeps_apart_what_was_made_apart(clean: Tensor) -> None:
+def test_a_collection_does_not_merge_different_metrics(clean: Tensor) -> None:
     from torchmetrics import MetricCollection
 
     collection = MetricCollection({"haspi": HASPI(), "hasqi": HASQI(), "one": HASPI(limit=1)})
@@ -152,7 +152,7 @@ def test_a_collection_keeps_apart_what_was_made_apart(clean: Tensor) -> None:
     )
 
 
-def test_plot_draws_one_value_several_and_those_of_a_collection(clean: Tensor) -> None:
+def test_values_are_plotted(clean: Tensor) -> None:
     pytest.importorskip("matplotlib").use("agg")
     from torchmetrics import MetricCollection
 
@@ -164,11 +164,6 @@ def test_plot_draws_one_value_several_and_those_of_a_collection(clean: Tensor) -
     _, axes = metric.plot([metric.compute(), torch.tensor(0.5)])
     assert len(axes.lines[0].get_ydata()) == 2
     assert len(collection.plot()) == 2
-
-
-def test_synchronisation_at_each_step_is_rejected() -> None:
-    with pytest.raises(ValueError, match="dist_sync_on_step"):
-        HASPI(dist_sync_on_step=True)
 
 
 def test_merged_states_are_one_mean_and_other_settings_are_rejected(clean: Tensor) -> None:
@@ -185,7 +180,7 @@ def test_merged_states_are_one_mean_and_other_settings_are_rejected(clean: Tenso
             first.merge_state(state)
 
 
-def test_what_cannot_be_scored_is_left_out_and_said(clean: Tensor) -> None:
+def test_items_without_a_score_are_left_out_with_a_warning(clean: Tensor) -> None:
     metric = HASPI(16000)
     for spoiled, reason in (
         ((clean[0] * 0, clean[0]), ".*is silent"),
@@ -196,13 +191,13 @@ def test_what_cannot_be_scored_is_left_out_and_said(clean: Tensor) -> None:
         with pytest.warns(UserWarning, match=f"HASPI leaves out item 0: {reason}"):
             metric.update(processed, reference, N3)
         assert (int(metric.failed), int(metric.count)) == (1, 1)
-        # the second item's seed does not depend on the first one's fate
+        # The seed of the second item does not depend on the first one.
         expected = expected_score(clean[1], clean[1], N3, seed=1)
         assert float(metric.compute()) == pytest.approx(expected, abs=1e-6)
 
 
 def test_silence_in_place_of_speech_counts(clean: Tensor) -> None:
-    """Or an aid that mutes what it does badly would have the best mean."""
+    """Otherwise an aid that mutes difficult items would have the best mean."""
     metric = HASPI(16000)
     metric.update(clean * torch.tensor([[0.0], [1.0]]), clean, N3)
     assert (int(metric.failed), int(metric.count)) == (0, 2)
@@ -210,46 +205,43 @@ def test_silence_in_place_of_speech_counts(clean: Tensor) -> None:
     assert float(metric.compute()) == pytest.approx(alone / 2.0, abs=0.01)
 
 
-@pytest.mark.parametrize(
-    ("processed", "clean", "audiogram"),
-    [
-        (torch.randn(2, 100), torch.randn(1, 100), N3),
-        (torch.zeros(2, 100, dtype=torch.int16), torch.randn(2, 100), N3),
-        (torch.randn(2, 100), torch.randn(2, 100).numpy(), N3),
-        (torch.randn(2, 100), torch.randn(2, 100), [N3]),
-        (torch.randn(2, 100), torch.randn(2, 100), 3),
-        (torch.randn(2, 100), torch.randn(2, 100), torch.zeros(3, 8)),
-    ],
-)
-def test_bad_update_raises_value_error(processed: Any, clean: Any, audiogram: Any) -> None:
+NOISE = torch.randn(2, 12800)
+BAD_UPDATES: list[dict[str, Any]] = [
+    {"clean": NOISE[:1]},
+    {"processed": NOISE.short()},
+    {"clean": NOISE.numpy()},
+    {"audiogram": [N3]},
+    {"audiogram": 3},
+    {"audiogram": torch.zeros(3, 8)},
+    {"lengths": torch.tensor([12800])},
+    {"lengths": torch.tensor([12800, -5])},
+    {"lengths": torch.tensor([12801, 12800])},
+    {"lengths": torch.tensor([12799.5, 12800.0])},
+]
+
+
+@pytest.mark.parametrize("change", BAD_UPDATES)
+def test_bad_update_raises_value_error(change: dict[str, Any]) -> None:
     with pytest.raises(ValueError):
-        HASPI(16000).update(processed, clean, audiogram)
+        HASPI().update(**{"processed": NOISE, "clean": NOISE, "audiogram": N3, **change})
 
 
-@pytest.mark.parametrize(
-    "lengths",
-    [[12800], [12800, -5], [12801, 12800], [12799.5, 12800.0]],
-)
-def test_bad_lengths_raise_value_error(clean: Tensor, lengths: list[float]) -> None:
+BAD_SETTINGS: list[dict[str, Any]] = [
+    {"limit": 0},
+    {"limit": 1.5},
+    {"full_scale_spl": float("inf")},
+    {"seed": -1},
+    {"seed": "a"},
+    {"noise": "loud"},
+    {"sample_rate": 8000},
+    {"dist_sync_on_step": True},
+]
+
+
+@pytest.mark.parametrize("settings", BAD_SETTINGS)
+def test_bad_settings_raise_value_error(settings: dict[str, Any]) -> None:
     with pytest.raises(ValueError):
-        HASPI(16000).update(clean, clean, N3, lengths=torch.tensor(lengths))
-
-
-@pytest.mark.parametrize(
-    "options",
-    [
-        {"limit": 0},
-        {"limit": 1.5},
-        {"full_scale_spl": float("inf")},
-        {"seed": -1},
-        {"seed": "a"},
-        {"noise": "loud"},
-        {"sample_rate": 8000},
-    ],
-)
-def test_bad_setting_raises_value_error(options: dict[str, Any]) -> None:
-    with pytest.raises(ValueError):
-        HASPI(**options)
+        HASPI(**settings)
 
 
 def test_in_a_lightning_validation_loop(clean: Tensor, tmp_path: Path) -> None:
@@ -284,8 +276,8 @@ def test_in_a_lightning_validation_loop(clean: Tensor, tmp_path: Path) -> None:
     )
     model = Amplifier()
     trainer.fit(model, loader, loader)
-    # the second epoch starts anew: the same items with the same seeds
+    # The second epoch has the same items with the same seeds.
     expected = sum(expected_score(clean[i], 4.0 * clean[i], N3, seed=i) for i in range(2)) / 2
     assert float(trainer.callback_metrics["haspi"]) == pytest.approx(expected, abs=1e-6)
-    # nothing of the metric is in the checkpoint
+    # The checkpoint does not contain the metric.
     assert set(model.state_dict()) == {"gain"}
