@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from numbers import Real
 from typing import Any, get_args
 
@@ -218,6 +219,18 @@ def check_waveform(
         if full_scale_spl is not None:
             _warn_if_loud(waveform, name, peak, full_scale_spl)
     return waveform
+
+
+@contextmanager
+def loud_outputs() -> Iterator[None]:
+    """Silence the warning of ``check_waveform`` for outputs of aids, which may be loud on purpose.
+
+    >>> with loud_outputs():
+    ...     _ = check_waveform(torch.full((10,), 1000.0), full_scale_spl=94.0)
+    """
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", ".*did you forget calibration")
+        yield
 
 
 _has_warned_of_level = False

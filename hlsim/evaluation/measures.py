@@ -14,6 +14,7 @@ from torch import Tensor, nn
 
 from hlsim.audiogram import Audiogram
 from hlsim.calibration import PASCAL_SPL, level_spl
+from hlsim.checks import loud_outputs
 from hlsim.evaluation.fingerprint import fingerprint
 from hlsim.evaluation.study import Item, Measure, Values
 from hlsim.extras import require
@@ -188,7 +189,7 @@ def perceive(signal: Tensor, ear: Audiogram, sample_rate: int) -> Tensor:
     >>> perceive(torch.ones(1600), Audiogram.standard("N3"), 16000).shape
     torch.Size([1600])
     """
-    with torch.no_grad():
+    with torch.no_grad(), loud_outputs():
         perceived: Tensor = MSBG(sample_rate=sample_rate)(signal, ear)
     return perceived
 

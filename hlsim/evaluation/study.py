@@ -21,6 +21,7 @@ from torch import Tensor
 
 from hlsim.audiogram import Audiogram
 from hlsim.calibration import PASCAL_SPL
+from hlsim.checks import check_waveform, loud_outputs
 from hlsim.evaluation.fingerprint import combined_fingerprint, fingerprint, samples_hash
 from hlsim.evaluation.parallel import Progress, describe_error, one_thread, run_parallel
 from hlsim.evaluation.store import ScoreStore, settings_hash
@@ -318,6 +319,7 @@ def _measure_item(task: _Task) -> list[Values | str]:
     """Compute the missing values of one item; a failure gives its reason instead."""
     try:
         item = task.source.load()
+        check_waveform(item.clean, "clean speech", full_scale_spl=item.full_scale_spl)
     except Exception as error:  # A failure must not end the study.
         return [describe_error(error)] * len(task.missing)
     results: list[Values | str] = []
@@ -326,7 +328,8 @@ def _measure_item(task: _Task) -> list[Values | str]:
         try:
             if condition.name not in pairs:
                 pairs[condition.name] = _item_and_output(condition, item)
-            values = measure.compute(*pairs[condition.name])
+            with loud_outputs():
+                values = measure.compute(*pairs[condition.name])
             _check_finite(values)
             results.append(values)
         except Exception as error:
