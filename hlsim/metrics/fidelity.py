@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable, Iterable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -200,8 +200,7 @@ def linear_correlation(expected_scores: Iterable[float], scores: Iterable[float]
     >>> round(linear_correlation([0.1, 0.2, 0.4], [0.2, 0.4, 0.8]), 6)
     1.0
     """
-    x, y = _check_scores(expected_scores, scores)
-    return float(stats.pearsonr(x, y)[0]) if _vary(x, y) else None
+    return _correlate(stats.pearsonr, expected_scores, scores)
 
 
 def rank_correlation(expected_scores: Iterable[float], scores: Iterable[float]) -> float | None:
@@ -215,8 +214,7 @@ def rank_correlation(expected_scores: Iterable[float], scores: Iterable[float]) 
     >>> round(rank_correlation([0.1, 0.2, 0.4], [0.1, 0.3, 0.9]), 6)
     1.0
     """
-    x, y = _check_scores(expected_scores, scores)
-    return float(stats.spearmanr(x, y)[0]) if _vary(x, y) else None
+    return _correlate(stats.spearmanr, expected_scores, scores)
 
 
 def mean_squared_error(expected_scores: Iterable[float], scores: Iterable[float]) -> float | None:
@@ -232,9 +230,12 @@ def mean_squared_error(expected_scores: Iterable[float], scores: Iterable[float]
     return float(np.mean((x - y) ** 2)) if len(x) else None
 
 
-def _vary(x: np.ndarray, y: np.ndarray) -> bool:
-    """Return whether there are two scores, and neither side is constant."""
-    return len(x) >= 2 and np.ptp(x) != 0.0 and np.ptp(y) != 0.0
+def _correlate(
+    correlation: Callable[..., Any], expected_scores: Iterable[float], scores: Iterable[float]
+) -> float | None:
+    x, y = _check_scores(expected_scores, scores)
+    is_defined = len(x) >= 2 and np.ptp(x) != 0.0 and np.ptp(y) != 0.0
+    return float(correlation(x, y)[0]) if is_defined else None
 
 
 def _check_scores(

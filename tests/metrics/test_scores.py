@@ -123,11 +123,11 @@ def test_equals_pyclarity_under_its_seed(pyclarity: PyclarityOutputs, key: str) 
     for dtype, error in ((torch.float64, in_double), (torch.float32, 1e-4)):
         x, y = clean.to(dtype), processed.to(dtype)
         if name == "haspi":
-            found = [float(haspi(y, x, ear, noise="seeded", seed=7, **settings))]
+            values = [float(haspi(y, x, ear, noise="seeded", seed=7, **settings))]
         else:
             kind = HasqiReference if name == "hasqi" else HaaqiReference
-            found = [float(v) for v in kind(x, ear, **settings).parts(y, noise="seeded", seed=7)]
-        assert found == pytest.approx(expected, abs=error)
+            values = [float(v) for v in kind(x, ear, **settings).parts(y, noise="seeded", seed=7)]
+        assert values == pytest.approx(expected, abs=error)
     score = float(SCORES[name](processed, clean, ear, **settings))
     assert score == pytest.approx(expected[0], abs=7e-3 if name == "haspi" else 2e-3)
 
@@ -144,8 +144,8 @@ def test_identical_music_has_pyclaritys_score_below_1(
     for kind, processed, score in (("clean", clean, unaided), ("NAL-R", by_nalr, amplified)):
         arguments = clean.numpy(), processed.numpy(), ear, 24000, 7
         expected = float(pyclarity(f"haaqi, {kind}, {name}", reference.haaqi, *arguments)[0])
-        found = haaqi(processed, clean, ear, sample_rate=24000, noise="seeded", seed=7)
-        assert float(found) == pytest.approx(expected, abs=1e-6)
+        result = haaqi(processed, clean, ear, sample_rate=24000, noise="seeded", seed=7)
+        assert float(result) == pytest.approx(expected, abs=1e-6)
         assert expected == pytest.approx(score, abs=0.005)
 
 

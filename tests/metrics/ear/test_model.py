@@ -1,4 +1,4 @@
-"""Kates' ear stage by stage against pyclarity, the recursions against scipy, and shifts against slices."""
+"""Stages of Kates' ear equal pyclarity's, the recursions scipy's, and shifts equal slices."""
 
 from pathlib import Path
 
@@ -64,15 +64,15 @@ def test_padded_items_are_resampled_and_aligned_as_alone(rate: int) -> None:
     ends = (3000, 2001)
     extent = ear_model.Extent(ends)
     signals = extent.cut(torch.randn(2, 3000, dtype=torch.float64))
-    together = ear_input.to_ear_rate(signals, rate, extent)
+    batch = ear_input.to_ear_rate(signals, rate, extent)
     both = ear_input.at_ear_rate(extent, rate)
-    late = both.cut(together.roll(40, -1))
-    delays = ear_input.bulk_delays(ear_input.spectrum_for_alignment(together, both), late, both)
+    late = both.cut(batch.roll(40, -1))
+    delays = ear_input.bulk_delays(ear_input.spectrum_for_alignment(batch, both), late, both)
     for item, end in enumerate(ends):
-        own = extent[item : item + 1]
-        alone = ear_input.to_ear_rate(signals[item : item + 1, :end], rate, own)[0]
-        torch.testing.assert_close(together[item, : len(alone)], alone, rtol=0, atol=1e-13)
-        assert not together[item, len(alone) :].any()
+        item_extent = extent[item : item + 1]
+        alone = ear_input.to_ear_rate(signals[item : item + 1, :end], rate, item_extent)[0]
+        torch.testing.assert_close(batch[item, : len(alone)], alone, rtol=0, atol=1e-13)
+        assert not batch[item, len(alone) :].any()
     assert (delays + 40 == ear_input.HEADROOM).all()
 
 
@@ -143,13 +143,15 @@ def test_the_ear_as_a_whole(pair: tuple[Tensor, Tensor], name: str) -> None:
     clean, late = eb.input_align(clean, late)
     extent = ear_model.Extent((len(clean),))
     gain = 10.0 ** (SPL / 20.0)
-    x, y = (torch.tensor(one)[None] * gain for one in (clean, late))
-    x, y = (torch.nn.functional.pad(one, (0, extent.padded - extent.longest)) for one in (x, y))
-    x, y = (recursions.middle_ear(CPU, torch.float64)(one).flatten(-2) for one in (x, y))
+    x, y = (torch.tensor(signal)[None] * gain for signal in (clean, late))
+    x, y = (
+        torch.nn.functional.pad(signal, (0, extent.padded - extent.longest)) for signal in (x, y)
+    )
+    x, y = (recursions.middle_ear(CPU, torch.float64)(signal).flatten(-2) for signal in (x, y))
     normal, ours = (
         ear_model.hair_cells(torch.tensor(a.thresholds)) for a in (Audiogram.standard("NH"), ear)
     )
-    latest = ear_model.longest_group_delay(x, normal, extent)
+    longest_delay = ear_model.longest_group_delay(x, normal, extent)
     for chosen in (slice(0, 3), slice(20, 22)):
         a = ear_model.simulate_cochlea(x, normal, chosen, extent, motion=True)
         b = ear_model.simulate_cochlea(y, ours, chosen, extent, motion=True)
@@ -157,14 +159,14 @@ def test_the_ear_as_a_whole(pair: tuple[Tensor, Tensor], name: str) -> None:
             ear_model.lag_spectrum(a.power.sqrt(), extent), b.power.sqrt(), extent
         )
         power = ear_model.shift(b.power, lags, extent.ends, extent.ends, extent.padded)
-        delays = latest - ear_model.group_delays(a.bandwidth, chosen)
+        delays = longest_delay - ear_model.group_delays(a.bandwidth, chosen)
         pairs = ((a.power, normal, expected[0]), (power, ours, expected[2]))
-        for heard, cells, wanted in pairs:
-            level = ear_model.apply_adaptation(ear_model.sensation(heard, cells.inner[chosen]))
+        for output, cells, wanted in pairs:
+            level = ear_model.apply_adaptation(ear_model.sensation(output, cells.inner[chosen]))
             level = ear_model.shift(level, delays, extent.ends, extent.ends, extent.longest)
             np.testing.assert_allclose(level[0].numpy(), wanted[chosen], rtol=0, atol=1e-5)
-        for heard, cells, wanted in ((a, normal, expected[4]), (b, ours, expected[5])):
-            level = ear_model.mean_level(heard, cells[chosen])
+        for output, cells, wanted in ((a, normal, expected[4]), (b, ours, expected[5])):
+            level = ear_model.mean_level(output, cells[chosen])
             np.testing.assert_allclose(level[0].numpy(), wanted[chosen], rtol=0, atol=1e-5)
 
 
@@ -179,15 +181,17 @@ def test_frames_and_modulation() -> None:
     expected, _ = ebm.env_filter(levels, levels, 320.0, 2560.0, 24000.0)
     np.testing.assert_allclose(ours.numpy(), expected.T, rtol=0, atol=1e-10)
     y = ours + torch.from_numpy(random.standard_normal(ours.shape))
-    x, y = (envelopes.cosines(one) for one in (ours, y))
+    x, y = (envelopes.cosines(signal) for signal in (ours, y))
     six = [
-        np.concatenate((np.zeros((1, one.shape[-1])), one - one.mean(-1, keepdims=True))).T
-        for one in (x.numpy(), y.numpy())
+        np.concatenate((np.zeros((1, signal.shape[-1])), signal - signal.mean(-1, keepdims=True))).T
+        for signal in (x.numpy(), y.numpy())
     ]
     before = ebm.fir_modulation_filter(*six, 2560.0)
     wanted = ebm.modulation_cross_correlation(before[0].copy(), before[1].copy())
-    found = envelopes.modulation_covariance(x[None], y[None], ear_model.Extent((x.shape[-1],)))
-    np.testing.assert_allclose(envelopes.correlation(found)[0].numpy(), wanted, rtol=0, atol=1e-12)
+    covariance = envelopes.modulation_covariance(x[None], y[None], ear_model.Extent((x.shape[-1],)))
+    np.testing.assert_allclose(
+        envelopes.correlation(covariance)[0].numpy(), wanted, rtol=0, atol=1e-12
+    )
 
 
 def test_channels_may_come_in_chunks() -> None:
@@ -225,8 +229,8 @@ def test_shift_of_several_items_and_its_gradient() -> None:
             inside = 0 <= source < ends[i] and t < stops[i]
             assert output[i, c, t] == (signal[i, c, source] if inside else 0.0)
     assert torch.autograd.gradcheck(shifted, (signal,))
-    together = ear_model._gather_rows(signal, delays, ends, stops, 45)  # as on a GPU
-    assert torch.equal(together, output)
+    batch = ear_model._gather_rows(signal, delays, ends, stops, 45)  # as on a GPU
+    assert torch.equal(batch, output)
 
 
 def test_extent_takes_each_item_to_its_end() -> None:
