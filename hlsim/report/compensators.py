@@ -234,4 +234,7 @@ def _test_tables(group: Evaluation) -> list[Table]:
         if c.unit_means is not None
     }
     caption = "All items; p adjusted by Holm within each measure but for a planned comparison"
-    return [comparison_table(chosen, caption), paired_table("Means of each ear", means)]
+    tables = [comparison_table(chosen, caption)] if chosen else []
+    if means:
+        tables.append(paired_table("Means of each ear", means))
+    return tables

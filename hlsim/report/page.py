@@ -206,12 +206,7 @@ class Page:
 
     def html(self) -> str:
         """Return the page as one HTML file; all text is escaped."""
-        claim, evidence = self.verdict, ""
-        if self.verdict.endswith(")."):  # numbers in parentheses are printed smaller
-            claim, _, evidence = self.verdict.rpartition(" (")
-            evidence = evidence and f"({evidence}"
-        parts = {"title": self.title, "sections": self.sections, "cards": self.cards}
-        return _render("page.html", verdict=claim or evidence, evidence=evidence, **parts)
+        return _render("page.html", page=self)
 
     def markdown(self) -> str:
         """Return text and tables without what is played or drawn; HTML tags stay text."""
