@@ -56,7 +56,7 @@ class STFT:
     def analyse(self, waveform: Tensor) -> Tensor:
         """Compute the spectrum of waveforms.
 
-        The result equals that of ``torch.stft``, whose gradient takes half as long again.
+        The result equals that of ``torch.stft``, whose gradient takes 1.5 times as long.
 
         Shape: (items, time) -> complex (items, time // hop + 1, frequencies).
         """

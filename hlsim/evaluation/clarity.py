@@ -305,7 +305,9 @@ def _signal_folders(conditions: Sequence[Condition], root: Path) -> dict[str, Pa
     """
     names = {c.name: re.sub(r"[^\w.+-]+", "-", c.name).strip(".-") for c in conditions}
     if len({*names.values(), ""}) <= len(names):
-        raise ValueError(f"the labels {', '.join(names)} make no folders of different names")
+        raise ValueError(
+            f"two of the labels {', '.join(names)} would have the same folder; rename one of them"
+        )
     return {condition: root / name for condition, name in names.items()}
 
 

@@ -68,8 +68,9 @@ def evaluate_simulators(
         running: ``jobs``, ``dask`` and ``progress``, as in ``run_study``.
 
     Returns:
-        The evaluation with one group per treatment, in which each simulator is compared with the
-        first by its SNR.
+        The evaluation with one group per treatment. The SNR of a simulator is that of the teacher's
+        output relative to the simulator's error. In each group, the SNR of every simulator is
+        compared with that of the first one in ``simulators``.
 
     Raises:
         ValueError: data or settings are not valid, or no item has a value.

@@ -112,14 +112,15 @@ BANKS = {"none": _NARROW, "mild": _NARROW, "moderate": _MIDDLE, "severe": _WIDE}
 def gammatone_response(
     bank: FilterBank, points: int, channels: slice = slice(None), bins: int | None = None
 ) -> NDArray[np.complex128]:
-    """Compute the frequency responses of channels, including advances and high-passes.
+    """Compute the frequency responses of channels.
 
     Each channel is a cascade of four identical gammatone stages with one zero and two poles::
 
         g (1 - r cos(w) / z) / (1 - 2 r cos(w) / z + r^2 / z^2)
 
     Here r is exp(-2 pi broadening ERB / fs), w is 2 pi f / fs, and g makes the gain 1 at the
-    channel's centre frequency f.
+    channel's centre frequency f. The advance of the channel and its high-pass, if it has one, are
+    part of the response (``FilterBank.advances``, ``highpass_corners``).
 
     Args:
         points: FFT length at 44.1 kHz, whose ``rfft`` has the frequencies of the responses.

@@ -74,13 +74,17 @@ def end_weights(bank: FilterBank) -> Array:
 
 
 def end_responses(bank: FilterBank, length: int) -> Array:
-    """Compute two oscillations per channel at the steps before and shortly behind the end.
+    """Compute the free oscillations of each channel's low-pass around the end of a signal.
+
+    Each low-pass has two free oscillations, for the two numbers of its state. They are sampled as
+    the envelopes are, every 24 samples (a step).
 
     Args:
-        length: number of samples of the signal, or this number up to whole steps.
+        length: number of samples of the signal, or a number that leaves the same remainder when
+            it is divided by 24.
 
-    Returns: oscillations of shape (channels, 170, 2), whose last step is ``AHEAD`` steps behind the
-        end.
+    Returns: oscillations of shape (channels, 170, 2). The last of the 170 steps is ``AHEAD`` steps
+        after the end of the signal.
 
     >>> from hlsim.msbg.filterbank import BANKS
     >>> end_responses(BANKS["severe"], 100).shape

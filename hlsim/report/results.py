@@ -123,7 +123,11 @@ def lower_first(title: str) -> str:
 
 
 def loss_name(severity: str) -> str:
-    """Return a degree of loss in words."""
+    """Return the name of a severity for a table or a sentence.
+
+    >>> loss_name("mild"), loss_name("none")
+    ('mild loss', 'no loss')
+    """
     return "no loss" if severity == "none" else f"{severity} loss"
 
 

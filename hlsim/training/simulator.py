@@ -28,7 +28,7 @@ POWER_FLOOR = 1e-18
 
 
 class SimulatorTraining(TrainingModule):
-    """Training of a network on the teacher's output, ``impaired`` in a batch."""
+    """Training of a network on the output of a teacher, which batches contain as ``impaired``."""
 
     recipe: SimulatorRecipe
 

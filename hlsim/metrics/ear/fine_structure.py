@@ -358,13 +358,16 @@ def relative_loudness(levels: Tensor) -> Tensor:
 
 
 def spectral_similarity(differences: Tensor, scale: float) -> Tensor:
-    """Return how equal two spectra are, by the standard deviation of their differences.
+    """Compute the similarity of two spectra, from 0 to 1.
+
+    It is 1 - 32 s / scale, where s is the standard deviation of the differences over the 32
+    channels, and at least 0.
 
     Args:
-        differences: differences of the channels.
-        scale: 32 times the standard deviation at which the similarity is 0.
+        differences: one spectrum minus the other. Shape: (..., channels).
+        scale: value of 32 s at which the similarity is 0.
 
-    Shape: (..., channels) -> (...), 0 to 1.
+    Shape: (..., channels) -> (...).
 
     >>> spectral_similarity(torch.zeros(32), 2.5)
     tensor(1.)

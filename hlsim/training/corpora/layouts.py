@@ -197,8 +197,8 @@ def recognise(
         meanings = [level for level in folders if level != "other"]
         if not set(folders) <= set(LEVELS) or len(set(meanings)) < len(meanings):
             raise ValueError(
-                f"{layout}: expected {', '.join(LEVELS)}, separated by /, and only 'other' "
-                "repeatedly"
+                f"{layout}: expected some of {', '.join(LEVELS)}, separated by /, each at most "
+                "once except 'other', such as --folders split/speaker"
             )
         pattern = "/".join(LEVELS[level] for level in folders) + "/(.*/)?[^/]+"
         return layout, _read_utterances(files, pattern, layout)

@@ -43,13 +43,13 @@ def read_manifest(path: str | Path, root: str | Path | None = None) -> list[Utte
     """Read and check a manifest.
 
     Args:
-        path: CSV file with a column ``path`` and optional columns ``noisy``, ``speaker`` and
-            ``split``. Without the column ``split``, all utterances are in the split ``train``.
+        path: CSV file with a column ``path`` and optional columns ``noisy`` (the path of the noisy
+            version), ``speaker`` and ``split``. Without the column ``split``, all utterances are in the split ``train``.
         root: Folder to which the paths are relative; by default the folder of the manifest.
 
     Raises:
-        ValueError: The file is not such a table, its rows contradict each other, or a path is
-            outside the root.
+        ValueError: The file is not such a table, a path is listed twice or is outside the root, or
+            a speaker or a file is in two splits.
     """
     table = read_table(path, "the manifest")
     utterances = []
