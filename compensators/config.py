@@ -14,9 +14,10 @@ class MappingConfig(NetworkConfig):
 
     Attributes:
         start: gain before training: ``"nalr"``, or a share of the hearing loss from 0 to 1.
-        phase: phase of the output: ``input`` for that of the input, or ``predicted`` as in the
-            paper. A criterion of levels alone, such as ``bands``, teaches a predicted phase to
-            remove steady sounds by a different shift in each frame.
+        phase: phase of the output: ``input`` for that of the input, or ``predicted`` by the
+            network, as in Neuro-MSBG. Do not combine ``predicted`` with a criterion that compares
+            only levels, such as ``"bands"``. Training may then find phases that differ between
+            overlapping frames, which cancels steady sounds.
         bands: number of bands of the correction, evenly spaced on the ERB-number scale, 4 to 40.
         reach_db: largest correction up or down in dB.
         limit_spl: peak of the output in dB SPL that no sample exceeds.

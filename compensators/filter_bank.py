@@ -164,8 +164,8 @@ def gain_at_rate(gains: Tensor, rate: int, time: int) -> Tensor:
 def frame_power(padded: Tensor) -> Tensor:
     """Compute the power at each frequency in frames of 16 ms every 4 ms.
 
-    The sum over frequencies is the mean square of a frame. The input begins with the HISTORY (12 ms)
-    before the first hop, or as many zeros, so that a frame ends with each hop.
+    The sum over frequencies is the mean square of a frame. The input begins with the HISTORY (12
+    ms) before the first hop, or as many zeros, so that a frame ends with each hop.
 
     Shape: (items, HISTORY + frames * HOP) in pascals -> (items, frames, FRAME / 2 + 1).
 

@@ -61,9 +61,9 @@ def measure_gains(
 
 
 def speech_noise() -> NDArray[np.float64]:
-    """Return a second of noise with the spectrum of average speech at 65 dB SPL, (16000,).
+    """Return one second of noise with the spectrum of average speech at 65 dB SPL.
 
-    The end of the noise continues with its beginning.
+    Samples are in pascals at 16 kHz, with shape (16000,). The noise can be repeated without a jump.
 
     >>> speech_noise().shape
     (16000,)

@@ -199,7 +199,7 @@ def _check_paths(source: Path, target: Path) -> None:
         inner, outer = resolve_links(source), resolve_links(target)
         if inner.is_relative_to(outer) or outer.is_relative_to(inner):
             raise ValueError(
-                f"{target}: expected a folder that is neither inside {source} nor around it"
+                f"{target}: expected a folder that is neither inside {source} nor contains it"
             )
         return
     if target.is_dir():

@@ -118,7 +118,7 @@ def equalise_bands(waveform: Tensor, gains_db: Sequence[float]) -> Tensor:
 
 
 class PluginAid(nn.Module):
-    """Aid of a user, ``(waveform, listener, sample_rate) -> waveform``.
+    """Aid of a user for two ears, a function ``(waveform, listener, sample_rate) -> waveform``.
 
     An output that is longer than the input by up to 0.1 s is cut.
 
@@ -132,7 +132,15 @@ class PluginAid(nn.Module):
         self.sample_rate = sample_rate
 
     def forward(self, waveform: Tensor, listener: Any) -> Tensor:
-        """Call the plug-in. Shape: (2, time) -> (2, time)."""
+        """Call the user's function.
+
+        Args:
+            waveform: signals at the left and the right ear in pascals. Shape: (2, time).
+            listener: audiograms of both ears, an ``hlsim.Listener``.
+
+        Returns:
+            Outputs for both ears. Shape: (2, time).
+        """
         output = self.plugin(waveform, listener, self.sample_rate)
         lengths = waveform.shape[-1], output.shape[-1]
         names = ("the input", f"the output of {self.plugin.name}")

@@ -50,9 +50,10 @@ def draw_items(
 ) -> list[Item]:
     """Draw items for simulators.
 
-    Half of the ears are those of the file, a quarter the milder standard ones (NH, N1, N2, S1) and
-    a quarter random. With noise, every second item is noisy. With four ratios and five levels, each
-    kind of ear meets each combination once in 160 items.
+    Half of the ears are from ``audiograms``, a quarter are mild standard ears (NH, N1, N2, S1) and
+    a quarter are random. With noise, every second item is noisy, with one of four signal-to-noise
+    ratios in turn. With five levels, 160 items contain each combination of ratio, level and kind of
+    ear once.
 
     Args:
         speech, noise: folders of recordings.

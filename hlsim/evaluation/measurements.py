@@ -277,8 +277,9 @@ def look_ahead(outputs: Iterable[Tensor], positions: Iterable[int]) -> int:
     Differences of more than 1e-4 of the output's peak count.
 
     Args:
-        outputs: outputs for the signals of ``changed_signals``. Shape: (..., time) each.
-        positions: samples from which on the input changes.
+        outputs: outputs for the signals of ``changed_signals``, in the same order: that for the
+            unchanged signal, and one for each position. Shape: (..., time) each.
+        positions: samples from which on the input becomes another sound.
 
     Returns:
         The largest number at any position, at least 0.

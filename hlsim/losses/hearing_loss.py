@@ -195,7 +195,7 @@ class HearingLossLoss(nn.Module):
 
     @property
     def reference(self) -> ReferenceName | None:
-        """The reference that was passed to the constructor."""
+        """The name of the signal to compare with, from the constructor; None for the default."""
         return self._frozen.choice
 
     @property

@@ -228,7 +228,9 @@ class _MeanScore(_Metric):
 
     @property
     def ears(self) -> Tensor:
-        """Mean score of the left and of the right ear in this process, NaN for a mono batch.
+        """Mean score of the left and of the right ear since the last reset, in this process.
+
+        Both are NaN if the signals had one channel.
 
         Shape: (2,).
         """

@@ -135,7 +135,7 @@ class Prior(nn.Module):
         Shape: (items, time), (items,) -> (items, time).
 
         Args:
-            severity: index of each ear's severity.
+            severity: degree of loss of each ear, 0 (none) to 3 (severe).
         """
         return filter_without_delay(waveform, self.response[severity].to(waveform))
 
@@ -147,8 +147,8 @@ class Prior(nn.Module):
 
         Args:
             powers: powers of the spectra of filtered waveforms in Pa^2.
-            thresholds: audiograms in dB HL.
-            severity: index of each ear's severity.
+            thresholds: audiograms in dB HL at ``hlsim.audiogram.FREQUENCIES``.
+            severity: degree of loss of each ear, 0 (none) to 3 (severe).
         """
         smeared_powers = powers @ self._smearing()[severity].mT
         levels = self.channel_levels(smeared_powers, severity)
@@ -194,14 +194,14 @@ class Prior(nn.Module):
         return envelopes.reshape(items, channels, -1).clamp_min(MIN_ENVELOPE)
 
     def log_gain(self, log_envelope: Tensor, thresholds: Tensor, severity: Tensor) -> Tensor:
-        """Compute the logarithm of recruitment's gain for each channel.
+        """Compute the natural logarithm of the gain that simulates recruitment in each channel.
 
         Shape: (items, channels, steps), (items, 8), (items,) -> (items, channels, steps).
 
         Args:
             log_envelope: natural logarithm of envelopes in Pa.
-            thresholds: audiograms in dB HL.
-            severity: index of each ear's severity.
+            thresholds: audiograms in dB HL at ``hlsim.audiogram.FREQUENCIES``.
+            severity: degree of loss of each ear, 0 (none) to 3 (severe).
         """
         weights = constant_like(thresholds, _threshold_weights)[severity]
         exponents = (expansion_ratios(thresholds, weights) - 1.0).unsqueeze(-1)
@@ -214,7 +214,7 @@ class Prior(nn.Module):
 
         Args:
             gains: real parts of all channels' gains, followed by the imaginary parts.
-            severity: index of each ear's severity.
+            severity: degree of loss of each ear, 0 (none) to 3 (severe).
 
         Returns: real and imaginary parts of the factors.
         """

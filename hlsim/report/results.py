@@ -174,7 +174,11 @@ def paired_cells(c: PairedComparison, p_t: float | None, p_w: float | None) -> d
 
 
 def comparison_sections(evaluation: Evaluation) -> list[Section]:
-    """Return the details of all comparisons: further pairs, degrees of loss, units."""
+    """Return the sections of a page with the details of all comparisons.
+
+    They contain the pairs of conditions that the verdict leaves out, the comparisons for each
+    degree of hearing loss, and those over other statistical units, such as listeners.
+    """
     headline, sections = evaluation.headline, []
     if headline is None:
         return []

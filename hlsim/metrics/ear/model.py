@@ -509,8 +509,8 @@ def shift(
     Args:
         signal: signals. Shape: (items, channels, time).
         delays: delays in samples; negative ones advance. Shape: (items, channels), int64.
-        ends: samples of each item that are signal; the others count as 0.
-        stops: samples of each item's output, behind which it is 0.
+        ends: number of samples of each item; later ones count as 0.
+        stops: number of samples of each item's output; later ones are 0.
         size: length of the output.
 
     Returns:

@@ -43,8 +43,9 @@ def read_manifest(path: str | Path, root: str | Path | None = None) -> list[Utte
     """Read and check a manifest.
 
     Args:
-        path: CSV file with a column ``path`` and optional columns ``noisy`` (the path of the noisy
-            version), ``speaker`` and ``split``. Without the column ``split``, all utterances are in the split ``train``.
+        path: CSV file with a column ``path`` and optional columns ``noisy`` (path of the noisy
+            version), ``speaker`` and ``split``. Without the column ``split``, all utterances are in
+            the split ``train``.
         root: Folder to which the paths are relative; by default the folder of the manifest.
 
     Raises:
