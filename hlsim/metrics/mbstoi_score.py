@@ -126,11 +126,15 @@ def _mean_correlation(envelopes: Tensor, counts: NDArray[np.int64]) -> Tensor:
     may_use_one_ear = start < segments[item] - 1
     positions = _to_device(np.stack((item, start, may_use_one_ear)), device)
     segments_at_once = CPU_SEGMENTS if device.type == "cpu" else GPU_SEGMENTS
-    correlations = map_on_cores(
-        lambda part: _correlate(windows[part[0], part[1]], part[2].bool()),
-        positions.split(segments_at_once, -1),
-        envelopes,
-    )
+    parts = positions.split(segments_at_once, -1)
+
+    def correlate(part: Tensor) -> Tensor:
+        return _correlate(windows[part[0], part[1]], part[2].bool())
+
+    if len(segments) == 1:  # a single item is so short that starting threads costs more
+        correlations = [correlate(part) for part in parts]
+    else:
+        correlations = map_on_cores(correlate, parts, envelopes)
     total = envelopes.new_zeros(len(segments)).index_add(0, positions[0], torch.cat(correlations))
     return total / _to_device(segments, device)
 
