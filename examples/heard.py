@@ -23,6 +23,12 @@ ROOT = Path(__file__).parents[1]
 RATE = 16000
 EXACT = "exact MSBG"
 RANGE_DB = 75.0
+AIDS = {
+    "nalr": "NAL-R",
+    "hearing-aid": "hearing-aid",
+    "compensator-general": "compensator-general",
+}
+"""Titles of the aids by name."""
 
 
 def read_speech() -> Tensor:
@@ -67,18 +73,23 @@ def draw(signals: dict[str, Tensor], path: Path, reference: str = "") -> None:
     for axes in places[len(panels) :]:
         axes.set_axis_off()
     data = BytesIO()
-    figure.savefig(data, dpi=160, format="png")
-    # 96 colours need less than half of the space
-    picture = Image.open(data).convert("RGB").quantize(96, Image.Quantize.MAXCOVERAGE)
+    figure.savefig(data, dpi=130, format="png")
+    # 48 colours need a third of the space
+    picture = Image.open(data).convert("RGB").quantize(48, Image.Quantize.MAXCOVERAGE)
     picture.save(path, optimize=True)
 
 
 @torch.no_grad()
 def main(folder: Path = ROOT / "docs") -> None:
     clean, exact, ear = read_speech(), MSBG(sample_rate=RATE), Audiogram.standard("N4")
-    perceived = {"clean speech": clean, "perceived without an aid": exact(clean, ear)}
-    for name in ("nalr", "compensator-general"):
-        perceived[f"perceived with {name}"] = exact(load_compensator(name)(clean, ear), ear)
+    perceived = {
+        "clean speech": clean,
+        "normal ear": exact(clean, Audiogram.standard("NH")),
+        "N4 ear without an aid": exact(clean, ear),
+    }
+    for name, title in AIDS.items():
+        output = load_compensator(name)(clean, ear)
+        perceived[f"N4 ear with {title}"] = exact(output, ear)
     draw(perceived, folder / "heard.png")
     ear = Audiogram.standard("N2")
     family = [name for name, loader in list_pretrained().items() if loader == "load_pretrained"]
