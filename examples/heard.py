@@ -1,5 +1,5 @@
-"""Draw docs/heard.png, speech as an N4 ear perceives it with and without an aid, and
-docs/family.png, an N2 ear by simulator.
+"""Draw docs/heard.png, speech as a normal ear and an N4 ear perceive it, without an aid and with
+three, and docs/family.png, an N2 ear by simulator.
 
 python examples/heard.py
 """
