@@ -12,7 +12,7 @@ import torch
 
 from hlsim import MSBG, Audiogram, load_pretrained
 from hlsim.calibration import level_spl, set_level
-from hlsim.evaluation.measurements import tones
+from hlsim.evaluation.aid_properties import tones
 from hlsim.metrics.fidelity import snr_db
 
 EARS = ("NH", "N1", "N2", "N3", "N4", "N5", "S1", "S2", "S3")

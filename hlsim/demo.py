@@ -15,10 +15,10 @@ from hlsim.audio import find_audio, read_audio, write_audio
 from hlsim.audiogram import STANDARD, Audiogram
 from hlsim.calibration import PASCAL_SPL, set_level
 from hlsim.dsp.resample import resample
+from hlsim.evaluation.aid_properties import gain_curves
 from hlsim.evaluation.aids import AtLevelOf, Unaided
 from hlsim.evaluation.comparison import compare
 from hlsim.evaluation.items import INPUT_LEVELS
-from hlsim.evaluation.measurements import gain_curves
 from hlsim.evaluation.measures import LEVELS, MEASURES, PERCEPTION, perceive
 from hlsim.evaluation.parallel import Progress, one_thread
 from hlsim.evaluation.result import Evaluation

@@ -17,7 +17,7 @@ from hlsim.audiogram import Audiogram
 from hlsim.calibration import PASCAL_SPL, gain_to_pascals, level_spl, set_level
 from hlsim.dsp.fir import filter_without_delay
 from hlsim.dsp.resample import resample
-from hlsim.evaluation.measurements import insertion_gain
+from hlsim.evaluation.aid_properties import insertion_gain
 from hlsim.losses.band_levels import band_centres
 from hlsim.metrics.pair import common_length
 from hlsim.neuro.config import NEURO_RATE

@@ -25,8 +25,8 @@ from hlsim.audio import read_audio, write_audio
 from hlsim.audiogram.listener import EARS, Listener
 from hlsim.audiogram.table import read_listeners
 from hlsim.calibration import set_level
+from hlsim.evaluation.aid_properties import changed_signals, look_ahead
 from hlsim.evaluation.aids import Enhanced, PluginAid, Unaided, load_enhancers
-from hlsim.evaluation.measurements import changed_signals, look_ahead
 from hlsim.evaluation.measures import find_measures
 from hlsim.evaluation.parallel import describe_error, one_thread, run_parallel
 from hlsim.evaluation.recordings import Recording, score_recordings

@@ -13,6 +13,13 @@ from compensators.nalr import NALR
 from compensators.wdrc import WDRC
 from hlsim.audiogram import Audiogram
 from hlsim.audiogram.thresholds import as_thresholds
+from hlsim.evaluation.aid_properties import (
+    draw_utterances,
+    gain_curves,
+    measure_aids,
+    steady_tones,
+    wearing,
+)
 from hlsim.evaluation.aids import (
     AtLevelOf,
     Enhanced,
@@ -23,13 +30,6 @@ from hlsim.evaluation.aids import (
 )
 from hlsim.evaluation.comparison import compare
 from hlsim.evaluation.items import INPUT_LEVELS, draw_judged_items, read_ears
-from hlsim.evaluation.measurements import (
-    draw_utterances,
-    gain_curves,
-    measure_aids,
-    steady_tones,
-    wearing,
-)
 from hlsim.evaluation.measures import LEVELS, PERCEPTION, find_measures, network_loss
 from hlsim.evaluation.result import Evaluation
 from hlsim.evaluation.study import Condition

@@ -1,4 +1,6 @@
-"""The default criterion: coherence and difference in level with a normal ear in each band.
+"""The criterion ``"coherent-bands"``, the default of ``HearingLossLoss``.
+
+It compares the coherence and the level in each band with those for a normal ear.
 
 Both signals are cut into 24 ERB-wide bands (``hlsim.losses.band_levels``) and overlapping segments
 of 96 ms. With ``H`` and ``R`` the spectra of the impaired and the normal ear's outputs, in frames

@@ -46,7 +46,7 @@ from hlsim.losses.frozen_simulator import (
     apply_to_module,
 )
 from hlsim.metrics.interaural import interaural_loss
-from hlsim.metrics.objective import SCORES, score_loss
+from hlsim.metrics.score_loss import SCORES, score_loss
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.torchtools import not_compiled
 
@@ -90,7 +90,7 @@ class HearingLossLoss(nn.Module):
     - ``"paper"``: Equations 2 to 9 of the Neuro-MSBG paper, which are not balanced between ears and
       levels (``hlsim.losses.paper``)
     - ``"haspi"`` and ``"hasqi"``: 1 minus the score of the compensated speech
-      (``hlsim.metrics.objective``). They ignore the level, so combine them with another criterion.
+      (``hlsim.metrics.score_loss``). They ignore the level, so combine them with another criterion.
     - ``"interaural"``: change of the differences between the ears of a listener
       (``hlsim.metrics.interaural``), to be combined with another criterion
     - several of these by name with their weights, ``{"coherent-bands": 1.0, "haspi": 0.3}``
@@ -104,8 +104,9 @@ class HearingLossLoss(nn.Module):
         simulator: ``"neuro-msbg"`` or the name or folder of another checkpoint; ``"msbg"``, the
             exact model; or a module, which is called with a waveform and thresholds. The module
             itself is frozen, so pass a copy of one that is still trained. It may have the
-            attributes ``sample_rate``, ``full_scale_spl`` and ``aligned``, which are validated;
-            ``emulates_msbg``, true if its normal ear and its phases are those of MSBG;
+            attributes ``sample_rate``, ``full_scale_spl`` and ``aligned`` (false if its output is
+            delayed), which are validated; ``emulates_msbg``, true if its normal ear and its phases
+            are those of MSBG;
             ``highest_frequency`` of its output in Hz; and ``needs_exact_lengths``, true if silence
             after the end of an item changes the output before.
         sample_rate: sample rate of the speech in Hz, 16000 to 48000. Neuro-MSBG compares the band
@@ -116,9 +117,9 @@ class HearingLossLoss(nn.Module):
             normal ear for it (the default otherwise). The other criteria always compare with a
             normal ear. The reference gets the phase of MSBG's filter bank for the severity of the
             ear (``hlsim.msbg.response``), unless ``normal`` is passed or the simulator does not
-            emulate MSBG. Without this phase, inverted speech could be closer than the speech.
+            emulate MSBG. Without this phase, speech of the opposite sign could have a lower loss.
         criterion: criterion, as listed above.
-        weights: weights of the parts by name; other parts do not count.
+        weights: weights of the parts that ``parts`` returns, by name; other parts do not count.
         reduction: ``"mean"`` over the items, whatever their lengths, or ``"none"`` for one value
             per item.
         normal: normal ear that belongs to the simulator: a module, which is frozen too, or a

@@ -29,11 +29,11 @@ from hlsim.audiogram.thresholds import (
 from hlsim.calibration import PASCAL_SPL, check_full_scale, gain_to_pascals
 from hlsim.checks import broadcast_shape, check_rate, check_waveform
 from hlsim.dsp.fft import rfft
-from hlsim.msbg.blocks import in_blocks
 from hlsim.msbg.cochlea import bank_points, simulate_cochlea, simulate_cochlea_at_full_rate
 from hlsim.msbg.ear import MSBG_RATE
 from hlsim.msbg.filterbank import BANKS, FilterBank
 from hlsim.msbg.multirate import multirate_bank, total_response
+from hlsim.msbg.overlapping_blocks import in_blocks
 from hlsim.msbg.recruitment import expansion_ratios, threshold_weights
 from hlsim.msbg.resampling import from_cochlea, from_spectrum, resample_to_model_rate, to_cochlea
 from hlsim.msbg.smearing import BROADENING, SMEARING_DELAY, smear, smearing_matrix_below
@@ -182,7 +182,7 @@ class MSBG(nn.Module):
             return self._simulate(waveform, thresholds, grids)
 
     def delay(self, severity: str) -> int:
-        """Return the structural delay in samples at 44.1 kHz.
+        """Return the structural delay in samples at 44.1 kHz: that of filters and frames.
 
         Args:
             severity: one of ``SEVERITIES``.

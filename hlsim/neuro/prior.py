@@ -140,13 +140,15 @@ class Prior(nn.Module):
         return filter_without_delay(waveform, self.response[severity].to(waveform))
 
     def forward(self, powers: Tensor, thresholds: Tensor, severity: Tensor) -> Tensor:
-        """Compute the complex factor of MSBG on spectra from their powers.
+        """Estimate the complex factors by which MSBG multiplies the bins of a spectrum.
+
+        They are computed by MSBG's formulae on frames of 8 ms, from the powers of the bins.
 
         Shape: (items, frames, frequencies), (items, 8), (items,) -> complex (items, frames,
             frequencies).
 
         Args:
-            powers: powers of the spectra of filtered waveforms in Pa^2.
+            powers: powers of the bins in Pa^2, after MSBG's filter of the outer and middle ear.
             thresholds: audiograms in dB HL at ``hlsim.audiogram.FREQUENCIES``.
             severity: degree of loss of each ear, 0 (none) to 3 (severe).
         """

@@ -30,8 +30,8 @@ from hlsim.training.corpora.manifest import SPLITS, read_manifest
 from hlsim.training.data_module import Batch, BatchData, Step
 from hlsim.training.ears import draw_thresholds
 from hlsim.training.recipes import CompensatorRecipe, SimulatorRecipe, TrainingRecipe
-from hlsim.training.sounds import draw_sounds
 from hlsim.training.teacher import Reference, Teacher
+from hlsim.training.tones_and_clicks import draw_sounds
 
 VALIDATION_SECONDS = 2.0
 """Duration of the clips for validation."""

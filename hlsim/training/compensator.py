@@ -83,7 +83,7 @@ class CompensatorTraining(TrainingModule):
         return self.loss(self.network(signal, ears, slider), reference, ears)
 
     def evaluate(self, batch: Batch) -> dict[str, Tensor]:
-        """Compute the training loss of a batch."""
+        """Compute the loss of a validation batch, by the name ``valid_loss``."""
         return {"valid_loss": self.training_loss(batch)[None]}
 
     def summarise(self, values: Mapping[str, Tensor]) -> dict[str, float]:

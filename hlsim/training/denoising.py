@@ -9,7 +9,7 @@ from torch.nn import functional
 from compensators.filter_bank import FRAME, HISTORY, HOP, frame_power, shares
 from compensators.hearing_aid import HearingAid
 from hlsim.calibration import PASCAL_SPL, level_spl, set_level
-from hlsim.metrics.objective import score_loss
+from hlsim.metrics.score_loss import score_loss
 from hlsim.neuro.config import NEURO_RATE
 from hlsim.torchtools import constant_like
 

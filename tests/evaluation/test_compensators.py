@@ -12,7 +12,7 @@ from compensators.config import MappingConfig
 from hlsim import MSBG, Audiogram, HearingLossLoss, load_pretrained
 from hlsim.calibration import level_spl, set_level
 from hlsim.cli.main import main
-from hlsim.evaluation import Item, measurements
+from hlsim.evaluation import Item, aid_properties
 from hlsim.evaluation.aids import Unaided, load_enhancers
 from hlsim.evaluation.compensators import evaluate_compensators
 from hlsim.evaluation.measures import NORMAL, PERCEPTION, band_error_db, network_loss
@@ -43,8 +43,8 @@ def options(
     speech_dir: Path, quick_scores: None, monkeypatch: pytest.MonkeyPatch
 ) -> dict[str, Any]:
     """Return settings of an evaluation that takes seconds."""
-    monkeypatch.setattr(measurements, "TONES", (1000,))
-    monkeypatch.setattr(measurements, "CHANGE_POSITIONS", range(8000, 40000, 16001))
+    monkeypatch.setattr(aid_properties, "TONES", (1000,))
+    monkeypatch.setattr(aid_properties, "CHANGE_POSITIONS", range(8000, 40000, 16001))
     folders = {"speech": speech_dir / "valid", "noise": speech_dir / "train"}
     return {**folders, "seconds": 0.4, "jobs": 1, "gain_ears": ("N3",)}
 

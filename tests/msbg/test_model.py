@@ -18,8 +18,8 @@ from hlsim.audio import find_audio, read_audio
 from hlsim.audiogram import STANDARD, Audiogram
 from hlsim.calibration import level_spl, set_level
 from hlsim.msbg import MSBG
-from hlsim.msbg.blocks import block_bounds
 from hlsim.msbg.model import STRUCTURAL_DELAY, active_rescaling
+from hlsim.msbg.overlapping_blocks import block_bounds
 from hlsim.msbg.resampling import resample_to_model_rate
 from hlsim.msbg.smearing import HOP
 from hlsim.training.ears import draw_thresholds
@@ -465,7 +465,9 @@ def test_processing_in_blocks_equals_processing_at_once(
     with torch.no_grad():
         output = model(wave)
         assert len(block_bounds(samples, rate)) == 2
-        monkeypatch.setattr("hlsim.msbg.blocks.block_bounds", lambda n, _: [(0, 0, n, n)])
+        monkeypatch.setattr(
+            "hlsim.msbg.overlapping_blocks.block_bounds", lambda n, _: [(0, 0, n, n)]
+        )
         expected = model(wave)
     assert output.shape == expected.shape
     assert relative_error(output.numpy(), expected.numpy()) < 1e-5
@@ -475,7 +477,7 @@ def test_processing_in_blocks_equals_processing_at_once(
 def test_gradients_through_blocks_equal_those_at_once(
     monkeypatch: pytest.MonkeyPatch, aligned: bool
 ) -> None:
-    monkeypatch.setattr("hlsim.msbg.blocks._BLOCK_SECONDS", 1.0)
+    monkeypatch.setattr("hlsim.msbg.overlapping_blocks._BLOCK_SECONDS", 1.0)
     wave = 0.03 * torch.randn(2 * 44100, dtype=torch.float64)
     model = fast_model(Audiogram.standard("N3"), aligned=aligned)
     assert len(block_bounds(wave.shape[-1], RATE)) > 1
@@ -488,7 +490,9 @@ def test_gradients_through_blocks_equal_those_at_once(
         if aligned:
             slope = torch.func.grad(lambda signal: model(signal).square().sum())(wave)
             torch.testing.assert_close(slope, leaf.grad)
-        monkeypatch.setattr("hlsim.msbg.blocks.block_bounds", lambda n, _: [(0, 0, n, n)])
+        monkeypatch.setattr(
+            "hlsim.msbg.overlapping_blocks.block_bounds", lambda n, _: [(0, 0, n, n)]
+        )
     assert relative_error(gradients[0], gradients[1]) < 1e-4
 
 

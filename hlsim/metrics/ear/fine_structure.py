@@ -78,7 +78,7 @@ def segments_of(extent: Extent, segment: int = SEGMENT) -> Extent:
 
 
 def smooth_levels(levels: Tensor, extent: Extent, segment: int = SEGMENT) -> Tensor:
-    """Compute the Hann-weighted mean of each segment.
+    """Compute the Hann-weighted means of segments, which overlap by half.
 
     Args:
         levels: levels of the envelopes in dB.

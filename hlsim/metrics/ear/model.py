@@ -576,7 +576,9 @@ def _gather_rows(
 
 
 def group_delays(bandwidth: Tensor, channels: slice) -> Tensor:
-    """Return the group delays of the gammatones at 0 Hz in whole samples.
+    """Return the delay of each gammatone at its centre frequency in whole samples.
+
+    Channels are shifted to 0 Hz before they are filtered, so it is the group delay at 0 Hz.
 
     Args:
         bandwidth: bandwidths of the filters, relative to normal hearing.

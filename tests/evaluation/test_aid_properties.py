@@ -13,8 +13,7 @@ from compensators import NALR, MappingCompensator
 from compensators.config import MappingConfig
 from hlsim import MSBG, Audiogram
 from hlsim.calibration import level_spl
-from hlsim.evaluation.aids import EqualiserLike, Unaided, equalise_bands
-from hlsim.evaluation.measurements import (
+from hlsim.evaluation.aid_properties import (
     TONES,
     gain_curves,
     insertion_gain,
@@ -22,6 +21,7 @@ from hlsim.evaluation.measurements import (
     tones,
     wearing,
 )
+from hlsim.evaluation.aids import EqualiserLike, Unaided, equalise_bands
 from hlsim.evaluation.measures import NORMAL
 from hlsim.losses.band_levels import band_edges
 

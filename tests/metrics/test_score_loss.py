@@ -8,7 +8,7 @@ from torch import Tensor
 
 from hlsim.audio import read_audio
 from hlsim.audiogram import Audiogram
-from hlsim.metrics.objective import SCORES, score_loss
+from hlsim.metrics.score_loss import SCORES, score_loss
 
 N3, N4 = (torch.tensor(Audiogram.standard(name).thresholds) for name in ("N3", "N4"))
 TIME = 12000

@@ -73,9 +73,11 @@ def in_blocks(
 
 
 def block_bounds(samples: int, rate: int) -> list[Block]:
-    """Return blocks that begin at frames of the smearing and steps of the envelopes.
+    """Split a signal into overlapping blocks.
 
-    The frames and steps in a block are therefore those of the whole signal.
+    Each block begins at a multiple of the hop of the smearing and of the step at which envelopes
+    are sampled, so that frames and steps are those of the whole signal. The overlap is longer than
+    the filters take to settle.
 
     Args:
         samples: length of the signal.
